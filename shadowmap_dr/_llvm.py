@@ -1,0 +1,183 @@
+"""Finds an LLVM library that Dr.Jit 1.5 can compile with.
+
+Dr.Jit loads the first ``libLLVM`` it finds while ``import drjit`` runs. With LLVM 15 or 16 its kernels later end the
+whole process (``Cannot select: fminimum``) without a Python exception, hence this module: it points Dr.Jit to a good
+library before the first import, and restarts the backend where Dr.Jit was imported with a bad one already.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import glob
+import importlib.metadata
+import os
+import re
+import sys
+import sysconfig
+import warnings
+from pathlib import Path
+
+from .errors import LLVMError
+
+MIN_VERSION = 17
+ENVIRONMENT_VARIABLE = "DRJIT_LIBLLVM_PATH"
+WHEEL = "karellen-llvm-core"
+
+# The C++ runtime of the wheel's libLLVM, in the order in which the parts depend on each other.
+_RUNTIME = ("libunwind.so.1", "libc++abi.so.1", "libc++.so.1")
+_RUNTIME_FOLDER = "x86_64-unknown-linux-gnu"
+_SYSTEM_PATTERNS = (
+    "/usr/lib/*-linux-gnu/libLLVM*.so*",
+    "/usr/lib64/libLLVM*.so*",
+    "/usr/lib/libLLVM*.so*",
+    "/usr/lib/llvm-*/lib/libLLVM*.so*",
+    "/usr/lib64/llvm*/lib*/libLLVM*.so*",
+    "/opt/homebrew/opt/llvm*/lib/libLLVM*.dylib",
+    "/usr/local/opt/llvm*/lib/libLLVM*.dylib",
+)
+
+
+def ensure() -> None:
+    """Make sure that Dr.Jit uses LLVM >= 17 (or a GPU where there is no LLVM at all).
+
+    Works before and after ``import drjit`` / ``import mitsuba``. Raises LLVMError, one sentence, if that cannot be had.
+    """
+    if "drjit" not in sys.modules and not os.environ.get(ENVIRONMENT_VARIABLE):
+        path = find()
+        if path is not None:
+            _use(path)
+
+    import drjit as dr
+
+    version = loaded_version()
+    if version is not None and version[0] >= MIN_VERSION:
+        return
+    found = "Dr.Jit found no LLVM library"
+    if version:
+        found = f"Dr.Jit loaded LLVM {_dotted(version)}, with which kernels end the whole process"
+
+    path = find()
+    if path is None:
+        if dr.has_backend(dr.JitBackend.CUDA):
+            if version:
+                warnings.warn(f"{found}; use the cuda variants only, or {_remedy()}.", stacklevel=3)
+            return
+        raise LLVMError(f"{found}; {_remedy()}.")
+    _reload(path, found)
+
+
+def find() -> Path | None:
+    """The best LLVM library on this machine with version >= 17, or None. Dr.Jit need not be imported."""
+    named = os.environ.get(ENVIRONMENT_VARIABLE)
+    if named and _file_version(Path(named)) >= MIN_VERSION and Path(named).is_file():
+        return Path(named)
+    bundled = _wheel_library()
+    if bundled is not None:
+        return bundled
+    system = {Path(p).resolve() for pattern in _SYSTEM_PATTERNS for p in glob.glob(pattern)}
+    usable = [(_file_version(path), str(path)) for path in system]
+    usable = [entry for entry in usable if entry[0] >= MIN_VERSION]
+    return Path(max(usable)[1]) if usable else None
+
+
+def loaded_version() -> tuple[int, int, int] | None:
+    """Version of the LLVM library that Dr.Jit uses, None if it has none. Imports drjit."""
+    import drjit as dr
+
+    if not dr.has_backend(dr.JitBackend.LLVM):
+        return None
+    return tuple(dr.detail.llvm_version())
+
+
+def loaded_library() -> str | None:
+    """Path of the LLVM library in use, as far as it can be told (Linux: from the process's memory map)."""
+    named = os.environ.get(ENVIRONMENT_VARIABLE)
+    try:
+        mapped = {line.split()[-1] for line in Path("/proc/self/maps").read_text().splitlines() if "libLLVM" in line}
+    except OSError:
+        return named
+    if named and str(Path(named).resolve()) in mapped:
+        return str(Path(named).resolve())
+    return min(mapped) if mapped else None
+
+
+def _wheel_library() -> Path | None:
+    for folder in dict.fromkeys((sysconfig.get_path("data"), sys.prefix, sys.base_prefix)):
+        for path in sorted(Path(folder, "lib").glob("libLLVM.so.*")):
+            if (path.parent / _RUNTIME_FOLDER).is_dir() and _file_version(path) >= MIN_VERSION:
+                return path
+    # `pip install --user` and `--target` put the library elsewhere; the wheel's own file list knows where.
+    try:
+        files = importlib.metadata.distribution(WHEEL).files or ()
+    except importlib.metadata.PackageNotFoundError:
+        return None
+    for entry in files:
+        if entry.name.startswith("libLLVM.so."):
+            path = Path(str(entry.locate())).resolve()
+            if path.is_file():
+                return path
+    return None
+
+
+def _file_version(path: Path) -> int:
+    """Major version by the file's name (libLLVM-15.so, libLLVM.so.19.1, libLLVM-14.0.6.so.1), by its folder, else 0."""
+    match = re.search(r"libLLVM-(\d+)|libLLVM\.so\.(\d+)|libLLVM\.(\d+)\.dylib", path.name)
+    if match is None:
+        match = re.search(r"llvm-?@?(\d+)", str(path.parent))
+    if match is not None:
+        return int(next(group for group in match.groups() if group))
+    try:
+        numbers = (ctypes.c_uint * 3)()
+        library = ctypes.CDLL(str(path))
+        library.LLVMGetVersion(*(ctypes.byref(numbers, 4 * i) for i in range(3)))
+        return int(numbers[0])
+    except (OSError, AttributeError):
+        return 0
+
+
+def _use(path: Path) -> None:
+    os.environ[ENVIRONMENT_VARIABLE] = str(path)
+    # The wheel creates the link libc++.so.1 at the first interpreter start; where the environment cannot be written to,
+    # the link is missing, and loading the runtime beforehand under its own name takes its place.
+    folder = path.parent / _RUNTIME_FOLDER
+    if folder.is_dir() and not all((folder / name).exists() for name in _RUNTIME):
+        for name in _RUNTIME:
+            for candidate in sorted(folder.glob(name + "*")):
+                ctypes.CDLL(str(candidate), mode=ctypes.RTLD_GLOBAL)
+                break
+
+
+def _reload(path: Path, found: str) -> None:
+    """Shut Dr.Jit down and start it again with another LLVM library, which its C API (jit.h) allows."""
+    import drjit as dr
+
+    advice = "import shadowmap_dr before any array or scene is created"
+    # A shutdown would pull the rug from under existing arrays.
+    if "No variables registered" not in str(dr.whos(as_string=True)):
+        raise LLVMError(f"{found}, and arrays exist already, so it cannot be exchanged: {advice}, or {_remedy()}.")
+    try:
+        core = ctypes.CDLL(str(Path(dr.__file__).parent / "libdrjit-core.so"))
+        shutdown, start = core._Z12jit_shutdowni, core._Z8jit_initj
+    except (OSError, AttributeError):
+        raise LLVMError(f"{found}: import shadowmap_dr before drjit and mitsuba, or {_remedy()}.") from None
+    _use(path)
+    backends = 1 << int(dr.JitBackend.LLVM.value)
+    if dr.has_backend(dr.JitBackend.CUDA):
+        backends |= 1 << int(dr.JitBackend.CUDA.value)
+    shutdown(ctypes.c_int(0))
+    start(ctypes.c_uint32(backends))
+    version = loaded_version()
+    if version is None or version[0] < MIN_VERSION:
+        raise LLVMError(f"{found}, and {path} could not be loaded in its place: {_remedy()}.")
+
+
+def _remedy() -> str:
+    named = os.environ.get(ENVIRONMENT_VARIABLE)
+    unset = f"unset {ENVIRONMENT_VARIABLE} (now {named}) and " if named else ""
+    if sys.platform == "linux" and os.uname().machine == "x86_64":
+        return f"{unset}install LLVM {MIN_VERSION} or newer with: pip install {WHEEL}"
+    return f"{unset}install LLVM {MIN_VERSION} or newer (Debian: libllvm19), or name it in {ENVIRONMENT_VARIABLE}"
+
+
+def _dotted(version: tuple[int, ...]) -> str:
+    return ".".join(map(str, version))

@@ -1,0 +1,18 @@
+"""Errors that the library raises on purpose.
+
+Every message is one line: what is wrong, the offending value, and what to do about it.
+"""
+
+from __future__ import annotations
+
+
+class ShadowmapError(ValueError):
+    """Bad input to shadowmap_dr: a scene, an option or an array that cannot be used as given."""
+
+
+class LLVMError(ShadowmapError, ImportError):
+    """No LLVM library that Dr.Jit can compile with."""
+
+
+class OutputError(ShadowmapError, OSError):
+    """A result could not be written (unwritable directory, full disk, unknown suffix)."""

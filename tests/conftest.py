@@ -1,0 +1,33 @@
+"""Fixtures shared by all tests."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+
+import pytest
+
+import shadowmap_dr  # noqa: F401  (selects the LLVM library before mitsuba is imported)
+
+# isort: split
+import drjit as dr
+import mitsuba as mi
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    if workers > 1:  # parallel workers share the cores instead of each claiming all of them
+        dr.set_thread_count(max(1, (os.cpu_count() or 1) // workers))
+
+
+@pytest.fixture(params=["llvm_ad_rgb", "cuda_ad_rgb"])
+def variant(request: pytest.FixtureRequest) -> Iterator[str]:
+    """Sets the Mitsuba variant for a test and names it; tests that use it run once for each backend at hand."""
+    name: str = request.param
+    backend = dr.JitBackend.CUDA if name.startswith("cuda") else dr.JitBackend.LLVM
+    if name not in mi.variants():
+        pytest.skip(f"this Mitsuba has no variant {name}")
+    if not dr.has_backend(backend):
+        pytest.skip("no GPU" if backend == dr.JitBackend.CUDA else "no LLVM")
+    mi.set_variant(name)
+    yield name

@@ -1,8 +1,9 @@
 """Finds an LLVM library that Dr.Jit 1.5 can compile with.
 
-Dr.Jit loads the first ``libLLVM`` it finds while ``import drjit`` runs. With LLVM 15 or 16 its kernels later end the
-whole process (``Cannot select: fminimum``) without a Python exception, hence this module: it points Dr.Jit to a good
-library before the first import, and restarts the backend where Dr.Jit was imported with a bad one already.
+Dr.Jit loads the first ``libLLVM`` it finds while ``import drjit`` runs, and keeps it. With LLVM 15 or 16 its kernels
+later end the whole process (``Cannot select: fminimum``) without a Python exception. So this module points Dr.Jit to a
+good library before the first import. For scripts that import mitsuba or drjit before shadowmap_dr, the file
+`_llvm.pth`, which an installation places beside the packages, does the same at the start of the interpreter.
 """
 
 from __future__ import annotations
@@ -40,37 +41,28 @@ _SYSTEM_PATTERNS = (
 def ensure() -> None:
     """Make sure that Dr.Jit uses LLVM >= 17 (or a GPU where there is no LLVM at all).
 
-    Works before and after ``import drjit`` / ``import mitsuba``. Raises LLVMError, one sentence, if that cannot be had.
+    Raises LLVMError, one sentence, if that cannot be had. Imports drjit.
     """
-    if "drjit" not in sys.modules and not os.environ.get(ENVIRONMENT_VARIABLE):
-        path = find()
-        if path is not None:
-            _use(path)
-
+    imported_before = "drjit" in sys.modules
+    if not imported_before:
+        _choose()
     import drjit as dr
 
     version = loaded_version()
     if version is not None and version[0] >= MIN_VERSION:
         return
-    found = "Dr.Jit found no LLVM library"
-    if version:
-        found = f"Dr.Jit loaded LLVM {_dotted(version)}, with which kernels end the whole process"
-
-    path = find()
-    if path is None:
-        if dr.has_backend(dr.JitBackend.CUDA):
-            if version:
-                warnings.warn(f"{found}; use the cuda variants only, or {_remedy()}.", stacklevel=3)
-            return
-        raise LLVMError(f"{found}; {_remedy()}.")
-    _reload(path, found)
+    found = f"LLVM {'.'.join(map(str, version))}, with which kernels end the process" if version else "no LLVM library"
+    if dr.has_backend(dr.JitBackend.CUDA):
+        if version is not None:
+            warnings.warn(f"Dr.Jit loaded {found}: use only cuda variants, or {_remedy()}.", stacklevel=3)
+        return
+    if imported_before and find() is not None:
+        raise LLVMError(f"Dr.Jit was imported first and found {found}: import shadowmap_dr before mitsuba and drjit.")
+    raise LLVMError(f"Dr.Jit found {found}: {_remedy()}.")
 
 
 def find() -> Path | None:
     """The best LLVM library on this machine with version >= 17, or None. Dr.Jit need not be imported."""
-    named = os.environ.get(ENVIRONMENT_VARIABLE)
-    if named and _file_version(Path(named)) >= MIN_VERSION and Path(named).is_file():
-        return Path(named)
     bundled = _wheel_library()
     if bundled is not None:
         return bundled
@@ -121,7 +113,7 @@ def _wheel_library() -> Path | None:
 
 def _file_version(path: Path) -> int:
     """Major version by the file's name (libLLVM-15.so, libLLVM.so.19.1, libLLVM-14.0.6.so.1), by its folder, else 0."""
-    match = re.search(r"libLLVM-(\d+)|libLLVM\.so\.(\d+)|libLLVM\.(\d+)\.dylib", path.name)
+    match = re.search(r"libLLVM-(\d+)|libLLVM\.so\.(\d\d+)|libLLVM\.(\d+)\.dylib", path.name)
     if match is None:
         match = re.search(r"llvm-?@?(\d+)", str(path.parent))
     if match is not None:
@@ -135,49 +127,30 @@ def _file_version(path: Path) -> int:
         return 0
 
 
-def _use(path: Path) -> None:
-    os.environ[ENVIRONMENT_VARIABLE] = str(path)
+def _choose() -> None:
+    """Set the environment variable that Dr.Jit reads, unless it names a usable library already."""
+    named = os.environ.get(ENVIRONMENT_VARIABLE)
+    if named and Path(named).is_file() and _file_version(Path(named)) >= MIN_VERSION:
+        path = Path(named)
+    else:
+        path = find()
+        if path is None:
+            return
+        if named:
+            warnings.warn(
+                f"{ENVIRONMENT_VARIABLE}={named} is not LLVM {MIN_VERSION} or newer: using {path}.", stacklevel=4
+            )
+        os.environ[ENVIRONMENT_VARIABLE] = str(path)
     # The wheel creates the link libc++.so.1 at the first interpreter start; where the environment cannot be written to,
     # the link is missing, and loading the runtime beforehand under its own name takes its place.
     folder = path.parent / _RUNTIME_FOLDER
     if folder.is_dir() and not all((folder / name).exists() for name in _RUNTIME):
         for name in _RUNTIME:
-            for candidate in sorted(folder.glob(name + "*")):
+            for candidate in sorted(folder.glob(name + "*"))[:1]:
                 ctypes.CDLL(str(candidate), mode=ctypes.RTLD_GLOBAL)
-                break
-
-
-def _reload(path: Path, found: str) -> None:
-    """Shut Dr.Jit down and start it again with another LLVM library, which its C API (jit.h) allows."""
-    import drjit as dr
-
-    advice = "import shadowmap_dr before any array or scene is created"
-    # A shutdown would pull the rug from under existing arrays.
-    if "No variables registered" not in str(dr.whos(as_string=True)):
-        raise LLVMError(f"{found}, and arrays exist already, so it cannot be exchanged: {advice}, or {_remedy()}.")
-    try:
-        core = ctypes.CDLL(str(Path(dr.__file__).parent / "libdrjit-core.so"))
-        shutdown, start = core._Z12jit_shutdowni, core._Z8jit_initj
-    except (OSError, AttributeError):
-        raise LLVMError(f"{found}: import shadowmap_dr before drjit and mitsuba, or {_remedy()}.") from None
-    _use(path)
-    backends = 1 << int(dr.JitBackend.LLVM.value)
-    if dr.has_backend(dr.JitBackend.CUDA):
-        backends |= 1 << int(dr.JitBackend.CUDA.value)
-    shutdown(ctypes.c_int(0))
-    start(ctypes.c_uint32(backends))
-    version = loaded_version()
-    if version is None or version[0] < MIN_VERSION:
-        raise LLVMError(f"{found}, and {path} could not be loaded in its place: {_remedy()}.")
 
 
 def _remedy() -> str:
-    named = os.environ.get(ENVIRONMENT_VARIABLE)
-    unset = f"unset {ENVIRONMENT_VARIABLE} (now {named}) and " if named else ""
     if sys.platform == "linux" and os.uname().machine == "x86_64":
-        return f"{unset}install LLVM {MIN_VERSION} or newer with: pip install {WHEEL}"
-    return f"{unset}install LLVM {MIN_VERSION} or newer (Debian: libllvm19), or name it in {ENVIRONMENT_VARIABLE}"
-
-
-def _dotted(version: tuple[int, ...]) -> str:
-    return ".".join(map(str, version))
+        return f"install LLVM {MIN_VERSION} or newer with: pip install {WHEEL}"
+    return f"install LLVM {MIN_VERSION} or newer (Debian: libllvm19), or name it in {ENVIRONMENT_VARIABLE}"

@@ -1,0 +1,68 @@
+"""Dr.Jit types and the records that all screen-space primitives share."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+import drjit as dr
+
+#: Triangle index of a pixel that no triangle covers.
+NO_TRIANGLE = 0xFFFFFFFF
+
+#: Largest image side for which the single-precision edge functions keep their accuracy (1/256 pixel).
+MAX_RESOLUTION = 4096
+
+
+def backend(array: Any) -> ModuleType:
+    """The Dr.Jit module (``drjit.llvm.ad``, ``drjit.cuda.ad``, ...) whose types ``array`` is made of.
+
+    Nested types that other libraries derive (such as ``mitsuba.Point3f``) are resolved through their components.
+    """
+    leaf = array
+    while dr.depth_v(leaf) > 1 and not dr.is_tensor_v(leaf):
+        leaf = leaf[0]
+    module = sys.modules[dr.detached_t(type(leaf)).__module__ + ".ad"]
+    return module
+
+
+@dataclass(frozen=True)
+class RasterOutput:
+    """What each pixel of a batch of images sees.
+
+    All arrays have ``batch * height * width`` entries, row-major (``(b * height + row) * width + column``).
+
+    Attributes:
+        triangle: index of the visible triangle, ``NO_TRIANGLE`` where there is none.
+        u, v: perspective-correct barycentric weights of the triangle's vertices 1 and 2 (vertex 0 has ``1 - u - v``).
+        depth: ``z / w`` in clip space, 1 (the far plane) where nothing is seen.
+        w: interpolated clip-space ``w`` (distance along the viewing axis of a perspective camera), 1 where nothing is seen.
+
+    ``u``, ``v``, ``depth`` and ``w`` carry gradients to the clip-space positions (for a fixed visible triangle; the change
+    of *which* triangle is visible is the business of :func:`shadowmap_dr.raster.antialias`).
+    """
+
+    triangle: Any
+    u: Any
+    v: Any
+    depth: Any
+    w: Any
+    batch: int
+    height: int
+    width: int
+
+    @property
+    def valid(self) -> Any:
+        """Mask of the pixels that see a triangle."""
+        return self.triangle != NO_TRIANGLE
+
+
+def pixel_coordinates(module: ModuleType, batch: int, height: int, width: int) -> tuple[Any, Any, Any]:
+    """Image index, row and column (``UInt32``) of every entry of a flat row-major batch of images."""
+    index = dr.arange(module.UInt32, batch * height * width)
+    row_flat = index // width
+    column = index - row_flat * width
+    image = row_flat // height
+    return image, row_flat - image * height, column

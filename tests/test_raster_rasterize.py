@@ -1,0 +1,162 @@
+"""The rasterizer against a brute-force twin, and the promises of its docstring."""
+
+from __future__ import annotations
+
+import brute_force
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from shadowmap_dr.raster import NO_TRIANGLE, rasterize
+
+
+def run(pos: np.ndarray, faces: np.ndarray, height: int, width: int):  # noqa: ANN201
+    return rasterize(mi.TensorXf(pos), mi.TensorXu(faces), (height, width))
+
+
+def as_ids(out) -> np.ndarray:  # noqa: ANN001
+    ids = out.triangle.numpy().astype(np.int64)
+    return np.where(ids == NO_TRIANGLE, -1, ids)
+
+
+@pytest.mark.parametrize("block", range(6))
+def test_random_soups_match_the_twin(variant: str, block: int) -> None:
+    wrong = total = 0
+    for seed in range(block * 40, block * 40 + 40):
+        pos, faces, height, width = brute_force.random_soup(np.random.default_rng(seed))
+        out = run(pos, faces, height, width)
+        ref = brute_force.rasterize(pos, faces, height, width)
+        ids = as_ids(out)
+        decided = (ref["margin_px"] > 1 / 256) & (ref["margin_depth"] > 1e-5)
+        assert (ids == ref["triangle"])[decided].all(), seed
+        wrong += int((ids != ref["triangle"]).sum())
+        total += ids.size
+        same = (ids == ref["triangle"]) & (ids >= 0) & decided
+        np.testing.assert_allclose(out.u.numpy()[same], ref["uv"][same, 0], atol=1e-4, err_msg=f"seed {seed}")
+        np.testing.assert_allclose(out.v.numpy()[same], ref["uv"][same, 1], atol=1e-4, err_msg=f"seed {seed}")
+        # A float32 barycentric is good to half an ulp; across the camera plane (corner w of both signs) that costs w_max / w.
+        w = np.abs(pos[faces[ids[same]]][..., 3])
+        condition = np.maximum(1, 0.1 * w.max(1) / np.abs(out.w.numpy()[same])) if same.any() else 1
+        assert (np.abs(out.depth.numpy()[same] - ref["depth"][same]) <= 1e-5 * condition).all(), seed
+    if block != 0:  # lattice soups have ties on purpose, spread over the blocks
+        assert wrong / total < 0.02
+
+
+def test_undecided_pixels_are_rare(variant: str) -> None:
+    wrong = total = 0
+    for seed in range(60):
+        rng = np.random.default_rng(1000 + seed)
+        pos = np.c_[rng.uniform(-1, 1, (30, 3)), np.ones(30)].astype(np.float32)
+        faces = rng.integers(0, 30, (40, 3)).astype(np.uint32)
+        ids = as_ids(run(pos, faces, 64, 64))
+        wrong += int((ids != brute_force.rasterize(pos, faces, 64, 64)["triangle"]).sum())
+        total += ids.size
+    assert wrong / total < 1e-3
+
+
+def test_shared_edges_leave_no_hole_and_no_double_owner(variant: str) -> None:
+    """A triangulated square whose inner vertices sit on pixel centres and elsewhere: each pixel has exactly one owner."""
+    rng = np.random.default_rng(3)
+    n, size = 9, 32
+    g = np.linspace(-1, 1, n)
+    x, y = np.meshgrid(g, g)
+    inner = (np.abs(x) < 1) & (np.abs(y) < 1)
+    jitter = np.where(rng.random(x.shape) < 0.5, 1 / size, rng.uniform(-0.08, 0.08, x.shape))
+    x, y = x + inner * jitter, y + inner * np.roll(jitter, 1, 0)
+    w = rng.uniform(0.5, 2, x.shape)
+    pos = np.stack([x * w, y * w, 0 * x, w], -1).reshape(-1, 4).astype(np.float32)
+    quads = [(j * n + i, j * n + i + 1, (j + 1) * n + i + 1, (j + 1) * n + i) for j in range(n - 1) for i in range(n - 1)]
+    faces = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))], np.uint32)
+    owners = np.zeros(size * size, int)
+    for f in faces:
+        owners += as_ids(run(pos, f[None], size, size)) >= 0
+    assert (owners == 1).all()
+
+
+@pytest.mark.parametrize("resolution", [(1, 1), (1, 7), (3, 2), (130, 5), (64, 4096)])
+def test_any_resolution(variant: str, resolution: tuple[int, int]) -> None:
+    rng = np.random.default_rng(5)
+    pos = np.c_[rng.uniform(-1.5, 1.5, (12, 2)), rng.uniform(-0.9, 0.9, 12), np.ones(12)].astype(np.float32)
+    faces = rng.integers(0, 12, (10, 3)).astype(np.uint32)
+    out, ref = run(pos, faces, *resolution), brute_force.rasterize(pos, faces, *resolution)
+    decided = (ref["margin_px"] > 1 / 256) & (ref["margin_depth"] > 1e-5)
+    assert (as_ids(out) == ref["triangle"])[decided].all()
+
+
+def test_batch_equals_single_images(variant: str) -> None:
+    rng = np.random.default_rng(7)
+    pos = np.concatenate([rng.uniform(-1, 1, (5, 20, 3)), np.ones((5, 20, 1))], -1).astype(np.float32)
+    faces = rng.integers(0, 20, (30, 3)).astype(np.uint32)
+    both = as_ids(run(pos, faces, 21, 34)).reshape(5, -1)
+    for b in range(5):
+        assert (both[b] == as_ids(run(pos[b], faces, 21, 34))).all()
+
+
+def test_deterministic_with_equal_depths(variant: str) -> None:
+    pos = np.array([[-1, -1, 0, 1], [1, -1, 0, 1], [0, 1, 0, 1]], np.float32)
+    faces = np.tile(np.array([[0, 1, 2]], np.uint32), (500, 1))
+    assert set(as_ids(run(pos, faces, 32, 32))) == {-1, 0}
+
+
+def test_barycentrics_carry_gradients(variant: str) -> None:
+    pos = np.array([[-1.2, -0.9, 0.3, 1.1], [1.4, -0.7, -0.2, 0.8], [0.1, 1.3, 0.5, 1.5]], np.float32)
+    faces = np.array([[0, 1, 2]], np.uint32)
+    rng = np.random.default_rng(0)
+    weights = [mi.Float(rng.normal(size=64).astype(np.float32)) for _ in range(4)]
+
+    rest = rasterize(mi.TensorXf(pos), mi.TensorXu(faces), (8, 8))
+    inside = (rest.u > 0.05) & (rest.v > 0.05) & (rest.u + rest.v < 0.95)
+
+    def value(p) -> mi.Float:  # noqa: ANN001
+        out = rasterize(p, mi.TensorXu(faces), (8, 8))
+        terms = (out.u, out.v, out.depth, out.w)
+        return dr.sum(sum(dr.select(inside, t * k, 0) for t, k in zip(terms, weights, strict=True)))
+
+    p = mi.TensorXf(pos)
+    dr.enable_grad(p)
+    dr.backward(value(p))
+    grad = dr.grad(p).numpy()
+    for i in range(12):
+        step = np.zeros(12, np.float32)
+        step[i] = 2e-3
+        step = step.reshape(3, 4)
+        difference = (value(mi.TensorXf(pos + step)) - value(mi.TensorXf(pos - step))).numpy()[0] / 4e-3
+        assert abs(difference - grad.flat[i]) < 2e-2 * max(1, np.abs(grad).max()), i
+
+
+def test_bad_input_is_named(variant: str) -> None:
+    pos = np.zeros((3, 4), np.float32)
+    face = np.array([[0, 1, 2]], np.uint32)
+    with pytest.raises(ValueError, match="vertex 7"):
+        run(pos, np.array([[0, 1, 7]], np.uint32), 4, 4)
+    with pytest.raises(ValueError, match="0 x 4"):
+        run(pos, face, 0, 4)
+    with pytest.raises(ValueError, match="4097"):
+        run(pos, face, 4097, 4)
+    with pytest.raises(ValueError, match="shape"):
+        run(pos[:, :3], face, 4, 4)
+    with pytest.raises(ValueError, match="faces"):
+        run(pos, face[:0], 4, 4)
+
+
+def test_degenerate_and_non_finite_triangles_are_not_drawn(variant: str) -> None:
+    pos = np.array([[-1, -1, 0, 1], [1, 1, 0, 1], [0, 0, 0, 1], [np.nan, 0, 0, 1], [np.inf, 1, 0, 1]], np.float32)
+    faces = np.array([[0, 1, 2], [0, 0, 1], [0, 1, 3], [0, 1, 4]], np.uint32)
+    assert (as_ids(run(pos, faces, 16, 16)) == -1).all()
+
+
+@pytest.mark.parametrize("near_camera", [False, True])
+def test_a_million_triangles(variant: str, near_camera: bool) -> None:
+    n = 708
+    g = np.linspace(-1, 1, n)
+    x, y = np.meshgrid(g, g)
+    z = -2.0 + 0.2 * np.sin(9 * x) * np.cos(7 * y) - (0.0 if near_camera else 2.0)
+    clip = np.c_[x.ravel(), y.ravel(), z.ravel(), np.ones(x.size)] @ brute_force.perspective().T
+    i = np.arange(n * n).reshape(n, n)
+    a, b, c, d = i[:-1, :-1].ravel(), i[:-1, 1:].ravel(), i[1:, 1:].ravel(), i[1:, :-1].ravel()
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]).astype(np.uint32)
+    assert len(faces) > 999_000
+    out = run(clip.astype(np.float32), faces, 128, 128)
+    ids = as_ids(out).reshape(128, 128)
+    assert (ids[40:88, 40:88] >= 0).all()

@@ -1,0 +1,217 @@
+"""Path-traced references: one bounce with shadow rays, as the mean over passes with different seeds."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from shadowmap_dr.errors import OutputError, ShadowmapError
+
+SETTINGS_KEY = "shadowmap_settings"
+SAMPLES_PER_LAUNCH = 1 << 24
+"""Upper bound for pixels x samples of one pass, which bounds its memory."""
+
+
+@dataclass(frozen=True)
+class Reference:
+    """An image and how it was made.
+
+    Attributes:
+        image: (H, W, C) float32, linear radiance; row 0 is the top.
+        settings: What made it, as plain JSON values. `relative_standard_error` is the root mean square over pixels and
+            channels of the mean's standard error, divided by the image's mean (present from two passes on).
+    """
+
+    image: np.ndarray
+    settings: dict[str, object] = field(default_factory=dict)
+
+
+def path_traced(
+    scene: mi.Scene,
+    *,
+    spp: int = 512,
+    seed: int = 0,
+    sensor: int = 0,
+    integrator: str | None = None,
+    hide_emitters: bool = False,
+    passes: int | None = None,
+) -> Reference:
+    """Renders a scene's direct light with shadows.
+
+    Where all emitters are delta lights (directional, spot, point), one light at a time is rendered and the images are
+    added up: the same integrator, but without the noise of choosing a light at random. `spp` counts per light.
+
+    Args:
+        scene: Scene whose film has a box filter.
+        spp: Samples per pixel (and light), at least 1, rounded up to squares per pass; protocol: 512 or more.
+        seed: Same seed, same image. Two images with one seed share their noise as far as their paths agree.
+        sensor: Index of the sensor.
+        integrator: `"direct"`, or `"volpath"` (depth 2), which is the same transport but looks through `mask` BSDFs
+            that `direct` takes for opaque. Default: `volpath` if a shape has such a BSDF, else `direct`.
+        hide_emitters: Show black instead of emitters in view.
+        passes: Number of passes; default: 8, or more to stay below `SAMPLES_PER_LAUNCH`.
+
+    Returns:
+        The reference. No gradients.
+
+    Raises:
+        ShadowmapError: The film's filter is not a box, or spp < 1.
+    """
+    name = integrator or ("volpath" if has_masks(scene) else "direct")
+    if name not in ("direct", "volpath"):
+        raise ShadowmapError(f"integrator {name!r} is no reference for direct light: use 'direct' or 'volpath'.")
+    description: dict[str, object] = {"type": name, "hide_emitters": hide_emitters}
+    if name == "volpath":
+        description["max_depth"] = 2
+    plugin = mi.load_dict(description)
+    weights = _selection_weights(scene)
+
+    def render(samples: int, pass_seed: int) -> np.ndarray:
+        return np.array(mi.render(scene, sensor=sensor, integrator=plugin, spp=samples, seed=pass_seed))
+
+    def render_all(samples: int, pass_seed: int) -> np.ndarray:
+        if weights is None or len(weights) < 2:
+            return render(samples, pass_seed)
+        total = 0.0
+        for index, key in enumerate(weights):
+            with _only(scene, weights, key):
+                total = total + render(samples, _mix(pass_seed, index))
+        return total
+
+    settings = {"kind": "path_traced", "integrator": name, "hide_emitters": hide_emitters, "sensor": sensor,
+                "lights": "summed" if weights is not None and len(weights) > 1 else "sampled"}
+    return accumulate(scene, render_all, settings, spp=spp, seed=seed, sensor=sensor, passes=passes)
+
+
+def accumulate(
+    scene: mi.Scene,
+    render: Callable[[int, int], np.ndarray],
+    settings: dict[str, object],
+    *,
+    spp: int,
+    seed: int,
+    sensor: int,
+    passes: int | None = None,
+) -> Reference:
+    """Mean of `render(samples, seed)` over passes with different seeds, with its standard error.
+
+    Args:
+        render: Makes an (H, W, C) image of the given samples per pixel.
+        settings: Copied into the result beside the sampling's own.
+
+    Raises:
+        ShadowmapError: The film's filter is not a box, or spp < 1.
+    """
+    film = scene.sensors()[sensor].film()
+    if type(film.rfilter()).__name__ != "BoxFilter" and "box" not in str(film.rfilter()).lower():
+        raise ShadowmapError(f"the film's filter is {film.rfilter()}: references need <rfilter type=\"box\"/>.")
+    if spp < 1:
+        raise ShadowmapError(f"spp is {spp}: give at least 1.")
+    width, height = film.crop_size()
+    count = passes or max(min(8, math.ceil(spp / 16)), math.ceil(spp * int(width) * int(height) / SAMPLES_PER_LAUNCH))
+    per_pass = math.ceil(math.sqrt(spp / count)) ** 2  # stratified samplers want a square
+    mean, square = 0.0, 0.0
+    for index in range(count):  # Welford's update: sums of squares would cancel
+        image = render(per_pass, _mix(seed, 1000 + index)).astype(np.float64)
+        step = image - mean
+        mean = mean + step / (index + 1)
+        square = square + step * (image - mean)
+    record = dict(settings)
+    record.update(spp=per_pass * count, passes=count, seed=seed, variant=mi.variant(), mitsuba=mi.__version__,
+                  filter="box", size=[int(width), int(height)])
+    if count > 1:
+        error = np.sqrt(np.mean(square) / (count - 1) / count)
+        record["relative_standard_error"] = float(error / max(float(np.mean(mean)), 1e-12))
+    return Reference(np.asarray(mean, dtype=np.float32), record)
+
+
+def has_masks(scene: mi.Scene) -> bool:
+    """True if a shape (outside of shape groups) has a BSDF that lets light pass straight through, such as `mask`."""
+    bsdfs = (shape.bsdf() for shape in scene.shapes())
+    return any(bsdf is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in bsdfs)
+
+
+def save(path: str | Path, reference: Reference, *, half: bool = False) -> None:
+    """Writes an EXR with the settings in its header (JSON under `shadowmap_settings`).
+
+    The file appears complete or not at all.
+
+    Args:
+        half: 16-bit floats: half the size, relative error up to 5e-4 per value.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    path = Path(path)
+    bitmap = mi.Bitmap(np.ascontiguousarray(reference.image, dtype=np.float32))
+    if half:
+        bitmap = bitmap.convert(component_format=mi.Struct.Type.Float16, srgb_gamma=False)
+    bitmap.metadata()[SETTINGS_KEY] = json.dumps(reference.settings)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(suffix=".exr", dir=path.parent)
+        os.close(handle)
+        try:
+            bitmap.write(temporary)
+            os.chmod(temporary, 0o644)
+            os.replace(temporary, path)
+        finally:
+            Path(temporary).unlink(missing_ok=True)
+    except (OSError, RuntimeError) as error:
+        raise OutputError(f"could not write {path}: {error}") from error
+
+
+def load(path: str | Path) -> Reference:
+    """Reads what `save` wrote; an EXR of other origin has empty settings.
+
+    Raises:
+        ShadowmapError: No such file.
+    """
+    if not Path(path).is_file():
+        raise ShadowmapError(f"no file {str(path)!r}: make references with tests/references/make.py.")
+    bitmap = mi.Bitmap(str(path))
+    metadata = bitmap.metadata()
+    settings = json.loads(metadata[SETTINGS_KEY]) if SETTINGS_KEY in metadata else {}
+    image = np.array(bitmap.convert(component_format=mi.Struct.Type.Float32, srgb_gamma=False))
+    return Reference(image, settings)
+
+
+def _mix(*numbers: int) -> int:
+    """A 32-bit seed from several numbers; neighbouring Mitsuba seeds are correlated in some samplers."""
+    return int(np.random.SeedSequence(numbers).generate_state(1)[0])
+
+
+def _selection_weights(scene: mi.Scene) -> dict[str, float] | None:
+    """Parameters with which the lights are chosen and their values, or None if not all are delta lights."""
+    if not all(mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaPosition)
+               or mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaDirection) for emitter in scene.emitters()):
+        return None  # an emitter with an extent also counts in passes that do not choose it: rays of the BSDF hit it
+    params = mi.traverse(scene)
+    keys = [key for key in params.keys() if key.rpartition(".")[2] == "sampling_weight"]
+    return {key: float(params[key]) for key in keys} if len(keys) == len(scene.emitters()) else None
+
+
+@contextmanager
+def _only(scene: mi.Scene, weights: dict[str, float], chosen: str) -> Iterator[None]:
+    """Lets emitter sampling choose one light only."""
+    params = mi.traverse(scene)
+
+    def assign(values: dict[str, float]) -> None:
+        for key, value in values.items():
+            params[key] = value
+        params.update()
+
+    assign({key: float(key == chosen) for key in weights})
+    try:
+        yield
+    finally:
+        assign(weights)

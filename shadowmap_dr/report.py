@@ -1,0 +1,141 @@
+"""What experiments leave behind: records as JSON, tables for the terminal, plots and sheets of images."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
+
+from .errors import ShadowmapError
+from .io import atomic, to_srgb
+
+
+def write_json(path: str | os.PathLike[str], value: Any) -> None:
+    """Write `value` (dicts, sequences, NumPy arrays and scalars; numbers that are not finite become null)."""
+    text = json.dumps(_plain(value), indent=1, allow_nan=False)
+    with atomic(path) as temporary:
+        temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def read_json(path: str | os.PathLike[str]) -> Any:
+    """The content of a JSON file, or a ShadowmapError that names it."""
+    try:
+        return json.loads(Path(path).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ShadowmapError(f"no file {str(path)!r}.") from None
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise ShadowmapError(f"cannot read {path}: {' '.join(str(error).split())}.") from error
+
+
+def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
+    """A table for the terminal: the first column left-aligned, all others right-aligned."""
+    result = Table(title=title, title_justify="left")
+    for i, column in enumerate(columns):
+        result.add_column(column, justify="left" if i == 0 else "right")
+    for row in rows:
+        result.add_row(*row)
+    return result
+
+
+def progress() -> Progress:
+    """A progress display; add one task for each part of the work."""
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[note]}"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+
+
+def plot_curves(
+    path: str | os.PathLike[str],
+    panels: Mapping[str, Mapping[str, Sequence[Sequence[float]]]],
+    x_label: str = "iteration",
+) -> None:
+    """Plot curves over their index, one panel beside the other, with logarithmic vertical axes.
+
+    Args:
+        path: file to write (.png, .pdf, .svg).
+        panels: vertical axis label -> legend entry -> curves (several curves of one entry, e.g. runs, share a colour).
+        x_label: label of the horizontal axes.
+    """
+    from matplotlib.figure import Figure  # without pyplot there is no global state and no display is needed
+
+    figure = Figure(figsize=(5 * len(panels), 4), layout="constrained")
+    for i, (y_label, entries) in enumerate(panels.items()):
+        axes = figure.add_subplot(1, len(panels), i + 1)
+        for colour, (label, curves) in enumerate(entries.items()):
+            for k, curve in enumerate(curves):
+                axes.plot(curve, color=f"C{colour}", alpha=0.8, linewidth=1.2, label=label if k == 0 else None)
+        if any(_positive(curve) for curves in entries.values() for curve in curves):
+            axes.set_yscale("log")
+        axes.set_xlabel(x_label)
+        axes.set_ylabel(y_label)
+        axes.grid(True, alpha=0.3)
+        if i == 0 and entries:
+            axes.legend()
+    with atomic(path) as temporary:
+        figure.savefig(temporary, dpi=150)
+
+
+def image_sheet(
+    path: str | os.PathLike[str], rows: Mapping[str, Mapping[str, npt.NDArray[np.floating[Any]]]], size: float = 2.2
+) -> None:
+    """Draw images in a grid: row title -> column title -> linear (H, W, 3) or (H, W, 1) image."""
+    from matplotlib.figure import Figure
+
+    columns = max(len(row) for row in rows.values())
+    figure = Figure(figsize=(size * columns, size * len(rows) + 0.3), layout="constrained")
+    for i, (row_title, row) in enumerate(rows.items()):
+        for j, (column_title, image) in enumerate(row.items()):
+            axes = figure.add_subplot(len(rows), columns, i * columns + j + 1)
+            pixels = to_srgb(np.nan_to_num(image))
+            pixels = np.repeat(pixels, 3, axis=2) if pixels.shape[2] == 1 else pixels[..., :3]
+            axes.imshow(pixels, interpolation="nearest")
+            axes.set_xticks([])
+            axes.set_yticks([])
+            if i == 0:
+                axes.set_title(column_title, fontsize=9)
+            if j == 0:
+                axes.set_ylabel(row_title, fontsize=9)
+    with atomic(path) as temporary:
+        figure.savefig(temporary, dpi=120)
+
+
+def _positive(curve: Sequence[float]) -> bool:
+    return any(value > 0 and math.isfinite(value) for value in curve)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _plain(entry) for key, entry in value.items()}
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if isinstance(value, (list, tuple)):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Path):
+        return str(value)
+    if value is None or isinstance(value, (str, int, bool)):
+        return value
+    raise TypeError(f"{type(value).__name__} is no JSON value")

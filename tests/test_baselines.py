@@ -7,12 +7,13 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
+from references import cases
 
-from mitsuba_baselines import reference, unshadowed
+from mitsuba_baselines import derivatives, reference, unshadowed
 from shadowmap_dr import assets
 from shadowmap_dr.errors import ShadowmapError
 
-SCENES = ["pose", "gallery", "still_life", "meadow", "pavilion"]
+SCENES = cases.SCENES
 
 
 def load(name: str, resolution: int = 48) -> mi.Scene:
@@ -143,3 +144,51 @@ def test_integrator_follows_the_variant() -> None:
         if name in mi.variants():
             mi.set_variant(name)
             assert "direct_unshadowed" in str(mi.load_dict({"type": "direct_unshadowed"}))
+
+
+def test_stored_scene_references_can_be_made_again(variant: str) -> None:
+    scene = load("pose", cases.RESOLUTION)
+    for kind, made in (("direct", reference.path_traced(scene, spp=512)),
+                       ("unshadowed", unshadowed.unshadowed(scene, spp=256))):
+        stored = reference.load(cases.FOLDER / f"pose_{kind}.exr")
+        assert relative_rms(made.image, stored.image) < 0.01
+        assert abs(made.image.mean() / stored.image.mean() - 1) < 5e-4
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_stored_scene_references_are_complete(name: str) -> None:
+    mi.set_variant("llvm_ad_rgb")
+    for kind in ("direct", "unshadowed"):
+        stored = reference.load(cases.FOLDER / f"{name}_{kind}.exr")
+        assert stored.image.shape == (cases.RESOLUTION, cases.RESOLUTION, 3)
+        assert stored.settings["spp"] >= 512 and stored.settings["filter"] == "box"
+        assert stored.settings["relative_standard_error"] < 0.005
+
+
+@pytest.mark.parametrize("case", cases.CASES, ids=lambda case: case.name)
+def test_stored_derivatives(variant: str, case: cases.Case) -> None:
+    stored = reference.load(case.path)
+    assert stored.settings["independent_cosine"] >= 0.995
+    assert stored.settings["step"] == case.step
+    made = derivatives.central_difference(case.build, case.step, spp=256, seed=7)
+    result = derivatives.agreement(made.image, stored.image)
+    assert result.cosine > 0.995 and abs(result.scale - 1) < 0.02
+
+
+def test_agreement_measures_direction_and_scale() -> None:
+    rng = np.random.default_rng(0)
+    image = rng.normal(size=(20, 30, 3))
+    assert derivatives.agreement(image, image).cosine == pytest.approx(1)
+    half = derivatives.agreement(0.5 * image, image)
+    assert half.cosine == pytest.approx(1) and half.scale == pytest.approx(0.5)
+    assert derivatives.agreement(-image, image).cosine == pytest.approx(-1)
+    # A boundary seen half a pixel away agrees after the blur, one that is ten pixels away does not.
+    line = np.zeros((40, 40, 1))
+    line[:, 20] = 1
+    assert derivatives.agreement(np.roll(line, 1, axis=1), line).cosine > 0.75
+    assert derivatives.agreement(np.roll(line, 10, axis=1), line).cosine == pytest.approx(0)
+    assert derivatives.agreement(np.roll(line, 10, axis=1), line, filter_footprint=10).cosine > 0.4
+    with pytest.raises(ShadowmapError, match="zero everywhere"):
+        derivatives.agreement(image, 0 * image)
+    with pytest.raises(ShadowmapError, match="shapes"):
+        derivatives.agreement(image, image[:5])

@@ -1,0 +1,65 @@
+"""Makes the stored references: ``python tests/references/make.py [NAME ...]`` (all by default; under two minutes on two cores).
+
+Files, 128 x 128, 16-bit EXR with the settings in the header (`mitsuba_baselines.reference.load` reads them):
+
+- `SCENE_direct.exr`, `SCENE_unshadowed.exr` for each scene in `scenes/`: with and without shadow rays.
+- `derivative_CASE.exr` for each case in `cases.py`: central differences of path-traced renderings. The header's
+  `independent_cosine` says how well two references made with different seeds agree (asked for: 0.995).
+- `primal_CASE.exr`: the rendering that the derivative belongs to.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from mitsuba_baselines import derivatives, reference, unshadowed  # noqa: E402
+from shadowmap_dr import assets  # noqa: E402
+
+# isort: split
+import mitsuba as mi  # noqa: E402
+
+from references import cases  # noqa: E402
+
+SPP_SCENE = 2048
+SPP_DERIVATIVE = 4096
+
+
+def make_scene(name: str) -> None:
+    scene = mi.load_file(str(assets.scene(name)), optimize=False, resolution=cases.RESOLUTION)
+    reference.save(cases.FOLDER / f"{name}_direct.exr", reference.path_traced(scene, spp=SPP_SCENE), half=True)
+    reference.save(cases.FOLDER / f"{name}_unshadowed.exr", unshadowed.unshadowed(scene, spp=SPP_SCENE), half=True)
+
+
+def make_derivative(case: cases.Case) -> None:
+    first, second = (derivatives.central_difference(case.build, case.step, spp=SPP_DERIVATIVE, seed=seed)
+                     for seed in (0, 1))
+    cosine = derivatives.agreement(first.image, second.image).cosine
+    settings = {**first.settings, "parameter": case.parameter, "independent_cosine": cosine}
+    reference.save(case.path, replace(first, settings=settings), half=True)
+    primal = reference.path_traced(case.build(0.0), spp=SPP_SCENE)
+    reference.save(cases.FOLDER / f"primal_{case.name}.exr", primal, half=True)
+
+
+def main() -> None:
+    jobs = {name: lambda name=name: make_scene(name) for name in cases.SCENES}
+    jobs |= {case.name: lambda case=case: make_derivative(case) for case in cases.CASES}
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(jobs))
+    names = parser.parse_args().names or list(jobs)
+    unknown = [name for name in names if name not in jobs]
+    if unknown:
+        parser.error(f"no reference {unknown[0]!r}: choose from {', '.join(jobs)}.")
+    mi.set_variant("llvm_ad_rgb")
+    for index, name in enumerate(names, 1):
+        print(f"{index}/{len(names)} {name}", flush=True)
+        jobs[name]()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,213 @@
+"""One merged triangle soup of a scene, in world space, and its vertex normals.
+
+The soup is what the rasterizer draws, from the camera and from the lights alike. Its static part (faces, texture coordinates,
+which shape a triangle belongs to) is separate from the two buffers that move (positions and normals), so that a step of an
+optimisation replaces the latter only and never touches Mitsuba's meshes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from .errors import ShadowmapError
+
+NO_TRIANGLE = 0xFFFFFFFF
+"""Triangle index that means "nothing was hit"."""
+
+HAS_NORMALS = 1
+HAS_TEXCOORDS = 2
+FLIP_GEOMETRIC = 4
+FLIP_SHADING = 8
+READS_ATTRIBUTES = 16
+
+
+@dataclass(frozen=True)
+class ShapeInfo:
+    """What is known about a shape without looking at its buffers. All fields are static.
+
+    ``name`` is the Mitsuba id (``instance.child`` for an instanced shape). The shape owns vertices
+    ``vertex_start .. vertex_start + vertex_count`` and faces ``face_start .. face_start + face_count`` of the soup.
+    ``flip_geometric`` says that its geometric normal is *minus* (p1 - p0) x (p2 - p0), ``flip_shading`` that vertex normals
+    are negated before use. ``reads_attributes``: it has mesh attributes, which Mitsuba finds through rest-pose positions.
+    ``planar``: all its vertices lay in one plane when the scene was loaded.
+    """
+
+    name: str
+    plugin: str
+    vertex_start: int
+    vertex_count: int
+    face_start: int
+    face_count: int
+    has_normals: bool
+    has_texcoords: bool
+    flip_geometric: bool = False
+    flip_shading: bool = False
+    reads_attributes: bool = False
+    planar: bool = False
+
+    @property
+    def flags(self) -> int:
+        """The booleans as the bits that ``Geometry.shape_flags`` holds."""
+        return (
+            HAS_NORMALS * self.has_normals
+            + HAS_TEXCOORDS * self.has_texcoords
+            + FLIP_GEOMETRIC * self.flip_geometric
+            + FLIP_SHADING * self.flip_shading
+            + READS_ATTRIBUTES * self.reads_attributes
+        )
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """All triangles of a scene: V vertices, F faces, S shapes. A PyTree that may cross ``dr.freeze``.
+
+    positions      Float  (3V,)  world space, may carry gradients
+    normals        Float  (3V,)  unit vertex normals, world space, may carry gradients; zero for shapes without
+    texcoords      Float  (2V,)  zero for shapes without
+    rest_positions Float  (3V,) or (0,)  positions as Mitsuba holds them, in the shape's own space, detached; only present
+                                 when some shape has mesh attributes
+    faces          UInt32 (3F,)  indices into the vertices of the whole soup
+    face_shape     UInt32 (F,)   index of the shape
+    vertex_shape   UInt32 (V,)
+    shape_face_start, shape_flags  UInt32 (S,)  ``ShapeInfo.face_start`` and ``ShapeInfo.flags`` as arrays
+    """
+
+    positions: Any
+    normals: Any
+    texcoords: Any
+    rest_positions: Any
+    faces: Any
+    face_shape: Any
+    vertex_shape: Any
+    shape_face_start: Any
+    shape_flags: Any
+    shapes: tuple[ShapeInfo, ...]
+
+    @property
+    def vertex_count(self) -> int:
+        """Number of vertices of all shapes."""
+        last = self.shapes[-1]
+        return last.vertex_start + last.vertex_count
+
+    @property
+    def face_count(self) -> int:
+        """Number of triangles of all shapes."""
+        last = self.shapes[-1]
+        return last.face_start + last.face_count
+
+    def shape(self, name: str) -> ShapeInfo:
+        """The shape called ``name``; raises ``ShadowmapError`` listing the known names otherwise."""
+        for info in self.shapes:
+            if info.name == name:
+                return info
+        known = ", ".join(repr(info.name) for info in self.shapes)
+        raise ShadowmapError(f"There is no shape '{name}' in the scene; its shapes are {known}.")
+
+    def shape_positions(self, name: str) -> Any:
+        """Positions of one shape as Point3f (Vs,), world space, attached."""
+        info = self.shape(name)
+        return dr.gather(mi.Point3f, self.positions, dr.arange(mi.UInt32, info.vertex_count) + info.vertex_start)
+
+    def with_positions(self, positions: Mapping[str, Any]) -> Geometry:
+        """Replace the positions of some shapes; returns a new Geometry, this one is left as it was.
+
+        Each value is the world-space positions of all Vs vertices of the shape: Float (3Vs,) interleaved as xyzxyz...,
+        TensorXf (Vs, 3), or Point3f/Vector3f (Vs,). Gradients flow through. Vertex normals of the shapes that have them
+        are computed anew with Mitsuba's angle weighting (``vertex_normals``), attached. Sizes must be those of the scene.
+        """
+        merged = self.positions
+        for name, value in positions.items():
+            info = self.shape(name)
+            value = _checked_positions(name, value, info.vertex_count)
+            merged = _write_vertices(merged, value, info.vertex_start, info.vertex_count, self.vertex_count)
+        normals = self.normals
+        for name in positions:
+            info = self.shape(name)
+            if info.has_normals:
+                smooth = vertex_normals(merged, _faces_of(self.faces, info), self.vertex_count)
+                own = dr.arange(mi.UInt32, info.vertex_count) + info.vertex_start
+                smooth = dr.gather(mi.Normal3f, smooth, own)
+                normals = _write_vertices(normals, smooth, info.vertex_start, info.vertex_count, self.vertex_count)
+        return replace(self, positions=merged, normals=normals)
+
+
+def vertex_normals(positions: Any, faces: Any, vertex_count: int) -> Any:
+    """Smooth unit vertex normals: face normals weighted by the angle at the vertex, as Mitsuba does.
+
+    positions Float (3V,), any space; faces Vector3u (F,). Returns Float (3V,). Where the face normals of a vertex cancel, or it
+    has no faces, the result is (1, 0, 0), as Mitsuba's. Gradients flow to positions.
+    Source: Thuermer and Wuethrich, "Computing Vertex Normals from Polygonal Facets", 1998.
+    """
+    p0, p1, p2 = (dr.gather(mi.Point3f, positions, faces[i]) for i in range(3))
+    e01, e02, e12 = p1 - p0, p2 - p0, p2 - p1
+    n = dr.cross(e01, e02)
+    n_squared = dr.squared_norm(n)
+    valid = n_squared > 0
+    # |e_i x e_j| is the same (twice the area) at all three corners, so the angles need one square root only.
+    area2 = dr.sqrt(dr.select(valid, n_squared, 1.0))
+    n = dr.select(valid, n / area2, 0.0)
+    angles = (dr.atan2(area2, dr.dot(e01, e02)), dr.atan2(area2, -dr.dot(e01, e12)), dr.atan2(area2, dr.dot(e02, e12)))
+    total = dr.zeros(mi.Float, 3 * vertex_count)
+    for corner, angle in enumerate(angles):
+        dr.scatter_add(total, n * angle, faces[corner], active=valid)
+    total = dr.unravel(mi.Vector3f, total)
+    # The weights are angles: a sum of this size is the rounding error of faces that lie back to back.
+    total = dr.select(dr.squared_norm(total) > 1e-10, total, 0.0)
+    return dr.ravel(normalize_or(total, mi.Vector3f(1.0, 0.0, 0.0)))
+
+
+def normalize_or(vector: Any, fallback: Any) -> Any:
+    """Unit vector, or ``fallback`` where the vector is zero. Neither its value nor its gradient is ever NaN there."""
+    squared = dr.squared_norm(vector)
+    valid = squared > 0
+    return dr.select(valid, vector * dr.rsqrt(dr.select(valid, squared, 1.0)), fallback)
+
+
+def _faces_of(faces: Any, info: ShapeInfo) -> Any:
+    return dr.gather(mi.Vector3u, faces, dr.arange(mi.UInt32, info.face_count) + info.face_start)
+
+
+def _checked_positions(name: str, value: Any, count: int) -> Any:
+    """Bring positions to Float (3Vs,) or an array of three components; sizes are known without evaluating anything."""
+    if dr.is_tensor_v(value):
+        if tuple(value.shape) not in ((count, 3), (3 * count,)):
+            raise ShadowmapError(
+                f"Positions of shape '{name}' have the tensor shape {tuple(value.shape)}, but it has {count} vertices: "
+                f"give a tensor of shape ({count}, 3)."
+            )
+        value = value.array
+    if dr.is_array_v(value) and dr.depth_v(value) == 2 and dr.size_v(value) == 3:
+        if dr.width(value) not in (1, count):
+            raise ShadowmapError(
+                f"Positions of shape '{name}' are an array of {dr.width(value)} points, but it has {count} vertices."
+            )
+        return mi.Point3f(value)
+    if not dr.is_array_v(value):
+        value = mi.Float(value)
+    if dr.depth_v(value) != 1 or dr.width(value) != 3 * count:
+        raise ShadowmapError(
+            f"Positions of shape '{name}' are an array of {dr.width(value)} numbers, but {count} vertices need {3 * count}."
+        )
+    return mi.Float(value)
+
+
+def _write_vertices(target: Any, value: Any, start: int, count: int, total: int) -> Any:
+    """A copy of the flat buffer ``target`` with ``count`` vertices from ``start`` on replaced, differentiable in both."""
+    points = dr.size_v(value) == 3
+    if start == 0 and count == total:
+        return dr.ravel(value) if points and dr.width(value) == count else _fill(value, count)
+    result = type(target)(target)
+    index = dr.arange(mi.UInt32, count if points else 3 * count) + (start if points else 3 * start)
+    dr.scatter(result, value, index, mode=dr.ReduceMode.Permute)
+    return result
+
+
+def _fill(value: Any, count: int) -> Any:
+    if dr.size_v(value) == 3:
+        return dr.ravel(dr.gather(mi.Point3f, dr.ravel(value), dr.zeros(mi.UInt32, count)))
+    return value

@@ -1,0 +1,173 @@
+"""Light records: directional, spot and point lights, and environments, read from Mitsuba emitters.
+
+``illuminate`` returns what ``emitter.sample_direction`` returns for the same point, without any visibility. All fields that
+are not names may carry gradients; replace them with ``dataclasses.replace``.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from .errors import ShadowmapError
+from .traversal import children, parameters
+
+_DEGREE = math.pi / 180.0
+
+
+@dataclass(frozen=True)
+class DirectionalLight:
+    """Parallel light. ``direction``: Vector3f, in which light travels, world space, any length; ``irradiance``: colour."""
+
+    name: str
+    direction: Any
+    irradiance: Any
+
+    def illuminate(self, p_world: Any, active: Any = True) -> tuple[Any, Any]:
+        """(wo, weight): unit direction to the light (Vector3f) and its irradiance on a surface that faces it."""
+        return -dr.normalize(mi.Vector3f(self.direction)), self.irradiance & mi.Bool(active)
+
+
+@dataclass(frozen=True)
+class PointLight:
+    """Light from a point. ``position``: Point3f, world space; ``intensity``: colour, W/sr."""
+
+    name: str
+    position: Any
+    intensity: Any
+
+    def illuminate(self, p_world: Any, active: Any = True) -> tuple[Any, Any]:
+        """(wo, weight) with weight = intensity / distance^2."""
+        wo, inverse_squared = _towards(p_world, self.position)
+        return wo, (self.intensity * inverse_squared) & mi.Bool(active)
+
+
+@dataclass(frozen=True)
+class SpotLight:
+    """Cone of light along the local +z axis.
+
+    to_world      Transform4f
+    intensity     colour on the axis, W/sr
+    cutoff_angle  Float, degrees, half-angle of the cone beyond which there is no light
+    beam_width    Float, degrees, half-angle up to which intensity is full; in between it falls off linearly in the angle
+    texture       ``mi.Texture`` over the square that circumscribes the cone, or None
+    """
+
+    name: str
+    to_world: Any
+    intensity: Any
+    cutoff_angle: Any
+    beam_width: Any
+    texture: Any = None
+
+    @property
+    def position(self) -> Any:
+        """Point3f, world space."""
+        matrix = self.to_world.matrix
+        return mi.Point3f(matrix[0, 3], matrix[1, 3], matrix[2, 3])
+
+    @property
+    def direction(self) -> Any:
+        """Vector3f, unit axis of the cone, the direction in which light travels, world space."""
+        matrix = self.to_world.matrix
+        return dr.normalize(mi.Vector3f(matrix[0, 2], matrix[1, 2], matrix[2, 2]))
+
+    def illuminate(self, p_world: Any, active: Any = True) -> tuple[Any, Any]:
+        """(wo, weight) with weight = intensity * falloff * texture / distance^2."""
+        wo, inverse_squared = _towards(p_world, self.position)
+        matrix = mi.Matrix3f(self.to_world.matrix)
+        local = dr.normalize(mi.Vector3f(dr.rcp(matrix) @ mi.Vector3f(-wo)))
+        cutoff, beam = self.cutoff_angle * _DEGREE, self.beam_width * _DEGREE
+        angle = dr.safe_acos(local.z)
+        falloff = dr.select(local.z >= dr.cos(beam), 1.0, (cutoff - angle) / (cutoff - beam))
+        lit = (local.z > dr.cos(cutoff)) & mi.Bool(active)
+        weight = self.intensity * (falloff * inverse_squared)
+        if self.texture is not None:
+            # Lanes outside the cone may have z = 0: keep their coordinates finite.
+            scale = 0.5 * dr.rcp(dr.select(lit, local.z, 1.0) * dr.tan(cutoff))
+            si = dr.zeros(mi.SurfaceInteraction3f, dr.width(local))
+            si.uv = mi.Point2f(0.5 + local.x * scale, 0.5 + local.y * scale)
+            weight = weight * self.texture.eval(si, lit)
+        return wo, weight & lit
+
+
+@dataclass(frozen=True)
+class Environment:
+    """Light from infinitely far away, from all directions: Mitsuba's ``constant`` or ``envmap`` emitter."""
+
+    name: str
+    emitter: Any
+
+    def radiance(self, direction: Any, active: Any = True) -> Any:
+        """Radiance (colour) that arrives *from* the unit world-space ``direction`` (Vector3f). Attached to the emitter."""
+        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(direction))
+        si.wi = -direction
+        return self.emitter.eval(si, mi.Bool(active))
+
+
+Light = DirectionalLight | PointLight | SpotLight
+
+
+def lights_of(scene: Any) -> tuple[Light, ...]:
+    """Records of the directional, spot and point lights of a ``mi.Scene``, in the scene's order, environments left out.
+
+    Raises ``ShadowmapError`` for any other emitter. Names are Mitsuba ids; lights without one are called ``light_0``, ...
+    """
+    return tuple(
+        light_of(emitter, emitter.id() or f"light_{i}")
+        for i, emitter in enumerate(scene.emitters())
+        if not emitter.is_environment()
+    )
+
+
+def environments_of(scene: Any) -> tuple[Environment, ...]:
+    """Records of the ``constant`` and ``envmap`` emitters of a ``mi.Scene`` (at most one)."""
+    found = []
+    for i, emitter in enumerate(scene.emitters()):
+        if emitter.is_environment():
+            name = emitter.id() or f"light_{i}"
+            if emitter.class_name() not in ("ConstantBackgroundEmitter", "EnvironmentMapEmitter"):
+                raise ShadowmapError(
+                    f"Emitter '{name}' ({emitter.class_name()}) is not supported: use constant or envmap as environment."
+                )
+            found.append(Environment(name, emitter))
+    return tuple(found)
+
+
+def light_of(emitter: Any, name: str) -> Light:
+    """Record of one ``mi.Emitter``; fields are attached where the emitter's parameters are."""
+    kind = emitter.class_name()
+    if kind not in ("DirectionalEmitter", "PointLight", "SpotLight"):
+        place = f" of shape '{emitter.get_shape().id()}'" if emitter.get_shape() is not None else ""
+        raise ShadowmapError(f"Emitter '{name}'{place} ({kind}) is not supported yet: use directional, spot or point lights.")
+    values, parts = parameters(emitter), dict(children(emitter))
+    if kind == "DirectionalEmitter":
+        matrix = values["to_world"].matrix
+        direction = mi.Vector3f(matrix[0, 2], matrix[1, 2], matrix[2, 2])
+        return DirectionalLight(name, dr.normalize(direction), colour_of(parts["irradiance"]))
+    if kind == "PointLight":
+        return PointLight(name, mi.Point3f(values["position"]), colour_of(parts["intensity"]))
+    return SpotLight(
+        name=name,
+        to_world=values["to_world"],
+        intensity=colour_of(parts["intensity"]),
+        cutoff_angle=mi.Float(values["cutoff_angle"]),
+        beam_width=mi.Float(values["beam_width"]),
+        texture=parts.get("texture"),
+    )
+
+
+def colour_of(texture: Any) -> Any:
+    """The colour of a spectrum that does not vary over space, as ``mi.UnpolarizedSpectrum``."""
+    return texture.eval(dr.zeros(mi.SurfaceInteraction3f))
+
+
+def _towards(p_world: Any, position: Any) -> tuple[Any, Any]:
+    """Unit vector from p_world to a position, and 1 / distance^2."""
+    offset = mi.Vector3f(position - p_world)
+    inverse_squared = dr.rcp(dr.squared_norm(offset))
+    return offset * dr.sqrt(inverse_squared), inverse_squared

@@ -1,0 +1,297 @@
+"""From a Mitsuba scene to the records that the renderer works on.
+
+``load`` does the expensive part once (topology, tessellation, tables, validation); ``refresh`` re-reads what parameters may
+change, attached where they carry gradients.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from . import tessellate
+from .errors import ShadowmapError
+from .geometry import Geometry, ShapeInfo
+from .lights import Environment, Light, environments_of, lights_of
+from .sensors import Sensor, sensors_of
+from .traversal import children, mesh_buffers, parameters
+
+_ANALYTIC = {"Sphere": tessellate.sphere, "Disk": tessellate.disk, "Cylinder": tessellate.cylinder}
+
+
+@dataclass(frozen=True)
+class ShapeSource:
+    """Where the vertices of one shape of the soup come from.
+
+    ``shape`` is the ``mi.Shape``, ``instance`` the ``mi.Shape`` that places it in the world or None; the ``local_*`` buffers
+    hold the tessellation of an analytic shape (None for meshes).
+    """
+
+    shape: Any
+    instance: Any
+    local_positions: Any = None
+    local_normals: Any = None
+    local_texcoords: Any = None
+
+
+@dataclass(frozen=True)
+class SceneData:
+    """A scene as records. A PyTree that may cross ``dr.freeze``.
+
+    sensors       one tuple for each sensor of the scene; a batch sensor's holds several cameras, all others one
+    lights        directional, spot and point lights
+    environments  constant and envmap emitters (at most one)
+    shape_ptr, bsdf_ptr   mi.ShapePtr, mi.BSDFPtr (S,), by the index that ``geometry.face_shape`` holds
+    """
+
+    scene: Any
+    geometry: Geometry
+    sensors: tuple[tuple[Sensor, ...], ...]
+    lights: tuple[Light, ...]
+    environments: tuple[Environment, ...]
+    shape_ptr: Any
+    bsdf_ptr: Any
+    sources: tuple[ShapeSource, ...]
+
+    def light(self, name: str) -> Light:
+        """The light called ``name``; raises ``ShadowmapError`` listing the known names otherwise."""
+        for light in self.lights:
+            if light.name == name:
+                return light
+        known = ", ".join(repr(light.name) for light in self.lights) or "none"
+        raise ShadowmapError(f"There is no light '{name}' in the scene; its lights: {known}.")
+
+
+def load(scene: Any, *, tessellation: int = 64) -> SceneData:
+    """Read a ``mi.Scene``.
+
+    ``tessellation``: triangles around the circumference of spheres, disks and cylinders. Raises ``ShadowmapError`` for what is
+    not supported or broken, naming the plug-in and its id; warns (``UserWarning``) where the result is still meaningful.
+    Needs a variant ``*_ad_rgb`` or ``*_ad_mono``.
+    """
+    if not ("_ad_" in mi.variant() and mi.variant().endswith(("_rgb", "_mono"))):
+        raise ShadowmapError(
+            f"Mitsuba variant '{mi.variant()}' is not supported: set one whose name ends in _ad_rgb or _ad_mono, "
+            "for instance llvm_ad_rgb."
+        )
+    if not isinstance(tessellation, int) or tessellation < 3:
+        raise ShadowmapError(f"tessellation is {tessellation!r}, but must be an integer of at least 3.")
+    infos, sources, faces = [], [], []
+    for name, shape, instance in _shapes_of(scene):
+        source, own_faces = _source_of(name, shape, instance, tessellation)
+        _check_surface(name, shape)
+        vertex_start = infos[-1].vertex_start + infos[-1].vertex_count if infos else 0
+        face_start = infos[-1].face_start + infos[-1].face_count if infos else 0
+        infos.append(_info_of(name, source, own_faces, vertex_start, face_start))
+        sources.append(source)
+        faces.append(own_faces + np.uint32(vertex_start))
+    if not infos:
+        raise ShadowmapError("The scene has no shapes: there is nothing to render.")
+    face_counts, vertex_counts = [i.face_count for i in infos], [i.vertex_count for i in infos]
+    shape_index = np.arange(len(infos), dtype=np.uint32)
+    empty = mi.Float()
+    geometry = Geometry(
+        positions=empty,
+        normals=empty,
+        texcoords=empty,
+        rest_positions=empty,
+        faces=mi.UInt32(np.concatenate(faces).ravel()),
+        face_shape=mi.UInt32(np.repeat(shape_index, face_counts)),
+        vertex_shape=mi.UInt32(np.repeat(shape_index, vertex_counts)),
+        shape_face_start=mi.UInt32([i.face_start for i in infos]),
+        shape_flags=mi.UInt32([i.flags for i in infos]),
+        shapes=tuple(infos),
+    )
+    data = SceneData(
+        scene=scene,
+        geometry=geometry,
+        sensors=(),
+        lights=(),
+        environments=(),
+        shape_ptr=dr.concat([mi.ShapePtr(source.shape) for source in sources]),
+        bsdf_ptr=dr.concat([mi.BSDFPtr(source.shape.bsdf()) for source in sources]),
+        sources=tuple(sources),
+    )
+    return refresh(data)
+
+
+def refresh(data: SceneData) -> SceneData:
+    """Read again what scene parameters may have changed: vertices, normals, texture coordinates, lights and sensors.
+
+    Values are attached where the scene's parameters are. Topology must be that of ``load``; BSDFs need no refresh, since they
+    are always evaluated by Mitsuba itself. Nothing is read back to the host.
+    """
+    buffers = [_vertex_buffers(source, info) for source, info in zip(data.sources, data.geometry.shapes, strict=True)]
+    positions, normals, texcoords, rest = (dr.concat(list(parts)) for parts in zip(*buffers, strict=True))
+    if not any(info.reads_attributes for info in data.geometry.shapes):
+        rest = mi.Float()
+    geometry = replace(data.geometry, positions=positions, normals=normals, texcoords=texcoords, rest_positions=dr.detach(rest))
+    return replace(
+        data,
+        geometry=geometry,
+        sensors=tuple(sensors_of(sensor) for sensor in data.scene.sensors()),
+        lights=lights_of(data.scene),
+        environments=environments_of(data.scene),
+    )
+
+
+def _shapes_of(scene: Any) -> Iterator[tuple[str, Any, Any]]:
+    """(unique name, shape, instance or None) of all shapes, shape groups resolved."""
+    groups = [children(node) for _, node in children(scene) if node.class_name().startswith("ShapeGroup")]
+    taken: set[str] = set()
+    for index, shape in enumerate(scene.shapes()):
+        name = shape.id() or f"shape_{index}"
+        if shape.class_name() == "Instance":
+            for child_index, child in enumerate(_group_of(shape, name, groups)):
+                yield _unique(f"{name}.{child.id() or child_index}", taken), child, shape
+        else:
+            yield _unique(name, taken), shape, None
+
+
+def _unique(name: str, taken: set[str]) -> str:
+    candidate, count = name, 1
+    while candidate in taken:
+        candidate, count = f"{name}_{count}", count + 1
+    taken.add(candidate)
+    return candidate
+
+
+def _group_of(instance: Any, name: str, groups: list[list[tuple[str, Any]]]) -> list[Any]:
+    """Shapes of the group that an instance shows.
+
+    An instance does not tell its group; but an intersection record made by hand shows which shape would have been hit.
+    """
+    hit = dr.zeros(mi.PreliminaryIntersection3f)
+    hit.t, hit.valid, hit.instance = mi.Float(1.0), mi.Bool(True), mi.ShapePtr(instance)
+    si = hit.compute_surface_interaction(mi.Ray3f(mi.Point3f(0.0), mi.Vector3f(0.0, 0.0, 1.0)), +mi.RayFlags.Minimal)
+    first = dr.reinterpret_array(mi.UInt32, si.shape)[0]
+    for group in groups:
+        shapes = [child for _, child in group if isinstance(child, mi.Shape)]
+        if shapes and dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shapes[0]))[0] == first:
+            return shapes
+    raise ShadowmapError(f"The shape group of instance '{name}' was not found in the scene.")
+
+
+def _source_of(name: str, shape: Any, instance: Any, tessellation: int) -> tuple[ShapeSource, np.ndarray]:
+    """The source of a shape's vertices and its faces (F, 3)."""
+    if isinstance(shape, mi.Mesh):
+        faces = mesh_buffers(shape)[0].numpy().reshape(-1, 3)
+        return ShapeSource(shape, instance), faces
+    tessellator = _ANALYTIC.get(shape.class_name())
+    if tessellator is None:
+        raise ShadowmapError(
+            f"Shape '{name}' ({shape.class_name()}) is not supported: use meshes, spheres, disks, cylinders or instances."
+        )
+    mesh = tessellator(tessellation)
+    flat = [mi.Float(a.ravel()) for a in (mesh.positions, mesh.normals, mesh.texcoords)]
+    return ShapeSource(shape, instance, *flat), mesh.faces
+
+
+def _check_surface(name: str, shape: Any) -> None:
+    """Refuse or warn about what else hangs on a shape."""
+    if shape.is_emitter():
+        raise ShadowmapError(
+            f"Shape '{name}' emits light ({shape.emitter().class_name()} '{shape.emitter().id()}'), which is not supported yet: "
+            "use directional, spot or point lights."
+        )
+    if shape.is_medium_transition():
+        warnings.warn(f"Shape '{name}' bounds a medium, which is ignored.", stacklevel=4)
+    bsdf = shape.bsdf()
+    if not mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth):
+        warnings.warn(
+            f"The BSDF '{bsdf.id()}' ({bsdf.class_name()}) of shape '{name}' has no smooth component and renders black.",
+            stacklevel=4,
+        )
+
+
+def _info_of(name: str, source: ShapeSource, faces: np.ndarray, vertex_start: int, face_start: int) -> ShapeInfo:
+    """Validate the buffers of a shape and describe them."""
+    shape, is_mesh = source.shape, source.local_positions is None
+    if is_mesh:
+        _, positions, normals, texcoords = mesh_buffers(shape)
+        has_normals, has_texcoords = len(normals) > 0, len(texcoords) > 0
+    else:
+        positions, has_normals, has_texcoords = source.local_positions, True, True
+    points = positions.numpy().reshape(-1, 3)
+    if not len(points) or not len(faces):
+        raise ShadowmapError(f"Shape '{name}' is an empty mesh ({len(points)} vertices, {len(faces)} faces): remove it.")
+    bad = np.flatnonzero(~np.isfinite(points).all(-1))
+    if len(bad):
+        raise ShadowmapError(f"Vertex {bad[0]} of shape '{name}' is {points[bad[0]].tolist()}: positions must be finite.")
+    if int(faces.max()) >= len(points):
+        where = int(np.argmax(faces.max(-1)))
+        raise ShadowmapError(
+            f"Face {where} of shape '{name}' refers to vertex {faces[where].max()}, but there are only {len(points)} vertices."
+        )
+    # Mitsuba's normals do not change sides under a mirroring transform, but the winding of a triangle does.
+    mirrored = False
+    for owner in (source.instance, None if is_mesh else shape):
+        if owner is not None:
+            matrix = np.array(parameters(owner)["to_world"].matrix).reshape(4, 4)[:3, :3]
+            mirrored ^= bool(np.linalg.det(matrix) < 0)
+    flipped = shape.has_flipped_normals()
+    return ShapeInfo(
+        name=name,
+        plugin=shape.class_name(),
+        vertex_start=vertex_start,
+        vertex_count=len(points),
+        face_start=face_start,
+        face_count=len(faces),
+        has_normals=has_normals,
+        has_texcoords=has_texcoords,
+        flip_geometric=flipped != mirrored,
+        flip_shading=flipped,
+        reads_attributes=is_mesh and shape.has_mesh_attributes(),
+        planar=_is_planar(points),
+    )
+
+
+def _is_planar(points: np.ndarray) -> bool:
+    centred = points.astype(np.float64) - points.mean(0, dtype=np.float64)
+    spread = np.linalg.eigvalsh(centred.T @ centred)
+    return bool(spread[0] <= 1e-10 * spread[2])
+
+
+def _vertex_buffers(source: ShapeSource, info: ShapeInfo) -> tuple[Any, Any, Any, Any]:
+    """(positions, normals, texcoords, rest positions) of one shape: flat, world space (rest: own space), attached."""
+    if source.local_positions is None:
+        _, positions, normals, texcoords = mesh_buffers(source.shape)
+        if len(positions) != 3 * info.vertex_count:
+            now = len(positions) // 3
+            raise ShadowmapError(
+                f"Shape '{info.name}' now has {now} vertices instead of {info.vertex_count}: load the scene again."
+            )
+        rest = positions
+    else:
+        to_world = parameters(source.shape)["to_world"]
+        positions = _transform(source.local_positions, to_world.matrix, mi.Point3f)
+        normals = _transform(source.local_normals, to_world.inverse_transpose, mi.Normal3f)
+        texcoords, rest = source.local_texcoords, positions
+    if source.instance is not None:
+        to_world = parameters(source.instance)["to_world"]
+        positions = _transform(positions, to_world.matrix, mi.Point3f)
+        if info.has_normals:
+            normals = _transform(normals, to_world.inverse_transpose, mi.Normal3f)
+    if not info.has_normals:
+        normals = dr.zeros(mi.Float, 3 * info.vertex_count)
+    if not info.has_texcoords:
+        texcoords = dr.zeros(mi.Float, 2 * info.vertex_count)
+    return positions, normals, texcoords, rest
+
+
+def _transform(flat: Any, matrix: Any, kind: Any) -> Any:
+    """Apply a 4x4 matrix to flat points, or the upper 3x3 of an inverse transpose to flat normals (then made unit)."""
+    value = dr.unravel(mi.Vector3f, flat)
+    linear = mi.Matrix3f(matrix)
+    result = mi.Vector3f(linear @ value)
+    if kind is mi.Point3f:
+        result += mi.Vector3f(matrix[0, 3], matrix[1, 3], matrix[2, 3])
+    else:
+        result = dr.normalize(result)
+    return dr.ravel(result)

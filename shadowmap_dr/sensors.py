@@ -1,0 +1,211 @@
+"""Cameras: a record with everything the rasterizer and the shading need, read from a Mitsuba sensor.
+
+``Sensor.view_projection`` takes world space to OpenGL clip space (visible where -w <= x, y, z <= w) with row 0 of the image, the
+topmost row of Mitsuba's film, at y = -w.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from .errors import ShadowmapError
+from .traversal import children, parameters
+
+_KINDS = {
+    "PerspectiveCamera": "perspective",
+    "ThinLensCamera": "perspective",
+    "OrthographicCamera": "orthographic",
+}
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A pinhole (``kind='perspective'``) or orthographic camera. Replace fields with ``dataclasses.replace``.
+
+    to_world         Transform4f; the camera looks along +z, x points to the *left* (Mitsuba's convention), y up
+    x_fov            Float, degrees, horizontal angle of the whole film (perspective only)
+    principal_point  Point2f, Mitsuba's principal_point_offset_x/y, as a fraction of the film's width and height
+    near, far        Float, clip distances along the viewing direction
+    film_size, crop_size, crop_offset   pixels
+    channels         colour channels that the film holds: 1 (luminance) or 3; ``alpha`` says whether one more holds coverage
+    filter, filter_radius   class name and radius in pixels of the film's reconstruction filter
+    film_column      leftmost column of this camera's picture in its film (batch sensors put several side by side)
+
+    Gradients flow from ``view_projection``, ``origin``, ``direction`` and ``wi_world`` to to_world, x_fov and principal_point.
+    """
+
+    name: str
+    kind: str
+    to_world: Any
+    x_fov: Any
+    principal_point: Any
+    near: Any
+    far: Any
+    film_size: tuple[int, int]
+    crop_size: tuple[int, int]
+    crop_offset: tuple[int, int]
+    channels: int
+    alpha: bool
+    filter: str
+    filter_radius: float
+    film_column: int = 0
+
+    @property
+    def width(self) -> int:
+        """Columns of the picture (the crop window)."""
+        return self.crop_size[0]
+
+    @property
+    def height(self) -> int:
+        """Rows of the picture (the crop window)."""
+        return self.crop_size[1]
+
+    @property
+    def origin(self) -> Any:
+        """Point3f, centre of projection (perspective) or a point on the optical axis (orthographic), world space."""
+        matrix = self.to_world.matrix
+        return mi.Point3f(matrix[0, 3], matrix[1, 3], matrix[2, 3])
+
+    @property
+    def direction(self) -> Any:
+        """Vector3f, unit viewing direction, world space."""
+        matrix = self.to_world.matrix
+        return dr.normalize(mi.Vector3f(matrix[0, 2], matrix[1, 2], matrix[2, 2]))
+
+    @property
+    def view(self) -> Any:
+        """Matrix4f, world to camera space."""
+        return dr.rcp(mi.Matrix4f(self.to_world.matrix))
+
+    @property
+    def projection(self) -> Any:
+        """Matrix4f, camera space to clip space, crop window and principal point included."""
+        (film_w, film_h), (crop_w, crop_h), (crop_x, crop_y) = self.film_size, self.crop_size, self.crop_offset
+        # Position in the crop window in [0, 1] = (position in the film - crop offset) * film size / crop size.
+        zoom = (film_w / crop_w, film_h / crop_h)
+        aspect = film_w / film_h
+        if self.kind == "perspective":
+            scale = dr.rcp(dr.tan(mi.Float(self.x_fov) * (0.5 * math.pi / 180.0)))
+        else:
+            scale = mi.Float(1.0)
+        sx, sy = -scale * zoom[0], -scale * (zoom[1] * aspect)
+        # Film position 0.5 + 0.5 * ndc - principal point, then the crop, then back to [-1, 1].
+        cx = zoom[0] * (1.0 - 2.0 * self.principal_point.x - 2.0 * crop_x / film_w) - 1.0
+        cy = zoom[1] * (1.0 - 2.0 * self.principal_point.y - 2.0 * crop_y / film_h) - 1.0
+        near, far = mi.Float(self.near), mi.Float(self.far)
+        inverse_depth = dr.rcp(far - near)
+        if self.kind == "perspective":
+            return mi.Matrix4f(
+                [sx, 0, cx, 0],
+                [0, sy, cy, 0],
+                [0, 0, (far + near) * inverse_depth, -2.0 * far * near * inverse_depth],
+                [0, 0, 1, 0],
+            )
+        return mi.Matrix4f(
+            [sx, 0, 0, cx],
+            [0, sy, 0, cy],
+            [0, 0, 2.0 * inverse_depth, -(far + near) * inverse_depth],
+            [0, 0, 0, 1],
+        )
+
+    @property
+    def view_projection(self) -> Any:
+        """Matrix4f, world space to clip space: pos_clip = view_projection @ (p_world, 1)."""
+        return self.projection @ self.view
+
+    def wi_world(self, p_world: Any) -> Any:
+        """Unit vector from p_world (Point3f) to the camera, world space."""
+        if self.kind == "perspective":
+            return dr.normalize(self.origin - p_world)
+        return -self.direction
+
+    def ray_direction(self, width: int | None = None, height: int | None = None) -> Any:
+        """Vector3f (H * W,), unit world-space directions through the pixel centres, row-major. Attached.
+
+        ``width`` and ``height`` ask for another grid over the same window (supersampling).
+        """
+        width, height = width or self.width, height or self.height
+        index = dr.arange(mi.UInt32, width * height)
+        ndc_x = (mi.Float(index % width) + 0.5) * (2.0 / width) - 1.0
+        ndc_y = (mi.Float(index // width) + 0.5) * (2.0 / height) - 1.0
+        if self.kind == "orthographic":
+            return dr.select(mi.Bool(True), self.direction, dr.zeros(mi.Vector3f, width * height))
+        projection = self.projection
+        x = (ndc_x - projection[0, 2]) / projection[0, 0]
+        y = (ndc_y - projection[1, 2]) / projection[1, 1]
+        linear = mi.Matrix3f(self.to_world.matrix)
+        return dr.normalize(mi.Vector3f(linear @ mi.Vector3f(x, y, 1.0)))
+
+    def with_depth_range(self, positions: Any) -> Sensor:
+        """This camera with near and far moved close around the given vertices (Float (3V,), world space), detached.
+
+        Mitsuba's defaults (0.01 and 10,000) waste float32 depth. Nothing that was visible is cut: where a vertex lies
+        behind the near plane the old near plane stays. No value is read back, so this works in a frozen function.
+        """
+        depth = _camera_depth(dr.detach(self.view), dr.detach(positions))
+        nearest, farthest = dr.min(depth), dr.max(depth)
+        margin = 1e-3 * dr.maximum(dr.abs(farthest), dr.abs(nearest)) + 1e-6
+        near = dr.maximum(dr.detach(mi.Float(self.near)), nearest - margin)
+        far = dr.minimum(dr.detach(mi.Float(self.far)), farthest + margin)
+        # With everything behind the camera there is nothing to see; the range must stay valid all the same.
+        return replace(self, near=near, far=dr.maximum(far, near * 1.001 + 1e-6))
+
+
+def sensors_of(sensor: Any) -> tuple[Sensor, ...]:
+    """Records of a ``mi.Sensor``: one, or for a batch sensor one for each camera in it, left to right."""
+    kind = sensor.class_name()
+    if kind == "BatchSensor":
+        film = sensor.film()
+        if tuple(film.crop_size()) != tuple(film.size()):
+            raise ShadowmapError(
+                f"Batch sensor '{sensor.id()}' has a film with a crop window, which is not supported: remove the crop."
+            )
+        cameras = [child for _, child in children(sensor) if isinstance(child, mi.Sensor)]
+        column = film.size()[0] // len(cameras)
+        return tuple(_sensor_of(camera, film, i * column) for i, camera in enumerate(cameras))
+    return (_sensor_of(sensor, sensor.film(), 0),)
+
+
+def _sensor_of(sensor: Any, film: Any, film_column: int) -> Sensor:
+    kind = _KINDS.get(sensor.class_name())
+    if kind is None:
+        raise ShadowmapError(
+            f"Sensor '{sensor.id()}' ({sensor.class_name()}) is not supported: use perspective, orthographic or batch."
+        )
+    if film.base_channels_count() not in (1, 2, 3, 4):
+        raise ShadowmapError(
+            f"The film of sensor '{sensor.id()}' has {film.base_channels_count()} channels: use pixel_format luminance or rgb."
+        )
+    if "pixel_format = xyz" in str(film):
+        raise ShadowmapError(f"The film of sensor '{sensor.id()}' stores XYZ, which is not supported: use pixel_format rgb.")
+    values = parameters(sensor)
+    window = sensor.film()  # a batch sensor's cameras have their share of the common film's size
+    alpha = film.base_channels_count() in (2, 4)
+    zero = mi.Float(0.0)
+    return Sensor(
+        name=sensor.id(),
+        kind=kind,
+        to_world=values["to_world"],
+        x_fov=values.get("x_fov", mi.Float(90.0)),
+        principal_point=mi.Point2f(values.get("principal_point_offset_x", zero), values.get("principal_point_offset_y", zero)),
+        near=mi.Float(values["near_clip"]),
+        far=mi.Float(values["far_clip"]),
+        film_size=tuple(int(n) for n in window.size()),
+        crop_size=tuple(int(n) for n in window.crop_size()),
+        crop_offset=tuple(int(n) for n in window.crop_offset()),
+        channels=int(film.base_channels_count()) - alpha,
+        alpha=alpha,
+        filter=film.rfilter().class_name(),
+        filter_radius=float(film.rfilter().radius()),
+        film_column=film_column,
+    )
+
+
+def _camera_depth(view: Any, positions: Any) -> Any:
+    p_world = dr.unravel(mi.Point3f, positions)
+    return view[2, 0] * p_world.x + view[2, 1] * p_world.y + view[2, 2] * p_world.z + view[2, 3]

@@ -1,6 +1,21 @@
 """Screen-space primitives on Dr.Jit arrays: rasterize, interpolate, antialias. No lights, no scenes."""
 
 from ._types import NO_TRIANGLE, RasterOutput
+from .antialias import antialias
+from .interpolate import interpolate
 from .rasterize import rasterize
+from .silhouette import Crossings, find_crossings
+from .topology import NO_VERTEX, Topology, build_topology
 
-__all__ = ["NO_TRIANGLE", "RasterOutput", "rasterize"]
+__all__ = [
+    "NO_TRIANGLE",
+    "NO_VERTEX",
+    "Crossings",
+    "RasterOutput",
+    "Topology",
+    "antialias",
+    "build_topology",
+    "find_crossings",
+    "interpolate",
+    "rasterize",
+]

@@ -39,6 +39,8 @@ class RasterOutput:
         u, v: perspective-correct barycentric weights of the triangle's vertices 1 and 2 (vertex 0 has ``1 - u - v``).
         depth: ``z / w`` in clip space, 1 (the far plane) where nothing is seen.
         w: interpolated clip-space ``w`` (distance along the viewing axis of a perspective camera), 1 where nothing is seen.
+        records: per-triangle set-up of the rasterizer (12 floats for each triangle of each image), for later passes.
+        face_count, batch, height, width: sizes.
 
     ``u``, ``v``, ``depth`` and ``w`` carry gradients to the clip-space positions (for a fixed visible triangle; the change
     of *which* triangle is visible is the business of :func:`shadowmap_dr.raster.antialias`).
@@ -49,6 +51,8 @@ class RasterOutput:
     v: Any
     depth: Any
     w: Any
+    records: Any
+    face_count: int
     batch: int
     height: int
     width: int

@@ -1,8 +1,8 @@
 """A pyramid of screen grids: which primitives may touch which pixels, in arrays of a size known in advance.
 
 Level ``l`` divides every image of a batch into square cells of ``4 * 2**l`` pixels. A primitive goes to the finest level
-at which the box of the pixel centres it may touch overlaps at most 2 x 2 cells, so that ``n`` primitives make at most ``4 n`` list
-entries. A counting sort puts these into one list per cell. No array size depends on the data, which keeps the program
+at which the box of the pixel centres it may touch overlaps at most 2 x 2 cells, so that ``n`` primitives make at most ``4 n``
+list entries. A counting sort puts these into one list per cell. No array size depends on the data, which keeps the program
 recordable (``dr.freeze``), and a pixel finds all candidates by walking one list per level.
 """
 

@@ -50,8 +50,8 @@ def rasterize(
     flat, face_indices, batch, vertex_count = check_mesh(positions, faces, batch, check_indices)
     height, width = check_resolution(resolution)
     with dr.suspend_grad():
-        triangle = _visible_triangles(dr.detach(flat), face_indices, batch, vertex_count, height, width)
-    return locate(flat, face_indices, triangle, batch, vertex_count, height, width)
+        triangle, records = _visible_triangles(dr.detach(flat), face_indices, batch, vertex_count, height, width)
+    return _locate(flat, face_indices, triangle, records, batch, vertex_count, height, width)
 
 
 def check_resolution(resolution: tuple[int, int]) -> tuple[int, int]:
@@ -99,8 +99,8 @@ def gather_triangle(positions: Any, faces: Any, triangle: Any, first_vertex: Any
     return tuple(dr.gather(module.Array4f, positions, first_vertex + i[k], active) for k in range(3))
 
 
-def locate(
-    positions: Any, faces: Any, triangle: Any, batch: int, vertex_count: int, height: int, width: int
+def _locate(
+    positions: Any, faces: Any, triangle: Any, records: Any, batch: int, vertex_count: int, height: int, width: int
 ) -> RasterOutput:
     """Perspective-correct barycentrics and depth of each pixel centre on its (given) triangle, attached to ``positions``.
 
@@ -131,6 +131,8 @@ def locate(
         dr.select(hit, v, 0),
         dr.select(hit, depth, 1),
         dr.select(hit, w, 1),
+        records,
+        dr.width(faces) // 3,
         batch,
         height,
         width,
@@ -159,12 +161,12 @@ def _exact_ndc(module: Any, index: Any, size: int) -> tuple[Any, Any]:
     return ndc, dr.fma(-ndc, size, numerator) / size
 
 
-def _visible_triangles(positions: Any, faces: Any, batch: int, vertex_count: int, height: int, width: int) -> Any:
+def _visible_triangles(positions: Any, faces: Any, batch: int, vertex_count: int, height: int, width: int) -> tuple[Any, Any]:
     shape = GridShape(batch, height, width)
     face_count = dr.width(faces) // 3
     records, image, box, active = _set_up(positions, faces, batch, vertex_count, face_count, height, width)
     lists = build_cell_lists(shape, image, box, active)
-    return _walk(lists, records, positions, faces, vertex_count)
+    return _walk(lists, records, positions, faces, vertex_count), records
 
 
 def _set_up(

@@ -1,0 +1,46 @@
+"""Vertex attributes at pixels."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+
+from ._types import RasterOutput, backend, pixel_coordinates
+
+
+def interpolate(attributes: Any, raster: RasterOutput, faces: Any) -> Any:
+    """Interpolate vertex attributes over the visible triangles, perspective-correct.
+
+    Args:
+        attributes: tensor (V, C), the same for all images, or (B, V, C).
+        raster: rasterizer output.
+        faces: vertex indices, tensor (F, 3) or flat, as given to the rasterizer.
+
+    Returns:
+        Tensor (H, W, C), or (B, H, W, C) for more than one image; 0 where nothing is seen. Gradients flow to ``attributes`` and,
+        through the barycentrics, to the positions that were rasterized.
+    """
+    shape = tuple(attributes.shape)
+    if len(shape) not in (2, 3) or 0 in shape:
+        raise ValueError(f"attributes have shape {shape}; expected (V, C) or (B, V, C), not empty")
+    if len(shape) == 3 and shape[0] != raster.batch:
+        raise ValueError(f"attributes of shape {shape} do not fit {raster.batch} image(s)")
+    module = backend(attributes)
+    face_indices = faces.array if dr.is_tensor_v(faces) else faces
+    channels = shape[-1]
+    image, _, _ = pixel_coordinates(module, raster.batch, raster.height, raster.width)
+    first = image * shape[1] if len(shape) == 3 else 0
+    hit = raster.valid
+    corners = dr.gather(module.Array3u, module.UInt32(face_indices), raster.triangle, hit)
+    weights = (1 - raster.u - raster.v, raster.u, raster.v)
+    index = dr.arange(module.UInt32, dr.width(raster.triangle))
+    result = dr.empty(module.Float, channels * dr.width(index))
+    for c in range(channels):
+        total = module.Float(0)
+        for k in range(3):
+            value = dr.gather(module.Float, attributes.array, (first + corners[k]) * channels + c, hit)
+            total = dr.fma(weights[k], value, total)
+        dr.scatter(result, dr.select(hit, total, 0), index * channels + c)
+    size = (raster.height, raster.width, channels)
+    return type(attributes)(result, shape=size if raster.batch == 1 else (raster.batch, *size))

@@ -1,0 +1,265 @@
+"""Where silhouettes cross the image: for each pair of neighbouring pixels, the mesh edge that separates them.
+
+The usual scheme looks for the separating edge among the three of the triangle that a pixel sampled, which fails once
+triangles are smaller than pixels. Here the silhouette edges of the whole mesh are found first, sorted into the rasterizer's
+pyramid of grids, and each pixel pair looks through the lists of its cell.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from ._types import NO_TRIANGLE, RasterOutput, backend, pixel_coordinates
+from .grid import FINEST, CellLists, GridShape, build_cell_lists
+from .topology import NO_VERTEX, Topology
+
+#: Entry of :class:`Crossings` for a pair of pixels that no silhouette separates.
+NO_EDGE = 0xFFFFFFFF
+
+# An edge must lie this far (in NDC depth) before the surface that it borders: it is a discontinuity, not a crease.
+_DEPTH_GAP = 2e-6
+
+
+@dataclass(frozen=True)
+class Crossings:
+    """Silhouette edges between each pixel and its right and lower neighbour.
+
+    ``edge_right``/``edge_down`` (``UInt32``) number an edge of the topology or are ``NO_EDGE``; ``share_right``/``share_down``
+    weight the pair: an edge steeper than 60 degrees counts for horizontal pairs only, one flatter than 30 degrees for vertical
+    pairs only, so that the two directions together blend each piece of silhouette once. No gradients.
+    """
+
+    edge_right: Any
+    edge_down: Any
+    share_right: Any
+    share_down: Any
+
+
+def find_crossings(positions: Any, topology: Topology, raster: RasterOutput, vertex_count: int) -> Crossings:
+    """Find the silhouette edge between each pair of neighbouring pixels.
+
+    Args:
+        positions: flat clip-space vertices (4 V B), as rasterized.
+        topology: edges of the mesh.
+        raster: output of the rasterizer for the same vertices.
+        vertex_count: vertices per image, V.
+
+    A silhouette is an edge whose faces all lie on one side of it in the image. It separates two pixels that see different
+    triangles when it crosses the segment between their centres and lies before the surface that the uncovered one sees
+    (extended to the crossing). Among several the outermost is taken: up to it the uncovered pixel's surface is hidden.
+    """
+    with dr.suspend_grad():
+        positions = dr.detach(positions)
+        shape = GridShape(raster.batch, raster.height, raster.width)
+        records, image, box, active = _set_up(positions, topology, vertex_count, shape)
+        lists = build_cell_lists(shape, image, box, active)
+        return _search(lists, records, topology.count, raster)
+
+
+def _set_up(
+    positions: Any, topology: Topology, vertex_count: int, shape: GridShape
+) -> tuple[Any, Any, tuple[Any, Any, Any, Any], Any]:
+    """Clipped, projected end points of all edges: (x, y, z, side) and (x, y, z, share); which are silhouettes; pixel boxes."""
+    module = backend(positions)
+    Float, UInt32, Int32, Array4f, Array2u = module.Float, module.UInt32, module.Int32, module.Array4f, module.Array2u
+    index = dr.arange(UInt32, shape.batch * topology.count)
+    image = index // topology.count
+    edge = index - image * topology.count
+    ends, opposite = dr.gather(Array2u, topology.edges, edge), dr.gather(Array2u, topology.opposite, edge)
+    first = image * vertex_count
+    a, b = (dr.gather(Array4f, positions, first + ends[k]) for k in range(2))
+    # Orientation is compared, not measured: the cross product is taken around one end point to keep small triangles exact.
+    sides = []
+    for k in range(2):
+        exists = opposite[k] != NO_VERTEX
+        o = dr.gather(Array4f, positions, first + opposite[k], exists)
+        sides.append(dr.select(exists, _orientation(a, b, o), 0))
+    same = sides[0] * sides[1]
+    side = dr.select(sides[0] != 0, sides[0], sides[1])
+    active = (same >= 0) & (side != 0)
+
+    near_a, near_b = a.z + a.w, b.z + b.w
+    active &= (near_a > 0) | (near_b > 0)
+
+    def clip(p: Any, q: Any, near_p: Any, near_q: Any) -> Any:
+        s = near_p / dr.select(near_p < 0, near_p - near_q, 1)
+        return dr.select(near_p < 0, dr.fma(q - p, s, p), p)
+
+    a, b = clip(a, b, near_a, near_b), clip(b, a, near_b, near_a)
+    active &= (a.w > 0) & (b.w > 0)
+
+    def project(p: Any) -> tuple[Any, Any, Any]:
+        inv = dr.rcp(dr.select(active, p.w, 1))
+        return p.x * inv * (0.5 * shape.width), p.y * inv * (0.5 * shape.height), p.z * inv
+
+    (ax, ay, az), (bx, by, bz) = project(a), project(b)
+    active &= dr.isfinite(ax + ay + bx + by)
+    dx, dy = dr.select(active, bx - ax, 0), dr.select(active, by - ay, 0)
+    square = dx * dx + dy * dy
+    share = dr.clip(0.5 + (dy * dy - dx * dx) / dr.select(square > 0, square, 1), 0, 1)
+
+    # Pair (i, i + 1) contains abscissa x where floor(x - 1/2) = i.
+    def first_pixel(v: Any, size: int) -> Any:
+        return Int32(dr.floor(dr.clip(dr.select(active, v, 0) + (0.5 * size - 0.5), -2.0, size + 1.0)))
+
+    m = 1.0 / 512.0
+    raw = (
+        first_pixel(dr.minimum(ax, bx) - m, shape.width),
+        first_pixel(dr.minimum(ay, by) - m, shape.height),
+        first_pixel(dr.maximum(ax, bx) + m, shape.width),
+        first_pixel(dr.maximum(ay, by) + m, shape.height),
+    )
+    # An edge that meets no line through pixel centres crosses no pair at all.
+    active &= (raw[0] < raw[2]) & (share < 1) | (raw[1] < raw[3]) & (share > 0)
+    box = (
+        dr.maximum(raw[0], 0),
+        dr.maximum(raw[1], 0),
+        dr.minimum(raw[2], shape.width - 1),
+        dr.minimum(raw[3], shape.height - 1),
+    )
+    active &= (box[0] <= box[2]) & (box[1] <= box[3])
+    records = dr.empty(Float, 8 * shape.batch * topology.count)
+    dr.scatter(records, Array4f(ax, ay, az, side), 2 * index, active)
+    dr.scatter(records, Array4f(bx, by, bz, share), 2 * index + 1, active)
+    dr.eval(records, box, active)
+    return records, image, box, active
+
+
+def _orientation(a: Any, b: Any, o: Any) -> Any:
+    """Sign of the determinant of three homogeneous (x, y, w) points, in double precision."""
+    Float64 = backend(a).Float64
+    ax, ay, aw = Float64(a.x), Float64(a.y), Float64(a.w)
+    bx, by, bw = Float64(b.x), Float64(b.y), Float64(b.w)
+    det = (ay * bw - by * aw) * Float64(o.x) + (bx * aw - ax * bw) * Float64(o.y) + (ax * by - bx * ay) * Float64(o.w)
+    return backend(a).Float(dr.select(det == 0, 0, dr.sign(det)))
+
+
+def _search(lists: CellLists, records: Any, edge_count: int, raster: RasterOutput) -> Crossings:
+    module = backend(records)
+    Float, UInt32 = module.Float, module.UInt32
+    shape = lists.shape
+    size = 1 << FINEST
+    block_columns, block_rows = shape.columns(0), shape.rows(0)
+    lane = dr.arange(UInt32, shape.batch * block_rows * block_columns * size * size)
+    block = lane >> (2 * FINEST)
+    row_of_blocks = block // block_columns
+    image = row_of_blocks // block_rows
+    column = (block - row_of_blocks * block_columns) * size + (lane & (size - 1))
+    row = (row_of_blocks - image * block_rows) * size + ((lane >> FINEST) & (size - 1))
+    inside = (column < shape.width) & (row < shape.height)
+    pixel = (image * shape.height + row) * shape.width + column
+
+    here = dr.gather(UInt32, raster.triangle, pixel, inside)
+    open_right, open_down = inside & (column + 1 < shape.width), inside & (row + 1 < shape.height)
+    right = dr.gather(UInt32, raster.triangle, pixel + 1, open_right)
+    down = dr.gather(UInt32, raster.triangle, pixel + shape.width, open_down)
+    open_right &= here != right
+    open_down &= here != down
+    planes = [_depth_plane(raster, image, t) for t in (here, right, down)]
+    x = Float(column) + (0.5 - 0.5 * shape.width)
+    y = Float(row) + (0.5 - 0.5 * shape.height)
+
+    edge_right, edge_down = UInt32(NO_EDGE), UInt32(NO_EDGE)
+    reach_right, reach_down = Float(-1), Float(-1)
+    share_right, share_down = Float(0), Float(0)
+    for level in range(shape.levels):
+        position, end = lists.range(level, image, row, column, open_right | open_down)
+
+        def body(position, end, edge_right, reach_right, share_right, edge_down, reach_down, share_down):  # noqa: ANN001, ANN202
+            candidate = dr.gather(UInt32, lists.items, position)
+            p = dr.gather(module.Array4f, records, 2 * candidate)
+            q = dr.gather(module.Array4f, records, 2 * candidate + 1)
+            side, share = p.w, q.w
+
+            def test(along: int, across: int, fixed: Any, start: Any, side: Any, planes: tuple[Any, Any]) -> tuple[Any, Any]:
+                """Does the edge separate the pair that starts at ``start`` along an axis? How far does it cover?"""
+                extent = q[across] - p[across]
+                s = (fixed - p[across]) / dr.select(extent == 0, 1, extent)
+                crossing = dr.fma(s, q[along] - p[along], p[along])
+                z = dr.fma(s, q.z - p.z, p.z)
+                t = crossing - start
+                covers_start = side * extent > 0
+                at = [None, None]
+                at[along], at[across] = crossing, fixed
+                hidden = dr.select(covers_start, planes[1](*at), planes[0](*at))
+                ok = (extent != 0) & (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1) & (z < hidden - _DEPTH_GAP)
+                return ok, dr.select(covers_start, t, 1 - t)
+
+            ok, reach = test(0, 1, y, x, side, (planes[0], planes[1]))
+            better = ok & open_right & (share > 0) & _wins(reach, candidate, reach_right, edge_right)
+            edge_right = dr.select(better, candidate, edge_right)
+            reach_right = dr.select(better, reach, reach_right)
+            share_right = dr.select(better, share, share_right)
+
+            ok, reach = test(1, 0, x, y, -side, (planes[0], planes[2]))
+            better = ok & open_down & (share < 1) & _wins(reach, candidate, reach_down, edge_down)
+            edge_down = dr.select(better, candidate, edge_down)
+            reach_down = dr.select(better, reach, reach_down)
+            share_down = dr.select(better, 1 - share, share_down)
+            return position + 1, end, edge_right, reach_right, share_right, edge_down, reach_down, share_down
+
+        _, _, edge_right, reach_right, share_right, edge_down, reach_down, share_down = dr.while_loop(
+            (position, end, edge_right, reach_right, share_right, edge_down, reach_down, share_down),
+            lambda position, end, *_: position < end,
+            body,
+            mode="symbolic",
+            label="find silhouettes",
+        )
+
+    first = image * edge_count
+    result = []
+    for value in (
+        dr.select(edge_right == NO_EDGE, edge_right, edge_right - first),
+        dr.select(edge_down == NO_EDGE, edge_down, edge_down - first),
+        share_right,
+        share_down,
+    ):
+        out = dr.empty(type(value), shape.batch * shape.height * shape.width)
+        dr.scatter(out, value, pixel, inside)
+        result.append(out)
+    dr.eval(result)
+    return Crossings(*result)
+
+
+def _wins(reach: Any, candidate: Any, best_reach: Any, best: Any) -> Any:
+    """Outermost first; equal ones by their number, so that the result does not depend on the order of the lists."""
+    return (reach > best_reach) | ((reach == best_reach) & (candidate < best))
+
+
+def _depth_plane(raster: RasterOutput, image: Any, triangle: Any) -> Any:
+    """NDC depth of a triangle's plane as a function of centred pixel coordinates; the far plane where there is none."""
+    module = backend(raster.records)
+    hit = triangle != NO_TRIANGLE
+    base = 12 * (image * raster.face_count + triangle)
+    dx, dy, d = (dr.gather(module.Float, raster.records, base + (4 * k + 3), hit) for k in range(3))
+    d = dr.select(hit, d, 1)
+    return lambda x, y: dr.fma(dx, x, dr.fma(dy, y, d))
+
+
+def crossing_position(positions: Any, topology: Topology, raster: RasterOutput, edge: Any, vertex_count: int, down: bool) -> Any:
+    """Where an edge crosses the line from each pixel's centre to its right (or lower) neighbour, in pixels from the former.
+
+    Attached to ``positions``; 1/2 where there is no edge. The homogeneous form is valid, in value and derivative, for edges
+    that reach behind the camera.
+    """
+    module = backend(positions)
+    image, row, column = pixel_coordinates(module, raster.batch, raster.height, raster.width)
+    has = edge != NO_EDGE
+    ends = dr.gather(module.Array2u, topology.edges, edge, has)
+    a, b = (dr.gather(module.Array4f, positions, image * vertex_count + ends[k], has) for k in range(2))
+    # The pixel line is y = const (x = const for the lower neighbour) in NDC.
+    along, across = ("y", "x") if down else ("x", "y")
+    start, size = (row, raster.height) if down else (column, raster.width)
+    fixed, fixed_size = (column, raster.width) if down else (row, raster.height)
+    ndc = dr.fma(module.Float(fixed), 2.0 / fixed_size, 1.0 / fixed_size - 1.0)
+    da = dr.fma(-a.w, ndc, getattr(a, across))
+    db = dr.fma(-b.w, ndc, getattr(b, across))
+    span = da - db
+    s = da / dr.select(has & (span != 0), span, 1)
+    w = dr.fma(s, b.w - a.w, a.w)
+    value = dr.fma(s, getattr(b, along) - getattr(a, along), getattr(a, along)) / dr.select(has & (w != 0), w, 1)
+    t = dr.fma(value, 0.5 * size, 0.5 * size - 0.5) - module.Float(start)
+    return dr.select(has, dr.clip(t, 0, 1), 0.5)

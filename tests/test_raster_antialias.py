@@ -1,0 +1,245 @@
+"""Silhouettes: coverage and its derivatives against supersampling and exact areas."""
+
+from __future__ import annotations
+
+import brute_force
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import trimesh
+
+from shadowmap_dr.raster import antialias, build_topology, find_crossings, interpolate, rasterize
+
+
+def render(clip, faces: np.ndarray, topology, size: int, colors: np.ndarray | None = None):  # noqa: ANN001, ANN201
+    """White (or per-face coloured) triangles on black, anti-aliased; also the raw image."""
+    out = rasterize(clip, mi.TensorXu(faces), (size, size))
+    if colors is None:
+        value = dr.select(out.valid, mi.Float(1), mi.Float(0))
+    else:
+        value = dr.gather(mi.Float, mi.Float(colors.astype(np.float32)), out.triangle, out.valid)
+    return antialias(value, out, clip, topology), value
+
+
+def topology_of(faces: np.ndarray, world: np.ndarray):  # noqa: ANN201
+    return build_topology(faces, world, mi.UInt32)
+
+
+def smooth_weights(size: int) -> np.ndarray:
+    x, y = np.meshgrid((np.arange(size) + 0.5) / size, (np.arange(size) + 0.5) / size)
+    return (0.5 + 0.3 * np.sin(5 * x + 1) * np.cos(4 * y) + 0.4 * x).astype(np.float32)
+
+
+def supersampled(clip: np.ndarray, faces: np.ndarray, size: int, factor: int = 16) -> np.ndarray:
+    """Coverage of each pixel by the union of some triangles in front of the far plane."""
+    n = size * factor
+    ndc = (2 * np.arange(n) + 1) / n - 1
+    covered = np.zeros((n, n), bool)
+    for face in faces:
+        inverse = np.linalg.inv(clip[face][:, [0, 1, 3]].astype(np.float64))
+        b = ndc[None, :, None] * inverse[0] + ndc[:, None, None] * inverse[1] + inverse[2]
+        z = b @ clip[face][:, 2]
+        covered |= (b >= 0).all(-1) & (np.abs(z) <= 1)
+    return covered.reshape(size, factor, size, factor).mean((1, 3))
+
+
+def to_clip(world, matrix: np.ndarray):  # noqa: ANN001, ANN201
+    """(V, 3) tensor -> (V, 4) clip-space tensor, attached."""
+    p = dr.unravel(mi.Point3f, world.array)
+    rows = [sum(float(matrix[r, c]) * p[c] for c in range(3)) + float(matrix[r, 3]) for r in range(4)]
+    return mi.TensorXf(dr.ravel(mi.Point4f(*rows)), shape=(world.shape[0], 4))
+
+
+TRIANGLE = np.array([[-0.71, -0.63, 0, 1], [0.66, -0.38, 0, 1], [-0.12, 0.77, 0, 1]], np.float32)
+
+
+def test_coverage_of_a_triangle(variant: str) -> None:
+    faces, size = np.array([[0, 1, 2]], np.uint32), 32
+    image, raw = render(mi.TensorXf(TRIANGLE), faces, topology_of(faces, TRIANGLE[:, :3]), size)
+    image, raw = (v.numpy().reshape(size, size) for v in (image, raw))
+    exact = supersampled(TRIANGLE, faces, size)
+    assert np.abs(image - exact).max() < 0.3  # at the corners
+    assert np.sqrt(np.mean((image - exact) ** 2)) < 0.2 * np.sqrt(np.mean((raw - exact) ** 2))
+    assert abs(image.sum() - exact.sum()) < 0.25  # pixels
+
+
+@pytest.mark.parametrize("angle", np.radians([0, 7, 29, 45, 61, 90, 133]))
+def test_moving_a_straight_edge_sweeps_its_exact_area(variant: str, angle: float) -> None:
+    """Translate a large rotated square; the derivative of the weighted image is the boundary integral."""
+    c, s = np.cos(angle), np.sin(angle)
+    corners = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]) @ np.array([[c, s], [-s, c]]) + 0.013
+    faces, size = np.array([[0, 1, 2], [0, 2, 3]], np.uint32), 128
+    world = np.c_[corners, np.zeros(4)].astype(np.float32)
+    topology, weights = topology_of(faces, world), smooth_weights(size)
+    for direction in ((1, 0), (0, 1)):
+        delta = mi.Float(0)
+        dr.enable_grad(delta)
+        p = [mi.Float(world[:, k].copy()) for k in range(3)]
+        clip = mi.TensorXf(dr.ravel(mi.Point4f(p[0] + delta * direction[0], p[1] + delta * direction[1], p[2], 1)), shape=(4, 4))
+        image, _ = render(clip, faces, topology, size)
+        dr.forward(delta)
+        got = float((dr.grad(image).numpy().reshape(size, size) * weights).sum())
+        # Boundary integral of weight * (normal . direction), sampled finely in pixels per unit of NDC.
+        want = 0.0
+        for k in range(4):
+            a, b = corners[k], corners[(k + 1) % 4]
+            points = a + (b - a) * ((np.arange(4000) + 0.5) / 4000)[:, None]
+            normal = np.array([b[1] - a[1], a[0] - b[0]])
+            x, y = ((points + 1) / 2).T
+            w = 0.5 + 0.3 * np.sin(5 * x + 1) * np.cos(4 * y) + 0.4 * x
+            want += w.mean() * (normal @ direction) * (size / 2) ** 2
+        scale = (size / 2) ** 2  # pixels swept by a unit edge moving one unit
+        # The ends of the four edges are rounded to whole rows or columns: at most about one of the 64 that an edge meets.
+        assert abs(got - want) < scale / 64, (direction, got, want)
+
+
+def grid(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """A unit square of n x n quads."""
+    g = np.linspace(-0.5, 0.5, n + 1)
+    x, y = np.meshgrid(g, g)
+    i = np.arange((n + 1) ** 2).reshape(n + 1, n + 1)
+    a, b, c, d = i[:-1, :-1].ravel(), i[:-1, 1:].ravel(), i[1:, 1:].ravel(), i[1:, :-1].ravel()
+    return np.c_[x.ravel(), y.ravel(), 0 * x.ravel()], np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+
+
+def test_tessellation_does_not_change_the_gradient(variant: str) -> None:
+    size = 64
+    gradients = []
+    for n in (2, 16, 128):  # 8, 512 and 32,768 triangles: the last are a fifth of a pixel
+        world, faces = grid(n)
+        angle = 0.4
+        rotation = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+        world = (world @ rotation.T).astype(np.float32)
+        topology = topology_of(faces, world)
+        parameters = [mi.Float(0), mi.Float(0), mi.Float(1)]
+        dr.enable_grad(parameters)
+        x, y = (mi.Float(world[:, k].copy()) * parameters[2] + parameters[k] for k in range(2))
+        clip = mi.TensorXf(dr.ravel(mi.Point4f(x, y, 0, 1)), shape=(len(world), 4))
+        image, _ = render(clip, faces.astype(np.uint32), topology, size)
+        dr.backward(dr.sum(image * mi.Float(smooth_weights(size).ravel())))
+        gradients.append([float(dr.grad(p)[0]) for p in parameters])
+    gradients = np.array(gradients)
+    assert np.abs(gradients - gradients[0]).max() < 0.02 * np.abs(gradients[0]).max()
+
+
+def test_sub_pixel_sphere_grows_like_a_disc(variant: str) -> None:
+    """81,920 faces in a 64 x 64 image: most triangles lie far below a pixel."""
+    sphere = trimesh.creation.icosphere(subdivisions=6, radius=0.6)
+    faces, world, size = sphere.faces.astype(np.uint32), sphere.vertices.astype(np.float32), 64
+    topology = topology_of(faces, world)
+    radius, dx = mi.Float(1), mi.Float(0)
+    dr.enable_grad(radius, dx)
+    x, y, z = (mi.Float(world[:, k].copy()) * radius for k in range(3))
+    clip = mi.TensorXf(dr.ravel(mi.Point4f(x + dx, y, z, 1)), shape=(len(world), 4))
+    image, _ = render(clip, faces, topology, size)
+    assert abs(float(dr.sum(image)[0]) - np.pi * (0.6 * size / 2) ** 2) < 2.5
+    dr.backward(dr.sum(image), flags=dr.ADFlag.Default & ~dr.ADFlag.ClearEdges)
+    want = 2 * np.pi * 0.6 * 0.6 * (size / 2) ** 2
+    assert abs(float(dr.grad(radius)[0]) - want) < 0.02 * want
+    dr.clear_grad(dx)
+    x_weight = np.tile((np.arange(size) + 0.5) / size * 2 - 1, size).astype(np.float32)
+    dr.backward(dr.sum(image * mi.Float(x_weight)))
+    want = np.pi * 0.36 * (size / 2) ** 2  # moment of area moved by dx
+    assert abs(float(dr.grad(dx)[0]) - want) < 0.02 * want
+
+
+@pytest.mark.parametrize("case", ["in front", "through the camera plane"])
+def test_vertex_gradients_match_differences_of_a_supersampled_image(variant: str, case: str) -> None:
+    if case == "in front":
+        world = np.array(
+            [[-1.1, -1, -3], [0.8, -0.9, -2], [-0.4, 0.9, -2.6], [-0.7, 0.3, -3], [1.2, -0.2, -2.6], [0.6, 1.3, -3.3]]
+        )
+    else:
+        world = np.array(
+            [[-0.6, -0.3, -2], [0.5, -0.4, -2.5], [0.1, -0.5, 1.0], [0.3, 0.4, -2], [0.9, 0.5, -2.2], [0.5, 0.9, -1.8]]
+        )
+    faces, size = np.array([[0, 1, 2], [3, 4, 5]], np.uint32), 64
+    matrix, weights = brute_force.perspective(60), smooth_weights(size)
+    topology = topology_of(faces, world)
+    p = mi.TensorXf(world.astype(np.float32))
+    dr.enable_grad(p)
+    image, _ = render(to_clip(p, matrix), faces, topology, size)
+    dr.backward(dr.sum(image * mi.Float(weights.ravel())))
+    got = dr.grad(p).numpy()
+
+    def total(w: np.ndarray) -> float:
+        return float((supersampled(np.c_[w, np.ones(6)] @ matrix.T, faces, size, 16) * weights).sum())
+
+    want, h = np.zeros_like(world), 0.01
+    for i in np.ndindex(6, 3):
+        step = np.zeros_like(world)
+        step[i] = h
+        want[i] = (total(world + step) - total(world - step)) / (2 * h)
+    cosine = (got * want).sum() / np.linalg.norm(got) / np.linalg.norm(want)
+    scale = (got * want).sum() / (want * want).sum()
+    assert cosine > 0.995 and 0.97 < scale < 1.03, (cosine, scale, got, want)
+
+
+def test_weights_are_convex_and_shared_by_all_channels(variant: str) -> None:
+    rng = np.random.default_rng(2)
+    size = 24
+    pos = np.c_[rng.uniform(-1, 1, (60, 3)), np.ones(60)].astype(np.float32)
+    faces = np.arange(60).reshape(20, 3).astype(np.uint32)
+    topology = topology_of(faces, pos[:, :3])
+    out = rasterize(mi.TensorXf(pos), mi.TensorXu(faces), (size, size))
+    constant = antialias(dr.full(mi.Float, 0.7, size * size), out, mi.TensorXf(pos), topology).numpy()
+    np.testing.assert_allclose(constant, 0.7, atol=1e-6)
+    moment = rng.uniform(-0.5, 0.5, size * size).astype(np.float32)
+    pair = mi.TensorXf(np.stack([moment, moment**2], -1).reshape(size, size, 2))
+    mixed = antialias(pair, out, mi.TensorXf(pos), topology).numpy()
+    assert (mixed[..., 1] >= mixed[..., 0] ** 2 - 1e-6).all()
+    assert mixed[..., 0].min() >= moment.min() and mixed[..., 0].max() <= moment.max()
+    assert np.abs(mixed[..., 0].ravel() - moment).max() > 0.1  # it did something
+
+
+def test_creases_and_hidden_edges_are_left_alone(variant: str) -> None:
+    """Inside a closed convex object, between its own faces, there is no silhouette; nor behind it."""
+    box = trimesh.creation.icosphere(subdivisions=2, radius=0.8)
+    hidden = trimesh.creation.box((0.5, 0.5, 0.02))
+    hidden.apply_translation([0, 0, 0.9])
+    world = np.concatenate([box.vertices, hidden.vertices]).astype(np.float32)
+    faces = np.concatenate([box.faces, hidden.faces + len(box.vertices)]).astype(np.uint32)
+    clip, size = np.c_[world, np.ones(len(world))].astype(np.float32), 48
+    colors = np.random.default_rng(0).random(len(faces))
+    image, raw = render(mi.TensorXf(clip), faces, topology_of(faces, world), size, colors)
+    x, y = np.meshgrid(*(2 * [(np.arange(size) + 0.5) / size * 2 - 1]))
+    interior = np.hypot(x, y).ravel() < 0.7
+    assert (image.numpy() == raw.numpy())[interior].all()
+
+
+def test_seams_are_welded(variant: str) -> None:
+    world, faces = grid(4)
+    split = world[faces].reshape(-1, 3)  # every face with vertices of its own
+    topology = topology_of(np.arange(len(split)).reshape(-1, 3), split)
+    assert topology.count == topology_of(faces, world).count
+    boundary = (topology.opposite.numpy().reshape(-1, 2)[:, 1] == 0xFFFFFFFF).sum()
+    assert boundary == 16
+
+
+def test_interpolate_matches_the_plane_and_is_differentiable(variant: str) -> None:
+    size = 16
+    pos = np.array([[-3, -3, 0, 1], [12, -6, 0, 2], [-4.5, 9, 0, 1.5]], np.float32)
+    faces = mi.TensorXu(np.array([[0, 1, 2]], np.uint32))
+    world = pos[:, :2] * 1.0
+    attributes = np.c_[world @ [2.0, 3.0] + 1, pos[:, 3]].astype(np.float32)  # affine in clip space
+    p, a = mi.TensorXf(pos), mi.TensorXf(attributes)
+    dr.enable_grad(a)
+    out = rasterize(p, faces, (size, size))
+    value = interpolate(a, out, faces)
+    ndc = (np.arange(size) + 0.5) / size * 2 - 1
+    x, y = np.meshgrid(ndc, ndc)
+    w = value.numpy()[..., 1]
+    np.testing.assert_allclose(value.numpy()[..., 0], (2 * x + 3 * y) * w + 1, rtol=2e-5, atol=2e-5)
+    dr.backward(dr.sum(value))
+    np.testing.assert_allclose(dr.grad(a).numpy().sum(0), [size * size] * 2, rtol=1e-5)
+
+
+def test_crossings_can_be_shared(variant: str) -> None:
+    faces = np.array([[0, 1, 2]], np.uint32)
+    clip = mi.TensorXf(TRIANGLE)
+    topology = topology_of(faces, TRIANGLE[:, :3])
+    out = rasterize(clip, mi.TensorXu(faces), (16, 16))
+    value = dr.select(out.valid, mi.Float(1), mi.Float(0))
+    shared = antialias(value, out, clip, topology, crossings=find_crossings(clip.array, topology, out, 3))
+    assert (shared.numpy() == antialias(value, out, clip, topology).numpy()).all()

@@ -1,0 +1,137 @@
+"""A rigid pose with three parameters: rotation about the vertical axis, then an offset parallel to the image of the wall."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import ShadowmapError
+
+
+def apply_pose(p_rest: Any, pose: Any, shift_z: float = 0.0) -> Any:
+    """Vertex positions of an object in a pose.
+
+    Args:
+        p_rest: Float (3V,), flat positions x0, y0, z0, x1, ... in the object's own space.
+        pose: Float (3,): rotation about the y axis through the origin in radians, offset in x, offset in y.
+        shift_z: constant offset in z.
+
+    Returns Float (3V,): R_y(rotation) p + (x, y, shift_z). Gradients flow to `p_rest` and `pose`.
+    """
+    Float = type(p_rest)
+    rotation, x, y = (dr.gather(Float, pose, i) for i in range(3))
+    vertex = dr.arange(dr.uint32_array_t(Float), dr.width(p_rest) // 3)
+    p = dr.gather(mi.Point3f, p_rest, vertex)
+    s, c = dr.sincos(rotation)
+    return dr.ravel(mi.Point3f(c * p.x + s * p.z + x, p.y + y, c * p.z - s * p.x + shift_z))
+
+
+class PoseFit:
+    """Fits a pose to a reference image by gradient descent (Adam) on the mean squared difference of linear colours.
+
+    A `Method` of the optimisation loop. A step - vertices, rendering, loss, backward pass, Adam - is recorded once with
+    `dr.freeze` and replayed from then on, without a read-back. Neither Mitsuba's meshes nor its ray tracing are touched.
+
+    Args:
+        renderer: a `shadowmap_dr.Renderer`, or anything with `render(vertex_positions={name: Float (3V,)})` -> tensor
+            (H, W, C), that can cross `dr.freeze`.
+        shape: name of the shape that moves.
+        p_rest: (V, 3) or (3V,) positions of its vertices in the object's own space.
+        reference: (H, W, C) linear image.
+        step_size, betas: parameters of Adam.
+        shift_z: see `apply_pose`.
+        settings: further entries for `describe`.
+    """
+
+    def __init__(
+        self,
+        renderer: Any,
+        shape: str,
+        p_rest: npt.ArrayLike,
+        reference: npt.ArrayLike,
+        *,
+        step_size: float = 0.01,
+        betas: tuple[float, float] = (0.9, 0.999),
+        shift_z: float = 0.0,
+        settings: Mapping[str, Any] | None = None,
+    ) -> None:
+        image = np.asarray(reference, np.float32)
+        if image.ndim != 3 or not np.isfinite(image).all():
+            raise ShadowmapError(f"a reference of shape {image.shape}: give finite values in the shape (H, W, C).")
+        self._renderer = renderer
+        self._shape = shape
+        self._p_rest = mi.Float(np.asarray(p_rest, np.float32).ravel())
+        self._reference = mi.TensorXf(image)
+        self._step_size, self._betas, self._shift_z = step_size, betas, shift_z
+        self._settings = dict(settings or {})
+        self._step = dr.freeze(_pose_step)
+        self.reset(np.zeros(3))
+
+    def reset(self, start: npt.ArrayLike) -> None:
+        """Start from (rotation in radians, x, y) with empty moments."""
+        self.load_state({"parameters": np.asarray(start), "m": np.zeros(3), "v": np.zeros(3), "t": np.zeros(1)})
+
+    def step(self) -> Any:
+        """One step; returns the loss before it, Float (1,), without waiting for it."""
+        return self._step(
+            self._renderer, self._optimizer, self._p_rest, self._reference, shape=self._shape, shift_z=self._shift_z
+        )
+
+    def parameters(self) -> Any:
+        """Float (3,): rotation in radians, x, y; detached, on the device."""
+        return dr.detach(self._optimizer["pose"])
+
+    def render(self, parameters: npt.ArrayLike) -> npt.NDArray[np.float32]:
+        """Linear image (H, W, C) at the given parameters. No gradients."""
+        pose = mi.Float(np.asarray(parameters, np.float32))
+        positions = apply_pose(self._p_rest, pose, self._shift_z)
+        with dr.suspend_grad():
+            return np.array(self._renderer.render(vertex_positions={self._shape: positions}))
+
+    def gradient(self, parameters: npt.ArrayLike) -> npt.NDArray[np.float32]:
+        """(3,) derivative of the loss with respect to the parameters; leaves the state of the fit alone."""
+        pose = mi.Float(np.asarray(parameters, np.float32))
+        dr.enable_grad(pose)
+        dr.backward(_loss(self._renderer, pose, self._p_rest, self._reference, self._shape, self._shift_z))
+        return np.array(dr.grad(pose))
+
+    def state(self) -> dict[str, npt.NDArray[Any]]:
+        """Parameters (3,), Adam's moments m and v (3,) and step count t (1,)."""
+        pose, _, _, (t, m, v, _) = self._optimizer.state["pose"]
+        return {"parameters": np.array(dr.detach(pose)), "m": np.array(m), "v": np.array(v), "t": np.array(t)}
+
+    def load_state(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
+        """Go on from what `state` returned."""
+        pose = mi.Float(np.asarray(state["parameters"], np.float32))
+        if dr.width(pose) != 3:
+            raise ShadowmapError(f"a pose of {dr.width(pose)} numbers: give rotation (radians), x and y.")
+        self._optimizer = mi.ad.Adam(lr=self._step_size, beta_1=self._betas[0], beta_2=self._betas[1], params={"pose": pose})
+        value, promoted, rate, (t, m, v, v_max) = self._optimizer.state["pose"]
+        t = type(t)(np.asarray(state["t"], np.uint32))
+        m, v = (type(m)(np.asarray(state[name], np.float32)) for name in ("m", "v"))
+        self._optimizer.state["pose"] = value, promoted, rate, (t, m, v, v_max)
+
+    def recordings(self) -> int:
+        """How often the step has been recorded so far; stays the same once the fit is warm."""
+        return int(self._step.n_recordings)
+
+    def describe(self) -> dict[str, Any]:
+        """Settings for the record."""
+        return {**self._settings, "optimizer": "Adam", "step_size": self._step_size, "betas": list(self._betas)}
+
+
+def _loss(renderer: Any, pose: Any, p_rest: Any, reference: Any, shape: str, shift_z: float) -> Any:
+    image = renderer.render(vertex_positions={shape: apply_pose(p_rest, pose, shift_z)})
+    return dr.mean(dr.square(image.array - reference.array))
+
+
+def _pose_step(renderer: Any, optimizer: Any, p_rest: Any, reference: Any, *, shape: str, shift_z: float) -> Any:
+    loss = _loss(renderer, optimizer["pose"], p_rest, reference, shape, shift_z)
+    dr.backward(loss)
+    optimizer.step()
+    return dr.detach(loss)

@@ -1,0 +1,174 @@
+"""Pose parametrisation and the optimisation loop."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from fakes import POINTS, BlobRenderer
+
+from shadowmap_dr.errors import ShadowmapError
+from shadowmap_dr.inverse import PoseFit, apply_pose, optimize
+
+START = [0.3, 0.15, -0.1]
+
+
+def fit(**options: Any) -> PoseFit:
+    renderer = BlobRenderer.create(16, len(POINTS))
+    target = np.array(renderer.render({"object": mi.Float(POINTS.ravel())}))
+    return PoseFit(renderer, "object", POINTS, target, **options)
+
+
+def test_pose_is_rotation_about_y_then_offset(variant: str) -> None:
+    angle, x, y = 0.4, 0.2, -0.3
+    moved = np.array(apply_pose(mi.Float(POINTS.ravel()), mi.Float([angle, x, y]), 5.0)).reshape(-1, 3)
+    matrix = np.array(mi.ScalarTransform4f().translate([x, y, 5]).rotate([0, 1, 0], np.rad2deg(angle)).matrix)
+    np.testing.assert_allclose(moved, POINTS @ matrix[:3, :3].T + matrix[:3, 3], atol=1e-6)
+
+
+def test_gradient_of_the_pose_against_central_differences(variant: str) -> None:
+    weights = mi.Float(np.random.default_rng(0).normal(size=POINTS.size).astype(np.float32))
+
+    def value(pose: Any) -> Any:
+        return dr.sum(weights * apply_pose(mi.Float(POINTS.ravel()), pose))
+
+    pose = mi.Float(START)
+    dr.enable_grad(pose)
+    dr.backward(value(pose))
+    for i, step in enumerate(np.eye(3) * 1e-2):
+        difference = (value(mi.Float(START + step)) - value(mi.Float(START - step)))[0] / 2e-2
+        assert dr.grad(pose)[i] == pytest.approx(difference, rel=2e-3, abs=1e-3)
+
+
+def test_fit_recovers_the_pose(variant: str) -> None:
+    method = fit()
+    history = optimize(method, START, 150)
+    assert np.abs(history.final).max() < 2e-3
+    assert history.parameters.shape == (151, 3) and history.loss.shape == (150,)
+    np.testing.assert_allclose(history.parameters[0], START)
+    assert history.loss[-1] < 1e-3 * history.loss[0]
+    assert method.render(history.final).shape == (16, 16, 1)
+
+
+def test_step_is_recorded_at_most_twice_and_compiles_nothing_afterwards(variant: str) -> None:
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        method = fit()
+        for _ in range(3):
+            method.step()
+        recordings = method.recordings()
+        dr.kernel_history_clear()
+        for _ in range(5):
+            method.step()
+        kernels = dr.kernel_history([dr.KernelType.JIT])
+    assert method.recordings() == recordings <= 2
+    assert kernels and all(kernel["cache_hit"] for kernel in kernels)
+
+
+def test_frozen_steps_equal_plain_ones(variant: str) -> None:
+    frozen = optimize(fit(), START, 12)
+    with dr.scoped_set_flag(dr.JitFlag.KernelFreezing, False):
+        plain = optimize(fit(), START, 12)
+    np.testing.assert_allclose(frozen.parameters, plain.parameters, atol=1e-5)
+    np.testing.assert_allclose(frozen.loss, plain.loss, rtol=1e-4)
+
+
+def test_gradient_leaves_the_fit_alone(variant: str) -> None:
+    method = fit()
+    method.reset(START)
+    before = method.state()
+    assert np.abs(method.gradient(START)).min() > 0
+    after = method.state()
+    for name, value in before.items():
+        np.testing.assert_array_equal(after[name], value)
+
+
+class Killed(Exception):
+    pass
+
+
+def killed_after(count: int) -> Any:
+    def on_step(done: int) -> None:
+        if done == count:
+            raise Killed
+
+    return on_step
+
+
+def test_killed_run_resumes_bit_for_bit(variant: str, tmp_path: Path) -> None:
+    whole = optimize(fit(), START, 33)
+    path = tmp_path / "run.npz"
+    for limit in (7, 27):  # before the first checkpoint, and after the second one
+        with pytest.raises(Killed):
+            optimize(fit(), START, 33, checkpoint=path, settings={"a": 1}, on_step=killed_after(limit))
+    steps: list[int] = []
+    resumed = optimize(fit(), START, 33, checkpoint=path, settings={"a": 1}, on_step=steps.append)
+    assert steps == list(range(21, 34))
+    np.testing.assert_array_equal(resumed.parameters, whole.parameters)
+    np.testing.assert_array_equal(resumed.loss, whole.loss)
+    assert resumed.warm.sum() == 33 - 5 - 5  # two processes contributed steps, each with a warm-up
+    again = optimize(fit(), START, 33, checkpoint=path, settings={"a": 1}, on_step=steps.append)
+    assert len(steps) == 13 and again.iterations == 33
+
+
+def test_foreign_and_damaged_checkpoints_are_refused(variant: str, tmp_path: Path) -> None:
+    path = tmp_path / "run.npz"
+    optimize(fit(), START, 1, checkpoint=path, settings={"a": 1})
+    with pytest.raises(ShadowmapError, match="other settings"):
+        optimize(fit(), START, 2, checkpoint=path, settings={"a": 2})
+    for damaged in (b"", path.read_bytes()[:200], b"PK"):
+        path.write_bytes(damaged)
+        with pytest.raises(ShadowmapError, match=r"cannot read the checkpoint .*run\.npz"):
+            optimize(fit(), START, 2, checkpoint=path, settings={"a": 1})
+
+
+class Counter:
+    """A method on the host: counts down by a tenth."""
+
+    def __init__(self) -> None:
+        self.value = np.zeros(3)
+
+    def reset(self, start: Any) -> None:
+        self.value = np.array(start, float)
+
+    def step(self) -> float:
+        loss = float(self.value.sum())
+        self.value = self.value - 0.1
+        return loss
+
+    def parameters(self) -> np.ndarray:
+        return self.value
+
+    def render(self, parameters: Any) -> np.ndarray:
+        return np.zeros((2, 2, 3), np.float32)
+
+    def state(self) -> dict[str, np.ndarray]:
+        return {"value": self.value}
+
+    def load_state(self, state: Mapping[str, np.ndarray]) -> None:
+        self.value = state["value"]
+
+    def describe(self) -> dict[str, Any]:
+        return {}
+
+
+def test_history_of_a_method_on_the_host() -> None:
+    history = optimize(Counter(), [1.0, 2.0, 3.0], 12)
+    np.testing.assert_allclose(history.loss[:2], [6.0, 5.7])
+    np.testing.assert_allclose(history.final, [-0.2, 0.8, 1.8])
+    assert list(history.warm) == [False] * 5 + [True] * 7
+    assert history.seconds_per_iteration == pytest.approx(np.median(history.seconds[5:]))
+    assert history.seconds_total == pytest.approx(history.seconds.sum())
+
+
+def test_bad_input_is_refused(variant: str) -> None:
+    with pytest.raises(ShadowmapError, match="0 iterations"):
+        optimize(Counter(), [0, 0, 0], 0)
+    with pytest.raises(ShadowmapError, match="2 numbers"):
+        fit().reset([0.0, 1.0])
+    with pytest.raises(ShadowmapError, match="finite"):
+        PoseFit(None, "object", POINTS, np.full((2, 2, 3), np.nan))

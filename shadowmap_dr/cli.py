@@ -18,6 +18,7 @@ from rich.console import Console
 
 from . import __version__, _llvm, assets, io
 from .errors import ShadowmapError
+from .experiments import pose as pose_experiment
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
 
@@ -27,6 +28,7 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,
 )
 
 Variant = Annotated[str, typer.Option(help="Mitsuba variant; the cuda ones need an NVIDIA GPU.")]
@@ -134,6 +136,50 @@ def render(
         pixels = np.asarray(image, dtype=np.float32)
         io.write_exr(output, {name: pixels[..., i] for i, name in enumerate(names)}, metadata)
     typer.echo(f"{output}: {width} x {height}, {', '.join(names)}")
+
+
+@app.command()
+def pose(
+    object_: Annotated[
+        list[str] | None, typer.Option("--object", metavar="NAME|FILE", help="Mesh of this package, .ply or .obj; repeatable.")
+    ] = None,
+    resolution: Annotated[list[int] | None, typer.Option(help="Image width and height in pixels; repeatable.")] = None,
+    method: Annotated[
+        list[str] | None,
+        typer.Option(metavar="|".join(pose_experiment.METHODS), help="Method; repeatable [default: all]."),
+    ] = None,
+    runs: Annotated[int, typer.Option(help="Runs with different starts.")] = 1,
+    seed: Annotated[int, typer.Option(help="Run r starts from the random numbers of seed + r.")] = 0,
+    iterations: Annotated[int, typer.Option(help="Steps of the optimiser.")] = 150,
+    reference: Annotated[
+        str, typer.Option(metavar="mitsuba|own", help="Reference image: path-traced, or made with this library.")
+    ] = "mitsuba",
+    shadow_only: Annotated[bool, typer.Option("--shadow-only", help="The camera sees the shadow but not the object.")] = False,
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("pose"),
+    resume: Annotated[bool, typer.Option("--resume", help="Keep finished runs, go on with killed ones.")] = False,
+    variant: Variant = DEFAULT_VARIANT,
+) -> None:
+    """Find an object's pose from an image of it and its shadow, with three methods side by side.
+
+    Spot at 128 x 128 pixels unless told otherwise. Writes OUT/pose.json, images and a convergence plot.
+    """
+    set_variant(variant)
+    methods = method or [name for name in pose_experiment.METHODS if not (shadow_only and name == "mitsuba")]
+    options = pose_experiment.PoseOptions(
+        objects=tuple(object_ or ["spot"]),
+        resolutions=tuple(resolution or [128]),
+        methods=tuple(methods),
+        runs=runs,
+        seed=seed,
+        iterations=iterations,
+        reference=reference,
+        shadow_only=shadow_only,
+        out=out,
+        resume=resume,
+    )
+    records = pose_experiment.run_pose(options)
+    Console().print(pose_experiment.table(records))
+    typer.echo(f"Records, images and plots: {out}")
 
 
 def set_variant(name: str) -> None:

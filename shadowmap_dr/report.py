@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from rich.console import Console
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -27,7 +28,7 @@ from .io import atomic, to_srgb
 
 def write_json(path: str | os.PathLike[str], value: Any) -> None:
     """Write `value` (dicts, sequences, NumPy arrays and scalars; numbers that are not finite become null)."""
-    text = json.dumps(_plain(value), indent=1, allow_nan=False)
+    text = json.dumps(plain(value), indent=1, allow_nan=False)
     with atomic(path) as temporary:
         temporary.write_text(text + "\n", encoding="utf-8")
 
@@ -52,8 +53,8 @@ def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> 
     return result
 
 
-def progress() -> Progress:
-    """A progress display; add one task for each part of the work."""
+def progress(console: Console) -> Progress:
+    """A progress display; add one task for each part of the work, with a field `note`."""
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -61,6 +62,7 @@ def progress() -> Progress:
         TextColumn("{task.fields[note]}"),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
+        console=console,
     )
 
 
@@ -119,19 +121,16 @@ def image_sheet(
         figure.savefig(temporary, dpi=120)
 
 
-def _positive(curve: Sequence[float]) -> bool:
-    return any(value > 0 and math.isfinite(value) for value in curve)
-
-
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """`value` as JSON can hold it: NumPy values become numbers and lists, numbers that are not finite None."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(entry) for key, entry in value.items()}
+        return {str(key): plain(entry) for key, entry in value.items()}
     if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
+        return plain(value.tolist())
     if isinstance(value, np.generic):
-        return _plain(value.item())
+        return plain(value.item())
     if isinstance(value, (list, tuple)):
-        return [_plain(entry) for entry in value]
+        return [plain(entry) for entry in value]
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, Path):
@@ -139,3 +138,7 @@ def _plain(value: Any) -> Any:
     if value is None or isinstance(value, (str, int, bool)):
         return value
     raise TypeError(f"{type(value).__name__} is no JSON value")
+
+
+def _positive(curve: Sequence[float]) -> bool:
+    return any(value > 0 and math.isfinite(value) for value in curve)

@@ -1,0 +1,248 @@
+"""The pose experiment: protocol, records, files, resuming. A cheap renderer stands in for the real ones."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from fakes import BlobRenderer
+
+from shadowmap_dr import assets
+from shadowmap_dr.errors import ShadowmapError
+from shadowmap_dr.experiments import pose, pose_scene
+from shadowmap_dr.experiments.pose import PoseOptions, run_pose
+from shadowmap_dr.inverse import Method, PoseFit
+
+REQUIRED = {
+    "object", "resolution", "method", "run", "seed", "start", "final", "rotation_error_deg", "translation_error_x100",
+    "seconds_per_iteration", "seconds_total", "iterations", "settings",
+}  # fmt: skip
+
+
+def build(name: str, problem: pose_scene.PoseProblem, reference: Any) -> Method:
+    settings = {"name": name}
+    points = problem.p_rest[:: len(problem.p_rest) // 5][:5]
+    renderer = BlobRenderer.create(problem.resolution, len(points))
+    return PoseFit(renderer, "object", points, reference[..., :1], settings=settings)
+
+
+def options(out: Path, **changes: Any) -> PoseOptions:
+    defaults: dict[str, Any] = {
+        "resolutions": (12,), "methods": ("shadows", "rasterizer"), "runs": 2, "iterations": 24, "reference": "own"
+    }  # fmt: skip
+    return PoseOptions(**{**defaults, "out": out, **changes})
+
+
+@pytest.fixture(autouse=True)
+def _variant() -> None:
+    mi.set_variant("llvm_ad_rgb")
+
+
+def test_records_and_files(tmp_path: Path) -> None:
+    records = run_pose(options(tmp_path), build=build)
+    stored = json.loads((tmp_path / "pose.json").read_text())
+    assert stored == records and len(records) == 4
+    for record in records:
+        assert REQUIRED <= record.keys()
+        assert len(record["loss_curve"]) == 24 and len(record["rotation_error_curve"]) == 25
+        assert record["rotation_error_deg"] == pytest.approx(abs(np.degrees(record["final"][0])))
+        assert record["translation_error_x100"] == pytest.approx(100 * np.hypot(*record["final"][1:]))
+        assert record["seconds_per_iteration"] > 0 and record["seconds_total"] > 0
+        for title in ("start", "result", "difference"):
+            assert (tmp_path / "spot-12" / f"{record['method']}-run{record['run']}-{title}.png").stat().st_size
+    names = set(os.listdir(tmp_path / "spot-12"))
+    assert {"reference.png", "convergence.png", "images.png"} <= names
+    assert not [name for name in names if "checkpoint" in name or name.startswith(".")]
+
+
+def test_both_methods_start_from_the_protocols_poses(tmp_path: Path) -> None:
+    records = run_pose(options(tmp_path, seed=5, iterations=1), build=build)
+    for record in records:
+        generator = np.random.default_rng(5 + record["run"])
+        x, y = generator.uniform(-0.25, 0.25, 2)
+        rotation = generator.uniform(-30, 30)
+        np.testing.assert_allclose(record["start"], [np.radians(rotation), x, y], rtol=1e-12)
+
+
+SCRIPT = """
+import sys, time
+sys.path.insert(0, sys.argv[1])
+import test_pose_experiment as t, mitsuba as mi
+from pathlib import Path
+mi.set_variant("llvm_ad_rgb")
+class Slow:
+    def __init__(self, method): self.method = method
+    def __getattr__(self, name): return getattr(self.method, name)
+    def step(self):
+        time.sleep(0.02)
+        return self.method.step()
+t.run_pose(t.options(Path(sys.argv[2]), runs=1, iterations=60), build=lambda *a: Slow(t.build(*a)))
+"""
+
+
+def test_killed_process_resumes_from_its_checkpoint(tmp_path: Path) -> None:
+    whole = run_pose(options(tmp_path / "whole", runs=1, iterations=60), build=build)
+
+    killed = tmp_path / "killed"
+    process = subprocess.Popen([sys.executable, "-c", SCRIPT, str(Path(__file__).parent), str(killed)])
+    checkpoint = killed / "spot-12" / "rasterizer-run0-seed0.checkpoint.npz"
+    deadline = time.monotonic() + 120
+    while not checkpoint.exists():  # the first method is complete then, the second one has begun
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.005)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert len(json.loads((killed / "pose.json").read_text())) == 1
+
+    first = json.loads((killed / "pose.json").read_text())[0]
+    resumed = run_pose(options(killed, runs=1, iterations=60, resume=True), build=build)
+    assert resumed[0] == first
+    for record, reference in zip(resumed, whole, strict=True):
+        assert record["method"] == reference["method"]
+        np.testing.assert_array_equal(record["final"], reference["final"])
+        np.testing.assert_array_equal(record["loss_curve"], reference["loss_curve"])
+    assert not checkpoint.exists()
+
+
+def test_resume_keeps_finished_runs_and_adds_new_ones(tmp_path: Path) -> None:
+    run_pose(options(tmp_path, methods=("shadows",), runs=1), build=build)
+    before = json.loads((tmp_path / "pose.json").read_text())
+    run_pose(options(tmp_path, runs=2, resume=True), build=build)
+    after = json.loads((tmp_path / "pose.json").read_text())
+    assert before[0] in after and len(after) == 4
+    run_pose(options(tmp_path, methods=("shadows",), runs=1, iterations=3), build=build)
+    assert [record["iterations"] for record in json.loads((tmp_path / "pose.json").read_text())] == [3]
+
+
+def test_failed_optimisation_is_recorded_as_such(tmp_path: Path) -> None:
+    class Diverging(PoseFit):
+        def parameters(self) -> Any:
+            return super().parameters() * float("nan")
+
+    def build_diverging(name: str, problem: pose_scene.PoseProblem, reference: Any) -> Method:
+        renderer = BlobRenderer.create(problem.resolution, 5)
+        return Diverging(renderer, "object", problem.p_rest[:5], reference[..., :1])
+
+    record = run_pose(options(tmp_path, methods=("shadows",), runs=1, iterations=3), build=build_diverging)[0]
+    assert record["rotation_error_deg"] is None and record["recovered"] is False
+    assert "failed" in "".join(str(cell) for cell in pose.table([record]).columns[4]._cells)
+
+
+def test_time_to_pose_counts_until_the_error_stays_small() -> None:
+    seconds = np.ones(4)
+    assert pose._seconds_to_pose(np.array([9, 0.05, 3, 0.09, 0.01]), seconds) == 3
+    assert pose._seconds_to_pose(np.array([9, 0.05, 3, 0.09, 0.2]), seconds) is None
+    assert pose._seconds_to_pose(np.array([0, 0, 0, 0, 0.0]), seconds) == 0
+    assert pose._seconds_to_pose(np.array([1, 1, 0, 0, np.nan]), seconds) is None
+
+
+def test_table_has_a_row_for_each_object_resolution_and_method(tmp_path: Path) -> None:
+    records = run_pose(options(tmp_path, resolutions=(8, 12), iterations=2), build=build)
+    assert pose.table(records).row_count == 4
+
+
+def test_shadow_only_moves_the_object_out_of_view_but_not_its_shadow(tmp_path: Path) -> None:
+    seen = pose_scene.make_problem("spot", 64, work=tmp_path)
+    hidden = pose_scene.make_problem("spot", 64, shadow_only=True, work=tmp_path)
+    np.testing.assert_array_equal(seen.p_rest, hidden.p_rest)
+    integrator = mi.load_dict({"type": "direct"})
+    images = [np.array(mi.render(problem.scene, integrator=integrator, spp=16)).mean(axis=2) for problem in (seen, hidden)]
+
+    ray, *_ = hidden.scene.sensors()[0].sample_ray(0, 0, mi.Point2f(0.5), mi.Point2f(0.5))
+    origin, view = np.array(ray.o).ravel(), np.array(ray.d).ravel()
+    # Whatever the pose: the object is a part of the cube, turned and shifted.
+    reach = np.array([2**0.5 + 0.5, 1.5, 2**0.5])
+    corners = np.array([[sx, sy, sz] for sx in (-1, 1) for sy in (-1, 1) for sz in (-1, 1)]) * reach
+    assert ((corners + [0, 0, hidden.shift_z] - origin) @ view < 0).all()
+
+    # Where the wall is seen in both images, shadow and light agree.
+    position = {}
+    for problem, name in ((seen, "seen"), (hidden, "hidden")):
+        aov = mi.load_dict({"type": "aov", "aovs": "p:position"})
+        position[name] = np.array(mi.render(problem.scene, integrator=aov, spp=4))[..., -1]
+    wall = (np.abs(position["seen"] + 1.5) < 1e-3) & (np.abs(position["hidden"] + 1.5) < 1e-3)
+    assert wall.mean() > 0.5
+    assert np.abs(images[0] - images[1])[wall].mean() < 0.01
+    assert (images[1][wall] < 0.05).mean() > 0.02  # there is a shadow
+
+
+def test_reference_is_made_once_and_again_when_its_settings_change(tmp_path: Path) -> None:
+    problem = pose_scene.make_problem("spot", 16, work=tmp_path)
+    path = tmp_path / "reference.exr"
+    image = pose_scene.path_traced_reference(problem, path)
+    assert image.shape == (16, 16, 3) and np.isfinite(image).all()
+    changed = path.stat().st_mtime_ns
+    np.testing.assert_array_equal(pose_scene.path_traced_reference(problem, path), image)
+    assert path.stat().st_mtime_ns == changed
+    other = pose_scene.make_problem("bunny", 16, work=tmp_path)
+    assert not np.array_equal(pose_scene.path_traced_reference(other, path), image)
+    path.write_bytes(b"damaged")
+    np.testing.assert_allclose(pose_scene.path_traced_reference(problem, path), image, atol=1e-6)
+
+
+def test_mesh_file_is_scaled_into_the_unit_cube(tmp_path: Path) -> None:
+    path = tmp_path / "box.obj"
+    path.write_text("v 10 0 0\nv 14 0 0\nv 10 2 0\nv 10 0 1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n")
+    problem = pose_scene.make_problem(str(path), 8, work=tmp_path / "work")
+    assert problem.name == "box"
+    np.testing.assert_allclose(problem.p_rest.min(axis=0), [-1, -0.5, -0.25], atol=1e-6)
+    np.testing.assert_allclose(problem.p_rest.max(axis=0), [1, 0.5, 0.25], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("nan.obj", "v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
+        ("inf.obj", "v inf 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
+        ("point.obj", "v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n"),
+        ("empty.obj", ""),
+        ("empty.ply", ""),
+        ("text.ply", "not a mesh"),
+        ("mesh.stl", "solid"),
+    ],
+)
+def test_unusable_meshes(tmp_path: Path, name: str, content: str) -> None:
+    path = tmp_path / name
+    path.write_text(content)
+    with pytest.raises(ShadowmapError, match=name) as caught:
+        pose_scene.make_problem(str(path), 8, work=tmp_path / "work")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"objects": ()},
+        {"objects": ("spot", "spot")},
+        {"methods": ("magic",)},
+        {"runs": 0},
+        {"iterations": 0},
+        {"seed": -1},
+        {"reference": "photo"},
+        {"shadow_only": True, "methods": ("mitsuba",)},
+    ],
+)
+def test_unusable_options(tmp_path: Path, changes: dict[str, Any]) -> None:
+    with pytest.raises(ShadowmapError):
+        options(tmp_path, **changes)
+
+
+def test_unusable_resolution_and_object(tmp_path: Path) -> None:
+    for resolution in (0, -1, 5000):
+        with pytest.raises(ShadowmapError, match=str(resolution)):
+            run_pose(options(tmp_path, resolutions=(resolution,)), build=build)
+    with pytest.raises(ShadowmapError, match="no mesh 'cow'"):
+        run_pose(options(tmp_path, objects=("cow",)), build=build)
+    copy = tmp_path / "spot.ply"
+    copy.write_bytes(assets.mesh("spot").read_bytes())
+    with pytest.raises(ShadowmapError, match="same name"):
+        run_pose(options(tmp_path, objects=("spot", str(copy))), build=build)

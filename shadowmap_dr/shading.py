@@ -1,0 +1,183 @@
+"""From what the rasterizer saw to radiance: surface records, direct light, ambient light, background.
+
+Mitsuba's own ``bsdf.eval`` does the shading, on ``mi.SurfaceInteraction3f`` records that are filled here from the triangle soup.
+Mitsuba's mesh buffers and its ray tracing are never used, so moving vertices costs nothing but the soup's new positions.
+All functions are made of pure, traced operations: no value is read back, every array is as long as there are pixels, and all of
+it may run in a frozen function.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from .geometry import FLIP_GEOMETRIC, FLIP_SHADING, HAS_TEXCOORDS, NO_TRIANGLE, READS_ATTRIBUTES, Geometry, normalize_or
+from .lights import Environment, Light
+from .scene import SceneData
+from .sensors import Sensor
+from .spread import spread
+
+
+@dataclass(frozen=True)
+class Surface:
+    """What is seen at each pixel, N of them.
+
+    p_world  Point3f (N,), attached to vertices and barycentrics
+    n_world  Normal3f (N,), unit geometric normal, on the side that the shape calls outside
+    shape    UInt32 (N,), index into ``geometry.shapes``
+    active   Bool (N,), false where nothing was hit; there all records are finite and meaningless
+    si       mi.SurfaceInteraction3f, for BSDF evaluation. ``si.p`` is the *rest-pose* position for shapes with mesh attributes
+    bsdf     mi.BSDFPtr (N,)
+    """
+
+    p_world: Any
+    n_world: Any
+    shape: Any
+    active: Any
+    si: Any
+    bsdf: Any
+
+
+def surface(data: SceneData, geometry: Geometry, sensor: Sensor, triangle: Any, u: Any, v: Any, active: Any = True) -> Surface:
+    """Surface records for triangles of the soup.
+
+    ``triangle`` UInt32 (N,), 0xFFFFFFFF for none; ``u``, ``v`` Float (N,), barycentrics of the triangle's vertices 1 and 2.
+    ``geometry`` is ``data.geometry`` or one derived from it.
+    Gradients flow to positions, normals, texture coordinates, u, v and the sensor.
+    Fields agree with ``compute_surface_interaction`` of Mitsuba for the same triangle and barycentrics.
+    """
+    active = mi.Bool(active) & (triangle != NO_TRIANGLE)
+    infos = geometry.shapes
+    face = dr.gather(mi.Vector3u, geometry.faces, triangle, active)
+    shape = dr.gather(mi.UInt32, geometry.face_shape, triangle, active)
+    flags = _Flags(geometry, shape, active)
+    u, v = dr.select(active, u, 0.0), dr.select(active, v, 0.0)
+
+    def corners(kind: Any, buffer: Any) -> tuple[Any, Any, Any]:
+        """Value at vertex 0 and the differences of vertices 1 and 2 to it."""
+        first, second, third = (dr.gather(kind, buffer, face[i], active) for i in range(3))
+        return first, second - first, third - first
+
+    origin, e1, e2 = corners(mi.Point3f, geometry.positions)
+    p_world = origin + e1 * u + e2 * v
+    n_face = normalize_or(mi.Normal3f(dr.cross(e1, e2)), mi.Normal3f(0.0, 0.0, 1.0))
+    dp_du, dp_dv = mi.Vector3f(e1), mi.Vector3f(e2)  # a shape without texture coordinates has uv = barycentrics
+    n_world = flags.negate(FLIP_GEOMETRIC, n_face)
+    if any(info.has_normals for info in infos):
+        first, d1, d2 = corners(mi.Vector3f, geometry.normals)
+        smooth = normalize_or(first + d1 * u + d2 * v, mi.Vector3f(0.0))
+        has = dr.squared_norm(smooth) > 0
+        n_shading = mi.Normal3f(dr.select(has, flags.negate(FLIP_SHADING, smooth), n_world))
+    else:
+        n_shading = n_world
+
+    uv = mi.Point2f(u, v)
+    if any(info.has_texcoords for info in infos):
+        has = flags.test(HAS_TEXCOORDS)
+        first, d1, d2 = corners(mi.Point2f, geometry.texcoords)
+        uv = dr.select(has, first + d1 * u + d2 * v, uv)
+        det = d1.x * d2.y - d1.y * d2.x
+        regular = has & (det != 0)
+        inverse = dr.rcp(dr.select(regular, det, 1.0))
+        any_du, any_dv = mi.coordinate_system(n_face)
+        dp_du = dr.select(has, dr.select(regular, (e1 * d2.y - e2 * d1.y) * inverse, any_du), dp_du)
+        dp_dv = dr.select(has, dr.select(regular, (e2 * d1.x - e1 * d2.x) * inverse, any_dv), dp_dv)
+
+    sensor = spread(sensor, dr.width(triangle))
+    wi_world = sensor.wi_world(p_world)
+    tangent = dp_du - n_shading * dr.dot(n_shading, dp_du)
+    tangent = normalize_or(tangent, mi.coordinate_system(n_shading)[0])
+
+    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(triangle))
+    si.t = dr.select(active, dr.norm(sensor.origin - p_world), dr.inf)
+    si.p = _interaction_position(geometry, flags, corners, p_world, u, v)
+    si.n = n_world
+    si.uv = uv
+    si.dp_du, si.dp_dv = dp_du, dp_dv
+    si.sh_frame = mi.Frame3f(tangent, dr.cross(n_shading, tangent), n_shading)
+    si.wi = si.to_local(wi_world)
+    si.shape = dr.gather(mi.ShapePtr, data.shape_ptr, shape, active)
+    si.prim_index = triangle - dr.gather(mi.UInt32, geometry.shape_face_start, shape, active)
+    bsdf = dr.gather(mi.BSDFPtr, data.bsdf_ptr, shape, active)
+    return Surface(p_world=p_world, n_world=n_world, shape=shape, active=active, si=si, bsdf=bsdf)
+
+
+def direct_light(surface: Surface, light: Light, visibility: Any = 1.0, *, gate: bool = True) -> Any:
+    """Radiance (colour, N) towards the camera of one light: BSDF * light * visibility.
+
+    ``visibility`` Float (N,), 0 dark to 1 lit. ``gate`` removes light that reaches the shading normal from the wrong side of the
+    triangle, as a shadow ray would. Gradients flow to all of surface, light and visibility, not through the gate.
+    """
+    wo_world, weight = spread(light, dr.width(surface.shape)).illuminate(surface.p_world, surface.active)
+    wo = surface.si.to_local(wo_world)
+    active = mi.Bool(surface.active)
+    if gate:
+        # On the same side of the triangle and of the shading normal's plane: holds for reflection and transmission.
+        active &= dr.dot(surface.n_world, wo_world) * wo.z > 0
+    value = surface.bsdf.eval(mi.BSDFContext(), surface.si, wo, active)
+    return dr.select(active, mi.UnpolarizedSpectrum(value) * weight * visibility, 0.0)
+
+
+def ambient_light(surface: Surface, environment: Environment, n_directions: int = 16) -> Any:
+    """Radiance (colour, N) towards the camera of an environment that nothing shadows.
+
+    A fixed set of ``n_directions`` cosine-distributed directions in the hemisphere of the shading normal on the viewer's side
+    (Fibonacci spiral): exact for diffuse surfaces under constant light, coarse for gloss. Gradients flow to surface and emitter.
+    """
+    total = dr.zeros(mi.UnpolarizedSpectrum, dr.width(surface.shape))
+    side = dr.select(surface.si.wi.z < 0, -1.0, mi.Float(1.0))
+    for i in range(n_directions):
+        radius = math.sqrt((i + 0.5) / n_directions)
+        angle = i * math.pi * (3.0 - math.sqrt(5.0))
+        cosine = math.sqrt(1.0 - radius * radius)
+        wo = mi.Vector3f(radius * math.cos(angle), radius * math.sin(angle), cosine * side)
+        radiance = environment.radiance(surface.si.to_world(wo), surface.active)
+        value = surface.bsdf.eval(mi.BSDFContext(), surface.si, wo, surface.active)
+        total += mi.UnpolarizedSpectrum(value) * radiance * (math.pi / (cosine * n_directions))
+    return dr.select(surface.active, total, 0.0)
+
+
+def background(environment: Environment, sensor: Sensor, width: int | None = None, height: int | None = None) -> Any:
+    """Radiance (colour, H * W) of an environment at every pixel centre, as seen where nothing is in front of it."""
+    return environment.radiance(sensor.ray_direction(width, height))
+
+
+def opacity(surface: Surface) -> Any:
+    """Float (N,): 1 where the surface is solid, 0 where its BSDF (``mask``, ``null``) lets everything through unchanged.
+
+    Gradients flow to the BSDF's opacity. Alpha tests compare this with 0.5.
+    """
+    through = surface.bsdf.eval_null_transmission(surface.si, surface.active)
+    return dr.select(surface.active, 1.0 - dr.mean(mi.UnpolarizedSpectrum(through)), 0.0)
+
+
+class _Flags:
+    """Per-pixel booleans of the shape, gathered only if shapes of the scene differ in them."""
+
+    def __init__(self, geometry: Geometry, shape: Any, active: Any) -> None:
+        self._static = [info.flags for info in geometry.shapes]
+        self._flags = dr.gather(mi.UInt32, geometry.shape_flags, shape, active)
+
+    def any(self, bit: int) -> bool:
+        return any(flags & bit for flags in self._static)
+
+    def test(self, bit: int) -> Any:
+        if all(flags & bit for flags in self._static):
+            return mi.Bool(True)
+        return (self._flags & bit) != 0
+
+    def negate(self, bit: int, vector: Any) -> Any:
+        """-vector where the bit is set."""
+        return dr.select(self.test(bit), -vector, vector) if self.any(bit) else vector
+
+
+def _interaction_position(geometry: Geometry, flags: _Flags, corners: Any, p_world: Any, u: Any, v: Any) -> Any:
+    """World position; rest-pose position for shapes with mesh attributes, since Mitsuba recovers barycentrics from it."""
+    if not flags.any(READS_ATTRIBUTES):
+        return p_world
+    first, d1, d2 = corners(mi.Point3f, geometry.rest_positions)
+    return dr.select(flags.test(READS_ATTRIBUTES), first + d1 * u + d2 * v, p_world)

@@ -137,9 +137,7 @@ def _choose() -> None:
         if path is None:
             return
         if named:
-            warnings.warn(
-                f"{ENVIRONMENT_VARIABLE}={named} is not LLVM {MIN_VERSION} or newer: using {path}.", stacklevel=4
-            )
+            warnings.warn(f"{ENVIRONMENT_VARIABLE}={named} is not LLVM {MIN_VERSION} or newer: using {path}.", stacklevel=4)
         os.environ[ENVIRONMENT_VARIABLE] = str(path)
     # The wheel creates the link libc++.so.1 at the first interpreter start; where the environment cannot be written to,
     # the link is missing, and loading the runtime beforehand under its own name takes its place.

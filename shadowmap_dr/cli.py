@@ -164,11 +164,10 @@ def pose(
     Spot at 128 x 128 pixels unless told otherwise. Writes OUT/pose.json, images and a convergence plot.
     """
     set_variant(variant)
-    methods = method or [name for name in pose_experiment.METHODS if not (shadow_only and name == "mitsuba")]
     options = pose_experiment.PoseOptions(
         objects=tuple(object_ or ["spot"]),
         resolutions=tuple(resolution or [128]),
-        methods=tuple(methods),
+        methods=tuple(method or pose_experiment.METHODS),
         runs=runs,
         seed=seed,
         iterations=iterations,

@@ -128,7 +128,6 @@ RENDER = ["render", "pose", "-D", "resolution=8", "--integrator", "direct", "--s
         (["pose", "--seed", "-1"], "-1"),
         (["pose", "--method", "magic"], "magic"),
         (["pose", "--reference", "photo"], "photo"),
-        (["pose", "--shadow-only", "--method", "mitsuba"], "shadow-only"),
         (["pose", "--out", "broken.xml"], "broken.xml"),
         (["magic"], "magic"),
         (["info", "--magic"], "--magic"),

@@ -228,7 +228,6 @@ def test_unusable_meshes(tmp_path: Path, name: str, content: str) -> None:
         {"iterations": 0},
         {"seed": -1},
         {"reference": "photo"},
-        {"shadow_only": True, "methods": ("mitsuba",)},
     ],
 )
 def test_unusable_options(tmp_path: Path, changes: dict[str, Any]) -> None:

@@ -67,8 +67,6 @@ class PoseOptions:
             raise ShadowmapError(f"the seed {self.seed}: give 0 or more.")
         if self.reference not in ("mitsuba", "own"):
             raise ShadowmapError(f"no reference {self.reference!r}: choose mitsuba or own.")
-        if self.shadow_only and "mitsuba" in self.methods:
-            raise ShadowmapError("the method mitsuba has no shadow-only case: choose from shadows, rasterizer.")
 
 
 Builder = Callable[[str, PoseProblem, Image], Method]
@@ -81,7 +79,14 @@ def build_method(name: str, problem: PoseProblem, reference: Image) -> Method:
 
         setting = baseline.fair_setting(problem.resolution)
         return baseline.MitsubaPose(
-            assets.scene("pose"), problem.mesh, problem.resolution, setting, reference, step_size=STEP_SIZE, betas=BETAS
+            assets.scene("pose"),
+            problem.mesh,
+            problem.resolution,
+            setting,
+            reference,
+            step_size=STEP_SIZE,
+            betas=BETAS,
+            shift_z=problem.shift_z,
         )
     from .. import Renderer
 

@@ -23,10 +23,10 @@ def apply_pose(p_rest: Any, pose: Any, shift_z: float = 0.0) -> Any:
 
     Returns Float (3V,): R_y(rotation) p + (x, y, shift_z). Gradients flow to `p_rest` and `pose`.
     """
-    Float = type(p_rest)
-    rotation, x, y = (dr.gather(Float, pose, i) for i in range(3))
-    vertex = dr.arange(dr.uint32_array_t(Float), dr.width(p_rest) // 3)
-    p = dr.gather(mi.Point3f, p_rest, vertex)
+    count = dr.width(p_rest) // 3
+    # One copy of the pose for each vertex: the backward pass then adds up all three derivatives in one kernel.
+    rotation, x, y = dr.gather(mi.Vector3f, pose, dr.zeros(mi.UInt32, count))
+    p = dr.gather(mi.Point3f, p_rest, dr.arange(mi.UInt32, count))
     s, c = dr.sincos(rotation)
     return dr.ravel(mi.Point3f(c * p.x + s * p.z + x, p.y + y, c * p.z - s * p.x + shift_z))
 

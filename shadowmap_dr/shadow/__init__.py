@@ -1,0 +1,44 @@
+"""Shadow maps for directional, spot and point lights: cameras, moments, filters, visibility. No Mitsuba."""
+
+from .camera import (
+    Frusta,
+    LightView,
+    Views,
+    cube_face,
+    cube_views,
+    directional_view,
+    fit_frusta,
+    shape_bounds,
+    spot_view,
+    stack_views,
+    to_light_space,
+)
+from .filters import FILTERS, filter_kernel, filter_map
+from .moments import METHODS, chebyshev_visibility, standard_visibility, variance_moments
+from .shadow_map import ShadowMaps, ShadowSettings, filter_maps, render_maps, visibility
+
+__all__ = [
+    "FILTERS",
+    "METHODS",
+    "Frusta",
+    "LightView",
+    "ShadowMaps",
+    "ShadowSettings",
+    "Views",
+    "chebyshev_visibility",
+    "cube_face",
+    "cube_views",
+    "directional_view",
+    "filter_kernel",
+    "filter_map",
+    "filter_maps",
+    "fit_frusta",
+    "render_maps",
+    "shape_bounds",
+    "spot_view",
+    "stack_views",
+    "standard_visibility",
+    "to_light_space",
+    "variance_moments",
+    "visibility",
+]

@@ -1,0 +1,371 @@
+"""Cameras at the lights: their axes, the frusta fitted to the scene, and the projections in between.
+
+A light sees the scene through one map (directional: orthographic; spot: perspective) or six (point: the faces of a cube). The
+maps of all lights form one batch of M images. Axes and origins are attached to the lights' parameters; the frustum (which part
+of the light's image plane the map covers) is detached and stable, so that an optimisation does not see the fit move.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from ..raster._types import backend
+
+#: Half-angle (tangent) of one cube face, before the margin for the filter.
+CUBE_FACE = 1.0
+
+# A frustum is kept while the scene fits and fills at least this fraction of it.
+_KEEP_FILL = 0.6
+_MARGIN = 0.10
+
+
+@dataclass(frozen=True)
+class LightView:
+    """One map's camera.
+
+    Attributes:
+        right, up, forward: ``Array3f`` of width 1, orthonormal, world space; light travels along ``forward``.
+        origin: ``Array3f``, world space: the light's position, or any point for a directional light.
+        spread: tangent of the half-angle that the map may cover, or 0 for an orthographic map.
+        fixed: always cover exactly ``spread`` (a cube face) instead of fitting within it.
+    """
+
+    right: Any
+    up: Any
+    forward: Any
+    origin: Any
+    spread: Any
+    fixed: bool = False
+
+
+@dataclass(frozen=True)
+class Views:
+    """The cameras of all M maps: ``Array3f``/``Float`` of width M. Gradients flow to the lights."""
+
+    right: Any
+    up: Any
+    forward: Any
+    origin: Any
+    spread: Any
+    fixed: Any
+
+    @property
+    def count(self) -> int:
+        return dr.width(self.spread)
+
+
+@dataclass(frozen=True)
+class Frusta:
+    """Part of the image plane and of the depth range that each map covers; ``Float`` of width M, detached.
+
+    A point with light-space coordinates (x, y, z) has image coordinates (x, y) in an orthographic and (x, y) / z in a perspective
+    view; the map covers ``center +- half`` in them and depths from ``near`` to ``far``.
+    """
+
+    center_x: Any
+    center_y: Any
+    half_x: Any
+    half_y: Any
+    near: Any
+    far: Any
+
+
+def directional_view(direction: Any) -> LightView:
+    """View along a light direction (``Array3f``, any length). The other axes follow from it without a twist of their own."""
+    forward = dr.normalize(direction)
+    # The world axis least aligned with the (detached) direction starts the frame.
+    d = dr.abs(dr.detach(forward))
+    use_x = (d.x <= d.y) & (d.x <= d.z)
+    use_y = ~use_x & (d.y <= d.z)
+    vector = type(direction)
+    axis = vector(dr.select(use_x, 1.0, 0.0), dr.select(use_y, 1.0, 0.0), dr.select(use_x | use_y, 0.0, 1.0))
+    right = dr.normalize(dr.cross(axis, forward))
+    zero = type(direction[0])(0)
+    return LightView(right, dr.cross(forward, right), forward, vector(zero, zero, zero), zero)
+
+
+def spot_view(position: Any, right: Any, up: Any, forward: Any, tan_cutoff: Any) -> LightView:
+    """View along the axis of a cone of light. Up to a half-angle of 60 degrees (tangent 1.73); wider ones use a cube."""
+    return LightView(right, up, forward, position, tan_cutoff)
+
+
+def cube_views(position: Any, resolution: int, filter_size: int) -> tuple[LightView, ...]:
+    """Six views along the world axes, each slightly wider than 90 degrees so that filters find neighbours, not a border."""
+    vector, scalar = type(position), type(position[0])
+    spread = scalar(CUBE_FACE / (1.0 - 2.0 * (filter_size // 2 + 1) / resolution))
+
+    def axis(k: int, sign: float) -> Any:
+        return vector(*(scalar(sign if c == k else 0.0) for c in range(3)))
+
+    views = []
+    for k in range(3):
+        for sign in (1.0, -1.0):
+            forward, right = axis(k, sign), axis((k + 1) % 3, 1.0)
+            views.append(LightView(right, dr.cross(forward, right), forward, position, spread, True))
+    return tuple(views)
+
+
+def cube_face(offset: Any) -> Any:
+    """Which of the six :func:`cube_views` sees a point at ``offset`` from the light (``UInt32``)."""
+    a = dr.abs(offset)
+    k = dr.select((a.x >= a.y) & (a.x >= a.z), 0, dr.select(a.y >= a.z, 1, 2))
+    component = dr.select(k == 0, offset.x, dr.select(k == 1, offset.y, offset.z))
+    return backend(offset).UInt32(2 * k + dr.select(component < 0, 1, 0))
+
+
+def stack_views(views: Sequence[LightView]) -> Views:
+    """Collect single views into arrays of width M, keeping their gradients."""
+    module = backend(views[0].spread)
+    index = dr.arange(module.UInt32, len(views))
+
+    def stack(values: list[Any]) -> Any:
+        if len(values) == 1:
+            return module.Float(values[0])
+        total = module.Float(0)
+        for k, value in enumerate(values):
+            total = dr.select(index == k, value, total)
+        return total
+
+    def stack3(name: str) -> Any:
+        return module.Array3f(*(stack([getattr(v, name)[c] for v in views]) for c in range(3)))
+
+    return Views(
+        stack3("right"),
+        stack3("up"),
+        stack3("forward"),
+        stack3("origin"),
+        stack([v.spread for v in views]),
+        stack([module.Float(1.0 if v.fixed else 0.0) for v in views]),
+    )
+
+
+def of_map(table: Any, index: Any, count: int) -> Any:
+    """Rows of :class:`Views` or :class:`Frusta` for the map that each lane works on (``index`` is ignored where there is one)."""
+    if count == 1:
+        return table
+    module = backend(index)
+
+    def pick(value: Any) -> Any:
+        if dr.depth_v(value) > 1:
+            return module.Array3f(*(dr.gather(module.Float, value[c], index) for c in range(3)))
+        return dr.gather(module.Float, value, index)
+
+    return type(table)(*(pick(getattr(table, name)) for name in table.__dataclass_fields__))
+
+
+def to_light_space(view: Views, p_world: Any) -> Any:
+    """(x, y, z) in a light's axes; z is the distance along its axis. Attached to points and light."""
+    d = backend(p_world).Array3f(p_world) - view.origin
+    return backend(p_world).Array3f(dr.dot(d, view.right), dr.dot(d, view.up), dr.dot(d, view.forward))
+
+
+def to_clip(view: Views, frustum: Frusta, p_light: Any) -> Any:
+    """Clip-space position (``Array4f``) in a map: its ndc square is the frustum's rectangle, depths near..far are -1..1."""
+    perspective = view.spread > 0
+    n, f = frustum.near, frustum.far
+    w = dr.select(perspective, p_light.z, 1.0)
+    x = dr.fma(-frustum.center_x, w, p_light.x) / frustum.half_x
+    y = dr.fma(-frustum.center_y, w, p_light.y) / frustum.half_y
+    a = dr.select(perspective, (f + n) / (f - n), 2 / (f - n))
+    b = dr.select(perspective, -2 * f * n / (f - n), -(f + n) / (f - n))
+    return backend(p_light).Array4f(x, y, dr.fma(a, p_light.z, b), w)
+
+
+def linear_depth(view: Views, frustum: Frusta, depth_ndc: Any, w: Any) -> Any:
+    """Depth along the light's axis, mapped linearly from near..far to -1/2..1/2, from what the rasterizer interpolates."""
+    return dr.select(view.spread > 0, (w - frustum.near) / (frustum.far - frustum.near) - 0.5, 0.5 * depth_ndc)
+
+
+def project(view: Views, frustum: Frusta, p_world: Any) -> tuple[Any, Any, Any, Any]:
+    """Where world-space points lie in a map: (u, v) in -1..1, linear depth, and whether (u, v) are inside.
+
+    Attached to points and light.
+    """
+    p = to_light_space(view, p_world)
+    perspective = view.spread > 0
+    in_front = ~perspective | (p.z > 1e-6 * frustum.far)
+    w = dr.select(perspective & in_front, p.z, 1.0)
+    u = (p.x / w - frustum.center_x) / frustum.half_x
+    v = (p.y / w - frustum.center_y) / frustum.half_y
+    depth = (p.z - frustum.near) / (frustum.far - frustum.near) - 0.5
+    inside = in_front & (dr.abs(u) <= 1) & (dr.abs(v) <= 1)
+    return u, v, depth, inside
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Light-space bounds of each shape in each map, ``Float`` of width M * S: image coordinates and depths."""
+
+    x0: Any
+    y0: Any
+    x1: Any
+    y1: Any
+    z0: Any
+    z1: Any
+
+
+def shape_bounds(view: Views, p_light: Any, map_index: Any, shape_index: Any, shape_count: int) -> Bounds:
+    """Reduce light-space vertices (one lane for each vertex in each map) to bounds for each shape. Detached."""
+    with dr.suspend_grad():
+        module = backend(p_light)
+        view, p = dr.detach(view), dr.detach(p_light)
+        perspective = of_map(view, map_index, view.count).spread > 0
+        behind = perspective & (p.z <= 0)
+        w = dr.select(perspective & ~behind, p.z, 1.0)
+        x, y = p.x / w, p.y / w
+        slot = map_index * shape_count + shape_index
+        size = view.count * shape_count
+
+        def reduce(value: Any, op: Any, start: float) -> Any:
+            target = dr.full(module.Float, start, size)
+            dr.scatter_reduce(op, target, value, slot)
+            return target
+
+        # A vertex behind a spot light bounds nothing: its shape may reach anywhere in the image.
+        low, high = dr.ReduceOp.Min, dr.ReduceOp.Max
+        result = Bounds(
+            reduce(dr.select(behind, -dr.inf, x), low, dr.inf),
+            reduce(dr.select(behind, -dr.inf, y), low, dr.inf),
+            reduce(dr.select(behind, dr.inf, x), high, -dr.inf),
+            reduce(dr.select(behind, dr.inf, y), high, -dr.inf),
+            reduce(p.z, low, dr.inf),
+            reduce(p.z, high, -dr.inf),
+        )
+        dr.eval(result)
+        return result
+
+
+def fit_frusta(
+    views: Views,
+    bounds: Bounds,
+    planes: tuple[Any, Any],
+    planar: Any,
+    shape_count: int,
+    resolution: int,
+    filter_size: int,
+    previous: Frusta | None,
+) -> Frusta:
+    """Frusta that cover everything that can cast a shadow, or the previous ones as long as they still do.
+
+    Args:
+        bounds: from :func:`shape_bounds`.
+        planes: (normal, point) in world space, ``Array3f`` of width S: the plane of each planar shape.
+        planar: ``Bool`` of width S. A planar shape with nothing behind its plane casts no shadow on anything.
+        previous: frusta of an earlier call. Kept bit by bit while the casters lie inside them with room for the filter
+            and fill most of them.
+
+    All arithmetic stays on the device: nothing is read back.
+    """
+    with dr.suspend_grad():
+        views = dr.detach(views)
+        module = backend(views.spread)
+        index = dr.arange(module.UInt32, views.count * shape_count)
+        map_index = index // shape_count
+        shape = index - map_index * shape_count
+        casts = _casts(views, bounds, planes, planar, map_index, shape, shape_count)
+        fitted = _fit(views, bounds, casts, map_index, resolution, filter_size)
+        if previous is None:
+            dr.eval(fitted[0])
+            return fitted[0]
+        keep = _still_fits(views, previous, *fitted, resolution, filter_size)
+        result = Frusta(
+            *(dr.select(keep, getattr(previous, name), getattr(fitted[0], name)) for name in Frusta.__dataclass_fields__)
+        )
+        dr.eval(result)
+        return result
+
+
+def _casts(
+    views: Views, bounds: Bounds, planes: tuple[Any, Any], planar: Any, map_index: Any, shape: Any, shape_count: int
+) -> Any:
+    """Which shapes can cast a shadow in which map: not planar ones with nothing behind them, nor what is behind the light."""
+    module = backend(views.spread)
+    Float, Array3f, Bool = module.Float, module.Array3f, module.Bool
+    view = of_map(views, map_index, views.count)
+
+    def per_shape(v: Any) -> Any:
+        return Array3f(*(dr.gather(Float, v[c], shape) for c in range(3)))
+
+    normal_world, point_world = per_shape(planes[0]), per_shape(planes[1])
+    normal = Array3f(*(dr.dot(normal_world, axis) for axis in (view.right, view.up, view.forward)))
+    offset = dr.dot(normal_world, point_world - view.origin)
+    # Orient the plane so that the light lies on its negative side.
+    away = dr.select(view.spread > 0, offset, normal.z) < 0
+    normal, offset = dr.select(away, -normal, normal), dr.select(away, -offset, offset)
+    visible = bounds.z1 > 0
+    in_perspective = view.spread > 0
+    visible = ~in_perspective | visible
+    size = dr.maximum(dr.max(dr.select(dr.isfinite(bounds.z1), bounds.z1, -dr.inf)) - dr.min(bounds.z0), 1e-6)
+    behind = Bool(False)
+    perspective = in_perspective
+    for other in range(shape_count):
+        base = map_index * shape_count + other
+        b = [dr.gather(Float, getattr(bounds, name), base) for name in ("x0", "x1", "y0", "y1", "z0", "z1")]
+        z0, z1 = b[4], b[5]
+        reach = dr.fma(normal.z, dr.select(normal.z > 0, z1, z0), -offset)
+        for lo, hi, n in ((b[0], b[1], normal.x), (b[2], b[3], normal.y)):
+            # Perspective bounds are slopes: the extreme of n * slope * z over the box lies in one of its corners.
+            flat = dr.maximum(n * lo, n * hi)
+            cone = dr.maximum(dr.maximum(n * lo * z0, n * lo * z1), dr.maximum(n * hi * z0, n * hi * z1))
+            reach += dr.select(n == 0, 0, dr.select(perspective, cone, flat))
+        behind |= (shape != other) & (reach > 1e-3 * size)
+    return visible & (~dr.gather(Bool, planar, shape) | behind)
+
+
+def _fit(
+    views: Views, bounds: Bounds, casts: Any, map_index: Any, resolution: int, filter_size: int
+) -> tuple[Frusta, tuple[Any, ...]]:
+    module = backend(views.spread)
+
+    def reduce(value: Any, op: Any, start: float) -> Any:
+        target = dr.full(module.Float, start, views.count)
+        dr.scatter_reduce(op, target, value, map_index, casts)
+        dr.eval(target)
+        return target
+
+    low, high = dr.ReduceOp.Min, dr.ReduceOp.Max
+    x0, y0, z0 = (reduce(v, low, dr.inf) for v in (bounds.x0, bounds.y0, bounds.z0))
+    x1, y1, z1 = (reduce(v, high, -dr.inf) for v in (bounds.x1, bounds.y1, bounds.z1))
+    nothing = ~(x1 >= x0)
+    x0, y0, x1, y1 = (dr.select(nothing, s, v) for s, v in ((-1.0, x0), (-1.0, y0), (1.0, x1), (1.0, y1)))
+    z0, z1 = dr.select(nothing, 0.0, z0), dr.select(nothing, 1.0, z1)
+
+    perspective = views.spread > 0
+    s = dr.select(perspective, views.spread, dr.inf)
+    full = views.fixed > 0
+    x0, y0 = dr.select(full, -s, dr.maximum(x0, -s)), dr.select(full, -s, dr.maximum(y0, -s))
+    x1, y1 = dr.select(full, s, dr.minimum(x1, s)), dr.select(full, s, dr.minimum(y1, s))
+    # Casters outside the cone leave an empty rectangle; any small one will do.
+    x1, y1 = dr.maximum(x1, x0 + 1e-4 * (1 + dr.abs(x0))), dr.maximum(y1, y0 + 1e-4 * (1 + dr.abs(y0)))
+    depth = dr.maximum(z1 - z0, 1e-3 * dr.maximum(dr.abs(z1), 1e-3))
+    near, far = z0 - 0.05 * depth, z1 + 0.05 * depth
+    far = dr.select(perspective, dr.maximum(far, 1e-6), far)
+    near = dr.select(perspective, dr.maximum(near, 1e-3 * far), near)
+
+    def widen(lo: Any, hi: Any) -> tuple[Any, Any]:
+        half = 0.5 * (hi - lo)
+        grown = half * max(1 + 2 * _MARGIN, 1 / (1 - 2 * (filter_size / 2 + 2) / resolution))
+        return 0.5 * (lo + hi), dr.select(full, half, grown)
+
+    (cx, hx), (cy, hy) = widen(x0, x1), widen(y0, y1)
+    return Frusta(cx, cy, hx, hy, near, far), (x0, y0, x1, y1, z0, z1)
+
+
+def _still_fits(views: Views, old: Frusta, new: Frusta, needed: tuple[Any, ...], resolution: int, filter_size: int) -> Any:
+    x0, y0, x1, y1, z0, z1 = needed
+    room = 2 * (filter_size / 2 + 1) / resolution
+
+    def holds(lo: Any, hi: Any, center: Any, half: Any) -> Any:
+        return (lo >= center - half * (1 - room)) & (hi <= center + half * (1 - room))
+
+    keep = holds(x0, x1, old.center_x, old.half_x) & holds(y0, y1, old.center_y, old.half_y)
+    keep &= (new.half_x >= _KEEP_FILL * old.half_x) & (new.half_y >= _KEEP_FILL * old.half_y)
+    # A face of a cube never moves laterally.
+    keep |= (views.fixed > 0) & (new.half_x == old.half_x)
+    keep &= (dr.maximum(z0, new.near) >= old.near) & (z1 <= old.far)
+    keep &= new.far - new.near >= _KEEP_FILL * (old.far - old.near)
+    return keep

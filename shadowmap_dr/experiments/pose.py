@@ -141,30 +141,31 @@ def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Co
     result: list[dict[str, Any]] = []
     with report.progress(console) as progress:
         for problem in problems:
-            task = progress.add_task(f"{problem.folder} reference", total=1, note=options.reference)
+            task = progress.add_task(f"{problem.folder} reference", total=None, note="")
             reference = _reference(problem, options, build)
-            progress.advance(task)
+            progress.remove_task(task)
             records, images = [], {}
             methods: dict[str, Method] = {}  # built when first needed, then used for all runs: what it compiled stays warm
             for run in range(options.runs):
                 for name in options.methods:
-                    task = progress.add_task(f"{problem.folder} {name} run {run}", total=options.iterations, note="preparing")
+                    title = f"{problem.folder} {name} run {run}"
+                    task = progress.add_task(title, total=options.iterations, note="preparing")
                     if name not in methods:
                         methods[name] = build(name, problem, reference)
                     step = functools.partial(_show, progress, task)
                     record = _run_one(problem, name, run, options, methods[name], stored, step)
                     final = record["final"] if None not in record["final"] else start_pose(options.seed, run)
                     pictures = _pictures(methods[name], record["start"], final, reference)
-                    for title, image in pictures.items():
-                        io.write_png(out / problem.folder / f"{name}-run{run}-{title}.png", image)
+                    for picture, image in pictures.items():
+                        io.write_png(out / problem.folder / f"{name}-run{run}-{picture}.png", image)
                     if run == 0:
                         images[name] = pictures
                     records.append(record)
                     stored = [*(other for other in stored if _key(other) != _key(record)), record]
                     report.write_json(out / "pose.json", stored)
                     _checkpoint(problem, name, run, options).unlink(missing_ok=True)
-                    note = "failed" if record["rotation_error_deg"] is None else f"{record['rotation_error_deg']:.3f} deg"
-                    progress.update(task, completed=options.iterations, note=note)
+                    progress.remove_task(task)
+                    progress.console.print(f"{title}: {_outcome(record)}", highlight=False)
             _plots(problem, options, records, images, reference)
             result += records
     return result
@@ -314,6 +315,12 @@ def _groups(records: Sequence[dict[str, Any]]) -> Iterator[list[dict[str, Any]]]
 def _mean(group: Sequence[dict[str, Any]], key: str, form: str) -> str:
     values = [record[key] for record in group]
     return "failed" if any(value is None for value in values) else form.format(sum(values) / len(values))
+
+
+def _outcome(record: dict[str, Any]) -> str:
+    values = (_mean([record], key, "{:.3f}") for key in ("rotation_error_deg", "translation_error_x100"))
+    time = _mean([record], "seconds_per_iteration", "{:.4f}")
+    return "rotation {} deg, offset x 100 {}, {} s per iteration".format(*values, time)
 
 
 def _environment() -> dict[str, Any]:

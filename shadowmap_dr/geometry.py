@@ -69,8 +69,8 @@ class Geometry:
     positions      Float  (3V,)  world space, may carry gradients
     normals        Float  (3V,)  unit vertex normals, world space, may carry gradients; zero for shapes without
     texcoords      Float  (2V,)  zero for shapes without
-    rest_positions Float  (3V,) or (0,)  positions as Mitsuba holds them, in the shape's own space, detached; only present
-                                 when some shape has mesh attributes
+    rest_positions Float  (3V,)  positions as Mitsuba holds them, in the shape's own space, detached; None when no shape has
+                                 mesh attributes
     faces          UInt32 (3F,)  indices into the vertices of the whole soup
     face_shape     UInt32 (F,)   index of the shape
     vertex_shape   UInt32 (V,)
@@ -117,7 +117,7 @@ class Geometry:
         """Replace the positions of some shapes; returns a new Geometry, this one is left as it was.
 
         Each value is the world-space positions of all Vs vertices of the shape: Float (3Vs,) interleaved as xyzxyz...,
-        TensorXf (Vs, 3), or Point3f/Vector3f (Vs,). Gradients flow through. Vertex normals of the shapes that have them
+        TensorXf or NumPy array (Vs, 3), or Point3f/Vector3f (Vs,). Gradients flow through. Normals of shapes that have them
         are computed anew with Mitsuba's angle weighting (``vertex_normals``), attached. Sizes must be those of the scene.
         """
         merged = self.positions
@@ -174,6 +174,8 @@ def _faces_of(faces: Any, info: ShapeInfo) -> Any:
 
 def _checked_positions(name: str, value: Any, count: int) -> Any:
     """Bring positions to Float (3Vs,) or an array of three components; sizes are known without evaluating anything."""
+    if not dr.is_array_v(value):
+        value = mi.TensorXf(value)
     if dr.is_tensor_v(value):
         if tuple(value.shape) not in ((count, 3), (3 * count,)):
             raise ShadowmapError(
@@ -181,14 +183,12 @@ def _checked_positions(name: str, value: Any, count: int) -> Any:
                 f"give a tensor of shape ({count}, 3)."
             )
         value = value.array
-    if dr.is_array_v(value) and dr.depth_v(value) == 2 and dr.size_v(value) == 3:
+    if dr.depth_v(value) == 2 and dr.size_v(value) == 3:
         if dr.width(value) not in (1, count):
             raise ShadowmapError(
                 f"Positions of shape '{name}' are an array of {dr.width(value)} points, but it has {count} vertices."
             )
         return mi.Point3f(value)
-    if not dr.is_array_v(value):
-        value = mi.Float(value)
     if dr.depth_v(value) != 1 or dr.width(value) != 3 * count:
         raise ShadowmapError(
             f"Positions of shape '{name}' are an array of {dr.width(value)} numbers, but {count} vertices need {3 * count}."
@@ -203,7 +203,8 @@ def _write_vertices(target: Any, value: Any, start: int, count: int, total: int)
         return dr.ravel(value) if points and dr.width(value) == count else _fill(value, count)
     result = type(target)(target)
     index = dr.arange(mi.UInt32, count if points else 3 * count) + (start if points else 3 * start)
-    dr.scatter(result, value, index, mode=dr.ReduceMode.Permute)
+    # Not ``Permute``: that promises that all of the target is written, and its gradient would be dropped.
+    dr.scatter(result, value, index, mode=dr.ReduceMode.NoConflicts)
     return result
 
 

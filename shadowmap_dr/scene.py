@@ -95,12 +95,11 @@ def load(scene: Any, *, tessellation: int = 64) -> SceneData:
         raise ShadowmapError("The scene has no shapes: there is nothing to render.")
     face_counts, vertex_counts = [i.face_count for i in infos], [i.vertex_count for i in infos]
     shape_index = np.arange(len(infos), dtype=np.uint32)
-    empty = mi.Float()
     geometry = Geometry(
-        positions=empty,
-        normals=empty,
-        texcoords=empty,
-        rest_positions=empty,
+        positions=None,  # the four buffers that may change are read by ``refresh``
+        normals=None,
+        texcoords=None,
+        rest_positions=None,
         faces=mi.UInt32(np.concatenate(faces).ravel()),
         face_shape=mi.UInt32(np.repeat(shape_index, face_counts)),
         vertex_shape=mi.UInt32(np.repeat(shape_index, vertex_counts)),
@@ -129,9 +128,9 @@ def refresh(data: SceneData) -> SceneData:
     """
     buffers = [_vertex_buffers(source, info) for source, info in zip(data.sources, data.geometry.shapes, strict=True)]
     positions, normals, texcoords, rest = (dr.concat(list(parts)) for parts in zip(*buffers, strict=True))
-    if not any(info.reads_attributes for info in data.geometry.shapes):
-        rest = mi.Float()
-    geometry = replace(data.geometry, positions=positions, normals=normals, texcoords=texcoords, rest_positions=dr.detach(rest))
+    # Not an empty array: one among the arguments of a frozen function ends the process (Dr.Jit 1.5).
+    rest = dr.detach(rest) if any(info.reads_attributes for info in data.geometry.shapes) else None
+    geometry = replace(data.geometry, positions=positions, normals=normals, texcoords=texcoords, rest_positions=rest)
     return replace(
         data,
         geometry=geometry,
@@ -229,13 +228,12 @@ def _info_of(name: str, source: ShapeSource, faces: np.ndarray, vertex_start: in
         raise ShadowmapError(
             f"Face {where} of shape '{name}' refers to vertex {faces[where].max()}, but there are only {len(points)} vertices."
         )
-    # Mitsuba's normals do not change sides under a mirroring transform, but the winding of a triangle does.
-    mirrored = False
-    for owner in (source.instance, None if is_mesh else shape):
-        if owner is not None:
-            matrix = np.array(parameters(owner)["to_world"].matrix).reshape(4, 4)[:3, :3]
-            mirrored ^= bool(np.linalg.det(matrix) < 0)
-    flipped = shape.has_flipped_normals()
+    # A mirroring transform reverses the winding of triangles. Mitsuba's normals stay on their side nevertheless, except for
+    # a cylinder's, which are computed from its parametrisation and change sides too.
+    own_mirror = not is_mesh and _mirrors(shape)
+    mirrored = own_mirror != (source.instance is not None and _mirrors(source.instance))
+    inverted = own_mirror and shape.class_name() == "Cylinder"
+    flipped = shape.has_flipped_normals() != inverted
     return ShapeInfo(
         name=name,
         plugin=shape.class_name(),
@@ -250,6 +248,11 @@ def _info_of(name: str, source: ShapeSource, faces: np.ndarray, vertex_start: in
         reads_attributes=is_mesh and shape.has_mesh_attributes(),
         planar=_is_planar(points),
     )
+
+
+def _mirrors(shape: Any) -> bool:
+    matrix = np.array(parameters(shape)["to_world"].matrix).reshape(4, 4)
+    return bool(np.linalg.det(matrix[:3, :3]) < 0)
 
 
 def _is_planar(points: np.ndarray) -> bool:

@@ -40,13 +40,16 @@ def sphere(segments: int) -> LocalMesh:
 
 
 def disk(segments: int) -> LocalMesh:
-    """Unit disk in the xy plane that faces +z; uv = (radius, phi / 2 pi)."""
-    angle, radius = _lattice(segments, 1)
+    """Unit disk in the xy plane that faces +z, in rings; uv = (radius, phi / 2 pi)."""
+    rings = max(segments // 8, 1)
+    angle, radius = _lattice(segments, rings)
+    # The centre has one vertex for each triangle that meets there, with the angle of the triangle's middle.
     angle = np.where(radius == 0, angle + 0.5 / segments, angle)
     phi = 2 * np.pi * angle
     positions = np.stack([radius * np.cos(phi), radius * np.sin(phi), 0 * phi], -1)
     normals = np.broadcast_to((0.0, 0.0, 1.0), positions.shape)
-    faces = _quads(segments, 1)[:, [0, 1, 2]]
+    quads = _quads(segments, rings)
+    faces = np.concatenate([quads[:, [0, 1, 2]], quads[segments:, [0, 2, 3]]])
     return _mesh(positions, normals, np.stack([radius, angle], -1), faces)
 
 

@@ -5,7 +5,9 @@ from . import _llvm
 _llvm.ensure()  # before anything imports mitsuba or drjit
 
 from .errors import ShadowmapError  # noqa: E402
+from .renderer import Renderer, RenderSettings  # noqa: E402
+from .shadow import ShadowSettings  # noqa: E402
 
 __version__ = "0.1.0"
 
-__all__ = ["ShadowmapError", "__version__"]
+__all__ = ["RenderSettings", "Renderer", "ShadowSettings", "ShadowmapError", "__version__"]

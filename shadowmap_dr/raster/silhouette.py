@@ -19,8 +19,10 @@ from .topology import NO_VERTEX, Topology
 #: Entry of :class:`Crossings` for a pair of pixels that no silhouette separates.
 NO_EDGE = 0xFFFFFFFF
 
-# An edge must lie this far (in NDC depth) before the surface that it borders: it is a discontinuity, not a crease.
-_DEPTH_GAP = 2e-6
+# An edge must lie this far (relative, and absolute in NDC depth) before the surface that it borders: it is a
+# discontinuity, not a crease. The relative part suits depths that are reciprocal in distance.
+_DEPTH_GAP = 1e-5
+_DEPTH_GAP_ABSOLUTE = 2e-7
 
 
 @dataclass(frozen=True)
@@ -185,7 +187,7 @@ def _search(lists: CellLists, records: Any, edge_count: int, raster: RasterOutpu
                 at = [None, None]
                 at[along], at[across] = crossing, fixed
                 hidden = dr.select(covers_start, planes[1](*at), planes[0](*at))
-                ok = (extent != 0) & (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1) & (z < hidden - _DEPTH_GAP)
+                ok = (extent != 0) & (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1) & (z < hidden - dr.fma(dr.abs(hidden), _DEPTH_GAP, _DEPTH_GAP_ABSOLUTE))
                 return ok, dr.select(covers_start, t, 1 - t)
 
             ok, reach = test(0, 1, y, x, side, (planes[0], planes[1]))

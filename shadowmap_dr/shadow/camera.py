@@ -144,12 +144,14 @@ def stack_views(views: Sequence[LightView]) -> Views:
 
 
 def of_map(table: Any, index: Any, count: int) -> Any:
-    """Rows of :class:`Views` or :class:`Frusta` for the map that each lane works on (``index`` is ignored where there is one)."""
-    if count == 1:
-        return table
+    """Rows of :class:`Views` or :class:`Frusta` for the map that each lane works on."""
     module = backend(index)
 
     def pick(value: Any) -> Any:
+        # A single row broadcasts by itself; but the adjoint of that is a reduction of its own for each number, while
+        # gathers share one kernel.
+        if count == 1 and not dr.grad_enabled(value):
+            return value
         if dr.depth_v(value) > 1:
             return module.Array3f(*(dr.gather(module.Float, value[c], index) for c in range(3)))
         return dr.gather(module.Float, value, index)

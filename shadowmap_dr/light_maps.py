@@ -1,0 +1,166 @@
+"""Which shadow maps a scene's lights need, where their cameras are, and what each pixel asks of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .geometry import Geometry
+from .lights import DirectionalLight, Light, PointLight, SpotLight
+from .raster import Topology
+from .shadow import (
+    Frusta,
+    LightView,
+    ShadowMaps,
+    ShadowSettings,
+    cube_face,
+    cube_views,
+    directional_view,
+    filter_maps,
+    fit_frusta,
+    render_maps,
+    shape_bounds,
+    spot_view,
+    stack_views,
+    to_light_space,
+    visibility,
+)
+from .shadow.camera import of_map
+
+#: Spot lights with a wider cone (half-angle in degrees) use the faces of a cube.
+WIDEST_SPOT = 60.0
+
+
+@dataclass(frozen=True)
+class MapPlan:
+    """The maps of each light. Static, made once for a scene.
+
+    ``kinds``: ``directional``, ``spot`` (one map each) or ``cube`` (six). ``first``: number of each light's first map. ``planes``:
+    a face (index) of each planar shape, 0 for others. ``planar``: Bool (S,). ``center``, ``radius``: a sphere around the
+    scene at rest, world space, for the fixed frusta of ``compat``.
+    """
+
+    kinds: tuple[str, ...]
+    first: tuple[int, ...]
+    planes: Any
+    planar: Any
+    center: tuple[float, float, float]
+    radius: float
+
+
+def plan_maps(lights: Sequence[Light], geometry: Geometry) -> MapPlan:
+    """Decide (on the host, once) which maps the lights need and what is known about the shapes."""
+    kinds = tuple(_kind_of(light) for light in lights)
+    sizes = [6 if kind == "cube" else 1 for kind in kinds]
+    positions = dr.detach(geometry.positions).numpy().reshape(-1, 3)
+    faces = geometry.faces.numpy().reshape(-1, 3)
+    planes = []
+    for info in geometry.shapes:
+        own = positions[faces[info.face_start : info.face_start + info.face_count]]
+        area = np.linalg.norm(np.cross(own[:, 1] - own[:, 0], own[:, 2] - own[:, 0]), axis=1)
+        planes.append(info.face_start + int(np.argmax(area)))
+    low, high = positions.min(0), positions.max(0)
+    center = 0.5 * (low + high)
+    return MapPlan(
+        kinds,
+        tuple(int(n) for n in np.cumsum([0, *sizes])[:-1]),
+        mi.UInt32(planes),
+        mi.Bool([info.planar for info in geometry.shapes]),
+        tuple(float(c) for c in center),
+        float(np.linalg.norm(positions - center, axis=1).max()) or 1.0,
+    )
+
+
+def _kind_of(light: Light) -> str:
+    if isinstance(light, DirectionalLight):
+        return "directional"
+    if isinstance(light, PointLight):
+        return "cube"
+    return "spot" if float(dr.max(dr.detach(light.cutoff_angle))[0]) <= WIDEST_SPOT else "cube"
+
+
+def make_maps(
+    plan: MapPlan,
+    lights: Sequence[Light],
+    geometry: Geometry,
+    topology: Topology,
+    settings: ShadowSettings,
+    previous: Frusta | None,
+) -> ShadowMaps:
+    """Render and filter the maps of all lights as one batch. Attached to lights and vertices."""
+    views = [view for light, kind in zip(lights, plan.kinds, strict=True) for view in _views(plan, light, kind, settings)]
+    stacked = stack_views(views)
+    count, vertices = len(views), geometry.vertex_count
+    lane = dr.arange(mi.UInt32, count * vertices)
+    map_index = lane // vertices if count > 1 else mi.UInt32(0)
+    vertex = lane - map_index * vertices
+    p_world = dr.gather(mi.Point3f, geometry.positions, vertex)
+    lanes = map_index if count > 1 else dr.zeros(mi.UInt32, vertices)
+    p_light = to_light_space(of_map(stacked, lanes, count), p_world)
+    if settings.compat:
+        frusta = _compat_frusta(plan, stacked)
+    else:
+        shapes = len(geometry.shapes)
+        shape = dr.gather(mi.UInt32, geometry.vertex_shape, vertex)
+        bounds = shape_bounds(stacked, p_light, lanes, shape, shapes)
+        frusta = fit_frusta(
+            stacked,
+            bounds,
+            _planes(plan, geometry),
+            plan.planar,
+            shapes,
+            settings.resolution,
+            settings.filter_size,
+            previous,
+        )
+    return filter_maps(render_maps(p_light, lanes, geometry.faces, topology, stacked, frusta, settings))
+
+
+def _views(plan: MapPlan, light: Light, kind: str, settings: ShadowSettings) -> tuple[LightView, ...]:
+    if kind == "cube":
+        return cube_views(mi.Point3f(light.position), settings.resolution, settings.filter_size)
+    if kind == "directional":
+        view = directional_view(mi.Vector3f(light.direction))
+        if not settings.compat:
+            return (view,)
+        # The authors' camera stands outside of the scene, facing its centre.
+        origin = mi.Point3f(*plan.center) - view.forward * (2 * plan.radius)
+        return (LightView(view.right, view.up, view.forward, origin, view.spread),)
+    assert isinstance(light, SpotLight)
+    matrix = light.to_world.matrix
+    right, up, forward = (dr.normalize(mi.Vector3f(matrix[0, k], matrix[1, k], matrix[2, k])) for k in range(3))
+    spread = dr.tan(dr.detach(light.cutoff_angle) * (math.pi / 180))
+    return (spot_view(light.position, right, up, forward, spread),)
+
+
+def _compat_frusta(plan: MapPlan, views: Any) -> Frusta:
+    """Fixed frusta that hold the whole scene, whatever moves in it."""
+    spread = dr.detach(views.spread)
+    zero = dr.zeros(mi.Float, views.count)
+    half = dr.select(spread > 0, spread, 1.2 * plan.radius)
+    return Frusta(zero, zero, half, half, zero + 0.01 * plan.radius, zero + 4 * plan.radius)
+
+
+def _planes(plan: MapPlan, geometry: Geometry) -> tuple[Any, Any]:
+    """(unit normal, point) of each planar shape where it is now, detached, world space."""
+    with dr.suspend_grad():
+        corners = dr.gather(mi.Vector3u, geometry.faces, plan.planes)
+        a, b, c = (dr.gather(mi.Point3f, dr.detach(geometry.positions), corners[k]) for k in range(3))
+        normal = dr.cross(b - a, c - a)
+        length = dr.norm(normal)
+        return normal / dr.select(length > 0, length, 1), a
+
+
+def light_visibility(maps: ShadowMaps, plan: MapPlan, light: Light, index: int, p_world: Any, active: Any) -> Any:
+    """Visibility (Float) of light number ``index`` from world-space points. Attached to points, casters and light."""
+    which: Any = plan.first[index]
+    if plan.kinds[index] == "cube":
+        offset = dr.detach(mi.Vector3f(p_world - light.position))
+        which = plan.first[index] + cube_face(offset)
+    return visibility(maps, which, p_world, active)

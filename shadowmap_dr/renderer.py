@@ -1,0 +1,292 @@
+"""The passes in order: shadow maps, G-buffer, shading, anti-aliasing. The functional path, and the core of the plug-in."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from .aovs import AOVS, collect_aovs
+from .camera_pass import camera_clip, footprint_points, within_far_plane
+from .errors import ShadowmapError
+from .geometry import Geometry
+from .light_maps import MapPlan, light_visibility, make_maps, plan_maps
+from .lights import Light
+from .raster import RasterOutput, Topology, antialias, build_topology, rasterize
+from .scene import SceneData, load, refresh
+from .sensors import Sensor
+from .shading import Surface, ambient_light, background, direct_light, surface
+from .shadow import Frusta, ShadowSettings
+
+# Directions over which the light of environments is summed.
+_AMBIENT_DIRECTIONS = 16
+
+
+@dataclass(frozen=True)
+class RenderSettings:
+    """How a scene is rendered.
+
+    Attributes:
+        shadow: see :class:`ShadowSettings`.
+        antialias: anti-alias silhouettes in the image; without it they have no gradient.
+        ambient: radiance of unshadowed light that arrives from everywhere, beside that of the scene's environment.
+        hide_emitters: environments light the scene, but are not seen themselves.
+        shadow_samples: look-ups along each side of a pixel's footprint (``samples ** 2`` in all), or 0 for 2 where the image is not
+            larger than the shadow map and 1 otherwise.
+        aovs: names of further channels, see :data:`shadowmap_dr.aovs.AOVS`.
+    """
+
+    shadow: ShadowSettings = field(default_factory=ShadowSettings)
+    antialias: bool = True
+    ambient: float = 0.0
+    hide_emitters: bool = False
+    shadow_samples: int = 0
+    aovs: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in self.aovs:
+            if name not in AOVS:
+                raise ShadowmapError(f"There is no AOV '{name}': choose from {', '.join(AOVS)}.")
+        if not 0 <= self.shadow_samples <= 8:
+            raise ShadowmapError(f"shadow_samples is {self.shadow_samples}: choose 0 (automatic) to 8.")
+        if not (self.ambient >= 0 and self.ambient < float("inf")):
+            raise ShadowmapError(f"ambient is {self.ambient}: give a finite radiance of at least 0.")
+
+
+@dataclass
+class Renderer:
+    """Renders one scene again and again, with other vertices, lights or cameras.
+
+    A PyTree: pass it to functions decorated with ``dr.freeze``. A step touches neither Mitsuba's meshes nor its acceleration
+    structures. The only state is ``frusta``, the fit of the shadow maps: it stays as it is while the casters move within it.
+
+    Attributes:
+        data: records of the scene.
+        topology: edges of the merged mesh.
+        plan: which shadow maps there are.
+        settings: how to render.
+        frusta: fit of the shadow maps in the last rendering, None before the first.
+    """
+
+    data: SceneData
+    topology: Topology
+    plan: MapPlan
+    settings: RenderSettings
+    frusta: Frusta | None = None
+
+    @classmethod
+    def from_scene(
+        cls,
+        scene: Any,
+        *,
+        shadow_map_resolution: int = 256,
+        shadow_method: str = "vsm",
+        shadow_filter: str = "gaussian",
+        shadow_filter_size: int = 3,
+        shadow_antialias: bool = True,
+        compat: bool = False,
+        tessellation: int = 64,
+        **settings: Any,
+    ) -> Renderer:
+        """Build a renderer for a ``mi.Scene``.
+
+        The scene's meshes are read now, for the last time. ``settings`` are those of :class:`RenderSettings`, ``tessellation`` is the
+        number of triangles around spheres, disks and cylinders.
+
+        Raises:
+            ShadowmapError: what the scene has and this renderer does not support, by name; invalid settings.
+        """
+        try:
+            shadow = ShadowSettings(
+                method=shadow_method,
+                resolution=shadow_map_resolution,
+                filter=shadow_filter,
+                filter_size=shadow_filter_size,
+                antialias=shadow_antialias,
+                compat=compat,
+            )
+        except ValueError as error:
+            raise ShadowmapError(str(error)) from None
+        return cls.from_data(load(scene, tessellation=tessellation), RenderSettings(shadow, **settings))
+
+    @classmethod
+    def from_data(cls, data: SceneData, settings: RenderSettings) -> Renderer:
+        """Build a renderer for scene records."""
+        geometry = data.geometry
+        positions = dr.detach(geometry.positions).numpy()
+        topology = build_topology(geometry.faces.numpy(), positions, mi.UInt32)
+        renderer = cls(data, topology, plan_maps(data.lights, geometry), settings)
+        # The first fit is made here, so that a step which is recorded later always starts from one.
+        if renderer._has_shadows:
+            with dr.suspend_grad():
+                renderer._make_maps(geometry, data.lights)
+        return renderer
+
+    def with_data(self, data: SceneData) -> Renderer:
+        """The same renderer for re-read records (:func:`shadowmap_dr.scene.refresh`) of the same scene."""
+        return replace(self, data=data)
+
+    def refresh(self) -> Renderer:
+        """The same renderer with the scene's current vertices, lights and sensors, attached where they carry gradients."""
+        return self.with_data(refresh(self.data))
+
+    def render(
+        self,
+        vertex_positions: Mapping[str, Any] | None = None,
+        lights: Mapping[str, Light] | None = None,
+        sensor: int | Sensor = 0,
+        spp: int = 1,
+    ) -> Any:
+        """Render an image.
+
+        Args:
+            vertex_positions: new world-space vertices by the name of their shape: ``Float`` (3V,), tensor (V, 3) or ``Point3f``.
+            lights: new records by the name of the light (start from ``renderer.light(name)`` and ``dataclasses.replace``).
+            sensor: number of the scene's sensor, or a camera record.
+            spp: samples per pixel, a grid of ``ceil(sqrt(spp)) ** 2``, at most 16 x 16. Each is anti-aliased.
+
+        Returns:
+            ``mi.TensorXf`` (H, W, C): linear colour (1 or 3 channels, as the film), then alpha if the film has it, then the AOVs.
+            Attached to vertices, lights, cameras, and the BSDFs and textures of the scene.
+        """
+        geometry = self.data.geometry
+        if vertex_positions:
+            geometry = geometry.with_positions(vertex_positions)
+        current = self._lights(lights)
+        maps = self._make_maps(geometry, current) if self._has_shadows else None
+        cameras = self._sensors(sensor)
+        images = [self._camera_image(camera, geometry, current, maps, spp) for camera in cameras]
+        return images[0] if len(images) == 1 else _side_by_side(images)
+
+    def light(self, name: str) -> Light:
+        """Record of a light of the scene."""
+        return self.data.light(name)
+
+    @property
+    def _has_shadows(self) -> bool:
+        return self.settings.shadow.method != "none" and bool(self.plan.kinds)
+
+    def _lights(self, replacements: Mapping[str, Light] | None) -> tuple[Light, ...]:
+        for name in replacements or ():
+            old, new = self.data.light(name), replacements[name]
+            if type(old) is not type(new):
+                raise ShadowmapError(f"Light '{name}' is a {type(old).__name__}, not a {type(new).__name__}.")
+        return tuple((replacements or {}).get(light.name, light) for light in self.data.lights)
+
+    def _sensors(self, sensor: int | Sensor) -> tuple[Sensor, ...]:
+        if isinstance(sensor, Sensor):
+            return (sensor,)
+        if not 0 <= sensor < len(self.data.sensors):
+            raise ShadowmapError(f"There is no sensor {sensor}: the scene has {len(self.data.sensors)}, counted from 0.")
+        return self.data.sensors[sensor]
+
+    def _make_maps(self, geometry: Geometry, lights: tuple[Light, ...]) -> Any:
+        maps = make_maps(self.plan, lights, geometry, self.topology, self.settings.shadow, self.frusta)
+        self.frusta = maps.frusta
+        return maps
+
+    def _camera_image(self, sensor: Sensor, geometry: Geometry, lights: tuple[Light, ...], maps: Any, spp: int) -> Any:
+        factor = min(max(1, -(-int(spp**0.5 * 1000000) // 1000000)), 16)
+        width, height = sensor.width * factor, sensor.height * factor
+        clip = camera_clip(sensor, geometry, self.plan.center, self.plan.radius)
+        dr.eval(clip)
+        raster = rasterize(clip, geometry.faces, (height, width), check_indices=False)
+        active = raster.valid & within_far_plane(sensor, raster.w)
+        seen = surface(self.data, geometry, sensor, raster.triangle, raster.u, raster.v, active)
+        visible = [self._visibility(maps, light, k, seen, raster, sensor) for k, light in enumerate(lights)]
+        color = self._radiance(seen, lights, visible, sensor, raster)
+        channels = _film_channels(color, seen.active, sensor)
+        named = collect_aovs(self.settings.aovs, seen, raster, lights, visible)
+        if self.settings.antialias:
+            flat = _interleave(channels)
+            flat = antialias(flat, raster, clip, self.topology)
+            image = mi.TensorXf(flat, shape=(height, width, len(channels)))
+        else:
+            image = mi.TensorXf(_interleave(channels), shape=(height, width, len(channels)))
+        if named:
+            image = dr.concat([image, mi.TensorXf(_interleave(named), shape=(height, width, len(named)))], axis=2)
+        return _downsample(image, factor) if factor > 1 else image
+
+    def _visibility(self, maps: Any, light: Light, index: int, seen: Surface, raster: RasterOutput, sensor: Sensor) -> Any:
+        if maps is None:
+            return mi.Float(1)
+        samples = self.settings.shadow_samples or (2 if raster.width <= self.settings.shadow.resolution else 1)
+        size = (raster.width, raster.height)
+        points = footprint_points(sensor, size, raster.w, seen.p_world, seen.n_world, samples)
+        total = sum(light_visibility(maps, self.plan, light, index, p, seen.active) for p in points)
+        return total * (1 / len(points))
+
+    def _radiance(
+        self, seen: Surface, lights: tuple[Light, ...], visible: list[Any], sensor: Sensor, raster: RasterOutput
+    ) -> Any:
+        gate = not self.settings.shadow.compat
+        color = dr.zeros(mi.UnpolarizedSpectrum, dr.width(seen.shape))
+        for light, fraction in zip(lights, visible, strict=True):
+            color += direct_light(seen, light, fraction, gate=gate)
+        for environment in (*self.data.environments, *self._uniform_ambient()):
+            color += ambient_light(seen, environment, _AMBIENT_DIRECTIONS)
+        if not self.settings.hide_emitters:
+            for environment in self.data.environments:
+                sky = background(environment, sensor, raster.width, raster.height)
+                color = dr.select(seen.active, color, sky)
+        return color
+
+    def _uniform_ambient(self) -> tuple[Any, ...]:
+        return (_Uniform(self.settings.ambient),) if self.settings.ambient > 0 else ()
+
+
+@dataclass(frozen=True)
+class _Uniform:
+    """Constant radiance from all directions, beside the scene's own environment."""
+
+    value: float
+
+    def radiance(self, direction: Any, active: Any = True) -> Any:
+        return dr.select(active, mi.UnpolarizedSpectrum(self.value), 0)
+
+
+def _film_channels(color: Any, active: Any, sensor: Sensor) -> list[Any]:
+    channels = [color[k] for k in range(len(color))]
+    if sensor.channels == 1 and len(channels) == 3:
+        channels = [mi.luminance(color)]
+    elif sensor.channels == 3 and len(channels) == 1:
+        channels = channels * 3
+    if sensor.alpha:
+        channels.append(dr.select(active, mi.Float(1), 0))
+    return channels
+
+
+def _interleave(channels: list[Any]) -> Any:
+    """Flat pixel-interleaved buffer of some channels, all of the same width."""
+    if len(channels) == 1:
+        return channels[0]
+    if len(channels) == 3:
+        return dr.ravel(mi.Vector3f(*channels))
+    count = len(channels)
+    width = max(dr.width(c) for c in channels)
+    index = dr.arange(mi.UInt32, width) * count
+    result = dr.zeros(mi.Float, count * width)
+    for k, channel in enumerate(channels):
+        dr.scatter(result, channel, index + k)
+    return result
+
+
+def _downsample(image: Any, factor: int) -> Any:
+    """Average factor x factor blocks."""
+    height, width, channels = image.shape[0] // factor, image.shape[1] // factor, image.shape[2]
+    index = dr.arange(mi.UInt32, height * width * channels)
+    pixel, channel = index // channels, index % channels
+    row, column = pixel // width, pixel % width
+    total = dr.zeros(mi.Float, height * width * channels)
+    for j in range(factor):
+        for i in range(factor):
+            source = ((row * factor + j) * (width * factor) + column * factor + i) * channels + channel
+            total += dr.gather(mi.Float, image.array, source)
+    return mi.TensorXf(total * (1 / factor**2), shape=(height, width, channels))
+
+
+def _side_by_side(images: list[Any]) -> Any:
+    return dr.concat(images, axis=1)

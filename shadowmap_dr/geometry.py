@@ -69,8 +69,8 @@ class Geometry:
     positions      Float  (3V,)  world space, may carry gradients
     normals        Float  (3V,)  unit vertex normals, world space, may carry gradients; zero for shapes without
     texcoords      Float  (2V,)  zero for shapes without
-    rest_positions Float  (3V,)  positions as Mitsuba holds them, in the shape's own space, detached; None when no shape has
-                                 mesh attributes
+    rest_positions Float  (3V,)  positions as Mitsuba holds them, in the shape's own space, attached to Mitsuba's buffers (so that
+                                 these cancel where barycentrics are recovered); None when no shape has mesh attributes
     faces          UInt32 (3F,)  indices into the vertices of the whole soup
     face_shape     UInt32 (F,)   index of the shape
     vertex_shape   UInt32 (V,)

@@ -88,7 +88,7 @@ def load(scene: Any, *, tessellation: int = 64) -> SceneData:
         _check_surface(name, shape)
         vertex_start = infos[-1].vertex_start + infos[-1].vertex_count if infos else 0
         face_start = infos[-1].face_start + infos[-1].face_count if infos else 0
-        infos.append(_info_of(name, source, own_faces, vertex_start, face_start))
+        infos.append(describe(name, source, own_faces, vertex_start, face_start))
         sources.append(source)
         faces.append(own_faces + np.uint32(vertex_start))
     if not infos:
@@ -129,7 +129,7 @@ def refresh(data: SceneData) -> SceneData:
     buffers = [_vertex_buffers(source, info) for source, info in zip(data.sources, data.geometry.shapes, strict=True)]
     positions, normals, texcoords, rest = (dr.concat(list(parts)) for parts in zip(*buffers, strict=True))
     # Not an empty array: one among the arguments of a frozen function ends the process (Dr.Jit 1.5).
-    rest = dr.detach(rest) if any(info.reads_attributes for info in data.geometry.shapes) else None
+    rest = rest if any(info.reads_attributes for info in data.geometry.shapes) else None
     geometry = replace(data.geometry, positions=positions, normals=normals, texcoords=texcoords, rest_positions=rest)
     return replace(
         data,
@@ -209,8 +209,8 @@ def _check_surface(name: str, shape: Any) -> None:
         )
 
 
-def _info_of(name: str, source: ShapeSource, faces: np.ndarray, vertex_start: int, face_start: int) -> ShapeInfo:
-    """Validate the buffers of a shape and describe them."""
+def describe(name: str, source: ShapeSource, faces: np.ndarray, vertex_start: int, face_start: int) -> ShapeInfo:
+    """Validate the buffers of a shape, with ``faces`` (F, 3), and describe it; it will start at the given vertex and face."""
     shape, is_mesh = source.shape, source.local_positions is None
     if is_mesh:
         _, positions, normals, texcoords = mesh_buffers(shape)

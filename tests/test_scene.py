@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from shadowmap_dr import ShadowmapError, assets
-from shadowmap_dr.scene import load, refresh
+from shadowmap_dr.scene import ShapeSource, describe, load, refresh
 from shadowmap_dr.shading import surface
 
 EXAMPLES = ["pose", "gallery", "still_life", "pavilion", "meadow"]
@@ -170,6 +170,15 @@ def test_broken_meshes_are_named(variant: str) -> None:
     nan = triangle_mesh([0, 0, 0, 1, float("nan"), 0, 0, 1, 0], [0, 1, 2])
     with pytest.raises(ShadowmapError, match="Vertex 1 of shape 'broken'"):
         load(mi.load_dict({"type": "scene", "broken": nan}, optimize=False))
+
+
+def test_faces_out_of_range_and_empty_meshes_are_named(variant: str) -> None:
+    """On the buffers themselves: Mitsuba would read beyond the end of its own before one could load such a mesh."""
+    source = ShapeSource(triangle_mesh([0, 0, 0, 1, 0, 0, 0, 1, 0], [0, 1, 2]), None)
+    with pytest.raises(ShadowmapError, match="Face 1 of shape 'broken' refers to vertex 3.* 3 vertices"):
+        describe("broken", source, np.array([[0, 1, 2], [0, 1, 3]], np.uint32), 0, 0)
+    with pytest.raises(ShadowmapError, match="'broken' is an empty mesh"):
+        describe("broken", source, np.zeros((0, 3), np.uint32), 0, 0)
 
 
 def test_unsupported_things_are_named(variant: str) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from shadowmap_dr.geometry import NO_TRIANGLE, Geometry
-from shadowmap_dr.scene import SceneData, load
+from shadowmap_dr.scene import SceneData, load, refresh
 from shadowmap_dr.shading import ambient_light, background, direct_light, opacity, surface
 
 SIZE = 48
@@ -165,6 +165,27 @@ def test_mesh_attribute_and_moved_mesh(variant: str) -> None:
     assert np.allclose(direct_light(surface(data, moved, sensor, triangle, u, v), sun).numpy(), still.numpy(), atol=1e-4)
 
 
+def test_mesh_attribute_ignores_rigid_motion_of_mitsubas_mesh(variant: str) -> None:
+    """With barycentrics fixed, vertex colours do not depend on where the vertices are, whoever moves them."""
+    mesh = bumpy_mesh("mesh", normals=True, texcoords=False, attribute=True)
+    mesh.set_bsdf(mi.load_dict({"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_paint"}}))
+    scene = mi.load_dict(base_scene(mesh=mesh), optimize=False)
+    data = load(scene)
+    triangle, u, v, _ = primary_hits(scene, data)
+    params = mi.traverse(scene)
+    x, y = mi.Float(0.0), mi.Float(0.0)
+    dr.enable_grad(x, y, u)
+    positions = dr.unravel(mi.Point3f, params["mesh.vertex_positions"]) + mi.Vector3f(x, 0, 0)
+    params["mesh.vertex_positions"] = dr.ravel(positions)
+    params.update()
+    data = refresh(data)
+    geometry = data.geometry.with_positions({"mesh": data.geometry.shape_positions("mesh") + mi.Vector3f(y, 0, 0)})
+    seen = surface(data, geometry, data.sensors[0][0], triangle, u, v)
+    dr.backward(dr.sum(seen.bsdf.eval_diffuse_reflectance(seen.si, seen.active).x))
+    assert np.allclose([x.grad[0], y.grad[0]], 0, atol=1e-3)
+    assert np.abs(u.grad.numpy()).max() > 0.1
+
+
 @pytest.mark.parametrize("flip", [False, True])
 def test_flipped_normals_and_instances(variant: str, flip: bool) -> None:
     # Only similarities: under other transforms, Mitsuba 3.9's ``si.n`` of an instance is not orthogonal to its surface.
@@ -172,7 +193,7 @@ def test_flipped_normals_and_instances(variant: str, flip: bool) -> None:
     two = {"type": "twosided", "bsdf": BSDFS["roughconductor"]()}
     group = {
         "type": "shapegroup",
-        "box": {"type": "cube", "flip_normals": flip, "bsdf": two},
+        "box": {"type": "cube", "flip_normals": flip, "bsdf": two, "to_world": transform().translate([0.5, 0, 0.4]).scale(0.4)},
         "mesh": bumpy_mesh("mesh", normals=True, texcoords=True),
     }
     place = {
@@ -185,9 +206,33 @@ def test_flipped_normals_and_instances(variant: str, flip: bool) -> None:
     }
     floor = {"type": "rectangle", "flip_normals": flip, "to_world": transform().translate([0, 0, -0.5]).scale(3), "bsdf": two}
     scene = mi.load_dict(base_scene(group=group, floor=floor, **instances), optimize=False)
-    names = {info.name for info in load(scene).geometry.shapes}
+    data = load(scene)
+    names = {info.name for info in data.geometry.shapes}
     assert names == {"left.box", "left.mesh", "mirrored.box", "mirrored.mesh", "floor"}
+    triangle = primary_hits(scene, data)[0]
+    assert len(np.unique(dr.gather(mi.UInt32, data.geometry.face_shape, triangle).numpy())) == 5  # all are in view
     assert_agrees_with_mitsuba(scene)
+
+
+def test_mesh_attribute_of_an_instance(variant: str) -> None:
+    """Against the attribute itself: Mitsuba 3.9 looks up the barycentrics of an instance's *world* position in its local mesh."""
+    mesh = bumpy_mesh("mesh", normals=True, texcoords=True, attribute=True)
+    mesh.set_bsdf(mi.load_dict({"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_paint"}}))
+    placed = {
+        "type": "instance",
+        "to_world": mi.ScalarTransform4f().translate([0.2, 0.1, 0]).rotate([0, 0.6, 0.8], 30),
+        "shapegroup": {"type": "ref", "id": "group"},
+    }
+    scene = mi.load_dict(base_scene(group={"type": "shapegroup", "mesh": mesh}, placed=placed), optimize=False)
+    data = load(scene)
+    triangle, u, v, _ = primary_hits(scene, data)
+    seen = surface(data, data.geometry, data.sensors[0][0], triangle, u, v)
+    hit = seen.active.numpy()
+    face = mesh.faces_buffer().numpy().reshape(-1, 3)[triangle.numpy()[hit]]
+    colour = mesh.attribute_buffer("vertex_paint").numpy().reshape(-1, 3)[face]
+    weight = np.stack([1 - u.numpy() - v.numpy(), u.numpy(), v.numpy()], -1)[hit]
+    expected = np.einsum("fvc,fv->cf", colour, weight)
+    assert np.allclose(seen.bsdf.eval_diffuse_reflectance(seen.si).numpy()[:, hit], expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("kind", ["orthographic", "batch", "merged", "mono"])
@@ -336,7 +381,9 @@ def test_frozen_step_records_once(variant: str) -> None:
     mesh = bumpy_mesh("mesh", normals=True, texcoords=True)
     mesh.set_bsdf(mi.load_dict(BSDFS["principled"]()))
     floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -0.5]).scale(3)}
-    scene = mi.load_dict(base_scene(mesh=mesh, floor=floor), optimize=False)
+    slide = {"type": "spot", "texture": bitmap(5), "to_world": mi.ScalarTransform4f().look_at([0, 1, 3], [0, 0, 0], [0, 1, 0])}
+    sky = {"type": "envmap", "bitmap": pixels(7, (8, 16, 3))}
+    scene = mi.load_dict(base_scene(mesh=mesh, floor=floor, slide=slide, sky=sky), optimize=False)
     data = load(scene)
     triangle, u, v, _ = primary_hits(scene, data)
 
@@ -348,6 +395,8 @@ def test_frozen_step_records_once(variant: str) -> None:
         image = direct_light(seen, replace(sun, direction=direction), 0.5)
         for light in others:
             image += direct_light(seen, light)
+        (sky,) = data.environments
+        image += ambient_light(seen, sky, 2) + dr.select(seen.active, 0.0, background(sky, data.sensors[0][0]))
         loss = dr.sum(dr.squared_norm(image))
         dr.backward(loss)
         return loss, positions.grad, direction.grad

@@ -247,6 +247,7 @@ def describe(name: str, source: ShapeSource, faces: np.ndarray, vertex_start: in
         flip_shading=flipped,
         reads_attributes=is_mesh and shape.has_mesh_attributes(),
         planar=_is_planar(points),
+        see_through=mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null),
     )
 
 

@@ -7,7 +7,7 @@ topmost row of Mitsuba's film, at y = -w.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -141,20 +141,6 @@ class Sensor:
         linear = mi.Matrix3f(self.to_world.matrix)
         return dr.normalize(mi.Vector3f(linear @ mi.Vector3f(x, y, 1.0)))
 
-    def with_depth_range(self, positions: Any) -> Sensor:
-        """This camera with near and far moved close around the given vertices (Float (3V,), world space), detached.
-
-        Mitsuba's defaults (0.01 and 10,000) waste float32 depth. Nothing that was visible is cut: where a vertex lies
-        behind the near plane the old near plane stays. No value is read back, so this works in a frozen function.
-        """
-        depth = _camera_depth(dr.detach(self.view), dr.detach(positions))
-        nearest, farthest = dr.min(depth), dr.max(depth)
-        margin = 1e-3 * dr.maximum(dr.abs(farthest), dr.abs(nearest)) + 1e-6
-        near = dr.maximum(dr.detach(mi.Float(self.near)), nearest - margin)
-        far = dr.minimum(dr.detach(mi.Float(self.far)), farthest + margin)
-        # With everything behind the camera there is nothing to see; the range must stay valid all the same.
-        return replace(self, near=near, far=dr.maximum(far, near * 1.001 + 1e-6))
-
 
 def sensors_of(sensor: Any) -> tuple[Sensor, ...]:
     """Records of a ``mi.Sensor``: one, or for a batch sensor one for each camera in it, left to right."""
@@ -204,8 +190,3 @@ def _sensor_of(sensor: Any, film: Any, film_column: int) -> Sensor:
         filter_radius=float(film.rfilter().radius()),
         film_column=film_column,
     )
-
-
-def _camera_depth(view: Any, positions: Any) -> Any:
-    p_world = dr.unravel(mi.Point3f, positions)
-    return view[2, 0] * p_world.x + view[2, 1] * p_world.y + view[2, 2] * p_world.z + view[2, 3]

@@ -116,8 +116,11 @@ def direct_light(surface: Surface, light: Light, visibility: Any = 1.0, *, gate:
     wo = surface.si.to_local(wo_world)
     active = mi.Bool(surface.active)
     if gate:
-        # On the same side of the triangle and of the shading normal's plane: holds for reflection and transmission.
-        active &= dr.dot(surface.n_world, wo_world) * wo.z > 0
+        # Light and viewer lie on the same side of the triangle exactly where they lie on the same side by the shading normal.
+        # Holds for reflection and transmission, and for triangles whose vertex normals point the other way.
+        wi = surface.si.wi
+        sides = dr.dot(surface.n_world, wo_world) * dr.dot(surface.n_world, surface.si.to_world(wi))
+        active &= (sides > 0) == (wo.z * wi.z > 0)
     value = surface.bsdf.eval(mi.BSDFContext(), surface.si, wo, active)
     return dr.select(active, mi.UnpolarizedSpectrum(value) * weight * visibility, 0.0)
 

@@ -33,6 +33,7 @@ def test_example_scenes(variant: str, name: str, optimize: bool) -> None:
         assert faces[own].min() >= info.vertex_start and faces[own].max() < info.vertex_start + info.vertex_count
         assert np.all(geometry.vertex_shape.numpy()[faces[own]] == index)
     assert len({info.name for info in geometry.shapes}) == len(geometry.shapes)
+    assert any(info.see_through for info in geometry.shapes) == (name == "meadow")
     p = geometry.positions.numpy().reshape(-1, 3)
     # The bounding box of a merged scene is too small in Mitsuba 3.9.
     box = mi.load_file(str(assets.scene(name)), optimize=False, resolution=32).bbox()

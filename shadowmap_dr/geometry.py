@@ -34,8 +34,8 @@ class ShapeInfo:
     ``vertex_start .. vertex_start + vertex_count`` and faces ``face_start .. face_start + face_count`` of the soup.
     ``flip_geometric`` says that its geometric normal is *minus* (p1 - p0) x (p2 - p0), ``flip_shading`` that vertex normals
     are negated before use. ``reads_attributes``: it has mesh attributes, which Mitsuba finds through rest-pose positions.
-    ``planar``: all its vertices lay in one plane when the scene was loaded. ``see_through``: its BSDF (``mask``, ``null``) lets some
-    light pass straight on, as ``shading.opacity`` tells for each point.
+    ``planar``: all its vertices lay in one plane when the scene was loaded. ``see_through``: its BSDF (``mask``, ``null``) lets
+    some light pass straight on, as ``shading.opacity`` tells for each point.
     """
 
     name: str

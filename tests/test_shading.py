@@ -415,6 +415,31 @@ def test_frozen_step_records_once(variant: str) -> None:
         assert np.allclose(ours.numpy(), reference.numpy(), rtol=1e-3, atol=1e-4 * np.abs(reference.numpy()).max())
 
 
+def test_frozen_step_with_texture_gradient(variant: str) -> None:
+    """Scene parameters change outside of the frozen function, which differentiates all the same and is not recorded again."""
+    _, _, (_, scene, data) = gradient_case("texture")
+    triangle, u, v, _ = primary_hits(scene, data)
+    params = mi.traverse(scene)
+
+    def step(data: SceneData, triangle: Any, u: Any, v: Any) -> Any:
+        seen = surface(data, data.geometry, data.sensors[0][0], triangle, u, v)
+        loss = dr.sum(dr.squared_norm(direct_light(seen, data.light("sun"))))
+        dr.backward(loss)
+        return loss
+
+    frozen = dr.freeze(step)
+    for i in range(5):
+        pictures = [mi.TensorXf(np.random.default_rng(i).random((8, 8, 3)).astype(np.float32)) for _ in range(2)]
+        for picture, function in zip(pictures, (frozen, step), strict=True):
+            dr.enable_grad(picture)
+            params["mesh.bsdf.base_color.data"] = picture
+            params.update()
+            function(data, triangle, u, v)
+        assert np.abs(pictures[1].grad.numpy()).max() > 0.1
+        assert np.allclose(pictures[0].grad.numpy(), pictures[1].grad.numpy(), rtol=1e-3, atol=1e-3)
+    assert frozen.n_recordings == 1
+
+
 def test_steps_need_no_ray_tracing(variant: str, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = mi.load_dict(base_scene(mesh=bumpy_mesh("mesh", normals=True, texcoords=True)), optimize=False)
     data = load(scene)

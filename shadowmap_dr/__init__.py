@@ -4,10 +4,13 @@ from . import _llvm
 
 _llvm.ensure()  # before anything imports mitsuba or drjit
 
+from . import integrator  # noqa: E402
 from .errors import ShadowmapError  # noqa: E402
 from .renderer import Renderer, RenderSettings  # noqa: E402
 from .shadow import ShadowSettings  # noqa: E402
 
 __version__ = "0.1.0"
+
+integrator.install()  # the plug-in `shadowmap`, in this variant and all that will be set
 
 __all__ = ["RenderSettings", "Renderer", "ShadowSettings", "ShadowmapError", "__version__"]

@@ -1,0 +1,356 @@
+"""The Mitsuba plug-in ``shadowmap``: a thin shell over :class:`shadowmap_dr.Renderer`.
+
+``import shadowmap_dr`` registers it for every variant ``*_ad_rgb`` and ``*_ad_mono`` that is or will be set; in others, loading it
+raises a ``ShadowmapError``. The module itself holds no types of a variant and no state: what a scene needs once (topology, the
+plan of its shadow maps, their frusta) lives in the integrator that renders it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from .aovs import aov_names
+from .errors import ShadowmapError
+from .renderer import Renderer, RenderSettings
+from .scene import SceneData, load
+from .sensors import Sensor, sensors_of
+from .shadow import ShadowSettings
+from .traversal import mesh_buffers, parameters
+
+PLUGIN = "shadowmap"
+
+# Names that Mitsuba's own `aov` integrator has for channels of ours.
+_SYNONYMS = {"sh_normal": "normal"}
+# Scenes that one integrator remembers; each holds the scene's shapes in memory.
+_REMEMBERED = 4
+
+
+@dataclass(frozen=True)
+class Options:
+    """Parameters of the plug-in, as in XML or a dictionary.
+
+    shadow_map_resolution  texels along each side of a shadow map, 1 to 4096
+    shadow_method          ``vsm``, ``standard`` (no gradients of shadows) or ``none`` (no shadows)
+    shadow_filter          ``box``, ``gaussian``, ``wendland`` or ``none``
+    shadow_filter_size     odd number of texels
+    shadow_antialias       anti-alias shadow maps; without it casters get no gradient from the outlines of their shadows
+    shadow_samples         look-ups along each side of a pixel, 1 to 8; 0 chooses
+    antialias              anti-alias the image; without it outlines have no gradient
+    ambient                radiance of unshadowed light from all directions, beside that of the scene's environment
+    hide_emitters          environments light the scene, but are not seen themselves
+    aovs                   further channels, separated by commas: names of ``shadowmap_dr.aovs.AOVS``, or ``label:name`` to call the
+                           channel ``label``
+    tessellation           triangles around spheres, disks and cylinders, at least 3
+    compat                 conventions of Worchel and Alexa's code
+    """
+
+    shadow_map_resolution: int = 256
+    shadow_method: str = "vsm"
+    shadow_filter: str = "gaussian"
+    shadow_filter_size: int = 3
+    shadow_antialias: bool = True
+    shadow_samples: int = 0
+    antialias: bool = True
+    ambient: float = 0.0
+    hide_emitters: bool = False
+    aovs: str = ""
+    tessellation: int = 64
+    compat: bool = False
+
+    @classmethod
+    def from_properties(cls, props: Any) -> Options:
+        """Read ``mi.Properties``. Raises ShadowmapError for an unknown parameter or a value of another type."""
+        defaults = {f.name: f.default for f in fields(cls)}
+        values = {}
+        for name in props.keys():  # noqa: SIM118  (Properties is no dictionary)
+            if name not in defaults:
+                raise ShadowmapError(f"'{PLUGIN}' has no parameter '{name}': it has {', '.join(sorted(defaults))}.")
+            values[name] = _typed(name, props[name], type(defaults[name]))
+        return cls(**values)
+
+    @property
+    def labelled_aovs(self) -> tuple[tuple[str, str], ...]:
+        """(label, name) of each further channel."""
+        pairs = []
+        for entry in filter(None, (part.strip() for part in self.aovs.split(","))):
+            label, _, name = entry.rpartition(":")
+            name = name.strip()
+            pairs.append((label.strip() or name, _SYNONYMS.get(name, name)))
+        labels = [label for label, _ in pairs]
+        for label in labels:
+            if labels.count(label) > 1:
+                raise ShadowmapError(f"aovs is {self.aovs!r}: '{label}' is there twice; label one of them, as in a:depth.")
+        return tuple(pairs)
+
+    def render_settings(self) -> RenderSettings:
+        """The same as the renderer wants it. Raises ShadowmapError for values out of range."""
+        if self.tessellation < 3:
+            raise ShadowmapError(f"tessellation is {self.tessellation}: spheres need at least 3 triangles around them.")
+        try:
+            shadow = ShadowSettings(
+                method=self.shadow_method,
+                resolution=self.shadow_map_resolution,
+                filter=self.shadow_filter,
+                filter_size=self.shadow_filter_size,
+                antialias=self.shadow_antialias,
+                compat=self.compat,
+            )
+        except ValueError as error:
+            raise ShadowmapError(str(error)) from None
+        return RenderSettings(
+            shadow=shadow,
+            antialias=self.antialias,
+            ambient=self.ambient,
+            hide_emitters=self.hide_emitters,
+            shadow_samples=self.shadow_samples,
+            aovs=tuple(name for _, name in self.labelled_aovs),
+        )
+
+
+def _typed(name: str, value: Any, kind: type) -> Any:
+    # A bool is an int to Python, not to us; and numbers may be written without a decimal point.
+    if type(value) is kind:
+        return value
+    if kind is float and type(value) is int:
+        return float(value)
+    words = {int: "an integer", float: "a number", bool: "a boolean", str: "a string"}
+    shown = repr(value) if isinstance(value, bool | int | float | str) else type(value).__name__
+    raise ShadowmapError(f"'{name}' of '{PLUGIN}' is {shown}, but must be {words[kind]}.")
+
+
+@dataclass
+class SceneRenderer:
+    """What stays the same between renderings of a scene.
+
+    The scene itself is not kept: it may own the integrator that owns this record.
+
+    parts     shapes, BSDFs and emitters of the scene; kept alive here, so that comparing them by identity is safe
+    statics   arrays that decided on the topology and on the shadow maps: faces, and the cutoff angles of spot lights
+    sizes     number of vertices of each shape
+    lights    names of the lights
+    renderer  without what is re-read for each rendering
+    """
+
+    parts: tuple[Any, ...]
+    statics: tuple[Any, ...]
+    sizes: tuple[int, ...]
+    lights: tuple[str, ...]
+    renderer: Renderer
+
+    @classmethod
+    def build(cls, scene: Any, options: Options, settings: RenderSettings) -> SceneRenderer:
+        """Read a scene. Raises ShadowmapError for what is not supported."""
+        with dr.suspend_grad():
+            renderer = Renderer.from_data(load(scene, tessellation=options.tessellation), settings)
+        data = renderer.data
+        lights = tuple(light.name for light in data.lights)
+        return cls(_parts(scene, data), _statics(scene, data), _sizes(data), lights, renderer.with_data(_without_scene(data)))
+
+    def matches(self, scene: Any) -> bool:
+        """Whether this record was made for the scene; it is none the worse for moved vertices or other parameter values."""
+        data = self.renderer.data
+        if not _same_objects(self.parts, _parts(scene, data)) or self.sizes != _sizes(data):
+            return False
+        statics = _statics(scene, data)
+        if not _same_arrays(self.statics, statics):
+            return False
+        self.statics = statics
+        return True
+
+    def render(self, scene: Any, sensor: tuple[Sensor, ...], spp: int) -> Any:
+        """Image (mi.TensorXf), attached to the scene's parameters unless gradients are suspended."""
+        current = self.renderer.with_data(replace(self.renderer.data, scene=scene)).refresh()
+        current = current.with_data(replace(current.data, sensors=(sensor,)))
+        image = current.render(spp=spp)
+        # Refitting for the same vertices and lights keeps the frusta as they are: the derivatives of a step see those of its image.
+        self.renderer.frusta = current.frusta
+        return image
+
+
+def _parts(scene: Any, data: SceneData) -> tuple[Any, ...]:
+    bsdfs = [source.shape.bsdf() for source in data.sources]
+    return (*scene.shapes(), *scene.emitters(), *bsdfs)
+
+
+def _statics(scene: Any, data: SceneData) -> tuple[Any, ...]:
+    faces = [mesh_buffers(source.shape)[0] for source in data.sources if isinstance(source.shape, mi.Mesh)]
+    cones = [e for e in scene.emitters() if e.class_name() == "SpotLight"]
+    return (*faces, *(dr.detach(mi.Float(parameters(cone)["cutoff_angle"])) for cone in cones))
+
+
+def _sizes(data: SceneData) -> tuple[int, ...]:
+    meshes = (source.shape for source in data.sources if isinstance(source.shape, mi.Mesh))
+    return tuple(size for mesh in meshes for size in (mesh.vertex_count(), mesh.face_count()))
+
+
+def _without_scene(data: SceneData) -> SceneData:
+    """Drop what ``refresh`` reads again."""
+    geometry = replace(data.geometry, positions=None, normals=None, texcoords=None, rest_positions=None)
+    return replace(data, scene=None, geometry=geometry, sensors=(), lights=(), environments=())
+
+
+def _same_objects(first: tuple[Any, ...], second: tuple[Any, ...]) -> bool:
+    return len(first) == len(second) and all(a is b for a, b in zip(first, second, strict=True))
+
+
+def _same_arrays(first: tuple[Any, ...], second: tuple[Any, ...]) -> bool:
+    """Equality of arrays that are read back only if they are not the very same."""
+    if len(first) != len(second):
+        return False
+    for a, b in zip(first, second, strict=True):
+        if a.index != b.index and (len(a) != len(b) or not dr.all(a == b)):
+            return False
+    return True
+
+
+@dataclass
+class Shell:
+    """The integrator without Mitsuba's base class: the same for all variants."""
+
+    options: Options
+    settings: RenderSettings
+    scenes: list[SceneRenderer] = field(default_factory=list)
+    light_names: tuple[str, ...] = ()
+
+    @classmethod
+    def from_properties(cls, props: Any) -> Shell:
+        """Read and check the parameters."""
+        options = Options.from_properties(props)
+        return cls(options, options.render_settings())
+
+    def image(self, scene: Any, sensor: Any, spp: int) -> Any:
+        """Attached image. ``spp`` 0 means not given: one sample, anti-aliased."""
+        if spp < 0:
+            raise ShadowmapError(f"spp is {spp}: give a positive number, or 0 for one anti-aliased sample.")
+        record = self._record(scene)
+        self.light_names = record.lights
+        return record.render(scene, sensors_of(sensor), spp or 1)
+
+    def channel_names(self) -> list[str]:
+        """Names of the further channels, in order; those of ``visibility`` follow the lights of the scene rendered last."""
+        names = []
+        for label, name in self.options.labelled_aovs:
+            names += [label + channel[len(name) :] for channel in aov_names((name,), list(self.light_names))]
+        return names
+
+    def _record(self, scene: Any) -> SceneRenderer:
+        for record in self.scenes:
+            if record.matches(scene):
+                break
+        else:
+            record = SceneRenderer.build(scene, self.options, self.settings)
+        self.scenes = [record, *(other for other in self.scenes if other is not record)][:_REMEMBERED]
+        return record
+
+
+def sensor_of(scene: Any, sensor: Any) -> Any:
+    """The ``mi.Sensor`` meant by a number or an object."""
+    if not isinstance(sensor, int):
+        return sensor
+    sensors = scene.sensors()
+    if not -len(sensors) <= sensor < len(sensors):
+        raise ShadowmapError(f"There is no sensor {sensor}: the scene has {len(sensors)}, counted from 0.")
+    return sensors[sensor]
+
+
+def make_class() -> type:
+    """The integrator class for the current variant, whose base class is made anew for each."""
+    from mitsuba.ad.integrators.common import ADIntegrator
+
+    class ShadowMapIntegrator(ADIntegrator):
+        """Renders and differentiates with shadow maps. Parameters: :class:`Options`.
+
+        ``spp`` not given (0) means one anti-aliased sample for each pixel; otherwise a grid of ``ceil(sqrt(spp)) ** 2``, at most
+        16 x 16. The scene's sampler, its sample count and the film's reconstruction filter are not used; ``seed`` changes nothing.
+        """
+
+        def __init__(self, props: Any) -> None:
+            self.shell = Shell.from_properties(props)
+            super().__init__(props)
+
+        def render(
+            self, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, develop: bool = True, evaluate: bool = True
+        ) -> Any:
+            """Image (H, W, C) without gradients. Unless called through ``mi.render``, it is put into the sensor's film too."""
+            sensor = sensor_of(scene, sensor)
+            with dr.suspend_grad():
+                image = self.shell.image(scene, sensor, spp)
+                if evaluate or not develop:
+                    put_into_film(sensor.film(), image, self.aov_names())
+            return image if develop else mi.TensorXf()
+
+        def render_forward(self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> Any:
+            """Derivative of the image (H, W, C) in the direction of the gradients that the parameters hold."""
+            with dr.resume_grad():
+                image = self.shell.image(scene, sensor_of(scene, sensor), spp)
+                if not dr.grad_enabled(image):
+                    return dr.zeros(mi.TensorXf, image.shape)
+                dr.forward_to(image)
+                return dr.grad(image)
+
+        def render_backward(
+            self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0
+        ) -> None:
+            """Add the gradients of <image, grad_in> to the parameters."""
+            with dr.resume_grad():
+                image = self.shell.image(scene, sensor_of(scene, sensor), spp)
+                if dr.grad_enabled(image):
+                    dr.set_grad(image, grad_in)
+                    dr.enqueue(dr.ADMode.Backward, image)
+                    dr.traverse(dr.ADMode.Backward)
+            dr.eval()
+
+        def aov_names(self) -> list[str]:
+            """Names of the channels after colour and alpha."""
+            return self.shell.channel_names()
+
+        def to_string(self) -> str:
+            return f"ShadowMapIntegrator[{', '.join(f'{k}={v!r}' for k, v in vars(self.shell.options).items())}]"
+
+    return ShadowMapIntegrator
+
+
+def put_into_film(film: Any, image: Any, aovs: list[str]) -> None:
+    """Make ``film.develop()``, ``film.bitmap()`` and ``film.write()`` give this image (detached)."""
+    film.prepare(aovs)
+    base = film.base_channels_count()
+    alpha = base in (2, 4)
+    colour = [image[..., k : k + 1] for k in range(base - alpha)]
+    # A film stores three colours, even if it is to give luminance, then alpha, then the weight that it divides by.
+    planes = colour * 3 if len(colour) == 1 else colour
+    planes += [image[..., base - 1 : base]] if alpha else []
+    planes += [dr.ones(mi.TensorXf, (*image.shape[:2], 1))]
+    planes += [image[..., base:]] if image.shape[2] > base else []
+    block = mi.ImageBlock(dr.concat(planes, axis=2), offset=film.crop_offset(), rfilter=None, border=False)
+    film.put_block(block)
+
+
+def register(old: str | None = None, new: str | None = None) -> None:
+    """Make the plug-in known to the current variant, if there is one. Called by Mitsuba whenever the variant changes."""
+    variant = new or mi.variant()
+    if variant is not None:
+        mi.register_integrator(PLUGIN, _constructor(variant))
+
+
+def _constructor(variant: str) -> Callable[[Any], Any]:
+    if variant.endswith(("_ad_rgb", "_ad_mono")):
+        return make_class()
+
+    def refuse(props: Any) -> Any:
+        raise ShadowmapError(
+            f"'{PLUGIN}' does not work with the variant {variant}: set one whose name ends in _ad_rgb or _ad_mono, "
+            "for instance llvm_ad_rgb."
+        )
+
+    return refuse
+
+
+def install() -> None:
+    """Register the plug-in now and for all variants that will be set."""
+    mi.detail.add_variant_callback(register)
+    register()

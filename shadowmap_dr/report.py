@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -45,7 +46,7 @@ def read_json(path: str | os.PathLike[str]) -> Any:
 
 def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
     """A table for the terminal: the first column left-aligned, all others right-aligned."""
-    result = Table(title=title, title_justify="left")
+    result = Table(title=title, title_justify="left", box=SIMPLE_HEAD)  # narrow enough for 80 columns
     for i, column in enumerate(columns):
         result.add_column(column, justify="left" if i == 0 else "right")
     for row in rows:

@@ -88,7 +88,7 @@ def build_method(name: str, problem: PoseProblem, reference: Image) -> Method:
             betas=BETAS,
             shift_z=problem.shift_z,
         )
-    from .. import Renderer
+    from ..renderer import Renderer
 
     settings = shadow_settings(name)
     renderer = Renderer.from_scene(problem.scene, **settings)
@@ -179,7 +179,7 @@ def table(records: Sequence[dict[str, Any]]) -> Table:
         recovered = sum(record["recovered"] for record in group)
         rows.append(
             [
-                first["object"] + (" (shadow only)" if first["shadow_only"] else ""),
+                first["object"] + (" (shadow)" if first["shadow_only"] else ""),
                 str(first["resolution"]),
                 first["method"],
                 f"{recovered}/{len(group)}",
@@ -189,7 +189,7 @@ def table(records: Sequence[dict[str, Any]]) -> Table:
                 _mean(group, "seconds_total", "{:.1f}"),
             ]
         )
-    columns = ["object", "pixels", "method", "recovered", "rotation [deg]", "offset x 100", "s/iteration", "s total"]
+    columns = ["object", "pixels", "method", "recovered", "degrees", "offset x100", "s/step", "s total"]
     return report.table("Pose estimation: mean errors of the last iterate", columns, rows)
 
 

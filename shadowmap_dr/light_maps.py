@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from .geometry import Geometry
 from .lights import DirectionalLight, Light, PointLight, SpotLight
-from .raster import Topology
+from .raster import RasterOutput, Topology
 from .shadow import (
     Frusta,
     LightView,
@@ -41,8 +41,8 @@ WIDEST_SPOT = 60.0
 class MapPlan:
     """The maps of each light. Static, made once for a scene.
 
-    ``kinds``: ``directional``, ``spot`` (one map each) or ``cube`` (six). ``first``: number of each light's first map. ``planes``:
-    a face (index) of each planar shape, 0 for others. ``planar``: Bool (S,). ``center``, ``radius``: a sphere around the
+    ``kinds``: ``directional``, ``spot`` (one map each) or ``cube`` (six). ``first``: number of each light's first map.
+    ``planes``: the largest face (index) of each shape. ``planar``: Bool (S,). ``center``, ``radius``: a sphere around the
     scene at rest, world space, for the fixed frusta of ``compat``.
     """
 
@@ -92,8 +92,12 @@ def make_maps(
     topology: Topology,
     settings: ShadowSettings,
     previous: Frusta | None,
+    transparent: Callable[[RasterOutput], Any] | None = None,
 ) -> ShadowMaps:
-    """Render and filter the maps of all lights as one batch. Attached to lights and vertices."""
+    """Render and filter the maps of all lights as one batch. Attached to lights and vertices.
+
+    ``transparent`` is the alpha test of :func:`shadowmap_dr.raster.rasterize`, ``previous`` the fit of an earlier call.
+    """
     views = [view for light, kind in zip(lights, plan.kinds, strict=True) for view in _views(plan, light, kind, settings)]
     stacked = stack_views(views)
     count, vertices = len(views), geometry.vertex_count
@@ -119,7 +123,8 @@ def make_maps(
             settings.filter_size,
             previous,
         )
-    return filter_maps(render_maps(p_light, lanes, geometry.faces, topology, stacked, frusta, settings))
+    maps = render_maps(p_light, lanes, geometry.faces, topology, stacked, frusta, settings, transparent)
+    return filter_maps(maps)
 
 
 def _views(plan: MapPlan, light: Light, kind: str, settings: ShadowSettings) -> tuple[LightView, ...]:

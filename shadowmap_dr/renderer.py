@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -12,13 +12,14 @@ import mitsuba as mi
 from .aovs import AOVS, collect_aovs
 from .camera_pass import camera_clip, footprint_points, within_far_plane
 from .errors import ShadowmapError
+from .facets import flat_faces, pixel_size, soften_facets
 from .geometry import Geometry
 from .light_maps import MapPlan, light_visibility, make_maps, plan_maps
 from .lights import Light
 from .raster import RasterOutput, Topology, antialias, build_topology, rasterize
 from .scene import SceneData, load, refresh
 from .sensors import Sensor
-from .shading import Surface, ambient_light, background, direct_light, surface
+from .shading import Surface, ambient_light, background, direct_light, opacity, surface
 from .shadow import Frusta, ShadowSettings
 
 # Directions over which the light of environments is summed.
@@ -34,8 +35,8 @@ class RenderSettings:
         antialias: anti-alias silhouettes in the image; without it they have no gradient.
         ambient: radiance of unshadowed light that arrives from everywhere, beside that of the scene's environment.
         hide_emitters: environments light the scene, but are not seen themselves.
-        shadow_samples: look-ups along each side of a pixel's footprint (``samples ** 2`` in all), or 0 for 2 where the image is not
-            larger than the shadow map and 1 otherwise.
+        shadow_samples: look-ups along each side of a pixel's footprint (``samples ** 2`` in all), or 0 for 2 where the image is
+            not larger than the shadow map and 1 otherwise.
         aovs: names of further channels, see :data:`shadowmap_dr.aovs.AOVS`.
     """
 
@@ -68,6 +69,7 @@ class Renderer:
         topology: edges of the merged mesh.
         plan: which shadow maps there are.
         settings: how to render.
+        flat: ``Bool`` (F,), faces that are shaded flat, or None.
         frusta: fit of the shadow maps in the last rendering, None before the first.
     """
 
@@ -75,6 +77,7 @@ class Renderer:
     topology: Topology
     plan: MapPlan
     settings: RenderSettings
+    flat: Any = None
     frusta: Frusta | None = None
 
     @classmethod
@@ -93,8 +96,8 @@ class Renderer:
     ) -> Renderer:
         """Build a renderer for a ``mi.Scene``.
 
-        The scene's meshes are read now, for the last time. ``settings`` are those of :class:`RenderSettings`, ``tessellation`` is the
-        number of triangles around spheres, disks and cylinders.
+        The scene's meshes are read now, for the last time. ``settings`` are those of :class:`RenderSettings`, ``tessellation`` is
+        the number of triangles around spheres, disks and cylinders.
 
         Raises:
             ShadowmapError: what the scene has and this renderer does not support, by name; invalid settings.
@@ -118,7 +121,7 @@ class Renderer:
         geometry = data.geometry
         positions = dr.detach(geometry.positions).numpy()
         topology = build_topology(geometry.faces.numpy(), positions, mi.UInt32)
-        renderer = cls(data, topology, plan_maps(data.lights, geometry), settings)
+        renderer = cls(data, topology, plan_maps(data.lights, geometry), settings, flat_faces(geometry))
         # The first fit is made here, so that a step which is recorded later always starts from one.
         if renderer._has_shadows:
             with dr.suspend_grad():
@@ -184,25 +187,42 @@ class Renderer:
         return self.data.sensors[sensor]
 
     def _make_maps(self, geometry: Geometry, lights: tuple[Light, ...]) -> Any:
-        maps = make_maps(self.plan, lights, geometry, self.topology, self.settings.shadow, self.frusta)
+        maps = make_maps(
+            self.plan, lights, geometry, self.topology, self.settings.shadow, self.frusta, self._transparent(geometry)
+        )
         self.frusta = maps.frusta
         return maps
+
+    def _transparent(self, geometry: Geometry) -> Callable[[RasterOutput], Any] | None:
+        """Alpha test for cameras and shadow maps; None where no material lets one look through."""
+        if not any(info.see_through for info in geometry.shapes):
+            return None
+        camera = self.data.sensors[0][0]  # transparency does not depend on where it is seen from
+
+        def transparent(raster: RasterOutput) -> Any:
+            return opacity(surface(self.data, geometry, camera, raster.triangle, raster.u, raster.v)) < 0.5
+
+        return transparent
 
     def _camera_image(self, sensor: Sensor, geometry: Geometry, lights: tuple[Light, ...], maps: Any, spp: int) -> Any:
         factor = min(max(1, -(-int(spp**0.5 * 1000000) // 1000000)), 16)
         width, height = sensor.width * factor, sensor.height * factor
         clip = camera_clip(sensor, geometry, self.plan.center, self.plan.radius)
         dr.eval(clip)
-        raster = rasterize(clip, geometry.faces, (height, width), check_indices=False)
+        transparent = self._transparent(geometry)
+        raster = rasterize(clip, geometry.faces, (height, width), check_indices=False, transparent=transparent)
         active = raster.valid & within_far_plane(sensor, raster.w)
         seen = surface(self.data, geometry, sensor, raster.triangle, raster.u, raster.v, active)
+        if self.flat is not None:
+            pixel = pixel_size(sensor, height, raster.w)
+            seen = soften_facets(seen, geometry, self.topology, self.flat, raster.triangle, raster.u, raster.v, pixel)
         visible = [self._visibility(maps, light, k, seen, raster, sensor) for k, light in enumerate(lights)]
         color = self._radiance(seen, lights, visible, sensor, raster)
         channels = _film_channels(color, seen.active, sensor)
         named = collect_aovs(self.settings.aovs, seen, raster, lights, visible)
         if self.settings.antialias:
             flat = _interleave(channels)
-            flat = antialias(flat, raster, clip, self.topology)
+            flat = antialias(flat, raster, clip, self.topology, creases=self.flat)
             image = mi.TensorXf(flat, shape=(height, width, len(channels)))
         else:
             image = mi.TensorXf(_interleave(channels), shape=(height, width, len(channels)))

@@ -243,3 +243,28 @@ def test_crossings_can_be_shared(variant: str) -> None:
     value = dr.select(out.valid, mi.Float(1), mi.Float(0))
     shared = antialias(value, out, clip, topology, crossings=find_crossings(clip.array, topology, out, 3))
     assert (shared.numpy() == antialias(value, out, clip, topology).numpy()).all()
+
+
+def test_creases_between_flat_faces_move(variant: str) -> None:
+    """Two differently coloured faces of a tent: the derivative of the ridge's sideways motion is that of the areas."""
+    size = 64
+    world = np.array([[-0.9, -0.8, 0.5], [-0.9, 0.8, 0.5], [0.11, -0.8, 0], [0.2, 0.8, 0], [0.9, -0.8, 0.5], [0.9, 0.8, 0.5]])
+    faces = np.array([[0, 2, 3], [0, 3, 1], [2, 4, 5], [2, 5, 3]], np.uint32)
+    colors = mi.Float(np.array([1, 1, 0.25, 0.25], np.float32))
+    world = world.astype(np.float32)
+    topology = topology_of(faces, world)
+    shift = mi.Float(0)
+    dr.enable_grad(shift)
+    ridge = mi.Float([0, 0, 1, 1, 0, 0])
+    x, y, z = (mi.Float(world[:, k].copy()) for k in range(3))
+    clip = mi.TensorXf(dr.ravel(mi.Point4f(x + shift * ridge, y, z, 1)), shape=(6, 4))
+    out = rasterize(clip, mi.TensorXu(faces), (size, size))
+    value = dr.gather(mi.Float, colors, out.triangle, out.valid)
+    image = antialias(value, out, clip, topology, creases=mi.Bool([True] * 4))
+    dr.backward(dr.sum(image))
+    want = 0.75 * 1.6 * (size / 2) ** 2
+    # Next to a vertex, where the faces at the ridge are narrower than a pixel, the two pixels see faces without a common edge.
+    rows = 1.6 * size / 2
+    assert abs(float(dr.grad(shift)[0]) - want) < want * 4 / rows
+    plain = antialias(value, out, clip, topology)
+    assert np.abs(plain.numpy() - image.numpy()).max() > 0.1

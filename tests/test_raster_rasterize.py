@@ -160,3 +160,23 @@ def test_a_million_triangles(variant: str, near_camera: bool) -> None:
     out = run(clip.astype(np.float32), faces, 128, 128)
     ids = as_ids(out).reshape(128, 128)
     assert (ids[40:88, 40:88] >= 0).all()
+
+
+def test_alpha_test_sees_through_layers_in_order(variant: str) -> None:
+    """Random soups with some faces transparent equal the soups without these faces, up to the number of layers."""
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        pos = np.c_[rng.uniform(-1, 1, (24, 3)), np.ones(24)].astype(np.float32)
+        faces = rng.integers(0, 24, (30, 3)).astype(np.uint32)
+        clear = rng.random(30) < 0.3
+        flags = mi.Bool(clear)
+
+        def transparent(out, flags=flags):  # noqa: ANN001, ANN202
+            return dr.gather(mi.Bool, flags, out.triangle, out.valid)
+
+        out = rasterize(mi.TensorXf(pos), mi.TensorXu(faces), (40, 33), transparent=transparent, layers=31)
+        want = as_ids(run(pos, faces[~clear], 40, 33))
+        kept = np.r_[np.nonzero(~clear)[0], -1]
+        assert (as_ids(out) == kept[want]).all()
+        one = rasterize(mi.TensorXf(pos), mi.TensorXu(faces), (40, 33), transparent=transparent, layers=1)
+        assert (as_ids(one) == as_ids(run(pos, faces, 40, 33))).all()

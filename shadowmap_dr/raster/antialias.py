@@ -7,7 +7,6 @@ from typing import Any
 import drjit as dr
 
 from ._types import RasterOutput, backend, pixel_coordinates
-from .rasterize import check_mesh
 from .silhouette import Crossings, crossing_position, find_crossings
 from .topology import Topology
 
@@ -19,6 +18,7 @@ def antialias(
     topology: Topology,
     *,
     crossings: Crossings | None = None,
+    creases: Any = None,
 ) -> Any:
     """Blend each pixel with the neighbours from which a silhouette separates it, by the share of the pixel they cover.
 
@@ -32,6 +32,7 @@ def antialias(
         positions: clip-space vertices as given to the rasterizer.
         topology: :func:`shadowmap_dr.raster.build_topology` of the mesh.
         crossings: result of :func:`find_crossings`, to share the search between several calls.
+        creases: ``Bool`` (F,), flat-shaded faces: the edges between them are blended (and differentiated) like silhouettes.
 
     Returns:
         The blended values in the shape of ``values``. Gradients flow to ``values`` and, through the position of the
@@ -48,8 +49,8 @@ def antialias(
         raise ValueError(f"values hold {count} numbers for {raster.batch} image(s) of {raster.height} x {raster.width} pixels")
     positions, vertex_count = _flat_positions(positions, raster)
     if crossings is None:
-        crossings = find_crossings(positions, topology, raster, vertex_count)
-    weights = blend_weights(positions, topology, raster, crossings, vertex_count)
+        crossings = find_crossings(positions, topology, raster, vertex_count, creases)
+    weights = blend_weights(positions, raster, crossings, vertex_count)
     blended = blend(flat, weights, raster, count // pixels)
     return type(values)(blended, shape=values.shape) if is_tensor else blended
 
@@ -61,16 +62,15 @@ def _flat_positions(positions: Any, raster: RasterOutput) -> tuple[Any, int]:
     return flat, dr.width(flat) // (4 * raster.batch)
 
 
-def blend_weights(
-    positions: Any, topology: Topology, raster: RasterOutput, crossings: Crossings, vertex_count: int
-) -> tuple[Any, Any]:
+def blend_weights(positions: Any, raster: RasterOutput, crossings: Crossings, vertex_count: int) -> tuple[Any, Any]:
     """Signed weights of the (right, lower) pairs, attached to ``positions``.
 
     Positive: so much of the pixel reaches into its neighbour; negative: so much of the neighbour into the pixel.
     """
-    t_right = crossing_position(positions, topology, raster, crossings.edge_right, vertex_count, down=False)
-    t_down = crossing_position(positions, topology, raster, crossings.edge_down, vertex_count, down=True)
-    return crossings.share_right * (t_right - 0.5), crossings.share_down * (t_down - 0.5)
+    c = crossings
+    t_right = crossing_position(positions, raster, (c.right_a, c.right_b), vertex_count, down=False)
+    t_down = crossing_position(positions, raster, (c.down_a, c.down_b), vertex_count, down=True)
+    return c.right_share * (t_right - 0.5), c.down_share * (t_down - 0.5)
 
 
 def blend(values: Any, weights: tuple[Any, Any], raster: RasterOutput, channels: int) -> Any:
@@ -102,6 +102,3 @@ def blend(values: Any, weights: tuple[Any, Any], raster: RasterOutput, channels:
     for c in range(channels):
         dr.scatter(result, blended[c], index * channels + c)
     return result
-
-
-__all__ = ["antialias", "blend", "blend_weights", "check_mesh"]

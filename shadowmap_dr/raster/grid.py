@@ -8,7 +8,9 @@ recordable (``dr.freeze``), and a pixel finds all candidates by walking one list
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from types import ModuleType
 from typing import Any
 
 import drjit as dr
@@ -50,11 +52,6 @@ class GridShape:
     def cells(self) -> int:
         return self.batch * self.cells_per_image
 
-    def cell(self, level: int, image: Any, row: Any, column: Any) -> Any:
-        """Number of the cell of ``level`` that contains a pixel."""
-        shift = FINEST + level
-        return image * self.cells_per_image + (row >> shift) * self.columns(level) + (column >> shift) + self.offset(level)
-
 
 @dataclass(frozen=True)
 class CellLists:
@@ -64,11 +61,80 @@ class CellLists:
     start: Any
     items: Any
 
-    def range(self, level: int, image: Any, row: Any, column: Any, active: Any = True) -> tuple[Any, Any]:
-        """First and one-past-last list position for the cell of ``level`` that contains a pixel (empty where inactive)."""
-        cell = self.shape.cell(level, image, row, column)
-        dtype = type(self.start)
-        return dr.gather(dtype, self.start, cell, active), dr.gather(dtype, self.start, cell + 1, active)
+    def walk(
+        self, pixel: BlockPixels, state: tuple[Any, ...], visit: Callable[..., tuple[Any, ...]], active: Any = True
+    ) -> tuple[Any, ...]:
+        """Visit, for each pixel, all primitives that may touch it: a symbolic loop over levels around one over a list.
+
+        Args:
+            pixel: the pixels, one lane each.
+            state: Dr.Jit variables that ``visit`` updates.
+            visit: ``(primitive, row, column, *state) -> state``.
+            active: pixels to walk for.
+
+        Returns the final state.
+        """
+        UInt32 = type(self.start)
+        shape = self.shape
+
+        def level(shift, first_cell, image, row, column, active, *state):  # noqa: ANN001, ANN002, ANN202
+            round_up = (UInt32(1) << shift) - 1
+            columns, rows = (shape.width + round_up) >> shift, (shape.height + round_up) >> shift
+            cell = image * shape.cells_per_image + first_cell + (row >> shift) * columns + (column >> shift)
+            # Lanes beyond the image walk along with their block: its cell exists, and uniform control flow costs nothing.
+            position = dr.gather(UInt32, self.start, cell, active)
+            end = dr.gather(UInt32, self.start, cell + 1, active)
+
+            def entry(position, end, row, column, *state):  # noqa: ANN001, ANN002, ANN202
+                primitive = dr.gather(UInt32, self.items, position)
+                return position + 1, end, row, column, *visit(primitive, row, column, *state)
+
+            inner = dr.while_loop(
+                (position, end, row, column, *state),
+                lambda position, end, *_: position < end,
+                entry,
+                mode="symbolic",
+                label="list",
+            )
+            return shift + 1, first_cell + columns * rows, image, row, column, active, *inner[4:]
+
+        last = FINEST + shape.levels
+        result = dr.while_loop(
+            (UInt32(FINEST), UInt32(0), pixel.image, pixel.row, pixel.column, dr.mask_t(self.start)(active), *state),
+            lambda shift, *_: shift < last,
+            level,
+            mode="symbolic",
+            label="levels",
+        )
+        return result[6:]
+
+
+@dataclass(frozen=True)
+class BlockPixels:
+    """All pixels of a batch of images, 16 consecutive lanes a 4 x 4 block; blocks at the border reach beyond the image.
+
+    ``index`` is the position in a flat row-major batch, valid where ``inside``.
+    """
+
+    image: Any
+    row: Any
+    column: Any
+    inside: Any
+    index: Any
+
+
+def block_pixels(shape: GridShape, module: ModuleType) -> BlockPixels:
+    """Enumerate the pixels of a grid block by block."""
+    size = 1 << FINEST
+    block_columns, block_rows = shape.columns(0), shape.rows(0)
+    lane = dr.arange(module.UInt32, shape.batch * block_rows * block_columns * size * size)
+    block = lane >> (2 * FINEST)
+    row_of_blocks = block // block_columns
+    image = row_of_blocks // block_rows
+    column = (block - row_of_blocks * block_columns) * size + (lane & (size - 1))
+    row = (row_of_blocks - image * block_rows) * size + ((lane >> FINEST) & (size - 1))
+    inside = (column < shape.width) & (row < shape.height)
+    return BlockPixels(image, row, column, inside, (image * shape.height + row) * shape.width + column)
 
 
 def build_cell_lists(shape: GridShape, image: Any, box: tuple[Any, Any, Any, Any], active: Any) -> CellLists:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
 from ._types import MAX_RESOLUTION, NO_TRIANGLE, RasterOutput, backend, pixel_coordinates
-from .grid import FINEST, CellLists, GridShape, build_cell_lists
+from .grid import CellLists, GridShape, block_pixels, build_cell_lists
 
 # Boxes are widened by this many pixels so that rounding in the single-precision edge functions cannot lose a pixel.
 _BOX_MARGIN = 1.0 / 512.0
@@ -21,6 +22,8 @@ def rasterize(
     *,
     batch: int | None = None,
     check_indices: bool = True,
+    transparent: Callable[[RasterOutput], Any] | None = None,
+    layers: int = 4,
 ) -> RasterOutput:
     """Rasterize one or several images of the same triangles.
 
@@ -37,6 +40,9 @@ def rasterize(
         batch: number of images B, needed only where ``positions`` is flat and holds more than one.
         check_indices: verify that no index is out of range. This reads back one number; a caller that has checked its
             (constant) faces before switches it off, as it must inside ``dr.freeze``.
+        transparent: alpha test. Gets what the pixels see (detached) and returns a mask of those that see through it, to what
+            lies behind. No gradients.
+        layers: how many surfaces are tested at most, one behind the other; the last one counts as opaque.
 
     Returns:
         :class:`RasterOutput`; barycentrics and depth carry gradients to ``positions``.
@@ -50,7 +56,8 @@ def rasterize(
     flat, face_indices, batch, vertex_count = check_mesh(positions, faces, batch, check_indices)
     height, width = check_resolution(resolution)
     with dr.suspend_grad():
-        triangle, records = _visible_triangles(dr.detach(flat), face_indices, batch, vertex_count, height, width)
+        size = (batch, vertex_count, height, width)
+        triangle, records = _visible_triangles(dr.detach(flat), face_indices, *size, transparent, layers)
     return _locate(flat, face_indices, triangle, records, batch, vertex_count, height, width)
 
 
@@ -161,12 +168,26 @@ def _exact_ndc(module: Any, index: Any, size: int) -> tuple[Any, Any]:
     return ndc, dr.fma(-ndc, size, numerator) / size
 
 
-def _visible_triangles(positions: Any, faces: Any, batch: int, vertex_count: int, height: int, width: int) -> tuple[Any, Any]:
+def _visible_triangles(
+    positions: Any,
+    faces: Any,
+    batch: int,
+    vertex_count: int,
+    height: int,
+    width: int,
+    transparent: Callable[[RasterOutput], Any] | None,
+    layers: int,
+) -> tuple[Any, Any]:
     shape = GridShape(batch, height, width)
     face_count = dr.width(faces) // 3
     records, image, box, active = _set_up(positions, faces, batch, vertex_count, face_count, height, width)
     lists = build_cell_lists(shape, image, box, active)
-    return _walk(lists, records, positions, faces, vertex_count), records
+    triangle = _walk(lists, records, positions, faces, vertex_count)
+    for _ in range(layers - 1 if transparent is not None else 0):
+        seen = _locate(positions, faces, triangle, records, batch, vertex_count, height, width)
+        through = seen.valid & dr.detach(transparent(seen))
+        triangle = _walk(lists, records, positions, faces, vertex_count, triangle, through)
+    return triangle, records
 
 
 def _set_up(
@@ -278,46 +299,45 @@ def _screen_bounds(corners: tuple[Any, Any, Any], height: int, width: int) -> tu
     )
 
 
-def _walk(lists: CellLists, records: Any, positions: Any, faces: Any, vertex_count: int) -> Any:
-    """One lane per pixel, 16 consecutive lanes a 4 x 4 block: keep the nearest covering triangle of the block's lists."""
+def _walk(
+    lists: CellLists,
+    records: Any,
+    positions: Any,
+    faces: Any,
+    vertex_count: int,
+    previous: Any = None,
+    through: Any = None,
+) -> Any:
+    """The nearest covering triangle of each pixel, row-major; or the next one behind ``previous`` where ``through`` says so."""
     module = backend(records)
     Float, UInt32 = module.Float, module.UInt32
     shape = lists.shape
-    face_count = dr.width(faces) // 3
-    size = 1 << FINEST
-    block_columns, block_rows = shape.columns(0), shape.rows(0)
-    lane = dr.arange(UInt32, shape.batch * block_rows * block_columns * size * size)
-    block = lane >> (2 * FINEST)
-    row_of_blocks = block // block_columns
-    image = row_of_blocks // block_rows
-    column = (block - row_of_blocks * block_columns) * size + (lane & (size - 1))
-    row = (row_of_blocks - image * block_rows) * size + ((lane >> FINEST) & (size - 1))
-    inside = (column < shape.width) & (row < shape.height)
+    pixel = block_pixels(shape, module)
 
-    best_depth, best = Float(dr.inf), UInt32(NO_TRIANGLE)
-    for level in range(shape.levels):
-        # Lanes beyond the image walk along with their block: its cell exists, and uniform control flow costs nothing.
-        position, end = lists.range(level, image, row, column)
+    def visit(triangle, row, column, best_depth, best):  # noqa: ANN001, ANN202
+        covered, depth = _cover(records, positions, faces, triangle, vertex_count, row, column, shape)
+        nearer = covered & ((depth < best_depth) | ((depth == best_depth) & (triangle < best)))
+        return dr.select(nearer, depth, best_depth), dr.select(nearer, triangle, best)
 
-        def body(position, end, best_depth, best, row, column):  # noqa: ANN001, ANN202
-            candidate = dr.gather(UInt32, lists.items, position)
-            covered, depth = _cover(records, positions, faces, candidate, vertex_count, row, column, shape)
-            nearer = covered & ((depth < best_depth) | ((depth == best_depth) & (candidate < best)))
-            best_depth = dr.select(nearer, depth, best_depth)
-            best = dr.select(nearer, candidate, best)
-            return position + 1, end, best_depth, best, row, column
+    def visit_behind(triangle, row, column, best_depth, best, last_depth, last):  # noqa: ANN001, ANN202
+        covered, depth = _cover(records, positions, faces, triangle, vertex_count, row, column, shape)
+        covered &= (depth > last_depth) | ((depth == last_depth) & (triangle > last))
+        nearer = covered & ((depth < best_depth) | ((depth == best_depth) & (triangle < best)))
+        return dr.select(nearer, depth, best_depth), dr.select(nearer, triangle, best), last_depth, last
 
-        position, end, best_depth, best, row, column = dr.while_loop(
-            (position, end, best_depth, best, row, column),
-            lambda position, end, *_: position < end,
-            body,
-            labels=("position", "end", "best_depth", "best", "row", "column"),
-            mode="symbolic",
-            label="rasterize",
-        )
-    triangle = dr.select(best == NO_TRIANGLE, best, best - image * face_count)
+    start = (Float(dr.inf), UInt32(NO_TRIANGLE))
+    if previous is None:
+        _, best = lists.walk(pixel, start, visit)
+    else:
+        skip = dr.gather(module.Bool, through, pixel.index, pixel.inside)
+        kept = dr.gather(UInt32, previous, pixel.index, pixel.inside)
+        last = dr.select(kept == NO_TRIANGLE, 0, kept + pixel.image * (dr.width(faces) // 3))
+        _, last_depth = _cover(records, positions, faces, last, vertex_count, pixel.row, pixel.column, shape)
+        _, best, _, _ = lists.walk(pixel, (*start, last_depth, last), visit_behind, skip)
+        best = dr.select(skip | (kept == NO_TRIANGLE), best, last)
+    triangle = dr.select(best == NO_TRIANGLE, best, best - pixel.image * (dr.width(faces) // 3))
     out = dr.empty(UInt32, shape.batch * shape.height * shape.width)
-    dr.scatter(out, triangle, (image * shape.height + row) * shape.width + column, inside)
+    dr.scatter(out, triangle, pixel.index, pixel.inside)
     dr.eval(out)
     return out
 

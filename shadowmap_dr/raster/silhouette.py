@@ -13,7 +13,7 @@ from typing import Any
 import drjit as dr
 
 from ._types import NO_TRIANGLE, RasterOutput, backend, pixel_coordinates
-from .grid import FINEST, CellLists, GridShape, build_cell_lists
+from .grid import CellLists, GridShape, block_pixels, build_cell_lists
 from .topology import NO_VERTEX, Topology
 
 #: Entry of :class:`Crossings` for a pair of pixels that no silhouette separates.
@@ -27,27 +27,30 @@ _DEPTH_GAP_ABSOLUTE = 2e-7
 
 @dataclass(frozen=True)
 class Crossings:
-    """Silhouette edges between each pixel and its right and lower neighbour.
+    """Edges that separate each pixel from its right and lower neighbour.
 
-    ``edge_right``/``edge_down`` (``UInt32``) number an edge of the topology or are ``NO_EDGE``; ``share_right``/``share_down``
-    weight the pair: an edge steeper than 60 degrees counts for horizontal pairs only, one flatter than 30 degrees for vertical
-    pairs only, so that the two directions together blend each piece of silhouette once. No gradients.
+    ``right_a``, ``right_b``, ``down_a``, ``down_b`` (``UInt32``) are the end points of the edge, ``NO_EDGE`` where there is none.
+    ``right_share``, ``down_share`` weight the pair: an edge steeper than 60 degrees counts for horizontal pairs only, one flatter
+    than 30 degrees for vertical pairs only, so that the two directions together blend each piece of outline once. No gradients.
     """
 
-    edge_right: Any
-    edge_down: Any
-    share_right: Any
-    share_down: Any
+    right_a: Any
+    right_b: Any
+    down_a: Any
+    down_b: Any
+    right_share: Any
+    down_share: Any
 
 
-def find_crossings(positions: Any, topology: Topology, raster: RasterOutput, vertex_count: int) -> Crossings:
-    """Find the silhouette edge between each pair of neighbouring pixels.
+def find_crossings(positions: Any, topology: Topology, raster: RasterOutput, vertex_count: int, creases: Any = None) -> Crossings:
+    """Find the edge between each pair of neighbouring pixels.
 
     Args:
         positions: flat clip-space vertices (4 V B), as rasterized.
         topology: edges of the mesh.
         raster: output of the rasterizer for the same vertices.
         vertex_count: vertices per image, V.
+        creases: ``Bool`` (F,), faces whose common edges separate pixels, too (flat-shaded ones, whose colours jump there).
 
     A silhouette is an edge whose faces all lie on one side of it in the image. It separates two pixels that see different
     triangles when it crosses the segment between their centres and lies before the surface that the uncovered one sees
@@ -58,7 +61,7 @@ def find_crossings(positions: Any, topology: Topology, raster: RasterOutput, ver
         shape = GridShape(raster.batch, raster.height, raster.width)
         records, image, box, active = _set_up(positions, topology, vertex_count, shape)
         lists = build_cell_lists(shape, image, box, active)
-        return _search(lists, records, topology.count, raster)
+        return _search(lists, records, positions, topology, vertex_count, raster, creases)
 
 
 def _set_up(
@@ -139,91 +142,124 @@ def _orientation(a: Any, b: Any, o: Any) -> Any:
     return backend(a).Float(dr.select(det == 0, 0, dr.sign(det)))
 
 
-def _search(lists: CellLists, records: Any, edge_count: int, raster: RasterOutput) -> Crossings:
+def _search(
+    lists: CellLists,
+    records: Any,
+    positions: Any,
+    topology: Topology,
+    vertex_count: int,
+    raster: RasterOutput,
+    creases: Any,
+) -> Crossings:
     module = backend(records)
     Float, UInt32 = module.Float, module.UInt32
     shape = lists.shape
-    size = 1 << FINEST
-    block_columns, block_rows = shape.columns(0), shape.rows(0)
-    lane = dr.arange(UInt32, shape.batch * block_rows * block_columns * size * size)
-    block = lane >> (2 * FINEST)
-    row_of_blocks = block // block_columns
-    image = row_of_blocks // block_rows
-    column = (block - row_of_blocks * block_columns) * size + (lane & (size - 1))
-    row = (row_of_blocks - image * block_rows) * size + ((lane >> FINEST) & (size - 1))
-    inside = (column < shape.width) & (row < shape.height)
-    pixel = (image * shape.height + row) * shape.width + column
+    pixel = block_pixels(shape, module)
+    image, index = pixel.image, pixel.index
 
-    here = dr.gather(UInt32, raster.triangle, pixel, inside)
-    open_right, open_down = inside & (column + 1 < shape.width), inside & (row + 1 < shape.height)
-    right = dr.gather(UInt32, raster.triangle, pixel + 1, open_right)
-    down = dr.gather(UInt32, raster.triangle, pixel + shape.width, open_down)
+    here = dr.gather(UInt32, raster.triangle, index, pixel.inside)
+    open_right = pixel.inside & (pixel.column + 1 < shape.width)
+    open_down = pixel.inside & (pixel.row + 1 < shape.height)
+    right = dr.gather(UInt32, raster.triangle, index + 1, open_right)
+    down = dr.gather(UInt32, raster.triangle, index + shape.width, open_down)
     open_right &= here != right
     open_down &= here != down
     planes = [_depth_plane(raster, image, t) for t in (here, right, down)]
-    x = Float(column) + (0.5 - 0.5 * shape.width)
-    y = Float(row) + (0.5 - 0.5 * shape.height)
 
-    edge_right, edge_down = UInt32(NO_EDGE), UInt32(NO_EDGE)
-    reach_right, reach_down = Float(-1), Float(-1)
-    share_right, share_down = Float(0), Float(0)
-    for level in range(shape.levels):
-        position, end = lists.range(level, image, row, column, open_right | open_down)
+    def visit(edge, row, column, edge_right, reach_right, share_right, edge_down, reach_down, share_down):  # noqa: ANN001, ANN202
+        x = Float(column) + (0.5 - 0.5 * shape.width)
+        y = Float(row) + (0.5 - 0.5 * shape.height)
+        p = dr.gather(module.Array4f, records, 2 * edge)
+        q = dr.gather(module.Array4f, records, 2 * edge + 1)
+        side, share = p.w, q.w
 
-        def body(position, end, edge_right, reach_right, share_right, edge_down, reach_down, share_down):  # noqa: ANN001, ANN202
-            candidate = dr.gather(UInt32, lists.items, position)
-            p = dr.gather(module.Array4f, records, 2 * candidate)
-            q = dr.gather(module.Array4f, records, 2 * candidate + 1)
-            side, share = p.w, q.w
+        ok, reach = _separates(p, q, side, 0, x, y, planes[0], planes[1])
+        better = ok & open_right & (share > 0) & _wins(reach, edge, reach_right, edge_right)
+        edge_right = dr.select(better, edge, edge_right)
+        reach_right = dr.select(better, reach, reach_right)
+        share_right = dr.select(better, share, share_right)
 
-            def test(along: int, across: int, fixed: Any, start: Any, side: Any, planes: tuple[Any, Any]) -> tuple[Any, Any]:
-                """Does the edge separate the pair that starts at ``start`` along an axis? How far does it cover?"""
-                extent = q[across] - p[across]
-                s = (fixed - p[across]) / dr.select(extent == 0, 1, extent)
-                crossing = dr.fma(s, q[along] - p[along], p[along])
-                z = dr.fma(s, q.z - p.z, p.z)
-                t = crossing - start
-                covers_start = side * extent > 0
-                at = [None, None]
-                at[along], at[across] = crossing, fixed
-                hidden = dr.select(covers_start, planes[1](*at), planes[0](*at))
-                ok = (extent != 0) & (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1) & (z < hidden - dr.fma(dr.abs(hidden), _DEPTH_GAP, _DEPTH_GAP_ABSOLUTE))
-                return ok, dr.select(covers_start, t, 1 - t)
+        ok, reach = _separates(p, q, -side, 1, y, x, planes[0], planes[2])
+        better = ok & open_down & (share < 1) & _wins(reach, edge, reach_down, edge_down)
+        edge_down = dr.select(better, edge, edge_down)
+        reach_down = dr.select(better, reach, reach_down)
+        share_down = dr.select(better, 1 - share, share_down)
+        return edge_right, reach_right, share_right, edge_down, reach_down, share_down
 
-            ok, reach = test(0, 1, y, x, side, (planes[0], planes[1]))
-            better = ok & open_right & (share > 0) & _wins(reach, candidate, reach_right, edge_right)
-            edge_right = dr.select(better, candidate, edge_right)
-            reach_right = dr.select(better, reach, reach_right)
-            share_right = dr.select(better, share, share_right)
+    none, start = UInt32(NO_EDGE), (UInt32(NO_EDGE), Float(-1), Float(0))
+    edge_right, _, share_right, edge_down, _, share_down = lists.walk(pixel, start + start, visit, open_right | open_down)
 
-            ok, reach = test(1, 0, x, y, -side, (planes[0], planes[2]))
-            better = ok & open_down & (share < 1) & _wins(reach, candidate, reach_down, edge_down)
-            edge_down = dr.select(better, candidate, edge_down)
-            reach_down = dr.select(better, reach, reach_down)
-            share_down = dr.select(better, 1 - share, share_down)
-            return position + 1, end, edge_right, reach_right, share_right, edge_down, reach_down, share_down
-
-        _, _, edge_right, reach_right, share_right, edge_down, reach_down, share_down = dr.while_loop(
-            (position, end, edge_right, reach_right, share_right, edge_down, reach_down, share_down),
-            lambda position, end, *_: position < end,
-            body,
-            mode="symbolic",
-            label="find silhouettes",
-        )
-
-    first = image * edge_count
-    result = []
-    for value in (
-        dr.select(edge_right == NO_EDGE, edge_right, edge_right - first),
-        dr.select(edge_down == NO_EDGE, edge_down, edge_down - first),
-        share_right,
-        share_down,
+    first = image * topology.count
+    ends = []
+    for edge, share, neighbour, is_open in (
+        (edge_right, share_right, right, open_right),
+        (edge_down, share_down, down, open_down),
     ):
+        found = edge != NO_EDGE
+        ab = dr.gather(module.Array2u, topology.edges, edge - first, found)
+        a, b = dr.select(found, ab.x, none), dr.select(found, ab.y, none)
+        if creases is not None:
+            crease = is_open & ~found & (here != NO_TRIANGLE) & (neighbour != NO_TRIANGLE)
+            crease &= dr.gather(module.Bool, creases, here, crease) & dr.gather(module.Bool, creases, neighbour, crease)
+            ca, cb, shared = _common_edge(topology, here, neighbour, crease)
+            steepness = _share(positions, image * vertex_count, ca, cb, shared, shape)
+            a, b = dr.select(shared, ca, a), dr.select(shared, cb, b)
+            share = dr.select(shared, steepness if edge is edge_right else 1 - steepness, share)
+        ends.append((a, b, share))
+
+    (ra, rb, right_share), (da, db, down_share) = ends
+    result = []
+    for value in (ra, rb, da, db, right_share, down_share):
         out = dr.empty(type(value), shape.batch * shape.height * shape.width)
-        dr.scatter(out, value, pixel, inside)
+        dr.scatter(out, value, index, pixel.inside)
         result.append(out)
     dr.eval(result)
     return Crossings(*result)
+
+
+def _separates(p: Any, q: Any, side: Any, along: int, start: Any, fixed: Any, here: Any, neighbour: Any) -> tuple[Any, Any]:
+    """Does a projected edge separate the pair of pixels from ``start`` to ``start + 1`` along an axis? How far does it cover?
+
+    ``here`` and ``neighbour`` are the depth planes of what the two see; ``side`` tells on which side of the edge its surface is.
+    """
+    across = 1 - along
+    extent = q[across] - p[across]
+    s = (fixed - p[across]) / dr.select(extent == 0, 1, extent)
+    crossing = dr.fma(s, q[along] - p[along], p[along])
+    z = dr.fma(s, q.z - p.z, p.z)
+    t = crossing - start
+    covers_start = side * extent > 0
+    x, y = (crossing, fixed) if along == 0 else (fixed, crossing)
+    hidden = dr.select(covers_start, neighbour(x, y), here(x, y))
+    gap = dr.fma(dr.abs(hidden), _DEPTH_GAP, _DEPTH_GAP_ABSOLUTE)
+    ok = (extent != 0) & (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1) & (z < hidden - gap)
+    return ok, dr.select(covers_start, t, 1 - t)
+
+
+def _common_edge(topology: Topology, first: Any, second: Any, active: Any) -> tuple[Any, Any, Any]:
+    """End points of the edge that two faces share, and whether they share one."""
+    module = backend(first)
+    UInt32 = module.UInt32
+    own = dr.gather(module.Array3u, topology.faces, first, active)
+    mine = dr.gather(module.Array3u, topology.welded, first, active)
+    other = dr.gather(module.Array3u, topology.welded, second, active)
+    common = [(mine[k] == other.x) | (mine[k] == other.y) | (mine[k] == other.z) for k in range(3)]
+    a = dr.select(common[0], own[0], own[1])
+    b = dr.select(common[2], own[2], own[1])
+    count = sum(dr.select(c, UInt32(1), 0) for c in common)
+    shared = active & (count == 2)
+    return a, b, shared
+
+
+def _share(positions: Any, first: Any, a: Any, b: Any, active: Any, shape: GridShape) -> Any:
+    """Share of horizontal pairs in an edge, from its direction in the image (of its line, if it reaches behind the camera)."""
+    module = backend(positions)
+    p, q = (dr.gather(module.Array4f, positions, first + v, active) for v in (a, b))
+    nx, ny = (p.y * q.w - q.y * p.w) * shape.width, (q.x * p.w - p.x * q.w) * shape.height
+    # The line a x + b y + c = 0 in ndc is a (2 / width) x + ... in pixels: the normal's components swap their factors.
+    nx, ny = nx / shape.width**2, ny / shape.height**2
+    square = nx * nx + ny * ny
+    return dr.clip(0.5 + (nx * nx - ny * ny) / dr.select(square > 0, square, 1), 0, 1)
 
 
 def _wins(reach: Any, candidate: Any, best_reach: Any, best: Any) -> Any:
@@ -241,7 +277,7 @@ def _depth_plane(raster: RasterOutput, image: Any, triangle: Any) -> Any:
     return lambda x, y: dr.fma(dx, x, dr.fma(dy, y, d))
 
 
-def crossing_position(positions: Any, topology: Topology, raster: RasterOutput, edge: Any, vertex_count: int, down: bool) -> Any:
+def crossing_position(positions: Any, raster: RasterOutput, ends: tuple[Any, Any], vertex_count: int, down: bool) -> Any:
     """Where an edge crosses the line from each pixel's centre to its right (or lower) neighbour, in pixels from the former.
 
     Attached to ``positions``; 1/2 where there is no edge. The homogeneous form is valid, in value and derivative, for edges
@@ -249,8 +285,7 @@ def crossing_position(positions: Any, topology: Topology, raster: RasterOutput, 
     """
     module = backend(positions)
     image, row, column = pixel_coordinates(module, raster.batch, raster.height, raster.width)
-    has = edge != NO_EDGE
-    ends = dr.gather(module.Array2u, topology.edges, edge, has)
+    has = ends[0] != NO_EDGE
     a, b = (dr.gather(module.Array4f, positions, image * vertex_count + ends[k], has) for k in range(2))
     # The pixel line is y = const (x = const for the lower neighbour) in NDC.
     along, across = ("y", "x") if down else ("x", "y")

@@ -20,11 +20,14 @@ class Topology:
         opposite: ``UInt32`` (2 E,) third vertices of the one or two faces at each edge, ``NO_VERTEX`` at a boundary. An edge of
             three or more faces stands once for each of them, as a boundary.
         count: number of edges E.
+        faces, welded: ``UInt32`` (3 F,) vertices of the faces, as they are and with one number for each place.
     """
 
     edges: Any
     opposite: Any
     count: int
+    faces: Any
+    welded: Any
 
 
 def build_topology(faces: np.ndarray, positions: np.ndarray, dtype: type) -> Topology:
@@ -46,6 +49,7 @@ def build_topology(faces: np.ndarray, positions: np.ndarray, dtype: type) -> Top
         raise ValueError(f"faces refer to vertices {faces.min()}..{faces.max()}, but there are {len(positions)}")
     _, weld = np.unique(positions.view([("", np.float32)] * 3).ravel(), return_inverse=True)
     welded = weld[faces]
+    flat = [dtype(np.ascontiguousarray(t.ravel().astype(np.uint32))) for t in (faces, welded)]
     proper = (welded != np.roll(welded, 1, 1)).all(1)
     faces, welded = faces[proper], welded[proper]
 
@@ -64,4 +68,5 @@ def build_topology(faces: np.ndarray, positions: np.ndarray, dtype: type) -> Top
         dtype(np.stack([a[edges], b[edges]], 1).ravel().astype(np.uint32)),
         dtype(np.stack([opposite[edges], second], 1).ravel().astype(np.uint32)),
         len(edges),
+        *flat,
     )

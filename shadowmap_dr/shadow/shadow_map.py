@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -83,7 +84,14 @@ class ShadowMaps:
 
 
 def render_maps(
-    p_light: Any, map_index: Any, faces: Any, topology: Topology, views: Views, frusta: Frusta, settings: ShadowSettings
+    p_light: Any,
+    map_index: Any,
+    faces: Any,
+    topology: Topology,
+    views: Views,
+    frusta: Frusta,
+    settings: ShadowSettings,
+    transparent: Callable[[RasterOutput], Any] | None = None,
 ) -> ShadowMaps:
     """Step 1: rasterize all maps at once and store what the method needs of the depths in each texel.
 
@@ -93,12 +101,13 @@ def render_maps(
         faces: flat ``UInt32`` (3 F,), valid indices.
         topology: of the mesh.
         views, frusta: cameras of the M maps.
+        transparent: alpha test, see :func:`shadowmap_dr.raster.rasterize`.
     """
     count, size = views.count, settings.resolution
     clip = to_clip(of_map(views, map_index, count), of_map(frusta, map_index, count), p_light)
     clip = dr.ravel(clip)
     dr.eval(clip)
-    raster = rasterize(clip, faces, (size, size), batch=count, check_indices=False)
+    raster = rasterize(clip, faces, (size, size), batch=count, check_indices=False, transparent=transparent)
     values, channels = _texels(raster, views, frusta, settings)
     if settings.antialias and settings.method != "standard":
         dr.eval(values)

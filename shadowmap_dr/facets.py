@@ -1,0 +1,89 @@
+"""Flat-shaded surfaces whose facets are smaller than a pixel.
+
+The colour of a flat-shaded mesh jumps from facet to facet. Facets larger than pixels are dealt with by anti-aliasing the edges
+between them. Smaller ones cannot be sampled: a pixel's centre sees one facet of many at random, and the derivative of what it
+sees says nothing about that of the pixel's average. What a pixel shows there is, up to the size of a facet, the shading of the
+facets' mean normal, so that is what is shaded.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from .geometry import Geometry, normalize_or
+from .raster import Topology
+from .sensors import Sensor
+from .shading import Surface
+
+# Facets below the first size (in pixels) are shaded with mean normals, those above the second with their own.
+_SMALL, _LARGE = 1.5, 3.0
+
+
+def flat_faces(geometry: Geometry) -> Any:
+    """``Bool`` (F,): faces of curved shapes without vertex normals; None if there are none (on the host, once)."""
+    flat = [not info.has_normals and not info.planar for info in geometry.shapes]
+    if not any(flat):
+        return None
+    return dr.gather(mi.Bool, mi.Bool(flat), geometry.face_shape)
+
+
+def mean_normals(geometry: Geometry, topology: Topology, flat: Any) -> Any:
+    """Sums of the flat faces' unit normals, weighted by their angles at each place (Float, 3 V, by welded vertex). Attached."""
+    face = dr.arange(mi.UInt32, geometry.face_count)
+    corner = dr.gather(mi.Vector3u, geometry.faces, face, flat)
+    p = [dr.gather(mi.Point3f, geometry.positions, corner[k], flat) for k in range(3)]
+    edge = [normalize_or(p[(k + 1) % 3] - p[k], mi.Vector3f(0)) for k in range(3)]
+    n = normalize_or(dr.cross(edge[0], edge[1]), mi.Vector3f(0))
+    slot = dr.gather(mi.Vector3u, topology.welded, face, flat)
+    total = dr.zeros(mi.Float, 3 * geometry.vertex_count)
+    for k in range(3):
+        angle = dr.safe_acos(-dr.dot(edge[k], edge[(k + 2) % 3]) * (1 - 1e-6))
+        dr.scatter_add(total, n * angle, slot[k], flat)
+    return total
+
+
+def pixel_size(sensor: Sensor, height: int, w_clip: Any) -> Any:
+    """Height of a pixel at the depth of what it sees, world units, detached."""
+    scale = 2 / (height * dr.abs(dr.detach(sensor.projection)[1, 1]))
+    if sensor.kind == "perspective":
+        return scale * dr.detach(w_clip)
+    matrix = dr.detach(sensor.to_world.matrix)
+    return scale * dr.norm(mi.Vector3f(matrix[0, 1], matrix[1, 1], matrix[2, 1]))
+
+
+def soften_facets(
+    seen: Surface, geometry: Geometry, topology: Topology, flat: Any, triangle: Any, u: Any, v: Any, pixel: Any
+) -> Surface:
+    """Replace the normals of flat-shaded facets smaller than ``pixel`` (world units) by the mean over their neighbourhood.
+
+    Gradients flow to the vertices through the new normals, not through the size of the facets.
+    """
+    active = seen.active & dr.gather(mi.Bool, flat, triangle, seen.active)
+    corner = dr.gather(mi.Vector3u, geometry.faces, triangle, active)
+    with dr.suspend_grad():
+        p = [dr.gather(mi.Point3f, dr.detach(geometry.positions), corner[k], active) for k in range(3)]
+        size = dr.sqrt(dr.norm(dr.cross(p[1] - p[0], p[2] - p[0])))
+        mix = dr.select(active, dr.clip((_LARGE - size / pixel) / (_LARGE - _SMALL), 0, 1), 0)
+    soft = active & (mix > 0)
+    slot = dr.gather(mi.Vector3u, topology.welded, triangle, soft)
+    buffer = mean_normals(geometry, topology, flat)
+    n = [normalize_or(dr.gather(mi.Normal3f, buffer, slot[k], soft), mi.Normal3f(0)) for k in range(3)]
+    mean = n[0] + (n[1] - n[0]) * u + (n[2] - n[0]) * v
+    mean = dr.select(dr.dot(mean, seen.n_world) < 0, -mean, mean)
+    si = seen.si
+    wi_world = si.to_world(si.wi)
+    normal = normalize_or(si.sh_frame.n + (mean - si.sh_frame.n) * mix, si.sh_frame.n)
+    tangent = si.dp_du - normal * dr.dot(normal, si.dp_du)
+    tangent = normalize_or(tangent, mi.coordinate_system(normal)[0])
+    si = mi.SurfaceInteraction3f(si)
+    si.sh_frame = mi.Frame3f(
+        dr.select(soft, tangent, si.sh_frame.s),
+        dr.select(soft, dr.cross(normal, tangent), si.sh_frame.t),
+        dr.select(soft, normal, si.sh_frame.n),
+    )
+    si.wi = si.to_local(wi_world)
+    return replace(seen, n_world=dr.select(soft, mi.Normal3f(normal), seen.n_world), si=si)

@@ -171,7 +171,7 @@ def test_shadow_only_moves_the_object_out_of_view_but_not_its_shadow(tmp_path: P
         position[name] = np.array(mi.render(problem.scene, integrator=aov, spp=4))[..., -1]
     wall = (np.abs(position["seen"] + 1.5) < 1e-3) & (np.abs(position["hidden"] + 1.5) < 1e-3)
     assert wall.mean() > 0.5
-    assert np.abs(images[0] - images[1])[wall].mean() < 0.01
+    assert (np.abs(images[0] - images[1])[wall] > 0.05).mean() < 0.003
     assert (images[1][wall] < 0.05).mean() > 0.02  # there is a shadow
 
 

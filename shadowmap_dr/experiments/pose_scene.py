@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -77,17 +77,18 @@ def make_problem(name: str, resolution: int, *, shadow_only: bool = False, work:
     if not 1 <= resolution <= MAX_RESOLUTION:
         raise ShadowmapError(f"a resolution of {resolution} pixels: give 1 to {MAX_RESOLUTION}.")
     label, mesh = (name, assets.mesh(name)) if name in assets.mesh_names() else _import_mesh(assets.mesh(name), work)
+    plain = _load_mesh(mesh)
+    p_rest = _positions(plain)
+    problem = PoseProblem(label, mesh, p_rest, resolution, shadow_only, None)
+    if shadow_only:
+        # A file of its own: Mitsuba's directional light learns the extent of the scene only when the scene is loaded.
+        mesh = work / f"{label}-shadow-only.ply"
+        _write_mesh(plain, p_rest + np.float32([0, 0, problem.shift_z]), mesh)
     try:
         scene = mi.load_file(str(assets.scene("pose")), object=str(mesh), resolution=str(resolution), optimize=False)
     except RuntimeError as error:
         raise ShadowmapError(f"cannot load the object {name}: {' '.join(str(error).split())}") from error
-    parameters = mi.traverse(scene)
-    p_rest = np.array(parameters["object.vertex_positions"]).reshape(-1, 3)
-    problem = PoseProblem(label, mesh, p_rest, resolution, shadow_only, scene)
-    if shadow_only:
-        parameters["object.vertex_positions"] = mi.Float((p_rest + np.float32([0, 0, problem.shift_z])).ravel())
-        parameters.update()
-    return problem
+    return replace(problem, scene=scene)
 
 
 def start_pose(seed: int, run: int) -> npt.NDArray[np.float64]:
@@ -129,15 +130,8 @@ def path_traced_reference(problem: PoseProblem, path: Path) -> npt.NDArray[np.fl
 
 def _import_mesh(path: Path, work: Path) -> tuple[str, Path]:
     """Name and PLY file of a mesh file of the user's, centred and scaled into [-1, 1]^3."""
-    kind = path.suffix.lower()
-    if kind not in MESH_SUFFIXES:
-        raise ShadowmapError(f"cannot load the object {path}: the suffix {kind!r} is not one of {', '.join(MESH_SUFFIXES)}.")
-    try:
-        mesh = mi.load_dict({"type": kind[1:], "filename": str(path), "face_normals": True})
-    except RuntimeError as error:
-        raise ShadowmapError(f"cannot load the object {path}: {' '.join(str(error).split())}") from error
-    parameters = mi.traverse(mesh)
-    positions = np.array(parameters["vertex_positions"], np.float64).reshape(-1, 3)
+    mesh = _load_mesh(path)
+    positions = _positions(mesh).astype(np.float64)
     if mesh.face_count() == 0 or not len(positions):
         raise ShadowmapError(f"the object {path} has no triangles: give a triangle mesh.")
     if not np.isfinite(positions).all():
@@ -146,9 +140,28 @@ def _import_mesh(path: Path, work: Path) -> tuple[str, Path]:
     extent = float((high - low).max())
     if extent <= 0:
         raise ShadowmapError(f"the object {path} has no extent: all its vertices lie at {tuple(low)}.")
-    parameters["vertex_positions"] = mi.Float(((positions - (low + high) / 2) * (2 / extent)).astype(np.float32).ravel())
-    parameters.update()
     target = work / f"{path.stem}.ply"
-    with io.atomic(target) as temporary:
-        mesh.write_ply(str(temporary))
+    _write_mesh(mesh, (positions - (low + high) / 2) * (2 / extent), target)
     return path.stem, target
+
+
+def _load_mesh(path: Path) -> Any:
+    kind = path.suffix.lower()
+    if kind not in MESH_SUFFIXES:
+        raise ShadowmapError(f"cannot load the object {path}: the suffix {kind!r} is not one of {', '.join(MESH_SUFFIXES)}.")
+    try:
+        return mi.load_dict({"type": kind[1:], "filename": str(path), "face_normals": True})
+    except RuntimeError as error:
+        raise ShadowmapError(f"cannot load the object {path}: {' '.join(str(error).split())}") from error
+
+
+def _positions(mesh: Any) -> npt.NDArray[np.float32]:
+    return np.array(mi.traverse(mesh)["vertex_positions"], np.float32).reshape(-1, 3)
+
+
+def _write_mesh(mesh: Any, positions: npt.NDArray[Any], path: Path) -> None:
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = mi.Float(positions.astype(np.float32).ravel())
+    parameters.update()
+    with io.atomic(path) as temporary:
+        mesh.write_ply(str(temporary))

@@ -37,6 +37,31 @@ def camera_clip(sensor: Sensor, geometry: Geometry, center: tuple[float, float, 
     return dr.ravel(mi.Point4f(*row))
 
 
+def view_frustum(sensor: Sensor, center: tuple[float, float, float], radius: float) -> Any:
+    """The 8 corners (Point3f, world space, detached) of what a camera can see of a scene around ``center``.
+
+    The far side lies behind the scene, with room for three radii of movement, or at the far plane.
+    """
+    with dr.suspend_grad():
+        matrix = dr.detach(sensor.to_world.matrix)
+        projection = dr.detach(sensor.projection)
+        axis = dr.normalize(mi.Vector3f(matrix[0, 2], matrix[1, 2], matrix[2, 2]))
+        reach = dr.dot(axis, mi.Point3f(*center) - dr.detach(sensor.origin)) + 4 * radius
+        near = dr.detach(sensor.near)
+        far = dr.maximum(dr.minimum(dr.detach(sensor.far), reach), near)
+        corner = dr.arange(mi.UInt32, 8)
+        x, y = (dr.select(corner & bit != 0, mi.Float(1), -1) for bit in (1, 2))
+        z = dr.select(corner & 4 != 0, far, near)
+        scale = z if sensor.kind == "perspective" else mi.Float(1)
+        shift = (2, 2) if sensor.kind == "perspective" else (3, 3)
+        local = mi.Point3f(
+            (x - projection[0, shift[0]]) / projection[0, 0] * scale,
+            (y - projection[1, shift[1]]) / projection[1, 1] * scale,
+            z,
+        )
+        return mi.Transform4f(matrix) @ local
+
+
 def within_far_plane(sensor: Sensor, w_clip: Any) -> Any:
     """Mask of the pixels whose surface lies before a perspective camera's far plane."""
     return w_clip <= dr.detach(sensor.far) if sensor.kind == "perspective" else mi.Bool(True)

@@ -93,10 +93,12 @@ def make_maps(
     settings: ShadowSettings,
     previous: Frusta | None,
     transparent: Callable[[RasterOutput], Any] | None = None,
+    seen: Any = None,
 ) -> ShadowMaps:
     """Render and filter the maps of all lights as one batch. Attached to lights and vertices.
 
-    ``transparent`` is the alpha test of :func:`shadowmap_dr.raster.rasterize`, ``previous`` the fit of an earlier call.
+    ``transparent`` is the alpha test of :func:`shadowmap_dr.raster.rasterize`, ``previous`` the fit of an earlier call,
+    ``seen`` the corners of what the cameras see (Point3f, world space).
     """
     views = [view for light, kind in zip(lights, plan.kinds, strict=True) for view in _views(plan, light, kind, settings)]
     stacked = stack_views(views)
@@ -122,6 +124,7 @@ def make_maps(
             settings.resolution,
             settings.filter_size,
             previous,
+            seen,
         )
     maps = render_maps(p_light, lanes, geometry.faces, topology, stacked, frusta, settings, transparent)
     return filter_maps(maps)

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .aovs import AOVS, collect_aovs
-from .camera_pass import camera_clip, footprint_points, within_far_plane
+from .camera_pass import camera_clip, footprint_points, view_frustum, within_far_plane
 from .errors import ShadowmapError
 from .facets import flat_faces, pixel_size, soften_facets
 from .geometry import Geometry
@@ -125,7 +125,7 @@ class Renderer:
         # The first fit is made here, so that a step which is recorded later always starts from one.
         if renderer._has_shadows:
             with dr.suspend_grad():
-                renderer._make_maps(geometry, data.lights)
+                renderer._make_maps(geometry, data.lights, renderer._sensors(0))
         return renderer
 
     def with_data(self, data: SceneData) -> Renderer:
@@ -159,8 +159,8 @@ class Renderer:
         if vertex_positions:
             geometry = geometry.with_positions(vertex_positions)
         current = self._lights(lights)
-        maps = self._make_maps(geometry, current) if self._has_shadows else None
         cameras = self._sensors(sensor)
+        maps = self._make_maps(geometry, current, cameras) if self._has_shadows else None
         images = [self._camera_image(camera, geometry, current, maps, spp) for camera in cameras]
         return images[0] if len(images) == 1 else _side_by_side(images)
 
@@ -186,10 +186,12 @@ class Renderer:
             raise ShadowmapError(f"There is no sensor {sensor}: the scene has {len(self.data.sensors)}, counted from 0.")
         return self.data.sensors[sensor]
 
-    def _make_maps(self, geometry: Geometry, lights: tuple[Light, ...]) -> Any:
-        maps = make_maps(
-            self.plan, lights, geometry, self.topology, self.settings.shadow, self.frusta, self._transparent(geometry)
-        )
+    def _make_maps(self, geometry: Geometry, lights: tuple[Light, ...], cameras: tuple[Sensor, ...]) -> Any:
+        plan = self.plan
+        corners = [view_frustum(camera, plan.center, plan.radius) for camera in cameras]
+        seen = corners[0] if len(corners) == 1 else mi.Point3f(*(dr.concat([p[c] for p in corners]) for c in range(3)))
+        transparent = self._transparent(geometry)
+        maps = make_maps(plan, lights, geometry, self.topology, self.settings.shadow, self.frusta, transparent, seen)
         self.frusta = maps.frusta
         return maps
 

@@ -226,3 +226,25 @@ def test_moment_and_standard_formulas(variant: str) -> None:
 def test_bad_settings_are_named(change: dict, word: str) -> None:
     with pytest.raises(ValueError, match=word):
         ShadowSettings(**change)
+
+
+@pytest.mark.parametrize("kind", ["directional", "spot"])
+def test_frusta_are_cut_to_what_is_seen(variant: str, kind: str) -> None:
+    """Of a wide caster only the part that can shadow the region in view gets texels; there the shadow stays right."""
+    casters = trimesh.util.concatenate(
+        [BOX.copy().apply_translation([4.0 * i, 4.0 * j, 0]) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+    )
+    x, y = np.meshgrid((-1.2, 1.2), (-1.2, 1.2))
+    seen = points(np.array([[a, b, z] for a, b in zip(x.ravel(), y.ravel(), strict=True) for z in (-1.6, 0.5)]))
+    settings = ShadowSettings(resolution=256)
+    views = views_of(kind, 256, 3)
+    full = shadow_scene.make_maps(views, points(casters.vertices), casters.vertices, casters.faces, settings)
+    cut = shadow_scene.make_maps(views, points(casters.vertices), casters.vertices, casters.faces, settings, seen=seen)
+    assert float(cut.frusta.half_x[0]) < 0.8 * float(full.frusta.half_x[0])
+    p = receivers(150, half=1.2)
+    light = np.array((0.4, 0.3, 2.5)) if kind != "directional" else p - 20 * np.array([0.2, -0.15, -1])
+    hit, margin = shadow_scene.occluded(p, np.broadcast_to(light, p.shape), casters.triangles)
+    clear = margin > 0.06
+    v = look_up(cut, kind, points(p)).numpy()
+    assert hit[clear].sum() > 40
+    assert np.abs(v - ~hit)[clear].max() < 0.02

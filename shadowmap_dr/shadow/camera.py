@@ -250,8 +250,9 @@ def fit_frusta(
     resolution: int,
     filter_size: int,
     previous: Frusta | None,
+    seen: Any = None,
 ) -> Frusta:
-    """Frusta that cover everything that can cast a shadow, or the previous ones as long as they still do.
+    """Frusta that cover everything that can cast a shadow on what is seen, or the previous ones as long as they still do.
 
     Args:
         bounds: from :func:`shape_bounds`.
@@ -259,6 +260,7 @@ def fit_frusta(
         planar: ``Bool`` of width S. A planar shape with nothing behind its plane casts no shadow on anything.
         previous: frusta of an earlier call. Kept bit by bit while the casters lie inside them with room for the filter
             and fill most of them.
+        seen: corners (``Array3f``, world space) of convex regions that hold all receivers in view. None: anywhere.
 
     All arithmetic stays on the device: nothing is read back.
     """
@@ -269,7 +271,8 @@ def fit_frusta(
         map_index = index // shape_count
         shape = index - map_index * shape_count
         casts = _casts(views, bounds, planes, planar, map_index, shape, shape_count)
-        fitted = _fit(views, bounds, casts, map_index, resolution, filter_size)
+        window = _window(views, seen)
+        fitted = _fit(views, bounds, casts, map_index, window, resolution, filter_size)
         if previous is None:
             dr.eval(fitted[0])
             return fitted[0]
@@ -318,8 +321,39 @@ def _casts(
     return visible & (~dr.gather(Bool, planar, shape) | behind)
 
 
+def _window(views: Views, seen: Any) -> tuple[Any, Any, Any, Any]:
+    """(x0, y0, x1, y1) in each map's image plane around what is seen, within the light's own cone."""
+    module = backend(views.spread)
+    perspective = views.spread > 0
+    limit = dr.select(perspective, views.spread, dr.inf)
+    if seen is None:
+        return -limit, -limit, limit, limit
+    corners = dr.width(seen)
+    lane = dr.arange(module.UInt32, views.count * corners)
+    map_index = lane // corners
+    view = of_map(views, map_index, views.count)
+    point = module.Array3f(*(dr.gather(module.Float, seen[c], lane - map_index * corners) for c in range(3)))
+    p = to_light_space(view, point)
+    in_perspective = view.spread > 0
+    behind = in_perspective & (p.z <= 0)
+    w = dr.select(in_perspective & ~behind, p.z, 1)
+    window = []
+    for value, sign in ((p.x, -1), (p.y, -1), (p.x, 1), (p.y, 1)):
+        extreme = dr.full(module.Float, -dr.inf, views.count)
+        dr.scatter_reduce(dr.ReduceOp.Max, extreme, dr.select(behind, dr.inf, sign * value / w), map_index)
+        window.append(extreme)
+    dr.eval(window)
+    return tuple(sign * dr.minimum(extreme, limit) for extreme, sign in zip(window, (-1, -1, 1, 1), strict=True))
+
+
 def _fit(
-    views: Views, bounds: Bounds, casts: Any, map_index: Any, resolution: int, filter_size: int
+    views: Views,
+    bounds: Bounds,
+    casts: Any,
+    map_index: Any,
+    window: tuple[Any, Any, Any, Any],
+    resolution: int,
+    filter_size: int,
 ) -> tuple[Frusta, tuple[Any, ...]]:
     module = backend(views.spread)
 
@@ -337,11 +371,11 @@ def _fit(
     z0, z1 = dr.select(nothing, 0.0, z0), dr.select(nothing, 1.0, z1)
 
     perspective = views.spread > 0
-    s = dr.select(perspective, views.spread, dr.inf)
+    s = views.spread
     full = views.fixed > 0
-    x0, y0 = dr.select(full, -s, dr.maximum(x0, -s)), dr.select(full, -s, dr.maximum(y0, -s))
-    x1, y1 = dr.select(full, s, dr.minimum(x1, s)), dr.select(full, s, dr.minimum(y1, s))
-    # Casters outside the cone leave an empty rectangle; any small one will do.
+    x0, y0 = dr.select(full, -s, dr.maximum(x0, window[0])), dr.select(full, -s, dr.maximum(y0, window[1]))
+    x1, y1 = dr.select(full, s, dr.minimum(x1, window[2])), dr.select(full, s, dr.minimum(y1, window[3]))
+    # Casters outside of the window leave an empty rectangle; any small one will do.
     x1, y1 = dr.maximum(x1, x0 + 1e-4 * (1 + dr.abs(x0))), dr.maximum(y1, y0 + 1e-4 * (1 + dr.abs(y0)))
     depth = dr.maximum(z1 - z0, 1e-3 * dr.maximum(dr.abs(z1), 1e-3))
     near, far = z0 - 0.05 * depth, z1 + 0.05 * depth

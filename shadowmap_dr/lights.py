@@ -96,6 +96,18 @@ class SpotLight:
 
 
 @dataclass(frozen=True)
+class SquareSpot:
+    """A spot light as in Worchel and Alexa's code: full intensity, at any distance, in the square that its shadow map covers."""
+
+    light: SpotLight
+
+    def illuminate(self, p_world: Any, active: Any = True) -> tuple[Any, Any]:
+        """(wo, weight) with weight = intensity. What lies outside of the square is dark by its visibility."""
+        wo, _ = _towards(p_world, self.light.position)
+        return wo, self.light.intensity & mi.Bool(active)
+
+
+@dataclass(frozen=True)
 class Environment:
     """Light from infinitely far away, from all directions: Mitsuba's ``constant`` or ``envmap`` emitter."""
 

@@ -15,7 +15,7 @@ from .errors import ShadowmapError
 from .facets import flat_faces, pixel_size, soften_facets
 from .geometry import Geometry
 from .light_maps import MapPlan, light_visibility, make_maps, plan_maps
-from .lights import Light
+from .lights import Light, SpotLight, SquareSpot
 from .raster import RasterOutput, Topology, antialias, build_topology, rasterize
 from .scene import SceneData, load, refresh
 from .sensors import Sensor
@@ -247,7 +247,8 @@ class Renderer:
         gate = not self.settings.shadow.compat
         color = dr.zeros(mi.UnpolarizedSpectrum, dr.width(seen.shape))
         for light, fraction in zip(lights, visible, strict=True):
-            color += direct_light(seen, light, fraction, gate=gate)
+            square = self.settings.shadow.compat and isinstance(light, SpotLight)
+            color += direct_light(seen, SquareSpot(light) if square else light, fraction, gate=gate)
         for environment in (*self.data.environments, *self._uniform_ambient()):
             color += ambient_light(seen, environment, _AMBIENT_DIRECTIONS)
         if not self.settings.hide_emitters:

@@ -1,0 +1,147 @@
+"""The area light in place of a directional one, and pose estimation with Mitsuba's projective integrator."""
+
+from __future__ import annotations
+
+import json
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsuba_baselines import proxy, reference
+from mitsuba_baselines.pose import MitsubaPose, ProjectiveSetting, fair_setting, pose_start
+from shadowmap_dr import assets
+from shadowmap_dr.errors import ShadowmapError
+
+RESOLUTION = 32
+
+
+@pytest.fixture(autouse=True)
+def llvm() -> None:
+    mi.set_variant("llvm_ad_rgb")
+
+
+@pytest.fixture
+def scene() -> mi.Scene:
+    mi.set_variant("llvm_ad_rgb")
+    return mi.load_file(str(assets.scene("pose")), optimize=False, resolution=RESOLUTION)
+
+
+@pytest.fixture
+def target(scene: mi.Scene) -> np.ndarray:
+    return reference.path_traced(scene, spp=256).image
+
+
+def fit(target: np.ndarray, setting: ProjectiveSetting | None = None, **options: object) -> MitsubaPose:
+    setting = setting or ProjectiveSetting(1, 1, 4)
+    return MitsubaPose(assets.scene("pose"), assets.mesh("spot"), RESOLUTION, setting, target, **options)
+
+
+def test_proxy_keeps_its_promises(scene: mi.Scene) -> None:
+    light = proxy.calibrate(scene)
+    assert light.penumbra_px <= 0.5 + 1e-9 and light.parallax_px <= 0.25 + 1e-9
+    assert light.irradiance_residual <= 0.005
+    assert light.image_residual < 0.02
+    np.testing.assert_allclose(light.direction, [0, 0, -1], atol=1e-6)
+    area = np.pi * light.diameter**2 / 4
+    np.testing.assert_allclose(light.radiance, np.pi * light.distance**2 / area, rtol=1e-5)
+    json.dumps(light.record())
+
+
+def test_proxy_of_tilted_light_and_finer_image() -> None:
+    def build(resolution: int) -> mi.Scene:
+        scene = mi.load_file(str(assets.scene("pose")), optimize=False, resolution=resolution)
+        params = mi.traverse(scene)
+        params["light.to_world"] = mi.Transform4f().look_at([0, 0, 0], [0.3, -0.2, -1], [0, 1, 0])
+        params.update()
+        return scene
+
+    coarse, fine = proxy.calibrate(build(32)), proxy.calibrate(build(64))
+    assert coarse.irradiance_residual <= 0.005 and fine.irradiance_residual <= 0.005
+    np.testing.assert_allclose(coarse.direction, np.array([0.3, -0.2, -1]) / np.linalg.norm([0.3, -0.2, -1]), atol=1e-5)
+    # Half the pixel, half the light's angle.
+    ratio = (fine.diameter / fine.distance) / (coarse.diameter / coarse.distance)
+    assert 0.4 < ratio < 0.6
+
+
+def test_proxy_errors_name_the_offender(scene: mi.Scene) -> None:
+    with pytest.raises(ShadowmapError, match="no emitter 'lamp'"):
+        proxy.calibrate(scene, light="lamp")
+    with pytest.raises(ShadowmapError, match="no shape 'floor'"):
+        proxy.calibrate(scene, receiver="floor")
+    still_life = mi.load_file(str(assets.scene("still_life")), optimize=False, resolution=16)
+    with pytest.raises(ShadowmapError, match="'bulb' is not directional"):
+        proxy.calibrate(still_life, light="bulb", receiver="table", casters=("vase",))
+
+
+def test_gradient_agrees_with_finite_differences(scene: mi.Scene, target: np.ndarray) -> None:
+    # A large light, whose shadow boundaries samples find often. Mitsuba leaves out the edges between flat-shaded faces,
+    # which is why the derivatives agree only roughly.
+    light = proxy.calibrate(scene, max_penumbra_px=1.5, uniformity=0.02)
+    pose = fit(target, ProjectiveSetting(16, 16, 64), proxy=light)
+    at = np.array([-0.35, 0.05, 0.2])
+    step = 0.02
+
+    def loss(parameters: np.ndarray) -> float:
+        return float(np.mean((pose.render(parameters, spp=256) - target) ** 2))
+
+    expected = [(loss(at + step * axis) - loss(at - step * axis)) / (2 * step) for axis in np.eye(3)]
+    value, _ = pose.loss_and_gradient(at)
+    gradients = []
+    for seed in range(8):
+        pose.seed = seed
+        gradients.append(pose.loss_and_gradient(at)[1])
+    gradient = np.mean(gradients, axis=0)
+    cosine = gradient @ expected / np.linalg.norm(gradient) / np.linalg.norm(expected)
+    assert value == pytest.approx(loss(at), rel=0.05)
+    assert cosine > 0.9, (gradient, expected)
+    assert 0.6 < np.linalg.norm(gradient) / np.linalg.norm(expected) < 1.5
+
+
+def test_continues_exactly_from_a_state(target: np.ndarray) -> None:
+    first = fit(target)
+    first.reset(pose_start(1))
+    for _ in range(3):
+        first.step()
+    state = {name: np.array(value) for name, value in first.state().items()}
+    losses = [first.step() for _ in range(2)]
+    second = fit(target)
+    second.load_state(state)
+    np.testing.assert_allclose([second.step() for _ in range(2)], losses, rtol=1e-5)
+    np.testing.assert_allclose(second.parameters(), first.parameters(), rtol=1e-4, atol=1e-6)
+
+
+def test_interface(target: np.ndarray) -> None:
+    pose = fit(target, step_size=0.02, seed=5)
+    np.testing.assert_array_equal(pose.parameters(), np.zeros(3))
+    image = pose.render(np.zeros(3))
+    assert image.shape == target.shape and image.dtype == np.float32
+    assert np.sqrt(np.mean((image - target) ** 2) / np.mean(target**2)) < 0.05
+    before = pose.parameters()
+    assert isinstance(pose.step(), float)
+    # Adam's first step has the length of its step size.
+    np.testing.assert_allclose(np.abs(pose.parameters() - before), 0.02, rtol=1e-3)
+    record = json.loads(json.dumps(pose.describe()))
+    assert record["proxy"]["penumbra_px"] <= 0.5 and record["guiding"] == "none" and record["step_size"] == 0.02
+
+
+def test_starts_follow_the_protocol() -> None:
+    rng = np.random.default_rng(7)
+    x, y, degrees = rng.uniform(-0.25, 0.25), rng.uniform(-0.25, 0.25), rng.uniform(-30, 30)
+    np.testing.assert_allclose(pose_start(3, seed=4), [np.radians(degrees), x, y])
+
+
+def test_errors(target: np.ndarray) -> None:
+    with pytest.raises(ShadowmapError, match="'tree'"):
+        ProjectiveSetting(1, 1, 1, "tree")
+    with pytest.raises(ShadowmapError, match="1/0/1"):
+        ProjectiveSetting(1, 0, 1)
+    with pytest.raises(ShadowmapError, match=r"\(8, 8, 3\)"):
+        fit(np.zeros((8, 8, 3)))
+    with pytest.raises(ShadowmapError, match=r"\(2,\)"):
+        fit(target).reset([0, 0])
+
+
+def test_fair_setting_is_stored() -> None:
+    assert fair_setting(128).guiding != "octree"
+    assert fair_setting(100) == fair_setting(128)

@@ -20,7 +20,7 @@ from shadowmap_dr import assets
 from shadowmap_dr.errors import ShadowmapError
 from shadowmap_dr.experiments import pose, pose_scene
 from shadowmap_dr.experiments.pose import PoseOptions, run_pose
-from shadowmap_dr.inverse import Method, PoseFit
+from shadowmap_dr.inverse import Method, PoseFit, optimize
 
 REQUIRED = {
     "object", "resolution", "method", "run", "seed", "start", "final", "rotation_error_deg", "translation_error_x100",
@@ -245,3 +245,48 @@ def test_unusable_resolution_and_object(tmp_path: Path) -> None:
     copy.write_bytes(assets.mesh("spot").read_bytes())
     with pytest.raises(ShadowmapError, match="same name"):
         run_pose(options(tmp_path, objects=("spot", str(copy))), build=build)
+
+
+@pytest.fixture(scope="module")
+def spot(tmp_path_factory: pytest.TempPathFactory) -> tuple[pose_scene.PoseProblem, np.ndarray]:
+    mi.set_variant("llvm_ad_rgb")
+    work = tmp_path_factory.mktemp("spot")
+    problem = pose_scene.make_problem("spot", 48, work=work)
+    return problem, pose_scene.path_traced_reference(problem, work / "reference.exr")
+
+
+def test_spot_is_found_from_a_path_traced_image(spot: Any) -> None:
+    method = pose.build_method("shadows", *spot)
+    history = optimize(method, pose_scene.start_pose(0, 1), 120)
+    rotation, offset = pose_scene.pose_errors(history.parameters)
+    assert rotation[0] > 20 and offset[0] > 20
+    assert rotation[-1] < 0.6 and offset[-1] < 1.0
+    assert method.recordings() <= 3
+
+
+def test_run_with_the_renderer_resumes(spot: Any, tmp_path: Path) -> None:
+    start, path = pose_scene.start_pose(0, 1), tmp_path / "a.npz"
+    first = pose.build_method("shadows", *spot)
+    before = optimize(first, start, 10, checkpoint=path)
+    after = optimize(pose.build_method("shadows", *spot), start, 11, checkpoint=path)
+    np.testing.assert_array_equal(after.parameters[:11], before.parameters)
+    # Only the next step can be compared: rounding errors, which differ from run to run, grow quickly.
+    first.step()
+    np.testing.assert_allclose(after.final, np.array(first.parameters()), atol=1e-5)
+    optimize(first, start, 1)
+    np.testing.assert_allclose(np.array(first.parameters()), before.parameters[1], atol=1e-5)
+
+
+def test_only_shadows_tell_the_pose_of_an_object_out_of_view(tmp_path: Path) -> None:
+    problem = pose_scene.make_problem("spot", 48, shadow_only=True, work=tmp_path)
+    reference = pose_scene.path_traced_reference(problem, tmp_path / "reference.exr")
+    start = pose_scene.start_pose(0, 1)
+    assert (pose.build_method("rasterizer", problem, reference).gradient(start) == 0).all()
+    gradient = pose.build_method("shadows", problem, reference).gradient(start)
+    assert (np.abs(gradient) > 1e-4).all()
+
+
+def test_own_reference_is_the_renderers_image_of_the_target(spot: Any, tmp_path: Path) -> None:
+    options_ = PoseOptions(resolutions=(16,), methods=("shadows",), iterations=1, reference="own", out=tmp_path)
+    assert run_pose(options_)[0]["reference"] == "own"
+    assert (tmp_path / "spot-16" / "reference-own.exr").exists()

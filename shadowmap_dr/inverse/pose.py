@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
+from dataclasses import fields, replace
 from typing import Any
 
 import drjit as dr
@@ -63,7 +65,7 @@ class PoseFit:
         image = np.asarray(reference, np.float32)
         if image.ndim != 3 or not np.isfinite(image).all():
             raise ShadowmapError(f"a reference of shape {image.shape}: give finite values in the shape (H, W, C).")
-        self._renderer = renderer
+        self._initial_renderer = renderer
         self._shape = shape
         self._p_rest = mi.Float(np.asarray(p_rest, np.float32).ravel())
         self._reference = mi.TensorXf(image)
@@ -91,19 +93,24 @@ class PoseFit:
         pose = mi.Float(np.asarray(parameters, np.float32))
         positions = apply_pose(self._p_rest, pose, self._shift_z)
         with dr.suspend_grad():
-            return np.array(self._renderer.render(vertex_positions={self._shape: positions}))
+            # A copy, since a renderer keeps the fit of its shadow maps from one image to the next.
+            return np.array(copy.copy(self._renderer).render(vertex_positions={self._shape: positions}))
 
     def gradient(self, parameters: npt.ArrayLike) -> npt.NDArray[np.float32]:
         """(3,) derivative of the loss with respect to the parameters; leaves the state of the fit alone."""
         pose = mi.Float(np.asarray(parameters, np.float32))
         dr.enable_grad(pose)
-        dr.backward(_loss(self._renderer, pose, self._p_rest, self._reference, self._shape, self._shift_z))
+        dr.backward(_loss(copy.copy(self._renderer), pose, self._p_rest, self._reference, self._shape, self._shift_z))
         return np.array(dr.grad(pose))
 
     def state(self) -> dict[str, npt.NDArray[Any]]:
-        """Parameters (3,), Adam's moments m and v (3,) and step count t (1,)."""
+        """Parameters (3,), Adam's moments m and v (3,), step count t (1,), and the fit of the shadow maps if there is one."""
         pose, _, _, (t, m, v, _) = self._optimizer.state["pose"]
-        return {"parameters": np.array(dr.detach(pose)), "m": np.array(m), "v": np.array(v), "t": np.array(t)}
+        state = {"parameters": np.array(dr.detach(pose)), "m": np.array(m), "v": np.array(v), "t": np.array(t)}
+        frusta = getattr(self._renderer, "frusta", None)
+        if frusta is not None:
+            state |= {f"frusta.{field.name}": np.array(getattr(frusta, field.name)) for field in fields(frusta)}
+        return state
 
     def load_state(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
         """Go on from what `state` returned."""
@@ -115,6 +122,11 @@ class PoseFit:
         t = type(t)(np.asarray(state["t"], np.uint32))
         m, v = (type(m)(np.asarray(state[name], np.float32)) for name in ("m", "v"))
         self._optimizer.state["pose"] = value, promoted, rate, (t, m, v, v_max)
+        # The fit of the shadow maps follows the object with some inertia: each run starts from the same fit, or from its own.
+        self._renderer = copy.copy(self._initial_renderer)
+        stored = {name.removeprefix("frusta."): mi.Float(value) for name, value in state.items() if name.startswith("frusta.")}
+        if stored:
+            self._renderer.frusta = replace(self._renderer.frusta, **stored)
 
     def recordings(self) -> int:
         """How often the step has been recorded so far; stays the same once the fit is warm."""

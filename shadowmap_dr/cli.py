@@ -291,8 +291,10 @@ def _root(error: BaseException) -> BaseException:
 
 def _one_line(error: BaseException) -> str:
     """Message of a Mitsuba exception without line breaks and without the position in Mitsuba's own source."""
-    text = " ".join(str(error).split())
-    return re.sub(r"\[\w+\.(?:cpp|h):\d+\] ?", "", text)
+    text = str(error)
+    if "Traceback (most recent call last)" in text:  # raised by a plug-in written in Python: its own message comes last
+        return re.sub(r"^[\w.]*(?:Error|Exception): ", "", text.strip().splitlines()[-1])
+    return re.sub(r"\[\w+\.(?:cpp|h):\d+\] ?", "", " ".join(text.split()))
 
 
 def _fail(message: str, status: int) -> None:

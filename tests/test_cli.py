@@ -73,6 +73,16 @@ def test_render_exr_equals_mitsuba(run: Any, tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == ["a.exr"]
 
 
+def test_render_with_shadow_maps_and_further_channels(run: Any) -> None:
+    aovs = "depth,position,normal,shape_index,prim_index,visibility"
+    result = run("render", "pose", "-o", "a.exr", "--size", "24x16", "--aovs", aovs)
+    assert result.status == 0, result.err
+    channels, metadata = io.read_exr("a.exr")
+    assert {"R", "G", "B", "depth", "position.X", "normal.Z", "shape_index", "visibility.light"} <= set(channels)
+    assert all(pixels.shape == (16, 24) for pixels in channels.values())
+    assert metadata["shadowmap_dr:integrator"] == "shadowmap"
+
+
 def test_render_png_in_another_size(run: Any) -> None:
     result = run("render", "pose", "-o", "sub/a.png", "--size", "30x20", "--integrator", "scene", "--spp", "1")
     assert result.status == 0, result.err
@@ -119,6 +129,10 @@ RENDER = ["render", "pose", "-D", "resolution=8", "--integrator", "direct", "--s
         ([*RENDER, "-o", "a.exr", "--aovs", "depth"], "NAME:TYPE"),
         ([*RENDER, "-o", "a.exr", "--aovs", "d:magic"], "magic"),
         ([*RENDER, "-o", "a.exr", "--variant", "magic"], "magic"),
+        (["render", "pose", "-o", "a.exr", "--aovs", "magic"], "error: --integrator shadowmap: There is no AOV 'magic'"),
+        (["render", "pose", "-o", "a.exr", "--variant", "llvm_ad_spectral"], "llvm_ad_spectral"),
+        (["render", "pose", "-o", "a.exr", "--size", "5000x10"], "4096"),
+        (["render", "lamp.xml", "-o", "a.exr"], "'lamp' emits light"),
         (["render", "bad_light.xml", "-o", "a.exr", "--integrator", "direct"], "not finite"),
         (["pose", "--object", "cow"], "cow"),
         (["pose", "--resolution", "0"], "0"),
@@ -140,6 +154,11 @@ def test_bad_input_is_one_clear_line(run: Any, tmp_path: Path, arguments: list[s
         '<scene version="3.0.0"><sensor type="perspective"><film type="hdrfilm"><integer name="width" value="4"/>'
         '<integer name="height" value="4"/></film></sensor>'
         '<emitter type="constant"><rgb name="radiance" value="nan"/></emitter></scene>'
+    )
+    (tmp_path / "lamp.xml").write_text(
+        '<scene version="3.0.0"><sensor type="perspective"><film type="hdrfilm"><integer name="width" value="4"/>'
+        '<integer name="height" value="4"/></film></sensor>'
+        '<shape type="sphere" id="lamp"><emitter type="area"/></shape></scene>'
     )
     result = run(*arguments)
     assert result.status in (1, 2)

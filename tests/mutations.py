@@ -1,0 +1,233 @@
+"""Breaks the renderer on purpose, one way at a time, and checks that a named test notices: ``python tests/mutations.py``.
+
+Each mutation replaces one function of the package while the tests run in a process of their own. A mutation counts as noticed
+only if its named tests fail by an assertion, its code was reached, and the same tests pass without it.
+
+This file is also the pytest plug-in that applies a mutation in that process (named by ``SHADOWMAP_MUTATION``).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+TESTS = Path(__file__).resolve().parent
+DERIVATIVE = "test_derivatives.py::test_forward_mode_agrees_with_path_traced_differences"
+
+
+@dataclass(frozen=True)
+class Mutation:
+    """A way to break the package, and the tests that must notice.
+
+    ``breaks`` makes the broken function from the good one, which is ``function`` of module ``shadowmap_dr.module``. It takes its
+    place in all modules, or with ``only_there`` in this one.
+    """
+
+    name: str
+    module: str
+    function: str
+    breaks: Callable[[Callable[..., Any]], Callable[..., Any]]
+    tests: tuple[str, ...]
+    only_there: bool = False
+
+
+def _halved_gradient(function: Callable[..., Any]) -> Callable[..., Any]:
+    def half(*arguments: Any, **options: Any) -> Any:
+        import drjit as dr
+
+        value = function(*arguments, **options)
+        return 0.5 * value + 0.5 * dr.detach(value)
+
+    return half
+
+
+def _flipped_direction(function: Callable[..., Any]) -> Callable[..., Any]:
+    return lambda direction: function(-direction)
+
+
+def _flipped_shading(function: Callable[..., Any]) -> Callable[..., Any]:
+    def flipped(light: Any, *arguments: Any) -> Any:
+        return function(replace(light, direction=-light.direction), *arguments)
+
+    return flipped
+
+
+def _no_antialiasing(function: Callable[..., Any]) -> Callable[..., Any]:
+    return lambda values, *_, **__: values
+
+
+def _detached_rotation(function: Callable[..., Any]) -> Callable[..., Any]:
+    def detached(*arguments: Any) -> Any:
+        import drjit as dr
+
+        view = function(*arguments)
+        return replace(view, right=dr.detach(view.right), up=dr.detach(view.up), forward=dr.detach(view.forward))
+
+    return detached
+
+
+def _detached_position(function: Callable[..., Any]) -> Callable[..., Any]:
+    def detached(position: Any, *arguments: Any) -> Any:
+        import drjit as dr
+
+        return function(dr.detach(position), *arguments)
+
+    return detached
+
+
+def _always_lit(function: Callable[..., Any]) -> Callable[..., Any]:
+    return lambda *arguments, **options: 0.0 * function(*arguments, **options) + 1.0
+
+
+def _half_a_texel_off(function: Callable[..., Any]) -> Callable[..., Any]:
+    def shifted(maps: Any, map_index: Any, u: Any, v: Any, *arguments: Any, **options: Any) -> Any:
+        step = 1.0 / maps.settings.resolution
+        return function(maps, map_index, u + step, v + step, *arguments, **options)
+
+    return shifted
+
+
+MUTATIONS = (
+    Mutation("halve the shadow gradient", "shadow.moments", "chebyshev_visibility", _halved_gradient,
+             (f"{DERIVATIVE}[llvm_ad_rgb-light_direction_box-256-1]",)),
+    Mutation("flip the light of the maps", "shadow.camera", "directional_view", _flipped_direction,
+             ("test_references.py::test_shadows_of_1024_texels[llvm_ad_rgb-pose]",)),
+    Mutation("flip the light of the shading", "lights", "DirectionalLight.illuminate", _flipped_shading,
+             ("test_references.py::test_shading_without_shadows[llvm_ad_rgb-pose]",)),
+    Mutation("switch moment anti-aliasing off", "shadow.shadow_map", "antialias", _no_antialiasing,
+             (f"{DERIVATIVE}[llvm_ad_rgb-light_direction_box-256-1]",), only_there=True),
+    Mutation("detach the light's rotation", "shadow.camera", "directional_view", _detached_rotation,
+             (f"{DERIVATIVE}[llvm_ad_rgb-light_direction_box-256-1]",)),
+    Mutation("detach the spot light's position", "shadow.camera", "spot_view", _detached_position,
+             (f"{DERIVATIVE}[llvm_ad_rgb-spot_position_box-256-1]",)),
+    Mutation("leave the shadows out", "shadow.moments", "chebyshev_visibility", _always_lit,
+             ("test_references.py::test_shadows_of_1024_texels[llvm_ad_rgb-gallery]",)),
+    Mutation("look half a texel off", "shadow.shadow_map", "_bilinear", _half_a_texel_off,
+             ("test_references.py::test_shadows_of_1024_texels[llvm_ad_rgb-gallery]",)),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the named tests said: ``noticed`` if all failed by an assertion, ``detail`` otherwise says what happened."""
+
+    name: str
+    tests: tuple[str, ...]
+    noticed: bool
+    detail: str
+
+
+def check_all(
+    mutations: tuple[Mutation, ...] = MUTATIONS, report: Callable[[Verdict], None] = lambda verdict: None
+) -> list[Verdict]:
+    """Run the named tests without any mutation (they must pass), then each mutation's with it (they must fail)."""
+    healthy = tuple(dict.fromkeys(test for mutation in mutations for test in mutation.tests))
+    _, outcomes = _run(healthy, None)
+    broken = [test for test in healthy if outcomes.get(test) != "passed"]
+    verdicts = [Verdict("none", healthy, not broken, "all pass" if not broken else f"do not pass: {', '.join(broken)}")]
+    report(verdicts[0])
+    for mutation in mutations:
+        reached, outcomes = _run(mutation.tests, mutation)
+        seen = [outcomes.get(test, "did not run") for test in mutation.tests]
+        noticed = reached > 0 and all(outcome.startswith("AssertionError") for outcome in seen)
+        detail = "; ".join(seen) + ("" if reached else "; the broken function was never called")
+        verdicts.append(Verdict(mutation.name, mutation.tests, noticed, detail))
+        report(verdicts[-1])
+    return verdicts
+
+
+def _run(tests: tuple[str, ...], mutation: Mutation | None) -> tuple[int, dict[str, str]]:
+    """(calls of the broken function, outcome by test: ``passed``, ``skipped`` or the exception in one line)."""
+    with tempfile.TemporaryDirectory() as folder:
+        record = Path(folder) / "record.json"
+        environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTEST_")}
+        environment.update(SHADOWMAP_MUTATION=mutation.name if mutation else "", SHADOWMAP_MUTATION_RECORD=str(record))
+        environment["PYTHONPATH"] = os.pathsep.join([str(TESTS), str(TESTS.parent), environment.get("PYTHONPATH", "")])
+        command = [sys.executable, "-m", "pytest", "-q", "-p", "mutations", "-p", "no:cacheprovider", f"--rootdir={TESTS.parent}"]
+        command += [str(TESTS / test) for test in tests]
+        done = subprocess.run(command, env=environment, cwd=TESTS.parent, capture_output=True, text=True, timeout=600)
+        if not record.exists():
+            raise RuntimeError(f"pytest did not run:\n{done.stdout[-2000:]}{done.stderr[-2000:]}")
+        content = json.loads(record.read_text())
+        return content["calls"], content["outcomes"]
+
+
+# The plug-in, in the process that runs the tests.
+
+_calls = 0
+_outcomes: dict[str, str] = {}
+
+
+def pytest_configure() -> None:
+    name = os.environ.get("SHADOWMAP_MUTATION")
+    if name:
+        _apply(next(mutation for mutation in MUTATIONS if mutation.name == name))
+
+
+def _apply(mutation: Mutation) -> None:
+    import shadowmap_dr.renderer  # noqa: F401  (everything a rendering calls is loaded now)
+
+    owner: Any = sys.modules[f"shadowmap_dr.{mutation.module}"]
+    *classes, attribute = mutation.function.split(".")
+    for name in classes:
+        owner = getattr(owner, name)
+    good = getattr(owner, attribute)
+    bad = mutation.breaks(good)
+
+    def counted(*arguments: Any, **options: Any) -> Any:
+        global _calls
+        _calls += 1
+        return bad(*arguments, **options)
+
+    setattr(owner, attribute, counted)
+    if mutation.only_there:
+        return
+    # Functions are imported by name: replace them wherever they are known.
+    for module in [m for key, m in sys.modules.items() if key.startswith("shadowmap_dr") and isinstance(m, ModuleType)]:
+        for key in [key for key, value in vars(module).items() if value is good]:
+            setattr(module, key, counted)
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo) -> Any:
+    outcome = (yield).get_result()
+    name = item.nodeid.removeprefix("tests/")
+    if call.excinfo is not None:
+        reason = " ".join(str(call.excinfo.value).split("\n")[:1])
+        _outcomes[name] = "skipped" if outcome.skipped else f"{call.excinfo.type.__name__}: {reason}"
+    elif call.when == "call":
+        _outcomes[name] = outcome.outcome
+
+
+def pytest_sessionfinish() -> None:
+    record = os.environ.get("SHADOWMAP_MUTATION_RECORD")
+    if record:
+        Path(record).write_text(json.dumps({"calls": _calls, "outcomes": _outcomes}))
+
+
+def main() -> None:
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
+
+    def report(verdict: Verdict) -> None:
+        mark = "ok    " if verdict.noticed else "MISSED"
+        print(f"{mark} {verdict.name:34} {verdict.detail}", flush=True)
+        for test in verdict.tests:
+            print(f"{'':6} {'':34} {test}", flush=True)
+
+    verdicts = check_all(report=report)
+    sys.exit(0 if all(verdict.noticed for verdict in verdicts) else 1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,8 +1,8 @@
 """The Mitsuba plug-in ``shadowmap``: a thin shell over :class:`shadowmap_dr.Renderer`.
 
-``import shadowmap_dr`` registers it for every variant ``*_ad_rgb`` and ``*_ad_mono`` that is or will be set; in others, loading it
-raises a ``ShadowmapError``. The module itself holds no types of a variant and no state: what a scene needs once (topology, the
-plan of its shadow maps, their frusta) lives in the integrator that renders it.
+``import shadowmap_dr`` registers it for every variant ``*_ad_rgb`` and ``*_ad_mono`` that is or will be set; in others, loading
+it raises a ``ShadowmapError``. The module itself holds no types of a variant and no state: what a scene needs once (topology,
+the plan of its shadow maps, their frusta) lives in the integrator that renders it.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ class Options:
     antialias              anti-alias the image; without it outlines have no gradient
     ambient                radiance of unshadowed light from all directions, beside that of the scene's environment
     hide_emitters          environments light the scene, but are not seen themselves
-    aovs                   further channels, separated by commas: names of ``shadowmap_dr.aovs.AOVS``, or ``label:name`` to call the
-                           channel ``label``
+    aovs                   further channels, separated by commas: names of ``shadowmap_dr.aovs.AOVS``, or ``label:name`` to call
+                           the channel ``label``
     tessellation           triangles around spheres, disks and cylinders, at least 3
     compat                 conventions of Worchel and Alexa's code
     """
@@ -145,6 +145,8 @@ class SceneRenderer:
     @classmethod
     def build(cls, scene: Any, options: Options, settings: RenderSettings) -> SceneRenderer:
         """Read a scene. Raises ShadowmapError for what is not supported."""
+        if dr.flag(dr.JitFlag.FreezingScope):
+            raise ShadowmapError("A scene cannot be read while a function is frozen: render it once with this integrator before.")
         with dr.suspend_grad():
             renderer = Renderer.from_data(load(scene, tessellation=options.tessellation), settings)
         data = renderer.data
@@ -167,7 +169,7 @@ class SceneRenderer:
         current = self.renderer.with_data(replace(self.renderer.data, scene=scene)).refresh()
         current = current.with_data(replace(current.data, sensors=(sensor,)))
         image = current.render(spp=spp)
-        # Refitting for the same vertices and lights keeps the frusta as they are: the derivatives of a step see those of its image.
+        # Fitting them again to the same vertices and lights keeps them bit by bit: a step's derivatives see those of its image.
         self.renderer.frusta = current.frusta
         return image
 
@@ -260,13 +262,13 @@ def sensor_of(scene: Any, sensor: Any) -> Any:
 
 def make_class() -> type:
     """The integrator class for the current variant, whose base class is made anew for each."""
-    from mitsuba.ad.integrators.common import ADIntegrator
 
-    class ShadowMapIntegrator(ADIntegrator):
+    # Not imported from `mitsuba.ad`: that would load the module a second time, which then stays with the first variant.
+    class ShadowMapIntegrator(mi.ad.integrators.common.ADIntegrator):
         """Renders and differentiates with shadow maps. Parameters: :class:`Options`.
 
         ``spp`` not given (0) means one anti-aliased sample for each pixel; otherwise a grid of ``ceil(sqrt(spp)) ** 2``, at most
-        16 x 16. The scene's sampler, its sample count and the film's reconstruction filter are not used; ``seed`` changes nothing.
+        16 x 16. The scene's sampler and the film's reconstruction filter are not used, and ``seed`` changes nothing.
         """
 
         def __init__(self, props: Any) -> None:
@@ -293,9 +295,7 @@ def make_class() -> type:
                 dr.forward_to(image)
                 return dr.grad(image)
 
-        def render_backward(
-            self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0
-        ) -> None:
+        def render_backward(self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> None:
             """Add the gradients of <image, grad_in> to the parameters."""
             with dr.resume_grad():
                 image = self.shell.image(scene, sensor_of(scene, sensor), spp)

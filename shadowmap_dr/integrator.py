@@ -18,8 +18,8 @@ from .aovs import aov_names
 from .errors import ShadowmapError
 from .renderer import Renderer, RenderSettings
 from .scene import SceneData, load
-from .sensors import Sensor, sensors_of
-from .shadow import ShadowSettings
+from .sensors import sensors_of
+from .shadow import Frusta, ShadowSettings
 from .traversal import mesh_buffers, parameters
 
 PLUGIN = "shadowmap"
@@ -27,7 +27,9 @@ PLUGIN = "shadowmap"
 # Names that Mitsuba's own `aov` integrator has for channels of ours.
 _SYNONYMS = {"sh_normal": "normal"}
 # Scenes that one integrator remembers; each holds the scene's shapes in memory.
-_REMEMBERED = 4
+_REMEMBERED_SCENES = 4
+# Sensors whose fit of the shadow maps is remembered.
+_REMEMBERED_SENSORS = 64
 
 
 @dataclass(frozen=True)
@@ -131,9 +133,10 @@ class SceneRenderer:
 
     parts     shapes, BSDFs and emitters of the scene; kept alive here, so that comparing them by identity is safe
     statics   arrays that decided on the topology and on the shadow maps: faces, and the cutoff angles of spot lights
-    sizes     number of vertices of each shape
+    sizes     number of vertices and faces of each mesh
     lights    names of the lights
     renderer  without what is re-read for each rendering
+    fits      (sensor, frusta of the shadow maps) of the last image that it took, latest first
     """
 
     parts: tuple[Any, ...]
@@ -141,15 +144,16 @@ class SceneRenderer:
     sizes: tuple[int, ...]
     lights: tuple[str, ...]
     renderer: Renderer
+    fits: list[tuple[Any, Frusta | None]] = field(default_factory=list)
 
     @classmethod
-    def build(cls, scene: Any, options: Options, settings: RenderSettings) -> SceneRenderer:
+    def build(cls, scene: Any, sensor: Any, options: Options, settings: RenderSettings) -> SceneRenderer:
         """Read a scene. Raises ShadowmapError for what is not supported."""
         if dr.flag(dr.JitFlag.FreezingScope):
             raise ShadowmapError("A scene cannot be read while a function is frozen: render it once with this integrator before.")
         with dr.suspend_grad():
-            renderer = Renderer.from_data(load(scene, tessellation=options.tessellation), settings)
-        data = renderer.data
+            data = replace(load(scene, tessellation=options.tessellation), sensors=(sensors_of(sensor),))
+            renderer = Renderer.from_data(data, settings)
         lights = tuple(light.name for light in data.lights)
         return cls(_parts(scene, data), _statics(scene, data), _sizes(data), lights, renderer.with_data(_without_scene(data)))
 
@@ -164,13 +168,16 @@ class SceneRenderer:
         self.statics = statics
         return True
 
-    def render(self, scene: Any, sensor: tuple[Sensor, ...], spp: int) -> Any:
+    def render(self, scene: Any, sensor: Any, spp: int) -> Any:
         """Image (mi.TensorXf), attached to the scene's parameters unless gradients are suspended."""
         current = self.renderer.with_data(replace(self.renderer.data, scene=scene)).refresh()
-        current = current.with_data(replace(current.data, sensors=(sensor,)))
+        current = current.with_data(replace(current.data, sensors=(sensors_of(sensor),)))
+        # Each sensor goes on from its own fit. Fitting it again to the same vertices and lights keeps it bit by bit, so the
+        # derivatives of a step see the frusta of its image, whatever other sensors have taken in between.
+        others = [fit for fit in self.fits if fit[0] is not sensor]
+        current.frusta = next((frusta for known, frusta in self.fits if known is sensor), self.renderer.frusta)
         image = current.render(spp=spp)
-        # Fitting them again to the same vertices and lights keeps them bit by bit: a step's derivatives see those of its image.
-        self.renderer.frusta = current.frusta
+        self.fits = [(sensor, current.frusta), *others][:_REMEMBERED_SENSORS]
         return image
 
 
@@ -229,9 +236,9 @@ class Shell:
         """Attached image. ``spp`` 0 means not given: one sample, anti-aliased."""
         if spp < 0:
             raise ShadowmapError(f"spp is {spp}: give a positive number, or 0 for one anti-aliased sample.")
-        record = self._record(scene)
+        record = self._record(scene, sensor)
         self.light_names = record.lights
-        return record.render(scene, sensors_of(sensor), spp or 1)
+        return record.render(scene, sensor, spp or 1)
 
     def channel_names(self) -> list[str]:
         """Names of the further channels, in order; those of ``visibility`` follow the lights of the scene rendered last."""
@@ -240,13 +247,13 @@ class Shell:
             names += [label + channel[len(name) :] for channel in aov_names((name,), list(self.light_names))]
         return names
 
-    def _record(self, scene: Any) -> SceneRenderer:
+    def _record(self, scene: Any, sensor: Any) -> SceneRenderer:
         for record in self.scenes:
             if record.matches(scene):
                 break
         else:
-            record = SceneRenderer.build(scene, self.options, self.settings)
-        self.scenes = [record, *(other for other in self.scenes if other is not record)][:_REMEMBERED]
+            record = SceneRenderer.build(scene, sensor, self.options, self.settings)
+        self.scenes = [record, *(other for other in self.scenes if other is not record)][:_REMEMBERED_SCENES]
         return record
 
 

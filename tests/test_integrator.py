@@ -38,12 +38,12 @@ def ball(subdivisions: int = 2) -> Any:
     return mesh
 
 
-def camera(size: int = SIZE, **film: Any) -> dict[str, Any]:
+def camera(size: int = SIZE, fov: float = 45, **film: Any) -> dict[str, Any]:
     film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}, "pixel_format": "rgb", **film}
     to_world = mi.ScalarTransform4f().look_at([2, -3, 4], [0, 0, 0], [0, 0, 1])
     # The sampler's count must not matter: a plug-in that heeded it would take 64 samples.
     sampler = {"type": "independent", "sample_count": 64}
-    return {"type": "perspective", "fov": 45, "to_world": to_world, "film": film, "sampler": sampler}
+    return {"type": "perspective", "fov": fov, "to_world": to_world, "film": film, "sampler": sampler}
 
 
 def floor(**changes: Any) -> dict[str, Any]:
@@ -349,7 +349,9 @@ def test_wider_spot_light_is_noticed(variant: str) -> None:
 
 
 def test_derivatives_see_the_frusta_of_the_image(variant: str) -> None:
-    scene, integrator = small_scene(), shadowmap()
+    """Although images of another sensor, which sees less and has other frusta, come in between."""
+    sideways = mi.ScalarTransform4f().look_at([0.3, -3, 1.2], [0.3, 0, 1.2], [0, 0, 1])
+    scene, integrator = small_scene(close={**camera(fov=1), "to_world": sideways}), shadowmap()
     params = mi.traverse(scene)
     key = "ball.vertex_positions"
     for shift in (0.0, 0.02, 0.7):  # kept, kept, fitted anew
@@ -357,16 +359,20 @@ def test_derivatives_see_the_frusta_of_the_image(variant: str) -> None:
         dr.enable_grad(params[key])
         params.update()
         image = mi.render(scene, params, integrator=integrator)
-        before = _numbers(integrator)
+        before = _frusta(integrator)
+        mi.render(scene, params, integrator=integrator, sensor=1)
+        assert not np.array_equal(before, _frusta(integrator))
         dr.backward(dr.sum(image), flags=dr.ADFlag.ClearNone)
-        assert np.array_equal(before, _numbers(integrator))
+        assert np.array_equal(before, _frusta(integrator))
+        mi.render(scene, params, integrator=integrator, sensor=1)
         dr.set_grad(params[key], 1.0)
         integrator.render_forward(scene, params)
-        assert np.array_equal(before, _numbers(integrator))
+        assert np.array_equal(before, _frusta(integrator))
 
 
-def _numbers(integrator: Any) -> np.ndarray:
-    frusta = integrator.shell.scenes[0].renderer.frusta
+def _frusta(integrator: Any) -> np.ndarray:
+    """Numbers of the frusta of the latest image."""
+    _, frusta = integrator.shell.scenes[0].fits[0]
     return np.array([value.numpy() for value in vars(frusta).values()])
 
 
@@ -381,6 +387,10 @@ def test_scenes_are_not_kept_alive(variant: str) -> None:
     for _ in range(6):
         render(small_scene(camera=camera(4)), integrator)
     assert len(integrator.shell.scenes) <= 4
+    scene = small_scene()
+    for _ in range(70):
+        render(scene, integrator, sensor=mi.load_dict(camera(1)))
+    assert len(integrator.shell.scenes[0].fits) <= 64
 
 
 def test_frozen_loop(variant: str) -> None:
@@ -436,8 +446,9 @@ def test_aovs(variant: str) -> None:
     assert np.array_equal(image[..., :3], render(scene))
     types = "d:depth,p:position,n:sh_normal,s:shape_index,i:prim_index"
     traced = render(scene, mi.load_dict({"type": "aov", "aovs": types, "sub": {"type": "direct"}}), spp=1)[..., -9:]
-    # Mitsuba counts shapes from 1, and its sample lies anywhere in the pixel instead of its middle.
-    inside = channels["shape_index"] == traced[..., 7] - 1
+    # Mitsuba numbers shapes as they were created, and its sample lies anywhere in the pixel instead of its middle.
+    numbers = [dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0] for shape in scene.shapes()]
+    inside = np.choose(channels["shape_index"].astype(int) + 1, [0, *numbers]) == traced[..., 7]
     assert inside.mean() > 0.95
     assert np.median(np.abs(channels["depth"] - traced[..., 0])[inside]) < 0.05
     assert np.median(np.abs(channels["position.X"] - traced[..., 1])[inside]) < 0.05
@@ -499,6 +510,11 @@ def test_batch_sensor(variant: str) -> None:
     assert image.shape == (32, 64, 3)
     for k, single in enumerate(cameras):
         assert np.allclose(image[:, 32 * k : 32 * k + 32], render(small_scene(camera=single)), atol=1e-5)
+
+
+def test_scene_without_sensors(variant: str) -> None:
+    scene = small_scene(camera=None)
+    assert np.array_equal(render(scene, sensor=mi.load_dict(camera())), render(small_scene()))
 
 
 def test_sensor_by_number_and_by_object(variant: str) -> None:

@@ -191,9 +191,9 @@ def _search(
 
     first = image * topology.count
     ends = []
-    for edge, share, neighbour, is_open in (
-        (edge_right, share_right, right, open_right),
-        (edge_down, share_down, down, open_down),
+    for edge, share, neighbour, is_open, horizontal in (
+        (edge_right, share_right, right, open_right, True),
+        (edge_down, share_down, down, open_down, False),
     ):
         found = edge != NO_EDGE
         ab = dr.gather(module.Array2u, topology.edges, edge - first, found)
@@ -204,7 +204,7 @@ def _search(
             ca, cb, shared = _common_edge(topology, here, neighbour, crease)
             steepness = _share(positions, image * vertex_count, ca, cb, shared, shape)
             a, b = dr.select(shared, ca, a), dr.select(shared, cb, b)
-            share = dr.select(shared, steepness if edge is edge_right else 1 - steepness, share)
+            share = dr.select(shared, steepness if horizontal else 1 - steepness, share)
         ends.append((a, b, share))
 
     (ra, rb, right_share), (da, db, down_share) = ends
@@ -255,9 +255,8 @@ def _share(positions: Any, first: Any, a: Any, b: Any, active: Any, shape: GridS
     """Share of horizontal pairs in an edge, from its direction in the image (of its line, if it reaches behind the camera)."""
     module = backend(positions)
     p, q = (dr.gather(module.Array4f, positions, first + v, active) for v in (a, b))
-    nx, ny = (p.y * q.w - q.y * p.w) * shape.width, (q.x * p.w - p.x * q.w) * shape.height
-    # The line a x + b y + c = 0 in ndc is a (2 / width) x + ... in pixels: the normal's components swap their factors.
-    nx, ny = nx / shape.width**2, ny / shape.height**2
+    # A line a x + b y + c = 0 in ndc has the normal (a / width, b / height) in pixels.
+    nx, ny = (p.y * q.w - q.y * p.w) / shape.width, (q.x * p.w - p.x * q.w) / shape.height
     square = nx * nx + ny * ny
     return dr.clip(0.5 + (nx * nx - ny * ny) / dr.select(square > 0, square, 1), 0, 1)
 

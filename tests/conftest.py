@@ -15,9 +15,10 @@ import mitsuba as mi
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    # Parallel workers share the cores instead of each claiming all of them. Never one thread alone: with it, Mitsuba 3.9 waits
+    # forever when it reads or writes an EXR file.
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
-    if workers > 1:  # parallel workers share the cores instead of each claiming all of them
-        dr.set_thread_count(max(1, (os.cpu_count() or 1) // workers))
+    dr.set_thread_count(max(2, (os.cpu_count() or 1) // workers))
 
 
 @pytest.fixture(params=["llvm_ad_rgb", "cuda_ad_rgb"])

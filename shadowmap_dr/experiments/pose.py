@@ -141,17 +141,16 @@ def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Co
     result: list[dict[str, Any]] = []
     with report.progress(console) as progress:
         for problem in problems:
-            task = progress.add_task(f"{problem.folder} reference", total=None, note="")
+            task = progress.add_task(f"{problem.folder} reference and methods", total=None, note="")
             reference = _reference(problem, options, build)
+            # Built once and used for all runs: what a method compiled stays warm, and what cannot be built fails at once.
+            methods = {name: build(name, problem, reference) for name in options.methods}
             progress.remove_task(task)
             records, images = [], {}
-            methods: dict[str, Method] = {}  # built when first needed, then used for all runs: what it compiled stays warm
             for run in range(options.runs):
                 for name in options.methods:
                     title = f"{problem.folder} {name} run {run}"
-                    task = progress.add_task(title, total=options.iterations, note="preparing")
-                    if name not in methods:
-                        methods[name] = build(name, problem, reference)
+                    task = progress.add_task(title, total=options.iterations, note="")
                     step = functools.partial(_show, progress, task)
                     record = _run_one(problem, name, run, options, methods[name], stored, step)
                     final = record["final"] if None not in record["final"] else start_pose(options.seed, run)

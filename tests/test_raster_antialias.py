@@ -268,3 +268,18 @@ def test_creases_between_flat_faces_move(variant: str) -> None:
     assert abs(float(dr.grad(shift)[0]) - want) < want * 4 / rows
     plain = antialias(value, out, clip, topology)
     assert np.abs(plain.numpy() - image.numpy()).max() > 0.1
+
+
+def test_plain_dr_jit_arrays_do_as_well(variant: str) -> None:
+    """Types without derivatives, and of no renderer: the same values."""
+    plain = dr.llvm if variant.startswith("llvm") else dr.cuda
+    faces, results = np.array([[0, 1, 2]], np.uint32), []
+    for module in (plain, plain.ad):
+        clip = module.TensorXf(TRIANGLE)
+        out = rasterize(clip, module.TensorXu(faces), (16, 16))
+        value = dr.select(out.valid, module.Float(1), module.Float(0))
+        image = antialias(value, out, clip, build_topology(faces, TRIANGLE[:, :3], module.UInt32))
+        results.append((image.numpy(), interpolate(clip, out, module.TensorXu(faces)).numpy()))
+        assert type(image) is module.Float
+    for a, b in zip(*results, strict=True):
+        np.testing.assert_array_equal(a, b)

@@ -17,15 +17,14 @@ MAX_RESOLUTION = 4096
 
 
 def backend(array: Any) -> ModuleType:
-    """The Dr.Jit module (``drjit.llvm.ad``, ``drjit.cuda.ad``, ...) whose types ``array`` is made of.
+    """The Dr.Jit module (``drjit.llvm``, ``drjit.llvm.ad``, ``drjit.cuda.ad``, ...) whose types ``array`` is made of.
 
     Nested types that other libraries derive (such as ``mitsuba.Point3f``) are resolved through their components.
     """
     leaf = array
     while dr.depth_v(leaf) > 1 and not dr.is_tensor_v(leaf):
         leaf = leaf[0]
-    module = sys.modules[dr.detached_t(type(leaf)).__module__ + ".ad"]
-    return module
+    return sys.modules[type(leaf).__module__]
 
 
 @dataclass(frozen=True)

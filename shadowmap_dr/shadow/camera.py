@@ -360,12 +360,12 @@ def _fit(
     def reduce(value: Any, op: Any, start: float) -> Any:
         target = dr.full(module.Float, start, views.count)
         dr.scatter_reduce(op, target, value, map_index, casts)
-        dr.eval(target)
         return target
 
     low, high = dr.ReduceOp.Min, dr.ReduceOp.Max
     x0, y0, z0 = (reduce(v, low, dr.inf) for v in (bounds.x0, bounds.y0, bounds.z0))
     x1, y1, z1 = (reduce(v, high, -dr.inf) for v in (bounds.x1, bounds.y1, bounds.z1))
+    dr.eval(x0, y0, z0, x1, y1, z1)  # in one kernel
     nothing = ~(x1 >= x0)
     x0, y0, x1, y1 = (dr.select(nothing, s, v) for s, v in ((-1.0, x0), (-1.0, y0), (1.0, x1), (1.0, y1)))
     z0, z1 = dr.select(nothing, 0.0, z0), dr.select(nothing, 1.0, z1)

@@ -13,6 +13,7 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from .geometry import Geometry, normalize_or
 from .raster import Topology
@@ -21,6 +22,8 @@ from .shading import Surface
 
 # Facets below the first size (in pixels) are shaded with mean normals, those above the second with their own.
 _SMALL, _LARGE = 1.5, 3.0
+# Vertex normals that differ by less (in any component) are the same for the eye.
+_NORMAL_JUMP = 0.02
 
 
 def flat_faces(geometry: Geometry) -> Any:
@@ -29,6 +32,34 @@ def flat_faces(geometry: Geometry) -> Any:
     if not any(flat):
         return None
     return dr.gather(mi.Bool, mi.Bool(flat), geometry.face_shape)
+
+
+def crease_edges(geometry: Geometry, topology: Topology) -> Any:
+    """``Bool`` (3 F,): whether shading jumps at the edge from corner k to k + 1 of a face. None if at none (on the host, once).
+
+    It does at the edges of flat faces, and between faces whose vertex normals differ at the edge they share.
+    """
+    shapes = geometry.face_shape.numpy()
+    flat = np.array([not info.has_normals and not info.planar for info in geometry.shapes])[shapes]
+    normals = dr.detach(geometry.normals).numpy().reshape(-1, 3)
+    faces, welded = (np.asarray(a.numpy(), np.int64).reshape(-1, 3) for a in (geometry.faces, topology.welded))
+    start, end = welded.ravel(), np.roll(welded, -1, 1).ravel()
+    key = np.minimum(start, end) * len(normals) + np.maximum(start, end)
+    order = np.argsort(key, kind="stable")
+    same = key[order][1:] == key[order][:-1]
+    one, other = order[:-1][same], order[1:][same]
+    # Normals of both at both ends: the other's half-edge may run either way.
+    first, second = normals[faces.ravel()], normals[np.roll(faces, -1, 1).ravel()]
+    reverse = (start[one] != start[other])[:, None]
+    jump = np.maximum(
+        np.abs(first[one] - np.where(reverse, second[other], first[other])).max(1),
+        np.abs(second[one] - np.where(reverse, first[other], second[other])).max(1),
+    )
+    smooth = np.array([info.has_normals for info in geometry.shapes])[shapes]
+    hard = np.repeat(flat, 3)
+    split = (jump > _NORMAL_JUMP) & smooth[one // 3] & smooth[other // 3]
+    hard[one[split]] = hard[other[split]] = True
+    return mi.Bool(hard) if hard.any() else None
 
 
 def mean_normals(geometry: Geometry, topology: Topology, flat: Any) -> Any:
@@ -57,9 +88,10 @@ def pixel_size(sensor: Sensor, height: int, w_clip: Any) -> Any:
 
 def soften_facets(
     seen: Surface, geometry: Geometry, topology: Topology, flat: Any, triangle: Any, u: Any, v: Any, pixel: Any
-) -> Surface:
+) -> tuple[Surface, Any]:
     """Replace the normals of flat-shaded facets smaller than ``pixel`` (world units) by the mean over their neighbourhood.
 
+    Also returns how much of their own normal is left (Float, 0 to 1), by which the edges between them still show.
     Gradients flow to the vertices through the new normals, not through the size of the facets.
     """
     active = seen.active & dr.gather(mi.Bool, flat, triangle, seen.active)
@@ -86,4 +118,4 @@ def soften_facets(
         dr.select(soft, normal, si.sh_frame.n),
     )
     si.wi = si.to_local(wi_world)
-    return replace(seen, n_world=dr.select(soft, mi.Normal3f(normal), seen.n_world), si=si)
+    return replace(seen, n_world=dr.select(soft, mi.Normal3f(normal), seen.n_world), si=si), 1 - mix

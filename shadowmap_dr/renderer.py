@@ -12,7 +12,7 @@ import mitsuba as mi
 from .aovs import AOVS, collect_aovs
 from .camera_pass import camera_clip, footprint_points, view_frustum, within_far_plane
 from .errors import ShadowmapError
-from .facets import flat_faces, pixel_size, soften_facets
+from .facets import crease_edges, flat_faces, pixel_size, soften_facets
 from .geometry import Geometry
 from .light_maps import MapPlan, light_visibility, make_maps, plan_maps
 from .lights import Light, SpotLight, SquareSpot
@@ -70,6 +70,7 @@ class Renderer:
         plan: which shadow maps there are.
         settings: how to render.
         flat: ``Bool`` (F,), faces that are shaded flat, or None.
+        creases: ``Bool`` (3 F,), edges of faces at which shading jumps, or None.
         frusta: fit of the shadow maps in the last rendering, None before the first.
     """
 
@@ -78,6 +79,7 @@ class Renderer:
     plan: MapPlan
     settings: RenderSettings
     flat: Any = None
+    creases: Any = None
     frusta: Frusta | None = None
 
     @classmethod
@@ -121,7 +123,8 @@ class Renderer:
         geometry = data.geometry
         positions = dr.detach(geometry.positions).numpy()
         topology = build_topology(geometry.faces.numpy(), positions, mi.UInt32)
-        renderer = cls(data, topology, plan_maps(data.lights, geometry), settings, flat_faces(geometry))
+        plan, creases = plan_maps(data.lights, geometry), crease_edges(geometry, topology)
+        renderer = cls(data, topology, plan, settings, flat_faces(geometry), creases)
         # The first fit is made here, so that a step which is recorded later always starts from one.
         if renderer._has_shadows:
             with dr.suspend_grad():
@@ -215,16 +218,17 @@ class Renderer:
         raster = rasterize(clip, geometry.faces, (height, width), check_indices=False, transparent=transparent)
         active = raster.valid & within_far_plane(sensor, raster.w)
         seen = surface(self.data, geometry, sensor, raster.triangle, raster.u, raster.v, active)
+        sharpness = None
         if self.flat is not None:
             pixel = pixel_size(sensor, height, raster.w)
-            seen = soften_facets(seen, geometry, self.topology, self.flat, raster.triangle, raster.u, raster.v, pixel)
+            seen, sharpness = soften_facets(seen, geometry, self.topology, self.flat, raster.triangle, raster.u, raster.v, pixel)
         visible = [self._visibility(maps, light, k, seen, raster, sensor) for k, light in enumerate(lights)]
         color = self._radiance(seen, lights, visible, sensor, raster)
         channels = _film_channels(color, seen.active, sensor)
         named = collect_aovs(self.settings.aovs, seen, raster, lights, visible)
         if self.settings.antialias:
             flat = _interleave(channels)
-            flat = antialias(flat, raster, clip, self.topology, creases=self.flat)
+            flat = antialias(flat, raster, clip, self.topology, creases=self.creases, crease_weights=sharpness)
             image = mi.TensorXf(flat, shape=(height, width, len(channels)))
         else:
             image = mi.TensorXf(_interleave(channels), shape=(height, width, len(channels)))

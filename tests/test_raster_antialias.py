@@ -260,7 +260,7 @@ def test_creases_between_flat_faces_move(variant: str) -> None:
     clip = mi.TensorXf(dr.ravel(mi.Point4f(x + shift * ridge, y, z, 1)), shape=(6, 4))
     out = rasterize(clip, mi.TensorXu(faces), (size, size))
     value = dr.gather(mi.Float, colors, out.triangle, out.valid)
-    image = antialias(value, out, clip, topology, creases=mi.Bool([True] * 4))
+    image = antialias(value, out, clip, topology, creases=mi.Bool([True] * 12))
     dr.backward(dr.sum(image))
     want = 0.75 * 1.6 * (size / 2) ** 2
     # Next to a vertex, where the faces at the ridge are narrower than a pixel, the two pixels see faces without a common edge.

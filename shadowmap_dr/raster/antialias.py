@@ -19,6 +19,7 @@ def antialias(
     *,
     crossings: Crossings | None = None,
     creases: Any = None,
+    crease_weights: Any = None,
 ) -> Any:
     """Blend each pixel with the neighbours from which a silhouette separates it, by the share of the pixel they cover.
 
@@ -32,7 +33,8 @@ def antialias(
         positions: clip-space vertices as given to the rasterizer.
         topology: :func:`shadowmap_dr.raster.build_topology` of the mesh.
         crossings: result of :func:`find_crossings`, to share the search between several calls.
-        creases: ``Bool`` (F,), flat-shaded faces: the edges between them are blended (and differentiated) like silhouettes.
+        creases, crease_weights: edges of faces that are blended (and differentiated) like silhouettes, and how much, see
+            :func:`find_crossings`.
 
     Returns:
         The blended values in the shape of ``values``. Gradients flow to ``values`` and, through the position of the
@@ -49,7 +51,7 @@ def antialias(
         raise ValueError(f"values hold {count} numbers for {raster.batch} image(s) of {raster.height} x {raster.width} pixels")
     positions, vertex_count = _flat_positions(positions, raster)
     if crossings is None:
-        crossings = find_crossings(positions, topology, raster, vertex_count, creases)
+        crossings = find_crossings(positions, topology, raster, vertex_count, creases, crease_weights)
     weights = blend_weights(positions, raster, crossings, vertex_count)
     blended = blend(flat, weights, raster, count // pixels)
     return type(values)(blended, shape=values.shape) if is_tensor else blended
@@ -70,7 +72,11 @@ def blend_weights(positions: Any, raster: RasterOutput, crossings: Crossings, ve
     c = crossings
     t_right = crossing_position(positions, raster, (c.right_a, c.right_b), vertex_count, down=False)
     t_down = crossing_position(positions, raster, (c.down_a, c.down_b), vertex_count, down=True)
-    return c.right_share * (t_right - 0.5), c.down_share * (t_down - 0.5)
+    right, down = c.right_share * (t_right - 0.5), c.down_share * (t_down - 0.5)
+    if c.second is not None:
+        more_right, more_down = blend_weights(positions, raster, c.second, vertex_count)
+        right, down = right + more_right, down + more_down
+    return right, down
 
 
 def blend(values: Any, weights: tuple[Any, Any], raster: RasterOutput, channels: int) -> Any:

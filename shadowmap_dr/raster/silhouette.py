@@ -7,12 +7,13 @@ pyramid of grids, and each pixel pair looks through the lists of its cell.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
 
 from ._types import NO_TRIANGLE, RasterOutput, backend, pixel_coordinates
+from .creases import find_creases
 from .grid import CellLists, GridShape, block_pixels, build_cell_lists
 from .topology import NO_VERTEX, Topology
 
@@ -32,6 +33,7 @@ class Crossings:
     ``right_a``, ``right_b``, ``down_a``, ``down_b`` (``UInt32``) are the end points of the edge, ``NO_EDGE`` where there is none.
     ``right_share``, ``down_share`` weight the pair: an edge steeper than 60 degrees counts for horizontal pairs only, one flatter
     than 30 degrees for vertical pairs only, so that the two directions together blend each piece of outline once. No gradients.
+    ``second``: further edges between the same pixels, with shares of their own, or None.
     """
 
     right_a: Any
@@ -40,9 +42,17 @@ class Crossings:
     down_b: Any
     right_share: Any
     down_share: Any
+    second: Crossings | None = None
 
 
-def find_crossings(positions: Any, topology: Topology, raster: RasterOutput, vertex_count: int, creases: Any = None) -> Crossings:
+def find_crossings(
+    positions: Any,
+    topology: Topology,
+    raster: RasterOutput,
+    vertex_count: int,
+    creases: Any = None,
+    crease_weights: Any = None,
+) -> Crossings:
     """Find the edge between each pair of neighbouring pixels.
 
     Args:
@@ -50,18 +60,23 @@ def find_crossings(positions: Any, topology: Topology, raster: RasterOutput, ver
         topology: edges of the mesh.
         raster: output of the rasterizer for the same vertices.
         vertex_count: vertices per image, V.
-        creases: ``Bool`` (F,), faces whose common edges separate pixels, too (flat-shaded ones, whose colours jump there).
+        creases: ``Bool`` (3 F,), whether the edge from corner k to k + 1 of a face separates pixels that see its two faces, too
+            (between flat-shaded ones, whose colours jump there).
+        crease_weights: ``Float`` for each pixel, between 0 and 1: how much creases count there; 1 if not given.
 
     A silhouette is an edge whose faces all lie on one side of it in the image. It separates two pixels that see different
     triangles when it crosses the segment between their centres and lies before the surface that the uncovered one sees
     (extended to the crossing). Among several the outermost is taken: up to it the uncovered pixel's surface is hidden.
+
+    Between two pixels whose triangles touch, the edges through which one leaves the first triangle and enters the other are
+    creases. If these are two edges, with something unseen in between, each counts half.
     """
     with dr.suspend_grad():
         positions = dr.detach(positions)
         shape = GridShape(raster.batch, raster.height, raster.width)
         records, image, box, active = _set_up(positions, topology, vertex_count, shape)
         lists = build_cell_lists(shape, image, box, active)
-        return _search(lists, records, positions, topology, vertex_count, raster, creases)
+        return _search(lists, records, positions, topology, vertex_count, raster, creases, crease_weights)
 
 
 def _set_up(
@@ -150,6 +165,7 @@ def _search(
     vertex_count: int,
     raster: RasterOutput,
     creases: Any,
+    crease_weights: Any,
 ) -> Crossings:
     module = backend(records)
     Float, UInt32 = module.Float, module.UInt32
@@ -161,10 +177,10 @@ def _search(
     open_right = pixel.inside & (pixel.column + 1 < shape.width)
     open_down = pixel.inside & (pixel.row + 1 < shape.height)
     right = dr.gather(UInt32, raster.triangle, index + 1, open_right)
-    down = dr.gather(UInt32, raster.triangle, index + shape.width, open_down)
+    below = dr.gather(UInt32, raster.triangle, index + shape.width, open_down)
     open_right &= here != right
-    open_down &= here != down
-    planes = [_depth_plane(raster, image, t) for t in (here, right, down)]
+    open_down &= here != below
+    planes = [_depth_plane(raster, image, t) for t in (here, right, below)]
 
     def visit(edge, row, column, edge_right, reach_right, share_right, edge_down, reach_down, share_down):  # noqa: ANN001, ANN202
         x = Float(column) + (0.5 - 0.5 * shape.width)
@@ -190,31 +206,32 @@ def _search(
     edge_right, _, share_right, edge_down, _, share_down = lists.walk(pixel, start + start, visit, open_right | open_down)
 
     first = image * topology.count
-    ends = []
-    for edge, share, neighbour, is_open, horizontal in (
-        (edge_right, share_right, right, open_right, True),
-        (edge_down, share_down, down, open_down, False),
-    ):
+    ends, seconds = [], []
+    for edge, share, is_open, down in ((edge_right, share_right, open_right, 0), (edge_down, share_down, open_down, 1)):
         found = edge != NO_EDGE
         ab = dr.gather(module.Array2u, topology.edges, edge - first, found)
-        a, b = dr.select(found, ab.x, none), dr.select(found, ab.y, none)
+        end = (dr.select(found, ab.x, none), dr.select(found, ab.y, none), share)
         if creases is not None:
-            crease = is_open & ~found & (here != NO_TRIANGLE) & (neighbour != NO_TRIANGLE)
-            crease &= dr.gather(module.Bool, creases, here, crease) & dr.gather(module.Bool, creases, neighbour, crease)
-            ca, cb, shared = _common_edge(topology, here, neighbour, crease)
-            steepness = _share(positions, image * vertex_count, ca, cb, shared, shape)
-            a, b = dr.select(shared, ca, a), dr.select(shared, cb, b)
-            share = dr.select(shared, steepness if horizontal else 1 - steepness, share)
-        ends.append((a, b, share))
+            pairs = is_open & ~found
+            near, far = find_creases(creases, crease_weights, positions, topology, vertex_count, raster, pixel, pairs, down)
+            end = tuple(dr.select(near.found, new, old) for new, old in zip(near.edge, end, strict=True))
+            seconds.append(tuple(dr.select(far.found, new, old) for new, old in zip(far.edge, (none, none, 0), strict=True)))
+        ends.append(end)
 
-    (ra, rb, right_share), (da, db, down_share) = ends
-    result = []
-    for value in (ra, rb, da, db, right_share, down_share):
-        out = dr.empty(type(value), shape.batch * shape.height * shape.width)
-        dr.scatter(out, value, index, pixel.inside)
-        result.append(out)
-    dr.eval(result)
-    return Crossings(*result)
+    def in_rows(values: list[tuple[Any, Any, Any]]) -> Crossings:
+        (ra, rb, right_share), (da, db, down_share) = values
+        result = []
+        for value in (ra, rb, da, db, right_share, down_share):
+            out = dr.empty(type(value), shape.batch * shape.height * shape.width)
+            dr.scatter(out, value, index, pixel.inside)
+            result.append(out)
+        return Crossings(*result)
+
+    crossings = in_rows(ends)
+    if seconds:
+        crossings = replace(crossings, second=in_rows(seconds))
+    dr.eval(crossings)
+    return crossings
 
 
 def _separates(p: Any, q: Any, side: Any, along: int, start: Any, fixed: Any, here: Any, neighbour: Any) -> tuple[Any, Any]:
@@ -234,31 +251,6 @@ def _separates(p: Any, q: Any, side: Any, along: int, start: Any, fixed: Any, he
     gap = dr.fma(dr.abs(hidden), _DEPTH_GAP, _DEPTH_GAP_ABSOLUTE)
     ok = (extent != 0) & (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1) & (z < hidden - gap)
     return ok, dr.select(covers_start, t, 1 - t)
-
-
-def _common_edge(topology: Topology, first: Any, second: Any, active: Any) -> tuple[Any, Any, Any]:
-    """End points of the edge that two faces share, and whether they share one."""
-    module = backend(first)
-    UInt32 = module.UInt32
-    own = dr.gather(module.Array3u, topology.faces, first, active)
-    mine = dr.gather(module.Array3u, topology.welded, first, active)
-    other = dr.gather(module.Array3u, topology.welded, second, active)
-    common = [(mine[k] == other.x) | (mine[k] == other.y) | (mine[k] == other.z) for k in range(3)]
-    a = dr.select(common[0], own[0], own[1])
-    b = dr.select(common[2], own[2], own[1])
-    count = sum(dr.select(c, UInt32(1), 0) for c in common)
-    shared = active & (count == 2)
-    return a, b, shared
-
-
-def _share(positions: Any, first: Any, a: Any, b: Any, active: Any, shape: GridShape) -> Any:
-    """Share of horizontal pairs in an edge, from its direction in the image (of its line, if it reaches behind the camera)."""
-    module = backend(positions)
-    p, q = (dr.gather(module.Array4f, positions, first + v, active) for v in (a, b))
-    # A line a x + b y + c = 0 in ndc has the normal (a / width, b / height) in pixels.
-    nx, ny = (p.y * q.w - q.y * p.w) / shape.width, (q.x * p.w - p.x * q.w) / shape.height
-    square = nx * nx + ny * ny
-    return dr.clip(0.5 + (nx * nx - ny * ny) / dr.select(square > 0, square, 1), 0, 1)
 
 
 def _wins(reach: Any, candidate: Any, best_reach: Any, best: Any) -> Any:

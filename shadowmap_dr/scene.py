@@ -168,7 +168,9 @@ def _group_of(instance: Any, name: str, groups: list[list[tuple[str, Any]]]) -> 
     """
     hit = dr.zeros(mi.PreliminaryIntersection3f)
     hit.t, hit.valid, hit.instance = mi.Float(1.0), mi.Bool(True), mi.ShapePtr(instance)
-    si = hit.compute_surface_interaction(mi.Ray3f(mi.Point3f(0.0), mi.Vector3f(0.0, 0.0, 1.0)), +mi.RayFlags.Minimal)
+    # Without FollowShape no shape is found where the instance's to_world is attached.
+    flags = mi.RayFlags.Minimal | mi.RayFlags.FollowShape
+    si = hit.compute_surface_interaction(mi.Ray3f(mi.Point3f(0.0), mi.Vector3f(0.0, 0.0, 1.0)), flags)
     first = dr.reinterpret_array(mi.UInt32, si.shape)[0]
     for group in groups:
         shapes = [child for _, child in group if isinstance(child, mi.Shape)]

@@ -269,6 +269,31 @@ def test_optimiser_moves_the_ball_back(variant: str) -> None:
     assert abs(adam["shift"][0]) < 0.05
 
 
+def test_instances(variant: str) -> None:
+    """Their places may be attached even before the first image, and the mesh that they show."""
+    cube = {"type": "cube", "to_world": mi.ScalarTransform4f().scale(0.3)}
+    place = mi.ScalarTransform4f().translate([0.5, 0, 0.5]).rotate([0, 0, 1], 30)
+    instance = {"type": "instance", "to_world": place, "group": {"type": "ref", "id": "group"}}
+    scene = small_scene(ball=None, group={"type": "shapegroup", "cube": cube}, one=instance)
+    integrator, weight = shadowmap(**SOFT), mi.TensorXf(weights((SIZE, SIZE, 3)))
+    params = mi.traverse(scene)
+    shift = mi.Float(0)
+    dr.enable_grad(shift)
+    params["one.to_world"] = mi.Transform4f().translate(mi.Vector3f(shift, 0, 0)) @ mi.Transform4f(place)
+    params.update()
+    dr.backward(dr.sum(mi.render(scene, params, integrator=integrator) * weight))
+    params["one.to_world"] = mi.Transform4f(place)
+    dr.enable_grad(params["group.cube.vertex_positions"])
+    params.update()
+    image = mi.render(scene, params, integrator=integrator)
+    assert relative_error(image.numpy(), render(scene, mi.load_dict({"type": "direct"}), spp=256)) < 0.03
+    dr.backward(dr.sum(image * weight))
+    # Moving the instance along x is moving its vertices along x in the world.
+    gradient = dr.unravel(mi.Vector3f, dr.grad(params["group.cube.vertex_positions"]))
+    along_x = mi.Transform4f(place).inverse() @ mi.Vector3f(1, 0, 0)
+    assert dr.grad(shift)[0] == pytest.approx(dr.sum(dr.dot(along_x, gradient))[0], rel=1e-3)
+
+
 def test_modes_without_attached_parameters(variant: str) -> None:
     scene, integrator = small_scene(), shadowmap()
     params = mi.traverse(scene)

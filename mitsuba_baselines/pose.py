@@ -37,25 +37,28 @@ class ProjectiveSetting:
     """Samples per pixel of Mitsuba's projective integrators.
 
     Attributes:
-        sppc: For the continuous part of the derivative, and for the image in the loss.
+        sppc: For the continuous part of the derivative.
         sppp: For silhouettes as the camera sees them.
         sppi: For silhouettes as the light sees them, which move shadows.
         guiding: "none", "grid" or "octree" (Mitsuba's default, rebuilt at every step).
+        spp: For the image in the loss. These samples are far cheaper than those of derivatives, and near the solution the
+            noise of the loss is what shakes the pose.
     """
 
     sppc: int
     sppp: int
     sppi: int
     guiding: str = "none"
+    spp: int = 64
 
     def __post_init__(self) -> None:
         if self.guiding not in GUIDINGS:
             raise ShadowmapError(f"guiding {self.guiding!r}: choose from {', '.join(GUIDINGS)}.")
-        if min(self.sppc, self.sppp, self.sppi) < 1:
+        if min(self.sppc, self.sppp, self.sppi, self.spp) < 1:
             raise ShadowmapError(f"sample counts {self.sppc}/{self.sppp}/{self.sppi}: each must be at least 1.")
 
     def __str__(self) -> str:
-        return f"{self.sppc}/{self.sppp}/{self.sppi} {self.guiding}"
+        return f"{self.sppc}/{self.sppp}/{self.sppi} {self.guiding}, {self.spp}"
 
 
 class MitsubaPose:
@@ -94,6 +97,7 @@ class MitsubaPose:
         if image.ndim != 3 or image.shape[:2] != (resolution, resolution) or not np.isfinite(image).all():
             raise ShadowmapError(f"a reference of shape {image.shape}: give finite values of shape "
                                  f"({resolution}, {resolution}, C).")
+        self._resolution = resolution
         self.setting, self.step_size, self.betas, self.seed, self.shift_z = setting, step_size, betas, seed, shift_z
         scene = mi.load_file(str(scene_path), optimize=False, object=str(mesh_path), resolution=resolution)
         params = mi.traverse(scene)
@@ -137,7 +141,7 @@ class MitsubaPose:
         self._place(pose)
         seeds = np.random.SeedSequence((self.seed, self._t)).generate_state(2)
         with dr.suspend_grad():
-            image = self._integrator.render(self._scene, sensor=self._sensor, seed=int(seeds[0]), spp=self.setting.sppc)
+            image = self._integrator.render(self._scene, sensor=self._sensor, seed=int(seeds[0]), spp=self.setting.spp)
             difference = dr.detach(image) - self._reference
             count = difference.array.shape[0]
             loss = dr.sum(dr.square(difference.array)) / count
@@ -171,7 +175,8 @@ class MitsubaPose:
         """Settings for the record: integrator, samples, proxy, optimiser."""
         return {
             "integrator": "direct_projective", **asdict(self.setting), "optimizer": "Adam", "step_size": self.step_size,
-            "betas": list(self.betas), "seed": self.seed, "proxy": self.proxy.record(),
+            "betas": list(self.betas), "seed": self.seed, "meets_fair_criterion": is_fair(self.setting, self._resolution),
+            "proxy": self.proxy.record(),
         }
 
     def _place(self, pose: Any) -> None:
@@ -198,14 +203,22 @@ def pose_start(run: int, seed: int = 0) -> np.ndarray:
 def fair_setting(resolution: int) -> ProjectiveSetting:
     """The stored fair setting at a resolution, or at the nearest one that was searched.
 
+    Where no candidate met the criterion so far, it is the measured one that came closest on the first start;
+    `is_fair` tells which.
+
     Raises:
         ShadowmapError: No search is stored.
     """
-    found = {int(key): entry for key, entry in _stored().items() if entry["setting"] is not None}
-    if not found:
-        raise ShadowmapError(f"{STORE} holds no setting: run python -m mitsuba_baselines.pose --search {resolution}.")
-    nearest = min(found, key=lambda size: abs(np.log2(size / resolution)))
-    return ProjectiveSetting(**found[nearest]["setting"])
+    entry = _nearest(resolution)
+    if entry["setting"] is not None:
+        return ProjectiveSetting(**entry["setting"])
+    closest = min(entry["measurements"], key=lambda measured: measured["runs"][0]["mean_error_deg_last_20"])
+    return ProjectiveSetting(**closest["setting"])
+
+
+def is_fair(setting: ProjectiveSetting, resolution: int) -> bool:
+    """True if a stored search at this or the nearest resolution found that the setting meets the criterion."""
+    return _nearest(resolution)["setting"] == asdict(setting)
 
 
 def find_fair_setting(
@@ -216,7 +229,9 @@ def find_fair_setting(
     starts: int = 3,
     iterations: int = 150,
     threshold_deg: float = 0.1,
+    earlier: Mapping[str, Any] | None = None,
     report: Callable[[str], None] = lambda line: None,
+    save: Callable[[dict[str, Any]], None] = lambda record: None,
 ) -> dict[str, Any]:
     """Searches the cheapest setting that converges.
 
@@ -226,15 +241,25 @@ def find_fair_setting(
     Args:
         resolution, mesh: Of the pose scene; mesh is a name or a file.
         threshold_deg: Degrees.
+        earlier: Record of a search that was cut short: what it measured is not measured again.
         report: Called with a line about each measurement.
+        save: Called with the record so far after each candidate.
 
     Returns:
-        A record of JSON values: `setting` (None if no candidate converges), `measurements` with the mean errors in
-        degrees, the final offsets and the median seconds per iteration of each candidate, the proxy and the machine.
+        A record of JSON values: `setting` (None if no candidate converged), `measurements` with the mean errors in
+        degrees, the final offsets and the median seconds per iteration of each candidate, the seconds per iteration of
+        those not tried, the proxy and the machine.
     """
     scene_path, mesh_path = assets.scene("pose"), assets.mesh(mesh)
     scene = mi.load_file(str(scene_path), optimize=False, object=str(mesh_path), resolution=resolution)
     reference, proxy = path_traced(scene, spp=512).image, calibrate(scene)
+    record: dict[str, Any] = {
+        "setting": None, "resolution": resolution, "mesh": mesh, "starts": starts, "iterations": iterations,
+        "threshold_deg": threshold_deg, "measurements": list((earlier or {}).get("measurements", [])), "untried": {},
+        "proxy": proxy.record(), "mitsuba": mi.__version__, "variant": mi.variant(), "threads": dr.thread_count(),
+    }
+    measured = [entry["setting"] for entry in record["measurements"]]
+    candidates = tuple(setting for setting in candidates if asdict(setting) not in measured)
 
     def method(setting: ProjectiveSetting) -> MitsubaPose:
         return MitsubaPose(scene_path, mesh_path, resolution, setting, reference, proxy=proxy)
@@ -244,40 +269,40 @@ def find_fair_setting(
         pose = method(setting)
         pose.reset(pose_start(0))
         pose.step()
-        cost[setting] = float(np.median([_timed(pose.step) for _ in range(3)]))
+        cost[setting] = record["untried"][str(setting)] = float(np.median([_timed(pose.step) for _ in range(3)]))
         report(f"{setting}: {cost[setting]:.2f} s per step")
 
-    measurements, chosen = [], None
     for setting in sorted(candidates, key=cost.__getitem__):
-        pose = method(setting)
-        runs: list[dict[str, Any]] = []
+        pose, runs = method(setting), []
         for run in range(starts):
-            pose.reset(pose_start(run))
-            trace, seconds = [], []
-            for _ in range(iterations):
-                seconds.append(_timed(pose.step))
-                trace.append(pose.parameters())
-            last = np.degrees(np.abs(np.array(trace)[-20:, 0]))
-            runs.append({
-                "run": run, "start": pose_start(run).tolist(), "final": trace[-1].tolist(),
-                "mean_error_deg_last_20": float(last.mean()), "offset_x100": float(100 * np.hypot(*trace[-1][1:])),
-                "seconds_per_iteration": float(np.median(seconds[5:] or seconds)),
-            })
-            report(f"{setting} run {run}: {last.mean():.3f} degrees, {runs[-1]['offset_x100']:.2f}, "
-                   f"{runs[-1]['seconds_per_iteration']:.2f} s per step")
-            if not last.mean() <= threshold_deg:
+            runs.append(_measure(pose, run, iterations))
+            report("{} run {run}: {mean_error_deg_last_20:.3f} degrees, {offset_x100:.2f}, "
+                   "{seconds_per_iteration:.2f} s per step".format(setting, **runs[-1]))
+            if not runs[-1]["mean_error_deg_last_20"] <= threshold_deg:
                 break
-        measurements.append({"setting": asdict(setting), "timed_seconds_per_iteration": cost[setting], "runs": runs})
+        record["measurements"].append({"setting": asdict(setting), "timed_seconds_per_iteration": cost[setting],
+                                       "load_average": os.getloadavg()[0], "runs": runs})
+        del record["untried"][str(setting)]
         if len(runs) == starts and runs[-1]["mean_error_deg_last_20"] <= threshold_deg:
-            chosen = setting
+            record["setting"] = asdict(setting)
+        save(record)
+        if record["setting"]:
             break
+    return record
+
+
+def _measure(pose: MitsubaPose, run: int, iterations: int) -> dict[str, Any]:
+    """One run from a start of the protocol."""
+    pose.reset(pose_start(run))
+    trace, seconds = [], []
+    for _ in range(iterations):
+        seconds.append(_timed(pose.step))
+        trace.append(pose.parameters())
     return {
-        "setting": asdict(chosen) if chosen else None, "resolution": resolution, "mesh": mesh, "starts": starts,
-        "iterations": iterations, "threshold_deg": threshold_deg, "measurements": measurements,
-        "untried": {str(each): cost[each] for each in candidates
-                    if asdict(each) not in [entry["setting"] for entry in measurements]},
-        "proxy": proxy.record(), "mitsuba": mi.__version__, "variant": mi.variant(), "threads": dr.thread_count(),
-        "load_average": os.getloadavg()[0],
+        "run": run, "start": pose_start(run).tolist(), "final": trace[-1].tolist(),
+        "mean_error_deg_last_20": float(np.degrees(np.abs(np.array(trace)[-20:, 0])).mean()),
+        "offset_x100": float(100 * np.hypot(*trace[-1][1:])),
+        "seconds_per_iteration": float(np.median(seconds[5:] or seconds)),
     }
 
 
@@ -288,23 +313,36 @@ def _timed(step: Callable[[], Any]) -> float:
     return time.perf_counter() - begin
 
 
-def _stored() -> dict[str, Any]:
-    return json.loads(STORE.read_text()) if STORE.is_file() else {}
+def _nearest(resolution: int) -> dict[str, Any]:
+    """Record of the stored search at the nearest resolution."""
+    table = json.loads(STORE.read_text()) if STORE.is_file() else {}
+    if not table:
+        raise ShadowmapError(f"{STORE} holds no setting: run python -m mitsuba_baselines.pose --search {resolution}.")
+    return table[min(table, key=lambda size: abs(np.log2(int(size) / resolution)))]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m mitsuba_baselines.pose", description="Searches fair settings.")
     parser.add_argument("--search", type=int, required=True, metavar="RESOLUTION")
     parser.add_argument("--mesh", default="spot", help="name or file")
-    parser.add_argument("--output", type=Path, default=STORE, help="JSON file to extend")
+    parser.add_argument("--candidates", nargs="+", metavar="C/P/I[/GUIDING[/SPP]]", help="settings to try instead of the usual")
+    parser.add_argument("--output", type=Path, default=STORE, help="JSON file to extend; a search in it goes on")
     options = parser.parse_args()
+    candidates = CANDIDATES
+    if options.candidates:
+        parts = [text.split("/") for text in options.candidates]
+        candidates = tuple(ProjectiveSetting(*map(int, part[:3]), *part[3:4], *map(int, part[4:])) for part in parts)
     mi.set_variant("llvm_ad_rgb")
-    record = find_fair_setting(options.search, mesh=options.mesh, report=lambda line: print(line, flush=True))
     table = json.loads(options.output.read_text()) if options.output.is_file() else {}
-    table[str(options.search)] = record
-    temporary = options.output.with_suffix(".tmp")
-    temporary.write_text(json.dumps(table, indent=1) + "\n")
-    os.replace(temporary, options.output)
+    key = str(options.search)
+
+    def save(record: dict[str, Any]) -> None:
+        temporary = options.output.with_suffix(".tmp")
+        temporary.write_text(json.dumps({**table, key: record}, indent=1) + "\n")
+        os.replace(temporary, options.output)
+
+    record = find_fair_setting(options.search, mesh=options.mesh, candidates=candidates, earlier=table.get(key), save=save,
+                               report=lambda line: print(line, flush=True))
     print(f"fair setting at {options.search}: {record['setting']}")
 
 

@@ -146,6 +146,10 @@ def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Co
             # Built once and used for all runs: what a method compiled stays warm, and what cannot be built fails at once.
             methods = {name: build(name, problem, reference) for name in options.methods}
             progress.remove_task(task)
+            for method in methods.values():
+                if _fairness(method, problem).get("fair") is False:
+                    note = "no sample counts are known to converge from all starts, these come closest"
+                    progress.console.print(f"{problem.folder} mitsuba: {note}: {getattr(method, 'setting', '')}", highlight=False)
             records, images = [], {}
             for run in range(options.runs):
                 for name in options.methods:
@@ -214,7 +218,7 @@ def _run_one(
             "iterations": options.iterations,
             "reference": options.reference,
             "shadow_only": problem.shadow_only,
-            "settings": {"object_digest": problem.digest, **method.describe()},
+            "settings": {"object_digest": problem.digest, **method.describe(), **_fairness(method, problem)},
         }
     )
     for record in stored:
@@ -225,6 +229,16 @@ def _run_one(
         path.unlink(missing_ok=True)
     history = optimize(method, start, options.iterations, checkpoint=path, settings=identity, on_step=on_step)
     return {**identity, **_results(history), "environment": _environment()}
+
+
+def _fairness(method: Method, problem: PoseProblem) -> dict[str, bool]:
+    """For Mitsuba's method: whether a search found its sample counts to be the cheapest ones that converge."""
+    setting = getattr(method, "setting", None)
+    if setting is None:
+        return {}
+    from mitsuba_baselines.pose import is_fair
+
+    return {"fair": is_fair(setting, problem.resolution)}
 
 
 def _show(progress: Progress, task: TaskID, done: int) -> None:

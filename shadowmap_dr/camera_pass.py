@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from .geometry import Geometry
+from .raster import NO_TRIANGLE, RasterOutput
 from .sensors import Sensor
 from .spread import spread
+
+# About so many pixels along each side are looked at to find out which part of the scene is in view.
+_SEEN_ACROSS = 128
 
 
 def camera_clip(sensor: Sensor, geometry: Geometry, center: tuple[float, float, float], radius: float) -> Any:
@@ -20,12 +25,11 @@ def camera_clip(sensor: Sensor, geometry: Geometry, center: tuple[float, float, 
     orthographic one spreads its range over the scene (a sphere, with room around it) instead of up to the far plane.
     """
     projection, view = sensor.projection, sensor.view
-    near, far = dr.detach(sensor.near), dr.detach(sensor.far)
+    near = dr.detach(sensor.near)
     if sensor.kind == "perspective":
         depth = [0.0, 0.0, 0.0, -near]
     else:
-        reach = dr.norm(dr.detach(sensor.origin) - mi.Point3f(*center)) + radius
-        reach = dr.minimum(far - near, 4 * reach)
+        reach = _orthographic_reach(sensor, center, radius)
         depth = [0.0, 0.0, 2 / reach, -1 - 2 * near / reach]
     rows = [[projection[r, c] for c in range(4)] for r in (0, 1, 3)]
     to_clip = mi.Matrix4f(rows[0], rows[1], depth, rows[2]) @ view
@@ -37,29 +41,40 @@ def camera_clip(sensor: Sensor, geometry: Geometry, center: tuple[float, float, 
     return dr.ravel(mi.Point4f(*row))
 
 
-def view_frustum(sensor: Sensor, center: tuple[float, float, float], radius: float) -> Any:
-    """The 8 corners (Point3f, world space, detached) of what a camera can see of a scene around ``center``.
+def seen_points(sensor: Sensor, raster: RasterOutput, center: tuple[float, float, float], radius: float) -> tuple[Any, Any]:
+    """Points on what a camera sees (Point3f, world space) and which of them there are, at most about 128 x 128. Detached.
 
-    The far side lies behind the scene, with room for three radii of movement, or at the far plane.
+    They come from the rasterizer's depth planes, without the cost of interpolating the whole image.
     """
     with dr.suspend_grad():
-        matrix = dr.detach(sensor.to_world.matrix)
-        projection = dr.detach(sensor.projection)
-        axis = dr.normalize(mi.Vector3f(matrix[0, 2], matrix[1, 2], matrix[2, 2]))
-        reach = dr.dot(axis, mi.Point3f(*center) - dr.detach(sensor.origin)) + 4 * radius
+        height, width = raster.height, raster.width
+        stride = max(1, math.ceil(math.sqrt(height * width) / _SEEN_ACROSS))
+        columns, rows = -(-width // stride), -(-height // stride)
+        lane = dr.arange(mi.UInt32, rows * columns)
+        row = dr.minimum((lane // columns) * stride + stride // 2, height - 1)
+        column = dr.minimum((lane % columns) * stride + stride // 2, width - 1)
+        triangle = dr.gather(mi.UInt32, raster.triangle, row * width + column)
+        hit = triangle != NO_TRIANGLE
+        plane = [dr.gather(mi.Float, raster.records, 12 * triangle + (4 * k + 3), hit) for k in range(3)]
+        x, y = mi.Float(column) + 0.5, mi.Float(row) + 0.5
+        depth = dr.fma(plane[0], x - 0.5 * width, dr.fma(plane[1], y - 0.5 * height, plane[2]))
+        x, y = 2 / width * x - 1, 2 / height * y - 1
         near = dr.detach(sensor.near)
-        far = dr.maximum(dr.minimum(dr.detach(sensor.far), reach), near)
-        corner = dr.arange(mi.UInt32, 8)
-        x, y = (dr.select(corner & bit != 0, mi.Float(1), -1) for bit in (1, 2))
-        z = dr.select(corner & 4 != 0, far, near)
-        scale = z if sensor.kind == "perspective" else mi.Float(1)
-        shift = (2, 2) if sensor.kind == "perspective" else (3, 3)
-        local = mi.Point3f(
-            (x - projection[0, shift[0]]) / projection[0, 0] * scale,
-            (y - projection[1, shift[1]]) / projection[1, 1] * scale,
-            z,
-        )
-        return mi.Transform4f(matrix) @ local
+        projection = dr.detach(sensor.projection)
+        if sensor.kind == "perspective":
+            z = -near / dr.select(hit, depth, -1)
+            local = mi.Point3f((x - projection[0, 2]) / projection[0, 0] * z, (y - projection[1, 2]) / projection[1, 1] * z, z)
+            hit &= z <= dr.detach(sensor.far)
+        else:
+            z = dr.fma(0.5 * depth + 0.5, _orthographic_reach(sensor, center, radius), near)
+            local = mi.Point3f((x - projection[0, 3]) / projection[0, 0], (y - projection[1, 3]) / projection[1, 1], z)
+        return mi.Transform4f(dr.detach(sensor.to_world.matrix)) @ local, hit
+
+
+def _orthographic_reach(sensor: Sensor, center: tuple[float, float, float], radius: float) -> Any:
+    """Depth range of an orthographic camera, detached: the scene with room around it, or up to the far plane."""
+    reach = dr.norm(dr.detach(sensor.origin) - mi.Point3f(*center)) + radius
+    return dr.minimum(dr.detach(sensor.far) - dr.detach(sensor.near), 4 * reach)
 
 
 def within_far_plane(sensor: Sensor, w_clip: Any) -> Any:

@@ -27,8 +27,8 @@ _NORMAL_JUMP = 0.02
 
 
 def flat_faces(geometry: Geometry) -> Any:
-    """``Bool`` (F,): faces of curved shapes without vertex normals; None if there are none (on the host, once)."""
-    flat = [not info.has_normals and not info.planar for info in geometry.shapes]
+    """``Bool`` (F,): faces of shapes without vertex normals; None if there are none (on the host, once)."""
+    flat = [not info.has_normals for info in geometry.shapes]
     if not any(flat):
         return None
     return dr.gather(mi.Bool, mi.Bool(flat), geometry.face_shape)
@@ -40,7 +40,7 @@ def crease_edges(geometry: Geometry, topology: Topology) -> Any:
     It does at the edges of flat faces, and between faces whose vertex normals differ at the edge they share.
     """
     shapes = geometry.face_shape.numpy()
-    flat = np.array([not info.has_normals and not info.planar for info in geometry.shapes])[shapes]
+    flat = np.array([not info.has_normals for info in geometry.shapes])[shapes]
     normals = dr.detach(geometry.normals).numpy().reshape(-1, 3)
     faces, welded = (np.asarray(a.numpy(), np.int64).reshape(-1, 3) for a in (geometry.faces, topology.welded))
     start, end = welded.ravel(), np.roll(welded, -1, 1).ravel()

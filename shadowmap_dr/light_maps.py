@@ -98,7 +98,7 @@ def make_maps(
     """Render and filter the maps of all lights as one batch. Attached to lights and vertices.
 
     ``transparent`` is the alpha test of :func:`shadowmap_dr.raster.rasterize`, ``previous`` the fit of an earlier call,
-    ``seen`` the corners of what the cameras see (Point3f, world space).
+    ``seen`` points on what the cameras see (Point3f, world space) and a mask of those that count.
     """
     views = [view for light, kind in zip(lights, plan.kinds, strict=True) for view in _views(plan, light, kind, settings)]
     stacked = stack_views(views)
@@ -114,12 +114,13 @@ def make_maps(
     else:
         shapes = len(geometry.shapes)
         shape = dr.gather(mi.UInt32, geometry.vertex_shape, vertex)
+        planes = _planes(plan, geometry)
         bounds = shape_bounds(stacked, p_light, lanes, shape, shapes)
         frusta = fit_frusta(
             stacked,
             bounds,
-            _planes(plan, geometry),
-            plan.planar,
+            planes,
+            _still_planar(plan, geometry, planes),
             shapes,
             settings.resolution,
             settings.filter_size,
@@ -163,6 +164,20 @@ def _planes(plan: MapPlan, geometry: Geometry) -> tuple[Any, Any]:
         normal = dr.cross(b - a, c - a)
         length = dr.norm(normal)
         return normal / dr.select(length > 0, length, 1), a
+
+
+def _still_planar(plan: MapPlan, geometry: Geometry, planes: tuple[Any, Any]) -> Any:
+    """Which of the shapes that were planar at rest still are (Bool, S): vertices may have moved out of the plane since."""
+    if not any(info.planar for info in geometry.shapes):
+        return plan.planar
+    with dr.suspend_grad():
+        vertex = dr.arange(mi.UInt32, geometry.vertex_count)
+        shape = geometry.vertex_shape
+        p = dr.gather(mi.Point3f, dr.detach(geometry.positions), vertex)
+        normal, point = (mi.Vector3f(*(dr.gather(mi.Float, v[c], shape) for c in range(3))) for v in planes)
+        farthest = dr.zeros(mi.Float, len(geometry.shapes))
+        dr.scatter_reduce(dr.ReduceOp.Max, farthest, dr.abs(dr.dot(normal, mi.Vector3f(p) - point)), shape)
+        return plan.planar & (farthest <= 1e-4 * plan.radius)
 
 
 def light_visibility(maps: ShadowMaps, plan: MapPlan, light: Light, index: int, p_world: Any, active: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -10,13 +11,13 @@ import drjit as dr
 import mitsuba as mi
 
 from .aovs import AOVS, collect_aovs
-from .camera_pass import camera_clip, footprint_points, view_frustum, within_far_plane
+from .camera_pass import camera_clip, footprint_points, seen_points, within_far_plane
 from .errors import ShadowmapError
 from .facets import crease_edges, flat_faces, pixel_size, soften_facets
 from .geometry import Geometry
 from .light_maps import MapPlan, light_visibility, make_maps, plan_maps
 from .lights import Light, SpotLight, SquareSpot
-from .raster import RasterOutput, Topology, antialias, build_topology, rasterize
+from .raster import MAX_RESOLUTION, RasterOutput, Topology, antialias, build_topology, rasterize
 from .scene import SceneData, load, refresh
 from .sensors import Sensor
 from .shading import Surface, ambient_light, background, direct_light, opacity, surface
@@ -128,7 +129,7 @@ class Renderer:
         # The first fit is made here, so that a step which is recorded later always starts from one.
         if renderer._has_shadows:
             with dr.suspend_grad():
-                renderer._make_maps(geometry, data.lights, renderer._sensors(0))
+                renderer._make_maps(geometry, data.lights, None, None)
         return renderer
 
     def with_data(self, data: SceneData) -> Renderer:
@@ -152,7 +153,8 @@ class Renderer:
             vertex_positions: new world-space vertices by the name of their shape: ``Float`` (3V,), tensor (V, 3) or ``Point3f``.
             lights: new records by the name of the light (start from ``renderer.light(name)`` and ``dataclasses.replace``).
             sensor: number of the scene's sensor, or a camera record.
-            spp: samples per pixel, a grid of ``ceil(sqrt(spp)) ** 2``, at most 16 x 16. Each is anti-aliased.
+            spp: samples per pixel, a grid of ``ceil(sqrt(spp)) ** 2``, at most 16 x 16 and
+                4096 along the longer side of the image. Each is anti-aliased.
 
         Returns:
             ``mi.TensorXf`` (H, W, C): linear colour (1 or 3 channels, as the film), then alpha if the film has it, then the AOVs.
@@ -163,8 +165,11 @@ class Renderer:
             geometry = geometry.with_positions(vertex_positions)
         current = self._lights(lights)
         cameras = self._sensors(sensor)
-        maps = self._make_maps(geometry, current, cameras) if self._has_shadows else None
-        images = [self._camera_image(camera, geometry, current, maps, spp) for camera in cameras]
+        views = [self._view(camera, geometry, _grid(spp, camera)) for camera in cameras]
+        maps = None
+        if self._has_shadows:
+            maps = self._make_maps(geometry, current, self._seen(views), self._transparent(geometry, cameras[0]))
+        images = [self._camera_image(view, geometry, current, maps) for view in views]
         return images[0] if len(images) == 1 else _side_by_side(images)
 
     def light(self, name: str) -> Light:
@@ -189,33 +194,40 @@ class Renderer:
             raise ShadowmapError(f"There is no sensor {sensor}: the scene has {len(self.data.sensors)}, counted from 0.")
         return self.data.sensors[sensor]
 
-    def _make_maps(self, geometry: Geometry, lights: tuple[Light, ...], cameras: tuple[Sensor, ...]) -> Any:
-        plan = self.plan
-        corners = [view_frustum(camera, plan.center, plan.radius) for camera in cameras]
-        seen = corners[0] if len(corners) == 1 else mi.Point3f(*(dr.concat([p[c] for p in corners]) for c in range(3)))
-        transparent = self._transparent(geometry)
-        maps = make_maps(plan, lights, geometry, self.topology, self.settings.shadow, self.frusta, transparent, seen)
+    def _make_maps(self, geometry: Geometry, lights: tuple[Light, ...], seen: Any, transparent: Any) -> Any:
+        maps = make_maps(self.plan, lights, geometry, self.topology, self.settings.shadow, self.frusta, transparent, seen)
         self.frusta = maps.frusta
         return maps
 
-    def _transparent(self, geometry: Geometry) -> Callable[[RasterOutput], Any] | None:
-        """Alpha test for cameras and shadow maps; None where no material lets one look through."""
+    def _seen(self, views: list[_View]) -> tuple[Any, Any]:
+        """Points on what the cameras see, and which of them there are."""
+        found = [seen_points(view.sensor, view.raster, self.plan.center, self.plan.radius) for view in views]
+        if len(found) == 1:
+            return found[0]
+        points = mi.Point3f(*(dr.concat([p[c] for p, _ in found]) for c in range(3)))
+        return points, dr.concat([mi.Bool(hit) for _, hit in found])
+
+    def _transparent(self, geometry: Geometry, camera: Sensor) -> Callable[[RasterOutput], Any] | None:
+        """Alpha test for cameras and shadow maps (from whichever side); None where no material lets one look through."""
         if not any(info.see_through for info in geometry.shapes):
             return None
-        camera = self.data.sensors[0][0]  # transparency does not depend on where it is seen from
 
         def transparent(raster: RasterOutput) -> Any:
             return opacity(surface(self.data, geometry, camera, raster.triangle, raster.u, raster.v)) < 0.5
 
         return transparent
 
-    def _camera_image(self, sensor: Sensor, geometry: Geometry, lights: tuple[Light, ...], maps: Any, spp: int) -> Any:
-        factor = min(max(1, -(-int(spp**0.5 * 1000000) // 1000000)), 16)
-        width, height = sensor.width * factor, sensor.height * factor
+    def _view(self, sensor: Sensor, geometry: Geometry, factor: int) -> _View:
         clip = camera_clip(sensor, geometry, self.plan.center, self.plan.radius)
         dr.eval(clip)
-        transparent = self._transparent(geometry)
-        raster = rasterize(clip, geometry.faces, (height, width), check_indices=False, transparent=transparent)
+        size = (sensor.height * factor, sensor.width * factor)
+        transparent = self._transparent(geometry, sensor)
+        raster = rasterize(clip, geometry.faces, size, check_indices=False, transparent=transparent)
+        return _View(sensor, factor, clip, raster)
+
+    def _camera_image(self, view: _View, geometry: Geometry, lights: tuple[Light, ...], maps: Any) -> Any:
+        sensor, raster, factor = view.sensor, view.raster, view.factor
+        height, width = raster.height, raster.width
         active = raster.valid & within_far_plane(sensor, raster.w)
         seen = surface(self.data, geometry, sensor, raster.triangle, raster.u, raster.v, active)
         sharpness = None
@@ -228,7 +240,7 @@ class Renderer:
         named = collect_aovs(self.settings.aovs, seen, raster, lights, visible)
         if self.settings.antialias:
             flat = _interleave(channels)
-            flat = antialias(flat, raster, clip, self.topology, creases=self.creases, crease_weights=sharpness)
+            flat = antialias(flat, raster, view.clip, self.topology, creases=self.creases, crease_weights=sharpness)
             image = mi.TensorXf(flat, shape=(height, width, len(channels)))
         else:
             image = mi.TensorXf(_interleave(channels), shape=(height, width, len(channels)))
@@ -263,6 +275,23 @@ class Renderer:
 
     def _uniform_ambient(self) -> tuple[Any, ...]:
         return (_Uniform(self.settings.ambient),) if self.settings.ambient > 0 else ()
+
+
+@dataclass(frozen=True)
+class _View:
+    """One camera's visibility: clip-space vertices and what each sample sees, ``factor`` x ``factor`` samples a pixel."""
+
+    sensor: Sensor
+    factor: int
+    clip: Any
+    raster: RasterOutput
+
+
+def _grid(spp: int, sensor: Sensor) -> int:
+    """Samples along each side of a pixel: at most 16, and as many as the rasterizer's largest image has room for."""
+    if spp < 1:
+        raise ShadowmapError(f"spp is {spp}: give at least 1 sample per pixel.")
+    return max(1, min(math.isqrt(math.ceil(spp) - 1) + 1, 16, MAX_RESOLUTION // max(sensor.width, sensor.height)))
 
 
 @dataclass(frozen=True)

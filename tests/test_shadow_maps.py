@@ -234,8 +234,9 @@ def test_frusta_are_cut_to_what_is_seen(variant: str, kind: str) -> None:
     casters = trimesh.util.concatenate(
         [BOX.copy().apply_translation([4.0 * i, 4.0 * j, 0]) for i in (-1, 0, 1) for j in (-1, 0, 1)]
     )
-    x, y = np.meshgrid((-1.2, 1.2), (-1.2, 1.2))
-    seen = points(np.array([[a, b, z] for a, b in zip(x.ravel(), y.ravel(), strict=True) for z in (-1.6, 0.5)]))
+    in_view = np.concatenate([receivers(9, z, 1.2) for z in (-1.5, 0.5)])
+    hidden = np.array([[50.0, 50.0, 0.0]])
+    seen = (points(np.concatenate([in_view, hidden])), mi.Bool([True] * len(in_view) + [False]))
     settings = ShadowSettings(resolution=256)
     views = views_of(kind, 256, 3)
     full = shadow_scene.make_maps(views, points(casters.vertices), casters.vertices, casters.faces, settings)

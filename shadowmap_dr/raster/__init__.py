@@ -1,6 +1,6 @@
 """Screen-space primitives on Dr.Jit arrays: rasterize, interpolate, antialias. No lights, no scenes."""
 
-from ._types import NO_TRIANGLE, RasterOutput
+from ._types import MAX_RESOLUTION, NO_TRIANGLE, RasterOutput
 from .antialias import antialias
 from .interpolate import interpolate
 from .rasterize import rasterize
@@ -8,6 +8,7 @@ from .silhouette import Crossings, find_crossings
 from .topology import NO_VERTEX, Topology, build_topology
 
 __all__ = [
+    "MAX_RESOLUTION",
     "NO_TRIANGLE",
     "NO_VERTEX",
     "Crossings",

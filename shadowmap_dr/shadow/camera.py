@@ -260,7 +260,7 @@ def fit_frusta(
         planar: ``Bool`` of width S. A planar shape with nothing behind its plane casts no shadow on anything.
         previous: frusta of an earlier call. Kept bit by bit while the casters lie inside them with room for the filter
             and fill most of them.
-        seen: corners (``Array3f``, world space) of convex regions that hold all receivers in view. None: anywhere.
+        seen: points (``Array3f``, world space) all over the receivers in view, and a mask of those that count. None: anywhere.
 
     All arithmetic stays on the device: nothing is read back.
     """
@@ -321,29 +321,35 @@ def _casts(
     return visible & (~dr.gather(Bool, planar, shape) | behind)
 
 
-def _window(views: Views, seen: Any) -> tuple[Any, Any, Any, Any]:
-    """(x0, y0, x1, y1) in each map's image plane around what is seen, within the light's own cone."""
+def _window(views: Views, seen: Any) -> tuple[Any, Any, Any, Any, Any]:
+    """(x0, y0, x1, y1) in each map's image plane around what is seen, within the light's own cone; depth of its far side."""
     module = backend(views.spread)
     perspective = views.spread > 0
     limit = dr.select(perspective, views.spread, dr.inf)
     if seen is None:
-        return -limit, -limit, limit, limit
-    corners = dr.width(seen)
-    lane = dr.arange(module.UInt32, views.count * corners)
-    map_index = lane // corners
+        return -limit, -limit, limit, limit, module.Float(dr.inf)
+    points, active = seen
+    count = dr.width(points)
+    lane = dr.arange(module.UInt32, views.count * count)
+    map_index = lane // count
     view = of_map(views, map_index, views.count)
-    point = module.Array3f(*(dr.gather(module.Float, seen[c], lane - map_index * corners) for c in range(3)))
+    if views.count > 1:
+        source = lane - map_index * count
+        points = module.Array3f(*(dr.gather(module.Float, points[c], source) for c in range(3)))
+        active = dr.gather(module.Bool, module.Bool(active), source)
+    point = module.Array3f(points)
     p = to_light_space(view, point)
     in_perspective = view.spread > 0
     behind = in_perspective & (p.z <= 0)
     w = dr.select(in_perspective & ~behind, p.z, 1)
     window = []
-    for value, sign in ((p.x, -1), (p.y, -1), (p.x, 1), (p.y, 1)):
+    for value in (*(dr.select(behind, dr.inf, v / w) for v in (-p.x, -p.y, p.x, p.y)), p.z):
         extreme = dr.full(module.Float, -dr.inf, views.count)
-        dr.scatter_reduce(dr.ReduceOp.Max, extreme, dr.select(behind, dr.inf, sign * value / w), map_index)
+        dr.scatter_reduce(dr.ReduceOp.Max, extreme, value, map_index, active)
         window.append(extreme)
     dr.eval(window)
-    return tuple(sign * dr.minimum(extreme, limit) for extreme, sign in zip(window, (-1, -1, 1, 1), strict=True))
+    x0, y0, x1, y1 = (dr.minimum(extreme, limit) for extreme in window[:4])
+    return -x0, -y0, x1, y1, window[4]
 
 
 def _fit(
@@ -351,7 +357,7 @@ def _fit(
     bounds: Bounds,
     casts: Any,
     map_index: Any,
-    window: tuple[Any, Any, Any, Any],
+    window: tuple[Any, Any, Any, Any, Any],
     resolution: int,
     filter_size: int,
 ) -> tuple[Frusta, tuple[Any, ...]]:
@@ -375,6 +381,8 @@ def _fit(
     full = views.fixed > 0
     x0, y0 = dr.select(full, -s, dr.maximum(x0, window[0])), dr.select(full, -s, dr.maximum(y0, window[1]))
     x1, y1 = dr.select(full, s, dr.minimum(x1, window[2])), dr.select(full, s, dr.minimum(y1, window[3]))
+    # Behind all that is seen, casters are of no account; but seen receivers may end before the first of them.
+    z1 = dr.maximum(dr.minimum(z1, window[4]), z0)
     # Casters outside of the window leave an empty rectangle; any small one will do.
     x1, y1 = dr.maximum(x1, x0 + 1e-4 * (1 + dr.abs(x0))), dr.maximum(y1, y0 + 1e-4 * (1 + dr.abs(y0)))
     depth = dr.maximum(z1 - z0, 1e-3 * dr.maximum(dr.abs(z1), 1e-3))

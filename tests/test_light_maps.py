@@ -1,0 +1,88 @@
+"""How the shadow maps of a scene follow what moves in it and what is seen of it."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from shadowmap_dr import Renderer, ShadowmapError
+
+
+def sheet(n: int = 24, height: float = 0.0) -> mi.Mesh:
+    """A 4 x 4 sheet of n x n quads, flat or with a bump in the middle."""
+    g = np.linspace(-2, 2, n + 1)
+    x, y = np.meshgrid(g, g)
+    z = height * np.exp(-4 * (x * x + y * y))
+    i = np.arange((n + 1) ** 2).reshape(n + 1, n + 1)
+    a, b, c, d = i[:-1, :-1].ravel(), i[:-1, 1:].ravel(), i[1:, 1:].ravel(), i[1:, :-1].ravel()
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    mesh = mi.Mesh("sheet", x.size, len(faces))
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = mi.Float(np.stack([x, y, z], -1).ravel().astype(np.float32))
+    params["faces"] = mi.UInt32(faces.ravel().astype(np.uint32))
+    params.update()
+    return mesh
+
+
+def scene_with(mesh: mi.Mesh, **more: dict) -> mi.Scene:
+    """The sheet from above under an oblique sun."""
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": {
+                "type": "perspective",
+                "fov": 50,
+                "to_world": mi.ScalarTransform4f().look_at([0, -3, 4], [0, 0, 0], [0, 0, 1]),
+                "film": {"type": "hdrfilm", "width": 64, "height": 64, "rfilter": {"type": "box"}},
+            },
+            "sun": {"type": "directional", "direction": [1.5, 0.2, -1.0], "irradiance": 3.0},
+            "sheet": mesh,
+            **more,
+        },
+        optimize=False,
+    )
+
+
+def test_a_flat_sheet_that_gets_a_bump_casts_its_shadow(variant: str) -> None:
+    """A planar shape with nothing behind it gets no texels, but only for as long as it is planar."""
+    flat, bumpy = (scene_with(sheet(height=h)) for h in (0.0, 0.8))
+    name = "sheet"
+    target = Renderer.from_scene(bumpy)
+    moved = Renderer.from_scene(flat)
+    vertices = target.data.geometry.shape_positions(name)
+    image, want = moved.render({name: vertices}).numpy(), target.render().numpy()
+    assert np.abs(want - moved.render().numpy()).max() > 0.1
+    assert np.abs(image - want).mean() < 2e-3 * want.mean()
+
+
+def test_texels_go_to_what_is_in_view(variant: str) -> None:
+    """A floor that could cast shadows, but reaches far out of view, must not blur those in view."""
+    box = {"type": "cube", "to_world": mi.ScalarTransform4f().translate([0, 0, 0.5]).scale(0.3)}
+    thick = {"type": "cube", "to_world": mi.ScalarTransform4f().translate([0, 0, -1.01]).scale([40, 40, 1])}
+    floor = Renderer.from_scene(scene_with(sheet(), box=box))
+    block = Renderer.from_scene(scene_with(sheet(), box=box, thick=thick))
+    want, image = floor.render().numpy(), block.render().numpy()
+    visible = want.sum(-1) > 0
+    # The block reaches towards the light, too, so that its map has a larger range of depths than that of the box alone.
+    assert np.abs(image - want)[visible].mean() < 0.025 * want[visible].mean()
+
+
+def test_samples_per_pixel_are_checked(variant: str) -> None:
+    renderer = Renderer.from_scene(scene_with(sheet()))
+    with pytest.raises(ShadowmapError, match="spp is -3"):
+        renderer.render(spp=-3)
+
+
+def test_a_scene_without_sensors_is_rendered_with_a_camera_of_ones_own(variant: str) -> None:
+    with_sensor = scene_with(sheet(height=0.8))
+    camera = Renderer.from_scene(with_sensor).data.sensors[0][0]
+    bare = mi.load_dict(
+        {
+            "type": "scene",
+            "sun": {"type": "directional", "direction": [1.5, 0.2, -1.0], "irradiance": 3.0},
+            "sheet": sheet(height=0.8),
+        }
+    )
+    image = Renderer.from_scene(bare).render(sensor=camera).numpy()
+    np.testing.assert_allclose(image, Renderer.from_scene(with_sensor).render().numpy(), atol=1e-5)

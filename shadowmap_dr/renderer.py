@@ -21,7 +21,7 @@ from .raster import MAX_RESOLUTION, RasterOutput, Topology, antialias, build_top
 from .scene import SceneData, load, refresh
 from .sensors import Sensor
 from .shading import Surface, ambient_light, background, direct_light, opacity, surface
-from .shadow import Frusta, ShadowSettings
+from .shadow import Frusta, ShadowMaps, ShadowSettings
 
 # Directions over which the light of environments is summed.
 _AMBIENT_DIRECTIONS = 16
@@ -127,9 +127,9 @@ class Renderer:
         plan, creases = plan_maps(data.lights, geometry), crease_edges(geometry, topology)
         renderer = cls(data, topology, plan, settings, flat_faces(geometry), creases)
         # The first fit is made here, so that a step which is recorded later always starts from one.
-        if renderer._has_shadows:
+        if renderer._has_shadows and data.sensors:
             with dr.suspend_grad():
-                renderer._make_maps(geometry, data.lights, None, None)
+                renderer._maps([renderer._view(camera, geometry, 1) for camera in data.sensors[0]], geometry, data.lights)
         return renderer
 
     def with_data(self, data: SceneData) -> Renderer:
@@ -166,9 +166,7 @@ class Renderer:
         current = self._lights(lights)
         cameras = self._sensors(sensor)
         views = [self._view(camera, geometry, _grid(spp, camera)) for camera in cameras]
-        maps = None
-        if self._has_shadows:
-            maps = self._make_maps(geometry, current, self._seen(views), self._transparent(geometry, cameras[0]))
+        maps = self._maps(views, geometry, current) if self._has_shadows else None
         images = [self._camera_image(view, geometry, current, maps) for view in views]
         return images[0] if len(images) == 1 else _side_by_side(images)
 
@@ -194,7 +192,8 @@ class Renderer:
             raise ShadowmapError(f"There is no sensor {sensor}: the scene has {len(self.data.sensors)}, counted from 0.")
         return self.data.sensors[sensor]
 
-    def _make_maps(self, geometry: Geometry, lights: tuple[Light, ...], seen: Any, transparent: Any) -> Any:
+    def _maps(self, views: list[_View], geometry: Geometry, lights: tuple[Light, ...]) -> ShadowMaps:
+        transparent, seen = self._transparent(geometry, views[0].sensor), self._seen(views)
         maps = make_maps(self.plan, lights, geometry, self.topology, self.settings.shadow, self.frusta, transparent, seen)
         self.frusta = maps.frusta
         return maps

@@ -7,13 +7,12 @@ from .camera import (
     cube_face,
     cube_views,
     directional_view,
-    fit_frusta,
-    shape_bounds,
     spot_view,
     stack_views,
     to_light_space,
 )
 from .filters import FILTERS, filter_kernel, filter_map
+from .fit import fit_frusta, shape_bounds
 from .moments import METHODS, chebyshev_visibility, standard_visibility, variance_moments
 from .shadow_map import ShadowMaps, ShadowSettings, filter_maps, render_maps, visibility
 

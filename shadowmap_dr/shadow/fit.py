@@ -1,0 +1,232 @@
+"""The frusta of the light cameras: fitted to what can cast shadows on what is seen, and stable under small changes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from ..raster._types import backend
+from .camera import Frusta, Views, of_map, to_light_space
+
+# A frustum is kept while the scene fits and fills at least this fraction of it.
+_KEEP_FILL = 0.6
+_MARGIN = 0.10
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Light-space bounds of each shape in each map, ``Float`` of width M * S: image coordinates and depths."""
+
+    x0: Any
+    y0: Any
+    x1: Any
+    y1: Any
+    z0: Any
+    z1: Any
+
+
+def shape_bounds(view: Views, p_light: Any, map_index: Any, shape_index: Any, shape_count: int) -> Bounds:
+    """Reduce light-space vertices (one lane for each vertex in each map) to bounds for each shape. Detached."""
+    with dr.suspend_grad():
+        module = backend(p_light)
+        view, p = dr.detach(view), dr.detach(p_light)
+        perspective = of_map(view, map_index, view.count).spread > 0
+        behind = perspective & (p.z <= 0)
+        w = dr.select(perspective & ~behind, p.z, 1.0)
+        x, y = p.x / w, p.y / w
+        slot = map_index * shape_count + shape_index
+        size = view.count * shape_count
+
+        def reduce(value: Any, op: Any, start: float) -> Any:
+            target = dr.full(module.Float, start, size)
+            dr.scatter_reduce(op, target, value, slot)
+            return target
+
+        # A vertex behind a spot light bounds nothing: its shape may reach anywhere in the image.
+        low, high = dr.ReduceOp.Min, dr.ReduceOp.Max
+        result = Bounds(
+            reduce(dr.select(behind, -dr.inf, x), low, dr.inf),
+            reduce(dr.select(behind, -dr.inf, y), low, dr.inf),
+            reduce(dr.select(behind, dr.inf, x), high, -dr.inf),
+            reduce(dr.select(behind, dr.inf, y), high, -dr.inf),
+            reduce(p.z, low, dr.inf),
+            reduce(p.z, high, -dr.inf),
+        )
+        dr.eval(result)
+        return result
+
+
+def fit_frusta(
+    views: Views,
+    bounds: Bounds,
+    planes: tuple[Any, Any],
+    planar: Any,
+    shape_count: int,
+    resolution: int,
+    filter_size: int,
+    previous: Frusta | None,
+    seen: Any = None,
+) -> Frusta:
+    """Frusta that cover everything that can cast a shadow on what is seen, or the previous ones as long as they still do.
+
+    Args:
+        bounds: from :func:`shape_bounds`.
+        planes: (normal, point) in world space, ``Array3f`` of width S: the plane of each planar shape.
+        planar: ``Bool`` of width S. A planar shape with nothing behind its plane casts no shadow on anything.
+        previous: frusta of an earlier call. Kept bit by bit while the casters lie inside them with room for the filter
+            and fill most of them.
+        seen: points (``Array3f``, world space) all over the receivers in view, and a mask of those that count. None: anywhere.
+
+    All arithmetic stays on the device: nothing is read back.
+    """
+    with dr.suspend_grad():
+        views = dr.detach(views)
+        module = backend(views.spread)
+        index = dr.arange(module.UInt32, views.count * shape_count)
+        map_index = index // shape_count
+        shape = index - map_index * shape_count
+        casts = _casts(views, bounds, planes, planar, map_index, shape, shape_count)
+        window = _window(views, seen)
+        fitted = _fit(views, bounds, casts, map_index, window, resolution, filter_size)
+        if previous is None:
+            dr.eval(fitted[0])
+            return fitted[0]
+        keep = _still_fits(views, previous, *fitted, resolution, filter_size)
+        result = Frusta(
+            *(dr.select(keep, getattr(previous, name), getattr(fitted[0], name)) for name in Frusta.__dataclass_fields__)
+        )
+        dr.eval(result)
+        return result
+
+
+def _casts(
+    views: Views, bounds: Bounds, planes: tuple[Any, Any], planar: Any, map_index: Any, shape: Any, shape_count: int
+) -> Any:
+    """Which shapes can cast a shadow in which map: not planar ones with nothing behind them, nor what is behind the light."""
+    module = backend(views.spread)
+    Float, Array3f, Bool = module.Float, module.Array3f, module.Bool
+    view = of_map(views, map_index, views.count)
+
+    def per_shape(v: Any) -> Any:
+        return Array3f(*(dr.gather(Float, v[c], shape) for c in range(3)))
+
+    normal_world, point_world = per_shape(planes[0]), per_shape(planes[1])
+    normal = Array3f(*(dr.dot(normal_world, axis) for axis in (view.right, view.up, view.forward)))
+    offset = dr.dot(normal_world, point_world - view.origin)
+    # Orient the plane so that the light lies on its negative side.
+    away = dr.select(view.spread > 0, offset, normal.z) < 0
+    normal, offset = dr.select(away, -normal, normal), dr.select(away, -offset, offset)
+    visible = bounds.z1 > 0
+    in_perspective = view.spread > 0
+    visible = ~in_perspective | visible
+    size = dr.maximum(dr.max(dr.select(dr.isfinite(bounds.z1), bounds.z1, -dr.inf)) - dr.min(bounds.z0), 1e-6)
+    behind = Bool(False)
+    perspective = in_perspective
+    for other in range(shape_count):
+        base = map_index * shape_count + other
+        b = [dr.gather(Float, getattr(bounds, name), base) for name in ("x0", "x1", "y0", "y1", "z0", "z1")]
+        z0, z1 = b[4], b[5]
+        reach = dr.fma(normal.z, dr.select(normal.z > 0, z1, z0), -offset)
+        for lo, hi, n in ((b[0], b[1], normal.x), (b[2], b[3], normal.y)):
+            # Perspective bounds are slopes: the extreme of n * slope * z over the box lies in one of its corners.
+            flat = dr.maximum(n * lo, n * hi)
+            cone = dr.maximum(dr.maximum(n * lo * z0, n * lo * z1), dr.maximum(n * hi * z0, n * hi * z1))
+            reach += dr.select(n == 0, 0, dr.select(perspective, cone, flat))
+        behind |= (shape != other) & (reach > 1e-3 * size)
+    return visible & (~dr.gather(Bool, planar, shape) | behind)
+
+
+def _window(views: Views, seen: Any) -> tuple[Any, Any, Any, Any, Any]:
+    """(x0, y0, x1, y1) in each map's image plane around what is seen, within the light's own cone; depth of its far side."""
+    module = backend(views.spread)
+    perspective = views.spread > 0
+    limit = dr.select(perspective, views.spread, dr.inf)
+    if seen is None:
+        return -limit, -limit, limit, limit, module.Float(dr.inf)
+    points, active = seen
+    count = dr.width(points)
+    lane = dr.arange(module.UInt32, views.count * count)
+    map_index = lane // count
+    view = of_map(views, map_index, views.count)
+    if views.count > 1:
+        source = lane - map_index * count
+        points = module.Array3f(*(dr.gather(module.Float, points[c], source) for c in range(3)))
+        active = dr.gather(module.Bool, module.Bool(active), source)
+    point = module.Array3f(points)
+    p = to_light_space(view, point)
+    in_perspective = view.spread > 0
+    behind = in_perspective & (p.z <= 0)
+    w = dr.select(in_perspective & ~behind, p.z, 1)
+    window = []
+    for value in (*(dr.select(behind, dr.inf, v / w) for v in (-p.x, -p.y, p.x, p.y)), p.z):
+        extreme = dr.full(module.Float, -dr.inf, views.count)
+        dr.scatter_reduce(dr.ReduceOp.Max, extreme, value, map_index, active)
+        window.append(extreme)
+    dr.eval(window)
+    x0, y0, x1, y1 = (dr.minimum(extreme, limit) for extreme in window[:4])
+    return -x0, -y0, x1, y1, window[4]
+
+
+def _fit(
+    views: Views,
+    bounds: Bounds,
+    casts: Any,
+    map_index: Any,
+    window: tuple[Any, Any, Any, Any, Any],
+    resolution: int,
+    filter_size: int,
+) -> tuple[Frusta, tuple[Any, ...]]:
+    module = backend(views.spread)
+
+    def reduce(value: Any, op: Any, start: float) -> Any:
+        target = dr.full(module.Float, start, views.count)
+        dr.scatter_reduce(op, target, value, map_index, casts)
+        return target
+
+    low, high = dr.ReduceOp.Min, dr.ReduceOp.Max
+    x0, y0, z0 = (reduce(v, low, dr.inf) for v in (bounds.x0, bounds.y0, bounds.z0))
+    x1, y1, z1 = (reduce(v, high, -dr.inf) for v in (bounds.x1, bounds.y1, bounds.z1))
+    dr.eval(x0, y0, z0, x1, y1, z1)  # in one kernel
+    nothing = ~(x1 >= x0)
+    x0, y0, x1, y1 = (dr.select(nothing, s, v) for s, v in ((-1.0, x0), (-1.0, y0), (1.0, x1), (1.0, y1)))
+    z0, z1 = dr.select(nothing, 0.0, z0), dr.select(nothing, 1.0, z1)
+
+    perspective = views.spread > 0
+    s = views.spread
+    full = views.fixed > 0
+    x0, y0 = dr.select(full, -s, dr.maximum(x0, window[0])), dr.select(full, -s, dr.maximum(y0, window[1]))
+    x1, y1 = dr.select(full, s, dr.minimum(x1, window[2])), dr.select(full, s, dr.minimum(y1, window[3]))
+    # Behind all that is seen, casters are of no account; but seen receivers may end before the first of them.
+    z1 = dr.maximum(dr.minimum(z1, window[4]), z0)
+    # Casters outside of the window leave an empty rectangle; any small one will do.
+    x1, y1 = dr.maximum(x1, x0 + 1e-4 * (1 + dr.abs(x0))), dr.maximum(y1, y0 + 1e-4 * (1 + dr.abs(y0)))
+    depth = dr.maximum(z1 - z0, 1e-3 * dr.maximum(dr.abs(z1), 1e-3))
+    near, far = z0 - 0.05 * depth, z1 + 0.05 * depth
+    far = dr.select(perspective, dr.maximum(far, 1e-6), far)
+    near = dr.select(perspective, dr.maximum(near, 1e-3 * far), near)
+
+    def widen(lo: Any, hi: Any) -> tuple[Any, Any]:
+        half = 0.5 * (hi - lo)
+        grown = half * max(1 + 2 * _MARGIN, 1 / (1 - 2 * (filter_size / 2 + 2) / resolution))
+        return 0.5 * (lo + hi), dr.select(full, half, grown)
+
+    (cx, hx), (cy, hy) = widen(x0, x1), widen(y0, y1)
+    return Frusta(cx, cy, hx, hy, near, far), (x0, y0, x1, y1, z0, z1)
+
+
+def _still_fits(views: Views, old: Frusta, new: Frusta, needed: tuple[Any, ...], resolution: int, filter_size: int) -> Any:
+    x0, y0, x1, y1, z0, z1 = needed
+    room = 2 * (filter_size / 2 + 1) / resolution
+
+    def holds(lo: Any, hi: Any, center: Any, half: Any) -> Any:
+        return (lo >= center - half * (1 - room)) & (hi <= center + half * (1 - room))
+
+    keep = holds(x0, x1, old.center_x, old.half_x) & holds(y0, y1, old.center_y, old.half_y)
+    keep &= (new.half_x >= _KEEP_FILL * old.half_x) & (new.half_y >= _KEEP_FILL * old.half_y)
+    # A face of a cube never moves laterally.
+    keep |= (views.fixed > 0) & (new.half_x == old.half_x)
+    keep &= (dr.maximum(z0, new.near) >= old.near) & (z1 <= old.far)
+    keep &= new.far - new.near >= _KEEP_FILL * (old.far - old.near)
+    return keep

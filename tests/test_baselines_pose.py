@@ -75,8 +75,8 @@ def test_proxy_errors_name_the_offender(scene: mi.Scene) -> None:
 
 
 def test_gradient_agrees_with_finite_differences(scene: mi.Scene, target: np.ndarray) -> None:
-    # A large light, whose shadow boundaries samples find often. Mitsuba leaves out the edges between flat-shaded faces,
-    # which is why the derivatives agree only roughly.
+    # A large light, whose shadow boundaries samples find often. The derivatives agree only roughly: probably because Mitsuba
+    # leaves out the edges between flat-shaded faces.
     light = proxy.calibrate(scene, max_penumbra_px=1.5, uniformity=0.02)
     pose = fit(target, ProjectiveSetting(16, 16, 64), proxy=light)
     at = np.array([-0.35, 0.05, 0.2])

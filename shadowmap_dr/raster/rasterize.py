@@ -153,14 +153,6 @@ def cross2(ax: Any, ay: Any, bx: Any, by: Any) -> Any:
     return dr.fma(ax, by, -product) + rounding
 
 
-def pixel_to_ndc(module: Any, row: Any, column: Any, height: int, width: int) -> tuple[Any, Any]:
-    """Normalised device coordinates of pixel centres."""
-    return (
-        dr.fma(module.Float(column), 2.0 / width, 1.0 / width - 1.0),
-        dr.fma(module.Float(row), 2.0 / height, 1.0 / height - 1.0),
-    )
-
-
 def _exact_ndc(module: Any, index: Any, size: int) -> tuple[Any, Any]:
     """NDC coordinate of a pixel centre as a sum of two floats: on steep triangles, half an ulp of it shows in the depth."""
     numerator = dr.fma(module.Float(index), 2.0, 1.0 - size)

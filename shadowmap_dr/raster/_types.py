@@ -38,7 +38,7 @@ class RasterOutput:
         u, v: perspective-correct barycentric weights of the triangle's vertices 1 and 2 (vertex 0 has ``1 - u - v``).
         depth: ``z / w`` in clip space, 1 (the far plane) where nothing is seen.
         w: interpolated clip-space ``w`` (distance along the viewing axis of a perspective camera), 1 where nothing is seen.
-        records: per-triangle set-up of the rasterizer (12 floats for each triangle of each image), for later passes.
+        records: per-triangle set-up of the rasterizer (three arrays of 4 floats a triangle), for later passes.
         face_count, batch, height, width: sizes.
 
     ``u``, ``v``, ``depth`` and ``w`` carry gradients to the clip-space positions (for a fixed visible triangle; the change
@@ -55,6 +55,16 @@ class RasterOutput:
     batch: int
     height: int
     width: int
+
+    def depth_plane(self, image: Any, triangle: Any, active: Any = True) -> tuple[Any, Any, Any]:
+        """NDC depth of a triangle's plane as ``dx * x + dy * y + d``, x and y in pixels from the image centre. Detached.
+
+        Returns (dx, dy, d), each ``Float``, for triangles (valid indices where ``active``) of images of the batch.
+        """
+        Float = backend(self.records[0]).Float
+        index = 4 * (image * self.face_count + triangle) + 3
+        dx, dy, d = (dr.gather(Float, record, index, active) for record in self.records)
+        return dx, dy, d
 
     @property
     def valid(self) -> Any:

@@ -260,10 +260,8 @@ def _wins(reach: Any, candidate: Any, best_reach: Any, best: Any) -> Any:
 
 def _depth_plane(raster: RasterOutput, image: Any, triangle: Any) -> Any:
     """NDC depth of a triangle's plane as a function of centred pixel coordinates; the far plane where there is none."""
-    module = backend(raster.records)
     hit = triangle != NO_TRIANGLE
-    base = 12 * (image * raster.face_count + triangle)
-    dx, dy, d = (dr.gather(module.Float, raster.records, base + (4 * k + 3), hit) for k in range(3))
+    dx, dy, d = raster.depth_plane(image, triangle, hit)
     d = dr.select(hit, d, 1)
     return lambda x, y: dr.fma(dx, x, dr.fma(dy, y, d))
 

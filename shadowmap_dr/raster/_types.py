@@ -56,11 +56,19 @@ class RasterOutput:
     height: int
     width: int
 
-    def depth_plane(self, image: Any, triangle: Any, active: Any = True) -> tuple[Any, Any, Any]:
-        """NDC depth of a triangle's plane as ``dx * x + dy * y + d``, x and y in pixels from the image centre. Detached.
+    def edge_functions(self, image: Any, triangle: Any, active: Any = True) -> tuple[Any, Any, Any]:
+        """``a x + b y + c``, x and y in pixels from the image centre, as three ``Array4f``. Detached.
 
-        Returns (dx, dy, d), each ``Float``, for triangles (valid indices where ``active``) of images of the batch.
+        Components 0, 1, 2: distance (pixels) from the edges opposite to vertices 0, 1, 2, positive inside; 3: NDC depth.
+        For triangles (valid indices where ``active``) of images of the batch.
         """
+        Array4f = backend(self.records[0]).Array4f
+        index = image * self.face_count + triangle
+        a, b, c = (dr.gather(Array4f, record, index, active) for record in self.records)
+        return a, b, c
+
+    def depth_plane(self, image: Any, triangle: Any, active: Any = True) -> tuple[Any, Any, Any]:
+        """The last component of :func:`edge_functions` alone: (dx, dy, d), each ``Float``."""
         Float = backend(self.records[0]).Float
         index = 4 * (image * self.face_count + triangle) + 3
         dx, dy, d = (dr.gather(Float, record, index, active) for record in self.records)

@@ -40,7 +40,7 @@ def find_creases(
         creases, weights: see :func:`find_crossings`.
         pixel: the pixels that the lanes work on (:func:`block_pixels`).
     """
-    module = backend(raster.records)
+    module = backend(pixel.row)
     index, image = pixel.index, pixel.image
     step = raster.width if down else 1
     here = dr.gather(module.UInt32, raster.triangle, index, pairs)
@@ -77,9 +77,8 @@ def _touch(topology: Topology, first: Any, second: Any, active: Any) -> Any:
 
 def _way_out(raster: RasterOutput, image: Any, triangle: Any, x: Any, y: Any, axis: int, sign: int, active: Any) -> Any:
     """Corner at which the edge starts through which one leaves a triangle from a point inside, along an axis of the image."""
-    module = backend(raster.records)
-    base = 3 * (image * raster.face_count + triangle)
-    lines = [dr.gather(module.Array4f, raster.records, base + k, active) for k in range(3)]
+    module = backend(x)
+    lines = raster.edge_functions(image, triangle, active)
     value = dr.fma(lines[0], x, dr.fma(lines[1], y, lines[2]))
     nearest, opposite = module.Float(dr.inf), module.UInt32(0)
     for k in range(3):

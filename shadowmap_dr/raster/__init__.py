@@ -2,9 +2,9 @@
 
 from ._types import MAX_RESOLUTION, NO_TRIANGLE, RasterOutput
 from .antialias import antialias
+from .crossings import Crossings, find_crossings
 from .interpolate import interpolate
 from .rasterize import rasterize
-from .silhouette import Crossings, find_crossings
 from .topology import NO_VERTEX, Topology, build_topology
 
 __all__ = [

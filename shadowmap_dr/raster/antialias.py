@@ -6,8 +6,9 @@ from typing import Any
 
 import drjit as dr
 
-from ._types import RasterOutput, backend, pixel_coordinates
-from .silhouette import Crossings, crossing_position, find_crossings
+from ._types import RasterOutput
+from .blend import blend
+from .crossings import Crossings, find_crossings
 from .topology import Topology
 
 
@@ -52,8 +53,7 @@ def antialias(
     positions, vertex_count = _flat_positions(positions, raster)
     if crossings is None:
         crossings = find_crossings(positions, topology, raster, vertex_count, creases, crease_weights)
-    weights = blend_weights(positions, raster, crossings, vertex_count)
-    blended = blend(flat, weights, raster, count // pixels)
+    blended = blend(flat, positions, raster, crossings)
     return type(values)(blended, shape=values.shape) if is_tensor else blended
 
 
@@ -62,49 +62,3 @@ def _flat_positions(positions: Any, raster: RasterOutput) -> tuple[Any, int]:
     if dr.width(flat) % (4 * raster.batch) != 0:
         raise ValueError(f"positions hold {dr.width(flat)} numbers, which is not {raster.batch} image(s) of (V, 4) vertices")
     return flat, dr.width(flat) // (4 * raster.batch)
-
-
-def blend_weights(positions: Any, raster: RasterOutput, crossings: Crossings, vertex_count: int) -> tuple[Any, Any]:
-    """Signed weights of the (right, lower) pairs, attached to ``positions``.
-
-    Positive: so much of the pixel reaches into its neighbour; negative: so much of the neighbour into the pixel.
-    """
-    c = crossings
-    t_right = crossing_position(positions, raster, (c.right_a, c.right_b), vertex_count, down=False)
-    t_down = crossing_position(positions, raster, (c.down_a, c.down_b), vertex_count, down=True)
-    right, down = c.right_share * (t_right - 0.5), c.down_share * (t_down - 0.5)
-    if c.second is not None:
-        more_right, more_down = blend_weights(positions, raster, c.second, vertex_count)
-        right, down = right + more_right, down + more_down
-    return right, down
-
-
-def blend(values: Any, weights: tuple[Any, Any], raster: RasterOutput, channels: int) -> Any:
-    """Apply the weights of all pairs to flat, interleaved values of ``channels`` channels."""
-    module = backend(values)
-    _, row, column = pixel_coordinates(module, raster.batch, raster.height, raster.width)
-    index = dr.arange(module.UInt32, raster.batch * raster.height * raster.width)
-    right, down = weights
-    has_left, has_up = column > 0, row > 0
-    neighbours = (
-        (index + 1, dr.maximum(-right, 0)),
-        (index + raster.width, dr.maximum(-down, 0)),
-        (index - 1, dr.maximum(dr.gather(module.Float, right, index - 1, has_left), 0)),
-        (index - raster.width, dr.maximum(dr.gather(module.Float, down, index - raster.width, has_up), 0)),
-    )
-    # Up to four neighbours may each claim half of an isolated pixel; more than all of it they cannot have.
-    scale = dr.rcp(dr.maximum(1, sum(w for _, w in neighbours)))
-    result = dr.empty(module.Float, channels * dr.width(index)) if channels > 1 else None
-    blended = []
-    for c in range(channels):
-        own = dr.gather(module.Float, values, index * channels + c) if channels > 1 else values
-        total = own
-        for other, weight in neighbours:
-            value = dr.gather(module.Float, values, other * channels + c, weight > 0)
-            total = dr.fma(weight * scale, dr.select(weight > 0, value - own, 0), total)
-        blended.append(total)
-    if channels == 1:
-        return blended[0]
-    for c in range(channels):
-        dr.scatter(result, blended[c], index * channels + c)
-    return result

@@ -2,71 +2,65 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 
 from ._types import NO_TRIANGLE, RasterOutput, backend
-from .topology import Topology
-
-
-@dataclass(frozen=True)
-class Crease:
-    """An edge for each pair of pixels: whether there is one, and (end points, share) as in :class:`Crossings`."""
-
-    found: Any
-    edge: tuple[Any, Any, Any]
+from .topology import NO_VERTEX, Topology
 
 
 def find_creases(
-    creases: Any,
-    weights: Any,
-    positions: Any,
-    topology: Topology,
-    vertex_count: int,
-    raster: RasterOutput,
-    pixel: Any,
-    pairs: Any,
-    down: int,
-) -> tuple[Crease, Crease]:
-    """Creases between pixels and their right (``down`` = 0) or lower (1) neighbours, where ``pairs`` asks for them.
+    creases: Any, topology: Topology, raster: RasterOutput, image: Any, pixel: Any, here: Any, neighbour: Any, down: Any
+) -> tuple[Any, Any, Any, Any, Any]:
+    """Creases between pixels and their right or (where ``down``) lower neighbours.
 
     Two triangles of one surface have a corner in common, if they are not much smaller than a pixel. Through one edge one
     leaves the first on the way to the neighbour, through one (the same, as a rule) one enters the other. If they are two, other
     faces of unknown colour lie in between, about the mean of both: each edge then counts half.
 
     Args:
-        creases, weights: see :func:`find_crossings`.
-        pixel: the pixels that the lanes work on (:func:`block_pixels`).
+        creases: see :func:`find_crossings`.
+        topology, raster: the mesh and what the pixels see.
+        image, pixel: which pixels, and in which images of the batch.
+        here, neighbour: triangles that the pixels and their neighbours see.
+
+    Returns ends (a, b) of the first edge, ``NO_VERTEX`` where there is none, those of the second, and the weight of each.
     """
-    module = backend(pixel.row)
-    index, image = pixel.index, pixel.image
-    step = raster.width if down else 1
-    here = dr.gather(module.UInt32, raster.triangle, index, pairs)
-    neighbour = dr.gather(module.UInt32, raster.triangle, index + step, pairs)
-    near = _touch(topology, here, neighbour, pairs)
-    x = module.Float(pixel.column) + (0.5 - 0.5 * raster.width)
-    y = module.Float(pixel.row) + (0.5 - 0.5 * raster.height)
-    corner_out = _way_out(raster, image, here, x, y, down, 1, near)
-    corner_in = _way_out(raster, image, neighbour, x + (1 - down), y + down, down, -1, near)
-    hard_out = near & dr.gather(module.Bool, creases, 3 * here + corner_out, near)
-    hard_in = near & dr.gather(module.Bool, creases, 3 * neighbour + corner_in, near)
-    weight = dr.select(hard_out & hard_in, 0.5, module.Float(1))
-    if weights is not None:
-        weight *= dr.minimum(*(dr.gather(module.Float, weights, index + k, near) for k in (0, step)))
-    result = []
-    for face, corner, found in ((here, corner_out, hard_out), (neighbour, corner_in, hard_in)):
-        a, b = (dr.gather(module.UInt32, topology.faces, 3 * face + k, found) for k in (corner, _next(corner)))
-        share = _horizontal_share(positions, image * vertex_count, a, b, found, raster)
-        result.append(Crease(found, (a, b, weight * (1 - share if down else share))))
-    return result[0], result[1]
+    module = backend(here)
+    UInt32, Bool = module.UInt32, module.Bool
+    near = _touch(topology, here, neighbour)
+
+    def search(image: Any, pixel: Any, here: Any, neighbour: Any, down: Any) -> tuple[Any, Any, Any, Any, Any]:
+        row = pixel // raster.width
+        x = module.Float(pixel - row * raster.width) + (0.5 - 0.5 * raster.width)
+        y = module.Float(row - image * raster.height) + (0.5 - 0.5 * raster.height)
+        corner_out = _way_out(raster, image, here, x, y, down, 1)
+        x, y = dr.select(down, x, x + 1), dr.select(down, y + 1, y)
+        corner_in = _way_out(raster, image, neighbour, x, y, down, -1)
+        hard_out = dr.gather(Bool, creases, 3 * here + corner_out)
+        hard_in = dr.gather(Bool, creases, 3 * neighbour + corner_in)
+        a, b = _ends(topology, here, corner_out, hard_out)
+        c, d = _ends(topology, neighbour, corner_in, hard_in)
+        # Twice the same edge, or only the second: one edge is what is left.
+        same = hard_out & hard_in & (((a == c) & (b == d)) | ((a == d) & (b == c)))
+        weight = dr.select(hard_out & hard_in & ~same, 0.5, module.Float(1))
+        a, b = dr.select(hard_out, a, c), dr.select(hard_out, b, d)
+        two = hard_out & hard_in & ~same
+        return a, b, dr.select(two, c, NO_VERTEX), dr.select(two, d, NO_VERTEX), weight
+
+    def nothing(image: Any, *_: Any) -> tuple[Any, Any, Any, Any, Any]:
+        none = dr.full(UInt32, NO_VERTEX, dr.width(image))
+        return none, none, none, none, dr.zeros(module.Float, dr.width(image))
+
+    arguments = (image, pixel, here, neighbour, down)
+    return dr.if_stmt(arguments, near, search, nothing, mode="symbolic", label="creases")
 
 
-def _touch(topology: Topology, first: Any, second: Any, active: Any) -> Any:
+def _touch(topology: Topology, first: Any, second: Any) -> Any:
     """Whether two faces (or none) have a corner in common."""
     module = backend(first)
-    active = active & (first != NO_TRIANGLE) & (second != NO_TRIANGLE)
+    active = (first != NO_TRIANGLE) & (second != NO_TRIANGLE)
     mine = dr.gather(module.Array3u, topology.welded, first, active)
     other = dr.gather(module.Array3u, topology.welded, second, active)
     common = module.Bool(False)
@@ -75,14 +69,14 @@ def _touch(topology: Topology, first: Any, second: Any, active: Any) -> Any:
     return active & common
 
 
-def _way_out(raster: RasterOutput, image: Any, triangle: Any, x: Any, y: Any, axis: int, sign: int, active: Any) -> Any:
+def _way_out(raster: RasterOutput, image: Any, triangle: Any, x: Any, y: Any, down: Any, sign: int) -> Any:
     """Corner at which the edge starts through which one leaves a triangle from a point inside, along an axis of the image."""
     module = backend(x)
-    lines = raster.edge_functions(image, triangle, active)
+    lines = raster.edge_functions(image, triangle)
     value = dr.fma(lines[0], x, dr.fma(lines[1], y, lines[2]))
     nearest, opposite = module.Float(dr.inf), module.UInt32(0)
     for k in range(3):
-        slope = lines[axis][k] * -sign
+        slope = dr.select(down, lines[1][k], lines[0][k]) * -sign
         distance = dr.select(slope > 0, dr.maximum(value[k], 0) / slope, dr.inf)
         opposite = dr.select(distance < nearest, k, opposite)
         nearest = dr.minimum(nearest, distance)
@@ -93,11 +87,9 @@ def _next(corner: Any) -> Any:
     return dr.select(corner == 2, 0, corner + 1)
 
 
-def _horizontal_share(positions: Any, first: Any, a: Any, b: Any, active: Any, raster: RasterOutput) -> Any:
-    """Share of horizontal pairs in an edge, from its direction in the image (of its line, if it reaches behind the camera)."""
-    module = backend(positions)
-    p, q = (dr.gather(module.Array4f, positions, first + v, active) for v in (a, b))
-    # The line a x + b y + c = 0 in ndc is a (2 / width) x + ... in pixels.
-    nx, ny = (p.y * q.w - q.y * p.w) / raster.width, (q.x * p.w - p.x * q.w) / raster.height
-    square = nx * nx + ny * ny
-    return dr.clip(0.5 + (nx * nx - ny * ny) / dr.select(square > 0, square, 1), 0, 1)
+def _ends(topology: Topology, face: Any, corner: Any, found: Any) -> tuple[Any, Any]:
+    """Vertices of the edge that starts at a corner of a face, ``NO_VERTEX`` if not ``found``."""
+    UInt32 = backend(face).UInt32
+    ends = (dr.gather(UInt32, topology.faces, 3 * face + k, found) for k in (corner, _next(corner)))
+    a, b = (dr.select(found, v, NO_VERTEX) for v in ends)
+    return a, b

@@ -1,0 +1,254 @@
+"""Mixing of pixels with the neighbours that reach into them, and its derivatives."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+
+from ._types import RasterOutput, backend
+from .crossings import Crossings
+from .topology import NO_VERTEX
+
+
+def blend(values: Any, positions: Any, raster: RasterOutput, crossings: Crossings) -> Any:
+    """Apply the weights of all pairs of pixels.
+
+    Args:
+        values: flat, interleaved channels of all pixels. Attached.
+        positions: flat clip-space vertices of all images. Attached.
+        raster: what the pixels see.
+        crossings: for the same positions.
+
+    Returns blended values like ``values``.
+    """
+    with dr.suspend_grad():
+        dr.eval(values)
+    if not dr.is_diff_v(values):
+        return _Mixer(values, raster.width, crossings).values
+    wanted = dr.grad_enabled(values), dr.grad_enabled(positions)
+    return dr.custom(_Blend, values, positions, raster.width, crossings, wanted)
+
+
+class _Blend(dr.CustomOp):
+    """Blending as one differentiable operation: the derivatives, too, do work only where pixels were blended."""
+
+    def eval(self, values: Any, positions: Any, width: int, crossings: Crossings, wanted: tuple[bool, bool]) -> Any:
+        self.mixer = _Mixer(values, width, crossings)
+        self.wanted, self.vertices = wanted, dr.width(positions)
+        return self.mixer.values
+
+    def forward(self) -> None:
+        values = self.grad_in("values") if self.wanted[0] else None
+        positions = self.grad_in("positions") if self.wanted[1] else None
+        dr.eval(values, positions)
+        self.set_grad_out(self.mixer.tangent(values, positions))
+
+    def backward(self) -> None:
+        adjoint = self.grad_out()
+        dr.eval(adjoint)
+        if self.wanted[0]:
+            self.set_grad_in("values", self.mixer.adjoint_of_values(adjoint))
+        if self.wanted[1]:
+            self.set_grad_in("positions", self.mixer.adjoint_of_positions(adjoint, self.vertices))
+
+
+class _Mixer:
+    """Blended ``values``, and what their derivatives need. Detached.
+
+    A pixel mixes ``scale * weight`` of each neighbour that reaches into it. Up to four may each claim half of an isolated pixel;
+    more than all of it they cannot have: ``scale = 1 / max(1, sum of weights)``.
+    """
+
+    def __init__(self, values: Any, width: int, crossings: Crossings) -> None:
+        self.module = backend(values)
+        self.crossings, self.width = crossings, width
+        self.pixels = dr.width(crossings.right)
+        self.channels = dr.width(values) // self.pixels
+        self.original = values
+        # Defined only where neighbours reach into a pixel.
+        self.scale = dr.empty(self.module.Float, self.pixels)
+        self.values = self._mix()
+        dr.eval(self.values, self.scale)
+
+    def _mix(self) -> Any:
+        pixel = dr.arange(self.module.UInt32, self.pixels)
+        incoming = self._around(self.crossings.right, self.crossings.down, 1)
+        own = self._read(self.original, pixel)
+
+        def mix(pixel: Any, *lanes: Any) -> tuple[Any, ...]:
+            incoming, own = lanes[:4], lanes[4:]
+            scale = dr.rcp(dr.maximum(1, sum(incoming)))
+            dr.scatter(self.scale, scale, pixel)
+            total = list(own)
+            for weight, neighbour in zip(incoming, self._neighbours(pixel), strict=True):
+                other = self._read(self.original, neighbour, weight > 0)
+                factor = weight * scale
+                total = [dr.fma(factor, dr.select(weight > 0, v - o, 0), t) for v, o, t in zip(other, own, total, strict=True)]
+            return tuple(total)
+
+        return self._written(self._where(sum(incoming) > 0, mix, pixel, (*incoming, *own), own))
+
+    def adjoint_of_values(self, adjoint: Any) -> Any:
+        """Gradient to the values from that of the result."""
+        pixel = dr.arange(self.module.UInt32, self.pixels)
+        right, down = self.crossings.right, self.crossings.down
+        incoming, outgoing = self._around(right, down, 1), self._around(right, down, -1)
+        own = self._read(adjoint, pixel)
+
+        def spread(pixel: Any, *lanes: Any) -> tuple[Any, ...]:
+            incoming, outgoing, own = lanes[:4], lanes[4:8], lanes[8:]
+            claimed = sum(incoming)
+            kept = 1 - claimed * dr.gather(self.module.Float, self.scale, pixel, claimed > 0)
+            total = [kept * o for o in own]
+            for weight, neighbour in zip(outgoing, self._neighbours(pixel), strict=True):
+                factor = weight * dr.gather(self.module.Float, self.scale, neighbour, weight > 0)
+                other = self._read(adjoint, neighbour, weight > 0)
+                total = [dr.fma(factor, v, t) for v, t in zip(other, total, strict=True)]
+            return tuple(total)
+
+        touched = sum(incoming) + sum(outgoing) > 0
+        return self._written(self._where(touched, spread, pixel, (*incoming, *outgoing, *own), own))
+
+    def adjoint_of_positions(self, adjoint: Any, size: int) -> Any:
+        """Gradient to the flat positions from that of the result."""
+        module = self.module
+        Float, Array4f = module.Float, module.Array4f
+        result = dr.zeros(Float, size)
+        crossings = self.crossings
+
+        def visit(slot: Any, pair: Any) -> None:
+            down, pixel = (pair & 1) != 0, pair >> 1
+            weight = dr.select(
+                down, dr.gather(Float, crossings.down, pixel, down), dr.gather(Float, crossings.right, pixel, ~down)
+            )
+
+            def add(slot: Any, pixel: Any, down: Any, weight: Any) -> Any:
+                # The neighbour takes from the pixel where the weight is positive, else the other way round.
+                neighbour = pixel + dr.select(down, module.UInt32(self.width), 1)
+                taker, giver = dr.select(weight > 0, neighbour, pixel), dr.select(weight > 0, pixel, neighbour)
+                scale = dr.gather(Float, self.scale, taker)
+                g, own = self._read(adjoint, taker), self._read(self.original, taker)
+                other = self._read(self.original, giver)
+                # A pixel of which all is claimed shares it out: more for one neighbour is less for all of them.
+                shared = scale < 1
+                mixed = self._read(self.values, taker, shared)
+                mean = [dr.select(shared, m, o) for m, o in zip(mixed, own, strict=True)]
+                gain = sum(a * (v - m) for a, v, m in zip(g, other, mean, strict=True))
+                gain *= dr.select(weight > 0, scale, -scale)
+                ends = dr.gather(module.Array4u, crossings.ends, slot)
+                _add(result, gain, dr.gather(Array4f, crossings.slopes, slot), ends.x, ends.y, True)
+                two = ends.z != NO_VERTEX
+
+                def second(slot: Any, gain: Any, c: Any, d: Any) -> Any:
+                    _add(result, gain, dr.gather(Array4f, crossings.second_slopes, slot), c, d, True)
+                    return gain
+
+                return dr.if_stmt((slot, gain, ends.z, ends.w), two, second, lambda slot, gain, c, d: gain, mode="symbolic")
+
+            dr.if_stmt((slot, pixel, down, weight), weight != 0, add, lambda slot, pixel, down, weight: weight, mode="symbolic")
+
+        crossings.pairs.for_each(visit)
+        return result
+
+    def tangent(self, values: Any, positions: Any) -> Any:
+        """Change of the result with that of the values and positions (each or None)."""
+        module = self.module
+        pixel = dr.arange(module.UInt32, self.pixels)
+        crossings = self.crossings
+        incoming = self._around(crossings.right, crossings.down, 1)
+        total_weight = sum(incoming)
+        takes = total_weight > 0
+        scale = dr.gather(module.Float, self.scale, pixel, takes)
+        own = self._read(self.original, pixel)
+        change = self._read(values, pixel) if values is not None else [module.Float(0)] * self.channels
+        total = list(change)
+        if positions is not None:
+            right, down = self._tangent_of_weights(positions)
+            # A weight's sign tells who takes; its change has the sign of the (right, lower) pair's.
+            rates = self._around(right, down, 1, signed=True)
+            mixed = self._read(self.values, pixel, takes & (scale < 1))
+            mean = [dr.select(scale < 1, m, o) for m, o in zip(mixed, own, strict=True)]
+        for k, (weight, neighbour) in enumerate(zip(incoming, self._neighbours(pixel), strict=True)):
+            active = weight > 0
+            if values is not None:
+                other = self._read(values, neighbour, active)
+                factor = weight * scale
+                total = [dr.fma(factor, v - c, t) for v, c, t in zip(other, change, total, strict=True)]
+            if positions is not None:
+                other = self._read(self.original, neighbour, active)
+                factor = dr.select(active, rates[k] * scale, 0)
+                total = [dr.fma(factor, v - m, t) for v, m, t in zip(other, mean, total, strict=True)]
+        return self._written(total)
+
+    def _tangent_of_weights(self, positions: Any) -> tuple[Any, Any]:
+        module = self.module
+        Float, Array4f = module.Float, module.Array4f
+        crossings = self.crossings
+        right, down = dr.zeros(Float, self.pixels), dr.zeros(Float, self.pixels)
+
+        def visit(slot: Any, pair: Any) -> None:
+            ends = dr.gather(module.Array4u, crossings.ends, slot)
+            change = Float(0)
+            for slopes, a, b in ((crossings.slopes, ends.x, ends.y), (crossings.second_slopes, ends.z, ends.w)):
+                has = a != NO_VERTEX
+                slope = dr.gather(Array4f, slopes, slot, has)
+                p, q = (dr.gather(Array4f, positions, v, has) for v in (a, b))
+                at = dr.fma(q - p, slope.x, p)
+                change += dr.select(has, slope.y * at.x + slope.z * at.y + slope.w * at.w, 0)
+            is_down = (pair & 1) != 0
+            dr.scatter(right, change, pair >> 1, ~is_down)
+            dr.scatter(down, change, pair >> 1, is_down)
+
+        crossings.pairs.for_each(visit)
+        dr.eval(right, down)
+        return right, down
+
+    def _neighbours(self, pixel: Any) -> tuple[Any, Any, Any, Any]:
+        """Right, lower, left, upper."""
+        return pixel + 1, pixel + self.width, pixel - 1, pixel - self.width
+
+    def _around(self, right: Any, down: Any, sign: int, signed: bool = False) -> tuple[Any, Any, Any, Any]:
+        """How much each neighbour (of :meth:`_neighbours`) reaches into a pixel, or (``sign`` -1) a pixel into each neighbour.
+
+        Pairs that reach beyond the image have weight 0, which is also what the last pixels of the line above and the image
+        before have for the first ones.
+        """
+        Float = self.module.Float
+        pixel = dr.arange(self.module.UInt32, self.pixels)
+        left = dr.gather(Float, right, pixel - 1, pixel >= 1)
+        up = dr.gather(Float, down, pixel - self.width, pixel >= self.width)
+        values = (-sign * right, -sign * down, sign * left, sign * up)
+        return values if signed else tuple(dr.maximum(v, 0) for v in values)
+
+    def _where(self, active: Any, function: Any, pixel: Any, lanes: tuple[Any, ...], otherwise: list[Any]) -> list[Any]:
+        """``function(pixel, *lanes)``, one number for each channel, in packets with active lanes; the last lanes elsewhere."""
+        count = len(otherwise)
+        result = dr.if_stmt(
+            (pixel, *lanes), active, function, lambda pixel, *lanes: tuple(lanes[-count:]), mode="symbolic", label="blend"
+        )
+        return list(result)
+
+    def _read(self, flat: Any, pixel: Any, active: Any = True) -> list[Any]:
+        """All channels of pixels."""
+        module = self.module
+        if self.channels in (2, 4):
+            packet = module.Array2f if self.channels == 2 else module.Array4f
+            return list(dr.gather(packet, flat, pixel, active))
+        return [dr.gather(module.Float, flat, pixel * self.channels + c, active) for c in range(self.channels)]
+
+    def _written(self, channels: list[Any]) -> Any:
+        """Interleave the channels."""
+        if self.channels == 1:
+            return channels[0]
+        result = dr.empty(self.module.Float, self.channels * self.pixels)
+        dr.scatter(result, self.module.ArrayXf(channels), dr.arange(self.module.UInt32, self.pixels))
+        return result
+
+
+def _add(result: Any, gain: Any, slopes: Any, a: Any, b: Any, active: Any) -> None:
+    """Pass a weight's gradient on to the ends of its edge."""
+    Array4f = type(slopes)
+    g = Array4f(gain * slopes.y, gain * slopes.z, 0, gain * slopes.w)
+    dr.scatter_add(result, g * (1 - slopes.x), a, active)
+    dr.scatter_add(result, g * slopes.x, b, active)

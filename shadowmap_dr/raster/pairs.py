@@ -1,0 +1,88 @@
+"""Pairs of neighbouring pixels, and lists of the few among them that need work.
+
+Pair ``2 * p`` consists of pixel ``p`` and its right neighbour, pair ``2 * p + 1`` of ``p`` and the lower one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from ._types import RasterOutput, backend
+
+# A list's slots are dealt out in rounds to one lane for this many: short lists end after the first round.
+_ROUNDS = 8
+
+
+@dataclass(frozen=True)
+class PairList:
+    """Some of the pairs, in no particular order.
+
+    Right pairs fill ``pairs`` from the front, down pairs from the back, or all pairs from the front: that makes ``front[0]`` and
+    ``back[0]`` many. A list numbers them from 0 on, without a gap ("slots"). The sizes of the arrays do not depend on the data.
+    """
+
+    pairs: Any
+    front: Any
+    back: Any
+    touched: Any = None
+
+    def add_once(self, pair: Any, active: Any) -> None:
+        """Add pairs that have not been added before. To be traced only once for a list."""
+        UInt32 = backend(self.pairs).UInt32
+        first = active & (dr.scatter_inc(self.touched, pair, active) == 0)
+        dr.scatter(self.pairs, pair, dr.scatter_inc(self.front, UInt32(0), first), first)
+
+    def for_each(self, visit: Callable[[Any, Any], None]) -> None:
+        """Call ``visit(slot, pair)``, which writes somewhere, for all pairs in the list: full packets, whatever the image."""
+        UInt32 = backend(self.pairs).UInt32
+        capacity = dr.width(self.pairs)
+        lanes = -(-capacity // _ROUNDS)
+        front, count = self.front, self.front + self.back
+
+        def one(slot: Any) -> tuple[Any]:
+            pair = dr.gather(UInt32, self.pairs, dr.select(slot < front, slot, capacity - 1 - (slot - front)))
+            visit(slot, pair)
+            return (slot + lanes,)
+
+        dr.while_loop((dr.arange(UInt32, lanes),), lambda slot: slot < count, one, mode="symbolic", label="pairs")
+
+
+def empty_list(raster: RasterOutput) -> PairList:
+    """A list to which pairs can be added."""
+    UInt32 = backend(raster.triangle).UInt32
+    capacity = 2 * dr.width(raster.triangle)
+    return PairList(dr.empty(UInt32, capacity), dr.zeros(UInt32, 1), dr.zeros(UInt32, 1), dr.zeros(UInt32, capacity))
+
+
+def differing_pairs(raster: RasterOutput, keys: Any) -> PairList:
+    """Pairs whose pixels see different triangles; sets their ``keys`` to 0 and leaves the others as they are."""
+    module = backend(raster.triangle)
+    UInt32 = module.UInt32
+    pixels = dr.width(raster.triangle)
+    pixel = dr.arange(UInt32, pixels)
+    row = pixel // raster.width
+    column = pixel - row * raster.width
+    if raster.batch > 1:
+        row %= raster.height
+    right, below = column + 1 < raster.width, row + 1 < raster.height
+    here = raster.triangle
+    right &= dr.gather(UInt32, here, pixel + 1, right) != here
+    below &= dr.gather(UInt32, here, pixel + raster.width, below) != here
+    result = PairList(dr.empty(UInt32, 2 * pixels), dr.zeros(UInt32, 1), dr.zeros(UInt32, 1))
+
+    def add(pixel: Any, right: Any, below: Any) -> Any:
+        slot = dr.scatter_inc(result.front, UInt32(0), right)
+        dr.scatter(result.pairs, 2 * pixel, slot, right)
+        slot = dr.scatter_inc(result.back, UInt32(0), below)
+        dr.scatter(result.pairs, 2 * pixel + 1, 2 * pixels - 1 - slot, below)
+        dr.scatter(keys, module.UInt64(0), 2 * pixel, right)
+        dr.scatter(keys, module.UInt64(0), 2 * pixel + 1, below)
+        return pixel
+
+    dr.if_stmt((pixel, right, below), right | below, add, lambda pixel, right, below: pixel, mode="symbolic", label="differ")
+    dr.eval(result.front, result.back, result.pairs, keys)
+    return result

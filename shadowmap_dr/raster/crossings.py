@@ -194,7 +194,8 @@ def _weight(
     weight = dr.select(has, weight * _share(p, q, down, raster), 0)
 
     # d value = sum over both ends of (1 - s, s) / w * (d along - tilt * d across - (value - tilt * ndc) * d w)
-    slope = dr.select((t >= 0) & (t <= 1), weight * 0.5 * size / w, 0)
+    # An edge on a pixel's centre belongs to two pairs (t = 0 and 1), but moves once.
+    slope = dr.select((t > 0) & (t <= 1), weight * 0.5 * size / w, 0)
     tilt = ((p_along - q_along) - value * (p.w - q.w)) / span
     across = -slope * tilt
     slopes = Array4f(

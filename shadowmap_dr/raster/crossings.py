@@ -67,14 +67,11 @@ def find_crossings(
     """
     with dr.suspend_grad():
         positions = dr.detach(positions)
-        UInt64 = backend(positions).UInt64
-        count = 2 * dr.width(raster.triangle)
         if creases is None:
-            keys, pairs = dr.zeros(UInt64, count), empty_list(raster)
+            pairs, keys = empty_list(raster)
             register_silhouettes(positions, topology, raster, vertex_count, keys, pairs)
         else:
-            keys = dr.empty(UInt64, count)
-            pairs = differing_pairs(raster, keys)
+            pairs, keys = differing_pairs(raster)
             register_silhouettes(positions, topology, raster, vertex_count, keys, None)
             crease_weights = None if crease_weights is None else dr.detach(crease_weights)
             dr.eval(crease_weights)

@@ -51,15 +51,23 @@ class PairList:
         dr.while_loop((dr.arange(UInt32, lanes),), lambda slot: slot < count, one, mode="symbolic", label="pairs")
 
 
-def empty_list(raster: RasterOutput) -> PairList:
-    """A list to which pairs can be added."""
-    UInt32 = backend(raster.triangle).UInt32
+def empty_list(raster: RasterOutput) -> tuple[PairList, Any]:
+    """A list to which pairs can be added, and for each pair a key (``UInt64``) of 0."""
+    module = backend(raster.triangle)
     capacity = 2 * dr.width(raster.triangle)
-    return PairList(dr.empty(UInt32, capacity), dr.zeros(UInt32, 1), dr.zeros(UInt32, 1), dr.zeros(UInt32, capacity))
+    zero = _zero(dr.arange(module.UInt32, capacity))
+    touched, keys = zero, module.UInt64(zero)
+    dr.eval(touched, keys)
+    return PairList(dr.empty(module.UInt32, capacity), dr.zeros(module.UInt32, 1), dr.zeros(module.UInt32, 1), touched), keys
 
 
-def differing_pairs(raster: RasterOutput, keys: Any) -> PairList:
-    """Pairs whose pixels see different triangles; sets their ``keys`` to 0 and leaves the others as they are."""
+def _zero(index: Any) -> Any:
+    """Zeros that a kernel of all threads writes, which is faster than the one thread that fills an array with a constant."""
+    return index >> 31
+
+
+def differing_pairs(raster: RasterOutput) -> tuple[PairList, Any]:
+    """Pairs whose pixels see different triangles, and keys (``UInt64``), 0 for these pairs and undefined for others."""
     module = backend(raster.triangle)
     UInt32 = module.UInt32
     pixels = dr.width(raster.triangle)
@@ -72,6 +80,7 @@ def differing_pairs(raster: RasterOutput, keys: Any) -> PairList:
     here = raster.triangle
     right &= dr.gather(UInt32, here, pixel + 1, right) != here
     below &= dr.gather(UInt32, here, pixel + raster.width, below) != here
+    keys = dr.empty(module.UInt64, 2 * pixels)
     result = PairList(dr.empty(UInt32, 2 * pixels), dr.zeros(UInt32, 1), dr.zeros(UInt32, 1))
 
     def add(pixel: Any, right: Any, below: Any) -> Any:
@@ -85,4 +94,4 @@ def differing_pairs(raster: RasterOutput, keys: Any) -> PairList:
 
     dr.if_stmt((pixel, right, below), right | below, add, lambda pixel, right, below: pixel, mode="symbolic", label="differ")
     dr.eval(result.front, result.back, result.pairs, keys)
-    return result
+    return result, keys

@@ -15,16 +15,16 @@ def blend(values: Any, positions: Any, raster: RasterOutput, crossings: Crossing
     """Apply the weights of all pairs of pixels.
 
     Args:
-        values: flat, interleaved channels of all pixels. Attached.
+        values: flat, interleaved channels of all pixels, or a list with one array for each channel. Attached.
         positions: flat clip-space vertices of all images. Attached.
         raster: what the pixels see.
         crossings: for the same positions.
 
-    Returns blended values like ``values``.
+    Returns blended values, flat and interleaved.
     """
     with dr.suspend_grad():
         dr.eval(values)
-    if not dr.is_diff_v(values):
+    if not dr.is_diff_v(positions):
         return _Mixer(values, raster.width, crossings).values
     wanted = dr.grad_enabled(values), dr.grad_enabled(positions)
     return dr.custom(_Blend, values, positions, raster.width, crossings, wanted)
@@ -61,10 +61,11 @@ class _Mixer:
     """
 
     def __init__(self, values: Any, width: int, crossings: Crossings) -> None:
-        self.module = backend(values)
+        self.module = backend(crossings.right)
         self.crossings, self.width = crossings, width
         self.pixels = dr.width(crossings.right)
-        self.channels = dr.width(values) // self.pixels
+        self.planar = isinstance(values, list)
+        self.channels = len(values) if self.planar else dr.width(values) // self.pixels
         self.original = values
         # Sums of weights, defined only where neighbours reach into a pixel.
         self.claims = dr.empty(self.module.Float, self.pixels)
@@ -109,7 +110,8 @@ class _Mixer:
             return tuple(total)
 
         touched = sum(incoming) + sum(outgoing) > 0
-        return self._written(self._where(touched, spread, pixel, (*incoming, *outgoing, *own), own))
+        result = self._where(touched, spread, pixel, (*incoming, *outgoing, *own), own)
+        return result if self.planar else self._written(result)
 
     def adjoint_of_positions(self, adjoint: Any, size: int) -> Any:
         """Gradient to the flat positions from that of the result."""
@@ -233,6 +235,8 @@ class _Mixer:
     def _read(self, flat: Any, pixel: Any, active: Any = True) -> list[Any]:
         """All channels of pixels."""
         module = self.module
+        if isinstance(flat, list):
+            return [dr.gather(module.Float, channel, pixel, active) for channel in flat]
         if self.channels in (2, 4):
             packet = module.Array2f if self.channels == 2 else module.Array4f
             return list(dr.gather(packet, flat, pixel, active))

@@ -33,9 +33,9 @@ def register_silhouettes(
     Args:
         positions: flat clip-space vertices, as rasterized. Detached.
         topology, raster, vertex_count: the mesh and what the pixels see.
-        keys: ``UInt64``, one number for each pair (see :mod:`shadowmap_dr.raster.pairs`), 0 at first. Gets the largest of the edges'
-            keys: how much of the uncovered pixel the edge's surface hides as the upper half (a float's bits), the complement of
-            the edge's index as the lower. The outermost edge wins, so that the result does not depend on the order.
+        keys: ``UInt64``, one number for each pair (see :mod:`shadowmap_dr.raster.pairs`), 0 at first. Gets the largest of the
+            edges' keys: how much of the uncovered pixel the edge's surface hides as the upper half (a float's bits), the complement
+            of the edge's index as the lower. The outermost edge wins, so that the result does not depend on the order.
         found: list to which pairs are added when the first edge registers.
     """
     module = backend(positions)
@@ -57,11 +57,11 @@ def register_silhouettes(
 def _collect(positions: Any, topology: Topology, raster: RasterOutput, vertex_count: int) -> tuple[Any, Any, Any]:
     """List the silhouettes that cross lines through pixel centres.
 
-    Returns their number (width 1), records and indices ``image * E + edge``. A record holds both ends, x and y in pixels from the image's
-    centre and the NDC depth, with the side on which the surface lies (as a sign) and the share of horizontal pairs.
+    Returns their number (width 1), records and indices ``image * E + edge``. A record holds both ends, x and y in pixels from the
+    image's centre and the NDC depth, with the side on which the surface lies (as a sign) and the share of horizontal pairs.
     """
     module = backend(positions)
-    Float, UInt32, Array4f = module.Float, module.UInt32, module.Array4f
+    Float, UInt32 = module.Float, module.UInt32
     width, height = raster.width, raster.height
     total = raster.batch * topology.count
     index = dr.arange(UInt32, total)
@@ -81,15 +81,21 @@ def _collect(positions: Any, topology: Topology, raster: RasterOutput, vertex_co
         dr.scatter(records, module.ArrayXf(*a, side, *b, share), slot)
         return slot
 
-    dr.if_stmt(
-        (index, a, b, side, share), active, add, lambda index, *_: index, mode="symbolic", label="silhouette"
-    )
+    dr.if_stmt((index, a, b, side, share), active, add, lambda index, *_: index, mode="symbolic", label="silhouette")
     dr.eval(count, edges, records)
     return count, records, edges
 
 
 def _walk(
-    a: Any, b: Any, index: Any, line: Any, stride: int, topology: Topology, raster: RasterOutput, keys: Any, found: PairList | None
+    a: Any,
+    b: Any,
+    index: Any,
+    line: Any,
+    stride: int,
+    topology: Topology,
+    raster: RasterOutput,
+    keys: Any,
+    found: PairList | None,
 ) -> None:
     """Visit every ``stride``-th of the lines through pixel centres that edges cross, beginning with ``line``."""
     module = backend(a)
@@ -154,9 +160,7 @@ def _walk(
     )
 
 
-def _silhouettes(
-    positions: Any, topology: Topology, image: Any, edge: Any, vertex_count: int
-) -> tuple[Any, Any, Any, Any]:
+def _silhouettes(positions: Any, topology: Topology, image: Any, edge: Any, vertex_count: int) -> tuple[Any, Any, Any, Any]:
     """Clip-space end points of edges, on which side of them their surface is, and whether it is on one side only."""
     module = backend(positions)
     Array4f, Array2u = module.Array4f, module.Array2u

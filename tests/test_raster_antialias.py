@@ -283,3 +283,63 @@ def test_plain_dr_jit_arrays_do_as_well(variant: str) -> None:
         assert type(image) is module.Float
     for a, b in zip(*results, strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+def test_channels_may_come_one_by_one(variant: str) -> None:
+    """A list of channels gives the values and derivatives (both modes) of the interleaved array."""
+    rng, size = np.random.default_rng(5), 20
+    world = rng.uniform(-1, 1, (45, 3)).astype(np.float32)
+    faces = np.arange(45).reshape(15, 3).astype(np.uint32)
+    topology = topology_of(faces, world)
+    channels = rng.random((3, size * size)).astype(np.float32)
+    weights = mi.Float(rng.standard_normal(3 * size * size).astype(np.float32))
+    results = []
+    for separate in (True, False):
+        clip = mi.TensorXf(np.c_[world, np.ones(45)].astype(np.float32))
+        planes = [mi.Float(c.copy()) for c in channels]
+        dr.enable_grad(clip, planes)
+        out = rasterize(clip, mi.TensorXu(faces), (size, size))
+        image = antialias(planes if separate else dr.ravel(mi.Color3f(*planes)), out, clip, topology)
+        dr.backward(dr.sum(image * weights), flags=dr.ADFlag.Default & ~dr.ADFlag.ClearEdges)
+        backward = [dr.grad(a).numpy().ravel() for a in (clip, *planes)]
+        moved, delta = mi.TensorXf(dr.detach(clip)), mi.Float(0)
+        dr.enable_grad(delta)
+        moved = moved + delta * mi.TensorXf(0.3)
+        lit = [mi.Float(c.copy()) + delta * (k + 1) for k, c in enumerate(channels)]
+        out = rasterize(moved, mi.TensorXu(faces), (size, size))
+        image_2 = antialias(lit if separate else dr.ravel(mi.Color3f(*lit)), out, moved, topology)
+        dr.forward(delta)
+        results.append([image.numpy(), *backward, dr.grad(image_2).numpy()])
+    for a, b in zip(*results, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
+    assert np.abs(results[0][-1]).max() > 0.1
+    with pytest.raises(ValueError, match="channels hold"):
+        antialias(planes[:1] + [mi.Float(1, 2, 3)], out, moved, topology)
+
+
+def test_derivatives_of_claimed_pixels_match_differences(variant: str) -> None:
+    """What one pixel sees is much smaller than it: the four neighbours claim more than all of it, and share it out."""
+    size, step = 8, 1e-3
+    world = np.array([[0.09, 0.08, 0], [0.17, 0.085, 0], [0.165, 0.17, 0], [0.085, 0.16, 0]])
+    world = np.r_[world, [[-0.9, -0.9, 0.5], [0.9, -0.9, 0.5], [0, 0.95, 0.5]]].astype(np.float32)
+    faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6]], np.uint32)
+    topology, colors = topology_of(faces, world), np.array([1, 1, 0.3])
+    weights = np.random.default_rng(1).random(size * size).astype(np.float32)
+
+    def total(flat):  # noqa: ANN001, ANN202
+        clip = mi.TensorXf(dr.ravel(mi.Point4f(*dr.unravel(mi.Point3f, flat), 1)), shape=(7, 4))
+        image, _ = render(clip, faces, topology, size, colors)
+        return dr.sum(image * mi.Float(weights))
+
+    p = mi.Float(world.ravel().copy())
+    dr.enable_grad(p)
+    dr.backward(total(p))
+    got = dr.grad(p).numpy()
+    for i in range(21):
+        ends = []
+        for sign in (1, -1):
+            moved = world.ravel().copy()
+            moved[i] += sign * step
+            ends.append(float(total(mi.Float(moved))[0]))
+        want = (ends[0] - ends[1]) / (2 * step)
+        assert abs(got[i] - want) < 2e-3 + 0.02 * abs(want), (i, got[i], want)

@@ -29,7 +29,8 @@ def antialias(
     channels: a moment pair stays a moment pair.
 
     Args:
-        values: tensor (H, W, C) or (B, H, W, C), or a flat ``Float`` array with C = 1.
+        values: tensor (H, W, C) or (B, H, W, C), or a flat ``Float`` array in the same order, or (cheapest) a list of C ``Float``
+            arrays with one number for each pixel, or one for all.
         raster: rasterizer output for the same images.
         positions: clip-space vertices as given to the rasterizer.
         topology: :func:`shadowmap_dr.raster.build_topology` of the mesh.
@@ -38,23 +39,34 @@ def antialias(
             :func:`find_crossings`.
 
     Returns:
-        The blended values in the shape of ``values``. Gradients flow to ``values`` and, through the position of the
-        silhouettes, to ``positions``.
+        The blended values in the shape of ``values``; flat, with interleaved channels, for a list. Gradients flow to ``values``
+        and, through the position of the silhouettes, to ``positions``.
 
     Source: the idea of blending along the axis that crosses the edge is that of Laine et al., "Modular Primitives for
     High-Performance Differentiable Rendering", 2020, section 3.6; the search for edges and the weights are different.
     """
     is_tensor = dr.is_tensor_v(values)
-    flat = values.array if is_tensor else values
-    pixels = raster.batch * raster.height * raster.width
-    count = dr.width(flat)
-    if count == 0 or count % pixels != 0:
-        raise ValueError(f"values hold {count} numbers for {raster.batch} image(s) of {raster.height} x {raster.width} pixels")
+    flat = _checked_values(values, raster)
     positions, vertex_count = _flat_positions(positions, raster)
     if crossings is None:
         crossings = find_crossings(positions, topology, raster, vertex_count, creases, crease_weights)
     blended = blend(flat, positions, raster, crossings)
     return type(values)(blended, shape=values.shape) if is_tensor else blended
+
+
+def _checked_values(values: Any, raster: RasterOutput) -> Any:
+    """Flat values, or a list of channels of full width."""
+    pixels = raster.batch * raster.height * raster.width
+    where = f"{raster.batch} image(s) of {raster.height} x {raster.width} pixels"
+    if isinstance(values, list | tuple):
+        if not values or any(dr.width(channel) not in (1, pixels) for channel in values):
+            raise ValueError(f"channels hold {[dr.width(channel) for channel in values]} numbers for {where}")
+        return [channel if dr.width(channel) == pixels else channel + dr.zeros(type(channel), pixels) for channel in values]
+    flat = values.array if dr.is_tensor_v(values) else values
+    count = dr.width(flat)
+    if count == 0 or count % pixels != 0:
+        raise ValueError(f"values hold {count} numbers for {where}")
+    return flat
 
 
 def _flat_positions(positions: Any, raster: RasterOutput) -> tuple[Any, int]:

@@ -15,16 +15,16 @@ def blend(values: Any, positions: Any, raster: RasterOutput, crossings: Crossing
     """Apply the weights of all pairs of pixels.
 
     Args:
-        values: flat, interleaved channels of all pixels. Attached.
+        values: flat, interleaved channels of all pixels, or a list with one array for each channel. Attached.
         positions: flat clip-space vertices of all images. Attached.
         raster: what the pixels see.
         crossings: for the same positions.
 
-    Returns blended values like ``values``.
+    Returns blended values, flat and interleaved.
     """
     with dr.suspend_grad():
         dr.eval(values)
-    if not dr.is_diff_v(values):
+    if not dr.is_diff_v(positions):
         return _Mixer(values, raster.width, crossings).values
     wanted = dr.grad_enabled(values), dr.grad_enabled(positions)
     return dr.custom(_Blend, values, positions, raster.width, crossings, wanted)
@@ -61,15 +61,16 @@ class _Mixer:
     """
 
     def __init__(self, values: Any, width: int, crossings: Crossings) -> None:
-        self.module = backend(values)
+        self.module = backend(crossings.right)
         self.crossings, self.width = crossings, width
         self.pixels = dr.width(crossings.right)
-        self.channels = dr.width(values) // self.pixels
+        self.planar = isinstance(values, list)
+        self.channels = len(values) if self.planar else dr.width(values) // self.pixels
         self.original = values
-        # Defined only where neighbours reach into a pixel.
-        self.scale = dr.empty(self.module.Float, self.pixels)
+        # Sums of weights, defined only where neighbours reach into a pixel.
+        self.claims = dr.empty(self.module.Float, self.pixels)
         self.values = self._mix()
-        dr.eval(self.values, self.scale)
+        dr.eval(self.values, self.claims)
 
     def _mix(self) -> Any:
         pixel = dr.arange(self.module.UInt32, self.pixels)
@@ -78,8 +79,9 @@ class _Mixer:
 
         def mix(pixel: Any, *lanes: Any) -> tuple[Any, ...]:
             incoming, own = lanes[:4], lanes[4:]
-            scale = dr.rcp(dr.maximum(1, sum(incoming)))
-            dr.scatter(self.scale, scale, pixel)
+            claims = sum(incoming)
+            dr.scatter(self.claims, claims, pixel)
+            scale = _scale(claims)
             total = list(own)
             for weight, neighbour in zip(incoming, self._neighbours(pixel), strict=True):
                 other = self._read(self.original, neighbour, weight > 0)
@@ -98,17 +100,18 @@ class _Mixer:
 
         def spread(pixel: Any, *lanes: Any) -> tuple[Any, ...]:
             incoming, outgoing, own = lanes[:4], lanes[4:8], lanes[8:]
-            claimed = sum(incoming)
-            kept = 1 - claimed * dr.gather(self.module.Float, self.scale, pixel, claimed > 0)
+            claims = sum(incoming)
+            kept = 1 - claims * _scale(claims)
             total = [kept * o for o in own]
             for weight, neighbour in zip(outgoing, self._neighbours(pixel), strict=True):
-                factor = weight * dr.gather(self.module.Float, self.scale, neighbour, weight > 0)
+                factor = weight * _scale(dr.gather(self.module.Float, self.claims, neighbour, weight > 0))
                 other = self._read(adjoint, neighbour, weight > 0)
                 total = [dr.fma(factor, v, t) for v, t in zip(other, total, strict=True)]
             return tuple(total)
 
         touched = sum(incoming) + sum(outgoing) > 0
-        return self._written(self._where(touched, spread, pixel, (*incoming, *outgoing, *own), own))
+        result = self._where(touched, spread, pixel, (*incoming, *outgoing, *own), own)
+        return result if self.planar else self._written(result)
 
     def adjoint_of_positions(self, adjoint: Any, size: int) -> Any:
         """Gradient to the flat positions from that of the result."""
@@ -127,11 +130,12 @@ class _Mixer:
                 # The neighbour takes from the pixel where the weight is positive, else the other way round.
                 neighbour = pixel + dr.select(down, module.UInt32(self.width), 1)
                 taker, giver = dr.select(weight > 0, neighbour, pixel), dr.select(weight > 0, pixel, neighbour)
-                scale = dr.gather(Float, self.scale, taker)
+                claims = dr.gather(Float, self.claims, taker)
+                scale = _scale(claims)
                 g, own = self._read(adjoint, taker), self._read(self.original, taker)
                 other = self._read(self.original, giver)
                 # A pixel of which all is claimed shares it out: more for one neighbour is less for all of them.
-                shared = scale < 1
+                shared = claims >= 1
                 mixed = self._read(self.values, taker, shared)
                 mean = [dr.select(shared, m, o) for m, o in zip(mixed, own, strict=True)]
                 gain = sum(a * (v - m) for a, v, m in zip(g, other, mean, strict=True))
@@ -157,9 +161,8 @@ class _Mixer:
         pixel = dr.arange(module.UInt32, self.pixels)
         crossings = self.crossings
         incoming = self._around(crossings.right, crossings.down, 1)
-        total_weight = sum(incoming)
-        takes = total_weight > 0
-        scale = dr.gather(module.Float, self.scale, pixel, takes)
+        claims = sum(incoming)
+        scale = _scale(claims)
         own = self._read(self.original, pixel)
         change = self._read(values, pixel) if values is not None else [module.Float(0)] * self.channels
         total = list(change)
@@ -167,8 +170,8 @@ class _Mixer:
             right, down = self._tangent_of_weights(positions)
             # A weight's sign tells who takes; its change has the sign of the (right, lower) pair's.
             rates = self._around(right, down, 1, signed=True)
-            mixed = self._read(self.values, pixel, takes & (scale < 1))
-            mean = [dr.select(scale < 1, m, o) for m, o in zip(mixed, own, strict=True)]
+            mixed = self._read(self.values, pixel, claims >= 1)
+            mean = [dr.select(claims >= 1, m, o) for m, o in zip(mixed, own, strict=True)]
         for k, (weight, neighbour) in enumerate(zip(incoming, self._neighbours(pixel), strict=True)):
             active = weight > 0
             if values is not None:
@@ -232,6 +235,8 @@ class _Mixer:
     def _read(self, flat: Any, pixel: Any, active: Any = True) -> list[Any]:
         """All channels of pixels."""
         module = self.module
+        if isinstance(flat, list):
+            return [dr.gather(module.Float, channel, pixel, active) for channel in flat]
         if self.channels in (2, 4):
             packet = module.Array2f if self.channels == 2 else module.Array4f
             return list(dr.gather(packet, flat, pixel, active))
@@ -244,6 +249,10 @@ class _Mixer:
         result = dr.empty(self.module.Float, self.channels * self.pixels)
         dr.scatter(result, self.module.ArrayXf(channels), dr.arange(self.module.UInt32, self.pixels))
         return result
+
+
+def _scale(claims: Any) -> Any:
+    return dr.rcp(dr.maximum(1, claims))
 
 
 def _add(result: Any, gain: Any, slopes: Any, a: Any, b: Any, active: Any) -> None:

@@ -19,8 +19,8 @@ class Crossings:
     """Edges that separate pixels from their right and lower neighbours, for one set of vertex positions. No gradients.
 
     Attributes:
-        right, down: ``Float`` for each pixel, the signed weight of its pair with the right (lower) neighbour. Positive: so much
-            of the pixel reaches into its neighbour; negative: so much of the neighbour into the pixel.
+        right, down: ``Float`` for each pixel, the signed weight of its pair with the right (lower) neighbour. Positive: so much of
+            the pixel reaches into its neighbour; negative: so much of the neighbour into the pixel.
         pairs: the pairs that may have a weight. What follows is indexed by their slots in this list.
         ends: ``UInt32``, four for each slot: ends of the edge and of a second one, as vertices of the whole batch; ``NO_VERTEX``
             where there is none.
@@ -67,19 +67,16 @@ def find_crossings(
     """
     with dr.suspend_grad():
         positions = dr.detach(positions)
-        UInt64 = backend(positions).UInt64
-        count = 2 * dr.width(raster.triangle)
         if creases is None:
-            keys, pairs = dr.zeros(UInt64, count), empty_list(raster)
+            pairs, keys, zeros = empty_list(raster)
             register_silhouettes(positions, topology, raster, vertex_count, keys, pairs)
         else:
-            keys = dr.empty(UInt64, count)
-            pairs = differing_pairs(raster, keys)
+            pairs, keys, zeros = differing_pairs(raster)
             register_silhouettes(positions, topology, raster, vertex_count, keys, None)
             crease_weights = None if crease_weights is None else dr.detach(crease_weights)
             dr.eval(crease_weights)
         dr.eval(keys, pairs)
-        return _measure(positions, topology, raster, vertex_count, keys, pairs, creases, crease_weights)
+        return _measure(positions, topology, raster, vertex_count, keys, pairs, zeros, creases, crease_weights)
 
 
 def _measure(
@@ -89,6 +86,7 @@ def _measure(
     vertex_count: int,
     keys: Any,
     pairs: PairList,
+    zeros: tuple[Any, Any],
     creases: Any,
     crease_weights: Any,
 ) -> Crossings:
@@ -96,8 +94,7 @@ def _measure(
     Float, UInt32, Array4f = module.Float, module.UInt32, module.Array4f
     pixels = dr.width(raster.triangle)
     found = Crossings(
-        dr.zeros(Float, pixels),
-        dr.zeros(Float, pixels),
+        *zeros,
         pairs,
         dr.empty(UInt32, 8 * pixels),
         dr.empty(Float, 8 * pixels),
@@ -194,12 +191,11 @@ def _weight(
     weight = dr.select(has, weight * _share(p, q, down, raster), 0)
 
     # d value = sum over both ends of (1 - s, s) / w * (d along - tilt * d across - (value - tilt * ndc) * d w)
-    slope = dr.select((t >= 0) & (t <= 1), weight * 0.5 * size / w, 0)
+    # An edge on a pixel's centre belongs to two pairs (t = 0 and 1), but moves once.
+    slope = dr.select((t > 0) & (t <= 1), weight * 0.5 * size / w, 0)
     tilt = ((p_along - q_along) - value * (p.w - q.w)) / span
     across = -slope * tilt
-    slopes = Array4f(
-        s, dr.select(down, across, slope), dr.select(down, slope, across), -dr.fma(value, slope, ndc * across)
-    )
+    slopes = Array4f(s, dr.select(down, across, slope), dr.select(down, slope, across), -dr.fma(value, slope, ndc * across))
     return weight * (dr.clip(t, 0, 1) - 0.5), slopes
 
 

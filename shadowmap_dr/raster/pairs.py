@@ -51,15 +51,30 @@ class PairList:
         dr.while_loop((dr.arange(UInt32, lanes),), lambda slot: slot < count, one, mode="symbolic", label="pairs")
 
 
-def empty_list(raster: RasterOutput) -> PairList:
-    """A list to which pairs can be added."""
-    UInt32 = backend(raster.triangle).UInt32
+def empty_list(raster: RasterOutput) -> tuple[PairList, Any, tuple[Any, Any]]:
+    """A list to which pairs can be added, for each pair a key (``UInt64``) of 0, and zeros for all right and down pairs."""
+    module = backend(raster.triangle)
+    UInt32 = module.UInt32
     capacity = 2 * dr.width(raster.triangle)
-    return PairList(dr.empty(UInt32, capacity), dr.zeros(UInt32, 1), dr.zeros(UInt32, 1), dr.zeros(UInt32, capacity))
+    touched = _zero(dr.arange(UInt32, capacity))
+    keys, zeros = module.UInt64(touched), _two_zeros(dr.arange(UInt32, capacity // 2))
+    dr.eval(touched, keys, zeros)
+    return PairList(dr.empty(UInt32, capacity), dr.zeros(UInt32, 1), dr.zeros(UInt32, 1), touched), keys, zeros
 
 
-def differing_pairs(raster: RasterOutput, keys: Any) -> PairList:
-    """Pairs whose pixels see different triangles; sets their ``keys`` to 0 and leaves the others as they are."""
+def _zero(index: Any) -> Any:
+    """Zeros that a kernel of all threads writes, which is faster than the one thread that fills an array with a constant."""
+    return index >> 31
+
+
+def _two_zeros(pixel: Any) -> tuple[Any, Any]:
+    """Two arrays of zeros (of different sign: otherwise it would be one array)."""
+    zero = backend(pixel).Float(_zero(pixel))
+    return zero, -zero
+
+
+def differing_pairs(raster: RasterOutput) -> tuple[PairList, Any, tuple[Any, Any]]:
+    """Pairs whose pixels see different triangles, and keys and zeros as in :func:`empty_list`; keys only for these pairs."""
     module = backend(raster.triangle)
     UInt32 = module.UInt32
     pixels = dr.width(raster.triangle)
@@ -72,6 +87,7 @@ def differing_pairs(raster: RasterOutput, keys: Any) -> PairList:
     here = raster.triangle
     right &= dr.gather(UInt32, here, pixel + 1, right) != here
     below &= dr.gather(UInt32, here, pixel + raster.width, below) != here
+    keys = dr.empty(module.UInt64, 2 * pixels)
     result = PairList(dr.empty(UInt32, 2 * pixels), dr.zeros(UInt32, 1), dr.zeros(UInt32, 1))
 
     def add(pixel: Any, right: Any, below: Any) -> Any:
@@ -84,5 +100,6 @@ def differing_pairs(raster: RasterOutput, keys: Any) -> PairList:
         return pixel
 
     dr.if_stmt((pixel, right, below), right | below, add, lambda pixel, right, below: pixel, mode="symbolic", label="differ")
-    dr.eval(result.front, result.back, result.pairs, keys)
-    return result
+    zeros = _two_zeros(dr.arange(UInt32, pixels))
+    dr.eval(result.front, result.back, result.pairs, keys, zeros)
+    return result, keys, zeros

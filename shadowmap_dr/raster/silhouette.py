@@ -21,6 +21,8 @@ _DEPTH_GAP = 1e-5
 _DEPTH_GAP_ABSOLUTE = 2e-7
 # Lines through pixel centres that lie this far (in pixels) beyond an edge's ends are tested, too, in spite of rounding.
 _MARGIN = 1.0 / 512.0
+# So many lanes walk along all silhouettes; few, so that threads get equal parts of a short list, too.
+_LANES, _LANES_PER_EDGE = 512, 4
 
 
 def register_silhouettes(
@@ -32,21 +34,78 @@ def register_silhouettes(
         positions: flat clip-space vertices, as rasterized. Detached.
         topology, raster, vertex_count: the mesh and what the pixels see.
         keys: ``UInt64``, one number for each pair (see :mod:`shadowmap_dr.raster.pairs`), 0 at first. Gets the largest of the
-            edges' keys: how much of the uncovered pixel the edge's surface hides as the upper half (a float's bits), the
-            complement of the edge's index as the lower. The outermost edge wins: the result does not depend on the order.
+            edges' keys: how much of the uncovered pixel the edge's surface hides as the upper half (a float's bits), the complement
+            of the edge's index as the lower. The outermost edge wins, so that the result does not depend on the order.
         found: list to which pairs are added when the first edge registers.
     """
     module = backend(positions)
-    Float, UInt32, UInt64 = module.Float, module.UInt32, module.UInt64
+    UInt32 = module.UInt32
+    count, records, edges = _collect(positions, topology, raster, vertex_count)
+    # Lanes that share an edge take turns: edges differ in length, and few are silhouettes.
+    lanes, stride = _LANES, _LANES_PER_EDGE
+
+    def walk(lane: Any) -> tuple[Any]:
+        slot, turn = lane // stride, lane % stride
+        a, b = (dr.gather(module.Array4f, records, 2 * slot + k) for k in range(2))
+        index = dr.gather(UInt32, edges, slot)
+        _walk(a, b, index, turn, stride, topology, raster, keys, found)
+        return (lane + lanes,)
+
+    dr.while_loop((dr.arange(UInt32, lanes),), lambda lane: lane < count * stride, walk, mode="symbolic", label="silhouettes")
+
+
+def _collect(positions: Any, topology: Topology, raster: RasterOutput, vertex_count: int) -> tuple[Any, Any, Any]:
+    """List the silhouettes that cross lines through pixel centres.
+
+    Returns their number (width 1), records and indices ``image * E + edge``. A record holds both ends, x and y in pixels from the
+    image's centre and the NDC depth, with the side on which the surface lies (as a sign) and the share of horizontal pairs.
+    """
+    module = backend(positions)
+    Float, UInt32 = module.Float, module.UInt32
     width, height = raster.width, raster.height
-    index = dr.arange(UInt32, raster.batch * topology.count)
+    total = raster.batch * topology.count
+    index = dr.arange(UInt32, total)
     image = index // topology.count
     edge = index - image * topology.count
     a, b, side, active = _silhouettes(positions, topology, image, edge, vertex_count)
     a, b, active = _project(a, b, active, width, height)
     share = _horizontal_share(b.x - a.x, b.y - a.y, active)
-    first_row, rows = _lines(a.y, b.y, active & (share > 0), height)
-    first_column, columns = _lines(a.x, b.x, active & (share < 1), width)
+    _, rows = _lines(a.y, b.y, active & (share > 0), height)
+    _, columns = _lines(a.x, b.x, active & (share < 1), width)
+    active &= rows + columns > 0
+    count, edges, records = dr.zeros(UInt32, 1), dr.empty(UInt32, total), dr.empty(Float, 8 * total)
+
+    def add(index: Any, a: Any, b: Any, side: Any, share: Any) -> Any:
+        slot = dr.scatter_inc(count, UInt32(0))
+        dr.scatter(edges, index, slot)
+        dr.scatter(records, module.ArrayXf(*a, side, *b, share), slot)
+        return slot
+
+    dr.if_stmt((index, a, b, side, share), active, add, lambda index, *_: index, mode="symbolic", label="silhouette")
+    dr.eval(count, edges, records)
+    return count, records, edges
+
+
+def _walk(
+    a: Any,
+    b: Any,
+    index: Any,
+    line: Any,
+    stride: int,
+    topology: Topology,
+    raster: RasterOutput,
+    keys: Any,
+    found: PairList | None,
+) -> None:
+    """Visit every ``stride``-th of the lines through pixel centres that edges cross, beginning with ``line``."""
+    module = backend(a)
+    Float, UInt32, UInt64 = module.Float, module.UInt32, module.UInt64
+    width, height = raster.width, raster.height
+    side, share = a.w, b.w
+    image = index // topology.count
+    edge = index - image * topology.count
+    first_row, rows = _lines(a.y, b.y, share > 0, height)
+    first_column, columns = _lines(a.x, b.x, share < 1, width)
 
     def step(line: Any, again: Any) -> tuple[Any, Any]:
         """One line through pixel centres: a row, where the edge separates pixels of two columns, or the other way round."""
@@ -89,11 +148,11 @@ def register_silhouettes(
         dr.scatter_reduce(dr.ReduceOp.Max, keys, key, pair, ok, mode=dr.ReduceMode.Direct)
         if found is not None:
             found.add_once(pair, ok)
-        return dr.select(on_center, line, line + 1), on_center
+        return dr.select(on_center, line, line + stride), on_center
 
     count = rows + columns
     dr.while_loop(
-        (UInt32(0), dr.zeros(module.Bool, dr.width(index))),
+        (line, module.Bool(False)),
         lambda line, again: line < count,
         step,
         mode="symbolic",
@@ -101,9 +160,7 @@ def register_silhouettes(
     )
 
 
-def _silhouettes(
-    positions: Any, topology: Topology, image: Any, edge: Any, vertex_count: int
-) -> tuple[Any, Any, Any, Any]:
+def _silhouettes(positions: Any, topology: Topology, image: Any, edge: Any, vertex_count: int) -> tuple[Any, Any, Any, Any]:
     """Clip-space end points of edges, on which side of them their surface is, and whether it is on one side only."""
     module = backend(positions)
     Array4f, Array2u = module.Array4f, module.Array2u

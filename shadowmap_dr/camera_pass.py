@@ -77,9 +77,21 @@ def _orthographic_reach(sensor: Sensor, center: tuple[float, float, float], radi
     return dr.minimum(dr.detach(sensor.far) - dr.detach(sensor.near), 4 * reach)
 
 
-def within_far_plane(sensor: Sensor, w_clip: Any) -> Any:
-    """Mask of the pixels whose surface lies before a perspective camera's far plane."""
-    return w_clip <= dr.detach(sensor.far) if sensor.kind == "perspective" else mi.Bool(True)
+def view_depth(sensor: Sensor, p_world: Any) -> Any:
+    """Distance along the viewing axis of points (Float), 1 for an orthographic camera: how much an image shrinks. Detached."""
+    if sensor.kind != "perspective":
+        return mi.Float(1)
+    with dr.suspend_grad():
+        matrix = dr.detach(sensor.to_world.matrix)
+        right, up, forward = (mi.Vector3f(matrix[0, k], matrix[1, k], matrix[2, k]) for k in range(3))
+        normal = dr.cross(right, up)
+        normal /= dr.dot(normal, forward)
+        return dr.dot(normal, dr.detach(p_world) - dr.detach(sensor.origin))
+
+
+def within_far_plane(sensor: Sensor, depth: Any) -> Any:
+    """Mask of the pixels whose surface (:func:`view_depth`) lies before a perspective camera's far plane."""
+    return depth <= dr.detach(sensor.far) if sensor.kind == "perspective" else mi.Bool(True)
 
 
 def footprint_points(sensor: Sensor, size: tuple[int, int], w_clip: Any, p_world: Any, n_world: Any, count: int) -> list[Any]:

@@ -19,6 +19,9 @@ from .errors import ShadowmapError
 NO_TRIANGLE = 0xFFFFFFFF
 """Triangle index that means "nothing was hit"."""
 
+# Shapes are told apart by comparing with each of a list, as long as that is cheaper than what it saves.
+_MANY_SHAPES = 8
+
 HAS_NORMALS = 1
 HAS_TEXCOORDS = 2
 FLIP_GEOMETRIC = 4
@@ -77,6 +80,7 @@ class Geometry:
     face_shape     UInt32 (F,)   index of the shape
     vertex_shape   UInt32 (V,)
     shape_face_start, shape_flags  UInt32 (S,)  ``ShapeInfo.face_start`` and ``ShapeInfo.flags`` as arrays
+    attached       names of the shapes whose positions and normals may carry gradients; None: any
     """
 
     positions: Any
@@ -89,6 +93,7 @@ class Geometry:
     shape_face_start: Any
     shape_flags: Any
     shapes: tuple[ShapeInfo, ...]
+    attached: tuple[str, ...] | None = None
 
     @property
     def vertex_count(self) -> int:
@@ -115,6 +120,20 @@ class Geometry:
         info = self.shape(name)
         return dr.gather(mi.Point3f, self.positions, dr.arange(mi.UInt32, info.vertex_count) + info.vertex_start)
 
+    def moves(self, shape: Any) -> Any:
+        """Bool: which of these shapes (UInt32, index) may carry gradients. Where they do not, nothing has to be scattered."""
+        if self.attached is None:
+            return mi.Bool(True)
+        chosen = [info.name in self.attached for info in self.shapes]
+        wanted = sum(chosen) <= len(chosen) // 2
+        listed = [k for k, value in enumerate(chosen) if value == wanted]
+        if len(listed) > _MANY_SHAPES:
+            return mi.Bool(True)
+        found = mi.Bool(False)
+        for k in listed:
+            found |= shape == k
+        return found if wanted else ~found
+
     def with_positions(self, positions: Mapping[str, Any]) -> Geometry:
         """Replace the positions of some shapes; returns a new Geometry, this one is left as it was.
 
@@ -122,6 +141,11 @@ class Geometry:
         TensorXf or NumPy array (Vs, 3), or Point3f/Vector3f (Vs,). Gradients flow through. Normals of shapes that have them
         are computed anew with Mitsuba's angle weighting (``vertex_normals``), attached. Sizes must be those of the scene.
         """
+        attached = self.attached
+        if attached is None and not dr.grad_enabled(self.positions, self.normals):
+            attached = ()
+        if attached is not None:
+            attached = tuple(sorted({*attached, *positions}))
         merged = self.positions
         for name, value in positions.items():
             info = self.shape(name)
@@ -135,7 +159,7 @@ class Geometry:
                 own = dr.arange(mi.UInt32, info.vertex_count) + info.vertex_start
                 smooth = dr.gather(mi.Normal3f, smooth, own)
                 normals = _write_vertices(normals, smooth, info.vertex_start, info.vertex_count, self.vertex_count)
-        return replace(self, positions=merged, normals=normals)
+        return replace(self, positions=merged, normals=normals, attached=attached)
 
 
 def vertex_normals(positions: Any, faces: Any, vertex_count: int) -> Any:

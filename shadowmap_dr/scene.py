@@ -48,6 +48,7 @@ class SceneData:
     lights        directional, spot and point lights
     environments  constant and envmap emitters (at most one)
     shape_ptr, bsdf_ptr   mi.ShapePtr, mi.BSDFPtr (S,), by the index that ``geometry.face_shape`` holds
+    needs_frames  whether any BSDF asks for more than the cosines of directions: tangents, texture coordinates
     """
 
     scene: Any
@@ -58,6 +59,7 @@ class SceneData:
     shape_ptr: Any
     bsdf_ptr: Any
     sources: tuple[ShapeSource, ...]
+    needs_frames: bool = True
 
     def light(self, name: str) -> Light:
         """The light called ``name``; raises ``ShadowmapError`` listing the known names otherwise."""
@@ -116,6 +118,7 @@ def load(scene: Any, *, tessellation: int = 64) -> SceneData:
         shape_ptr=dr.concat([mi.ShapePtr(source.shape) for source in sources]),
         bsdf_ptr=dr.concat([mi.BSDFPtr(source.shape.bsdf()) for source in sources]),
         sources=tuple(sources),
+        needs_frames=not all(_is_plain(source.shape.bsdf()) for source in sources),
     )
     return refresh(data)
 
@@ -130,7 +133,9 @@ def refresh(data: SceneData) -> SceneData:
     positions, normals, texcoords, rest = (dr.concat(list(parts)) for parts in zip(*buffers, strict=True))
     # Not an empty array: one among the arguments of a frozen function ends the process (Dr.Jit 1.5).
     rest = rest if any(info.reads_attributes for info in data.geometry.shapes) else None
-    geometry = replace(data.geometry, positions=positions, normals=normals, texcoords=texcoords, rest_positions=rest)
+    geometry = replace(
+        data.geometry, positions=positions, normals=normals, texcoords=texcoords, rest_positions=rest, attached=None
+    )
     return replace(
         data,
         geometry=geometry,
@@ -251,6 +256,16 @@ def describe(name: str, source: ShapeSource, faces: np.ndarray, vertex_start: in
         planar=_is_planar(points),
         see_through=mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null),
     )
+
+
+def _is_plain(bsdf: Any) -> bool:
+    """Whether a BSDF is known to depend on nothing but the cosines of directions: diffuse, of the same colour everywhere."""
+    parts = [part for _, part in children(bsdf)]
+    if bsdf.class_name() == "TwoSidedBRDF":
+        return all(_is_plain(part) for part in parts)
+    if bsdf.class_name() != "SmoothDiffuse":
+        return False
+    return all(isinstance(part, mi.Texture) and not part.is_spatially_varying() for part in parts)
 
 
 def _mirrors(shape: Any) -> bool:

@@ -77,24 +77,12 @@ def _orthographic_reach(sensor: Sensor, center: tuple[float, float, float], radi
     return dr.minimum(dr.detach(sensor.far) - dr.detach(sensor.near), 4 * reach)
 
 
-def view_depth(sensor: Sensor, p_world: Any) -> Any:
-    """Distance along the viewing axis of points (Float), 1 for an orthographic camera: how much an image shrinks. Detached."""
-    if sensor.kind != "perspective":
-        return mi.Float(1)
-    with dr.suspend_grad():
-        matrix = dr.detach(sensor.to_world.matrix)
-        right, up, forward = (mi.Vector3f(matrix[0, k], matrix[1, k], matrix[2, k]) for k in range(3))
-        normal = dr.cross(right, up)
-        normal /= dr.dot(normal, forward)
-        return dr.dot(normal, dr.detach(p_world) - dr.detach(sensor.origin))
-
-
 def within_far_plane(sensor: Sensor, depth: Any) -> Any:
-    """Mask of the pixels whose surface (:func:`view_depth`) lies before a perspective camera's far plane."""
+    """Mask of the pixels whose surface (``Hits.depth``) lies before a perspective camera's far plane."""
     return depth <= dr.detach(sensor.far) if sensor.kind == "perspective" else mi.Bool(True)
 
 
-def footprint_points(sensor: Sensor, size: tuple[int, int], w_clip: Any, p_world: Any, n_world: Any, count: int) -> list[Any]:
+def footprint_points(sensor: Sensor, size: tuple[int, int], depth: Any, p_world: Any, n_world: Any, count: int) -> list[Any]:
     """``count`` x ``count`` points spread over a pixel's footprint on the tangent plane of what it sees (Point3f each).
 
     Attached to ``p_world`` only: the spread itself is detached.
@@ -107,7 +95,7 @@ def footprint_points(sensor: Sensor, size: tuple[int, int], w_clip: Any, p_world
         right, up, forward = (dr.normalize(mi.Vector3f(matrix[0, k], matrix[1, k], matrix[2, k])) for k in range(3))
         projection = dr.detach(sensor.projection)
         if sensor.kind == "perspective":
-            scale = dr.detach(w_clip)
+            scale = dr.detach(depth)
             view = dr.normalize(dr.detach(p_world) - dr.detach(sensor.origin))
         else:
             # An orthographic camera's scale lies in its transformation, whose columns were normalised above.

@@ -11,9 +11,9 @@ import drjit as dr
 import mitsuba as mi
 
 from .aovs import AOVS, collect_aovs
-from .camera_pass import camera_clip, footprint_points, seen_points, view_depth, within_far_plane
+from .camera_pass import camera_clip, footprint_points, seen_points, within_far_plane
 from .errors import ShadowmapError
-from .facets import crease_edges, flat_faces, mean_normals, pixel_size, soften_facets
+from .facets import crease_edges, flat_faces, mean_normals, soften_facets
 from .geometry import Geometry
 from .hits import pixel_hits
 from .light_maps import MapPlan, light_visibility, make_maps, plan_maps
@@ -231,15 +231,13 @@ class Renderer:
         sensor, raster, factor = view.sensor, view.raster, view.factor
         height, width = raster.height, raster.width
         hits = pixel_hits(geometry, sensor, raster.triangle, (width, height))
-        depth = view_depth(sensor, hits.p_world)
-        hits = replace(hits, active=hits.active & within_far_plane(sensor, depth))
+        hits = replace(hits, active=hits.active & within_far_plane(sensor, hits.depth))
         normals, sharpness = normals_at(geometry, hits), None
         if self.flat is not None:
-            pixel = pixel_size(sensor, height, depth)
-            normals, sharpness = soften_facets(hits, normals, self.topology, self.flat, facets, pixel)
+            normals, sharpness = soften_facets(hits, normals, self.topology, facets)
         ambient = bool(self.data.environments) or self.settings.ambient > 0
         seen = surface_at(self.data, geometry, sensor, hits, *normals, frames=self.data.needs_frames or ambient)
-        visible = [self._visibility(maps, light, k, seen, view, depth) for k, light in enumerate(lights)]
+        visible = [self._visibility(maps, light, k, seen, view, hits.depth) for k, light in enumerate(lights)]
         color = self._radiance(seen, lights, visible, sensor, raster)
         channels = _film_channels(color, seen.active, sensor)
         named = collect_aovs(self.settings.aovs, seen, raster, lights, visible)

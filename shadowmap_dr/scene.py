@@ -17,7 +17,7 @@ import numpy as np
 
 from . import tessellate
 from .errors import ShadowmapError
-from .geometry import Geometry, ShapeInfo
+from .geometry import Geometry, ShapeInfo, pack_face_info
 from .lights import Environment, Light, environments_of, lights_of
 from .sensors import Sensor, sensors_of
 from .traversal import children, mesh_buffers, parameters
@@ -104,9 +104,9 @@ def load(scene: Any, *, tessellation: int = 64) -> SceneData:
         rest_positions=None,
         faces=mi.UInt32(np.concatenate(faces).ravel()),
         face_shape=mi.UInt32(np.repeat(shape_index, face_counts)),
+        face_info=mi.UInt32(pack_face_info(tuple(infos))),
         vertex_shape=mi.UInt32(np.repeat(shape_index, vertex_counts)),
         shape_face_start=mi.UInt32([i.face_start for i in infos]),
-        shape_flags=mi.UInt32([i.flags for i in infos]),
         shapes=tuple(infos),
     )
     data = SceneData(
@@ -120,7 +120,8 @@ def load(scene: Any, *, tessellation: int = 64) -> SceneData:
         sources=tuple(sources),
         needs_frames=not all(_is_plain(source.shape.bsdf()) for source in sources),
     )
-    return refresh(data)
+    data = refresh(data)
+    return replace(data, geometry=replace(data.geometry, shapes=tuple(infos)))
 
 
 def refresh(data: SceneData) -> SceneData:
@@ -134,7 +135,13 @@ def refresh(data: SceneData) -> SceneData:
     # Not an empty array: one among the arguments of a frozen function ends the process (Dr.Jit 1.5).
     rest = rest if any(info.reads_attributes for info in data.geometry.shapes) else None
     geometry = replace(
-        data.geometry, positions=positions, normals=normals, texcoords=texcoords, rest_positions=rest, attached=None
+        data.geometry,
+        positions=positions,
+        normals=normals,
+        texcoords=texcoords,
+        rest_positions=rest,
+        shapes=tuple(replace(info, faceted=False) for info in data.geometry.shapes),
+        changed=None,
     )
     return replace(
         data,
@@ -255,6 +262,7 @@ def describe(name: str, source: ShapeSource, faces: np.ndarray, vertex_start: in
         reads_attributes=is_mesh and shape.has_mesh_attributes(),
         planar=_is_planar(points),
         see_through=mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null),
+        faceted=is_mesh and has_normals and not mirrored and _is_faceted(points, faces, normals.numpy().reshape(-1, 3)),
     )
 
 
@@ -271,6 +279,14 @@ def _is_plain(bsdf: Any) -> bool:
 def _mirrors(shape: Any) -> bool:
     matrix = np.array(parameters(shape)["to_world"].matrix).reshape(4, 4)
     return bool(np.linalg.det(matrix[:3, :3]) < 0)
+
+
+def _is_faceted(points: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> bool:
+    """Whether the vertex normals are those of the faces."""
+    corners = points[faces].astype(np.float64)
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    return bool((length > 0).all() and np.abs(normals[faces] - (normal / length)[:, None]).max() < 1e-6)
 
 
 def _is_planar(points: np.ndarray) -> bool:

@@ -15,8 +15,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from .geometry import FLIP_GEOMETRIC, FLIP_SHADING, HAS_NORMALS, HAS_TEXCOORDS, READS_ATTRIBUTES, Geometry, normalize_or
-from .hits import Hits, hits_at
+from .geometry import FACETED, FLIP_GEOMETRIC, FLIP_SHADING, HAS_NORMALS, HAS_TEXCOORDS, READS_ATTRIBUTES, Geometry, normalize_or
+from .hits import Hits, corner_values, hits_at
 from .lights import Environment, Light
 from .scene import SceneData
 from .sensors import Sensor
@@ -60,16 +60,26 @@ def surface(data: SceneData, geometry: Geometry, sensor: Sensor, triangle: Any, 
 
 def normals_at(geometry: Geometry, hits: Hits) -> tuple[Any, Any]:
     """(geometric, shading) unit normals (Normal3f, N) on the side that each shape calls outside. Attached."""
-    flags = _Flags(geometry, hits.shape, hits.active)
+    flags = _Flags(geometry, hits.flags)
     n_world = flags.negate(FLIP_GEOMETRIC, hits.n_face)
-    if not any(info.has_normals for info in geometry.shapes):
+    infos = geometry.shapes
+    if not any(info.has_normals for info in infos):
         return n_world, n_world
-    needed = hits.active & flags.test(HAS_NORMALS)
 
-    first, d1, d2 = hits.corners(mi.Vector3f, geometry.normals)
-    smooth = normalize_or(first + d1 * hits.u + d2 * hits.v, mi.Vector3f(0.0))
-    has = needed & (dr.squared_norm(smooth) > 0)
-    return n_world, mi.Normal3f(dr.select(has, flags.negate(FLIP_SHADING, smooth), n_world))
+    def interpolated(face: Any, changed: Any, u: Any, v: Any, n_world: Any, negative: Any, active: Any = True) -> Any:
+        first, d1, d2 = corner_values(mi.Vector3f, geometry.normals, face, active, changed)
+        normal = normalize_or(first + d1 * u + d2 * v, mi.Vector3f(0.0))
+        return mi.Normal3f(dr.select(dr.squared_norm(normal) > 0, dr.select(negative, -normal, normal), n_world))
+
+    arguments = (hits.face, hits.changed, hits.u, hits.v, n_world, flags.test(FLIP_SHADING))
+    needed = hits.active & flags.test(HAS_NORMALS)
+    if any(info.faceted for info in infos) and geometry.changed is not None:
+        needed &= ~flags.test(FACETED) | hits.changed
+    elif all(info.has_normals for info in infos):
+        return n_world, interpolated(*arguments, hits.active)
+    return n_world, dr.if_stmt(
+        arguments, needed, interpolated, lambda *args: mi.Normal3f(args[4]), mode="symbolic", label="smooth normals"
+    )
 
 
 def surface_at(
@@ -81,7 +91,7 @@ def surface_at(
     but cosines (:attr:`shadowmap_dr.scene.SceneData.needs_frames`).
     """
     active, shape = hits.active, hits.shape
-    flags = _Flags(geometry, shape, active)
+    flags = _Flags(geometry, hits.flags)
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(hits.triangle))
     if frames:
         si.uv, si.dp_du, si.dp_dv = _parametrisation(geometry, flags, hits)
@@ -170,11 +180,11 @@ def opacity(surface: Surface) -> Any:
 
 
 class _Flags:
-    """Per-pixel booleans of the shape, gathered only if shapes of the scene differ in them."""
+    """Per-pixel booleans of the shape, looked at only if shapes of the scene differ in them."""
 
-    def __init__(self, geometry: Geometry, shape: Any, active: Any) -> None:
+    def __init__(self, geometry: Geometry, flags: Any) -> None:
         self._static = [info.flags for info in geometry.shapes]
-        self._flags = dr.gather(mi.UInt32, geometry.shape_flags, shape, active)
+        self._flags = flags
 
     def any(self, bit: int) -> bool:
         return any(flags & bit for flags in self._static)
@@ -182,6 +192,8 @@ class _Flags:
     def test(self, bit: int) -> Any:
         if all(flags & bit for flags in self._static):
             return mi.Bool(True)
+        if not self.any(bit):
+            return mi.Bool(False)
         return (self._flags & bit) != 0
 
     def negate(self, bit: int, vector: Any) -> Any:

@@ -42,8 +42,8 @@ class ShapeInfo:
     ``flip_geometric`` says that its geometric normal is *minus* (p1 - p0) x (p2 - p0), ``flip_shading`` that vertex normals
     are negated before use. ``reads_attributes``: it has mesh attributes, which Mitsuba finds through rest-pose positions.
     ``planar``: all its vertices lay in one plane when the scene was loaded. ``see_through``: its BSDF (``mask``, ``null``) lets
-    some light pass straight on, as ``shading.opacity`` tells for each point. ``faceted``: its vertex normals are those of its
-    faces, as on a cube or a rectangle (known only until the scene is read again).
+    some light pass straight on, as ``shading.opacity`` tells for each point. ``faceted``: its vertex normals were those of its
+    faces, as on a cube or a rectangle, when the scene was loaded.
     """
 
     name: str
@@ -89,6 +89,7 @@ class Geometry:
     vertex_shape   UInt32 (V,)
     shape_face_start  UInt32 (S,)  ``ShapeInfo.face_start`` as an array
     changed        names of the shapes that ``with_positions`` replaced, if only their vertices may carry gradients; else None
+    as_loaded      whether the other shapes are as they were when the scene was loaded
     """
 
     positions: Any
@@ -102,6 +103,7 @@ class Geometry:
     shape_face_start: Any
     shapes: tuple[ShapeInfo, ...]
     changed: tuple[str, ...] | None = None
+    as_loaded: bool = False
 
     @property
     def vertex_count(self) -> int:
@@ -146,6 +148,10 @@ class Geometry:
         for k in listed:
             found |= shape == k
         return found if wanted else ~found
+
+    def known_unchanged(self, info: ShapeInfo) -> bool:
+        """Whether a shape is known (on the host) to be as it was when the scene was loaded."""
+        return self.as_loaded and self.changed is not None and info.name not in self.changed
 
     def with_positions(self, positions: Mapping[str, Any]) -> Geometry:
         """Replace the positions of some shapes; returns a new Geometry, this one is left as it was.

@@ -121,7 +121,7 @@ def load(scene: Any, *, tessellation: int = 64) -> SceneData:
         needs_frames=not all(_is_plain(source.shape.bsdf()) for source in sources),
     )
     data = refresh(data)
-    return replace(data, geometry=replace(data.geometry, shapes=tuple(infos)))
+    return replace(data, geometry=replace(data.geometry, as_loaded=True))
 
 
 def refresh(data: SceneData) -> SceneData:
@@ -140,8 +140,8 @@ def refresh(data: SceneData) -> SceneData:
         normals=normals,
         texcoords=texcoords,
         rest_positions=rest,
-        shapes=tuple(replace(info, faceted=False) for info in data.geometry.shapes),
         changed=None,
+        as_loaded=False,
     )
     return replace(
         data,

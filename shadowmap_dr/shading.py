@@ -73,7 +73,7 @@ def normals_at(geometry: Geometry, hits: Hits) -> tuple[Any, Any]:
 
     arguments = (hits.face, hits.changed, hits.u, hits.v, n_world, flags.test(FLIP_SHADING))
     needed = hits.active & flags.test(HAS_NORMALS)
-    if any(info.faceted for info in infos) and geometry.changed is not None:
+    if any(info.faceted and geometry.known_unchanged(info) for info in infos):
         needed &= ~flags.test(FACETED) | hits.changed
     elif all(info.has_normals for info in infos):
         return n_world, interpolated(*arguments, hits.active)

@@ -77,12 +77,12 @@ def _orthographic_reach(sensor: Sensor, center: tuple[float, float, float], radi
     return dr.minimum(dr.detach(sensor.far) - dr.detach(sensor.near), 4 * reach)
 
 
-def within_far_plane(sensor: Sensor, w_clip: Any) -> Any:
-    """Mask of the pixels whose surface lies before a perspective camera's far plane."""
-    return w_clip <= dr.detach(sensor.far) if sensor.kind == "perspective" else mi.Bool(True)
+def within_far_plane(sensor: Sensor, depth: Any) -> Any:
+    """Mask of the pixels whose surface (``Hits.depth``) lies before a perspective camera's far plane."""
+    return depth <= dr.detach(sensor.far) if sensor.kind == "perspective" else mi.Bool(True)
 
 
-def footprint_points(sensor: Sensor, size: tuple[int, int], w_clip: Any, p_world: Any, n_world: Any, count: int) -> list[Any]:
+def footprint_points(sensor: Sensor, size: tuple[int, int], depth: Any, p_world: Any, n_world: Any, count: int) -> list[Any]:
     """``count`` x ``count`` points spread over a pixel's footprint on the tangent plane of what it sees (Point3f each).
 
     Attached to ``p_world`` only: the spread itself is detached.
@@ -95,7 +95,7 @@ def footprint_points(sensor: Sensor, size: tuple[int, int], w_clip: Any, p_world
         right, up, forward = (dr.normalize(mi.Vector3f(matrix[0, k], matrix[1, k], matrix[2, k])) for k in range(3))
         projection = dr.detach(sensor.projection)
         if sensor.kind == "perspective":
-            scale = dr.detach(w_clip)
+            scale = dr.detach(depth)
             view = dr.normalize(dr.detach(p_world) - dr.detach(sensor.origin))
         else:
             # An orthographic camera's scale lies in its transformation, whose columns were normalised above.

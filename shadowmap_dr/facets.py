@@ -8,17 +8,15 @@ facets' mean normal, so that is what is shaded.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .geometry import Geometry, normalize_or
+from .geometry import HAS_NORMALS, Geometry, normalize_or
+from .hits import Hits
 from .raster import Topology
-from .sensors import Sensor
-from .shading import Surface
 
 # Facets below the first size (in pixels) are shaded with mean normals, those above the second with their own.
 _SMALL, _LARGE = 1.5, 3.0
@@ -77,45 +75,38 @@ def mean_normals(geometry: Geometry, topology: Topology, flat: Any) -> Any:
     return total
 
 
-def pixel_size(sensor: Sensor, height: int, w_clip: Any) -> Any:
-    """Height of a pixel at the depth of what it sees, world units, detached."""
-    scale = 2 / (height * dr.abs(dr.detach(sensor.projection)[1, 1]))
-    if sensor.kind == "perspective":
-        return scale * dr.detach(w_clip)
-    matrix = dr.detach(sensor.to_world.matrix)
-    return scale * dr.norm(mi.Vector3f(matrix[0, 1], matrix[1, 1], matrix[2, 1]))
-
-
 def soften_facets(
-    seen: Surface, geometry: Geometry, topology: Topology, flat: Any, triangle: Any, u: Any, v: Any, pixel: Any
-) -> tuple[Surface, Any]:
-    """Replace the normals of flat-shaded facets smaller than ``pixel`` (world units) by the mean over their neighbourhood.
+    hits: Hits, normals: tuple[Any, Any], topology: Topology, mean: Any
+) -> tuple[tuple[Any, Any], Any]:
+    """Replace the normals of flat-shaded facets smaller than pixels by the mean over their neighbourhood.
 
-    Also returns how much of their own normal is left (Float, 0 to 1), by which the edges between them still show.
-    Gradients flow to the vertices through the new normals, not through the size of the facets.
+    ``normals`` (geometric, shading) and the result are as :func:`shadowmap_dr.shading.normals_at`, ``mean`` is the sum that
+    :func:`mean_normals` returns. Also returns how much of their own normal is left (Float, 0 to 1), by which the edges between
+    them still show. Gradients flow to the vertices through the new normals, not through the size of the facets.
     """
-    active = seen.active & dr.gather(mi.Bool, flat, triangle, seen.active)
-    corner = dr.gather(mi.Vector3u, geometry.faces, triangle, active)
     with dr.suspend_grad():
-        p = [dr.gather(mi.Point3f, dr.detach(geometry.positions), corner[k], active) for k in range(3)]
-        size = dr.sqrt(dr.norm(dr.cross(p[1] - p[0], p[2] - p[0])))
-        mix = dr.select(active, dr.clip((_LARGE - size / pixel) / (_LARGE - _SMALL), 0, 1), 0)
-    soft = active & (mix > 0)
-    slot = dr.gather(mi.Vector3u, topology.welded, triangle, soft)
-    buffer = mean_normals(geometry, topology, flat)
-    n = [normalize_or(dr.gather(mi.Normal3f, buffer, slot[k], soft), mi.Normal3f(0)) for k in range(3)]
-    mean = n[0] + (n[1] - n[0]) * u + (n[2] - n[0]) * v
-    mean = dr.select(dr.dot(mean, seen.n_world) < 0, -mean, mean)
-    si = seen.si
-    wi_world = si.to_world(si.wi)
-    normal = normalize_or(si.sh_frame.n + (mean - si.sh_frame.n) * mix, si.sh_frame.n)
-    tangent = si.dp_du - normal * dr.dot(normal, si.dp_du)
-    tangent = normalize_or(tangent, mi.coordinate_system(normal)[0])
-    si = mi.SurfaceInteraction3f(si)
-    si.sh_frame = mi.Frame3f(
-        dr.select(soft, tangent, si.sh_frame.s),
-        dr.select(soft, dr.cross(normal, tangent), si.sh_frame.t),
-        dr.select(soft, normal, si.sh_frame.n),
+        # Sizes are square roots of (twice the) areas, and compared without taking any.
+        square = dr.squared_norm(dr.cross(dr.detach(hits.e1), dr.detach(hits.e2)))
+        pixel = mi.Float(hits.pixel)
+        soft = hits.active & ((hits.flags & HAS_NORMALS) == 0) & (square < dr.square(dr.square(_LARGE * pixel)))
+
+    def mixed(triangle: Any, u: Any, v: Any, n_world: Any, n_shading: Any, square: Any, pixel: Any) -> tuple[Any, Any, Any]:
+        size = dr.sqrt(dr.sqrt(square))
+        mix = dr.detach(dr.clip((_LARGE - size / pixel) / (_LARGE - _SMALL), 0, 1))
+        slot = dr.gather(mi.Vector3u, topology.welded, triangle)
+        n = [normalize_or(dr.gather(mi.Normal3f, mean, slot[k]), mi.Normal3f(0)) for k in range(3)]
+        normal = n[0] + (n[1] - n[0]) * u + (n[2] - n[0]) * v
+        normal = dr.select(dr.dot(normal, n_world) < 0, -normal, normal)
+        normal = mi.Normal3f(normalize_or(n_shading + (normal - n_shading) * mix, n_shading))
+        return normal, normal, 1 - mix
+
+    # Most pixels of a large image see large facets: a branch spares them the look-ups.
+    n_world, n_shading, own = dr.if_stmt(
+        (hits.triangle, hits.u, hits.v, *normals, square, pixel),
+        soft,
+        mixed,
+        lambda triangle, u, v, n_world, n_shading, square, pixel: (n_world, n_shading, mi.Float(1)),
+        mode="symbolic",
+        label="soften facets",
     )
-    si.wi = si.to_local(wi_world)
-    return replace(seen, n_world=dr.select(soft, mi.Normal3f(normal), seen.n_world), si=si), 1 - mix
+    return (n_world, n_shading), dr.detach(own)

@@ -13,17 +13,24 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from .errors import ShadowmapError
 
 NO_TRIANGLE = 0xFFFFFFFF
 """Triangle index that means "nothing was hit"."""
 
+# Shapes are told apart by comparing with each of a list, as long as that is cheaper than what it saves.
+_MANY_SHAPES = 8
+
 HAS_NORMALS = 1
 HAS_TEXCOORDS = 2
 FLIP_GEOMETRIC = 4
 FLIP_SHADING = 8
 READS_ATTRIBUTES = 16
+FACETED = 32
+# Bits of ``Geometry.face_info`` that hold flags; the shape's index lies above them.
+_FLAG_BITS = 8
 
 
 @dataclass(frozen=True)
@@ -35,7 +42,8 @@ class ShapeInfo:
     ``flip_geometric`` says that its geometric normal is *minus* (p1 - p0) x (p2 - p0), ``flip_shading`` that vertex normals
     are negated before use. ``reads_attributes``: it has mesh attributes, which Mitsuba finds through rest-pose positions.
     ``planar``: all its vertices lay in one plane when the scene was loaded. ``see_through``: its BSDF (``mask``, ``null``) lets
-    some light pass straight on, as ``shading.opacity`` tells for each point.
+    some light pass straight on, as ``shading.opacity`` tells for each point. ``faceted``: its vertex normals were those of its
+    faces, as on a cube or a rectangle, when the scene was loaded.
     """
 
     name: str
@@ -51,16 +59,18 @@ class ShapeInfo:
     reads_attributes: bool = False
     planar: bool = False
     see_through: bool = False
+    faceted: bool = False
 
     @property
     def flags(self) -> int:
-        """The booleans as the bits that ``Geometry.shape_flags`` holds."""
+        """The booleans as bits, for ``Geometry.face_info``."""
         return (
             HAS_NORMALS * self.has_normals
             + HAS_TEXCOORDS * self.has_texcoords
             + FLIP_GEOMETRIC * self.flip_geometric
             + FLIP_SHADING * self.flip_shading
             + READS_ATTRIBUTES * self.reads_attributes
+            + FACETED * self.faceted
         )
 
 
@@ -75,8 +85,11 @@ class Geometry:
                                  these cancel where barycentrics are recovered); None when no shape has mesh attributes
     faces          UInt32 (3F,)  indices into the vertices of the whole soup
     face_shape     UInt32 (F,)   index of the shape
+    face_info      UInt32 (F,)   index and flags of the shape, see ``shape_and_flags``
     vertex_shape   UInt32 (V,)
-    shape_face_start, shape_flags  UInt32 (S,)  ``ShapeInfo.face_start`` and ``ShapeInfo.flags`` as arrays
+    shape_face_start  UInt32 (S,)  ``ShapeInfo.face_start`` as an array
+    changed        names of the shapes that ``with_positions`` replaced, if only their vertices may carry gradients; else None
+    as_loaded      whether the other shapes are as they were when the scene was loaded
     """
 
     positions: Any
@@ -85,10 +98,12 @@ class Geometry:
     rest_positions: Any
     faces: Any
     face_shape: Any
+    face_info: Any
     vertex_shape: Any
     shape_face_start: Any
-    shape_flags: Any
     shapes: tuple[ShapeInfo, ...]
+    changed: tuple[str, ...] | None = None
+    as_loaded: bool = False
 
     @property
     def vertex_count(self) -> int:
@@ -115,6 +130,29 @@ class Geometry:
         info = self.shape(name)
         return dr.gather(mi.Point3f, self.positions, dr.arange(mi.UInt32, info.vertex_count) + info.vertex_start)
 
+    def shape_and_flags(self, triangle: Any, active: Any) -> tuple[Any, Any]:
+        """(index of the shape, its ``ShapeInfo.flags``), UInt32 each, for each triangle."""
+        info = dr.gather(mi.UInt32, self.face_info, triangle, active)
+        return info >> _FLAG_BITS, info & (2**_FLAG_BITS - 1)
+
+    def has_changed(self, shape: Any) -> Any:
+        """Bool: which of these shapes (UInt32, index) may have been replaced. The others' vertices carry no gradients."""
+        if self.changed is None:
+            return mi.Bool(True)
+        chosen = [info.name in self.changed for info in self.shapes]
+        wanted = sum(chosen) <= len(chosen) // 2
+        listed = [k for k, value in enumerate(chosen) if value == wanted]
+        if len(listed) > _MANY_SHAPES:
+            return mi.Bool(True)
+        found = mi.Bool(False)
+        for k in listed:
+            found |= shape == k
+        return found if wanted else ~found
+
+    def known_unchanged(self, info: ShapeInfo) -> bool:
+        """Whether a shape is known (on the host) to be as it was when the scene was loaded."""
+        return self.as_loaded and self.changed is not None and info.name not in self.changed
+
     def with_positions(self, positions: Mapping[str, Any]) -> Geometry:
         """Replace the positions of some shapes; returns a new Geometry, this one is left as it was.
 
@@ -122,6 +160,11 @@ class Geometry:
         TensorXf or NumPy array (Vs, 3), or Point3f/Vector3f (Vs,). Gradients flow through. Normals of shapes that have them
         are computed anew with Mitsuba's angle weighting (``vertex_normals``), attached. Sizes must be those of the scene.
         """
+        changed = self.changed
+        if changed is None and not dr.grad_enabled(self.positions, self.normals):
+            changed = ()
+        if changed is not None:
+            changed = tuple(sorted({*changed, *positions}))
         merged = self.positions
         for name, value in positions.items():
             info = self.shape(name)
@@ -135,7 +178,7 @@ class Geometry:
                 own = dr.arange(mi.UInt32, info.vertex_count) + info.vertex_start
                 smooth = dr.gather(mi.Normal3f, smooth, own)
                 normals = _write_vertices(normals, smooth, info.vertex_start, info.vertex_count, self.vertex_count)
-        return replace(self, positions=merged, normals=normals)
+        return replace(self, positions=merged, normals=normals, changed=changed)
 
 
 def vertex_normals(positions: Any, faces: Any, vertex_count: int) -> Any:
@@ -161,6 +204,12 @@ def vertex_normals(positions: Any, faces: Any, vertex_count: int) -> Any:
     # The weights are angles: a sum of this size is the rounding error of faces that lie back to back.
     total = dr.select(dr.squared_norm(total) > 1e-10, total, 0.0)
     return dr.ravel(normalize_or(total, mi.Vector3f(1.0, 0.0, 0.0)))
+
+
+def pack_face_info(shapes: tuple[ShapeInfo, ...]) -> np.ndarray:
+    """``Geometry.face_info``, uint32 (F,), for shapes in the order of the soup."""
+    packed = [(index << _FLAG_BITS) + info.flags for index, info in enumerate(shapes)]
+    return np.repeat(np.array(packed, np.uint32), [info.face_count for info in shapes])
 
 
 def normalize_or(vector: Any, fallback: Any) -> Any:

@@ -168,7 +168,7 @@ def _planes(plan: MapPlan, geometry: Geometry) -> tuple[Any, Any]:
 
 def _still_planar(plan: MapPlan, geometry: Geometry, planes: tuple[Any, Any]) -> Any:
     """Which of the shapes that were planar at rest still are (Bool, S): vertices may have moved out of the plane since."""
-    if not any(info.planar for info in geometry.shapes):
+    if all(not info.planar or geometry.known_unchanged(info) for info in geometry.shapes):
         return plan.planar
     with dr.suspend_grad():
         vertex = dr.arange(mi.UInt32, geometry.vertex_count)

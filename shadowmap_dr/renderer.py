@@ -13,14 +13,15 @@ import mitsuba as mi
 from .aovs import AOVS, collect_aovs
 from .camera_pass import camera_clip, footprint_points, seen_points, within_far_plane
 from .errors import ShadowmapError
-from .facets import crease_edges, flat_faces, pixel_size, soften_facets
+from .facets import crease_edges, flat_faces, mean_normals, soften_facets
 from .geometry import Geometry
+from .hits import pixel_hits
 from .light_maps import MapPlan, light_visibility, make_maps, plan_maps
 from .lights import Light, SpotLight, SquareSpot
 from .raster import MAX_RESOLUTION, RasterOutput, Topology, antialias, build_topology, rasterize
 from .scene import SceneData, load, refresh
 from .sensors import Sensor
-from .shading import Surface, ambient_light, background, direct_light, opacity, surface
+from .shading import Surface, ambient_light, background, direct_light, normals_at, opacity, surface, surface_at
 from .shadow import Frusta, ShadowMaps, ShadowSettings
 
 # Directions over which the light of environments is summed.
@@ -163,11 +164,13 @@ class Renderer:
         geometry = self.data.geometry
         if vertex_positions:
             geometry = geometry.with_positions(vertex_positions)
+        # Before all else that is attached: derivatives are taken in the reverse order, and pixels should need one pass only.
+        facets = None if self.flat is None else mean_normals(geometry, self.topology, self.flat)
         current = self._lights(lights)
         cameras = self._sensors(sensor)
         views = [self._view(camera, geometry, _grid(spp, camera)) for camera in cameras]
         maps = self._maps(views, geometry, current) if self._has_shadows else None
-        images = [self._camera_image(view, geometry, current, maps) for view in views]
+        images = [self._camera_image(view, geometry, current, maps, facets) for view in views]
         return images[0] if len(images) == 1 else _side_by_side(images)
 
     def light(self, name: str) -> Light:
@@ -224,16 +227,17 @@ class Renderer:
         raster = rasterize(clip, geometry.faces, size, check_indices=False, transparent=transparent)
         return _View(sensor, factor, clip, raster)
 
-    def _camera_image(self, view: _View, geometry: Geometry, lights: tuple[Light, ...], maps: Any) -> Any:
+    def _camera_image(self, view: _View, geometry: Geometry, lights: tuple[Light, ...], maps: Any, facets: Any) -> Any:
         sensor, raster, factor = view.sensor, view.raster, view.factor
         height, width = raster.height, raster.width
-        active = raster.valid & within_far_plane(sensor, raster.w)
-        seen = surface(self.data, geometry, sensor, raster.triangle, raster.u, raster.v, active)
-        sharpness = None
+        hits = pixel_hits(geometry, sensor, raster.triangle, (width, height))
+        hits = replace(hits, active=hits.active & within_far_plane(sensor, hits.depth))
+        normals, sharpness = normals_at(geometry, hits), None
         if self.flat is not None:
-            pixel = pixel_size(sensor, height, raster.w)
-            seen, sharpness = soften_facets(seen, geometry, self.topology, self.flat, raster.triangle, raster.u, raster.v, pixel)
-        visible = [self._visibility(maps, light, k, seen, raster, sensor) for k, light in enumerate(lights)]
+            normals, sharpness = soften_facets(hits, normals, self.topology, facets)
+        ambient = bool(self.data.environments) or self.settings.ambient > 0
+        seen = surface_at(self.data, geometry, sensor, hits, *normals, frames=self.data.needs_frames or ambient)
+        visible = [self._visibility(maps, light, k, seen, view, hits.depth) for k, light in enumerate(lights)]
         color = self._radiance(seen, lights, visible, sensor, raster)
         channels = _film_channels(color, seen.active, sensor)
         named = collect_aovs(self.settings.aovs, seen, raster, lights, visible)
@@ -247,12 +251,12 @@ class Renderer:
             image = dr.concat([image, mi.TensorXf(_interleave(named), shape=(height, width, len(named)))], axis=2)
         return _downsample(image, factor) if factor > 1 else image
 
-    def _visibility(self, maps: Any, light: Light, index: int, seen: Surface, raster: RasterOutput, sensor: Sensor) -> Any:
+    def _visibility(self, maps: Any, light: Light, index: int, seen: Surface, view: _View, depth: Any) -> Any:
         if maps is None:
             return mi.Float(1)
-        samples = self.settings.shadow_samples or (2 if raster.width <= self.settings.shadow.resolution else 1)
-        size = (raster.width, raster.height)
-        points = footprint_points(sensor, size, raster.w, seen.p_world, seen.n_world, samples)
+        samples = self.settings.shadow_samples or (2 if view.raster.width <= self.settings.shadow.resolution else 1)
+        size = (view.raster.width, view.raster.height)
+        points = footprint_points(view.sensor, size, depth, seen.p_world, seen.n_world, samples)
         total = sum(light_visibility(maps, self.plan, light, index, p, seen.active) for p in points)
         return total * (1 / len(points))
 

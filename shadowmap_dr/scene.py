@@ -17,7 +17,7 @@ import numpy as np
 
 from . import tessellate
 from .errors import ShadowmapError
-from .geometry import Geometry, ShapeInfo
+from .geometry import Geometry, ShapeInfo, pack_face_info
 from .lights import Environment, Light, environments_of, lights_of
 from .sensors import Sensor, sensors_of
 from .traversal import children, mesh_buffers, parameters
@@ -48,6 +48,7 @@ class SceneData:
     lights        directional, spot and point lights
     environments  constant and envmap emitters (at most one)
     shape_ptr, bsdf_ptr   mi.ShapePtr, mi.BSDFPtr (S,), by the index that ``geometry.face_shape`` holds
+    needs_frames  whether any BSDF asks for more than the cosines of directions: tangents, texture coordinates
     """
 
     scene: Any
@@ -58,6 +59,7 @@ class SceneData:
     shape_ptr: Any
     bsdf_ptr: Any
     sources: tuple[ShapeSource, ...]
+    needs_frames: bool = True
 
     def light(self, name: str) -> Light:
         """The light called ``name``; raises ``ShadowmapError`` listing the known names otherwise."""
@@ -102,9 +104,9 @@ def load(scene: Any, *, tessellation: int = 64) -> SceneData:
         rest_positions=None,
         faces=mi.UInt32(np.concatenate(faces).ravel()),
         face_shape=mi.UInt32(np.repeat(shape_index, face_counts)),
+        face_info=mi.UInt32(pack_face_info(tuple(infos))),
         vertex_shape=mi.UInt32(np.repeat(shape_index, vertex_counts)),
         shape_face_start=mi.UInt32([i.face_start for i in infos]),
-        shape_flags=mi.UInt32([i.flags for i in infos]),
         shapes=tuple(infos),
     )
     data = SceneData(
@@ -116,8 +118,10 @@ def load(scene: Any, *, tessellation: int = 64) -> SceneData:
         shape_ptr=dr.concat([mi.ShapePtr(source.shape) for source in sources]),
         bsdf_ptr=dr.concat([mi.BSDFPtr(source.shape.bsdf()) for source in sources]),
         sources=tuple(sources),
+        needs_frames=not all(_is_plain(source.shape.bsdf()) for source in sources),
     )
-    return refresh(data)
+    data = refresh(data)
+    return replace(data, geometry=replace(data.geometry, as_loaded=True))
 
 
 def refresh(data: SceneData) -> SceneData:
@@ -130,7 +134,15 @@ def refresh(data: SceneData) -> SceneData:
     positions, normals, texcoords, rest = (dr.concat(list(parts)) for parts in zip(*buffers, strict=True))
     # Not an empty array: one among the arguments of a frozen function ends the process (Dr.Jit 1.5).
     rest = rest if any(info.reads_attributes for info in data.geometry.shapes) else None
-    geometry = replace(data.geometry, positions=positions, normals=normals, texcoords=texcoords, rest_positions=rest)
+    geometry = replace(
+        data.geometry,
+        positions=positions,
+        normals=normals,
+        texcoords=texcoords,
+        rest_positions=rest,
+        changed=None,
+        as_loaded=False,
+    )
     return replace(
         data,
         geometry=geometry,
@@ -250,12 +262,31 @@ def describe(name: str, source: ShapeSource, faces: np.ndarray, vertex_start: in
         reads_attributes=is_mesh and shape.has_mesh_attributes(),
         planar=_is_planar(points),
         see_through=mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null),
+        faceted=is_mesh and has_normals and not mirrored and _is_faceted(points, faces, normals.numpy().reshape(-1, 3)),
     )
+
+
+def _is_plain(bsdf: Any) -> bool:
+    """Whether a BSDF is known to depend on nothing but the cosines of directions: diffuse, of the same colour everywhere."""
+    parts = [part for _, part in children(bsdf)]
+    if bsdf.class_name() == "TwoSidedBRDF":
+        return all(_is_plain(part) for part in parts)
+    if bsdf.class_name() != "SmoothDiffuse":
+        return False
+    return all(isinstance(part, mi.Texture) and not part.is_spatially_varying() for part in parts)
 
 
 def _mirrors(shape: Any) -> bool:
     matrix = np.array(parameters(shape)["to_world"].matrix).reshape(4, 4)
     return bool(np.linalg.det(matrix[:3, :3]) < 0)
+
+
+def _is_faceted(points: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> bool:
+    """Whether the vertex normals are those of the faces."""
+    corners = points[faces].astype(np.float64)
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    return bool((length > 0).all() and np.abs(normals[faces] - (normal / length)[:, None]).max() < 1e-6)
 
 
 def _is_planar(points: np.ndarray) -> bool:

@@ -14,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .errors import ShadowmapError
+from .spread import spread
 from .traversal import children, parameters
 
 _KINDS = {
@@ -141,6 +142,36 @@ class Sensor:
         linear = mi.Matrix3f(self.to_world.matrix)
         return dr.normalize(mi.Vector3f(linear @ mi.Vector3f(x, y, 1.0)))
 
+    def pixel_rays(self, width: int, height: int) -> tuple[Any, Any, Any]:
+        """(origin Point3f, direction Vector3f) of the rays through the pixel centres of a ``width`` x ``height`` picture.
+
+        Row-major, world space, attached. Directions have unit length along the viewing axis (perspective) or in all
+        (orthographic); the one of the two that all rays share may be of width 1. Also returns the height of a pixel (Float,
+        width 1, detached), world units, at unit distance along a perspective camera's axis.
+        """
+        index = dr.arange(mi.UInt32, width * height)
+        row = index // width
+        ndc_x = (mi.Float(index - row * width) + 0.5) * (2.0 / width) - 1.0
+        ndc_y = (mi.Float(row) + 0.5) * (2.0 / height) - 1.0
+        projection, linear = self.projection, mi.Matrix3f(self.to_world.matrix)
+        column = 2 if self.kind == "perspective" else 3
+        across, down = linear @ mi.Vector3f(dr.rcp(projection[0, 0]), 0, 0), linear @ mi.Vector3f(0, dr.rcp(projection[1, 1]), 0)
+        centre = -(across * projection[0, column] + down * projection[1, column])
+        if self.kind == "perspective":
+            centre += mi.Vector3f(linear @ mi.Vector3f(0, 0, 1))
+            fixed = mi.Vector3f(self.origin)
+        else:
+            centre += self.origin
+            fixed = self.direction
+        # Nine numbers for all pixels: worked out once, and for each pixel their derivatives are summed up in one kernel.
+        parts = (fixed, mi.Vector3f(centre), mi.Vector3f(across), mi.Vector3f(down))
+        pixel = dr.norm(dr.detach(parts[3])) * (2.0 / height)
+        dr.eval(parts, pixel)
+        fixed, centre, across, down = spread(parts, width * height)
+        varying = dr.fma(across, ndc_x, dr.fma(down, ndc_y, centre))
+        if self.kind == "perspective":
+            return mi.Point3f(fixed), varying, pixel
+        return mi.Point3f(varying), fixed, pixel
 
 def sensors_of(sensor: Any) -> tuple[Sensor, ...]:
     """Records of a ``mi.Sensor``: one, or for a batch sensor one for each camera in it, left to right."""

@@ -9,13 +9,14 @@ it may run in a frozen function.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from .geometry import FLIP_GEOMETRIC, FLIP_SHADING, HAS_TEXCOORDS, NO_TRIANGLE, READS_ATTRIBUTES, Geometry, normalize_or
+from .geometry import FACETED, FLIP_GEOMETRIC, FLIP_SHADING, HAS_NORMALS, HAS_TEXCOORDS, READS_ATTRIBUTES, Geometry, normalize_or
+from .hits import Hits, corner_values, hits_at
 from .lights import Environment, Light
 from .scene import SceneData
 from .sensors import Sensor
@@ -28,6 +29,7 @@ class Surface:
 
     p_world  Point3f (N,), attached to vertices and barycentrics
     n_world  Normal3f (N,), unit geometric normal, on the side that the shape calls outside
+    wi_world Vector3f (N,), unit vector to the camera
     shape    UInt32 (N,), index into ``geometry.shapes``
     active   Bool (N,), false where nothing was hit; there all records are finite and meaningless
     si       mi.SurfaceInteraction3f, for BSDF evaluation. ``si.p`` is the *rest-pose* position for shapes with mesh attributes
@@ -36,6 +38,7 @@ class Surface:
 
     p_world: Any
     n_world: Any
+    wi_world: Any
     shape: Any
     active: Any
     si: Any
@@ -50,60 +53,78 @@ def surface(data: SceneData, geometry: Geometry, sensor: Sensor, triangle: Any, 
     Gradients flow to positions, normals, texture coordinates, u, v and the sensor.
     Fields agree with ``compute_surface_interaction`` of Mitsuba for the same triangle and barycentrics.
     """
-    active = mi.Bool(active) & (triangle != NO_TRIANGLE)
+    hits = hits_at(geometry, triangle, u, v, active)
+    hits = replace(hits, wi_world=spread(sensor, dr.width(triangle)).wi_world(hits.p_world))
+    return surface_at(data, geometry, sensor, hits, *normals_at(geometry, hits))
+
+
+def normals_at(geometry: Geometry, hits: Hits) -> tuple[Any, Any]:
+    """(geometric, shading) unit normals (Normal3f, N) on the side that each shape calls outside. Attached."""
+    flags = _Flags(geometry, hits.flags)
+    n_world = flags.negate(FLIP_GEOMETRIC, hits.n_face)
     infos = geometry.shapes
-    face = dr.gather(mi.Vector3u, geometry.faces, triangle, active)
-    shape = dr.gather(mi.UInt32, geometry.face_shape, triangle, active)
-    flags = _Flags(geometry, shape, active)
-    u, v = dr.select(active, u, 0.0), dr.select(active, v, 0.0)
+    if not any(info.has_normals for info in infos):
+        return n_world, n_world
 
-    def corners(kind: Any, buffer: Any) -> tuple[Any, Any, Any]:
-        """Value at vertex 0 and the differences of vertices 1 and 2 to it."""
-        first, second, third = (dr.gather(kind, buffer, face[i], active) for i in range(3))
-        return first, second - first, third - first
+    def interpolated(face: Any, changed: Any, u: Any, v: Any, n_world: Any, negative: Any, active: Any = True) -> Any:
+        first, d1, d2 = corner_values(mi.Vector3f, geometry.normals, face, active, changed)
+        normal = normalize_or(first + d1 * u + d2 * v, mi.Vector3f(0.0))
+        return mi.Normal3f(dr.select(dr.squared_norm(normal) > 0, dr.select(negative, -normal, normal), n_world))
 
-    origin, e1, e2 = corners(mi.Point3f, geometry.positions)
-    p_world = origin + e1 * u + e2 * v
-    n_face = normalize_or(mi.Normal3f(dr.cross(e1, e2)), mi.Normal3f(0.0, 0.0, 1.0))
-    dp_du, dp_dv = mi.Vector3f(e1), mi.Vector3f(e2)  # a shape without texture coordinates has uv = barycentrics
-    n_world = flags.negate(FLIP_GEOMETRIC, n_face)
-    if any(info.has_normals for info in infos):
-        first, d1, d2 = corners(mi.Vector3f, geometry.normals)
-        smooth = normalize_or(first + d1 * u + d2 * v, mi.Vector3f(0.0))
-        has = dr.squared_norm(smooth) > 0
-        n_shading = mi.Normal3f(dr.select(has, flags.negate(FLIP_SHADING, smooth), n_world))
+    arguments = (hits.face, hits.changed, hits.u, hits.v, n_world, flags.test(FLIP_SHADING))
+    needed = hits.active & flags.test(HAS_NORMALS)
+    if any(info.faceted and geometry.known_unchanged(info) for info in infos):
+        needed &= ~flags.test(FACETED) | hits.changed
+    elif all(info.has_normals for info in infos):
+        return n_world, interpolated(*arguments, hits.active)
+    return n_world, dr.if_stmt(
+        arguments, needed, interpolated, lambda *args: mi.Normal3f(args[4]), mode="symbolic", label="smooth normals"
+    )
+
+
+def surface_at(
+    data: SceneData, geometry: Geometry, sensor: Sensor, hits: Hits, n_world: Any, n_shading: Any, *, frames: bool = True
+) -> Surface:
+    """Surface records for points on triangles, with the normals of :func:`normals_at`. Attached to all of these.
+
+    ``frames``: whether tangents and texture coordinates are needed; without them ``si`` serves materials only that know nothing
+    but cosines (:attr:`shadowmap_dr.scene.SceneData.needs_frames`).
+    """
+    active, shape = hits.active, hits.shape
+    flags = _Flags(geometry, hits.flags)
+    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(hits.triangle))
+    if frames:
+        si.uv, si.dp_du, si.dp_dv = _parametrisation(geometry, flags, hits)
+        tangent = si.dp_du - n_shading * dr.dot(n_shading, si.dp_du)
+        tangent = normalize_or(tangent, mi.coordinate_system(n_shading)[0])
+        si.sh_frame = mi.Frame3f(tangent, dr.cross(n_shading, tangent), n_shading)
     else:
-        n_shading = n_world
-
-    uv = mi.Point2f(u, v)
-    if any(info.has_texcoords for info in infos):
-        has = flags.test(HAS_TEXCOORDS)
-        first, d1, d2 = corners(mi.Point2f, geometry.texcoords)
-        uv = dr.select(has, first + d1 * u + d2 * v, uv)
-        det = d1.x * d2.y - d1.y * d2.x
-        regular = has & (det != 0)
-        inverse = dr.rcp(dr.select(regular, det, 1.0))
-        any_du, any_dv = mi.coordinate_system(n_face)
-        dp_du = dr.select(has, dr.select(regular, (e1 * d2.y - e2 * d1.y) * inverse, any_du), dp_du)
-        dp_dv = dr.select(has, dr.select(regular, (e2 * d1.x - e1 * d2.x) * inverse, any_dv), dp_dv)
-
-    sensor = spread(sensor, dr.width(triangle))
-    wi_world = sensor.wi_world(p_world)
-    tangent = dp_du - n_shading * dr.dot(n_shading, dp_du)
-    tangent = normalize_or(tangent, mi.coordinate_system(n_shading)[0])
-
-    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(triangle))
-    si.t = dr.select(active, dr.norm(sensor.origin - p_world), dr.inf)
-    si.p = _interaction_position(geometry, flags, corners, p_world, u, v)
-    si.n = n_world
-    si.uv = uv
-    si.dp_du, si.dp_dv = dp_du, dp_dv
-    si.sh_frame = mi.Frame3f(tangent, dr.cross(n_shading, tangent), n_shading)
-    si.wi = si.to_local(wi_world)
+        si.sh_frame = mi.Frame3f(mi.Vector3f(0), mi.Vector3f(0), n_shading)
+    si.t = dr.select(active, dr.norm(sensor.origin - hits.p_world), dr.inf)
+    si.p = _interaction_position(geometry, flags, hits)
+    si.n = flags.negate(FLIP_GEOMETRIC, hits.n_face)
+    si.wi = si.to_local(hits.wi_world)
     si.shape = dr.gather(mi.ShapePtr, data.shape_ptr, shape, active)
-    si.prim_index = triangle - dr.gather(mi.UInt32, geometry.shape_face_start, shape, active)
+    si.prim_index = hits.triangle - dr.gather(mi.UInt32, geometry.shape_face_start, shape, active)
     bsdf = dr.gather(mi.BSDFPtr, data.bsdf_ptr, shape, active)
-    return Surface(p_world=p_world, n_world=n_world, shape=shape, active=active, si=si, bsdf=bsdf)
+    return Surface(hits.p_world, n_world, hits.wi_world, shape, active, si, bsdf)
+
+
+def _parametrisation(geometry: Geometry, flags: _Flags, hits: Hits) -> tuple[Any, Any, Any]:
+    """Texture coordinates and the derivatives of the position by them; a shape without any has uv = barycentrics."""
+    uv, dp_du, dp_dv = mi.Point2f(hits.u, hits.v), mi.Vector3f(hits.e1), mi.Vector3f(hits.e2)
+    if not any(info.has_texcoords for info in geometry.shapes):
+        return uv, dp_du, dp_dv
+    has = flags.test(HAS_TEXCOORDS)
+    first, d1, d2 = hits.corners(mi.Point2f, geometry.texcoords)
+    uv = dr.select(has, first + d1 * hits.u + d2 * hits.v, uv)
+    det = d1.x * d2.y - d1.y * d2.x
+    regular = has & (det != 0)
+    inverse = dr.rcp(dr.select(regular, det, 1.0))
+    any_du, any_dv = mi.coordinate_system(hits.n_face)
+    dp_du = dr.select(has, dr.select(regular, (hits.e1 * d2.y - hits.e2 * d1.y) * inverse, any_du), dp_du)
+    dp_dv = dr.select(has, dr.select(regular, (hits.e2 * d1.x - hits.e1 * d2.x) * inverse, any_dv), dp_dv)
+    return uv, dp_du, dp_dv
 
 
 def direct_light(surface: Surface, light: Light, visibility: Any = 1.0, *, gate: bool = True) -> Any:
@@ -118,9 +139,9 @@ def direct_light(surface: Surface, light: Light, visibility: Any = 1.0, *, gate:
     if gate:
         # Light and viewer lie on the same side of the triangle exactly where they lie on the same side by the shading normal.
         # Holds for reflection and transmission, and for triangles whose vertex normals point the other way.
-        wi = surface.si.wi
-        sides = dr.dot(surface.n_world, wo_world) * dr.dot(surface.n_world, surface.si.to_world(wi))
-        active &= (sides > 0) == (wo.z * wi.z > 0)
+        with dr.suspend_grad():
+            sides = dr.dot(surface.n_world, wo_world) * dr.dot(surface.n_world, surface.wi_world)
+            active &= (sides > 0) == (wo.z * surface.si.wi.z > 0)
     value = surface.bsdf.eval(mi.BSDFContext(), surface.si, wo, active)
     return dr.select(active, mi.UnpolarizedSpectrum(value) * weight * visibility, 0.0)
 
@@ -159,11 +180,11 @@ def opacity(surface: Surface) -> Any:
 
 
 class _Flags:
-    """Per-pixel booleans of the shape, gathered only if shapes of the scene differ in them."""
+    """Per-pixel booleans of the shape, looked at only if shapes of the scene differ in them."""
 
-    def __init__(self, geometry: Geometry, shape: Any, active: Any) -> None:
+    def __init__(self, geometry: Geometry, flags: Any) -> None:
         self._static = [info.flags for info in geometry.shapes]
-        self._flags = dr.gather(mi.UInt32, geometry.shape_flags, shape, active)
+        self._flags = flags
 
     def any(self, bit: int) -> bool:
         return any(flags & bit for flags in self._static)
@@ -171,6 +192,8 @@ class _Flags:
     def test(self, bit: int) -> Any:
         if all(flags & bit for flags in self._static):
             return mi.Bool(True)
+        if not self.any(bit):
+            return mi.Bool(False)
         return (self._flags & bit) != 0
 
     def negate(self, bit: int, vector: Any) -> Any:
@@ -178,9 +201,9 @@ class _Flags:
         return dr.select(self.test(bit), -vector, vector) if self.any(bit) else vector
 
 
-def _interaction_position(geometry: Geometry, flags: _Flags, corners: Any, p_world: Any, u: Any, v: Any) -> Any:
+def _interaction_position(geometry: Geometry, flags: _Flags, hits: Hits) -> Any:
     """World position; rest-pose position for shapes with mesh attributes, since Mitsuba recovers barycentrics from it."""
     if not flags.any(READS_ATTRIBUTES):
-        return p_world
-    first, d1, d2 = corners(mi.Point3f, geometry.rest_positions)
-    return dr.select(flags.test(READS_ATTRIBUTES), first + d1 * u + d2 * v, p_world)
+        return hits.p_world
+    first, d1, d2 = hits.corners(mi.Point3f, geometry.rest_positions)
+    return dr.select(flags.test(READS_ATTRIBUTES), first + d1 * hits.u + d2 * hits.v, hits.p_world)

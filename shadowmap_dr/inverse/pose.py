@@ -100,7 +100,7 @@ class PoseFit:
         """(3,) derivative of the loss with respect to the parameters; leaves the state of the fit alone."""
         pose = mi.Float(np.asarray(parameters, np.float32))
         dr.enable_grad(pose)
-        dr.backward(_loss(copy.copy(self._renderer), pose, self._p_rest, self._reference, self._shape, self._shift_z))
+        _gradient(copy.copy(self._renderer), pose, self._p_rest, self._reference, self._shape, self._shift_z)
         return np.array(dr.grad(pose))
 
     def state(self) -> dict[str, npt.NDArray[Any]]:
@@ -137,13 +137,20 @@ class PoseFit:
         return {**self._settings, "optimizer": "Adam", "step_size": self._step_size, "betas": list(self._betas)}
 
 
-def _loss(renderer: Any, pose: Any, p_rest: Any, reference: Any, shape: str, shift_z: float) -> Any:
+def _gradient(renderer: Any, pose: Any, p_rest: Any, reference: Any, shape: str, shift_z: float) -> Any:
+    """Add the derivative of the mean squared difference to the gradient of ``pose``; returns the difference, Float (1,)."""
     image = renderer.render(vertex_positions={shape: apply_pose(p_rest, pose, shift_z)})
-    return dr.mean(dr.square(image.array - reference.array))
+    # By hand, since the loss and its derivative then read the image together, once.
+    difference = dr.detach(image.array) - reference.array
+    square, slope = dr.square(difference), difference * (2 / dr.width(difference))
+    dr.eval(square, slope)
+    dr.set_grad(image, type(image)(slope, shape=image.shape))
+    dr.enqueue(dr.ADMode.Backward, image)
+    dr.traverse(dr.ADMode.Backward)
+    return dr.mean(square)
 
 
 def _pose_step(renderer: Any, optimizer: Any, p_rest: Any, reference: Any, *, shape: str, shift_z: float) -> Any:
-    loss = _loss(renderer, optimizer["pose"], p_rest, reference, shape, shift_z)
-    dr.backward(loss)
+    loss = _gradient(renderer, optimizer["pose"], p_rest, reference, shape, shift_z)
     optimizer.step()
-    return dr.detach(loss)
+    return loss

@@ -17,45 +17,44 @@ _MARGIN = 0.10
 
 @dataclass(frozen=True)
 class Bounds:
-    """Light-space bounds of each shape in each map, ``Float`` of width M * S: image coordinates and depths."""
+    """Light-space bounds of each shape in each map: image coordinates and depths.
 
-    x0: Any
-    y0: Any
-    x1: Any
-    y1: Any
-    z0: Any
-    z1: Any
+    ``negated`` holds -x0, -y0, -z0, x1, y1, z1 (``Float``, 6 for each shape in each map): all maxima, and all in one buffer,
+    since a reduction costs more to start than to run.
+    """
+
+    negated: Any
+
+    def of(self, index: Any) -> tuple[Any, Any, Any, Any, Any, Any]:
+        """(x0, y0, x1, y1, z0, z1) of entry ``map * shapes + shape``."""
+        x0, y0, z0, x1, y1, z1 = _rows(self.negated, index, 6)
+        return -x0, -y0, x1, y1, -z0, z1
+
+
+def _maxima(values: list[Any], index: Any, count: int, active: Any = True) -> Any:
+    """Maxima of several values over the lanes with the same ``index`` (below ``count``), interleaved in one buffer."""
+    target = dr.full(backend(index).Float, -dr.inf, len(values) * count)
+    for k, value in enumerate(values):
+        dr.scatter_reduce(dr.ReduceOp.Max, target, value, index * len(values) + k, active)
+    return target
+
+
+def _rows(flat: Any, index: Any, count: int) -> list[Any]:
+    return [dr.gather(backend(index).Float, flat, index * count + k) for k in range(count)]
 
 
 def shape_bounds(view: Views, p_light: Any, map_index: Any, shape_index: Any, shape_count: int) -> Bounds:
     """Reduce light-space vertices (one lane for each vertex in each map) to bounds for each shape. Detached."""
     with dr.suspend_grad():
-        module = backend(p_light)
         view, p = dr.detach(view), dr.detach(p_light)
         perspective = of_map(view, map_index, view.count).spread > 0
         behind = perspective & (p.z <= 0)
         w = dr.select(perspective & ~behind, p.z, 1.0)
         x, y = p.x / w, p.y / w
-        slot = map_index * shape_count + shape_index
-        size = view.count * shape_count
-
-        def reduce(value: Any, op: Any, start: float) -> Any:
-            target = dr.full(module.Float, start, size)
-            dr.scatter_reduce(op, target, value, slot)
-            return target
-
         # A vertex behind a spot light bounds nothing: its shape may reach anywhere in the image.
-        low, high = dr.ReduceOp.Min, dr.ReduceOp.Max
-        result = Bounds(
-            reduce(dr.select(behind, -dr.inf, x), low, dr.inf),
-            reduce(dr.select(behind, -dr.inf, y), low, dr.inf),
-            reduce(dr.select(behind, dr.inf, x), high, -dr.inf),
-            reduce(dr.select(behind, dr.inf, y), high, -dr.inf),
-            reduce(p.z, low, dr.inf),
-            reduce(p.z, high, -dr.inf),
-        )
-        dr.eval(result)
-        return result
+        sides = [dr.select(behind, dr.inf, value) for value in (-x, -y, x, y)]
+        values = [*sides[:2], -p.z, *sides[2:], p.z]
+        return Bounds(_maxima(values, map_index * shape_count + shape_index, view.count * shape_count))
 
 
 def fit_frusta(
@@ -87,9 +86,10 @@ def fit_frusta(
         index = dr.arange(module.UInt32, views.count * shape_count)
         map_index = index // shape_count
         shape = index - map_index * shape_count
-        casts = _casts(views, bounds, planes, planar, map_index, shape, shape_count)
+        extent = bounds.of(index)
+        casts = _casts(views, bounds, extent, planes, planar, map_index, shape, shape_count)
         window = _window(views, seen)
-        fitted = _fit(views, bounds, casts, map_index, window, resolution, filter_size)
+        fitted = _fit(views, extent, casts, map_index, window, resolution, filter_size)
         if previous is None:
             dr.eval(fitted[0])
             return fitted[0]
@@ -102,7 +102,14 @@ def fit_frusta(
 
 
 def _casts(
-    views: Views, bounds: Bounds, planes: tuple[Any, Any], planar: Any, map_index: Any, shape: Any, shape_count: int
+    views: Views,
+    bounds: Bounds,
+    extent: tuple[Any, ...],
+    planes: tuple[Any, Any],
+    planar: Any,
+    map_index: Any,
+    shape: Any,
+    shape_count: int,
 ) -> Any:
     """Which shapes can cast a shadow in which map: not planar ones with nothing behind them, nor what is behind the light."""
     module = backend(views.spread)
@@ -110,32 +117,35 @@ def _casts(
     view = of_map(views, map_index, views.count)
 
     def per_shape(v: Any) -> Any:
-        return Array3f(*(dr.gather(Float, v[c], shape) for c in range(3)))
+        # With one map lanes are shapes already, and nothing needs to be evaluated to be looked up.
+        return Array3f(v) if views.count == 1 else Array3f(*(dr.gather(Float, v[c], shape) for c in range(3)))
 
+    if views.count > 1:
+        dr.eval(planes)
     normal_world, point_world = per_shape(planes[0]), per_shape(planes[1])
     normal = Array3f(*(dr.dot(normal_world, axis) for axis in (view.right, view.up, view.forward)))
     offset = dr.dot(normal_world, point_world - view.origin)
     # Orient the plane so that the light lies on its negative side.
     away = dr.select(view.spread > 0, offset, normal.z) < 0
     normal, offset = dr.select(away, -normal, normal), dr.select(away, -offset, offset)
-    visible = bounds.z1 > 0
     in_perspective = view.spread > 0
-    visible = ~in_perspective | visible
-    size = dr.maximum(dr.max(dr.select(dr.isfinite(bounds.z1), bounds.z1, -dr.inf)) - dr.min(bounds.z0), 1e-6)
+    visible = ~in_perspective | (extent[5] > 0)
+    others = [bounds.of(map_index * shape_count + other) for other in range(shape_count)]
+    nearest, farthest = Float(dr.inf), Float(-dr.inf)
+    for *_, z0, z1 in others:
+        nearest, farthest = dr.minimum(nearest, z0), dr.maximum(farthest, dr.select(dr.isfinite(z1), z1, -dr.inf))
+    size = dr.maximum(farthest - nearest, 1e-6)
     behind = Bool(False)
-    perspective = in_perspective
-    for other in range(shape_count):
-        base = map_index * shape_count + other
-        b = [dr.gather(Float, getattr(bounds, name), base) for name in ("x0", "x1", "y0", "y1", "z0", "z1")]
-        z0, z1 = b[4], b[5]
+    for other, (x0, y0, x1, y1, z0, z1) in enumerate(others):
         reach = dr.fma(normal.z, dr.select(normal.z > 0, z1, z0), -offset)
-        for lo, hi, n in ((b[0], b[1], normal.x), (b[2], b[3], normal.y)):
+        for lo, hi, n in ((x0, x1, normal.x), (y0, y1, normal.y)):
             # Perspective bounds are slopes: the extreme of n * slope * z over the box lies in one of its corners.
             flat = dr.maximum(n * lo, n * hi)
             cone = dr.maximum(dr.maximum(n * lo * z0, n * lo * z1), dr.maximum(n * hi * z0, n * hi * z1))
-            reach += dr.select(n == 0, 0, dr.select(perspective, cone, flat))
+            reach += dr.select(n == 0, 0, dr.select(in_perspective, cone, flat))
         behind |= (shape != other) & (reach > 1e-3 * size)
-    return visible & (~dr.gather(Bool, planar, shape) | behind)
+    planar = planar if views.count == 1 else dr.gather(Bool, planar, shape)
+    return visible & (~planar | behind)
 
 
 def _window(views: Views, seen: Any) -> tuple[Any, Any, Any, Any, Any]:
@@ -159,19 +169,15 @@ def _window(views: Views, seen: Any) -> tuple[Any, Any, Any, Any, Any]:
     in_perspective = view.spread > 0
     behind = in_perspective & (p.z <= 0)
     w = dr.select(in_perspective & ~behind, p.z, 1)
-    window = []
-    for value in (*(dr.select(behind, dr.inf, v / w) for v in (-p.x, -p.y, p.x, p.y)), p.z):
-        extreme = dr.full(module.Float, -dr.inf, views.count)
-        dr.scatter_reduce(dr.ReduceOp.Max, extreme, value, map_index, active)
-        window.append(extreme)
-    dr.eval(window)
-    x0, y0, x1, y1 = (dr.minimum(extreme, limit) for extreme in window[:4])
-    return -x0, -y0, x1, y1, window[4]
+    values = [*(dr.select(behind, dr.inf, v / w) for v in (-p.x, -p.y, p.x, p.y)), p.z]
+    *sides, depth = _rows(_maxima(values, map_index, views.count, active), dr.arange(module.UInt32, views.count), 5)
+    x0, y0, x1, y1 = (dr.minimum(side, limit) for side in sides)
+    return -x0, -y0, x1, y1, depth
 
 
 def _fit(
     views: Views,
-    bounds: Bounds,
+    extent: tuple[Any, ...],
     casts: Any,
     map_index: Any,
     window: tuple[Any, Any, Any, Any, Any],
@@ -179,16 +185,9 @@ def _fit(
     filter_size: int,
 ) -> tuple[Frusta, tuple[Any, ...]]:
     module = backend(views.spread)
-
-    def reduce(value: Any, op: Any, start: float) -> Any:
-        target = dr.full(module.Float, start, views.count)
-        dr.scatter_reduce(op, target, value, map_index, casts)
-        return target
-
-    low, high = dr.ReduceOp.Min, dr.ReduceOp.Max
-    x0, y0, z0 = (reduce(v, low, dr.inf) for v in (bounds.x0, bounds.y0, bounds.z0))
-    x1, y1, z1 = (reduce(v, high, -dr.inf) for v in (bounds.x1, bounds.y1, bounds.z1))
-    dr.eval(x0, y0, z0, x1, y1, z1)  # in one kernel
+    x0, y0, x1, y1, z0, z1 = extent
+    needed = _maxima([-x0, -y0, -z0, x1, y1, z1], map_index, views.count, casts)
+    x0, y0, x1, y1, z0, z1 = Bounds(needed).of(dr.arange(module.UInt32, views.count))
     nothing = ~(x1 >= x0)
     x0, y0, x1, y1 = (dr.select(nothing, s, v) for s, v in ((-1.0, x0), (-1.0, y0), (1.0, x1), (1.0, y1)))
     z0, z1 = dr.select(nothing, 0.0, z0), dr.select(nothing, 1.0, z1)

@@ -141,6 +141,34 @@ def load() -> list[float] | None:
     return list(os.getloadavg()) if hasattr(os, "getloadavg") else None
 
 
+class OtherWork:
+    """How busy other processes keep the machine. A load average cannot tell them from this one."""
+
+    def __init__(self) -> None:
+        self._began = self._now()
+
+    def cores(self) -> float | None:
+        """Cores that processes other than this one and its children have used on average since the start of this record.
+
+        None where the system does not tell (Linux does).
+        """
+        before, now = self._began, self._now()
+        if before is None or now is None or now[0] <= before[0]:
+            return None
+        return max(0.0, ((now[1] - before[1]) - (now[2] - before[2])) / (now[0] - before[0]))
+
+    @staticmethod
+    def _now() -> tuple[float, float, float] | None:
+        """Seconds: of the clock, of all processors' work, of the work of this process and its finished children."""
+        try:
+            ticks = [int(text) for text in Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:8]]
+            busy = (sum(ticks) - ticks[3] - ticks[4]) / os.sysconf("SC_CLK_TCK")  # all but idle and waiting for disks
+        except (OSError, ValueError, IndexError):
+            return None
+        own = os.times()
+        return time.perf_counter(), busy, own.user + own.system + own.children_user + own.children_system
+
+
 def peak_memory() -> int:
     """Most memory (bytes) that this process has occupied so far."""
     try:

@@ -18,7 +18,7 @@ from rich.console import Console
 
 from .. import __version__, io, report
 from ..errors import ShadowmapError
-from ..timing import load, machine
+from ..timing import OtherWork, load, machine
 from . import bench_breakdown, bench_raster, bench_report, bench_scaling, bench_steps
 from .bench_common import BenchOptions, Unit
 
@@ -75,7 +75,8 @@ def run_bench(options: BenchOptions, *, console: Console | None = None) -> dict[
                 done[unit.name] = _measured(unit, done, update)
                 progress.remove_task(inner)
                 _write(options, record)
-                progress.console.print(f"{name} {unit.name}: {bench_report.outcome(done[unit.name])}", highlight=False)
+                line = f"{name} {unit.name}: {bench_report.outcome(done[unit.name])}"
+                progress.console.print(line, highlight=False, markup=False)
                 # What a unit leaves behind would count as memory of the next.
                 dr.flush_malloc_cache()
             progress.remove_task(task)
@@ -97,13 +98,19 @@ def failures(record: dict[str, Any], sections: tuple[str, ...]) -> list[str]:
 
 
 def _measured(unit: Unit, done: dict[str, Any], update: Callable[[int, int, str], None]) -> dict[str, Any]:
-    before, began = load(), time.perf_counter()
+    before, began, others = load(), time.perf_counter(), OtherWork()
     try:
         result = unit.run(done, update)
     except (RuntimeError, ShadowmapError, MemoryError) as error:
         text = " ".join(str(error).split()) or type(error).__name__
         result = {"failed": text}
-    return report.plain({**result, "load_before": before, "load_after": load(), "wall_seconds": time.perf_counter() - began})
+    surroundings = {
+        "load_before": before,
+        "load_after": load(),
+        "cores_used_by_others": others.cores(),
+        "wall_seconds": time.perf_counter() - began,
+    }
+    return report.plain({**result, **surroundings})
 
 
 def _settings(options: BenchOptions) -> dict[str, Any]:

@@ -54,6 +54,7 @@ def _series(axes: Any, unit: dict[str, Any]) -> None:
     exponent = unit["exponent"]
     axes.set_title("" if exponent is None else f"exponent {exponent:.2f}", fontsize=9)
     _logarithmic(axes, _LABELS[unit["quantity"]], "step [ms]")
+    _ticks(axes, sizes)
     memory = axes.twinx()
     memory.plot(sizes, [point["peak_memory"] / 2**30 for point in points], "s--", color="C3", markersize=3, linewidth=1)
     memory.set_ylabel("peak memory [GiB]", color="C3")
@@ -65,6 +66,7 @@ def _batch(axes: Any, unit: dict[str, Any]) -> None:
         values = unit[kind]["images_per_second"]
         axes.plot([int(count) for count in values], list(values.values()), "o-", color=f"C{k}", label=kind, markersize=4)
     _logarithmic(axes, f"images of {unit['resolution']} x {unit['resolution']} in a step", "images a second")
+    _ticks(axes, unit["batches"])
     axes.legend(fontsize=8)
 
 
@@ -89,6 +91,7 @@ def _steps(axes: Any, units: list[dict[str, Any]]) -> None:
     medians = [1e3 * unit["mitsuba default"]["median"] for unit in default]
     axes.plot([unit["resolution"] for unit in default], medians, "o-", color="C3", label="Mitsuba's default", markersize=4)
     _logarithmic(axes, "image width in pixels", "step [ms]")
+    _ticks(axes, [unit["resolution"] for unit in units])
     axes.legend(fontsize=8)
 
 
@@ -116,3 +119,10 @@ def _logarithmic(axes: Any, x_label: str, y_label: str) -> None:
     axes.set_xlabel(x_label)
     axes.set_ylabel(y_label)
     axes.grid(True, alpha=0.3)
+
+
+def _ticks(axes: Any, values: list[float]) -> None:
+    """Ticks where there are points, and nowhere else."""
+    short = [f"{v / 1e6:.3g}M" if v >= 1e6 else f"{v / 1e3:.3g}k" if v >= 1e4 else f"{v:g}" for v in values]
+    axes.set_xticks(values, short, fontsize=8)
+    axes.set_xticks([], minor=True)

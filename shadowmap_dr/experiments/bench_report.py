@@ -29,6 +29,8 @@ WORST_CASE = 5.0
 #: Linear growth, with room for what a fit to noisy times may be off.
 EXPONENT = 1.05
 LARGE_MS, LARGE_GIB = 250.0, 3.0
+#: Cores that other work may use before times are called doubtful.
+BUSY = 0.3
 EIGHT_LIGHTS, BATCH, OUTSIDE_KERNELS = 4.5, 1.2, 0.10
 
 
@@ -84,10 +86,9 @@ def table(record: dict[str, Any]) -> Table:
 def markdown(record: dict[str, Any]) -> str:
     """For documentation: the machine and the command, then the table."""
     machine = record["machine"]
-    loads = [
-        unit["load_before"][0] for s in record["sections"].values() for unit in s["units"].values() if unit.get("load_before")
-    ]
-    spread = f"; load average {min(loads):.1f} to {max(loads):.1f}" if loads else ""
+    units = [unit for section in record["sections"].values() for unit in section["units"].values()]
+    others = [unit["cores_used_by_others"] for unit in units if unit.get("cores_used_by_others") is not None]
+    spread = f"; cores used by other work: {max(others):.1f} at most" if others else ""
     lines = [
         f"`{record['command']}` on {machine['processor']}, {machine['threads']} threads, {machine['variant']}; "
         f"shadowmap_dr {machine['shadowmap_dr']}, Mitsuba {machine['mitsuba']}, Dr.Jit {machine['drjit']}, "
@@ -106,6 +107,9 @@ def outcome(unit: dict[str, Any]) -> str:
         if name in unit:
             return f"{name}: {unit[name]}"
     parts = [f"{name} {_time(entry['median'])}" for name, entry in unit.get("seconds", {}).items() if isinstance(entry, dict)]
+    others = unit.get("cores_used_by_others") or 0.0
+    if others > BUSY:
+        parts.append(f"(other work used {others:.1f} cores meanwhile: not to be trusted)")
     return ", ".join(parts) or f"{unit['wall_seconds']:.0f} s"
 
 
@@ -128,6 +132,8 @@ def _step_rows(key: str, unit: dict[str, Any]) -> Iterator[Row]:
         yield Row(
             "step with shadows", f"{size}", _time(ours), f"{mitsuba} {_time(other)}", f"{value:.0f}x", text, met if fair else None
         )
+    elif unit["mitsuba"].get("left_out"):
+        yield Row("step with shadows", f"{size}", _time(ours), f"{mitsuba} left out: {unit['mitsuba']['left_out']}")
     default = unit.get("mitsuba default", {})
     if "median" in default:
         value = default["median"] / ours
@@ -138,7 +144,9 @@ def _step_rows(key: str, unit: dict[str, Any]) -> Iterator[Row]:
 
 def _pose_rows(unit: dict[str, Any], mitsuba: str) -> Iterator[Row]:
     def shown(name: str) -> str:
-        entry = unit["methods"][name]
+        entry = unit["methods"].get(name)
+        if entry is None:
+            return "left out"
         median = entry["median_seconds_to_pose"]
         return f"{'never' if median is None else _time(median)} ({entry['reached']} of {entry['starts']})"
 

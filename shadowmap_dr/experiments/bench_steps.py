@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import os
 import statistics
 import time
 from collections.abc import Callable, Mapping
@@ -22,6 +23,8 @@ from .pose import BETAS, METHODS, STEP_SIZE, build_method, seconds_to_pose
 from .pose_scene import PoseProblem, make_problem, path_traced_reference, pose_errors, start_pose
 
 OBJECT = "spot"
+#: Memory that Mitsuba's integrator takes for each of the samples that are alive at once (bytes, roughly).
+BYTES_PER_SAMPLE = 60
 SEED = 0
 RATIOS = (("mitsuba", "shadows"), ("mitsuba", "rasterizer"), ("shadows", "rasterizer"))
 
@@ -45,7 +48,7 @@ def measure_steps(options: BenchOptions, resolution: int, done: Mapping[str, Any
     """
     what = options.what
     problem, reference, path = _problem(options, resolution, update)
-    methods = _methods(problem, reference)
+    methods, left_out = _methods(problem, reference)
     contenders = {}
     for name, method in methods.items():
         method.reset(start_pose(SEED, 0))
@@ -56,7 +59,11 @@ def measure_steps(options: BenchOptions, resolution: int, done: Mapping[str, Any
         else:
             contenders[name] = Contender(method.step, what.rounds)
     samples = alternate(contenders, update)
-    result = {"resolution": resolution, **compare(samples, RATIOS), "mitsuba": _setting(methods["mitsuba"], resolution)}
+    result = {
+        "resolution": resolution,
+        **compare(samples, RATIOS),
+        "mitsuba": _setting(methods.get("mitsuba"), resolution, left_out),
+    }
     result["recordings"] = {name: methods[name].recordings() for name in methods if name != "mitsuba"}  # type: ignore[attr-defined]
     steps = what.default_steps.get(resolution, 0)
     if steps:
@@ -92,7 +99,7 @@ def measure_poses(options: BenchOptions, resolution: int, done: Mapping[str, Any
     """Seconds until the rotation error is at most 0.1 degrees and stays there, from several starts, methods in turns."""
     what = options.what
     problem, reference, _ = _problem(options, resolution, update)
-    methods = _methods(problem, reference)
+    methods, left_out = _methods(problem, reference)
     for name, method in methods.items():
         method.reset(start_pose(SEED, 0))
         for _ in range(1 if name == "mitsuba" else 3):
@@ -115,16 +122,18 @@ def measure_poses(options: BenchOptions, resolution: int, done: Mapping[str, Any
         "resolution": resolution,
         "reference": "path-traced" if what.path_traced else "own",
         "iterations": what.iterations,
-        "mitsuba": _setting(methods["mitsuba"], resolution),
+        "mitsuba": _setting(methods.get("mitsuba"), resolution, left_out),
         "methods": {name: {**_times(entries), "runs": entries} for name, entries in runs.items()},
         "cut": {
             "mitsuba_seconds": options.mitsuba_seconds,
             "mitsuba_starts_not_run": not_run,
-            "mitsuba_starts_cut_short": [entry["run"] for entry in runs["mitsuba"] if entry["cut_short"]],
+            "mitsuba_starts_cut_short": [entry["run"] for entry in runs.get("mitsuba", ()) if entry["cut_short"]],
         },
     }
+    if left_out:
+        result["cut"]["mitsuba_starts_not_run"] = list(range(what.starts))
     medians = {name: entry["median_seconds_to_pose"] for name, entry in result["methods"].items()}
-    result["ratio_of_medians"] = {f"{a} / {b}": medians[a] / medians[b] for a, b in RATIOS if medians[a] and medians[b]}
+    result["ratio_of_medians"] = {f"{a} / {b}": medians[a] / medians[b] for a, b in RATIOS if medians.get(a) and medians.get(b)}
     return result
 
 
@@ -166,14 +175,25 @@ def _times(entries: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _setting(method: Any, resolution: int) -> dict[str, Any]:
-    from mitsuba_baselines.pose import is_fair
+def _setting(method: Any, resolution: int, left_out: str | None) -> dict[str, Any]:
+    from mitsuba_baselines.pose import fair_setting, is_fair
 
-    return {"setting": asdict(method.setting), "fair": is_fair(method.setting, resolution), "proxy": method.proxy.record()}
+    setting = fair_setting(resolution)
+    result = {"setting": asdict(setting), "fair": is_fair(setting, resolution)}
+    return {**result, "left_out": left_out} if method is None else {**result, "proxy": method.proxy.record()}
 
 
-def _methods(problem: PoseProblem, reference: Image) -> dict[str, Any]:
-    return {name: build_method(name, problem, reference) for name in METHODS}
+def _methods(problem: PoseProblem, reference: Image) -> tuple[dict[str, Any], str | None]:
+    """All methods, but for Mitsuba's if its samples do not fit into the memory; and why it was left out."""
+    from mitsuba_baselines.pose import fair_setting
+
+    setting = fair_setting(problem.resolution)
+    samples = max(setting.spp, setting.sppc, setting.sppp, setting.sppi) * problem.resolution**2
+    names, left_out = list(METHODS), None
+    if hasattr(os, "sysconf") and samples * BYTES_PER_SAMPLE > os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2:
+        names.remove("mitsuba")
+        left_out = f"{samples / 1e6:.0f} million samples at once do not fit into the memory"
+    return {name: build_method(name, problem, reference) for name in names}, left_out
 
 
 def _problem(options: BenchOptions, resolution: int, update: Update) -> tuple[PoseProblem, Image, Path]:

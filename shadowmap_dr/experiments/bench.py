@@ -38,25 +38,21 @@ def run_bench(options: BenchOptions, *, console: Console | None = None) -> dict[
     A unit that fails is stored with the entry `failed` and does not keep the others from being measured.
 
     Returns:
-        What is in the JSON file: `sections` (by name, each with `settings` and `units`), `machine`, `load_before` and
-        `load_after`, `command`, and `figures`, the rows of the table.
+        What is in the JSON file: `sections` (by name, each with `command`, `settings`, `machine` and `units`),
+        `machine`, `load_before` and `load_after`, and `figures`, the rows of the table.
     """
     console = console or Console(stderr=True)
     io.check_output(options.out, (".json",))
     record = _stored(options)
-    record |= {
-        "format": FORMAT,
-        "command": shlex.join(["shadowmap-dr", *sys.argv[1:]]),
-        "machine": machine(),
-        "load_before": load(),
-    }
+    command = shlex.join(["shadowmap-dr", *sys.argv[1:]])
+    record |= {"format": FORMAT, "machine": machine(), "load_before": load()}
     settings = _settings(options)
     plan = {name: UNITS[name](options) for name in UNITS if name in options.only}
     for name in plan:
         section = record["sections"].get(name, {})
         keep = options.resume and section.get("settings") == settings
         units = {key: value for key, value in section.get("units", {}).items() if "failed" not in value} if keep else {}
-        record["sections"][name] = {"settings": settings, "machine": machine(), "units": units}
+        record["sections"][name] = {"command": command, "settings": settings, "machine": machine(), "units": units}
     _write(options, record)
 
     with report.progress(console) as progress:

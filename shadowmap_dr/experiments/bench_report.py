@@ -89,9 +89,9 @@ def markdown(record: dict[str, Any]) -> str:
     units = [unit for section in record["sections"].values() for unit in section["units"].values()]
     others = [unit["cores_used_by_others"] for unit in units if unit.get("cores_used_by_others") is not None]
     spread = f"; cores used by other work: {max(others):.1f} at most" if others else ""
-    commands = dict.fromkeys(section["command"] for section in record["sections"].values())
+    commands = ", ".join(f"`{text}`" for text in dict.fromkeys(section["command"] for section in record["sections"].values()))
     lines = [
-        f"{', '.join(f'`{command}`' for command in commands)} on {machine['processor']}, {machine['threads']} threads, {machine['variant']}; "
+        f"{commands} on {machine['processor']}, {machine['threads']} threads, {machine['variant']}; "
         f"shadowmap_dr {machine['shadowmap_dr']}, Mitsuba {machine['mitsuba']}, Dr.Jit {machine['drjit']}, "
         f"LLVM {machine['llvm']}{spread}.",
         "",

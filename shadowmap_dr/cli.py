@@ -18,6 +18,8 @@ from rich.console import Console
 
 from . import __version__, _llvm, assets, io
 from .errors import ShadowmapError
+from .experiments import bench as bench_experiment
+from .experiments import bench_common, bench_report
 from .experiments import pose as pose_experiment
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
@@ -183,6 +185,40 @@ def pose(
     records = pose_experiment.run_pose(options)
     Console().print(pose_experiment.table(records))
     typer.echo(f"Records, images and plots: {out}")
+
+
+@app.command()
+def bench(
+    quick: Annotated[bool, typer.Option("--quick", help="Small sizes and few steps: some minutes instead of hours.")] = False,
+    out: Annotated[Path, typer.Option(help="JSON file to write; a plot lies beside it.")] = Path("bench.json"),
+    only: Annotated[
+        list[str] | None,
+        typer.Option(metavar="|".join(bench_common.SECTIONS), help="Section to measure; repeatable [default: all]."),
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Keep what a killed run with the same options has measured.")] = False,
+    mitsuba_seconds: Annotated[
+        float, typer.Option(help="Limit for each part that waits for Mitsuba's integrator; what it cuts off is recorded.")
+    ] = 900.0,
+    variant: Variant = DEFAULT_VARIANT,
+) -> None:
+    """Measure steps, rasterization, how costs grow, and where the time goes, beside Mitsuba and Embree.
+
+    Writes a JSON file, a plot, and a folder of meshes and reference images. Sections that are not measured stay as they are.
+    """
+    options = bench_common.BenchOptions(
+        quick=quick,
+        out=out,
+        only=tuple(dict.fromkeys(only or bench_common.SECTIONS)),
+        resume=resume,
+        mitsuba_seconds=mitsuba_seconds,
+    )
+    set_variant(variant)
+    record = bench_experiment.run_bench(options)
+    Console().print(bench_report.table(record))
+    typer.echo(f"Record: {out}, plot: {out.with_suffix('.png')}")
+    failed = bench_experiment.failures(record, options.only)
+    if failed:
+        raise ShadowmapError(f"{len(failed)} part(s) could not be measured; the first: {failed[0]}")
 
 
 def set_variant(name: str) -> None:

@@ -55,7 +55,7 @@ def test_info(run: Any) -> None:
 def test_help_names_the_commands(run: Any) -> None:
     result = run("--help")
     assert result.status == 0
-    for command in ("info", "render", "pose"):
+    for command in ("info", "render", "pose", "bench"):
         assert command in result.out
     assert run().status == 2
 
@@ -143,12 +143,20 @@ RENDER = ["render", "pose", "-D", "resolution=8", "--integrator", "direct", "--s
         (["pose", "--method", "magic"], "magic"),
         (["pose", "--reference", "photo"], "photo"),
         (["pose", "--out", "broken.xml"], "broken.xml"),
+        (["bench", "--only", "magic"], "magic"),
+        (["bench", "--out", "bench.txt"], "'.txt'"),
+        (["bench", "--out", "broken.xml/b.json"], "broken.xml/b.json"),
+        (["bench", "--out", "list.json"], "list.json is no record of a benchmark"),
+        (["bench", "--mitsuba-seconds", "0"], "--mitsuba-seconds 0"),
+        (["bench", "--mitsuba-seconds", "x"], "--mitsuba-seconds"),
+        (["bench", "--variant", "magic"], "magic"),
         (["magic"], "magic"),
         (["info", "--magic"], "--magic"),
     ],
 )
 def test_bad_input_is_one_clear_line(run: Any, tmp_path: Path, arguments: list[str], message: str) -> None:
     (tmp_path / "broken.xml").write_text("<scene")
+    (tmp_path / "list.json").write_text("[]")
     (tmp_path / "bsdf.xml").write_text('<bsdf version="3.0.0" type="diffuse"/>')
     (tmp_path / "bad_light.xml").write_text(
         '<scene version="3.0.0"><sensor type="perspective"><film type="hdrfilm"><integer name="width" value="4"/>'
@@ -195,3 +203,16 @@ def test_pose_prints_a_table_and_writes_records(run: Any, monkeypatch: pytest.Mo
     assert result.status == 0, result.err
     assert "spot" in result.out and "shadows" in result.out
     assert len(json.loads(Path("o/pose.json").read_text())) == 1
+
+
+def test_bench_prints_a_table_and_writes_a_record(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    from test_bench import TINY
+
+    from shadowmap_dr.experiments import bench_common
+
+    monkeypatch.setattr(bench_common, "QUICK", TINY)
+    result = run("bench", "--quick", "--only", "breakdown", "--out", "o/b.json")
+    assert result.status == 0, result.err
+    assert "frozen" in result.out and "o/b.png" in result.out
+    assert list(json.loads(Path("o/b.json").read_text())["sections"]) == ["breakdown"]
+    assert Path("o/b.png").exists()

@@ -139,10 +139,10 @@ def test_failed_optimisation_is_recorded_as_such(tmp_path: Path) -> None:
 
 def test_time_to_pose_counts_until_the_error_stays_small() -> None:
     seconds = np.ones(4)
-    assert pose._seconds_to_pose(np.array([9, 0.05, 3, 0.09, 0.01]), seconds) == 3
-    assert pose._seconds_to_pose(np.array([9, 0.05, 3, 0.09, 0.2]), seconds) is None
-    assert pose._seconds_to_pose(np.array([0, 0, 0, 0, 0.0]), seconds) == 0
-    assert pose._seconds_to_pose(np.array([1, 1, 0, 0, np.nan]), seconds) is None
+    assert pose.seconds_to_pose(np.array([9, 0.05, 3, 0.09, 0.01]), seconds) == 3
+    assert pose.seconds_to_pose(np.array([9, 0.05, 3, 0.09, 0.2]), seconds) is None
+    assert pose.seconds_to_pose(np.array([0, 0, 0, 0, 0.0]), seconds) == 0
+    assert pose.seconds_to_pose(np.array([1, 1, 0, 0, np.nan]), seconds) is None
 
 
 def test_table_has_a_row_for_each_object_resolution_and_method(tmp_path: Path) -> None:

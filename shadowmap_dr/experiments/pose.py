@@ -255,7 +255,7 @@ def _results(history: History) -> dict[str, Any]:
             "recovered": bool(rotation[-1] < RECOVERED_DEG and translation[-1] < RECOVERED_X100),
             "seconds_per_iteration": history.seconds_per_iteration,
             "seconds_total": history.seconds_total,
-            "seconds_to_pose": _seconds_to_pose(rotation, history.seconds),
+            "seconds_to_pose": seconds_to_pose(rotation, history.seconds),
             "loss_curve": history.loss,
             "rotation_error_curve": rotation,
             "translation_error_curve": translation,
@@ -263,7 +263,7 @@ def _results(history: History) -> dict[str, Any]:
     )
 
 
-def _seconds_to_pose(rotation_deg: npt.NDArray[np.float64], seconds: npt.NDArray[np.float64]) -> float | None:
+def seconds_to_pose(rotation_deg: npt.NDArray[np.float64], seconds: npt.NDArray[np.float64]) -> float | None:
     """Seconds until the rotation error is at most 0.1 degrees and stays there, None if it never does."""
     outside = np.flatnonzero(~(rotation_deg <= TIME_TO_POSE_DEG))
     first = int(outside[-1]) + 1 if len(outside) else 0

@@ -19,8 +19,8 @@ class Crossings:
     """Edges that separate pixels from their right and lower neighbours, for one set of vertex positions. No gradients.
 
     Attributes:
-        right, down: ``Float`` for each pixel, the signed weight of its pair with the right (lower) neighbour. Positive: so much of
-            the pixel reaches into its neighbour; negative: so much of the neighbour into the pixel.
+        right, down: ``Float`` for each pixel, the signed weight of its pair with the right (lower) neighbour. Positive: so much
+            of the pixel reaches into its neighbour; negative: so much of the neighbour into the pixel.
         pairs: the pairs that may have a weight. What follows is indexed by their slots in this list.
         ends: ``UInt32``, four for each slot: ends of the edge and of a second one, as vertices of the whole batch; ``NO_VERTEX``
             where there is none.

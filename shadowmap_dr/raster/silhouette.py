@@ -34,8 +34,8 @@ def register_silhouettes(
         positions: flat clip-space vertices, as rasterized. Detached.
         topology, raster, vertex_count: the mesh and what the pixels see.
         keys: ``UInt64``, one number for each pair (see :mod:`shadowmap_dr.raster.pairs`), 0 at first. Gets the largest of the
-            edges' keys: how much of the uncovered pixel the edge's surface hides as the upper half (a float's bits), the complement
-            of the edge's index as the lower. The outermost edge wins, so that the result does not depend on the order.
+            edges' keys: how much of the uncovered pixel the edge's surface hides as the upper half (a float's bits), the
+            complement of the edge's index as the lower. The outermost edge wins: the result does not depend on the order.
         found: list to which pairs are added when the first edge registers.
     """
     module = backend(positions)

@@ -55,7 +55,7 @@ def seen_points(sensor: Sensor, raster: RasterOutput, center: tuple[float, float
         column = dr.minimum((lane % columns) * stride + stride // 2, width - 1)
         triangle = dr.gather(mi.UInt32, raster.triangle, row * width + column)
         hit = triangle != NO_TRIANGLE
-        plane = [dr.gather(mi.Float, raster.records, 12 * triangle + (4 * k + 3), hit) for k in range(3)]
+        plane = raster.depth_plane(0, triangle, hit)
         x, y = mi.Float(column) + 0.5, mi.Float(row) + 0.5
         depth = dr.fma(plane[0], x - 0.5 * width, dr.fma(plane[1], y - 0.5 * height, plane[2]))
         x, y = 2 / width * x - 1, 2 / height * y - 1

@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from shadowmap_dr.raster import NO_TRIANGLE, rasterize
+from shadowmap_dr.raster import NO_TRIANGLE, rasterize, tiles
 
 
 def run(pos: np.ndarray, faces: np.ndarray, height: int, width: int):  # noqa: ANN201
@@ -41,6 +41,44 @@ def test_random_soups_match_the_twin(variant: str, block: int) -> None:
         assert (np.abs(out.depth.numpy()[same] - ref["depth"][same]) <= 1e-5 * condition).all(), seed
     if block != 0:  # lattice soups have ties on purpose, spread over the blocks
         assert wrong / total < 0.02
+
+
+@pytest.mark.parametrize("capacity", [32, 2])
+def test_large_triangles_match_the_twin(variant: str, capacity: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Triangles that cover many tiles, tilted so that they hide each other in parts; also with lists that overflow."""
+    monkeypatch.setattr(tiles, "CAPACITY", capacity)
+    for seed in range(12):
+        rng = np.random.default_rng(500 + seed)
+        count, height, width = 40, int(rng.integers(60, 150)), int(rng.integers(60, 150))
+        pos = np.c_[rng.uniform(-2.5, 2.5, (3 * count, 2)), rng.uniform(-1.3, 1.3, 3 * count), np.ones(3 * count)]
+        if seed % 2:
+            pos *= rng.uniform(0.3, 2, (3 * count, 1))
+        if seed % 3 == 0:  # behind the camera with a corner
+            pos[::7, 3] *= -1
+        faces = np.arange(3 * count).reshape(-1, 3)
+        ref = brute_force.rasterize(pos.astype(np.float32), faces, height, width)
+        ids = as_ids(run(pos.astype(np.float32), faces.astype(np.uint32), height, width))
+        decided = (ref["margin_px"] > 1 / 256) & (ref["margin_depth"] > 1e-5)
+        assert decided.mean() > 0.9 and (ids >= 0).mean() > 0.5
+        assert (ids == ref["triangle"])[decided].all(), seed
+
+
+def test_slivers_and_layers_match_the_twin(variant: str) -> None:
+    """Hundreds of diagonal slivers narrower than a pixel before a stack of layers that fill the image."""
+    rng = np.random.default_rng(9)
+    count, size = 300, 160
+    middle, direction = rng.uniform(-1, 1, (count, 2)), np.array([0.6, 0.5])
+    ends = [middle - direction, middle + direction, middle + direction + np.array([0.7, -0.7]) / size]
+    slivers = np.stack([np.c_[e, rng.uniform(-0.9, 0, count), np.ones(count)] for e in ends], 1).reshape(-1, 4)
+    layers = np.stack([[-1.1, -1.2, 0, 1], [3.5, -1.0, 0, 1], [-1.3, 3.7, 0, 1]])[None].repeat(60, 0)
+    layers[..., 2] = rng.uniform(0.1, 0.9, (60, 1))
+    pos = np.concatenate([slivers, layers.reshape(-1, 4)]).astype(np.float32)
+    faces = np.arange(len(pos)).reshape(-1, 3)
+    ref = brute_force.rasterize(pos, faces, size, size)
+    ids = as_ids(run(pos, faces.astype(np.uint32), size, size))
+    decided = (ref["margin_px"] > 1 / 256) & (ref["margin_depth"] > 1e-5)
+    assert (ids == ref["triangle"])[decided].all()
+    assert np.unique(ids).size > 200 and ids.max() >= count
 
 
 def test_undecided_pixels_are_rare(variant: str) -> None:
@@ -88,9 +126,10 @@ def test_batch_equals_single_images(variant: str) -> None:
     rng = np.random.default_rng(7)
     pos = np.concatenate([rng.uniform(-1, 1, (5, 20, 3)), np.ones((5, 20, 1))], -1).astype(np.float32)
     faces = rng.integers(0, 20, (30, 3)).astype(np.uint32)
-    both = as_ids(run(pos, faces, 21, 34)).reshape(5, -1)
-    for b in range(5):
-        assert (both[b] == as_ids(run(pos[b], faces, 21, 34))).all()
+    for size in ((21, 34), (77, 90)):
+        both = as_ids(run(pos, faces, *size)).reshape(5, -1)
+        for b in range(5):
+            assert (both[b] == as_ids(run(pos[b], faces, *size))).all()
 
 
 def test_deterministic_with_equal_depths(variant: str) -> None:
@@ -166,6 +205,7 @@ def test_alpha_test_sees_through_layers_in_order(variant: str) -> None:
     """Random soups with some faces transparent equal the soups without these faces, up to the number of layers."""
     for seed in range(10):
         rng = np.random.default_rng(seed)
+        height, width = (40, 33) if seed else (120, 97)
         pos = np.c_[rng.uniform(-1, 1, (24, 3)), np.ones(24)].astype(np.float32)
         faces = rng.integers(0, 24, (30, 3)).astype(np.uint32)
         clear = rng.random(30) < 0.3
@@ -174,9 +214,9 @@ def test_alpha_test_sees_through_layers_in_order(variant: str) -> None:
         def transparent(out, flags=flags):  # noqa: ANN001, ANN202
             return dr.gather(mi.Bool, flags, out.triangle, out.valid)
 
-        out = rasterize(mi.TensorXf(pos), mi.TensorXu(faces), (40, 33), transparent=transparent, layers=31)
-        want = as_ids(run(pos, faces[~clear], 40, 33))
+        out = rasterize(mi.TensorXf(pos), mi.TensorXu(faces), (height, width), transparent=transparent, layers=31)
+        want = as_ids(run(pos, faces[~clear], height, width))
         kept = np.r_[np.nonzero(~clear)[0], -1]
         assert (as_ids(out) == kept[want]).all()
-        one = rasterize(mi.TensorXf(pos), mi.TensorXu(faces), (40, 33), transparent=transparent, layers=1)
-        assert (as_ids(one) == as_ids(run(pos, faces, 40, 33))).all()
+        one = rasterize(mi.TensorXf(pos), mi.TensorXu(faces), (height, width), transparent=transparent, layers=1)
+        assert (as_ids(one) == as_ids(run(pos, faces, height, width))).all()

@@ -38,7 +38,7 @@ class RasterOutput:
         u, v: perspective-correct barycentric weights of the triangle's vertices 1 and 2 (vertex 0 has ``1 - u - v``).
         depth: ``z / w`` in clip space, 1 (the far plane) where nothing is seen.
         w: interpolated clip-space ``w`` (distance along the viewing axis of a perspective camera), 1 where nothing is seen.
-        records: per-triangle set-up of the rasterizer (12 floats for each triangle of each image), for later passes.
+        records: per-triangle set-up of the rasterizer (three arrays of 4 floats a triangle), for later passes.
         face_count, batch, height, width: sizes.
 
     ``u``, ``v``, ``depth`` and ``w`` carry gradients to the clip-space positions (for a fixed visible triangle; the change
@@ -55,6 +55,24 @@ class RasterOutput:
     batch: int
     height: int
     width: int
+
+    def edge_functions(self, image: Any, triangle: Any, active: Any = True) -> tuple[Any, Any, Any]:
+        """``a x + b y + c``, x and y in pixels from the image centre, as three ``Array4f``. Detached.
+
+        Components 0, 1, 2: distance (pixels) from the edges opposite to vertices 0, 1, 2, positive inside; 3: NDC depth.
+        For triangles (valid indices where ``active``) of images of the batch.
+        """
+        Array4f = backend(self.records[0]).Array4f
+        index = image * self.face_count + triangle
+        a, b, c = (dr.gather(Array4f, record, index, active) for record in self.records)
+        return a, b, c
+
+    def depth_plane(self, image: Any, triangle: Any, active: Any = True) -> tuple[Any, Any, Any]:
+        """The last component of :func:`edge_functions` alone: (dx, dy, d), each ``Float``."""
+        Float = backend(self.records[0]).Float
+        index = 4 * (image * self.face_count + triangle) + 3
+        dx, dy, d = (dr.gather(Float, record, index, active) for record in self.records)
+        return dx, dy, d
 
     @property
     def valid(self) -> Any:

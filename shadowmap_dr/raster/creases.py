@@ -27,7 +27,7 @@ def find_creases(
 
     Returns ends (a, b) of the first edge, ``NO_VERTEX`` where there is none, those of the second, and the weight of each.
     """
-    module = backend(raster.records)
+    module = backend(pixel)
     UInt32, Bool = module.UInt32, module.Bool
     near = _touch(topology, here, neighbour)
 
@@ -71,9 +71,8 @@ def _touch(topology: Topology, first: Any, second: Any) -> Any:
 
 def _way_out(raster: RasterOutput, image: Any, triangle: Any, x: Any, y: Any, down: Any, sign: int) -> Any:
     """Corner at which the edge starts through which one leaves a triangle from a point inside, along an axis of the image."""
-    module = backend(raster.records)
-    base = 3 * (image * raster.face_count + triangle)
-    lines = [dr.gather(module.Array4f, raster.records, base + k) for k in range(3)]
+    module = backend(x)
+    lines = raster.edge_functions(image, triangle)
     value = dr.fma(lines[0], x, dr.fma(lines[1], y, lines[2]))
     nearest, opposite = module.Float(dr.inf), module.UInt32(0)
     for k in range(3):

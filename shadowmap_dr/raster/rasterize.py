@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
 from ._types import MAX_RESOLUTION, NO_TRIANGLE, RasterOutput, backend, pixel_coordinates
-from .grid import CellLists, GridShape, block_pixels, build_cell_lists
+from .fragments import EMPTY, draw
+from .setup import centred, covers, edge_lines, fragment_key, gather_triangle, set_up
+from .tiles import TileGrid, TileLists, block_pixels, build_tile_lists, nearest_covers
 
-# Boxes are widened by this many pixels so that rounding in the single-precision edge functions cannot lose a pixel.
-_BOX_MARGIN = 1.0 / 512.0
+#: A triangle that covers more pixels than this, and is not thin, goes through the lists of tiles.
+_LARGE = 512
 
 
 def rasterize(
@@ -50,8 +53,9 @@ def rasterize(
     Raises:
         ValueError: on wrong shapes, an empty mesh, a resolution outside the limits, or an index out of range.
 
-    The method: homogeneous edge functions (Olano and Greer, "Triangle scan conversion using 2D homogeneous coordinates", 1997)
-    over a pyramid of screen grids (:mod:`shadowmap_dr.raster.grid`).
+    The method: homogeneous edge functions (Olano and Greer, "Triangle scan conversion using 2D homogeneous coordinates", 1997);
+    small and thin triangles draw their fragments themselves (:mod:`shadowmap_dr.raster.fragments`), pixels look for the large
+    ones in the list of their tile (:mod:`shadowmap_dr.raster.tiles`).
     """
     flat, face_indices, batch, vertex_count = check_mesh(positions, faces, batch, check_indices)
     height, width = check_resolution(resolution)
@@ -97,13 +101,6 @@ def check_mesh(positions: Any, faces: Any, batch: int | None, check_indices: boo
         if largest >= vertex_count:
             raise ValueError(f"faces refer to vertex {largest}, but there are only {vertex_count} vertices")
     return flat, faces, batch, vertex_count
-
-
-def gather_triangle(positions: Any, faces: Any, triangle: Any, first_vertex: Any, active: Any) -> tuple[Any, Any, Any]:
-    """Clip-space corners (``Array4f``) of triangles of one image of the batch."""
-    module = backend(positions)
-    i = dr.gather(module.Array3u, faces, triangle, active)
-    return tuple(dr.gather(module.Array4f, positions, first_vertex + i[k], active) for k in range(3))
 
 
 def _locate(
@@ -170,205 +167,111 @@ def _visible_triangles(
     transparent: Callable[[RasterOutput], Any] | None,
     layers: int,
 ) -> tuple[Any, Any]:
-    shape = GridShape(batch, height, width)
-    face_count = dr.width(faces) // 3
-    records, image, box, active = _set_up(positions, faces, batch, vertex_count, face_count, height, width)
-    lists = build_cell_lists(shape, image, box, active)
-    triangle = _walk(lists, records, positions, faces, vertex_count)
-    for _ in range(layers - 1 if transparent is not None else 0):
-        seen = _locate(positions, faces, triangle, records, batch, vertex_count, height, width)
+    """Triangle index of each pixel, row-major, and the records of all triangles."""
+    mesh = (positions, faces, batch, vertex_count, height, width)
+    if transparent is None:
+        keys, records = _nearest_fragments(*mesh)
+        return _triangle_of(keys), records
+    keys, records = _nearest_fragments(*mesh, cull=False)
+    for _ in range(layers - 1):
+        seen = _locate(positions, faces, _triangle_of(keys), records, batch, vertex_count, height, width)
         through = seen.valid & dr.detach(transparent(seen))
-        triangle = _walk(lists, records, positions, faces, vertex_count, triangle, through)
-    return triangle, records
+        behind = dr.select(through, keys, type(keys)(EMPTY))
+        dr.eval(behind)
+        farther, records = _nearest_fragments(*mesh, behind=behind, cull=False)
+        keys = dr.select(through, farther, keys)
+        dr.eval(keys)
+    return _triangle_of(keys), records
 
 
-def _set_up(
-    positions: Any, faces: Any, batch: int, vertex_count: int, face_count: int, height: int, width: int
-) -> tuple[Any, Any, tuple[Any, Any, Any, Any], Any]:
-    """Edge functions, depth plane (12 floats a triangle) and pixel box of every triangle of every image.
-
-    Edge functions are cross products of float32 (x, y, w) evaluated in float64: every product is then exact, so the two
-    triangles that share an edge get coefficients that are exact negatives, whatever their vertex order or indices.
-    """
-    module = backend(positions)
-    Float, Float64, UInt32, Int32 = module.Float, module.Float64, module.UInt32, module.Int32
-    index = dr.arange(UInt32, batch * face_count)
-    image = index // face_count
-    corners = gather_triangle(positions, faces, index - image * face_count, image * vertex_count, True)
-    lines, det = _edge_lines(corners)
-    zs = [Float64(p.z) for p in corners]
-    finite = dr.isfinite(det)
-    active = finite & (det != 0)
-    sign = dr.select(det < 0, Float64(-1), Float64(1))
-    inv_det = dr.rcp(dr.select(active, det, 1))
-
-    # NDC -> pixels counted from the image centre, where single precision loses least.
-    sx, sy = 2.0 / width, 2.0 / height
-    edge = [[], [], []]
-    for a, b, c in lines:
-        norm = dr.sqrt(a * a * (sx * sx) + b * b * (sy * sy))
-        active &= norm > 0
-        scale = sign / dr.select(norm > 0, norm, 1)
-        for store, value in zip(edge, (a * sx * scale, b * sy * scale, c * scale), strict=True):
-            store.append(Float(value))
-    plane = [sum(zs[k] * lines[k][c] for k in range(3)) * inv_det for c in range(3)]
-    edge[0].append(Float(plane[0] * sx))
-    edge[1].append(Float(plane[1] * sy))
-    edge[2].append(Float(plane[2]))
-
-    records = dr.empty(Float, 12 * batch * face_count)
-    for k in range(3):
-        dr.scatter(records, module.Array4f(*edge[k]), 3 * index + k)
-
-    x_min, y_min, x_max, y_max, seen = _screen_bounds(corners, height, width)
-    active &= seen
-    m = _BOX_MARGIN
-    box = (
-        dr.maximum(Int32(dr.ceil(x_min - (0.5 + m))), 0),
-        dr.maximum(Int32(dr.ceil(y_min - (0.5 + m))), 0),
-        dr.minimum(Int32(dr.floor(x_max - (0.5 - m))), width - 1),
-        dr.minimum(Int32(dr.floor(y_max - (0.5 - m))), height - 1),
-    )
-    active &= (box[0] <= box[2]) & (box[1] <= box[3])
-    dr.eval(records, box, active)
-    return records, image, box, active
+def _triangle_of(keys: Any) -> Any:
+    """Triangle index of fragment keys: that of an empty one is ``NO_TRIANGLE``."""
+    return backend(keys).UInt32(keys)
 
 
-def _edge_lines(corners: tuple[Any, Any, Any]) -> tuple[list[tuple[Any, Any, Any]], Any]:
-    """Homogeneous lines (opposite to vertices 0, 1, 2) and their common determinant, in double precision."""
-    module = backend(corners[0])
-    xs, ys, ws = ([module.Float64(p[c]) for p in corners] for c in (0, 1, 3))
-
-    def line(a: int, b: int) -> tuple[Any, Any, Any]:
-        return ys[a] * ws[b] - ys[b] * ws[a], xs[b] * ws[a] - xs[a] * ws[b], xs[a] * ys[b] - xs[b] * ys[a]
-
-    lines = [line(1, 2), line(2, 0), line(0, 1)]
-    return lines, lines[0][0] * xs[0] + lines[0][1] * ys[0] + lines[0][2] * ws[0]
-
-
-def _screen_bounds(corners: tuple[Any, Any, Any], height: int, width: int) -> tuple[Any, Any, Any, Any, Any]:
-    """Pixel bounds of the part of a triangle in front of the near plane, and whether there is any within the depth range.
-
-    Where a visible point has ``w <= 0`` (no camera does that, but a caller's matrix may), the whole image is the bound.
-    """
-    module = backend(corners[0])
-    Float, Bool = module.Float, module.Bool
-    x_min, y_min, x_max, y_max = Float(dr.inf), Float(dr.inf), Float(-dr.inf), Float(-dr.inf)
-    unbounded, beyond_far = Bool(False), Bool(True)
-    near = [p.z + p.w for p in corners]
-    for p in corners:
-        beyond_far &= p.z > p.w
-
-    def include(x: Any, y: Any, w: Any, use: Any) -> None:
-        nonlocal x_min, y_min, x_max, y_max, unbounded
-        ok = use & (w > 0)
-        unbounded |= use & ~(w > 0)
-        inv = dr.rcp(dr.select(ok, w, 1))
-        px, py = x * inv, y * inv
-        x_min, x_max = dr.select(ok, dr.minimum(x_min, px), x_min), dr.select(ok, dr.maximum(x_max, px), x_max)
-        y_min, y_max = dr.select(ok, dr.minimum(y_min, py), y_min), dr.select(ok, dr.maximum(y_max, py), y_max)
-
-    for p, d in zip(corners, near, strict=True):
-        include(p.x, p.y, p.w, d >= 0)
-    for a, b in ((0, 1), (1, 2), (2, 0)):
-        crosses = (near[a] >= 0) != (near[b] >= 0)
-        s = near[a] / dr.select(crosses, near[a] - near[b], 1)
-        q = dr.fma(corners[b] - corners[a], s, corners[a])
-        include(q.x, q.y, q.w, crosses)
-
-    # Clamp before the conversion to integers: a vertex near the camera plane projects beyond their range.
-    def to_pixel(ndc: Any, size: int) -> Any:
-        return dr.clip(dr.fma(ndc, 0.5 * size, 0.5 * size), -2.0, size + 2.0)
-
-    seen = ~beyond_far & (unbounded | (x_max >= x_min))
-    wide = unbounded | ~seen
-    return (
-        dr.select(wide, 0, to_pixel(dr.select(wide, 0, x_min), width)),
-        dr.select(wide, 0, to_pixel(dr.select(wide, 0, y_min), height)),
-        dr.select(wide, width, to_pixel(dr.select(wide, 0, x_max), width)),
-        dr.select(wide, height, to_pixel(dr.select(wide, 0, y_max), height)),
-        seen,
-    )
-
-
-def _walk(
-    lists: CellLists,
-    records: Any,
+def _nearest_fragments(
     positions: Any,
     faces: Any,
+    batch: int,
     vertex_count: int,
-    previous: Any = None,
-    through: Any = None,
-) -> Any:
-    """The nearest covering triangle of each pixel, row-major; or the next one behind ``previous`` where ``through`` says so."""
-    module = backend(records)
-    Float, UInt32 = module.Float, module.UInt32
-    shape = lists.shape
-    pixel = block_pixels(shape, module)
-
-    def visit(triangle, row, column, best_depth, best):  # noqa: ANN001, ANN202
-        covered, depth = _cover(records, positions, faces, triangle, vertex_count, row, column, shape)
-        nearer = covered & ((depth < best_depth) | ((depth == best_depth) & (triangle < best)))
-        return dr.select(nearer, depth, best_depth), dr.select(nearer, triangle, best)
-
-    def visit_behind(triangle, row, column, best_depth, best, last_depth, last):  # noqa: ANN001, ANN202
-        covered, depth = _cover(records, positions, faces, triangle, vertex_count, row, column, shape)
-        covered &= (depth > last_depth) | ((depth == last_depth) & (triangle > last))
-        nearer = covered & ((depth < best_depth) | ((depth == best_depth) & (triangle < best)))
-        return dr.select(nearer, depth, best_depth), dr.select(nearer, triangle, best), last_depth, last
-
-    start = (Float(dr.inf), UInt32(NO_TRIANGLE))
-    if previous is None:
-        _, best = lists.walk(pixel, start, visit)
-    else:
-        skip = dr.gather(module.Bool, through, pixel.index, pixel.inside)
-        kept = dr.gather(UInt32, previous, pixel.index, pixel.inside)
-        last = dr.select(kept == NO_TRIANGLE, 0, kept + pixel.image * (dr.width(faces) // 3))
-        _, last_depth = _cover(records, positions, faces, last, vertex_count, pixel.row, pixel.column, shape)
-        _, best, _, _ = lists.walk(pixel, (*start, last_depth, last), visit_behind, skip)
-        best = dr.select(skip | (kept == NO_TRIANGLE), best, last)
-    triangle = dr.select(best == NO_TRIANGLE, best, best - pixel.image * (dr.width(faces) // 3))
-    out = dr.empty(UInt32, shape.batch * shape.height * shape.width)
-    dr.scatter(out, triangle, pixel.index, pixel.inside)
-    dr.eval(out)
-    return out
-
-
-def _cover(
-    records: Any, positions: Any, faces: Any, candidate: Any, vertex_count: int, row: Any, column: Any, shape: GridShape
+    height: int,
+    width: int,
+    behind: Any = None,
+    cull: bool = True,
 ) -> tuple[Any, Any]:
-    """Does a triangle contain a pixel's centre, and at what depth?
+    """Fragment key of each pixel, row-major, and the edge functions and depth planes of all triangles (see ``Triangles``).
 
-    Single precision decides unless the centre lies within its rounding error of an edge. There (rarely) double precision
-    does, for otherwise the rounded edges that meet in a vertex would leave pinholes or doubly owned pixels around it.
+    Args:
+        behind: ``UInt64`` keys: pixels see only what lies behind.
+        cull: leave out what large triangles hide; not for peeling.
     """
-    module = backend(records)
-    Float, Float64, Array4f = module.Float, module.Float64, module.Array4f
-    px = Float(column) + (0.5 - 0.5 * shape.width)
-    py = Float(row) + (0.5 - 0.5 * shape.height)
-    a, b, c = (dr.gather(Array4f, records, 3 * candidate + k) for k in range(3))
-    e = dr.fma(a, px, dr.fma(b, py, c))
-    least = dr.minimum(dr.minimum(e.x, e.y), e.z)
-    in_range = (e.w >= -1) & (e.w <= 1)
-    rounding = max(shape.width, shape.height) * 3e-7
+    module = backend(positions)
+    UInt32, UInt64 = module.UInt32, module.UInt64
+    face_count = dr.width(faces) // 3
+    index = dr.arange(UInt32, batch * face_count)
+    image = index // face_count
+    triangle = index - image * face_count
+    triangles = set_up(gather_triangle(positions, faces, triangle, image * vertex_count, True), height, width)
+    # Not one array: Dr.Jit would write its parts in kernels of their own.
+    records = tuple(dr.ravel(coefficients) for coefficients in (triangles.a, triangles.b, triangles.c))
 
-    def exact(candidate, row, column):  # noqa: ANN001, ANN202
-        face_count = dr.width(faces) // 3
-        image = candidate // face_count
-        corners = gather_triangle(positions, faces, candidate - image * face_count, image * vertex_count, True)
-        lines, det = _edge_lines(corners)
-        x = (2 * Float64(column) + (1 - shape.width)) / shape.width
-        y = (2 * Float64(row) + (1 - shape.height)) / shape.height
-        covered = module.Bool(True)
-        for la, lb, lc in lines:
-            la, lb, lc = (dr.select(det < 0, -q, q) for q in (la, lb, lc))
-            value = dr.fma(la, x, dr.fma(lb, y, lc))
-            covered &= (value > 0) | ((value == 0) & ((la > 0) | ((la == 0) & (lb > 0))))
-        return covered
+    keys = dr.full(UInt64, EMPTY, batch * height * width)
+    dr.eval(keys)
+    x0, y0, x1, y1 = triangles.box
+    sides = module.Float(x1 - x0 + (y1 - y0) + 2)
+    small = triangles.active & ((triangles.fragments <= _LARGE) | (triangles.fragments <= 5 * sides))
+    draw(triangles, keys, behind, image * (height * width), triangle, triangles.box, small)
+    if height * width <= _LARGE:  # no triangle can be large
+        dr.eval(records, keys)
+        return keys, records
 
-    undecided = in_range & (dr.abs(least) <= rounding)
-    covered = dr.if_stmt(
-        (candidate, row, column), undecided, exact, lambda candidate, row, column: least > 0,
-        mode="symbolic", label="exact edge test",
-    )  # fmt: skip
-    return covered & in_range, e.w
+    grid = TileGrid(batch, height, width)
+    large = triangles.active & ~small
+    nearest = nearest_covers(grid, triangles, image, large) if cull else None
+    first, last = (UInt32(x) | (UInt32(y) << 16) for x, y in ((x0, y0), (x1, y1)))
+    dr.eval(records, keys, nearest, large, first, last)
+
+    def exact_lines(index: Any) -> Any:
+        image = index // face_count
+        return edge_lines(gather_triangle(positions, faces, index - image * face_count, image * vertex_count, True))
+
+    a, b, c = (dr.gather(module.Array4f, record, index, large) for record in records)
+    box = tuple(module.Int32(corner) for corner in (first & 0xFFFF, first >> 16, last & 0xFFFF, last >> 16))
+    again = replace(triangles, a=a, b=b, c=c, box=box, exact=lambda: exact_lines(index))
+    lists = build_tile_lists(grid, again, index, image, triangle, large, nearest, keys, behind)
+    return _merge_large(lists, keys, behind, records, exact_lines, face_count), records
+
+
+def _merge_large(
+    lists: TileLists, keys: Any, behind: Any, records: Any, exact_lines: Callable[[Any], Any], face_count: int
+) -> Any:
+    """The nearer of what small triangles left at each pixel and of the large ones in its tile's list."""
+    module = backend(keys)
+    UInt32, UInt64 = module.UInt32, module.UInt64
+    grid = lists.grid
+    pixel = block_pixels(grid.batch, grid.height, grid.width, module)
+    tile = pixel.tile(grid)
+    x, y = centred(module, pixel.row, pixel.column, grid.height, grid.width)
+    best = dr.gather(UInt64, keys, pixel.index, pixel.inside)
+    beyond = dr.gather(UInt64, behind, pixel.index, pixel.inside) if behind is not None else None
+    # Lanes beyond the image walk along with their block: its tile exists, and uniform control flow costs nothing.
+    position = tile * lists.capacity
+    end = position + dr.minimum(dr.gather(UInt32, lists.count, tile), lists.capacity)
+
+    def visit(position, end, best):  # noqa: ANN001, ANN202
+        index = dr.gather(UInt32, lists.items, position)
+        a, b, c = (dr.gather(module.Array4f, record, index) for record in records)
+        values = dr.fma(a, x, dr.fma(b, y, c))
+        covered = covers(values, pixel.row, pixel.column, grid.height, grid.width, lambda: exact_lines(index))
+        key = fragment_key(values.w, index - pixel.image * face_count)
+        if beyond is not None:
+            covered &= key > beyond
+        return position + 1, end, dr.select(covered & (key < best), key, best)
+
+    loop = dr.while_loop(
+        (position, end, best), lambda position, end, best: position < end, visit, mode="symbolic", label="tile list"
+    )
+    merged = dr.empty(UInt64, grid.batch * grid.height * grid.width)
+    dr.scatter(merged, loop[2], pixel.index, pixel.inside)
+    dr.eval(merged)
+    return merged

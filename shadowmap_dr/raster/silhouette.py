@@ -228,8 +228,6 @@ def _lines(p: Any, q: Any, active: Any, size: int) -> tuple[Any, Any]:
 
 def _depth_on_plane(raster: RasterOutput, image: Any, triangle: Any, x: Any, y: Any, active: Any) -> Any:
     """NDC depth of a triangle's plane at centred pixel coordinates; the far plane where there is no triangle."""
-    module = backend(raster.records)
     hit = active & (triangle != NO_TRIANGLE)
-    base = 12 * (image * raster.face_count + triangle)
-    dx, dy, d = (dr.gather(module.Float, raster.records, base + (4 * k + 3), hit) for k in range(3))
+    dx, dy, d = raster.depth_plane(image, triangle, hit)
     return dr.fma(dx, x, dr.fma(dy, y, dr.select(hit, d, 1)))

@@ -147,11 +147,9 @@ def _radial_depth(view: Views, frustum: Frusta, raster: RasterOutput, row: Any, 
 def _slope_square(view: Views, frustum: Frusta, raster: RasterOutput, image: Any, size: int) -> Any:
     """Squared change of linear depth across a texel, detached; 0 where the texel is empty."""
     with dr.suspend_grad():
-        module = backend(raster.u)
         view, frustum = dr.detach(view), dr.detach(frustum)
         hit = raster.triangle != NO_TRIANGLE
-        base = 12 * (image * raster.face_count + raster.triangle)
-        dx, dy = (dr.gather(module.Float, raster.records, base + (4 * k + 3), hit) for k in range(2))
+        dx, dy, _ = raster.depth_plane(image, raster.triangle, hit)
         perspective = view.spread > 0
         n, f, w = frustum.near, frustum.far, dr.detach(raster.w)
         # ndc depth -> linear depth: the derivative of the hyperbola is w^2 / (2 f n).

@@ -1,0 +1,70 @@
+"""Drawing triangles row by row, one lane a triangle: the way for the small and the thin ones, that is, nearly all.
+
+Each lane walks the rows of its triangle and, in each, the few columns between its edges, and merges fragments into the image
+with an atomic minimum over ``(depth, triangle)`` keys. Nothing is sorted and no list is kept.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+
+from ._types import backend
+from .setup import Triangles, centred, covers, fragment_key, rounding_error
+
+#: Key of a pixel that nothing covers.
+EMPTY = 0xFFFFFFFFFFFFFFFF
+
+
+def draw(
+    triangles: Triangles, keys: Any, behind: Any, first_pixel: Any, triangle: Any, box: tuple[Any, Any, Any, Any], active: Any
+) -> None:
+    """Merge the fragments of triangles within a box each into an image of keys.
+
+    Args:
+        keys: ``UInt64`` for each pixel of the batch, written.
+        behind: None or ``UInt64`` for each pixel: only fragments with a larger key count.
+        first_pixel: index of the first pixel of the triangle's image.
+        triangle: index that goes into the keys.
+        box: inclusive bounds (first column, first row, last column, last row), inside the image.
+        active: triangles to draw.
+    """
+    t = triangles
+    module = backend(t.a)
+    Float, Int32, UInt32 = module.Float, module.Int32, module.UInt32
+    x0, y0, x1, y1 = (Int32(b) for b in box)
+    rounding = rounding_error(t.height, t.width)
+    tiny = 1e-12
+    slope = [dr.select(dr.abs(t.a[k]) < tiny, dr.select(t.a[k] < 0, Float(-tiny), Float(tiny)), t.a[k]) for k in range(3)]
+    inverse = [dr.rcp(s) for s in slope]
+
+    def draw_row(row, last):  # noqa: ANN001, ANN202
+        _, y = centred(module, row, 0, t.height, t.width)
+        at_middle = dr.fma(t.b, y, t.c)
+        # Columns between the edges, and no fewer: what rounding might hide is left to the coverage test.
+        low, high = Float(x0), Float(x1)
+        for k in range(3):
+            crossing = dr.fma(-at_middle[k], inverse[k], 0.5 * t.width - 0.5)
+            error = dr.fma(dr.abs(inverse[k]), rounding, 1e-3)
+            low = dr.select(slope[k] > 0, dr.maximum(low, crossing - error), low)
+            high = dr.select(slope[k] < 0, dr.minimum(high, crossing + error), high)
+        start, end = Int32(dr.ceil(dr.minimum(low, t.width))), Int32(dr.floor(dr.maximum(high, -1.0)))
+
+        def draw_pixel(column, end):  # noqa: ANN001, ANN202
+            x, _ = centred(module, 0, column, t.height, t.width)
+            values = dr.fma(t.a, x, at_middle)
+            covered = covers(values, row, column, t.height, t.width, t.exact)
+            key = fragment_key(values.w, triangle)
+            pixel = first_pixel + UInt32(row) * t.width + UInt32(column)
+            if behind is not None:
+                covered &= key > dr.gather(module.UInt64, behind, pixel, covered)
+            # A copy of the image for each thread, Dr.Jit's usual way, would cost far more than a few atomic operations.
+            dr.scatter_reduce(dr.ReduceOp.Min, keys, key, pixel, covered, mode=dr.ReduceMode.Direct)
+            return column + 1, end
+
+        dr.while_loop((start, end), lambda column, end: column <= end, draw_pixel, mode="symbolic", label="columns")
+        return row + 1, last
+
+    rows = (dr.select(active, y0, 0), dr.select(active, y1, -1))
+    dr.while_loop(rows, lambda row, last: row <= last, draw_row, mode="symbolic", label="rows")

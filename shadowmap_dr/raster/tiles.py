@@ -1,0 +1,182 @@
+"""Large triangles: short lists for tiles of 16 x 16 pixels, which the pixels then walk.
+
+A triangle is kept out of a tile when it misses it, or lies behind one that covers it. What a list has no room for is drawn
+fragment by fragment, so that no array size depends on the data.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+import drjit as dr
+
+from ._types import backend
+from .fragments import draw
+from .setup import Triangles, centred, depth_key, rounding_error
+
+#: log2 of the side of a tile in pixels.
+TILE = 4
+#: Triangles that a tile's list has room for.
+CAPACITY = 32
+
+
+@dataclass(frozen=True)
+class TileGrid:
+    """The tiles of a batch of ``height`` x ``width`` images."""
+
+    batch: int
+    height: int
+    width: int
+
+    @property
+    def columns(self) -> int:
+        return -(-self.width >> TILE)
+
+    @property
+    def rows(self) -> int:
+        return -(-self.height >> TILE)
+
+    @property
+    def count(self) -> int:
+        return self.batch * self.rows * self.columns
+
+
+@dataclass(frozen=True)
+class TileLists:
+    """``items[c * capacity:][:count[c]]`` are the triangles (numbered through the batch) that tile ``c`` may see.
+
+    ``count`` may exceed the capacity: triangles beyond it are not in the list, but drawn.
+    """
+
+    grid: TileGrid
+    capacity: int
+    count: Any
+    items: Any
+
+
+@dataclass(frozen=True)
+class BlockPixels:
+    """All pixels of a batch of images, 16 consecutive lanes a 4 x 4 block; blocks at the border reach beyond the image.
+
+    ``index`` is the position in a flat row-major batch, valid where ``inside``.
+    """
+
+    image: Any
+    row: Any
+    column: Any
+    inside: Any
+    index: Any
+
+    def tile(self, grid: TileGrid) -> Any:
+        """Number of each pixel's tile."""
+        return (self.image * grid.rows + (self.row >> TILE)) * grid.columns + (self.column >> TILE)
+
+
+def block_pixels(batch: int, height: int, width: int, module: ModuleType) -> BlockPixels:
+    """Enumerate pixels so that a SIMD packet of 16 lanes is a 4 x 4 block, whose control flow hardly ever diverges."""
+    block_columns, block_rows = -(-width >> 2), -(-height >> 2)
+    lane = dr.arange(module.UInt32, batch * block_rows * block_columns * 16)
+    block = lane >> 4
+    row_of_blocks = block // block_columns
+    image = row_of_blocks // block_rows
+    column = (block - row_of_blocks * block_columns) * 4 + (lane & 3)
+    row = (row_of_blocks - image * block_rows) * 4 + ((lane >> 2) & 3)
+    inside = (column < width) & (row < height)
+    return BlockPixels(image, row, column, inside, (image * height + row) * width + column)
+
+
+def nearest_covers(grid: TileGrid, triangles: Triangles, image: Any, active: Any) -> Any:
+    """``UInt32`` for each tile: key of the smallest depth that a triangle which covers all of the tile reaches nowhere beyond."""
+    module = backend(triangles.a)
+    nearest = dr.full(module.UInt32, 0xFFFFFFFF, grid.count)
+    dr.eval(nearest)
+
+    def visit(row: Any, column: Any) -> None:
+        span = _Span(triangles, row, column)
+        tile = (image * grid.rows + row) * grid.columns + column
+        dr.scatter_reduce(dr.ReduceOp.Min, nearest, depth_key(span.farthest), tile, span.covered, mode=dr.ReduceMode.Direct)
+
+    _for_each_tile(triangles.box, active, visit)
+    return nearest
+
+
+def build_tile_lists(
+    grid: TileGrid, triangles: Triangles, index: Any, image: Any, triangle: Any, active: Any, nearest: Any, keys: Any, behind: Any
+) -> TileLists:
+    """Enter large triangles into the lists of the tiles where they may be seen.
+
+    Args:
+        grid: the tiles.
+        triangles: with ``box`` set; ``a``, ``b``, ``c`` of all of them.
+        index, triangle: number of each triangle through the batch, and in its image.
+        image: image of each triangle.
+        active: the large ones.
+        nearest: from :func:`nearest_covers`, or None to keep hidden triangles too.
+        keys, behind: see :func:`shadowmap_dr.raster.fragments.draw`, for triangles that find a list full.
+    """
+    module = backend(triangles.a)
+    Int32 = module.Int32
+    count = dr.zeros(module.UInt32, grid.count)
+    items = dr.empty(module.UInt32, grid.count * CAPACITY)
+    dr.eval(count, items)
+    first_pixel = image * (grid.height * grid.width)
+
+    def visit(row: Any, column: Any) -> None:
+        span = _Span(triangles, row, column)
+        tile = (image * grid.rows + row) * grid.columns + column
+        wanted = ~span.missed
+        if nearest is not None:
+            wanted &= depth_key(span.nearest) <= dr.gather(module.UInt32, nearest, tile, wanted)
+        slot = dr.scatter_inc(count, tile, wanted)
+        fits = wanted & (slot < CAPACITY)
+        dr.scatter(items, index, tile * CAPACITY + slot, fits)
+        x0, y0, x1, y1 = triangles.box
+        left, top = Int32(column << TILE), Int32(row << TILE)
+        size = (1 << TILE) - 1
+        box = (dr.maximum(x0, left), dr.maximum(y0, top), dr.minimum(x1, left + size), dr.minimum(y1, top + size))
+        draw(triangles, keys, behind, first_pixel, triangle, box, wanted & ~fits)
+
+    _for_each_tile(triangles.box, active, visit)
+    dr.eval(count, items, keys)
+    return TileLists(grid, CAPACITY, count, items)
+
+
+def _for_each_tile(box: tuple[Any, Any, Any, Any], active: Any, visit: Any) -> None:
+    """Call ``visit(row, column)`` in a symbolic loop over the tiles that a box touches."""
+    UInt32 = backend(box[0]).UInt32
+    x0, y0, x1, y1 = (UInt32(dr.select(active, b, 0)) >> TILE for b in box)
+    across = x1 - x0 + 1
+    total = dr.select(active, across * (y1 - y0 + 1), 0)
+
+    def body(step, row, column, total):  # noqa: ANN001, ANN202
+        visit(row, column)
+        wrap = column == x1
+        return step + 1, dr.select(wrap, row + 1, row), dr.select(wrap, x0, column + 1), total
+
+    state = (dr.zeros(UInt32, dr.width(total)), y0, x0, total)
+    dr.while_loop(state, lambda step, row, column, total: step < total, body, mode="symbolic", label="tiles")
+
+
+class _Span:
+    """What a triangle does over the pixel centres of a tile.
+
+    ``missed``: it contains none of them; ``covered``: it contains all; ``nearest``, ``farthest``: bounds of its depth there.
+    """
+
+    def __init__(self, t: Triangles, row: Any, column: Any) -> None:
+        module = backend(t.a)
+        half = 0.5 * ((1 << TILE) - 1)
+        x, y = centred(module, row << TILE, column << TILE, t.height, t.width)
+        middle = dr.fma(t.a, x + half, dr.fma(t.b, y + half, t.c))
+        reach = (dr.abs(t.a) + dr.abs(t.b)) * half
+        error = rounding_error(t.height, t.width)
+        # The depth is evaluated elsewhere, with rounding errors relative to its largest term.
+        error_depth = 1e-6 * dr.fma(dr.abs(t.a.w), 0.5 * t.width, dr.fma(dr.abs(t.b.w), 0.5 * t.height, dr.abs(t.c.w)))
+        self.nearest = middle.w - reach.w - error_depth
+        self.farthest = middle.w + reach.w + error_depth
+        outside = [middle[k] + reach[k] < -error for k in range(3)]
+        inside = [middle[k] - reach[k] > error for k in range(3)]
+        self.missed = outside[0] | outside[1] | outside[2] | (self.nearest > 1) | (self.farthest < -1)
+        self.covered = inside[0] & inside[1] & inside[2] & (self.nearest >= -1) & (self.farthest <= 1)

@@ -23,13 +23,16 @@ from .bench_scaling import Case
 #: The passes of a step in their order: label, and the function (module:name below `shadowmap_dr`) that makes them up.
 PASSES = (
     ("vertices", "geometry:Geometry.with_positions"),
+    ("facets: mean normals", "renderer:mean_normals"),
     ("camera: projection", "renderer:camera_clip"),
     ("camera: rasterization", "renderer:rasterize"),
     ("shadow map: frustum", "light_maps:fit_frusta"),
     ("shadow map: rendering", "light_maps:render_maps"),
     ("shadow map: filter", "light_maps:filter_maps"),
-    ("surface", "renderer:surface"),
-    ("surface: facets", "renderer:soften_facets"),
+    ("hits", "renderer:pixel_hits"),
+    ("normals", "renderer:normals_at"),
+    ("facets: blend", "renderer:soften_facets"),
+    ("surface", "renderer:surface_at"),
     ("shadow look-up", "renderer:Renderer._visibility"),
     ("shading", "renderer:Renderer._radiance"),
     ("anti-aliasing", "renderer:antialias"),

@@ -111,7 +111,10 @@ class _Mixer:
 
         touched = sum(incoming) + sum(outgoing) > 0
         result = self._where(touched, spread, pixel, (*incoming, *outgoing, *own), own)
-        return result if self.planar else self._written(result)
+        if not self.planar:
+            return self._written(result)
+        dr.eval(result)  # more than one kernel may want it
+        return result
 
     def adjoint_of_positions(self, adjoint: Any, size: int) -> Any:
         """Gradient to the flat positions from that of the result."""

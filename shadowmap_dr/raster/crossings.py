@@ -68,15 +68,15 @@ def find_crossings(
     with dr.suspend_grad():
         positions = dr.detach(positions)
         if creases is None:
-            pairs, keys, zeros = empty_list(raster)
+            pairs, keys = empty_list(raster)
             register_silhouettes(positions, topology, raster, vertex_count, keys, pairs)
         else:
-            pairs, keys, zeros = differing_pairs(raster)
+            pairs, keys = differing_pairs(raster)
             register_silhouettes(positions, topology, raster, vertex_count, keys, None)
             crease_weights = None if crease_weights is None else dr.detach(crease_weights)
             dr.eval(crease_weights)
         dr.eval(keys, pairs)
-        return _measure(positions, topology, raster, vertex_count, keys, pairs, zeros, creases, crease_weights)
+        return _measure(positions, topology, raster, vertex_count, keys, pairs, creases, crease_weights)
 
 
 def _measure(
@@ -86,7 +86,6 @@ def _measure(
     vertex_count: int,
     keys: Any,
     pairs: PairList,
-    zeros: tuple[Any, Any],
     creases: Any,
     crease_weights: Any,
 ) -> Crossings:
@@ -94,7 +93,8 @@ def _measure(
     Float, UInt32, Array4f = module.Float, module.UInt32, module.Array4f
     pixels = dr.width(raster.triangle)
     found = Crossings(
-        *zeros,
+        dr.zeros(Float, pixels),
+        dr.zeros(Float, pixels),
         pairs,
         dr.empty(UInt32, 8 * pixels),
         dr.empty(Float, 8 * pixels),

@@ -51,30 +51,20 @@ class PairList:
         dr.while_loop((dr.arange(UInt32, lanes),), lambda slot: slot < count, one, mode="symbolic", label="pairs")
 
 
-def empty_list(raster: RasterOutput) -> tuple[PairList, Any, tuple[Any, Any]]:
-    """A list to which pairs can be added, for each pair a key (``UInt64``) of 0, and zeros for all right and down pairs."""
+def empty_list(raster: RasterOutput) -> tuple[PairList, Any]:
+    """A list to which pairs can be added, and for each pair a key (``UInt64``) of 0."""
     module = backend(raster.triangle)
     UInt32 = module.UInt32
     capacity = 2 * dr.width(raster.triangle)
-    touched = _zero(dr.arange(UInt32, capacity))
-    keys, zeros = module.UInt64(touched), _two_zeros(dr.arange(UInt32, capacity // 2))
-    dr.eval(touched, keys, zeros)
-    return PairList(dr.empty(UInt32, capacity), dr.zeros(UInt32, 1), dr.zeros(UInt32, 1), touched), keys, zeros
+    # Zeros that a kernel of all threads writes: faster than the one thread that fills an array with a constant.
+    touched = dr.arange(UInt32, capacity) >> 31
+    keys = module.UInt64(touched)
+    dr.eval(touched, keys)
+    return PairList(dr.empty(UInt32, capacity), dr.zeros(UInt32, 1), dr.zeros(UInt32, 1), touched), keys
 
 
-def _zero(index: Any) -> Any:
-    """Zeros that a kernel of all threads writes, which is faster than the one thread that fills an array with a constant."""
-    return index >> 31
-
-
-def _two_zeros(pixel: Any) -> tuple[Any, Any]:
-    """Two arrays of zeros (of different sign: otherwise it would be one array)."""
-    zero = backend(pixel).Float(_zero(pixel))
-    return zero, -zero
-
-
-def differing_pairs(raster: RasterOutput) -> tuple[PairList, Any, tuple[Any, Any]]:
-    """Pairs whose pixels see different triangles, and keys and zeros as in :func:`empty_list`; keys only for these pairs."""
+def differing_pairs(raster: RasterOutput) -> tuple[PairList, Any]:
+    """Pairs whose pixels see different triangles, and keys (``UInt64``), 0 for these pairs and undefined for others."""
     module = backend(raster.triangle)
     UInt32 = module.UInt32
     pixels = dr.width(raster.triangle)
@@ -100,6 +90,5 @@ def differing_pairs(raster: RasterOutput) -> tuple[PairList, Any, tuple[Any, Any
         return pixel
 
     dr.if_stmt((pixel, right, below), right | below, add, lambda pixel, right, below: pixel, mode="symbolic", label="differ")
-    zeros = _two_zeros(dr.arange(UInt32, pixels))
-    dr.eval(result.front, result.back, result.pairs, keys, zeros)
-    return result, keys, zeros
+    dr.eval(result.front, result.back, result.pairs, keys)
+    return result, keys

@@ -67,7 +67,7 @@ def mean_normals(geometry: Geometry, topology: Topology, flat: Any) -> Any:
     """
     face = dr.arange(mi.UInt32, geometry.face_count)
     corner = dr.gather(mi.Vector3u, geometry.faces, face, flat)
-    p = [dr.gather(mi.Point3f, geometry.positions, corner[k], flat) for k in range(3)]
+    p = [geometry.vertices(corner[k], flat) for k in range(3)]
     edge = [normalize_or(p[(k + 1) % 3] - p[k], mi.Vector3f(0)) for k in range(3)]
     n = normalize_or(dr.cross(edge[0], edge[1]), mi.Vector3f(0))
     slot = dr.gather(mi.Vector3u, topology.welded, face, flat)

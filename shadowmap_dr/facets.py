@@ -61,17 +61,21 @@ def crease_edges(geometry: Geometry, topology: Topology) -> Any:
 
 
 def mean_normals(geometry: Geometry, topology: Topology, flat: Any) -> Any:
-    """Sums of the flat faces' unit normals, weighted by their angles at each place (Float, 3 V, by welded vertex). Attached."""
+    """Sums of the flat faces' unit normals, weighted by their angles, for each welded vertex (Float, 4 V). Attached.
+
+    Four numbers and not three (the last is 0), since these are read and summed up as packets.
+    """
     face = dr.arange(mi.UInt32, geometry.face_count)
     corner = dr.gather(mi.Vector3u, geometry.faces, face, flat)
-    p = [dr.gather(mi.Point3f, geometry.positions, corner[k], flat) for k in range(3)]
+    p = [geometry.vertices(corner[k], flat) for k in range(3)]
     edge = [normalize_or(p[(k + 1) % 3] - p[k], mi.Vector3f(0)) for k in range(3)]
     n = normalize_or(dr.cross(edge[0], edge[1]), mi.Vector3f(0))
     slot = dr.gather(mi.Vector3u, topology.welded, face, flat)
-    total = dr.zeros(mi.Float, 3 * geometry.vertex_count)
+    total = dr.zeros(mi.Float, 4 * geometry.vertex_count)
     for k in range(3):
         angle = dr.safe_acos(-dr.dot(edge[k], edge[(k + 2) % 3]) * (1 - 1e-6))
-        dr.scatter_add(total, n * angle, slot[k], flat)
+        weighted = n * angle
+        dr.scatter_add(total, mi.Vector4f(weighted.x, weighted.y, weighted.z, 0), slot[k], flat)
     return total
 
 
@@ -94,7 +98,8 @@ def soften_facets(
         size = dr.sqrt(dr.sqrt(square))
         mix = dr.detach(dr.clip((_LARGE - size / pixel) / (_LARGE - _SMALL), 0, 1))
         slot = dr.gather(mi.Vector3u, topology.welded, triangle)
-        n = [normalize_or(dr.gather(mi.Normal3f, mean, slot[k]), mi.Normal3f(0)) for k in range(3)]
+        sums = [dr.gather(mi.Vector4f, mean, slot[k]) for k in range(3)]
+        n = [normalize_or(mi.Normal3f(s.x, s.y, s.z), mi.Normal3f(0)) for s in sums]
         normal = n[0] + (n[1] - n[0]) * u + (n[2] - n[0]) * v
         normal = dr.select(dr.dot(normal, n_world) < 0, -normal, normal)
         normal = mi.Normal3f(normalize_or(n_shading + (normal - n_shading) * mix, n_shading))

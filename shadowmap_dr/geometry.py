@@ -90,6 +90,7 @@ class Geometry:
     shape_face_start  UInt32 (S,)  ``ShapeInfo.face_start`` as an array
     changed        names of the shapes that ``with_positions`` replaced, if only their vertices may carry gradients; else None
     as_loaded      whether the other shapes are as they were when the scene was loaded
+    packets        Float (4V,), positions with a fourth number, through which derivatives take the way back (``in_packets``)
     """
 
     positions: Any
@@ -104,6 +105,7 @@ class Geometry:
     shapes: tuple[ShapeInfo, ...]
     changed: tuple[str, ...] | None = None
     as_loaded: bool = False
+    packets: Any = None
 
     @property
     def vertex_count(self) -> int:
@@ -153,6 +155,27 @@ class Geometry:
         """Whether a shape is known (on the host) to be as it was when the scene was loaded."""
         return self.as_loaded and self.changed is not None and info.name not in self.changed
 
+    def in_packets(self) -> Geometry:
+        """The same geometry, prepared for many look-ups of attached positions.
+
+        Sums over packets of four numbers run several times faster than those of three.
+        """
+        if not dr.grad_enabled(self.positions):
+            return self
+        p = dr.gather(mi.Point3f, self.positions, dr.arange(mi.UInt32, self.vertex_count))
+        return replace(self, packets=dr.ravel(mi.Point4f(p.x, p.y, p.z, 0)))
+
+    def vertices(self, index: Any, active: Any = True, changed: Any = None) -> Any:
+        """Positions (Point3f) of vertices (UInt32); gradients flow only where they may have ``changed`` (None: anywhere)."""
+        p = dr.gather(mi.Point3f, self.positions, index, active)
+        if not dr.grad_enabled(self.positions):
+            return p
+        changed = active if changed is None else changed
+        if self.packets is None:
+            return dr.replace_grad(p, dr.gather(mi.Point3f, self.positions, index, changed))
+        q = dr.gather(mi.Point4f, self.packets, index, changed)
+        return dr.replace_grad(p, mi.Point3f(q.x, q.y, q.z))
+
     def with_positions(self, positions: Mapping[str, Any]) -> Geometry:
         """Replace the positions of some shapes; returns a new Geometry, this one is left as it was.
 
@@ -178,7 +201,7 @@ class Geometry:
                 own = dr.arange(mi.UInt32, info.vertex_count) + info.vertex_start
                 smooth = dr.gather(mi.Normal3f, smooth, own)
                 normals = _write_vertices(normals, smooth, info.vertex_start, info.vertex_count, self.vertex_count)
-        return replace(self, positions=merged, normals=normals, changed=changed)
+        return replace(self, positions=merged, normals=normals, changed=changed, packets=None)
 
 
 def vertex_normals(positions: Any, faces: Any, vertex_count: int) -> Any:

@@ -63,7 +63,7 @@ def hits_at(geometry: Geometry, triangle: Any, u: Any, v: Any, active: Any = Tru
     face = dr.gather(mi.Vector3u, geometry.faces, triangle, active)
     shape, flags = geometry.shape_and_flags(triangle, active)
     u, v = dr.select(active, u, 0.0), dr.select(active, v, 0.0)
-    origin, e1, e2 = corner_values(mi.Point3f, geometry.positions, face, active, active)
+    origin, e1, e2 = _triangle(geometry, face, active, active)
     p_world = origin + e1 * u + e2 * v
     return Hits(triangle, active, active, face, shape, flags, e1, e2, _normal(e1, e2), u, v, p_world)
 
@@ -77,7 +77,7 @@ def pixel_hits(geometry: Geometry, sensor: Sensor, triangle: Any, size: tuple[in
     face = dr.gather(mi.Vector3u, geometry.faces, triangle, active)
     shape, flags = geometry.shape_and_flags(triangle, active)
     changed = active & geometry.has_changed(shape)
-    first, e1, e2 = corner_values(mi.Point3f, geometry.positions, face, active, changed)
+    first, e1, e2 = _triangle(geometry, face, active, changed)
     ray_o, ray_d, pixel = sensor.pixel_rays(*size)
     with dr.suspend_grad():
         q, a, b, o, d = (dr.detach(x) for x in (first, e1, e2, ray_o, ray_d))
@@ -121,6 +121,11 @@ def pixel_hits(geometry: Geometry, sensor: Sensor, triangle: Any, size: tuple[in
 
 def _normal(e1: Any, e2: Any) -> Any:
     return normalize_or(mi.Normal3f(dr.cross(e1, e2)), mi.Normal3f(0.0, 0.0, 1.0))
+
+
+def _triangle(geometry: Geometry, face: Any, active: Any, changed: Any) -> tuple[Any, Any, Any]:
+    first, second, third = (geometry.vertices(face[k], active, changed) for k in range(3))
+    return first, second - first, third - first
 
 
 def corner_values(kind: Any, buffer: Any, face: Any, active: Any, changed: Any) -> tuple[Any, Any, Any]:

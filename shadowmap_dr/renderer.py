@@ -164,6 +164,7 @@ class Renderer:
         geometry = self.data.geometry
         if vertex_positions:
             geometry = geometry.with_positions(vertex_positions)
+        geometry = geometry.in_packets()
         # Before all else that is attached: derivatives are taken in the reverse order, and pixels should need one pass only.
         facets = None if self.flat is None else mean_normals(geometry, self.topology, self.flat)
         current = self._lights(lights)

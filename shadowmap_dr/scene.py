@@ -142,6 +142,7 @@ def refresh(data: SceneData) -> SceneData:
         rest_positions=rest,
         changed=None,
         as_loaded=False,
+        packets=None,
     )
     return replace(
         data,

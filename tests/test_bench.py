@@ -112,8 +112,8 @@ def test_passes(tmp_path: Path) -> None:
             assert unit[name]["kernels"] > 10 and 0 <= unit[name]["share_outside_kernels"] < 1
         for entry in unit["passes"]:
             assert entry["forward_seconds"] + entry["backward_seconds"] > 0
-        raster = next(entry for entry in unit["passes"] if entry["pass"] == "camera: rasterization")
-        assert raster["forward_seconds"] > 0 and raster["backward_seconds"] > 0
+        hits = next(entry for entry in unit["passes"] if entry["pass"] == "hits")
+        assert hits["forward_seconds"] > 0 and hits["backward_seconds"] > 0
 
 
 def test_passes_exist() -> None:

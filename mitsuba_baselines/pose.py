@@ -30,8 +30,6 @@ from .reference import path_traced
 
 STORE = Path(__file__).with_name("fair_settings.json")
 GUIDINGS = ("none", "grid", "octree")
-AFFORDABLE_SECONDS = 1.5
-"""150 steps of a stand-in should not take longer than a few minutes."""
 
 
 @dataclass(frozen=True, order=True)
@@ -212,20 +210,6 @@ def fair_setting(resolution: int) -> ProjectiveSetting:
     if entry["setting"] is None:
         raise ShadowmapError(f"no setting is known to converge: run python -m mitsuba_baselines.pose --search {resolution}.")
     return ProjectiveSetting(**entry["setting"])
-
-
-def quick_setting(resolution: int) -> ProjectiveSetting:
-    """Of the settings whose steps took less than `AFFORDABLE_SECONDS`, the one with the smallest error on the first start.
-
-    A stand-in to look at in a few minutes, not a baseline: `is_fair` tells which it is.
-
-    Raises:
-        ShadowmapError: No search is stored.
-    """
-    entry = _nearest(resolution)
-    affordable = [m for m in entry["measurements"] if m["runs"][0]["seconds_per_iteration"] < AFFORDABLE_SECONDS]
-    closest = min(affordable or entry["measurements"], key=lambda m: m["runs"][0]["mean_error_deg_last_20"])
-    return ProjectiveSetting(**closest["setting"])
 
 
 def is_fair(setting: ProjectiveSetting, resolution: int) -> bool:

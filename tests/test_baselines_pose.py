@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mitsuba_baselines import proxy, reference
-from mitsuba_baselines.pose import MitsubaPose, ProjectiveSetting, fair_setting, is_fair, pose_start, quick_setting
+from mitsuba_baselines.pose import MitsubaPose, ProjectiveSetting, fair_setting, is_fair, pose_start
 from shadowmap_dr import assets
 from shadowmap_dr.errors import ShadowmapError
 
@@ -148,5 +148,4 @@ def test_fair_setting_is_stored() -> None:
     assert fair_setting(100) == setting
     assert is_fair(setting, 128)
     assert not is_fair(setting, 100)  # not searched there
-    assert not is_fair(quick_setting(128), 128)  # steps of the fair one take longer than a quick run has
     assert not is_fair(ProjectiveSetting(1, 1, 1), 128)

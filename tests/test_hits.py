@@ -60,8 +60,9 @@ def test_derivatives_are_those_of_the_barycentrics(variant: str, kind: str) -> N
     want, want_gradients = gradients(lambda g, s, raster: hits_at(g, raster.triangle, raster.u, raster.v))
     got, got_gradients = gradients(lambda g, s, raster: pixel_hits(g, s, raster.triangle, (raster.width, raster.height)))
     for k, (a, b) in enumerate(zip(want, got, strict=True)):
-        # Points agree to a few roundings; in units of edges, some as short as a thirtieth, that is as much more.
-        np.testing.assert_allclose(b, a, atol=5e-6 if k < 3 else 1e-4)
+        # Points five units away agree to a few roundings, more where one sees a face nearly edge-on; in units of edges, some as
+        # short as a thirtieth, that is as much more.
+        np.testing.assert_allclose(b, a, atol=2e-5 if k < 3 else 1e-4)
     for a, b in zip(want_gradients, got_gradients, strict=True):
         assert np.abs(a).max() > 0.1
         np.testing.assert_allclose(b, a, atol=1e-3 * np.abs(a).max())
@@ -71,7 +72,8 @@ def test_shapes_that_do_not_move_leave_image_and_gradients_alone(variant: str) -
     """Moving one shape of several takes shortcuts for the others; giving all of them new vertices takes none."""
     renderer = build("perspective")
     geometry = renderer.data.geometry
-    assert [info.faceted for info in geometry.shapes] == [info.name in ("box", "wall") for info in geometry.shapes]
+    # The wall is a rectangle, not a mesh.
+    assert [info.faceted for info in geometry.shapes] == [info.name == "box" for info in geometry.shapes]
     results = []
     for names in (["ball"], ["ball", "box", "wall"]):
         moving = {name: mi.Float(dr.ravel(geometry.shape_positions(name))) for name in names}

@@ -77,7 +77,7 @@ def build_method(name: str, problem: PoseProblem, reference: Image) -> Method:
     if name == "mitsuba":
         from mitsuba_baselines import pose as baseline
 
-        setting = baseline.quick_setting(problem.resolution)
+        setting = baseline.fair_setting(problem.resolution)
         return baseline.MitsubaPose(
             assets.scene("pose"),
             problem.mesh,
@@ -148,7 +148,7 @@ def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Co
             progress.remove_task(task)
             for method in methods.values():
                 if _fairness(method, problem).get("fair") is False:
-                    note = "sample counts for a look in a few minutes, which do not converge from every start (see the README)"
+                    note = "sample counts found at another resolution, where they converge; here nobody has searched"
                     progress.console.print(f"{problem.folder} mitsuba: {note}: {getattr(method, 'setting', '')}", highlight=False)
             records, images = [], {}
             for run in range(options.runs):

@@ -73,7 +73,7 @@ def test_shapes_that_do_not_move_leave_image_and_gradients_alone(variant: str) -
     renderer = build("perspective")
     geometry = renderer.data.geometry
     # The wall is a rectangle, not a mesh.
-    assert [info.faceted for info in geometry.shapes] == [info.name == "box" for info in geometry.shapes]
+    assert {info.name for info in geometry.shapes if info.faceted} == {"box"}
     results = []
     for names in (["ball"], ["ball", "box", "wall"]):
         moving = {name: mi.Float(dr.ravel(geometry.shape_positions(name))) for name in names}

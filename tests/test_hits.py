@@ -72,8 +72,7 @@ def test_shapes_that_do_not_move_leave_image_and_gradients_alone(variant: str) -
     """Moving one shape of several takes shortcuts for the others; giving all of them new vertices takes none."""
     renderer = build("perspective")
     geometry = renderer.data.geometry
-    # The wall is a rectangle, not a mesh.
-    assert {info.name for info in geometry.shapes if info.faceted} == {"box"}
+    assert {info.name for info in geometry.shapes if info.faceted} == {"box", "wall"}
     results = []
     for names in (["ball"], ["ball", "box", "wall"]):
         moving = {name: mi.Float(dr.ravel(geometry.shape_positions(name))) for name in names}

@@ -29,7 +29,7 @@ def build(kind: str) -> Renderer:
         "camera": {**camera, "film": film},
         "sun": {"type": "directional", "direction": [0.3, -0.2, -1.0]},
         "ball": {"type": "sphere", "radius": 0.8},
-        "box": {"type": "cube", "to_world": mi.ScalarTransform4f().translate([1.1, -0.2, 0.4]).rotate([1, 1, 0], 30).scale(0.4)},
+        "box": {"type": "cube", "to_world": mi.ScalarTransform4f().translate([1.1, -0.2, 0.4]).rotate([0, 1, 0], 30).scale(0.4)},
         "wall": {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -1.2]).scale(4)},
     }
     return Renderer.from_scene(mi.load_dict(scene), tessellation=16, shadow_method="none")

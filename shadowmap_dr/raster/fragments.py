@@ -39,32 +39,36 @@ def draw(
     slope = [dr.select(dr.abs(t.a[k]) < tiny, dr.select(t.a[k] < 0, Float(-tiny), Float(tiny)), t.a[k]) for k in range(3)]
     inverse = [dr.rcp(s) for s in slope]
 
-    def draw_row(row, last):  # noqa: ANN001, ANN202
+    def span(row: Any) -> tuple[Any, Any, Any]:
+        """Edge functions and depth in the middle of a row, and the columns between the edges, or a few more."""
         _, y = centred(module, row, 0, t.height, t.width)
         at_middle = dr.fma(t.b, y, t.c)
-        # Columns between the edges, and no fewer: what rounding might hide is left to the coverage test.
+        # What rounding might hide is left to the coverage test.
         low, high = Float(x0), Float(x1)
         for k in range(3):
             crossing = dr.fma(-at_middle[k], inverse[k], 0.5 * t.width - 0.5)
             error = dr.fma(dr.abs(inverse[k]), rounding, 1e-3)
             low = dr.select(slope[k] > 0, dr.maximum(low, crossing - error), low)
             high = dr.select(slope[k] < 0, dr.minimum(high, crossing + error), high)
-        start, end = Int32(dr.ceil(dr.minimum(low, t.width))), Int32(dr.floor(dr.maximum(high, -1.0)))
+        return at_middle, Int32(dr.ceil(dr.minimum(low, t.width))), Int32(dr.floor(dr.maximum(high, -1.0)))
 
-        def draw_pixel(column, end):  # noqa: ANN001, ANN202
-            x, _ = centred(module, 0, column, t.height, t.width)
-            values = dr.fma(t.a, x, at_middle)
-            covered = covers(values, row, column, t.height, t.width, t.exact)
-            key = fragment_key(values.w, triangle)
-            pixel = first_pixel + UInt32(row) * t.width + UInt32(column)
-            if behind is not None:
-                covered &= key > dr.gather(module.UInt64, behind, pixel, covered)
-            # A copy of the image for each thread, Dr.Jit's usual way, would cost far more than a few atomic operations.
-            dr.scatter_reduce(dr.ReduceOp.Min, keys, key, pixel, covered, mode=dr.ReduceMode.Direct)
-            return column + 1, end
+    def draw_pixel(row, column, end, at_middle):  # noqa: ANN001, ANN202
+        x, _ = centred(module, 0, column, t.height, t.width)
+        values = dr.fma(t.a, x, at_middle)
+        covered = (column <= end) & covers(values, row, column, t.height, t.width, t.exact)
+        key = fragment_key(values.w, triangle)
+        pixel = first_pixel + UInt32(row) * t.width + UInt32(column)
+        if behind is not None:
+            covered &= key > dr.gather(module.UInt64, behind, pixel, covered)
+        # A copy of the image for each thread, Dr.Jit's usual way, would cost far more than a few atomic operations.
+        dr.scatter_reduce(dr.ReduceOp.Min, keys, key, pixel, covered, mode=dr.ReduceMode.Direct)
+        wrap = column >= end
+        row = dr.select(wrap, row + 1, row)
+        next_middle, start, next_end = span(row)
+        return row, dr.select(wrap, start, column + 1), dr.select(wrap, next_end, end), dr.select(wrap, next_middle, at_middle)
 
-        dr.while_loop((start, end), lambda column, end: column <= end, draw_pixel, mode="symbolic", label="columns")
-        return row + 1, last
-
-    rows = (dr.select(active, y0, 0), dr.select(active, y1, -1))
-    dr.while_loop(rows, lambda row, last: row <= last, draw_row, mode="symbolic", label="rows")
+    # One loop and not one in another: each lane goes on to its next row when it is done with one, without waiting for others.
+    first, last = dr.select(active, y0, 0), dr.select(active, y1, -1)
+    at_middle, start, end = span(first)
+    state = (first, start, end, at_middle)
+    dr.while_loop(state, lambda row, *_: row <= last, draw_pixel, mode="symbolic", label="fragments")

@@ -12,7 +12,7 @@ import numpy as np
 from ._types import MAX_RESOLUTION, NO_TRIANGLE, RasterOutput, backend, pixel_coordinates
 from .fragments import EMPTY, draw
 from .setup import centred, covers, edge_lines, fragment_key, gather_triangle, set_up
-from .tiles import TileGrid, TileLists, block_pixels, build_tile_lists, nearest_covers
+from .tiles import STRIP, TileGrid, TileLists, build_tile_lists, nearest_covers, strips
 
 #: A triangle that covers more pixels than this, and is not thin, goes through the lists of tiles.
 _LARGE = 512
@@ -170,15 +170,14 @@ def _visible_triangles(
     """Triangle index of each pixel, row-major, and the records of all triangles."""
     mesh = (positions, faces, batch, vertex_count, height, width)
     if transparent is None:
-        keys, records = _nearest_fragments(*mesh)
-        return _triangle_of(keys), records
-    keys, records = _nearest_fragments(*mesh, cull=False)
+        return _nearest_fragments(*mesh)
+    keys, records = _nearest_fragments(*mesh, peel=True)
     for _ in range(layers - 1):
         seen = _locate(positions, faces, _triangle_of(keys), records, batch, vertex_count, height, width)
         through = seen.valid & dr.detach(transparent(seen))
         behind = dr.select(through, keys, type(keys)(EMPTY))
         dr.eval(behind)
-        farther, records = _nearest_fragments(*mesh, behind=behind, cull=False)
+        farther, records = _nearest_fragments(*mesh, behind=behind, peel=True)
         keys = dr.select(through, farther, keys)
         dr.eval(keys)
     return _triangle_of(keys), records
@@ -197,17 +196,19 @@ def _nearest_fragments(
     height: int,
     width: int,
     behind: Any = None,
-    cull: bool = True,
+    peel: bool = False,
 ) -> tuple[Any, Any]:
-    """Fragment key of each pixel, row-major, and the edge functions and depth planes of all triangles (see ``Triangles``).
+    """Triangle of each pixel, row-major, and the edge functions and depth planes of all triangles (see ``Triangles``).
 
     Args:
         behind: ``UInt64`` keys: pixels see only what lies behind.
-        cull: leave out what large triangles hide; not for peeling.
+        peel: return fragment keys instead of triangles, and do not leave out what large triangles hide.
     """
     module = backend(positions)
     UInt32, UInt64 = module.UInt32, module.UInt64
     face_count = dr.width(faces) // 3
+    keys = dr.full(UInt64, EMPTY, batch * height * width)
+    dr.eval(keys)
     index = dr.arange(UInt32, batch * face_count)
     image = index // face_count
     triangle = index - image * face_count
@@ -215,19 +216,17 @@ def _nearest_fragments(
     # Not one array: Dr.Jit would write its parts in kernels of their own.
     records = tuple(dr.ravel(coefficients) for coefficients in (triangles.a, triangles.b, triangles.c))
 
-    keys = dr.full(UInt64, EMPTY, batch * height * width)
-    dr.eval(keys)
     x0, y0, x1, y1 = triangles.box
     sides = module.Float(x1 - x0 + (y1 - y0) + 2)
     small = triangles.active & ((triangles.fragments <= _LARGE) | (triangles.fragments <= 5 * sides))
     draw(triangles, keys, behind, image * (height * width), triangle, triangles.box, small)
     if height * width <= _LARGE:  # no triangle can be large
         dr.eval(records, keys)
-        return keys, records
+        return keys if peel else _triangle_of(keys), records
 
     grid = TileGrid(batch, height, width)
     large = triangles.active & ~small
-    nearest = nearest_covers(grid, triangles, image, large) if cull else None
+    nearest = nearest_covers(grid, triangles, image, large) if not peel else None
     first, last = (UInt32(x) | (UInt32(y) << 16) for x, y in ((x0, y0), (x1, y1)))
     dr.eval(records, keys, nearest, large, first, last)
 
@@ -239,39 +238,43 @@ def _nearest_fragments(
     box = tuple(module.Int32(corner) for corner in (first & 0xFFFF, first >> 16, last & 0xFFFF, last >> 16))
     again = replace(triangles, a=a, b=b, c=c, box=box, exact=lambda: exact_lines(index))
     lists = build_tile_lists(grid, again, index, image, triangle, large, nearest, keys, behind)
-    return _merge_large(lists, keys, behind, records, exact_lines, face_count), records
+    merged = _merge_large(lists, keys, behind, records, exact_lines, face_count, UInt64 if peel else UInt32)
+    return merged, records
 
 
 def _merge_large(
-    lists: TileLists, keys: Any, behind: Any, records: Any, exact_lines: Callable[[Any], Any], face_count: int
+    lists: TileLists, keys: Any, behind: Any, records: Any, exact_lines: Callable[[Any], Any], face_count: int, kind: Any
 ) -> Any:
-    """The nearer of what small triangles left at each pixel and of the large ones in its tile's list."""
+    """The nearer of what small triangles left at each pixel and of the large ones in its tile's list.
+
+    As keys or triangle indices, by the ``kind`` of the result: ``UInt64`` or ``UInt32``.
+    """
     module = backend(keys)
     UInt32, UInt64 = module.UInt32, module.UInt64
     grid = lists.grid
-    pixel = block_pixels(grid.batch, grid.height, grid.width, module)
-    tile = pixel.tile(grid)
-    x, y = centred(module, pixel.row, pixel.column, grid.height, grid.width)
-    best = dr.gather(UInt64, keys, pixel.index, pixel.inside)
-    beyond = dr.gather(UInt64, behind, pixel.index, pixel.inside) if behind is not None else None
-    # Lanes beyond the image walk along with their block: its tile exists, and uniform control flow costs nothing.
-    position = tile * lists.capacity
-    end = position + dr.minimum(dr.gather(UInt32, lists.count, tile), lists.capacity)
+    strip = strips(grid, module)
+    x, y = centred(module, strip.row, strip.column, grid.height, grid.width)
+    best = strip.gather(keys)
+    beyond = strip.gather(behind) if behind is not None else None
+    # Lanes beyond the image walk along with their tile: uniform control flow costs nothing.
+    position = strip.tile * lists.capacity
+    end = position + dr.minimum(dr.gather(UInt32, lists.count, strip.tile), lists.capacity)
 
-    def visit(position, end, best):  # noqa: ANN001, ANN202
+    def visit(position, end, *best):  # noqa: ANN001, ANN002, ANN202
         index = dr.gather(UInt32, lists.items, position)
         a, b, c = (dr.gather(module.Array4f, record, index) for record in records)
-        values = dr.fma(a, x, dr.fma(b, y, c))
-        covered = covers(values, pixel.row, pixel.column, grid.height, grid.width, lambda: exact_lines(index))
-        key = fragment_key(values.w, index - pixel.image * face_count)
-        if beyond is not None:
-            covered &= key > beyond
-        return position + 1, end, dr.select(covered & (key < best), key, best)
+        # What a triangle's look-up costs is shared by the pixels of a strip.
+        values = [dr.fma(a, x + k, dr.fma(b, y, c)) for k in range(STRIP)]
+        nearer = []
+        for k, old in enumerate(best):
+            covered = covers(values[k], strip.row, strip.column + k, grid.height, grid.width, lambda: exact_lines(index))
+            key = fragment_key(values[k].w, index - strip.image * face_count)
+            if beyond is not None:
+                covered &= key > beyond[k]
+            nearer.append(dr.select(covered & (key < old), key, old))
+        return position + 1, end, *nearer
 
-    loop = dr.while_loop(
-        (position, end, best), lambda position, end, best: position < end, visit, mode="symbolic", label="tile list"
+    _, _, *best = dr.while_loop(
+        (position, end, *best), lambda position, end, *best: position < end, visit, mode="symbolic", label="tile list"
     )
-    merged = dr.empty(UInt64, grid.batch * grid.height * grid.width)
-    dr.scatter(merged, loop[2], pixel.index, pixel.inside)
-    dr.eval(merged)
-    return merged
+    return strip.written([kind(key) for key in best])

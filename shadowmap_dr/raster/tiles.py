@@ -18,6 +18,8 @@ from .setup import Triangles, centred, depth_key, rounding_error
 
 #: log2 of the side of a tile in pixels.
 TILE = 4
+#: Pixels of a strip.
+STRIP = 4
 #: Triangles that a tile's list has room for.
 CAPACITY = 32
 
@@ -57,34 +59,62 @@ class TileLists:
 
 
 @dataclass(frozen=True)
-class BlockPixels:
-    """All pixels of a batch of images, 16 consecutive lanes a 4 x 4 block; blocks at the border reach beyond the image.
+class Strips:
+    """All pixels of a batch of images in horizontal strips of four, one lane each; some may reach beyond the image.
 
-    ``index`` is the position in a flat row-major batch, valid where ``inside``.
+    16 consecutive lanes make up 16 x 4 pixels of one tile, so that the control flow of a SIMD packet hardly ever diverges.
+    ``column`` is that of the first pixel, ``index`` its position in a flat row-major batch.
     """
 
     image: Any
     row: Any
     column: Any
-    inside: Any
+    tile: Any
     index: Any
+    images: int
+    height: int
+    width: int
 
-    def tile(self, grid: TileGrid) -> Any:
-        """Number of each pixel's tile."""
-        return (self.image * grid.rows + (self.row >> TILE)) * grid.columns + (self.column >> TILE)
+    def gather(self, flat: Any) -> list[Any]:
+        """What a row-major batch of images (``UInt64``) holds for the pixels of each strip; undefined beyond the image."""
+        inside = self.row < self.height
+        if self.width % STRIP == 0:
+            return list(dr.gather(backend(flat).Array4u64, flat, self.index // STRIP, inside & (self.column < self.width)))
+        return [dr.gather(type(flat), flat, self.index + k, inside & (self.column + k < self.width)) for k in range(STRIP)]
+
+    def written(self, values: list[Any]) -> Any:
+        """A row-major batch of images with a value for each pixel of the strips, evaluated."""
+        kind = type(values[0])
+        module = backend(values[0])
+        across = -(-self.width // STRIP)
+        rows = self.images * self.height
+        # One packet for each strip: several scatters would be kernels of their own.
+        padded = dr.empty(kind, rows * across * STRIP)
+        inside = (self.row < self.height) & (self.column < self.width)
+        packet = {module.UInt32: module.Array4u, module.UInt64: module.Array4u64}[kind]
+        at = (self.image * self.height + self.row) * across + self.column // STRIP
+        dr.scatter(padded, packet(*values), at, inside)
+        dr.eval(padded)
+        if self.width % STRIP == 0:
+            return padded
+        pixel = dr.arange(module.UInt32, rows * self.width)
+        row = pixel // self.width
+        result = dr.gather(kind, padded, row * (across * STRIP) + (pixel - row * self.width))
+        dr.eval(result)
+        return result
 
 
-def block_pixels(batch: int, height: int, width: int, module: ModuleType) -> BlockPixels:
-    """Enumerate pixels so that a SIMD packet of 16 lanes is a 4 x 4 block, whose control flow hardly ever diverges."""
-    block_columns, block_rows = -(-width >> 2), -(-height >> 2)
-    lane = dr.arange(module.UInt32, batch * block_rows * block_columns * 16)
-    block = lane >> 4
-    row_of_blocks = block // block_columns
-    image = row_of_blocks // block_rows
-    column = (block - row_of_blocks * block_columns) * 4 + (lane & 3)
-    row = (row_of_blocks - image * block_rows) * 4 + ((lane >> 2) & 3)
-    inside = (column < width) & (row < height)
-    return BlockPixels(image, row, column, inside, (image * height + row) * width + column)
+def strips(grid: TileGrid, module: ModuleType) -> Strips:
+    """Enumerate the strips of a batch of images."""
+    lane = dr.arange(module.UInt32, grid.count << (2 * TILE - 2))
+    within = lane & ((1 << (2 * TILE - 2)) - 1)
+    tile = lane >> (2 * TILE - 2)
+    row_of_tiles = tile // grid.columns
+    image = row_of_tiles // grid.rows
+    row = ((row_of_tiles - image * grid.rows) << TILE) + (within >> (TILE - 2))
+    column = ((tile - row_of_tiles * grid.columns) << TILE) + ((within & ((1 << (TILE - 2)) - 1)) * STRIP)
+    index = (image * grid.height + row) * grid.width + column
+    return Strips(image, row, column, tile, index, grid.batch, grid.height, grid.width)
 
 
 def nearest_covers(grid: TileGrid, triangles: Triangles, image: Any, active: Any) -> Any:

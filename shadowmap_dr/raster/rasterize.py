@@ -250,7 +250,7 @@ def _merge_large(
     As keys or triangle indices, by the ``kind`` of the result: ``UInt64`` or ``UInt32``.
     """
     module = backend(keys)
-    UInt32, UInt64 = module.UInt32, module.UInt64
+    UInt32 = module.UInt32
     grid = lists.grid
     strip = strips(grid, module)
     x, y = centred(module, strip.row, strip.column, grid.height, grid.width)

@@ -77,8 +77,38 @@ def pixel_hits(geometry: Geometry, sensor: Sensor, triangle: Any, size: tuple[in
     face = dr.gather(mi.Vector3u, geometry.faces, triangle, active)
     shape, flags = geometry.shape_and_flags(triangle, active)
     changed = active & geometry.has_changed(shape)
-    first, e1, e2 = _triangle(geometry, face, active, changed)
     ray_o, ray_d, pixel = sensor.pixel_rays(*size)
+    moving = dr.grad_enabled(ray_o, ray_d)
+
+    def intersect(face: Any, active: Any, ray_o: Any, ray_d: Any) -> tuple[Any, ...]:
+        return _intersect(_triangle(geometry, face, active, active), active, ray_o, ray_d)
+
+    if moving or not dr.grad_enabled(geometry.positions):
+        found = intersect(face, active, ray_o, ray_d)
+    else:
+        with dr.suspend_grad():
+            found = intersect(face, active, ray_o, ray_d)
+
+        def none(face: Any, active: Any, ray_o: Any, ray_d: Any) -> tuple[Any, ...]:
+            return tuple(dr.zeros(type(value)) for value in found)
+
+        # Derivatives on their own, in a branch: most pixels of many images see nothing that moves.
+        attached = dr.if_stmt((face, changed, ray_o, ray_d), changed, intersect, none, mode="symbolic", label="attached hits")
+        found = tuple(dr.replace_grad(value, other) for value, other in zip(found, attached, strict=True))
+    e1, e2, normal, u, v, p_world = found
+    wi_world = -dr.normalize(ray_d)
+    # Along the axis directions have unit length, so this is the length of the ray.
+    depth = None
+    if sensor.kind == "perspective":
+        d = dr.detach(ray_d)
+        depth = dr.dot(dr.detach(p_world) - dr.detach(ray_o), d) * dr.rcp(dr.squared_norm(d))
+        pixel *= depth
+    return Hits(triangle, active, changed, face, shape, flags, e1, e2, normal, u, v, p_world, wi_world, depth, pixel)
+
+
+def _intersect(triangle: tuple[Any, Any, Any], active: Any, ray_o: Any, ray_d: Any) -> tuple[Any, Any, Any, Any, Any, Any]:
+    """(e1, e2, unit normal, u, v, point) where rays meet the planes of their triangles."""
+    first, e1, e2 = triangle
     with dr.suspend_grad():
         q, a, b, o, d = (dr.detach(x) for x in (first, e1, e2, ray_o, ray_d))
         n = dr.cross(a, b)
@@ -109,14 +139,7 @@ def pixel_hits(geometry: Geometry, sensor: Sensor, triangle: Any, size: tuple[in
         slide = p_world - p_material
         u = dr.replace_grad(u, dr.dot(slide, dual_u))
         v = dr.replace_grad(v, dr.dot(slide, dual_v))
-    wi_world = -dr.normalize(ray_d)
-    # Along the axis directions have unit length, so this is the length of the ray.
-    depth = None
-    if sensor.kind == "perspective":
-        depth = dr.dot(dr.detach(p_world) - o, d) * dr.rcp(dr.squared_norm(d))
-        pixel *= depth
-    normal = _normal(e1, e2)
-    return Hits(triangle, active, changed, face, shape, flags, e1, e2, normal, u, v, p_world, wi_world, depth, pixel)
+    return e1, e2, _normal(e1, e2), u, v, p_world
 
 
 def _normal(e1: Any, e2: Any) -> Any:

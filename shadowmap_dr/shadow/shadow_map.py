@@ -199,8 +199,24 @@ def visibility(maps: ShadowMaps, map_index: Any, p_world: Any, active: Any = Tru
         row = module.UInt32(dr.clip((v * 0.5 + 0.5) * size, 0, size - 1))
         stored = dr.gather(module.Float, maps.values, (map_index * size + row) * size + column, inside)
         return dr.select(inside, standard_visibility(stored, depth, maps.settings.bias), 1)
-    moments = _bilinear(maps, map_index, u, v, inside)
-    return dr.select(inside, chebyshev_visibility(moments, depth, MINIMUM_VARIANCE), 1)
+    return _where(inside, _look_up, maps, map_index, u, v, depth)
+
+
+def _where(active: Any, function: Callable[..., Any], maps: ShadowMaps, *lanes: Any) -> Any:
+    """``function(maps, *lanes)`` in packets with active lanes, 1 elsewhere: shadow maps cover the casters, not all that is seen."""
+    return dr.if_stmt(
+        lanes,
+        active,
+        lambda *lanes: function(maps, *lanes),
+        lambda *lanes: type(lanes[1])(1),
+        mode="symbolic",
+        label="shadow look-up",
+    )
+
+
+def _look_up(maps: ShadowMaps, map_index: Any, u: Any, v: Any, depth: Any) -> Any:
+    moments = _bilinear(maps, map_index, u, v, True)
+    return chebyshev_visibility(moments, depth, MINIMUM_VARIANCE)
 
 
 def _bilinear(maps: ShadowMaps, map_index: Any, u: Any, v: Any, active: Any, outside_reads_zero: bool = False) -> Any:

@@ -243,8 +243,9 @@ class Renderer:
         channels = _film_channels(color, seen.active, sensor)
         named = collect_aovs(self.settings.aovs, seen, raster, lights, visible)
         if self.settings.antialias:
-            flat = _interleave(channels)
-            flat = antialias(flat, raster, view.clip, self.topology, creases=self.creases, crease_weights=sharpness)
+            # In one pass over the pixels, since both need much of the same.
+            dr.eval(channels, sharpness)
+            flat = antialias(channels, raster, view.clip, self.topology, creases=self.creases, crease_weights=sharpness)
             image = mi.TensorXf(flat, shape=(height, width, len(channels)))
         else:
             image = mi.TensorXf(_interleave(channels), shape=(height, width, len(channels)))

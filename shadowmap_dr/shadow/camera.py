@@ -173,9 +173,13 @@ def to_clip(view: Views, frustum: Frusta, p_light: Any) -> Any:
     return backend(p_light).Array4f(x, y, dr.fma(a, p_light.z, b), w)
 
 
-def linear_depth(view: Views, frustum: Frusta, depth_ndc: Any, w: Any) -> Any:
-    """Depth along the light's axis, mapped linearly from near..far to -1/2..1/2, from what the rasterizer interpolates."""
-    return dr.select(view.spread > 0, (w - frustum.near) / (frustum.far - frustum.near) - 0.5, 0.5 * depth_ndc)
+def linear_depth(view: Views, frustum: Frusta, depth_ndc: Any) -> tuple[Any, Any]:
+    """Depth along the light's axis, mapped linearly from near..far to -1/2..1/2, and its derivative by NDC depth."""
+    perspective = view.spread > 0
+    n, f = frustum.near, frustum.far
+    w = 2 * f * n * dr.rcp(dr.select(perspective, dr.fma(-depth_ndc, f - n, f + n), 1))
+    linear = dr.select(perspective, (w - n) / (f - n) - 0.5, 0.5 * depth_ndc)
+    return linear, dr.select(perspective, w * w / (2 * f * n), 0.5)
 
 
 def project(view: Views, frustum: Frusta, p_world: Any) -> tuple[Any, Any, Any, Any]:

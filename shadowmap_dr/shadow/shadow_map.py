@@ -8,8 +8,9 @@ from typing import Any
 
 import drjit as dr
 
-from ..raster import NO_TRIANGLE, RasterOutput, Topology, antialias, rasterize
+from ..raster import RasterOutput, Topology, antialias, rasterize
 from ..raster._types import backend, pixel_coordinates
+from ..raster.planes import pixel_depth
 from .camera import Frusta, Views, linear_depth, of_map, project, to_clip, to_light_space
 from .filters import FILTERS, filter_kernel, filter_map
 from .moments import (
@@ -108,14 +109,16 @@ def render_maps(
     clip = dr.ravel(clip)
     dr.eval(clip)
     raster = rasterize(clip, faces, (size, size), batch=count, check_indices=False, transparent=transparent)
-    values, channels = _texels(raster, views, frusta, settings)
+    values, channels = _texels(raster, clip, faces, views, frusta, settings)
     if settings.antialias and settings.method != "standard":
         dr.eval(values)
         values = antialias(values, raster, clip, topology)
     return ShadowMaps(values, views, frusta, settings, channels)
 
 
-def _texels(raster: RasterOutput, views: Views, frusta: Frusta, settings: ShadowSettings) -> tuple[Any, int]:
+def _texels(
+    raster: RasterOutput, clip: Any, faces: Any, views: Views, frusta: Frusta, settings: ShadowSettings
+) -> tuple[Any, int]:
     module = backend(raster.u)
     size = settings.resolution
     image, row, column = pixel_coordinates(module, views.count, size, size)
@@ -123,11 +126,14 @@ def _texels(raster: RasterOutput, views: Views, frusta: Frusta, settings: Shadow
     hit = raster.valid
     if settings.compat:
         depth = _radial_depth(view, frustum, raster, row, column, size)
-        depth = dr.select(hit, depth, frustum.far)
-        slope_square = 0
+        depth, slope_square = dr.select(hit, depth, frustum.far), 0
     else:
-        depth = dr.select(hit, linear_depth(view, frustum, raster.depth, raster.w), _FAR)
-        slope_square = _slope_square(view, frustum, raster, image, size)
+        ndc, dx, dy = pixel_depth(raster, clip, faces)
+        linear, to_linear = linear_depth(view, frustum, ndc)
+        depth = dr.select(hit, linear, _FAR)
+        with dr.suspend_grad():
+            slopes = [dr.detach(to_linear * slope) for slope in (dx, dy)]
+            slope_square = dr.select(hit, _slope_square(dr.detach(view), dr.detach(frustum), dr.detach(linear), slopes, size), 0)
     if settings.method == "standard":
         return depth, 1
     return dr.ravel(variance_moments(depth, slope_square)), 2
@@ -144,21 +150,14 @@ def _radial_depth(view: Views, frustum: Frusta, raster: RasterOutput, row: Any, 
     return dr.sqrt(dr.fma(x, x, dr.fma(y, y, z * z)))
 
 
-def _slope_square(view: Views, frustum: Frusta, raster: RasterOutput, image: Any, size: int) -> Any:
-    """Squared change of linear depth across a texel, detached; 0 where the texel is empty."""
-    with dr.suspend_grad():
-        view, frustum = dr.detach(view), dr.detach(frustum)
-        hit = raster.triangle != NO_TRIANGLE
-        dx, dy, _ = raster.depth_plane(image, raster.triangle, hit)
-        perspective = view.spread > 0
-        n, f, w = frustum.near, frustum.far, dr.detach(raster.w)
-        # ndc depth -> linear depth: the derivative of the hyperbola is w^2 / (2 f n).
-        to_linear = dr.select(perspective, w * w / (2 * f * n), 0.5)
-        texel = dr.select(perspective, w, 1.0) * (2 / size) / (f - n)
-        limit_x, limit_y = _MAX_SLOPE * texel * frustum.half_x, _MAX_SLOPE * texel * frustum.half_y
-        sx = dr.minimum(dr.abs(dx * to_linear), limit_x)
-        sy = dr.minimum(dr.abs(dy * to_linear), limit_y)
-        return dr.select(hit, sx * sx + sy * sy, 0)
+def _slope_square(view: Views, frustum: Frusta, linear: Any, slopes: list[Any], size: int) -> Any:
+    """Squared change of linear depth across a texel, given its change along both axes."""
+    n, f = frustum.near, frustum.far
+    # The side of a texel in units of depth.
+    texel = dr.select(view.spread > 0, dr.fma(linear + 0.5, f - n, n), 1.0) * (2 / size) / (f - n)
+    sx = dr.minimum(dr.abs(slopes[0]), _MAX_SLOPE * texel * frustum.half_x)
+    sy = dr.minimum(dr.abs(slopes[1]), _MAX_SLOPE * texel * frustum.half_y)
+    return sx * sx + sy * sy
 
 
 def filter_maps(maps: ShadowMaps) -> ShadowMaps:
@@ -203,7 +202,7 @@ def visibility(maps: ShadowMaps, map_index: Any, p_world: Any, active: Any = Tru
 
 
 def _where(active: Any, function: Callable[..., Any], maps: ShadowMaps, *lanes: Any) -> Any:
-    """``function(maps, *lanes)`` in packets with active lanes, 1 elsewhere: shadow maps cover the casters, not all that is seen."""
+    """``function(maps, *lanes)`` where there are active lanes, 1 elsewhere: maps cover the casters, not all that is seen."""
     return dr.if_stmt(
         lanes,
         active,

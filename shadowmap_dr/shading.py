@@ -63,14 +63,22 @@ def plain_colours(data: SceneData) -> Any:
     That is all there is to know about a BSDF that is proportional to the cosine (:attr:`SceneData.needs_frames`), and calling
     it for two directions is much cheaper than for each pixel. Float (8 S,), four numbers for each side, attached.
     """
-    lane = dr.arange(mi.UInt32, 2 * len(data.geometry.shapes))
+    bsdfs = [source.shape.bsdf() for source in data.sources]
+    lane = dr.arange(mi.UInt32, 2 * len(bsdfs))
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(lane))
     normal = mi.Vector3f(0, 0, dr.select((lane & 1) == 0, 1, -1))
     si.n = mi.Normal3f(0, 0, 1)
     si.sh_frame = mi.Frame3f(mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), mi.Vector3f(0, 0, 1))
     si.wi = normal
-    bsdf = dr.gather(mi.BSDFPtr, data.bsdf_ptr, lane >> 1)
-    colour = mi.UnpolarizedSpectrum(bsdf.eval(mi.BSDFContext(), si, normal))
+    # One by one and not through pointers to them: such calls in small kernels come out wrong when a frozen function is replayed.
+    colour = dr.zeros(mi.UnpolarizedSpectrum, dr.width(lane))
+    known: list[tuple[Any, Any]] = []
+    for shape, bsdf in enumerate(bsdfs):
+        value = next((value for other, value in known if other == bsdf), None)
+        if value is None:
+            value = mi.UnpolarizedSpectrum(bsdf.eval(mi.BSDFContext(), si, normal))
+            known.append((bsdf, value))
+        colour = dr.select(lane >> 1 == shape, value, colour)
     result = dr.ravel(mi.Vector4f(*colour, *(mi.Float(0) for _ in range(4 - len(colour)))))
     dr.eval(result)
     return result

@@ -18,7 +18,7 @@ from .geometry import Geometry
 from .hits import pixel_hits
 from .light_maps import MapPlan, light_visibility, make_maps, plan_maps
 from .lights import Light, SpotLight, SquareSpot
-from .raster import MAX_RESOLUTION, RasterOutput, Topology, antialias, build_topology, rasterize
+from .raster import MAX_RESOLUTION, RasterOutput, Topology, antialias, build_topology, visible_triangles
 from .scene import SceneData, load, refresh
 from .sensors import Sensor
 from .shading import Surface, ambient_light, background, direct_light, normals_at, opacity, surface, surface_at
@@ -225,7 +225,7 @@ class Renderer:
         dr.eval(clip)
         size = (sensor.height * factor, sensor.width * factor)
         transparent = self._transparent(geometry, sensor)
-        raster = rasterize(clip, geometry.faces, size, check_indices=False, transparent=transparent)
+        raster = visible_triangles(clip, geometry.faces, size, transparent=transparent)
         return _View(sensor, factor, clip, raster)
 
     def _camera_image(self, view: _View, geometry: Geometry, lights: tuple[Light, ...], maps: Any, facets: Any) -> Any:

@@ -25,7 +25,7 @@ PASSES = (
     ("vertices", "geometry:Geometry.with_positions"),
     ("facets: mean normals", "renderer:mean_normals"),
     ("camera: projection", "renderer:camera_clip"),
-    ("camera: rasterization", "renderer:rasterize"),
+    ("camera: rasterization", "renderer:visible_triangles"),
     ("shadow map: frustum", "light_maps:fit_frusta"),
     ("shadow map: rendering", "light_maps:render_maps"),
     ("shadow map: filter", "light_maps:filter_maps"),

@@ -4,7 +4,7 @@ from ._types import MAX_RESOLUTION, NO_TRIANGLE, RasterOutput
 from .antialias import antialias
 from .crossings import Crossings, find_crossings
 from .interpolate import interpolate
-from .rasterize import rasterize
+from .rasterize import rasterize, visible_triangles
 from .topology import NO_VERTEX, Topology, build_topology
 
 __all__ = [
@@ -19,4 +19,5 @@ __all__ = [
     "find_crossings",
     "interpolate",
     "rasterize",
+    "visible_triangles",
 ]

@@ -34,13 +34,14 @@ def interpolate(attributes: Any, raster: RasterOutput, faces: Any) -> Any:
     hit = raster.valid
     corners = dr.gather(module.Array3u, module.UInt32(face_indices), raster.triangle, hit)
     weights = (1 - raster.u - raster.v, raster.u, raster.v)
-    index = dr.arange(module.UInt32, dr.width(raster.triangle))
-    result = dr.empty(module.Float, channels * dr.width(index))
+    totals = []
     for c in range(channels):
         total = module.Float(0)
         for k in range(3):
             value = dr.gather(module.Float, attributes.array, (first + corners[k]) * channels + c, hit)
             total = dr.fma(weights[k], value, total)
-        dr.scatter(result, dr.select(hit, total, 0), index * channels + c)
+        totals.append(dr.select(hit, total, 0))
+    # At once: scattered one by one, each channel would be a kernel of its own.
+    result = totals[0] if channels == 1 else dr.ravel(module.ArrayXf(totals))
     size = (raster.height, raster.width, channels)
     return type(attributes)(result, shape=size if raster.batch == 1 else (raster.batch, *size))

@@ -1,7 +1,7 @@
-"""Depth as a function of the pixel, one for each triangle: the cheapest way to a depth that carries gradients.
+"""What triangles look like as functions of the pixel: depths and barycentrics from a few numbers for each triangle.
 
-NDC depth is affine on the screen, perspective or not. Derivatives of an image of depths may therefore be summed up over the
-pixels of each triangle, as those of three numbers, before they go on to its vertices.
+NDC depth, and barycentrics divided by w, are affine on the screen, perspective or not. That makes them cheap to evaluate, and
+derivatives of an image of depths may be summed up over the pixels of each triangle before they go on to its vertices.
 """
 
 from __future__ import annotations
@@ -28,24 +28,55 @@ def pixel_depth(raster: RasterOutput, positions: Any, faces: Any) -> tuple[Any, 
         raster: of these positions and faces.
         positions, faces: flat arrays, as rasterized.
     """
-    module = backend(positions)
-    Float, Int32, UInt32 = module.Float, module.Int32, module.UInt32
-    planes = _planes(positions, faces, raster)
-    dr.eval(planes)
-    image, row, column = pixel_coordinates(module, raster.batch, raster.height, raster.width)
+    depths, _ = _planes(positions, faces, raster, False)
+    dr.eval(depths)
+    index, row, column = _pixels(raster)
     hit = raster.valid
-    plane = dr.gather(module.Array4f, planes, image * raster.face_count + raster.triangle, hit)
-    corner = UInt32(dr.detach(plane.w))
-    x = Float(Int32(column) - Int32(corner & (MAX_RESOLUTION - 1)))
-    y = Float(Int32(row) - Int32(corner >> _COLUMN_BITS))
+    plane = dr.gather(backend(positions).Array4f, depths, index, hit)
+    x, y = _offset(plane, row, column)
     depth = dr.select(hit, dr.fma(plane.x, x, dr.fma(plane.y, y, plane.z)), 1)
     return depth, dr.detach(plane.x), dr.detach(plane.y)
 
 
-def _planes(positions: Any, faces: Any, raster: RasterOutput) -> Any:
-    """``Float``, four for each triangle of each image: change of depth by column and row, depth at a pixel, that pixel.
+def pixel_barycentrics(raster: RasterOutput, positions: Any, faces: Any) -> tuple[Any, Any, Any]:
+    """Perspective-correct (u, v), 0 where nothing is seen, and NDC depth, 1 there, of each pixel's centre. Detached."""
+    module = backend(positions)
+    with dr.suspend_grad():
+        depths, weights = _planes(dr.detach(positions), faces, raster, True)
+        dr.eval(depths, weights)
+        index, row, column = _pixels(raster)
+        hit = raster.valid
+        plane, one, two = (dr.gather(module.Array4f, flat, index, hit) for flat in (depths, *weights[:2]))
+        x, y = _offset(plane, row, column)
+        at_pixel = dr.gather(module.Float, weights[2], index, hit)
+        total = dr.fma(one.w, x, dr.fma(two.w, y, at_pixel))
+        inverse = dr.rcp(dr.select(hit & (total != 0), total, 1))
+        u, v = (dr.select(hit, dr.fma(w.x, x, dr.fma(w.y, y, w.z)) * inverse, 0) for w in (one, two))
+        return u, v, dr.select(hit, dr.fma(plane.x, x, dr.fma(plane.y, y, plane.z)), 1)
 
-    The pixel lies near the triangle: far away from it, small triangles would lose their depth to rounding.
+
+def _pixels(raster: RasterOutput) -> tuple[Any, Any, Any]:
+    """(number of the triangle through the batch, row, column) of each pixel."""
+    image, row, column = pixel_coordinates(backend(raster.triangle), raster.batch, raster.height, raster.width)
+    return image * raster.face_count + raster.triangle, row, column
+
+
+def _offset(plane: Any, row: Any, column: Any) -> tuple[Any, Any]:
+    """Pixels from the one that a triangle's functions refer to."""
+    module = backend(plane)
+    corner = module.UInt32(dr.detach(plane.w))
+    x = module.Float(module.Int32(column) - module.Int32(corner & (MAX_RESOLUTION - 1)))
+    return x, module.Float(module.Int32(row) - module.Int32(corner >> _COLUMN_BITS))
+
+
+def _planes(positions: Any, faces: Any, raster: RasterOutput, barycentrics: bool) -> tuple[Any, tuple[Any, ...]]:
+    """Affine functions of the pixel for each triangle of each image: change by column, by row, and value at a pixel.
+
+    That pixel lies near the triangle: far away from it, small triangles would lose their depth to rounding.
+
+    Returns a ``Float`` array with four numbers for each triangle: the function of the depth, attached, and the pixel. And,
+    detached and only if asked for, those of the barycentrics of vertices 1 and 2, divided by w, with the changes of 1 / w as
+    the fourth numbers, and the values of 1 / w.
     """
     module = backend(positions)
     Float, Float64, UInt32 = module.Float, module.Float64, module.UInt32
@@ -81,7 +112,13 @@ def _planes(positions: Any, faces: Any, raster: RasterOutput) -> Any:
             dr.replace_grad(v, sum(w * e for w, e in zip(row, excess, strict=True)))
             for v, row in zip(value, weights, strict=True)
         ]
-    return dr.ravel(module.Array4f(*value, Float((near[1] << _COLUMN_BITS) | near[0])))
+    depths = dr.ravel(module.Array4f(*value, Float((near[1] << _COLUMN_BITS) | near[0])))
+    if not barycentrics:
+        return depths, ()
+    with dr.suspend_grad():
+        inverse_w = [Float(sum(row)) for row in (change_x, change_y, there)]
+        packets = [module.Array4f(*(row[k] for row in weights), inverse_w[k - 1]) for k in (1, 2)]
+        return depths, (*(dr.ravel(packet) for packet in packets), inverse_w[2])
 
 
 def _pixel_near(corners: list[Any], axis: int, size: int) -> Any:

@@ -12,6 +12,7 @@ import numpy as np
 
 from ._types import MAX_RESOLUTION, NO_TRIANGLE, RasterOutput, backend, pixel_coordinates
 from .fragments import EMPTY, draw
+from .planes import pixel_barycentrics
 from .setup import centred, covers, edge_lines, fragment_key, gather_triangle, set_up
 from .tiles import STRIP, TileGrid, TileLists, build_tile_lists, nearest_covers, strips
 
@@ -60,12 +61,33 @@ def rasterize(
     small and thin triangles draw their fragments themselves (:mod:`shadowmap_dr.raster.fragments`), pixels look for the large
     ones in the list of their tile (:mod:`shadowmap_dr.raster.tiles`).
     """
-    flat, face_indices, batch, vertex_count = check_mesh(positions, faces, batch, check_indices)
-    height, width = check_resolution(resolution)
+    flat, face_indices, batch, _ = check_mesh(positions, faces, batch, check_indices)
+    located = visible_triangles(flat, face_indices, resolution, batch=batch, transparent=transparent, layers=layers)
+    values = pixel_barycentrics(located, flat, face_indices)
+    if dr.grad_enabled(flat):
+        values = [dr.replace_grad(value, old) for value, old in zip(values, (located.u, located.v, located.depth), strict=True)]
+    u, v, depth = values
+    return replace(located, u=u, v=v, depth=depth)
+
+
+def visible_triangles(
+    positions: Any,
+    faces: Any,
+    resolution: tuple[int, int],
+    *,
+    batch: int | None = None,
+    transparent: Callable[[RasterOutput], Any] | None = None,
+    layers: int = 4,
+) -> RasterOutput:
+    """As :func:`rasterize`, for positions and faces known to be valid, without the cost of barycentrics and depths.
+
+    These are there, and attached, but not prepared: whoever uses them pays for them.
+    """
+    flat, face_indices, batch, vertex_count = check_mesh(positions, faces, batch, False)
+    size = (batch, vertex_count, *check_resolution(resolution))
     with dr.suspend_grad():
-        size = (batch, vertex_count, height, width)
         triangle, records = _visible_triangles(dr.detach(flat), face_indices, *size, transparent, layers)
-    return _locate(flat, face_indices, triangle, records, batch, vertex_count, height, width)
+    return _locate(flat, face_indices, triangle, records, *size)
 
 
 def check_resolution(resolution: tuple[int, int]) -> tuple[int, int]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import drjit as dr
 
-from ..raster import RasterOutput, Topology, antialias, rasterize
+from ..raster import RasterOutput, Topology, antialias, visible_triangles
 from ..raster._types import backend, pixel_coordinates
 from ..raster.planes import pixel_depth
 from .camera import Frusta, Views, linear_depth, of_map, project, to_clip, to_light_space
@@ -108,7 +108,7 @@ def render_maps(
     clip = to_clip(of_map(views, map_index, count), of_map(frusta, map_index, count), p_light)
     clip = dr.ravel(clip)
     dr.eval(clip)
-    raster = rasterize(clip, faces, (size, size), batch=count, check_indices=False, transparent=transparent)
+    raster = visible_triangles(clip, faces, (size, size), batch=count, transparent=transparent)
     values, channels = _texels(raster, clip, faces, views, frusta, settings)
     if settings.antialias and settings.method != "standard":
         dr.eval(values)
@@ -119,7 +119,7 @@ def render_maps(
 def _texels(
     raster: RasterOutput, clip: Any, faces: Any, views: Views, frusta: Frusta, settings: ShadowSettings
 ) -> tuple[Any, int]:
-    module = backend(raster.u)
+    module = backend(raster.triangle)
     size = settings.resolution
     image, row, column = pixel_coordinates(module, views.count, size, size)
     view, frustum = of_map(views, image, views.count), of_map(frusta, image, views.count)
@@ -141,7 +141,7 @@ def _texels(
 
 def _radial_depth(view: Views, frustum: Frusta, raster: RasterOutput, row: Any, column: Any, size: int) -> Any:
     """Distance from the light camera's origin to what a texel sees."""
-    module = backend(raster.u)
+    module = backend(raster.triangle)
     perspective = view.spread > 0
     z = dr.select(perspective, raster.w, dr.fma(0.5 * raster.depth + 0.5, frustum.far - frustum.near, frustum.near))
     scale = dr.select(perspective, z, 1.0)

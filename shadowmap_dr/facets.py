@@ -8,6 +8,7 @@ facets' mean normal, so that is what is shaded.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -24,12 +25,29 @@ _SMALL, _LARGE = 1.5, 3.0
 _NORMAL_JUMP = 0.02
 
 
-def flat_faces(geometry: Geometry) -> Any:
-    """``Bool`` (F,): faces of shapes without vertex normals; None if there are none (on the host, once)."""
-    flat = [not info.has_normals for info in geometry.shapes]
-    if not any(flat):
+@dataclass(frozen=True)
+class FlatFaces:
+    """Which flat faces meet at each place of a mesh: those of place v are ``faces[start[v]:start[v + 1]]``, ``UInt32`` each.
+
+    ``flat``: ``Bool`` (F,), whether a face is one of them.
+    """
+
+    start: Any
+    faces: Any
+    flat: Any
+
+
+def flat_faces(geometry: Geometry, topology: Topology) -> FlatFaces | None:
+    """Faces of shapes without vertex normals, by welded vertex; None if there are none (on the host, once)."""
+    flat = np.array([not info.has_normals for info in geometry.shapes])
+    if not flat.any():
         return None
-    return dr.gather(mi.Bool, mi.Bool(flat), geometry.face_shape)
+    chosen = flat[geometry.face_shape.numpy()]
+    faces = np.flatnonzero(chosen).astype(np.uint32)
+    places = topology.welded.numpy().reshape(-1, 3)[faces].ravel()
+    order = np.argsort(places, kind="stable")
+    start = np.searchsorted(places[order], np.arange(geometry.vertex_count + 1))
+    return FlatFaces(mi.UInt32(start.astype(np.uint32)), mi.UInt32(faces[order // 3]), mi.Bool(chosen))
 
 
 def crease_edges(geometry: Geometry, topology: Topology) -> Any:
@@ -60,23 +78,51 @@ def crease_edges(geometry: Geometry, topology: Topology) -> Any:
     return mi.Bool(hard) if hard.any() else None
 
 
-def mean_normals(geometry: Geometry, topology: Topology, flat: Any) -> Any:
-    """Sums of the flat faces' unit normals, weighted by their angles, for each welded vertex (Float, 4 V). Attached.
+def mean_normals(geometry: Geometry, topology: Topology, flat: FlatFaces) -> Any:
+    """Sums of the flat faces' normals, as long as the faces are large, at each place (Float, 4 V, by welded vertex). Attached.
 
-    Four numbers and not three (the last is 0), since these are read and summed up as packets.
+    Four numbers and not three (the last is 0), since packets of four are read faster.
     """
     face = dr.arange(mi.UInt32, geometry.face_count)
-    corner = dr.gather(mi.Vector3u, geometry.faces, face, flat)
-    p = [geometry.vertices(corner[k], flat) for k in range(3)]
-    edge = [normalize_or(p[(k + 1) % 3] - p[k], mi.Vector3f(0)) for k in range(3)]
-    n = normalize_or(dr.cross(edge[0], edge[1]), mi.Vector3f(0))
-    slot = dr.gather(mi.Vector3u, topology.welded, face, flat)
-    total = dr.zeros(mi.Float, 4 * geometry.vertex_count)
-    for k in range(3):
-        angle = dr.safe_acos(-dr.dot(edge[k], edge[(k + 2) % 3]) * (1 - 1e-6))
-        weighted = n * angle
-        dr.scatter_add(total, mi.Vector4f(weighted.x, weighted.y, weighted.z, 0), slot[k], flat)
-    return total
+    corner = dr.gather(mi.Vector3u, geometry.faces, face, flat.flat)
+    p = [geometry.vertices(corner[k], flat.flat) for k in range(3)]
+    n = dr.cross(p[1] - p[0], p[2] - p[0])
+    normals = dr.ravel(mi.Vector4f(n.x, n.y, n.z, 0))
+    dr.eval(normals)
+    return dr.custom(_Sums, normals, topology, flat)
+
+
+class _Sums(dr.CustomOp):
+    """Sums over the faces at each place. Both ways look up what they add: atomic operations would cost several times as much."""
+
+    def eval(self, normals: Any, topology: Topology, flat: FlatFaces) -> Any:
+        self.topology, self.flat, self.faces = topology, flat, dr.width(normals) // 4
+        return self._at_places(normals)
+
+    def forward(self) -> None:
+        self.set_grad_out(self._at_places(self.grad_in("normals")))
+
+    def backward(self) -> None:
+        adjoint = self.grad_out()
+        dr.eval(adjoint)
+        places = dr.gather(mi.Vector3u, self.topology.welded, dr.arange(mi.UInt32, self.faces), self.flat.flat)
+        total = sum(dr.gather(mi.Vector4f, adjoint, places[k], self.flat.flat) for k in range(3))
+        self.set_grad_in("normals", dr.ravel(mi.Vector4f(total)))
+
+    def _at_places(self, normals: Any) -> Any:
+        dr.eval(normals)
+        place = dr.arange(mi.UInt32, dr.width(self.flat.start) - 1)
+        at, end = dr.gather(mi.UInt32, self.flat.start, place), dr.gather(mi.UInt32, self.flat.start, place + 1)
+
+        def add(at: Any, end: Any, total: Any) -> tuple[Any, Any, Any]:
+            face = dr.gather(mi.UInt32, self.flat.faces, at)
+            return at + 1, end, total + dr.gather(mi.Vector4f, normals, face)
+
+        state = (at, end, dr.zeros(mi.Vector4f, dr.width(place)))
+        total = dr.while_loop(state, lambda at, end, total: at < end, add, mode="symbolic", label="faces at a place")[2]
+        result = dr.ravel(total)
+        dr.eval(result)
+        return result
 
 
 def soften_facets(

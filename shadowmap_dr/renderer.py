@@ -71,7 +71,7 @@ class Renderer:
         topology: edges of the merged mesh.
         plan: which shadow maps there are.
         settings: how to render.
-        flat: ``Bool`` (F,), faces that are shaded flat, or None.
+        flat: faces that are shaded flat, or None.
         creases: ``Bool`` (3 F,), edges of faces at which shading jumps, or None.
         frusta: fit of the shadow maps in the last rendering, None before the first.
     """
@@ -126,7 +126,7 @@ class Renderer:
         positions = dr.detach(geometry.positions).numpy()
         topology = build_topology(geometry.faces.numpy(), positions, mi.UInt32)
         plan, creases = plan_maps(data.lights, geometry), crease_edges(geometry, topology)
-        renderer = cls(data, topology, plan, settings, flat_faces(geometry), creases)
+        renderer = cls(data, topology, plan, settings, flat_faces(geometry, topology), creases)
         # The first fit is made here, so that a step which is recorded later always starts from one.
         if renderer._has_shadows and data.sensors:
             with dr.suspend_grad():

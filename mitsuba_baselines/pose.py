@@ -12,7 +12,7 @@ import json
 import os
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -201,21 +201,25 @@ def pose_start(run: int, seed: int = 0) -> np.ndarray:
 
 
 def fair_setting(resolution: int) -> ProjectiveSetting:
-    """The stored fair setting at a resolution, or at the nearest one that was searched.
+    """The stored fair setting at a resolution; where none was found, the nearest one with as many samples for the whole image.
+
+    Such a stand-in (`is_fair` tells) is on the cheap side: a proxy light has a size in pixels, and the smaller it is, the more
+    samples miss it.
 
     Raises:
-        ShadowmapError: No search is stored, or none of its candidates met the criterion.
+        ShadowmapError: No search is stored that found a setting.
     """
-    entry = _nearest(resolution)
-    if entry["setting"] is None:
-        raise ShadowmapError(f"no setting is known to converge: run python -m mitsuba_baselines.pose --search {resolution}.")
-    return ProjectiveSetting(**entry["setting"])
+    found, setting = _nearest(resolution)
+    if found == resolution:
+        return setting
+    scale = (found / resolution) ** 2
+    counts = {name: max(1, round(getattr(setting, name) * scale)) for name in ("sppc", "sppp", "sppi", "spp")}
+    return replace(setting, **counts)
 
 
 def is_fair(setting: ProjectiveSetting, resolution: int) -> bool:
     """True if a stored search at this very resolution found the setting to be the cheapest one that meets the criterion."""
-    entry = _nearest(resolution)
-    return entry["resolution"] == resolution and entry["setting"] == asdict(setting)
+    return _nearest(resolution) == (resolution, setting)
 
 
 def find_fair_setting(
@@ -320,12 +324,14 @@ def _timed(step: Callable[[], Any]) -> float:
     return time.perf_counter() - begin
 
 
-def _nearest(resolution: int) -> dict[str, Any]:
-    """Record of the stored search at the nearest resolution."""
+def _nearest(resolution: int) -> tuple[int, ProjectiveSetting]:
+    """The resolution nearest to the given one at which a stored search found a setting, and the setting."""
     table = json.loads(STORE.read_text()) if STORE.is_file() else {}
-    if not table:
-        raise ShadowmapError(f"{STORE} holds no setting: run python -m mitsuba_baselines.pose --search {resolution}.")
-    return table[min(table, key=lambda size: abs(np.log2(int(size) / resolution)))]
+    found = {int(size): ProjectiveSetting(**entry["setting"]) for size, entry in table.items() if entry["setting"]}
+    if not found:
+        raise ShadowmapError(f"no setting is known to converge: run python -m mitsuba_baselines.pose --search {resolution}.")
+    nearest = min(found, key=lambda size: abs(np.log2(size / resolution)))
+    return nearest, found[nearest]
 
 
 def main() -> None:

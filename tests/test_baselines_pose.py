@@ -145,7 +145,10 @@ def test_errors(target: np.ndarray) -> None:
 def test_fair_setting_is_stored() -> None:
     setting = fair_setting(128)
     assert setting.guiding != "octree"
-    assert fair_setting(100) == setting
     assert is_fair(setting, 128)
     assert not is_fair(setting, 100)  # not searched there
+    # Half the width, twice the resolution: as many samples in all, and at least one for each pixel.
+    coarse, fine = fair_setting(64), fair_setting(1 << 12)
+    assert (coarse.sppc, coarse.sppi) == (4 * setting.sppc, 4 * setting.sppi)
+    assert (fine.sppc, fine.sppi) == (1, 1) and not is_fair(fine, 1 << 12)
     assert not is_fair(ProjectiveSetting(1, 1, 1), 128)

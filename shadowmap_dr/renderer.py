@@ -94,6 +94,8 @@ class Renderer:
         shadow_filter: str = "gaussian",
         shadow_filter_size: int = 3,
         shadow_antialias: bool = True,
+        shadow_bleeding: float = 0.0,
+        shadow_order: int = 4,
         compat: bool = False,
         tessellation: int = 64,
         **settings: Any,
@@ -114,6 +116,8 @@ class Renderer:
                 filter_size=shadow_filter_size,
                 antialias=shadow_antialias,
                 compat=compat,
+                bleeding=shadow_bleeding,
+                order=shadow_order,
             )
         except ValueError as error:
             raise ShadowmapError(str(error)) from None

@@ -113,7 +113,7 @@ MUTATIONS = (
              (f"{DERIVATIVE}[llvm_ad_rgb-spot_position_box-256-1]",)),
     Mutation("leave the shadows out", "shadow.moments", "chebyshev_visibility", _always_lit,
              ("test_references.py::test_shadows_of_1024_texels[llvm_ad_rgb-gallery]",)),
-    Mutation("look half a texel off", "shadow.shadow_map", "_bilinear", _half_a_texel_off,
+    Mutation("look half a texel off", "shadow.lookup", "_bilinear", _half_a_texel_off,
              ("test_references.py::test_shadows_of_1024_texels[llvm_ad_rgb-gallery]",)),
 )  # fmt: skip
 

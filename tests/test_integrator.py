@@ -621,7 +621,7 @@ def test_defaults_are_those_of_the_renderer(variant: str) -> None:
         ({"shadow_map_resolution": 64.5}, "'shadow_map_resolution' of 'shadowmap' is 64.5, but must be an integer"),
         ({"shadow_map_resolution": 0}, "shadow map resolution is 0"),
         ({"shadow_map_resolution": True}, "is True, but must be an integer"),
-        ({"shadow_method": "pcf"}, "shadow method 'pcf' is unknown; choose one of vsm, standard, none"),
+        ({"shadow_method": "magic"}, "shadow method 'magic' is unknown; choose one of vsm, esm"),
         ({"shadow_filter": "median"}, "shadow filter 'median' is unknown"),
         ({"shadow_filter_size": 4}, "4"),
         ({"shadow_samples": 100}, "shadow_samples is 100"),

@@ -13,12 +13,15 @@ from .camera import (
 )
 from .filters import FILTERS, filter_kernel, filter_map
 from .fit import fit_frusta, shape_bounds
-from .moments import METHODS, chebyshev_visibility, standard_visibility, variance_moments
-from .shadow_map import ShadowMaps, ShadowSettings, filter_maps, render_maps, visibility
+from .lookup import visibility
+from .methods import METHODS, PREFILTERED
+from .moments import chebyshev_visibility, standard_visibility, variance_moments
+from .shadow_map import ShadowMaps, ShadowSettings, filter_maps, render_maps
 
 __all__ = [
     "FILTERS",
     "METHODS",
+    "PREFILTERED",
     "Frusta",
     "LightView",
     "ShadowMaps",

@@ -61,7 +61,7 @@ def filter_map(values: Any, kernel: np.ndarray, maps: int, height: int, width: i
     """Convolve maps with a kernel; the border is replicated.
 
     Args:
-        values: flat ``Float`` (maps * height * width * channels), channels interleaved; 1, 2 or 4 channels.
+        values: flat ``Float`` (maps * height * width * channels), channels interleaved; 1, 2 or a multiple of 4 channels.
         kernel: (k, k) weights, k odd.
 
     Gradients flow to ``values``. Exact adjoint by gathering, without atomics.
@@ -96,10 +96,13 @@ def _convolve(values: Any, weights: list[float], axis: int, shape: tuple[int, in
         # What lies side by side is treated alike: columns in packets of four numbers.
         width, channels = width * channels // 4, 4
     module = backend(values)
+    # Texels of many numbers are several packets, that is, several lanes.
+    parts = max(1, channels // 4)
+    channels //= parts
     packet = {1: module.Float, 2: module.Array2f, 4: module.Array4f}[channels]
-    n, stride = (height, width) if axis == 0 else (width, 1)
+    n, stride = (height, width) if axis == 0 else (width, parts)
     radius = len(weights) // 2
-    lane = dr.arange(module.UInt32, maps * height * width)
+    lane = dr.arange(module.UInt32, maps * height * width * parts)
     at = module.Int32((lane // stride) % n)
     dr.eval(values)
     total = dr.zeros(packet)

@@ -11,19 +11,12 @@ import drjit as dr
 from ..raster import RasterOutput, Topology, antialias, visible_triangles
 from ..raster._types import backend, pixel_coordinates
 from ..raster.planes import pixel_depth
-from .camera import Frusta, Views, linear_depth, of_map, project, to_clip, to_light_space
+from .camera import Frusta, Views, linear_depth, of_map, to_clip
 from .filters import FILTERS, filter_kernel, filter_map
-from .moments import (
-    METHODS,
-    MINIMUM_VARIANCE,
-    MINIMUM_VARIANCE_COMPAT,
-    chebyshev_visibility,
-    standard_visibility,
-    variance_moments,
-)
+from .methods import METHODS, PREFILTERED
 
-# Depth that a texel without geometry holds, and beyond which receivers are moved to it: an unoccluded receiver lies at its mean.
-_FAR = 0.5
+#: Depth that a texel without geometry holds, and beyond which receivers are moved to it: an unoccluded receiver lies at its mean.
+FAR = 0.5
 # A plane's slope counts as variance up to this many texels of depth per texel; silhouettes seen edge-on would have any amount.
 _MAX_SLOPE = 2.0
 
@@ -33,12 +26,17 @@ class ShadowSettings:
     """How shadows are computed.
 
     Attributes:
-        method: ``vsm`` (variance shadow map), ``standard`` (depth comparison, no gradients) or ``none``.
+        method: ``vsm`` (variance), ``esm`` (exponential), ``evsm2``, ``evsm4`` (exponential variance, two or four moments),
+            ``msm`` (four power moments), ``csm`` (convolution: Fourier series), ``pcf`` (percentage-closer: depths are compared,
+            and the filter applied, in the look-up; its derivatives say little about shadows that move), ``standard`` (one
+            comparison, no gradients) or ``none``.
         resolution: texels along each side of a map.
         filter: ``box``, ``gaussian``, ``wendland`` or ``none``.
         filter_size: odd number of texels.
         antialias: anti-alias the maps; without it shadows have no gradient to the outlines of their casters.
-        bias: depth offset of ``standard``, in units of the depth range of the map.
+        bias: depth offset of ``standard`` and ``pcf``, in units of the depth range of the map.
+        bleeding: visibilities below this are cut off and the rest is stretched to 0..1; for ``vsm``, ``evsm`` and ``msm``.
+        order: terms of the series of ``csm``, an even number.
         compat: the conventions of Worchel and Alexa's code: unnormalised radial depth, fixed frusta, dark outside of them, their
             kernels, minimum variance 1e-4.
     """
@@ -50,12 +48,20 @@ class ShadowSettings:
     antialias: bool = True
     bias: float = 5e-3
     compat: bool = False
+    bleeding: float = 0.0
+    order: int = 4
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise ValueError(f"shadow method {self.method!r} is unknown; choose one of {', '.join(METHODS)}")
         if self.filter not in FILTERS:
             raise ValueError(f"shadow filter {self.filter!r} is unknown; choose one of {', '.join(FILTERS)}")
+        if self.compat and self.method not in ("vsm", "standard", "none"):
+            raise ValueError(f"shadow method {self.method!r} has no compatible variant; use vsm with compat")
+        if not 0 <= self.bleeding < 1:
+            raise ValueError(f"light bleeding is to be cut off below {self.bleeding}; give a number from 0 to below 1")
+        if not 2 <= self.order <= 16 or self.order % 2:
+            raise ValueError(f"the order of the Fourier series is {self.order}; it must be an even number from 2 to 16")
         if not 1 <= self.resolution <= 4096:
             raise ValueError(f"shadow map resolution is {self.resolution}; it must lie between 1 and 4096")
         filter_kernel(self.filter, self.filter_size)
@@ -65,13 +71,18 @@ class ShadowSettings:
                 f"use at least {self.filter_size + 6} texels"
             )
 
+    @property
+    def filterable(self) -> bool:
+        """Whether what a map stores may be mixed, and so anti-aliased and filtered."""
+        return self.method in PREFILTERED
+
 
 @dataclass(frozen=True)
 class ShadowMaps:
     """A batch of M square maps.
 
     Attributes:
-        values: flat ``Float`` (M * N * N * C): moments (C = 2), or depths for the standard method (C = 1). Attached.
+        values: flat ``Float`` (M * N * N * C): what the method stores of the depths in each texel, such as two moments. Attached.
         views, frusta: cameras of the maps.
         settings: how they were made.
         channels: C.
@@ -130,13 +141,23 @@ def _texels(
     else:
         ndc, dx, dy = pixel_depth(raster, clip, faces)
         linear, to_linear = linear_depth(view, frustum, ndc)
-        depth = dr.select(hit, linear, _FAR)
+        depth = dr.select(hit, linear, FAR)
         with dr.suspend_grad():
             slopes = [dr.detach(to_linear * slope) for slope in (dx, dy)]
             slope_square = dr.select(hit, _slope_square(dr.detach(view), dr.detach(frustum), dr.detach(linear), slopes, size), 0)
-    if settings.method == "standard":
+    method = PREFILTERED.get(settings.method)
+    if method is None:
         return depth, 1
-    return dr.ravel(variance_moments(depth, slope_square)), 2
+    values = method.encode(depth, slope_square, settings.order)
+    return _interleaved(values), len(values)
+
+
+def _interleaved(values: list[Any]) -> Any:
+    module = backend(values[0])
+    if len(values) == 1:
+        return values[0]
+    packet = {2: module.Array2f, 4: module.Array4f}.get(len(values), module.ArrayXf)
+    return dr.ravel(packet(*values) if packet is not module.ArrayXf else packet(values))
 
 
 def _radial_depth(view: Views, frustum: Frusta, raster: RasterOutput, row: Any, column: Any, size: int) -> Any:
@@ -161,86 +182,10 @@ def _slope_square(view: Views, frustum: Frusta, linear: Any, slopes: list[Any], 
 
 
 def filter_maps(maps: ShadowMaps) -> ShadowMaps:
-    """Step 2: pre-filter. Depths of the standard method cannot be filtered and pass unchanged."""
+    """Step 2: pre-filter. Depths that are compared in the look-up cannot be filtered and pass unchanged."""
     s = maps.settings
-    if s.method == "standard":
+    if not s.filterable:
         return maps
     kernel = filter_kernel(s.filter, s.filter_size, s.compat)
     values = filter_map(maps.values, kernel, maps.views.count, s.resolution, s.resolution, maps.channels)
     return ShadowMaps(values, maps.views, maps.frusta, s, maps.channels)
-
-
-def visibility(maps: ShadowMaps, map_index: Any, p_world: Any, active: Any = True) -> Any:
-    """Step 3: fraction of the light that reaches world-space points.
-
-    Args:
-        maps: filtered maps.
-        map_index: which map to ask, ``UInt32`` for each point or one number.
-        p_world: ``Array3f``. Attached.
-        active: points to ask for; the others get 1.
-
-    Returns:
-        ``Float`` in 0..1; 1 outside the map (0 with ``compat``). Gradients flow to the points, the casters and the light.
-    """
-    module = backend(maps.values)
-    count = maps.views.count
-    map_index = module.UInt32(map_index)
-    view, frustum = of_map(maps.views, map_index, count), of_map(maps.frusta, map_index, count)
-    u, v, depth, inside = project(view, frustum, p_world)
-    if maps.settings.compat:
-        p = to_light_space(view, p_world)
-        return dr.select(active, _look_up_compat(maps, map_index, u, v, dr.norm(p), inside & active), 1)
-    inside &= module.Bool(active)
-    depth = dr.select(depth > _FAR, _FAR, depth)
-    if maps.settings.method == "standard":
-        size = maps.settings.resolution
-        column = module.UInt32(dr.clip((u * 0.5 + 0.5) * size, 0, size - 1))
-        row = module.UInt32(dr.clip((v * 0.5 + 0.5) * size, 0, size - 1))
-        stored = dr.gather(module.Float, maps.values, (map_index * size + row) * size + column, inside)
-        return dr.select(inside, standard_visibility(stored, depth, maps.settings.bias), 1)
-    return _where(inside, _look_up, maps, map_index, u, v, depth)
-
-
-def _where(active: Any, function: Callable[..., Any], maps: ShadowMaps, *lanes: Any) -> Any:
-    """``function(maps, *lanes)`` where there are active lanes, 1 elsewhere: maps cover the casters, not all that is seen."""
-    return dr.if_stmt(
-        lanes,
-        active,
-        lambda *lanes: function(maps, *lanes),
-        lambda *lanes: type(lanes[1])(1),
-        mode="symbolic",
-        label="shadow look-up",
-    )
-
-
-def _look_up(maps: ShadowMaps, map_index: Any, u: Any, v: Any, depth: Any) -> Any:
-    moments = _bilinear(maps, map_index, u, v, True)
-    return chebyshev_visibility(moments, depth, MINIMUM_VARIANCE)
-
-
-def _bilinear(maps: ShadowMaps, map_index: Any, u: Any, v: Any, active: Any, outside_reads_zero: bool = False) -> Any:
-    """Moments at (u, v) in -1..1, between texel centres at + 1/2; attached to the moments and to the coordinates."""
-    module = backend(maps.values)
-    size = maps.settings.resolution
-    x = dr.select(active, dr.fma(u, 0.5 * size, 0.5 * size - 0.5), 0)
-    y = dr.select(active, dr.fma(v, 0.5 * size, 0.5 * size - 0.5), 0)
-    x0, y0 = dr.floor(dr.detach(x)), dr.floor(dr.detach(y))
-    fx, fy = x - x0, y - y0
-    column, row = module.Int32(x0), module.Int32(y0)
-    base = module.Int32(map_index) * (size * size)
-    packet = {2: module.Array2f, 4: module.Array4f}[maps.channels]
-    rows = []
-    for j in range(2):
-        ends = []
-        for i in range(2):
-            c, r = column + i, row + j
-            use = active & (c >= 0) & (c < size) & (r >= 0) & (r < size) if outside_reads_zero else active
-            index = base + dr.clip(r, 0, size - 1) * size + dr.clip(c, 0, size - 1)
-            ends.append(dr.gather(packet, maps.values, module.UInt32(index), use))
-        rows.append(dr.fma(ends[1] - ends[0], fx, ends[0]))
-    return dr.fma(rows[1] - rows[0], fy, rows[0])
-
-
-def _look_up_compat(maps: ShadowMaps, map_index: Any, u: Any, v: Any, depth: Any, active: Any) -> Any:
-    moments = _bilinear(maps, map_index, dr.select(active, u, 0), dr.select(active, v, 0), active, outside_reads_zero=True)
-    return chebyshev_visibility(moments, depth, MINIMUM_VARIANCE_COMPAT)

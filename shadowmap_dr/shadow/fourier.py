@@ -1,0 +1,42 @@
+"""Convolution shadow maps: the depth comparison as a Fourier series, whose terms can be filtered.
+
+Source: Annen et al., "Convolution Shadow Maps", 2007, equation 8.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import drjit as dr
+
+
+def fourier_terms(depth: Any, slope_square: Any, order: int) -> list[Any]:
+    """Sine and cosine of each of ``order`` odd multiples of pi times the depth: 2 ``order`` numbers. Attached.
+
+    A plane's extent within the texel dampens them as it would those of a normal distribution.
+    """
+    variance = 0.25 * dr.detach(slope_square)
+    terms = []
+    for k in range(order):
+        frequency = math.pi * (2 * k + 1)
+        damping = dr.exp(-0.5 * frequency**2 * variance)
+        sine, cosine = dr.sincos(frequency * depth)
+        terms += [sine * damping, cosine * damping]
+    return terms
+
+
+def fourier_visibility(terms: list[Any], depth: Any) -> Any:
+    """Twice the series for the step from 0 (occluder before ``depth``) to 1, cut off at 1: a surface is not its own occluder.
+
+    Lanczos' factors suppress the series' ringing, which would show as stripes. Attached.
+    """
+    order = len(terms) // 2
+    total = 0.5
+    for k in range(order):
+        frequency = math.pi * (2 * k + 1)
+        x = math.pi * (2 * k + 1) / (2 * order + 1)
+        sine, cosine = dr.sincos(frequency * depth)
+        difference = terms[2 * k] * cosine - terms[2 * k + 1] * sine
+        total += (2 * math.sin(x) / (x * frequency)) * difference
+    return dr.clip(2 * total, 0, 1)

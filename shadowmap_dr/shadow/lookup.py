@@ -1,0 +1,152 @@
+"""Step 3 of a shadow map: how much light reaches points."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from ..raster._types import backend
+from .camera import of_map, project, to_light_space
+from .filters import filter_kernel, separable_terms
+from .methods import PREFILTERED
+from .moments import MINIMUM_VARIANCE_COMPAT, chebyshev_visibility, reduced_bleeding, soft_comparison, standard_visibility
+from .shadow_map import FAR, ShadowMaps
+
+# Depth over which the comparison of percentage-closer filtering is spread: without it there would be no derivative.
+_SOFTNESS = 0.02
+
+
+def visibility(maps: ShadowMaps, map_index: Any, p_world: Any, active: Any = True) -> Any:
+    """Step 3: fraction of the light that reaches world-space points.
+
+    Args:
+        maps: filtered maps.
+        map_index: which map to ask, ``UInt32`` for each point or one number.
+        p_world: ``Array3f``. Attached.
+        active: points to ask for; the others get 1.
+
+    Returns:
+        ``Float`` in 0..1; 1 outside the map (0 with ``compat``). Gradients flow to the points, the casters and the light.
+    """
+    module = backend(maps.values)
+    count = maps.views.count
+    map_index = module.UInt32(map_index)
+    view, frustum = of_map(maps.views, map_index, count), of_map(maps.frusta, map_index, count)
+    u, v, depth, inside = project(view, frustum, p_world)
+    if maps.settings.compat:
+        p = to_light_space(view, p_world)
+        return dr.select(active, _look_up_compat(maps, map_index, u, v, dr.norm(p), inside & active), 1)
+    inside &= module.Bool(active)
+    depth = dr.select(depth > FAR, FAR, depth)
+    look_up = {"standard": _compare, "pcf": _compare_all}.get(maps.settings.method, _resolve)
+    return _where(inside, look_up, maps, map_index, u, v, depth)
+
+
+def _where(active: Any, function: Callable[..., Any], maps: ShadowMaps, *lanes: Any) -> Any:
+    """``function(maps, *lanes)`` where there are active lanes, 1 elsewhere: maps cover the casters, not all that is seen."""
+    return dr.if_stmt(
+        lanes,
+        active,
+        lambda *lanes: function(maps, *lanes),
+        lambda *lanes: type(lanes[1])(1),
+        mode="symbolic",
+        label="shadow look-up",
+    )
+
+
+def _resolve(maps: ShadowMaps, map_index: Any, u: Any, v: Any, depth: Any) -> Any:
+    """Visibility from filtered numbers."""
+    method = PREFILTERED[maps.settings.method]
+    value = method.resolve(_bilinear(maps, map_index, u, v, True), depth)
+    return reduced_bleeding(value, maps.settings.bleeding) if method.bleeds else value
+
+
+def _compare(maps: ShadowMaps, map_index: Any, u: Any, v: Any, depth: Any) -> Any:
+    """One comparison with the nearest texel."""
+    module = backend(maps.values)
+    size = maps.settings.resolution
+    column, row = (module.UInt32(dr.clip((x * 0.5 + 0.5) * size, 0, size - 1)) for x in (u, v))
+    stored = dr.gather(module.Float, maps.values, (map_index * size + row) * size + column)
+    return standard_visibility(stored, depth, maps.settings.bias)
+
+
+def _compare_all(maps: ShadowMaps, map_index: Any, u: Any, v: Any, depth: Any) -> Any:
+    """Comparisons with all texels under the filter, which is moved bilinearly: attached to the point.
+
+    Source: Reeves et al., "Rendering Antialiased Shadows with Depth Maps", 1987.
+    """
+    module = backend(maps.values)
+    s = maps.settings
+    at = _Texels(maps, map_index, u, v)
+    total = module.Float(0)
+    for column, row in separable_terms(filter_kernel(s.filter, s.filter_size)):
+        radius = len(row) // 2
+        across, down = _moved(row, at.fx), _moved(column, at.fy)
+        for j, weight_down in enumerate(down):
+            line = module.Float(0)
+            for i, weight in enumerate(across):
+                stored = dr.gather(module.Float, maps.values, at.index(i - radius, j - radius))
+                line = dr.fma(weight, soft_comparison(stored, depth, s.bias, _SOFTNESS), line)
+            total = dr.fma(weight_down, line, total)
+    return dr.clip(total, 0, 1)
+
+
+def _moved(weights: list[float], fraction: Any) -> list[Any]:
+    """Weights of a line of taps that is moved by a fraction of a texel: one tap more."""
+    padded = np.array([0.0, *weights, 0.0])
+    return [dr.fma(fraction, float(a - b), float(b)) for a, b in zip(padded[:-1], padded[1:], strict=True)]
+
+
+class _Texels:
+    """The texels around points (u, v in -1..1). Texel centres lie at + 1/2."""
+
+    def __init__(self, maps: ShadowMaps, map_index: Any, u: Any, v: Any, active: Any = True) -> None:
+        module = backend(maps.values)
+        self.size = size = maps.settings.resolution
+        x = dr.select(active, dr.fma(u, 0.5 * size, 0.5 * size - 0.5), 0)
+        y = dr.select(active, dr.fma(v, 0.5 * size, 0.5 * size - 0.5), 0)
+        x0, y0 = dr.floor(dr.detach(x)), dr.floor(dr.detach(y))
+        self.fx, self.fy = x - x0, y - y0
+        self.column, self.row = module.Int32(x0), module.Int32(y0)
+        self.base = module.Int32(map_index) * (size * size)
+
+    def index(self, i: int, j: int) -> Any:
+        """Number of the texel i columns and j rows from the upper left neighbour; the border is replicated."""
+        c, r = (dr.clip(x, 0, self.size - 1) for x in (self.column + i, self.row + j))
+        return backend(c).UInt32(self.base + r * self.size + c)
+
+    def inside(self, i: int, j: int) -> Any:
+        c, r = self.column + i, self.row + j
+        return (c >= 0) & (c < self.size) & (r >= 0) & (r < self.size)
+
+
+def _bilinear(maps: ShadowMaps, map_index: Any, u: Any, v: Any, active: Any, outside_reads_zero: bool = False) -> list[Any]:
+    """What the four texels around (u, v) store, mixed; attached to the texels and to the coordinates."""
+    at = _Texels(maps, map_index, u, v, active)
+    rows = []
+    for j in range(2):
+        use = [active & at.inside(i, j) if outside_reads_zero else active for i in range(2)]
+        left, right = (_stored(maps, at.index(i, j), use[i]) for i in range(2))
+        rows.append([dr.fma(b - a, at.fx, a) for a, b in zip(left, right, strict=True)])
+    return [value for a, b in zip(*rows, strict=True) for value in _entries(dr.fma(b - a, at.fy, a))]
+
+
+def _stored(maps: ShadowMaps, texel: Any, active: Any) -> list[Any]:
+    """All numbers of a texel, in packets as large as there are."""
+    module = backend(maps.values)
+    size = next(n for n in (4, 2, 1) if maps.channels % n == 0)
+    packet = {1: module.Float, 2: module.Array2f, 4: module.Array4f}[size]
+    count = maps.channels // size
+    return [dr.gather(packet, maps.values, texel * count + k, active) for k in range(count)]
+
+
+def _entries(packet: Any) -> list[Any]:
+    return list(packet) if dr.depth_v(packet) > 1 else [packet]
+
+
+def _look_up_compat(maps: ShadowMaps, map_index: Any, u: Any, v: Any, depth: Any, active: Any) -> Any:
+    moments = _bilinear(maps, map_index, dr.select(active, u, 0), dr.select(active, v, 0), active, outside_reads_zero=True)
+    return chebyshev_visibility(backend(depth).Array2f(*moments), depth, MINIMUM_VARIANCE_COMPAT)

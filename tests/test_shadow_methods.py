@@ -1,0 +1,197 @@
+"""The family of pre-filtered shadow maps: formulas, bounds, derivatives, and shadows against shadow rays."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import shadow_scene
+import trimesh
+
+from shadowmap_dr.shadow import PREFILTERED, ShadowSettings, directional_view, visibility
+from shadowmap_dr.shadow.moments import reduced_bleeding
+
+FAMILY = (*PREFILTERED, "pcf")
+BOX = trimesh.creation.box((0.8, 0.5, 0.6), transform=trimesh.transformations.euler_matrix(0.3, 0.5, 0.2))
+DIRECTION = np.array([0.2, -0.15, -1.0])
+ORDER = 8
+
+
+def points(array: np.ndarray) -> Any:
+    return mi.Point3f(*(mi.Float(np.ascontiguousarray(array[:, k], np.float32)) for k in range(3)))
+
+
+def floats(array: Any) -> Any:
+    return mi.Float(np.ascontiguousarray(array, np.float32))
+
+
+def stored(method: str, depths: np.ndarray, weights: np.ndarray) -> list[Any]:
+    """What a filter makes of texels at some depths (n, k) with weights (n, k)."""
+    total: list[Any] = []
+    for depth, weight in zip(depths.T, weights.T, strict=True):
+        part = [value * floats(weight) for value in PREFILTERED[method].encode(floats(depth), 0, ORDER)]
+        total = [a + b for a, b in zip(total, part, strict=True)] if total else part
+    return total
+
+
+@pytest.mark.parametrize("method", PREFILTERED)
+def test_one_surface_shadows_what_lies_behind_it(variant: str, method: str) -> None:
+    depth = np.linspace(-0.45, 0.3, 60)
+    texels = stored(method, depth[:, None], np.ones((60, 1)))
+    resolve = PREFILTERED[method].resolve
+    assert resolve(texels, floats(depth)).numpy().min() > 0.98  # the surface itself
+    assert resolve(texels, floats(depth - 0.05)).numpy().min() > 0.98
+    far = 0.3 if method == "csm" else 0.15  # a series of few terms has a soft step
+    assert resolve(texels, floats(depth + far)).numpy().max() < (0.08 if method == "csm" else 0.02)
+
+
+@pytest.mark.parametrize("method", PREFILTERED)
+def test_half_covered_surfaces_are_half_lit(variant: str, method: str) -> None:
+    """Two depths, a receiver on the farther one: half of the light arrives (the convolution map rounds the step off)."""
+    near = np.linspace(-0.4, 0.0, 20)
+    depths = np.stack([near, near + 0.3], 1)
+    value = PREFILTERED[method].resolve(stored(method, depths, np.full((20, 2), 0.5)), floats(near + 0.3)).numpy()
+    np.testing.assert_allclose(value, 0.5, atol=0.12 if method == "csm" else 0.02)
+
+
+@pytest.mark.parametrize(("method", "bleeds"), [("vsm", True), ("evsm4", False), ("evsm2", False), ("esm", False)])
+def test_bleeding(variant: str, method: str, bleeds: bool) -> None:
+    """Occluders at two depths hide a receiver behind both: the difference of the depths lets light through in a variance map."""
+    n = 20
+    depths = np.tile([[-0.45, 0.1]], (n, 1))
+    receiver = np.linspace(0.2, 0.4, n)
+    value = PREFILTERED[method].resolve(stored(method, depths, np.full((n, 2), 0.5)), floats(receiver)).numpy()
+    assert (value.min() > 0.1) == bleeds
+    assert bleeds or value.max() < 0.03
+
+
+def test_moment_map_is_sharper_than_variance_map(variant: str) -> None:
+    n = 20
+    depths, receiver = np.tile([[-0.45, 0.1]], (n, 1)), floats(np.linspace(0.2, 0.4, n))
+    weights = np.full((n, 2), 0.5)
+    vsm, msm = (PREFILTERED[m].resolve(stored(m, depths, weights), receiver).numpy() for m in ("vsm", "msm"))
+    assert msm.max() < 0.05 < vsm.min()
+
+
+def hankel_bound(moments: np.ndarray, z: float) -> float:
+    """The least mass before z, from the definition: quadrature at z and the roots of the orthogonal polynomial."""
+    b = np.array([[1, moments[0], moments[1]], [moments[0], moments[1], moments[2]], [moments[1], moments[2], moments[3]]])
+    c = np.linalg.solve(b, [1, z, z * z])
+    support = np.array([z, *np.roots(c[::-1])])
+    weights = np.linalg.solve(np.vander(support, 3, increasing=True).T, [1, moments[0], moments[1]])
+    return float(weights[1:][support[1:] < z].sum())
+
+
+def test_hamburger_bound(variant: str) -> None:
+    rng = np.random.default_rng(4)
+    depths, weights = rng.uniform(-0.45, 0.45, (200, 5)), rng.dirichlet(np.ones(5), 200)
+    receiver = rng.uniform(-0.5, 0.5, 200)
+    got = PREFILTERED["msm"].resolve(stored("msm", depths, weights), floats(receiver)).numpy()
+    want = []
+    for z, w, d in zip(2 * depths, weights, 2 * receiver, strict=True):
+        moments = np.array([(w * z**k).sum() for k in (1, 2, 3, 4)])
+        moments += 3e-6 * (np.array([0, 0.375, 0, 0.375]) - moments)
+        want.append(1 - hankel_bound(moments, d))
+    assert np.abs(got - want).max() < 0.02
+    assert np.abs(got - want).mean() < 1e-3
+
+
+def random_texels(method: str) -> tuple[list[Any], np.ndarray]:
+    """Filtered values of random depths, degenerate ones (one depth, all far, all near) and nonsense, and receivers."""
+    rng = np.random.default_rng(1)
+    depths, weights = rng.uniform(-0.5, 0.5, (3000, 3)), rng.dirichlet(np.full(3, 0.3), 3000)
+    depths[:500] = depths[:500, :1]
+    depths[500:600], depths[600:700] = 0.5, -0.5
+    receiver = rng.uniform(-0.6, 0.5, 3000)
+    receiver[:250] = depths[:250, 0]
+    texels = stored(method, depths, weights)
+    nonsense = [dr.concat([t, floats(rng.normal(size=300)), dr.zeros(mi.Float, 100)]) for t in texels]
+    return nonsense, np.r_[receiver, rng.uniform(-0.6, 0.5, 400)]
+
+
+@pytest.mark.parametrize("method", PREFILTERED)
+def test_bounded_and_finite_on_any_moments(variant: str, method: str) -> None:
+    texels, receiver = random_texels(method)
+    depth = floats(receiver)
+    dr.enable_grad(texels, depth)
+    value = reduced_bleeding(PREFILTERED[method].resolve(texels, depth), 0.2)
+    assert np.isfinite(value.numpy()).all()
+    assert ((value.numpy() >= 0) & (value.numpy() <= 1)).all()
+    dr.backward(dr.sum(value))
+    for g in (*(dr.grad(t) for t in texels), dr.grad(depth)):
+        assert np.isfinite(g.numpy()).all()
+
+
+def shadow(settings: ShadowSettings, offset: Any, frusta: Any = None, n: int = 60) -> tuple[Any, Any, np.ndarray]:
+    """(visibility on a plane behind the box, its maps, the plane's points) for a box that is moved by ``offset``."""
+    line = 1.2 * ((2 * np.arange(n) + 1) / n - 1)
+    x, y = np.meshgrid(line, line)
+    plane = np.c_[x.ravel(), y.ravel(), np.full(n * n, -1.5)]
+    vertices = points(BOX.vertices) + offset
+    views = [directional_view(mi.Vector3f(*DIRECTION.tolist()))]
+    maps = shadow_scene.make_maps(views, vertices, BOX.vertices, BOX.faces, settings, frusta=frusta)
+    return visibility(maps, 0, points(plane)), maps, plane
+
+
+@pytest.mark.parametrize("method", FAMILY)
+def test_agrees_with_shadow_rays(variant: str, method: str) -> None:
+    value, maps, plane = shadow(ShadowSettings(method=method, resolution=512, order=ORDER), mi.Vector3f(0))
+    light = plane - 20 * DIRECTION
+    hit, margin = shadow_scene.occluded(plane, light, BOX.triangles)
+    clear = margin > 6 * float(dr.max(maps.frusta.half_x)[0]) / 512
+    assert hit[clear].sum() > 40
+    assert np.abs(value.numpy() - ~hit)[clear].max() < (0.1 if method == "csm" else 0.02)
+
+
+@pytest.mark.parametrize("filter_size", [3, 7])
+@pytest.mark.parametrize("method", FAMILY)
+def test_derivatives(variant: str, method: str, filter_size: int) -> None:
+    """A caster that moves: forward and backward agree, and both with central differences of the same image."""
+    settings = ShadowSettings(method=method, resolution=128, filter_size=filter_size, order=ORDER)
+    weights = floats(np.random.default_rng(0).normal(size=3600))
+
+    frusta = shadow(settings, mi.Vector3f(0))[1].frusta
+
+    def value(t: Any) -> Any:
+        return shadow(settings, mi.Vector3f(t, 0.5 * t, 0), frusta)[0]
+
+    t = mi.Float(0)
+    dr.enable_grad(t)
+    image = value(t)
+    dr.forward(t)
+    derivative = dr.grad(image).numpy()
+    t = mi.Float(0)
+    dr.enable_grad(t)
+    dr.backward(dr.sum(value(t) * weights))
+    assert float(t.grad[0]) == pytest.approx(float((derivative * weights.numpy()).sum()), rel=1e-3, abs=1e-3)
+    if method == "pcf":
+        return  # comparisons have a derivative only within their softness: it is no measure of how the shadow moves
+    step = 2e-3
+    difference = (value(mi.Float(step)).numpy() - value(mi.Float(-step)).numpy()) / (2 * step)
+    cosine, scale = compared(derivative, difference)
+    assert cosine > 0.97 and 0.9 < scale < 1.1, (cosine, scale)
+
+
+def compared(derivative: np.ndarray, reference: np.ndarray) -> tuple[float, float]:
+    """Cosine, and the factor by which the first is larger."""
+    product = float((derivative * reference).sum())
+    squares: Callable[[np.ndarray], float] = lambda x: float((x * x).sum())  # noqa: E731
+    return product / np.sqrt(squares(derivative) * squares(reference)), product / squares(reference)
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"method": "msm", "compat": True}, "msm"),
+        ({"bleeding": 1.0}, "1.0"),
+        ({"order": 3}, "3"),
+        ({"order": 18}, "18"),
+    ],
+)
+def test_bad_settings_are_named(change: dict[str, Any], word: str) -> None:
+    with pytest.raises(ValueError, match=word):
+        ShadowSettings(**change)

@@ -19,7 +19,8 @@ from rich.console import Console
 from . import __version__, _llvm, assets, io
 from .errors import ShadowmapError
 from .experiments import bench as bench_experiment
-from .experiments import bench_common, bench_report
+from .experiments import bench_common, bench_report, maps_scenes
+from .experiments import maps as maps_experiment
 from .experiments import pose as pose_experiment
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
@@ -185,6 +186,40 @@ def pose(
     records = pose_experiment.run_pose(options)
     Console().print(pose_experiment.table(records))
     typer.echo(f"Records, images and plots: {out}")
+
+
+@app.command()
+def maps(
+    scene: Annotated[
+        list[str] | None, typer.Option(metavar="|".join(maps_scenes.SCENES), help="Scene; repeatable [default: all].")
+    ] = None,
+    method: Annotated[
+        list[str] | None,
+        typer.Option(metavar="|".join(maps_experiment.CANDIDATES), help="Shadow map; repeatable [default: all]."),
+    ] = None,
+    resolution: Annotated[int, typer.Option(help="Image width and height in pixels.")] = 512,
+    map_resolution: Annotated[int, typer.Option(help="Texels along each side of a shadow map.")] = 256,
+    filter_size: Annotated[int, typer.Option(help="Texels along each side of the filter.")] = 3,
+    spp: Annotated[int, typer.Option(help="Samples per pixel of the path-traced images.")] = 1024,
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("maps"),
+    variant: Variant = DEFAULT_VARIANT,
+) -> None:
+    """Compare all shadow maps on scenes that are hard for them, against path tracing.
+
+    Writes OUT/maps.json and a sheet of pictures, OUT/maps.png.
+    """
+    options = maps_experiment.MapsOptions(
+        scenes=tuple(scene or maps_scenes.SCENES),
+        candidates=tuple(method or maps_experiment.CANDIDATES),
+        resolution=resolution,
+        map_resolution=map_resolution,
+        filter_size=filter_size,
+        reference_spp=spp,
+        out=out,
+    )
+    set_variant(variant)
+    Console().print(maps_experiment.table(maps_experiment.run_maps(options)))
+    typer.echo(f"Record and pictures: {out}")
 
 
 @app.command()

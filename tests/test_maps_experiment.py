@@ -1,0 +1,81 @@
+"""The comparison of shadow maps: its measures, its scenes, and a small run."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from shadowmap_dr.errors import ShadowmapError
+from shadowmap_dr.experiments import maps, maps_scenes
+from shadowmap_dr.experiments.maps import MapsOptions, contour_shift, metrics, run_maps
+
+
+def disk(radius: float, size: int = 200, x: float = 0.0) -> np.ndarray:
+    """Visibility around the shadow of a disk, anti-aliased."""
+    line = np.arange(size) - (size - 1) / 2
+    distance = np.hypot(line[None] - x, line[:, None])
+    return np.clip(distance - radius + 0.5, 0, 1).astype(np.float32)
+
+
+def test_contour_shift_is_a_distance() -> None:
+    everywhere = np.ones((200, 200), bool)
+    assert contour_shift(disk(50), disk(50), everywhere) == 0
+    for shift in (0.5, 1.0, 3.0):
+        assert contour_shift(disk(50 + shift), disk(50), everywhere) == pytest.approx(shift, rel=0.15)
+    # A disk that moves sideways: the mean of |cos| around the circle.
+    assert contour_shift(disk(50, x=2.0), disk(50), everywhere) == pytest.approx(2 * 2 / np.pi, rel=0.1)
+
+
+def test_metrics_tell_bleeding_from_acne() -> None:
+    options = MapsOptions(resolution=200, map_resolution=100, filter_size=3)
+    mask, reference = np.ones((200, 200), bool), disk(60)
+    perfect = metrics(reference, reference, mask, options)
+    assert all(perfect[name] == 0 for name in ("rmse", "rmse_shadowed", "bleeding", "acne", "contour_shift_texels"))
+    bleeding = metrics(np.maximum(reference, 0.1), reference, mask, options)
+    assert bleeding["bleeding"] == pytest.approx(0.1, rel=1e-3) and bleeding["acne"] == 0
+    assert bleeding["rmse_shadowed"] == pytest.approx(0.1, rel=0.05)
+    acne = metrics(np.minimum(reference, 0.95), reference, mask, options)
+    assert acne["acne"] == pytest.approx(0.05, rel=1e-3) and acne["bleeding"] == 0
+    # A blurred edge is neither.
+    blurred = metrics(np.clip((disk(60) - 0.5) * 0.2 + 0.5 + 0.3 * (disk(60) - 0.5), 0, 1), reference, mask, options)
+    assert blurred["contour_shift_texels"] == 0
+
+
+@pytest.mark.parametrize("name", maps_scenes.SCENES)
+def test_scenes_have_light_and_shadow(variant: str, name: str) -> None:
+    reference, mask = maps.reference_visibility(maps_scenes.build(name, 48), 16)
+    assert mask.mean() > 0.7
+    assert 0.02 < (reference[mask] < 0.1).mean() < 0.9 and (reference[mask] > 0.9).mean() > 0.1
+
+
+def test_small_run(variant: str, tmp_path: Path) -> None:
+    options = MapsOptions(
+        scenes=("overlap",), candidates=("vsm", "evsm4"), resolution=64, map_resolution=64, reference_spp=16, rounds=3,
+        out=tmp_path / "m",
+    )
+    record = run_maps(options)
+    stored = json.loads((tmp_path / "m" / "maps.json").read_text())
+    assert stored["scenes"].keys() == {"overlap"} and (tmp_path / "m" / "maps.png").stat().st_size > 1000
+    vsm, evsm = (record["scenes"]["overlap"][label] for label in ("vsm", "evsm4"))
+    assert vsm["seconds_over_vsm"] == 1 and np.isfinite(evsm["seconds"])
+    assert evsm["rmse"] < vsm["rmse"] < 0.2
+    assert min(vsm["derivative_cosine"], evsm["derivative_cosine"]) > 0.85
+    assert maps.table(record).row_count == 2
+
+
+def test_scenes_follow_the_offset(variant: str) -> None:
+    left, right = (mi.traverse(maps_scenes.build("fence", 16, x)) for x in (0.0, 0.25))
+    moved = right["fence.vertex_positions"].numpy() - left["fence.vertex_positions"].numpy()
+    np.testing.assert_allclose(moved.reshape(-1, 3), [[0.25, 0, 0]] * (len(moved) // 3), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "word"), [({"scenes": ("moon",)}, "moon"), ({"candidates": ()}, "method"), ({"resolution": 4}, "resolution")]
+)
+def test_bad_options_are_named(change: dict[str, tuple[str, ...]], word: str) -> None:
+    with pytest.raises(ShadowmapError, match=word):
+        MapsOptions(**change)

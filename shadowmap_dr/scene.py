@@ -287,7 +287,7 @@ def _is_faceted(points: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> b
     corners = points[faces].astype(np.float64)
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normal, axis=1, keepdims=True)
-    return bool((length > 0).all() and np.abs(normals[faces] - (normal / length)[:, None]).max() < 1e-5)
+    return bool((length > 0).all() and np.abs(normals[faces] - (normal / length)[:, None]).max() < 1e-6)
 
 
 def _is_planar(points: np.ndarray) -> bool:

@@ -16,10 +16,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from shadowmap_dr import timing
+from shadowmap_dr import assets, timing
 from shadowmap_dr.errors import ShadowmapError
 from shadowmap_dr.experiments import bench, bench_breakdown, bench_common, bench_meshes, bench_raster, bench_report
 from shadowmap_dr.experiments.bench_common import BenchOptions, Sizes, Unit, run_child
+from shadowmap_dr.scene import load
 
 TINY = Sizes(
     resolutions=(16,),
@@ -31,7 +32,7 @@ TINY = Sizes(
     path_traced=False,
     meshes=("teapot-1k",),
     raster_resolutions=(8, 16),
-    worst={"slivers-20": "teapot-1k", "screen-filling-10": "teapot-1k"},
+    worst={"slivers-20": "even-20", "screen-filling-10": "teapot-1k"},
     full_raster=("spot-6k", (16,)),
     series={"resolution": (8, 16), "lights": (1, 2)},
     passes=1,
@@ -70,7 +71,7 @@ def assert_summary(entry: dict[str, Any]) -> None:
 
 def test_rasterization(tmp_path: Path) -> None:
     units = run(options(tmp_path, "raster"))["sections"]["raster"]["units"]
-    assert list(units) == [f"{m}@{r}" for m in ("teapot-1k", "slivers-20", "screen-filling-10") for r in (8, 16)] + [
+    assert list(units) == [f"{m}@{r}" for m in ("teapot-1k", "even-20", "slivers-20", "screen-filling-10") for r in (8, 16)] + [
         "full spot-6k@16"
     ]
     for name in ("ours", "embree update and trace", "embree trace"):
@@ -78,7 +79,7 @@ def test_rasterization(tmp_path: Path) -> None:
     assert units["teapot-1k@8"]["triangles"] == bench_meshes.KINDS["teapot-1k"] + 2  # the wall
     assert units["teapot-1k@8"]["ratio_of_medians"].keys() == {"embree update and trace / ours", "embree trace / ours"}
     assert 0.5 < units["teapot-1k@8"]["pixels_covered"] <= 1
-    assert "slivers-20 / teapot-1k" in units["slivers-20@16"]["ratio_of_medians"]
+    assert "slivers-20 / even-20" in units["slivers-20@16"]["ratio_of_medians"]
     assert units["full spot-6k@16"]["seconds"].keys() == {"rasterize", "rasterize and interpolate", "forward and backward"}
     for unit in units.values():
         assert unit["wall_seconds"] > 0 and {"load_before", "load_after", "cores_used_by_others"} <= unit.keys()
@@ -315,16 +316,34 @@ def test_child_that_fails_or_hangs(tmp_path: Path) -> None:
     assert run_child("bench_scaling:measure_case", {}, 0.01)["failed"].startswith("ended after")
 
 
-@pytest.mark.parametrize("kind", ["teapot-1k", "spot-23k", "torus-48k", "slivers-50", "screen-filling-7", "bunny*1"])
+@pytest.mark.parametrize("kind", ["teapot-1k", "spot-23k", "torus-48k", "slivers-50", "even-50", "screen-filling-7", "bunny*1"])
 def test_meshes(kind: str, tmp_path: Path) -> None:
     mesh = bench_meshes.make(kind)
     assert len(mesh.faces) == bench_meshes.KINDS.get(
-        kind, {"slivers-50": 50, "screen-filling-7": 7, "bunny*1": 4 * 3674}.get(kind)
+        kind, {"slivers-50": 50, "even-50": 50, "screen-filling-7": 7, "bunny*1": 4 * 3674}.get(kind)
     )
     assert mesh.faces.max() == len(mesh.vertices) - 1 and np.isfinite(mesh.vertices).all()
     corners = mesh.vertices[mesh.faces].astype(float)
     assert (np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) > 0).mean() > 0.99
     assert bench_meshes.stored(kind, tmp_path).stat().st_size == bench_meshes.stored(kind, tmp_path).stat().st_size > 0
+
+
+def test_even_triangles_cover_as_many_pixels_as_slivers() -> None:
+    """Pixel centres of a small image, counted one triangle at a time."""
+    axis = (np.arange(96) + 0.5) / 48 - 1
+    x, y = np.meshgrid(axis, axis)
+
+    def covered(kind: str) -> int:
+        matrix = np.array(load(bench_meshes.scene(assets.mesh("spot"), 96)).sensors[0][0].view_projection)[:, :, 0]
+        mesh = bench_meshes.make(kind)
+        clip = np.c_[mesh.vertices, np.ones(len(mesh.vertices))] @ matrix.T
+        total = 0
+        for a, b, c in (clip[:, :2] / clip[:, 3:])[mesh.faces]:
+            sides = [(q[0] - p[0]) * (y - p[1]) - (q[1] - p[1]) * (x - p[0]) for p, q in ((a, b), (b, c), (c, a))]
+            total += int(np.sum(np.all(np.array(sides) > 0, axis=0) | np.all(np.array(sides) < 0, axis=0)))
+        return total
+
+    assert covered("even-2000") == pytest.approx(covered("slivers-2000"), rel=0.1)
 
 
 def test_subdivision_keeps_surface_and_closedness() -> None:

@@ -30,7 +30,7 @@ class Sizes:
         starts, iterations: of the times to pose.
         path_traced: whether the reference images are path-traced or, faster, our own.
         meshes, raster_resolutions: of rasterization alone, see `bench_meshes.make`.
-        worst: worst cases, with the well-behaved mesh that each is compared with.
+        worst: worst cases, with the well-behaved mesh that each is compared with; see `bench_meshes`.
         full_raster: mesh and resolutions for the forward and backward pass through the raster functions.
         call_seconds: a rasterization that is predicted to take longer than this is left out.
         series: quantity -> values; see `bench_scaling`.
@@ -47,7 +47,7 @@ class Sizes:
     path_traced: bool = True
     meshes: tuple[str, ...] = ("teapot-1k", "spot-6k", "torus-48k", "spot-94k", "spot-375k", "spot-1.5M")
     raster_resolutions: tuple[int, ...] = (128, 512, 1024, 2048)
-    worst: Mapping[str, str] = field(default_factory=lambda: {"slivers-100k": "spot-94k", "screen-filling-10k": "spot-6k"})
+    worst: Mapping[str, str] = field(default_factory=lambda: {"slivers-100k": "even-100k", "screen-filling-10k": "spot-6k"})
     full_raster: tuple[str, tuple[int, ...]] = ("spot-6k", (128, 512, 1024))
     call_seconds: float = 20.0
     series: Mapping[str, tuple[Any, ...]] = field(

@@ -1,4 +1,4 @@
-"""Meshes of the benchmark: known ones, subdivided, and two that are as bad as they get for a rasterizer."""
+"""Meshes of the benchmark: known ones, subdivided, two that are as bad as they get for a rasterizer, and one to compare with."""
 
 from __future__ import annotations
 
@@ -38,6 +38,7 @@ KINDS = {
     "spot-375k": 374784,
     "spot-1.5M": 1499136,
     "slivers-100k": 100_000,
+    "even-100k": 100_000,
     "screen-filling-10k": 10_000,
 }
 
@@ -48,6 +49,8 @@ def make(kind: str) -> Mesh:
         return torus(200, 120)
     if kind.startswith("slivers-"):
         return slivers(KINDS.get(kind) or _count(kind))
+    if kind.startswith("even-"):
+        return even(KINDS.get(kind) or _count(kind))
     if kind.startswith("screen-filling-"):
         return screen_filling(KINDS.get(kind) or _count(kind))
     name, _, levels = kind.partition("*")
@@ -97,12 +100,34 @@ def torus(around: int, across: int) -> Mesh:
 def slivers(count: int, seed: int = 0) -> Mesh:
     """Long thin triangles along the diagonals of the image, at random places and depths: a half to a whole diagonal long
     and a thousandth of the image's side wide, so that their boxes are large and hardly a pixel's centre lies in them."""
+    return _before_camera(*_slivers(count, seed))
+
+
+def even(count: int, seed: int = 0) -> Mesh:
+    """Equilateral triangles of one size at random places and depths, as many as in `slivers` and covering as many pixels."""
+    corners, depth = _slivers(count, seed)
+    rng = np.random.default_rng(seed)
+    # What lies outside the image does not count.
+    u, v = rng.random((2, 64, 1, 1))
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    samples = corners[:, 0] + u * (corners[:, 1] - corners[:, 0]) + v * (corners[:, 2] - corners[:, 0])
+    one, two = (corners[:, k] - corners[:, 0] for k in (1, 2))
+    area = 0.5 * np.abs(one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0])
+    area = np.mean(area * (np.abs(samples) < 1).all(axis=-1).mean(axis=0))
+    radius = np.sqrt(area * 4 / (3 * np.sqrt(3)))
+    angle = rng.uniform(0, 2 * np.pi, (count, 1)) + np.arange(3) * (2 * np.pi / 3)
+    centre = rng.uniform(radius - 1, 1 - radius, (count, 1, 2))
+    return _before_camera(centre + radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1), depth)
+
+
+def _slivers(count: int, seed: int) -> tuple[Array, Array]:
+    """Image positions (n, 3, 2) and depths (n,)."""
     rng = np.random.default_rng(seed)
     centre = rng.uniform(-0.7, 0.7, (count, 2))
     along = np.where(rng.random(count) < 0.5, 1.0, -1.0)[:, None] * [1.0, 0.0] + [0.0, 1.0]
     half = rng.uniform(0.5, 1.0, (count, 1)) * along
     side = half[:, ::-1] * [1, -1] / np.linalg.norm(half, axis=1, keepdims=True) * 0.002
-    return _before_camera(np.stack([centre - half, centre + half, centre + half + side], axis=1), rng.uniform(3.0, 5.0, count))
+    return np.stack([centre - half, centre + half, centre + half + side], axis=1), rng.uniform(3.0, 5.0, count)
 
 
 def screen_filling(count: int, seed: int = 0) -> Mesh:

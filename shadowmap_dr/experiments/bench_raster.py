@@ -34,7 +34,7 @@ def units(options: BenchOptions) -> list[Unit]:
     what = options.what
     result = [
         Unit(f"{kind}@{resolution}", functools.partial(measure_raster, options, kind, resolution))
-        for kind in (*what.meshes, *what.worst)
+        for kind in dict.fromkeys((*what.meshes, *what.worst.values(), *what.worst))
         for resolution in what.raster_resolutions
     ]
     kind, resolutions = what.full_raster

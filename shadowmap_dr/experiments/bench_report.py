@@ -181,7 +181,7 @@ def _raster_rows(key: str, unit: dict[str, Any]) -> Iterator[Row]:
     embree = f"Embree {_time(seconds['embree update and trace'])}, trace {_time(seconds['embree trace'])}"
     value = ratios["embree update and trace / ours"]
     partner = next((name.split(" / ")[1] for name in ratios if name.startswith(f"{mesh} / ")), None)
-    worst = partner is not None or mesh.startswith(("slivers", "screen-filling"))
+    worst = partner is not None or mesh.startswith(("slivers", "screen-filling", "even"))
     aims = _aim(value, None if worst else OVER_EMBREE.get(size), ">= {:g}x", least=True)
     yield Row(f"rasterize {mesh}", f"{size}", _time(seconds["ours"]), embree, f"{value:.1f}x", *aims)
     if partner is not None:

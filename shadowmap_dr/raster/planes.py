@@ -28,40 +28,23 @@ def pixel_depth(raster: RasterOutput, positions: Any, faces: Any) -> tuple[Any, 
         raster: of these positions and faces.
         positions, faces: flat arrays, as rasterized.
     """
-    depths, _ = _planes(positions, faces, raster, False)
+    depths, _ = planes(positions, faces, raster, False)
     dr.eval(depths)
-    index, row, column = _pixels(raster)
+    index, row, column = pixels(raster)
     hit = raster.valid
     plane = dr.gather(backend(positions).Array4f, depths, index, hit)
-    x, y = _offset(plane, row, column)
+    x, y = offset(plane, row, column)
     depth = dr.select(hit, dr.fma(plane.x, x, dr.fma(plane.y, y, plane.z)), 1)
     return depth, dr.detach(plane.x), dr.detach(plane.y)
 
 
-def pixel_barycentrics(raster: RasterOutput, positions: Any, faces: Any) -> tuple[Any, Any, Any]:
-    """Perspective-correct (u, v), 0 where nothing is seen, and NDC depth, 1 there, of each pixel's centre. Detached."""
-    module = backend(positions)
-    with dr.suspend_grad():
-        depths, weights = _planes(dr.detach(positions), faces, raster, True)
-        dr.eval(depths, weights)
-        index, row, column = _pixels(raster)
-        hit = raster.valid
-        plane, one, two = (dr.gather(module.Array4f, flat, index, hit) for flat in (depths, *weights[:2]))
-        x, y = _offset(plane, row, column)
-        at_pixel = dr.gather(module.Float, weights[2], index, hit)
-        total = dr.fma(one.w, x, dr.fma(two.w, y, at_pixel))
-        inverse = dr.rcp(dr.select(hit & (total != 0), total, 1))
-        u, v = (dr.select(hit, dr.fma(w.x, x, dr.fma(w.y, y, w.z)) * inverse, 0) for w in (one, two))
-        return u, v, dr.select(hit, dr.fma(plane.x, x, dr.fma(plane.y, y, plane.z)), 1)
-
-
-def _pixels(raster: RasterOutput) -> tuple[Any, Any, Any]:
+def pixels(raster: RasterOutput) -> tuple[Any, Any, Any]:
     """(number of the triangle through the batch, row, column) of each pixel."""
     image, row, column = pixel_coordinates(backend(raster.triangle), raster.batch, raster.height, raster.width)
     return image * raster.face_count + raster.triangle, row, column
 
 
-def _offset(plane: Any, row: Any, column: Any) -> tuple[Any, Any]:
+def offset(plane: Any, row: Any, column: Any) -> tuple[Any, Any]:
     """Pixels from the one that a triangle's functions refer to."""
     module = backend(plane)
     corner = module.UInt32(dr.detach(plane.w))
@@ -69,7 +52,7 @@ def _offset(plane: Any, row: Any, column: Any) -> tuple[Any, Any]:
     return x, module.Float(module.Int32(row) - module.Int32(corner >> _COLUMN_BITS))
 
 
-def _planes(positions: Any, faces: Any, raster: RasterOutput, barycentrics: bool) -> tuple[Any, tuple[Any, ...]]:
+def planes(positions: Any, faces: Any, raster: RasterOutput, barycentrics: bool) -> tuple[Any, tuple[Any, ...]]:
     """Affine functions of the pixel for each triangle of each image: change by column, by row, and value at a pixel.
 
     That pixel lies near the triangle: far away from it, small triangles would lose their depth to rounding.

@@ -11,8 +11,8 @@ import drjit as dr
 import numpy as np
 
 from ._types import MAX_RESOLUTION, NO_TRIANGLE, RasterOutput, backend, pixel_coordinates
+from .barycentrics import pixel_barycentrics
 from .fragments import EMPTY, draw
-from .planes import pixel_barycentrics
 from .setup import centred, covers, edge_lines, fragment_key, gather_triangle, set_up
 from .tiles import STRIP, TileGrid, TileLists, build_tile_lists, nearest_covers, strips
 

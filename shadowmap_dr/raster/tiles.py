@@ -1,7 +1,7 @@
 """Large triangles: short lists for tiles of 16 x 16 pixels, which the pixels then walk.
 
-A triangle is kept out of a tile when it misses it, or lies behind one that covers it. What a list has no room for is drawn
-fragment by fragment, so that no array size depends on the data.
+A triangle is kept out of a tile when it misses it, or lies behind one that covers it; if possible, of a block of 4 x 4 tiles
+at once. What a list has no room for is drawn fragment by fragment, so that no array size depends on the data.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from .setup import Triangles, centred, depth_key, rounding_error
 
 #: log2 of the side of a tile in pixels.
 TILE = 4
+#: Side of a block in tiles, a power of two.
+BLOCK = 4
 #: Pixels of a strip.
 STRIP = 4
 #: Triangles that a tile's list has room for.
@@ -43,6 +45,26 @@ class TileGrid:
     @property
     def count(self) -> int:
         return self.batch * self.rows * self.columns
+
+    @property
+    def block_count(self) -> int:
+        return self.batch * self._block_rows * self._block_columns
+
+    @property
+    def _block_rows(self) -> int:
+        return -(-self.rows // BLOCK)
+
+    @property
+    def _block_columns(self) -> int:
+        return -(-self.columns // BLOCK)
+
+    def tile(self, image: Any, row: Any, column: Any) -> Any:
+        """Number of the tile in a row and column of tiles."""
+        return (image * self.rows + row) * self.columns + column
+
+    def block(self, image: Any, row: Any, column: Any) -> Any:
+        """Number of the block that holds that tile."""
+        return (image * self._block_rows + row // BLOCK) * self._block_columns + column // BLOCK
 
 
 @dataclass(frozen=True)
@@ -118,15 +140,17 @@ def strips(grid: TileGrid, module: ModuleType) -> Strips:
 
 
 def nearest_covers(grid: TileGrid, triangles: Triangles, image: Any, active: Any) -> Any:
-    """``UInt32`` for each tile: key of the smallest depth that a triangle which covers all of the tile reaches nowhere beyond."""
+    """``UInt32`` for each tile, then for each block: key of the smallest depth beyond which some triangle that covers all of it
+    reaches nowhere. What is noted for a block is not repeated for its tiles."""
     module = backend(triangles.a)
-    nearest = dr.full(module.UInt32, 0xFFFFFFFF, grid.count)
+    nearest = dr.full(module.UInt32, 0xFFFFFFFF, grid.count + grid.block_count)
     dr.eval(nearest)
 
-    def visit(row: Any, column: Any) -> None:
-        span = _Span(triangles, row, column)
-        tile = (image * grid.rows + row) * grid.columns + column
-        dr.scatter_reduce(dr.ReduceOp.Min, nearest, depth_key(span.farthest), tile, span.covered, mode=dr.ReduceMode.Direct)
+    def visit(row: Any, column: Any, is_tile: Any) -> Any:
+        span = _Span(triangles, row, column, is_tile)
+        node = dr.select(is_tile, grid.tile(image, row, column), grid.count + grid.block(image, row, column))
+        dr.scatter_reduce(dr.ReduceOp.Min, nearest, depth_key(span.farthest), node, span.covered, mode=dr.ReduceMode.Direct)
+        return ~span.missed & ~span.covered
 
     _for_each_tile(triangles.box, active, visit)
     return nearest
@@ -153,12 +177,15 @@ def build_tile_lists(
     dr.eval(count, items)
     first_pixel = image * (grid.height * grid.width)
 
-    def visit(row: Any, column: Any) -> None:
-        span = _Span(triangles, row, column)
-        tile = (image * grid.rows + row) * grid.columns + column
-        wanted = ~span.missed
+    def visit(row: Any, column: Any, is_tile: Any) -> Any:
+        span = _Span(triangles, row, column, is_tile)
+        tile = grid.tile(image, row, column)
+        seen = ~span.missed
         if nearest is not None:
-            wanted &= depth_key(span.nearest) <= dr.gather(module.UInt32, nearest, tile, wanted)
+            depth = depth_key(span.nearest)
+            seen &= depth <= dr.gather(module.UInt32, nearest, grid.count + grid.block(image, row, column), seen)
+            seen &= ~is_tile | (depth <= dr.gather(module.UInt32, nearest, tile, seen & is_tile))
+        wanted = seen & is_tile
         slot = dr.scatter_inc(count, tile, wanted)
         fits = wanted & (slot < CAPACITY)
         dr.scatter(items, index, tile * CAPACITY + slot, fits)
@@ -167,6 +194,7 @@ def build_tile_lists(
         size = (1 << TILE) - 1
         box = (dr.maximum(x0, left), dr.maximum(y0, top), dr.minimum(x1, left + size), dr.minimum(y1, top + size))
         draw(triangles, keys, behind, first_pixel, triangle, box, wanted & ~fits)
+        return seen
 
     _for_each_tile(triangles.box, active, visit)
     dr.eval(count, items, keys)
@@ -174,30 +202,46 @@ def build_tile_lists(
 
 
 def _for_each_tile(box: tuple[Any, Any, Any, Any], active: Any, visit: Any) -> None:
-    """Call ``visit(row, column)`` in a symbolic loop over the tiles that a box touches."""
+    """Call ``visit(row, column, is_tile)`` in a symbolic loop over the tiles that a box touches.
+
+    A box of many tiles is walked block by block: a block is visited first (``is_tile`` is false, row and column are those of its
+    first tile), and its tiles only if that returns true.
+    """
     UInt32 = backend(box[0]).UInt32
     x0, y0, x1, y1 = (UInt32(dr.select(active, b, 0)) >> TILE for b in box)
-    across = x1 - x0 + 1
-    total = dr.select(active, across * (y1 - y0 + 1), 0)
+    few = (x1 - x0 + 1) * (y1 - y0 + 1) <= BLOCK * BLOCK
 
-    def body(step, row, column, total):  # noqa: ANN001, ANN202
-        visit(row, column)
-        wrap = column == x1
-        return step + 1, dr.select(wrap, row + 1, row), dr.select(wrap, x0, column + 1), total
+    def first(top: Any, left: Any) -> tuple[Any, Any]:
+        """Where to begin in the block with this first tile."""
+        return dr.select(few, dr.maximum(top, y0), top), dr.select(few, dr.maximum(left, x0), left)
 
-    state = (dr.zeros(UInt32, dr.width(total)), y0, x0, total)
-    dr.while_loop(state, lambda step, row, column, total: step < total, body, mode="symbolic", label="tiles")
+    def body(row, column, is_tile):  # noqa: ANN001, ANN202
+        descend = visit(row, column, is_tile)
+        top, left = row & ~UInt32(BLOCK - 1), column & ~UInt32(BLOCK - 1)
+        right, bottom = dr.minimum(left + BLOCK - 1, x1), dr.minimum(top + BLOCK - 1, y1)
+        next_row = is_tile & (column == right)
+        leave = dr.select(is_tile, next_row & (row == bottom), ~descend)
+        last = left + BLOCK > x1
+        block_row, block_column = first(dr.select(last, top + BLOCK, top), dr.select(last, x0 & ~UInt32(BLOCK - 1), left + BLOCK))
+        tile_row = dr.select(is_tile, dr.select(next_row, row + 1, row), dr.maximum(top, y0))
+        tile_column = dr.select(is_tile & ~next_row, column + 1, dr.maximum(left, x0))
+        row, column = dr.select(leave, block_row, tile_row), dr.select(leave, block_column, tile_column)
+        return row, column, ~leave | few
+
+    row, column = first(y0 & ~UInt32(BLOCK - 1), x0 & ~UInt32(BLOCK - 1))
+    state = (dr.select(active, row, y1 + 1), column, few)
+    dr.while_loop(state, lambda row, *_: row <= y1, body, mode="symbolic", label="tiles")
 
 
 class _Span:
-    """What a triangle does over the pixel centres of a tile.
+    """What a triangle does over the pixel centres of a tile or block.
 
     ``missed``: it contains none of them; ``covered``: it contains all; ``nearest``, ``farthest``: bounds of its depth there.
     """
 
-    def __init__(self, t: Triangles, row: Any, column: Any) -> None:
+    def __init__(self, t: Triangles, row: Any, column: Any, is_tile: Any) -> None:
         module = backend(t.a)
-        half = 0.5 * ((1 << TILE) - 1)
+        half = dr.select(is_tile, module.Float(0.5 * ((1 << TILE) - 1)), 0.5 * ((BLOCK << TILE) - 1))
         x, y = centred(module, row << TILE, column << TILE, t.height, t.width)
         middle = dr.fma(t.a, x + half, dr.fma(t.b, y + half, t.c))
         reach = (dr.abs(t.a) + dr.abs(t.b)) * half

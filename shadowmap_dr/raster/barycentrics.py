@@ -1,0 +1,87 @@
+"""Perspective-correct barycentrics and depths of all pixels, from affine functions of the pixel for each triangle."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+
+from ._types import NO_TRIANGLE, RasterOutput, backend
+from .planes import offset, pixels, planes
+
+# Pixels of a lane, as many as a packet holds.
+_STRIP = 4
+
+
+def pixel_barycentrics(raster: RasterOutput, positions: Any, faces: Any) -> tuple[Any, Any, Any]:
+    """Perspective-correct (u, v), 0 where nothing is seen, and NDC depth, 1 there, of each pixel's centre. Detached."""
+    with dr.suspend_grad():
+        depths, weights = planes(dr.detach(positions), faces, raster, True)
+        dr.eval(depths, weights)
+        return _strips(raster, depths, weights) if raster.width % _STRIP == 0 else _each(raster, depths, weights)
+
+
+def _each(raster: RasterOutput, depths: Any, weights: Any) -> tuple[Any, Any, Any]:
+    """One pixel a lane."""
+    index, row, column = pixels(raster)
+    hit = raster.valid
+    u, v, depth = _at_pixel(index, row, column, hit, depths, weights)
+    return dr.select(hit, u, 0), dr.select(hit, v, 0), dr.select(hit, depth, 1)
+
+
+def _strips(raster: RasterOutput, depths: Any, weights: Any) -> tuple[Any, Any, Any]:
+    """Four pixels of a row a lane: mostly they see the same triangle, whose look-up they share."""
+    module = backend(depths)
+    Float, UInt32 = module.Float, module.UInt32
+    count = dr.width(raster.triangle)
+    lane = dr.arange(UInt32, count // _STRIP)
+    line = lane * _STRIP // raster.width
+    column = lane * _STRIP - line * raster.width
+    image = line // raster.height
+    row = line - image * raster.height
+    base = image * raster.face_count
+    triangle = dr.gather(module.Array4u, raster.triangle, lane)
+    shared = dr.minimum(dr.minimum(triangle[0], triangle[1]), dr.minimum(triangle[2], triangle[3]))  # NO_TRIANGLE is the largest
+    records = _look_up(base + shared, shared != NO_TRIANGLE, depths, weights)
+    x, y = offset(records[0], row, column)
+
+    def other(index: Any, row: Any, column: Any, *_: Any) -> tuple[Any, ...]:
+        return _at_pixel(index, row, column, True, depths, weights)
+
+    values = []
+    for k in range(_STRIP):
+        hit = triangle[k] != NO_TRIANGLE
+        u, v, depth = dr.if_stmt(
+            (base + triangle[k], row, column + k, *_evaluate(records, x + k, y)),
+            hit & (triangle[k] != shared),
+            other,
+            lambda index, row, column, *values: values,
+            mode="symbolic",
+        )
+        values.append((dr.select(hit, u, 0), dr.select(hit, v, 0), dr.select(hit, depth, 1)))
+    results = tuple(dr.empty(Float, count) for _ in range(3))
+    for result, of_pixels in zip(results, zip(*values, strict=True), strict=True):
+        dr.scatter(result, module.Array4f(*of_pixels), lane)
+    dr.eval(results)
+    return results
+
+
+def _at_pixel(index: Any, row: Any, column: Any, active: Any, depths: Any, weights: Any) -> tuple[Any, Any, Any]:
+    records = _look_up(index, active, depths, weights)
+    return _evaluate(records, *offset(records[0], row, column))
+
+
+def _look_up(index: Any, active: Any, depths: Any, weights: Any) -> tuple[Any, Any, Any, Any]:
+    """What `planes` knows of a triangle: depth; barycentrics of vertices 1 and 2 divided by w; 1 / w at the pixel."""
+    module = backend(depths)
+    depth, one, two = (dr.gather(module.Array4f, flat, index, active) for flat in (depths, *weights[:2]))
+    return depth, one, two, dr.gather(module.Float, weights[2], index, active)
+
+
+def _evaluate(records: tuple[Any, Any, Any, Any], x: Any, y: Any) -> tuple[Any, Any, Any]:
+    """(u, v, depth) so many columns and rows from the pixel that a triangle's functions refer to."""
+    depth, one, two, at_pixel = records
+    inverse_w = dr.fma(one.w, x, dr.fma(two.w, y, at_pixel))
+    w = dr.rcp(dr.select(inverse_w != 0, inverse_w, 1))
+    u, v = (dr.fma(weight.x, x, dr.fma(weight.y, y, weight.z)) * w for weight in (one, two))
+    return u, v, dr.fma(depth.x, x, dr.fma(depth.y, y, depth.z))

@@ -249,7 +249,9 @@ class Renderer:
         if self.settings.antialias:
             # In one pass over the pixels, since both need much of the same.
             dr.eval(channels, sharpness)
-            flat = antialias(channels, raster, view.clip, self.topology, creases=self.creases, crease_weights=sharpness)
+            flat = antialias(
+                channels, raster, view.clip, self.topology, creases=self.creases, crease_weights=sharpness, meetings=True
+            )
             image = mi.TensorXf(flat, shape=(height, width, len(channels)))
         else:
             image = mi.TensorXf(_interleave(channels), shape=(height, width, len(channels)))

@@ -343,3 +343,68 @@ def test_derivatives_of_claimed_pixels_match_differences(variant: str) -> None:
             ends.append(float(total(mi.Float(moved))[0]))
         want = (ends[0] - ends[1]) / (2 * step)
         assert abs(got[i] - want) < 2e-3 + 0.02 * abs(want), (i, got[i], want)
+
+
+def test_surfaces_that_meet_without_an_edge(variant: str) -> None:
+    """Two squares that cut each other: where their depths are equal follows from all eight vertices."""
+    size, half = 64, 0.8
+    corners = half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], np.uint32)
+    # The first plane is 0.3 x + 0.1 y, the second -0.2 x - 0.05 y + 0.03: they meet at 0.5 x + 0.15 y = 0.03.
+    depth = np.r_[corners @ [0.3, 0.1], corners @ [-0.2, -0.05] + 0.03]
+    world = np.c_[np.r_[corners, corners], depth].astype(np.float32)
+    topology = topology_of(faces, world)
+    assert topology.part_count == 2 and topology.parts.numpy().tolist() == [0, 0, 1, 1]
+    colors, area = mi.Float([1, 1, 0.25, 0.25]), (size / 2) ** 2
+    moved = mi.Float(world[:, 2] * np.repeat([1, 0], 4)), mi.Float(world[:, 0] * np.repeat([0, 1], 4))
+
+    def image(meetings: bool, creases: object) -> tuple:
+        parameters = [mi.Float(0) for _ in range(4)]
+        dr.enable_grad(parameters)
+        rise, fall, steeper, slide = parameters
+        first = mi.Float(np.repeat([1, 0], 4).astype(np.float32))
+        x, y, z = (mi.Float(world[:, k].copy()) for k in range(3))
+        z = z + rise * first + fall * (1 - first) + steeper * moved[0]
+        clip = mi.TensorXf(dr.ravel(mi.Point4f(x + slide * (1 - first), y, z, 1)), shape=(8, 4))
+        out = rasterize(clip, mi.TensorXu(faces), (size, size))
+        value = dr.gather(mi.Float, colors, out.triangle, out.valid)
+        return antialias(value, out, clip, topology, meetings=meetings, creases=creases), value, parameters
+
+    x, y = np.meshgrid(*(2 * [(np.arange(16 * size) + 0.5) / (8 * size) - 1]))
+    exact = np.where(0.5 * x + 0.15 * y < 0.03, 1, 0.25) * (np.maximum(np.abs(x), np.abs(y)) < half)
+    exact = exact.reshape(size, 16, size, 16).mean((1, 3))
+    for creases in (None, mi.Bool([False] * 12)):
+        blended, raw, parameters = image(True, creases)
+        inside = np.s_[8:56, 8:56]
+        errors = [np.abs(v.numpy().reshape(size, size) - exact)[inside] for v in (blended, raw)]
+        assert errors[0].mean() < 0.15 * errors[1].mean()
+        dr.backward(dr.sum(blended))
+        # A depth changed by d moves the line by d / 0.5 along x; the squares' own outlines leave the sum as it is, but for the
+        # second's, where it is seen: its right side.
+        swept = 0.75 * 2 * half / 0.5 * area
+        tilted = 0.75 * 2 * half * 0.3 * 0.06 / 0.5 * area  # the depth of the first on the line, on average: 0.3 * 0.06
+        want = np.array([-swept, swept, -tilted, 0.75 * 2 * half * 0.2 / 0.5 * area + 0.25 * 2 * half * area])
+        got = np.array([float(dr.grad(p)[0]) for p in parameters])
+        assert np.allclose(got, want, atol=0.02 * swept), (got, want)
+        assert not np.any([dr.grad(p)[0] for p in _gradients_without(image, creases)])
+        forward = image(True, creases)
+        dr.set_grad(forward[2][1], 1.0)
+        dr.forward_to(forward[0])
+        assert dr.sum(dr.grad(forward[0]))[0] == pytest.approx(got[1], rel=1e-4)
+
+
+def _gradients_without(image, creases: object) -> list:  # noqa: ANN001
+    """Parameters that change depths alone, after a backward pass in which nobody looks where surfaces meet."""
+    blended, _, parameters = image(False, creases)
+    dr.backward(dr.sum(blended))
+    return parameters[:3]
+
+
+def test_one_surface_does_not_meet_itself(variant: str) -> None:
+    """Connected faces are one part, however many there are, and seams of texture coordinates do not part them."""
+    sphere = trimesh.creation.icosphere(subdivisions=3)
+    split = np.asarray(sphere.vertices)[sphere.faces].reshape(-1, 3)
+    both = np.r_[split, split + [3, 0, 0]].astype(np.float32)
+    topology = topology_of(np.arange(len(both)).reshape(-1, 3), both)
+    assert topology.part_count == 2
+    assert np.array_equal(topology.parts.numpy(), np.repeat([0, 1], len(sphere.faces)))

@@ -21,6 +21,7 @@ def antialias(
     crossings: Crossings | None = None,
     creases: Any = None,
     crease_weights: Any = None,
+    meetings: bool = False,
 ) -> Any:
     """Blend each pixel with the neighbours from which a silhouette separates it, by the share of the pixel they cover.
 
@@ -37,6 +38,7 @@ def antialias(
         crossings: result of :func:`find_crossings`, to share the search between several calls.
         creases, crease_weights: edges of faces that are blended (and differentiated) like silhouettes, and how much, see
             :func:`find_crossings`.
+        meetings: blend (and differentiate) where surfaces meet without an edge, too, see :func:`find_crossings`.
 
     Returns:
         The blended values in the shape of ``values``; flat, with interleaved channels, for a list. Gradients flow to ``values``
@@ -49,7 +51,7 @@ def antialias(
     flat = _checked_values(values, raster)
     positions, vertex_count = _flat_positions(positions, raster)
     if crossings is None:
-        crossings = find_crossings(positions, topology, raster, vertex_count, creases, crease_weights)
+        crossings = find_crossings(positions, topology, raster, vertex_count, creases, crease_weights, meetings)
     blended = blend(flat, positions, raster, crossings)
     return type(values)(blended, shape=values.shape) if is_tensor else blended
 

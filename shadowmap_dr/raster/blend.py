@@ -8,6 +8,7 @@ import drjit as dr
 
 from ._types import RasterOutput, backend
 from .crossings import Crossings
+from .meetings import Meetings
 from .topology import NO_VERTEX
 
 
@@ -144,7 +145,10 @@ class _Mixer:
                 gain = sum(a * (v - m) for a, v, m in zip(g, other, mean, strict=True))
                 gain *= dr.select(weight > 0, scale, -scale)
                 ends = dr.gather(module.Array4u, crossings.ends, slot)
-                _add(result, gain, dr.gather(Array4f, crossings.slopes, slot), ends.x, ends.y, True)
+                one = ends.x != NO_VERTEX
+                _add(result, gain, dr.gather(Array4f, crossings.slopes, slot), ends.x, ends.y, one)
+                if crossings.meetings is not None:
+                    _add_meeting(result, crossings.meetings, gain, pixel, down, ~one)
                 two = ends.z != NO_VERTEX
 
                 def second(slot: Any, gain: Any, c: Any, d: Any) -> Any:
@@ -203,6 +207,10 @@ class _Mixer:
                 at = dr.fma(q - p, slope.x, p)
                 change += dr.select(has, slope.y * at.x + slope.z * at.y + slope.w * at.w, 0)
             is_down = (pair & 1) != 0
+            if crossings.meetings is not None:
+                weight = dr.select(is_down, *(dr.gather(Float, w, pair >> 1) for w in (crossings.down, crossings.right)))
+                active = (ends.x == NO_VERTEX) & (weight != 0)
+                change = _change_of_meeting(crossings.meetings, positions, pair >> 1, is_down, active, change)
             dr.scatter(right, change, pair >> 1, ~is_down)
             dr.scatter(down, change, pair >> 1, is_down)
 
@@ -264,3 +272,24 @@ def _add(result: Any, gain: Any, slopes: Any, a: Any, b: Any, active: Any) -> No
     g = Array4f(gain * slopes.y, gain * slopes.z, 0, gain * slopes.w)
     dr.scatter_add(result, g * (1 - slopes.x), a, active)
     dr.scatter_add(result, g * slopes.x, b, active)
+
+
+def _add_meeting(result: Any, meetings: Meetings, gain: Any, pixel: Any, down: Any, active: Any) -> None:
+    """Pass a weight's gradient on to the corners of two triangles that meet."""
+
+    def add(gain: Any, pixel: Any, down: Any) -> Any:
+        for vertex, slope in meetings.slopes(pixel, down):
+            dr.scatter_add(result, slope * gain, vertex)
+        return gain
+
+    dr.if_stmt((gain, pixel, down), active, add, lambda gain, pixel, down: gain, mode="symbolic", label="surfaces meet")
+
+
+def _change_of_meeting(meetings: Meetings, positions: Any, pixel: Any, down: Any, active: Any, other: Any) -> Any:
+    """Change of the weight of two triangles that meet, ``other`` where not ``active``."""
+
+    def change(pixel: Any, down: Any, other: Any) -> Any:
+        return sum(dr.dot(slope, dr.gather(type(slope), positions, vertex)) for vertex, slope in meetings.slopes(pixel, down))
+
+    arguments = (pixel, down, other)
+    return dr.if_stmt(arguments, active, change, lambda pixel, down, other: other, mode="symbolic", label="surfaces meet")

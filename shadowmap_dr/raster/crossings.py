@@ -7,8 +7,9 @@ from typing import Any
 
 import drjit as dr
 
-from ._types import RasterOutput, backend
+from ._types import NO_TRIANGLE, RasterOutput, backend
 from .creases import find_creases
+from .meetings import Meetings
 from .pairs import PairList, differing_pairs, empty_list
 from .silhouette import register_silhouettes
 from .topology import NO_VERTEX, Topology
@@ -26,6 +27,7 @@ class Crossings:
             where there is none.
         slopes, second_slopes: ``Float``, four for each slot: the weight changes by the sum over x, y, w (numbers 2 to 4) of
             slope * (change of the clip-space edge at the crossing), whose ends count by 1 - s and s (number 1).
+        meetings: if surfaces that meet without an edge were looked for: what the weights of pairs without ends depend on.
     """
 
     right: Any
@@ -34,6 +36,7 @@ class Crossings:
     ends: Any
     slopes: Any
     second_slopes: Any
+    meetings: Meetings | None = None
 
 
 def find_crossings(
@@ -43,6 +46,7 @@ def find_crossings(
     vertex_count: int,
     creases: Any = None,
     crease_weights: Any = None,
+    meetings: bool = False,
 ) -> Crossings:
     """Find the edges between neighbouring pixels.
 
@@ -54,6 +58,8 @@ def find_crossings(
         creases: ``Bool`` (3 F,), whether the edge from corner k to k + 1 of a face separates pixels that see its two faces, too
             (between flat-shaded ones, whose colours jump there).
         crease_weights: ``Float`` for each pixel, between 0 and 1: how much creases count there; 1 if not given.
+        meetings: also look for the lines along which surfaces that are not connected pass through each other or touch. Depths,
+            and what follows from them alone, do not jump there.
 
     A silhouette is an edge whose faces all lie on one side of it in the image. It separates two pixels that see different
     triangles when it crosses the segment between their centres and lies before the surface that the uncovered one sees
@@ -67,7 +73,8 @@ def find_crossings(
     """
     with dr.suspend_grad():
         positions = dr.detach(positions)
-        if creases is None:
+        meetings = meetings and topology.part_count > 1
+        if creases is None and not meetings:
             pairs, keys = empty_list(raster)
             register_silhouettes(positions, topology, raster, vertex_count, keys, pairs)
         else:
@@ -76,7 +83,8 @@ def find_crossings(
             crease_weights = None if crease_weights is None else dr.detach(crease_weights)
             dr.eval(crease_weights)
         dr.eval(keys, pairs)
-        return _measure(positions, topology, raster, vertex_count, keys, pairs, creases, crease_weights)
+        meet = Meetings.of(positions, topology, raster, vertex_count) if meetings else None
+        return _measure(positions, topology, raster, vertex_count, keys, pairs, creases, crease_weights, meet)
 
 
 def _measure(
@@ -88,6 +96,7 @@ def _measure(
     pairs: PairList,
     creases: Any,
     crease_weights: Any,
+    meetings: Meetings | None,
 ) -> Crossings:
     module = backend(positions)
     Float, UInt32, Array4f = module.Float, module.UInt32, module.Array4f
@@ -99,6 +108,7 @@ def _measure(
         dr.empty(UInt32, 8 * pixels),
         dr.empty(Float, 8 * pixels),
         dr.empty(Float, 8 * pixels),
+        meetings,
     )
 
     def visit(slot: Any, pair: Any) -> None:
@@ -149,6 +159,8 @@ def _measure(
                 mode="symbolic",
                 label="second crease",
             )
+        if meetings is not None:
+            value = _meeting(meetings, pixel, step, down, a == NO_VERTEX, value)
         dr.scatter(found.ends, module.Array4u(a, b, c, d), slot)
         dr.scatter(found.slopes, Array4f(slopes), slot)
         dr.scatter(found.right, value, pixel, ~down)
@@ -157,6 +169,19 @@ def _measure(
     pairs.for_each(visit)
     dr.eval(found)
     return found
+
+
+def _meeting(meetings: Meetings, pixel: Any, step: Any, down: Any, bare: Any, value: Any) -> Any:
+    """The weight of pairs without an edge (``bare``) whose surfaces meet, ``value`` for others."""
+    here, there = (dr.gather(type(pixel), meetings.triangle, p, bare) for p in (pixel, pixel + step))
+    return dr.if_stmt(
+        (pixel, down, value),
+        bare & meetings.possible(dr.select(bare, here, NO_TRIANGLE), there),
+        lambda pixel, down, value: meetings.weight(pixel, down),
+        lambda pixel, down, value: value,
+        mode="symbolic",
+        label="surfaces meet",
+    )
 
 
 def _weight(

@@ -21,6 +21,8 @@ class Topology:
             three or more faces stands once for each of them, as a boundary.
         count: number of edges E.
         faces, welded: ``UInt32`` (3 F,) vertices of the faces, as they are and with one number for each place.
+        parts: ``UInt32`` (F,) a number for each face, the same for faces that are connected through common vertices.
+        part_count: how many different numbers there are.
     """
 
     edges: Any
@@ -28,6 +30,8 @@ class Topology:
     count: int
     faces: Any
     welded: Any
+    parts: Any
+    part_count: int
 
 
 def build_topology(faces: np.ndarray, positions: np.ndarray, dtype: type) -> Topology:
@@ -49,7 +53,8 @@ def build_topology(faces: np.ndarray, positions: np.ndarray, dtype: type) -> Top
         raise ValueError(f"faces refer to vertices {faces.min()}..{faces.max()}, but there are {len(positions)}")
     _, weld = np.unique(positions.view([("", np.float32)] * 3).ravel(), return_inverse=True)
     welded = weld[faces]
-    flat = [dtype(np.ascontiguousarray(t.ravel().astype(np.uint32))) for t in (faces, welded)]
+    parts, part_count = _parts(welded)
+    flat = [dtype(np.ascontiguousarray(t.ravel().astype(np.uint32))) for t in (faces, welded, parts)]
     proper = (welded != np.roll(welded, 1, 1)).all(1)
     faces, welded = faces[proper], welded[proper]
 
@@ -69,4 +74,24 @@ def build_topology(faces: np.ndarray, positions: np.ndarray, dtype: type) -> Top
         dtype(np.stack([opposite[edges], second], 1).ravel().astype(np.uint32)),
         len(edges),
         *flat,
+        part_count,
     )
+
+
+def _parts(welded: np.ndarray) -> tuple[np.ndarray, int]:
+    """Number of the connected part of each face, from 0 on, and how many there are.
+
+    All vertices point to themselves at first. Those that the corners of a face point to are redirected to the lowest of them and
+    chains are cut short, until nothing changes: as many rounds as the logarithm of a part's size, about.
+    """
+    target = np.arange(welded.max() + 1)
+    while True:
+        corners = target[welded]
+        lowest = corners.min(1)
+        if (corners == lowest[:, None]).all():
+            break
+        np.minimum.at(target, corners.ravel(), np.repeat(lowest, 3))
+        while (target != target[target]).any():
+            target = target[target]
+    _, parts = np.unique(lowest, return_inverse=True)
+    return parts, int(parts.max()) + 1

@@ -23,7 +23,8 @@ from typing import Any
 import pytest
 
 TESTS = Path(__file__).resolve().parent
-DERIVATIVE = "test_derivatives.py::test_forward_mode_agrees_with_path_traced_differences"
+TRACED = "test_gradients.py::test_derivative_image_agrees_with_path_tracing[llvm_ad_rgb-{}]"
+DIFFERENCES = "test_gradients.py::test_derivative_image_agrees_with_differences[llvm_ad_rgb-{}]"
 
 
 @dataclass(frozen=True)
@@ -86,6 +87,32 @@ def _detached_position(function: Callable[..., Any]) -> Callable[..., Any]:
     return detached
 
 
+def _nowhere(function: Callable[..., Any]) -> Callable[..., Any]:
+    return lambda *arguments: 0.0 * function(*arguments)
+
+
+def _only_the_first_triangle(function: Callable[..., Any]) -> Callable[..., Any]:
+    return lambda *arguments: function(*arguments)[:3]
+
+
+def _detached_cone(function: Callable[..., Any]) -> Callable[..., Any]:
+    def detached(light: Any, *arguments: Any) -> Any:
+        import drjit as dr
+
+        return function(replace(light, cutoff_angle=dr.detach(light.cutoff_angle)), *arguments)
+
+    return detached
+
+
+def _detached_rays(function: Callable[..., Any]) -> Callable[..., Any]:
+    def detached(*arguments: Any) -> Any:
+        import drjit as dr
+
+        return dr.detach(function(*arguments))
+
+    return detached
+
+
 def _always_lit(function: Callable[..., Any]) -> Callable[..., Any]:
     return lambda *arguments, **options: 0.0 * function(*arguments, **options) + 1.0
 
@@ -100,21 +127,29 @@ def _half_a_texel_off(function: Callable[..., Any]) -> Callable[..., Any]:
 
 MUTATIONS = (
     Mutation("halve the shadow gradient", "shadow.moments", "chebyshev_visibility", _halved_gradient,
-             (f"{DERIVATIVE}[llvm_ad_rgb-light_direction_box-256-1]",)),
+             (TRACED.format("sun_box_light_direction"),)),
     Mutation("flip the light of the maps", "shadow.camera", "directional_view", _flipped_direction,
              ("test_references.py::test_shadows_of_1024_texels[llvm_ad_rgb-pose]",)),
     Mutation("flip the light of the shading", "lights", "DirectionalLight.illuminate", _flipped_shading,
              ("test_references.py::test_shading_without_shadows[llvm_ad_rgb-pose]",)),
     Mutation("switch moment anti-aliasing off", "shadow.shadow_map", "antialias", _no_antialiasing,
-             (f"{DERIVATIVE}[llvm_ad_rgb-light_direction_box-256-1]",), only_there=True),
+             (TRACED.format("sun_box_light_direction"),), only_there=True),
     Mutation("detach the light's rotation", "shadow.camera", "directional_view", _detached_rotation,
-             (f"{DERIVATIVE}[llvm_ad_rgb-light_direction_box-256-1]",)),
+             (TRACED.format("sun_box_light_direction"),)),
     Mutation("detach the spot light's position", "shadow.camera", "spot_view", _detached_position,
-             (f"{DERIVATIVE}[llvm_ad_rgb-spot_position_box-256-1]",)),
+             (TRACED.format("spot_box_spot_position"),)),
     Mutation("leave the shadows out", "shadow.moments", "chebyshev_visibility", _always_lit,
              ("test_references.py::test_shadows_of_1024_texels[llvm_ad_rgb-gallery]",)),
     Mutation("look half a texel off", "shadow.lookup", "_bilinear", _half_a_texel_off,
              ("test_references.py::test_shadows_of_1024_texels[llvm_ad_rgb-gallery]",)),
+    Mutation("do not see where surfaces meet", "raster.meetings", "Meetings.weight", _nowhere,
+             (DIFFERENCES.format("crossing_boxes-camera_shift"),)),
+    Mutation("move one of two surfaces that meet", "raster.meetings", "Meetings.slopes", _only_the_first_triangle,
+             (DIFFERENCES.format("standing_box-caster_rotation"), DIFFERENCES.format("standing_box-camera_turn"))),
+    Mutation("detach the spot light's cone", "lights", "SpotLight.illuminate", _detached_cone,
+             (DIFFERENCES.format("spot_cow-spot_cone"),)),
+    Mutation("detach an orthographic camera's rays", "sensors", "Sensor.pixel_rays", _detached_rays,
+             (DIFFERENCES.format("orthographic_cow-camera_turn"),)),
 )  # fmt: skip
 
 

@@ -165,13 +165,26 @@ def test_stored_scene_references_are_complete(name: str) -> None:
         assert stored.settings["relative_standard_error"] < 0.005
 
 
-@pytest.mark.parametrize("case", cases.CASES, ids=lambda case: case.name)
-def test_stored_derivatives(variant: str, case: cases.Case) -> None:
-    stored = reference.load(case.path)
+@pytest.mark.parametrize("traced", cases.TRACED, ids=lambda traced: traced.name)
+def test_stored_derivatives_are_complete(traced: cases.Traced) -> None:
+    mi.set_variant("llvm_ad_rgb")
+    stored = reference.load(traced.path)
+    assert stored.image.shape == (cases.RESOLUTION, cases.RESOLUTION, 3)
     assert stored.settings["independent_cosine"] >= 0.995
-    assert stored.settings["step"] == case.step
-    made = derivatives.central_difference(case.build, case.step, spp=256, seed=7)
-    result = derivatives.agreement(made.image, stored.image)
+    assert stored.settings["step"] == traced.changed.step and stored.settings["parameter"] == traced.changed.key
+
+
+def test_stored_derivatives_are_of_cases_that_exist() -> None:
+    assert {traced.path for traced in cases.TRACED} == set(cases.FOLDER.glob("derivative_*.exr"))
+
+
+@pytest.mark.parametrize(
+    "name", ["sun_cow_light_direction", "spot_cow_spot_cone", "orthographic_cow_camera_shift", "standing_box_caster_translation"]
+)
+def test_stored_derivatives_can_be_made_again(variant: str, name: str) -> None:
+    (traced,) = (traced for traced in cases.TRACED if traced.name == name)
+    made = derivatives.central_difference(traced.build, traced.changed.step, spp=256, seed=7)
+    result = derivatives.agreement(made.image, reference.load(traced.path).image)
     assert result.cosine > 0.995 and abs(result.scale - 1) < 0.02
 
 

@@ -1,4 +1,4 @@
-"""The plug-in: ``mi.render`` in all modes and variants, against Mitsuba's own images and against central differences."""
+"""The plug-in: ``mi.render`` in all modes and variants, against Mitsuba's own images. Its derivatives: test_gradients.py."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import subprocess
 import sys
 import textwrap
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
-from scipy.ndimage import uniform_filter
 
 import shadowmap_dr
 from shadowmap_dr import ShadowmapError
@@ -135,106 +134,12 @@ def _translated(base: Any, t: Any) -> Any:
     return base + t * mi.Float(np.tile(np.float32([1.0, 0.5, 0.2]), dr.width(base) // 3))
 
 
-def _rotated(axis: list[float]) -> Callable[[Any, Any], Any]:
-    return lambda base, t: mi.Transform4f().rotate(mi.Vector3f(axis), t * 50) @ base
-
-
-def _moved(offset: list[float]) -> Callable[[Any, Any], Any]:
-    return lambda base, t: mi.Transform4f().translate(mi.Vector3f(offset) * t) @ base
-
-
 def _scaled(base: Any, t: Any) -> Any:
     return mi.TensorXf(base.array * (1 + t), base.shape) if dr.is_tensor_v(base) else base * (1 + t)
 
 
-# Parameter -> (its value as a function of a number t, half the difference of t that central differences use).
-CHANGES: dict[str, tuple[Callable[[Any, Any], Any], float]] = {
-    "ball.vertex_positions": (_translated, 0.02),
-    "ball.bsdf.reflectance.value": (_scaled, 0.05),
-    "floor.to_world": (_moved([0, 0, 1]), 0.02),
-    "floor.bsdf.reflectance.data": (_scaled, 0.05),
-    "camera.to_world": (_rotated([0, 0, 1]), 0.01),
-    "sun.to_world": (_rotated([1, 0.5, 0]), 0.02),
-    "sun.irradiance.value": (_scaled, 0.05),
-    "lamp.position": (lambda base, t: base + mi.Vector3f(t, 0.5 * t, -0.3 * t), 0.03),
-    "lamp.intensity.value": (_scaled, 0.05),
-    "spot.to_world": (_moved([1, 0.5, 0]), 0.03),
-    "spot.intensity.value": (_scaled, 0.05),
-}
-
-
-class Changes:
-    """Writes the parameters of CHANGES into the full scene, each moved by its own number."""
-
-    def __init__(self) -> None:
-        self.scene = full_scene()
-        self.params = mi.traverse(self.scene)
-        self.base = {key: type(self.params[key])(self.params[key]) for key in CHANGES}
-        self.integrator = shadowmap(**SOFT)
-
-    def image(self, values: dict[str, Any]) -> Any:
-        for key, value in values.items():
-            self.params[key] = CHANGES[key][0](self.base[key], value)
-        self.params.update()
-        return mi.render(self.scene, self.params, integrator=self.integrator)
-
-    def image_at(self, key: str, value: float) -> np.ndarray:
-        # All numbers are opaque, so that all these images come from the same kernels.
-        return self.image({k: dr.opaque(mi.Float, value if k == key else 0) for k in CHANGES}).numpy()
-
-    def derivative(self, tangents: dict[str, float]) -> np.ndarray:
-        values = {k: dr.opaque(mi.Float, 0) for k in CHANGES}
-        for key, value in values.items():
-            dr.enable_grad(value)
-            dr.set_grad(value, dr.opaque(mi.Float, tangents.get(key, 0.0)))
-        image = self.image(values)
-        dr.forward_to(image)
-        return dr.grad(image).numpy()
-
-    def gradients(self, weight: np.ndarray, keys: Any = CHANGES) -> dict[str, float]:
-        values = {k: dr.opaque(mi.Float, 0) for k in keys}
-        dr.enable_grad(values)
-        image = self.image(values)
-        dr.backward(dr.sum(image * mi.TensorXf(weight)))
-        return {k: float(dr.grad(value)[0]) for k, value in values.items()}
-
-
 def weights(shape: tuple[int, ...]) -> np.ndarray:
     return np.random.default_rng(3).uniform(-1, 1, shape).astype(np.float32)
-
-
-@pytest.fixture
-def changes(variant: str) -> Changes:
-    return Changes()
-
-
-@pytest.mark.parametrize("key", CHANGES)
-def test_derivative_image_agrees_with_central_differences(changes: Changes, key: str) -> None:
-    step = CHANGES[key][1]
-    automatic = changes.derivative({key: 1.0})
-    reference = (changes.image_at(key, step) - changes.image_at(key, -step)) / (2 * step)
-    a, f = (uniform_filter(image.sum(-1), 5) for image in (automatic, reference))
-    cosine = (a * f).sum() / np.sqrt((a * a).sum() * (f * f).sum())
-    scale = (a * f).sum() / (f * f).sum()
-    assert cosine > 0.95
-    assert 0.9 < scale < 1.1
-
-
-def test_forward_and_reverse_mode_agree(changes: Changes) -> None:
-    weight = weights((SIZE, SIZE, 3))
-    gradients = changes.gradients(weight)
-    for key, gradient in gradients.items():
-        derivative = changes.derivative({key: 1.0})
-        assert gradient == pytest.approx((derivative * weight).sum(), rel=1e-3, abs=1e-4 * float(np.abs(derivative).sum())), key
-    tangents = dict(zip(CHANGES, np.random.default_rng(4).normal(size=len(CHANGES)), strict=True))
-    total = sum(tangents[key] * gradients[key] for key in CHANGES)
-    assert (changes.derivative(tangents) * weight).sum() == pytest.approx(total, rel=1e-3)
-
-
-@pytest.mark.parametrize("key", ["ball.vertex_positions", "floor.bsdf.reflectance.data", "spot.to_world"])
-def test_single_parameter_gets_the_same_gradient(changes: Changes, key: str) -> None:
-    weight = weights((SIZE, SIZE, 3))
-    assert changes.gradients(weight, [key])[key] == pytest.approx(changes.gradients(weight)[key], rel=1e-4)
 
 
 def test_texture_gradient_is_an_image(variant: str) -> None:

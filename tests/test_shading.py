@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from shadowmap_dr.geometry import NO_TRIANGLE, Geometry
+from shadowmap_dr.geometry import NO_TRIANGLE
 from shadowmap_dr.scene import SceneData, load, refresh
 from shadowmap_dr.shading import ambient_light, background, direct_light, opacity, surface
 
@@ -281,58 +281,6 @@ def test_gate_closes_where_a_shadow_ray_would(variant: str) -> None:
     assert np.any(free[away] > 0) and np.all(gated[away] == 0) and np.array_equal(free[~away], gated[~away])
 
 
-def gradient_case(name: str) -> tuple[float, float, Any]:
-    """(start, step, function of one Float that returns (geometry, lights, sensor, data) changed by it)."""
-    mesh = bumpy_mesh("mesh", normals=True, texcoords=True)
-    mesh.set_bsdf(mi.load_dict({"type": "principled", "base_color": bitmap(1), "roughness": 0.5}))
-    scene = mi.load_dict(base_scene(mesh=mesh), optimize=False)
-    data = load(scene)
-    sensor = data.sensors[0][0]
-    params = mi.traverse(scene)
-
-    def change(x: Any) -> tuple[Geometry, tuple[Any, ...], Any, SceneData]:
-        geometry, lights, camera = data.geometry, data.lights, sensor
-        if name == "positions":
-            p = geometry.shape_positions("mesh")
-            geometry = geometry.with_positions({"mesh": p + x * mi.Vector3f(0.5 * p.z, 0, p.x + p.y)})
-        elif name == "direction":
-            lights = (replace(data.light("sun"), direction=mi.Vector3f(x, 0.4, -1)),)
-        elif name == "spot":
-            lamp = data.light("lamp")
-            lights = (replace(lamp, to_world=lamp.to_world @ mi.Transform4f().rotate([0, 1, 0], 40 * x)),)
-        elif name == "camera":
-            camera = replace(sensor, to_world=mi.Transform4f().translate([x, 0, 0]) @ sensor.to_world)
-        elif name == "roughness":
-            params["mesh.bsdf.roughness.value"] = x
-            params.update()
-        elif name == "texture":
-            texture = np.random.default_rng(1).random((8, 8, 3)).astype(np.float32)
-            params["mesh.bsdf.base_color.data"] = mi.TensorXf(mi.Float(texture.ravel()) * x, shape=(8, 8, 3))
-            params.update()
-        return geometry, lights, camera, data
-
-    return {"roughness": 0.5, "texture": 0.8}.get(name, 0.0), 2e-3, (change, scene, data)
-
-
-@pytest.mark.parametrize("name", ["positions", "direction", "spot", "camera", "roughness", "texture"])
-def test_gradients(variant: str, name: str) -> None:
-    start, step, (change, scene, data) = gradient_case(name)
-    triangle, u, v, _ = primary_hits(scene, data)
-
-    def total(x: Any) -> Any:
-        geometry, lights, camera, records = change(x)
-        seen = surface(records, geometry, camera, triangle, u, v)
-        radiance = sum(direct_light(seen, light, gate=False) for light in lights)
-        return dr.sum(dr.squared_norm(radiance)) / SIZE**2
-
-    x = mi.Float(start)
-    dr.enable_grad(x)
-    dr.backward(total(x))
-    difference = (total(mi.Float(start + step)) - total(mi.Float(start - step))) / (2 * step)
-    assert np.abs(difference.numpy()) > 1e-3
-    assert np.allclose(x.grad.numpy(), difference.numpy(), rtol=0.02)
-
-
 def test_forward_mode_and_barycentrics(variant: str) -> None:
     """d p / d u is an edge of the triangle; forward mode goes through with_positions and smooth normals."""
     scene = mi.load_dict(base_scene(mesh=bumpy_mesh("mesh", normals=True, texcoords=True)), optimize=False)
@@ -417,7 +365,10 @@ def test_frozen_step_records_once(variant: str) -> None:
 
 def test_frozen_step_with_texture_gradient(variant: str) -> None:
     """Scene parameters change outside of the frozen function, which differentiates all the same and is not recorded again."""
-    _, _, (_, scene, data) = gradient_case("texture")
+    mesh = bumpy_mesh("mesh", normals=True, texcoords=True)
+    mesh.set_bsdf(mi.load_dict({"type": "principled", "base_color": bitmap(1), "roughness": 0.5}))
+    scene = mi.load_dict(base_scene(mesh=mesh), optimize=False)
+    data = load(scene)
     triangle, u, v, _ = primary_hits(scene, data)
     params = mi.traverse(scene)
 

@@ -1,11 +1,10 @@
-"""Makes the stored references: ``python tests/references/make.py [NAME ...]`` (all by default; under two minutes on two cores).
+"""Makes the stored references: ``python tests/references/make.py [NAME ...]`` (all by default; some minutes on two cores).
 
 Files, 128 x 128, 16-bit EXR with the settings in the header (`mitsuba_baselines.reference.load` reads them):
 
 - `SCENE_direct.exr`, `SCENE_unshadowed.exr` for each scene in `scenes/`: with and without shadow rays.
-- `derivative_CASE.exr` for each case in `cases.py`: central differences of path-traced renderings. The header's
+- `derivative_CASE_PARAMETER.exr` for what `cases.py` lists: central differences of path-traced renderings. The header's
   `independent_cosine` says how well two references made with different seeds agree (asked for: 0.995).
-- `primal_CASE.exr`: the rendering that the derivative belongs to.
 """
 
 from __future__ import annotations
@@ -36,19 +35,17 @@ def make_scene(name: str) -> None:
     reference.save(cases.FOLDER / f"{name}_unshadowed.exr", unshadowed.unshadowed(scene, spp=SPP_SCENE), half=True)
 
 
-def make_derivative(case: cases.Case) -> None:
-    first, second = (derivatives.central_difference(case.build, case.step, spp=SPP_DERIVATIVE, seed=seed)
-                     for seed in (0, 1))
+def make_derivative(traced: cases.Traced) -> None:
+    step = traced.changed.step
+    first, second = (derivatives.central_difference(traced.build, step, spp=SPP_DERIVATIVE, seed=seed) for seed in (0, 1))
     cosine = derivatives.agreement(first.image, second.image).cosine
-    settings = {**first.settings, "parameter": case.parameter, "independent_cosine": cosine}
-    reference.save(case.path, replace(first, settings=settings), half=True)
-    primal = reference.path_traced(case.build(0.0), spp=SPP_SCENE)
-    reference.save(cases.FOLDER / f"primal_{case.name}.exr", primal, half=True)
+    settings = {**first.settings, "parameter": traced.changed.key, "independent_cosine": cosine}
+    reference.save(traced.path, replace(first, settings=settings), half=True)
 
 
 def main() -> None:
     jobs = {name: lambda name=name: make_scene(name) for name in cases.SCENES}
-    jobs |= {case.name: lambda case=case: make_derivative(case) for case in cases.CASES}
+    jobs |= {traced.name: lambda traced=traced: make_derivative(traced) for traced in cases.TRACED}
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(jobs))
     names = parser.parse_args().names or list(jobs)

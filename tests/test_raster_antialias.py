@@ -408,3 +408,21 @@ def test_one_surface_does_not_meet_itself(variant: str) -> None:
     topology = topology_of(np.arange(len(both)).reshape(-1, 3), both)
     assert topology.part_count == 2
     assert np.array_equal(topology.parts.numpy(), np.repeat([0, 1], len(sphere.faces)))
+
+
+def test_surfaces_that_lie_on_each_other_do_not_meet(variant: str) -> None:
+    """Two squares in one plane, up to rounding: which of both a pixel sees is chance, and has no derivative."""
+    corners = 0.8 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    world = np.c_[np.r_[corners, 0.9 * corners[:, ::-1]], np.zeros(8)]
+    world[:, 2] = 0.3 * world[:, 0] - 0.21 * world[:, 1] + 0.17
+    world, faces, size = world.astype(np.float32), np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], np.uint32), 48
+    topology, rise = topology_of(faces, world), mi.Float(0)
+    dr.enable_grad(rise)
+    x, y, z = (mi.Float(world[:, k].copy()) for k in range(3))
+    clip = mi.TensorXf(dr.ravel(mi.Point4f(x, y, z + rise * mi.Float(np.repeat([1, 0], 4)), 1)), shape=(8, 4))
+    out = rasterize(clip, mi.TensorXu(faces), (size, size))
+    assert len(np.unique(out.triangle.numpy())) > 3
+    value = dr.gather(mi.Float, mi.Float([1, 1, 0.25, 0.25]), out.triangle, out.valid)
+    image = antialias(value, out, clip, topology, meetings=True)
+    dr.backward(dr.sum(dr.square(image)))
+    assert dr.grad(rise)[0] == 0

@@ -15,6 +15,9 @@ from ._types import NO_TRIANGLE, RasterOutput, backend
 from .setup import edge_lines, gather_triangle
 from .topology import Topology
 
+# Depths whose difference changes by less (relative) from one pixel to the next are the same: the surfaces lie on each other.
+_LEAST_CHANGE = 1e-6
+
 
 @dataclass(frozen=True)
 class Meetings:
@@ -89,7 +92,8 @@ class Meetings:
         a, b, c = (u - v for u, v in zip(*differences, strict=True))
         # First depth minus second here, and its change on the way to the neighbour.
         start, change = dr.fma(a, x, dr.fma(b, y, c)), dr.select(down, b * step_y, a * step_x)
-        meet = (start < 0) & (start + change > 0)
+        depth = found[0][2][0] * x + found[0][2][1] * y + found[0][2][2]
+        meet = (start < 0) & (start + change > 0) & (change > _LEAST_CHANGE * dr.abs(depth))
         slope = dr.select(meet, dr.rcp(dr.select(meet, change, 1)), 0)
         t = -start * slope
         across = (a * step_x) ** 2

@@ -31,6 +31,8 @@ from shadowmap_dr.lights import DirectionalLight
 
 ALL = [(case.name, parameter) for case in CASES for parameter in case.parameters]
 
+# What needs more samples than the case has: highlights on fine facets (c = 0.989, s = 1.033 with 16).
+SAMPLES = {("glossy", "caster_rise"): 64}
 # What one sample per pixel is enough for.
 AT_ONE_SAMPLE = {
     "sun_box": ("light_direction", "irradiance", "caster_translation", "camera_shift", "floor_reflectance", "floor_height"),
@@ -71,7 +73,7 @@ def assert_agrees_with_differences(tested: Model, parameter: str) -> None:
 
 @pytest.mark.parametrize(("case", "parameter"), ALL)
 def test_derivative_image_agrees_with_differences(variant: str, case: str, parameter: str) -> None:
-    assert_agrees_with_differences(model(variant, case), parameter)
+    assert_agrees_with_differences(model(variant, case, SAMPLES.get((case, parameter))), parameter)
 
 
 @pytest.mark.parametrize(("case", "parameter"), [(case, name) for case, names in AT_ONE_SAMPLE.items() for name in names])

@@ -161,7 +161,7 @@ CASES = (
         {"roughness": Parameter("floor.bsdf.roughness.value", increased(), 0.02),
          "base_color": Parameter("floor.bsdf.base_color.data", repainted(3), 0.1),
          "metal": Parameter("other.bsdf.alpha.value", increased(), 0.02),
-         "spot_position": SPOT["spot_position"], **without(CASTER, "caster_rise"), **CAMERA},
+         "spot_position": SPOT["spot_position"], **CASTER, **CAMERA},
     ),
     Case("two_lights", two_lights, {
         "ball": Parameter("ball.vertex_positions", translated(1, 0.2, 0.5), 0.01),

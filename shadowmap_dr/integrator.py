@@ -44,6 +44,7 @@ class Options:
     shadow_antialias       anti-alias shadow maps; without it casters get no gradient from the outlines of their shadows
     shadow_bleeding        visibilities below this count as 0, against light that bleeds through (``vsm``, ``evsm``, ``msm``)
     shadow_order           terms of the Fourier series of ``csm``, 2 to 16
+    shadow_supersampling   texels along each side that are averaged into one of the map, 1 to 8 (pre-filtered methods)
     shadow_samples         look-ups along each side of a pixel, 1 to 8; 0 chooses
     antialias              anti-alias the image; without it outlines have no gradient
     ambient                radiance of unshadowed light from all directions, beside that of the scene's environment
@@ -61,6 +62,7 @@ class Options:
     shadow_antialias: bool = True
     shadow_bleeding: float = 0.0
     shadow_order: int = 4
+    shadow_supersampling: int = 1
     shadow_samples: int = 0
     antialias: bool = True
     ambient: float = 0.0
@@ -108,6 +110,7 @@ class Options:
                 compat=self.compat,
                 bleeding=self.shadow_bleeding,
                 order=self.shadow_order,
+                supersampling=self.shadow_supersampling,
             )
         except ValueError as error:
             raise ShadowmapError(str(error)) from None

@@ -96,6 +96,7 @@ class Renderer:
         shadow_antialias: bool = True,
         shadow_bleeding: float = 0.0,
         shadow_order: int = 4,
+        shadow_supersampling: int = 1,
         compat: bool = False,
         tessellation: int = 64,
         **settings: Any,
@@ -118,6 +119,7 @@ class Renderer:
                 compat=compat,
                 bleeding=shadow_bleeding,
                 order=shadow_order,
+                supersampling=shadow_supersampling,
             )
         except ValueError as error:
             raise ShadowmapError(str(error)) from None

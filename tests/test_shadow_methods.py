@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -12,7 +13,7 @@ import pytest
 import shadow_scene
 import trimesh
 
-from shadowmap_dr.shadow import PREFILTERED, ShadowSettings, directional_view, visibility
+from shadowmap_dr.shadow import PREFILTERED, ShadowSettings, cube_views, directional_view, visibility
 from shadowmap_dr.shadow.moments import reduced_bleeding
 
 FAMILY = (*PREFILTERED, "pcf")
@@ -176,6 +177,52 @@ def test_derivatives(variant: str, method: str, filter_size: int) -> None:
     assert cosine > 0.97 and 0.9 < scale < 1.1, (cosine, scale)
 
 
+@pytest.mark.parametrize("method", ["vsm", "esm", "csm"])  # 2, 1 and 8 numbers a texel
+def test_supersampled_texels_are_means(variant: str, method: str) -> None:
+    """Of texels of a finer map, in all maps of a batch; and derivatives in both modes go through the mean."""
+    views = list(cube_views(mi.Point3f(0.4, 0.3, 0.7), 32, 1))
+    base = ShadowSettings(method=method, resolution=32, filter="none", order=4)
+    vertices = points(BOX.vertices)
+
+    def values(settings: ShadowSettings, t: Any = 0) -> Any:
+        moved = vertices + mi.Vector3f(t, 0.5 * t, 0)
+        return shadow_scene.make_maps(views, moved, BOX.vertices, BOX.faces, settings, frusta=frusta).values
+
+    frusta = shadow_scene.make_maps(views, vertices, BOX.vertices, BOX.faces, base).frusta
+    supersampled = replace(base, supersampling=4)
+    fine = values(replace(base, resolution=128)).numpy().reshape(6, 32, 4, 32, 4, -1)
+    coarse = values(supersampled).numpy().reshape(6, 32, 32, -1)
+    assert (coarse.std(axis=(1, 2)).max(axis=1) > 1e-3).sum() >= 2  # the box is in several maps
+    np.testing.assert_allclose(coarse, fine.mean((2, 4), dtype=np.float64), rtol=1e-5, atol=1e-5)
+
+    weights = floats(np.random.default_rng(2).normal(size=coarse.size))
+    t = mi.Float(0)
+    dr.enable_grad(t)
+    stored_values = values(supersampled, t)
+    dr.forward(t)
+    forward = (dr.grad(stored_values).numpy() * weights.numpy()).sum()
+    t = mi.Float(0)
+    dr.enable_grad(t)
+    dr.backward(dr.sum(values(supersampled, t) * weights))
+    assert float(t.grad[0]) == pytest.approx(float(forward), rel=1e-3)
+
+
+def test_supersampled_derivatives_are_closer_to_differences(variant: str) -> None:
+    """Without a filter, coverage that is exact along one axis only is seen in the derivative; finer texels come closer."""
+    errors = []
+    for supersampling in (1, 4):
+        settings = ShadowSettings(resolution=64, filter="none", supersampling=supersampling)
+        frusta = shadow(settings, mi.Vector3f(0))[1].frusta
+        t = mi.Float(0)
+        dr.enable_grad(t)
+        image = shadow(settings, mi.Vector3f(t, 0.5 * t, 0), frusta)[0]
+        dr.forward(t)
+        step = 0.01
+        low, high = (shadow(settings, mi.Vector3f(x, 0.5 * x, 0), frusta)[0].numpy() for x in (-step, step))
+        errors.append(1 - compared(dr.grad(image).numpy(), (high - low) / (2 * step))[0])
+    assert errors[1] < 0.5 * errors[0], errors
+
+
 def compared(derivative: np.ndarray, reference: np.ndarray) -> tuple[float, float]:
     """Cosine, and the factor by which the first is larger."""
     product = float((derivative * reference).sum())
@@ -190,6 +237,9 @@ def compared(derivative: np.ndarray, reference: np.ndarray) -> tuple[float, floa
         ({"bleeding": 1.0}, "1.0"),
         ({"order": 3}, "3"),
         ({"order": 18}, "18"),
+        ({"supersampling": 0}, "0"),
+        ({"supersampling": 4, "resolution": 2048}, "4096"),
+        ({"supersampling": 2, "method": "pcf"}, "pcf"),
     ],
 )
 def test_bad_settings_are_named(change: dict[str, Any], word: str) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import drjit as dr
 
-from ..raster import RasterOutput, Topology, antialias, visible_triangles
+from ..raster import MAX_RESOLUTION, RasterOutput, Topology, antialias, visible_triangles
 from ..raster._types import backend, pixel_coordinates
 from ..raster.planes import pixel_depth
 from .camera import Frusta, Views, linear_depth, of_map, to_clip
@@ -37,6 +37,8 @@ class ShadowSettings:
         bias: depth offset of ``standard`` and ``pcf``, in units of the depth range of the map.
         bleeding: visibilities below this are cut off and the rest is stretched to 0..1; for ``vsm``, ``evsm`` and ``msm``.
         order: terms of the series of ``csm``, an even number.
+        supersampling: each texel is the mean of so many texels along both sides, anti-aliased first; for pre-filtered methods. More
+            exact coverage, and derivatives, for that many times as many texels to rasterize.
         compat: the conventions of Worchel and Alexa's code: unnormalised radial depth, fixed frusta, dark outside of them, their
             kernels, minimum variance 1e-4.
     """
@@ -50,6 +52,7 @@ class ShadowSettings:
     compat: bool = False
     bleeding: float = 0.0
     order: int = 4
+    supersampling: int = 1
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
@@ -64,6 +67,13 @@ class ShadowSettings:
             raise ValueError(f"the order of the Fourier series is {self.order}; it must be an even number from 2 to 16")
         if not 1 <= self.resolution <= 4096:
             raise ValueError(f"shadow map resolution is {self.resolution}; it must lie between 1 and 4096")
+        if not 1 <= self.supersampling <= 8 or self.supersampling * self.resolution > MAX_RESOLUTION:
+            raise ValueError(
+                f"shadow map supersampling is {self.supersampling}; it must lie between 1 and 8, "
+                f"and maps may have {MAX_RESOLUTION} texels along a side in all"
+            )
+        if self.supersampling > 1 and self.method != "none" and (self.compat or not self.filterable):
+            raise ValueError(f"shadow method {self.method!r} cannot be supersampled; use a pre-filtered one without compat")
         filter_kernel(self.filter, self.filter_size)
         if self.filter_size + 6 > self.resolution and self.method != "none":
             raise ValueError(
@@ -115,23 +125,25 @@ def render_maps(
         views, frusta: cameras of the M maps.
         transparent: alpha test, see :func:`shadowmap_dr.raster.rasterize`.
     """
-    count, size = views.count, settings.resolution
+    count, size = views.count, settings.resolution * settings.supersampling
     clip = to_clip(of_map(views, map_index, count), of_map(frusta, map_index, count), p_light)
     clip = dr.ravel(clip)
     dr.eval(clip)
     raster = visible_triangles(clip, faces, (size, size), batch=count, transparent=transparent)
-    values, channels = _texels(raster, clip, faces, views, frusta, settings)
+    values, channels = _texels(raster, clip, faces, views, frusta, settings, size)
     if settings.antialias and settings.method != "standard":
         dr.eval(values)
         values = antialias(values, raster, clip, topology)
+    if settings.supersampling > 1:
+        values = _averaged(values, size, channels, settings.supersampling)
     return ShadowMaps(values, views, frusta, settings, channels)
 
 
 def _texels(
-    raster: RasterOutput, clip: Any, faces: Any, views: Views, frusta: Frusta, settings: ShadowSettings
+    raster: RasterOutput, clip: Any, faces: Any, views: Views, frusta: Frusta, settings: ShadowSettings, size: int
 ) -> tuple[Any, int]:
+    """Numbers to store (flat) and how many there are in a texel, for maps of ``size`` texels along each side."""
     module = backend(raster.triangle)
-    size = settings.resolution
     image, row, column = pixel_coordinates(module, views.count, size, size)
     view, frustum = of_map(views, image, views.count), of_map(frusta, image, views.count)
     hit = raster.valid
@@ -150,6 +162,23 @@ def _texels(
         return depth, 1
     values = method.encode(depth, slope_square, settings.order)
     return _interleaved(values), len(values)
+
+
+def _averaged(values: Any, size: int, channels: int, factor: int) -> Any:
+    """Means of blocks of factor x factor texels; maps have ``size`` texels along each side."""
+    module = backend(values)
+    dr.eval(values)
+    index = dr.arange(module.UInt32, dr.width(values) // factor**2)
+    texel = index // channels
+    row = texel // (size // factor)  # of the whole batch: maps lie below each other
+    column = texel - row * (size // factor)
+    first = (row * factor * size + column * factor) * channels + (index - texel * channels)
+    total = module.Float(0)
+    for j in range(factor):
+        for i in range(factor):
+            # Each number is read once, so that the backward pass needs no atomics.
+            total += dr.gather(module.Float, values, first + (j * size + i) * channels, mode=dr.ReduceMode.Permute)
+    return total * (1 / factor**2)
 
 
 def _interleaved(values: list[Any]) -> Any:

@@ -16,14 +16,13 @@ import numpy as np
 import typer
 from rich.console import Console
 
-from . import __version__, _llvm, assets, io
+from . import __version__, _llvm, assets, cli_gradients, io
+from .cli_options import DEFAULT_VARIANT, Variant, set_variant
 from .errors import ShadowmapError
 from .experiments import bench as bench_experiment
 from .experiments import bench_common, bench_report, maps_scenes
 from .experiments import maps as maps_experiment
 from .experiments import pose as pose_experiment
-
-DEFAULT_VARIANT = "llvm_ad_rgb"
 
 app = typer.Typer(
     name="shadowmap-dr",
@@ -33,8 +32,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-
-Variant = Annotated[str, typer.Option(help="Mitsuba variant; the cuda ones need an NVIDIA GPU.")]
+app.add_typer(cli_gradients.app, name="gradients")
 
 
 def main() -> None:
@@ -254,15 +252,6 @@ def bench(
     failed = bench_experiment.failures(record, options.only)
     if failed:
         raise ShadowmapError(f"{len(failed)} part(s) could not be measured; the first: {failed[0]}")
-
-
-def set_variant(name: str) -> None:
-    """Set the Mitsuba variant; ShadowmapError if it does not exist or has no device."""
-    if name not in mi.variants():
-        raise ShadowmapError(f"no variant {name!r} in this Mitsuba: choose one of {', '.join(mi.variants())}.")
-    if name.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
-        raise ShadowmapError(f"the variant {name} needs an NVIDIA GPU, and Dr.Jit found none: use {DEFAULT_VARIANT}.")
-    mi.set_variant(name)
 
 
 def _definitions(entries: list[str]) -> dict[str, str]:

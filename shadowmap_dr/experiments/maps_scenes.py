@@ -108,11 +108,12 @@ def build(name: str, resolution: int, offset: float = 0.0) -> Any:
         },
     }
     for key, (points, faces) in meshes(offset).items():
-        scene[key] = _mesh(key, points, faces)
+        scene[key] = occluder(key, points, faces)
     return mi.load_dict(scene, optimize=False)  # else Mitsuba would merge meshes, and they lose their names
 
 
-def _mesh(name: str, points: npt.NDArray[np.float32], faces: npt.NDArray[np.uint32]) -> Any:
+def occluder(name: str, points: npt.NDArray[np.float32], faces: npt.NDArray[np.uint32]) -> Any:
+    """A ``mi.Mesh`` of (V, 3) vertices and (F, 3) faces, diffuse on both sides."""
     props = mi.Properties()
     props["bsdf"] = mi.load_dict({"type": "twosided", "bsdf": {"type": "diffuse"}})
     mesh = mi.Mesh(name, len(points), len(faces), props=props)

@@ -37,8 +37,8 @@ class ShadowSettings:
         bias: depth offset of ``standard`` and ``pcf``, in units of the depth range of the map.
         bleeding: visibilities below this are cut off and the rest is stretched to 0..1; for ``vsm``, ``evsm`` and ``msm``.
         order: terms of the series of ``csm``, an even number.
-        supersampling: each texel is the mean of so many texels along both sides, anti-aliased first; for pre-filtered methods. More
-            exact coverage, and derivatives, for that many times as many texels to rasterize.
+        supersampling: each texel is the mean of so many along both sides, anti-aliased first: coverage and derivatives are more
+            exact, and so many times as many texels are rasterized. For pre-filtered methods.
         compat: the conventions of Worchel and Alexa's code: unnormalised radial depth, fixed frusta, dark outside of them, their
             kernels, minimum variance 1e-4.
     """

@@ -1,0 +1,24 @@
+"""What commands have in common: the option for the Mitsuba variant."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import drjit as dr
+import mitsuba as mi
+import typer
+
+from .errors import ShadowmapError
+
+DEFAULT_VARIANT = "llvm_ad_rgb"
+
+Variant = Annotated[str, typer.Option(help="Mitsuba variant; the cuda ones need an NVIDIA GPU.")]
+
+
+def set_variant(name: str) -> None:
+    """Set the Mitsuba variant; ShadowmapError if it does not exist or has no device."""
+    if name not in mi.variants():
+        raise ShadowmapError(f"no variant {name!r} in this Mitsuba: choose one of {', '.join(mi.variants())}.")
+    if name.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
+        raise ShadowmapError(f"the variant {name} needs an NVIDIA GPU, and Dr.Jit found none: use {DEFAULT_VARIANT}.")
+    mi.set_variant(name)

@@ -228,6 +228,25 @@ def test_bad_settings_are_named(change: dict, word: str) -> None:
         ShadowSettings(**change)
 
 
+@pytest.mark.parametrize("height", [0.0, 1e-3, 0.5])
+def test_flat_casters_that_face_the_light(variant: str, height: float) -> None:
+    """Their tilt moves no outline, whatever their depth: the derivative of the shadow is small beside that of a motion."""
+    square = np.array([[-0.5, -0.4, height], [0.5, -0.5, height], [0.4, 0.5, height], [-0.5, 0.5, height]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    views = [directional_view(mi.Vector3f(0, 0, -1))]
+    settings = ShadowSettings(resolution=64)
+    norms = []
+    for rate in ([1.0, 0.0, 0.0], square[:, 1:2] * [0, 0, 1.0]):
+        t = mi.Float(0)
+        dr.enable_grad(t)
+        moved = points(square) + points(np.broadcast_to(rate, square.shape)) * t
+        maps = shadow_scene.make_maps(views, moved, square, faces, settings)
+        value = visibility(maps, 0, points(receivers(80, z=-1, half=0.7)))
+        dr.forward(t)
+        norms.append(float(np.linalg.norm(dr.grad(value).numpy())))
+    assert norms[0] > 10 and norms[1] < 0.01 * norms[0], norms
+
+
 @pytest.mark.parametrize("kind", ["directional", "spot"])
 def test_frusta_are_cut_to_what_is_seen(variant: str, kind: str) -> None:
     """Of a wide caster only the part that can shadow the region in view gets texels; there the shadow stays right."""

@@ -13,6 +13,8 @@ from .camera import Frusta, Views, of_map, to_light_space
 # A frustum is kept while the scene fits and fills at least this fraction of it.
 _KEEP_FILL = 0.6
 _MARGIN = 0.10
+# Least depth range of a frustum in units of its lateral extent.
+_FLATTEST = 1e-2
 
 
 @dataclass(frozen=True)
@@ -201,7 +203,10 @@ def _fit(
     z1 = dr.maximum(dr.minimum(z1, window[4]), z0)
     # Casters outside of the window leave an empty rectangle; any small one will do.
     x1, y1 = dr.maximum(x1, x0 + 1e-4 * (1 + dr.abs(x0))), dr.maximum(y1, y0 + 1e-4 * (1 + dr.abs(y0)))
-    depth = dr.maximum(z1 - z0, 1e-3 * dr.maximum(dr.abs(z1), 1e-3))
+    # A flat caster that faces the light has no depth of its own. In a range of next to nothing all that tilts it would be a huge
+    # change, of which the derivative of visibility is the small difference.
+    lateral = dr.maximum(x1 - x0, y1 - y0) * dr.select(perspective, dr.abs(z1), 1)
+    depth = dr.maximum(dr.maximum(z1 - z0, _FLATTEST * lateral), 1e-3 * dr.maximum(dr.abs(z1), 1e-3))
     near, far = z0 - 0.05 * depth, z1 + 0.05 * depth
     far = dr.select(perspective, dr.maximum(far, 1e-6), far)
     near = dr.select(perspective, dr.maximum(near, 1e-3 * far), near)

@@ -44,7 +44,7 @@ def jacobian(
     filter_size: FilterSizes = None,
     resolution: Annotated[int, typer.Option(help="Image width and height in pixels.")] = 512,
     faces: Annotated[int, typer.Option(help="Triangles of the occluder.")] = 130_000,
-    spp: Annotated[int | None, typer.Option(help="Samples per pixel of the path-traced images [default: 64].")] = None,
+    spp: Annotated[int | None, typer.Option(help="Samples per pixel of the path-traced images [default: 128].")] = None,
     mitsuba_passes: Annotated[int, typer.Option(help="Passes of Mitsuba's projective integrator, 0 for none.")] = 2,
     full: Full = False,
     out: Out = Path("gradients"),

@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 from test_pose_experiment import build
 
-from shadowmap_dr import cli, io
+from shadowmap_dr import cli, cli_gradients, io
 from shadowmap_dr.experiments import pose as experiment
 
 
@@ -216,3 +216,36 @@ def test_bench_prints_a_table_and_writes_a_record(run: Any, monkeypatch: pytest.
     assert "frozen" in result.out and "o/b.png" in result.out
     assert list(json.loads(Path("o/b.json").read_text())["sections"]) == ["breakdown"]
     assert Path("o/b.png").exists()
+
+
+def test_gradients(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Options reach the experiments; the tables and the reading are shown."""
+    seen: list[Any] = []
+
+    def fake(name: str, record: Any) -> Any:
+        def call(options: Any) -> Any:
+            seen.append(options)
+            options.out.mkdir(exist_ok=True)
+            (options.out / f"{name}.md").write_text("# Title\n\n| a |\n|---|\n\nWhat it says.\n")
+            return record
+
+        return call
+
+    monkeypatch.setattr(cli_gradients.jacobian_experiment, "run_jacobian", fake("jacobian", {"entries": {}}))
+    monkeypatch.setattr(cli_gradients.convergence_experiment, "run_convergence", fake("convergence", {"runs": {}}))
+    monkeypatch.setattr(cli_gradients.plane_experiment, "run_plane", fake("minimal-plane", {"runs": []}))
+    for arguments in (
+        ("jacobian", "--motion", "x", "--filter-size", "5", "--out", "here", "--resume"),
+        ("jacobian", "--full", "--map-resolution", "64"),
+        ("convergence", "--displacement", "0.2", "--camera", "perspective"),
+        ("minimal-plane", "--iterations", "7"),
+    ):
+        result = run("gradients", *arguments)
+        assert result.status == 0 and "What it says." in result.out and "Title" not in result.out, result.err
+    first, full, convergence, plane = seen
+    assert first.motions == ("x",) and first.filter_sizes == (5,) and first.out == Path("here") and first.resume
+    assert len(full.candidates) > 3 and full.map_resolutions == (64,) and full.spp > first.spp
+    assert convergence.displacements == (0.2,) and convergence.cameras == ("perspective",)
+    assert plane.iterations == 7
+    result = run("gradients", "convergence", "--occluder", "moon")
+    assert result.status == 1 and "moon" in result.err

@@ -68,7 +68,7 @@ class JacobianOptions:
     filter_sizes: tuple[int, ...] = (1, 3, 5, 9, 15)
     resolution: int = 512
     faces: int = 130_000
-    spp: int = 64
+    spp: int = 128
     mitsuba_passes: int = 2
     out: Path = Path("gradients")
     resume: bool = False
@@ -233,4 +233,10 @@ def _pictures(
         renderer = make_renderer(scene, options.candidates[0], size, taps)
         label = f"filter {taps}" if taps > 1 else "no filter"
         row[label] = forward_derivative(renderer, motion.rate(mesh))[1][..., 0]
-    return row
+    return {title: _middle(image) for title, image in row.items()}
+
+
+def _middle(image: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.floating[Any]]:
+    """An image without the eighth along each side that no shadow reaches."""
+    border = len(image) // 8
+    return image[border : len(image) - border, border : len(image) - border]

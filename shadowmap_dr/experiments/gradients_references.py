@@ -15,8 +15,8 @@ from .bench_meshes import Mesh
 from .gradients_images import Image
 from .gradients_scenes import MOTIONS, Motion
 
-#: Pixels along each side of Mitsuba's image, and width of the penumbra of its area light in these pixels. With the half pixel
-#: that a sharp shadow needs, the integrator finds no light at all behind an occluder of so many faces.
+#: Pixels along each side of Mitsuba's image, and width of the penumbra of its area light in these pixels. A light that is small
+#: enough for the half pixel of a sharp shadow is met by no sample of the integrator, or by few.
 MITSUBA_RESOLUTION, MITSUBA_PENUMBRA, _MITSUBA_SPPI = 128, 16.0, 256
 
 

@@ -83,8 +83,8 @@ def _first_candidate(record: Mapping[str, Any]) -> str:
 
 
 def jacobian_rows(record: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
-    """Columns and rows: for each candidate, map and filter the worst cosine and the range of scales over the motions."""
-    columns = ["map, filter", "own c", "own s", "traced c", "traced s", "blurred c", "blurred s", "reverse"]
+    """Columns and rows: for each candidate, map and filter the worst cosine and scale over the motions."""
+    columns = ["map, filter", "own c", "s", "traced c", "s", "blurred c", "s", "reverse"]
     groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for entry in _compared(record):
         groups.setdefault((entry["candidate"], entry["map"], entry["filter"]), []).append(entry)
@@ -92,8 +92,8 @@ def jacobian_rows(record: Mapping[str, Any]) -> tuple[list[str], list[list[str]]
     for (label, size, taps), entries in groups.items():
         cells = []
         for kind in _KINDS:
-            scales = [e[kind]["scale"] for e in entries]
-            cells += [f"{min(e[kind]['cosine'] for e in entries):.3f}", f"{min(scales):.3f}-{max(scales):.3f}"]
+            farthest = max((e[kind]["scale"] for e in entries), key=lambda scale: abs(scale - 1))
+            cells += [f"{min(e[kind]['cosine'] for e in entries):.3f}", f"{farthest:.3f}"]
         reverse = max(e["reverse_error"] for e in entries)
         rows.append([f"{label}, {size}, {taps if taps > 1 else 'none'}", *cells, f"{reverse:.0e}"])
     return columns, rows
@@ -101,7 +101,7 @@ def jacobian_rows(record: Mapping[str, Any]) -> tuple[list[str], list[list[str]]
 
 def jacobian_table(record: Mapping[str, Any]) -> Table:
     """For the terminal."""
-    return report.table("Derivative images: worst cosine c and range of scales s over all motions", *jacobian_rows(record))
+    return report.table("Derivative images: worst cosine c and scale s over all motions", *jacobian_rows(record))
 
 
 def read_jacobian(record: Mapping[str, Any]) -> str:

@@ -89,7 +89,8 @@ def jacobian_rows(record: Mapping[str, Any]) -> tuple[list[str], list[list[str]]
     for entry in _compared(record):
         groups.setdefault((entry["candidate"], entry["map"], entry["filter"]), []).append(entry)
     rows = []
-    for (label, size, taps), entries in groups.items():
+    order = list(dict.fromkeys(label for label, _, _ in groups))
+    for (label, size, taps), entries in sorted(groups.items(), key=lambda item: (order.index(item[0][0]), *item[0][1:])):
         cells = []
         for kind in _KINDS:
             farthest = max((e[kind]["scale"] for e in entries), key=lambda scale: abs(scale - 1))

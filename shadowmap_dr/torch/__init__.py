@@ -1,0 +1,42 @@
+"""The raster functions, shadow maps and the renderer as differentiable functions of PyTorch tensors.
+
+Tensors are float32, indices any integers, and all of one call lie on one device: the CPU, or the GPU that Dr.Jit uses. Any
+strides will do. Functions copy what they are given and share no memory with what they return, so tensors may be changed in
+place before and after the backward pass; that may run more than once (``retain_graph=True``), but not be differentiated itself.
+Bad input raises a one-line :class:`shadowmap_dr.ShadowmapError`.
+
+Images are stored as in Mitsuba: row 0 of what is rasterized lies at y = -1 in clip space.
+
+Importing this module needs PyTorch: ``pip install 'shadowmap-dr[torch]'``.
+"""
+
+from __future__ import annotations
+
+try:
+    import torch  # noqa: F401
+except ModuleNotFoundError as error:
+    if error.name != "torch":
+        raise
+    raise ImportError("shadowmap_dr.torch needs PyTorch: pip install 'shadowmap-dr[torch]'.", name="torch") from None
+
+from .raster import Raster, Topology, antialias, build_topology, interpolate, rasterize
+from .render import Renderer
+from .shadow import DirectionalLight, Light, PointLight, ShadowMaps, SpotLight, filter_maps, render_maps, visibility
+
+__all__ = [
+    "DirectionalLight",
+    "Light",
+    "PointLight",
+    "Raster",
+    "Renderer",
+    "ShadowMaps",
+    "SpotLight",
+    "Topology",
+    "antialias",
+    "build_topology",
+    "filter_maps",
+    "interpolate",
+    "rasterize",
+    "render_maps",
+    "visibility",
+]

@@ -1,0 +1,140 @@
+"""The crossing between PyTorch's autograd and Dr.Jit's.
+
+Dr.Jit's own ``drjit.wrap`` shares memory with both sides and ends each backward pass with an empty graph: an optimiser that moves
+its parameters between the two passes, or a second backward pass, gets wrong gradients without a word. Here nothing is shared,
+and graphs stay whole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from types import ModuleType
+from typing import Any, Protocol
+
+import drjit as dr
+import torch
+
+from .checks import backend_of
+
+
+class Operation(Protocol):
+    """Something that Dr.Jit computes from float tensors, and its derivatives. An object is good for one call."""
+
+    #: Whether the results are needed for the derivatives, so that nobody else may write to them.
+    keeps_results: bool
+
+    def forward(self, arrays: list[Any], wanted: list[bool]) -> Sequence[Any]:
+        """Results (Dr.Jit tensors) for Dr.Jit tensors. ``wanted`` tells which of these need gradients; maybe none."""
+
+    def backward(self, adjoints: Sequence[Any]) -> Sequence[Any]:
+        """Gradients to the arrays (of those that are not wanted: anything) from those to the results (None: zero)."""
+
+
+class Recorded:
+    """A differentiable Dr.Jit function, whose graph is kept from the forward pass to the end of the last backward pass."""
+
+    keeps_results = True
+
+    def __init__(self, function: Callable[..., Sequence[Any]]) -> None:
+        self.function = function
+
+    def forward(self, arrays: list[Any], wanted: list[bool]) -> Sequence[Any]:
+        if not any(wanted):
+            with dr.suspend_grad():
+                return self.function(*arrays)
+        with dr.resume_grad():
+            dr.enable_grad([array for array, want in zip(arrays, wanted, strict=True) if want])
+            self.arrays, self.results = arrays, self.function(*arrays)
+        return self.results
+
+    def backward(self, adjoints: Sequence[Any]) -> Sequence[Any]:
+        with dr.resume_grad():
+            return gradients(self.arrays, self.results, adjoints)
+
+
+def gradients(arrays: Sequence[Any], results: Sequence[Any], adjoints: Sequence[Any]) -> list[Any]:
+    """Gradients of the sum of <result, adjoint> to attached arrays. The graph stays as it is, without any gradients in it."""
+    starts = [r for r, a in zip(results, adjoints, strict=True) if a is not None and dr.grad_enabled(r)]
+    for result, adjoint in zip(results, adjoints, strict=True):
+        if adjoint is not None and dr.grad_enabled(result):
+            dr.accum_grad(result, adjoint)
+    dr.enqueue(dr.ADMode.Backward, starts)
+    # Not the results' gradients: a result may be an array that was passed through.
+    dr.traverse(dr.ADMode.Backward, dr.ADFlag.ClearInterior)
+    found = [dr.grad(array) for array in arrays]
+    dr.eval(found)
+    dr.clear_grad((list(arrays), list(results)))
+    return found
+
+
+def cross(operation: Operation, *tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    """Results of an operation on (checked) float32 tensors of one device, at least one, as part of PyTorch's graph."""
+    return _Crossing.apply(operation, torch.is_grad_enabled(), *tensors)
+
+
+def to_drjit(tensor: torch.Tensor) -> Any:
+    """A Dr.Jit tensor with memory of its own, float32 or int32."""
+    # Copied by PyTorch, and shared with the copy: that nobody else knows.
+    copy = tensor.detach().clone(memory_format=torch.contiguous_format)
+    module = backend_of(tensor.device)
+    return (module.TensorXf if tensor.dtype == torch.float32 else module.TensorXi)(copy)
+
+
+def index_array(indices: torch.Tensor) -> Any:
+    """(Checked) indices as a flat ``UInt32`` array."""
+    with drjit_turn(indices.device) as module:
+        array = to_drjit(indices.to(torch.int32)).array
+        result = module.UInt32(array)
+        dr.eval(result)
+    return result
+
+
+def to_torch(array: Any, *, copy: bool) -> torch.Tensor:
+    """A PyTorch tensor with the values of a Dr.Jit tensor; shares the memory unless it is to be a copy."""
+    tensor = dr.detach(array).torch()
+    return tensor.clone() if copy else tensor
+
+
+@contextmanager
+def drjit_turn(device: torch.device) -> Iterator[ModuleType]:
+    """Let Dr.Jit work: on what PyTorch has finished, and finishing before PyTorch goes on. Yields the module of its types.
+
+    Also keeps alive what is made inside until it is no longer read: arrays that share memory with PyTorch must not be dropped
+    before the end of this context.
+    """
+    module = backend_of(device)
+    if device.type == "cuda":
+        torch.cuda.current_stream(device).synchronize()
+    # PyTorch may call from another thread than before: Dr.Jit orders what it traces by scopes, which count up across threads.
+    dr.detail.new_scope(dr.backend_v(module.Float))
+    try:
+        yield module
+    finally:
+        dr.sync_thread()
+        dr.detail.new_scope(dr.backend_v(module.Float))
+
+
+class _Crossing(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, operation: Operation, record: bool, *tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        wanted = [record and needed for needed in ctx.needs_input_grad[2:]]
+        with drjit_turn(tensors[0].device):
+            arrays = [to_drjit(tensor) for tensor in tensors]
+            results = operation.forward(arrays, wanted)
+            dr.eval(results)
+        ctx.operation, ctx.wanted, ctx.device = operation, wanted, tensors[0].device
+        ctx.set_materialize_grads(False)
+        copy = operation.keeps_results and any(wanted)
+        return tuple(to_torch(result, copy=copy) for result in results)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *adjoints: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
+        with drjit_turn(ctx.device):
+            arrays = [None if adjoint is None else to_drjit(adjoint) for adjoint in adjoints]
+            found = ctx.operation.backward(arrays)
+            dr.eval(found)
+        # PyTorch may add to them in place.
+        wanted = zip(found, ctx.wanted, strict=True)
+        return None, None, *(to_torch(gradient, copy=True) if want else None for gradient, want in wanted)

@@ -1,0 +1,84 @@
+"""What tensors must be like: every mistake is one line that names the tensor and says what to do."""
+
+from __future__ import annotations
+
+from types import ModuleType
+from typing import Any
+
+import drjit as dr
+import torch
+
+from ..errors import ShadowmapError
+
+_INTEGERS = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
+
+
+def backend_of(device: torch.device) -> ModuleType:
+    """The Dr.Jit module (``drjit.llvm.ad`` or ``drjit.cuda.ad``) that computes with tensors of a device."""
+    return dr.llvm.ad if device.type == "cpu" else dr.cuda.ad
+
+
+def check_floats(name: str, tensor: Any, *shapes: tuple[int | str, ...]) -> None:
+    """Refuse what is no strided float32 tensor of one of the shapes.
+
+    Shapes are tuples of sizes and of names for sizes of any (positive) number; "..." at the start for any leading ones.
+    """
+    _check_tensor(name, tensor)
+    if tensor.dtype != torch.float32:
+        raise ShadowmapError(f"{name}: {tensor.dtype}, but must be torch.float32; convert with .float().")
+    if not any(_fits(tensor.shape, shape) for shape in shapes):
+        raise ShadowmapError(f"{name}: shape {tuple(tensor.shape)}, but must be {' or '.join(map(_written, shapes))}.")
+    if tensor.numel() == 0:
+        raise ShadowmapError(f"{name}: shape {tuple(tensor.shape)} holds no numbers.")
+
+
+def check_indices(name: str, tensor: Any, count: int, what: str = "vertices") -> None:
+    """Refuse what is no integer tensor (F, 3), F > 0, with indices from 0 to ``count - 1``. Reads them all."""
+    _check_tensor(name, tensor)
+    if tensor.dtype not in _INTEGERS:
+        raise ShadowmapError(f"{name}: {tensor.dtype}, but must be integers; convert with .int().")
+    if tensor.ndim != 2 or tensor.shape[1] != 3 or len(tensor) == 0:
+        raise ShadowmapError(f"{name}: shape {tuple(tensor.shape)}, but must be (F, 3) with at least one triangle.")
+    low, high = (int(value) for value in torch.aminmax(tensor))
+    if low < 0 or high >= count:
+        raise ShadowmapError(f"{name}: indices from {low} to {high}, but there are {count} {what}, counted from 0.")
+
+
+def check_devices(**tensors: torch.Tensor) -> torch.device:
+    """The device that all (checked) tensors lie on; names are those of arguments."""
+    (first, tensor), *others = tensors.items()
+    for name, other in others:
+        if other.device != tensor.device:
+            raise ShadowmapError(f"{name}: on {other.device}, but {first} on {tensor.device}; move them to one device.")
+    return tensor.device
+
+
+def check_same(what: str, given: Any, expected: Any, hint: str) -> None:
+    """Refuse sizes that contradict each other."""
+    if given != expected:
+        raise ShadowmapError(f"{what}: {given} instead of {expected}; {hint}.")
+
+
+def _check_tensor(name: str, tensor: Any) -> None:
+    if not isinstance(tensor, torch.Tensor):
+        raise ShadowmapError(f"{name}: {type(tensor).__name__}, but must be a torch.Tensor.")
+    if tensor.layout != torch.strided:
+        raise ShadowmapError(f"{name}: {tensor.layout}, but must be a dense tensor; convert with .to_dense().")
+    kinds = {"cpu": dr.JitBackend.LLVM, "cuda": dr.JitBackend.CUDA}
+    if tensor.device.type not in kinds:
+        raise ShadowmapError(f"{name}: on {tensor.device}, but Dr.Jit computes on cpu and cuda only; move it with .cpu().")
+    if not dr.has_backend(kinds[tensor.device.type]):
+        other = "cuda" if tensor.device.type == "cpu" else "cpu"
+        lacking = "no LLVM library" if tensor.device.type == "cpu" else "no GPU"
+        raise ShadowmapError(f"{name}: on {tensor.device}, but Dr.Jit found {lacking}; move it with .to('{other}').")
+
+
+def _fits(sizes: tuple[int, ...], shape: tuple[int | str, ...]) -> bool:
+    if shape[:1] == ("...",):
+        shape = shape[1:]
+        sizes = sizes[max(0, len(sizes) - len(shape)) :]
+    return len(sizes) == len(shape) and all(isinstance(s, str) or s == size for s, size in zip(shape, sizes, strict=True))
+
+
+def _written(shape: tuple[int | str, ...]) -> str:
+    return f"({', '.join(map(str, shape))}{',' if len(shape) == 1 else ''})"

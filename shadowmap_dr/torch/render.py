@@ -1,0 +1,266 @@
+"""Whole images with shadows from PyTorch tensors: the renderer of Mitsuba scenes as a differentiable function."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import torch
+
+from ..errors import ShadowmapError
+from ..renderer import Renderer as _Renderer
+from .bridge import Recorded, cross, drjit_turn, gradients, to_torch
+from .checks import check_devices, check_floats
+
+
+class Renderer:
+    """Renders one Mitsuba scene again and again, with vertices, lights and other parameters from tensors.
+
+    Works in the variants ``llvm_ad_rgb`` and ``llvm_ad_mono`` on CPU tensors, in ``cuda_ad_rgb`` and ``cuda_ad_mono`` on CUDA ones.
+
+    Derivatives see the scene as it is at the time of the backward pass: what is no tensor here (Mitsuba's own parameters) must not
+    be changed between the two passes.
+    """
+
+    def __init__(self, renderer: _Renderer, *, frozen: bool = False) -> None:
+        """Wrap a :class:`shadowmap_dr.Renderer`.
+
+        Args:
+            renderer: its shadow maps' fit is carried on here; the object itself stays as it is.
+            frozen: record what the passes do (``dr.freeze``) and replay it while only numbers change, which is several times as
+                fast for small images. The backward pass then renders the image once more. Calls with ``parameters`` are never
+                recorded.
+        """
+        self._renderer = replace(renderer)
+        self._variant = mi.variant()
+        self._frozen = (dr.freeze(_forward), dr.freeze(_backward)) if frozen else None
+
+    @classmethod
+    def from_scene(cls, scene: Any, *, frozen: bool = False, **settings: Any) -> Renderer:
+        """Build a renderer for a ``mi.Scene``. ``settings`` are those of :meth:`shadowmap_dr.Renderer.from_scene`."""
+        return cls(_Renderer.from_scene(scene, **settings), frozen=frozen)
+
+    def vertices(self, name: str) -> torch.Tensor:
+        """Positions of a shape when the scene was loaded: float32 (V, 3), world space, without gradients."""
+        count = self._renderer.data.geometry.shape(name).vertex_count
+        flat = dr.ravel(dr.detach(self._renderer.data.geometry.shape_positions(name)))
+        return to_torch(mi.TensorXf(flat, (count, 3)), copy=True)
+
+    def faces(self, name: str) -> torch.Tensor:
+        """Triangles of a shape: int32 (F, 3), indices into its vertices."""
+        info = self._renderer.data.geometry.shape(name)
+        faces = self._renderer.data.geometry.faces.numpy().reshape(-1, 3).astype("int32")
+        own = torch.from_numpy(faces[info.face_start : info.face_start + info.face_count] - info.vertex_start)
+        return own.to("cuda" if self._variant.startswith("cuda") else "cpu")
+
+    def render(
+        self,
+        vertex_positions: Mapping[str, torch.Tensor] | None = None,
+        lights: Mapping[str, Mapping[str, torch.Tensor]] | None = None,
+        parameters: Mapping[str, torch.Tensor] | None = None,
+        sensor: int = 0,
+        spp: int = 1,
+    ) -> torch.Tensor:
+        """Render an image.
+
+        Args:
+            vertex_positions: new world-space vertices, float32 (V, 3), by the name of their shape.
+            lights: by the name of the light, new values of fields of its record (:mod:`shadowmap_dr.lights`): ``direction``,
+                ``position`` (3,), ``irradiance``, ``intensity`` (3,) or (1,) as the variant has colours, ``to_world`` (4, 4),
+                ``cutoff_angle``, ``beam_width`` (1,), in degrees.
+            parameters: by Mitsuba's names (``mi.traverse(scene)``), new values of anything else: textures (H, W, C) in linear
+                colour, colours, ``to_world`` (4, 4) of cameras. Set in the scene for the time of the call only. All else is
+                read from the scene as it is now, too; and each call loads textures anew.
+            sensor: number of the scene's sensor.
+            spp: samples per pixel, see :meth:`shadowmap_dr.Renderer.render`.
+
+        Returns:
+            float32 (H, W, C): linear colour, then alpha if the film has it, then the AOVs. Attached to all tensors.
+
+        Raises:
+            ShadowmapError: unknown names, tensors that do not fit, a variant that does not fit the tensors.
+        """
+        given = self._inputs(vertex_positions, lights, parameters)
+        repeats = self._frozen is not None or any(place.kind == "parameter" for place in given)
+        call = (tuple(given), sensor, spp)
+        operation = _Repeated(self, *call) if repeats else Recorded(lambda *arrays: self._image(list(arrays), *call))
+        if given:
+            return cross(operation, *given.values())[0]
+        with drjit_turn(torch.device("cpu" if self._variant.startswith("llvm") else "cuda")):
+            (image,) = operation.forward([], [])
+            return to_torch(image, copy=False)
+
+    def _image(self, arrays: list[Any], places: tuple[_Place, ...], sensor: int, spp: int) -> tuple[Any]:
+        image, self._renderer.frusta = _forward(self._renderer, places, arrays, sensor, spp)
+        return (image,)
+
+    def _inputs(
+        self,
+        vertex_positions: Mapping[str, torch.Tensor] | None,
+        lights: Mapping[str, Mapping[str, torch.Tensor]] | None,
+        parameters: Mapping[str, torch.Tensor] | None,
+    ) -> dict[_Place, torch.Tensor]:
+        """All tensors, checked, by what they are for."""
+        if mi.variant() != self._variant:
+            raise ShadowmapError(f"The variant is {mi.variant()}, but this renderer was made for {self._variant}: set that one.")
+        given: dict[_Place, torch.Tensor] = {}
+        for name, value in (vertex_positions or {}).items():
+            count = self._renderer.data.geometry.shape(name).vertex_count
+            check_floats(f"vertex_positions['{name}']", value, (count, 3))
+            given[_Place("vertices", name)] = value
+        for name, values in (lights or {}).items():
+            record = self._renderer.light(name)
+            known = [f.name for f in fields(record) if f.name not in ("name", "texture")]
+            for key, value in values.items():
+                if key not in known:
+                    raise ShadowmapError(f"Light '{name}' has no '{key}' that a tensor could replace: {', '.join(known)}.")
+                check_floats(f"lights['{name}']['{key}']", value, *_shapes_of(f"lights: '{key}'", getattr(record, key)))
+                given[_Place("light", name, key)] = value
+        if parameters:
+            current = mi.traverse(self._renderer.data.scene)
+            for name, value in parameters.items():
+                if name not in current:
+                    raise ShadowmapError(f"The scene has no parameter '{name}': print(mi.traverse(scene)) lists them.")
+                check_floats(f"parameters['{name}']", value, *_shapes_of(f"parameters: '{name}'", current[name]))
+                given[_Place("parameter", name)] = value
+        if given:
+            device = check_devices(**{str(place): value for place, value in given.items()})
+            if not self._variant.startswith({"cpu": "llvm", "cuda": "cuda"}[device.type]):
+                wanted = self._variant.replace("llvm", "cuda") if device.type == "cuda" else self._variant.replace("cuda", "llvm")
+                raise ShadowmapError(
+                    f"Tensors lie on {device}, but the renderer was made for {self._variant}: mi.set_variant('{wanted}') before."
+                )
+        return given
+
+
+@dataclass(frozen=True)
+class _Place:
+    """What a tensor is for: ``kind`` is vertices, light or parameter."""
+
+    kind: str
+    name: str
+    field: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.kind} '{self.name}'{self.field and '.'}{self.field}"
+
+
+class _Repeated:
+    """One image as an operation of the bridge that is done again for its derivatives: nothing but the arrays is kept.
+
+    For what cannot keep a graph: frozen functions, and scenes that are changed for the time of the call.
+    """
+
+    keeps_results = False
+
+    def __init__(self, owner: Renderer, places: tuple[_Place, ...], sensor: int, spp: int) -> None:
+        self.owner, self.places, self.camera = owner, places, (sensor, spp)
+        changes_scene = any(place.kind == "parameter" for place in places)
+        self.functions = (_forward, _backward) if changes_scene or owner._frozen is None else owner._frozen
+
+    def forward(self, arrays: list[Any], wanted: list[bool]) -> Sequence[Any]:
+        with dr.suspend_grad(), self._scene(arrays) as renderer:
+            image, frusta = self.functions[0](renderer, self.places, arrays, *self.camera)
+            # While the scene is as it should be.
+            dr.eval(image, frusta)
+        self.arrays, self.wanted, self.frusta = arrays, wanted, frusta
+        self.owner._renderer.frusta = frusta
+        return (image,)
+
+    def backward(self, adjoints: Sequence[Any]) -> Sequence[Any]:
+        arrays = [type(array)(array) for array in self.arrays]
+        with dr.resume_grad():
+            # Before the arrays enter the scene.
+            dr.enable_grad([array for array, want in zip(arrays, self.wanted, strict=True) if want])
+            with self._scene(arrays) as renderer:
+                return self.functions[1](renderer, self.places, arrays, self.wanted, adjoints[0], *self.camera)
+
+    @contextmanager
+    def _scene(self, arrays: list[Any]) -> Iterator[_Renderer]:
+        """The renderer for this call, while the scene has the parameters that it is to have."""
+        # Fitting maps again to what they have been fitted to keeps them bit by bit, as the derivatives want it.
+        frusta = getattr(self, "frusta", self.owner._renderer.frusta)
+        renderer = replace(self.owner._renderer, frusta=frusta)
+        values = {place.name: array for place, array in zip(self.places, arrays, strict=True) if place.kind == "parameter"}
+        if not values:
+            yield renderer
+            return
+        table = mi.traverse(renderer.data.scene)
+        # Copies: what the table returns changes with the scene.
+        before = {name: type(table[name])(table[name]) for name in values}
+        try:
+            _set(table, {name: _converted(before[name], array) for name, array in values.items()})
+            yield renderer.refresh()
+        finally:
+            _set(table, before)
+
+
+def _set(table: Any, values: Mapping[str, Any]) -> None:
+    for name, value in values.items():
+        table[name] = value
+    table.update()
+
+
+def _forward(renderer: _Renderer, places: tuple[_Place, ...], arrays: list[Any], sensor: int, spp: int) -> tuple[Any, Any]:
+    """Image and the fit of the shadow maps."""
+    given = list(zip(places, arrays, strict=True))
+    vertices = {place.name: array for place, array in given if place.kind == "vertices"}
+    lights: dict[str, Any] = {}
+    for place, array in given:
+        if place.kind == "light":
+            light = lights.get(place.name, renderer.light(place.name))
+            lights[place.name] = replace(light, **{place.field: _converted(getattr(light, place.field), array)})
+    image = renderer.render(vertices, lights, sensor, spp)
+    return image, renderer.frusta
+
+
+def _backward(
+    renderer: _Renderer,
+    places: tuple[_Place, ...],
+    arrays: list[Any],
+    wanted: list[bool],
+    adjoint: Any,
+    sensor: int,
+    spp: int,
+) -> list[Any]:
+    """Gradients to the arrays from that to the image."""
+    for array, want in zip(arrays, wanted, strict=True):
+        if want:
+            dr.enable_grad(array)
+    image, _ = _forward(renderer, places, arrays, sensor, spp)
+    return gradients(arrays, (image,), (adjoint,))
+
+
+def _shapes_of(what: str, value: Any) -> tuple[tuple[int, ...], ...]:
+    """Shapes of tensors that may replace a parameter."""
+    if _is_transform(value):
+        return ((4, 4),)
+    if not dr.is_array_v(value) or not dr.is_float_v(value):
+        raise ShadowmapError(f"{what} is a {type(value).__name__}, which no tensor can replace.")
+    if dr.is_tensor_v(value):
+        return (tuple(value.shape),)
+    if dr.depth_v(value) > 1:
+        return ((dr.size_v(value),),)
+    return ((1,), ()) if len(value) == 1 else ((len(value),),)
+
+
+def _is_transform(value: Any) -> bool:
+    # Mitsuba has several types of them; and arrays have all sorts of attributes.
+    return not dr.is_array_v(value) and hasattr(value, "matrix")
+
+
+def _converted(old: Any, array: Any) -> Any:
+    """A (checked) tensor as the type of what it replaces, attached."""
+    if dr.is_tensor_v(old):
+        return type(old)(array)
+    flat = array.array
+    if not _is_transform(old) and dr.depth_v(old) == 1:
+        return type(old)(flat)
+    numbers = [dr.gather(mi.Float, flat, mi.UInt32(k)) for k in range(len(flat))]
+    if _is_transform(old):
+        return type(old)(mi.Matrix4f(*(numbers[4 * row : 4 * row + 4] for row in range(4))))
+    return type(old)(*numbers)

@@ -15,6 +15,7 @@ from typing import Any, Protocol
 import drjit as dr
 import torch
 
+from ..raster._types import backend
 from .checks import backend_of
 
 
@@ -88,6 +89,22 @@ def index_array(indices: torch.Tensor) -> Any:
         result = module.UInt32(array)
         dr.eval(result)
     return result
+
+
+def number(flat: Any, index: Any) -> Any:
+    """Numbers of a small array, none of them twice."""
+    return _gathered(backend(flat).Float, flat, index)
+
+
+def vector(flat: Any, index: Any) -> Any:
+    """Vectors (``Array3f``) of a small array of interleaved ones, none of them twice."""
+    return _gathered(backend(flat).Array3f, flat, index)
+
+
+def _gathered(kind: Any, flat: Any, index: Any) -> Any:
+    # Said to have no conflicts: the adjoints that Dr.Jit 1.5 chooses by itself for small arrays lose the first of several numbers
+    # whose gradients are sums of the same kind themselves.
+    return dr.gather(kind, flat, backend(flat).UInt32(index), mode=dr.ReduceMode.NoConflicts)
 
 
 def to_torch(array: Any, *, copy: bool) -> torch.Tensor:

@@ -13,17 +13,18 @@ import torch
 
 from ..errors import ShadowmapError
 from ..renderer import Renderer as _Renderer
-from .bridge import Recorded, cross, drjit_turn, gradients, to_torch
+from .bridge import Recorded, cross, drjit_turn, gradients, number, to_torch
 from .checks import check_devices, check_floats
 
 
 class Renderer:
     """Renders one Mitsuba scene again and again, with vertices, lights and other parameters from tensors.
 
-    Works in the variants ``llvm_ad_rgb`` and ``llvm_ad_mono`` on CPU tensors, in ``cuda_ad_rgb`` and ``cuda_ad_mono`` on CUDA ones.
+    Works in the variants ``llvm_ad_rgb`` and ``llvm_ad_mono`` on CPU tensors, in ``cuda_ad_rgb`` and ``cuda_ad_mono`` on CUDA
+    ones.
 
-    Derivatives see the scene as it is at the time of the backward pass: what is no tensor here (Mitsuba's own parameters) must not
-    be changed between the two passes.
+    Derivatives see the scene as it is at the time of the backward pass: what is no tensor here (Mitsuba's own parameters) must
+    not be changed between the two passes.
     """
 
     def __init__(self, renderer: _Renderer, *, frozen: bool = False) -> None:
@@ -85,6 +86,9 @@ class Renderer:
             ShadowmapError: unknown names, tensors that do not fit, a variant that does not fit the tensors.
         """
         given = self._inputs(vertex_positions, lights, parameters)
+        if not 0 <= sensor < len(self._renderer.data.sensors) or spp < 1:
+            count = len(self._renderer.data.sensors)
+            raise ShadowmapError(f"sensor {sensor}, spp {spp}: there are {count} sensors, counted from 0; spp is 1 or more.")
         repeats = self._frozen is not None or any(place.kind == "parameter" for place in given)
         call = (tuple(given), sensor, spp)
         operation = _Repeated(self, *call) if repeats else Recorded(lambda *arrays: self._image(list(arrays), *call))
@@ -260,7 +264,7 @@ def _converted(old: Any, array: Any) -> Any:
     flat = array.array
     if not _is_transform(old) and dr.depth_v(old) == 1:
         return type(old)(flat)
-    numbers = [dr.gather(mi.Float, flat, mi.UInt32(k)) for k in range(len(flat))]
+    numbers = [number(flat, k) for k in range(len(flat))]
     if _is_transform(old):
         return type(old)(mi.Matrix4f(*(numbers[4 * row : 4 * row + 4] for row in range(4))))
     return type(old)(*numbers)

@@ -15,7 +15,7 @@ from ..errors import ShadowmapError
 from ..raster._types import backend
 from ..shadow import Frusta, LightView, ShadowSettings, Views
 from ..shadow.camera import of_map
-from .bridge import Recorded, cross, drjit_turn, index_array
+from .bridge import Recorded, cross, drjit_turn, index_array, vector
 from .checks import check_devices, check_floats, check_same
 from .raster import Topology
 
@@ -87,8 +87,8 @@ def render_maps(
         topology: of their mesh.
         lights: one or several.
         settings: default ``ShadowSettings()``; ``compat`` and the method ``none`` have no maps of their own.
-        previous: maps of the step before. The part of space that they cover is kept while the casters stay within it and fill most
-            of it, so that an optimisation does not see it move.
+        previous: maps of the step before. The part of space that they cover is kept while the casters stay within it and fill
+            most of it, so that an optimisation does not see it move.
         seen: float32 (..., 3), points all over the receivers: maps need not cover what casts its shadow elsewhere.
 
     Returns:
@@ -171,14 +171,14 @@ def visibility(maps: ShadowMaps, points: torch.Tensor, light: int = 0) -> torch.
     def run(points: Any, values: Any, axes: Any) -> tuple[Any, ...]:
         module = backend(points)
         row = dr.arange(module.UInt32, count)
-        vectors = {name: dr.gather(module.Array3f, axes.array, row + k * count) for k, name in enumerate(_AXES)}
+        vectors = {name: vector(axes.array, row + k * count) for k, name in enumerate(_AXES)}
         views = replace(maps._views, **vectors)
         flat = _shadow.ShadowMaps(values.array, views, maps._frusta, maps.settings, values.shape[-1])
         p_world = dr.gather(module.Array3f, points.array, dr.arange(module.UInt32, dr.width(points.array) // 3))
         which: Any = start
         if size > 1:
-            position = dr.gather(module.Array3f, axes.array, len(_AXES[:3]) * count + start)
-            which = start + _shadow.cube_face(dr.detach(p_world - position))
+            position = vector(dr.detach(axes.array), _AXES.index("origin") * count + start)
+            which = start + _shadow.cube_face(dr.detach(p_world) - position)
         result = _shadow.visibility(flat, which, p_world)
         return (type(points)(_full(result, dr.width(p_world)), points.shape[:-1]),)
 
@@ -204,17 +204,16 @@ def _has_cube(light: Light) -> bool:
 
 
 def _light_views(light: Light, number: int, given: dict[str, Any], settings: ShadowSettings) -> Sequence[LightView]:
-    def vector(name: str) -> Any:
-        flat = given[f"lights[{number}].{name}"].array
-        return dr.gather(backend(flat).Array3f, flat, backend(flat).UInt32(0))
+    def own(name: str) -> Any:
+        return vector(given[f"lights[{number}].{name}"].array, 0)
 
     if _has_cube(light):
-        return _shadow.cube_views(vector("position"), settings.resolution, settings.filter_size)
-    view = _shadow.directional_view(vector("direction"))
+        return _shadow.cube_views(own("position"), settings.resolution, settings.filter_size)
+    view = _shadow.directional_view(own("direction"))
     if isinstance(light, DirectionalLight):
         return (view,)
     spread = type(view.spread)(math.tan(math.radians(light.cutoff_angle)))
-    return (_shadow.spot_view(vector("position"), view.right, view.up, view.forward, spread),)
+    return (_shadow.spot_view(own("position"), view.right, view.up, view.forward, spread),)
 
 
 def _fit(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import pytest
@@ -22,15 +23,29 @@ def readme() -> str:
     return path.read_text()
 
 
+def python_blocks(readme: str) -> list[str]:
+    return re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
+
+
 def test_python_examples_run(readme: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.chdir(ROOT)
-    blocks = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
+    blocks = [block for block in python_blocks(readme) if "import torch" not in block]
     assert len(blocks) == 2
     names: dict[str, object] = {}
     for block in blocks:
         exec(compile(block, "README.md", "exec"), names)
     assert capsys.readouterr().out.startswith("[")
     assert names["image"].shape == (128, 128, 3)
+
+
+def test_example_for_pytorch_finds_the_offset(readme: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("torch", reason="PyTorch is not installed: pip install '.[torch]'")
+    monkeypatch.chdir(ROOT)
+    (block,) = [block for block in python_blocks(readme) if "import torch" in block]
+    names: dict[str, Any] = {}
+    exec(compile(block, "README.md", "exec"), names)
+    assert names["image"].shape == (128, 128, 3)
+    assert 0 < names["offset"].norm() < 0.05  # of 0.14
 
 
 def test_named_parameters_exist(readme: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -177,6 +178,21 @@ def test_gradients_are_those_of_their_own_call(renderer: sdr.Renderer) -> None:
         alone = vertices.detach().clone().requires_grad_()
         renderer.render({"ball": alone}).square().sum().backward()
         torch.testing.assert_close(vertices.grad, alone.grad, rtol=1e-3, atol=1e-3 * float(alone.grad.abs().max()))
+
+
+def test_frozen_or_not_no_graph_stays_behind(renderer: sdr.Renderer) -> None:
+    """Dr.Jit never frees some of those that are dropped; when the process ends, it would crash on them."""
+    vertices = renderer.vertices("ball").requires_grad_()
+
+    def nodes() -> int:
+        gc.collect()
+        return len(dr.whos_ad_str().splitlines())
+
+    before = nodes()
+    for _ in range(3):
+        renderer.render({"ball": vertices})
+        renderer.render({"ball": vertices}).square().sum().backward(retain_graph=True)
+    assert nodes() == before
 
 
 def test_without_gradients(renderer: sdr.Renderer) -> None:

@@ -1,8 +1,8 @@
 """The crossing between PyTorch's autograd and Dr.Jit's.
 
-Dr.Jit's own ``drjit.wrap`` shares memory with both sides and ends each backward pass with an empty graph: an optimiser that moves
-its parameters between the two passes, or a second backward pass, gets wrong gradients without a word. Here nothing is shared,
-and graphs stay whole.
+Dr.Jit's own ``drjit.wrap`` shares memory with both sides and has no graph left after a backward pass: an optimiser that moves its
+parameters between the two passes, or a second backward pass, gets wrong gradients without a word. Here nothing is shared, and
+each backward pass makes a graph of its own.
 """
 
 from __future__ import annotations
@@ -22,9 +22,6 @@ from .checks import backend_of
 class Operation(Protocol):
     """Something that Dr.Jit computes from float tensors, and its derivatives. An object is good for one call."""
 
-    #: Whether the results are needed for the derivatives, so that nobody else may write to them.
-    keeps_results: bool
-
     def forward(self, arrays: list[Any], wanted: list[bool]) -> Sequence[Any]:
         """Results (Dr.Jit tensors) for Dr.Jit tensors. ``wanted`` tells which of these need gradients; maybe none."""
 
@@ -32,40 +29,44 @@ class Operation(Protocol):
         """Gradients to the arrays (of those that are not wanted: anything) from those to the results (None: zero)."""
 
 
-class Recorded:
-    """A differentiable Dr.Jit function, whose graph is kept from the forward pass to the end of the last backward pass."""
+class Repeated:
+    """A differentiable Dr.Jit function, which is evaluated once more for its derivatives.
 
-    keeps_results = True
+    No graph is kept in between: one that is dropped, or that is to serve for another backward pass, Dr.Jit 1.5 never frees.
+    """
 
     def __init__(self, function: Callable[..., Sequence[Any]]) -> None:
         self.function = function
 
     def forward(self, arrays: list[Any], wanted: list[bool]) -> Sequence[Any]:
-        if not any(wanted):
-            with dr.suspend_grad():
-                return self.function(*arrays)
-        with dr.resume_grad():
-            dr.enable_grad([array for array, want in zip(arrays, wanted, strict=True) if want])
-            self.arrays, self.results = arrays, self.function(*arrays)
-        return self.results
+        self.arrays, self.wanted = arrays, wanted
+        with dr.suspend_grad():
+            return self.function(*arrays)
 
     def backward(self, adjoints: Sequence[Any]) -> Sequence[Any]:
         with dr.resume_grad():
-            return gradients(self.arrays, self.results, adjoints)
+            arrays = attached(self.arrays, self.wanted)
+            return gradients(arrays, self.function(*arrays), adjoints)
+
+
+def attached(arrays: Sequence[Any], wanted: Sequence[bool]) -> list[Any]:
+    """The same arrays, with gradients where they are wanted."""
+    copies = [type(array)(array) for array in arrays]
+    dr.enable_grad([copy for copy, want in zip(copies, wanted, strict=True) if want])
+    return copies
 
 
 def gradients(arrays: Sequence[Any], results: Sequence[Any], adjoints: Sequence[Any]) -> list[Any]:
-    """Gradients of the sum of <result, adjoint> to attached arrays. The graph stays as it is, without any gradients in it."""
+    """Gradients of the sum of <result, adjoint> to attached arrays. Ends the graph."""
     starts = [r for r, a in zip(results, adjoints, strict=True) if a is not None and dr.grad_enabled(r)]
     for result, adjoint in zip(results, adjoints, strict=True):
         if adjoint is not None and dr.grad_enabled(result):
             dr.accum_grad(result, adjoint)
     dr.enqueue(dr.ADMode.Backward, starts)
     # Not the results' gradients: a result may be an array that was passed through.
-    dr.traverse(dr.ADMode.Backward, dr.ADFlag.ClearInterior)
+    dr.traverse(dr.ADMode.Backward, dr.ADFlag.ClearInterior | dr.ADFlag.ClearEdges)
     found = [dr.grad(array) for array in arrays]
     dr.eval(found)
-    dr.clear_grad((list(arrays), list(results)))
     return found
 
 
@@ -142,8 +143,8 @@ class _Crossing(torch.autograd.Function):
             dr.eval(results)
         ctx.operation, ctx.wanted, ctx.device = operation, wanted, tensors[0].device
         ctx.set_materialize_grads(False)
-        copy = operation.keeps_results and any(wanted)
-        return tuple(to_torch(result, copy=copy) for result in results)
+        # A result may be memory of an array that is kept for the derivatives, and that nobody else may write to.
+        return tuple(to_torch(result, copy=any(wanted)) for result in results)
 
     @staticmethod
     @torch.autograd.function.once_differentiable

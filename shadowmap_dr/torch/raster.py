@@ -12,7 +12,7 @@ from .. import raster as _raster
 from ..errors import ShadowmapError
 from ..raster import RasterOutput
 from ..raster.rasterize import check_resolution
-from .bridge import Recorded, cross, drjit_turn, index_array, to_torch
+from .bridge import Repeated, cross, drjit_turn, index_array, to_torch
 from .checks import check_devices, check_floats, check_indices, check_same
 
 
@@ -82,9 +82,9 @@ def rasterize(positions: torch.Tensor, faces: torch.Tensor, resolution: tuple[in
         shape = (output.batch, output.height, output.width)
         return tuple(type(positions)(value, shape) for value in (output.u, output.v, output.depth))
 
-    u, v, depth = cross(Recorded(run), positions)
+    u, v, depth = cross(Repeated(run), positions)
     with drjit_turn(device) as module:
-        # What the pixels see by itself: with the gradients, the whole graph would stay alive.
+        # What the pixels see by itself: the rest is in the tensors.
         found = dr.detach(replace(kept[0], u=None, v=None, depth=None, w=None))
         triangle = to_torch(module.TensorXi(module.Int32(found.triangle), u.shape), copy=True)
     return Raster(triangle, u, v, depth, found)
@@ -117,7 +117,7 @@ def interpolate(attributes: torch.Tensor, raster: Raster, faces: torch.Tensor) -
         result = _raster.interpolate(attributes, replace(found, u=u.array, v=v.array), indices)
         return (type(result)(result.array, (*shape, result.shape[-1])),)
 
-    return cross(Recorded(run), attributes, raster.u, raster.v)[0]
+    return cross(Repeated(run), attributes, raster.u, raster.v)[0]
 
 
 def build_topology(faces: torch.Tensor, positions: torch.Tensor) -> Topology:
@@ -160,6 +160,6 @@ def antialias(image: torch.Tensor, raster: Raster, positions: torch.Tensor, topo
     def run(image: Any, positions: Any) -> tuple[Any, ...]:
         return (_raster.antialias(image, found, positions, topology._edges),)
 
-    return cross(Recorded(run), image, positions)[0]
+    return cross(Repeated(run), image, positions)[0]
 
 

@@ -13,7 +13,7 @@ import torch
 
 from ..errors import ShadowmapError
 from ..renderer import Renderer as _Renderer
-from .bridge import Recorded, cross, drjit_turn, gradients, number, to_torch
+from .bridge import attached, cross, drjit_turn, gradients, number, to_torch
 from .checks import check_devices, check_floats
 
 
@@ -33,8 +33,7 @@ class Renderer:
         Args:
             renderer: its shadow maps' fit is carried on here; the object itself stays as it is.
             frozen: record what the passes do (``dr.freeze``) and replay it while only numbers change, which is several times as
-                fast for small images. The backward pass then renders the image once more. Calls with ``parameters`` are never
-                recorded.
+                fast for small images. Calls with ``parameters`` are never recorded.
         """
         self._renderer = replace(renderer)
         self._variant = mi.variant()
@@ -89,18 +88,12 @@ class Renderer:
         if not 0 <= sensor < len(self._renderer.data.sensors) or spp < 1:
             count = len(self._renderer.data.sensors)
             raise ShadowmapError(f"sensor {sensor}, spp {spp}: there are {count} sensors, counted from 0; spp is 1 or more.")
-        repeats = self._frozen is not None or any(place.kind == "parameter" for place in given)
-        call = (tuple(given), sensor, spp)
-        operation = _Repeated(self, *call) if repeats else Recorded(lambda *arrays: self._image(list(arrays), *call))
+        operation = _Rendering(self, tuple(given), sensor, spp)
         if given:
             return cross(operation, *given.values())[0]
         with drjit_turn(torch.device("cpu" if self._variant.startswith("llvm") else "cuda")):
             (image,) = operation.forward([], [])
             return to_torch(image, copy=False)
-
-    def _image(self, arrays: list[Any], places: tuple[_Place, ...], sensor: int, spp: int) -> tuple[Any]:
-        image, self._renderer.frusta = _forward(self._renderer, places, arrays, sensor, spp)
-        return (image,)
 
     def _inputs(
         self,
@@ -153,13 +146,8 @@ class _Place:
         return f"{self.kind} '{self.name}'{self.field and '.'}{self.field}"
 
 
-class _Repeated:
-    """One image as an operation of the bridge that is done again for its derivatives: nothing but the arrays is kept.
-
-    For what cannot keep a graph: frozen functions, and scenes that are changed for the time of the call.
-    """
-
-    keeps_results = False
+class _Rendering:
+    """One image as an operation of the bridge, rendered once more for its derivatives."""
 
     def __init__(self, owner: Renderer, places: tuple[_Place, ...], sensor: int, spp: int) -> None:
         self.owner, self.places, self.camera = owner, places, (sensor, spp)
@@ -176,10 +164,8 @@ class _Repeated:
         return (image,)
 
     def backward(self, adjoints: Sequence[Any]) -> Sequence[Any]:
-        arrays = [type(array)(array) for array in self.arrays]
         with dr.resume_grad():
-            # Before the arrays enter the scene.
-            dr.enable_grad([array for array, want in zip(arrays, self.wanted, strict=True) if want])
+            arrays = attached(self.arrays, self.wanted)  # before they enter the scene
             with self._scene(arrays) as renderer:
                 return self.functions[1](renderer, self.places, arrays, self.wanted, adjoints[0], *self.camera)
 

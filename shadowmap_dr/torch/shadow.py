@@ -15,7 +15,7 @@ from ..errors import ShadowmapError
 from ..raster._types import backend
 from ..shadow import Frusta, LightView, ShadowSettings, Views
 from ..shadow.camera import of_map
-from .bridge import Recorded, cross, drjit_turn, index_array, vector
+from .bridge import Repeated, cross, drjit_turn, index_array, vector
 from .checks import check_devices, check_floats, check_same
 from .raster import Topology
 
@@ -130,7 +130,7 @@ def render_maps(
         tensor = type(vertices)
         return tensor(maps.values, (count, size, size, maps.channels)), tensor(axes, (len(_AXES), count, 3))
 
-    values, axes = cross(Recorded(run), vertices, *tensors.values())
+    values, axes = cross(Repeated(run), vertices, *tensors.values())
     views, frusta = kept[0]
     with drjit_turn(vertices.device):
         dr.eval(views, frusta)
@@ -146,7 +146,7 @@ def filter_maps(maps: ShadowMaps) -> ShadowMaps:
         flat = _shadow.ShadowMaps(values.array, maps._views, maps._frusta, maps.settings, values.shape[-1])
         return (type(values)(_shadow.filter_maps(flat).values, values.shape),)
 
-    return replace(maps, values=cross(Recorded(run), maps.values)[0])
+    return replace(maps, values=cross(Repeated(run), maps.values)[0])
 
 
 def visibility(maps: ShadowMaps, points: torch.Tensor, light: int = 0) -> torch.Tensor:
@@ -182,7 +182,7 @@ def visibility(maps: ShadowMaps, points: torch.Tensor, light: int = 0) -> torch.
         result = _shadow.visibility(flat, which, p_world)
         return (type(points)(_full(result, dr.width(p_world)), points.shape[:-1]),)
 
-    return cross(Recorded(run), points, maps.values, maps.axes)[0]
+    return cross(Repeated(run), points, maps.values, maps.axes)[0]
 
 
 def _checked(light: Light, number: int) -> dict[str, torch.Tensor]:

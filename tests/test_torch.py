@@ -243,7 +243,7 @@ def test_two_steps_of_an_optimiser_lower_the_loss() -> None:
         loss = (image - target).square().mean() + (visible - shadow_target).square().mean()
         loss.backward()
         optimiser.step()
-        losses.append(float(loss))
+        losses.append(loss.item())
     assert losses[0] > losses[1] > losses[2]
 
 

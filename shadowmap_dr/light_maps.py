@@ -153,7 +153,8 @@ def _compat_frusta(plan: MapPlan, views: Any) -> Frusta:
     spread = dr.detach(views.spread)
     zero = dr.zeros(mi.Float, views.count)
     half = dr.select(spread > 0, spread, 1.2 * plan.radius)
-    return Frusta(zero, zero, half, half, zero + 0.01 * plan.radius, zero + 4 * plan.radius)
+    near = zero + 0.01 * plan.radius
+    return Frusta(zero, zero, half, half, near, zero + 4 * plan.radius, near)
 
 
 def _planes(plan: MapPlan, geometry: Geometry) -> tuple[Any, Any]:

@@ -37,6 +37,11 @@ def _overlap(offset: float) -> dict[str, Mesh]:
     return {"high": high, "low": low}
 
 
+def _tiers(offset: float) -> dict[str, Mesh]:
+    """The same with occluders that are seen, beside their shadows."""
+    return {"high": box((-1.9 + offset, 2.4, -0.9), (-0.4 + offset, 2.5, 0.6)), "low": box((-0.9, 0.8, -0.3), (0.3, 0.9, 1.2))}
+
+
 def _fence(offset: float) -> dict[str, Mesh]:
     """Thin pickets and two rails."""
     pickets = [box((x + offset, 0.0, -0.03), (x + offset + 0.06, 1.2, 0.03)) for x in np.arange(-1.8, 1.8, 0.24)]
@@ -46,15 +51,16 @@ def _fence(offset: float) -> dict[str, Mesh]:
 
 def _sheet(offset: float) -> dict[str, Mesh]:
     """A crumpled sheet that shadows itself: ridges in random directions."""
-    n = 161
+    n = 241
     rng = np.random.default_rng(5)
     line = np.linspace(-1.7, 1.7, n)
     x, z = np.meshgrid(line, line, indexing="ij")
-    height = np.full_like(x, 0.9)
+    height = np.full_like(x, 0.6)
     for _ in range(7):
         angle, phase = rng.uniform(0, 2 * np.pi, 2)
         frequency = rng.uniform(1.0, 3.5)
-        height += 0.34 / frequency * np.abs(np.sin(frequency * (np.cos(angle) * x + np.sin(angle) * z) + phase))
+        wave = np.sin(frequency * (np.cos(angle) * x + np.sin(angle) * z) + phase)
+        height += 0.6 / frequency * np.hypot(wave, 0.2)
     points = np.stack([x + offset, height, z], -1).reshape(-1, 3).astype(np.float32)
     a = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
     faces = np.concatenate([np.stack([a, a + 1, a + n], 1), np.stack([a + 1, a + n + 1, a + n], 1)])
@@ -65,7 +71,7 @@ def _deep(offset: float) -> dict[str, Mesh]:
     """Occluders at heights 1 and 1000: all that is near the floor has a thousandth of the depth range."""
     far = 1000.0
     return {
-        "near": merged([box((-1.0 + offset, 0.0, -0.8), (-0.6 + offset, 1.0, -0.4)), box((0.2, 0.3, -0.2), (1.2, 0.4, 0.6))]),
+        "near": merged([box((-1.0 + offset, 0.3, -0.8), (-0.6 + offset, 1.0, -0.4)), box((0.2, 0.3, -0.2), (1.2, 0.4, 0.6))]),
         "far": box((-0.9 - far * _SLANT[0], far, 0.7 - far * _SLANT[2]), (0.4 - far * _SLANT[0], far + 1, 1.3 - far * _SLANT[2])),
     }
 
@@ -77,6 +83,7 @@ _LOW_SLANT = (0.35, -1.0, -0.55)
 #: Name -> (meshes for an offset along x of what casts the shadow, direction of the light).
 SCENES: Mapping[str, tuple[Callable[[float], dict[str, Mesh]], tuple[float, float, float]]] = {
     "overlap": (_overlap, _SLANT),
+    "tiers": (_tiers, (0.6, -1.0, 0.1)),
     "fence": (_fence, _LOW_SLANT),
     "sheet": (_sheet, (0.9, -1.0, 0.3)),
     "deep": (_deep, _SLANT),
@@ -86,10 +93,10 @@ SCENES: Mapping[str, tuple[Callable[[float], dict[str, Mesh]], tuple[float, floa
 def build(name: str, resolution: int, offset: float = 0.0) -> Any:
     """A ``mi.Scene``: diffuse floor (y = 0) and occluders, a directional light, an orthographic camera that looks down.
 
-    The camera is above the sheet and the fence, and below the other occluders, which it does not see.
+    The camera is above the sheet, the fence and the tiers, and below the other occluders, which it does not see.
     """
     meshes, direction = SCENES[name]
-    height = 3.0 if name in ("sheet", "fence") else 0.25
+    height = {"overlap": 0.25, "deep": 0.25, "tiers": 4.0}.get(name, 3.0)
     t = mi.ScalarTransform4f
     scene: dict[str, Any] = {
         "type": "scene",

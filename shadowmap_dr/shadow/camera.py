@@ -59,7 +59,8 @@ class Frusta:
     """Part of the image plane and of the depth range that each map covers; ``Float`` of width M, detached.
 
     A point with light-space coordinates (x, y, z) has image coordinates (x, y) in an orthographic and (x, y) / z in a perspective
-    view; the map covers ``center +- half`` in them and depths from ``near`` to ``far``.
+    view; the map covers ``center +- half`` in them and depths from ``near`` to ``far``. It tells depths apart from ``first`` on:
+    what lies before that lies before all receivers, and it does not matter how far.
     """
 
     center_x: Any
@@ -68,6 +69,7 @@ class Frusta:
     half_y: Any
     near: Any
     far: Any
+    first: Any
 
 
 def directional_view(direction: Any) -> LightView:
@@ -174,12 +176,19 @@ def to_clip(view: Views, frustum: Frusta, p_light: Any) -> Any:
 
 
 def linear_depth(view: Views, frustum: Frusta, depth_ndc: Any) -> tuple[Any, Any]:
-    """Depth along the light's axis, mapped linearly from near..far to -1/2..1/2, and its derivative by NDC depth."""
+    """Depth along the light's axis, mapped linearly from first..far to -1/2..1/2, and its derivative by NDC depth.
+
+    Depths before ``first`` are moved to it: -1/2, without derivative.
+    """
     perspective = view.spread > 0
-    n, f = frustum.near, frustum.far
-    w = 2 * f * n * dr.rcp(dr.select(perspective, dr.fma(-depth_ndc, f - n, f + n), 1))
-    linear = dr.select(perspective, (w - n) / (f - n) - 0.5, 0.5 * depth_ndc)
-    return linear, dr.select(perspective, w * w / (2 * f * n), 0.5)
+    n, f, first = frustum.near, frustum.far, frustum.first
+    z = 2 * f * n * dr.rcp(dr.select(perspective, dr.fma(-depth_ndc, f - n, f + n), 1))
+    scale = 1 / (f - first)
+    z = dr.select(perspective, z, 0.5 * dr.fma(depth_ndc, f - n, f + n))
+    linear = (z - first) * scale - 0.5
+    slope = dr.select(perspective, z * z * (f - n) / (2 * f * n), 0.5 * (f - n)) * scale
+    told_apart = linear > -0.5
+    return dr.select(told_apart, linear, -0.5), dr.select(told_apart, slope, 0)
 
 
 def project(view: Views, frustum: Frusta, p_world: Any) -> tuple[Any, Any, Any, Any]:
@@ -193,6 +202,6 @@ def project(view: Views, frustum: Frusta, p_world: Any) -> tuple[Any, Any, Any, 
     w = dr.select(perspective & in_front, p.z, 1.0)
     u = (p.x / w - frustum.center_x) / frustum.half_x
     v = (p.y / w - frustum.center_y) / frustum.half_y
-    depth = (p.z - frustum.near) / (frustum.far - frustum.near) - 0.5
+    depth = (p.z - frustum.first) / (frustum.far - frustum.first) - 0.5
     inside = in_front & (dr.abs(u) <= 1) & (dr.abs(v) <= 1)
     return u, v, depth, inside

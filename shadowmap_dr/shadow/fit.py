@@ -15,6 +15,9 @@ _KEEP_FILL = 0.6
 _MARGIN = 0.10
 # Least depth range of a frustum in units of its lateral extent.
 _FLATTEST = 1e-2
+# Depths are told apart from this far before the first receiver on, in units of the range from there to the last.
+import os
+_BEFORE = float(os.environ.get("BEFORE", "1"))
 
 
 @dataclass(frozen=True)
@@ -150,13 +153,13 @@ def _casts(
     return visible & (~planar | behind)
 
 
-def _window(views: Views, seen: Any) -> tuple[Any, Any, Any, Any, Any]:
-    """(x0, y0, x1, y1) in each map's image plane around what is seen, within the light's own cone; depth of its far side."""
+def _window(views: Views, seen: Any) -> tuple[Any, ...]:
+    """(x0, y0, x1, y1) in each map's image plane around what is seen, within the light's own cone; its least and greatest depth."""
     module = backend(views.spread)
     perspective = views.spread > 0
     limit = dr.select(perspective, views.spread, dr.inf)
     if seen is None:
-        return -limit, -limit, limit, limit, module.Float(dr.inf)
+        return -limit, -limit, limit, limit, module.Float(-dr.inf), module.Float(dr.inf)
     points, active = seen
     count = dr.width(points)
     lane = dr.arange(module.UInt32, views.count * count)
@@ -171,10 +174,10 @@ def _window(views: Views, seen: Any) -> tuple[Any, Any, Any, Any, Any]:
     in_perspective = view.spread > 0
     behind = in_perspective & (p.z <= 0)
     w = dr.select(in_perspective & ~behind, p.z, 1)
-    values = [*(dr.select(behind, dr.inf, v / w) for v in (-p.x, -p.y, p.x, p.y)), p.z]
-    *sides, depth = _rows(_maxima(values, map_index, views.count, active), dr.arange(module.UInt32, views.count), 5)
+    values = [*(dr.select(behind, dr.inf, v / w) for v in (-p.x, -p.y, p.x, p.y)), -p.z, p.z]
+    *sides, nearest, farthest = _rows(_maxima(values, map_index, views.count, active), dr.arange(module.UInt32, views.count), 6)
     x0, y0, x1, y1 = (dr.minimum(side, limit) for side in sides)
-    return -x0, -y0, x1, y1, depth
+    return -x0, -y0, x1, y1, -nearest, farthest
 
 
 def _fit(
@@ -182,7 +185,7 @@ def _fit(
     extent: tuple[Any, ...],
     casts: Any,
     map_index: Any,
-    window: tuple[Any, Any, Any, Any, Any],
+    window: tuple[Any, ...],
     resolution: int,
     filter_size: int,
 ) -> tuple[Frusta, tuple[Any, ...]]:
@@ -200,16 +203,20 @@ def _fit(
     x0, y0 = dr.select(full, -s, dr.maximum(x0, window[0])), dr.select(full, -s, dr.maximum(y0, window[1]))
     x1, y1 = dr.select(full, s, dr.minimum(x1, window[2])), dr.select(full, s, dr.minimum(y1, window[3]))
     # Behind all that is seen, casters are of no account; but seen receivers may end before the first of them.
-    z1 = dr.maximum(dr.minimum(z1, window[4]), z0)
+    z1 = dr.maximum(dr.minimum(z1, window[5]), z0)
+    # How far casters lie before all that is seen does not matter.
+    receivers = dr.clip(window[4], z0, z1)
     # Casters outside of the window leave an empty rectangle; any small one will do.
     x1, y1 = dr.maximum(x1, x0 + 1e-4 * (1 + dr.abs(x0))), dr.maximum(y1, y0 + 1e-4 * (1 + dr.abs(y0)))
     # A flat caster that faces the light has no depth of its own. In a range of next to nothing all that tilts it would be a huge
     # change, of which the derivative of visibility is the small difference.
     lateral = dr.maximum(x1 - x0, y1 - y0) * dr.select(perspective, dr.abs(z1), 1)
-    depth = dr.maximum(dr.maximum(z1 - z0, _FLATTEST * lateral), 1e-3 * dr.maximum(dr.abs(z1), 1e-3))
-    near, far = z0 - 0.05 * depth, z1 + 0.05 * depth
+    least = dr.maximum(_FLATTEST * lateral, 1e-3 * dr.maximum(dr.abs(z1), 1e-3))
+    depth = dr.maximum(z1 - receivers, least)
+    near, far = z0 - 0.05 * dr.maximum(z1 - z0, least), z1 + 0.05 * depth
     far = dr.select(perspective, dr.maximum(far, 1e-6), far)
     near = dr.select(perspective, dr.maximum(near, 1e-3 * far), near)
+    first = dr.maximum(near, receivers - _BEFORE * depth)
 
     def widen(lo: Any, hi: Any) -> tuple[Any, Any]:
         half = 0.5 * (hi - lo)
@@ -217,11 +224,11 @@ def _fit(
         return 0.5 * (lo + hi), dr.select(full, half, grown)
 
     (cx, hx), (cy, hy) = widen(x0, x1), widen(y0, y1)
-    return Frusta(cx, cy, hx, hy, near, far), (x0, y0, x1, y1, z0, z1)
+    return Frusta(cx, cy, hx, hy, near, far, first), (x0, y0, x1, y1, z0, z1, receivers)
 
 
 def _still_fits(views: Views, old: Frusta, new: Frusta, needed: tuple[Any, ...], resolution: int, filter_size: int) -> Any:
-    x0, y0, x1, y1, z0, z1 = needed
+    x0, y0, x1, y1, z0, z1, receivers = needed
     room = 2 * (filter_size / 2 + 1) / resolution
 
     def holds(lo: Any, hi: Any, center: Any, half: Any) -> Any:
@@ -231,6 +238,6 @@ def _still_fits(views: Views, old: Frusta, new: Frusta, needed: tuple[Any, ...],
     keep &= (new.half_x >= _KEEP_FILL * old.half_x) & (new.half_y >= _KEEP_FILL * old.half_y)
     # A face of a cube never moves laterally.
     keep |= (views.fixed > 0) & (new.half_x == old.half_x)
-    keep &= (dr.maximum(z0, new.near) >= old.near) & (z1 <= old.far)
-    keep &= new.far - new.near >= _KEEP_FILL * (old.far - old.near)
+    keep &= (dr.maximum(z0, new.near) >= old.near) & (z1 <= old.far) & (dr.maximum(receivers, new.first) >= old.first)
+    keep &= new.far - new.first >= _KEEP_FILL * (old.far - old.first)
     return keep

@@ -202,7 +202,7 @@ def _radial_depth(view: Views, frustum: Frusta, raster: RasterOutput, row: Any, 
 
 def _slope_square(view: Views, frustum: Frusta, linear: Any, slopes: list[Any], size: int) -> Any:
     """Squared change of linear depth across a texel, given its change along both axes."""
-    n, f = frustum.near, frustum.far
+    n, f = frustum.first, frustum.far
     # The side of a texel in units of depth.
     texel = dr.select(view.spread > 0, dr.fma(linear + 0.5, f - n, n), 1.0) * (2 / size) / (f - n)
     sx = dr.minimum(dr.abs(slopes[0]), _MAX_SLOPE * texel * frustum.half_x)

@@ -37,14 +37,15 @@ class Options:
     """Parameters of the plug-in, as in XML or a dictionary.
 
     shadow_map_resolution  texels along each side of a shadow map, 1 to 4096
-    shadow_method          ``vsm``, ``esm``, ``evsm2``, ``evsm4``, ``msm``, ``csm``, ``pcf``, ``standard`` (no shadow
-                           gradients) or ``none`` (no shadows); see ``shadowmap_dr.shadow.ShadowSettings``
+    shadow_method          ``auto`` (``evsm2``), ``vsm``, ``esm``, ``evsm2``, ``evsm4``, ``msm``, ``csm``, ``pcf``, ``standard``
+                           (no shadow gradients) or ``none`` (no shadows); see ``shadowmap_dr.shadow.ShadowSettings``
     shadow_filter          ``box``, ``gaussian``, ``wendland`` or ``none``
     shadow_filter_size     odd number of texels
     shadow_antialias       anti-alias shadow maps; without it casters get no gradient from the outlines of their shadows
     shadow_bleeding        visibilities below this count as 0, against light that bleeds through (``vsm``, ``evsm``, ``msm``)
     shadow_order           terms of the Fourier series of ``csm``, 2 to 16
     shadow_supersampling   texels along each side that are averaged into one of the map, 1 to 8 (pre-filtered methods)
+    shadow_receiver_range  tell depths apart only from the first receiver on, against light that bleeds through
     shadow_samples         look-ups along each side of a pixel, 1 to 8; 0 chooses
     antialias              anti-alias the image; without it outlines have no gradient
     ambient                radiance of unshadowed light from all directions, beside that of the scene's environment
@@ -56,13 +57,14 @@ class Options:
     """
 
     shadow_map_resolution: int = 256
-    shadow_method: str = "vsm"
+    shadow_method: str = "auto"
     shadow_filter: str = "gaussian"
     shadow_filter_size: int = 3
     shadow_antialias: bool = True
     shadow_bleeding: float = 0.0
     shadow_order: int = 4
     shadow_supersampling: int = 1
+    shadow_receiver_range: bool = True
     shadow_samples: int = 0
     antialias: bool = True
     ambient: float = 0.0
@@ -111,6 +113,7 @@ class Options:
                 bleeding=self.shadow_bleeding,
                 order=self.shadow_order,
                 supersampling=self.shadow_supersampling,
+                receiver_range=self.shadow_receiver_range,
             )
         except ValueError as error:
             raise ShadowmapError(str(error)) from None

@@ -126,6 +126,7 @@ def make_maps(
             settings.filter_size,
             previous,
             seen,
+            settings.receiver_range,
         )
     maps = render_maps(p_light, lanes, geometry.faces, topology, stacked, frusta, settings, transparent)
     return filter_maps(maps)

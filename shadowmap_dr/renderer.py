@@ -90,13 +90,14 @@ class Renderer:
         scene: Any,
         *,
         shadow_map_resolution: int = 256,
-        shadow_method: str = "vsm",
+        shadow_method: str = "auto",
         shadow_filter: str = "gaussian",
         shadow_filter_size: int = 3,
         shadow_antialias: bool = True,
         shadow_bleeding: float = 0.0,
         shadow_order: int = 4,
         shadow_supersampling: int = 1,
+        shadow_receiver_range: bool = True,
         compat: bool = False,
         tessellation: int = 64,
         **settings: Any,
@@ -120,6 +121,7 @@ class Renderer:
                 bleeding=shadow_bleeding,
                 order=shadow_order,
                 supersampling=shadow_supersampling,
+                receiver_range=shadow_receiver_range,
             )
         except ValueError as error:
             raise ShadowmapError(str(error)) from None

@@ -42,8 +42,8 @@ def make_maps(
     if frusta is None:
         bounds = shape_bounds(stacked, p_light, map_index, mi.UInt32(0), 1)
         none = dr.zeros(mi.Point3f, 1)
-        size, kernel = settings.resolution, settings.filter_size
-        frusta = fit_frusta(stacked, bounds, (none, none), mi.Bool(False), 1, size, kernel, previous, seen)
+        size, kernel, nearer = settings.resolution, settings.filter_size, settings.receiver_range
+        frusta = fit_frusta(stacked, bounds, (none, none), mi.Bool(False), 1, size, kernel, previous, seen, nearer)
     topology = build_topology(faces, world, mi.UInt32)
     flat_faces = mi.UInt32(faces.ravel().astype(np.uint32))
     return filter_maps(render_maps(p_light, map_index, flat_faces, topology, stacked, frusta, settings))

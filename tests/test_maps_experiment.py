@@ -54,17 +54,19 @@ def test_scenes_have_light_and_shadow(variant: str, name: str) -> None:
 
 def test_small_run(variant: str, tmp_path: Path) -> None:
     options = MapsOptions(
-        scenes=("overlap",), candidates=("vsm", "evsm4"), resolution=64, map_resolution=64, reference_spp=16, rounds=3,
-        out=tmp_path / "m",
+        scenes=("overlap",), candidates=("plain vsm", "evsm4"), resolution=64, map_resolution=64, reference_spp=16, rounds=3,
+        pose_runs=1, out=tmp_path / "m",
     )
     record = run_maps(options)
     stored = json.loads((tmp_path / "m" / "maps.json").read_text())
     assert stored["scenes"].keys() == {"overlap"} and (tmp_path / "m" / "maps.png").stat().st_size > 1000
-    vsm, evsm = (record["scenes"]["overlap"][label] for label in ("vsm", "evsm4"))
-    assert vsm["seconds_over_vsm"] == 1 and np.isfinite(evsm["seconds"])
+    vsm, evsm = (record["scenes"]["overlap"][label] for label in ("plain vsm", "evsm4"))
+    assert vsm["seconds_over_plain_vsm"] == 1 and np.isfinite(evsm["seconds"])
     assert evsm["rmse"] < vsm["rmse"] < 0.2
     assert min(vsm["derivative_cosine"], evsm["derivative_cosine"]) > 0.85
-    assert maps.table(record).row_count == 2
+    # Maps of 64 texels are too coarse for the last tenth of a degree.
+    assert all(entry["runs"] == 1 and entry["median_rotation_deg"] < 2 for entry in record["poses"].values())
+    assert maps.table(record).row_count == 4
 
 
 def test_scenes_follow_the_offset(variant: str) -> None:

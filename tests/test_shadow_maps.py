@@ -248,6 +248,38 @@ def test_flat_casters_that_face_the_light(variant: str, height: float) -> None:
 
 
 @pytest.mark.parametrize("kind", ["directional", "spot"])
+@pytest.mark.parametrize("method", ["vsm", "evsm2", "msm"])
+def test_how_far_before_all_receivers_casters_lie_does_not_matter(variant: str, kind: str, method: str) -> None:
+    """Far above a square is the edge of another: it lets no light into the first one's shadow, and its motion changes nothing."""
+    if kind == "directional":
+        views, high, scale = [directional_view(mi.Vector3f(0, 0, -1))], 500.0, 1.0
+    else:  # half as large at half the distance
+        axes = (mi.Point3f(1, 0, 0), mi.Point3f(0, -1, 0), mi.Point3f(0, 0, -1))
+        views, high, scale = [spot_view(mi.Point3f(0, 0, 4), *axes, mi.Float(0.7))], 2.0, 0.5
+    square = np.array([[-0.8, -0.8, 0], [0.4, -0.8, 0], [0.4, 0.8, 0], [-0.8, 0.8, 0]])
+    world = np.concatenate([square + [0.2, 0, 0], (square + [-0.1, 0.3, 0]) * [scale, scale, 1] + [0, 0, high]])
+    faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
+    floor = receivers(60, z=-0.5, half=1.2)
+    dark = np.all(np.abs(floor[:, :2]) < [0.5, 0.7], axis=1)
+    seen = (points(floor), mi.Bool(True))
+    most, slope = [], []
+    for receiver_range in (True, False):
+        settings = ShadowSettings(method=method, resolution=128, receiver_range=receiver_range)
+        rise = mi.Float(0)
+        dr.enable_grad(rise)
+        higher = mi.Float((np.arange(8) >= 4).astype(np.float32))
+        moved = points(world) + mi.Point3f(0, 0, 1) * (higher * rise)
+        maps = shadow_scene.make_maps(views, moved, world, faces, settings, seen=seen)
+        value = visibility(maps, 0, points(floor))
+        dr.forward(rise)
+        most.append(float(value.numpy()[dark].max()))
+        slope.append(float(np.abs(dr.grad(value).numpy()[dark]).max()))
+    assert most[0] < 1e-3 and slope[0] < 1e-6
+    if method == "vsm":
+        assert most[1] > 0.1
+
+
+@pytest.mark.parametrize("kind", ["directional", "spot"])
 def test_frusta_are_cut_to_what_is_seen(variant: str, kind: str) -> None:
     """Of a wide caster only the part that can shadow the region in view gets texels; there the shadow stays right."""
     casters = trimesh.util.concatenate(

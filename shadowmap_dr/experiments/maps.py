@@ -20,10 +20,11 @@ from .. import io, report
 from ..errors import ShadowmapError
 from ..renderer import Renderer
 from ..timing import Contender, alternate, machine
-from . import maps_scenes
+from . import maps_pose, maps_scenes
 
 #: What is compared: a label, and options of the `Renderer`.
 CANDIDATES: dict[str, dict[str, Any]] = {
+    "plain vsm": {"shadow_method": "vsm", "shadow_receiver_range": False},
     "vsm": {"shadow_method": "vsm"},
     "vsm, cut": {"shadow_method": "vsm", "shadow_bleeding": 0.2},
     "pcf": {"shadow_method": "pcf"},
@@ -53,6 +54,7 @@ class MapsOptions:
         map_resolution, filter_size: of the shadow maps.
         reference_spp: samples of the path-traced images.
         rounds: measured renderings of each candidate.
+        pose_runs: poses to be found with each candidate, from shadows alone; 0 leaves this out.
         out: folder for the results.
     """
 
@@ -63,6 +65,7 @@ class MapsOptions:
     filter_size: int = 3
     reference_spp: int = _REFERENCE_SPP
     rounds: int = 30
+    pose_runs: int = 10
     out: Path = Path("maps")
 
     def __post_init__(self) -> None:
@@ -72,8 +75,8 @@ class MapsOptions:
             for name in names:
                 if name not in known:
                     raise ShadowmapError(f"no {kind} {name!r}: choose from {', '.join(known)}.")
-        if self.resolution < 8 or self.reference_spp < 1 or self.rounds < 1:
-            raise ShadowmapError("resolution, samples and rounds must be at least 8, 1 and 1.")
+        if self.resolution < 8 or self.reference_spp < 1 or self.rounds < 1 or self.pose_runs < 0:
+            raise ShadowmapError("resolution, samples, rounds and runs must be at least 8, 1, 1 and 0.")
 
 
 def run_maps(options: MapsOptions, *, console: Console | None = None) -> dict[str, Any]:
@@ -99,13 +102,33 @@ def run_maps(options: MapsOptions, *, console: Console | None = None) -> dict[st
                 progress.update(task, advance=1)
             _add_times(record["scenes"][name], scene, options)
             report.write_json(options.out / "maps.json", record)
+        if options.pose_runs:
+            record["poses"] = _poses(options, progress)
+            report.write_json(options.out / "maps.json", record)
     report.image_sheet(options.out / "maps.png", sheet, size=1.8)
     return record
 
 
+def _poses(options: MapsOptions, progress: Any) -> dict[str, Any]:
+    """Poses found with each candidate."""
+    task = progress.add_task("poses", total=len(options.candidates) * options.pose_runs, note="reference")
+    problem, reference = maps_pose.shadow_problem(options.out / "pose")
+    result = {}
+    for label in options.candidates:
+        progress.update(task, note=label)
+        advance = functools.partial(progress.update, task, advance=1)
+        result[label] = maps_pose.poses_found(problem, reference, _settings(label, options), options.pose_runs, advance)
+    return result
+
+
+def _settings(label: str, options: MapsOptions) -> dict[str, Any]:
+    """Of the `Renderer`."""
+    sizes = {"shadow_map_resolution": options.map_resolution, "shadow_filter_size": options.filter_size}
+    return {**sizes, **CANDIDATES[label]}
+
+
 def _renderer(scene: Any, label: str, options: MapsOptions) -> Renderer:
-    settings = {"shadow_map_resolution": options.map_resolution, "shadow_filter_size": options.filter_size}
-    return Renderer.from_scene(scene, **settings, **CANDIDATES[label], aovs=("visibility",))
+    return Renderer.from_scene(scene, **_settings(label, options), aovs=("visibility",))
 
 
 def visibility_image(renderer: Renderer) -> Image:
@@ -209,20 +232,19 @@ def _add_times(entries: dict[str, dict[str, Any]], scene: Any, options: MapsOpti
     """Seconds of a frozen rendering, less those of one without shadows: map, filter and look-ups. All take turns."""
 
     def contender(settings: dict[str, Any]) -> Contender:
-        sizes = {"shadow_map_resolution": options.map_resolution, "shadow_filter_size": options.filter_size}
-        renderer = Renderer.from_scene(scene, **sizes, **settings)
+        renderer = Renderer.from_scene(scene, **settings)
         render = dr.freeze(lambda renderer: renderer.render().array)
         return Contender(lambda: dr.eval(render(renderer)), options.rounds)
 
-    calls = {label: contender(CANDIDATES[label]) for label in entries}
+    calls = {label: contender(_settings(label, options)) for label in entries}
     calls["none"] = contender({"shadow_method": "none"})
     samples = alternate(calls)
     base = statistics.median(samples["none"])
     seconds = {label: statistics.median(samples[label]) - base for label in entries}
     for label, entry in entries.items():
         entry["seconds"] = seconds[label]
-        if "vsm" in seconds:
-            entry["seconds_over_vsm"] = seconds[label] / seconds["vsm"]
+        if "plain vsm" in seconds:
+            entry["seconds_over_plain_vsm"] = seconds[label] / seconds["plain vsm"]
 
 
 def table(record: dict[str, Any]) -> Table:
@@ -231,7 +253,7 @@ def table(record: dict[str, Any]) -> Table:
     rows: list[Sequence[str]] = []
     for scene, entries in record["scenes"].items():
         for label, e in entries.items():
-            ratio = e.get("seconds_over_vsm")
+            ratio = e.get("seconds_over_plain_vsm")
             rows.append(
                 [
                     f"{scene}, {label}",
@@ -240,4 +262,7 @@ def table(record: dict[str, Any]) -> Table:
                     f"{ratio:.2f}x" if ratio is not None else f"{1e3 * e['seconds']:.2f} ms",
                 ]
             )
-    return report.table("Shadow maps against path tracing (shift in texels, time over vsm)", columns, rows)
+    for label, e in record.get("poses", {}).items():
+        errors = f"{e['median_rotation_deg']:.3f} deg, {e['median_offset_x100']:.3f}"
+        rows.append([f"poses, {label}", f"{e['found']} of {e['runs']}", errors, *[""] * (len(columns) - 3)])
+    return report.table("Shadow maps against path tracing (shift in texels, time over plain vsm)", columns, rows)

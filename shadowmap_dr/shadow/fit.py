@@ -15,9 +15,8 @@ _KEEP_FILL = 0.6
 _MARGIN = 0.10
 # Least depth range of a frustum in units of its lateral extent.
 _FLATTEST = 1e-2
-# Depths are told apart from this far before the first receiver on, in units of the range from there to the last.
-import os
-_BEFORE = float(os.environ.get("BEFORE", "1"))
+# Depths are told apart from this far before the first receiver on, in units of the range from there on.
+_BEFORE = 1.0
 
 
 @dataclass(frozen=True)
@@ -72,6 +71,7 @@ def fit_frusta(
     filter_size: int,
     previous: Frusta | None,
     seen: Any = None,
+    receiver_range: bool = True,
 ) -> Frusta:
     """Frusta that cover everything that can cast a shadow on what is seen, or the previous ones as long as they still do.
 
@@ -82,6 +82,7 @@ def fit_frusta(
         previous: frusta of an earlier call. Kept bit by bit while the casters lie inside them with room for the filter
             and fill most of them.
         seen: points (``Array3f``, world space) all over the receivers in view, and a mask of those that count. None: anywhere.
+        receiver_range: tell depths apart only from a little before the first receiver on, not from the first caster on.
 
     All arithmetic stays on the device: nothing is read back.
     """
@@ -94,6 +95,8 @@ def fit_frusta(
         extent = bounds.of(index)
         casts = _casts(views, bounds, extent, planes, planar, map_index, shape, shape_count)
         window = _window(views, seen)
+        if not receiver_range:
+            window = (*window[:4], module.Float(-dr.inf), window[5])
         fitted = _fit(views, extent, casts, map_index, window, resolution, filter_size)
         if previous is None:
             dr.eval(fitted[0])
@@ -154,7 +157,7 @@ def _casts(
 
 
 def _window(views: Views, seen: Any) -> tuple[Any, ...]:
-    """(x0, y0, x1, y1) in each map's image plane around what is seen, within the light's own cone; its least and greatest depth."""
+    """(x0, y0, x1, y1) in each map's image plane around what is seen, within the light's own cone, and bounds of its depth."""
     module = backend(views.spread)
     perspective = views.spread > 0
     limit = dr.select(perspective, views.spread, dr.inf)
@@ -204,16 +207,18 @@ def _fit(
     x1, y1 = dr.select(full, s, dr.minimum(x1, window[2])), dr.select(full, s, dr.minimum(y1, window[3]))
     # Behind all that is seen, casters are of no account; but seen receivers may end before the first of them.
     z1 = dr.maximum(dr.minimum(z1, window[5]), z0)
-    # How far casters lie before all that is seen does not matter.
-    receivers = dr.clip(window[4], z0, z1)
+    # How far casters lie before all that is seen does not matter. All of them may.
+    receivers = dr.select(dr.isfinite(window[4]), dr.maximum(window[4], z0), z0)
     # Casters outside of the window leave an empty rectangle; any small one will do.
     x1, y1 = dr.maximum(x1, x0 + 1e-4 * (1 + dr.abs(x0))), dr.maximum(y1, y0 + 1e-4 * (1 + dr.abs(y0)))
     # A flat caster that faces the light has no depth of its own. In a range of next to nothing all that tilts it would be a huge
     # change, of which the derivative of visibility is the small difference.
     lateral = dr.maximum(x1 - x0, y1 - y0) * dr.select(perspective, dr.abs(z1), 1)
     least = dr.maximum(_FLATTEST * lateral, 1e-3 * dr.maximum(dr.abs(z1), 1e-3))
-    depth = dr.maximum(z1 - receivers, least)
-    near, far = z0 - 0.05 * dr.maximum(z1 - z0, least), z1 + 0.05 * depth
+    # What is seen is known from samples: a little may lie before them.
+    spread = dr.select(dr.isfinite(window[5]), window[5] - receivers, 0)
+    depth = dr.maximum(dr.maximum(z1 - receivers, least), 0.1 * spread)
+    near, far = z0 - 0.05 * dr.maximum(z1 - z0, least), dr.maximum(z1 + 0.05 * depth, receivers)
     far = dr.select(perspective, dr.maximum(far, 1e-6), far)
     near = dr.select(perspective, dr.maximum(near, 1e-3 * far), near)
     first = dr.maximum(near, receivers - _BEFORE * depth)

@@ -13,7 +13,7 @@ from ..raster._types import backend, pixel_coordinates
 from ..raster.planes import pixel_depth
 from .camera import Frusta, Views, linear_depth, of_map, to_clip
 from .filters import FILTERS, filter_kernel, filter_map
-from .methods import METHODS, PREFILTERED
+from .methods import DEFAULT, METHODS, PREFILTERED
 
 #: Depth that a texel without geometry holds, and beyond which receivers are moved to it: an unoccluded receiver lies at its mean.
 FAR = 0.5
@@ -26,10 +26,10 @@ class ShadowSettings:
     """How shadows are computed.
 
     Attributes:
-        method: ``vsm`` (variance), ``esm`` (exponential), ``evsm2``, ``evsm4`` (exponential variance, two or four moments),
-            ``msm`` (four power moments), ``csm`` (convolution: Fourier series), ``pcf`` (percentage-closer: depths are compared,
-            and the filter applied, in the look-up; its derivatives say little about shadows that move), ``standard`` (one
-            comparison, no gradients) or ``none``.
+        method: ``auto`` (``evsm2``, or ``vsm`` with ``compat``), ``vsm`` (variance), ``esm`` (exponential), ``evsm2``, ``evsm4``
+            (exponential variance, two or four moments), ``msm`` (four power moments), ``csm`` (convolution: Fourier series),
+            ``pcf`` (percentage-closer: depths are compared, and the filter applied, in the look-up; its derivatives say little
+            about shadows that move), ``standard`` (one comparison, no gradients) or ``none``.
         resolution: texels along each side of a map.
         filter: ``box``, ``gaussian``, ``wendland`` or ``none``.
         filter_size: odd number of texels.
@@ -39,11 +39,13 @@ class ShadowSettings:
         order: terms of the series of ``csm``, an even number.
         supersampling: each texel is the mean of so many along both sides, anti-aliased first: coverage and derivatives are more
             exact, and so many times as many texels are rasterized. For pre-filtered methods.
+        receiver_range: maps tell depths apart only from a little before the first receiver in view on: how far before it casters
+            lie does not matter, and does not bleed.
         compat: the conventions of Worchel and Alexa's code: unnormalised radial depth, fixed frusta, dark outside of them, their
             kernels, minimum variance 1e-4.
     """
 
-    method: str = "vsm"
+    method: str = "auto"
     resolution: int = 256
     filter: str = "gaussian"
     filter_size: int = 3
@@ -53,10 +55,13 @@ class ShadowSettings:
     bleeding: float = 0.0
     order: int = 4
     supersampling: int = 1
+    receiver_range: bool = True
 
     def __post_init__(self) -> None:
+        if self.method == "auto":
+            object.__setattr__(self, "method", "vsm" if self.compat else DEFAULT)
         if self.method not in METHODS:
-            raise ValueError(f"shadow method {self.method!r} is unknown; choose one of {', '.join(METHODS)}")
+            raise ValueError(f"shadow method {self.method!r} is unknown; choose one of auto, {', '.join(METHODS)}")
         if self.filter not in FILTERS:
             raise ValueError(f"shadow filter {self.filter!r} is unknown; choose one of {', '.join(FILTERS)}")
         if self.compat and self.method not in ("vsm", "standard", "none"):

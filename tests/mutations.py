@@ -141,7 +141,7 @@ MUTATIONS = (
     Mutation("leave the shadows out", "shadow.moments", "chebyshev_visibility", _always_lit,
              ("test_references.py::test_shadows_of_1024_texels[llvm_ad_rgb-gallery]",)),
     Mutation("look half a texel off", "shadow.lookup", "_bilinear", _half_a_texel_off,
-             ("test_references.py::test_shadows_of_1024_texels[llvm_ad_rgb-gallery]",)),
+             ("test_shadow_maps.py::test_compat_follows_the_authors_formulas[llvm_ad_rgb-spot]",)),
     Mutation("do not see where surfaces meet", "raster.meetings", "Meetings.weight", _nowhere,
              (DIFFERENCES.format("crossing_boxes-camera_shift"),)),
     Mutation("move one of two surfaces that meet", "raster.meetings", "Meetings.slopes", _only_the_first_triangle,

@@ -479,7 +479,7 @@ XML = """
 <scene version="3.0.0">
   <integrator type="shadowmap">
     <integer name="shadow_map_resolution" value="128"/>
-    <string name="shadow_method" value="vsm"/>
+    <string name="shadow_method" value="evsm4"/>
     <string name="shadow_filter" value="box"/>
     <integer name="shadow_filter_size" value="5"/>
     <boolean name="shadow_antialias" value="true"/>
@@ -526,7 +526,7 @@ def test_defaults_are_those_of_the_renderer(variant: str) -> None:
         ({"shadow_map_resolution": 64.5}, "'shadow_map_resolution' of 'shadowmap' is 64.5, but must be an integer"),
         ({"shadow_map_resolution": 0}, "shadow map resolution is 0"),
         ({"shadow_map_resolution": True}, "is True, but must be an integer"),
-        ({"shadow_method": "magic"}, "shadow method 'magic' is unknown; choose one of vsm, esm"),
+        ({"shadow_method": "magic"}, "shadow method 'magic' is unknown; choose one of auto, vsm, esm"),
         ({"shadow_filter": "median"}, "shadow filter 'median' is unknown"),
         ({"shadow_filter_size": 4}, "4"),
         ({"shadow_samples": 100}, "shadow_samples is 100"),

@@ -45,7 +45,7 @@ def units(options: BenchOptions) -> list[Unit]:
     return [
         Unit(f"{name}-{resolution}", functools.partial(measure, options, method, resolution))
         for resolution in options.what.resolutions
-        for name, method in (("shadows", "auto"), ("rasterizer", "none"))
+        for name, method in (("shadows", "vsm"), ("rasterizer", "none"))
     ]
 
 

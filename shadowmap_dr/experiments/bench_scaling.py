@@ -32,7 +32,7 @@ class Case:
     map_resolution: int = 256
     filter_size: int = 3
     lights: int = 1
-    method: str = "auto"
+    method: str = "vsm"
     views: int = 1
 
     def fit(self, work: Path) -> PoseFit:

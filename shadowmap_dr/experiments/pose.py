@@ -108,7 +108,7 @@ def shadow_settings(method: str) -> dict[str, Any]:
     """Options of the `Renderer` that the methods `shadows` and `rasterizer` use."""
     if method == "rasterizer":
         return {"shadow_method": "none"}
-    return {"shadow_method": "evsm2", "shadow_map_resolution": 256, "shadow_filter": "gaussian", "shadow_filter_size": 3}
+    return {"shadow_method": "vsm", "shadow_map_resolution": 256, "shadow_filter": "gaussian", "shadow_filter_size": 3}
 
 
 def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Console | None = None) -> list[dict[str, Any]]:

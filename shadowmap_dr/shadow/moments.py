@@ -14,6 +14,8 @@ from ..raster._types import backend
 
 #: Smallest variance that Chebyshev's bound uses, in units of the squared depth range.
 MINIMUM_VARIANCE = 1e-6
+#: The same for warped depths, to first order: with less, surfaces that the light hardly strikes would shadow themselves.
+MINIMUM_WARPED_VARIANCE = 1e-5
 #: The authors' value, for their unnormalised depths.
 MINIMUM_VARIANCE_COMPAT = 1e-4
 
@@ -100,7 +102,7 @@ def warped_visibility(moments: Any, depth: Any, exponent: float) -> Any:
     # Moments span many orders of magnitude: everything is scaled by the receiver's own warped depth.
     scale = dr.rcp(dr.detach(dr.abs(warped)))
     relative = backend(depth).Array2f(moments.x * scale, moments.y * scale * scale)
-    return chebyshev_visibility(relative, warped * scale, MINIMUM_VARIANCE * exponent * exponent)
+    return chebyshev_visibility(relative, warped * scale, MINIMUM_WARPED_VARIANCE * exponent * exponent)
 
 
 def _warp(depth: Any, exponent: float) -> Any:

@@ -26,7 +26,7 @@ class ShadowSettings:
     """How shadows are computed.
 
     Attributes:
-        method: ``auto`` (``evsm2``, or ``vsm`` with ``compat``), ``vsm`` (variance), ``esm`` (exponential), ``evsm2``, ``evsm4``
+        method: ``auto`` (``evsm4``, or ``vsm`` with ``compat``), ``vsm`` (variance), ``esm`` (exponential), ``evsm2``, ``evsm4``
             (exponential variance, two or four moments), ``msm`` (four power moments), ``csm`` (convolution: Fourier series),
             ``pcf`` (percentage-closer: depths are compared, and the filter applied, in the look-up; its derivatives say little
             about shadows that move), ``standard`` (one comparison, no gradients) or ``none``.

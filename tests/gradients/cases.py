@@ -179,6 +179,8 @@ CASES = (
          {"shadow_map_resolution": 1024}),
     Case("near_plane", near_plane, {
         **SUN, **CAMERA,
+        # Shorter than elsewhere: what the camera passes moves by more pixels.
+        "camera_shift": Parameter("camera.to_world", moved(1, 0.2, 0), 0.006),
         "bar_translation": Parameter("other.vertex_positions", translated(1, 0, 0), 0.008),
         "bar_vertex": Parameter("other.vertex_positions", one_corner(0, 1, 0.2, 0), 0.015),
         "wall_vertex": Parameter("object.vertex_positions", one_corner(2, 1, 0.2, 0), 0.02)}),

@@ -36,7 +36,7 @@ def jacobian(
     ] = None,
     candidate: Annotated[
         list[str] | None,
-        typer.Option(metavar="|".join(jacobian_experiment.CANDIDATES), help="Kind of shadow map; repeatable [default: vsm]."),
+        typer.Option(metavar="|".join(jacobian_experiment.CANDIDATES), help="Kind of shadow map; repeatable [default: default]."),
     ] = None,
     map_resolution: Annotated[
         list[int] | None, typer.Option(help="Texels along each side of the map; repeatable [default: 256 and 1024].")

@@ -108,7 +108,7 @@ def test_blur_of_the_map(variant: str, taps: int) -> None:
 
 def test_derivative_images_and_reverse_mode(variant: str) -> None:
     mesh, motion = turned_square(17), MOTIONS["rotation"]
-    renderer = gradients_jacobian.make_renderer(gradients_scenes.build(mesh, 96), "vsm", 64, 3)
+    renderer = gradients_jacobian.make_renderer(gradients_scenes.build(mesh, 96), "default", 64, 3)
     _, derivative = forward_derivative(renderer, motion.rate(mesh))
     found = agreement(derivative, central_derivative(renderer, mesh, motion, motion.step(mesh, 96)), 6)
     assert found.cosine > 0.98 and found.scale == pytest.approx(1, abs=0.03)
@@ -183,10 +183,10 @@ SMALL = {"resolution": 96, "faces": 600, "spp": 32, "mitsuba_passes": 0, "motion
 
 def test_small_jacobian(variant: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     first = run_jacobian(JacobianOptions(**SMALL, filter_sizes=(3,), out=tmp_path))
-    entry = first["entries"]["vsm | x | 64 | 3"]
+    entry = first["entries"]["default | x | 64 | 3"]
     assert min(entry["own"]["cosine"], entry["traced_blurred"]["cosine"]) > 0.98
     assert entry["own"]["scale"] == pytest.approx(1, abs=0.05) and entry["reverse_error"] < 1e-4
-    along = first["entries"]["vsm | z | 64 | 3"]
+    along = first["entries"]["default | z | 64 | 3"]
     assert along["relative_norm"] < 0.1 and "own" not in along
     assert first["references"]["z"]["norm"] == 0 < first["references"]["x"]["norm"]
     assert first["tessellation"]["x"]["gradient_change"] < 0.02 and first["tessellation"]["x"]["divided_faces"] > 100_000
@@ -198,10 +198,10 @@ def test_small_jacobian(variant: str, tmp_path: Path, monkeypatch: pytest.Monkey
     measured = []
     measure = gradients_jacobian._measure
     monkeypatch.setattr(gradients_jacobian, "_measure", lambda *args: measured.append(args[1:5]) or measure(*args))
-    wider = JacobianOptions(**SMALL, filter_sizes=(1, 3), candidates=("vsm", "no anti-aliasing"), out=tmp_path, resume=True)
+    wider = JacobianOptions(**SMALL, filter_sizes=(1, 3), candidates=("default", "no anti-aliasing"), out=tmp_path, resume=True)
     second = run_jacobian(wider)
-    assert ("vsm", "x", 64, 3) not in measured and ("vsm", "x", 64, 1) in measured
-    assert second["entries"]["vsm | x | 64 | 3"] == json.loads(json.dumps(entry))
+    assert ("default", "x", 64, 3) not in measured and ("default", "x", 64, 1) in measured
+    assert second["entries"]["default | x | 64 | 3"] == json.loads(json.dumps(entry))
     assert second["entries"]["no anti-aliasing | x | 64 | 3"]["own"]["cosine"] < 0.8
     with pytest.raises(ShadowmapError, match="leave out --resume"):
         run_jacobian(JacobianOptions(**{**SMALL, "spp": 8}, filter_sizes=(3,), out=tmp_path, resume=True))
@@ -209,7 +209,7 @@ def test_small_jacobian(variant: str, tmp_path: Path, monkeypatch: pytest.Monkey
 
 def test_reading_tells_what_is_not_reached() -> None:
     good = {"cosine": 0.999, "scale": 1.0}
-    entry = {"candidate": "vsm", "motion": "x", "map": 64, "filter": 3, "reverse_error": 1e-6,
+    entry = {"candidate": "default", "motion": "x", "map": 64, "filter": 3, "reverse_error": 1e-6,
              "own": good, "traced": good, "traced_blurred": good}
     bad = {**entry, "motion": "scale", "filter": 9, "traced": {"cosine": 0.99, "scale": 0.8}, "reverse_error": 1e-3}
     record = {"settings": {"faces": 1, "resolution": 2, "spp": 3}, "entries": {"a": entry, "b": bad}, "references": {},

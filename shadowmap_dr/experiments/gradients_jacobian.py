@@ -32,13 +32,13 @@ from .gradients_scenes import MOTIONS
 
 #: What may be compared: a label, and options of the `Renderer`.
 CANDIDATES: dict[str, dict[str, Any]] = {
-    "vsm": {},
+    "default": {},
     "no anti-aliasing": {"shadow_antialias": False},
     "2 x 2 texels": {"shadow_supersampling": 2},
     "4 x 4 texels": {"shadow_supersampling": 4},
     "4 x 4 look-ups": {"shadow_samples": 4},
-    "evsm4": {"shadow_method": "evsm4"},
-    "evsm4, 2 x 2": {"shadow_method": "evsm4", "shadow_supersampling": 2},
+    "plain vsm": {"shadow_method": "vsm", "shadow_receiver_range": False},
+    "plain vsm, 2 x 2": {"shadow_method": "vsm", "shadow_receiver_range": False, "shadow_supersampling": 2},
     "msm": {"shadow_method": "msm"},
 }
 # Faces of the coarse occluder in the test of tessellation, and how often each is divided in four: 64-fold.
@@ -63,7 +63,7 @@ class JacobianOptions:
     """
 
     motions: tuple[str, ...] = tuple(MOTIONS)
-    candidates: tuple[str, ...] = ("vsm",)
+    candidates: tuple[str, ...] = ("default",)
     map_resolutions: tuple[int, ...] = (256, 1024)
     filter_sizes: tuple[int, ...] = (1, 3, 5, 9, 15)
     resolution: int = 512
@@ -202,7 +202,7 @@ def _tessellation(name: str, options: JacobianOptions) -> dict[str, float]:
     images, gradients, faces = [], [], []
     for divisions in (0, _DIVISIONS):
         mesh, aim = (gradients_scenes.tessellated(each, divisions) for each in (coarse, target_mesh))
-        renderer = make_renderer(gradients_scenes.build(mesh, options.resolution), "vsm", 256, 3)
+        renderer = make_renderer(gradients_scenes.build(mesh, options.resolution), "default", 256, 3)
         value, derivative = forward_derivative(renderer, motion.rate(mesh))
         target = image_of(renderer, aim)
         images.append(derivative)

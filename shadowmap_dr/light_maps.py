@@ -184,7 +184,8 @@ def _still_planar(plan: MapPlan, geometry: Geometry, planes: tuple[Any, Any]) ->
 
 def light_visibility(maps: ShadowMaps, plan: MapPlan, light: Light, index: int, p_world: Any, active: Any) -> Any:
     """Visibility (Float) of light number ``index`` from world-space points. Attached to points, casters and light."""
-    which: Any = plan.first[index]
+    # Wide, although it is one number: adjoints of look-ups with it then run in one kernel, others in one for each number.
+    which: Any = dr.full(mi.UInt32, plan.first[index], dr.width(p_world))
     if plan.kinds[index] == "cube":
         offset = dr.detach(mi.Vector3f(p_world - light.position))
         which = plan.first[index] + cube_face(offset)

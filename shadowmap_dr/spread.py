@@ -8,6 +8,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from .tables import look_up, one_buffer
+
 
 def spread(record: Any, width: int) -> Any:
     """A copy of ``record`` whose differentiable numbers of width 1 are gathered ``width`` times from one common buffer.
@@ -26,9 +28,9 @@ def spread(record: Any, width: int) -> Any:
     _map(record, collect)
     if not leaves or width == 1:
         return record
-    flat = dr.concat(leaves)
+    flat = one_buffer(leaves)
     position = iter(range(len(leaves)))
-    return _map(record, lambda leaf: dr.gather(type(leaf), flat, dr.full(mi.UInt32, next(position), width)))
+    return _map(record, lambda _: look_up(flat, dr.full(mi.UInt32, next(position), width)))
 
 
 def _map(value: Any, function: Any) -> Any:

@@ -14,6 +14,7 @@ from typing import Any
 import drjit as dr
 
 from ..raster._types import backend
+from ..tables import from_one_buffer, look_up
 
 #: Half-angle (tangent) of one cube face, before the margin for the filter.
 CUBE_FACE = 1.0
@@ -129,7 +130,9 @@ def stack_views(views: Sequence[LightView]) -> Views:
         return total
 
     def stack3(name: str) -> Any:
-        return module.Array3f(*(stack([getattr(v, name)[c] for v in views]) for c in range(3)))
+        parts = [stack([getattr(v, name)[c] for v in views]) for c in range(3)]
+        # A single view's are the caller's own numbers.
+        return module.Array3f(*(from_one_buffer(parts) if dr.grad_enabled(parts) else parts))
 
     return Views(
         stack3("right"),
@@ -151,8 +154,8 @@ def of_map(table: Any, index: Any, count: int) -> Any:
         if count == 1 and not dr.grad_enabled(value):
             return value
         if dr.depth_v(value) > 1:
-            return module.Array3f(*(dr.gather(module.Float, value[c], index) for c in range(3)))
-        return dr.gather(module.Float, value, index)
+            return module.Array3f(*(look_up(value[c], index) for c in range(3)))
+        return look_up(value, index)
 
     return type(table)(*(pick(getattr(table, name)) for name in table.__dataclass_fields__))
 

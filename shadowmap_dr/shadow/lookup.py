@@ -15,7 +15,7 @@ from .methods import PREFILTERED
 from .moments import MINIMUM_VARIANCE_COMPAT, chebyshev_visibility, reduced_bleeding, soft_comparison, standard_visibility
 from .shadow_map import FAR, ShadowMaps
 
-# Depth over which the comparison of percentage-closer filtering is spread: without it there would be no derivative.
+# Depth over which the comparison of percentage-closer filtering is spread: without it there would be no derivative by depth.
 _SOFTNESS = 0.02
 
 
@@ -74,7 +74,7 @@ def _compare(maps: ShadowMaps, map_index: Any, u: Any, v: Any, depth: Any) -> An
 
 
 def _compare_all(maps: ShadowMaps, map_index: Any, u: Any, v: Any, depth: Any) -> Any:
-    """Comparisons with all texels under the filter, which is moved bilinearly: attached to the point.
+    """Comparisons with all texels under the filter, which is moved bilinearly: attached to the point and the texels.
 
     Source: Reeves et al., "Rendering Antialiased Shadows with Depth Maps", 1987.
     """
@@ -88,10 +88,20 @@ def _compare_all(maps: ShadowMaps, map_index: Any, u: Any, v: Any, depth: Any) -
         for j, weight_down in enumerate(down):
             line = module.Float(0)
             for i, weight in enumerate(across):
-                stored = dr.gather(module.Float, maps.values, at.index(i - radius, j - radius))
-                line = dr.fma(weight, soft_comparison(stored, depth, s.bias, _SOFTNESS), line)
+                line = dr.fma(weight, _compare_texel(maps, at.index(i - radius, j - radius), depth), line)
             total = dr.fma(weight_down, line, total)
     return dr.clip(total, 0, 1)
+
+
+def _compare_texel(maps: ShadowMaps, texel: Any, depth: Any) -> Any:
+    """Share of a texel that lets light through to a depth."""
+    bias = maps.settings.bias
+    if maps.channels == 1:
+        stored = dr.gather(backend(maps.values).Float, maps.values, texel)
+        return soft_comparison(stored, depth, bias, _SOFTNESS)
+    centre, other, share, _ = dr.gather(backend(maps.values).Array4f, maps.values, texel)
+    lit = soft_comparison(centre, depth, bias, _SOFTNESS)
+    return dr.fma(share, soft_comparison(other, depth, bias, _SOFTNESS) - lit, lit)
 
 
 def _moved(weights: list[float], fraction: Any) -> list[Any]:

@@ -14,6 +14,7 @@ from ..raster.planes import pixel_depth
 from .camera import Frusta, Views, linear_depth, of_map, to_clip
 from .filters import FILTERS, filter_kernel, filter_map
 from .methods import DEFAULT, METHODS, PREFILTERED
+from .moments import other_depth, variance_moments
 
 #: Depth that a texel without geometry holds, and beyond which receivers are moved to it: an unoccluded receiver lies at its mean.
 FAR = 0.5
@@ -28,8 +29,8 @@ class ShadowSettings:
     Attributes:
         method: ``auto`` (``evsm4``, or ``vsm`` with ``compat``), ``vsm`` (variance), ``esm`` (exponential), ``evsm2``, ``evsm4``
             (exponential variance, two or four moments), ``msm`` (four power moments), ``csm`` (convolution: Fourier series),
-            ``pcf`` (percentage-closer: depths are compared, and the filter applied, in the look-up; its derivatives say little
-            about shadows that move), ``standard`` (one comparison, no gradients) or ``none``.
+            ``pcf`` (percentage-closer: depths are compared, and the filter applied, in the look-up; of a texel that an
+            outline crosses both depths, by the share that each covers), ``standard`` (one comparison, no gradients) or ``none``.
         resolution: texels along each side of a map.
         filter: ``box``, ``gaussian``, ``wendland`` or ``none``.
         filter_size: odd number of texels.
@@ -138,7 +139,8 @@ def render_maps(
     values, channels = _texels(raster, clip, faces, views, frusta, settings, size)
     if settings.antialias and settings.method != "standard":
         dr.eval(values)
-        values = antialias(values, raster, clip, topology)
+        blended = antialias(values, raster, clip, topology)
+        values, channels = _two_depths(values, blended) if settings.method == "pcf" else (blended, channels)
     if settings.supersampling > 1:
         values = _averaged(values, size, channels, settings.supersampling)
     return ShadowMaps(values, views, frusta, settings, channels)
@@ -164,9 +166,25 @@ def _texels(
             slope_square = dr.select(hit, _slope_square(dr.detach(view), dr.detach(frustum), dr.detach(linear), slopes, size), 0)
     method = PREFILTERED.get(settings.method)
     if method is None:
+        if settings.method == "pcf" and settings.antialias:
+            return _interleaved(list(variance_moments(depth))), 2
         return depth, 1
     values = method.encode(depth, slope_square, settings.order)
     return _interleaved(values), len(values)
+
+
+def _two_depths(plain: Any, blended: Any) -> tuple[Any, int]:
+    """(depth at the centre, other depth, its share, nothing) of each texel from its moments without and with anti-aliasing.
+
+    Blended depths mean nothing to a comparison, but their moments tell what has been blended. The fourth number is there because
+    packets of four are read, and their derivatives added up, much faster than three numbers.
+    """
+    module = backend(plain)
+    dr.eval(blended)
+    texel = dr.arange(module.UInt32, dr.width(plain) // 2)
+    depth = dr.gather(module.Array2f, plain, texel).x
+    other, share = other_depth(depth, dr.gather(module.Array2f, blended, texel))
+    return dr.ravel(module.Array4f(depth, other, share, 0)), 4
 
 
 def _averaged(values: Any, size: int, channels: int, factor: int) -> Any:

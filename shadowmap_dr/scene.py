@@ -325,7 +325,8 @@ def _vertex_buffers(source: ShapeSource, info: ShapeInfo) -> tuple[Any, Any, Any
 
 def _transform(flat: Any, matrix: Any, kind: Any) -> Any:
     """Apply a 4x4 matrix to flat points, or the upper 3x3 of an inverse transpose to flat normals (then made unit)."""
-    value = dr.unravel(mi.Vector3f, flat)
+    # Not ``dr.unravel``, whose adjoint overwrites what other instances of the same buffer have added.
+    value = dr.gather(mi.Vector3f, flat, dr.arange(mi.UInt32, dr.width(flat) // 3))
     linear = mi.Matrix3f(matrix)
     result = mi.Vector3f(linear @ value)
     if kind is mi.Point3f:

@@ -145,6 +145,27 @@ def test_refresh_reads_attached_parameters(variant: str, kind: str) -> None:
     assert np.array_equal(data.geometry.positions.numpy(), before)
 
 
+def test_all_instances_of_a_mesh_pass_gradients_on(variant: str) -> None:
+    factors = [1.0, 2.0, 5.0]
+    instances = {
+        f"copy{k}": {
+            "type": "instance",
+            "to_world": mi.ScalarTransform4f().scale(factor),
+            "group": {"type": "ref", "id": "group"},
+        }
+        for k, factor in enumerate(factors)
+    }
+    mesh = {"type": "ply", "filename": str(assets.mesh("spot")), "face_normals": True}
+    scene = mi.load_dict({"type": "scene", "group": {"type": "shapegroup", "mesh": mesh}, **instances}, optimize=False)
+    data = load(scene)
+    params = mi.traverse(scene)
+    key = next(key for key in params.keys() if key.endswith("vertex_positions"))
+    dr.enable_grad(params[key])
+    params.update()
+    dr.backward(dr.sum(refresh(data).geometry.positions))
+    np.testing.assert_allclose(dr.grad(params[key]).numpy(), sum(factors), rtol=1e-5)
+
+
 def test_topology_change_is_refused(variant: str) -> None:
     scene = mi.load_dict({"type": "scene", "box": {"type": "cube"}}, optimize=False)
     data = load(scene)

@@ -224,6 +224,14 @@ def test_two_depths_are_bounded_and_finite_on_any_moments(variant: str) -> None:
         assert np.isfinite(dr.grad(x).numpy()).all()
 
 
+@pytest.mark.parametrize("method", PREFILTERED)
+def test_occluders_and_receivers_at_the_ends_of_the_range(variant: str, method: str) -> None:
+    """Where all casters lie before all receivers, one ends up at -1/2 and the other at 1/2."""
+    depths = np.full((4, 1), -0.5)
+    value = PREFILTERED[method].resolve(stored(method, depths, np.ones((4, 1))), floats([0.3, 0.4, 0.45, 0.5])).numpy()
+    assert value.max() < (0.1 if method == "csm" else 0.01)
+
+
 @pytest.mark.parametrize("method", ["vsm", "esm", "csm"])  # 2, 1 and 8 numbers a texel
 def test_supersampled_texels_are_means(variant: str, method: str) -> None:
     """Of texels of a finer map, in all maps of a batch; and derivatives in both modes go through the mean."""

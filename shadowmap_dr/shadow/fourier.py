@@ -10,16 +10,19 @@ from typing import Any
 
 import drjit as dr
 
+# The series is periodic: where depths differ by the whole range, it must still be far from its next step.
+_BASE = 0.88 * math.pi
+
 
 def fourier_terms(depth: Any, slope_square: Any, order: int) -> list[Any]:
-    """Sine and cosine of each of ``order`` odd multiples of pi times the depth: 2 ``order`` numbers. Attached.
+    """Sine and cosine of each of ``order`` odd multiples of a base frequency: 2 ``order`` numbers. Attached.
 
     A plane's extent within the texel dampens them as it would those of a normal distribution.
     """
     variance = 0.25 * dr.detach(slope_square)
     terms = []
     for k in range(order):
-        frequency = math.pi * (2 * k + 1)
+        frequency = _BASE * (2 * k + 1)
         damping = dr.exp(-0.5 * frequency**2 * variance)
         sine, cosine = dr.sincos(frequency * depth)
         terms += [sine * damping, cosine * damping]
@@ -34,7 +37,7 @@ def fourier_visibility(terms: list[Any], depth: Any) -> Any:
     order = len(terms) // 2
     total = 0.5
     for k in range(order):
-        frequency = math.pi * (2 * k + 1)
+        frequency = _BASE * (2 * k + 1)
         x = math.pi * (2 * k + 1) / (2 * order + 1)
         sine, cosine = dr.sincos(frequency * depth)
         difference = terms[2 * k] * cosine - terms[2 * k + 1] * sine

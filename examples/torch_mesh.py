@@ -26,8 +26,6 @@ from shadowmap_dr.io import write_png
 # isort: split
 import mitsuba as mi  # after shadowmap_dr, which chooses the LLVM library
 
-SHADOW, VIEW = 0, 1  # the scene's sensors
-
 
 def ball(subdivisions: int, radius: float) -> tuple[torch.Tensor, torch.Tensor]:
     """Vertices (V, 3) and faces (F, 3) of an octahedron whose faces are divided into four again and again."""
@@ -66,8 +64,8 @@ def scene_of(mesh: Any, size: int) -> Any:
     return mi.load_dict(
         {
             "type": "scene",
-            "sensor_0": {"type": "orthographic", "near_clip": 0.01, "to_world": facing, "film": film(size)},
-            "sensor_1": view,
+            "shadow": {"type": "orthographic", "near_clip": 0.01, "to_world": facing, "film": film(size)},
+            "view": view,
             "light": {"type": "directional", "direction": [0, 0, -1], "irradiance": {"type": "rgb", "value": 3.0}},
             "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.15}},
             "wall": {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -2]).scale(12), "bsdf": wall},
@@ -75,6 +73,11 @@ def scene_of(mesh: Any, size: int) -> Any:
         },
         optimize=False,
     )
+
+
+def camera(scene: Any, name: str) -> int:
+    """Number of a camera in a scene: Mitsuba loads them in any order."""
+    return [sensor.id() for sensor in scene.sensors()].index(name)
 
 
 def mesh_of(vertices: torch.Tensor, faces: torch.Tensor) -> Any:
@@ -91,7 +94,8 @@ def wanted_shadow(size: int) -> torch.Tensor:
     """The wall with the shadow of a cow, which turns its side to the light."""
     turned = mi.ScalarTransform4f().rotate([0, 1, 0], 60)
     spot = {"type": "ply", "filename": str(assets.mesh("spot")), "to_world": turned}
-    return sdr.Renderer.from_scene(scene_of(spot, size)).render(sensor=SHADOW)
+    scene = scene_of(spot, size)
+    return sdr.Renderer.from_scene(scene).render(sensor=camera(scene, "shadow"))
 
 
 def optimise(steps: int, size: int, out: Path, subdivisions: int = 4) -> list[float]:
@@ -99,7 +103,9 @@ def optimise(steps: int, size: int, out: Path, subdivisions: int = 4) -> list[fl
     mi.set_variant("llvm_ad_rgb")
     target = wanted_shadow(size)
     start, faces = ball(subdivisions, 0.6)
-    renderer = sdr.Renderer.from_scene(scene_of(mesh_of(start, faces), size), frozen=True)
+    scene = scene_of(mesh_of(start, faces), size)
+    shadow_camera, view_camera = camera(scene, "shadow"), camera(scene, "view")
+    renderer = sdr.Renderer.from_scene(scene, frozen=True)
     matrix = smoothing(faces, len(start), 20.0)
     inverse = torch.linalg.inv(matrix)
     # The shadow knows nothing of what lies along the light: only x and y move.
@@ -112,7 +118,7 @@ def optimise(steps: int, size: int, out: Path, subdivisions: int = 4) -> list[fl
     losses = []
     for _ in track(range(steps), "moving vertices"):
         optimiser.zero_grad()
-        shadow = renderer.render({"mesh": vertices()}, sensor=SHADOW)
+        shadow = renderer.render({"mesh": vertices()}, sensor=shadow_camera)
         loss = (shadow - target).square().mean()
         loss.backward()
         optimiser.step()
@@ -121,8 +127,8 @@ def optimise(steps: int, size: int, out: Path, subdivisions: int = 4) -> list[fl
     with torch.no_grad():
         shadows = []
         for name, mesh in (("before", start), ("after", vertices())):
-            write_png(out / f"{name}.png", renderer.render({"mesh": mesh}, sensor=VIEW, spp=4).numpy())
-            shadows.append(renderer.render({"mesh": mesh}, sensor=SHADOW))
+            write_png(out / f"{name}.png", renderer.render({"mesh": mesh}, sensor=view_camera, spp=4).numpy())
+            shadows.append(renderer.render({"mesh": mesh}, sensor=shadow_camera))
     write_png(out / "shadows.png", torch.cat([*shadows, target], 1).numpy())
     return losses
 

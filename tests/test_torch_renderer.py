@@ -117,6 +117,16 @@ def test_frozen_or_not_image_and_gradients_are_those_of_drjit(renderer: sdr.Rend
             np.testing.assert_allclose(tensor.grad, gradient, rtol=1e-3, atol=1e-3 * scale)
 
 
+def test_frozen_renderers_notice_other_samples() -> None:
+    plain, frozen = (sdr.Renderer.from_scene(build(), frozen=f, **OPTIONS) for f in (False, True))
+    name = frozen._renderer.data.geometry.shapes[0].name
+    vertices = plain.vertices(name)
+    for spp in (1, 4, 1):
+        expected, image = (renderer.render({name: vertices}, spp=spp) for renderer in (plain, frozen))
+        torch.testing.assert_close(image, expected, atol=1e-4, rtol=1e-4)
+    assert frozen._frozen[0].n_recordings == 2
+
+
 def test_frozen_or_not_gradients_agree_with_differences(renderer: sdr.Renderer) -> None:
     rest = renderer.vertices("ball")
     agrees(lambda v: renderer.render({"ball": v}), rest, torch.tensor([1.0, 0.3, 0.2]).expand_as(rest), 0.01)

@@ -112,7 +112,7 @@ def test_lights_of_one_batch_are_those_by_themselves() -> None:
     topology, points = sdr.build_topology(FACES, VERTICES), receivers(20)
     kinds = ["point", "directional", "wide spot", "spot"]
     maps = sdr.filter_maps(sdr.render_maps(VERTICES, topology, [light_of(kind) for kind in kinds], SETTINGS))
-    assert maps.first == (0, 6, 7, 13) and maps.values.shape == (14, 64, 64, 2) and maps.axes.shape == (4, 14, 3)
+    assert maps.first == (0, 6, 7, 13) and maps.values.shape == (14, 64, 64, 4) and maps.axes.shape == (4, 14, 3)
     for k, kind in enumerate(kinds):
         torch.testing.assert_close(sdr.visibility(maps, points, k), lit(VERTICES, light_of(kind), points))
 

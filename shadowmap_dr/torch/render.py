@@ -156,7 +156,7 @@ class _Rendering:
 
     def forward(self, arrays: list[Any], wanted: list[bool]) -> Sequence[Any]:
         with dr.suspend_grad(), self._scene(arrays) as renderer:
-            image, frusta = self.functions[0](renderer, self.places, arrays, *self.camera)
+            image, frusta = self.functions[0](self.places, *self.camera, arrays, renderer)
             # While the scene is as it should be.
             dr.eval(image, frusta)
         self.arrays, self.wanted, self.frusta = arrays, wanted, frusta
@@ -167,7 +167,7 @@ class _Rendering:
         with dr.resume_grad():
             arrays = attached(self.arrays, self.wanted)  # before they enter the scene
             with self._scene(arrays) as renderer:
-                return self.functions[1](renderer, self.places, arrays, self.wanted, adjoints[0], *self.camera)
+                return self.functions[1](self.places, *self.camera, self.wanted, arrays, adjoints[0], renderer)
 
     @contextmanager
     def _scene(self, arrays: list[Any]) -> Iterator[_Renderer]:
@@ -195,7 +195,8 @@ def _set(table: Any, values: Mapping[str, Any]) -> None:
     table.update()
 
 
-def _forward(renderer: _Renderer, places: tuple[_Place, ...], arrays: list[Any], sensor: int, spp: int) -> tuple[Any, Any]:
+# The renderer comes last: Dr.Jit 1.5 does not tell recordings apart by Python's numbers and strings that follow it.
+def _forward(places: tuple[_Place, ...], sensor: int, spp: int, arrays: list[Any], renderer: _Renderer) -> tuple[Any, Any]:
     """Image and the fit of the shadow maps."""
     given = list(zip(places, arrays, strict=True))
     vertices = {place.name: array for place, array in given if place.kind == "vertices"}
@@ -209,19 +210,19 @@ def _forward(renderer: _Renderer, places: tuple[_Place, ...], arrays: list[Any],
 
 
 def _backward(
-    renderer: _Renderer,
     places: tuple[_Place, ...],
-    arrays: list[Any],
-    wanted: list[bool],
-    adjoint: Any,
     sensor: int,
     spp: int,
+    wanted: list[bool],
+    arrays: list[Any],
+    adjoint: Any,
+    renderer: _Renderer,
 ) -> list[Any]:
     """Gradients to the arrays from that to the image."""
     for array, want in zip(arrays, wanted, strict=True):
         if want:
             dr.enable_grad(array)
-    image, _ = _forward(renderer, places, arrays, sensor, spp)
+    image, _ = _forward(places, sensor, spp, arrays, renderer)
     return gradients(arrays, (image,), (adjoint,))
 
 

@@ -1,4 +1,4 @@
-"""The scripts in ``examples/``, shortened."""
+"""The scripts in ``docs/examples``, shortened."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ ROOT = Path(__file__).resolve().parent.parent
 
 def test_a_mesh_takes_the_shape_of_its_shadow(tmp_path: Path) -> None:
     pytest.importorskip("torch", reason="PyTorch is not installed: pip install '.[torch]'")
-    command = [sys.executable, ROOT / "examples" / "torch_mesh.py", "--steps", "40", "--size", "96", "--out", tmp_path / "out"]
+    script = ROOT / "docs" / "examples" / "torch_mesh.py"
+    command = [sys.executable, script, "--steps", "40", "--size", "96", "--out", tmp_path / "out"]
     result = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=ROOT)
     assert result.returncode == 0, result.stderr
     before, after = map(float, re.search(r"loss ([0-9.]+) -> ([0-9.]+)", result.stdout).groups())

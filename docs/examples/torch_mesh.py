@@ -4,7 +4,7 @@ The camera of the optimisation sees the shadow on the wall and never the ball. A
 x = (I + 20 L)^-1 u (L: graph Laplacian), so that each gradient moves the surface smoothly
 (Nicolet et al., "Large Steps in Inverse Rendering of Geometry", 2021).
 
-    python examples/torch_mesh.py [--steps N] [--out DIR]
+    python docs/examples/torch_mesh.py [--steps N] [--out DIR]
 
 writes DIR/before.png, DIR/after.png (the mesh and its shadow) and DIR/shadows.png (shadow before, after, wanted).
 """

@@ -16,7 +16,8 @@ import mitsuba as mi
 
 from .aovs import aov_names
 from .errors import ShadowmapError
-from .renderer import Renderer, RenderSettings
+from .render_settings import RenderSettings
+from .renderer import Renderer
 from .scene import SceneData, load
 from .sensors import sensors_of
 from .shadow import Frusta, ShadowSettings
@@ -46,6 +47,9 @@ class Options:
     shadow_order           terms of the Fourier series of ``csm``, 2 to 16
     shadow_supersampling   texels along each side that are averaged into one of the map, 1 to 8 (pre-filtered methods)
     shadow_receiver_range  tell depths apart only from the first receiver on, against light that bleeds through
+    emitter_samples        points on each area light that cast shadows
+    environment_samples    directions of an environment that cast shadows
+    soft_map_resolution    texels along each side of their shadow maps
     shadow_samples         look-ups along each side of a pixel, 1 to 8; 0 chooses
     antialias              anti-alias the image; without it outlines have no gradient
     ambient                radiance of unshadowed light from all directions, beside that of the scene's environment
@@ -66,6 +70,9 @@ class Options:
     shadow_supersampling: int = 1
     shadow_receiver_range: bool = True
     shadow_samples: int = 0
+    emitter_samples: int = 32
+    environment_samples: int = 64
+    soft_map_resolution: int = 128
     antialias: bool = True
     ambient: float = 0.0
     hide_emitters: bool = False
@@ -123,6 +130,9 @@ class Options:
             ambient=self.ambient,
             hide_emitters=self.hide_emitters,
             shadow_samples=self.shadow_samples,
+            emitter_samples=self.emitter_samples,
+            environment_samples=self.environment_samples,
+            soft_map_resolution=self.soft_map_resolution,
             aovs=tuple(name for _, name in self.labelled_aovs),
         )
 
@@ -149,7 +159,7 @@ class SceneRenderer:
     sizes     number of vertices and faces of each mesh
     lights    names of the lights
     renderer  without what is re-read for each rendering
-    fits      (sensor, frusta of the shadow maps) of the last image that it took, latest first
+    fits      (sensor, frusta of the shadow maps, of those of extended lights) of the last image that it took, latest first
     """
 
     parts: tuple[Any, ...]
@@ -157,7 +167,7 @@ class SceneRenderer:
     sizes: tuple[int, ...]
     lights: tuple[str, ...]
     renderer: Renderer
-    fits: list[tuple[Any, Frusta | None]] = field(default_factory=list)
+    fits: list[tuple[Any, Frusta | None, Frusta | None]] = field(default_factory=list)
 
     @classmethod
     def build(cls, scene: Any, sensor: Any, options: Options, settings: RenderSettings) -> SceneRenderer:
@@ -188,9 +198,10 @@ class SceneRenderer:
         # Each sensor goes on from its own fit. Fitting it again to the same vertices and lights keeps it bit by bit, so the
         # derivatives of a step see the frusta of its image, whatever other sensors have taken in between.
         others = [fit for fit in self.fits if fit[0] is not sensor]
-        current.frusta = next((frusta for known, frusta in self.fits if known is sensor), self.renderer.frusta)
+        known = next((fit for fit in self.fits if fit[0] is sensor), (sensor, self.renderer.frusta, self.renderer.soft_frusta))
+        _, current.frusta, current.soft_frusta = known
         image = current.render(spp=spp)
-        self.fits = [(sensor, current.frusta), *others][:_REMEMBERED_SENSORS]
+        self.fits = [(sensor, current.frusta, current.soft_frusta), *others][:_REMEMBERED_SENSORS]
         return image
 
 
@@ -213,7 +224,7 @@ def _sizes(data: SceneData) -> tuple[int, ...]:
 def _without_scene(data: SceneData) -> SceneData:
     """Drop what ``refresh`` reads again."""
     geometry = replace(data.geometry, positions=None, normals=None, texcoords=None, rest_positions=None)
-    return replace(data, scene=None, geometry=geometry, sensors=(), lights=(), environments=())
+    return replace(data, scene=None, geometry=geometry, sensors=(), lights=(), areas=(), environments=())
 
 
 def _same_objects(first: tuple[Any, ...], second: tuple[Any, ...]) -> bool:

@@ -19,6 +19,7 @@ from .shadow import (
     LightView,
     ShadowMaps,
     ShadowSettings,
+    casting_shapes,
     cube_face,
     cube_views,
     directional_view,
@@ -114,13 +115,12 @@ def make_maps(
     else:
         shapes = len(geometry.shapes)
         shape = dr.gather(mi.UInt32, geometry.vertex_shape, vertex)
-        planes = _planes(plan, geometry)
+        planes, planar = shape_planes(plan, geometry)
         bounds = shape_bounds(stacked, p_light, lanes, shape, shapes)
         frusta = fit_frusta(
             stacked,
             bounds,
-            planes,
-            _still_planar(plan, geometry, planes),
+            casting_shapes(stacked, bounds, planes, planar, shapes),
             shapes,
             settings.resolution,
             settings.filter_size,
@@ -156,6 +156,12 @@ def _compat_frusta(plan: MapPlan, views: Any) -> Frusta:
     half = dr.select(spread > 0, spread, 1.2 * plan.radius)
     near = zero + 0.01 * plan.radius
     return Frusta(zero, zero, half, half, near, zero + 4 * plan.radius, near)
+
+
+def shape_planes(plan: MapPlan, geometry: Geometry) -> tuple[tuple[Any, Any], Any]:
+    """((unit normal, point), whether it is one (Bool)) of the plane of each shape where it is now, detached, world space."""
+    planes = _planes(plan, geometry)
+    return planes, _still_planar(plan, geometry, planes)
 
 
 def _planes(plan: MapPlan, geometry: Geometry) -> tuple[Any, Any]:

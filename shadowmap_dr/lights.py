@@ -7,6 +7,7 @@ are not names may carry gradients; replace them with ``dataclasses.replace``.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -108,11 +109,43 @@ class SquareSpot:
 
 
 @dataclass(frozen=True)
+class AreaLight:
+    """A shape that shines from its outer side. ``shape``: its index; ``emitter``: Mitsuba's ``area``; ``scale``: of radiance."""
+
+    name: str
+    shape: int
+    emitter: Any
+    scale: Any = 1.0
+
+    def radiance(self, uv: Any) -> Any:
+        """Radiance (colour) of points with these texture coordinates (Point2f). Attached to the emitter."""
+        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(uv))
+        si.uv = uv
+        si.wi = mi.Vector3f(0, 0, 1)
+        return self.seen(si, mi.Bool(True))
+
+    def seen(self, si: Any, active: Any) -> Any:
+        """Radiance (colour) of surface points towards ``si.wi``."""
+        return mi.UnpolarizedSpectrum(self.emitter.eval(si, active)) * self.scale
+
+
+@dataclass(frozen=True)
 class Environment:
     """Light from infinitely far away, from all directions: Mitsuba's ``constant`` or ``envmap`` emitter."""
 
     name: str
     emitter: Any
+
+    @property
+    def rows(self) -> int:
+        """Rows of its image, 0 if it has none."""
+        data = parameters(self.emitter).get("data")
+        return 0 if data is None else int(data.shape[0])
+
+    def to_world(self, direction: Any) -> Any:
+        """World-space direction (Vector3f) of one in the environment's own space. Attached to its rotation."""
+        to_world = parameters(self.emitter).get("to_world")
+        return direction if to_world is None else mi.Vector3f(mi.Matrix3f(to_world.matrix) @ direction)
 
     def radiance(self, direction: Any, active: Any = True) -> Any:
         """Radiance (colour) that arrives *from* the unit world-space ``direction`` (Vector3f). Attached to the emitter."""
@@ -125,15 +158,26 @@ Light = DirectionalLight | PointLight | SpotLight
 
 
 def lights_of(scene: Any) -> tuple[Light, ...]:
-    """Records of the directional, spot and point lights of a ``mi.Scene``, in the scene's order, environments left out.
+    """Records of the directional, spot and point lights of a ``mi.Scene``, in the scene's order; no area lights, no environments.
 
     Raises ``ShadowmapError`` for any other emitter. Names are Mitsuba ids; lights without one are called ``light_0``, ...
     """
     return tuple(
         light_of(emitter, emitter.id() or f"light_{i}")
         for i, emitter in enumerate(scene.emitters())
-        if not emitter.is_environment()
+        if not emitter.is_environment() and emitter.class_name() != "AreaLight"
     )
+
+
+def area_lights_of(scene: Any, shapes: Sequence[Any]) -> tuple[AreaLight, ...]:
+    """Records of the area lights of a ``mi.Scene``; ``shapes``: its ``mi.Shape`` objects in the order of the soup."""
+    found = []
+    for i, emitter in enumerate(scene.emitters()):
+        if emitter.class_name() == "AreaLight":
+            shape = emitter.get_shape()
+            index = next(k for k, other in enumerate(shapes) if other is shape or other == shape)
+            found.append(AreaLight(emitter.id() or f"light_{i}", index, emitter))
+    return tuple(found)
 
 
 def environments_of(scene: Any) -> tuple[Environment, ...]:

@@ -4,59 +4,30 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from .aovs import AOVS, collect_aovs
+from .aovs import collect_aovs
 from .camera_pass import camera_clip, footprint_points, seen_points, within_far_plane
 from .errors import ShadowmapError
 from .facets import crease_edges, flat_faces, mean_normals, soften_facets
 from .geometry import Geometry
 from .hits import pixel_hits
 from .light_maps import MapPlan, light_visibility, make_maps, plan_maps
-from .lights import Light, SpotLight, SquareSpot
+from .lights import AreaLight, Light, SpotLight, SquareSpot
 from .raster import MAX_RESOLUTION, RasterOutput, Topology, antialias, build_topology, visible_triangles
+from .render_settings import RenderSettings
 from .scene import SceneData, load, refresh
 from .sensors import Sensor
-from .shading import Surface, ambient_light, background, direct_light, normals_at, opacity, surface, surface_at
+from .shading import Surface, ambient_light, background, direct_light, emission, normals_at, opacity, surface, surface_at
 from .shadow import Frusta, ShadowMaps, ShadowSettings
+from .soft import LightSamples, SoftPlan, make_soft_maps, plan_soft, samples_of, soft_light
 
 # Directions over which the light of environments is summed.
 _AMBIENT_DIRECTIONS = 16
-
-
-@dataclass(frozen=True)
-class RenderSettings:
-    """How a scene is rendered.
-
-    Attributes:
-        shadow: see :class:`ShadowSettings`.
-        antialias: anti-alias silhouettes in the image; without it they have no gradient.
-        ambient: radiance of unshadowed light that arrives from everywhere, beside that of the scene's environment.
-        hide_emitters: environments light the scene, but are not seen themselves.
-        shadow_samples: look-ups along each side of a pixel's footprint (``samples ** 2`` in all), or 0 for 2 where the image is
-            not larger than the shadow map and 1 otherwise.
-        aovs: names of further channels, see :data:`shadowmap_dr.aovs.AOVS`.
-    """
-
-    shadow: ShadowSettings = field(default_factory=ShadowSettings)
-    antialias: bool = True
-    ambient: float = 0.0
-    hide_emitters: bool = False
-    shadow_samples: int = 0
-    aovs: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        for name in self.aovs:
-            if name not in AOVS:
-                raise ShadowmapError(f"There is no AOV '{name}': choose from {', '.join(AOVS)}.")
-        if not 0 <= self.shadow_samples <= 8:
-            raise ShadowmapError(f"shadow_samples is {self.shadow_samples}: choose 0 (automatic) to 8.")
-        if not (self.ambient >= 0 and self.ambient < float("inf")):
-            raise ShadowmapError(f"ambient is {self.ambient}: give a finite radiance of at least 0.")
 
 
 @dataclass
@@ -64,7 +35,8 @@ class Renderer:
     """Renders one scene again and again, with other vertices, lights or cameras.
 
     A PyTree: pass it to functions decorated with ``dr.freeze``. A step touches neither Mitsuba's meshes nor its acceleration
-    structures. The only state is ``frusta``, the fit of the shadow maps: it stays as it is while the casters move within it.
+    structures. The only state is the fit of the shadow maps (``frusta``, ``soft_frusta``): it stays as it is while the casters
+    move within it.
 
     Attributes:
         data: records of the scene.
@@ -73,7 +45,8 @@ class Renderer:
         settings: how to render.
         flat: faces that are shaded flat, or None.
         creases: ``Bool`` (3 F,), edges of faces at which shading jumps, or None.
-        frusta: fit of the shadow maps in the last rendering, None before the first.
+        soft: how extended lights (area lights, environments) are sampled, and which maps these samples have.
+        frusta: fit of the shadow maps in the last rendering, None before the first. ``soft_frusta``: of those of extended lights.
     """
 
     data: SceneData
@@ -82,7 +55,9 @@ class Renderer:
     settings: RenderSettings
     flat: Any = None
     creases: Any = None
+    soft: tuple[SoftPlan, ...] = ()
     frusta: Frusta | None = None
+    soft_frusta: Frusta | None = None
 
     @classmethod
     def from_scene(
@@ -134,11 +109,14 @@ class Renderer:
         positions = dr.detach(geometry.positions).numpy()
         topology = build_topology(geometry.faces.numpy(), positions, mi.UInt32)
         plan, creases = plan_maps(data.lights, geometry), crease_edges(geometry, topology)
-        renderer = cls(data, topology, plan, settings, flat_faces(geometry, topology), creases)
+        lights = (*data.areas, *data.environments)
+        soft = plan_soft(lights, geometry, settings.emitter_samples, settings.environment_samples)
+        renderer = cls(data, topology, plan, settings, flat_faces(geometry, topology), creases, soft)
         # The first fit is made here, so that a step which is recorded later always starts from one.
-        if renderer._has_shadows and data.sensors:
+        if data.sensors:
             with dr.suspend_grad():
-                renderer._maps([renderer._view(camera, geometry, 1) for camera in data.sensors[0]], geometry, data.lights)
+                views = [renderer._view(camera, geometry, 1) for camera in data.sensors[0]]
+                renderer._lighting(views, geometry, None)
         return renderer
 
     def with_data(self, data: SceneData) -> Renderer:
@@ -175,27 +153,22 @@ class Renderer:
         geometry = geometry.in_packets()
         # Before all else that is attached: derivatives are taken in the reverse order, and pixels should need one pass only.
         facets = None if self.flat is None else mean_normals(geometry, self.topology, self.flat)
-        current = self._lights(lights)
         cameras = self._sensors(sensor)
         views = [self._view(camera, geometry, _grid(spp, camera)) for camera in cameras]
-        maps = self._maps(views, geometry, current) if self._has_shadows else None
-        images = [self._camera_image(view, geometry, current, maps, facets) for view in views]
+        lighting = self._lighting(views, geometry, lights)
+        images = [self._camera_image(view, geometry, lighting, facets) for view in views]
         return images[0] if len(images) == 1 else _side_by_side(images)
 
-    def light(self, name: str) -> Light:
+    def light(self, name: str) -> Light | AreaLight:
         """Record of a light of the scene."""
         return self.data.light(name)
 
-    @property
-    def _has_shadows(self) -> bool:
-        return self.settings.shadow.method != "none" and bool(self.plan.kinds)
-
-    def _lights(self, replacements: Mapping[str, Light] | None) -> tuple[Light, ...]:
+    def _replaced(self, lights: tuple[Any, ...], replacements: Mapping[str, Any] | None) -> tuple[Any, ...]:
         for name in replacements or ():
             old, new = self.data.light(name), replacements[name]
             if type(old) is not type(new):
                 raise ShadowmapError(f"Light '{name}' is a {type(old).__name__}, not a {type(new).__name__}.")
-        return tuple((replacements or {}).get(light.name, light) for light in self.data.lights)
+        return tuple((replacements or {}).get(light.name, light) for light in lights)
 
     def _sensors(self, sensor: int | Sensor) -> tuple[Sensor, ...]:
         if isinstance(sensor, Sensor):
@@ -204,11 +177,24 @@ class Renderer:
             raise ShadowmapError(f"There is no sensor {sensor}: the scene has {len(self.data.sensors)}, counted from 0.")
         return self.data.sensors[sensor]
 
-    def _maps(self, views: list[_View], geometry: Geometry, lights: tuple[Light, ...]) -> ShadowMaps:
-        transparent, seen = self._transparent(geometry, views[0].sensor), self._seen(views)
-        maps = make_maps(self.plan, lights, geometry, self.topology, self.settings.shadow, self.frusta, transparent, seen)
-        self.frusta = maps.frusta
-        return maps
+    def _lighting(self, views: list[_View], geometry: Geometry, replacements: Mapping[str, Any] | None) -> _Lighting:
+        """All lights and their shadow maps."""
+        data, settings = self.data, self.settings
+        lights, areas = self._replaced(data.lights, replacements), self._replaced(data.areas, replacements)
+        extended = (*areas, *data.environments)
+        samples = tuple(samples_of(light, plan, geometry) for light, plan in zip(extended, self.soft, strict=True))
+        maps = soft_maps = None
+        if settings.shadow.method != "none" and (lights or samples):
+            transparent, seen = self._transparent(geometry, views[0].sensor), self._seen(views)
+            common = (geometry, self.topology)
+            if lights:
+                maps = make_maps(self.plan, lights, *common, settings.shadow, self.frusta, transparent, seen)
+                self.frusta = maps.frusta
+            if samples:
+                shadow = settings.soft_shadow
+                soft_maps = make_soft_maps(self.soft, samples, self.plan, *common, shadow, self.soft_frusta, transparent, seen)
+                self.soft_frusta = soft_maps.frusta
+        return _Lighting(lights, maps, areas, samples, soft_maps)
 
     def _seen(self, views: list[_View]) -> tuple[Any, Any]:
         """Points on what the cameras see, and which of them there are."""
@@ -236,7 +222,7 @@ class Renderer:
         raster = visible_triangles(clip, geometry.faces, size, transparent=transparent)
         return _View(sensor, factor, clip, raster)
 
-    def _camera_image(self, view: _View, geometry: Geometry, lights: tuple[Light, ...], maps: Any, facets: Any) -> Any:
+    def _camera_image(self, view: _View, geometry: Geometry, lighting: _Lighting, facets: Any) -> Any:
         sensor, raster, factor = view.sensor, view.raster, view.factor
         height, width = raster.height, raster.width
         hits = pixel_hits(geometry, sensor, raster.triangle, (width, height))
@@ -244,10 +230,12 @@ class Renderer:
         normals, sharpness = normals_at(geometry, hits), None
         if self.flat is not None:
             normals, sharpness = soften_facets(hits, normals, self.topology, facets)
-        ambient = bool(self.data.environments) or self.settings.ambient > 0
-        seen = surface_at(self.data, geometry, sensor, hits, *normals, frames=self.data.needs_frames or ambient)
-        visible = [self._visibility(maps, light, k, seen, view, hits.depth) for k, light in enumerate(lights)]
-        color = self._radiance(seen, lights, visible, sensor, raster)
+        # Emitters are asked for the radiance of points, which may depend on texture coordinates.
+        frames = self.data.needs_frames or self.settings.ambient > 0 or bool(lighting.areas)
+        seen = surface_at(self.data, geometry, sensor, hits, *normals, frames=frames)
+        lights = lighting.lights
+        visible = [self._visibility(lighting.maps, light, k, seen, view, hits.depth) for k, light in enumerate(lights)]
+        color = self._radiance(seen, lighting, visible, sensor, raster)
         channels = _film_channels(color, seen.active, sensor)
         named = collect_aovs(self.settings.aovs, seen, raster, lights, visible)
         if self.settings.antialias:
@@ -272,17 +260,18 @@ class Renderer:
         total = sum(light_visibility(maps, self.plan, light, index, p, seen.active) for p in points)
         return total * (1 / len(points))
 
-    def _radiance(
-        self, seen: Surface, lights: tuple[Light, ...], visible: list[Any], sensor: Sensor, raster: RasterOutput
-    ) -> Any:
-        gate = not self.settings.shadow.compat
+    def _radiance(self, seen: Surface, lighting: _Lighting, visible: list[Any], sensor: Sensor, raster: RasterOutput) -> Any:
+        compat = self.settings.shadow.compat
         color = dr.zeros(mi.UnpolarizedSpectrum, dr.width(seen.shape))
-        for light, fraction in zip(lights, visible, strict=True):
-            square = self.settings.shadow.compat and isinstance(light, SpotLight)
-            color += direct_light(seen, SquareSpot(light) if square else light, fraction, gate=gate)
-        for environment in (*self.data.environments, *self._uniform_ambient()):
-            color += ambient_light(seen, environment, _AMBIENT_DIRECTIONS)
+        for light, fraction in zip(lighting.lights, visible, strict=True):
+            square = compat and isinstance(light, SpotLight)
+            color += direct_light(seen, SquareSpot(light) if square else light, fraction, gate=not compat)
+        for plan, samples in zip(self.soft, lighting.samples, strict=True):
+            color += soft_light(seen, plan, samples, lighting.soft_maps, gate=not compat)
+        for uniform in self._uniform_ambient():
+            color += ambient_light(seen, uniform, _AMBIENT_DIRECTIONS)
         if not self.settings.hide_emitters:
+            color += emission(seen, lighting.areas)
             for environment in self.data.environments:
                 sky = background(environment, sensor, raster.width, raster.height)
                 color = dr.select(seen.active, color, sky)
@@ -290,6 +279,17 @@ class Renderer:
 
     def _uniform_ambient(self) -> tuple[Any, ...]:
         return (_Uniform(self.settings.ambient),) if self.settings.ambient > 0 else ()
+
+
+@dataclass(frozen=True)
+class _Lighting:
+    """The lights of one rendering with their shadow maps, None where there are none."""
+
+    lights: tuple[Light, ...]
+    maps: ShadowMaps | None
+    areas: tuple[AreaLight, ...]
+    samples: tuple[LightSamples, ...]
+    soft_maps: ShadowMaps | None
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ import numpy as np
 from . import tessellate
 from .errors import ShadowmapError
 from .geometry import Geometry, ShapeInfo, pack_face_info
-from .lights import Environment, Light, environments_of, lights_of
+from .lights import AreaLight, Environment, Light, area_lights_of, environments_of, lights_of
 from .sensors import Sensor, sensors_of
 from .traversal import children, mesh_buffers, parameters
 
@@ -46,6 +46,7 @@ class SceneData:
 
     sensors       one tuple for each sensor of the scene; a batch sensor's holds several cameras, all others one
     lights        directional, spot and point lights
+    areas         area lights
     environments  constant and envmap emitters (at most one)
     shape_ptr, bsdf_ptr   mi.ShapePtr, mi.BSDFPtr (S,), by the index that ``geometry.face_shape`` holds
     needs_frames  whether any BSDF asks for more than the cosines of directions: tangents, texture coordinates
@@ -55,18 +56,20 @@ class SceneData:
     geometry: Geometry
     sensors: tuple[tuple[Sensor, ...], ...]
     lights: tuple[Light, ...]
+    areas: tuple[AreaLight, ...]
     environments: tuple[Environment, ...]
     shape_ptr: Any
     bsdf_ptr: Any
     sources: tuple[ShapeSource, ...]
     needs_frames: bool = True
 
-    def light(self, name: str) -> Light:
+    def light(self, name: str) -> Light | AreaLight:
         """The light called ``name``; raises ``ShadowmapError`` listing the known names otherwise."""
-        for light in self.lights:
+        lights = (*self.lights, *self.areas)
+        for light in lights:
             if light.name == name:
                 return light
-        known = ", ".join(repr(light.name) for light in self.lights) or "none"
+        known = ", ".join(repr(light.name) for light in lights) or "none"
         raise ShadowmapError(f"There is no light '{name}' in the scene; its lights: {known}.")
 
 
@@ -114,6 +117,7 @@ def load(scene: Any, *, tessellation: int = 64) -> SceneData:
         geometry=geometry,
         sensors=(),
         lights=(),
+        areas=(),
         environments=(),
         shape_ptr=dr.concat([mi.ShapePtr(source.shape) for source in sources]),
         bsdf_ptr=dr.concat([mi.BSDFPtr(source.shape.bsdf()) for source in sources]),
@@ -149,6 +153,7 @@ def refresh(data: SceneData) -> SceneData:
         geometry=geometry,
         sensors=tuple(sensors_of(sensor) for sensor in data.scene.sensors()),
         lights=lights_of(data.scene),
+        areas=area_lights_of(data.scene, [source.shape for source in data.sources]),
         environments=environments_of(data.scene),
     )
 
@@ -209,10 +214,10 @@ def _source_of(name: str, shape: Any, instance: Any, tessellation: int) -> tuple
 
 def _check_surface(name: str, shape: Any) -> None:
     """Refuse or warn about what else hangs on a shape."""
-    if shape.is_emitter():
+    if shape.is_emitter() and shape.emitter().class_name() != "AreaLight":
         raise ShadowmapError(
-            f"Shape '{name}' emits light ({shape.emitter().class_name()} '{shape.emitter().id()}'), which is not supported yet: "
-            "use directional, spot or point lights."
+            f"Shape '{name}' emits light ({shape.emitter().class_name()} '{shape.emitter().id()}'), which is not supported: "
+            "use an area light."
         )
     if shape.is_medium_transition():
         warnings.warn(f"Shape '{name}' bounds a medium, which is ignored.", stacklevel=4)

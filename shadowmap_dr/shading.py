@@ -9,6 +9,7 @@ it may run in a frozen function.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,7 +18,7 @@ import mitsuba as mi
 
 from .geometry import FACETED, FLIP_GEOMETRIC, FLIP_SHADING, HAS_NORMALS, HAS_TEXCOORDS, READS_ATTRIBUTES, Geometry, normalize_or
 from .hits import Hits, corner_values, hits_at
-from .lights import Environment, Light
+from .lights import AreaLight, Environment, Light
 from .scene import SceneData
 from .sensors import Sensor
 from .spread import spread
@@ -177,12 +178,26 @@ def direct_light(surface: Surface, light: Light, visibility: Any = 1.0, *, gate:
     wo = surface.si.to_local(wo_world)
     active = mi.Bool(surface.active)
     if gate:
-        # Light and viewer lie on the same side of the triangle exactly where they lie on the same side by the shading normal.
-        # Holds for reflection and transmission, and for triangles whose vertex normals point the other way.
-        with dr.suspend_grad():
-            sides = dr.dot(surface.n_world, wo_world) * dr.dot(surface.n_world, surface.wi_world)
-            active &= (sides > 0) == (wo.z * surface.si.wi.z > 0)
+        active &= passes_gate(surface, wo_world, wo)
     return dr.select(active, surface.evaluate(wo, active) * weight * visibility, 0.0)
+
+
+def passes_gate(surface: Surface, wo_world: Any, wo: Any) -> Any:
+    """Bool (N,): where no light comes through the triangle's wrong side; ``wo``: the same direction in the shading frame."""
+    # Light and viewer lie on the same side of the triangle exactly where they lie on the same side by the shading normal.
+    # Holds for reflection and transmission, and for triangles whose vertex normals point the other way.
+    with dr.suspend_grad():
+        sides = dr.dot(surface.n_world, wo_world) * dr.dot(surface.n_world, surface.wi_world)
+        return (sides > 0) == (wo.z * surface.si.wi.z > 0)
+
+
+def emission(surface: Surface, lights: Sequence[AreaLight]) -> Any:
+    """Radiance (colour, N) that surfaces give off themselves, seen from the camera. Attached to surface and lights."""
+    total = dr.zeros(mi.UnpolarizedSpectrum, dr.width(surface.shape))
+    for light in lights:
+        own = surface.active & (surface.shape == light.shape) & (dr.detach(surface.si.wi.z) > 0)
+        total += dr.select(own, light.seen(surface.si, own), 0)
+    return total
 
 
 def ambient_light(surface: Surface, environment: Environment, n_directions: int = 16) -> Any:

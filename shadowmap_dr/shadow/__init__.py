@@ -12,7 +12,7 @@ from .camera import (
     to_light_space,
 )
 from .filters import FILTERS, filter_kernel, filter_map
-from .fit import fit_frusta, shape_bounds
+from .fit import casting_shapes, fit_frusta, shape_bounds
 from .lookup import visibility
 from .methods import METHODS, PREFILTERED
 from .moments import chebyshev_visibility, standard_visibility, variance_moments
@@ -27,6 +27,7 @@ __all__ = [
     "ShadowMaps",
     "ShadowSettings",
     "Views",
+    "casting_shapes",
     "chebyshev_visibility",
     "cube_face",
     "cube_views",

@@ -64,8 +64,7 @@ def shape_bounds(view: Views, p_light: Any, map_index: Any, shape_index: Any, sh
 def fit_frusta(
     views: Views,
     bounds: Bounds,
-    planes: tuple[Any, Any],
-    planar: Any,
+    casts: Any,
     shape_count: int,
     resolution: int,
     filter_size: int,
@@ -77,8 +76,7 @@ def fit_frusta(
 
     Args:
         bounds: from :func:`shape_bounds`.
-        planes: (normal, point) in world space, ``Array3f`` of width S: the plane of each planar shape.
-        planar: ``Bool`` of width S. A planar shape with nothing behind its plane casts no shadow on anything.
+        casts: which shapes can cast a shadow in which map (:func:`casting_shapes`).
         previous: frusta of an earlier call. Kept bit by bit while the casters lie inside them with room for the filter
             and fill most of them.
         seen: points (``Array3f``, world space) all over the receivers in view, and a mask of those that count. None: anywhere.
@@ -91,9 +89,7 @@ def fit_frusta(
         module = backend(views.spread)
         index = dr.arange(module.UInt32, views.count * shape_count)
         map_index = index // shape_count
-        shape = index - map_index * shape_count
         extent = bounds.of(index)
-        casts = _casts(views, bounds, extent, planes, planar, map_index, shape, shape_count)
         window = _window(views, seen)
         if not receiver_range:
             window = (*window[:4], module.Float(-dr.inf), window[5])
@@ -109,19 +105,23 @@ def fit_frusta(
         return result
 
 
-def _casts(
-    views: Views,
-    bounds: Bounds,
-    extent: tuple[Any, ...],
-    planes: tuple[Any, Any],
-    planar: Any,
-    map_index: Any,
-    shape: Any,
-    shape_count: int,
-) -> Any:
-    """Which shapes can cast a shadow in which map: not planar ones with nothing behind them, nor what is behind the light."""
+def casting_shapes(views: Views, bounds: Bounds, planes: tuple[Any, Any], planar: Any, shape_count: int) -> Any:
+    """Which shapes can cast a shadow in which map: not planar ones with nothing behind them, nor what is behind the light.
+
+    ``planes`` (normal, point) in world space, ``Array3f`` of width S: the plane of each shape that is ``planar`` (``Bool``).
+    Returns ``Bool`` of width M * S, detached.
+    """
+    with dr.suspend_grad():
+        return _casting_shapes(dr.detach(views), bounds, planes, planar, shape_count)
+
+
+def _casting_shapes(views: Views, bounds: Bounds, planes: tuple[Any, Any], planar: Any, shape_count: int) -> Any:
     module = backend(views.spread)
     Float, Array3f, Bool = module.Float, module.Array3f, module.Bool
+    index = dr.arange(module.UInt32, views.count * shape_count)
+    map_index = index // shape_count
+    shape = index - map_index * shape_count
+    extent = bounds.of(index)
     view = of_map(views, map_index, views.count)
 
     def per_shape(v: Any) -> Any:

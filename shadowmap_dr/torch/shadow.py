@@ -229,7 +229,8 @@ def _fit(
         points = dr.gather(module.Array3f, seen.array, dr.arange(module.UInt32, number)), dr.full(module.Bool, True, number)
     frusta = previous._frusta if previous is not None else None
     size, kernel = settings.resolution, settings.filter_size
-    return _shadow.fit_frusta(views, bounds, (nowhere, nowhere), module.Bool(False), 1, size, kernel, frusta, points)
+    casts = _shadow.casting_shapes(views, bounds, (nowhere, nowhere), module.Bool(False), 1)
+    return _shadow.fit_frusta(views, bounds, casts, 1, size, kernel, frusta, points)
 
 
 def _full(value: Any, width: int) -> Any:

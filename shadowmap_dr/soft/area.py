@@ -1,0 +1,175 @@
+"""Area lights: points on the emitting surface that stand for the parts of it around them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..geometry import Geometry, ShapeInfo
+from ..lights import AreaLight
+from .clusters import surface_clusters
+from .samples import LightSamples, cluster_sums
+
+# Pieces of the emitter for each sample, at least.
+_PIECES = 16
+# Importance of what faces away from everything, in units of the mean.
+_AWAY = 0.05
+# Points on the rest of the scene that are asked whether they see a piece.
+_PROBES = 256
+
+
+@dataclass(frozen=True)
+class AreaPlan:
+    """The pieces of an emitter and their clusters. Static; made once for a scene.
+
+    face      UInt32 (P,), triangle of the soup that a piece lies in
+    u, v      Float (P,), barycentrics of its centre
+    fraction  Float (P,), its share of the triangle's area
+    cluster   UInt32 (P,), which of the N clusters it belongs to
+    chosen    UInt32 (N,), the piece in whose centre a cluster's sample lies
+    shape     index of the emitter's shape
+    """
+
+    face: Any
+    u: Any
+    v: Any
+    fraction: Any
+    cluster: Any
+    chosen: Any
+    shape: int
+
+
+def plan_area(light: AreaLight, geometry: Geometry, count: int) -> AreaPlan:
+    """Divide an emitter into ``count`` parts (on the host, once).
+
+    Parts that face the rest of the scene, or shine brighter, are smaller: what no other surface sees gets few samples.
+    """
+    info = geometry.shapes[light.shape]
+    positions = dr.detach(geometry.positions).numpy().reshape(-1, 3).astype(np.float64)
+    faces = geometry.faces.numpy().reshape(-1, 3)
+    own = slice(info.face_start, info.face_start + info.face_count)
+    corners = positions[faces[own]]
+    normals, areas = _normals(corners, info)
+    face, (u, v), fraction = _pieces(areas, _PIECES * count)
+    a, b, c = (corners[face, k] for k in range(3))
+    centres = a + u[:, None] * (b - a) + v[:, None] * (c - a)
+    probes = _probes(geometry, positions, faces, own)
+    importance = _importance(centres, normals[face], probes)
+    with dr.suspend_grad():
+        shine = _brightness(light, geometry, face + info.face_start, u, v)
+    weights = fraction * areas[face] * importance * (shine + _AWAY * max(shine.mean(), 1e-30))
+    weights = np.maximum(weights, 1e-12 * max(weights.max(), 1e-300))
+    cluster, chosen = surface_clusters(centres, weights, count)
+    return AreaPlan(
+        face=mi.UInt32((face + info.face_start).astype(np.uint32)),
+        u=mi.Float(u.astype(np.float32)),
+        v=mi.Float(v.astype(np.float32)),
+        fraction=mi.Float(fraction.astype(np.float32)),
+        cluster=mi.UInt32(cluster),
+        chosen=mi.UInt32(chosen.astype(np.uint32)),
+        shape=light.shape,
+    )
+
+
+def area_samples(light: AreaLight, plan: AreaPlan, geometry: Geometry) -> LightSamples:
+    """The samples of an emitter where it is now. Attached to its vertices and its radiance."""
+    info, count = geometry.shapes[plan.shape], dr.width(plan.chosen)
+    _, e1, e2 = _triangles(geometry, plan.face)
+    area = 0.5 * dr.norm(dr.cross(e1, e2)) * plan.fraction
+    radiance = light.radiance(_uv(geometry, plan.face, plan.u, plan.v, info))
+    face = dr.gather(mi.UInt32, plan.face, plan.chosen)
+    first, e1, e2 = _triangles(geometry, face)
+    u, v = dr.gather(mi.Float, plan.u, plan.chosen), dr.gather(mi.Float, plan.v, plan.chosen)
+    normal = dr.normalize(dr.cross(e1, e2))
+    return LightSamples(
+        distant=False,
+        place=mi.Vector3f(first + e1 * u + e2 * v),
+        normal=-normal if info.flip_geometric else normal,
+        power=cluster_sums(radiance * area, plan.cluster, count),
+        area=cluster_sums(area, plan.cluster, count),
+    )
+
+
+def _triangles(geometry: Geometry, face: Any) -> tuple[Any, Any, Any]:
+    corner = dr.gather(mi.Vector3u, geometry.faces, face)
+    a, b, c = (mi.Vector3f(geometry.vertices(corner[k])) for k in range(3))
+    return a, b - a, c - a
+
+
+def _uv(geometry: Geometry, face: Any, u: Any, v: Any, info: ShapeInfo) -> Any:
+    """Texture coordinates (Point2f), as Mitsuba has them: barycentrics on shapes without any."""
+    if not info.has_texcoords:
+        return mi.Point2f(u, v)
+    corner = dr.gather(mi.Vector3u, geometry.faces, face)
+    a, b, c = (dr.gather(mi.Point2f, geometry.texcoords, corner[k]) for k in range(3))
+    return a * (1 - u - v) + b * u + c * v
+
+
+def _brightness(light: AreaLight, geometry: Geometry, face: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    arguments = (mi.UInt32(face.astype(np.uint32)), mi.Float(u.astype(np.float32)), mi.Float(v.astype(np.float32)))
+    radiance = light.radiance(_uv(geometry, *arguments, geometry.shapes[light.shape]))
+    mean = dr.mean(mi.UnpolarizedSpectrum(radiance)) + dr.zeros(mi.Float, len(face))
+    return np.maximum(np.nan_to_num(mean.numpy().astype(np.float64)), 0)
+
+
+def _normals(corners: np.ndarray, info: ShapeInfo) -> tuple[np.ndarray, np.ndarray]:
+    """(unit normals (F, 3), areas (F,)) of triangles (F, 3, 3)."""
+    n = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(n, axis=1)
+    n /= np.maximum(length, 1e-300)[:, None]
+    return -n if info.flip_geometric else n, 0.5 * length
+
+
+def _pieces(areas: np.ndarray, count: int) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray], np.ndarray]:
+    """Cut triangles into equal parts, larger ones into more, ``count`` or more in all.
+
+    Returns (triangle, (barycentrics of vertices 1 and 2 of the centre), share of the triangle), one entry a piece.
+    """
+    share = areas / max(areas.sum(), 1e-300)
+    sides = np.maximum(np.ceil(np.sqrt(share * count)), 1).astype(np.int64)
+    face, u, v = [], [], []
+    for n in np.unique(sides):
+        own = np.flatnonzero(sides == n)
+        i, j = np.divmod(np.arange(n * n), n)
+        # Cells of an n x n lattice over the unit square; those beyond the diagonal are the other halves of cells before it.
+        upper = i + j >= n
+        cu = np.where(upper, (n - 1 - i) + 2 / 3, i + 1 / 3) / n
+        cv = np.where(upper, (n - 1 - j) + 2 / 3, j + 1 / 3) / n
+        face.append(np.repeat(own, n * n))
+        u.append(np.tile(cu, len(own)))
+        v.append(np.tile(cv, len(own)))
+    face_all = np.concatenate(face)
+    return face_all, (np.concatenate(u), np.concatenate(v)), 1.0 / sides[face_all] ** 2
+
+
+def _probes(geometry: Geometry, positions: np.ndarray, faces: np.ndarray, own: slice) -> np.ndarray:
+    """Points (K, 3) on the other shapes: half of them spread by area, half by number of triangles."""
+    others = np.concatenate([faces[: own.start], faces[own.stop :]])
+    if not len(others):
+        return np.zeros((0, 3))
+    corners = positions[others]
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    random = np.random.default_rng(0)
+    half = _PROBES // 2
+    by_area = np.searchsorted(areas.cumsum(), (np.arange(half) + 0.5) / half * areas.sum())
+    by_count = np.linspace(0, len(others) - 1, half).astype(np.int64)
+    chosen = corners[np.minimum(np.concatenate([by_area, by_count]), len(others) - 1)]
+    weights = random.dirichlet((1.0, 1.0, 1.0), len(chosen))
+    return (chosen * weights[:, :, None]).sum(1)
+
+
+def _importance(centres: np.ndarray, normals: np.ndarray, probes: np.ndarray) -> np.ndarray:
+    """How much of the scene each piece (P) sees, at its mean 1: the mean cosine towards the probes, and a little more."""
+    if not len(probes):
+        return np.ones(len(centres))
+    seen = np.zeros(len(centres))
+    for block in np.array_split(np.arange(len(centres)), max(1, len(centres) // 4096)):
+        to = probes[None] - centres[block, None]
+        distance = np.maximum(np.linalg.norm(to, axis=-1), 1e-12)
+        seen[block] = np.maximum((to * normals[block, None]).sum(-1) / distance, 0).mean(-1)
+    mean = seen.mean()
+    return seen / mean + _AWAY if mean > 0 else np.ones(len(centres))

@@ -1,0 +1,78 @@
+"""Dividing an emitter into parts of equal importance: pieces of a surface, or of the sky."""
+
+from __future__ import annotations
+
+import heapq
+
+import numpy as np
+
+
+def surface_clusters(positions: np.ndarray, weights: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Divide pieces of a surface among ``count`` clusters that are compact and weigh about the same, by repeated halving.
+
+    positions (P, 3), weights (P,) > 0, P >= count. Returns (cluster of each piece (P,) uint32, representative piece of each
+    cluster (count,) int64: the one nearest to the weighted mean).
+    """
+    heap = [(-float(weights.sum()), 0, np.arange(len(positions)))]
+    done: list[np.ndarray] = []
+    for step in range(1, count):
+        while len(heap[0][2]) == 1:
+            done.append(heapq.heappop(heap)[2])
+        _, _, members = heapq.heappop(heap)
+        axis = int(np.argmax(np.ptp(positions[members], axis=0)))
+        members = members[np.argsort(positions[members, axis], kind="stable")]
+        cut = _halfway(np.concatenate([[0.0], weights[members].cumsum()]))
+        for k, part in enumerate((members[:cut], members[cut:])):
+            # The second number keeps heaps from comparing arrays.
+            heapq.heappush(heap, (-float(weights[part].sum()), 2 * step + k, part))
+    cluster = np.zeros(len(positions), np.uint32)
+    best = np.zeros(count, np.int64)
+    for k, members in enumerate([*done, *(entry[2] for entry in heap)]):
+        cluster[members] = k
+        mean = np.average(positions[members], axis=0, weights=weights[members])
+        best[k] = members[np.argmin(((positions[members] - mean) ** 2).sum(-1))]
+    return cluster, best
+
+
+def sky_clusters(weights: np.ndarray, count: int) -> np.ndarray:
+    """Divide a latitude-longitude image into ``count`` rectangles that weigh about the same, by repeated halving.
+
+    weights (H, W) >= 0 with a positive sum, solid angle included; H * W >= count. Returns the cluster of each pixel, (H, W)
+    uint32. Source: Debevec, "A Median Cut Algorithm for Light Probe Sampling", 2006.
+    """
+    height, width = weights.shape
+    table = np.zeros((height + 1, width + 1))
+    table[1:, 1:] = weights.cumsum(0).cumsum(1)
+
+    def total(y0: int, y1: int, x0: int, x1: int) -> float:
+        return float(table[y1, x1] - table[y0, x1] - table[y1, x0] + table[y0, x0])
+
+    heap = [(-total(0, height, 0, width), 0, height, 0, width)]
+    done: list[tuple[int, int, int, int]] = []
+    while heap and len(heap) + len(done) < count:
+        _, y0, y1, x0, x1 = heapq.heappop(heap)
+        if y1 - y0 == 1 and x1 - x0 == 1:
+            done.append((y0, y1, x0, x1))
+            continue
+        # The longer side on the sphere is cut, where either half has the same weight.
+        breadth = (x1 - x0) * np.sin(np.pi * 0.5 * (y0 + y1) / height) * 2 * np.pi / width
+        if x1 - x0 > 1 and (breadth >= (y1 - y0) * np.pi / height or y1 - y0 == 1):
+            line = table[y1, x0 : x1 + 1] - table[y0, x0 : x1 + 1]
+            cut = x0 + _halfway(line)
+            parts = [(y0, y1, x0, cut), (y0, y1, cut, x1)]
+        else:
+            line = table[y0 : y1 + 1, x1] - table[y0 : y1 + 1, x0]
+            cut = y0 + _halfway(line)
+            parts = [(y0, cut, x0, x1), (cut, y1, x0, x1)]
+        for part in parts:
+            heapq.heappush(heap, (-total(*part), *part))
+    cluster = np.zeros((height, width), np.uint32)
+    for k, (y0, y1, x0, x1) in enumerate([*done, *(entry[1:] for entry in heap)]):
+        cluster[y0:y1, x0:x1] = k
+    return cluster
+
+
+def _halfway(cumulative: np.ndarray) -> int:
+    """Where a rising line passes the middle between its ends: the nearest of its inner points."""
+    middle = 0.5 * (cumulative[0] + cumulative[-1])
+    return int(np.clip(np.argmin(np.abs(cumulative - middle)), 1, len(cumulative) - 2))

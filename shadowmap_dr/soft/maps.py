@@ -1,0 +1,291 @@
+"""Shadow maps of light samples: one each, all of a scene in one batch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..geometry import Geometry
+from ..light_maps import MapPlan, shape_planes
+from ..lights import AreaLight, Environment
+from ..raster import RasterOutput, Topology
+from ..shadow import (
+    Frusta,
+    ShadowMaps,
+    ShadowSettings,
+    Views,
+    cube_face,
+    cube_views,
+    directional_view,
+    filter_maps,
+    fit_frusta,
+    render_maps,
+    shape_bounds,
+    to_light_space,
+)
+from ..shadow.camera import of_map
+from .area import AreaPlan, area_samples, plan_area
+from .samples import LightSamples, SampleTable
+from .sky import SkyPlan, plan_sky, sky_samples
+
+SoftLight = AreaLight | Environment
+
+# Half-angle in degrees that one perspective map may cover: beyond it, a light looks around itself with the faces of a cube.
+_WIDEST = 75.0
+# No shape is left out of a map.
+_NONE = 0xFFFFFFFF
+# Seen points that the fit of a map looks at.
+_SEEN = 1024
+
+
+@dataclass(frozen=True)
+class SoftPlan:
+    """How one extended light is sampled, and which maps it has. Static.
+
+    ``kind``: ``distant`` or ``near`` (one map for each sample) or ``cube`` (six). ``first``: number of the first map.
+    ``target``: point that the maps of a ``near`` light face. ``hides``: shape that casts no shadow of this light, its own.
+    """
+
+    parts: AreaPlan | SkyPlan
+    kind: str
+    count: int
+    first: int
+    target: tuple[float, float, float]
+    hides: int
+
+    @property
+    def maps(self) -> int:
+        """Number of its maps."""
+        return self.count * (6 if self.kind == "cube" else 1)
+
+
+def plan_soft(lights: Sequence[SoftLight], geometry: Geometry, area_count: int, sky_count: int) -> tuple[SoftPlan, ...]:
+    """Sample the lights and decide on their maps (on the host, once)."""
+    plans: list[SoftPlan] = []
+    for light in lights:
+        first = plans[-1].first + plans[-1].maps if plans else 0
+        if isinstance(light, Environment):
+            plans.append(SoftPlan(plan_sky(light, sky_count), "distant", sky_count, first, (0.0, 0.0, 0.0), _NONE))
+        else:
+            parts = plan_area(light, geometry, area_count)
+            target, kind = _aim(geometry, light.shape)
+            plans.append(SoftPlan(parts, kind, area_count, first, target, light.shape))
+    return tuple(plans)
+
+
+def samples_of(light: SoftLight, plan: SoftPlan, geometry: Geometry) -> LightSamples:
+    """The light's samples as it is now. Attached."""
+    if isinstance(light, Environment):
+        return sky_samples(light, plan.parts)
+    return area_samples(light, plan.parts, geometry)
+
+
+def make_soft_maps(
+    plans: Sequence[SoftPlan],
+    samples: Sequence[LightSamples],
+    scene: MapPlan,
+    geometry: Geometry,
+    topology: Topology,
+    settings: ShadowSettings,
+    previous: Frusta | None,
+    transparent: Callable[[RasterOutput], Any] | None = None,
+    seen: Any = None,
+) -> ShadowMaps:
+    """Render and filter the maps of all samples as one batch. Attached to samples and vertices.
+
+    ``scene`` tells the shapes' planes; the rest is as in :func:`shadowmap_dr.light_maps.make_maps`.
+    """
+    views = _stack([_views(plan, s, settings) for plan, s in zip(plans, samples, strict=True)])
+    hidden = dr.concat([dr.full(mi.UInt32, plan.hides, plan.maps) for plan in plans])
+    dr.eval(views, hidden)
+    frusta = _fit(views, hidden, scene, geometry, settings, previous, seen)
+    vertices = geometry.vertex_count
+    lane = dr.arange(mi.UInt32, views.count * vertices)
+    which = lane // vertices
+    vertex = lane - which * vertices
+    p_light = to_light_space(of_map(views, which, views.count), dr.gather(mi.Point3f, geometry.positions, vertex))
+    if any(plan.hides != _NONE for plan in plans):
+        own = dr.gather(mi.UInt32, hidden, which) == dr.gather(mi.UInt32, geometry.vertex_shape, vertex)
+        # Behind the light's camera, where no triangle is drawn.
+        p_light = dr.select(own, type(p_light)(0, 0, -1), p_light)
+    return filter_maps(render_maps(p_light, which, geometry.faces, topology, views, frusta, settings, transparent))
+
+
+def map_of(plan: SoftPlan, table: SampleTable, sample: Any, p_world: Any) -> Any:
+    """Number of the map (UInt32) that tells whether points see a sample (UInt32)."""
+    if plan.kind == "cube":
+        return plan.first + sample * 6 + cube_face(dr.detach(mi.Vector3f(p_world) - table.place(sample)))
+    return plan.first + sample
+
+
+def _aim(geometry: Geometry, own: int) -> tuple[tuple[float, float, float], str]:
+    """Centre of what can cast shadows on something, and whether one map sees all of it from anywhere on the emitter."""
+    positions = dr.detach(geometry.positions).numpy().reshape(-1, 3).astype(np.float64)
+    parts = [positions[i.vertex_start : i.vertex_start + i.vertex_count] for i in geometry.shapes]
+    emitter, others = parts[own], [k for k in range(len(parts)) if k != own]
+    casters = [k for k in others if _may_cast(geometry, parts, k, others, emitter.mean(0))]
+    points = np.concatenate([parts[k] for k in casters or others or [own]])
+    centre = 0.5 * (points.min(0) + points.max(0))
+    corners = _box(emitter)
+    widest = 0.0
+    for corner in np.concatenate([corners, emitter[:: max(1, len(emitter) // 64)]]):
+        to, axis = points - corner, centre - corner
+        length = np.linalg.norm(to, axis=1) * np.linalg.norm(axis)
+        cosine = (to @ axis) / np.maximum(length, 1e-12)
+        widest = max(widest, float(np.degrees(np.arccos(np.clip(cosine.min(), -1, 1)))))
+    return tuple(float(c) for c in centre), "near" if widest <= _WIDEST - 5 else "cube"
+
+
+def _may_cast(geometry: Geometry, parts: list[np.ndarray], k: int, others: list[int], light: np.ndarray) -> bool:
+    """Whether a shape has anything behind it, as seen from the light: walls and floors have not."""
+    if not geometry.shapes[k].planar:
+        return True
+    own = parts[k]
+    _, _, axes = np.linalg.svd(own - own.mean(0), full_matrices=False)
+    normal, size = axes[-1], np.ptp(np.concatenate(parts), axis=0).max()
+    side = (light - own.mean(0)) @ normal
+    behind = [((parts[o] - own.mean(0)) @ normal) * -np.sign(side) for o in others if o != k]
+    return any(float(b.max()) > 1e-3 * size for b in behind)
+
+
+def _box(points: np.ndarray) -> np.ndarray:
+    low, high = points.min(0), points.max(0)
+    return np.stack([np.where([i & 1, i & 2, i & 4], high, low) for i in range(8)])
+
+
+def _views(plan: SoftPlan, samples: LightSamples, settings: ShadowSettings) -> Views:
+    """Cameras of a light's samples, attached to their places and directions."""
+    count = plan.maps
+    zero = dr.zeros(mi.Float, count)
+    if plan.kind == "distant":
+        view = directional_view(samples.place)
+        return Views(view.right, view.up, view.forward, mi.Vector3f(zero), zero, zero)
+    if plan.kind == "near":
+        # Which way a camera faces has no influence on what it sees, so it need not be differentiated.
+        with dr.suspend_grad():
+            view = directional_view(mi.Vector3f(*plan.target) - dr.detach(samples.place))
+        spread = dr.full(mi.Float, math.tan(math.radians(_WIDEST)), count)
+        return Views(view.right, view.up, view.forward, samples.place, spread, zero)
+    lane = dr.arange(mi.UInt32, count)
+    sample, face = lane // 6, lane % 6
+    faces = cube_views(mi.Point3f(0), settings.resolution, settings.filter_size)
+
+    def pick(name: str) -> Any:
+        total = mi.Vector3f(0)
+        for k, view in enumerate(faces):
+            total = dr.select(face == k, mi.Vector3f(getattr(view, name)), total)
+        return total
+
+    origin = mi.Vector3f(*(dr.gather(mi.Float, samples.place[c], sample) for c in range(3)))
+    spread = dr.full(mi.Float, 0, count) + faces[0].spread
+    return Views(pick("right"), pick("up"), pick("forward"), origin, spread, dr.full(mi.Float, 1, count))
+
+
+def _stack(parts: list[Views]) -> Views:
+    """One batch of all cameras."""
+    if len(parts) == 1:
+        return parts[0]
+
+    def join(name: str) -> Any:
+        values = [getattr(part, name) for part in parts]
+        if dr.depth_v(values[0]) == 1:
+            return dr.concat(values)
+        return mi.Vector3f(*(dr.concat([mi.Float(v[c]) for v in values]) for c in range(3)))
+
+    return Views(*(join(name) for name in Views.__dataclass_fields__))
+
+
+def _fit(
+    views: Views, hidden: Any, scene: MapPlan, geometry: Geometry, settings: ShadowSettings, previous: Frusta | None, seen: Any
+) -> Frusta:
+    """Frusta around the boxes of shapes: with so many maps, asking each vertex would cost more than drawing it."""
+    with dr.suspend_grad():
+        shapes, count = len(geometry.shapes), views.count
+        low, high = _boxes(geometry)
+        lane = dr.arange(mi.UInt32, count * shapes * 8)
+        corner, entry = lane & 7, lane >> 3
+        which = entry // shapes
+        shape = entry - which * shapes
+        row = [(corner & (1 << c)) != 0 for c in range(3)]
+        ends = [(dr.gather(mi.Float, high[c], shape), dr.gather(mi.Float, low[c], shape)) for c in range(3)]
+        p_world = mi.Point3f(*(dr.select(upper, *end) for upper, end in zip(row, ends, strict=True)))
+        p_light = to_light_space(of_map(dr.detach(views), which, count), p_world)
+        bounds = shape_bounds(views, p_light, which, shape, shapes)
+        casts = _casts(dr.detach(views), bounds, hidden, shape_planes(scene, geometry), low, high)
+        return fit_frusta(
+            views,
+            bounds,
+            casts,
+            shapes,
+            settings.resolution,
+            settings.filter_size,
+            previous,
+            _few(seen),
+            settings.receiver_range,
+        )
+
+
+def _casts(views: Views, bounds: Any, hidden: Any, planes: tuple[tuple[Any, Any], Any], low: Any, high: Any) -> Any:
+    """Which shapes can cast a shadow in which map: not a light's own, nor what lies behind it, nor walls with nothing behind."""
+    (normal, point), planar = planes
+    dr.eval(normal, point, planar)
+    shapes = dr.width(low[0])
+    # How far the boxes of the others reach on either side of a shape's plane.
+    pair = dr.arange(mi.UInt32, shapes * shapes)
+    own = pair // shapes
+    other = pair - own * shapes
+    reach = [mi.Float(0), mi.Float(0)]
+    for c in range(3):
+        n, p = dr.gather(mi.Float, normal[c], own), dr.gather(mi.Float, point[c], own)
+        lo, hi = dr.gather(mi.Float, low[c], other), dr.gather(mi.Float, high[c], other)
+        reach[0] += n * (dr.select(n > 0, hi, lo) - p)
+        reach[1] -= n * (dr.select(n > 0, lo, hi) - p)
+    extremes = dr.full(mi.Float, -dr.inf, 2 * shapes)
+    for k in range(2):
+        dr.scatter_reduce(dr.ReduceOp.Max, extremes, reach[k], own * 2 + k, own != other)
+    size = dr.max(dr.maximum(high[0] - low[0], dr.maximum(high[1] - low[1], high[2] - low[2])))
+    index = dr.arange(mi.UInt32, views.count * shapes)
+    which = index // shapes
+    shape = index - which * shapes
+    view = of_map(views, which, views.count)
+    n = mi.Vector3f(*(dr.gather(mi.Float, normal[c], shape) for c in range(3)))
+    p = mi.Vector3f(*(dr.gather(mi.Float, point[c], shape) for c in range(3)))
+    perspective = view.spread > 0
+    above = dr.dot(n, dr.select(perspective, view.origin - p, -view.forward)) > 0
+    behind = dr.gather(mi.Float, extremes, shape * 2 + dr.select(above, mi.UInt32(1), 0)) > 1e-3 * size
+    casts = ~dr.gather(mi.Bool, planar, shape) | behind
+    casts &= ~perspective | (bounds.of(index)[5] > 0)
+    return casts & (shape != dr.gather(mi.UInt32, hidden, which))
+
+
+def _boxes(geometry: Geometry) -> tuple[Any, Any]:
+    """(low, high), each three ``Float`` (S,): the shapes' boxes in world space."""
+    vertex = dr.arange(mi.UInt32, geometry.vertex_count)
+    p = dr.gather(mi.Point3f, dr.detach(geometry.positions), vertex)
+    shapes = len(geometry.shapes)
+    extremes = dr.full(mi.Float, -dr.inf, 6 * shapes)
+    for k, value in enumerate((p.x, p.y, p.z, -p.x, -p.y, -p.z)):
+        dr.scatter_reduce(dr.ReduceOp.Max, extremes, value, geometry.vertex_shape * 6 + k)
+    row = dr.arange(mi.UInt32, shapes) * 6
+    high, low = ([dr.gather(mi.Float, extremes, row + k) for k in ks] for ks in ((0, 1, 2), (3, 4, 5)))
+    low = [-v for v in low]
+    dr.eval(high, low)
+    return low, high
+
+
+def _few(seen: Any) -> Any:
+    """About 1,000 of the seen points."""
+    if seen is None:
+        return None
+    points, active = seen
+    stride = max(1, dr.width(points) // _SEEN)
+    # Odd steps do not run down the columns of an image.
+    stride += stride > 1 and stride % 2 == 0
+    index = dr.arange(mi.UInt32, dr.width(points) // stride) * stride
+    return mi.Point3f(*(dr.gather(mi.Float, points[c], index) for c in range(3))), dr.gather(mi.Bool, mi.Bool(active), index)

@@ -1,0 +1,96 @@
+"""What an extended light is to the shading: a fixed number of points, or of directions, each with a shadow map of its own."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+
+@dataclass(frozen=True)
+class LightSamples:
+    """N points of a light that is near (an area light), or N directions of one that is infinitely far away.
+
+    distant  which of the two (static)
+    place    Vector3f (N,), positions, or unit directions in which light travels, world space
+    normal   Vector3f (N,), unit normals of the emitter (unused if distant)
+    power    colour (N,), radiance times area, or irradiance on a surface that faces the light
+    area     Float (N,), share of the emitter's area (unused if distant)
+
+    All may carry gradients.
+    """
+
+    distant: bool
+    place: Any
+    normal: Any
+    power: Any
+    area: Any
+
+    @property
+    def count(self) -> int:
+        """N."""
+        return dr.width(self.place)
+
+    def table(self) -> SampleTable:
+        """The same numbers in packets, for look-ups by many lanes."""
+        p, n, c = self.place, self.normal, self.power
+        colour = [c[k] for k in range(dr.size_v(type(c)))]
+        rows = [mi.Vector4f(p.x, p.y, p.z, self.area), mi.Vector4f(*colour, *[mi.Float(0)] * (4 - len(colour)))]
+        if not self.distant:
+            rows.append(mi.Vector4f(n.x, n.y, n.z, 0))
+        packets = tuple(dr.ravel(row) for row in rows)
+        dr.eval(packets)
+        return SampleTable(self.distant, self.count, packets)
+
+
+@dataclass(frozen=True)
+class SampleTable:
+    """:class:`LightSamples` as flat buffers of four numbers for each sample."""
+
+    distant: bool
+    count: int
+    packets: tuple[Any, ...]
+
+    def place(self, index: Any) -> Any:
+        """Vector3f, where sample ``index`` (UInt32) is, detached."""
+        packet = dr.gather(mi.Vector4f, dr.detach(self.packets[0]), index)
+        return mi.Vector3f(packet.x, packet.y, packet.z)
+
+    def illuminate(self, index: Any, p_world: Any) -> tuple[Any, Any]:
+        """(wo, weight): unit direction from points to sample ``index`` (UInt32), and its irradiance on a surface that faces it.
+
+        ``p_world`` Point3f (P,), world space. Attached to points and samples. One-sided, as Mitsuba's area lights are.
+        """
+        place, colour, *rest = (_packet(packet, index) for packet in self.packets)
+        channels = dr.size_v(mi.UnpolarizedSpectrum)
+        power = mi.UnpolarizedSpectrum(*(colour[k] for k in range(channels)))
+        where = mi.Vector3f(place.x, place.y, place.z)
+        if self.distant:
+            return -where, power
+        offset = where - mi.Vector3f(p_world)
+        squared = dr.squared_norm(offset)
+        # A point on the light's own surface may be the sample itself.
+        valid = squared > 0
+        wo = offset * dr.rsqrt(dr.select(valid, squared, 1))
+        n = rest[0]
+        cosine = dr.maximum(-dr.dot(mi.Vector3f(n.x, n.y, n.z), wo), 0)
+        # The share of a disk of this area in the view of a point on its axis: exact at any distance, and never infinite.
+        return wo, power * (cosine * dr.rcp(dr.maximum(squared + place.w * (1 / math.pi), 1e-20)))
+
+
+def _packet(flat: Any, index: Any) -> Any:
+    return dr.gather(mi.Vector4f, flat, index, mode=dr.ReduceMode.Local)
+
+
+def cluster_sums(values: Any, cluster: Any, count: int) -> Any:
+    """Sums of ``values`` (Float or vector, P) over the pieces that belong to each of ``count`` clusters (UInt32, P). Attached."""
+    if dr.depth_v(values) == 1:
+        total = dr.zeros(mi.Float, count)
+        dr.scatter_add(total, values, cluster)
+        return total
+    return type(values)(*(cluster_sums(values[k], cluster, count) for k in range(len(values))))
+
+

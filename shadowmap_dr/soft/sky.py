@@ -1,0 +1,80 @@
+"""Environments: directions that stand for the parts of the sky around them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..lights import Environment
+from .clusters import sky_clusters
+from .samples import LightSamples, cluster_sums
+
+# Rows of the grid on which a sky is measured: as many as its image has, within bounds.
+_ROWS = (64, 1024)
+# Importance of dark parts, in units of the mean: light may appear there during an optimisation.
+_DARK = 0.05
+
+
+@dataclass(frozen=True)
+class SkyPlan:
+    """The parts of a sky. Static; made once for a scene.
+
+    rows       of the latitude-longitude grid, with twice as many columns
+    cluster    UInt32 (P,), the part that each of its cells belongs to
+    direction  Vector3f (N,), unit, towards the centre of each part, in the environment's own space
+    """
+
+    rows: int
+    cluster: Any
+    direction: Any
+
+
+def plan_sky(light: Environment, count: int) -> SkyPlan:
+    """Divide a sky into ``count`` parts of about the same energy (on the host, once)."""
+    rows = int(np.clip(light.rows, *_ROWS))
+    with dr.suspend_grad():
+        local, solid_angle = _grid(rows)
+        radiance = mi.UnpolarizedSpectrum(light.radiance(light.to_world(local)))
+        mean = dr.mean(radiance) + dr.zeros(mi.Float, dr.width(solid_angle))
+        brightness, weight = mean.numpy().astype(np.float64), solid_angle.numpy().astype(np.float64)
+        directions = np.stack([c.numpy() for c in local], -1).astype(np.float64)
+    brightness = np.maximum(np.nan_to_num(brightness), 0)
+    average = (brightness * weight).sum() / weight.sum()
+    energy = (brightness + _DARK * average if average > 0 else np.ones_like(brightness)) * weight
+    cluster = sky_clusters(energy.reshape(rows, 2 * rows), count).ravel()
+    centre = np.stack([np.bincount(cluster, energy * directions[:, c], count) for c in range(3)], -1)
+    # Opposite directions of one part may cancel: its heaviest cell then stands for it.
+    length = np.linalg.norm(centre, axis=-1)
+    order = np.lexsort((-energy, cluster))
+    heaviest = directions[order[np.searchsorted(cluster[order], np.arange(count))]]
+    cancelled = length < 1e-3 * np.bincount(cluster, energy, count)
+    centre = np.where(cancelled[:, None], heaviest, centre / np.maximum(length, 1e-300)[:, None])
+    return SkyPlan(rows, mi.UInt32(cluster), mi.Vector3f(centre.T.astype(np.float32)))
+
+
+def sky_samples(light: Environment, plan: SkyPlan) -> LightSamples:
+    """The samples of an environment as it is now. Attached to its radiance, all of it, and to its rotation."""
+    local, solid_angle = _grid(plan.rows)
+    radiance = mi.UnpolarizedSpectrum(light.radiance(light.to_world(local)))
+    count = dr.width(plan.direction)
+    power = cluster_sums(radiance * solid_angle, plan.cluster, count)
+    towards = light.to_world(plan.direction)
+    return LightSamples(True, -towards, mi.Vector3f(0), power, mi.Float(0))
+
+
+def _grid(rows: int) -> tuple[Any, Any]:
+    """(unit directions Vector3f, solid angles Float) of the cells of a latitude-longitude grid, as ``envmap`` lays out images."""
+    columns = 2 * rows
+    lane = dr.arange(mi.UInt32, rows * columns)
+    row = lane // columns
+    theta = (mi.Float(row) + 0.5) * (np.pi / rows)
+    phi = (mi.Float(lane - row * columns) + 0.5) * (2 * np.pi / columns)
+    sin_theta, cos_theta = dr.sincos(theta)
+    sin_phi, cos_phi = dr.sincos(phi)
+    # The integral of sin(theta) over a row, so that all solid angles add up to that of the sphere.
+    solid_angle = sin_theta * float(2 * np.sin(0.5 * np.pi / rows) * 2 * np.pi / columns)
+    return mi.Vector3f(sin_phi * sin_theta, cos_theta, -cos_phi * sin_theta), solid_angle

@@ -266,8 +266,9 @@ class Renderer:
         for light, fraction in zip(lighting.lights, visible, strict=True):
             square = compat and isinstance(light, SpotLight)
             color += direct_light(seen, SquareSpot(light) if square else light, fraction, gate=not compat)
+        bsdfs = [source.shape.bsdf() for source in self.data.sources]
         for plan, samples in zip(self.soft, lighting.samples, strict=True):
-            color += soft_light(seen, plan, samples, lighting.soft_maps, gate=not compat)
+            color += soft_light(seen, plan, samples, lighting.soft_maps, bsdfs, gate=not compat)
         for uniform in self._uniform_ambient():
             color += ambient_light(seen, uniform, _AMBIENT_DIRECTIONS)
         if not self.settings.hide_emitters:

@@ -44,7 +44,8 @@ def make_maps(
         bounds = shape_bounds(stacked, p_light, map_index, mi.UInt32(0), 1)
         none = dr.zeros(mi.Point3f, 1)
         size, kernel, nearer = settings.resolution, settings.filter_size, settings.receiver_range
-        frusta = fit_frusta(stacked, bounds, casting_shapes(stacked, bounds, (none, none), mi.Bool(False), 1), 1, size, kernel, previous, seen, nearer)
+        casts = casting_shapes(stacked, bounds, (none, none), mi.Bool(False), 1)
+        frusta = fit_frusta(stacked, bounds, casts, 1, size, kernel, previous, seen, nearer)
     topology = build_topology(faces, world, mi.UInt32)
     flat_faces = mi.UInt32(faces.ravel().astype(np.uint32))
     return filter_maps(render_maps(p_light, map_index, flat_faces, topology, stacked, frusta, settings))

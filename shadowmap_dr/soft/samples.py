@@ -88,9 +88,28 @@ def _packet(flat: Any, index: Any) -> Any:
 def cluster_sums(values: Any, cluster: Any, count: int) -> Any:
     """Sums of ``values`` (Float or vector, P) over the pieces that belong to each of ``count`` clusters (UInt32, P). Attached."""
     if dr.depth_v(values) == 1:
-        total = dr.zeros(mi.Float, count)
-        dr.scatter_add(total, values, cluster)
-        return total
+        return dr.custom(_Sums, mi.Float(values), cluster, count)
     return type(values)(*(cluster_sums(values[k], cluster, count) for k in range(len(values))))
 
 
+class _Sums(dr.CustomOp):
+    """Scatter-add whose derivatives are evaluated at once: pending ones end the process where a loop comes to read them."""
+
+    def eval(self, values: Any, cluster: Any, count: int) -> Any:
+        self._cluster, self._count = cluster, count
+        total = dr.zeros(mi.Float, count)
+        dr.scatter_add(total, values, cluster)
+        dr.eval(total)
+        return total
+
+    def forward(self) -> None:
+        total = dr.zeros(mi.Float, self._count)
+        dr.scatter_add(total, self.grad_in("values"), self._cluster)
+        dr.eval(total)
+        self.set_grad_out(total)
+
+    def backward(self) -> None:
+        self.set_grad_in("values", dr.gather(mi.Float, self.grad_out(), self._cluster))
+
+    def name(self) -> str:
+        return "cluster sums"

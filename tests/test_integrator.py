@@ -302,7 +302,7 @@ def test_derivatives_see_the_frusta_of_the_image(variant: str) -> None:
 
 def _frusta(integrator: Any) -> np.ndarray:
     """Numbers of the frusta of the latest image."""
-    _, frusta = integrator.shell.scenes[0].fits[0]
+    _, frusta, _ = integrator.shell.scenes[0].fits[0]
     return np.array([value.numpy() for value in vars(frusta).values()])
 
 
@@ -550,11 +550,11 @@ def test_numbers_may_be_integers(variant: str) -> None:
 
 
 def test_unsupported_scene(variant: str) -> None:
-    scene = small_scene(lamp={"type": "sphere", "emitter": {"type": "area", "id": "glow"}})
+    scene = small_scene(lamp={"type": "sphere", "emitter": {"type": "directionalarea", "id": "glow"}})
     with pytest.raises(RuntimeError) as error:
         render(scene)
     assert isinstance(error.value.__cause__, ShadowmapError)
-    assert "lamp" in str(error.value.__cause__) and "AreaLight" in str(error.value.__cause__)
+    assert "lamp" in str(error.value.__cause__) and "DirectionalArea" in str(error.value.__cause__)
     with pytest.raises(ShadowmapError, match="lamp"):
         shadowmap().render(scene)
 

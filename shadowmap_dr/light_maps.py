@@ -15,6 +15,7 @@ from .geometry import Geometry
 from .lights import DirectionalLight, Light, PointLight, SpotLight
 from .raster import RasterOutput, Topology
 from .shadow import (
+    Boxes,
     Frusta,
     LightView,
     ShadowMaps,
@@ -27,6 +28,7 @@ from .shadow import (
     fit_frusta,
     render_maps,
     shape_bounds,
+    shape_boxes,
     spot_view,
     stack_views,
     to_light_space,
@@ -120,7 +122,7 @@ def make_maps(
         frusta = fit_frusta(
             stacked,
             bounds,
-            casting_shapes(stacked, bounds, planes, planar, shapes),
+            casting_shapes(stacked, planes, planar, boxes_of(geometry)),
             shapes,
             settings.resolution,
             settings.filter_size,
@@ -156,6 +158,13 @@ def _compat_frusta(plan: MapPlan, views: Any) -> Frusta:
     half = dr.select(spread > 0, spread, 1.2 * plan.radius)
     near = zero + 0.01 * plan.radius
     return Frusta(zero, zero, half, half, near, zero + 4 * plan.radius, near)
+
+
+def boxes_of(geometry: Geometry) -> Boxes:
+    """Boxes of the shapes where they are now."""
+    vertex = dr.arange(mi.UInt32, geometry.vertex_count)
+    p_world = dr.gather(mi.Point3f, dr.detach(geometry.positions), vertex)
+    return shape_boxes(p_world, geometry.vertex_shape, len(geometry.shapes))
 
 
 def shape_planes(plan: MapPlan, geometry: Geometry) -> tuple[tuple[Any, Any], Any]:

@@ -12,7 +12,6 @@ from shadowmap_dr.shadow import (
     LightView,
     ShadowMaps,
     ShadowSettings,
-    casting_shapes,
     filter_maps,
     fit_frusta,
     render_maps,
@@ -42,10 +41,8 @@ def make_maps(
     p_light = to_light_space(of_map(stacked, map_index, count), p_world)
     if frusta is None:
         bounds = shape_bounds(stacked, p_light, map_index, mi.UInt32(0), 1)
-        none = dr.zeros(mi.Point3f, 1)
         size, kernel, nearer = settings.resolution, settings.filter_size, settings.receiver_range
-        casts = casting_shapes(stacked, bounds, (none, none), mi.Bool(False), 1)
-        frusta = fit_frusta(stacked, bounds, casts, 1, size, kernel, previous, seen, nearer)
+        frusta = fit_frusta(stacked, bounds, mi.Bool(True), 1, size, kernel, previous, seen, nearer)
     topology = build_topology(faces, world, mi.UInt32)
     flat_faces = mi.UInt32(faces.ravel().astype(np.uint32))
     return filter_maps(render_maps(p_light, map_index, flat_faces, topology, stacked, frusta, settings))

@@ -166,7 +166,7 @@ def test_bad_input_is_one_clear_line(run: Any, tmp_path: Path, arguments: list[s
     (tmp_path / "lamp.xml").write_text(
         '<scene version="3.0.0"><sensor type="perspective"><film type="hdrfilm"><integer name="width" value="4"/>'
         '<integer name="height" value="4"/></film></sensor>'
-        '<shape type="sphere" id="lamp"><emitter type="area"/></shape></scene>'
+        '<shape type="sphere" id="lamp"><emitter type="directionalarea"/></shape></scene>'
     )
     result = run(*arguments)
     assert result.status in (1, 2)

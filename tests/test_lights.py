@@ -122,7 +122,7 @@ def test_unsupported_emitters_are_named(variant: str) -> None:
     beamer = {"type": "projector", "irradiance": {"type": "bitmap", "bitmap": slide(np.random.default_rng(6))}}
     with pytest.raises(ShadowmapError, match="'beamer'.*directional, spot or point"):
         lights_of(mi.load_dict({"type": "scene", "beamer": beamer}))
-    panel = {"type": "rectangle", "glow": {"type": "area"}}
+    panel = {"type": "rectangle", "glow": {"type": "directionalarea"}}
     with pytest.raises(ShadowmapError, match="'panel'"):
         lights_of(mi.load_dict({"type": "scene", "panel": panel}))
     with pytest.raises(ShadowmapError, match="'sky'"):

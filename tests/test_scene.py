@@ -209,7 +209,7 @@ def test_unsupported_things_are_named(variant: str) -> None:
             load(mi.load_dict({"type": "scene", **parts}, optimize=False))
 
     refused("no shapes")
-    refused("'glow'.*AreaLight.*directional", glow={"type": "sphere", "emitter": {"type": "area"}})
+    refused("'glow'.*DirectionalArea.*area light", glow={"type": "sphere", "emitter": {"type": "directionalarea"}})
     refused("'beam'.*Projector", box={"type": "cube"}, beam={"type": "projector", "irradiance": 1.0})
     grid = mi.TensorXf(np.linspace(-1, 1, 27, dtype=np.float32).reshape(3, 3, 3, 1))
     refused("'blob'.*SDFGrid", blob={"type": "sdfgrid", "grid": grid})

@@ -11,8 +11,9 @@ from .camera import (
     stack_views,
     to_light_space,
 )
+from .casters import Boxes, casting_shapes, shape_boxes
 from .filters import FILTERS, filter_kernel, filter_map
-from .fit import casting_shapes, fit_frusta, shape_bounds
+from .fit import fit_frusta, shape_bounds
 from .lookup import visibility
 from .methods import METHODS, PREFILTERED
 from .moments import chebyshev_visibility, standard_visibility, variance_moments
@@ -22,6 +23,7 @@ __all__ = [
     "FILTERS",
     "METHODS",
     "PREFILTERED",
+    "Boxes",
     "Frusta",
     "LightView",
     "ShadowMaps",
@@ -38,6 +40,7 @@ __all__ = [
     "fit_frusta",
     "render_maps",
     "shape_bounds",
+    "shape_boxes",
     "spot_view",
     "stack_views",
     "standard_visibility",

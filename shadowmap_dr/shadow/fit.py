@@ -76,7 +76,7 @@ def fit_frusta(
 
     Args:
         bounds: from :func:`shape_bounds`.
-        casts: which shapes can cast a shadow in which map (:func:`casting_shapes`).
+        casts: which shapes can cast a shadow in which map (:func:`casting_shapes`; ``Bool``). What is behind a light does not.
         previous: frusta of an earlier call. Kept bit by bit while the casters lie inside them with room for the filter
             and fill most of them.
         seen: points (``Array3f``, world space) all over the receivers in view, and a mask of those that count. None: anywhere.
@@ -90,6 +90,7 @@ def fit_frusta(
         index = dr.arange(module.UInt32, views.count * shape_count)
         map_index = index // shape_count
         extent = bounds.of(index)
+        casts &= ~(of_map(views, map_index, views.count).spread > 0) | (extent[5] > 0)
         window = _window(views, seen)
         if not receiver_range:
             window = (*window[:4], module.Float(-dr.inf), window[5])
@@ -103,57 +104,6 @@ def fit_frusta(
         )
         dr.eval(result)
         return result
-
-
-def casting_shapes(views: Views, bounds: Bounds, planes: tuple[Any, Any], planar: Any, shape_count: int) -> Any:
-    """Which shapes can cast a shadow in which map: not planar ones with nothing behind them, nor what is behind the light.
-
-    ``planes`` (normal, point) in world space, ``Array3f`` of width S: the plane of each shape that is ``planar`` (``Bool``).
-    Returns ``Bool`` of width M * S, detached.
-    """
-    with dr.suspend_grad():
-        return _casting_shapes(dr.detach(views), bounds, planes, planar, shape_count)
-
-
-def _casting_shapes(views: Views, bounds: Bounds, planes: tuple[Any, Any], planar: Any, shape_count: int) -> Any:
-    module = backend(views.spread)
-    Float, Array3f, Bool = module.Float, module.Array3f, module.Bool
-    index = dr.arange(module.UInt32, views.count * shape_count)
-    map_index = index // shape_count
-    shape = index - map_index * shape_count
-    extent = bounds.of(index)
-    view = of_map(views, map_index, views.count)
-
-    def per_shape(v: Any) -> Any:
-        # With one map lanes are shapes already, and nothing needs to be evaluated to be looked up.
-        return Array3f(v) if views.count == 1 else Array3f(*(dr.gather(Float, v[c], shape) for c in range(3)))
-
-    if views.count > 1:
-        dr.eval(planes)
-    normal_world, point_world = per_shape(planes[0]), per_shape(planes[1])
-    normal = Array3f(*(dr.dot(normal_world, axis) for axis in (view.right, view.up, view.forward)))
-    offset = dr.dot(normal_world, point_world - view.origin)
-    # Orient the plane so that the light lies on its negative side.
-    away = dr.select(view.spread > 0, offset, normal.z) < 0
-    normal, offset = dr.select(away, -normal, normal), dr.select(away, -offset, offset)
-    in_perspective = view.spread > 0
-    visible = ~in_perspective | (extent[5] > 0)
-    others = [bounds.of(map_index * shape_count + other) for other in range(shape_count)]
-    nearest, farthest = Float(dr.inf), Float(-dr.inf)
-    for *_, z0, z1 in others:
-        nearest, farthest = dr.minimum(nearest, z0), dr.maximum(farthest, dr.select(dr.isfinite(z1), z1, -dr.inf))
-    size = dr.maximum(farthest - nearest, 1e-6)
-    behind = Bool(False)
-    for other, (x0, y0, x1, y1, z0, z1) in enumerate(others):
-        reach = dr.fma(normal.z, dr.select(normal.z > 0, z1, z0), -offset)
-        for lo, hi, n in ((x0, x1, normal.x), (y0, y1, normal.y)):
-            # Perspective bounds are slopes: the extreme of n * slope * z over the box lies in one of its corners.
-            flat = dr.maximum(n * lo, n * hi)
-            cone = dr.maximum(dr.maximum(n * lo * z0, n * lo * z1), dr.maximum(n * hi * z0, n * hi * z1))
-            reach += dr.select(n == 0, 0, dr.select(in_perspective, cone, flat))
-        behind |= (shape != other) & (reach > 1e-3 * size)
-    planar = planar if views.count == 1 else dr.gather(Bool, planar, shape)
-    return visible & (~planar | behind)
 
 
 def _window(views: Views, seen: Any) -> tuple[Any, ...]:

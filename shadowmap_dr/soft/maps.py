@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..geometry import Geometry
-from ..light_maps import MapPlan, shape_planes
+from ..light_maps import MapPlan, boxes_of, shape_planes
 from ..lights import AreaLight, Environment
 from ..raster import RasterOutput, Topology
 from ..shadow import (
@@ -20,6 +20,7 @@ from ..shadow import (
     ShadowMaps,
     ShadowSettings,
     Views,
+    casting_shapes,
     cube_face,
     cube_views,
     directional_view,
@@ -207,17 +208,14 @@ def _fit(
     """Frusta around the boxes of shapes: with so many maps, asking each vertex would cost more than drawing it."""
     with dr.suspend_grad():
         shapes, count = len(geometry.shapes), views.count
-        low, high = _boxes(geometry)
+        boxes = boxes_of(geometry)
         lane = dr.arange(mi.UInt32, count * shapes * 8)
-        corner, entry = lane & 7, lane >> 3
+        entry = lane >> 3
         which = entry // shapes
         shape = entry - which * shapes
-        row = [(corner & (1 << c)) != 0 for c in range(3)]
-        ends = [(dr.gather(mi.Float, high[c], shape), dr.gather(mi.Float, low[c], shape)) for c in range(3)]
-        p_world = mi.Point3f(*(dr.select(upper, *end) for upper, end in zip(row, ends, strict=True)))
-        p_light = to_light_space(of_map(dr.detach(views), which, count), p_world)
-        bounds = shape_bounds(views, p_light, which, shape, shapes)
-        casts = _casts(dr.detach(views), bounds, hidden, shape_planes(scene, geometry), low, high)
+        corner = boxes.corners(shape, lane & 7)
+        bounds = shape_bounds(views, to_light_space(of_map(dr.detach(views), which, count), corner), which, shape, shapes)
+        casts = casting_shapes(views, *shape_planes(scene, geometry), boxes, hidden)
         return fit_frusta(
             views,
             bounds,
@@ -229,54 +227,6 @@ def _fit(
             _few(seen),
             settings.receiver_range,
         )
-
-
-def _casts(views: Views, bounds: Any, hidden: Any, planes: tuple[tuple[Any, Any], Any], low: Any, high: Any) -> Any:
-    """Which shapes can cast a shadow in which map: not a light's own, nor what lies behind it, nor walls with nothing behind."""
-    (normal, point), planar = planes
-    dr.eval(normal, point, planar)
-    shapes = dr.width(low[0])
-    # How far the boxes of the others reach on either side of a shape's plane.
-    pair = dr.arange(mi.UInt32, shapes * shapes)
-    own = pair // shapes
-    other = pair - own * shapes
-    reach = [mi.Float(0), mi.Float(0)]
-    for c in range(3):
-        n, p = dr.gather(mi.Float, normal[c], own), dr.gather(mi.Float, point[c], own)
-        lo, hi = dr.gather(mi.Float, low[c], other), dr.gather(mi.Float, high[c], other)
-        reach[0] += n * (dr.select(n > 0, hi, lo) - p)
-        reach[1] -= n * (dr.select(n > 0, lo, hi) - p)
-    extremes = dr.full(mi.Float, -dr.inf, 2 * shapes)
-    for k in range(2):
-        dr.scatter_reduce(dr.ReduceOp.Max, extremes, reach[k], own * 2 + k, own != other)
-    size = dr.max(dr.maximum(high[0] - low[0], dr.maximum(high[1] - low[1], high[2] - low[2])))
-    index = dr.arange(mi.UInt32, views.count * shapes)
-    which = index // shapes
-    shape = index - which * shapes
-    view = of_map(views, which, views.count)
-    n = mi.Vector3f(*(dr.gather(mi.Float, normal[c], shape) for c in range(3)))
-    p = mi.Vector3f(*(dr.gather(mi.Float, point[c], shape) for c in range(3)))
-    perspective = view.spread > 0
-    above = dr.dot(n, dr.select(perspective, view.origin - p, -view.forward)) > 0
-    behind = dr.gather(mi.Float, extremes, shape * 2 + dr.select(above, mi.UInt32(1), 0)) > 1e-3 * size
-    casts = ~dr.gather(mi.Bool, planar, shape) | behind
-    casts &= ~perspective | (bounds.of(index)[5] > 0)
-    return casts & (shape != dr.gather(mi.UInt32, hidden, which))
-
-
-def _boxes(geometry: Geometry) -> tuple[Any, Any]:
-    """(low, high), each three ``Float`` (S,): the shapes' boxes in world space."""
-    vertex = dr.arange(mi.UInt32, geometry.vertex_count)
-    p = dr.gather(mi.Point3f, dr.detach(geometry.positions), vertex)
-    shapes = len(geometry.shapes)
-    extremes = dr.full(mi.Float, -dr.inf, 6 * shapes)
-    for k, value in enumerate((p.x, p.y, p.z, -p.x, -p.y, -p.z)):
-        dr.scatter_reduce(dr.ReduceOp.Max, extremes, value, geometry.vertex_shape * 6 + k)
-    row = dr.arange(mi.UInt32, shapes) * 6
-    high, low = ([dr.gather(mi.Float, extremes, row + k) for k in ks] for ks in ((0, 1, 2), (3, 4, 5)))
-    low = [-v for v in low]
-    dr.eval(high, low)
-    return low, high
 
 
 def _few(seen: Any) -> Any:

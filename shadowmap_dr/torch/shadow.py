@@ -222,15 +222,13 @@ def _fit(
     """The casters as one shape that is not flat."""
     module = backend(map_index)
     bounds = _shadow.shape_bounds(views, p_light, map_index, module.UInt32(0), 1)
-    nowhere = dr.zeros(module.Array3f, 1)
     points = None
     if seen is not None:
         number = dr.width(seen.array) // 3
         points = dr.gather(module.Array3f, seen.array, dr.arange(module.UInt32, number)), dr.full(module.Bool, True, number)
     frusta = previous._frusta if previous is not None else None
     size, kernel = settings.resolution, settings.filter_size
-    casts = _shadow.casting_shapes(views, bounds, (nowhere, nowhere), module.Bool(False), 1)
-    return _shadow.fit_frusta(views, bounds, casts, 1, size, kernel, frusta, points)
+    return _shadow.fit_frusta(views, bounds, module.Bool(True), 1, size, kernel, frusta, points)
 
 
 def _full(value: Any, width: int) -> Any:

@@ -21,6 +21,7 @@ from .renderer import Renderer
 from .scene import SceneData, load
 from .sensors import sensors_of
 from .shadow import Frusta, ShadowSettings
+from .soft import SoftFrusta
 from .traversal import mesh_buffers, parameters
 
 PLUGIN = "shadowmap"
@@ -50,6 +51,7 @@ class Options:
     emitter_samples        points on each area light that cast shadows
     environment_samples    directions of an environment that cast shadows
     soft_map_resolution    texels along each side of their shadow maps
+    emitter_shadows        ``samples``, or ``single``: one map for each area light, penumbrae estimated from it
     shadow_samples         look-ups along each side of a pixel, 1 to 8; 0 chooses
     antialias              anti-alias the image; without it outlines have no gradient
     ambient                radiance of unshadowed light from all directions, beside that of the scene's environment
@@ -73,6 +75,7 @@ class Options:
     emitter_samples: int = 32
     environment_samples: int = 64
     soft_map_resolution: int = 128
+    emitter_shadows: str = "samples"
     antialias: bool = True
     ambient: float = 0.0
     hide_emitters: bool = False
@@ -133,6 +136,7 @@ class Options:
             emitter_samples=self.emitter_samples,
             environment_samples=self.environment_samples,
             soft_map_resolution=self.soft_map_resolution,
+            emitter_shadows=self.emitter_shadows,
             aovs=tuple(name for _, name in self.labelled_aovs),
         )
 
@@ -167,7 +171,7 @@ class SceneRenderer:
     sizes: tuple[int, ...]
     lights: tuple[str, ...]
     renderer: Renderer
-    fits: list[tuple[Any, Frusta | None, Frusta | None]] = field(default_factory=list)
+    fits: list[tuple[Any, Frusta | None, SoftFrusta]] = field(default_factory=list)
 
     @classmethod
     def build(cls, scene: Any, sensor: Any, options: Options, settings: RenderSettings) -> SceneRenderer:

@@ -24,8 +24,10 @@ class RenderSettings:
         emitter_samples: points on each area light, each with a shadow map.
         environment_samples: directions of an environment, each with a shadow map.
         soft_map_resolution: texels along each side of these maps.
-        shadow_samples: look-ups along each side of a pixel's footprint (``samples ** 2`` in all), or 0 for 2 where the image is
-            not larger than the shadow map and 1 otherwise.
+        emitter_shadows: ``samples``, or ``single``: one map of ``shadow.resolution`` texels (a power of two) for each area light,
+            from which penumbrae are estimated; fast, and right for simple occluders only.
+        shadow_samples: look-ups along each side of a pixel's footprint (``samples ** 2`` in all), or 0 for 1 where the image is
+            larger than the shadow map, else 2 to 4, one for every two texels of the map that a pixel of the image has.
         aovs: names of further channels, see :data:`shadowmap_dr.aovs.AOVS`.
     """
 
@@ -37,6 +39,7 @@ class RenderSettings:
     emitter_samples: int = 32
     environment_samples: int = 64
     soft_map_resolution: int = 128
+    emitter_shadows: str = "samples"
     aovs: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -48,13 +51,25 @@ class RenderSettings:
         for name in ("emitter_samples", "environment_samples"):
             if not 1 <= getattr(self, name) <= MOST_SAMPLES:
                 raise ShadowmapError(f"{name} is {getattr(self, name)}: choose 1 to {MOST_SAMPLES}.")
+        if self.emitter_shadows not in ("samples", "single"):
+            raise ShadowmapError(f"emitter_shadows is {self.emitter_shadows!r}: choose samples or single.")
+        size = self.shadow.resolution
+        if self.emitter_shadows == "single" and (size < 8 or size & (size - 1)):
+            raise ShadowmapError(f"shadow map resolution is {size}; with emitter_shadows 'single' choose a power of two from 8")
         if not (self.ambient >= 0 and self.ambient < float("inf")):
             raise ShadowmapError(f"ambient is {self.ambient}: give a finite radiance of at least 0.")
 
+    def look_ups(self, width: int) -> int:
+        """Look-ups along each side of a pixel's footprint in images of this many columns of samples."""
+        if self.shadow_samples:
+            return self.shadow_samples
+        return 1 if width > self.shadow.resolution else min(max(2, self.shadow.resolution // (2 * width)), 4)
+
     @property
-    def soft_shadow(self) -> ShadowSettings:
-        """Settings of the maps of extended lights."""
+    def soft_shadow(self) -> tuple[ShadowSettings, ShadowSettings]:
+        """Settings of the maps of extended lights: those of samples, and single ones."""
         try:
-            return replace(self.shadow, resolution=self.soft_map_resolution)
+            sampled = replace(self.shadow, resolution=self.soft_map_resolution)
         except ValueError as error:
             raise ShadowmapError(f"{error} (soft_map_resolution)") from None
+        return sampled, replace(self.shadow, method="vsm", filter="none", filter_size=1, supersampling=1, compat=False)

@@ -24,7 +24,7 @@ from .scene import SceneData, load, refresh
 from .sensors import Sensor
 from .shading import Surface, ambient_light, background, direct_light, emission, normals_at, opacity, surface, surface_at
 from .shadow import Frusta, ShadowMaps, ShadowSettings
-from .soft import LightSamples, SoftPlan, make_soft_maps, plan_soft, samples_of, soft_light
+from .soft import LightSamples, SoftFrusta, SoftMaps, SoftPlan, make_soft_maps, plan_soft, samples_of, soft_light
 
 # Directions over which the light of environments is summed.
 _AMBIENT_DIRECTIONS = 16
@@ -57,7 +57,7 @@ class Renderer:
     creases: Any = None
     soft: tuple[SoftPlan, ...] = ()
     frusta: Frusta | None = None
-    soft_frusta: Frusta | None = None
+    soft_frusta: SoftFrusta = (None, None)
 
     @classmethod
     def from_scene(
@@ -110,7 +110,8 @@ class Renderer:
         topology = build_topology(geometry.faces.numpy(), positions, mi.UInt32)
         plan, creases = plan_maps(data.lights, geometry), crease_edges(geometry, topology)
         lights = (*data.areas, *data.environments)
-        soft = plan_soft(lights, geometry, settings.emitter_samples, settings.environment_samples)
+        single = settings.emitter_shadows == "single"
+        soft = plan_soft(lights, geometry, settings.emitter_samples, settings.environment_samples, single)
         renderer = cls(data, topology, plan, settings, flat_faces(geometry, topology), creases, soft)
         # The first fit is made here, so that a step which is recorded later always starts from one.
         if data.sensors:
@@ -254,7 +255,7 @@ class Renderer:
     def _visibility(self, maps: Any, light: Light, index: int, seen: Surface, view: _View, depth: Any) -> Any:
         if maps is None:
             return mi.Float(1)
-        samples = self.settings.shadow_samples or (2 if view.raster.width <= self.settings.shadow.resolution else 1)
+        samples = self.settings.look_ups(view.raster.width)
         size = (view.raster.width, view.raster.height)
         points = footprint_points(view.sensor, size, depth, seen.p_world, seen.n_world, samples)
         total = sum(light_visibility(maps, self.plan, light, index, p, seen.active) for p in points)
@@ -290,7 +291,7 @@ class _Lighting:
     maps: ShadowMaps | None
     areas: tuple[AreaLight, ...]
     samples: tuple[LightSamples, ...]
-    soft_maps: ShadowMaps | None
+    soft_maps: SoftMaps | None
 
 
 @dataclass(frozen=True)

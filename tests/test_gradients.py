@@ -46,8 +46,6 @@ BEYOND = [
     ("sun_cow", "caster_scale", {}, 1, "single pixels see facets from the side, on which what they show changes fast"),
     ("fine", "caster_translation", {}, 1, "82,000 flat facets of a fifth of a pixel"),
     ("fine_box", "caster_rise", {}, 16, "an edge between two flat faces, of which one is seen from the side, made of triangles"),
-    ("standing_box", "caster_translation", {"shadow_map_resolution": 256}, 16, "a seam between box and shadow, below a texel"),
-    ("crossing_meshes", "caster_scale", {"shadow_map_resolution": 256}, 16, "outlines of shadows that are two texels wide"),
 ]
 
 

@@ -10,6 +10,9 @@ import drjit as dr
 from ..raster._types import backend
 from .camera import Views, of_map
 
+# Share of a shape's extent that may lie behind a floor without the floor casting a shadow on it.
+_SUNK = 0.1
+
 
 @dataclass(frozen=True)
 class Boxes:
@@ -76,18 +79,22 @@ def casting_shapes(views: Views, planes: tuple[Any, Any], planar: Any, boxes: Bo
 
 
 def _reach(normal: Any, point: Any, boxes: Boxes) -> Any:
-    """How far the boxes of the other shapes reach on either side of each shape's plane (``Float``, 2 S)."""
+    """How far the boxes of the other shapes reach on either side of each shape's plane (``Float``, 2 S).
+
+    The first tenth does not count: something that stands on the floor may sink in a little, and shall not change the maps by that.
+    """
     module, shapes = backend(boxes.low), boxes.count
     pair = dr.arange(module.UInt32, shapes * shapes)
     own = pair // shapes
     other = pair - own * shapes
-    before, behind = module.Float(0), module.Float(0)
+    before, behind, extent = module.Float(0), module.Float(0), module.Float(0)
     for c in range(3):
         n, p = dr.gather(module.Float, normal[c], own), dr.gather(module.Float, point[c], own)
         low, high = dr.gather(module.Float, boxes.low[c], other), dr.gather(module.Float, boxes.high[c], other)
         before += n * (dr.select(n > 0, high, low) - p)
         behind -= n * (dr.select(n > 0, low, high) - p)
+        extent += dr.abs(n) * (high - low)
     reach = dr.full(module.Float, -dr.inf, 2 * shapes)
     for k, value in enumerate((before, behind)):
-        dr.scatter_reduce(dr.ReduceOp.Max, reach, value, own * 2 + k, own != other)
+        dr.scatter_reduce(dr.ReduceOp.Max, reach, dr.fma(-_SUNK, extent, value), own * 2 + k, own != other)
     return reach

@@ -142,7 +142,7 @@ def render_maps(
         blended = antialias(values, raster, clip, topology)
         values, channels = _two_depths(values, blended) if settings.method == "pcf" else (blended, channels)
     if settings.supersampling > 1:
-        values = _averaged(values, size, channels, settings.supersampling)
+        values = block_means(values, size, channels, settings.supersampling)
     return ShadowMaps(values, views, frusta, settings, channels)
 
 
@@ -187,7 +187,7 @@ def _two_depths(plain: Any, blended: Any) -> tuple[Any, int]:
     return dr.ravel(module.Array4f(depth, other, share, 0)), 4
 
 
-def _averaged(values: Any, size: int, channels: int, factor: int) -> Any:
+def block_means(values: Any, size: int, channels: int, factor: int) -> Any:
     """Means of blocks of factor x factor texels; maps have ``size`` texels along each side."""
     module = backend(values)
     dr.eval(values)
@@ -199,8 +199,8 @@ def _averaged(values: Any, size: int, channels: int, factor: int) -> Any:
     total = module.Float(0)
     for j in range(factor):
         for i in range(factor):
-            # Each number is read once, so that the backward pass needs no atomics.
-            total += dr.gather(module.Float, values, first + (j * size + i) * channels, mode=dr.ReduceMode.Permute)
+            # Each number is read once, so that the backward pass needs no atomics; but others may read it too.
+            total += dr.gather(module.Float, values, first + (j * size + i) * channels, mode=dr.ReduceMode.NoConflicts)
     return total * (1 / factor**2)
 
 

@@ -1,7 +1,17 @@
 """Extended lights: area lights and environments as many samples, each with a shadow map."""
 
-from .maps import SoftLight, SoftPlan, make_soft_maps, plan_soft, samples_of
+from .maps import SoftFrusta, SoftLight, SoftMaps, SoftPlan, make_soft_maps, plan_soft, samples_of
 from .samples import LightSamples
 from .shading import soft_light
 
-__all__ = ["LightSamples", "SoftLight", "SoftPlan", "make_soft_maps", "plan_soft", "samples_of", "soft_light"]
+__all__ = [
+    "LightSamples",
+    "SoftFrusta",
+    "SoftLight",
+    "SoftMaps",
+    "SoftPlan",
+    "make_soft_maps",
+    "plan_soft",
+    "samples_of",
+    "soft_light",
+]

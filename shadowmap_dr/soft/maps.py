@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -32,10 +32,12 @@ from ..shadow import (
 )
 from ..shadow.camera import of_map
 from .area import AreaPlan, area_samples, plan_area
+from .penumbra import Pyramid
 from .samples import LightSamples, SampleTable
 from .sky import SkyPlan, plan_sky, sky_samples
 
 SoftLight = AreaLight | Environment
+SoftFrusta = tuple[Frusta | None, Frusta | None]
 
 # Half-angle in degrees that one perspective map may cover: beyond it, a light looks around itself with the faces of a cube.
 _WIDEST = 75.0
@@ -49,7 +51,8 @@ _SEEN = 1024
 class SoftPlan:
     """How one extended light is sampled, and which maps it has. Static.
 
-    ``kind``: ``distant`` or ``near`` (one map for each sample) or ``cube`` (six). ``first``: number of the first map.
+    ``kind``: ``distant`` or ``near`` (one map for each sample), ``cube`` (six), or ``single`` (one in all, see
+    :mod:`shadowmap_dr.soft.penumbra`). ``first``: number of the first map, single ones and others counted apart.
     ``target``: point that the maps of a ``near`` light face. ``hides``: shape that casts no shadow of this light, its own.
     """
 
@@ -63,20 +66,25 @@ class SoftPlan:
     @property
     def maps(self) -> int:
         """Number of its maps."""
-        return self.count * (6 if self.kind == "cube" else 1)
+        return 1 if self.kind == "single" else self.count * (6 if self.kind == "cube" else 1)
 
 
-def plan_soft(lights: Sequence[SoftLight], geometry: Geometry, area_count: int, sky_count: int) -> tuple[SoftPlan, ...]:
-    """Sample the lights and decide on their maps (on the host, once)."""
+def plan_soft(
+    lights: Sequence[SoftLight], geometry: Geometry, area_count: int, sky_count: int, single: bool = False
+) -> tuple[SoftPlan, ...]:
+    """Sample the lights and decide on their maps (on the host, once). ``single``: area lights get one map where one is enough."""
     plans: list[SoftPlan] = []
+    first = {True: 0, False: 0}
     for light in lights:
-        first = plans[-1].first + plans[-1].maps if plans else 0
         if isinstance(light, Environment):
-            plans.append(SoftPlan(plan_sky(light, sky_count), "distant", sky_count, first, (0.0, 0.0, 0.0), _NONE))
+            plan = SoftPlan(plan_sky(light, sky_count), "distant", sky_count, 0, (0.0, 0.0, 0.0), _NONE)
         else:
-            parts = plan_area(light, geometry, area_count)
             target, kind = _aim(geometry, light.shape)
-            plans.append(SoftPlan(parts, kind, area_count, first, target, light.shape))
+            kind = "single" if single and kind == "near" else kind
+            plan = SoftPlan(plan_area(light, geometry, area_count), kind, area_count, 0, target, light.shape)
+        alone = plan.kind == "single"
+        plans.append(replace(plan, first=first[alone]))
+        first[alone] += plan.maps
     return tuple(plans)
 
 
@@ -87,22 +95,58 @@ def samples_of(light: SoftLight, plan: SoftPlan, geometry: Geometry) -> LightSam
     return area_samples(light, plan.parts, geometry)
 
 
+@dataclass(frozen=True)
+class SoftMaps:
+    """The maps of all extended lights: ``sampled``, one for each sample, and ``single``, one for each light; or None."""
+
+    sampled: ShadowMaps | None
+    single: Pyramid | None
+
+    @property
+    def frusta(self) -> SoftFrusta:
+        """Their fit."""
+        return (
+            None if self.sampled is None else self.sampled.frusta,
+            None if self.single is None else self.single.maps.frusta,
+        )
+
+
 def make_soft_maps(
     plans: Sequence[SoftPlan],
     samples: Sequence[LightSamples],
     scene: MapPlan,
     geometry: Geometry,
     topology: Topology,
-    settings: ShadowSettings,
-    previous: Frusta | None,
+    settings: tuple[ShadowSettings, ShadowSettings],
+    previous: SoftFrusta,
     transparent: Callable[[RasterOutput], Any] | None = None,
     seen: Any = None,
-) -> ShadowMaps:
-    """Render and filter the maps of all samples as one batch. Attached to samples and vertices.
+) -> SoftMaps:
+    """Render and filter the maps of all samples as one batch, and those of single ones as another. Attached to samples, vertices.
 
-    ``scene`` tells the shapes' planes; the rest is as in :func:`shadowmap_dr.light_maps.make_maps`.
+    ``scene`` tells the shapes' planes, ``settings`` are those of either kind, ``previous`` is the fit of an earlier call; the
+    rest is as in :func:`shadowmap_dr.light_maps.make_maps`.
     """
-    views = _stack([_views(plan, s, settings) for plan, s in zip(plans, samples, strict=True)])
+    made: list[ShadowMaps | None] = []
+    for single, setting, fit in zip((False, True), settings, previous, strict=True):
+        own = [(p, s) for p, s in zip(plans, samples, strict=True) if (p.kind == "single") == single]
+        made.append(_make(own, scene, geometry, topology, setting, fit, transparent, seen) if own else None)
+    sampled, single = made
+    return SoftMaps(None if sampled is None else filter_maps(sampled), None if single is None else Pyramid.of(single))
+
+
+def _make(
+    lights: Sequence[tuple[SoftPlan, LightSamples]],
+    scene: MapPlan,
+    geometry: Geometry,
+    topology: Topology,
+    settings: ShadowSettings,
+    previous: Frusta | None,
+    transparent: Callable[[RasterOutput], Any] | None,
+    seen: Any,
+) -> ShadowMaps:
+    plans = [plan for plan, _ in lights]
+    views = _stack([_views(plan, s, settings) for plan, s in lights])
     hidden = dr.concat([dr.full(mi.UInt32, plan.hides, plan.maps) for plan in plans])
     dr.eval(views, hidden)
     frusta = _fit(views, hidden, scene, geometry, settings, previous, seen)
@@ -115,7 +159,7 @@ def make_soft_maps(
         own = dr.gather(mi.UInt32, hidden, which) == dr.gather(mi.UInt32, geometry.vertex_shape, vertex)
         # Behind the light's camera, where no triangle is drawn.
         p_light = dr.select(own, type(p_light)(0, 0, -1), p_light)
-    return filter_maps(render_maps(p_light, which, geometry.faces, topology, views, frusta, settings, transparent))
+    return render_maps(p_light, which, geometry.faces, topology, views, frusta, settings, transparent)
 
 
 def map_of(plan: SoftPlan, table: SampleTable, sample: Any, p_world: Any) -> Any:
@@ -167,12 +211,13 @@ def _views(plan: SoftPlan, samples: LightSamples, settings: ShadowSettings) -> V
     if plan.kind == "distant":
         view = directional_view(samples.place)
         return Views(view.right, view.up, view.forward, mi.Vector3f(zero), zero, zero)
-    if plan.kind == "near":
+    if plan.kind in ("near", "single"):
+        place = samples.centre() if plan.kind == "single" else samples.place
         # Which way a camera faces has no influence on what it sees, so it need not be differentiated.
         with dr.suspend_grad():
-            view = directional_view(mi.Vector3f(*plan.target) - dr.detach(samples.place))
+            view = directional_view(mi.Vector3f(*plan.target) - dr.detach(place))
         spread = dr.full(mi.Float, math.tan(math.radians(_WIDEST)), count)
-        return Views(view.right, view.up, view.forward, samples.place, spread, zero)
+        return Views(view.right, view.up, view.forward, place, spread, zero)
     lane = dr.arange(mi.UInt32, count)
     sample, face = lane // 6, lane % 6
     faces = cube_views(mi.Point3f(0), settings.resolution, settings.filter_size)

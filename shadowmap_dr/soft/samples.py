@@ -34,6 +34,21 @@ class LightSamples:
         """N."""
         return dr.width(self.place)
 
+    def centre(self) -> Any:
+        """Vector3f of width 1, the mean position by area. Attached."""
+        total = dr.sum(self.area)
+        return mi.Vector3f(*(dr.sum(self.place[c] * self.area) / total for c in range(3)))
+
+    def radius_towards(self, p_world: Any) -> Any:
+        """Float, radius of a disk of the area that points see of the light, if nothing hides it. Attached."""
+        direction = dr.normalize(mi.Vector3f(p_world) - self.centre())
+        # The mean normal times the whole area is the area vector of what faces one way; closed surfaces show a quarter of theirs.
+        total = dr.sum(self.area)
+        facing = mi.Vector3f(*(dr.sum(self.normal[c] * self.area) for c in range(3)))
+        flat = dr.maximum(dr.dot(facing, direction), 0)
+        closed = 0.25 * (total - dr.norm(facing))
+        return dr.sqrt(dr.maximum(flat + closed, 1e-12 * total) * (1 / math.pi))
+
     def table(self) -> SampleTable:
         """The same numbers in packets, for look-ups by many lanes."""
         p, n, c = self.place, self.normal, self.power

@@ -10,9 +10,10 @@ import mitsuba as mi
 
 from ..records import attached_arrays, with_arrays
 from ..shading import Surface, passes_gate
-from ..shadow import ShadowMaps, visibility
+from ..shadow import visibility
 from ..traversal import parameters
-from .maps import SoftPlan, map_of
+from .maps import SoftMaps, SoftPlan, map_of
+from .penumbra import penumbra_visibility
 from .samples import LightSamples
 
 
@@ -20,7 +21,7 @@ def soft_light(
     seen: Surface,
     plan: SoftPlan,
     samples: LightSamples,
-    maps: ShadowMaps | None,
+    maps: SoftMaps | None,
     bsdfs: Sequence[Any],
     *,
     gate: bool = True,
@@ -30,7 +31,8 @@ def soft_light(
     ``maps`` None: unshadowed. ``bsdfs``: all that ``seen`` may call. ``gate``: see :func:`shadowmap_dr.shading.direct_light`.
     Gradients flow to all of surface, samples, maps and BSDFs.
     """
-    inputs = (seen, samples.table(), maps)
+    sampled = None if maps is None or plan.kind == "single" else maps.sampled
+    inputs = (seen, samples.table(), sampled)
 
     def one_sample(index: Any, arrays: list[Any]) -> Any:
         seen, table, maps = with_arrays(inputs, arrays)
@@ -44,7 +46,11 @@ def soft_light(
             value *= visibility(maps, map_of(plan, table, index, seen.p_world), seen.p_world, active)
         return dr.select(active, value, 0)
 
-    return sum_over(one_sample, samples.count, dr.width(seen.shape), attached_arrays(inputs), _attached_parameters(bsdfs))
+    light = sum_over(one_sample, samples.count, dr.width(seen.shape), attached_arrays(inputs), _attached_parameters(bsdfs))
+    if maps is None or plan.kind != "single":
+        return light
+    radius = samples.radius_towards(seen.p_world)
+    return light * penumbra_visibility(maps.single, mi.UInt32(plan.first), radius, seen.p_world, seen.n_world, seen.active)
 
 
 def _attached_parameters(bsdfs: Sequence[Any]) -> list[Any]:

@@ -79,6 +79,11 @@ def test_derivative_image_of_one_sample_per_pixel(variant: str, case: str, param
     assert_agrees_with_differences(model(variant, case, 1), parameter)
 
 
+@pytest.mark.parametrize(("case", "parameter"), [("standing_box", "caster_translation"), ("crossing_meshes", "caster_scale")])
+def test_derivative_image_with_default_maps(variant: str, case: str, parameter: str) -> None:
+    assert_agrees_with_differences(model(variant, case, 16, shadow_map_resolution=256), parameter)
+
+
 @pytest.mark.parametrize(
     ("case", "parameter", "options", "spp"),
     [

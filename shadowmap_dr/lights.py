@@ -110,11 +110,16 @@ class SquareSpot:
 
 @dataclass(frozen=True)
 class AreaLight:
-    """A shape that shines from its outer side. ``shape``: its index; ``emitter``: Mitsuba's ``area``; ``scale``: of radiance."""
+    """A shape that shines from its outer side.
+
+    ``shape``: its index; ``emitter``: Mitsuba's ``area``; ``textured``: whether its radiance varies over the shape (static);
+    ``scale``: factor of radiance.
+    """
 
     name: str
     shape: int
     emitter: Any
+    textured: bool = False
     scale: Any = 1.0
 
     def radiance(self, uv: Any) -> Any:
@@ -176,7 +181,9 @@ def area_lights_of(scene: Any, shapes: Sequence[Any]) -> tuple[AreaLight, ...]:
         if emitter.class_name() == "AreaLight":
             shape = emitter.get_shape()
             index = next(k for k, other in enumerate(shapes) if other is shape or other == shape)
-            found.append(AreaLight(emitter.id() or f"light_{i}", index, emitter))
+            textures = [part for _, part in children(emitter) if isinstance(part, mi.Texture)]
+            textured = any(texture.is_spatially_varying() for texture in textures)
+            found.append(AreaLight(emitter.id() or f"light_{i}", index, emitter, textured))
     return tuple(found)
 
 

@@ -231,8 +231,8 @@ class Renderer:
         normals, sharpness = normals_at(geometry, hits), None
         if self.flat is not None:
             normals, sharpness = soften_facets(hits, normals, self.topology, facets)
-        # Emitters are asked for the radiance of points, which may depend on texture coordinates.
-        frames = self.data.needs_frames or self.settings.ambient > 0 or bool(lighting.areas)
+        textured = any(light.textured for light in lighting.areas)
+        frames = self.data.needs_frames or self.settings.ambient > 0 or textured
         seen = surface_at(self.data, geometry, sensor, hits, *normals, frames=frames)
         lights = lighting.lights
         visible = [self._visibility(lighting.maps, light, k, seen, view, hits.depth) for k, light in enumerate(lights)]

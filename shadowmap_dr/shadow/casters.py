@@ -81,7 +81,7 @@ def casting_shapes(views: Views, planes: tuple[Any, Any], planar: Any, boxes: Bo
 def _reach(normal: Any, point: Any, boxes: Boxes) -> Any:
     """How far the boxes of the other shapes reach on either side of each shape's plane (``Float``, 2 S).
 
-    The first tenth does not count: something that stands on the floor may sink in a little, and shall not change the maps by that.
+    The first tenth does not count: something that stands on the floor may sink in a little, which shall not change the maps.
     """
     module, shapes = backend(boxes.low), boxes.count
     pair = dr.arange(module.UInt32, shapes * shapes)

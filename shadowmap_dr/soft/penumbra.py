@@ -13,9 +13,11 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..shadow import ShadowMaps, chebyshev_visibility
+from ..records import attached_arrays, with_arrays
+from ..shadow import Frusta, ShadowMaps, Views, chebyshev_visibility
 from ..shadow.camera import of_map, to_light_space
 from ..shadow.shadow_map import FAR, block_means
+from .sums import sum_over
 
 # Places that are looked at for occluders, and again for visibility.
 _TAPS = 16
@@ -77,56 +79,85 @@ def penumbra_visibility(pyramid: Pyramid, which: Any, radius: Any, p_world: Any,
     a point does not hide it. In 0..1; 1 for points that are not ``active``. Attached to points, casters, light and radius, but
     not to the tangent plane, nor through the level of the pyramid.
     """
-    maps = pyramid.maps
-    count = maps.views.count
-    view, frustum = of_map(maps.views, which, count), of_map(maps.frusta, which, count)
-    p = to_light_space(view, p_world)
-    active = mi.Bool(active) & (p.z > 1e-6 * frustum.far)
-    z = dr.select(active, p.z, 1)
-    x = 0.5 + 0.5 * (p.x / z - frustum.center_x) / frustum.half_x
-    y = 0.5 + 0.5 * (p.y / z - frustum.center_y) / frustum.half_y
-    depth_range = frustum.far - frustum.first
-    plane = [dr.detach(dr.dot(mi.Vector3f(n_world), axis)) for axis in (view.right, view.up, view.forward)]
-    facing = dr.detach(p.x / z * plane[0] + p.y / z * plane[1] + plane[2])
+    inputs = (pyramid, radius, mi.Point3f(p_world))
+    arrays, start = attached_arrays(inputs), dr.zeros(mi.Vector2f, dr.width(p_world))
 
-    def depth_at(dx: Any, dy: Any) -> Any:
-        """Linear depth of the point's tangent plane at a place (dx, dy) away from it in the map."""
-        tilt = (dx * frustum.half_x * plane[0] + dy * frustum.half_y * plane[1]) * 2
-        # Planes seen edge-on run away to infinity: as far as half the distance is far enough.
-        ratio = dr.clip(dr.detach(tilt) / dr.select(facing == 0, 1, facing), -0.5, 0.5)
-        linear = (z / (1 + ratio) - frustum.first) / depth_range - 0.5
-        return dr.select(linear > FAR, FAR, linear)
-
-    def footprint(z_occluder: Any) -> tuple[Any, Any]:
-        """Where rays from the point to the rim of the light pass a depth: half-axes in units of the map."""
-        slope = radius * dr.maximum(z - z_occluder, 0) / (z * z_occluder)
-        return tuple(dr.minimum(0.5 * slope / half, _WIDEST) for half in (frustum.half_x, frustum.half_y))
-
-    nearest = dr.maximum(frustum.first, frustum.near)
-    search = [dr.detach(r) for r in footprint(nearest)]
-    blocked, blocker = mi.Float(0), mi.Float(0)
-    for dx, dy, moments in _taps(pyramid, which, x, y, *search):
-        depth = depth_at(dx, dy)
+    def occluders(index: Any, arrays: list[Any]) -> Any:
+        pyramid, radius, p_world = with_arrays(inputs, arrays)
+        at = _Place.of(pyramid, which, p_world, n_world, active)
+        moments, depth = at.look_up(pyramid, which, index, at.footprint(radius, at.nearest), attached=False)
         lit = chebyshev_visibility(moments, depth)
-        dark = moments.x < depth
-        blocked += dr.select(dark, 1 - lit, 0)
-        blocker += dr.select(dark, moments.x - lit * depth, 0)
+        return dr.select(moments.x < depth, mi.Vector2f(1 - lit, moments.x - lit * depth), 0)
+
+    blocked, depths = sum_over(occluders, _TAPS, start, arrays, [])
     some = blocked > 1e-4
-    mean = dr.select(some, blocker / dr.select(some, blocked, 1), -0.5)
-    z_blocker = dr.maximum((mean + 0.5) * depth_range + frustum.first, nearest)
-    total = mi.Float(0)
-    for dx, dy, moments in _taps(pyramid, which, x, y, *footprint(z_blocker)):
-        total += chebyshev_visibility(moments, depth_at(dx, dy))
-    return dr.select(active & some, total * (1 / _TAPS), 1)
+    mean = dr.select(some, depths / dr.select(some, blocked, 1), -0.5)
+    dr.eval(mean, some)
+    found = (*inputs, mean)
+
+    def passing(index: Any, arrays: list[Any]) -> Any:
+        pyramid, radius, p_world, mean = with_arrays(found, arrays)
+        at = _Place.of(pyramid, which, p_world, n_world, active)
+        nearer = at.frustum.first + (mean + 0.5) * (at.frustum.far - at.frustum.first)
+        moments, depth = at.look_up(pyramid, which, index, at.footprint(radius, dr.maximum(nearer, at.nearest)))
+        return mi.Vector2f(chebyshev_visibility(moments, depth), 0)
+
+    total, _ = sum_over(passing, _TAPS, start, attached_arrays(found), [])
+    return dr.select(mi.Bool(active) & some, total * (1 / _TAPS), 1)
 
 
-def _taps(pyramid: Pyramid, which: Any, x: Any, y: Any, rx: Any, ry: Any) -> Any:
-    """(offset, offset, moments) at places all over an ellipse around (x, y)."""
-    size = pyramid.maps.settings.resolution
-    # Each place stands for its share of the ellipse.
-    texels = dr.detach(dr.maximum(rx, ry)) * size * math.sqrt(math.pi / _TAPS)
-    level = mi.UInt32(dr.clip(dr.log2(dr.maximum(texels, 1)) + 0.5, 0, pyramid.levels - 1))
-    for k in range(_TAPS):
-        r, angle = math.sqrt((k + 0.5) / _TAPS), k * math.pi * (3 - math.sqrt(5))
-        dx, dy = rx * (r * math.cos(angle)), ry * (r * math.sin(angle))
-        yield dx, dy, pyramid.look_up(which, x + dx, y + dy, level)
+@dataclass(frozen=True)
+class _Place:
+    """Where points lie in their maps: (x, y) in 0..1, distance z along the light's axis, and the tilt of their tangent planes."""
+
+    view: Views
+    frustum: Frusta
+    x: Any
+    y: Any
+    z: Any
+    plane: tuple[Any, Any]
+
+    @classmethod
+    def of(cls, pyramid: Pyramid, which: Any, p_world: Any, n_world: Any, active: Any) -> _Place:
+        maps = pyramid.maps
+        count = maps.views.count
+        view, frustum = of_map(maps.views, which, count), of_map(maps.frusta, which, count)
+        p = to_light_space(view, p_world)
+        z = dr.select(mi.Bool(active) & (p.z > 1e-6 * frustum.far), p.z, 1)
+        sx, sy = p.x / z, p.y / z
+        with dr.suspend_grad():
+            n = [dr.dot(mi.Vector3f(dr.detach(n_world)), dr.detach(axis)) for axis in (view.right, view.up, view.forward)]
+            facing = dr.detach(sx) * n[0] + dr.detach(sy) * n[1] + n[2]
+            facing = dr.select(facing == 0, 1, facing)
+            plane = (2 * frustum.half_x * n[0] / facing, 2 * frustum.half_y * n[1] / facing)
+        x = 0.5 + 0.5 * (sx - frustum.center_x) / frustum.half_x
+        y = 0.5 + 0.5 * (sy - frustum.center_y) / frustum.half_y
+        return cls(view, frustum, x, y, z, plane)
+
+    @property
+    def nearest(self) -> Any:
+        """Distance at which occluders are looked for."""
+        return dr.maximum(self.frustum.first, self.frustum.near)
+
+    def footprint(self, radius: Any, z_occluder: Any) -> tuple[Any, Any]:
+        """Where rays from the point to the rim of the light pass a distance: half-axes in units of the map."""
+        slope = radius * dr.maximum(self.z - z_occluder, 0) / (self.z * z_occluder)
+        return tuple(dr.minimum(0.5 * slope / half, _WIDEST) for half in (self.frustum.half_x, self.frustum.half_y))
+
+    def look_up(
+        self, pyramid: Pyramid, which: Any, tap: Any, radii: tuple[Any, Any], attached: bool = True
+    ) -> tuple[Any, Any]:
+        """(moments at one of the places all over an ellipse around the point, depth of the point's tangent plane there)."""
+        rx, ry = radii if attached else (dr.detach(r) for r in radii)
+        # Each place stands for its share of the ellipse.
+        texels = dr.detach(dr.maximum(rx, ry)) * (pyramid.maps.settings.resolution * math.sqrt(math.pi / _TAPS))
+        level = mi.UInt32(dr.clip(dr.log2(dr.maximum(texels, 1)) + 0.5, 0, pyramid.levels - 1))
+        number = mi.Float(tap)
+        sine, cosine = dr.sincos(number * (math.pi * (3 - math.sqrt(5))))
+        r = dr.sqrt((number + 0.5) * (1 / _TAPS))
+        dx, dy = rx * (r * cosine), ry * (r * sine)
+        # Planes seen edge-on run away to infinity: as far as half the distance is far enough.
+        ratio = dr.clip(dr.detach(dx) * self.plane[0] + dr.detach(dy) * self.plane[1], -0.5, 0.5)
+        f = self.frustum
+        depth = (self.z / (1 + ratio) - f.first) / (f.far - f.first) - 0.5
+        return pyramid.look_up(which, self.x + dx, self.y + dy, level), dr.select(depth > FAR, FAR, depth)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
@@ -15,6 +15,7 @@ from ..traversal import parameters
 from .maps import SoftMaps, SoftPlan, map_of
 from .penumbra import penumbra_visibility
 from .samples import LightSamples
+from .sums import sum_over
 
 
 def soft_light(
@@ -46,7 +47,8 @@ def soft_light(
             value *= visibility(maps, map_of(plan, table, index, seen.p_world), seen.p_world, active)
         return dr.select(active, value, 0)
 
-    light = sum_over(one_sample, samples.count, dr.width(seen.shape), attached_arrays(inputs), _attached_parameters(bsdfs))
+    start = dr.zeros(mi.UnpolarizedSpectrum, dr.width(seen.shape))
+    light = sum_over(one_sample, samples.count, start, attached_arrays(inputs), _attached_parameters(bsdfs))
     if maps is None or plan.kind != "single":
         return light
     radius = samples.radius_towards(seen.p_world)
@@ -59,70 +61,3 @@ def _attached_parameters(bsdfs: Sequence[Any]) -> list[Any]:
     for bsdf in dict.fromkeys(bsdfs):
         found += [v for v in parameters(bsdf).values() if dr.is_array_v(v) and dr.is_float_v(v) and dr.grad_enabled(v)]
     return found
-
-
-def sum_over(term: Callable[[Any, list[Any]], Any], count: int, lanes: int, arrays: list[Any], implicit: list[Any]) -> Any:
-    """Sum of ``term(index, arrays)`` (colour, one entry a lane) over the indices below ``count``.
-
-    Terms are worked out once more for derivatives, instead of being kept. Gradients flow to ``arrays``, which ``term`` must take
-    from its argument, and to ``implicit``, which it reaches by itself.
-    """
-    if not arrays and not implicit:
-        return _loop(lambda index: term(index, arrays), count, lanes)
-    return dr.custom(_Sum, arrays, implicit, term, count, lanes)
-
-
-def _loop(term: Callable[[Any], Any], count: int, lanes: int, label: str = "soft light") -> Any:
-    _, total = dr.while_loop(
-        (dr.zeros(mi.UInt32, lanes), dr.zeros(mi.UnpolarizedSpectrum, lanes)),
-        lambda index, total: index < count,
-        lambda index, total: (index + 1, total + term(index)),
-        mode="symbolic",
-        # Iterations depend on each other through the sum only: Dr.Jit's way back needs no memory then.
-        max_iterations=-1,
-        label=label,
-    )
-    return total
-
-
-class _Sum(dr.CustomOp):
-    """The loop with derivatives of its own: Dr.Jit 1.5 fails in forward mode where a loop reads what others read too."""
-
-    def eval(self, arrays: list[Any], implicit: list[Any], term: Any, count: int, lanes: int) -> Any:
-        self._arrays = arrays
-        self._call = (term, count, lanes)
-        self.add_input(implicit)
-        term_of = self._call[0]
-        return _loop(lambda index: term_of(index, arrays), count, lanes)
-
-    def forward(self) -> None:
-        term, count, lanes = self._call
-        leaves = self._leaves()
-        tangents = self.grad_in("arrays")
-        dr.eval(tangents)
-        for leaf, tangent in zip(leaves, tangents, strict=True):
-            dr.set_grad(leaf, tangent)
-
-        def change(index: Any) -> Any:
-            with dr.resume_grad():
-                value = term(index, leaves)
-                dr.forward_to(value, flags=dr.ADFlag.ClearInterior | dr.ADFlag.ClearEdges)
-            return dr.grad(value)
-
-        self.set_grad_out(_loop(change, count, lanes, "soft light, forward"))
-
-    def backward(self) -> None:
-        term, count, lanes = self._call
-        leaves = self._leaves()
-        with dr.resume_grad():
-            total = _loop(lambda index: term(index, leaves), count, lanes)
-            dr.backward_from(total * self.grad_out())
-        self.set_grad_in("arrays", [dr.grad(leaf) for leaf in leaves])
-
-    def _leaves(self) -> list[Any]:
-        leaves = [type(array)(dr.detach(array)) for array in self._arrays]
-        dr.enable_grad(leaves)
-        return leaves
-
-    def name(self) -> str:
-        return "soft light"

@@ -255,7 +255,7 @@ class Renderer:
     def _visibility(self, maps: Any, light: Light, index: int, seen: Surface, view: _View, depth: Any) -> Any:
         if maps is None:
             return mi.Float(1)
-        samples = self.settings.look_ups(view.raster.width)
+        samples = self.settings.look_ups(view.sensor.film_size[0] * view.factor)
         size = (view.raster.width, view.raster.height)
         points = footprint_points(view.sensor, size, depth, seen.p_world, seen.n_world, samples)
         total = sum(light_visibility(maps, self.plan, light, index, p, seen.active) for p in points)

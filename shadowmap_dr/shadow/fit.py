@@ -195,6 +195,8 @@ def _still_fits(views: Views, old: Frusta, new: Frusta, needed: tuple[Any, ...],
     keep |= (views.fixed > 0) & (new.half_x == old.half_x)
     # Where casters surround a light, its near plane follows from the far one alone, and need not follow it closely.
     around = (views.spread > 0) & (z0 < new.near)
-    keep &= dr.select(around, new.near >= 0.5 * old.near, dr.maximum(z0, new.near) >= old.near) & (z1 <= old.far) & (dr.maximum(receivers, new.first) >= old.first)
+    for value, bound in ((dr.maximum(z0, new.near), old.near), (dr.maximum(receivers, new.first), old.first)):
+        keep &= value >= dr.select(around, 0.5 * bound, bound)
+    keep &= z1 <= old.far
     keep &= new.far - new.first >= _KEEP_FILL * (old.far - old.first)
     return keep

@@ -167,6 +167,7 @@ class Renderer:
 
         Returns:
             ``mi.TensorXf`` (H, W, C): linear colour (1 or 3 channels, as the film), then alpha if the film has it, then the AOVs.
+            Colour and alpha have passed through the film's reconstruction filter.
             Attached to vertices, lights, cameras, and the BSDFs and textures of the scene.
         """
         geometry = self.data.geometry

@@ -159,18 +159,19 @@ def test_crop_window_that_cannot_be_shared_is_refused(variant: str) -> None:
 # ------------------------------------------------------------------------------------------------------------ derivatives
 
 
-@pytest.mark.parametrize(
-    "name, border, spp", [("gaussian", False, 1), ("gaussian", True, 4), ("lanczos", True, 1), ("tent", False, 9)]
-)
-def test_derivatives_of_a_filtered_image(variant: str, name: str, border: bool, spp: int) -> None:
-    """The ball moves; the image is cropped so that its outline and its shadow cross the borders."""
+@pytest.mark.parametrize("name, border", [("gaussian", False), ("gaussian", True), ("lanczos", True), ("tent", False)])
+def test_derivatives_of_a_filtered_image(variant: str, name: str, border: bool) -> None:
+    """The ball moves; the image is cropped so that its outline and its shadow cross the borders.
+
+    With 16 samples a pixel, since the facets of the ball's outline make differences of images with one noisy, filter or not.
+    """
     scene = small_scene(camera=filtered(name, 48, sample_border=border, **{**CROP, "crop_offset_x": 14, "crop_offset_y": 10}))
     renderer = Renderer.from_scene(scene, shadow_map_resolution=64, shadow_filter_size=5)
     base = mi.traverse(scene)["ball.vertex_positions"]
     direction = mi.Float(np.tile(np.float32([1.0, 0.5, 0.2]), dr.width(base) // 3))
 
     def image(x: Any) -> Any:
-        return renderer.render({"ball": base + x * direction}, spp=spp)
+        return renderer.render({"ball": base + x * direction}, spp=16)
 
     weights = np.random.default_rng(0).normal(size=(*image(mi.Float(0)).shape[:2], 1)).astype(np.float32)
     x = mi.Float(0.0)
@@ -185,8 +186,8 @@ def test_derivatives_of_a_filtered_image(variant: str, name: str, border: bool, 
     x = mi.Float(0.0)
     dr.enable_grad(x)
     dr.backward(dr.sum(image(x) * mi.TensorXf(weights)))
-    scale = np.abs(forward * weights).sum()
-    assert dr.grad(x)[0] == pytest.approx(np.sum(forward * weights), abs=1e-4 * scale)
+    scale = float(np.abs(forward * weights).sum())
+    assert dr.grad(x)[0] == pytest.approx(float(np.sum(forward * weights)), abs=1e-4 * scale)
 
 
 def test_filtered_step_is_recorded(variant: str) -> None:
@@ -195,22 +196,17 @@ def test_filtered_step_is_recorded(variant: str) -> None:
     renderer = Renderer.from_scene(scene, shadow_map_resolution=64)
     base = mi.Float(dr.detach(mi.traverse(scene)["ball.vertex_positions"]))
 
-    def step(x: Any, renderer: Renderer) -> tuple[Any, Any]:
+    def step(x: Any, base: Any, renderer: Renderer) -> tuple[Any, Any]:
         dr.enable_grad(x)
-        loss = dr.mean(renderer.render({"ball": base_of(renderer) + x}, spp=4) ** 2)
+        loss = dr.mean(renderer.render({"ball": base + x}, spp=4) ** 2)
         dr.backward(loss)
         return dr.detach(loss), dr.grad(x)
-
-    def base_of(renderer: Renderer) -> Any:
-        info = next(info for info in renderer.data.geometry.shapes if info.name == "ball")
-        index = dr.arange(mi.UInt32, 3 * info.vertex_count) + 3 * info.vertex_start
-        return dr.gather(mi.Float, renderer.data.geometry.positions, index)
 
     frozen = dr.freeze(step)
     for k in range(4):
         x = mi.Float(np.random.default_rng(k).normal(size=dr.width(base)) * 0.01)
-        (loss, gradient), (expected, true) = frozen(mi.Float(x), renderer), step(mi.Float(x), renderer)
-        assert loss.numpy() == pytest.approx(expected.numpy(), rel=1e-5)
+        (loss, gradient), (expected, true) = frozen(mi.Float(x), base, renderer), step(mi.Float(x), base, renderer)
+        assert np.allclose(loss.numpy().ravel(), expected.numpy().ravel(), rtol=1e-5)
         assert np.allclose(gradient.numpy(), true.numpy(), atol=1e-4 * np.abs(true.numpy()).max())
     assert frozen.n_recordings <= 2
 

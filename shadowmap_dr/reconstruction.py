@@ -188,7 +188,9 @@ class _Gathered(dr.CustomOp):
 
 def _packets(axis: _Axis) -> tuple[Any, int]:
     """Type of what is moved at once, and how many of them lie after an entry of the axis."""
-    return (mi.Vector4f, axis.after // 4) if axis.after % 4 == 0 else (mi.Float, axis.after)
+    if axis.after % 4 == 0:
+        return mi.Vector4f, axis.after // 4
+    return (mi.Vector3f, axis.after // 3) if axis.after % 3 == 0 else (mi.Float, axis.after)
 
 
 def _to_pixels(values: Any, weights: tuple[float, ...], axis: _Axis) -> Any:

@@ -73,7 +73,7 @@ def test_filtered_image_agrees_with_path_tracing(variant: str, name: str) -> Non
     assert 0.1 < edge.mean() < 0.5
     image, coarse = (render(scene, shadowmap(**SHARP), spp=spp) for spp in (64, 1))
     assert rmse(image, reference, edge) < 0.012 and rmse(image, reference, ~edge) < 0.003
-    assert rmse(coarse, reference, edge) < 0.055 and rmse(coarse, reference, ~edge) < 0.003
+    assert rmse(coarse, reference, edge) < 0.065 and rmse(coarse, reference, ~edge) < 0.003
     # A box in its place is far off, so that these bounds tell filters apart.
     box = render(small_scene(camera=camera(SIZE)), shadowmap(**SHARP), spp=64)
     assert rmse(box, reference, edge) > 2.5 * rmse(image, reference, edge)

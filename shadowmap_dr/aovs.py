@@ -39,7 +39,8 @@ def collect_aovs(
     """Channels (Float, one entry a pixel), 0 where nothing is seen; visibility is 1 there.
 
     ``depth``: distance from the camera, world units (as Mitsuba's). ``position``, ``normal``: world space, the normal is the
-    shading normal. ``shape_index``, ``prim_index``: counted from 0, -1 where nothing is seen. Not anti-aliased.
+    shading normal. ``shape_index``, ``prim_index``: counted from 0, -1 where nothing is seen. Not anti-aliased, and not passed
+    through the film's reconstruction filter.
     """
     width = dr.width(raster.triangle)
 

@@ -16,10 +16,11 @@ import mitsuba as mi
 
 from .aovs import aov_names
 from .errors import ShadowmapError
+from .film import put_into_film
 from .render_settings import RenderSettings
 from .renderer import Renderer
 from .scene import SceneData, load
-from .sensors import sensors_of
+from .sensors import sensors_of, warn_about_lens
 from .shadow import Frusta, ShadowSettings
 from .soft import SoftFrusta
 from .traversal import mesh_buffers, parameters
@@ -202,6 +203,8 @@ class SceneRenderer:
         # Each sensor goes on from its own fit. Fitting it again to the same vertices and lights keeps it bit by bit, so the
         # derivatives of a step see the frusta of its image, whatever other sensors have taken in between.
         others = [fit for fit in self.fits if fit[0] is not sensor]
+        if len(others) == len(self.fits) and not any(sensor is known for known in scene.sensors()):
+            warn_about_lens(sensor)
         known = next((fit for fit in self.fits if fit[0] is sensor), (sensor, self.renderer.frusta, self.renderer.soft_frusta))
         _, current.frusta, current.soft_frusta = known
         image = current.render(spp=spp)
@@ -303,7 +306,8 @@ def make_class() -> type:
         """Renders and differentiates with shadow maps. Parameters: :class:`Options`.
 
         ``spp`` not given (0) means one anti-aliased sample for each pixel; otherwise a grid of ``ceil(sqrt(spp)) ** 2``, at most
-        16 x 16. The scene's sampler and the film's reconstruction filter are not used, and ``seed`` changes nothing.
+        16 x 16. The film's reconstruction filter and ``sample_border`` are heeded (not for the further channels of ``aovs``); the
+        scene's sampler is not used, and ``seed`` changes nothing.
         """
 
         def __init__(self, props: Any) -> None:
@@ -348,21 +352,6 @@ def make_class() -> type:
             return f"ShadowMapIntegrator[{', '.join(f'{k}={v!r}' for k, v in vars(self.shell.options).items())}]"
 
     return ShadowMapIntegrator
-
-
-def put_into_film(film: Any, image: Any, aovs: list[str]) -> None:
-    """Make ``film.develop()``, ``film.bitmap()`` and ``film.write()`` give this image (detached)."""
-    film.prepare(aovs)
-    base = film.base_channels_count()
-    alpha = base in (2, 4)
-    colour = [image[..., k : k + 1] for k in range(base - alpha)]
-    # A film stores three colours, even if it is to give luminance, then alpha, then the weight that it divides by.
-    planes = colour * 3 if len(colour) == 1 else colour
-    planes += [image[..., base - 1 : base]] if alpha else []
-    planes += [dr.ones(mi.TensorXf, (*image.shape[:2], 1))]
-    planes += [image[..., base:]] if image.shape[2] > base else []
-    block = mi.ImageBlock(dr.concat(planes, axis=2), offset=film.crop_offset(), rfilter=None, border=False)
-    film.put_block(block)
 
 
 def register(old: str | None = None, new: str | None = None) -> None:

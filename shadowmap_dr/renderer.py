@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -14,11 +13,12 @@ from .aovs import collect_aovs
 from .camera_pass import camera_clip, footprint_points, seen_points, within_far_plane
 from .errors import ShadowmapError
 from .facets import crease_edges, flat_faces, mean_normals, soften_facets
+from .film import develop, sample_grid, sample_windows
 from .geometry import Geometry
 from .hits import pixel_hits
 from .light_maps import MapPlan, light_visibility, make_maps, plan_maps
 from .lights import AreaLight, Light, SpotLight, SquareSpot
-from .raster import MAX_RESOLUTION, RasterOutput, Topology, antialias, build_topology, visible_triangles
+from .raster import RasterOutput, Topology, antialias, build_topology, visible_triangles
 from .render_settings import RenderSettings
 from .scene import SceneData, load, refresh
 from .sensors import Sensor
@@ -146,6 +146,7 @@ class Renderer:
 
         Returns:
             ``mi.TensorXf`` (H, W, C): linear colour (1 or 3 channels, as the film), then alpha if the film has it, then the AOVs.
+            Colour and alpha have passed through the film's reconstruction filter.
             Attached to vertices, lights, cameras, and the BSDFs and textures of the scene.
         """
         geometry = self.data.geometry
@@ -154,11 +155,12 @@ class Renderer:
         geometry = geometry.in_packets()
         # Before all else that is attached: derivatives are taken in the reverse order, and pixels should need one pass only.
         facets = None if self.flat is None else mean_normals(geometry, self.topology, self.flat)
-        cameras = self._sensors(sensor)
-        views = [self._view(camera, geometry, _grid(spp, camera)) for camera in cameras]
+        windows = sample_windows(self._sensors(sensor))
+        factor = sample_grid(spp, windows)
+        views = [self._view(window, geometry, factor) for window in windows]
         lighting = self._lighting(views, geometry, lights)
-        images = [self._camera_image(view, geometry, lighting, facets) for view in views]
-        return images[0] if len(images) == 1 else _side_by_side(images)
+        pictures = [self._camera_image(view, geometry, lighting, facets) for view in views]
+        return develop(pictures, windows[0], factor)
 
     def light(self, name: str) -> Light | AreaLight:
         """Record of a light of the scene."""
@@ -224,7 +226,7 @@ class Renderer:
         return _View(sensor, factor, clip, raster)
 
     def _camera_image(self, view: _View, geometry: Geometry, lighting: _Lighting, facets: Any) -> Any:
-        sensor, raster, factor = view.sensor, view.raster, view.factor
+        sensor, raster = view.sensor, view.raster
         height, width = raster.height, raster.width
         hits = pixel_hits(geometry, sensor, raster.triangle, (width, height))
         hits = replace(hits, active=hits.active & within_far_plane(sensor, hits.depth))
@@ -250,12 +252,12 @@ class Renderer:
             image = mi.TensorXf(_interleave(channels), shape=(height, width, len(channels)))
         if named:
             image = dr.concat([image, mi.TensorXf(_interleave(named), shape=(height, width, len(named)))], axis=2)
-        return _downsample(image, factor) if factor > 1 else image
+        return image
 
     def _visibility(self, maps: Any, light: Light, index: int, seen: Surface, view: _View, depth: Any) -> Any:
         if maps is None:
             return mi.Float(1)
-        samples = self.settings.look_ups(view.sensor.film_size[0] * view.factor)
+        samples = self.settings.look_ups(view.columns)
         size = (view.raster.width, view.raster.height)
         points = footprint_points(view.sensor, size, depth, seen.p_world, seen.n_world, samples)
         total = sum(light_visibility(maps, self.plan, light, index, p, seen.active) for p in points)
@@ -303,12 +305,10 @@ class _View:
     clip: Any
     raster: RasterOutput
 
-
-def _grid(spp: int, sensor: Sensor) -> int:
-    """Samples along each side of a pixel: at most 16, and as many as the rasterizer's largest image has room for."""
-    if spp < 1:
-        raise ShadowmapError(f"spp is {spp}: give at least 1 sample per pixel.")
-    return max(1, min(math.isqrt(math.ceil(spp) - 1) + 1, 16, MAX_RESOLUTION // max(sensor.width, sensor.height)))
+    @property
+    def columns(self) -> int:
+        """Samples across the picture, without those beyond its borders."""
+        return self.raster.width - 2 * self.sensor.border * self.factor
 
 
 @dataclass(frozen=True)
@@ -345,21 +345,3 @@ def _interleave(channels: list[Any]) -> Any:
     for k, channel in enumerate(channels):
         dr.scatter(result, channel, index + k)
     return result
-
-
-def _downsample(image: Any, factor: int) -> Any:
-    """Average factor x factor blocks."""
-    height, width, channels = image.shape[0] // factor, image.shape[1] // factor, image.shape[2]
-    index = dr.arange(mi.UInt32, height * width * channels)
-    pixel, channel = index // channels, index % channels
-    row, column = pixel // width, pixel % width
-    total = dr.zeros(mi.Float, height * width * channels)
-    for j in range(factor):
-        for i in range(factor):
-            source = ((row * factor + j) * (width * factor) + column * factor + i) * channels + channel
-            total += dr.gather(mi.Float, image.array, source)
-    return mi.TensorXf(total * (1 / factor**2), shape=(height, width, channels))
-
-
-def _side_by_side(images: list[Any]) -> Any:
-    return dr.concat(images, axis=1)

@@ -19,7 +19,7 @@ from . import tessellate
 from .errors import ShadowmapError
 from .geometry import Geometry, ShapeInfo, pack_face_info
 from .lights import AreaLight, Environment, Light, area_lights_of, environments_of, lights_of
-from .sensors import Sensor, sensors_of
+from .sensors import Sensor, sensors_of, warn_about_lens
 from .traversal import children, mesh_buffers, parameters
 
 _ANALYTIC = {"Sphere": tessellate.sphere, "Disk": tessellate.disk, "Cylinder": tessellate.cylinder}
@@ -125,6 +125,8 @@ def load(scene: Any, *, tessellation: int = 64) -> SceneData:
         needs_frames=not all(_is_plain(source.shape.bsdf()) for source in sources),
     )
     data = refresh(data)
+    for sensor in scene.sensors():
+        warn_about_lens(sensor)
     return replace(data, geometry=replace(data.geometry, as_loaded=True))
 
 

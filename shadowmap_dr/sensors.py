@@ -7,13 +7,15 @@ topmost row of Mitsuba's film, at y = -w.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+import warnings
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from .errors import ShadowmapError
+from .reconstruction import Filter
 from .spread import spread
 from .traversal import children, parameters
 
@@ -22,6 +24,10 @@ _KINDS = {
     "ThinLensCamera": "perspective",
     "OrthographicCamera": "orthographic",
 }
+
+
+# Mitsuba makes something of about this size of an aperture of zero.
+_PINHOLE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -34,8 +40,11 @@ class Sensor:
     near, far        Float, clip distances along the viewing direction
     film_size, crop_size, crop_offset   pixels
     channels         colour channels that the film holds: 1 (luminance) or 3; ``alpha`` says whether one more holds coverage
-    filter, filter_radius   class name and radius in pixels of the film's reconstruction filter
+    filter           the film's reconstruction filter
+    sample_border    whether samples beyond the window contribute to its outermost pixels, as the film's parameter says
     film_column      leftmost column of this camera's picture in its film (batch sensors put several side by side)
+    pixel_aspect     width of a pixel for a height of 1; other than 1 where a batch sensor has a crop window, into which Mitsuba
+                     squeezes all that its cameras see
 
     Gradients flow from ``view_projection``, ``origin``, ``direction`` and ``wi_world`` to to_world, x_fov and principal_point.
     """
@@ -52,9 +61,10 @@ class Sensor:
     crop_offset: tuple[int, int]
     channels: int
     alpha: bool
-    filter: str
-    filter_radius: float
+    filter: Filter
+    sample_border: bool = False
     film_column: int = 0
+    pixel_aspect: float = 1.0
 
     @property
     def width(self) -> int:
@@ -65,6 +75,11 @@ class Sensor:
     def height(self) -> int:
         """Rows of the picture (the crop window)."""
         return self.crop_size[1]
+
+    @property
+    def border(self) -> int:
+        """Pixels on each side of the picture that are sampled for the filter's sake."""
+        return self.filter.border if self.sample_border else 0
 
     @property
     def origin(self) -> Any:
@@ -89,7 +104,7 @@ class Sensor:
         (film_w, film_h), (crop_w, crop_h), (crop_x, crop_y) = self.film_size, self.crop_size, self.crop_offset
         # Position in the crop window in [0, 1] = (position in the film - crop offset) * film size / crop size.
         zoom = (film_w / crop_w, film_h / crop_h)
-        aspect = film_w / film_h
+        aspect = self.pixel_aspect * film_w / film_h
         if self.kind == "perspective":
             scale = dr.rcp(dr.tan(mi.Float(self.x_fov) * (0.5 * math.pi / 180.0)))
         else:
@@ -173,19 +188,48 @@ class Sensor:
             return mi.Point3f(fixed), varying, pixel
         return mi.Point3f(varying), fixed, pixel
 
+
+def warn_about_lens(sensor: Any) -> None:
+    """Warn (``UserWarning``) that a ``mi.Sensor``, or a camera in a batch sensor, has an aperture, which is ignored."""
+    if dr.flag(dr.JitFlag.FreezingScope):
+        return  # the aperture cannot be read now
+    for camera in (sensor, *_cameras_of(sensor)):
+        if camera.class_name() != "ThinLensCamera":
+            continue
+        aperture = float(dr.detach(mi.Float(parameters(camera)["aperture_radius"]))[0])
+        if aperture > _PINHOLE:
+            warnings.warn(
+                f"Sensor '{camera.id()}' is a thin lens with an aperture_radius of {aperture:g}: it is treated as a pinhole, "
+                "and everything is in focus.",
+                stacklevel=3,
+            )
+
+
+def _cameras_of(batch: Any) -> list[Any]:
+    return [child for _, child in children(batch) if isinstance(child, mi.Sensor)]
+
+
 def sensors_of(sensor: Any) -> tuple[Sensor, ...]:
     """Records of a ``mi.Sensor``: one, or for a batch sensor one for each camera in it, left to right."""
     kind = sensor.class_name()
     if kind == "BatchSensor":
-        film = sensor.film()
-        if tuple(film.crop_size()) != tuple(film.size()):
+        cameras, film = _cameras_of(sensor), sensor.film()
+        columns = int(film.crop_size()[0])
+        if columns % len(cameras):
             raise ShadowmapError(
-                f"Batch sensor '{sensor.id()}' has a film with a crop window, which is not supported: remove the crop."
+                f"The crop window of batch sensor '{sensor.id()}' has {columns} columns for {len(cameras)} cameras: "
+                "choose a multiple of them."
             )
-        cameras = [child for _, child in children(sensor) if isinstance(child, mi.Sensor)]
-        column = film.size()[0] // len(cameras)
-        return tuple(_sensor_of(camera, film, i * column) for i, camera in enumerate(cameras))
+        share = (columns // len(cameras), int(film.crop_size()[1]))
+        return tuple(_squeezed(_sensor_of(camera, film, i * share[0]), share) for i, camera in enumerate(cameras))
     return (_sensor_of(sensor, sensor.film(), 0),)
+
+
+def _squeezed(camera: Sensor, size: tuple[int, int]) -> Sensor:
+    """A camera that shows all it sees on other pixels: what a batch sensor's crop window does to its cameras in Mitsuba."""
+    (width, height) = camera.film_size
+    aspect = (width * size[1]) / (height * size[0])
+    return replace(camera, film_size=size, crop_size=size, crop_offset=(0, 0), pixel_aspect=aspect)
 
 
 def _sensor_of(sensor: Any, film: Any, film_column: int) -> Sensor:
@@ -217,7 +261,7 @@ def _sensor_of(sensor: Any, film: Any, film_column: int) -> Sensor:
         crop_offset=tuple(int(n) for n in window.crop_offset()),
         channels=int(film.base_channels_count()) - alpha,
         alpha=alpha,
-        filter=film.rfilter().class_name(),
-        filter_radius=float(film.rfilter().radius()),
+        filter=Filter.read(film, sensor.id()),
+        sample_border=bool(film.sample_border()),
         film_column=film_column,
     )

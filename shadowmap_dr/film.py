@@ -1,0 +1,100 @@
+"""Films: the window of samples that a picture needs, the picture made of them, and Mitsuba's film that is to hold it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from .errors import ShadowmapError
+from .raster import MAX_RESOLUTION
+from .reconstruction import reconstruct
+from .sensors import Sensor
+
+
+def sample_windows(cameras: Sequence[Sensor]) -> tuple[Sensor, ...]:
+    """Cameras whose windows include what a film samples beyond its border (``sample_border``).
+
+    Cameras of one film lie side by side: the first one gets a border on its left, the last one on its right.
+    """
+    border = cameras[0].border
+    if border == 0:
+        return tuple(cameras)
+    windows = []
+    for k, camera in enumerate(cameras):
+        left, right = border * (k == 0), border * (k == len(cameras) - 1)
+        width, height = camera.crop_size
+        x, y = camera.crop_offset
+        size = (width + left + right, height + 2 * border)
+        windows.append(replace(camera, crop_size=size, crop_offset=(x - left, y - border)))
+    return tuple(windows)
+
+
+def sample_grid(spp: int, windows: Sequence[Sensor]) -> int:
+    """Samples along each side of a pixel: at most 16, and as many as the rasterizer's largest image has room for."""
+    if spp < 1:
+        raise ShadowmapError(f"spp is {spp}: give at least 1 sample per pixel.")
+    longest = max(max(window.width, window.height) for window in windows)
+    return max(1, min(math.isqrt(math.ceil(spp) - 1) + 1, 16, MAX_RESOLUTION // longest))
+
+
+def develop(pictures: Sequence[Any], camera: Sensor, factor: int) -> Any:
+    """Picture (``mi.TensorXf``, H, W, C) of the samples that the cameras of one film took.
+
+    Args:
+        pictures: for each camera's window (:func:`sample_windows`) a tensor (rows, columns, C) of ``factor`` x ``factor`` samples
+            for each pixel; side by side they are the film.
+        camera: any of these cameras.
+
+    The film's colours and alpha pass through its reconstruction filter, further channels are means over the samples in a pixel.
+    Gradients flow to ``pictures``.
+    """
+    if camera.filter.is_box:
+        return _side_by_side([_means(picture, factor) for picture in pictures])
+    samples = _side_by_side(pictures)
+    filtered = camera.channels + camera.alpha
+    if samples.shape[2] == filtered:
+        return reconstruct(samples, camera.filter, factor, camera.border)
+    edge = camera.border * factor
+    inner = samples[edge : samples.shape[0] - edge, edge : samples.shape[1] - edge, filtered:]
+    image = reconstruct(samples[:, :, :filtered], camera.filter, factor, camera.border)
+    return dr.concat([image, _means(inner, factor)], axis=2)
+
+
+def _side_by_side(images: Sequence[Any]) -> Any:
+    return images[0] if len(images) == 1 else dr.concat(list(images), axis=1)
+
+
+def _means(image: Any, factor: int) -> Any:
+    """Average factor x factor blocks."""
+    if factor == 1:
+        return image
+    height, width, channels = image.shape[0] // factor, image.shape[1] // factor, image.shape[2]
+    index = dr.arange(mi.UInt32, height * width * channels)
+    pixel, channel = index // channels, index % channels
+    row, column = pixel // width, pixel % width
+    total = dr.zeros(mi.Float, height * width * channels)
+    for j in range(factor):
+        for i in range(factor):
+            source = ((row * factor + j) * (width * factor) + column * factor + i) * channels + channel
+            total += dr.gather(mi.Float, image.array, source)
+    return mi.TensorXf(total * (1 / factor**2), shape=(height, width, channels))
+
+
+def put_into_film(film: Any, image: Any, aovs: list[str]) -> None:
+    """Make ``film.develop()``, ``film.bitmap()`` and ``film.write()`` give this image (detached)."""
+    film.prepare(aovs)
+    base = film.base_channels_count()
+    alpha = base in (2, 4)
+    colour = [image[..., k : k + 1] for k in range(base - alpha)]
+    # A film stores three colours, even if it is to give luminance, then alpha, then the weight that it divides by.
+    planes = colour * 3 if len(colour) == 1 else colour
+    planes += [image[..., base - 1 : base]] if alpha else []
+    planes += [dr.ones(mi.TensorXf, (*image.shape[:2], 1))]
+    planes += [image[..., base:]] if image.shape[2] > base else []
+    block = mi.ImageBlock(dr.concat(planes, axis=2), offset=film.crop_offset(), rfilter=None, border=False)
+    film.put_block(block)

@@ -307,8 +307,8 @@ class _View:
 
     @property
     def columns(self) -> int:
-        """Samples across the picture, without those beyond its borders."""
-        return self.raster.width - 2 * self.sensor.border * self.factor
+        """Samples across the camera's whole picture, whatever part of it is rendered."""
+        return self.sensor.film_size[0] * self.factor
 
 
 @dataclass(frozen=True)

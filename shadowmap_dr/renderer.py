@@ -24,7 +24,17 @@ from .scene import SceneData, load, refresh
 from .sensors import Sensor
 from .shading import Surface, ambient_light, background, direct_light, emission, normals_at, opacity, surface, surface_at
 from .shadow import Frusta, ShadowMaps, ShadowSettings
-from .soft import LightSamples, SoftFrusta, SoftMaps, SoftPlan, make_soft_maps, plan_soft, samples_of, soft_light
+from .soft import (
+    LightSamples,
+    SoftFrusta,
+    SoftMaps,
+    SoftPlan,
+    check_sizes,
+    make_soft_maps,
+    plan_soft,
+    samples_of,
+    soft_light,
+)
 
 # Directions over which the light of environments is summed.
 _AMBIENT_DIRECTIONS = 16
@@ -112,6 +122,7 @@ class Renderer:
         lights = (*data.areas, *data.environments)
         single = settings.emitter_shadows == "single"
         soft = plan_soft(lights, geometry, settings.emitter_samples, settings.environment_samples, single)
+        check_sizes(soft, geometry, settings.soft_map_resolution)
         renderer = cls(data, topology, plan, settings, flat_faces(geometry, topology), creases, soft)
         # The first fit is made here, so that a step which is recorded later always starts from one.
         if data.sensors:

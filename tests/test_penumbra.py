@@ -83,3 +83,8 @@ def test_resolution_must_be_a_power_of_two(variant: str) -> None:
         shadowmap_dr.Renderer.from_scene(scene(), emitter_shadows="single", shadow_map_resolution=300)
     with pytest.raises(shadowmap_dr.ShadowmapError, match="emitter_shadows is 'one'"):
         shadowmap_dr.Renderer.from_scene(scene(), emitter_shadows="one")
+
+
+def test_too_many_maps_are_refused(variant: str) -> None:
+    with pytest.raises(shadowmap_dr.ShadowmapError, match="4096 shadow maps.*emitter_samples"):
+        shadowmap_dr.Renderer.from_scene(scene(), emitter_samples=4096, soft_map_resolution=1024)

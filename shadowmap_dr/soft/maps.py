@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..errors import ShadowmapError
 from ..geometry import Geometry
 from ..light_maps import MapPlan, boxes_of, shape_planes
 from ..lights import AreaLight, Environment
@@ -86,6 +87,17 @@ def plan_soft(
         plans.append(replace(plan, first=first[alone]))
         first[alone] += plan.maps
     return tuple(plans)
+
+
+def check_sizes(plans: Sequence[SoftPlan], geometry: Geometry, texels: int) -> None:
+    """Refuse (ShadowmapError) what would not fit into arrays: lanes are counted with 32 bits."""
+    maps = sum(plan.maps for plan in plans)
+    largest = max(geometry.vertex_count, geometry.face_count, 4 * texels * texels)
+    if maps * largest >= 2**31:
+        raise ShadowmapError(
+            f"{maps} shadow maps of extended lights, {texels} x {texels} texels of {geometry.face_count} triangles, are too many: "
+            "lower emitter_samples, environment_samples or soft_map_resolution."
+        )
 
 
 def samples_of(light: SoftLight, plan: SoftPlan, geometry: Geometry) -> LightSamples:

@@ -95,7 +95,7 @@ def check_sizes(plans: Sequence[SoftPlan], geometry: Geometry, texels: int) -> N
     largest = max(geometry.vertex_count, geometry.face_count, 4 * texels * texels)
     if maps * largest >= 2**31:
         raise ShadowmapError(
-            f"{maps} shadow maps of extended lights, {texels} x {texels} texels of {geometry.face_count} triangles, are too many: "
+            f"{maps} shadow maps of extended lights, {texels} x {texels} texels, {geometry.face_count} triangles, are too many: "
             "lower emitter_samples, environment_samples or soft_map_resolution."
         )
 

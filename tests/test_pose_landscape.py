@@ -50,6 +50,10 @@ def test_program_draws_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert lines["target"][1] < 1e-9 < lines["target"].max() and (lines["best"] <= lines["end"]).all()
     assert (tmp_path / "a.png").stat().st_size
 
+    # Without shadows the same pose makes another image, and the target is not matched.
+    without = pose_landscape.landscape(tmp_path, wanted, tmp_path / "b.png", renderer="rasterizer", count=3)
+    assert without["target"][1] > 1e-6
+
     with pytest.raises(ShadowmapError, match="no run with object spot, resolution 16, method shadows, run 7"):
         pose_landscape.landscape(tmp_path, {**wanted, "run": 7}, tmp_path / "b.png")
     monkeypatch.setattr(sys, "argv", ["pose_landscape", str(tmp_path / "nothing")])

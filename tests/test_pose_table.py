@@ -81,6 +81,11 @@ def test_mitsuba_is_compared_on_the_starts_that_both_have() -> None:
     lost = [*ours[:2], record("shadows", 2, 5.0)]  # the same median, a run fewer
     assert not pose_table.comparison(pose_table.rows(lost + theirs))[0]["met"]
     assert pose_table.comparison(pose_table.rows(ours)) == []
+    smoother = [record("shadows", run, 0.01, settings={"samples_per_pixel": 4}) for run in range(3)]
+    smooth = [record("mitsuba", run, 0.1, normals="vertex") for run in range(3)]
+    both = pose_table.comparison(pose_table.rows(ours + theirs + smoother + smooth))
+    assert [entry["case"] for entry in both] == ["seen", "four-samples"]
+    assert both[1]["ours_less_mitsuba"]["rotation_error_deg"] == pytest.approx(-0.09)
 
 
 def test_failed_runs_count_as_infinitely_far_off(tmp_path: Path) -> None:
@@ -101,7 +106,8 @@ def test_program_writes_record_table_and_plots(tmp_path: Path) -> None:
     assert {path.name for path in out.iterdir()} == {"pose.json", "pose-table.md", "pose-seen.png", "pose-shadow-only.png"}
     assert (out / "pose-table.md").read_text().strip() == done.stdout.strip()
     assert "| spot | 128 | shadows | 1 of 1 | 0.100 | 0.100 | 0.200 | 0.200 | 0.25 |" in done.stdout
-    assert "| face | spot | 128 | 1 | 1, 1 | 0.100, 0.125 | 0.200, 0.250 | yes |" in done.stdout
+    assert "| face | 1 | spot | 128 | 1 | 1, 1 | 0.100, 0.125 | 0.200, 0.250 | yes |" in done.stdout
+    assert "| spot | 128 | 1/1: 0.100, 0.200 |  |  | 1/1: 0.125, 0.250 |  | 1/1: 0.100, 0.200 |" in done.stdout
     stored = json.loads((out / "pose.json").read_text())
     assert len(stored["rows"]) == 3 and len(stored["comparison"]) == 1
 

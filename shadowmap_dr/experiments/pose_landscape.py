@@ -107,7 +107,7 @@ def plot_slices(
     left.set_yscale("log")
     left.set_title(title, fontsize=10)
     left.grid(True, alpha=0.3)
-    left.legend(fontsize=8)
+    left.legend(fontsize=8, loc="lower right")
     right.plot(rotation, "k", linewidth=1.2, label="rotation error [degrees]")
     right.plot(np.asarray(record["translation_error_curve"], np.float64), "C3", linewidth=1.2, label="offset error x 100")
     right.set_xlabel("step")
@@ -118,9 +118,12 @@ def plot_slices(
         figure.savefig(temporary, dpi=110)
 
 
-def landscape(folder: Path, wanted: Mapping[str, Any], out: Path, width_deg: float = 35.0, count: int = 71) -> dict[str, Any]:
+def landscape(
+    folder: Path, wanted: Mapping[str, Any], out: Path, *, renderer: str | None = None, width_deg: float = 35.0, count: int = 71
+) -> dict[str, Any]:
     """Draw the slices for the record of a folder in which `wanted` (object, resolution, method, run, ...) holds.
 
+    The images are those of the run's own method unless another one is named as `renderer`: Mitsuba's are slow and noisy.
     Returns angles in degrees and the slices. Raises ShadowmapError if there is no such record or no reference image.
     """
     records = report.read_json(folder / "pose.json")
@@ -131,10 +134,12 @@ def landscape(folder: Path, wanted: Mapping[str, Any], out: Path, width_deg: flo
                            normals=record.get("normals", "face"), work=folder / "objects")
     name = "reference.exr" if record["reference"] == "mitsuba" else "reference-own.exr"
     reference = io.read_image(folder / problem.folder / name)
-    method = build_method(record["method"], problem, reference)
+    renderer = renderer or record["method"]
+    method = build_method(renderer, problem, reference, record["settings"].get("samples_per_pixel", 1))
     angles = np.radians(np.linspace(-width_deg, width_deg, count))
     lines = slices(method.render, reference, angles, record["final"])
-    plot_slices(out, f"{problem.folder}, {record['method']}, run {record['run']}", angles, lines, record)
+    title = f"{problem.folder}, {record['method']}, run {record['run']}"
+    plot_slices(out, title + (f" (lines: {renderer})" if renderer != record["method"] else ""), angles, lines, record)
     return {"angles_deg": np.degrees(angles), **lines}
 
 
@@ -144,13 +149,14 @@ def main() -> None:
     parser.add_argument("--object", default="spot")
     parser.add_argument("--resolution", type=int, default=128)
     parser.add_argument("--method", choices=METHODS, default="shadows")
+    parser.add_argument("--renderer", choices=METHODS, help="whose images make the loss, if not the method's own")
     parser.add_argument("--run", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("landscape.png"), help="picture to write")
     options = parser.parse_args()
     mi.set_variant(DEFAULT_VARIANT)
     wanted = {key: getattr(options, key) for key in ("object", "resolution", "method", "run")}
     try:
-        landscape(options.folder, wanted, options.out)
+        landscape(options.folder, wanted, options.out, renderer=options.renderer)
     except ShadowmapError as error:
         sys.exit(f"error: {error}")
 

@@ -25,16 +25,29 @@ ALLOWED_DEG, ALLOWED_X100 = 0.05, 0.05
 METHODS = ("shadows", "rasterizer", "mitsuba")
 #: What is run: records with these values belong to it.
 CASES: dict[str, dict[str, Any]] = {
-    "seen": {"shadow_only": False, "reference": "mitsuba", "normals": "face"},
-    "own-reference": {"shadow_only": False, "reference": "own", "normals": "face"},
-    "shadow-only": {"shadow_only": True, "reference": "mitsuba", "normals": "face"},
-    "vertex-normals": {"shadow_only": False, "reference": "mitsuba", "normals": "vertex"},
+    "seen": {"shadow_only": False, "reference": "mitsuba", "normals": "face", "samples_per_pixel": 1},
+    "four-samples": {"shadow_only": False, "reference": "mitsuba", "normals": "face", "samples_per_pixel": 4},
+    "own-reference": {"shadow_only": False, "reference": "own", "normals": "face", "samples_per_pixel": 1},
+    "shadow-only": {"shadow_only": True, "reference": "mitsuba", "normals": "face", "samples_per_pixel": 1},
+    "vertex-normals": {"shadow_only": False, "reference": "mitsuba", "normals": "vertex", "samples_per_pixel": 1},
+    "vertex-normals-four-samples": {"shadow_only": False, "reference": "mitsuba", "normals": "vertex", "samples_per_pixel": 4},
 }
 TITLES = {
     "seen": "Object and shadow in view, path-traced reference",
-    "own-reference": "The same, reference image by our own renderer",
+    "four-samples": "The same, our own methods with four samples per pixel",
+    "own-reference": "One sample per pixel, reference image by our own renderer",
     "shadow-only": "Object out of view, path-traced reference",
     "vertex-normals": "Object and shadow in view, path-traced reference, smooth shading (vertex normals)",
+    "vertex-normals-four-samples": "The same, our own methods with four samples per pixel",
+}
+#: Columns of the summary: case, method.
+_SUMMARY = {
+    "with shadows": ("seen", "shadows"),
+    "the same, 4 samples": ("four-samples", "shadows"),
+    "without shadows": ("seen", "rasterizer"),
+    "Mitsuba": ("seen", "mitsuba"),
+    "with shadows, own reference": ("own-reference", "shadows"),
+    "with shadows, object out of view": ("shadow-only", "shadows"),
 }
 _ERRORS = ("rotation_error_deg", "translation_error_x100")
 _PER_RUN = ("run", "start", "final", *_ERRORS, "recovered")
@@ -109,6 +122,7 @@ def rows(records: Iterable[Mapping[str, Any]], timed: Iterable[Mapping[str, Any]
 
 def _row_key(record: Mapping[str, Any]) -> tuple[str, str, int, str] | None:
     values = {"normals": "face", **record}  # records from before there was a choice
+    values["samples_per_pixel"] = record["settings"].get("samples_per_pixel", 1)
     for case, wanted in CASES.items():
         if all(values[name] == value for name, value in wanted.items()):
             return case, record["object"], record["resolution"], record["method"]
@@ -121,11 +135,11 @@ def comparison(table: Sequence[Row]) -> list[dict[str, Any]]:
     The differences are those of medians, ours less Mitsuba's (degrees, 100 x offset). `met`: neither is above what is allowed,
     and no fewer runs are recovered.
     """
-    by_key = {(row.case, row.object, row.resolution, row.method): row for row in table}
+    pairs = [(ours, theirs) for ours in table for theirs in table if ours.method == "shadows" and theirs.method == "mitsuba"]
     result = []
-    for theirs in table:
-        ours = by_key.get((theirs.case, theirs.object, theirs.resolution, "shadows"))
-        if theirs.method != "mitsuba" or ours is None:
+    for ours, theirs in pairs:
+        same = {**CASES[ours.case], "samples_per_pixel": 1} == CASES[theirs.case]  # those are our own samples
+        if not same or (ours.object, ours.resolution) != (theirs.object, theirs.resolution):
             continue
         starts = [key for key in theirs.runs if key in ours.runs and theirs.runs[key]["start"] == ours.runs[key]["start"]]
         if not starts:
@@ -134,7 +148,7 @@ def comparison(table: Sequence[Row]) -> list[dict[str, Any]]:
         less = {key: pair[0] - pair[1] for key, pair in medians.items()}
         found = [ours.recovered(starts), theirs.recovered(starts)]
         result.append({
-            "case": theirs.case, "object": theirs.object, "resolution": theirs.resolution,
+            "case": ours.case, "object": theirs.object, "resolution": theirs.resolution,
             "starts": [run for _, run in starts], "medians_ours_and_mitsuba": medians, "ours_less_mitsuba": less,
             "recovered_ours_and_mitsuba": found,
             "met": less[_ERRORS[0]] <= ALLOWED_DEG and less[_ERRORS[1]] <= ALLOWED_X100 and found[0] >= found[1],
@@ -143,8 +157,9 @@ def comparison(table: Sequence[Row]) -> list[dict[str, Any]]:
 
 
 def document(table: Sequence[Row]) -> str:
-    """Markdown: the comparison with Mitsuba, then a table for each case."""
-    lines = ["# Poses found", ""]
+    """Markdown: a summary, the comparison with Mitsuba, then a table for each case."""
+    lines = ["# Poses found", "", "## Runs recovered: median rotation error [degrees], median 100 x offset error", "",
+             *_summary(table), ""]
     compared = comparison(table)
     if compared:
         lines += ["## With shadows and by Mitsuba, from the same starts", "", *_compared(compared), ""]
@@ -155,11 +170,28 @@ def document(table: Sequence[Row]) -> str:
     return "\n".join(lines)
 
 
+def _summary(table: Sequence[Row]) -> list[str]:
+    by_key = {(row.object, row.resolution, row.case, row.method): row for row in table}
+
+    def cell(key: tuple[str, int, str, str]) -> str:
+        if key not in by_key:
+            return ""
+        row = by_key[key]
+        medians = ", ".join(f"{np.median(row.errors(name)):.3f}" for name in _ERRORS)
+        return f"{row.recovered()}/{len(row.runs)}: {medians}"
+
+    problems = sorted({key[:2] for key in by_key})
+    return markdown(["object", "pixels", *_SUMMARY], (
+        [name, str(resolution), *(cell((name, resolution, *column)) for column in _SUMMARY.values())]
+        for name, resolution in problems))
+
+
 def _compared(entries: Sequence[Mapping[str, Any]]) -> list[str]:
-    columns = ["normals", "object", "pixels", "starts", "recovered: ours, Mitsuba", "median rotation [deg]: ours, Mitsuba",
-               "median 100 x offset: ours, Mitsuba", "aim"]
+    columns = ["normals", "our samples", "object", "pixels", "starts", "recovered: ours, Mitsuba",
+               "median rotation [deg]: ours, Mitsuba", "median 100 x offset: ours, Mitsuba", "aim"]
     return markdown(columns, ([
-        CASES[entry["case"]]["normals"], entry["object"], str(entry["resolution"]), str(len(entry["starts"])),
+        *(str(CASES[entry["case"]][key]) for key in ("normals", "samples_per_pixel")),
+        entry["object"], str(entry["resolution"]), str(len(entry["starts"])),
         ", ".join(map(str, entry["recovered_ours_and_mitsuba"])),
         *(", ".join(f"{value:.3f}" for value in entry["medians_ours_and_mitsuba"][key]) for key in _ERRORS),
         "yes" if entry["met"] else "NO",

@@ -30,7 +30,7 @@ _DIFFERENCE, _LONGEST = 0.01, 0.05
 
 
 def slices(
-    render: Render, reference: npt.ArrayLike, angles: npt.ArrayLike, end: npt.ArrayLike, steps: int = 4
+    render: Render, reference: npt.ArrayLike, angles: npt.ArrayLike, end: npt.ArrayLike, steps: int = 3
 ) -> dict[str, npt.NDArray[np.float64]]:
     """Loss over the rotation along three lines.
 
@@ -56,13 +56,11 @@ def slices(
     best = np.minimum(result["target"], result["end"])
     where = np.where((result["target"] <= result["end"])[:, None], lines["target"], lines["end"])
     for order in (range(len(angles)), range(len(angles) - 1, -1, -1)):
-        offset = None
+        offset = where[order[0]]
         for i in order:
-            # What served the neighbour, unless something better is known here already.
-            for candidate in [where[i]] if offset is None else [where[i], offset]:
-                found, value = _best_offset(render, reference, angles[i], candidate, steps, loss)
-                if value < best[i]:
-                    best[i], where[i] = value, found
+            found, value = _best_offset(render, reference, angles[i], offset, steps, loss)
+            if value < best[i]:
+                best[i], where[i] = value, found
             offset = where[i].copy()
     return {**result, "best": best, "best_offset": where}
 

@@ -75,6 +75,7 @@ class MitsubaPose:
         seed: Of the sampling; step i uses seeds of its own.
         shift_z: Constant offset in z on top of the pose.
         proxy: Area light to use; default: calibrated here for this scene and resolution.
+        normals: "face" or "vertex": flat or smooth shading of the object, the scene's parameter `$face_normals`.
 
     Raises:
         ShadowmapError: The reference's shape does not fit the resolution, or see `proxy.calibrate`.
@@ -92,14 +93,15 @@ class MitsubaPose:
         seed: int = 0,
         shift_z: float = 0.0,
         proxy: Proxy | None = None,
+        normals: str = "face",
     ) -> None:
         image = np.asarray(reference, np.float32)
         if image.ndim != 3 or image.shape[:2] != (resolution, resolution) or not np.isfinite(image).all():
             raise ShadowmapError(f"a reference of shape {image.shape}: give finite values of shape "
                                  f"({resolution}, {resolution}, C).")
-        self._resolution = resolution
+        self._resolution, self._normals = resolution, normals
         self.setting, self.step_size, self.betas, self.seed, self.shift_z = setting, step_size, betas, seed, shift_z
-        scene = mi.load_file(str(scene_path), optimize=False, object=str(mesh_path), resolution=resolution)
+        scene = _load(scene_path, mesh_path, resolution, normals)
         params = mi.traverse(scene)
         self._rest = mi.Float(params["object.vertex_positions"])
         params["object.vertex_positions"] = apply_pose(self._rest, dr.zeros(mi.Float, 3), shift_z)
@@ -175,8 +177,8 @@ class MitsubaPose:
         """Settings for the record: integrator, samples, proxy, optimiser."""
         return {
             "integrator": "direct_projective", **asdict(self.setting), "optimizer": "Adam", "step_size": self.step_size,
-            "betas": list(self.betas), "seed": self.seed, "meets_fair_criterion": is_fair(self.setting, self._resolution),
-            "proxy": self.proxy.record(),
+            "betas": list(self.betas), "seed": self.seed, "proxy": self.proxy.record(),
+            "meets_fair_criterion": is_fair(self.setting, self._resolution, self._normals),
         }
 
     def _place(self, pose: Any) -> None:
@@ -200,8 +202,9 @@ def pose_start(run: int, seed: int = 0) -> np.ndarray:
     return np.array([np.radians(rng.uniform(-30, 30)), x, y])
 
 
-def fair_setting(resolution: int) -> ProjectiveSetting:
-    """The stored fair setting at a resolution; where none was found, the nearest one with as many samples for the whole image.
+def fair_setting(resolution: int, normals: str = "face") -> ProjectiveSetting:
+    """The stored fair setting at a resolution, with normals "face" or "vertex"; where none was found, the one at
+    the nearest resolution, with as many samples for the whole image.
 
     Such a stand-in (`is_fair` tells) is on the cheap side: a proxy light has a size in pixels, and the smaller it is, the more
     samples miss it.
@@ -209,7 +212,7 @@ def fair_setting(resolution: int) -> ProjectiveSetting:
     Raises:
         ShadowmapError: No search is stored that found a setting.
     """
-    found, setting = _nearest(resolution)
+    found, setting = _nearest(resolution, normals)
     if found == resolution:
         return setting
     scale = (found / resolution) ** 2
@@ -217,15 +220,16 @@ def fair_setting(resolution: int) -> ProjectiveSetting:
     return replace(setting, **counts)
 
 
-def is_fair(setting: ProjectiveSetting, resolution: int) -> bool:
+def is_fair(setting: ProjectiveSetting, resolution: int, normals: str = "face") -> bool:
     """True if a stored search at this very resolution found the setting to be the cheapest one that meets the criterion."""
-    return _nearest(resolution) == (resolution, setting)
+    return _nearest(resolution, normals) == (resolution, setting)
 
 
 def find_fair_setting(
     resolution: int,
     *,
     mesh: str = "spot",
+    normals: str = "face",
     candidates: tuple[ProjectiveSetting, ...] = CANDIDATES,
     starts: int = 3,
     iterations: int = 150,
@@ -240,11 +244,11 @@ def find_fair_setting(
     one whose mean rotation error over the last 20 iterations is at most the threshold on all starts is the fair setting.
 
     Args:
-        resolution, mesh: Of the pose scene; mesh is a name or a file.
+        resolution, mesh, normals: Of the pose scene; mesh is a name or a file, normals "face" or "vertex".
         threshold_deg: Degrees.
         earlier: Record of a search that was cut short: what it measured is not measured again.
         report: Called with a line about each measurement.
-        save: Called with the record so far after each candidate.
+        save: Called with the record so far after each run and each candidate.
 
     Returns:
         A record of JSON values: `setting` (None if no candidate converged), `measurements` with the mean errors in
@@ -252,19 +256,20 @@ def find_fair_setting(
         those not tried, the proxy and the machine.
     """
     scene_path, mesh_path = assets.scene("pose"), assets.mesh(mesh)
-    scene = mi.load_file(str(scene_path), optimize=False, object=str(mesh_path), resolution=resolution)
+    scene = _load(scene_path, mesh_path, resolution, normals)
     reference, proxy = path_traced(scene, spp=512).image, calibrate(scene)
     record: dict[str, Any] = {
-        "resolution": resolution, "mesh": mesh, "starts": starts, "iterations": iterations,
+        "resolution": resolution, "mesh": mesh, "normals": normals, "starts": starts, "iterations": iterations,
         "threshold_deg": threshold_deg, "measurements": list((earlier or {}).get("measurements", [])), "untried": {},
         "proxy": proxy.record(), "mitsuba": mi.__version__, "variant": mi.variant(), "threads": dr.thread_count(),
     }
     record["setting"] = _cheapest(record["measurements"], starts, threshold_deg)
-    measured = [entry["setting"] for entry in record["measurements"]]
+    begun = [entry for entry in record["measurements"] if not _complete(entry, starts, threshold_deg)]
+    measured = [entry["setting"] for entry in record["measurements"] if entry not in begun]
     candidates = tuple(setting for setting in candidates if asdict(setting) not in measured)
 
     def method(setting: ProjectiveSetting) -> MitsubaPose:
-        return MitsubaPose(scene_path, mesh_path, resolution, setting, reference, proxy=proxy)
+        return MitsubaPose(scene_path, mesh_path, resolution, setting, reference, proxy=proxy, normals=normals)
 
     cost: dict[ProjectiveSetting, float] = {}
     for setting in candidates:
@@ -275,21 +280,30 @@ def find_fair_setting(
         report(f"{setting}: {cost[setting]:.2f} s per step")
 
     for setting in sorted(candidates, key=cost.__getitem__):
-        pose, runs = method(setting), []
-        for run in range(starts):
-            runs.append(_measure(pose, run, iterations))
+        pose = method(setting)
+        entry = next((entry for entry in begun if entry["setting"] == asdict(setting)), None)
+        if entry is None:
+            entry = {"setting": asdict(setting), "timed_seconds_per_iteration": cost[setting], "load_average": os.getloadavg()[0],
+                     "runs": []}
+            record["measurements"].append(entry)
+        runs = entry["runs"]
+        while not _complete(entry, starts, threshold_deg):
+            runs.append(_measure(pose, len(runs), iterations))
             report("{} run {run}: {mean_error_deg_last_20:.3f} degrees, {offset_x100:.2f}, "
                    "{seconds_per_iteration:.2f} s per step".format(setting, **runs[-1]))
-            if not runs[-1]["mean_error_deg_last_20"] <= threshold_deg:
-                break
-        record["measurements"].append({"setting": asdict(setting), "timed_seconds_per_iteration": cost[setting],
-                                       "load_average": os.getloadavg()[0], "runs": runs})
+            save(record)
         del record["untried"][str(setting)]
         record["setting"] = _cheapest(record["measurements"], starts, threshold_deg)
         save(record)
-        if _cheapest(record["measurements"][-1:], starts, threshold_deg):
+        if _cheapest([entry], starts, threshold_deg):
             break
     return record
+
+
+def _complete(entry: Mapping[str, Any], starts: int, threshold_deg: float) -> bool:
+    """Whether a candidate has run from all starts, or lost one, so that no more need be known."""
+    runs = entry["runs"]
+    return len(runs) >= starts or any(not run["mean_error_deg_last_20"] <= threshold_deg for run in runs)
 
 
 def _cheapest(measurements: list[dict[str, Any]], starts: int, threshold_deg: float) -> dict[str, Any] | None:
@@ -324,12 +338,21 @@ def _timed(step: Callable[[], Any]) -> float:
     return time.perf_counter() - begin
 
 
-def _nearest(resolution: int) -> tuple[int, ProjectiveSetting]:
+def _load(scene_path: str | Path, mesh_path: str | Path, resolution: int, normals: str) -> Any:
+    flat = "true" if normals == "face" else "false"
+    return mi.load_file(str(scene_path), optimize=False, object=str(mesh_path), resolution=resolution, face_normals=flat)
+
+
+def _nearest(resolution: int, normals: str) -> tuple[int, ProjectiveSetting]:
     """The resolution nearest to the given one at which a stored search found a setting, and the setting."""
     table = json.loads(STORE.read_text()) if STORE.is_file() else {}
-    found = {int(size): ProjectiveSetting(**entry["setting"]) for size, entry in table.items() if entry["setting"]}
+    found = {
+        entry["resolution"]: ProjectiveSetting(**entry["setting"]) for entry in table.values()
+        if entry["setting"] and entry.get("normals", "face") == normals
+    }
     if not found:
-        raise ShadowmapError(f"no setting is known to converge: run python -m mitsuba_baselines.pose --search {resolution}.")
+        raise ShadowmapError(f"no setting is known to converge with {normals} normals: "
+                             f"run python -m mitsuba_baselines.pose --search {resolution} --normals {normals}.")
     nearest = min(found, key=lambda size: abs(np.log2(size / resolution)))
     return nearest, found[nearest]
 
@@ -338,6 +361,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m mitsuba_baselines.pose", description="Searches fair settings.")
     parser.add_argument("--search", type=int, required=True, metavar="RESOLUTION")
     parser.add_argument("--mesh", default="spot", help="name or file")
+    parser.add_argument("--normals", choices=("face", "vertex"), default="face", help="flat or smooth shading of the object")
     parser.add_argument("--candidates", nargs="+", metavar="C/P/I[/GUIDING[/SPP]]", help="settings to try instead of the usual")
     parser.add_argument("--output", type=Path, default=STORE, help="JSON file to extend; a search in it goes on")
     options = parser.parse_args()
@@ -347,16 +371,16 @@ def main() -> None:
         candidates = tuple(ProjectiveSetting(*map(int, part[:3]), *part[3:4], *map(int, part[4:])) for part in parts)
     mi.set_variant("llvm_ad_rgb")
     table = json.loads(options.output.read_text()) if options.output.is_file() else {}
-    key = str(options.search)
+    key = str(options.search) if options.normals == "face" else f"{options.search} {options.normals} normals"
 
     def save(record: dict[str, Any]) -> None:
         temporary = options.output.with_suffix(".tmp")
         temporary.write_text(json.dumps({**table, key: record}, indent=1) + "\n")
         os.replace(temporary, options.output)
 
-    record = find_fair_setting(options.search, mesh=options.mesh, candidates=candidates, earlier=table.get(key), save=save,
-                               report=lambda line: print(line, flush=True))
-    print(f"fair setting at {options.search}: {record['setting']}")
+    record = find_fair_setting(options.search, mesh=options.mesh, normals=options.normals, candidates=candidates,
+                               earlier=table.get(key), save=save, report=lambda line: print(line, flush=True))
+    print(f"fair setting at {key}: {record['setting']}")
 
 
 if __name__ == "__main__":

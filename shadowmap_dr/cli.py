@@ -158,6 +158,10 @@ def pose(
         str, typer.Option(metavar="mitsuba|own", help="Reference image: path-traced, or made with this library.")
     ] = "mitsuba",
     shadow_only: Annotated[bool, typer.Option("--shadow-only", help="The camera sees the shadow but not the object.")] = False,
+    normals: Annotated[
+        str, typer.Option(metavar="face|vertex", help="Shade the object flat, with the normals of its faces, or smoothly.")
+    ] = "face",
+    samples: Annotated[int, typer.Option(help="Samples per pixel of our own methods.")] = 1,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("pose"),
     resume: Annotated[bool, typer.Option("--resume", help="Keep finished runs, go on with killed ones.")] = False,
     variant: Variant = DEFAULT_VARIANT,
@@ -178,6 +182,8 @@ def pose(
         iterations=iterations,
         reference=reference,
         shadow_only=shadow_only,
+        normals=normals,
+        samples=samples,
         out=out,
         resume=resume,
     )

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
+from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_baselines import proxy, reference
+from mitsuba_baselines import pose, proxy, reference
 from mitsuba_baselines.pose import MitsubaPose, ProjectiveSetting, fair_setting, is_fair, pose_start
 from shadowmap_dr import assets
 from shadowmap_dr.errors import ShadowmapError
@@ -152,3 +154,53 @@ def test_fair_setting_is_stored() -> None:
     assert (coarse.sppc, coarse.sppi) == (4 * setting.sppc, 4 * setting.sppi)
     assert (fine.sppc, fine.sppi) == (1, 1) and not is_fair(fine, 1 << 12)
     assert not is_fair(ProjectiveSetting(1, 1, 1), 128)
+
+
+def test_fair_settings_are_kept_by_kind_of_normals(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    store = tmp_path / "fair.json"
+    monkeypatch.setattr(pose, "STORE", store)
+    flat, smooth = ProjectiveSetting(4, 4, 64), ProjectiveSetting(4, 4, 16)
+    entries = {"128": {"resolution": 128, "setting": asdict(flat)}}
+    store.write_text(json.dumps(entries))
+    with pytest.raises(ShadowmapError, match="--normals vertex"):
+        fair_setting(128, "vertex")
+    entries["128 vertex normals"] = {"resolution": 128, "normals": "vertex", "setting": asdict(smooth)}
+    store.write_text(json.dumps(entries))
+    assert fair_setting(128) == flat and fair_setting(128, "vertex") == smooth
+    assert is_fair(smooth, 128, "vertex") and not is_fair(smooth, 128) and not is_fair(flat, 128, "vertex")
+
+
+def test_search_goes_on_within_a_candidate(monkeypatch: pytest.MonkeyPatch) -> None:
+    measured: list[tuple[str, int]] = []
+
+    def measure(method: MitsubaPose, run: int, iterations: int) -> dict[str, float]:
+        measured.append((str(method.setting), run))
+        lost = method.setting.sppi == 1 and run == 1
+        return {"run": run, "mean_error_deg_last_20": 5.0 if lost else 0.01, "offset_x100": 0.1, "seconds_per_iteration": 1.0}
+
+    def search(earlier: dict | None = None, stop_after: int = 99) -> tuple[dict, list[dict]]:
+        saved: list[dict] = []
+
+        def save(record: dict) -> None:
+            saved.append(json.loads(json.dumps(record)))
+            if len(saved) >= stop_after:
+                raise KeyboardInterrupt
+
+        try:
+            return pose.find_fair_setting(16, candidates=(bad, good), earlier=earlier, save=save), saved
+        except KeyboardInterrupt:
+            return {}, saved
+
+    bad, good = ProjectiveSetting(1, 1, 1, spp=1), ProjectiveSetting(1, 1, 4, spp=1)
+    monkeypatch.setattr(pose, "_measure", measure)
+    monkeypatch.setattr(pose, "_timed", lambda step: 0.1)
+    whole, _ = search()
+    assert measured == [(str(bad), 0), (str(bad), 1), (str(good), 0), (str(good), 1), (str(good), 2)]
+    assert whole["setting"]["sppi"] == 4 and not whole["untried"]
+
+    measured.clear()
+    _, saved = search(stop_after=5)  # two runs and the candidate, then two runs of the other one
+    resumed, _ = search(saved[-1])
+    assert measured == [(str(bad), 0), (str(bad), 1), (str(good), 0), (str(good), 1), (str(good), 2)]
+    assert resumed["setting"] == whole["setting"]
+    assert [len(entry["runs"]) for entry in resumed["measurements"]] == [2, 3]

@@ -28,3 +28,14 @@ def test_a_mesh_takes_the_shape_of_its_shadow(tmp_path: Path) -> None:
     assert (end != wanted).mean() < 0.3 * (start != wanted).mean()
     views = [np.asarray(Image.open(tmp_path / "out" / f"{name}.png"), np.float32) for name in ("before", "after")]
     assert views[0].shape == (384, 384, 3) and np.abs(views[0] - views[1]).mean() > 2
+
+
+def test_steps_are_timed_in_turns() -> None:
+    script = ROOT / "docs" / "examples" / "pose_speed.py"
+    command = [sys.executable, script, "--resolution", "16", "--rounds", "1"]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=ROOT)
+    assert result.returncode == 0, result.stderr
+    steps = {name: float(value) for name, value in re.findall(r"^(\w+): ([0-9.]+) ms a step", result.stdout, re.MULTILINE)}
+    assert steps.keys() == {"shadows", "rasterizer", "mitsuba"} and min(steps.values()) > 0
+    ratio = float(re.search(r"mitsuba / shadows: (\d+)x", result.stdout).group(1))
+    assert ratio == pytest.approx(steps["mitsuba"] / steps["shadows"], rel=0.02, abs=0.6)

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from fakes import BlobRenderer
 
+from mitsuba_baselines.pose import MitsubaPose, ProjectiveSetting
 from shadowmap_dr import assets
 from shadowmap_dr.errors import ShadowmapError
 from shadowmap_dr.experiments import pose, pose_scene
@@ -189,6 +190,36 @@ def test_reference_is_made_once_and_again_when_its_settings_change(tmp_path: Pat
     np.testing.assert_allclose(pose_scene.path_traced_reference(problem, path), image, atol=1e-6)
 
 
+def test_normals_are_those_of_faces_or_of_vertices(tmp_path: Path) -> None:
+    flat, smooth = (pose_scene.make_problem("spot", 48, normals=kind, work=tmp_path) for kind in ("face", "vertex"))
+    assert flat.folder != smooth.folder
+    np.testing.assert_array_equal(flat.p_rest, smooth.p_rest)
+    path = tmp_path / "reference.exr"
+    references = {problem.normals: pose_scene.path_traced_reference(problem, path) for problem in (flat, smooth)}
+    assert np.abs(references["face"] - references["vertex"]).max() > 0.02
+    setting = ProjectiveSetting(1, 1, 1)
+    for problem in (flat, smooth):
+        right, wrong = (references[kind] for kind in (("face", "vertex") if problem is flat else ("vertex", "face")))
+        ours = pose.build_method("shadows", problem, right, samples=16)
+        theirs = MitsubaPose(assets.scene("pose"), problem.mesh, 48, setting, right, normals=problem.normals)
+        for image in (ours.render(np.zeros(3)), theirs.render(np.zeros(3), spp=256)):
+            # How far the image has gone from the wrong reference to the right one: the silhouettes are the same in both.
+            share = np.vdot(image - wrong, right - wrong) / np.vdot(right - wrong, right - wrong)
+            assert 0.8 < share < 1.2, share
+
+
+def test_runs_with_other_normals_are_not_taken_for_finished(tmp_path: Path) -> None:
+    def run(**changes: Any) -> list[dict[str, Any]]:
+        run_pose(options(tmp_path, methods=("shadows",), runs=1, iterations=2, **changes), build=build)
+        return sorted(json.loads((tmp_path / "pose.json").read_text()), key=lambda record: record["normals"])
+
+    flat = run()
+    both = run(normals="vertex", resume=True)
+    assert [record["normals"] for record in both] == ["face", "vertex"] and both[0] == flat[0]
+    assert run(normals="face", resume=True) == both
+    assert pose.table(both).row_count == 2
+
+
 def test_mesh_file_is_scaled_into_the_unit_cube(tmp_path: Path) -> None:
     path = tmp_path / "box.obj"
     path.write_text("v 10 0 0\nv 14 0 0\nv 10 2 0\nv 10 0 1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n")
@@ -228,6 +259,8 @@ def test_unusable_meshes(tmp_path: Path, name: str, content: str) -> None:
         {"iterations": 0},
         {"seed": -1},
         {"reference": "photo"},
+        {"normals": "smooth"},
+        {"samples": 0},
     ],
 )
 def test_unusable_options(tmp_path: Path, changes: dict[str, Any]) -> None:
@@ -284,6 +317,18 @@ def test_only_shadows_tell_the_pose_of_an_object_out_of_view(tmp_path: Path) -> 
     assert (pose.build_method("rasterizer", problem, reference).gradient(start) == 0).all()
     gradient = pose.build_method("shadows", problem, reference).gradient(start)
     assert (np.abs(gradient) > 1e-4).all()
+
+
+def test_samples_make_the_image_of_a_fit_smoother(spot: Any) -> None:
+    problem, reference = spot
+    one, many = (pose.build_method("shadows", problem, reference, samples=samples) for samples in (1, 16))
+    errors = [np.sqrt(np.mean((method.render(np.zeros(3)) - reference) ** 2)) for method in (one, many)]
+    assert errors[1] < 0.8 * errors[0]
+    assert many.describe()["samples_per_pixel"] == 16 and "samples_per_pixel" not in one.describe()
+    # The steps see these images, too.
+    losses = [optimize(method, np.zeros(3), 1).loss[0] for method in (one, many)]
+    np.testing.assert_allclose(np.sqrt(losses), errors, rtol=1e-3)
+    assert not np.allclose(one.gradient(np.zeros(3)), many.gradient(np.zeros(3)), rtol=0.1)
 
 
 def test_own_reference_is_the_renderers_image_of_the_target(spot: Any, tmp_path: Path) -> None:

@@ -25,7 +25,15 @@ from rich.table import Table
 from .. import __version__, assets, io, report
 from ..errors import ShadowmapError
 from ..inverse import History, Method, PoseFit, optimize
-from .pose_scene import PoseProblem, ReferenceKind, make_problem, path_traced_reference, pose_errors, start_pose
+from .pose_scene import (
+    NormalKind,
+    PoseProblem,
+    ReferenceKind,
+    make_problem,
+    path_traced_reference,
+    pose_errors,
+    start_pose,
+)
 
 METHODS = ("shadows", "rasterizer", "mitsuba")
 RECOVERED_DEG, RECOVERED_X100 = 0.2, 0.3
@@ -48,6 +56,8 @@ class PoseOptions:
     iterations: int = 150
     reference: ReferenceKind = "mitsuba"
     shadow_only: bool = False
+    normals: NormalKind = "face"
+    samples: int = 1
     out: Path = Path("pose")
     resume: bool = False
 
@@ -60,24 +70,26 @@ class PoseOptions:
         for method in self.methods:
             if method not in METHODS:
                 raise ShadowmapError(f"no method {method!r}: choose from {', '.join(METHODS)}.")
-        for name, value in (("runs", self.runs), ("iterations", self.iterations)):
+        for name, value in (("runs", self.runs), ("iterations", self.iterations), ("samples per pixel", self.samples)):
             if value < 1:
                 raise ShadowmapError(f"{value} {name}: give at least 1.")
         if self.seed < 0:
             raise ShadowmapError(f"the seed {self.seed}: give 0 or more.")
         if self.reference not in ("mitsuba", "own"):
             raise ShadowmapError(f"no reference {self.reference!r}: choose mitsuba or own.")
+        if self.normals not in ("face", "vertex"):
+            raise ShadowmapError(f"no normals {self.normals!r}: choose face or vertex.")
 
 
 Builder = Callable[[str, PoseProblem, Image], Method]
 
 
-def build_method(name: str, problem: PoseProblem, reference: Image) -> Method:
-    """One of the three methods for a problem and its reference image."""
+def build_method(name: str, problem: PoseProblem, reference: Image, samples: int = 1) -> Method:
+    """One of the three methods for a problem and its reference image; our own ones with so many samples per pixel."""
     if name == "mitsuba":
         from mitsuba_baselines import pose as baseline
 
-        setting = baseline.fair_setting(problem.resolution)
+        setting = baseline.fair_setting(problem.resolution, problem.normals)
         return baseline.MitsubaPose(
             assets.scene("pose"),
             problem.mesh,
@@ -87,11 +99,14 @@ def build_method(name: str, problem: PoseProblem, reference: Image) -> Method:
             step_size=STEP_SIZE,
             betas=BETAS,
             shift_z=problem.shift_z,
+            normals=problem.normals,
         )
     from ..renderer import Renderer
 
     settings = shadow_settings(name)
     renderer = Renderer.from_scene(problem.scene, **settings)
+    if samples != 1:
+        settings["samples_per_pixel"] = samples
     return PoseFit(
         renderer,
         "object",
@@ -100,6 +115,7 @@ def build_method(name: str, problem: PoseProblem, reference: Image) -> Method:
         step_size=STEP_SIZE,
         betas=BETAS,
         shift_z=problem.shift_z,
+        spp=samples,
         settings=settings,
     )
 
@@ -122,6 +138,8 @@ def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Co
     checkpoint, at most ten iterations before the end. Returns the records of this call's runs, in the order of the file.
     """
     console = console or Console(stderr=True)
+    if build is build_method:
+        build = functools.partial(build_method, samples=options.samples)
     out = options.out
     io.check_output(out / "pose.json", (".json",))
     stored: list[dict[str, Any]] = []
@@ -131,7 +149,7 @@ def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Co
             raise ShadowmapError(f"{out / 'pose.json'} is no list of records: choose another folder.")
 
     problems = [
-        make_problem(name, resolution, shadow_only=options.shadow_only, work=out / "objects")
+        make_problem(name, resolution, shadow_only=options.shadow_only, normals=options.normals, work=out / "objects")
         for name in options.objects
         for resolution in options.resolutions
     ]
@@ -180,9 +198,10 @@ def table(records: Sequence[dict[str, Any]]) -> Table:
     for group in _groups(records):
         first = group[0]
         recovered = sum(record["recovered"] for record in group)
+        smooth = _normals(first) == "vertex"
         rows.append(
             [
-                first["object"] + (" (shadow)" if first["shadow_only"] else ""),
+                first["object"] + (" (shadow)" if first["shadow_only"] else "") + (" (smooth)" if smooth else ""),
                 str(first["resolution"]),
                 first["method"],
                 f"{recovered}/{len(group)}",
@@ -218,6 +237,7 @@ def _run_one(
             "iterations": options.iterations,
             "reference": options.reference,
             "shadow_only": problem.shadow_only,
+            "normals": problem.normals,
             "settings": {"object_digest": problem.digest, **method.describe(), **_fairness(method, problem)},
         }
     )
@@ -238,7 +258,7 @@ def _fairness(method: Method, problem: PoseProblem) -> dict[str, bool]:
         return {}
     from mitsuba_baselines.pose import is_fair
 
-    return {"fair": is_fair(setting, problem.resolution)}
+    return {"fair": is_fair(setting, problem.resolution, problem.normals)}
 
 
 def _show(progress: Progress, task: TaskID, done: int) -> None:
@@ -314,13 +334,19 @@ def _checkpoint(problem: PoseProblem, name: str, run: int, options: PoseOptions)
 
 def _key(record: dict[str, Any]) -> tuple[Any, ...]:
     """What a record is about: a newer one with the same key takes its place."""
-    return tuple(record.get(name) for name in ("object", "resolution", "method", "run", "seed", "reference", "shadow_only"))
+    names = ("object", "resolution", "method", "run", "seed", "reference", "shadow_only")
+    return (*(record.get(name) for name in names), _normals(record))
+
+
+def _normals(record: dict[str, Any]) -> str:
+    """Records from before there was a choice are of flat shading."""
+    return record.get("normals", "face")
 
 
 def _groups(records: Sequence[dict[str, Any]]) -> Iterator[list[dict[str, Any]]]:
     groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for record in records:
-        key = (record["object"], record["resolution"], record["shadow_only"], record["method"])
+        key = (record["object"], record["resolution"], record["shadow_only"], _normals(record), record["method"])
         groups.setdefault(key, []).append(record)
     yield from groups.values()
 

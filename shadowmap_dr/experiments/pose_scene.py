@@ -17,6 +17,7 @@ from .. import assets, io
 from ..errors import ShadowmapError
 
 ReferenceKind = Literal["mitsuba", "own"]
+NormalKind = Literal["face", "vertex"]
 
 REFERENCE_SPP = 512
 MAX_OFFSET = 0.25
@@ -39,6 +40,7 @@ class PoseProblem:
         p_rest: (V, 3) float32 vertex positions, in [-1, 1]^3.
         resolution: width and height of the image in pixels.
         shadow_only: the camera sees the object's shadow, but not the object.
+        normals: the object is shaded with the normals of its faces, or smoothly with those of its vertices.
         scene: Mitsuba scene with the object in its target pose, as `scenes/pose.xml` describes it.
     """
 
@@ -47,6 +49,7 @@ class PoseProblem:
     p_rest: npt.NDArray[np.float32]
     resolution: int
     shadow_only: bool
+    normals: NormalKind
     scene: Any
 
     @property
@@ -62,16 +65,19 @@ class PoseProblem:
     @property
     def folder(self) -> str:
         """Name of the folder for this problem's results."""
-        return f"{self.name}-{self.resolution}" + ("-shadow-only" if self.shadow_only else "")
+        smooth = "-vertex-normals" if self.normals == "vertex" else ""
+        return f"{self.name}-{self.resolution}" + ("-shadow-only" if self.shadow_only else "") + smooth
 
 
-def make_problem(name: str, resolution: int, *, shadow_only: bool = False, work: Path) -> PoseProblem:
+def make_problem(
+    name: str, resolution: int, *, shadow_only: bool = False, normals: NormalKind = "face", work: Path
+) -> PoseProblem:
     """Load an object and build the scene around it.
 
     Args:
         name: name of a mesh of this package, or a .ply or .obj file, which is centred and scaled into [-1, 1]^3.
         resolution: 1 to 4096 pixels.
-        shadow_only: see PoseProblem.
+        shadow_only, normals: see PoseProblem.
         work: folder for the scaled copy of a mesh file.
     """
     if not 1 <= resolution <= MAX_RESOLUTION:
@@ -79,13 +85,16 @@ def make_problem(name: str, resolution: int, *, shadow_only: bool = False, work:
     label, mesh = (name, assets.mesh(name)) if name in assets.mesh_names() else _import_mesh(assets.mesh(name), work)
     plain = _load_mesh(mesh)
     p_rest = _positions(plain)
-    problem = PoseProblem(label, mesh, p_rest, resolution, shadow_only, None)
+    problem = PoseProblem(label, mesh, p_rest, resolution, shadow_only, normals, None)
     if shadow_only:
         # A file of its own: Mitsuba's directional light learns the extent of the scene only when the scene is loaded.
         mesh = work / f"{label}-shadow-only.ply"
         _write_mesh(plain, p_rest + np.float32([0, 0, problem.shift_z]), mesh)
+    flat = "true" if normals == "face" else "false"
     try:
-        scene = mi.load_file(str(assets.scene("pose")), object=str(mesh), resolution=str(resolution), optimize=False)
+        scene = mi.load_file(
+            str(assets.scene("pose")), object=str(mesh), resolution=str(resolution), face_normals=flat, optimize=False
+        )
     except RuntimeError as error:
         raise ShadowmapError(f"cannot load the object {name}: {' '.join(str(error).split())}") from error
     return replace(problem, scene=scene)
@@ -113,6 +122,7 @@ def path_traced_reference(problem: PoseProblem, path: Path) -> npt.NDArray[np.fl
         "object": problem.digest,
         "resolution": problem.resolution,
         "shadow_only": problem.shadow_only,
+        "normals": problem.normals,
         "spp": REFERENCE_SPP,
         "mitsuba": mi.__version__,
     }

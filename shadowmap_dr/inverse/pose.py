@@ -47,6 +47,7 @@ class PoseFit:
         reference: (H, W, C) linear image.
         step_size, betas: parameters of Adam.
         shift_z: see `apply_pose`.
+        spp: samples per pixel that the renderer is asked for.
         settings: further entries for `describe`.
     """
 
@@ -60,6 +61,7 @@ class PoseFit:
         step_size: float = 0.01,
         betas: tuple[float, float] = (0.9, 0.999),
         shift_z: float = 0.0,
+        spp: int = 1,
         settings: Mapping[str, Any] | None = None,
     ) -> None:
         image = np.asarray(reference, np.float32)
@@ -70,6 +72,7 @@ class PoseFit:
         self._p_rest = mi.Float(np.asarray(p_rest, np.float32).ravel())
         self._reference = mi.TensorXf(image)
         self._step_size, self._betas, self._shift_z = step_size, betas, shift_z
+        self._spp = {} if spp == 1 else {"spp": spp}  # the default need not be known to the renderer
         self._settings = dict(settings or {})
         self._step = dr.freeze(_pose_step)
         self.reset(np.zeros(3))
@@ -80,9 +83,8 @@ class PoseFit:
 
     def step(self) -> Any:
         """One step; returns the loss before it, Float (1,), without waiting for it."""
-        return self._step(
-            self._renderer, self._optimizer, self._p_rest, self._reference, shape=self._shape, shift_z=self._shift_z
-        )
+        constants = {"shape": self._shape, "shift_z": self._shift_z, "spp": self._spp}
+        return self._step(self._renderer, self._optimizer, self._p_rest, self._reference, **constants)
 
     def parameters(self) -> Any:
         """Float (3,): rotation in radians, x, y; detached, on the device."""
@@ -94,13 +96,13 @@ class PoseFit:
         positions = apply_pose(self._p_rest, pose, self._shift_z)
         with dr.suspend_grad():
             # A copy, since a renderer keeps the fit of its shadow maps from one image to the next.
-            return np.array(copy.copy(self._renderer).render(vertex_positions={self._shape: positions}))
+            return np.array(copy.copy(self._renderer).render(vertex_positions={self._shape: positions}, **self._spp))
 
     def gradient(self, parameters: npt.ArrayLike) -> npt.NDArray[np.float32]:
         """(3,) derivative of the loss with respect to the parameters; leaves the state of the fit alone."""
         pose = mi.Float(np.asarray(parameters, np.float32))
         dr.enable_grad(pose)
-        _gradient(copy.copy(self._renderer), pose, self._p_rest, self._reference, self._shape, self._shift_z)
+        _gradient(copy.copy(self._renderer), pose, self._p_rest, self._reference, self._shape, self._shift_z, self._spp)
         return np.array(dr.grad(pose))
 
     def state(self) -> dict[str, npt.NDArray[Any]]:
@@ -137,9 +139,9 @@ class PoseFit:
         return {**self._settings, "optimizer": "Adam", "step_size": self._step_size, "betas": list(self._betas)}
 
 
-def _gradient(renderer: Any, pose: Any, p_rest: Any, reference: Any, shape: str, shift_z: float) -> Any:
+def _gradient(renderer: Any, pose: Any, p_rest: Any, reference: Any, shape: str, shift_z: float, spp: dict[str, int]) -> Any:
     """Add the derivative of the mean squared difference to the gradient of ``pose``; returns the difference, Float (1,)."""
-    image = renderer.render(vertex_positions={shape: apply_pose(p_rest, pose, shift_z)})
+    image = renderer.render(vertex_positions={shape: apply_pose(p_rest, pose, shift_z)}, **spp)
     # By hand, since the loss and its derivative then read the image together, once.
     difference = dr.detach(image.array) - reference.array
     square, slope = dr.square(difference), difference * (2 / dr.width(difference))
@@ -150,7 +152,9 @@ def _gradient(renderer: Any, pose: Any, p_rest: Any, reference: Any, shape: str,
     return dr.mean(square)
 
 
-def _pose_step(renderer: Any, optimizer: Any, p_rest: Any, reference: Any, *, shape: str, shift_z: float) -> Any:
-    loss = _gradient(renderer, optimizer["pose"], p_rest, reference, shape, shift_z)
+def _pose_step(
+    renderer: Any, optimizer: Any, p_rest: Any, reference: Any, *, shape: str, shift_z: float, spp: dict[str, int]
+) -> Any:
+    loss = _gradient(renderer, optimizer["pose"], p_rest, reference, shape, shift_z, spp)
     optimizer.step()
     return loss

@@ -1,0 +1,46 @@
+"""Time of an optimisation step with shadows, without, and with Mitsuba's projective integrator at its fair setting, in turns.
+
+    python docs/examples/pose_speed.py --normals vertex [--resolution 128] [--rounds 10]
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from pathlib import Path
+
+from shadowmap_dr.experiments.pose import METHODS, build_method
+from shadowmap_dr.experiments.pose_scene import make_problem, path_traced_reference, start_pose
+from shadowmap_dr.timing import Contender, OtherWork, alternate, compare
+
+# isort: split
+import mitsuba as mi  # after shadowmap_dr, which chooses the LLVM library
+
+parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+parser.add_argument("--object", default="spot")
+parser.add_argument("--resolution", type=int, default=128)
+parser.add_argument("--normals", choices=("face", "vertex"), default="face")
+parser.add_argument("--rounds", type=int, default=10, help="steps of Mitsuba's; ours make five times as many")
+options = parser.parse_args()
+
+mi.set_variant("llvm_ad_rgb")
+with tempfile.TemporaryDirectory() as folder:
+    problem = make_problem(options.object, options.resolution, normals=options.normals, work=Path(folder))
+    reference = path_traced_reference(problem, Path(folder) / "reference.exr")
+    contenders = {}
+    for name in METHODS:
+        method = build_method(name, problem, reference)
+        method.reset(start_pose(0, 0))
+        if name == "mitsuba":
+            print(f"Mitsuba: {method.setting}")
+            contenders[name] = Contender(method.step, options.rounds, warm_up=2, settle=0, burst=1)
+        else:
+            contenders[name] = Contender(method.step, 5 * options.rounds)
+    others = OtherWork()
+    result = compare(alternate(contenders), [("mitsuba", "shadows"), ("mitsuba", "rasterizer")])
+    for name, seconds in result["seconds"].items():
+        print(f"{name}: {1e3 * seconds['median']:.2f} ms a step (quartiles {1e3 * seconds['q1']:.2f}, {1e3 * seconds['q3']:.2f})")
+    for name, ratio in result["ratio_of_medians"].items():
+        print(f"{name}: {ratio:.0f}x")
+    cores = others.cores()
+    print("" if cores is None else f"cores that other work used meanwhile: {cores:.1f}")

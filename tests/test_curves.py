@@ -103,6 +103,14 @@ def test_topology(variant: str, kind: str, points: Any) -> None:
     assert kind == "bsplinecurve" or 0.3 < inside.mean() < 0.8
 
 
+def test_joints_do_not_show_on_a_straight_curve(variant: str) -> None:
+    source, _ = curve_source("linearcurve", STRAIGHT)
+    p, n, _ = vertices(source)
+    sides = source.plan.cap.numpy() == 0
+    assert sides.sum() > 10 and np.abs(n[sides][..., 0]).max() < 1e-6
+    assert np.linalg.norm(p[sides][..., 1:], axis=-1) == pytest.approx(0.1, rel=2e-3)
+
+
 def test_several_curves_are_not_joined(variant: str) -> None:
     blocks = [GENTLE, [(x + 3, y, z, r) for x, y, z, r in GENTLE]]
     for kind in KINDS:

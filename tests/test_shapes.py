@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
+from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -55,3 +58,20 @@ def test_shadows(variant: str, case: str) -> None:
     target = reference.path_traced(build(), spp=SPP).image
     error = np.abs(ours - target).mean() / target.mean()
     assert error < 0.015, f"mean absolute error {error:.2%} of the mean"
+
+
+def test_frozen_rendering_of_curves(variant: str) -> None:
+    """Scenes with curves cross the border of a frozen function, whose recording knows none of their vertices."""
+    renderer = Renderer.from_scene(CASES_BY_NAME["curves"].build(), shadow_map_resolution=64)
+    rest = renderer.data.geometry.shape_positions("stick")
+
+    @dr.freeze
+    def image(renderer: Renderer, positions: Any) -> Any:
+        return renderer.render(vertex_positions={"stick": positions})
+
+    frozen = replace(renderer)
+    for k in range(4):
+        moved = rest + mi.Vector3f(0.1 * k, 0, 0.05 * k)
+        expected = replace(renderer).render(vertex_positions={"stick": moved})
+        assert np.allclose(image(frozen, moved).numpy(), expected.numpy(), atol=1e-4), k
+    assert image.n_recordings <= 3

@@ -218,8 +218,7 @@ CASES = (
         **SUN, **CAMERA,
         "sphere_translation": Parameter("ball.to_world", moved(1, 0, 0), 0.010),
         "sphere_scale": Parameter("ball.to_world", stretched(1, 1, 1), 0.020),
-        "sphere_stretch": Parameter("ball.to_world", stretched(0, 1, 0), 0.020),
-        "cylinder_turn": Parameter("tube.to_world", swung_locally((1, 0.3, 0)), 0.012),
+        "cylinder_turn": Parameter("tube.to_world", swung((1, 0.3, 0), (0.35, 0.6, -0.35)), 0.020),
         "cylinder_radius": Parameter("tube.to_world", stretched(1, 1, 0), 0.040),
         "disk_rise": Parameter("plate.to_world", moved(0, 1, 0), 0.010),
         "disk_turn": Parameter("plate.to_world", swung_locally((0.4, 1, 0)), 0.020)}),
@@ -254,6 +253,6 @@ TRACED = {
     "standing_box": ("caster_translation", "camera_turn"),
     "near_plane": ("light_direction", "bar_translation", "camera_turn"),
     "fine": ("caster_translation", "caster_scale"),
-    "shapes": ("sphere_translation", "sphere_scale", "cylinder_turn", "disk_turn"),
+    "shapes": ("sphere_translation", "cylinder_turn"),
     "curves": ("wire_point", "wire_thickness", "stick_point", "stick_thickness"),
 }

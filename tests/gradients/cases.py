@@ -253,6 +253,6 @@ TRACED = {
     "standing_box": ("caster_translation", "camera_turn"),
     "near_plane": ("light_direction", "bar_translation", "camera_turn"),
     "fine": ("caster_translation", "caster_scale"),
-    "shapes": ("sphere_translation", "cylinder_turn"),
+    "shapes": ("sphere_translation",),
     "curves": ("wire_point", "wire_thickness", "stick_point", "stick_thickness"),
 }

@@ -23,7 +23,7 @@ from .scene import SceneData, load
 from .sensors import sensors_of, warn_about_lens
 from .shadow import Frusta, ShadowSettings
 from .soft import SoftFrusta
-from .traversal import mesh_buffers, parameters
+from .traversal import parameters
 
 PLUGIN = "shadowmap"
 
@@ -59,7 +59,8 @@ class Options:
     hide_emitters          environments light the scene, but are not seen themselves
     aovs                   further channels, separated by commas: names of ``shadowmap_dr.aovs.AOVS``, or ``label:name`` to call
                            the channel ``label``
-    tessellation           triangles around spheres, disks and cylinders, at least 3
+    tessellation           triangles around spheres, disks and cylinders, at least 3; curves have half as many around them, and
+                           B-splines an eighth of it along each segment
     compat                 conventions of Worchel and Alexa's code
     """
 
@@ -160,8 +161,8 @@ class SceneRenderer:
     The scene itself is not kept: it may own the integrator that owns this record.
 
     parts     shapes, BSDFs and emitters of the scene; kept alive here, so that comparing them by identity is safe
-    statics   arrays that decided on the topology and on the shadow maps: faces, and the cutoff angles of spot lights
-    sizes     number of vertices and faces of each mesh
+    statics   arrays that decided on the topology and on the shadow maps: faces, segments of curves, cutoff angles of spot lights
+    sizes     number of vertices and faces of each mesh, of control points of each curve
     lights    names of the lights
     renderer  without what is re-read for each rendering
     fits      (sensor, frusta of the shadow maps, of those of extended lights) of the last image that it took, latest first
@@ -218,14 +219,13 @@ def _parts(scene: Any, data: SceneData) -> tuple[Any, ...]:
 
 
 def _statics(scene: Any, data: SceneData) -> tuple[Any, ...]:
-    faces = [mesh_buffers(source.shape)[0] for source in data.sources if isinstance(source.shape, mi.Mesh)]
+    topology = [array for source in data.sources for array in source.statics()]
     cones = [e for e in scene.emitters() if e.class_name() == "SpotLight"]
-    return (*faces, *(dr.detach(mi.Float(parameters(cone)["cutoff_angle"])) for cone in cones))
+    return (*topology, *(dr.detach(mi.Float(parameters(cone)["cutoff_angle"])) for cone in cones))
 
 
 def _sizes(data: SceneData) -> tuple[int, ...]:
-    meshes = (source.shape for source in data.sources if isinstance(source.shape, mi.Mesh))
-    return tuple(size for mesh in meshes for size in (mesh.vertex_count(), mesh.face_count()))
+    return tuple(size for source in data.sources for size in source.sizes())
 
 
 def _without_scene(data: SceneData) -> SceneData:

@@ -15,29 +15,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import tessellate
 from .errors import ShadowmapError
 from .geometry import Geometry, ShapeInfo, pack_face_info
 from .lights import AreaLight, Environment, Light, area_lights_of, environments_of, lights_of
 from .sensors import Sensor, sensors_of, warn_about_lens
-from .traversal import children, mesh_buffers, parameters
-
-_ANALYTIC = {"Sphere": tessellate.sphere, "Disk": tessellate.disk, "Cylinder": tessellate.cylinder}
-
-
-@dataclass(frozen=True)
-class ShapeSource:
-    """Where the vertices of one shape of the soup come from.
-
-    ``shape`` is the ``mi.Shape``, ``instance`` the ``mi.Shape`` that places it in the world or None; the ``local_*`` buffers
-    hold the tessellation of an analytic shape (None for meshes).
-    """
-
-    shape: Any
-    instance: Any
-    local_positions: Any = None
-    local_normals: Any = None
-    local_texcoords: Any = None
+from .sources import ShapeSource, source_of
+from .traversal import children
 
 
 @dataclass(frozen=True)
@@ -76,8 +59,9 @@ class SceneData:
 def load(scene: Any, *, tessellation: int = 64) -> SceneData:
     """Read a ``mi.Scene``.
 
-    ``tessellation``: triangles around the circumference of spheres, disks and cylinders. Raises ``ShadowmapError`` for what is
-    not supported or broken, naming the plug-in and its id; warns (``UserWarning``) where the result is still meaningful.
+    ``tessellation``: triangles around the circumference of spheres, disks and cylinders; curves have fewer in proportion
+    (``sources.source_of``). Raises ``ShadowmapError`` for what is not supported or broken, naming the plug-in and its id; warns
+    (``UserWarning``) where the result is still meaningful.
     Needs a variant ``*_ad_rgb`` or ``*_ad_mono``.
     """
     if not ("_ad_" in mi.variant() and mi.variant().endswith(("_rgb", "_mono"))):
@@ -89,7 +73,7 @@ def load(scene: Any, *, tessellation: int = 64) -> SceneData:
         raise ShadowmapError(f"tessellation is {tessellation!r}, but must be an integer of at least 3.")
     infos, sources, faces = [], [], []
     for name, shape, instance in _shapes_of(scene):
-        source, own_faces = _source_of(name, shape, instance, tessellation)
+        source, own_faces = source_of(name, shape, instance, tessellation)
         _check_surface(name, shape)
         vertex_start = infos[-1].vertex_start + infos[-1].vertex_count if infos else 0
         face_start = infos[-1].face_start + infos[-1].face_count if infos else 0
@@ -190,28 +174,14 @@ def _group_of(instance: Any, name: str, groups: list[list[tuple[str, Any]]]) -> 
     hit.t, hit.valid, hit.instance = mi.Float(1.0), mi.Bool(True), mi.ShapePtr(instance)
     # Without FollowShape no shape is found where the instance's to_world is attached.
     flags = mi.RayFlags.Minimal | mi.RayFlags.FollowShape
-    si = hit.compute_surface_interaction(mi.Ray3f(mi.Point3f(0.0), mi.Vector3f(0.0, 0.0, 1.0)), flags)
+    # From afar: curves are not hit from behind, and so they face the ray wherever they are.
+    si = hit.compute_surface_interaction(mi.Ray3f(mi.Point3f(0.0, 0.0, -1e6), mi.Vector3f(0.0, 0.0, 1.0)), flags)
     first = dr.reinterpret_array(mi.UInt32, si.shape)[0]
     for group in groups:
         shapes = [child for _, child in group if isinstance(child, mi.Shape)]
         if shapes and dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shapes[0]))[0] == first:
             return shapes
     raise ShadowmapError(f"The shape group of instance '{name}' was not found in the scene.")
-
-
-def _source_of(name: str, shape: Any, instance: Any, tessellation: int) -> tuple[ShapeSource, np.ndarray]:
-    """The source of a shape's vertices and its faces (F, 3)."""
-    if isinstance(shape, mi.Mesh):
-        faces = mesh_buffers(shape)[0].numpy().reshape(-1, 3)
-        return ShapeSource(shape, instance), faces
-    tessellator = _ANALYTIC.get(shape.class_name())
-    if tessellator is None:
-        raise ShadowmapError(
-            f"Shape '{name}' ({shape.class_name()}) is not supported: use meshes, spheres, disks, cylinders or instances."
-        )
-    mesh = tessellator(tessellation)
-    flat = [mi.Float(a.ravel()) for a in (mesh.positions, mesh.normals, mesh.texcoords)]
-    return ShapeSource(shape, instance, *flat), mesh.faces
 
 
 def _check_surface(name: str, shape: Any) -> None:
@@ -233,13 +203,8 @@ def _check_surface(name: str, shape: Any) -> None:
 
 def describe(name: str, source: ShapeSource, faces: np.ndarray, vertex_start: int, face_start: int) -> ShapeInfo:
     """Validate the buffers of a shape, with ``faces`` (F, 3), and describe it; it will start at the given vertex and face."""
-    shape, is_mesh = source.shape, source.local_positions is None
-    if is_mesh:
-        _, positions, normals, texcoords = mesh_buffers(shape)
-        has_normals, has_texcoords = len(normals) > 0, len(texcoords) > 0
-    else:
-        positions, has_normals, has_texcoords = source.local_positions, True, True
-    points = positions.numpy().reshape(-1, 3)
+    shape, own = source.shape, source.own()
+    points = own.positions.numpy().reshape(-1, 3)
     if not len(points) or not len(faces):
         raise ShadowmapError(f"Shape '{name}' is an empty mesh ({len(points)} vertices, {len(faces)} faces): remove it.")
     bad = np.flatnonzero(~np.isfinite(points).all(-1))
@@ -250,12 +215,10 @@ def describe(name: str, source: ShapeSource, faces: np.ndarray, vertex_start: in
         raise ShadowmapError(
             f"Face {where} of shape '{name}' refers to vertex {faces[where].max()}, but there are only {len(points)} vertices."
         )
-    # A mirroring transform reverses the winding of triangles. Mitsuba's normals stay on their side nevertheless, except for
-    # a cylinder's, which are computed from its parametrisation and change sides too.
-    own_mirror = not is_mesh and _mirrors(shape)
-    mirrored = own_mirror != (source.instance is not None and _mirrors(source.instance))
-    inverted = own_mirror and shape.class_name() == "Cylinder"
-    flipped = shape.has_flipped_normals() != inverted
+    mirrored = source.mirrored != source.instance_mirrored
+    flipped = shape.has_flipped_normals() != source.inverted
+    has_normals = own.normals is not None
+    faceted = isinstance(shape, mi.Mesh) and has_normals and not mirrored
     return ShapeInfo(
         name=name,
         plugin=shape.class_name(),
@@ -264,13 +227,13 @@ def describe(name: str, source: ShapeSource, faces: np.ndarray, vertex_start: in
         face_start=face_start,
         face_count=len(faces),
         has_normals=has_normals,
-        has_texcoords=has_texcoords,
+        has_texcoords=own.texcoords is not None,
         flip_geometric=flipped != mirrored,
         flip_shading=flipped,
-        reads_attributes=is_mesh and shape.has_mesh_attributes(),
+        reads_attributes=isinstance(shape, mi.Mesh) and shape.has_mesh_attributes(),
         planar=_is_planar(points),
         see_through=mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null),
-        faceted=is_mesh and has_normals and not mirrored and _is_faceted(points, faces, normals.numpy().reshape(-1, 3)),
+        faceted=faceted and _is_faceted(points, faces, own.normals.numpy().reshape(-1, 3)),
     )
 
 
@@ -282,11 +245,6 @@ def _is_plain(bsdf: Any) -> bool:
     if bsdf.class_name() != "SmoothDiffuse":
         return False
     return all(isinstance(part, mi.Texture) and not part.is_spatially_varying() for part in parts)
-
-
-def _mirrors(shape: Any) -> bool:
-    matrix = np.array(parameters(shape)["to_world"].matrix).reshape(4, 4)
-    return bool(np.linalg.det(matrix[:3, :3]) < 0)
 
 
 def _is_faceted(points: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> bool:
@@ -305,39 +263,11 @@ def _is_planar(points: np.ndarray) -> bool:
 
 def _vertex_buffers(source: ShapeSource, info: ShapeInfo) -> tuple[Any, Any, Any, Any]:
     """(positions, normals, texcoords, rest positions) of one shape: flat, world space (rest: own space), attached."""
-    if source.local_positions is None:
-        _, positions, normals, texcoords = mesh_buffers(source.shape)
-        if len(positions) != 3 * info.vertex_count:
-            now = len(positions) // 3
-            raise ShadowmapError(
-                f"Shape '{info.name}' now has {now} vertices instead of {info.vertex_count}: load the scene again."
-            )
-        rest = positions
-    else:
-        to_world = parameters(source.shape)["to_world"]
-        positions = _transform(source.local_positions, to_world.matrix, mi.Point3f)
-        normals = _transform(source.local_normals, to_world.inverse_transpose, mi.Normal3f)
-        texcoords, rest = source.local_texcoords, positions
-    if source.instance is not None:
-        to_world = parameters(source.instance)["to_world"]
-        positions = _transform(positions, to_world.matrix, mi.Point3f)
-        if info.has_normals:
-            normals = _transform(normals, to_world.inverse_transpose, mi.Normal3f)
-    if not info.has_normals:
-        normals = dr.zeros(mi.Float, 3 * info.vertex_count)
-    if not info.has_texcoords:
-        texcoords = dr.zeros(mi.Float, 2 * info.vertex_count)
-    return positions, normals, texcoords, rest
-
-
-def _transform(flat: Any, matrix: Any, kind: Any) -> Any:
-    """Apply a 4x4 matrix to flat points, or the upper 3x3 of an inverse transpose to flat normals (then made unit)."""
-    # Not ``dr.unravel``, whose adjoint overwrites what other instances of the same buffer have added.
-    value = dr.gather(mi.Vector3f, flat, dr.arange(mi.UInt32, dr.width(flat) // 3))
-    linear = mi.Matrix3f(matrix)
-    result = mi.Vector3f(linear @ value)
-    if kind is mi.Point3f:
-        result += mi.Vector3f(matrix[0, 3], matrix[1, 3], matrix[2, 3])
-    else:
-        result = dr.normalize(result)
-    return dr.ravel(result)
+    own = source.own()
+    if len(own.positions) != 3 * info.vertex_count:
+        now = len(own.positions) // 3
+        raise ShadowmapError(f"Shape '{info.name}' now has {now} vertices instead of {info.vertex_count}: load the scene again.")
+    world = source.placed(own)
+    normals = world.normals if info.has_normals else dr.zeros(mi.Float, 3 * info.vertex_count)
+    texcoords = world.texcoords if info.has_texcoords else dr.zeros(mi.Float, 2 * info.vertex_count)
+    return world.positions, normals, texcoords, own.positions

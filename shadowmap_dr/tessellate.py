@@ -27,8 +27,8 @@ def sphere(segments: int) -> LocalMesh:
     u, v = _lattice(segments, rings)
     # A pole has one vertex for each triangle that ends there, with the u of the triangle's middle.
     u = np.where((v == 0) | (v == 1), u + 0.5 / segments, u)
-    phi, theta = 2 * np.pi * u, np.pi * v
-    positions = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
+    (x, y), theta = _circle(u), np.pi * v
+    positions = np.stack([np.sin(theta) * x, np.sin(theta) * y, np.cos(theta)], -1)
     positions[v == 0] = (0, 0, 1)
     positions[v == 1] = (0, 0, -1)
     quads = _quads(segments, rings)
@@ -45,8 +45,8 @@ def disk(segments: int) -> LocalMesh:
     angle, radius = _lattice(segments, rings)
     # The centre has one vertex for each triangle that meets there, with the angle of the triangle's middle.
     angle = np.where(radius == 0, angle + 0.5 / segments, angle)
-    phi = 2 * np.pi * angle
-    positions = np.stack([radius * np.cos(phi), radius * np.sin(phi), 0 * phi], -1)
+    x, y = _circle(angle)
+    positions = np.stack([radius * x, radius * y, 0 * x], -1)
     normals = np.broadcast_to((0.0, 0.0, 1.0), positions.shape)
     quads = _quads(segments, rings)
     faces = np.concatenate([quads[:, [0, 1, 2]], quads[segments:, [0, 2, 3]]])
@@ -56,8 +56,8 @@ def disk(segments: int) -> LocalMesh:
 def cylinder(segments: int) -> LocalMesh:
     """Unit cylinder around the z axis, z from 0 to 1, without caps; uv = (phi / 2 pi, z)."""
     u, z = _lattice(segments, 1)
-    phi = 2 * np.pi * u
-    normals = np.stack([np.cos(phi), np.sin(phi), 0 * phi], -1)
+    x, y = _circle(u)
+    normals = np.stack([x, y, 0 * x], -1)
     positions = normals + np.stack([0 * z, 0 * z, z], -1)
     quads = _quads(segments, 1)
     return _mesh(positions, normals, np.stack([u, z], -1), np.concatenate([quads[:, [0, 2, 1]], quads[:, [0, 3, 2]]]))
@@ -67,6 +67,12 @@ def _lattice(columns: int, rows: int) -> tuple[np.ndarray, np.ndarray]:
     """(columns + 1) x (rows + 1) points of the unit square, row by row."""
     second, first = np.meshgrid(np.linspace(0, 1, rows + 1), np.linspace(0, 1, columns + 1), indexing="ij")
     return first.ravel(), second.ravel()
+
+
+def _circle(turns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Cosine and sine. After a whole turn those of the start to the last bit, or else the surface would be open there."""
+    angle = 2 * np.pi * (turns % 1)
+    return np.cos(angle), np.sin(angle)
 
 
 def _quads(columns: int, rows: int) -> np.ndarray:

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from shadowmap_dr import ShadowmapError, assets
-from shadowmap_dr.scene import ShapeSource, describe, load, refresh
+from shadowmap_dr.scene import describe, load, refresh
 from shadowmap_dr.shading import surface
+from shadowmap_dr.sources import MeshSource
 
 EXAMPLES = ["pose", "gallery", "still_life", "pavilion", "meadow"]
 
@@ -109,13 +110,13 @@ def test_unnamed_shapes_lights_and_sensors_get_names(variant: str) -> None:
         data.light("sun")
 
 
-@pytest.mark.parametrize("kind", ["mesh", "rectangle", "sphere", "instance"])
+@pytest.mark.parametrize("kind", ["mesh", "rectangle", "sphere", "disk", "cylinder", "instance"])
 def test_refresh_reads_attached_parameters(variant: str, kind: str) -> None:
     """A parameter of the scene moves everything that depends on it, with gradients."""
     shapes: dict[str, Any] = {
         "mesh": {"thing": {"type": "cube"}},
         "rectangle": {"thing": {"type": "rectangle"}},
-        "sphere": {"thing": {"type": "sphere"}},
+        **{name: {"thing": {"type": name}} for name in ("sphere", "disk", "cylinder")},
         "instance": {
             "group": {"type": "shapegroup", "box": {"type": "cube"}},
             "thing": {"type": "instance", "group": {"type": "ref", "id": "group"}},
@@ -196,7 +197,7 @@ def test_broken_meshes_are_named(variant: str) -> None:
 
 def test_faces_out_of_range_and_empty_meshes_are_named(variant: str) -> None:
     """On the buffers themselves: Mitsuba would read beyond the end of its own before one could load such a mesh."""
-    source = ShapeSource(triangle_mesh([0, 0, 0, 1, 0, 0, 0, 1, 0], [0, 1, 2]), None)
+    source = MeshSource(triangle_mesh([0, 0, 0, 1, 0, 0, 0, 1, 0], [0, 1, 2]), None)
     with pytest.raises(ShadowmapError, match="Face 1 of shape 'broken' refers to vertex 3.* 3 vertices"):
         describe("broken", source, np.array([[0, 1, 2], [0, 1, 3]], np.uint32), 0, 0)
     with pytest.raises(ShadowmapError, match="'broken' is an empty mesh"):

@@ -10,11 +10,13 @@ import numpy as np
 from . import scenes
 from .changes import (
     brighter,
+    controlled,
     increased,
     moved,
     one_corner,
     repainted,
     scaled,
+    stretched,
     swung,
     swung_locally,
     translated,
@@ -127,6 +129,34 @@ def near_plane() -> Any:
     )
 
 
+def shapes() -> Any:
+    """A sphere, and an open cylinder and a disk that are seen from both sides."""
+    two = lambda *c: {"type": "twosided", "bsdf": scenes.diffuse(*c)}  # noqa: E731
+    T = mi.ScalarTransform4f
+    return scenes.scene(
+        light=scenes.sun(),
+        ball={"type": "sphere", "center": [-0.45, 0.6, 0.2], "radius": 0.35, "bsdf": scenes.diffuse(0.7, 0.3, 0.2)},
+        tube={"type": "cylinder", "p0": [0.1, 0.35, -0.6], "p1": [0.6, 0.9, -0.1], "radius": 0.18, "bsdf": two(0.2, 0.5, 0.7)},
+        plate={"type": "disk", "to_world": T().look_at([0.4, 0.7, 0.7], [1, 3, 1.5], [0, 0, 1]) @ T().scale(0.3),
+               "bsdf": two(0.3, 0.6, 0.3)},
+    )  # fmt: skip
+
+
+def curves() -> Any:
+    """A bent wire that tapers to points, each of three control points, and a zigzag of cones and spheres.
+
+    To Mitsuba the walls of an open end have an outside only: its shadows would differ there.
+    """
+    start, end = (-1.0, 0.3, 0.6, 0.0), (0.6, 0.5, 0.2, 0.0)
+    wire = [*3 * [start], (-0.7, 0.5, 0.3, 0.1), (-0.3, 1.0, 0.5, 0.12), (0.3, 0.6, 0.6, 0.08), *3 * [end]]
+    stick = [(-0.9, 0.5, -0.5, 0.12), (-0.3, 0.8, -0.6, 0.06), (0.1, 0.4, -0.4, 0.14), (0.7, 0.9, -0.3, 0.1)]
+    return scenes.scene(
+        light=scenes.sun(),
+        wire=scenes.curve("bsplinecurve", "wire", wire, scenes.diffuse(0.7, 0.3, 0.2)),
+        stick=scenes.curve("linearcurve", "stick", stick, scenes.diffuse(0.2, 0.5, 0.7)),
+    )
+
+
 CASES = (
     Case(
         "sun_box",
@@ -184,6 +214,22 @@ CASES = (
         "bar_translation": Parameter("other.vertex_positions", translated(1, 0, 0), 0.008),
         "bar_vertex": Parameter("other.vertex_positions", one_corner(0, 1, 0.2, 0), 0.015),
         "wall_vertex": Parameter("object.vertex_positions", one_corner(2, 1, 0.2, 0), 0.02)}),
+    Case("shapes", shapes, {
+        **SUN, **CAMERA,
+        "sphere_translation": Parameter("ball.to_world", moved(1, 0, 0), 0.010),
+        "sphere_scale": Parameter("ball.to_world", stretched(1, 1, 1), 0.020),
+        "cylinder_turn": Parameter("tube.to_world", swung((1, 0.3, 0), (0.35, 0.6, -0.35)), 0.020),
+        "cylinder_radius": Parameter("tube.to_world", stretched(1, 1, 0), 0.040),
+        "disk_rise": Parameter("plate.to_world", moved(0, 1, 0), 0.010),
+        "disk_turn": Parameter("plate.to_world", swung_locally((0.4, 1, 0)), 0.020)}),
+    Case("curves", curves, {
+        "wire_translation": Parameter("wire.control_points", controlled(1, 0, 0), 0.010),
+        "wire_point": Parameter("wire.control_points", controlled(0.3, 0.5, 1, only=4), 0.015),
+        "wire_thickness": Parameter("wire.control_points", controlled(0, 0, 0, 1), 0.008),
+        "stick_translation": Parameter("stick.control_points", controlled(0.5, 1, 0), 0.010),
+        "stick_point": Parameter("stick.control_points", controlled(0, 0.5, 1, only=1), 0.010),
+        "stick_thickness": Parameter("stick.control_points", controlled(0, 0, 0, 1), 0.008),
+        **SUN, **CAMERA}, {"shadow_map_resolution": 1024}),
     Case("fine", lambda: scenes.scene(light=scenes.sun(), object=scenes.mesh("object", *scenes.ball(6))),
          {**SUN, **without(CASTER, "caster_rotation"), **CAMERA}),
 )  # fmt: skip
@@ -207,4 +253,6 @@ TRACED = {
     "standing_box": ("caster_translation", "camera_turn"),
     "near_plane": ("light_direction", "bar_translation", "camera_turn"),
     "fine": ("caster_translation", "caster_scale"),
+    "shapes": ("sphere_translation",),
+    "curves": ("wire_point", "wire_thickness", "stick_point", "stick_thickness"),
 }

@@ -59,9 +59,25 @@ def one_corner(index: int, x: float, y: float, z: float) -> Change:
     return change
 
 
+def controlled(x: float, y: float, z: float, radius: float = 0.0, only: int | None = None) -> Change:
+    """All control points of curves, or only one, moved along a direction, and their radii increased."""
+
+    def change(rest: Any, t: Any) -> Any:
+        way = np.zeros((dr.width(rest) // 4, 4), np.float32)
+        way[slice(None) if only is None else only] = (x, y, z, radius)
+        return rest + t * mi.Float(way.ravel())
+
+    return change
+
+
 def moved(x: float, y: float, z: float) -> Change:
     """A transformation, after which everything is moved along a direction."""
     return lambda rest, t: mi.Transform4f().translate(mi.Vector3f(x, y, z) * t) @ rest
+
+
+def stretched(x: float, y: float, z: float) -> Change:
+    """A transformation, before which everything is scaled along the axes."""
+    return lambda rest, t: rest @ mi.Transform4f().scale(1 + t * mi.Vector3f(x, y, z))
 
 
 def swung(axis: tuple[float, float, float], centre: tuple[float, float, float] = (0, 0, 0)) -> Change:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tempfile
+from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
@@ -89,6 +91,14 @@ def mesh(name: str, vertices: np.ndarray, faces: np.ndarray, bsdf: Any = None, n
     params.update()
     made.set_bsdf(mi.load_dict(bsdf or diffuse(0.6)))
     return made
+
+
+def curve(kind: str, name: str, points: Any, bsdf: Any = None) -> Any:
+    """A ``bsplinecurve`` or ``linearcurve`` with control points (x, y, z, radius), which Mitsuba reads from a file."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "curve.txt"
+        path.write_text("\n".join(" ".join(map(str, point)) for point in points))
+        return mi.load_dict({"type": kind, "id": name, "filename": str(path), "bsdf": bsdf or diffuse(0.6)})
 
 
 def block(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:

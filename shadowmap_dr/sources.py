@@ -1,0 +1,183 @@
+"""Where the vertices of the triangle soup come from: one class for each kind of shape.
+
+A source knows what stays the same for as long as the scene's topology does, and reads anew what parameters may change: vertices
+of a mesh, ``to_world`` of an analytic shape, control points of a curve. Gradients flow to all of these.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from . import curves, tessellate, tubes
+from .errors import ShadowmapError
+from .traversal import mesh_buffers, parameters
+
+_ANALYTIC = {"Sphere": tessellate.sphere, "Disk": tessellate.disk, "Cylinder": tessellate.cylinder}
+_CURVES = {"BSplineCurve": curves.BSplines, "LinearCurve": curves.Polylines}
+
+
+@dataclass(frozen=True)
+class Buffers:
+    """Vertices of a shape, flat Float, attached: positions (3V,), normals (3V,) or None, texture coordinates (2V,) or None."""
+
+    positions: Any
+    normals: Any
+    texcoords: Any
+
+
+@dataclass(frozen=True)
+class ShapeSource:
+    """Where the vertices of one shape of the soup come from.
+
+    ``shape`` is the ``mi.Shape``, ``instance`` the ``mi.Shape`` that places it in the world or None.
+    """
+
+    shape: Any
+    instance: Any
+
+    def own(self) -> Buffers:
+        """Vertices where Mitsuba holds them: before the instance's transformation."""
+        raise NotImplementedError
+
+    def statics(self) -> tuple[Any, ...]:
+        """Arrays that decided on the topology. Where they change, the scene has to be loaded again."""
+        return ()
+
+    def sizes(self) -> tuple[int, ...]:
+        """Lengths of arrays that decided on the topology, likewise."""
+        return ()
+
+    @property
+    def mirrored(self) -> bool:
+        """Whether the triangles' winding is reversed before the instance's transformation. Read back to the host."""
+        return False
+
+    @property
+    def inverted(self) -> bool:
+        """Whether Mitsuba's normals are on the inside, apart from ``flip_normals``. Read back to the host."""
+        return False
+
+    @property
+    def instance_mirrored(self) -> bool:
+        """Whether the instance's transformation reverses the triangles' winding. Read back to the host."""
+        return self.instance is not None and _mirrors(self.instance)
+
+    def placed(self, own: Buffers) -> Buffers:
+        """The same vertices in world space: after the instance's transformation."""
+        return own if self.instance is None else _placed(own, parameters(self.instance)["to_world"])
+
+
+@dataclass(frozen=True)
+class MeshSource(ShapeSource):
+    """The buffers of a ``mi.Mesh``."""
+
+    def own(self) -> Buffers:
+        _, positions, normals, texcoords = mesh_buffers(self.shape)
+        return Buffers(positions, normals if len(normals) else None, texcoords if len(texcoords) else None)
+
+    def statics(self) -> tuple[Any, ...]:
+        return (mesh_buffers(self.shape)[0],)
+
+    def sizes(self) -> tuple[int, ...]:
+        return self.shape.vertex_count(), self.shape.face_count()
+
+
+@dataclass(frozen=True)
+class AnalyticSource(ShapeSource):
+    """A sphere, disk or cylinder: ``local``, a mesh that does not change, and the shape's ``to_world``.
+
+    Mitsuba has all other parameters in ``to_world`` (``center``, ``radius``, ``p0``, ``p1``).
+    """
+
+    local: Buffers
+
+    def own(self) -> Buffers:
+        return _placed(self.local, parameters(self.shape)["to_world"])
+
+    @property
+    def mirrored(self) -> bool:
+        return _mirrors(self.shape)
+
+    @property
+    def inverted(self) -> bool:
+        # Mitsuba's normals stay on their side where a shape is mirrored, except for a cylinder's, which are computed from its
+        # parametrisation and change sides too.
+        return self.shape.class_name() == "Cylinder" and self.mirrored
+
+
+@dataclass(frozen=True)
+class CurveSource(ShapeSource):
+    """B-spline or linear curves: circles about points of the curves that the shape's control points place.
+
+    ``name`` for messages, ``plan`` and ``layout``: which circles there are and how they are joined, ``count``: of control points.
+    """
+
+    name: str
+    plan: curves.BSplines | curves.Polylines
+    layout: tubes.Layout
+    count: int
+
+    def own(self) -> Buffers:
+        points = mi.Float(parameters(self.shape)["control_points"])
+        now = len(points) / 4
+        if now != self.count:
+            changed = f"now has {now:g} control points instead of {self.count}"
+            raise ShadowmapError(f"Curve '{self.name}' {changed}: load the scene again.")
+        return Buffers(*tubes.tube_mesh(self.layout, self.plan.circles(points)))
+
+    def statics(self) -> tuple[Any, ...]:
+        return (mi.UInt32(parameters(self.shape)["segment_indices"]),)
+
+    def sizes(self) -> tuple[int, ...]:
+        return (len(parameters(self.shape)["control_points"]),)
+
+
+def source_of(name: str, shape: Any, instance: Any, tessellation: int) -> tuple[ShapeSource, np.ndarray]:
+    """The source of a shape's vertices and its faces, uint32 (F, 3).
+
+    ``tessellation``: triangles around spheres, disks and cylinders. Curves have half as many around them and, if they are
+    B-splines, an eighth of it along each segment. Raises ``ShadowmapError`` for other shapes and for curves that are broken.
+    """
+    if isinstance(shape, mi.Mesh):
+        return MeshSource(shape, instance), mesh_buffers(shape)[0].numpy().reshape(-1, 3)
+    kind = shape.class_name()
+    if kind in _ANALYTIC:
+        mesh = _ANALYTIC[kind](tessellation)
+        local = Buffers(*(mi.Float(a.ravel()) for a in (mesh.positions, mesh.normals, mesh.texcoords)))
+        return AnalyticSource(shape, instance, local), mesh.faces
+    if kind in _CURVES:
+        held = parameters(shape)
+        points, segments = np.array(held["control_points"]), np.array(held["segment_indices"])
+        points = points[: len(points) // 4 * 4].reshape(-1, 4)
+        curves.check_control_points(name, points, segments, _CURVES[kind].points_of_segment)
+        plan, layout = _CURVES[kind].plan(segments, max(tessellation // 2, 3), max(tessellation // 8, 1))
+        return CurveSource(shape, instance, name, plan, layout, len(points)), layout.faces()
+    raise ShadowmapError(
+        f"Shape '{name}' ({kind}) is not supported: use meshes, spheres, disks, cylinders, bsplinecurve, linearcurve, instances."
+    )
+
+
+def _mirrors(shape: Any) -> bool:
+    matrix = np.array(parameters(shape)["to_world"].matrix).reshape(4, 4)
+    return bool(np.linalg.det(matrix[:3, :3]) < 0)
+
+
+def _placed(buffers: Buffers, to_world: Any) -> Buffers:
+    """Points by a transformation, normals by its inverse transpose (then made unit)."""
+    matrix = to_world.matrix
+    offset = mi.Vector3f(matrix[0, 3], matrix[1, 3], matrix[2, 3])
+    positions = mi.Vector3f(mi.Matrix3f(matrix) @ _vectors(buffers.positions)) + offset
+    normals = buffers.normals
+    if normals is not None:
+        normals = dr.ravel(dr.normalize(mi.Vector3f(mi.Matrix3f(to_world.inverse_transpose) @ _vectors(normals))))
+    return Buffers(dr.ravel(positions), normals, buffers.texcoords)
+
+
+def _vectors(flat: Any) -> Any:
+    # Not ``dr.unravel``, whose adjoint overwrites what other instances of the same buffer have added.
+    return dr.gather(mi.Vector3f, flat, dr.arange(mi.UInt32, dr.width(flat) // 3))

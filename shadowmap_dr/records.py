@@ -1,4 +1,4 @@
-"""Taking trees of frozen dataclasses apart into differentiable arrays, and putting them together again with others."""
+"""Taking trees of records apart into arrays, and putting them together again with others."""
 
 from __future__ import annotations
 
@@ -7,39 +7,55 @@ from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 
 
-def attached_arrays(record: Any) -> list[Any]:
-    """The arrays of a tree (dataclasses, tuples, Mitsuba's records) through which gradients flow, in a fixed order."""
-    found: list[Any] = []
+def map_arrays(value: Any, function: Callable[[Any], Any]) -> Any:
+    """A copy of a tree with ``function`` applied to all Dr.Jit arrays in it, in a fixed order.
 
-    def collect(leaf: Any) -> Any:
-        found.append(leaf)
-        return leaf
-
-    _map(record, collect)
-    return found
-
-
-def with_arrays(record: Any, arrays: list[Any]) -> Any:
-    """The same tree with others in the place of :func:`attached_arrays`."""
-    position = iter(arrays)
-    return _map(record, lambda _: next(position))
-
-
-def _map(value: Any, function: Callable[[Any], Any]) -> Any:
+    Trees are made of dataclasses, tuples, lists, dictionaries, transformations and Mitsuba's records; other things in them, and
+    parts of which no array has changed, stay the very same objects.
+    """
     if dr.is_array_v(value):
-        return function(value) if dr.is_float_v(value) and dr.grad_enabled(value) else value
+        return function(value)
+    if isinstance(value, mi.Transform4f):
+        matrix = function(value.matrix)
+        return value if matrix is value.matrix else mi.Transform4f(mi.Matrix4f(matrix))
+    if isinstance(value, tuple | list):
+        return type(value)(map_arrays(item, function) for item in value)
+    if isinstance(value, dict):
+        return {key: map_arrays(item, function) for key, item in value.items()}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = {field.name: _map(getattr(value, field.name), function) for field in dataclasses.fields(value)}
+        fields = {field.name: map_arrays(getattr(value, field.name), function) for field in dataclasses.fields(value)}
         return dataclasses.replace(value, **fields)
-    if isinstance(value, tuple):
-        return tuple(_map(item, function) for item in value)
     names = getattr(type(value), "DRJIT_STRUCT", None)
     if names is None:
         return value
     # Mitsuba's records can be changed, but not constructed from their fields.
     changed = type(value)(value)
     for name in names:
-        setattr(changed, name, _map(getattr(value, name), function))
+        setattr(changed, name, map_arrays(getattr(value, name), function))
     return changed
+
+
+def attached_arrays(record: Any) -> list[Any]:
+    """The arrays of a tree through which gradients flow, in a fixed order."""
+    found: list[Any] = []
+
+    def collect(array: Any) -> Any:
+        if _attached(array):
+            found.append(array)
+        return array
+
+    map_arrays(record, collect)
+    return found
+
+
+def with_arrays(record: Any, arrays: list[Any]) -> Any:
+    """The same tree with others in the place of :func:`attached_arrays`."""
+    position = iter(arrays)
+    return map_arrays(record, lambda array: next(position) if _attached(array) else array)
+
+
+def _attached(array: Any) -> bool:
+    return dr.is_float_v(array) and dr.grad_enabled(array)

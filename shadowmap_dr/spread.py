@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from .records import map_arrays
 from .tables import look_up, one_buffer
 
 
@@ -21,34 +21,26 @@ def spread(record: Any, width: int) -> Any:
     """
     leaves: list[Any] = []
 
-    def collect(leaf: Any) -> Any:
-        leaves.append(leaf)
-        return leaf
+    def collect(number: Any) -> Any:
+        leaves.append(number)
+        return number
 
-    _map(record, collect)
+    map_arrays(record, lambda array: _map_numbers(array, collect))
     if not leaves or width == 1:
         return record
     flat = one_buffer(leaves)
     position = iter(range(len(leaves)))
-    return _map(record, lambda _: look_up(flat, dr.full(mi.UInt32, next(position), width)))
+
+    def wide(number: Any) -> Any:
+        return look_up(flat, dr.full(mi.UInt32, next(position), width))
+
+    return map_arrays(record, lambda array: _map_numbers(array, wide))
 
 
-def _map(value: Any, function: Any) -> Any:
-    """Apply a function to all differentiable single numbers in a tree; parts without any are kept as they are."""
-    if isinstance(value, mi.Transform4f):
-        matrix = _map(value.matrix, function)
-        return value if matrix is value.matrix else mi.Transform4f(mi.Matrix4f(matrix))
-    if dr.is_array_v(value):
-        if dr.is_tensor_v(value) or not dr.is_float_v(value) or not dr.grad_enabled(value):
-            return value
-        if dr.depth_v(value) == 1:
-            return function(value) if dr.width(value) == 1 else value
-        return type(value)(*(_map(value[i], function) for i in range(len(value))))
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = {field.name: _map(getattr(value, field.name), function) for field in dataclasses.fields(value)}
-        return dataclasses.replace(value, **fields)
-    if isinstance(value, tuple | list):
-        return type(value)(_map(item, function) for item in value)
-    if isinstance(value, dict):
-        return {key: _map(item, function) for key, item in value.items()}
-    return value
+def _map_numbers(array: Any, function: Any) -> Any:
+    """Apply a function to all differentiable single numbers of an array; parts without any are kept as they are."""
+    if dr.is_tensor_v(array) or not dr.is_float_v(array) or not dr.grad_enabled(array):
+        return array
+    if dr.depth_v(array) == 1:
+        return function(array) if dr.width(array) == 1 else array
+    return type(array)(*(_map_numbers(array[i], function) for i in range(len(array))))

@@ -186,6 +186,8 @@ def test_small_jacobian(variant: str, tmp_path: Path, monkeypatch: pytest.Monkey
     entry = first["entries"]["default | x | 64 | 3"]
     assert min(entry["own"]["cosine"], entry["traced_blurred"]["cosine"]) > 0.98
     assert entry["own"]["scale"] == pytest.approx(1, abs=0.05) and entry["reverse_error"] < 1e-4
+    # What is missing against path tracing is what a faultless map's blur takes away.
+    assert entry["blur"]["scale"] < 0.97 and entry["traced"]["scale"] == pytest.approx(entry["blur"]["scale"], abs=0.04)
     along = first["entries"]["default | z | 64 | 3"]
     assert along["relative_norm"] < 0.1 and "own" not in along
     assert first["references"]["z"]["norm"] == 0 < first["references"]["x"]["norm"]
@@ -216,8 +218,13 @@ def test_reading_tells_what_is_not_reached() -> None:
               "mitsuba": {}, "tessellation": {"x": {"gradient_change": 0.03, "image_change": 0.1}}}
     text = gradients_report.read_jacobian(record)
     assert "against path-traced differences 1 of 2 reach" in text and "worst scale at 64 texels, filter 9: 0.990, 0.800" in text
-    assert "against own differences 2 of 2 reach" in text
+    assert "against own differences 2 of 2 reach" in text and "with the map's blur" not in text
     assert text.count("not reached") == 2  # tessellation and reverse mode
+    worse = {**bad, "filter": 15, "traced": {"cosine": 0.99, "scale": 0.94}, "blur": {"cosine": 0.99, "scale": 0.96}}
+    bad["blur"] = {"cosine": 0.99, "scale": 0.79}
+    text = gradients_report.read_jacobian(record | {"entries": {"a": entry, "b": bad, "c": worse}})
+    assert "Of the 2 that miss path-traced differences, path-traced images with the map's blur miss them in 1, too" in text
+    assert "nearer to 1 than theirs by up to 0.010, farther from it by up to 0.020" in text
     _, rows = gradients_report.jacobian_rows(record)
     assert rows[1][1:] == ["0.999", "1.000", "0.990", "0.800", "0.999", "1.000", "1e-03"]
 

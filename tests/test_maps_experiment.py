@@ -11,7 +11,9 @@ import pytest
 
 from shadowmap_dr.errors import ShadowmapError
 from shadowmap_dr.experiments import maps, maps_scenes
-from shadowmap_dr.experiments.maps import MapsOptions, contour_shift, metrics, run_maps
+from shadowmap_dr.experiments.maps import MapsOptions, run_maps
+from shadowmap_dr.experiments.maps_metrics import Texel, contour_shift, metrics, texel_in_pixels
+from shadowmap_dr.shadow import directional_view
 
 
 def disk(radius: float, size: int = 200, x: float = 0.0) -> np.ndarray:
@@ -30,18 +32,61 @@ def test_contour_shift_is_a_distance() -> None:
     assert contour_shift(disk(50, x=2.0), disk(50), everywhere) == pytest.approx(2 * 2 / np.pi, rel=0.1)
 
 
+@pytest.mark.parametrize("shift", [0.3, 2.0])
+@pytest.mark.parametrize("degrees", [0, 22.5, 40, 70])
+def test_contour_shift_of_straight_edges(degrees: float, shift: float) -> None:
+    """Whatever their direction, and also where it is less than a pixel."""
+    across, rows = np.meshgrid(np.arange(300) + 0.5, np.arange(300) + 0.5)
+    distance = np.cos(np.radians(degrees)) * (across - 150.3) + np.sin(np.radians(degrees)) * (rows - 150.3)
+    edge, moved = (np.clip(distance + d + 0.5, 0, 1).astype(np.float32) for d in (0.0, shift))
+    assert contour_shift(moved, edge, np.ones((300, 300), bool)) == pytest.approx(shift, rel=0.06, abs=0.05)
+
+
+def test_what_is_masked_out_shifts_no_contour() -> None:
+    mask = np.ones((200, 200), bool)
+    mask[:, 120:] = False
+    found = contour_shift(np.where(mask, disk(51), 1), np.where(mask, disk(50), 0), mask)
+    assert found == pytest.approx(contour_shift(disk(51), disk(50), mask), rel=1e-6) and found == pytest.approx(1, rel=0.1)
+
+
+def test_shift_and_footprint_are_in_texels() -> None:
+    mask = np.ones((200, 200), bool)
+    shifts = [metrics(disk(51), disk(50), mask, Texel(size, size), 3)["contour_shift_texels"] for size in (1.0, 4.0)]
+    assert shifts[0] == pytest.approx(4 * shifts[1]) and shifts[0] == pytest.approx(1, rel=0.15)
+    # Light as far from an edge as a filter of large texels reaches is no bleeding.
+    leaking = np.maximum(disk(60), np.clip(disk(50), 0, 0.3))
+    bleeding = [metrics(leaking, disk(60), mask, Texel(size, size), 3)["bleeding"] for size in (1.0, 4.0)]
+    assert bleeding[0] > 0.04 and bleeding[1] == 0
+
+
+def test_texels_are_measured_on_the_receiver(variant: str) -> None:
+    """A floor under slanted light, of which the map covers more than the camera sees."""
+    scene = maps_scenes.build("overlap", 64)
+    renderer = maps._renderer(scene, "evsm4", MapsOptions(resolution=64, map_resolution=32))
+    p_world = maps._positions(scene)
+    texel = maps._texel("overlap", p_world, renderer, np.ones((64, 64), bool))
+    dx, dy, dz = maps_scenes.SCENES["overlap"][1]
+    # On the floor an area is as much larger as the light is slanted; pixels are all alike.
+    half_x, half_y = float(renderer.frusta.half_x[0]), float(renderer.frusta.half_y[0])
+    area = (2 * half_x / 32) * (2 * half_y / 32) * np.sqrt(dx**2 + dy**2 + dz**2) / abs(dy) / (2 * maps_scenes.HALF / 64) ** 2
+    assert texel.size == pytest.approx(np.sqrt(area), rel=1e-3)
+    assert texel.size < texel.longest < 1.5 * texel.size
+    finer = texel_in_pixels(p_world, directional_view(mi.Vector3f(dx, dy, dz)), renderer.frusta, 64, np.ones((64, 64), bool))
+    assert (finer.size, finer.longest) == pytest.approx((texel.size / 2, texel.longest / 2), rel=1e-4)
+
+
 def test_metrics_tell_bleeding_from_acne() -> None:
-    options = MapsOptions(resolution=200, map_resolution=100, filter_size=3)
+    texel = Texel(2.0, 2.0)
     mask, reference = np.ones((200, 200), bool), disk(60)
-    perfect = metrics(reference, reference, mask, options)
+    perfect = metrics(reference, reference, mask, texel, 3)
     assert all(perfect[name] == 0 for name in ("rmse", "rmse_shadowed", "bleeding", "acne", "contour_shift_texels"))
-    bleeding = metrics(np.maximum(reference, 0.1), reference, mask, options)
+    bleeding = metrics(np.maximum(reference, 0.1), reference, mask, texel, 3)
     assert bleeding["bleeding"] == pytest.approx(0.1, rel=1e-3) and bleeding["acne"] == 0
     assert bleeding["rmse_shadowed"] == pytest.approx(0.1, rel=0.05)
-    acne = metrics(np.minimum(reference, 0.95), reference, mask, options)
+    acne = metrics(np.minimum(reference, 0.95), reference, mask, texel, 3)
     assert acne["acne"] == pytest.approx(0.05, rel=1e-3) and acne["bleeding"] == 0
     # A blurred edge is neither.
-    blurred = metrics(np.clip((disk(60) - 0.5) * 0.2 + 0.5 + 0.3 * (disk(60) - 0.5), 0, 1), reference, mask, options)
+    blurred = metrics(np.clip((disk(60) - 0.5) * 0.2 + 0.5 + 0.3 * (disk(60) - 0.5), 0, 1), reference, mask, texel, 3)
     assert blurred["contour_shift_texels"] == 0
 
 

@@ -116,7 +116,7 @@ def read_jacobian(record: Mapping[str, Any]) -> str:
     entries = _compared(record)
     for label in dict.fromkeys(e["candidate"] for e in entries):
         own = [e for e in entries if e["candidate"] == label]
-        lines.append(f"**{label}**: " + "; ".join(_reading_of(own, kind) for kind in _KINDS) + ".")
+        lines.append(f"**{label}**: " + "; ".join(_reading_of(own, kind) for kind in _KINDS) + "." + _blur(own))
     lines.append("")
     lines += _along_light(record) + _noise(record) + _mitsuba(record) + _tessellation(record)
     worst = max((e["reverse_error"] for e in record["entries"].values()), default=0.0)
@@ -125,8 +125,9 @@ def read_jacobian(record: Mapping[str, Any]) -> str:
 
 
 def _reading_of(entries: Sequence[Mapping[str, Any]], kind: str) -> str:
-    title, (least, low, high) = _KINDS[kind]
-    good = [e for e in entries if e[kind]["cosine"] >= least and low <= e[kind]["scale"] <= high]
+    title, bounds = _KINDS[kind]
+    least, low, high = bounds
+    good = [e for e in entries if _reaches(e[kind], bounds)]
     cosines, scales = ([e[kind][q] for e in entries] for q in ("cosine", "scale"))
     text = (f"against {title} {len(good)} of {len(entries)} reach c >= {least} and s in [{low}, {high}] "
             f"(c from {min(cosines):.3f}, s {min(scales):.3f} to {max(scales):.3f})")
@@ -136,6 +137,23 @@ def _reading_of(entries: Sequence[Mapping[str, Any]], kind: str) -> str:
     worst = min(bad, key=lambda e: e[kind]["cosine"] - abs(1 - e[kind]["scale"]))
     return text + (f", worst {worst['motion']} at {worst['map']} texels, filter {worst['filter']}: "
                    f"{worst[kind]['cosine']:.3f}, {worst[kind]['scale']:.3f}")
+
+
+def _reaches(found: Mapping[str, float], bounds: tuple[float, float, float]) -> bool:
+    least, low, high = bounds
+    return found["cosine"] >= least and low <= found["scale"] <= high
+
+
+def _blur(entries: Sequence[Mapping[str, Any]]) -> str:
+    """How much of what is missing against path tracing is the map's blur."""
+    missed = [e for e in entries if "blur" in e and not _reaches(e["traced"], TRACED)]
+    if not missed:
+        return ""
+    alike = sum(not _reaches(e["blur"], TRACED) for e in missed)
+    gains = [abs(e["blur"]["scale"] - 1) - abs(e["traced"]["scale"] - 1) for e in missed]
+    return (f" Of the {len(missed)} that miss path-traced differences, path-traced images with the map's blur miss them in "
+            f"{alike}, too; scales are nearer to 1 than theirs by up to {max(0.0, *gains):.3f}, "
+            f"farther from it by up to {max(0.0, *(-gain for gain in gains)):.3f}.")
 
 
 def _along_light(record: Mapping[str, Any]) -> list[str]:

@@ -19,8 +19,10 @@ from rich.table import Table
 from .. import io, report
 from ..errors import ShadowmapError
 from ..renderer import Renderer
+from ..shadow import directional_view
 from ..timing import Contender, alternate, machine
 from . import maps_pose, maps_scenes
+from .maps_metrics import Image, Texel, metrics, texel_in_pixels
 
 #: What is compared: a label, and options of the `Renderer`.
 CANDIDATES: dict[str, dict[str, Any]] = {
@@ -36,11 +38,7 @@ CANDIDATES: dict[str, dict[str, Any]] = {
     "msm, cut": {"shadow_method": "msm", "shadow_bleeding": 0.1},
     "csm": {"shadow_method": "csm", "shadow_order": 8},
 }
-# Visibility counts as dark or lit, in the reference, below and above these.
-_DARK, _LIT = 0.002, 0.998
 _REFERENCE_SPP = 1024
-
-Image = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -91,13 +89,17 @@ def run_maps(options: MapsOptions, *, console: Console | None = None) -> dict[st
             scene = maps_scenes.build(name, options.resolution)
             reference, mask = reference_visibility(scene, options.reference_spp)
             derivative = _reference_derivative(name, options)
+            p_world = _positions(scene)
             progress.update(task, advance=1)
             record["scenes"][name], sheet[name] = {}, {"path traced": reference[..., None]}
             for label in options.candidates:
                 progress.update(task, note=label)
-                image = visibility_image(_renderer(scene, label, options))
-                entry = metrics(image, reference, mask, options)
-                record["scenes"][name][label] = entry | _derivative_agreement(name, label, derivative, options)
+                renderer = _renderer(scene, label, options)
+                image = visibility_image(renderer)
+                texel = _texel(name, p_world, renderer, mask)
+                entry = {"texel_pixels": asdict(texel)} | metrics(image, reference, mask, texel, options.filter_size)
+                footprint = options.filter_size * texel.longest
+                record["scenes"][name][label] = entry | _derivative_agreement(name, label, derivative, footprint, options)
                 sheet[name][label] = image[..., None]
                 progress.update(task, advance=1)
             _add_times(record["scenes"][name], scene, options)
@@ -147,50 +149,6 @@ def reference_visibility(scene: Any, spp: int) -> tuple[Image, npt.NDArray[np.bo
     return np.where(mask, np.clip(lit / np.where(mask, full, 1), 0, 1), 0).astype(np.float32), mask
 
 
-def metrics(image: Image, reference: Image, mask: npt.NDArray[np.bool_], options: MapsOptions) -> dict[str, float]:
-    """Errors of a visibility image (H, W), after `protocols`: root mean squares, bleeding, acne, shift of the contour."""
-    error = np.where(mask, image - reference, 0)
-
-    def root_mean_square(where: npt.NDArray[np.bool_]) -> float:
-        return float(np.sqrt(np.mean(np.square(error[where])))) if where.any() else float("nan")
-
-    # A filter's footprint away from edges: their blur is no bleeding, and no acne.
-    texel = options.resolution / options.map_resolution
-    distance = int(np.ceil((options.filter_size + 1) * texel))
-    dark, lit = (_eroded(mask & where, distance) for where in (reference < _DARK, reference > _LIT))
-    return {
-        "rmse": root_mean_square(mask),
-        "rmse_shadowed": root_mean_square(mask & (reference < 0.5)),
-        "bleeding": float(image[dark].mean()) if dark.any() else float("nan"),
-        "acne": float(1 - image[lit].mean()) if lit.any() else float("nan"),
-        "contour_shift_texels": contour_shift(image, reference, mask) / texel,
-    }
-
-
-def contour_shift(image: Image, reference: Image, mask: npt.NDArray[np.bool_]) -> float:
-    """Mean distance in pixels between the lines where two images are one half: area between them by the length of the second."""
-    inside, want = image > 0.5, reference > 0.5
-    area = float(((inside != want) & mask).sum())
-    crossings = sum(
-        float(((want[a] != want[b]) & mask[a] & mask[b]).sum())
-        for a, b in (((slice(None, -1), slice(None)), (slice(1, None), slice(None))),
-                     ((slice(None), slice(None, -1)), (slice(None), slice(1, None))))
-    )
-    # A line of random direction crosses 4 / pi grid lines for each pixel of its length.
-    return area / max(crossings * np.pi / 4, 1.0)
-
-
-def _eroded(mask: npt.NDArray[np.bool_], distance: int) -> npt.NDArray[np.bool_]:
-    """Pixels whose whole neighbourhood of so many pixels (a square, within the image) is in the mask."""
-    result = mask
-    for axis in (0, 1):
-        counts = np.cumsum(np.pad(~result, [(1, 0) if k == axis else (0, 0) for k in (0, 1)]), axis=axis)
-        n = result.shape[axis]
-        high, low = np.minimum(np.arange(n) + distance + 1, n), np.maximum(np.arange(n) - distance, 0)
-        result = np.take(counts, high, axis) == np.take(counts, low, axis)
-    return result
-
-
 def _step(options: MapsOptions) -> float:
     """Half the distance of the two renderings of a central difference: their shadows lie a pixel apart."""
     return 0.5 * 2 * maps_scenes.HALF / options.resolution
@@ -203,8 +161,25 @@ def _reference_derivative(name: str, options: MapsOptions) -> Image:
     return central_difference(build, _step(options), spp=max(1, options.reference_spp)).image
 
 
-def _derivative_agreement(name: str, label: str, reference: Image, options: MapsOptions) -> dict[str, float]:
-    """Forward derivative of the image by the offset of what casts the shadow, against path-traced central differences."""
+def _positions(scene: Any) -> Image:
+    """(H, W, 3): what each pixel sees, world space."""
+    return np.array(Renderer.from_scene(scene, shadow_method="none", aovs=("position",)).render())[..., 3:6]
+
+
+def _texel(name: str, p_world: Image, renderer: Renderer, mask: npt.NDArray[np.bool_]) -> Texel:
+    """Of a renderer's maps, on what is seen. They are fitted to the scene: the size of the image says nothing about it."""
+    assert renderer.frusta is not None  # all candidates have maps
+    view = directional_view(mi.Vector3f(*maps_scenes.SCENES[name][1]))
+    return texel_in_pixels(p_world, view, renderer.frusta, renderer.settings.shadow.resolution, mask)
+
+
+def _derivative_agreement(
+    name: str, label: str, reference: Image, footprint: float, options: MapsOptions
+) -> dict[str, float]:
+    """Forward derivative of the image by the offset of what casts the shadow, against path-traced central differences.
+
+    ``footprint``: width of the filter in pixels.
+    """
     from mitsuba_baselines.derivatives import agreement
 
     scene = maps_scenes.build(name, options.resolution)
@@ -223,7 +198,6 @@ def _derivative_agreement(name: str, label: str, reference: Image, options: Maps
     image = renderer.render(positions)
     dr.forward(offset)
     derivative = np.array(dr.grad(image))[..., :3]
-    footprint = options.filter_size * options.resolution / options.map_resolution
     result = agreement(derivative, reference, footprint)
     return {"derivative_cosine": result.cosine, "derivative_scale": result.scale}
 

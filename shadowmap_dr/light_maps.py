@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .beams import Beam, Projector
 from .geometry import Geometry
 from .lights import DirectionalLight, Light, PointLight, SpotLight
 from .raster import RasterOutput, Topology
@@ -36,15 +37,17 @@ from .shadow import (
 )
 from .shadow.camera import of_map
 
-#: Spot lights with a wider cone (half-angle in degrees) use the faces of a cube.
+#: Spot lights and projectors with a wider cone (half-angle in degrees) use the faces of a cube.
 WIDEST_SPOT = 60.0
+# Casters of a beam's shadows are as far from its shape, at least, in units of the scene's radius: it must not shadow itself.
+_BEAM_START = 1e-3
 
 
 @dataclass(frozen=True)
 class MapPlan:
     """The maps of each light. Static, made once for a scene.
 
-    ``kinds``: ``directional``, ``spot`` (one map each) or ``cube`` (six). ``first``: number of each light's first map.
+    ``kinds``: ``directional``, ``beam``, ``spot`` (one map each) or ``cube`` (six). ``first``: number of each light's first map.
     ``planes``: the largest face (index) of each shape. ``planar``: Bool (S,). ``center``, ``radius``: a sphere around the
     scene at rest, world space, for the fixed frusta of ``compat``.
     """
@@ -83,9 +86,19 @@ def plan_maps(lights: Sequence[Light], geometry: Geometry) -> MapPlan:
 def _kind_of(light: Light) -> str:
     if isinstance(light, DirectionalLight):
         return "directional"
+    if isinstance(light, Beam):
+        return "beam"
     if isinstance(light, PointLight):
         return "cube"
-    return "spot" if float(dr.max(dr.detach(light.cutoff_angle))[0]) <= WIDEST_SPOT else "cube"
+    half_angle = dr.atan(light.spread) * (180 / math.pi) if isinstance(light, Projector) else light.cutoff_angle
+    return "spot" if float(dr.max(dr.detach(half_angle))[0]) <= WIDEST_SPOT else "cube"
+
+
+def _spread(light: SpotLight | Projector) -> Any:
+    """Tangent of the half-angle that its map has to cover (Float), detached."""
+    if isinstance(light, Projector):
+        return dr.detach(light.spread)
+    return dr.tan(dr.detach(light.cutoff_angle) * (math.pi / 180))
 
 
 def make_maps(
@@ -118,7 +131,7 @@ def make_maps(
         shapes = len(geometry.shapes)
         shape = dr.gather(mi.UInt32, geometry.vertex_shape, vertex)
         planes, planar = shape_planes(plan, geometry)
-        bounds = shape_bounds(stacked, p_light, lanes, shape, shapes)
+        bounds = shape_bounds(stacked, _within_beams(plan, lights, p_light, lanes), lanes, shape, shapes)
         frusta = fit_frusta(
             stacked,
             bounds,
@@ -130,6 +143,7 @@ def make_maps(
             seen,
             settings.receiver_range,
         )
+        frusta = _from_beams_on(plan, frusta)
     maps = render_maps(p_light, lanes, geometry.faces, topology, stacked, frusta, settings, transparent)
     return filter_maps(maps)
 
@@ -144,11 +158,40 @@ def _views(plan: MapPlan, light: Light, kind: str, settings: ShadowSettings) -> 
         # The authors' camera stands outside of the scene, facing its centre.
         origin = mi.Point3f(*plan.center) - view.forward * (2 * plan.radius)
         return (LightView(view.right, view.up, view.forward, origin, view.spread),)
-    assert isinstance(light, SpotLight)
+    if isinstance(light, Beam):
+        view = directional_view(light.direction)
+        return (LightView(view.right, view.up, view.forward, mi.Vector3f(light.position), view.spread),)
+    assert isinstance(light, SpotLight | Projector)
     matrix = light.to_world.matrix
     right, up, forward = (dr.normalize(mi.Vector3f(matrix[0, k], matrix[1, k], matrix[2, k])) for k in range(3))
-    spread = dr.tan(dr.detach(light.cutoff_angle) * (math.pi / 180))
-    return (spot_view(light.position, right, up, forward, spread),)
+    return (spot_view(light.position, right, up, forward, _spread(light)),)
+
+
+def _within_beams(plan: MapPlan, lights: Sequence[Light], p_light: Any, map_index: Any) -> Any:
+    """Light-space points, moved to the nearest that a beam can reach in the maps of beams."""
+    result = p_light
+    for k, light in enumerate(lights):
+        if isinstance(light, Beam):
+            reach, start = dr.detach(light.reach), _BEAM_START * plan.radius
+            x, y = dr.clip(p_light.x, -reach, reach), dr.clip(p_light.y, -reach, reach)
+            moved = type(p_light)(x, y, dr.maximum(p_light.z, start))
+            result = dr.select(map_index == plan.first[k], moved, result)
+    return result
+
+
+def _from_beams_on(plan: MapPlan, frusta: Frusta) -> Frusta:
+    """Frusta that begin in front of a beam's shape, so that what lies behind it casts no shadow, nor the shape itself."""
+    if "beam" not in plan.kinds:
+        return frusta
+    index, start = dr.arange(mi.UInt32, dr.width(frusta.near)), _BEAM_START * plan.radius
+    beam = mi.Bool(False)
+    for kind, first in zip(plan.kinds, plan.first, strict=True):
+        beam |= (index == first) & (kind == "beam")
+    near = dr.select(beam, dr.maximum(frusta.near, start), frusta.near)
+    first = dr.maximum(frusta.first, near)
+    frusta = replace(frusta, near=near, first=first, far=dr.maximum(frusta.far, first + 0.1 * start))
+    dr.eval(frusta)
+    return frusta
 
 
 def _compat_frusta(plan: MapPlan, views: Any) -> Frusta:

@@ -1,4 +1,4 @@
-"""Light records: directional, spot and point lights, and environments, read from Mitsuba emitters.
+"""Light records, read from Mitsuba emitters. Those that throw a picture or a beam: :mod:`shadowmap_dr.beams`.
 
 ``illuminate`` returns what ``emitter.sample_direction`` returns for the same point, without any visibility. All fields that
 are not names may carry gradients; replace them with ``dataclasses.replace``.
@@ -14,7 +14,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from .errors import ShadowmapError
+from .beams import Beam, Projector, beam_of, projector_of, towards
 from .traversal import children, parameters
 
 _DEGREE = math.pi / 180.0
@@ -43,7 +43,7 @@ class PointLight:
 
     def illuminate(self, p_world: Any, active: Any = True) -> tuple[Any, Any]:
         """(wo, weight) with weight = intensity / distance^2."""
-        wo, inverse_squared = _towards(p_world, self.position)
+        wo, inverse_squared = towards(p_world, self.position)
         return wo, (self.intensity * inverse_squared) & mi.Bool(active)
 
 
@@ -79,7 +79,7 @@ class SpotLight:
 
     def illuminate(self, p_world: Any, active: Any = True) -> tuple[Any, Any]:
         """(wo, weight) with weight = intensity * falloff * texture / distance^2."""
-        wo, inverse_squared = _towards(p_world, self.position)
+        wo, inverse_squared = towards(p_world, self.position)
         matrix = mi.Matrix3f(self.to_world.matrix)
         local = dr.normalize(mi.Vector3f(dr.rcp(matrix) @ mi.Vector3f(-wo)))
         cutoff, beam = self.cutoff_angle * _DEGREE, self.beam_width * _DEGREE
@@ -104,7 +104,7 @@ class SquareSpot:
 
     def illuminate(self, p_world: Any, active: Any = True) -> tuple[Any, Any]:
         """(wo, weight) with weight = intensity. What lies outside of the square is dark by its visibility."""
-        wo, _ = _towards(p_world, self.light.position)
+        wo, _ = towards(p_world, self.light.position)
         return wo, self.light.intensity & mi.Bool(active)
 
 
@@ -159,61 +159,76 @@ class Environment:
         return self.emitter.eval(si, mi.Bool(active))
 
 
-Light = DirectionalLight | PointLight | SpotLight
+Light = DirectionalLight | PointLight | SpotLight | Projector | Beam
+
+_ENVIRONMENTS = ("ConstantBackgroundEmitter", "EnvironmentMapEmitter")
+_LIGHTS = ("DirectionalEmitter", "PointLight", "SpotLight", "Projector")
+_BEAMS = ("Rectangle", "Disk")
+
+
+def objection(emitter: Any) -> str | None:
+    """Why a ``mi.Emitter`` is not supported, as the end of a sentence about it; None if it is."""
+    kind = emitter.class_name()
+    if kind in _LIGHTS or kind in _ENVIRONMENTS or kind == "AreaLight":
+        return None
+    if kind == "DirectionalArea":
+        shape = emitter.get_shape().class_name()
+        return None if shape in _BEAMS else f"shines along the normals of a {shape}: only rectangles and disks may"
+    wanted = "constant or envmap" if emitter.is_environment() else "area, directional, spot or point lights, or projectors"
+    return f"is not supported: use {wanted}"
 
 
 def lights_of(scene: Any) -> tuple[Light, ...]:
-    """Records of the directional, spot and point lights of a ``mi.Scene``, in the scene's order; no area lights, no environments.
+    """Records of the lights of a ``mi.Scene`` without extent, of its projectors and beams, in the scene's order.
 
-    Raises ``ShadowmapError`` for any other emitter. Names are Mitsuba ids; lights without one are called ``light_0``, ...
+    Area lights and environments have functions of their own; what is not supported (:func:`objection`) is left out. Names are
+    Mitsuba ids; lights without one are called ``light_0``, ... Fields are attached where the emitters' parameters are.
     """
     return tuple(
-        light_of(emitter, emitter.id() or f"light_{i}")
-        for i, emitter in enumerate(scene.emitters())
-        if not emitter.is_environment() and emitter.class_name() != "AreaLight"
+        _light_of(emitter, name)
+        for name, emitter in named_emitters(scene)
+        if emitter.class_name() in (*_LIGHTS, "DirectionalArea") and objection(emitter) is None
     )
 
 
 def area_lights_of(scene: Any, shapes: Sequence[Any]) -> tuple[AreaLight, ...]:
-    """Records of the area lights of a ``mi.Scene``; ``shapes``: its ``mi.Shape`` objects in the order of the soup."""
+    """Records of the area lights of a ``mi.Scene``.
+
+    ``shapes``: its ``mi.Shape`` objects in the order of the soup. The lights of others are left out.
+    """
     found = []
-    for i, emitter in enumerate(scene.emitters()):
+    for name, emitter in named_emitters(scene):
         if emitter.class_name() == "AreaLight":
             shape = emitter.get_shape()
-            index = next(k for k, other in enumerate(shapes) if other is shape or other == shape)
+            index = next((k for k, other in enumerate(shapes) if other is shape or other == shape), None)
             textures = [part for _, part in children(emitter) if isinstance(part, mi.Texture)]
-            textured = any(texture.is_spatially_varying() for texture in textures)
-            found.append(AreaLight(emitter.id() or f"light_{i}", index, emitter, textured))
+            if index is not None:
+                found.append(AreaLight(name, index, emitter, any(texture.is_spatially_varying() for texture in textures)))
     return tuple(found)
 
 
 def environments_of(scene: Any) -> tuple[Environment, ...]:
     """Records of the ``constant`` and ``envmap`` emitters of a ``mi.Scene`` (at most one)."""
-    found = []
-    for i, emitter in enumerate(scene.emitters()):
-        if emitter.is_environment():
-            name = emitter.id() or f"light_{i}"
-            if emitter.class_name() not in ("ConstantBackgroundEmitter", "EnvironmentMapEmitter"):
-                raise ShadowmapError(
-                    f"Emitter '{name}' ({emitter.class_name()}) is not supported: use constant or envmap as environment."
-                )
-            found.append(Environment(name, emitter))
-    return tuple(found)
+    return tuple(Environment(name, emitter) for name, emitter in named_emitters(scene) if emitter.class_name() in _ENVIRONMENTS)
 
 
-def light_of(emitter: Any, name: str) -> Light:
-    """Record of one ``mi.Emitter``; fields are attached where the emitter's parameters are."""
-    kind = emitter.class_name()
-    if kind not in ("DirectionalEmitter", "PointLight", "SpotLight"):
-        place = f" of shape '{emitter.get_shape().id()}'" if emitter.get_shape() is not None else ""
-        raise ShadowmapError(f"Emitter '{name}'{place} ({kind}) is not supported yet: use directional, spot or point lights.")
-    values, parts = parameters(emitter), dict(children(emitter))
+def named_emitters(scene: Any) -> list[tuple[str, Any]]:
+    """(name, ``mi.Emitter``) of all emitters of a ``mi.Scene``."""
+    return [(emitter.id() or f"light_{i}", emitter) for i, emitter in enumerate(scene.emitters())]
+
+
+def _light_of(emitter: Any, name: str) -> Light:
+    kind, values, parts = emitter.class_name(), parameters(emitter), dict(children(emitter))
     if kind == "DirectionalEmitter":
         matrix = values["to_world"].matrix
         direction = mi.Vector3f(matrix[0, 2], matrix[1, 2], matrix[2, 2])
         return DirectionalLight(name, dr.normalize(direction), colour_of(parts["irradiance"]))
     if kind == "PointLight":
         return PointLight(name, mi.Point3f(values["position"]), colour_of(parts["intensity"]))
+    if kind == "Projector":
+        return projector_of(emitter, name, values, parts["irradiance"])
+    if kind == "DirectionalArea":
+        return beam_of(emitter, name, parameters(emitter.get_shape())["to_world"], parts["radiance"])
     return SpotLight(
         name=name,
         to_world=values["to_world"],
@@ -227,10 +242,3 @@ def light_of(emitter: Any, name: str) -> Light:
 def colour_of(texture: Any) -> Any:
     """The colour of a spectrum that does not vary over space, as ``mi.UnpolarizedSpectrum``."""
     return texture.eval(dr.zeros(mi.SurfaceInteraction3f))
-
-
-def _towards(p_world: Any, position: Any) -> tuple[Any, Any]:
-    """Unit vector from p_world to a position, and 1 / distance^2."""
-    offset = mi.Vector3f(position - p_world)
-    inverse_squared = dr.rcp(dr.squared_norm(offset))
-    return offset * dr.sqrt(inverse_squared), inverse_squared

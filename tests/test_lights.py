@@ -10,8 +10,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from shadowmap_dr import ShadowmapError
-from shadowmap_dr.lights import environments_of, lights_of
+from shadowmap_dr.lights import environments_of, lights_of, objection
+from shadowmap_dr.traversal import children
 
 
 def slide(rng: np.random.Generator, channels: int = 3) -> Any:
@@ -27,6 +27,14 @@ def emitters() -> dict[str, Any]:
         "cone": {"type": "spot", "to_world": look_at, "cutoff_angle": 35, "intensity": {"type": "rgb", "value": [3, 2, 1]}},
         "slide": {"type": "spot", "to_world": look_at, "cutoff_angle": 40, "beam_width": 10, "texture": texture},
         "wide": {"type": "spot", "to_world": look_at @ mi.ScalarTransform4f().scale(2.0), "cutoff_angle": 80},
+        "beamer": {"type": "projector", "to_world": look_at, "irradiance": texture, "fov": 70, "scale": 3.0},
+        "squeezed": {
+            "type": "projector",
+            "to_world": look_at @ mi.ScalarTransform4f().scale([2.0, 3.0, 1.5]),
+            "irradiance": {"type": "rgb", "value": [1, 2, 3]},
+            "fov": 50,
+            "fov_axis": "y",
+        },
     }
 
 
@@ -41,7 +49,7 @@ def sample(emitter: Any, p_world: Any) -> tuple[Any, Any]:
     return ds.d, weight
 
 
-@pytest.mark.parametrize("name", ["sun", "bulb", "cone", "slide", "wide"])
+@pytest.mark.parametrize("name", ["sun", "bulb", "cone", "slide", "wide", "beamer", "squeezed"])
 @pytest.mark.parametrize("mono", [False, True], ids=["rgb", "mono"])
 def test_equals_sample_direction(variant: str, name: str, mono: bool) -> None:
     if mono:
@@ -65,6 +73,8 @@ PARAMETERS = {
     "bulb": ["intensity.value", "position"],
     "cone": ["intensity.value", "cutoff_angle", "beam_width", "to_world"],
     "slide": ["texture.data", "to_world"],
+    "beamer": ["irradiance.data", "scale", "to_world"],
+    "squeezed": ["irradiance.value", "to_world"],
 }
 
 
@@ -118,12 +128,50 @@ def test_environment(variant: str, kind: str) -> None:
     assert np.allclose(sky.radiance(direction).numpy(), expected.numpy())
 
 
-def test_unsupported_emitters_are_named(variant: str) -> None:
-    beamer = {"type": "projector", "irradiance": {"type": "bitmap", "bitmap": slide(np.random.default_rng(6))}}
-    with pytest.raises(ShadowmapError, match="'beamer'.*directional, spot or point"):
-        lights_of(mi.load_dict({"type": "scene", "beamer": beamer}))
-    panel = {"type": "rectangle", "glow": {"type": "directionalarea"}}
-    with pytest.raises(ShadowmapError, match="'panel'"):
-        lights_of(mi.load_dict({"type": "scene", "panel": panel}))
-    with pytest.raises(ShadowmapError, match="'sky'"):
-        environments_of(mi.load_dict({"type": "scene", "sky": {"type": "sunsky"}}))
+def test_projector_covers_what_mitsubas_covers(variant: str) -> None:
+    """Wherever the projector stands, and however small its angle of view is."""
+    for place, fov in (([0, 0, 0], 40), ([300, -200, 500], 3)):
+        to_world = mi.ScalarTransform4f().look_at(place, [0, 0.1, 0.2], [0, 1, 0])
+        picture = {"type": "bitmap", "bitmap": slide(np.random.default_rng(6))}
+        settings = {"type": "projector", "to_world": to_world, "fov": fov, "irradiance": picture}
+        (light,) = lights_of(mi.load_dict({"type": "scene", "light": settings}))
+        half = np.tan(np.radians(fov / 2))
+        # The picture has 16 columns and 8 rows.
+        assert np.allclose(light.tangents.numpy().ravel(), [half, half / 2], rtol=1e-4)
+        assert np.allclose(light.spread.numpy(), half, rtol=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["rectangle", "disk"])
+@pytest.mark.parametrize("mirror", [False, True], ids=["plain", "mirrored"])
+@pytest.mark.parametrize("flip", [False, True], ids=["outwards", "flipped"])
+def test_beam_is_along_the_normals(variant: str, kind: str, mirror: bool, flip: bool) -> None:
+    """What arrives at points in front of the shape is what Mitsuba's texture has where the normal through them begins."""
+    to_world = mi.ScalarTransform4f().look_at([1, 2, 3], [0, 0.3, -1], [0, 1, 0]) @ mi.ScalarTransform4f().scale([0.8, 0.5, 1])
+    if mirror:
+        to_world = to_world @ mi.ScalarTransform4f().scale([-1, 1, 1])
+    texture = {"type": "bitmap", "bitmap": slide(np.random.default_rng(7)), "wrap_mode": "clamp"}
+    panel = {"type": kind, "to_world": to_world, "flip_normals": flip, "glow": {"type": "directionalarea", "radiance": texture}}
+    scene = mi.load_dict({"type": "scene", "panel": panel})
+    (light,) = lights_of(scene)
+    start = scene.shapes()[0].sample_position(0, mi.Point2f(np.random.default_rng(8).uniform(0.03, 0.97, (2, 500))))
+    si = dr.zeros(mi.SurfaceInteraction3f, 500)
+    si.uv = start.uv
+    radiance = dict(children(scene.emitters()[0]))["radiance"].eval(si)
+    wo, weight = light.illuminate(start.p + 2.5 * start.n)
+    assert np.allclose(wo.numpy(), -start.n.numpy(), atol=1e-5)
+    # Not in the rim.
+    inside = np.abs(weight.numpy() - radiance.numpy()).max(0) < 1e-3
+    assert inside.mean() > 0.93
+    assert np.all(light.illuminate(start.p - 2.5 * start.n)[1].numpy() == 0)
+    sideways = mi.Vector3f(light.to_world @ mi.Vector3f(1.1, 0, 0))
+    assert np.all(light.illuminate(light.position + sideways + 2.5 * light.direction)[1].numpy() == 0)
+
+
+def test_unsupported_emitters_are_left_out(variant: str) -> None:
+    ball = {"type": "sphere", "glow": {"type": "directionalarea"}}
+    scene = mi.load_dict({"type": "scene", "ball": ball, "sky": {"type": "sunsky"}, "sun": emitters()["sun"]})
+    assert [light.name for light in lights_of(scene)] == ["sun"]
+    assert environments_of(scene) == ()
+    reasons = {emitter.class_name(): objection(emitter) for emitter in scene.emitters()}
+    assert reasons["DirectionalEmitter"] is None
+    assert "rectangles and disks" in reasons["DirectionalArea"] and "envmap" in reasons["SunskyEmitter"]

@@ -1,0 +1,181 @@
+"""Records of lights that throw a picture or a beam: projectors, and flat shapes that shine along their normal only."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+# Width of the rim in which a beam fades, as a share of the narrower half of its cross-section.
+_RIM = 0.02
+
+
+@dataclass(frozen=True)
+class Projector:
+    """A picture thrown along the local +z axis: Mitsuba's ``projector``.
+
+    to_world    Transform4f
+    irradiance  ``mi.Texture``: the picture, as irradiance on a plane at local z = 1 (times pi, as Mitsuba has it)
+    scale       Float, factor of the irradiance
+    tangents    Vector2f, of the half-angles that the picture covers, in local x and y
+    """
+
+    name: str
+    to_world: Any
+    irradiance: Any
+    scale: Any
+    tangents: Any
+
+    @property
+    def position(self) -> Any:
+        """Point3f, world space."""
+        return translation(self.to_world)
+
+    @property
+    def direction(self) -> Any:
+        """Vector3f, unit axis, the direction in which light travels, world space."""
+        return dr.normalize(axis(self.to_world, 2))
+
+    @property
+    def spread(self) -> Any:
+        """Float, tangent of the half-angle of the smallest cone about the axis with a square base that holds the picture."""
+        x, y, z = (dr.norm(axis(self.to_world, k)) for k in range(3))
+        return dr.maximum(self.tangents.x * x, self.tangents.y * y) / z
+
+    def illuminate(self, p_world: Any, active: Any = True) -> tuple[Any, Any]:
+        """(wo, weight): unit direction to the projector (Vector3f), and its irradiance (colour) on a surface that faces it.
+
+        ``p_world`` Point3f (N,), world space. Attached to points, to_world, picture, scale and tangents.
+        """
+        wo, _ = towards(p_world, self.position)
+        local = dr.rcp(mi.Matrix3f(self.to_world.matrix)) @ mi.Vector3f(p_world - self.position)
+        lit = mi.Bool(active) & (local.z > 0)
+        z = dr.select(lit, local.z, 1.0)
+        # As in Mitsuba's cameras, local x points to the left of the picture.
+        uv = mi.Point2f(*(0.5 - 0.5 * local[k] / (z * self.tangents[k]) for k in range(2)))
+        lit &= (uv.x >= 0) & (uv.x <= 1) & (uv.y >= 0) & (uv.y <= 1)
+        cosine = dr.select(lit, -dr.dot(axis(self.to_world, 2), wo), 1.0)
+        weight = picture(self.irradiance, uv, lit) * (dr.pi * self.scale / (dr.square(z) * cosine))
+        return wo, dr.select(lit, weight, 0)
+
+
+@dataclass(frozen=True)
+class Beam:
+    """Parallel light from a rectangle or a disk: Mitsuba's ``directionalarea``.
+
+    Mitsuba's particle tracer shows the beam; its other integrators cannot find it.
+
+    shape      ``rectangle`` (local -1..1 in x and y) or ``disk`` (local radius 1)
+    to_world   Transform4f, of the shape
+    radiance   ``mi.Texture`` over the shape; what Mitsuba calls radiance is irradiance on a surface across the beam
+    flipped    whether it shines along local -z instead of +z
+    rim        Float, world units: width of the rim in which the beam fades, half of it on either side of its outline. Through
+               it a moving outline has derivatives.
+    """
+
+    name: str
+    shape: str
+    to_world: Any
+    radiance: Any
+    flipped: bool
+    rim: Any
+
+    @property
+    def position(self) -> Any:
+        """Point3f, centre of the shape, world space."""
+        return translation(self.to_world)
+
+    @property
+    def direction(self) -> Any:
+        """Vector3f, unit normal of the shape, the direction in which light travels, world space."""
+        normal = dr.normalize(mi.Vector3f(dr.cross(axis(self.to_world, 0), axis(self.to_world, 1))))
+        matrix = mi.Matrix3f(self.to_world.matrix)
+        # Mitsuba's normals stay on the side of local z where a transform mirrors.
+        inwards = dr.detach(dr.det(matrix)) < 0
+        return dr.select(inwards ^ self.flipped, -normal, normal)
+
+    @property
+    def reach(self) -> Any:
+        """Float, world units: nothing of the beam is farther from its axis."""
+        return dr.norm(axis(self.to_world, 0)) + dr.norm(axis(self.to_world, 1)) + self.rim
+
+    def illuminate(self, p_world: Any, active: Any = True) -> tuple[Any, Any]:
+        """(wo, weight): unit direction against the beam (Vector3f), and its irradiance (colour) on a surface across it.
+
+        ``p_world`` Point3f (N,), world space. Attached to points, to_world, radiance and rim.
+        """
+        direction = self.direction
+        offset = mi.Vector3f(p_world - self.position)
+        along = dr.dot(offset, direction)
+        inverse = dr.rcp(mi.Matrix3f(self.to_world.matrix))
+        local = mi.Vector2f((inverse @ (offset - direction * along)).xy)
+        lit = mi.Bool(active) & (along > 0)
+        rows = [mi.Vector3f(inverse[k, 0], inverse[k, 1], inverse[k, 2]) for k in range(2)]
+        if self.shape == "disk":
+            # The centre has neither angle nor derivatives: any other point inside will do.
+            centre = dr.squared_norm(local) == 0
+            local = mi.Vector2f(dr.select(centre, 1e-6, local.x), local.y)
+            radius = dr.norm(local)
+            slope = dr.norm(rows[0] * local.x + rows[1] * local.y) / radius
+            inside = self._inside((1 - radius) / slope)
+            angle = dr.atan2(local.y, local.x) * (0.5 / dr.pi)
+            uv = mi.Point2f(dr.minimum(radius, 1), dr.select(angle < 0, angle + 1, angle))
+        else:
+            across, down = (self._inside((1 - dr.abs(local[k])) / dr.norm(rows[k])) for k in range(2))
+            inside = across * down
+            uv = mi.Point2f(*(dr.clip(0.5 + 0.5 * local[k], 0, 1) for k in range(2)))
+        lit &= inside > 0
+        return -direction, dr.select(lit, picture(self.radiance, uv, lit) * inside, 0)
+
+    def _inside(self, distance: Any) -> Any:
+        """Share of the light at a distance (world units) from an edge, positive inside."""
+        return dr.clip(0.5 + distance / self.rim, 0, 1)
+
+
+def projector_of(emitter: Any, name: str, values: dict[str, Any], picture: Any) -> Projector:
+    """Record of a ``mi.Emitter`` called ``projector``. ``values``: its parameters, ``picture``: its texture."""
+    to_world = values["to_world"]
+    with dr.suspend_grad():
+        # Mitsuba tells the angles of view by where it projects points only. How far away they are has no influence.
+        place = dr.detach(to_world)
+        far = 1 + dr.norm(mi.Vector3f(translation(place)))
+        si = dr.zeros(mi.SurfaceInteraction3f)
+        si.p = place @ mi.Point3f(0.5 * far, 0.5 * far, far)
+        uv = emitter.sample_direction(si, mi.Point2f(0.5))[0].uv
+        tangents = mi.Vector2f(0.25 / (0.5 - uv.x), 0.25 / (0.5 - uv.y))
+    return Projector(name, to_world, picture, mi.Float(values["scale"]), tangents)
+
+
+def beam_of(emitter: Any, name: str, to_world: Any, radiance: Any) -> Beam:
+    """Record of a ``mi.Emitter`` called ``directionalarea``, which belongs to a rectangle or a disk placed by ``to_world``."""
+    shape = emitter.get_shape()
+    sides = dr.minimum(*(dr.norm(axis(dr.detach(to_world), k)) for k in range(2)))
+    return Beam(name, shape.class_name().lower(), to_world, radiance, shape.has_flipped_normals(), _RIM * sides)
+
+
+def towards(p_world: Any, position: Any) -> tuple[Any, Any]:
+    """Unit vector from p_world to a position, and 1 / distance^2."""
+    offset = mi.Vector3f(position - p_world)
+    inverse_squared = dr.rcp(dr.squared_norm(offset))
+    return offset * dr.sqrt(inverse_squared), inverse_squared
+
+
+def picture(texture: Any, uv: Any, active: Any) -> Any:
+    """Colour of a texture at texture coordinates (Point2f). Attached to both."""
+    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(uv))
+    si.uv = uv
+    return mi.UnpolarizedSpectrum(texture.eval(si, active))
+
+
+def translation(to_world: Any) -> Any:
+    """Where a Transform4f puts the origin (Point3f)."""
+    matrix = to_world.matrix
+    return mi.Point3f(matrix[0, 3], matrix[1, 3], matrix[2, 3])
+
+
+def axis(to_world: Any, k: int) -> Any:
+    """Where a Transform4f points the k-th axis (Vector3f, with its scale)."""
+    matrix = to_world.matrix
+    return mi.Vector3f(matrix[0, k], matrix[1, k], matrix[2, k])

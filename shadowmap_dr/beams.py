@@ -8,6 +8,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from .geometry import normalize_or
+
 # Width of the rim in which a beam fades, as a share of the narrower half of its cross-section.
 _RIM = 0.02
 
@@ -90,7 +92,8 @@ class Beam:
     @property
     def direction(self) -> Any:
         """Vector3f, unit normal of the shape, the direction in which light travels, world space."""
-        normal = dr.normalize(mi.Vector3f(dr.cross(axis(self.to_world, 0), axis(self.to_world, 1))))
+        # A shape without area has no normal; nor does it light anything.
+        normal = normalize_or(dr.cross(axis(self.to_world, 0), axis(self.to_world, 1)), mi.Vector3f(0, 0, 1))
         matrix = mi.Matrix3f(self.to_world.matrix)
         # Mitsuba's normals stay on the side of local z where a transform mirrors.
         inwards = dr.detach(dr.det(matrix)) < 0

@@ -10,6 +10,10 @@ class ShadowmapError(ValueError):
     """Bad input to shadowmap_dr: a scene, an option or an array that cannot be used as given."""
 
 
+class UnsupportedShape(ShadowmapError):
+    """A shape that cannot be rendered, but that a scene can be rendered without."""
+
+
 class LLVMError(ShadowmapError, ImportError):
     """No LLVM library that Dr.Jit can compile with."""
 

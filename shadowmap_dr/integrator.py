@@ -176,12 +176,12 @@ class SceneRenderer:
     fits: list[tuple[Any, Frusta | None, SoftFrusta]] = field(default_factory=list)
 
     @classmethod
-    def build(cls, scene: Any, sensor: Any, options: Options, settings: RenderSettings) -> SceneRenderer:
-        """Read a scene. Raises ShadowmapError for what is not supported."""
+    def build(cls, scene: Any, sensor: Any, options: Options, settings: RenderSettings, warn: bool = True) -> SceneRenderer:
+        """Read a scene. Raises ShadowmapError for what is broken; ``warn``: of what is left out."""
         if dr.flag(dr.JitFlag.FreezingScope):
             raise ShadowmapError("A scene cannot be read while a function is frozen: render it once with this integrator before.")
         with dr.suspend_grad():
-            data = replace(load(scene, tessellation=options.tessellation), sensors=(sensors_of(sensor),))
+            data = replace(load(scene, tessellation=options.tessellation, warn=warn), sensors=(sensors_of(sensor),))
             renderer = Renderer.from_data(data, settings)
         lights = tuple(light.name for light in data.lights)
         return cls(_parts(scene, data), _statics(scene, data), _sizes(data), lights, renderer.with_data(_without_scene(data)))
@@ -283,7 +283,10 @@ class Shell:
             if record.matches(scene):
                 break
         else:
-            record = SceneRenderer.build(scene, sensor, self.options, self.settings)
+            # The scene is told from others by its shapes: it may be here again with another topology.
+            shapes = tuple(scene.shapes())
+            known = any(_same_objects(other.parts[: len(shapes)], shapes) for other in self.scenes)
+            record = SceneRenderer.build(scene, sensor, self.options, self.settings, warn=not known)
         self.scenes = [record, *(other for other in self.scenes if other is not record)][:_REMEMBERED_SCENES]
         return record
 

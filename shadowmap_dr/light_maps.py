@@ -64,7 +64,7 @@ def plan_maps(lights: Sequence[Light], geometry: Geometry) -> MapPlan:
     """Decide (on the host, once) which maps the lights need and what is known about the shapes."""
     kinds = tuple(_kind_of(light) for light in lights)
     sizes = [6 if kind == "cube" else 1 for kind in kinds]
-    positions = dr.detach(geometry.positions).numpy().reshape(-1, 3)
+    positions = dr.detach(geometry.positions).numpy().reshape(-1, 3).astype(np.float64)
     faces = geometry.faces.numpy().reshape(-1, 3)
     planes = []
     for info in geometry.shapes:

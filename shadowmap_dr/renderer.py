@@ -118,6 +118,8 @@ class Renderer:
         geometry = data.geometry
         positions = dr.detach(geometry.positions).numpy()
         topology = build_topology(geometry.faces.numpy(), positions, mi.UInt32)
+        if not topology.count:
+            raise ShadowmapError("There is nothing to render: all triangles of the scene have two corners at the same place.")
         plan, creases = plan_maps(data.lights, geometry), crease_edges(geometry, topology)
         lights = (*data.areas, *data.environments)
         single = settings.emitter_shadows == "single"

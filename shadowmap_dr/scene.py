@@ -6,7 +6,6 @@ change, attached where they carry gradients.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -15,9 +14,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .errors import ShadowmapError
+from .errors import ShadowmapError, UnsupportedShape
 from .geometry import Geometry, ShapeInfo, pack_face_info
 from .lights import AreaLight, Environment, Light, area_lights_of, environments_of, lights_of
+from .omissions import omissions_of, warn_of
 from .sensors import Sensor, sensors_of, warn_about_lens
 from .sources import ShapeSource, source_of
 from .traversal import children
@@ -28,7 +28,7 @@ class SceneData:
     """A scene as records. A PyTree that may cross ``dr.freeze``.
 
     sensors       one tuple for each sensor of the scene; a batch sensor's holds several cameras, all others one
-    lights        directional, spot and point lights
+    lights        directional, spot and point lights, projectors and beams
     areas         area lights
     environments  constant and envmap emitters (at most one)
     shape_ptr, bsdf_ptr   mi.ShapePtr, mi.BSDFPtr (S,), by the index that ``geometry.face_shape`` holds
@@ -56,12 +56,12 @@ class SceneData:
         raise ShadowmapError(f"There is no light '{name}' in the scene; its lights: {known}.")
 
 
-def load(scene: Any, *, tessellation: int = 64) -> SceneData:
+def load(scene: Any, *, tessellation: int = 64, warn: bool = True) -> SceneData:
     """Read a ``mi.Scene``.
 
     ``tessellation``: triangles around the circumference of spheres, disks and cylinders; curves have fewer in proportion
-    (``sources.source_of``). Raises ``ShadowmapError`` for what is not supported or broken, naming the plug-in and its id; warns
-    (``UserWarning``) where the result is still meaningful.
+    (``sources.source_of``). ``warn``: name all that is left out, since it is not supported, in one ``UserWarning``. Raises
+    ``ShadowmapError`` for what is broken, naming the plug-in and its id, and where nothing is left.
     Needs a variant ``*_ad_rgb`` or ``*_ad_mono``.
     """
     if not ("_ad_" in mi.variant() and mi.variant().endswith(("_rgb", "_mono"))):
@@ -71,17 +71,21 @@ def load(scene: Any, *, tessellation: int = 64) -> SceneData:
         )
     if not isinstance(tessellation, int) or tessellation < 3:
         raise ShadowmapError(f"tessellation is {tessellation!r}, but must be an integer of at least 3.")
-    infos, sources, faces = [], [], []
+    infos, sources, faces, unsupported = [], [], [], []
     for name, shape, instance in _shapes_of(scene):
-        source, own_faces = source_of(name, shape, instance, tessellation)
-        _check_surface(name, shape)
+        try:
+            source, own_faces = source_of(name, shape, instance, tessellation)
+        except UnsupportedShape as error:
+            unsupported.append(str(error).rstrip("."))
+            continue
         vertex_start = infos[-1].vertex_start + infos[-1].vertex_count if infos else 0
         face_start = infos[-1].face_start + infos[-1].face_count if infos else 0
         infos.append(describe(name, source, own_faces, vertex_start, face_start))
         sources.append(source)
         faces.append(own_faces + np.uint32(vertex_start))
     if not infos:
-        raise ShadowmapError("The scene has no shapes: there is nothing to render.")
+        why = "; ".join(unsupported) or "it has no shapes"
+        raise ShadowmapError(f"There is nothing to render in the scene: {why}.")
     face_counts, vertex_counts = [i.face_count for i in infos], [i.vertex_count for i in infos]
     shape_index = np.arange(len(infos), dtype=np.uint32)
     geometry = Geometry(
@@ -109,8 +113,10 @@ def load(scene: Any, *, tessellation: int = 64) -> SceneData:
         needs_frames=not all(_is_plain(source.shape.bsdf()) for source in sources),
     )
     data = refresh(data)
-    for sensor in scene.sensors():
-        warn_about_lens(sensor)
+    if warn:
+        warn_of(omissions_of(scene, [(i.name, s.shape) for i, s in zip(infos, sources, strict=True)], unsupported), stacklevel=2)
+        for sensor in scene.sensors():
+            warn_about_lens(sensor)
     return replace(data, geometry=replace(data.geometry, as_loaded=True))
 
 
@@ -182,23 +188,6 @@ def _group_of(instance: Any, name: str, groups: list[list[tuple[str, Any]]]) -> 
         if shapes and dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shapes[0]))[0] == first:
             return shapes
     raise ShadowmapError(f"The shape group of instance '{name}' was not found in the scene.")
-
-
-def _check_surface(name: str, shape: Any) -> None:
-    """Refuse or warn about what else hangs on a shape."""
-    if shape.is_emitter() and shape.emitter().class_name() != "AreaLight":
-        raise ShadowmapError(
-            f"Shape '{name}' emits light ({shape.emitter().class_name()} '{shape.emitter().id()}'), which is not supported: "
-            "use an area light."
-        )
-    if shape.is_medium_transition():
-        warnings.warn(f"Shape '{name}' bounds a medium, which is ignored.", stacklevel=4)
-    bsdf = shape.bsdf()
-    if not mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth):
-        warnings.warn(
-            f"The BSDF '{bsdf.id()}' ({bsdf.class_name()}) of shape '{name}' has no smooth component and renders black.",
-            stacklevel=4,
-        )
 
 
 def describe(name: str, source: ShapeSource, faces: np.ndarray, vertex_start: int, face_start: int) -> ShapeInfo:

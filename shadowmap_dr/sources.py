@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from . import curves, tessellate, tubes
-from .errors import ShadowmapError
+from .errors import ShadowmapError, UnsupportedShape
 from .traversal import mesh_buffers, parameters
 
 _ANALYTIC = {"Sphere": tessellate.sphere, "Disk": tessellate.disk, "Cylinder": tessellate.cylinder}
@@ -157,8 +157,8 @@ def source_of(name: str, shape: Any, instance: Any, tessellation: int) -> tuple[
         curves.check_control_points(name, points, segments, _CURVES[kind].points_of_segment)
         plan, layout = _CURVES[kind].plan(segments, max(tessellation // 2, 3), max(tessellation // 8, 1))
         return CurveSource(shape, instance, name, plan, layout, len(points)), layout.faces()
-    raise ShadowmapError(
-        f"Shape '{name}' ({kind}) is not supported: use meshes, spheres, disks, cylinders, bsplinecurve, linearcurve, instances."
+    raise UnsupportedShape(
+        f"shape '{name}' ({kind}) is not supported: use meshes, spheres, disks, cylinders, bsplinecurve, linearcurve, instances."
     )
 
 

@@ -204,25 +204,12 @@ def test_faces_out_of_range_and_empty_meshes_are_named(variant: str) -> None:
         describe("broken", source, np.zeros((0, 3), np.uint32), 0, 0)
 
 
-def test_unsupported_things_are_named(variant: str) -> None:
-    def refused(match: str, **parts: Any) -> None:
-        with pytest.raises(ShadowmapError, match=match):
-            load(mi.load_dict({"type": "scene", **parts}, optimize=False))
-
-    refused("no shapes")
-    refused("'glow'.*DirectionalArea.*area light", glow={"type": "sphere", "emitter": {"type": "directionalarea"}})
-    refused("'beam'.*Projector", box={"type": "cube"}, beam={"type": "projector", "irradiance": 1.0})
+def test_nothing_to_render_is_refused(variant: str) -> None:
+    with pytest.raises(ShadowmapError, match="nothing to render.*no shapes"):
+        load(mi.load_dict({"type": "scene"}))
     grid = mi.TensorXf(np.linspace(-1, 1, 27, dtype=np.float32).reshape(3, 3, 3, 1))
-    refused("'blob'.*SDFGrid", blob={"type": "sdfgrid", "grid": grid})
-
-
-def test_warnings(variant: str) -> None:
-    glass = {"type": "dielectric", "id": "glass"}
-    with pytest.warns(UserWarning, match="'glass'.*'ball'.*black"):
-        load(mi.load_dict({"type": "scene", "ball": {"type": "sphere", "bsdf": glass}}))
-    fog = {"type": "sphere", "interior": {"type": "homogeneous"}, "bsdf": {"type": "diffuse"}}
-    with pytest.warns(UserWarning, match="'fog'.*medium"):
-        load(mi.load_dict({"type": "scene", "fog": fog}))
+    with pytest.raises(ShadowmapError, match="nothing to render.*'blob' .SDFGrid"):
+        load(mi.load_dict({"type": "scene", "blob": {"type": "sdfgrid", "grid": grid}}))
 
 
 def test_scalar_variant_is_refused(variant: str) -> None:

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..geometry import Geometry, ShapeInfo
+from ..geometry import Geometry, ShapeInfo, normalize_or
 from ..lights import AreaLight
 from .clusters import surface_clusters
 from .samples import LightSamples, cluster_sums
@@ -84,7 +84,7 @@ def area_samples(light: AreaLight, plan: AreaPlan, geometry: Geometry) -> LightS
     face = dr.gather(mi.UInt32, plan.face, plan.chosen)
     first, e1, e2 = _triangles(geometry, face)
     u, v = dr.gather(mi.Float, plan.u, plan.chosen), dr.gather(mi.Float, plan.v, plan.chosen)
-    normal = dr.normalize(dr.cross(e1, e2))
+    normal = normalize_or(dr.cross(e1, e2), mi.Vector3f(0.0))
     return LightSamples(
         distant=False,
         place=mi.Vector3f(first + e1 * u + e2 * v),
@@ -129,7 +129,8 @@ def _pieces(areas: np.ndarray, count: int) -> tuple[np.ndarray, tuple[np.ndarray
 
     Returns (triangle, (barycentrics of vertices 1 and 2 of the centre), share of the triangle), one entry a piece.
     """
-    share = areas / max(areas.sum(), 1e-300)
+    # An emitter without area may get some later.
+    share = areas / areas.sum() if areas.sum() > 0 else np.full(len(areas), 1 / len(areas))
     sides = np.maximum(np.ceil(np.sqrt(share * count)), 1).astype(np.int64)
     face, u, v = [], [], []
     for n in np.unique(sides):

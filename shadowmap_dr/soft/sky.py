@@ -42,7 +42,7 @@ def plan_sky(light: Environment, count: int) -> SkyPlan:
         mean = dr.mean(radiance) + dr.zeros(mi.Float, dr.width(solid_angle))
         brightness, weight = mean.numpy().astype(np.float64), solid_angle.numpy().astype(np.float64)
         directions = np.stack([c.numpy() for c in local], -1).astype(np.float64)
-    brightness = np.maximum(np.nan_to_num(brightness), 0)
+    brightness = np.maximum(np.nan_to_num(brightness, posinf=0), 0)
     average = (brightness * weight).sum() / weight.sum()
     energy = (brightness + _DARK * average if average > 0 else np.ones_like(brightness)) * weight
     cluster = sky_clusters(energy.reshape(rows, 2 * rows), count).ravel()

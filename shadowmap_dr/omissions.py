@@ -1,0 +1,75 @@
+"""What a scene has and images leave out, said in one warning."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import mitsuba as mi
+
+from .lights import named_emitters, objection
+
+# Names that a warning lists.
+_LISTED = 4
+
+
+def omissions_of(scene: Any, shapes: Sequence[tuple[str, Any]], unsupported: Sequence[str]) -> tuple[str, ...]:
+    """One sentence without its full stop for all of a kind that images of a scene leave out.
+
+    ``shapes``: (name, ``mi.Shape``) of all that are rendered; ``unsupported``: sentences about those that are not.
+    """
+    found = list(unsupported)
+    media = [name for name, shape in shapes if shape.is_medium_transition()]
+    if media:
+        found.append(f"{_named('shape', media)} {_bounds(media)}, which is ignored: light passes through it unchanged")
+    found += _delta_materials(shapes, _has_extended_lights(scene))
+    rendered = [shape for _, shape in shapes]
+    for name, emitter in named_emitters(scene):
+        shape, reason = emitter.get_shape(), objection(emitter)
+        place = f" of shape '{shape.id()}'" if shape is not None else ""
+        if reason is not None:
+            found.append(f"emitter '{name}'{place} ({emitter.class_name()}) {reason}")
+        elif emitter.class_name() == "AreaLight" and not any(other == shape for other in rendered):
+            found.append(f"emitter '{name}'{place} is left out with its shape")
+    return tuple(found)
+
+
+def warn_of(omissions: Sequence[str], stacklevel: int) -> None:
+    """One ``UserWarning`` that names all omissions; nothing if there are none."""
+    if omissions:
+        warnings.warn(f"Not all of the scene is rendered: {'; '.join(omissions)}.", stacklevel=stacklevel + 1)
+
+
+def _has_extended_lights(scene: Any) -> bool:
+    return any(emitter.is_environment() or emitter.class_name() == "AreaLight" for emitter in scene.emitters())
+
+
+def _delta_materials(shapes: Sequence[tuple[str, Any]], mirrored: bool) -> list[str]:
+    """About BSDFs that reflect or refract into single directions. ``mirrored``: whether there is direct light in mirrors."""
+    groups: list[tuple[Any, list[str]]] = []
+    for name, shape in shapes:
+        bsdf = shape.bsdf()
+        users = next((users for other, users in groups if other == bsdf), None)
+        if users is None:
+            groups.append((bsdf, [name]))
+        else:
+            users.append(name)
+    found = []
+    for bsdf, users in groups:
+        flags, what = bsdf.flags(), f"BSDF '{bsdf.id()}' ({bsdf.class_name()}) of {_named('shape', users)}"
+        delta = mi.has_flag(flags, mi.BSDFFlags.DeltaReflection) or mi.has_flag(flags, mi.BSDFFlags.DeltaTransmission)
+        if not mi.has_flag(flags, mi.BSDFFlags.Smooth):
+            found.append(f"{what} has no smooth component and renders black")
+        elif delta and mirrored:
+            found.append(f"{what} shows no mirror images of lights, only its smooth component")
+    return found
+
+
+def _named(kind: str, names: Sequence[str]) -> str:
+    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+    return f"{kind}{'s' if len(names) > 1 else ''} " + ", ".join(f"'{name}'" for name in names[:_LISTED]) + more
+
+
+def _bounds(names: Sequence[str]) -> str:
+    return "bounds a medium" if len(names) == 1 else "bound media"

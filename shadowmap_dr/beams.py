@@ -10,8 +10,10 @@ import mitsuba as mi
 
 from .geometry import normalize_or
 
-# Width of the rim in which a beam fades, as a share of the narrower half of its cross-section.
-_RIM = 0.02
+# Width of the rim in which light fades, half of it on either side of the outline: through it a moving outline has derivatives.
+# In units of the picture, and of the narrower half of a beam's cross-section.
+_PICTURE_RIM = 1 / 256
+_BEAM_RIM = 0.02
 
 
 @dataclass(frozen=True)
@@ -22,6 +24,8 @@ class Projector:
     irradiance  ``mi.Texture``: the picture, as irradiance on a plane at local z = 1 (times pi, as Mitsuba has it)
     scale       Float, factor of the irradiance
     tangents    Vector2f, of the half-angles that the picture covers, in local x and y
+    rim         width of the rim in which the light fades, half of it on either side of the outline, in units of the picture's
+                width and height. Through it a moving outline has derivatives. Elsewhere all is as in Mitsuba.
     """
 
     name: str
@@ -29,6 +33,7 @@ class Projector:
     irradiance: Any
     scale: Any
     tangents: Any
+    rim: float = _PICTURE_RIM
 
     @property
     def position(self) -> Any:
@@ -44,7 +49,7 @@ class Projector:
     def spread(self) -> Any:
         """Float, tangent of the half-angle of the smallest cone about the axis with a square base that holds the picture."""
         x, y, z = (dr.norm(axis(self.to_world, k)) for k in range(3))
-        return dr.maximum(self.tangents.x * x, self.tangents.y * y) / z
+        return dr.maximum(self.tangents.x * x, self.tangents.y * y) * (1 + self.rim) / z
 
     def illuminate(self, p_world: Any, active: Any = True) -> tuple[Any, Any]:
         """(wo, weight): unit direction to the projector (Vector3f), and its irradiance (colour) on a surface that faces it.
@@ -57,9 +62,13 @@ class Projector:
         z = dr.select(lit, local.z, 1.0)
         # As in Mitsuba's cameras, local x points to the left of the picture.
         uv = mi.Point2f(*(0.5 - 0.5 * local[k] / (z * self.tangents[k]) for k in range(2)))
-        lit &= (uv.x >= 0) & (uv.x <= 1) & (uv.y >= 0) & (uv.y <= 1)
+        # Distances from the outline, positive inside.
+        across, down = (_ramp(0.5 - dr.abs(uv[k] - 0.5), self.rim) for k in range(2))
+        inside = across * down
+        lit &= inside > 0
         cosine = dr.select(lit, -dr.dot(axis(self.to_world, 2), wo), 1.0)
-        weight = picture(self.irradiance, uv, lit) * (dr.pi * self.scale / (dr.square(z) * cosine))
+        uv = dr.clip(uv, 0, 1)
+        weight = picture(self.irradiance, uv, lit) * inside * (dr.pi * self.scale / (dr.square(z) * cosine))
         return wo, dr.select(lit, weight, 0)
 
 
@@ -73,8 +82,7 @@ class Beam:
     to_world   Transform4f, of the shape
     radiance   ``mi.Texture`` over the shape; what Mitsuba calls radiance is irradiance on a surface across the beam
     flipped    whether it shines along local -z instead of +z
-    rim        Float, world units: width of the rim in which the beam fades, half of it on either side of its outline. Through
-               it a moving outline has derivatives.
+    rim        Float, world units: width of the rim in which the beam fades, as a projector's picture
     """
 
     name: str
@@ -122,19 +130,15 @@ class Beam:
             local = mi.Vector2f(dr.select(centre, 1e-6, local.x), local.y)
             radius = dr.norm(local)
             slope = dr.norm(rows[0] * local.x + rows[1] * local.y) / radius
-            inside = self._inside((1 - radius) / slope)
+            inside = _ramp((1 - radius) / slope, self.rim)
             angle = dr.atan2(local.y, local.x) * (0.5 / dr.pi)
             uv = mi.Point2f(dr.minimum(radius, 1), dr.select(angle < 0, angle + 1, angle))
         else:
-            across, down = (self._inside((1 - dr.abs(local[k])) / dr.norm(rows[k])) for k in range(2))
+            across, down = (_ramp((1 - dr.abs(local[k])) / dr.norm(rows[k]), self.rim) for k in range(2))
             inside = across * down
             uv = mi.Point2f(*(dr.clip(0.5 + 0.5 * local[k], 0, 1) for k in range(2)))
         lit &= inside > 0
         return -direction, dr.select(lit, picture(self.radiance, uv, lit) * inside, 0)
-
-    def _inside(self, distance: Any) -> Any:
-        """Share of the light at a distance (world units) from an edge, positive inside."""
-        return dr.clip(0.5 + distance / self.rim, 0, 1)
 
 
 def projector_of(emitter: Any, name: str, values: dict[str, Any], picture: Any) -> Projector:
@@ -155,7 +159,7 @@ def beam_of(emitter: Any, name: str, to_world: Any, radiance: Any) -> Beam:
     """Record of a ``mi.Emitter`` called ``directionalarea``, which belongs to a rectangle or a disk placed by ``to_world``."""
     shape = emitter.get_shape()
     sides = dr.minimum(*(dr.norm(axis(dr.detach(to_world), k)) for k in range(2)))
-    return Beam(name, shape.class_name().lower(), to_world, radiance, shape.has_flipped_normals(), _RIM * sides)
+    return Beam(name, shape.class_name().lower(), to_world, radiance, shape.has_flipped_normals(), _BEAM_RIM * sides)
 
 
 def towards(p_world: Any, position: Any) -> tuple[Any, Any]:
@@ -163,6 +167,11 @@ def towards(p_world: Any, position: Any) -> tuple[Any, Any]:
     offset = mi.Vector3f(position - p_world)
     inverse_squared = dr.rcp(dr.squared_norm(offset))
     return offset * dr.sqrt(inverse_squared), inverse_squared
+
+
+def _ramp(distance: Any, rim: Any) -> Any:
+    """Share of the light at a distance from an edge, positive inside."""
+    return dr.clip(0.5 + distance / rim, 0, 1)
 
 
 def picture(texture: Any, uv: Any, active: Any) -> Any:

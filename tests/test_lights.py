@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from shadowmap_dr.beams import Projector
 from shadowmap_dr.lights import environments_of, lights_of, objection
 from shadowmap_dr.traversal import children
 
@@ -49,6 +50,17 @@ def sample(emitter: Any, p_world: Any) -> tuple[Any, Any]:
     return ds.d, weight
 
 
+def in_rim(light: Any, p_world: Any) -> np.ndarray:
+    """Which points lie where a projector's light fades, unlike Mitsuba's: a narrow strip."""
+    if not isinstance(light, Projector):
+        return np.zeros(dr.width(p_world), bool)
+    local = mi.Transform4f(light.to_world).inverse() @ p_world
+    x, y = (np.abs(0.5 * (local[k] / (local.z * light.tangents[k])).numpy()) - 0.5 for k in range(2))
+    rim = np.maximum(x, y)
+    assert (np.abs(rim) < light.rim).mean() < 0.02
+    return np.abs(rim) < light.rim
+
+
 @pytest.mark.parametrize("name", ["sun", "bulb", "cone", "slide", "wide", "beamer", "squeezed"])
 @pytest.mark.parametrize("mono", [False, True], ids=["rgb", "mono"])
 def test_equals_sample_direction(variant: str, name: str, mono: bool) -> None:
@@ -63,7 +75,8 @@ def test_equals_sample_direction(variant: str, name: str, mono: bool) -> None:
     wo, weight = light.illuminate(points())
     wo_mitsuba, weight_mitsuba = sample(scene.emitters()[0], points())
     assert np.allclose(wo.numpy(), wo_mitsuba.numpy(), atol=1e-6)
-    assert np.allclose(weight.numpy(), weight_mitsuba.numpy(), rtol=1e-4, atol=1e-6)
+    same = np.isclose(weight.numpy(), weight_mitsuba.numpy(), rtol=1e-4, atol=1e-6).all(0)
+    assert np.all(same | in_rim(light, points()))
     assert weight.numpy().max() > 0
     assert np.all(light.illuminate(points(), mi.Bool(False))[1].numpy() == 0)
 
@@ -92,10 +105,11 @@ def test_gradients_equal_mitsubas(variant: str, name: str, key: str) -> None:
         params[f"light.{key}"] = start + (x if key == "position" else 1.5 * x)
     params.update()
     (light,) = lights_of(scene)
+    usual = mi.Bool(~in_rim(light, points()))
 
     def gradient(wo: Any, weight: Any) -> np.ndarray:
         dr.clear_grad(x)
-        total = dr.sum(dr.squared_norm(weight) + dr.dot(wo, mi.Vector3f(3, -1, 2)))
+        total = dr.sum(dr.select(usual, dr.squared_norm(weight) + dr.dot(wo, mi.Vector3f(3, -1, 2)), 0))
         dr.backward(total, flags=dr.ADFlag.ClearInterior)
         return x.grad.numpy()
 
@@ -138,7 +152,7 @@ def test_projector_covers_what_mitsubas_covers(variant: str) -> None:
         half = np.tan(np.radians(fov / 2))
         # The picture has 16 columns and 8 rows.
         assert np.allclose(light.tangents.numpy().ravel(), [half, half / 2], rtol=1e-4)
-        assert np.allclose(light.spread.numpy(), half, rtol=1e-4)
+        assert np.allclose(light.spread.numpy(), half, rtol=5e-3) and light.spread[0] > half
 
 
 @pytest.mark.parametrize("kind", ["rectangle", "disk"])

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..geometry import Geometry, ShapeInfo, normalize_or
+from ..geometry import Geometry, ShapeInfo
 from ..lights import AreaLight
 from .clusters import surface_clusters
 from .samples import LightSamples, cluster_sums
@@ -84,7 +84,7 @@ def area_samples(light: AreaLight, plan: AreaPlan, geometry: Geometry) -> LightS
     face = dr.gather(mi.UInt32, plan.face, plan.chosen)
     first, e1, e2 = _triangles(geometry, face)
     u, v = dr.gather(mi.Float, plan.u, plan.chosen), dr.gather(mi.Float, plan.v, plan.chosen)
-    normal = normalize_or(dr.cross(e1, e2), mi.Vector3f(0.0))
+    normal = dr.normalize(dr.cross(e1, e2))
     return LightSamples(
         distant=False,
         place=mi.Vector3f(first + e1 * u + e2 * v),

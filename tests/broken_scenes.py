@@ -49,6 +49,18 @@ def mesh(positions: Any, faces: Any, name: str = "broken") -> Any:
     return made
 
 
+def smooth() -> Any:
+    """A triangle with normals and texture coordinates."""
+    made = mi.Mesh("smooth", 3, 1, has_vertex_normals=True, has_vertex_texcoords=True)
+    return with_parameters(
+        made,
+        vertex_positions=mi.Float(np.ravel(TRIANGLE)),
+        vertex_normals=mi.Float([0, 0, 1] * 3),
+        vertex_texcoords=mi.Float([0, 0, 1, 0, 0, 1]),
+        faces=mi.UInt32([0, 1, 2]),
+    )
+
+
 def with_parameters(made: Any, **values: Any) -> Any:
     """A scene whose parameters were set later; ``__`` in names stands for a dot."""
     later(**values)(made)
@@ -125,6 +137,11 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
         IMAGE,
     ),
     "huge_floor": (lambda: scene(floor={"type": "rectangle", "to_world": mi.ScalarTransform4f().scale([1e20, 1e20, 1])}), IMAGE),
+    "empty": (lambda: scene(box=mi.Mesh("empty", 0, 0)), ERROR),
+    "no_faces": (lambda: scene(box=mesh(TRIANGLE, np.zeros((0, 3)))), ERROR),
+    "normals_nan": (lambda: scene(box=with_parameters(smooth(), vertex_normals=mi.Float([NAN] * 9))), IMAGE),
+    "normals_zero": (lambda: scene(box=with_parameters(smooth(), vertex_normals=mi.Float([0] * 9))), IMAGE),
+    "texcoords_nan": (lambda: scene(box=with_parameters(smooth(), vertex_texcoords=mi.Float([NAN] * 6))), IMAGE),
     "no_area": (lambda: scene(box=mesh([[0, 0, 1]] * 3, [[0, 1, 2], [0, 0, 0]])), IMAGE),
     "one_vertex_triangle": (lambda: scene(box=mesh(TRIANGLE, [[0, 1, 2], [1, 1, 1], [0, 1, 1]])), IMAGE),
     "all_without_area": (lambda: scene(box=None, floor=mesh([[0, 0, 0]] * 3, [[0, 1, 2]])), ERROR),
@@ -138,6 +155,11 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
     "no_radius": (lambda: scene(box={"type": "sphere", "radius": 0.0}), IMAGE),
     "behind_camera": (lambda: scene(camera=camera(to_world=look_at([0, 0, 9], [0, 0, 20], [0, 1, 0]))), IMAGE),
     # -------------------------------------------------------------------------------------------------------------- cameras
+    "no_fov": (lambda: scene(camera=camera(fov=0.0)), NOT_LOADED),
+    "orthographic_singular": (
+        lambda: scene(camera={"type": "orthographic", "to_world": singular(), "film": film()}),
+        IMAGE,
+    ),
     "one_pixel": (lambda: scene(camera=camera(film=film(1))), IMAGE),
     "narrow": (lambda: scene(camera=camera(fov=1e-4)), IMAGE),
     "wide": (lambda: scene(camera=camera(fov=179.9)), IMAGE),
@@ -162,6 +184,7 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
         PARTLY,
     ),
     "sun_negative": (lambda: with_parameters(scene(), sun__irradiance__value=mi.Float(-3.0)), IMAGE),
+    "point_at_nan": (lambda: scene(sun={"type": "point", "position": [NAN, 0, 3], "intensity": 5.0}), PARTLY),
     "point_in_box": (lambda: scene(sun={"type": "point", "position": [0, 0, 1], "intensity": 5.0}), IMAGE),
     "point_on_floor": (lambda: scene(sun={"type": "point", "position": [0.5, 0.2, 0], "intensity": 5.0}), IMAGE),
     "point_on_vertex": (lambda: scene(sun={"type": "point", "position": [0.4, 0.4, 1.4], "intensity": 5.0}), IMAGE),
@@ -173,6 +196,14 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
         IMAGE,
     ),
     "spot_no_angle": (lambda: scene(sun={"type": "spot", "cutoff_angle": 0.0, **overhead()}), IMAGE),
+    "spot_no_angle_between": (
+        lambda: (scene(sun={"type": "spot", **overhead()}), later(sun__cutoff_angle=mi.Float(0))),
+        IMAGE,
+    ),
+    "spot_nan_angle_between": (
+        lambda: (scene(sun={"type": "spot", **overhead()}), later(sun__cutoff_angle=mi.Float(NAN))),
+        IMAGE,
+    ),
     "spot_no_falloff": (lambda: scene(sun={"type": "spot", "cutoff_angle": 20.0, "beam_width": 20.0, **overhead()}), IMAGE),
     "spot_texture_nan": (lambda: scene(sun={"type": "spot", "texture": texture(NAN), **overhead()}), PARTLY),
     "projector_singular": (
@@ -191,6 +222,10 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
     "lamp_singular": (lambda: scene(lamp=lamp(to_world=singular())), IMAGE),
     "lamp_collapses_between": (
         lambda: (scene(lamp=lamp()), later(lamp__to_world=mi.Transform4f(singular()))),
+        IMAGE,
+    ),
+    "lamp_vertex_nan_between": (
+        lambda: (scene(lamp=lamp(**{"type": "cube"})), later(lamp__vertex_positions=mi.Float([NAN] * 72))),
         IMAGE,
     ),
     "lamp_nan_between": (

@@ -17,10 +17,11 @@ import mitsuba as mi
 from .aovs import aov_names
 from .errors import ShadowmapError
 from .film import put_into_film
+from .omissions import warn_of
 from .render_settings import RenderSettings
 from .renderer import Renderer
 from .scene import SceneData, load
-from .sensors import sensors_of, warn_about_lens
+from .sensors import lenses_of, sensors_of
 from .shadow import Frusta, ShadowSettings
 from .soft import SoftFrusta
 from .traversal import parameters
@@ -205,7 +206,7 @@ class SceneRenderer:
         # derivatives of a step see the frusta of its image, whatever other sensors have taken in between.
         others = [fit for fit in self.fits if fit[0] is not sensor]
         if len(others) == len(self.fits) and not any(sensor is known for known in scene.sensors()):
-            warn_about_lens(sensor)
+            warn_of(lenses_of(sensor), stacklevel=2)
         known = next((fit for fit in self.fits if fit[0] is sensor), (sensor, self.renderer.frusta, self.renderer.soft_frusta))
         _, current.frusta, current.soft_frusta = known
         image = current.render(spp=spp)

@@ -9,6 +9,7 @@ from typing import Any
 import mitsuba as mi
 
 from .lights import named_emitters, objection
+from .sensors import lenses_of
 
 # Names that a warning lists.
 _LISTED = 4
@@ -32,13 +33,15 @@ def omissions_of(scene: Any, shapes: Sequence[tuple[str, Any]], unsupported: Seq
             found.append(f"emitter '{name}'{place} ({emitter.class_name()}) {reason}")
         elif emitter.class_name() == "AreaLight" and not any(other == shape for other in rendered):
             found.append(f"emitter '{name}'{place} is left out with its shape")
+    for sensor in scene.sensors():
+        found += lenses_of(sensor)
     return tuple(found)
 
 
 def warn_of(omissions: Sequence[str], stacklevel: int) -> None:
     """One ``UserWarning`` that names all omissions; nothing if there are none."""
     if omissions:
-        warnings.warn(f"Not all of the scene is rendered: {'; '.join(omissions)}.", stacklevel=stacklevel + 1)
+        warnings.warn(f"Not all in the scene is supported: {'; '.join(omissions)}.", stacklevel=stacklevel + 1)
 
 
 def _has_extended_lights(scene: Any) -> bool:

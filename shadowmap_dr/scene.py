@@ -18,7 +18,7 @@ from .errors import ShadowmapError, UnsupportedShape
 from .geometry import Geometry, ShapeInfo, pack_face_info
 from .lights import AreaLight, Environment, Light, area_lights_of, environments_of, lights_of
 from .omissions import omissions_of, warn_of
-from .sensors import Sensor, sensors_of, warn_about_lens
+from .sensors import Sensor, sensors_of
 from .sources import ShapeSource, source_of
 from .traversal import children
 
@@ -114,9 +114,8 @@ def load(scene: Any, *, tessellation: int = 64, warn: bool = True) -> SceneData:
     )
     data = refresh(data)
     if warn:
-        warn_of(omissions_of(scene, [(i.name, s.shape) for i, s in zip(infos, sources, strict=True)], unsupported), stacklevel=2)
-        for sensor in scene.sensors():
-            warn_about_lens(sensor)
+        shapes = [(info.name, source.shape) for info, source in zip(infos, sources, strict=True)]
+        warn_of(omissions_of(scene, shapes, unsupported), stacklevel=2)
     return replace(data, geometry=replace(data.geometry, as_loaded=True))
 
 

@@ -7,7 +7,6 @@ topmost row of Mitsuba's film, at y = -w.
 from __future__ import annotations
 
 import math
-import warnings
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -189,20 +188,21 @@ class Sensor:
         return mi.Point3f(varying), fixed, pixel
 
 
-def warn_about_lens(sensor: Any) -> None:
-    """Warn (``UserWarning``) that a ``mi.Sensor``, or a camera in a batch sensor, has an aperture, which is ignored."""
+def lenses_of(sensor: Any) -> list[str]:
+    """Sentences (without full stops) about a ``mi.Sensor``, or cameras in a batch sensor, whose aperture is ignored."""
     if dr.flag(dr.JitFlag.FreezingScope):
-        return  # the aperture cannot be read now
+        return []  # the aperture cannot be read now
+    found = []
     for camera in (sensor, *_cameras_of(sensor)):
         if camera.class_name() != "ThinLensCamera":
             continue
         aperture = float(dr.detach(mi.Float(parameters(camera)["aperture_radius"]))[0])
         if aperture > _PINHOLE:
-            warnings.warn(
-                f"Sensor '{camera.id()}' is a thin lens with an aperture_radius of {aperture:g}: it is treated as a pinhole, "
-                "and everything is in focus.",
-                stacklevel=3,
+            found.append(
+                f"sensor '{camera.id()}' is a thin lens with an aperture_radius of {aperture:g} and treated as a pinhole, "
+                "so that everything is in focus"
             )
+    return found
 
 
 def _cameras_of(batch: Any) -> list[Any]:

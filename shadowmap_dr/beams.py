@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,9 +12,9 @@ import mitsuba as mi
 from .geometry import normalize_or
 
 # Width of the rim in which light fades, half of it on either side of the outline: through it a moving outline has derivatives.
-# In units of the picture, and of the narrower half of a beam's cross-section.
-_PICTURE_RIM = 1 / 256
-_BEAM_RIM = 0.02
+# In units of the picture, and of the narrower half of a beam's cross-section. In images it is at least as wide as a pixel.
+_PICTURE_RIM = 1 / 1024
+_BEAM_RIM = 0.005
 
 
 @dataclass(frozen=True)
@@ -51,25 +52,32 @@ class Projector:
         x, y, z = (dr.norm(axis(self.to_world, k)) for k in range(3))
         return dr.maximum(self.tangents.x * x, self.tangents.y * y) * (1 + self.rim) / z
 
-    def illuminate(self, p_world: Any, active: Any = True) -> tuple[Any, Any]:
+    def illuminate(self, p_world: Any, active: Any = True, inside: Any = None) -> tuple[Any, Any]:
         """(wo, weight): unit direction to the projector (Vector3f), and its irradiance (colour) on a surface that faces it.
 
-        ``p_world`` Point3f (N,), world space. Attached to points, to_world, picture, scale and tangents.
+        ``p_world`` Point3f (N,), world space. ``inside``: share of the light at the outline (:func:`share_inside`), Float (N,).
+        Attached to points, to_world, picture, scale and tangents.
         """
         wo, _ = towards(p_world, self.position)
-        local = dr.rcp(mi.Matrix3f(self.to_world.matrix)) @ mi.Vector3f(p_world - self.position)
-        lit = mi.Bool(active) & (local.z > 0)
+        local, uv = self._local(p_world)
+        inside = share_inside(self, p_world) if inside is None else inside
+        lit = mi.Bool(active) & (local.z > 0) & (inside > 0)
         z = dr.select(lit, local.z, 1.0)
-        # As in Mitsuba's cameras, local x points to the left of the picture.
-        uv = mi.Point2f(*(0.5 - 0.5 * local[k] / (z * self.tangents[k]) for k in range(2)))
-        # Distances from the outline, positive inside.
-        across, down = (_ramp(0.5 - dr.abs(uv[k] - 0.5), self.rim) for k in range(2))
-        inside = across * down
-        lit &= inside > 0
         cosine = dr.select(lit, -dr.dot(axis(self.to_world, 2), wo), 1.0)
-        uv = dr.clip(uv, 0, 1)
-        weight = picture(self.irradiance, uv, lit) * inside * (dr.pi * self.scale / (dr.square(z) * cosine))
+        weight = picture(self.irradiance, dr.clip(uv, 0, 1), lit) * inside * (dr.pi * self.scale / (dr.square(z) * cosine))
         return wo, dr.select(lit, weight, 0)
+
+    def distances(self, p_world: Any) -> list[Any]:
+        """Distances from the edges that bound the light (Float), positive inside, in units of ``rim``. Attached."""
+        _, uv = self._local(p_world)
+        return [0.5 - dr.abs(uv[k] - 0.5) for k in range(2)]
+
+    def _local(self, p_world: Any) -> tuple[Any, Any]:
+        """Place in the projector's own space, and in the picture."""
+        local = dr.rcp(mi.Matrix3f(self.to_world.matrix)) @ mi.Vector3f(p_world - self.position)
+        z = dr.select(local.z > 0, local.z, 1.0)
+        # As in Mitsuba's cameras, local x points to the left of the picture.
+        return local, mi.Point2f(*(0.5 - 0.5 * local[k] / (z * self.tangents[k]) for k in range(2)))
 
 
 @dataclass(frozen=True)
@@ -112,33 +120,88 @@ class Beam:
         """Float, world units: nothing of the beam is farther from its axis."""
         return dr.norm(axis(self.to_world, 0)) + dr.norm(axis(self.to_world, 1)) + self.rim
 
-    def illuminate(self, p_world: Any, active: Any = True) -> tuple[Any, Any]:
+    def illuminate(self, p_world: Any, active: Any = True, inside: Any = None) -> tuple[Any, Any]:
         """(wo, weight): unit direction against the beam (Vector3f), and its irradiance (colour) on a surface across it.
 
-        ``p_world`` Point3f (N,), world space. Attached to points, to_world, radiance and rim.
+        ``p_world`` Point3f (N,), world space. ``inside``: share of the light at the outline (:func:`share_inside`), Float (N,).
+        Attached to points, to_world, radiance and rim.
         """
-        direction = self.direction
+        along, local, _ = self._local(p_world)
+        inside = share_inside(self, p_world) if inside is None else inside
+        lit = mi.Bool(active) & (along > 0) & (inside > 0)
+        if self.shape == "disk":
+            angle = dr.atan2(local.y, local.x) * (0.5 / dr.pi)
+            uv = mi.Point2f(dr.minimum(dr.norm(local), 1), dr.select(angle < 0, angle + 1, angle))
+        else:
+            uv = mi.Point2f(*(dr.clip(0.5 + 0.5 * local[k], 0, 1) for k in range(2)))
+        return -self.direction, dr.select(lit, picture(self.radiance, uv, lit) * inside, 0)
+
+    def distances(self, p_world: Any) -> list[Any]:
+        """Distances from the edges that bound the light (Float), positive inside, in units of ``rim``. Attached."""
+        _, local, rows = self._local(p_world)
+        if self.shape == "disk":
+            radius = dr.norm(local)
+            return [(1 - radius) * radius / dr.norm(rows[0] * local.x + rows[1] * local.y)]
+        return [(1 - dr.abs(local[k])) / dr.norm(rows[k]) for k in range(2)]
+
+    def _local(self, p_world: Any) -> tuple[Any, Any, list[Any]]:
+        """(distance along the beam, place on the shape (Vector2f), derivatives of its two coordinates)."""
         offset = mi.Vector3f(p_world - self.position)
-        along = dr.dot(offset, direction)
+        along = dr.dot(offset, self.direction)
         inverse = dr.rcp(mi.Matrix3f(self.to_world.matrix))
-        local = mi.Vector2f((inverse @ (offset - direction * along)).xy)
-        lit = mi.Bool(active) & (along > 0)
         rows = [mi.Vector3f(inverse[k, 0], inverse[k, 1], inverse[k, 2]) for k in range(2)]
+        across = offset - self.direction * along
+        local = mi.Vector2f(dr.dot(rows[0], across), dr.dot(rows[1], across))
         if self.shape == "disk":
             # The centre has neither angle nor derivatives: any other point inside will do.
-            centre = dr.squared_norm(local) == 0
-            local = mi.Vector2f(dr.select(centre, 1e-6, local.x), local.y)
-            radius = dr.norm(local)
-            slope = dr.norm(rows[0] * local.x + rows[1] * local.y) / radius
-            inside = _ramp((1 - radius) / slope, self.rim)
-            angle = dr.atan2(local.y, local.x) * (0.5 / dr.pi)
-            uv = mi.Point2f(dr.minimum(radius, 1), dr.select(angle < 0, angle + 1, angle))
-        else:
-            across, down = (_ramp((1 - dr.abs(local[k])) / dr.norm(rows[k]), self.rim) for k in range(2))
-            inside = across * down
-            uv = mi.Point2f(*(dr.clip(0.5 + 0.5 * local[k], 0, 1) for k in range(2)))
-        lit &= inside > 0
-        return -direction, dr.select(lit, picture(self.radiance, uv, lit) * inside, 0)
+            local = mi.Vector2f(dr.select(dr.squared_norm(local) == 0, 1e-6, local.x), local.y)
+        return along, local, rows
+
+
+@dataclass(frozen=True)
+class Softened:
+    """A projector or beam on a surface, where the share of its light that the outline lets through is known: Float (N,)."""
+
+    light: Projector | Beam
+    inside: Any
+
+    def illuminate(self, p_world: Any, active: Any = True) -> tuple[Any, Any]:
+        """As the light's."""
+        return self.light.illuminate(p_world, active, self.inside)
+
+
+def softened(lights: Sequence[Any], p_world: Any, footprints: Callable[[], Sequence[Any]]) -> tuple[Any, ...]:
+    """The same lights; the outlines of projectors and beams among them are as soft as pixels are wide.
+
+    ``p_world`` Point3f (N,); ``footprints`` gives points half way to the corners of each pixel (Point3f (N,) each), and is called
+    only where there are such lights. One sample per pixel is enough then for derivatives of moving outlines.
+    """
+    if not any(isinstance(light, Projector | Beam) for light in lights):
+        return tuple(lights)
+    around = footprints()
+    return tuple(
+        Softened(light, share_inside(light, p_world, around)) if isinstance(light, Projector | Beam) else light
+        for light in lights
+    )
+
+
+def share_inside(light: Projector | Beam, p_world: Any, around: Sequence[Any] = ()) -> Any:
+    """Share of the light (Float, N) that the outline lets through: 1 inside, 0 outside, a ramp in between. Attached.
+
+    ``around``: points half way to the corners of the pixel around each of ``p_world``; the ramp is as wide as the pixel, or else
+    as the rim.
+    """
+    distances = light.distances(p_world)
+    with dr.suspend_grad():
+        widest = 0.5 if isinstance(light, Projector) else light.reach
+        widths = [mi.Float(light.rim) for _ in distances]
+        for other in around:
+            for k, (here, there) in enumerate(zip(distances, light.distances(other), strict=True)):
+                widths[k] = dr.maximum(widths[k], dr.minimum(4 * dr.abs(dr.detach(there) - dr.detach(here)), widest))
+    share = mi.Float(1)
+    for distance, width in zip(distances, widths, strict=True):
+        share *= dr.clip(0.5 + distance / width, 0, 1)
+    return share
 
 
 def projector_of(emitter: Any, name: str, values: dict[str, Any], picture: Any) -> Projector:
@@ -167,11 +230,6 @@ def towards(p_world: Any, position: Any) -> tuple[Any, Any]:
     offset = mi.Vector3f(position - p_world)
     inverse_squared = dr.rcp(dr.squared_norm(offset))
     return offset * dr.sqrt(inverse_squared), inverse_squared
-
-
-def _ramp(distance: Any, rim: Any) -> Any:
-    """Share of the light at a distance from an edge, positive inside."""
-    return dr.clip(0.5 + distance / rim, 0, 1)
 
 
 def picture(texture: Any, uv: Any, active: Any) -> Any:

@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .aovs import collect_aovs
+from .beams import softened
 from .camera_pass import camera_clip, footprint_points, seen_points, within_far_plane
 from .errors import ShadowmapError
 from .facets import crease_edges, flat_faces, mean_normals, soften_facets
@@ -251,6 +252,8 @@ class Renderer:
         seen = surface_at(self.data, geometry, sensor, hits, *normals, frames=frames)
         lights = lighting.lights
         visible = [self._visibility(lighting.maps, light, k, seen, view, hits.depth) for k, light in enumerate(lights)]
+        around = lambda: footprint_points(sensor, (width, height), hits.depth, seen.p_world, seen.n_world, 2)  # noqa: E731
+        lighting = replace(lighting, lights=softened(lights, seen.p_world, around))
         color = self._radiance(seen, lighting, visible, sensor, raster)
         channels = _film_channels(color, seen.active, sensor)
         named = collect_aovs(self.settings.aovs, seen, raster, lights, visible)

@@ -77,7 +77,8 @@ def measure(options: BenchOptions, method: str, resolution: int, done: Mapping[s
 
 def unfrozen_step(fit: PoseFit) -> Any:
     """A step of a fit, traced anew."""
-    return _pose_step(fit._renderer, fit._optimizer, fit._p_rest, fit._reference, shape=fit._shape, shift_z=fit._shift_z)
+    constants = {"shape": fit._shape, "shift_z": fit._shift_z, "spp": fit._spp}
+    return _pose_step(fit._renderer, fit._optimizer, fit._p_rest, fit._reference, **constants)
 
 
 @contextmanager

@@ -549,13 +549,14 @@ def test_numbers_may_be_integers(variant: str) -> None:
     assert shadowmap(ambient=1).shell.settings.ambient == 1.0
 
 
-def test_unsupported_scene(variant: str) -> None:
-    scene = small_scene(lamp={"type": "sphere", "emitter": {"type": "directionalarea", "id": "glow"}})
+def test_scene_with_nothing_to_render(variant: str) -> None:
+    grid = mi.TensorXf(np.linspace(-1, 1, 27, dtype=np.float32).reshape(3, 3, 3, 1))
+    scene = small_scene(ball=None, floor=None, blob={"type": "sdfgrid", "grid": grid})
     with pytest.raises(RuntimeError) as error:
         render(scene)
     assert isinstance(error.value.__cause__, ShadowmapError)
-    assert "lamp" in str(error.value.__cause__) and "DirectionalArea" in str(error.value.__cause__)
-    with pytest.raises(ShadowmapError, match="lamp"):
+    assert "blob" in str(error.value.__cause__) and "SDFGrid" in str(error.value.__cause__)
+    with pytest.raises(ShadowmapError, match="blob"):
         shadowmap().render(scene)
 
 

@@ -52,18 +52,26 @@ def test_power_adds_up_to_radiance_times_area(variant: str, kind: str, count: in
     power = np.array(found.power).sum(1)
     np.testing.assert_allclose(power, np.array([4, 3, 2]) * found.area.numpy().sum(), rtol=1e-5)
     assert found.area.numpy().min() > 0
-    np.testing.assert_allclose(np.linalg.norm(np.array(found.normal), axis=0), 1, atol=1e-5)
+    length = np.linalg.norm(np.array(found.normal), axis=0)
+    if kind == "sphere":
+        # Of caps of equal size; the whole sphere has no normal at all.
+        assert length.max() <= 1 and (count == 1) == (length.mean() < 0.1) and (count < 64 or length.mean() > 0.95)
+    else:
+        np.testing.assert_allclose(length, 1, atol=1e-5)
 
 
 @pytest.mark.parametrize("kind", AREAS)
 def test_samples_lie_on_the_emitter_and_face_outwards(variant: str, kind: str) -> None:
     scene = scene_of(lamp=lamp(kind))
     found = samples(32, lamp=lamp(kind))
-    origin = mi.Point3f(found.place + 0.2 * found.normal)
-    hit = scene.ray_intersect(mi.Ray3f(origin, -found.normal))
+    normal = dr.normalize(found.normal)
+    origin = mi.Point3f(found.place + 0.2 * normal)
+    hit = scene.ray_intersect(mi.Ray3f(origin, -normal))
     assert dr.all(hit.emitter(scene) != None)  # noqa: E711  (compares pointers)
     np.testing.assert_allclose(hit.t.numpy(), 0.2, atol=2e-3)
-    assert dr.all(dr.dot(hit.n, found.normal) > 0.99)
+    # Of round parts it is the mean of many directions.
+    cosine = dr.dot(hit.n, normal).numpy()
+    assert cosine.min() > (0.5 if kind == "sphere" else 0.999) and cosine.mean() > 0.97
     # No two of them in one place.
     places = np.array(found.place).T
     assert np.linalg.norm(places[:, None] - places[None], axis=-1)[~np.eye(32, dtype=bool)].min() > 0.02

@@ -20,7 +20,8 @@ class RenderSettings:
         shadow: see :class:`ShadowSettings`.
         antialias: anti-alias silhouettes in the image; without it they have no gradient.
         ambient: radiance of unshadowed light that arrives from everywhere, beside that of the scene's environment.
-        hide_emitters: environments light the scene, but are not seen themselves.
+        hide_emitters: the camera looks through area lights, and sees black instead of environments, which light the scene all
+            the same.
         emitter_samples: points on each area light, each with a shadow map.
         environment_samples: directions of an environment, each with a shadow map.
         soft_map_resolution: texels along each side of these maps.

@@ -175,7 +175,10 @@ def lights_of(scene: Any) -> tuple[Light, ...]:
 
 
 def area_lights_of(scene: Any, shapes: Sequence[Any]) -> tuple[AreaLight, ...]:
-    """Records of the area lights of a ``mi.Scene``; ``shapes``: its ``mi.Shape`` objects in the order of the soup."""
+    """Records of the area lights of a ``mi.Scene``; ``shapes``: its ``mi.Shape`` objects in the order of the soup.
+
+    They have the names of their shapes: emitters inside of shapes are all called the same.
+    """
     found = []
     for i, emitter in enumerate(scene.emitters()):
         if emitter.class_name() == "AreaLight":
@@ -183,7 +186,7 @@ def area_lights_of(scene: Any, shapes: Sequence[Any]) -> tuple[AreaLight, ...]:
             index = next(k for k, other in enumerate(shapes) if other is shape or other == shape)
             textures = [part for _, part in children(emitter) if isinstance(part, mi.Texture)]
             textured = any(texture.is_spatially_varying() for texture in textures)
-            found.append(AreaLight(emitter.id() or f"light_{i}", index, emitter, textured))
+            found.append(AreaLight(shape.id() or emitter.id() or f"light_{i}", index, emitter, textured))
     return tuple(found)
 
 

@@ -57,6 +57,8 @@ class RenderSettings:
         size = self.shadow.resolution
         if self.emitter_shadows == "single" and (size < 8 or size & (size - 1)):
             raise ShadowmapError(f"shadow map resolution is {size}; with emitter_shadows 'single' choose a power of two from 8")
+        if self.shadow.method != "none":
+            _ = self.soft_shadow  # whether such maps can be
         if not (self.ambient >= 0 and self.ambient < float("inf")):
             raise ShadowmapError(f"ambient is {self.ambient}: give a finite radiance of at least 0.")
 

@@ -194,7 +194,7 @@ def test_mono_variant(variant: str) -> None:
     colour = render(scene_of(**parts()))
     mi.set_variant(mono)
     grey = render(scene_of(**parts()))
-    assert grey.shape == (SIZE, SIZE, 3) and np.allclose(grey, colour, rtol=1e-3, atol=1e-3)
+    assert grey.shape == (SIZE, SIZE, 1) and np.allclose(grey, colour[..., :1], rtol=1e-3, atol=1e-3)
 
 
 # ------------------------------------------------------------------------------------------------------- functional path
@@ -257,15 +257,17 @@ def test_lights_are_replaced_by_name(variant: str) -> None:
 def test_bad_settings_are_named(variant: str, options: dict[str, int], message: str) -> None:
     with pytest.raises(ShadowmapError, match=message):
         Renderer.from_scene(scenery(), **options)
-    with pytest.raises(ShadowmapError, match=message):
+    with pytest.raises(RuntimeError, match=message):  # Mitsuba's parser wraps it
         mi.load_dict({"type": "shadowmap", **options})
 
 
-def test_light_that_is_not_a_number_ends_nothing(variant: str) -> None:
-    """The image tells; the process goes on, and so do other lights."""
-    scene = scenery(lamp=panel(1.2, 0.3, emitter=area(float("nan"))))
-    assert np.isnan(render(scene, **OPTIONS)).any()
-    assert np.isfinite(render(scenery(), **OPTIONS)).all()
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_radiance_that_is_not_finite_is_named(variant: str, value: float) -> None:
+    with pytest.raises(ShadowmapError, match="radiance of light 'lamp' is not finite"):
+        Renderer.from_scene(scenery(lamp=panel(1.2, 0.3, emitter=area(value))), **OPTIONS)
+    with pytest.raises(ShadowmapError, match="radiance of light 'sky' is not finite"):
+        sky = {"type": "constant", "radiance": {"type": "rgb", "value": [1.0, value, 1.0]}}
+        Renderer.from_scene(scenery(sky=sky), **OPTIONS)
 
 
 def test_dark_emitter_has_no_light(variant: str) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from ..geometry import Geometry, ShapeInfo
 from ..lights import AreaLight
 from .clusters import surface_clusters
-from .samples import BEND, LightSamples, cluster_sums
+from .samples import BEND, LightSamples, brightness, cluster_sums
 
 # Pieces of the emitter for each sample, at least.
 _PIECES = 16
@@ -127,8 +127,7 @@ def _uv(geometry: Geometry, face: Any, u: Any, v: Any, info: ShapeInfo) -> Any:
 def _brightness(light: AreaLight, geometry: Geometry, face: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     arguments = (mi.UInt32(face.astype(np.uint32)), mi.Float(u.astype(np.float32)), mi.Float(v.astype(np.float32)))
     radiance = light.radiance(_uv(geometry, *arguments, geometry.shapes[light.shape]))
-    mean = dr.mean(mi.UnpolarizedSpectrum(radiance)) + dr.zeros(mi.Float, len(face))
-    return np.maximum(np.nan_to_num(mean.numpy().astype(np.float64)), 0)
+    return brightness(light.name, radiance, len(face))
 
 
 def _normals(corners: np.ndarray, info: ShapeInfo) -> tuple[np.ndarray, np.ndarray]:

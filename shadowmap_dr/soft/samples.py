@@ -8,6 +8,9 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
+
+from ..errors import ShadowmapError
 
 # Which entries of a covariance of unit vectors are kept: the last one follows from the mean vector's length.
 BEND = ((0, 0), (1, 1), (0, 1), (0, 2), (1, 2))
@@ -123,6 +126,18 @@ def _mean_cosine(cosine: Any, spread: Any) -> Any:
 
 def _packet(flat: Any, index: Any) -> Any:
     return dr.gather(mi.Vector4f, flat, index, mode=dr.ReduceMode.Local)
+
+
+def brightness(name: str, radiance: Any, count: int) -> np.ndarray:
+    """Mean over the channels of radiances (colour, ``count``), on the host, at least 0.
+
+    Raises ``ShadowmapError`` if one is not finite: sums over parts would lose it, and the light would just be dark.
+    """
+    mean = dr.mean(mi.UnpolarizedSpectrum(radiance)) + dr.zeros(mi.Float, count)
+    values = mean.numpy().astype(np.float64)
+    if not np.isfinite(values).all():
+        raise ShadowmapError(f"The radiance of light '{name}' is not finite everywhere: check its values for NaN or inf.")
+    return np.maximum(values, 0)
 
 
 def cluster_sums(values: Any, cluster: Any, count: int) -> Any:

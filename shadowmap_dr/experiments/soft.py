@@ -210,9 +210,8 @@ def counted_pixels(scene: Any) -> Mask:
         differs = s[1:] != s[:-1]
         o[1:] |= differs
         o[:-1] |= differs
-        bend = np.abs(d[2:] - 2 * d[1:-1] + d[:-2]) > _JUMP * d[1:-1]
-        for part in (o[:-2], o[1:-1], o[2:]):
-            part |= bend
+        # Large on both sides of a jump, and there only.
+        o[1:-1] |= np.abs(d[2:] - 2 * d[1:-1] + d[:-2]) > _JUMP * d[1:-1]
     grown = outline.copy()
     for y in (-1, 0, 1):
         for x in (-1, 0, 1):

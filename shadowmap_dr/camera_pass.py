@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
@@ -39,6 +40,16 @@ def camera_clip(sensor: Sensor, geometry: Geometry, center: tuple[float, float, 
     row = [dr.fma(m[r, 0], p.x, dr.fma(m[r, 1], p.y, dr.fma(m[r, 2], p.z, m[r, 3]))) for r in range(4)]
     # Identities written out: a row of zeros would still be multiplied with every vertex.
     return dr.ravel(mi.Point4f(*row))
+
+
+def without_shapes(clip: Any, geometry: Geometry, shapes: Sequence[int]) -> Any:
+    """Clip-space vertices (Float, 4 V) of which those of some shapes lie behind the camera, where no triangle is drawn."""
+    lane = dr.arange(mi.UInt32, dr.width(clip))
+    shape = dr.gather(mi.UInt32, geometry.vertex_shape, lane >> 2)
+    hidden = mi.Bool(False)
+    for each in shapes:
+        hidden |= shape == each
+    return dr.select(hidden, dr.select((lane & 3) == 3, mi.Float(-1), 0), clip)
 
 
 def seen_points(sensor: Sensor, raster: RasterOutput, center: tuple[float, float, float], radius: float) -> tuple[Any, Any]:

@@ -16,7 +16,7 @@ import numpy as np
 import typer
 from rich.console import Console
 
-from . import __version__, _llvm, assets, cli_gradients, io
+from . import __version__, _llvm, assets, cli_gradients, cli_soft, io
 from .cli_options import DEFAULT_VARIANT, Variant, set_variant
 from .errors import ShadowmapError
 from .experiments import bench as bench_experiment
@@ -33,6 +33,7 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 app.add_typer(cli_gradients.app, name="gradients")
+app.command()(cli_soft.soft)
 
 
 def main() -> None:

@@ -57,7 +57,7 @@ class Options:
     shadow_samples         look-ups along each side of a pixel, 1 to 8; 0 chooses
     antialias              anti-alias the image; without it outlines have no gradient
     ambient                radiance of unshadowed light from all directions, beside that of the scene's environment
-    hide_emitters          environments light the scene, but are not seen themselves
+    hide_emitters          the camera looks through area lights, and sees black instead of environments; both light the scene
     aovs                   further channels, separated by commas: names of ``shadowmap_dr.aovs.AOVS``, or ``label:name`` to call
                            the channel ``label``
     tessellation           triangles around spheres, disks and cylinders, at least 3; curves have half as many around them, and

@@ -194,7 +194,8 @@ def lights_of(scene: Any) -> tuple[Light, ...]:
 def area_lights_of(scene: Any, shapes: Sequence[Any]) -> tuple[AreaLight, ...]:
     """Records of the area lights of a ``mi.Scene``.
 
-    ``shapes``: its ``mi.Shape`` objects in the order of the soup. The lights of others are left out.
+    ``shapes``: its ``mi.Shape`` objects in the order of the soup; the lights of others are left out. Lights have the names of
+    their shapes: emitters inside of shapes are all called the same.
     """
     found = []
     for name, emitter in named_emitters(scene):
@@ -203,7 +204,8 @@ def area_lights_of(scene: Any, shapes: Sequence[Any]) -> tuple[AreaLight, ...]:
             index = next((k for k, other in enumerate(shapes) if other is shape or other == shape), None)
             textures = [part for _, part in children(emitter) if isinstance(part, mi.Texture)]
             if index is not None:
-                found.append(AreaLight(name, index, emitter, any(texture.is_spatially_varying() for texture in textures)))
+                textured = any(texture.is_spatially_varying() for texture in textures)
+                found.append(AreaLight(shape.id() or name, index, emitter, textured))
     return tuple(found)
 
 

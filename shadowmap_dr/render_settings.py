@@ -20,7 +20,8 @@ class RenderSettings:
         shadow: see :class:`ShadowSettings`.
         antialias: anti-alias silhouettes in the image; without it they have no gradient.
         ambient: radiance of unshadowed light that arrives from everywhere, beside that of the scene's environment.
-        hide_emitters: environments light the scene, but are not seen themselves.
+        hide_emitters: the camera looks through area lights, and sees black instead of environments, which light the scene all
+            the same.
         emitter_samples: points on each area light, each with a shadow map.
         environment_samples: directions of an environment, each with a shadow map.
         soft_map_resolution: texels along each side of these maps.
@@ -56,6 +57,8 @@ class RenderSettings:
         size = self.shadow.resolution
         if self.emitter_shadows == "single" and (size < 8 or size & (size - 1)):
             raise ShadowmapError(f"shadow map resolution is {size}; with emitter_shadows 'single' choose a power of two from 8")
+        if self.shadow.method != "none":
+            _ = self.soft_shadow  # whether such maps can be
         if not (self.ambient >= 0 and self.ambient < float("inf")):
             raise ShadowmapError(f"ambient is {self.ambient}: give a finite radiance of at least 0.")
 

@@ -11,7 +11,7 @@ import mitsuba as mi
 
 from .aovs import collect_aovs
 from .beams import softened
-from .camera_pass import camera_clip, footprint_points, seen_points, within_far_plane
+from .camera_pass import camera_clip, footprint_points, seen_points, within_far_plane, without_shapes
 from .errors import ShadowmapError
 from .facets import crease_edges, flat_faces, mean_normals, soften_facets
 from .film import develop, sample_grid, sample_windows
@@ -233,6 +233,8 @@ class Renderer:
 
     def _view(self, sensor: Sensor, geometry: Geometry, factor: int) -> _View:
         clip = camera_clip(sensor, geometry, self.plan.center, self.plan.radius)
+        if self.settings.hide_emitters and self.data.areas:
+            clip = without_shapes(clip, geometry, [light.shape for light in self.data.areas])
         dr.eval(clip)
         size = (sensor.height * factor, sensor.width * factor)
         transparent = self._transparent(geometry, sensor)

@@ -55,7 +55,7 @@ def test_info(run: Any) -> None:
 def test_help_names_the_commands(run: Any) -> None:
     result = run("--help")
     assert result.status == 0
-    for command in ("info", "render", "pose", "bench"):
+    for command in ("info", "render", "pose", "bench", "soft"):
         assert command in result.out
     assert run().status == 2
 
@@ -150,6 +150,8 @@ RENDER = ["render", "pose", "-D", "resolution=8", "--integrator", "direct", "--s
         (["bench", "--mitsuba-seconds", "0"], "--mitsuba-seconds 0"),
         (["bench", "--mitsuba-seconds", "x"], "--mitsuba-seconds"),
         (["bench", "--variant", "magic"], "magic"),
+        (["soft", "--scene", "moon"], "moon"),
+        (["soft", "--samples", "64"], "--samples 64"),
         (["magic"], "magic"),
         (["info", "--magic"], "--magic"),
     ],

@@ -104,9 +104,14 @@ def test_derivative_image_agrees_with_path_tracing(variant: str, traced: stored.
 
 @cache
 def filter_footprint(name: str) -> float:
-    """Width of the shadow filter in pixels, on a surface at the caster that faces light and camera alike."""
+    """Width of the shadow filter in pixels, on a surface at the caster that faces light and camera alike.
+
+    0 for extended lights, whose penumbrae are wider than the filter.
+    """
     case = CASES_BY_NAME[name]
     renderer = Renderer.from_scene(case.build(), **case.options)
+    if not renderer.data.lights:
+        return 0.0
     light, sensor, frusta = renderer.light("light"), renderer.data.sensors[0][0], renderer.frusta
     distance = 1.0 if isinstance(light, DirectionalLight) else float(dr.norm(light.position - mi.Point3f(CENTRE))[0])
     texel = 2 * max(frusta.half_x[0], frusta.half_y[0]) * distance / renderer.settings.shadow.resolution

@@ -86,3 +86,21 @@ def test_a_scene_without_sensors_is_rendered_with_a_camera_of_ones_own(variant: 
     )
     image = Renderer.from_scene(bare).render(sensor=camera).numpy()
     np.testing.assert_allclose(image, Renderer.from_scene(with_sensor).render().numpy(), atol=1e-5)
+
+
+@pytest.mark.parametrize("height", [0.43, 0.5, 0.61, 0.77, 0.95, 1.3])
+def test_floor_seen_from_close_by_is_lit(variant: str, height: float) -> None:
+    """All that is seen lies at the same depth, whose range is narrow, and the near plane is close: rounding must not matter."""
+    T = mi.ScalarTransform4f
+    film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}
+    look = T().look_at([0, 0.4, 0], [0, 0, 0], [0, 0, 1]) @ T().scale([0.05, 0.05, 1])
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "camera": {"type": "orthographic", "near_clip": 0.01, "to_world": look, "film": film},
+            "floor": {"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90) @ T().scale(3)},
+            "bulb": {"type": "point", "position": [0.01, height, 0.01]},
+        }
+    )
+    shadowed, plain = (Renderer.from_scene(scene, shadow_method=method).render().numpy() for method in ("auto", "none"))
+    np.testing.assert_allclose(shadowed, plain, rtol=1e-3)

@@ -18,7 +18,7 @@ _LEAST = 1e-25
 _COLUMN_BITS = (MAX_RESOLUTION - 1).bit_length()
 
 
-def pixel_depth(raster: RasterOutput, positions: Any, faces: Any) -> tuple[Any, Any, Any]:
+def pixel_depth(raster: RasterOutput, positions: Any, faces: Any, reciprocal: Any = None) -> tuple[Any, Any, Any]:
     """NDC depth of what each pixel sees (``Float``, 1 where it sees nothing), and its change by column and row.
 
     The depth is attached to ``positions``: the same as ``raster.depth`` up to rounding, in value and derivative, and several
@@ -27,8 +27,11 @@ def pixel_depth(raster: RasterOutput, positions: Any, faces: Any) -> tuple[Any, 
     Args:
         raster: of these positions and faces.
         positions, faces: flat arrays, as rasterized.
+        reciprocal: ``Bool``, for each image: whether it is to be 1 / w in the place of the depth. In perspective that is the same
+            up to a scale and an offset, but next to the offset, which is huge where the near plane is close, it would drown
+            in rounding.
     """
-    depths, _ = planes(positions, faces, raster, False)
+    depths, _ = planes(positions, faces, raster, False, reciprocal)
     dr.eval(depths)
     index, row, column = pixels(raster)
     hit = raster.valid
@@ -52,10 +55,13 @@ def offset(plane: Any, row: Any, column: Any) -> tuple[Any, Any]:
     return x, module.Float(module.Int32(row) - module.Int32(corner >> _COLUMN_BITS))
 
 
-def planes(positions: Any, faces: Any, raster: RasterOutput, barycentrics: bool) -> tuple[Any, tuple[Any, ...]]:
+def planes(
+    positions: Any, faces: Any, raster: RasterOutput, barycentrics: bool, reciprocal: Any = None
+) -> tuple[Any, tuple[Any, ...]]:
     """Affine functions of the pixel for each triangle of each image: change by column, by row, and value at a pixel.
 
-    That pixel lies near the triangle: far away from it, small triangles would lose their depth to rounding.
+    That pixel lies near the triangle: far away from it, small triangles would lose their depth to rounding. ``reciprocal``: see
+    :func:`pixel_depth`.
 
     Returns a ``Float`` array with four numbers for each triangle: the function of the depth, attached, and the pixel. And,
     detached and only if asked for, those of the barycentrics of vertices 1 and 2, divided by w, with the changes of 1 / w as
@@ -68,6 +74,10 @@ def planes(positions: Any, faces: Any, raster: RasterOutput, barycentrics: bool)
     image = index // raster.face_count
     vertex_count = dr.width(positions) // (4 * raster.batch)
     corners = gather_triangle(positions, faces, index - image * raster.face_count, image * vertex_count, True)
+    heights = [p.z for p in corners]
+    if reciprocal is not None:
+        inverted = dr.gather(module.Bool, reciprocal, image)
+        heights = [dr.select(inverted, 1, z) for z in heights]
     with dr.suspend_grad():
         own = [dr.detach(p) for p in corners]
         lines, det = edge_lines(own)
@@ -81,7 +91,7 @@ def planes(positions: Any, faces: Any, raster: RasterOutput, barycentrics: bool)
         change_x = [line[0] * inverse * (2 / width) for line in lines]
         change_y = [line[1] * inverse * (2 / height) for line in lines]
         there = [dr.fma(line[0], x, dr.fma(line[1], y, line[2])) * inverse for line in lines]
-        zs = [Float64(p.z) for p in own]
+        zs = [Float64(dr.detach(z)) for z in heights]
         dx, dy, d = (sum(w * z for w, z in zip(weights, zs, strict=True)) for weights in (change_x, change_y, there))
         slope_x, slope_y = dx * (0.5 * width), dy * (0.5 * height)
         w_part = d - slope_x * x - slope_y * y
@@ -90,7 +100,9 @@ def planes(positions: Any, faces: Any, raster: RasterOutput, barycentrics: bool)
         value = [Float(v) for v in (dx, dy, d)]
     if dr.grad_enabled(positions):
         # z = A x + B y + C w holds for all corners: what a corner's change violates, the plane's change makes up for.
-        excess = [p.z - slopes[0] * p.x - slopes[1] * p.y - slopes[2] * p.w for p in corners]
+        excess = [
+            z - slopes[0] * p.x - slopes[1] * p.y - slopes[2] * p.w for p, z in zip(corners, heights, strict=True)
+        ]
         value = [
             dr.replace_grad(v, sum(w * e for w, e in zip(row, excess, strict=True)))
             for v, row in zip(value, weights, strict=True)

@@ -178,18 +178,20 @@ def to_clip(view: Views, frustum: Frusta, p_light: Any) -> Any:
     return backend(p_light).Array4f(x, y, dr.fma(a, p_light.z, b), w)
 
 
-def linear_depth(view: Views, frustum: Frusta, depth_ndc: Any) -> tuple[Any, Any]:
-    """Depth along the light's axis, mapped linearly from first..far to -1/2..1/2, and its derivative by NDC depth.
+def linear_depth(view: Views, frustum: Frusta, depth: Any) -> tuple[Any, Any]:
+    """Depth along the light's axis, mapped linearly from first..far to -1/2..1/2, and its derivative by ``depth``.
 
-    Depths before ``first`` are moved to it: -1/2, without derivative.
+    ``depth``: NDC depth in parallel projections, 1 / w in perspective. Depths before ``first`` are moved to it: -1/2, without
+    derivative.
     """
     perspective = view.spread > 0
     n, f, first = frustum.near, frustum.far, frustum.first
-    z = 2 * f * n * dr.rcp(dr.select(perspective, dr.fma(-depth_ndc, f - n, f + n), 1))
+    # Where nothing is seen, whatever stands for it is no reason to divide by zero.
+    z = dr.rcp(dr.select(perspective & (depth > 0), depth, 1))
     scale = 1 / (f - first)
-    z = dr.select(perspective, z, 0.5 * dr.fma(depth_ndc, f - n, f + n))
+    z = dr.select(perspective, z, 0.5 * dr.fma(depth, f - n, f + n))
     linear = (z - first) * scale - 0.5
-    slope = dr.select(perspective, z * z * (f - n) / (2 * f * n), 0.5 * (f - n)) * scale
+    slope = dr.select(perspective, -z * z, 0.5 * (f - n)) * scale
     told_apart = linear > -0.5
     return dr.select(told_apart, linear, -0.5), dr.select(told_apart, slope, 0)
 

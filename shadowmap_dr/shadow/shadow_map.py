@@ -158,8 +158,8 @@ def _texels(
         depth = _radial_depth(view, frustum, raster, row, column, size)
         depth, slope_square = dr.select(hit, depth, frustum.far), 0
     else:
-        ndc, dx, dy = pixel_depth(raster, clip, faces)
-        linear, to_linear = linear_depth(view, frustum, ndc)
+        seen, dx, dy = pixel_depth(raster, clip, faces, dr.detach(views.spread) > 0)
+        linear, to_linear = linear_depth(view, frustum, seen)
         depth = dr.select(hit, linear, FAR)
         with dr.suspend_grad():
             slopes = [dr.detach(to_linear * slope) for slope in (dx, dy)]

@@ -12,12 +12,12 @@ import numpy as np
 from ..geometry import Geometry, ShapeInfo
 from ..lights import AreaLight
 from .clusters import surface_clusters
-from .samples import LightSamples, cluster_sums
+from .samples import BEND, LightSamples, brightness, cluster_sums
 
 # Pieces of the emitter for each sample, at least.
 _PIECES = 16
 # Importance of what faces away from everything, in units of the mean.
-_AWAY = 0.05
+_AWAY = 0.1
 # Points on the rest of the scene that are asked whether they see a piece.
 _PROBES = 256
 
@@ -79,19 +79,34 @@ def area_samples(light: AreaLight, plan: AreaPlan, geometry: Geometry) -> LightS
     """The samples of an emitter where it is now. Attached to its vertices and its radiance."""
     info, count = geometry.shapes[plan.shape], dr.width(plan.chosen)
     _, e1, e2 = _triangles(geometry, plan.face)
-    area = 0.5 * dr.norm(dr.cross(e1, e2)) * plan.fraction
+    vector = dr.cross(e1, e2) * (plan.fraction * (-0.5 if info.flip_geometric else 0.5))
+    area = dr.norm(vector)
     radiance = light.radiance(_uv(geometry, plan.face, plan.u, plan.v, info))
     face = dr.gather(mi.UInt32, plan.face, plan.chosen)
     first, e1, e2 = _triangles(geometry, face)
     u, v = dr.gather(mi.Float, plan.u, plan.chosen), dr.gather(mi.Float, plan.v, plan.chosen)
-    normal = dr.normalize(dr.cross(e1, e2))
+    total = cluster_sums(area, plan.cluster, count)
+    share = dr.rcp(dr.maximum(total, 1e-30))
+    normal = cluster_sums(vector, plan.cluster, count) * share
     return LightSamples(
         distant=False,
         place=mi.Vector3f(first + e1 * u + e2 * v),
-        normal=-normal if info.flip_geometric else normal,
+        normal=normal,
         power=cluster_sums(radiance * area, plan.cluster, count),
-        area=cluster_sums(area, plan.cluster, count),
+        area=total,
+        bend=None if info.planar else _bend(vector, area, normal, share, plan.cluster),
     )
+
+
+def _bend(vector: Any, area: Any, normal: Any, share: Any, cluster: Any) -> Any:
+    """Covariance of the normals of each part, see :class:`LightSamples`. ``vector``: normals of pieces times their areas."""
+    n = vector * dr.rcp(dr.maximum(area, 1e-30))
+    count = dr.width(share)
+
+    def entry(i: int, j: int) -> Any:
+        return cluster_sums(vector[i] * n[j], cluster, count) * share - normal[i] * normal[j]
+
+    return tuple(entry(i, j) for i, j in BEND)
 
 
 def _triangles(geometry: Geometry, face: Any) -> tuple[Any, Any, Any]:
@@ -112,8 +127,7 @@ def _uv(geometry: Geometry, face: Any, u: Any, v: Any, info: ShapeInfo) -> Any:
 def _brightness(light: AreaLight, geometry: Geometry, face: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     arguments = (mi.UInt32(face.astype(np.uint32)), mi.Float(u.astype(np.float32)), mi.Float(v.astype(np.float32)))
     radiance = light.radiance(_uv(geometry, *arguments, geometry.shapes[light.shape]))
-    mean = dr.mean(mi.UnpolarizedSpectrum(radiance)) + dr.zeros(mi.Float, len(face))
-    return np.maximum(np.nan_to_num(mean.numpy().astype(np.float64)), 0)
+    return brightness(light.name, radiance, len(face))
 
 
 def _normals(corners: np.ndarray, info: ShapeInfo) -> tuple[np.ndarray, np.ndarray]:

@@ -8,6 +8,12 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
+
+from ..errors import ShadowmapError
+
+# Which entries of a covariance of unit vectors are kept: the last one follows from the mean vector's length.
+BEND = ((0, 0), (1, 1), (0, 1), (0, 2), (1, 2))
 
 
 @dataclass(frozen=True)
@@ -16,9 +22,10 @@ class LightSamples:
 
     distant  which of the two (static)
     place    Vector3f (N,), positions, or unit directions in which light travels, world space
-    normal   Vector3f (N,), unit normals of the emitter (unused if distant)
+    normal   Vector3f (N,), mean normals of the parts, shorter than 1 where these are curved (unused if distant)
     power    colour (N,), radiance times area, or irradiance on a surface that faces the light
     area     Float (N,), share of the emitter's area (unused if distant)
+    bend     Float (N,) for each of :data:`BEND`, covariance of the normals of each part, or None where the emitter is flat
 
     All may carry gradients.
     """
@@ -28,6 +35,7 @@ class LightSamples:
     normal: Any
     power: Any
     area: Any
+    bend: tuple[Any, ...] | None = None
 
     @property
     def count(self) -> int:
@@ -55,7 +63,9 @@ class LightSamples:
         colour = [c[k] for k in range(dr.size_v(type(c)))]
         rows = [mi.Vector4f(p.x, p.y, p.z, self.area), mi.Vector4f(*colour, *[mi.Float(0)] * (4 - len(colour)))]
         if not self.distant:
-            rows.append(mi.Vector4f(n.x, n.y, n.z, 0))
+            rows.append(mi.Vector4f(n.x, n.y, n.z, self.bend[0] if self.bend else 0))
+            if self.bend:
+                rows.append(mi.Vector4f(*self.bend[1:]))
         packets = tuple(dr.ravel(row) for row in rows)
         dr.eval(packets)
         return SampleTable(self.distant, self.count, packets)
@@ -91,13 +101,43 @@ class SampleTable:
         valid = squared > 0
         wo = offset * dr.rsqrt(dr.select(valid, squared, 1))
         n = rest[0]
-        cosine = dr.maximum(-dr.dot(mi.Vector3f(n.x, n.y, n.z), wo), 0)
+        normal = mi.Vector3f(n.x, n.y, n.z)
+        cosine = -dr.dot(normal, wo)
+        cosine = _mean_cosine(cosine, _spread(normal, n.w, rest[1], wo)) if len(rest) > 1 else dr.maximum(cosine, 0)
         # The share of a disk of this area in the view of a point on its axis: exact at any distance, and never infinite.
         return wo, power * (cosine * dr.rcp(dr.maximum(squared + place.w * (1 / math.pi), 1e-20)))
 
 
+def _spread(normal: Any, xx: Any, others: Any, wo: Any) -> Any:
+    """How far the cosines of a part's own normals lie on either side of their mean (Float), if they are spread evenly."""
+    yy, xy, xz, yz = others
+    zz = 1 - dr.squared_norm(normal) - xx - yy
+    variance = xx * wo.x * wo.x + yy * wo.y * wo.y + zz * wo.z * wo.z
+    variance += 2 * (xy * wo.x * wo.y + xz * wo.x * wo.z + yz * wo.y * wo.z)
+    # The least keeps the derivative of the root finite.
+    return dr.sqrt(dr.maximum(3 * variance, 1e-8))
+
+
+def _mean_cosine(cosine: Any, spread: Any) -> Any:
+    """Mean of what is positive of cosines spread evenly around ``cosine``: parts that turn away do so little by little."""
+    partly = dr.square(cosine + spread) * dr.rcp(4 * spread)
+    return dr.select(dr.abs(cosine) < spread, partly, dr.maximum(cosine, 0))
+
+
 def _packet(flat: Any, index: Any) -> Any:
     return dr.gather(mi.Vector4f, flat, index, mode=dr.ReduceMode.Local)
+
+
+def brightness(name: str, radiance: Any, count: int) -> np.ndarray:
+    """Mean over the channels of radiances (colour, ``count``), on the host, at least 0.
+
+    Raises ``ShadowmapError`` if one is not finite: sums over parts would lose it, and the light would just be dark.
+    """
+    mean = dr.mean(mi.UnpolarizedSpectrum(radiance)) + dr.zeros(mi.Float, count)
+    values = mean.numpy().astype(np.float64)
+    if not np.isfinite(values).all():
+        raise ShadowmapError(f"The radiance of light '{name}' is not finite everywhere: check its values for NaN or inf.")
+    return np.maximum(values, 0)
 
 
 def cluster_sums(values: Any, cluster: Any, count: int) -> Any:

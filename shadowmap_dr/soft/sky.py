@@ -11,7 +11,7 @@ import numpy as np
 
 from ..lights import Environment
 from .clusters import sky_clusters
-from .samples import LightSamples, cluster_sums
+from .samples import LightSamples, brightness, cluster_sums
 
 # Rows of the grid on which a sky is measured: as many as its image has, within bounds.
 _ROWS = (64, 1024)
@@ -39,12 +39,11 @@ def plan_sky(light: Environment, count: int) -> SkyPlan:
     with dr.suspend_grad():
         local, solid_angle = _grid(rows)
         radiance = mi.UnpolarizedSpectrum(light.radiance(light.to_world(local)))
-        mean = dr.mean(radiance) + dr.zeros(mi.Float, dr.width(solid_angle))
-        brightness, weight = mean.numpy().astype(np.float64), solid_angle.numpy().astype(np.float64)
+        bright = brightness(light.name, radiance, dr.width(solid_angle))
+        weight = solid_angle.numpy().astype(np.float64)
         directions = np.stack([c.numpy() for c in local], -1).astype(np.float64)
-    brightness = np.maximum(np.nan_to_num(brightness, posinf=0), 0)
-    average = (brightness * weight).sum() / weight.sum()
-    energy = (brightness + _DARK * average if average > 0 else np.ones_like(brightness)) * weight
+    average = (bright * weight).sum() / weight.sum()
+    energy = (bright + _DARK * average if average > 0 else np.ones_like(bright)) * weight
     cluster = sky_clusters(energy.reshape(rows, 2 * rows), count).ravel()
     centre = np.stack([np.bincount(cluster, energy * directions[:, c], count) for c in range(3)], -1)
     # Opposite directions of one part may cancel: its heaviest cell then stands for it.

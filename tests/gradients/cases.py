@@ -24,6 +24,7 @@ from .changes import (
     waved,
 )
 from .model import Case, Parameter
+from .soft_cases import SOFT_CASES, SOFT_TRACED
 
 CENTRE = (0.0, 0.85, 0.0)
 
@@ -232,6 +233,7 @@ CASES = (
         **SUN, **CAMERA}, {"shadow_map_resolution": 1024}),
     Case("fine", lambda: scenes.scene(light=scenes.sun(), object=scenes.mesh("object", *scenes.ball(6))),
          {**SUN, **without(CASTER, "caster_rotation"), **CAMERA}),
+    *SOFT_CASES,
 )  # fmt: skip
 # Not among those that are checked throughout: what is known not to work.
 FINE_BOX = Case(
@@ -255,4 +257,5 @@ TRACED = {
     "fine": ("caster_translation", "caster_scale"),
     "shapes": ("sphere_translation",),
     "curves": ("wire_point", "wire_thickness", "stick_point", "stick_thickness"),
+    **SOFT_TRACED,
 }

@@ -100,6 +100,17 @@ def increased(by: float = 1.0) -> Change:
     return lambda rest, t: rest + by * t
 
 
+def lightened(top: int, bottom: int, left: int, right: int) -> Change:
+    """A texture or the map of a sky with some rows and columns of texels increased."""
+
+    def change(rest: Any, t: Any) -> Any:
+        mask = np.zeros(rest.shape, np.float32)
+        mask[top:bottom, left:right] = 1
+        return mi.TensorXf(rest.array + t * mi.Float(mask.ravel()), rest.shape)
+
+    return change
+
+
 def repainted(seed: int) -> Change:
     """A texture plus noise."""
 

@@ -97,7 +97,7 @@ def test_all_kinds_of_lights_at_once(variant: str) -> None:
         shapes = {key: {k: v for k, v in parts[key].items() if k != "emitter"} for key in ("panel", "lamp")}
         return {key: part if key == name else shapes[key] for key, part in parts.items() if key == name or key in shapes}
 
-    options = {"emitter_samples": 8, "environment_samples": 16, "hide_emitters": True, "shadow_map_resolution": 128}
+    options = {"emitter_samples": 8, "environment_samples": 16, "shadow_map_resolution": 128}
     together = np.array(mi.render(lit_by(32, **parts), integrator=shadowmap(**options)))
     alone = [mi.render(lit_by(32, **only(name)), integrator=shadowmap(**options)) for name in parts]
     assert all(np.array(image).max() > 0.05 for image in alone)

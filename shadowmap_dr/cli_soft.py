@@ -28,7 +28,7 @@ def soft(
     ] = None,
     resolution: Annotated[int | None, typer.Option(help="Image width and height in pixels [default: 96].")] = None,
     map_resolution: Annotated[int, typer.Option(help="Texels along each side of the map of each sample.")] = 128,
-    spp: Annotated[int, typer.Option(help="Samples per pixel of our images.")] = 4,
+    spp: Annotated[int, typer.Option(help="Samples per pixel of our images.")] = 16,
     reference_spp: Annotated[
         int | None, typer.Option(help="Samples per pixel of each of the two path-traced images [default: 512].")
     ] = None,

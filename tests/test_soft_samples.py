@@ -105,13 +105,24 @@ def sky_image(rows: int = 16) -> np.ndarray:
 
 @pytest.mark.parametrize("count", [1, 16, 128])
 def test_power_of_a_constant_sky_is_its_integral(variant: str, count: int) -> None:
-    found = samples(sky=count, sky_={"type": "constant", "radiance": {"type": "rgb", "value": [0.5, 1.0, 2.0]}})
+    ball = {"type": "sphere", "center": [0, 1, 0], "radius": 0.5}
+    sky = {"type": "constant", "radiance": {"type": "rgb", "value": [0.5, 1.0, 2.0]}}
+    found = samples(sky=count, sky_=sky, ball=ball)
     assert found.distant and found.count == count
     np.testing.assert_allclose(np.array(found.power).sum(1), 4 * np.pi * np.array([0.5, 1, 2]), rtol=1e-4)
     np.testing.assert_allclose(np.linalg.norm(np.array(found.place), axis=0), 1, atol=1e-5)
-    # From all sides alike.
+    # Most samples come from above the floor, but no light is lost.
+    above = np.array(found.place)[1] < 0
+    assert count < 16 or above.mean() > 0.7
     mean = (np.array(found.place) * np.array(found.power)[1]).sum(1) / (4 * np.pi)
-    assert count < 16 or np.linalg.norm(mean) < 0.05
+    assert count < 128 or np.linalg.norm(mean) < 0.1
+
+
+def test_sky_without_a_floor_is_sampled_from_all_sides(variant: str) -> None:
+    """A wall beside a ball, with nothing below the ball: light comes from everywhere."""
+    ball = {"type": "sphere", "center": [0, 5, 0], "radius": 4.0}
+    found = samples(sky=64, sky_={"type": "constant"}, ball=ball)
+    assert 0.4 < (np.array(found.place)[1] < 0).mean() < 0.6
 
 
 @pytest.mark.parametrize("turn", [0.0, 70.0])

@@ -52,7 +52,7 @@ class SoftOptions:
     samples: tuple[tuple[int, int], ...] = ((16, 32), (32, 64), (64, 128))
     resolution: int = 96
     map_resolution: int = 128
-    spp: int = 4
+    spp: int = 16
     reference_spp: int = 512
     timed: bool = True
     out: Path = Path("soft")

@@ -78,7 +78,7 @@ def plan_soft(
     first = {True: 0, False: 0}
     for light in lights:
         if isinstance(light, Environment):
-            plan = SoftPlan(plan_sky(light, sky_count), "distant", sky_count, 0, (0.0, 0.0, 0.0), _NONE)
+            plan = SoftPlan(plan_sky(light, sky_count, geometry), "distant", sky_count, 0, (0.0, 0.0, 0.0), _NONE)
         else:
             target, kind = _aim(geometry, light.shape)
             kind = "single" if single and kind == "near" else kind

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..geometry import Geometry
 from ..lights import Environment
 from .clusters import sky_clusters
 from .samples import LightSamples, brightness, cluster_sums
@@ -17,6 +18,8 @@ from .samples import LightSamples, brightness, cluster_sums
 _ROWS = (64, 1024)
 # Importance of dark parts, in units of the mean: light may appear there during an optimisation.
 _DARK = 0.05
+# Importance of what lies behind a floor.
+_HIDDEN = 0.1
 
 
 @dataclass(frozen=True)
@@ -33,17 +36,22 @@ class SkyPlan:
     direction: Any
 
 
-def plan_sky(light: Environment, count: int) -> SkyPlan:
-    """Divide a sky into ``count`` parts of about the same energy (on the host, once)."""
+def plan_sky(light: Environment, count: int, geometry: Geometry) -> SkyPlan:
+    """Divide a sky into ``count`` parts of about the same energy (on the host, once).
+
+    Light from below a floor that everything stands on reaches nothing: parts down there are large.
+    """
     rows = int(np.clip(light.rows, *_ROWS))
     with dr.suspend_grad():
         local, solid_angle = _grid(rows)
         radiance = mi.UnpolarizedSpectrum(light.radiance(light.to_world(local)))
         bright = brightness(light.name, radiance, dr.width(solid_angle))
         weight = solid_angle.numpy().astype(np.float64)
-        directions = np.stack([c.numpy() for c in local], -1).astype(np.float64)
+        directions, world = (np.stack([c.numpy() for c in v], -1).astype(np.float64) for v in (local, light.to_world(local)))
     average = (bright * weight).sum() / weight.sum()
     energy = (bright + _DARK * average if average > 0 else np.ones_like(bright)) * weight
+    for normal in _floors(geometry):
+        energy = np.where(world @ normal < 0, _HIDDEN * energy, energy)
     cluster = sky_clusters(energy.reshape(rows, 2 * rows), count).ravel()
     centre = np.stack([np.bincount(cluster, energy * directions[:, c], count) for c in range(3)], -1)
     # Opposite directions of one part may cancel: its heaviest cell then stands for it.
@@ -53,6 +61,27 @@ def plan_sky(light: Environment, count: int) -> SkyPlan:
     cancelled = length < 1e-3 * np.bincount(cluster, energy, count)
     centre = np.where(cancelled[:, None], heaviest, centre / np.maximum(length, 1e-300)[:, None])
     return SkyPlan(rows, mi.UInt32(cluster), mi.Vector3f(centre.T.astype(np.float32)))
+
+
+def _floors(geometry: Geometry) -> list[np.ndarray]:
+    """Unit normals of flat shapes that all others lie in front of, and over (as their box goes): nothing is lit from behind."""
+    positions = dr.detach(geometry.positions).numpy().reshape(-1, 3).astype(np.float64)
+    parts = [positions[i.vertex_start : i.vertex_start + i.vertex_count] for i in geometry.shapes]
+    found = []
+    for k, own in enumerate(parts):
+        others = [part for j, part in enumerate(parts) if j != k]
+        if not geometry.shapes[k].planar or not others:
+            continue
+        rest = np.concatenate(others)
+        centre = own.mean(0)
+        axes = np.linalg.svd(own - centre, full_matrices=False)[2]
+        across, height = (own - centre) @ axes[:2].T, (rest - centre) @ axes[2]
+        over = (rest - centre) @ axes[:2].T
+        tolerance = 1e-3 * np.ptp(own, axis=0).max()
+        if (over < across.min(0) - tolerance).any() or (over > across.max(0) + tolerance).any():
+            continue
+        found += [sign * axes[2] for sign in (1, -1) if (sign * height).min() >= -tolerance and (sign * height).max() > tolerance]
+    return found
 
 
 def sky_samples(light: Environment, plan: SkyPlan) -> LightSamples:

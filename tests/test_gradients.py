@@ -32,7 +32,7 @@ from shadowmap_dr.lights import DirectionalLight
 ALL = [(case.name, parameter) for case in CASES for parameter in case.parameters]
 
 # What needs more samples than the case has: highlights on fine facets (c = 0.989, s = 1.033 with 16), and ridges that bend
-# (c = 0.998, s = 1.037), whose place follows from triangles at some distance.
+# (c = 0.997, s = 1.041), whose place follows from triangles at some distance.
 SAMPLES = {("glossy", "caster_rise"): 64, ("fine_box", "caster_deformation"): 64}
 # What one sample per pixel is enough for.
 AT_ONE_SAMPLE = {

@@ -67,7 +67,8 @@ def find_crossings(
 
     Between two pixels whose triangles touch, the edges through which one leaves the first triangle and enters the other are
     creases. If these are two edges, with something unseen in between, each counts as much as the surface bends there. Between
-    flat triangles that do not touch, the crease is where their planes cross, if that is in between.
+    flat triangles that do not touch, the crease is where their planes cross, if that is in between and the faces beside the
+    triangles lie in these planes, too.
 
     An edge steeper than 60 degrees counts for horizontal pairs only, one flatter than 30 degrees for vertical pairs only, so that
     the two directions together blend each piece of outline once.

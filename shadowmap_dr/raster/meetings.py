@@ -3,7 +3,8 @@
 Surfaces do so along lines where one passes through another, or stands on it: no silhouette lies between the pixels there, but
 what they see changes at once. So do flat faces of one surface between which there are others, too narrow for a pixel to see: the
 faces of a box are, seen from the side, if they consist of many triangles. The depths of both triangles are affine on the screen,
-so that the place between the pixels' centres where they are equal follows from six vertices.
+so that the place between the pixels' centres where they are equal follows from six vertices. Within one surface that is true
+only if it is flat up to there; planes of a curved one cross where it is not.
 """
 
 from __future__ import annotations
@@ -17,12 +18,15 @@ import drjit as dr
 from ._types import NO_TRIANGLE, RasterOutput, backend
 from .pairs import each_number
 from .setup import edge_lines, gather_triangle
-from .topology import Topology
+from .topology import NO_VERTEX, Topology
 
 # Depths whose difference changes by less (relative) from one pixel to the next are the same: the surfaces lie on each other.
 _LEAST_CHANGE = 1e-6
 # Faces of one surface whose depths change so much alike (relative) from one pixel to the next lie in one plane.
 _LEAST_FOLD = 0.02
+# Faces beside two triangles may leave both their planes by this part of the bend between them; at twice that there is no crease.
+# On curved surfaces they leave them by more: with one facet in between, by about a half.
+_BENT = 0.05
 # So many lanes take turns at the pairs that are listed; few, so that threads get equal parts of a short list, too.
 _LANES = 1024
 
@@ -34,7 +38,7 @@ class Meetings:
     Attributes:
         positions: flat clip-space vertices (4 V B), as rasterized.
         faces: ``UInt32`` (3 F,).
-        parts: ``UInt32`` (F,), see :class:`Topology`.
+        parts, beyond: ``UInt32`` (F,) and (3 F,), see :class:`Topology`.
         triangle: what each pixel sees.
         height, width, vertex_count: of an image.
         unconnected: whether faces of different parts may meet.
@@ -45,6 +49,7 @@ class Meetings:
     positions: Any
     faces: Any
     parts: Any
+    beyond: Any
     triangle: Any
     height: int
     width: int
@@ -67,7 +72,7 @@ class Meetings:
         crease_weights: Any = None,
     ) -> Meetings:
         size = raster.height, raster.width, vertex_count
-        surfaces = topology.faces, topology.parts, raster.triangle
+        surfaces = topology.faces, topology.parts, topology.beyond, raster.triangle
         UInt32 = backend(raster.triangle).UInt32
         found = dr.empty(UInt32, 2 * dr.width(raster.triangle)), dr.zeros(UInt32, 1)
         return cls(dr.detach(positions), *surfaces, *size, unconnected, creases, crease_weights, *found)
@@ -134,39 +139,68 @@ class Meetings:
         x, y = (2 * Float64(column) + (1 - self.width)) / self.width, (2 * Float64(row) + (1 - self.height)) / self.height
         step_x, step_y = 2 / self.width, 2 / self.height
         step = dr.select(down, UInt32(self.width), 1)
-        found, differences, parts, soft = [], [], [], Float(1)
+        found, seen, parts, soft = [], [], [], Float(1)
         for p in (pixel, pixel + step):
             triangle = dr.gather(UInt32, self.triangle, p)
             parts.append(dr.gather(UInt32, self.parts, triangle))
             if self.crease_weights is not None:
                 soft = dr.minimum(soft, dr.gather(Float, self.crease_weights, p))
             corners = gather_triangle(self.positions, self.faces, triangle, first, True)
-            lines, det = edge_lines(corners)
-            inverse = dr.select(det != 0, dr.rcp(dr.select(det != 0, det, 1)), 0)
-            lines = [[c * inverse for c in line] for line in lines]
-            plane = [sum(line[c] * Float64(p.z) for line, p in zip(lines, corners, strict=True)) for c in range(3)]
+            lines, plane = _plane(corners)
             i = dr.gather(module.Array3u, self.faces, triangle)
             found.append(([first + i[k] for k in range(3)], lines, plane))
-            differences.append(plane)
-        a, b, c = (u - v for u, v in zip(*differences, strict=True))
+            seen.append((triangle, first, corners))
+        planes = [plane for _, _, plane in found]
+
+        def along(plane: Any) -> Any:
+            """Its change on the way to the neighbour."""
+            return dr.select(down, plane[1] * step_y, plane[0] * step_x)
+
+        a, b, c = (u - v for u, v in zip(*planes, strict=True))
         # First depth minus second here, and its change on the way to the neighbour.
         start, change = dr.fma(a, x, dr.fma(b, y, c)), dr.select(down, b * step_y, a * step_x)
         end = start + change
         depth = found[0][2][0] * x + found[0][2][1] * y + found[0][2][2]
         # Of two surfaces one sees the nearer one. Faces of one surface form a ridge or a valley.
         folded = parts[0] == parts[1]
-        steepness = sum(dr.select(down, dr.abs(plane[1]) * step_y, dr.abs(plane[0]) * step_x) for _, _, plane in found)
+        steepness = sum(dr.abs(along(plane)) for plane in planes)
         least = dr.maximum(_LEAST_CHANGE * dr.abs(depth), dr.select(folded, _LEAST_FOLD * steepness, 0))
         meet = (((start < 0) & (end > 0)) | (folded & (start > 0) & (end < 0))) & (dr.abs(change) > least)
         slope = dr.select(meet, dr.rcp(dr.select(meet, change, 1)), 0)
         t = -start * slope
         across = (a * step_x) ** 2
-        along = (b * step_y) ** 2
-        share = dr.clip(0.5 + (across - along) / dr.select(meet, across + along, 1), 0, 1)
-        share = dr.select(meet, dr.select(down, 1 - share, share) * dr.select(folded, soft, 1), 0)
+        upwards = (b * step_y) ** 2
+        bent = dr.maximum(*(self._bent(*one, planes, along) for one in seen))
+        flat = Float(dr.clip(2 - bent / (_BENT * dr.select(meet, dr.abs(change), 1)), 0, 1))
+        share = dr.clip(0.5 + (across - upwards) / dr.select(meet, across + upwards, 1), 0, 1)
+        share = dr.select(meet, dr.select(down, 1 - share, share) * dr.select(folded, soft * flat, 1), 0)
         x, y = dr.select(down, x, x + t * step_x), dr.select(down, y + t * step_y, y)
         triangles = [
             (vertices, [Float(v) for v in plane], [Float(dr.fma(m, x, dr.fma(n, y, o))) for m, n, o in lines])
             for vertices, lines, plane in found
         ]
         return Float(share * (t - 0.5)), Float(-share * slope), triangles
+
+    def _bent(self, triangle: Any, first: Any, corners: Any, planes: list[Any], along: Callable[[Any], Any]) -> Any:
+        """How far from both planes the faces beside a triangle turn, as changes of depth on the way to the neighbour: the most.
+
+        The ridge itself lies between a face of the one plane and a face of the other.
+        """
+        module = backend(self.positions)
+        most = module.Float64(0)
+        for k in range(3):
+            vertex = dr.gather(module.UInt32, self.beyond, 3 * triangle + k)
+            has = vertex != NO_VERTEX
+            beside = corners[k], corners[(k + 1) % 3], dr.gather(module.Array4f, self.positions, first + vertex, has)
+            slope = along(_plane(beside)[1])
+            apart = dr.minimum(*(dr.abs(slope - along(plane)) for plane in planes))
+            most = dr.maximum(most, dr.select(has, apart, 0))
+        return most
+
+
+def _plane(corners: tuple[Any, Any, Any]) -> tuple[list[list[Any]], list[Any]]:
+    """Barycentrics / w of a triangle as affine functions (a, b, c: a x + b y + c) in NDC, and its depth as such a one."""
+    lines, det = edge_lines(corners)
+    inverse = dr.select(det != 0, dr.rcp(dr.select(det != 0, det, 1)), 0)
+    lines = [[c * inverse for c in line] for line in lines]
+    return lines, [sum(line[c] * type(det)(p.z) for line, p in zip(lines, corners, strict=True)) for c in range(3)]

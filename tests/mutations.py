@@ -91,6 +91,18 @@ def _nowhere(function: Callable[..., Any]) -> Callable[..., Any]:
     return lambda *arguments: 0.0 * function(*arguments)
 
 
+def _never(function: Callable[..., Any]) -> Callable[..., Any]:
+    return lambda *arguments: function(*arguments) & False
+
+
+def _halves(function: Callable[..., Any]) -> Callable[..., Any]:
+    def broken(*arguments: Any) -> Any:
+        a, b, c, d, first, second = function(*arguments)
+        return a, b, c, d, 0.5 * (first + second), 0.5 * (first + second)
+
+    return broken
+
+
 def _only_the_first_triangle(function: Callable[..., Any]) -> Callable[..., Any]:
     return lambda *arguments: function(*arguments)[:3]
 
@@ -142,8 +154,12 @@ MUTATIONS = (
              ("test_references.py::test_shadows_of_1024_texels[llvm_ad_rgb-gallery]",)),
     Mutation("look half a texel off", "shadow.lookup", "_bilinear", _half_a_texel_off,
              ("test_shadow_maps.py::test_compat_follows_the_authors_formulas[llvm_ad_rgb-spot]",)),
-    Mutation("do not see where surfaces meet", "raster.meetings", "Meetings.weight", _nowhere,
-             (DIFFERENCES.format("crossing_boxes-camera_shift"),)),
+    Mutation("do not see where surfaces meet", "raster.meetings", "Meetings.possible", _never,
+             (DIFFERENCES.format("crossing_boxes-camera_shift"), DIFFERENCES.format("fine_box-caster_rise"))),
+    Mutation("take edges beside a ridge for it", "raster.creases", "find_creases", _halves,
+             ("test_raster_antialias.py::test_tessellation_of_a_crease_does_not_change_it[llvm_ad_rgb-ridge]",)),
+    Mutation("take curved surfaces for flat ones", "raster.meetings", "Meetings._bent", _nowhere,
+             ("test_raster_antialias.py::test_planes_of_a_curved_surface_are_not_extended[llvm_ad_rgb-2-30]",)),
     Mutation("move one of two surfaces that meet", "raster.meetings", "Meetings.slopes", _only_the_first_triangle,
              ("test_raster_antialias.py::test_surfaces_that_meet_without_an_edge[llvm_ad_rgb]",)),
     Mutation("detach the spot light's cone", "lights", "SpotLight.illuminate", _detached_cone,

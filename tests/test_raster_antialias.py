@@ -217,6 +217,23 @@ def test_seams_are_welded(variant: str) -> None:
     assert boundary == 16
 
 
+def test_faces_beyond_edges(variant: str) -> None:
+    """By brute force, of a grid with a fin on one of its edges and a face without area."""
+    world, faces = grid(3)
+    faces = np.r_[faces, [[faces[4][0], faces[4][1], len(world)], [0, 0, 5]]]
+    world = np.r_[world, [[0.1, 0.2, 1]]]
+    split = world[faces].reshape(-1, 3)
+    found = topology_of(np.arange(len(split)).reshape(-1, 3), split).beyond.numpy().reshape(-1, 3)
+    for f, face in enumerate(faces):
+        for k in range(3):
+            edge = {face[k], face[(k + 1) % 3]}
+            others = [g for g in range(len(faces)) if g != f and len(set(faces[g])) == 3 and edge <= set(faces[g])]
+            if len(others) == 1 and len(edge) == 2 and f < len(faces) - 1:
+                assert found[f, k] // 3 == others[0] and faces.ravel()[found[f, k]] not in edge
+            else:
+                assert found[f, k] == 0xFFFFFFFF
+
+
 def test_interpolate_matches_the_plane_and_is_differentiable(variant: str) -> None:
     size = 16
     pos = np.array([[-3, -3, 0, 1], [12, -6, 0, 2], [-4.5, 9, 0, 1.5]], np.float32)
@@ -268,6 +285,65 @@ def test_creases_between_flat_faces_move(variant: str) -> None:
     assert abs(float(dr.grad(shift)[0]) - want) < want * 4 / rows
     plain = antialias(value, out, clip, topology)
     assert np.abs(plain.numpy() - image.numpy()).max() > 0.1
+
+
+@pytest.mark.parametrize("depth", [-1, 1], ids=["ridge", "valley"])
+def test_tessellation_of_a_crease_does_not_change_it(variant: str, depth: int) -> None:
+    """Two flat faces, one seen from the side: made of 2 triangles each, or 32, or 512, of which few that pixels see touch."""
+    size, across, results = 64, 0.1, []
+    for n in (1, 4, 16):
+        grid = np.stack(np.meshgrid(np.arange(n + 1) / n, np.linspace(-0.8, 0.8, n + 1)), -1).reshape(-1, 2)
+        corner = np.add.outer((n + 1) * np.arange(n), np.arange(n)).ravel()[:, None]
+        one = np.r_[corner + [0, 1, n + 2], corner + [0, n + 2, n + 1]]
+        faces = np.r_[one, one + len(grid)].astype(np.uint32)
+        a, y = (mi.Float(np.tile(grid[:, k], 2).astype(np.float32)) for k in range(2))
+        steep = mi.Float(np.repeat([0, 1], len(grid)).astype(np.float32))
+        shift, turn = mi.Float(0), mi.Float(0)
+        dr.enable_grad(shift, turn)
+        ridge = 0.11 + shift + (0.05 + turn) * y
+        x = ridge + dr.select(steep > 0, across * a, (ridge + 0.8) * (a - 1))
+        z = depth * (0.2 * x + 0.4 * steep * a)
+        clip = mi.TensorXf(dr.ravel(mi.Point4f(x, y, z, 1)), shape=(2 * len(grid), 4))
+        topology = topology_of(faces, np.array(dr.detach(mi.Point3f(x, y, z))).T)
+        assert topology.part_count == 1
+        out = rasterize(clip, mi.TensorXu(faces), (size, size))
+        value = dr.select(out.valid, dr.select(out.triangle >= len(one), mi.Float(0.25), 1), 0)
+        image = antialias(value, out, clip, topology, creases=mi.Bool([True] * faces.size))
+        weight = mi.Float(np.repeat(np.linspace(-0.8, 1.2, size), size).astype(np.float32))
+        dr.backward(dr.sum(image * weight))
+        results.append((image.numpy().reshape(size, size), [float(dr.grad(p)[0]) for p in (shift, turn)]))
+    (coarse, want), *others = results
+    for fine, got in others:
+        # But for the rows at the ends, where outlines and crease come together.
+        assert np.abs(coarse - fine)[8:-8].max() < 1e-3
+        assert np.allclose(got, want, rtol=0.02), (got, want)
+
+
+@pytest.mark.parametrize("rows", [1, 30])
+@pytest.mark.parametrize("facet", [1.5, 2, 3])
+def test_planes_of_a_curved_surface_are_not_extended(variant: str, facet: float, rows: int) -> None:
+    """Facets (of a size in pixels) around an arc, seen from the side at its ends, and over a roof, on one side of it."""
+    size = 64
+    columns = int(0.8 * np.radians(168) * size / 2 / facet)
+    arc, y = np.meshgrid(np.radians(np.linspace(-84, 84, columns + 1)), np.linspace(-0.9, 0.9, rows + 1))
+    steep = np.clip(np.arange(columns + 1) - columns // 2, 0, None) / columns
+    shallow = np.clip(np.arange(columns + 1) - columns // 2, None, 0) / columns
+    corner = np.add.outer((columns + 1) * np.arange(rows), np.arange(columns)).ravel()[:, None]
+    faces = np.r_[corner + [0, 1, columns + 2], corner + [0, columns + 2, columns + 1]].astype(np.uint32)
+    parts = []
+    for x, z in ((0.8 * np.sin(arc), -0.4 * np.cos(arc)), (1.6 * shallow + 0.1 * steep + 0 * y, 0.1 * shallow + steep + 0 * y)):
+        world = np.stack([0.98 * x + 0.2 * y, 0.98 * y - 0.2 * x, z], -1).reshape(-1, 3).astype(np.float32)
+        clip, topology = mi.TensorXf(np.c_[world, np.ones(len(world), np.float32)]), topology_of(faces, world)
+        out = rasterize(clip, mi.TensorXu(faces), (size, size))
+        found = find_crossings(clip.array, topology, out, len(world), creases=mi.Bool([True] * faces.size))
+        count = int(found.meetings.count[0])
+        assert count > 20
+        pair = found.pairs.at(mi.UInt32(found.meetings.slots.numpy()[:count]))
+        weight = dr.select(pair & 1 == 1, *(dr.gather(mi.Float, w, pair >> 1) for w in (found.down, found.right)))
+        parts.append((weight.numpy() != 0).mean())
+    curved, roof = parts
+    # The rest of the roof's pairs see twice the same side.
+    assert curved == 0 and roof > 0.25
 
 
 def test_plain_dr_jit_arrays_do_as_well(variant: str) -> None:

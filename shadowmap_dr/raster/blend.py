@@ -8,7 +8,6 @@ import drjit as dr
 
 from ._types import RasterOutput, backend
 from .crossings import Crossings
-from .meetings import Meetings
 from .topology import NO_VERTEX
 
 
@@ -125,30 +124,11 @@ class _Mixer:
         crossings = self.crossings
 
         def visit(slot: Any, pair: Any) -> None:
-            down, pixel = (pair & 1) != 0, pair >> 1
-            weight = dr.select(
-                down, dr.gather(Float, crossings.down, pixel, down), dr.gather(Float, crossings.right, pixel, ~down)
-            )
+            down, pixel, weight = self._pair(pair)
 
             def add(slot: Any, pixel: Any, down: Any, weight: Any) -> Any:
-                # The neighbour takes from the pixel where the weight is positive, else the other way round.
-                neighbour = pixel + dr.select(down, module.UInt32(self.width), 1)
-                taker, giver = dr.select(weight > 0, neighbour, pixel), dr.select(weight > 0, pixel, neighbour)
-                claims = dr.gather(Float, self.claims, taker)
-                scale = _scale(claims)
-                g, own = self._read(adjoint, taker), self._read(self.original, taker)
-                other = self._read(self.original, giver)
-                # A pixel of which all is claimed shares it out: more for one neighbour is less for all of them.
-                shared = claims >= 1
-                mixed = self._read(self.values, taker, shared)
-                mean = [dr.select(shared, m, o) for m, o in zip(mixed, own, strict=True)]
-                gain = sum(a * (v - m) for a, v, m in zip(g, other, mean, strict=True))
-                gain *= dr.select(weight > 0, scale, -scale)
-                ends = dr.gather(module.Array4u, crossings.ends, slot)
-                one = ends.x != NO_VERTEX
-                _add(result, gain, dr.gather(Array4f, crossings.slopes, slot), ends.x, ends.y, one)
-                if crossings.meetings is not None:
-                    _add_meeting(result, crossings.meetings, gain, pixel, down, ~one)
+                gain, ends = self._gain(adjoint, pixel, down, weight), dr.gather(module.Array4u, crossings.ends, slot)
+                _add(result, gain, dr.gather(Array4f, crossings.slopes, slot), ends.x, ends.y, ends.x != NO_VERTEX)
                 two = ends.z != NO_VERTEX
 
                 def second(slot: Any, gain: Any, c: Any, d: Any) -> Any:
@@ -159,8 +139,47 @@ class _Mixer:
 
             dr.if_stmt((slot, pixel, down, weight), weight != 0, add, lambda slot, pixel, down, weight: weight, mode="symbolic")
 
+        def meet(slot: Any) -> None:
+            down, pixel, weight = self._pair(crossings.pairs.at(slot))
+            active = (weight != 0) & self._bare(slot)
+
+            def add(pixel: Any, down: Any, weight: Any) -> Any:
+                gain = self._gain(adjoint, pixel, down, weight)
+                for vertex, slope in crossings.meetings.slopes(pixel, down):
+                    dr.scatter_add(result, slope * gain, vertex)
+                return weight
+
+            dr.if_stmt((pixel, down, weight), active, add, lambda pixel, down, weight: weight, mode="symbolic")
+
         crossings.pairs.for_each(visit)
+        if crossings.meetings is not None:
+            crossings.meetings.for_each(meet)
         return result
+
+    def _pair(self, pair: Any) -> tuple[Any, Any, Any]:
+        """Whether it is a pair with the lower neighbour, its pixel, and its weight."""
+        down, pixel = (pair & 1) != 0, pair >> 1
+        below = dr.gather(self.module.Float, self.crossings.down, pixel, down)
+        return down, pixel, dr.select(down, below, dr.gather(self.module.Float, self.crossings.right, pixel, ~down))
+
+    def _bare(self, slot: Any) -> Any:
+        """Whether a pair has no edge."""
+        return dr.gather(self.module.UInt32, self.crossings.ends, 4 * slot) == NO_VERTEX
+
+    def _gain(self, adjoint: Any, pixel: Any, down: Any, weight: Any) -> Any:
+        """Gradient to the weight of a pair."""
+        # The neighbour takes from the pixel where the weight is positive, else the other way round.
+        neighbour = pixel + dr.select(down, self.module.UInt32(self.width), 1)
+        taker, giver = dr.select(weight > 0, neighbour, pixel), dr.select(weight > 0, pixel, neighbour)
+        claims = dr.gather(self.module.Float, self.claims, taker)
+        scale = _scale(claims)
+        g, own = self._read(adjoint, taker), self._read(self.original, taker)
+        other = self._read(self.original, giver)
+        shared = claims >= 1  # shares itself out: more for one neighbour is less for all of them
+        mixed = self._read(self.values, taker, shared)
+        mean = [dr.select(shared, m, o) for m, o in zip(mixed, own, strict=True)]
+        gain = sum(a * (v - m) for a, v, m in zip(g, other, mean, strict=True))
+        return gain * dr.select(weight > 0, scale, -scale)
 
     def tangent(self, values: Any, positions: Any) -> Any:
         """Change of the result with that of the values and positions (each or None)."""
@@ -207,14 +226,21 @@ class _Mixer:
                 at = dr.fma(q - p, slope.x, p)
                 change += dr.select(has, slope.y * at.x + slope.z * at.y + slope.w * at.w, 0)
             is_down = (pair & 1) != 0
-            if crossings.meetings is not None:
-                weight = dr.select(is_down, *(dr.gather(Float, w, pair >> 1) for w in (crossings.down, crossings.right)))
-                active = (ends.x == NO_VERTEX) & (weight != 0)
-                change = _change_of_meeting(crossings.meetings, positions, pair >> 1, is_down, active, change)
             dr.scatter(right, change, pair >> 1, ~is_down)
             dr.scatter(down, change, pair >> 1, is_down)
 
+        def meet(slot: Any) -> None:
+            is_down, pixel, weight = self._pair(crossings.pairs.at(slot))
+            slopes = crossings.meetings.slopes(pixel, is_down)
+            change = sum(dr.dot(slope, dr.gather(Array4f, positions, vertex)) for vertex, slope in slopes)
+            active = (weight != 0) & self._bare(slot)
+            dr.scatter(right, change, pixel, active & ~is_down)
+            dr.scatter(down, change, pixel, active & is_down)
+
         crossings.pairs.for_each(visit)
+        if crossings.meetings is not None:
+            dr.eval(right, down)
+            crossings.meetings.for_each(meet)
         dr.eval(right, down)
         return right, down
 
@@ -272,24 +298,3 @@ def _add(result: Any, gain: Any, slopes: Any, a: Any, b: Any, active: Any) -> No
     g = Array4f(gain * slopes.y, gain * slopes.z, 0, gain * slopes.w)
     dr.scatter_add(result, g * (1 - slopes.x), a, active)
     dr.scatter_add(result, g * slopes.x, b, active)
-
-
-def _add_meeting(result: Any, meetings: Meetings, gain: Any, pixel: Any, down: Any, active: Any) -> None:
-    """Pass a weight's gradient on to the corners of two triangles that meet."""
-
-    def add(gain: Any, pixel: Any, down: Any) -> Any:
-        for vertex, slope in meetings.slopes(pixel, down):
-            dr.scatter_add(result, slope * gain, vertex)
-        return gain
-
-    dr.if_stmt((gain, pixel, down), active, add, lambda gain, pixel, down: gain, mode="symbolic", label="surfaces meet")
-
-
-def _change_of_meeting(meetings: Meetings, positions: Any, pixel: Any, down: Any, active: Any, other: Any) -> Any:
-    """Change of the weight of two triangles that meet, ``other`` where not ``active``."""
-
-    def change(pixel: Any, down: Any, other: Any) -> Any:
-        return sum(dr.dot(slope, dr.gather(type(slope), positions, vertex)) for vertex, slope in meetings.slopes(pixel, down))
-
-    arguments = (pixel, down, other)
-    return dr.if_stmt(arguments, active, change, lambda pixel, down, other: other, mode="symbolic", label="surfaces meet")

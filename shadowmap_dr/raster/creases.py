@@ -9,15 +9,20 @@ import drjit as dr
 from ._types import NO_TRIANGLE, RasterOutput, backend
 from .topology import NO_VERTEX, Topology
 
+# Planes that cross so far (relative) beyond two edges still cross at the nearer one, in spite of rounding.
+_SLACK = 0.05
+
 
 def find_creases(
     creases: Any, topology: Topology, raster: RasterOutput, image: Any, pixel: Any, here: Any, neighbour: Any, down: Any
-) -> tuple[Any, Any, Any, Any, Any]:
+) -> tuple[Any, Any, Any, Any, Any, Any]:
     """Creases between pixels and their right or (where ``down``) lower neighbours.
 
     Two triangles of one surface have a corner in common, if they are not much smaller than a pixel. Through one edge one
     leaves the first on the way to the neighbour, through one (the same, as a rule) one enters the other. If they are two, other
-    faces of unknown colour lie in between, about the mean of both: each edge then counts half.
+    faces of unknown colour lie in between. Each edge then counts as much as the surface bends there: not at all where it lies
+    within a flat face of many triangles. That follows from where the planes of both triangles cross: at the first edge if all of
+    the bend is there, at the second, or in between. If they do not cross there, each edge counts half.
 
     Args:
         creases: see :func:`find_crossings`.
@@ -25,33 +30,39 @@ def find_creases(
         image, pixel: which pixels, and in which images of the batch.
         here, neighbour: triangles that the pixels and their neighbours see.
 
-    Returns ends (a, b) of the first edge, ``NO_VERTEX`` where there is none, those of the second, and the weight of each.
+    Returns ends (a, b) of the first edge, ``NO_VERTEX`` where there is none, those of the second, and the weights of both.
     """
     module = backend(here)
     UInt32, Bool = module.UInt32, module.Bool
     near = _touch(topology, here, neighbour)
 
-    def search(image: Any, pixel: Any, here: Any, neighbour: Any, down: Any) -> tuple[Any, Any, Any, Any, Any]:
+    def search(image: Any, pixel: Any, here: Any, neighbour: Any, down: Any) -> tuple[Any, Any, Any, Any, Any, Any]:
         row = pixel // raster.width
         x = module.Float(pixel - row * raster.width) + (0.5 - 0.5 * raster.width)
         y = module.Float(row - image * raster.height) + (0.5 - 0.5 * raster.height)
-        corner_out = _way_out(raster, image, here, x, y, down, 1)
+        corner_out, way_out, depth, slope = _way_out(raster, image, here, x, y, down, 1)
         x, y = dr.select(down, x, x + 1), dr.select(down, y + 1, y)
-        corner_in = _way_out(raster, image, neighbour, x, y, down, -1)
+        corner_in, way_in, other_depth, other_slope = _way_out(raster, image, neighbour, x, y, down, -1)
         hard_out = dr.gather(Bool, creases, 3 * here + corner_out)
         hard_in = dr.gather(Bool, creases, 3 * neighbour + corner_in)
         a, b = _ends(topology, here, corner_out, hard_out)
         c, d = _ends(topology, neighbour, corner_in, hard_in)
         # Twice the same edge, or only the second: one edge is what is left.
         same = hard_out & hard_in & (((a == c) & (b == d)) | ((a == d) & (b == c)))
-        weight = dr.select(hard_out & hard_in & ~same, 0.5, module.Float(1))
         a, b = dr.select(hard_out, a, c), dr.select(hard_out, b, d)
         two = hard_out & hard_in & ~same
-        return a, b, dr.select(two, c, NO_VERTEX), dr.select(two, d, NO_VERTEX), weight
+        # Where the planes cross, from 0 at the first edge to 1 at the second.
+        bend = other_slope - slope
+        crossing = (depth - (other_depth - other_slope)) / dr.select(bend == 0, 1, bend)
+        between = 1 - way_in - way_out
+        second = (crossing - way_out) / dr.select(between == 0, 1, between)
+        second = dr.select((bend != 0) & (between > 0) & (second >= -_SLACK) & (second <= 1 + _SLACK), dr.clip(second, 0, 1), 0.5)
+        second = dr.select(two, second, 0)
+        return a, b, dr.select(two, c, NO_VERTEX), dr.select(two, d, NO_VERTEX), 1 - second, second
 
-    def nothing(image: Any, *_: Any) -> tuple[Any, Any, Any, Any, Any]:
-        none = dr.full(UInt32, NO_VERTEX, dr.width(image))
-        return none, none, none, none, dr.zeros(module.Float, dr.width(image))
+    def nothing(image: Any, *_: Any) -> tuple[Any, Any, Any, Any, Any, Any]:
+        none, zero = dr.full(UInt32, NO_VERTEX, dr.width(image)), dr.zeros(module.Float, dr.width(image))
+        return none, none, none, none, zero, zero
 
     arguments = (image, pixel, here, neighbour, down)
     return dr.if_stmt(arguments, near, search, nothing, mode="symbolic", label="creases")
@@ -69,8 +80,12 @@ def _touch(topology: Topology, first: Any, second: Any) -> Any:
     return active & common
 
 
-def _way_out(raster: RasterOutput, image: Any, triangle: Any, x: Any, y: Any, down: Any, sign: int) -> Any:
-    """Corner at which the edge starts through which one leaves a triangle from a point inside, along an axis of the image."""
+def _way_out(raster: RasterOutput, image: Any, triangle: Any, x: Any, y: Any, down: Any, sign: int) -> tuple[Any, Any, Any, Any]:
+    """The edge through which one leaves a triangle from a point inside, along an axis of the image.
+
+    Returns the corner at which it starts, the way there in pixels, the depth at the point, and its change with each pixel (along
+    the axis, whichever way one goes).
+    """
     module = backend(x)
     lines = raster.edge_functions(image, triangle)
     value = dr.fma(lines[0], x, dr.fma(lines[1], y, lines[2]))
@@ -80,7 +95,7 @@ def _way_out(raster: RasterOutput, image: Any, triangle: Any, x: Any, y: Any, do
         distance = dr.select(slope > 0, dr.maximum(value[k], 0) / slope, dr.inf)
         opposite = dr.select(distance < nearest, k, opposite)
         nearest = dr.minimum(nearest, distance)
-    return _next(opposite)
+    return _next(opposite), nearest, value.w, dr.select(down, lines[1].w, lines[0].w)
 
 
 def _next(corner: Any) -> Any:

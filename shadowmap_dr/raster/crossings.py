@@ -66,7 +66,9 @@ def find_crossings(
     (extended to the crossing). Among several the outermost is taken: up to it the uncovered pixel's surface is hidden.
 
     Between two pixels whose triangles touch, the edges through which one leaves the first triangle and enters the other are
-    creases. If these are two edges, with something unseen in between, each counts half.
+    creases. If these are two edges, with something unseen in between, each counts as much as the surface bends there. Between
+    flat triangles that do not touch, the crease is where their planes cross, if that is in between and the faces beside the
+    triangles lie in these planes, too.
 
     An edge steeper than 60 degrees counts for horizontal pairs only, one flatter than 30 degrees for vertical pairs only, so that
     the two directions together blend each piece of outline once.
@@ -74,6 +76,7 @@ def find_crossings(
     with dr.suspend_grad():
         positions = dr.detach(positions)
         meetings = meetings and topology.part_count > 1
+        meet = None
         if creases is None and not meetings:
             pairs, keys = empty_list(raster)
             register_silhouettes(positions, topology, raster, vertex_count, keys, pairs)
@@ -83,7 +86,8 @@ def find_crossings(
             crease_weights = None if crease_weights is None else dr.detach(crease_weights)
             dr.eval(crease_weights)
         dr.eval(keys, pairs)
-        meet = Meetings.of(positions, topology, raster, vertex_count) if meetings else None
+        if creases is not None or meetings:
+            meet = Meetings.of(positions, topology, raster, vertex_count, meetings, creases, crease_weights)
         return _measure(positions, topology, raster, vertex_count, keys, pairs, creases, crease_weights, meet)
 
 
@@ -121,46 +125,47 @@ def _measure(
         silhouette = key != 0
         ends = dr.gather(module.Array2u, topology.edges, ~UInt32(key & 0xFFFFFFFF), silhouette)
         a, b = (dr.select(silhouette, end, NO_VERTEX) for end in (ends.x, ends.y))
-        c, d, weight = UInt32(NO_VERTEX), UInt32(NO_VERTEX), Float(1)
+        c, d, weight, weight_2, soft = UInt32(NO_VERTEX), UInt32(NO_VERTEX), Float(1), Float(0), Float(1)
         if creases is not None:
-            soft = Float(1)
             if crease_weights is not None:
                 soft = dr.minimum(*(dr.gather(Float, crease_weights, p, ~silhouette) for p in (pixel, pixel + step)))
 
             def crease(image, pixel, step, down, a, b, soft):  # noqa: ANN001, ANN202
                 here, neighbour = (dr.gather(UInt32, raster.triangle, p) for p in (pixel, pixel + step))
-                a, b, c, d, weight = find_creases(creases, topology, raster, image, pixel, here, neighbour, down)
-                return a, b, c, d, soft * weight
+                a, b, c, d, weight, weight_2 = find_creases(creases, topology, raster, image, pixel, here, neighbour, down)
+                return a, b, c, d, soft * weight, soft * weight_2
 
             none = dr.full(UInt32, NO_VERTEX, dr.width(pair))
-            a, b, c, d, weight = dr.if_stmt(
+            a, b, c, d, weight, weight_2 = dr.if_stmt(
                 (image, pixel, step, down, a, b, soft),
                 ~silhouette & (soft > 0),
                 crease,
-                lambda image, pixel, step, down, a, b, soft: (a, b, none, none, Float(1)),
+                lambda image, pixel, step, down, a, b, soft: (a, b, none, none, Float(1), Float(0)),
                 mode="symbolic",
                 label="no silhouette",
             )
+        if meetings is not None:
+            bare = a == NO_VERTEX
+            here, there = (dr.gather(UInt32, raster.triangle, p, bare) for p in (pixel, pixel + step))
+            meetings.add(slot, dr.select(bare, here, NO_TRIANGLE), there, soft)
         first = image * vertex_count
         a, b, c, d = (dr.select(end == NO_VERTEX, NO_VERTEX, end + first) for end in (a, b, c, d))
         value, slopes = _weight(positions, a, b, raster, row, column, down, weight)
 
-        def second(slot, c, d, row, column, down, weight, value):  # noqa: ANN001, ANN202
-            more, slopes = _weight(positions, c, d, raster, row, column, down, weight)
+        def second(slot, c, d, row, column, down, weight_2, value):  # noqa: ANN001, ANN202
+            more, slopes = _weight(positions, c, d, raster, row, column, down, weight_2)
             dr.scatter(found.second_slopes, slopes, slot)
             return value + more
 
         if creases is not None:
             value = dr.if_stmt(
-                (slot, c, d, row, column, down, weight, value),
+                (slot, c, d, row, column, down, weight_2, value),
                 c != NO_VERTEX,
                 second,
-                lambda slot, c, d, row, column, down, weight, value: value,
+                lambda slot, c, d, row, column, down, weight_2, value: value,
                 mode="symbolic",
                 label="second crease",
             )
-        if meetings is not None:
-            value = _meeting(meetings, pixel, step, down, a == NO_VERTEX, value)
         dr.scatter(found.ends, module.Array4u(a, b, c, d), slot)
         dr.scatter(found.slopes, Array4f(slopes), slot)
         dr.scatter(found.right, value, pixel, ~down)
@@ -168,20 +173,25 @@ def _measure(
 
     pairs.for_each(visit)
     dr.eval(found)
+    if meetings is not None:
+        _meet(found, meetings, raster)
+        dr.eval(found)
     return found
 
 
-def _meeting(meetings: Meetings, pixel: Any, step: Any, down: Any, bare: Any, value: Any) -> Any:
-    """The weight of pairs without an edge (``bare``) whose surfaces meet, ``value`` for others."""
-    here, there = (dr.gather(type(pixel), meetings.triangle, p, bare) for p in (pixel, pixel + step))
-    return dr.if_stmt(
-        (pixel, down, value),
-        bare & meetings.possible(dr.select(bare, here, NO_TRIANGLE), there),
-        lambda pixel, down, value: meetings.weight(pixel, down),
-        lambda pixel, down, value: value,
-        mode="symbolic",
-        label="surfaces meet",
-    )
+def _meet(found: Crossings, meetings: Meetings, raster: RasterOutput) -> None:
+    """Write the weights of pairs whose triangles meet other than in an edge."""
+    UInt32 = backend(found.ends).UInt32
+
+    def visit(slot: Any) -> None:
+        pair = found.pairs.at(slot)
+        down, pixel = (pair & 1) != 0, pair >> 1
+        value = meetings.weight(pixel, down)
+        met = meetings.possible(pixel, dr.select(down, UInt32(raster.width), 1))
+        dr.scatter(found.right, value, pixel, met & ~down)
+        dr.scatter(found.down, value, pixel, met & down)
+
+    meetings.for_each(visit)
 
 
 def _weight(

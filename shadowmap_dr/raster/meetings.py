@@ -1,55 +1,116 @@
-"""Where surfaces meet without an edge: lines along which one passes through another, or stands on it.
+"""Where what two neighbouring pixels see meets, other than in an edge that both have.
 
-No silhouette lies between two pixels there, but what they see changes at once. The depths of both triangles are affine on the
-screen, so that the place between the pixels' centres where they are equal follows from six vertices.
+Surfaces do so along lines where one passes through another, or stands on it: no silhouette lies between the pixels there, but
+what they see changes at once. So do flat faces of one surface between which there are others, too narrow for a pixel to see: the
+faces of a box are, seen from the side, if they consist of many triangles. The depths of both triangles are affine on the screen,
+so that the place between the pixels' centres where they are equal follows from six vertices. Within one surface that is true
+only if it is flat up to there; planes of a curved one cross where it is not.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 
 from ._types import NO_TRIANGLE, RasterOutput, backend
+from .pairs import each_number
 from .setup import edge_lines, gather_triangle
-from .topology import Topology
+from .topology import NO_VERTEX, Topology
 
 # Depths whose difference changes by less (relative) from one pixel to the next are the same: the surfaces lie on each other.
 _LEAST_CHANGE = 1e-6
+# Faces of one surface whose depths change so much alike (relative) from one pixel to the next lie in one plane.
+_LEAST_FOLD = 0.02
+# Faces beside two triangles may leave both their planes by this part of the bend between them; at twice that there is no crease.
+# On curved surfaces they leave them by more: with one facet in between, by about a half.
+_BENT = 0.05
+# So many lanes take turns at the pairs that are listed; few, so that threads get equal parts of a short list, too.
+_LANES = 1024
 
 
 @dataclass(frozen=True)
 class Meetings:
-    """What it takes to find out where the surfaces that two neighbouring pixels see meet. Detached.
+    """What it takes to find out where the triangles that two neighbouring pixels see meet. Detached.
 
     Attributes:
         positions: flat clip-space vertices (4 V B), as rasterized.
         faces: ``UInt32`` (3 F,).
-        parts: ``UInt32`` (F,), see :class:`Topology`.
+        parts, beyond: ``UInt32`` (F,) and (3 F,), see :class:`Topology`.
         triangle: what each pixel sees.
         height, width, vertex_count: of an image.
+        unconnected: whether faces of different parts may meet.
+        creases, crease_weights: see :func:`shadowmap_dr.raster.crossings.find_crossings`. Without, faces of one part do not meet.
+        slots, count: ``UInt32``, pairs without an edge that may meet, as slots in the list of all pairs, and how many there are.
     """
 
     positions: Any
     faces: Any
     parts: Any
+    beyond: Any
     triangle: Any
     height: int
     width: int
     vertex_count: int
+    unconnected: bool
+    creases: Any
+    crease_weights: Any
+    slots: Any
+    count: Any
 
     @classmethod
-    def of(cls, positions: Any, topology: Topology, raster: RasterOutput, vertex_count: int) -> Meetings:
-        return cls(
-            dr.detach(positions), topology.faces, topology.parts, raster.triangle, raster.height, raster.width, vertex_count
-        )
+    def of(
+        cls,
+        positions: Any,
+        topology: Topology,
+        raster: RasterOutput,
+        vertex_count: int,
+        unconnected: bool = True,
+        creases: Any = None,
+        crease_weights: Any = None,
+    ) -> Meetings:
+        size = raster.height, raster.width, vertex_count
+        surfaces = topology.faces, topology.parts, topology.beyond, raster.triangle
+        UInt32 = backend(raster.triangle).UInt32
+        found = dr.empty(UInt32, 2 * dr.width(raster.triangle)), dr.zeros(UInt32, 1)
+        return cls(dr.detach(positions), *surfaces, *size, unconnected, creases, crease_weights, *found)
 
-    def possible(self, here: Any, there: Any) -> Any:
-        """Whether two triangles (or none) belong to different surfaces: one surface seldom passes through itself."""
-        UInt32 = backend(here).UInt32
+    def add(self, slot: Any, here: Any, there: Any, soft: Any) -> None:
+        """List a pair if what it sees may meet. To be traced only once.
+
+        Args:
+            slot: of the pair.
+            here, there: triangles that it sees, or none, also if the pair has an edge.
+            soft: how much creases count there (``Float``).
+        """
+        UInt32 = backend(slot).UInt32
         both = (here != NO_TRIANGLE) & (there != NO_TRIANGLE)
-        return both & (dr.gather(UInt32, self.parts, here, both) != dr.gather(UInt32, self.parts, there, both))
+        apart = dr.gather(UInt32, self.parts, here, both) != dr.gather(UInt32, self.parts, there, both)
+        folded = (soft > 0) & (self.creases is not None)
+        listed = both & dr.select(apart, self.unconnected, folded)
+        dr.scatter(self.slots, slot, dr.scatter_inc(self.count, UInt32(0), listed), listed)
+
+    def for_each(self, visit: Callable[[Any], None]) -> None:
+        """Call ``visit(slot)``, which writes somewhere, for all pairs that were listed: few, and dear to visit."""
+        each_number(self.count, _LANES, lambda k: visit(dr.gather(type(k), self.slots, k)))
+
+    def possible(self, pixel: Any, step: Any) -> Any:
+        """Whether the triangles that pixels and those ``step`` further on see belong to different surfaces, or are flat.
+
+        Smooth surfaces are spared: they have no ridges, and one seldom passes through itself.
+        """
+        UInt32, Bool = type(pixel), backend(pixel).Bool
+        here, there = (dr.gather(UInt32, self.triangle, p) for p in (pixel, pixel + step))
+        apart = dr.gather(UInt32, self.parts, here) != dr.gather(UInt32, self.parts, there)
+        if self.creases is None:
+            return apart
+        flat = ~apart
+        for triangle in (here, there):
+            for k in range(3):
+                flat &= dr.gather(Bool, self.creases, 3 * triangle + k, flat)
+        return apart | flat
 
     def weight(self, pixel: Any, down: Any) -> Any:
         """Signed weight (see :class:`Crossings`) of pairs of pixels that see triangles, 0 where these do not meet in between."""
@@ -78,31 +139,68 @@ class Meetings:
         x, y = (2 * Float64(column) + (1 - self.width)) / self.width, (2 * Float64(row) + (1 - self.height)) / self.height
         step_x, step_y = 2 / self.width, 2 / self.height
         step = dr.select(down, UInt32(self.width), 1)
-        found, differences = [], []
+        found, seen, parts, soft = [], [], [], Float(1)
         for p in (pixel, pixel + step):
             triangle = dr.gather(UInt32, self.triangle, p)
+            parts.append(dr.gather(UInt32, self.parts, triangle))
+            if self.crease_weights is not None:
+                soft = dr.minimum(soft, dr.gather(Float, self.crease_weights, p))
             corners = gather_triangle(self.positions, self.faces, triangle, first, True)
-            lines, det = edge_lines(corners)
-            inverse = dr.select(det != 0, dr.rcp(dr.select(det != 0, det, 1)), 0)
-            lines = [[c * inverse for c in line] for line in lines]
-            plane = [sum(line[c] * Float64(p.z) for line, p in zip(lines, corners, strict=True)) for c in range(3)]
+            lines, plane = _plane(corners)
             i = dr.gather(module.Array3u, self.faces, triangle)
             found.append(([first + i[k] for k in range(3)], lines, plane))
-            differences.append(plane)
-        a, b, c = (u - v for u, v in zip(*differences, strict=True))
+            seen.append((triangle, first, corners))
+        planes = [plane for _, _, plane in found]
+
+        def along(plane: Any) -> Any:
+            """Its change on the way to the neighbour."""
+            return dr.select(down, plane[1] * step_y, plane[0] * step_x)
+
+        a, b, c = (u - v for u, v in zip(*planes, strict=True))
         # First depth minus second here, and its change on the way to the neighbour.
         start, change = dr.fma(a, x, dr.fma(b, y, c)), dr.select(down, b * step_y, a * step_x)
+        end = start + change
         depth = found[0][2][0] * x + found[0][2][1] * y + found[0][2][2]
-        meet = (start < 0) & (start + change > 0) & (change > _LEAST_CHANGE * dr.abs(depth))
+        # Of two surfaces one sees the nearer one. Faces of one surface form a ridge or a valley.
+        folded = parts[0] == parts[1]
+        steepness = sum(dr.abs(along(plane)) for plane in planes)
+        least = dr.maximum(_LEAST_CHANGE * dr.abs(depth), dr.select(folded, _LEAST_FOLD * steepness, 0))
+        meet = (((start < 0) & (end > 0)) | (folded & (start > 0) & (end < 0))) & (dr.abs(change) > least)
         slope = dr.select(meet, dr.rcp(dr.select(meet, change, 1)), 0)
         t = -start * slope
         across = (a * step_x) ** 2
-        along = (b * step_y) ** 2
-        share = dr.clip(0.5 + (across - along) / dr.select(meet, across + along, 1), 0, 1)
-        share = dr.select(meet, dr.select(down, 1 - share, share), 0)
+        upwards = (b * step_y) ** 2
+        bent = dr.maximum(*(self._bent(*one, planes, along) for one in seen))
+        flat = Float(dr.clip(2 - bent / (_BENT * dr.select(meet, dr.abs(change), 1)), 0, 1))
+        share = dr.clip(0.5 + (across - upwards) / dr.select(meet, across + upwards, 1), 0, 1)
+        share = dr.select(meet, dr.select(down, 1 - share, share) * dr.select(folded, soft * flat, 1), 0)
         x, y = dr.select(down, x, x + t * step_x), dr.select(down, y + t * step_y, y)
         triangles = [
             (vertices, [Float(v) for v in plane], [Float(dr.fma(m, x, dr.fma(n, y, o))) for m, n, o in lines])
             for vertices, lines, plane in found
         ]
         return Float(share * (t - 0.5)), Float(-share * slope), triangles
+
+    def _bent(self, triangle: Any, first: Any, corners: Any, planes: list[Any], along: Callable[[Any], Any]) -> Any:
+        """How far from both planes the faces beside a triangle turn, as changes of depth on the way to the neighbour: the most.
+
+        The ridge itself lies between a face of the one plane and a face of the other.
+        """
+        module = backend(self.positions)
+        most = module.Float64(0)
+        for k in range(3):
+            vertex = dr.gather(module.UInt32, self.beyond, 3 * triangle + k)
+            has = vertex != NO_VERTEX
+            beside = corners[k], corners[(k + 1) % 3], dr.gather(module.Array4f, self.positions, first + vertex, has)
+            slope = along(_plane(beside)[1])
+            apart = dr.minimum(*(dr.abs(slope - along(plane)) for plane in planes))
+            most = dr.maximum(most, dr.select(has, apart, 0))
+        return most
+
+
+def _plane(corners: tuple[Any, Any, Any]) -> tuple[list[list[Any]], list[Any]]:
+    """Barycentrics / w of a triangle as affine functions (a, b, c: a x + b y + c) in NDC, and its depth as such a one."""
+    lines, det = edge_lines(corners)
+    inverse = dr.select(det != 0, dr.rcp(dr.select(det != 0, det, 1)), 0)
+    lines = [[c * inverse for c in line] for line in lines]
+    return lines, [sum(line[c] * type(det)(p.z) for line, p in zip(lines, corners, strict=True)) for c in range(3)]

@@ -38,17 +38,24 @@ class PairList:
 
     def for_each(self, visit: Callable[[Any, Any], None]) -> None:
         """Call ``visit(slot, pair)``, which writes somewhere, for all pairs in the list: full packets, whatever the image."""
-        UInt32 = backend(self.pairs).UInt32
-        capacity = dr.width(self.pairs)
-        lanes = -(-capacity // _ROUNDS)
-        front, count = self.front, self.front + self.back
+        lanes = -(-dr.width(self.pairs) // _ROUNDS)
+        each_number(self.front + self.back, lanes, lambda slot: visit(slot, self.at(slot)))
 
-        def one(slot: Any) -> tuple[Any]:
-            pair = dr.gather(UInt32, self.pairs, dr.select(slot < front, slot, capacity - 1 - (slot - front)))
-            visit(slot, pair)
-            return (slot + lanes,)
+    def at(self, slot: Any) -> Any:
+        """The pair in a slot."""
+        index = dr.select(slot < self.front, slot, dr.width(self.pairs) - 1 - (slot - self.front))
+        return dr.gather(type(slot), self.pairs, index)
 
-        dr.while_loop((dr.arange(UInt32, lanes),), lambda slot: slot < count, one, mode="symbolic", label="pairs")
+
+def each_number(count: Any, lanes: int, visit: Callable[[Any], None]) -> None:
+    """Call ``visit(number)``, which writes somewhere, for all ``UInt32`` below ``count``, ``lanes`` at a time."""
+
+    def one(number: Any) -> tuple[Any]:
+        visit(number)
+        return (number + lanes,)
+
+    start = dr.arange(backend(count).UInt32, lanes)
+    dr.while_loop((start,), lambda number: number < count, one, mode="symbolic", label="pairs")
 
 
 def empty_list(raster: RasterOutput) -> tuple[PairList, Any]:

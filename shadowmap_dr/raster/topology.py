@@ -23,6 +23,8 @@ class Topology:
         faces, welded: ``UInt32`` (3 F,) vertices of the faces, as they are and with one number for each place.
         parts: ``UInt32`` (F,) a number for each face, the same for faces that are connected through common vertices.
         part_count: how many different numbers there are.
+        beyond: ``UInt32`` (3 F,) for the edge from corner k to k + 1 of each face the third vertex of the face on its other side,
+            ``NO_VERTEX`` where there is none or more than one.
     """
 
     edges: Any
@@ -32,6 +34,7 @@ class Topology:
     welded: Any
     parts: Any
     part_count: int
+    beyond: Any
 
 
 def build_topology(faces: np.ndarray, positions: np.ndarray, dtype: type) -> Topology:
@@ -56,6 +59,8 @@ def build_topology(faces: np.ndarray, positions: np.ndarray, dtype: type) -> Top
     parts, part_count = _parts(welded)
     flat = [dtype(np.ascontiguousarray(t.ravel().astype(np.uint32))) for t in (faces, welded, parts)]
     proper = (welded != np.roll(welded, 1, 1)).all(1)
+    where = np.flatnonzero(proper)
+    beyond = np.full(3 * len(proper), NO_VERTEX)
     faces, welded = faces[proper], welded[proper]
 
     a, b, opposite = (np.concatenate([faces[:, (k + s) % 3] for k in range(3)]) for s in (0, 1, 2))
@@ -68,6 +73,8 @@ def build_topology(faces: np.ndarray, positions: np.ndarray, dtype: type) -> Top
     partner = order[first[size == 2] + 1]
     alone = order[np.repeat(size != 2, size)]
     edges = np.concatenate([pair, alone])
+    slot = np.concatenate([3 * where + k for k in range(3)])
+    beyond[slot[pair]], beyond[slot[partner]] = opposite[partner], opposite[pair]
     second = np.concatenate([opposite[partner], np.full(len(alone), NO_VERTEX)])
     return Topology(
         dtype(np.stack([a[edges], b[edges]], 1).ravel().astype(np.uint32)),
@@ -75,6 +82,7 @@ def build_topology(faces: np.ndarray, positions: np.ndarray, dtype: type) -> Top
         len(edges),
         *flat,
         part_count,
+        dtype(beyond.astype(np.uint32)),
     )
 
 

@@ -24,7 +24,7 @@ from . import soft_report, soft_scenes
 #: Error that scenes are held to, relative to the mean of the image, with this many samples of each area light and of the sky.
 BAR, BAR_SAMPLES = 0.02, (64, 128)
 # Distances from the camera whose second difference, relative to themselves, is larger lie on either side of an outline.
-_JUMP = 0.03
+_JUMP = 0.01
 # Seconds and renderings at most that a time is measured for.
 _TIMED_SECONDS, _TIMED_ROUNDS = 10.0, 9
 

@@ -14,8 +14,9 @@ from ..lights import AreaLight
 from .clusters import surface_clusters
 from .samples import BEND, LightSamples, brightness, cluster_sums
 
-# Pieces of the emitter for each sample, at least.
+# Pieces of the emitter for each sample, at least; and how many more of them a texture needs, up to so many in all.
 _PIECES = 16
+_TEXTURED, _MOST = 64, 1 << 17
 # Importance of what faces away from everything, in units of the mean.
 _AWAY = 0.1
 # Points on the rest of the scene that are asked whether they see a piece.
@@ -54,7 +55,8 @@ def plan_area(light: AreaLight, geometry: Geometry, count: int) -> AreaPlan:
     own = slice(info.face_start, info.face_start + info.face_count)
     corners = positions[faces[own]]
     normals, areas = _normals(corners, info)
-    face, (u, v), fraction = _pieces(areas, _PIECES * count)
+    pieces = _PIECES * count
+    face, (u, v), fraction = _pieces(areas, max(pieces, min(_TEXTURED * pieces, _MOST)) if light.textured else pieces)
     a, b, c = (corners[face, k] for k in range(3))
     centres = a + u[:, None] * (b - a) + v[:, None] * (c - a)
     probes = _probes(geometry, positions, faces, own)

@@ -50,9 +50,10 @@ def plan_sky(light: Environment, count: int, geometry: Geometry) -> SkyPlan:
         directions, world = (np.stack([c.numpy() for c in v], -1).astype(np.float64) for v in (local, light.to_world(local)))
     average = (bright * weight).sum() / weight.sum()
     energy = (bright + _DARK * average if average > 0 else np.ones_like(bright)) * weight
+    hidden = np.zeros((rows, 2 * rows), bool)
     for normal in _floors(geometry):
-        energy = np.where(world @ normal < 0, _HIDDEN * energy, energy)
-    cluster = sky_clusters(energy.reshape(rows, 2 * rows), count).ravel()
+        hidden |= (world @ normal < 0).reshape(rows, 2 * rows)
+    cluster = _divided(energy.reshape(rows, 2 * rows), hidden, count).ravel()
     centre = np.stack([np.bincount(cluster, energy * directions[:, c], count) for c in range(3)], -1)
     # Opposite directions of one part may cancel: its heaviest cell then stands for it.
     length = np.linalg.norm(centre, axis=-1)
@@ -61,6 +62,21 @@ def plan_sky(light: Environment, count: int, geometry: Geometry) -> SkyPlan:
     cancelled = length < 1e-3 * np.bincount(cluster, energy, count)
     centre = np.where(cancelled[:, None], heaviest, centre / np.maximum(length, 1e-300)[:, None])
     return SkyPlan(rows, mi.UInt32(cluster), mi.Vector3f(centre.T.astype(np.float32)))
+
+
+def _divided(energy: np.ndarray, hidden: np.ndarray, count: int) -> np.ndarray:
+    """Parts of a sky; fewer where it is hidden, if that is all of the upper or the lower half: no part shall lie in both."""
+    half = len(energy) // 2
+    for top in (True, False):
+        own = hidden if top else hidden[::-1]
+        if count > 1 and own[:half].all() and not own[half:].any():
+            weights = [energy[:half].sum(), energy[half:].sum()]
+            share = _HIDDEN * weights[not top] / (_HIDDEN * weights[not top] + weights[top])
+            few = int(np.clip(round(share * count), 1, count - 1))
+            upper, lower = (few, count - few) if top else (count - few, few)
+            parts = sky_clusters(energy[:half], upper), sky_clusters(energy[half:], lower) + np.uint32(upper)
+            return np.concatenate(parts)
+    return sky_clusters(energy, count)
 
 
 def _floors(geometry: Geometry) -> list[np.ndarray]:

@@ -51,8 +51,8 @@ def plan_sky(light: Environment, count: int, geometry: Geometry) -> SkyPlan:
     average = (bright * weight).sum() / weight.sum()
     energy = (bright + _DARK * average if average > 0 else np.ones_like(bright)) * weight
     hidden = np.zeros((rows, 2 * rows), bool)
-    for normal in _floors(geometry):
-        hidden |= (world @ normal < 0).reshape(rows, 2 * rows)
+    for normal, least in _floors(geometry):
+        hidden |= (world @ normal < -least).reshape(rows, 2 * rows)
     cluster = _divided(energy.reshape(rows, 2 * rows), hidden, count).ravel()
     centre = np.stack([np.bincount(cluster, energy * directions[:, c], count) for c in range(3)], -1)
     # Opposite directions of one part may cancel: its heaviest cell then stands for it.
@@ -65,22 +65,24 @@ def plan_sky(light: Environment, count: int, geometry: Geometry) -> SkyPlan:
 
 
 def _divided(energy: np.ndarray, hidden: np.ndarray, count: int) -> np.ndarray:
-    """Parts of a sky; fewer where it is hidden, if that is all of the upper or the lower half: no part shall lie in both."""
-    half = len(energy) // 2
-    for top in (True, False):
-        own = hidden if top else hidden[::-1]
-        if count > 1 and own[:half].all() and not own[half:].any():
-            weights = [energy[:half].sum(), energy[half:].sum()]
-            share = _HIDDEN * weights[not top] / (_HIDDEN * weights[not top] + weights[top])
-            few = int(np.clip(round(share * count), 1, count - 1))
-            upper, lower = (few, count - few) if top else (count - few, few)
-            parts = sky_clusters(energy[:half], upper), sky_clusters(energy[half:], lower) + np.uint32(upper)
-            return np.concatenate(parts)
-    return sky_clusters(energy, count)
+    """Parts of a sky; fewer in hidden rows, if these are all at the upper or the lower end: no part shall be partly hidden."""
+    full, some = hidden.all(1), hidden.any(1)
+    edge = int(np.argmin(full)) if full[0] else len(full) - int(np.argmin(full[::-1]))
+    above = bool(full[0])
+    split = 0 < edge < len(full) and (full[:edge] == above).all() and (full[edge:] != above).all()
+    if count == 1 or not split or (full != some).any():
+        return sky_clusters(energy, count)
+    weights = (_HIDDEN if above else 1) * energy[:edge].sum(), (1 if above else _HIDDEN) * energy[edge:].sum()
+    upper = int(np.clip(round(count * weights[0] / sum(weights)), 1, count - 1))
+    parts = sky_clusters(energy[:edge], upper), sky_clusters(energy[edge:], count - upper) + np.uint32(upper)
+    return np.concatenate(parts)
 
 
-def _floors(geometry: Geometry) -> list[np.ndarray]:
-    """Unit normals of flat shapes that all others lie in front of, and over (as their box goes): nothing is lit from behind."""
+def _floors(geometry: Geometry) -> list[tuple[np.ndarray, float]]:
+    """(unit normal, sine) of flat shapes that all others lie in front of, and over, as their box goes.
+
+    Nothing is lit from directions that are further behind such a plane than by the angle of this sine: past the floor's edge.
+    """
     positions = dr.detach(geometry.positions).numpy().reshape(-1, 3).astype(np.float64)
     parts = [positions[i.vertex_start : i.vertex_start + i.vertex_count] for i in geometry.shapes]
     found = []
@@ -96,7 +98,11 @@ def _floors(geometry: Geometry) -> list[np.ndarray]:
         tolerance = 1e-3 * np.ptp(own, axis=0).max()
         if (over < across.min(0) - tolerance).any() or (over > across.max(0) + tolerance).any():
             continue
-        found += [sign * axes[2] for sign in (1, -1) if (sign * height).min() >= -tolerance and (sign * height).max() > tolerance]
+        room = min((over.min(0) - across.min(0)).min(), (across.max(0) - over.max(0)).min())
+        for sign in (1, -1):
+            top = float((sign * height).max())
+            if (sign * height).min() >= -tolerance and top > tolerance:
+                found.append((sign * axes[2], top / max(float(np.hypot(top, room)), 1e-12)))
     return found
 
 

@@ -98,8 +98,8 @@ SOFT_CASES = (
         "sky_pixels": Parameter("sky.data", lightened(2, 6, 8, 13), 0.3)}, OPTIONS),
 )  # fmt: skip
 
-# Compared with stored path-traced differences. Not among them: `lamp_vertex` of `crystal_box`, whose scale is too small (c = 0.996,
-# s = 0.893), though it agrees with differences of our own images.
+# Compared with stored path-traced differences. Not among them: `lamp_vertex` of `crystal_box`, whose scale is too small
+# (c = 0.996, s = 0.893), though it agrees with differences of our own images.
 SOFT_TRACED = {
     "panel_box": ("caster_translation", "floor_height", "lamp_translation", "lamp_rise", "radiance", "camera_shift"),
     "painted_box": ("texture",),

@@ -10,8 +10,8 @@ import drjit as dr
 from ..raster._types import backend
 from .camera import Views, of_map
 
-# Share of a shape's extent that may lie behind a floor without the floor casting a shadow on it.
-_SUNK = 0.1
+#: Share of a shape's extent that may lie behind a floor without the floor casting a shadow on it.
+SUNK = 0.1
 
 
 @dataclass(frozen=True)
@@ -96,5 +96,5 @@ def _reach(normal: Any, point: Any, boxes: Boxes) -> Any:
         extent += dr.abs(n) * (high - low)
     reach = dr.full(module.Float, -dr.inf, 2 * shapes)
     for k, value in enumerate((before, behind)):
-        dr.scatter_reduce(dr.ReduceOp.Max, reach, dr.fma(-_SUNK, extent, value), own * 2 + k, own != other)
+        dr.scatter_reduce(dr.ReduceOp.Max, reach, dr.fma(-SUNK, extent, value), own * 2 + k, own != other)
     return reach

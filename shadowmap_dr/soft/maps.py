@@ -32,6 +32,7 @@ from ..shadow import (
     to_light_space,
 )
 from ..shadow.camera import of_map
+from ..shadow.casters import SUNK
 from .area import AreaPlan, area_samples, plan_area
 from .penumbra import Pyramid
 from .samples import LightSamples, SampleTable
@@ -208,7 +209,7 @@ def _may_cast(geometry: Geometry, parts: list[np.ndarray], k: int, others: list[
     normal, size = axes[-1], np.ptp(np.concatenate(parts), axis=0).max()
     side = (light - own.mean(0)) @ normal
     behind = [((parts[o] - own.mean(0)) @ normal) * -np.sign(side) for o in others if o != k]
-    return any(float(b.max()) > 1e-3 * size for b in behind)
+    return any(float(b.max() - SUNK * np.ptp(b)) > 1e-3 * size for b in behind)
 
 
 def _box(points: np.ndarray) -> np.ndarray:

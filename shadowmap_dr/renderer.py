@@ -180,6 +180,21 @@ class Renderer:
         """Record of a light of the scene."""
         return self.data.light(name)
 
+    def curve_vertices(self, name: str, control_points: Any) -> Any:
+        """World-space vertices of a `bsplinecurve` or `linearcurve` for ``vertex_positions`` of :meth:`render`.
+
+        Args:
+            name: of the curve.
+            control_points: ``Float`` (4P,): x, y, z and radius of all its control points, in the curve's own space.
+
+        Returns:
+            ``Float`` (3V,), attached to the control points.
+
+        Raises:
+            ShadowmapError: there is no such curve; it has another number of control points.
+        """
+        return self.data.curve_vertices(name, control_points)
+
     def _replaced(self, lights: tuple[Any, ...], replacements: Mapping[str, Any] | None) -> tuple[Any, ...]:
         for name in replacements or ():
             old, new = self.data.light(name), replacements[name]

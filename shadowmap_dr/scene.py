@@ -19,7 +19,7 @@ from .geometry import Geometry, ShapeInfo, pack_face_info
 from .lights import AreaLight, Environment, Light, area_lights_of, environments_of, lights_of
 from .omissions import omissions_of, warn_of
 from .sensors import Sensor, sensors_of
-from .sources import ShapeSource, source_of
+from .sources import CurveSource, ShapeSource, source_of
 from .traversal import children
 
 
@@ -54,6 +54,19 @@ class SceneData:
                 return light
         known = ", ".join(repr(light.name) for light in lights) or "none"
         raise ShadowmapError(f"There is no light '{name}' in the scene; its lights: {known}.")
+
+    def curve_vertices(self, name: str, control_points: Any) -> Any:
+        """See :meth:`shadowmap_dr.Renderer.curve_vertices`."""
+        index = [info.name for info in self.geometry.shapes].index(self.geometry.shape(name).name)
+        source = self.sources[index]
+        if not isinstance(source, CurveSource):
+            raise ShadowmapError(f"Shape '{name}' is no curve: give its vertices instead of control points.")
+        points = mi.Float(control_points)
+        if dr.width(points) != 4 * source.count:
+            raise ShadowmapError(
+                f"{dr.width(points)} numbers for curve '{name}': give x, y, z and radius of {source.count} control points."
+            )
+        return source.placed(source.with_control_points(points)).positions
 
 
 def load(scene: Any, *, tessellation: int = 64, warn: bool = True) -> SceneData:

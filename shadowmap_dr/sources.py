@@ -128,6 +128,10 @@ class CurveSource(ShapeSource):
         if now != self.count:
             changed = f"now has {now:g} control points instead of {self.count}"
             raise ShadowmapError(f"Curve '{self.name}' {changed}: load the scene again.")
+        return self.with_control_points(points)
+
+    def with_control_points(self, points: Any) -> Buffers:
+        """Vertices for control points (x, y, z, radius), flat Float (4P,), attached to them; before the instance's placement."""
         return Buffers(*tubes.tube_mesh(self.layout, self.plan.circles(points)))
 
     def statics(self) -> tuple[Any, ...]:

@@ -9,9 +9,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from gradients.scenes import curve
+from gradients.scenes import camera, curve, floor, sun
 
-from shadowmap_dr import ShadowmapError
+from shadowmap_dr import Renderer, ShadowmapError
 from shadowmap_dr.curves import check_control_points
 from shadowmap_dr.raster.topology import NO_VERTEX, build_topology
 from shadowmap_dr.scene import load, refresh
@@ -256,3 +256,30 @@ def test_another_number_of_control_points_is_refused(variant: str) -> None:
     source, _ = curve_source("bsplinecurve", GENTLE)
     with pytest.raises(ShadowmapError, match="'wire' now has 5 control points instead of 9: load the scene again"):
         replace(source, count=9).own()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_renderer_gives_the_vertices_for_control_points(variant: str, kind: str) -> None:
+    """What Mitsuba's parameters would give, attached; in a rendering, the same image but for a mesh's normals."""
+    parts = {"camera": camera(32), "wire": curve(kind, "wire", GENTLE), "sun": sun(), "floor": floor()}
+    scene = mi.load_dict({"type": "scene", **parts}, optimize=False)
+    renderer = Renderer.from_scene(scene, shadow_map_resolution=64)
+    params = mi.traverse(scene)
+    bent = mi.Float(params["wire.control_points"])
+    bent += 0.1 * dr.sin(mi.Float(dr.arange(mi.UInt32, dr.width(bent)))) * mi.Float([1, 1, 1, 0] * len(GENTLE))
+    dr.enable_grad(bent)
+    p = renderer.curve_vertices("wire", bent)
+    image = renderer.render(vertex_positions={"wire": p})
+    params["wire.control_points"] = dr.detach(bent)
+    params.update()
+    expected = Renderer.from_scene(scene, shadow_map_resolution=64)
+    assert np.array_equal(p.numpy(), expected.data.geometry.shape_positions("wire").numpy().T.ravel())
+    assert np.abs(image.numpy() - expected.render().numpy()).mean() < 0.05 * image.numpy().mean()
+    dr.backward(dr.sum(p))
+    slope = dr.grad(bent).numpy().reshape(-1, 4)
+    vertices_each = len(p) // 3
+    assert slope[:, 0].sum() == pytest.approx(vertices_each, rel=1e-3)  # moving all points moves all vertices
+    with pytest.raises(ShadowmapError, match="Shape 'floor' is no curve"):
+        renderer.curve_vertices("floor", bent)
+    with pytest.raises(ShadowmapError, match=f"8 numbers for curve 'wire': give x, y, z and radius of {len(GENTLE)}"):
+        renderer.curve_vertices("wire", mi.Float(np.zeros(8)))

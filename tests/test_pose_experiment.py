@@ -288,7 +288,7 @@ def spot(tmp_path_factory: pytest.TempPathFactory) -> tuple[pose_scene.PoseProbl
     return problem, pose_scene.path_traced_reference(problem, work / "reference.exr")
 
 
-def test_spot_is_found_from_a_path_traced_image(spot: Any) -> None:
+def test_spot_is_found_from_a_path_traced_image_with_few_recordings(spot: Any) -> None:
     method = pose.build_method("shadows", *spot)
     history = optimize(method, pose_scene.start_pose(0, 1), 120)
     rotation, offset = pose_scene.pose_errors(history.parameters)

@@ -43,11 +43,11 @@ def make_scene(name: str, lights: int, resolution: int) -> Any:
     transform = mi.ScalarTransform4f
     grey = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}
     film = {"type": "hdrfilm", "width": resolution, "height": resolution, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
-    camera = transform().look_at(origin=[0, 8, 5], target=[0, ground + 0.5, 0], up=[0, 1, 0])
+    camera = transform().look_at(origin=[0, 6.5, 4], target=[0, ground + 0.5, 0], up=[0, 1, 0])
     scene: dict[str, Any] = {
         "type": "scene",
         "integrator": {"type": "direct"},
-        "camera": {"type": "perspective", "fov": 45, "to_world": camera, "film": film},
+        "camera": {"type": "perspective", "fov": 40, "to_world": camera, "film": film},
         # A rectangle's normal is +z: turned to face up.
         "floor": {
             "type": "rectangle",

@@ -13,7 +13,7 @@ from .. import assets
 from ..errors import ShadowmapError
 
 OBJECTS = ("bunny", "dragon", "hand", "spot", "teapot", "suzanne")
-#: Directions to the lights lie within this angle (degrees) of the vertical.
+#: Opening angle (degrees) of the cone about the vertical in which the directions to the lights lie.
 CONE_DEG = 60.0
 MOST_LIGHTS = 5
 #: Irradiance of all lights together on a surface that faces them.
@@ -23,7 +23,7 @@ FloatArray = npt.NDArray[np.float64]
 
 
 def make_scene(name: str, lights: int, resolution: int) -> Any:
-    """``mi.Scene``: an object of [-1, 1]^3 standing on a diffuse floor, seen from above, under directional lights of equal irradiance.
+    """``mi.Scene``: an object of [-1, 1]^3 on a diffuse floor, seen from above, under equal directional lights.
 
     Args:
         name: name of a mesh of this package, or a mesh file in the same position.
@@ -71,17 +71,23 @@ def make_scene(name: str, lights: int, resolution: int) -> Any:
 
 
 def random_directions(generator: np.random.Generator, count: int, cone_deg: float = CONE_DEG) -> FloatArray:
-    """(count, 3) unit vectors, uniform by solid angle within ``cone_deg`` of +y."""
-    cosine = 1 - generator.uniform(0, 1, count) * (1 - math.cos(math.radians(cone_deg)))
+    """(count, 3) unit vectors, uniform by solid angle in a cone about +y with this opening angle."""
+    cosine = 1 - generator.uniform(0, 1, count) * (1 - math.cos(math.radians(cone_deg / 2)))
     angle = generator.uniform(0, 2 * math.pi, count)
     sine = np.sqrt(1 - cosine**2)
     return np.stack([sine * np.cos(angle), cosine, sine * np.sin(angle)], -1)
 
 
-def target_and_start(seed: int, run: int, lights: int) -> tuple[FloatArray, FloatArray]:
-    """Directions *to* the lights (lights, 3), target and start of a run: by seed, run and number of lights only."""
+def target_and_starts(
+    seed: int, run: int, lights: int, starts: int = 1, cone_deg: float = CONE_DEG
+) -> tuple[FloatArray, FloatArray]:
+    """Directions *to* the lights, target (lights, 3) and starts (starts, lights, 3) of a run.
+
+    They depend on seed, run, number of lights and cone only: further starts leave the target and the first one as they are.
+    """
     generator = np.random.default_rng((seed, run))
-    return random_directions(generator, lights), random_directions(generator, lights)
+    target = random_directions(generator, lights, cone_deg)
+    return target, np.stack([random_directions(generator, lights, cone_deg) for _ in range(starts)])
 
 
 def alignment(target: npt.ArrayLike, found: npt.ArrayLike) -> float:

@@ -21,9 +21,9 @@ from .light_shading import fit_maps, images, light_views, losses_and_gradients, 
 
 FloatArray = npt.NDArray[np.float32]
 
-#: Bytes of one shadow map with all that belongs to it, for each texel and number that its method stores.
-_BYTES_OF_TEXEL = 110
-#: The same for each pixel of a run's image, and for each pixel and light.
+# Bytes of one shadow map with all that belongs to it, for each texel (measured, `vsm`).
+_BYTES_OF_TEXEL = 150
+# The same for each pixel of a run's image, and for each pixel and light.
 _BYTES_OF_PIXEL, _BYTES_OF_LIT_PIXEL = 60, 20
 
 
@@ -55,7 +55,7 @@ class Stage:
 class LightHistory:
     """What happened in N steps of R runs with n lights each.
 
-    ``losses`` (N, R): before each step. ``directions`` (N + 1, R, n, 3): unit vectors to the lights, at the start and after each step.
+    ``losses`` (N, R): before each step. ``directions`` (N + 1, R, n, 3): unit vectors to the lights, first and after each step.
     """
 
     losses: FloatArray
@@ -149,10 +149,6 @@ class LightBatch:
         """How often a step has been recorded so far."""
         return int(self._step.n_recordings)
 
-    def bytes_per_run(self) -> int:
-        """About how much memory (bytes) a run of a batch needs."""
-        return bytes_per_run(self.scene)
-
     def _vectors(self, directions: npt.ArrayLike) -> tuple[Any, int]:
         array = np.asarray(directions, np.float64)
         if array.ndim != 3 or array.shape[1:] != (self.lights, 3) or not len(array):
@@ -171,19 +167,15 @@ class LightBatch:
         return [mi.Float(np.ascontiguousarray(array[..., c]).ravel()) for c in range(pixels.channels)]
 
 
-def bytes_per_run(scene: StillScene) -> int:
-    """About how much memory (bytes) a run of a batch in this scene needs."""
-    shadow, pixels = scene.shadow, scene.pixels.count
-    maps = 0
-    if shadow.method != "none":
-        maps = scene.lights * _BYTES_OF_TEXEL * (shadow.resolution * shadow.supersampling) ** 2
-    return maps + pixels * (scene.lights * _BYTES_OF_LIT_PIXEL + _BYTES_OF_PIXEL * scene.pixels.channels)
+def batch_bytes(lights: int, pixels: int, channels: int = 3, map_resolution: int = 0) -> int:
+    """About how much memory (bytes) each run of a batch needs; ``map_resolution`` 0: without shadows.
 
-
-def batch_size(scene: StillScene, runs: int, memory: int) -> int:
-    """How many of ``runs`` runs to optimise at once so that a batch needs about ``memory`` bytes at most; batches as equal as can be."""
-    most = max(1, memory // bytes_per_run(scene))
-    return -(-runs // -(-runs // min(most, runs)))
+    Args:
+        lights: of a run.
+        pixels: of an image with so many ``channels``.
+        map_resolution: texels along each side of a map, times its supersampling.
+    """
+    return lights * _BYTES_OF_TEXEL * map_resolution**2 + pixels * (lights * _BYTES_OF_LIT_PIXEL + channels * _BYTES_OF_PIXEL)
 
 
 def _step(

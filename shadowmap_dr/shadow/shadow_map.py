@@ -186,7 +186,9 @@ class TexelDepths:
     dy: Any
 
 
-def texel_depths(raster: RasterOutput, clip: Any, faces: Any, view: Views, frustum: Frusta, views: Views, size: int) -> TexelDepths:
+def texel_depths(
+    raster: RasterOutput, clip: Any, faces: Any, view: Views, frustum: Frusta, views: Views, size: int
+) -> TexelDepths:
     """Depths in maps of ``size`` texels along each side; ``view`` and ``frustum`` are those of each texel's map."""
     hit = raster.valid
     seen, dx, dy = pixel_depth(raster, clip, faces, dr.detach(views.spread) > 0)

@@ -2,8 +2,8 @@
 
 A light's direction has two degrees of freedom, and a map depends on no light but its own. So two tangents for each map and each
 point that asks it are all the derivatives there are, and they need no atomic operations, no second pass over the points, and
-none of the vertices' derivatives: when a light turns, a point with light-space coordinates (x, y, z) moves by a linear function of
-these coordinates, and so does everything that lies on a triangle or an edge.
+none of the vertices' derivatives: when a light turns, points with light-space coordinates (x, y, z) move by linear functions
+of these, and so does everything that lies on a triangle or an edge.
 
 Turning by (a, b) means: the light's ``forward`` axis moves by ``a right + b up``. The other axes follow as
 :func:`shadowmap_dr.shadow.directional_view` makes them, which includes a twist about ``forward`` of ``a * twist``.
@@ -74,7 +74,7 @@ def tangent_maps(
         p_world: ``Array3f`` (V,), vertices.
         faces: flat ``UInt32`` (3 F,), valid indices.
         topology: of the mesh.
-        views, frusta: cameras of the M maps, all orthographic, with axes as :func:`shadowmap_dr.shadow.directional_view` has them.
+        views, frusta: cameras of the M maps, all orthographic, with axes as :func:`directional_view` makes them.
         settings: a pre-filtered method, without ``compat``.
 
     Values agree with :func:`shadowmap_dr.shadow.render_maps`, tangents with its derivatives.

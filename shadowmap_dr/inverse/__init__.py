@@ -2,5 +2,8 @@
 
 from .loop import History, Method, optimize
 from .pose import PoseFit, apply_pose
+from .sculpt import Sculptor
+from .shadow_views import ShadowView, shadow_view
+from .start_meshes import even_sphere
 
-__all__ = ["History", "Method", "PoseFit", "apply_pose", "optimize"]
+__all__ = ["History", "Method", "PoseFit", "Sculptor", "ShadowView", "apply_pose", "even_sphere", "optimize", "shadow_view"]

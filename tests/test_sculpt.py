@@ -10,7 +10,7 @@ import pytest
 from shadowmap_dr.errors import ShadowmapError
 from shadowmap_dr.inverse import Sculptor, even_sphere, shadow_view
 from shadowmap_dr.inverse.shadow_images import shadow_images
-from shadowmap_dr.inverse.shadow_views import BESIDE, FOV_DEG, WAVE_HEIGHT, height
+from shadowmap_dr.inverse.shadow_views import BESIDE, FOV_DEG, LOOKS_AT, WAVE_HEIGHT, height
 from shadowmap_dr.inverse.smoothness import inverted_share, normal_consistency
 from shadowmap_dr.raster import build_topology
 
@@ -69,7 +69,7 @@ def test_perspective_pixels_see_the_first_point_of_the_receiver(receiver):
     np.testing.assert_allclose(p[..., 2][view.seen], height(receiver, p[..., 0], 2.0)[view.seen], atol=1e-5)
     # Seen from the camera, each point lies where its pixel is, and nothing of the receiver lies before it.
     offset = p - np.array(BESIDE)
-    ahead = -np.array(BESIDE) / np.linalg.norm(BESIDE)
+    ahead = np.subtract(LOOKS_AT, BESIDE) / np.linalg.norm(np.subtract(LOOKS_AT, BESIDE))
     right = np.cross(ahead, [0, 1, 0]) / np.linalg.norm(np.cross(ahead, [0, 1, 0]))
     scale = np.tan(np.radians(FOV_DEG / 2)) * (offset @ ahead)
     row, column = np.nonzero(view.seen)

@@ -19,9 +19,9 @@ CAMERAS = ("orthographic", "perspective")
 DISTANCE, HALF = 4.0, 2.0
 #: A wavy receiver: how far it reaches out of its plane, and how many waves cross it.
 WAVE_HEIGHT, WAVES = 0.35, 1.5
-#: A perspective camera's place (right, up, towards the object, from the receiver's middle) and horizontal angle: rays from there
-#: to the receiver pass below the object.
-BESIDE, FOV_DEG = (4.5, 0.0, 3.4), 46.0
+#: A perspective camera: its place and the point it looks at (right, up, towards the object, from the receiver's middle), and its
+#: horizontal angle. Rays from there to the receiver pass below the object.
+BESIDE, LOOKS_AT, FOV_DEG = (3.0, 0.0, 3.0), (0.5, 0.0, 0.0), 54.0
 
 Array = npt.NDArray[np.float32]
 
@@ -126,9 +126,9 @@ def _orthographic(receiver: str, size: int, half: float) -> tuple[npt.NDArray[np
 
 
 def _perspective(receiver: str, size: int, half: float) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
-    """First points of the receiver along the rays of a camera beside it that looks at its middle."""
-    place = np.array(BESIDE) * (half / HALF)
-    ahead = -place / np.linalg.norm(place)
+    """First points of the receiver along the rays of a camera beside it."""
+    place, target = (np.array(point) * (half / HALF) for point in (BESIDE, LOOKS_AT))
+    ahead = (target - place) / np.linalg.norm(target - place)
     # The image's up is the receiver's, as far as it can be.
     across = np.cross(ahead, [0.0, 1.0, 0.0])
     across /= np.linalg.norm(across)

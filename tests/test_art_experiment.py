@@ -129,6 +129,18 @@ def test_any_mesh_can_be_deformed(variant, tmp_path):
         art_files.read_mesh(tmp_path / "broken.ply")
 
 
+def test_recorded_collections_are_pieces_too(variant, tmp_path):
+    options = art.ArtOptions(
+        ("text:I",), collection="teapot", resolution=SIZE, iterations=20, interval=8, most=4, out=tmp_path / "out"
+    )
+    assert art.ArtOptions(("a",), collection="teapot").iterations == 1100 and art.ArtOptions(("a",)).iterations == 400
+    record = art.run_art(options)
+    assert record["mesh"]["faces"] == 4 * 992 and record["settings"]["collection"] == "teapot"
+    assert record["iou_curve"]["step"] == [10, 20]
+    with Image.open(tmp_path / "out" / "steps.webp") as animation:
+        assert animation.n_frames > 10
+
+
 def test_errors_are_red_where_the_shadow_is_missing_and_blue_where_it_is_too_much():
     shadow, lit = np.zeros((1, 1)), np.ones((1, 1))
     both, missing, much, none = (art_files.error_picture(*pair)[0, 0] for pair in (
@@ -147,6 +159,7 @@ def test_errors_are_red_where_the_shadow_is_missing_and_blue_where_it_is_too_muc
         (["--text", "a", "--camera", "fisheye"], "fisheye"),
         (["--text", "a", "--animate", "mp4"], "mp4"),
         (["--text", "a", "--iterations", "0"], "0 iterations"),
+        (["--text", "a", "--mesh", "spot", "--collection", "spot"], "one of the two"),
         (["--text", "a", "--mesh", "nothing"], "nothing"),
         (["--text", "a", "--resolution", "5"], "5 x 5"),
     ],

@@ -18,7 +18,7 @@ from rich.table import Table
 
 from .. import __version__, assets, figures, io, report
 from ..errors import ShadowmapError
-from ..inverse import Sculptor, even_sphere, shadow_view
+from ..inverse import Collection, Sculptor, even_sphere, shadow_view
 from ..inverse.shadow_views import CAMERAS, RECEIVERS, ShadowView
 from ..timing import machine
 from . import art_files, art_pictures
@@ -39,10 +39,14 @@ class ArtOptions:
     Attributes:
         targets: image files, or names of this package, one for each view; ``text:L`` stands for letters.
         mesh: what is deformed: None for the sphere, a name of this package, or a file.
+        collection: a name or a file of a mesh: many copies of it, moved, turned and scaled, cast the shadow instead.
         receiver, camera: see `shadow_view`.
         resolution: pixels along each side of the shadow images.
         map_resolution: texels along each side of the shadow maps; None: as many as pixels.
-        iterations, step_size, smoothness, consistency: of the `Sculptor`.
+        iterations: steps; None: 400, and 1100 of a collection.
+        step_size, smoothness, consistency: of the `Sculptor`; a `Collection` has its own step size.
+        interval, most: steps after which copies double, and copies at most, see `Collection`.
+        seed: of the collection.
         animate: suffix of the animations (.webp or .gif), None for none.
         printable: write an STL file, and report whether the mesh is closed.
         out: folder for the results.
@@ -51,14 +55,18 @@ class ArtOptions:
 
     targets: tuple[str, ...]
     mesh: str | None = None
+    collection: str | None = None
     receiver: str = "plane"
     camera: str = "orthographic"
     resolution: int = 256
     map_resolution: int | None = None
-    iterations: int = 400
+    iterations: int | None = None
     step_size: float = 0.2
     smoothness: float = 20.0
     consistency: float = 0.2
+    interval: int = 150
+    most: int = 128
+    seed: int = 0
     animate: str | None = ".webp"
     printable: bool = False
     out: Path = Path("art")
@@ -71,6 +79,10 @@ class ArtOptions:
             raise ShadowmapError(f"no receiver {self.receiver!r}: choose from {', '.join(RECEIVERS)}.")
         if self.camera not in CAMERAS:
             raise ShadowmapError(f"no camera {self.camera!r}: choose from {', '.join(CAMERAS)}.")
+        if self.mesh is not None and self.collection is not None:
+            raise ShadowmapError("a mesh to deform and a collection: choose one of the two.")
+        if self.iterations is None:
+            object.__setattr__(self, "iterations", 400 if self.collection is None else 1100)
         if self.iterations < 1:
             raise ShadowmapError(f"{self.iterations} iterations: at least one is needed.")
         if self.animate is not None and self.animate not in art_pictures.ANIMATIONS:
@@ -101,18 +113,21 @@ def place(figure_list: list[Any], views: tuple[ShadowView, ...]) -> list[Any]:
     return [figures.fit(figure, view.seen, high=min(heights)) for figure, view in zip(figure_list, views, strict=True)]
 
 
-def start_mesh(options: ArtOptions) -> tuple[Any, Any]:
-    """(V, 3) and (F, 3) of the mesh that is deformed."""
-    return even_sphere() if options.mesh is None else art_files.read_mesh(assets.mesh(options.mesh))
-
-
 def build(options: ArtOptions) -> Maker:
     """What `run_art` lets make its steps."""
     views = views_of(options)
     targets = place([read_target(target) for target in options.targets], views)
+    texels = options.map_resolution or options.resolution
+    if options.collection is not None:
+        mesh = art_files.read_mesh(assets.mesh(options.collection))
+        return Collection(
+            *mesh, views, targets, interval=options.interval, most=options.most, seed=options.seed, map_resolution=texels,
+            settings={"collection": _name(options.collection)},
+        )  # fmt: skip
+    mesh = even_sphere() if options.mesh is None else art_files.read_mesh(assets.mesh(options.mesh))
     return Sculptor(
-        *start_mesh(options), views, targets, step_size=options.step_size, smoothness=options.smoothness,
-        consistency=options.consistency, map_resolution=options.map_resolution or options.resolution,
+        *mesh, views, targets, step_size=options.step_size, smoothness=options.smoothness, consistency=options.consistency,
+        map_resolution=texels, settings={"mesh": "sphere" if options.mesh is None else _name(options.mesh)},
     )  # fmt: skip
 
 

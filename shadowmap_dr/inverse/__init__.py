@@ -1,9 +1,21 @@
 """Inverse problems: what is optimised (parametrisations) and how (a loop that survives being killed)."""
 
+from .collection import Collection
 from .loop import History, Method, optimize
 from .pose import PoseFit, apply_pose
 from .sculpt import Sculptor
 from .shadow_views import ShadowView, shadow_view
 from .start_meshes import even_sphere
 
-__all__ = ["History", "Method", "PoseFit", "Sculptor", "ShadowView", "apply_pose", "even_sphere", "optimize", "shadow_view"]
+__all__ = [
+    "Collection",
+    "History",
+    "Method",
+    "PoseFit",
+    "Sculptor",
+    "ShadowView",
+    "apply_pose",
+    "even_sphere",
+    "optimize",
+    "shadow_view",
+]

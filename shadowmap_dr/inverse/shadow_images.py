@@ -130,6 +130,19 @@ def shadow_images(
     )
 
 
+def image_loss(shadows: ShadowImages, seen: Any, wanted: Any) -> Any:
+    """Mean squared difference of images, summed over the views: ``Float`` (1,), detached. Its derivative is set in ``seen``.
+
+    By hand, since the loss and its derivative then read the images together, once. A backward pass from ``seen`` is to follow.
+    """
+    difference = dr.detach(seen) - wanted
+    weighted = shadows.weight * difference
+    square, slope = weighted * difference, 2 * weighted
+    dr.eval(square, slope)
+    dr.set_grad(seen, slope)
+    return dr.sum(square)
+
+
 def _columns(vectors: Sequence[npt.ArrayLike]) -> list[Any]:
     return [mi.Float(np.ascontiguousarray(column)) for column in np.asarray(vectors, np.float32).T]
 

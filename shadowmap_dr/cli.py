@@ -16,7 +16,7 @@ import numpy as np
 import typer
 from rich.console import Console
 
-from . import __version__, _llvm, assets, cli_gradients, cli_lights, cli_soft, io
+from . import __version__, _llvm, assets, cli_art, cli_gradients, cli_lights, cli_soft, io
 from .cli_options import DEFAULT_VARIANT, Variant, set_variant
 from .errors import ShadowmapError
 from .experiments import bench as bench_experiment
@@ -35,6 +35,7 @@ app = typer.Typer(
 app.add_typer(cli_gradients.app, name="gradients")
 app.command()(cli_soft.soft)
 app.command()(cli_lights.lights)
+app.command()(cli_art.art)
 
 
 def main() -> None:
@@ -78,6 +79,7 @@ def info() -> None:
         ("GPU", f"CUDA {dr.detail.cuda_version()}" if gpu else "none"),
         ("scenes", ", ".join(assets.scene_names())),
         ("meshes", ", ".join(assets.mesh_names())),
+        ("targets", ", ".join(assets.target_names())),
     ]
     width = max(len(name) for name, _ in rows)
     for name, value in rows:

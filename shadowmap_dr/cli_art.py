@@ -32,6 +32,10 @@ def art(
         int | None, typer.Option(help="Steps of the optimiser [default: 400, and 1100 of a collection].")
     ] = None,
     smoothness: Annotated[float, typer.Option(help="How stiff the mesh is; finer meshes need more.")] = 20.0,
+    remesh: Annotated[
+        int | None, typer.Option(metavar="STEPS", help="Mesh the surface anew after so many steps, again and again.")
+    ] = None,
+    fill_holes: Annotated[bool, typer.Option("--fill-holes", help="Fill enclosed holes of the targets.")] = False,
     resolution: Annotated[int, typer.Option(help="Pixels along each side of the shadow images.")] = 256,
     map_resolution: Annotated[
         int | None, typer.Option(help="Texels along each side of the shadow maps [default: as many as pixels].")
@@ -55,6 +59,8 @@ def art(
         receiver=receiver,
         camera=camera,
         smoothness=smoothness,
+        remesh=remesh,
+        fill_holes=fill_holes,
         resolution=resolution,
         map_resolution=map_resolution,
         iterations=iterations,

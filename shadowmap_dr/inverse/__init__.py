@@ -3,6 +3,7 @@
 from .collection import Collection
 from .loop import History, Method, optimize
 from .pose import PoseFit, apply_pose
+from .remeshing import RemeshingSculptor
 from .sculpt import Sculptor
 from .shadow_views import ShadowView, shadow_view
 from .start_meshes import even_sphere
@@ -12,6 +13,7 @@ __all__ = [
     "History",
     "Method",
     "PoseFit",
+    "RemeshingSculptor",
     "Sculptor",
     "ShadowView",
     "apply_pose",

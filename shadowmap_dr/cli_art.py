@@ -24,6 +24,7 @@ def art(
     collection: Annotated[
         str | None, typer.Option(metavar="NAME|FILE", help="Copies of this mesh cast the shadow: moved, turned and scaled.")
     ] = None,
+    copies: Annotated[int, typer.Option(metavar="N", help="Copies at most; their number doubles every 150 steps.")] = 128,
     receiver: Annotated[str, typer.Option(metavar="plane|wavy", help="What the shadow falls on.")] = "plane",
     camera: Annotated[
         str, typer.Option(metavar="orthographic|perspective", help="Seen straight on, or in perspective from the side.")
@@ -56,6 +57,7 @@ def art(
         targets=(*(target or ()), *(f"text:{letters}" for letters in text or ())),
         mesh=mesh,
         collection=collection,
+        most=copies,
         receiver=receiver,
         camera=camera,
         smoothness=smoothness,

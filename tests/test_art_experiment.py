@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from shadowmap_dr import cli
 from shadowmap_dr.errors import ShadowmapError
-from shadowmap_dr.experiments import art, art_files, art_pictures
+from shadowmap_dr.experiments import art, art_files, art_gallery, art_pictures
 from shadowmap_dr.experiments.art_run import frame_steps, intersection_over_union, make
 from shadowmap_dr.inverse import RemeshingSculptor, Sculptor, even_sphere, shadow_view
 
@@ -203,3 +203,29 @@ def test_holes_of_targets_can_be_filled(variant):
     with_holes, without = (art.build(art.ArtOptions(("text:O",), resolution=SIZE, fill_holes=fill)).target(0) for fill in (0, 1))
     assert with_holes[SIZE // 2, SIZE // 2] == 1 and without[SIZE // 2, SIZE // 2] == 0
     assert (without <= with_holes + 1e-6).all()
+
+
+def test_recorded_gallery_shows_pieces_and_their_numbers(variant, tmp_path, monkeypatch):
+    quick = {"resolution": SIZE, "iterations": 10}
+    pieces = (
+        art_gallery.Piece("heart", "one view", {"targets": ("heart",), **quick}),
+        art_gallery.Piece("two", "two views", {"targets": ("text:I", "text:O"), **quick}, "Two letters"),
+        art_gallery.Piece("other", "one view", {"targets": ("missing.png",)}),
+    )
+    monkeypatch.setattr(art_gallery, "PIECES", pieces)
+    monkeypatch.setattr(art_gallery, "_PICTURE_SIZE", 32)
+    monkeypatch.setattr(art_gallery, "_TURNS", 2)
+    folders = (tmp_path / "work", tmp_path / "out", tmp_path / "results" / "art.json")
+    record = art_gallery.run_gallery(["heart", "two"], *folders)
+    assert json.loads(folders[2].read_text()) == json.loads(json.dumps(record))
+    assert record["summary"]["one_view_mean"] == record["pieces"]["heart"]["views"][0]["iou"]
+    assert record["summary"]["two_views_least"] == min(view["iou"] for view in record["pieces"]["two"]["views"])
+    page, tables = (tmp_path / "out" / "gallery.md").read_text(), folders[2].with_suffix(".md").read_text()
+    assert "shadowmap-dr art --text I --text O" in page and "Two letters" in page and "heart" not in page
+    for name in ("two-turntable.webp", "two-steps.webp", "gallery.png"):
+        assert (tmp_path / "out" / name).is_file() and (name in page or name == "gallery.png")
+    assert f"{record['pieces']['heart']['views'][0]['iou']:.4f}" in tables and "## Two views" in tables
+    monkeypatch.setattr(art_gallery, "run_art", None)  # finished pieces are kept
+    assert art_gallery.run_gallery(["heart", "two"], *folders, resume=True) == record
+    with pytest.raises(SystemExit, match="no piece 'nothing'"):
+        art_gallery.main(["nothing"])

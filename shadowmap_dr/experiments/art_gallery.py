@@ -23,6 +23,7 @@ from rich.console import Console
 from .. import io, report
 from ..cli_options import DEFAULT_VARIANT
 from ..errors import ShadowmapError
+from ..timing import machine
 from .art import ArtOptions, run_art
 from .gradients_report import markdown
 
@@ -31,6 +32,8 @@ WHOLE, HOLED = ("airplane", "heart", "elephant", "palm"), ("cat", "duck", "rabbi
 # What a gallery shows of each piece.
 _SHOWN = ("turntable.webp", "steps.webp")
 _PICTURE_SIZE, _TURNS = 256, 32
+# What the record of all pieces has no room for.
+_LEFT_OUT = ("machine", "loss_curve", "iou_curve", "files")
 
 
 @dataclass(frozen=True)
@@ -105,12 +108,13 @@ def run_gallery(
                            out=work / piece.name, resume=resume),
                 console=console,
             )  # fmt: skip
-        records[piece.name] = {"group": piece.group, **report.read_json(path)}
+        kept = {name: value for name, value in report.read_json(path).items() if name not in _LEFT_OUT}
+        records[piece.name] = {"group": piece.group, **kept}
         if piece.shown:
-            for name in _SHOWN:
+            for name in (*_SHOWN, *_shadow_images(piece)):
                 with io.atomic(out / f"{piece.name}-{name}") as temporary:
                     shutil.copyfile(work / piece.name / name, temporary)
-    record = {"pieces": records, "summary": summary(records)}
+    record = {"machine": report.plain(machine()), "pieces": records, "summary": summary(records)}
     report.write_json(results, record)
     with io.atomic(results.with_suffix(".md")) as temporary:
         temporary.write_text("\n".join(document(record)) + "\n", encoding="utf-8")
@@ -160,13 +164,14 @@ def document(record: Mapping[str, Any]) -> list[str]:
 
 
 def gallery(pieces: Sequence[Piece], records: Mapping[str, Any]) -> list[str]:
-    """Markdown: two animations and a line for each piece."""
+    """Markdown: animations, shadows and a line for each piece."""
     lines = ["# Gallery of shadow art", "", "Left: a turn of the finished object; its shadow is right at the beginning only. "
-             "Right: how it came about.", "", "    python -m shadowmap_dr.experiments.art_gallery", "",
+             "Then: how it came about, and what the cameras see.", "", "    python -m shadowmap_dr.experiments.art_gallery", "",
              "makes all of it. [../art.md](../art.md) says how.", ""]  # fmt: skip
     for piece in pieces:
         ious = ", ".join(f"{view['iou']:.3f}" for view in records[piece.name]["views"])
-        lines += [f"## {piece.title}", "", f"![a turn]({piece.name}-{_SHOWN[0]}) ![steps]({piece.name}-{_SHOWN[1]})", "",
+        names = (*_SHOWN, *_shadow_images(piece))
+        lines += [f"## {piece.title}", "", " ".join(f"![{name.split('.')[0]}]({piece.name}-{name})" for name in names), "",
                   f"    {_command(piece)}", "", f"Intersection over union with the target: {ious}.", ""]  # fmt: skip
     return lines
 
@@ -176,9 +181,14 @@ def _command(piece: Piece) -> str:
     for name, value in piece.options.items():
         if name == "targets":
             words += [f"--text {v.removeprefix('text:')}" if v.startswith("text:") else f"--target {v}" for v in value]
-        elif name != "most":
-            words.append(f"--{name} {value}")
+        else:
+            words.append(f"--{'copies' if name == 'most' else name} {value}")
     return " ".join(words)
+
+
+def _shadow_images(piece: Piece) -> list[str]:
+    """Names of the images of what its cameras see."""
+    return [f"shadow-{k + 1}.png" for k in range(len(piece.options["targets"]))]
 
 
 def _sheet(path: Path, pictures: Sequence[Path], columns: int = 5, size: int = 256) -> None:

@@ -19,7 +19,6 @@ first:
 from __future__ import annotations
 
 import json
-import math
 import struct
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -107,7 +106,8 @@ def _stroke(value: dict[str, Any], size: tuple[int, int]) -> Stroke:
 
 
 def _number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    # A comparison also refuses NaN, and integers that no float can hold.
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e9
 
 
 def _integer(value: dict[str, Any], name: str) -> int:

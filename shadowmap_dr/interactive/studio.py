@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+import anyio
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from ..inverse import ShadowView
@@ -20,6 +22,8 @@ MOST_CLIENTS = 8
 _UNSEEN = 2
 # Seconds until a page that takes nothing off its connection is given up.
 _PATIENCE = 20.0
+# What a connection ends with when the page has gone: closed, or asleep.
+_GONE = (WebSocketDisconnect, TimeoutError, ConnectionError)
 
 
 @dataclass(eq=False)
@@ -86,17 +90,20 @@ class Studio:
             return
         client = _Client(next(self._numbers), socket)
         self._clients.add(client)
-        tasks = [asyncio.create_task(self._send(client)), asyncio.create_task(self._receive(client))]
         try:
-            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-            for task in done:
-                if (error := task.exception()) is not None and not isinstance(error, _GONE):
-                    raise error
+            async with anyio.create_task_group() as group:
+
+                async def run(half: Callable[[_Client], Awaitable[None]]) -> None:
+                    try:
+                        await half(client)
+                    except _GONE:
+                        pass
+                    group.cancel_scope.cancel()
+
+                group.start_soon(run, self._send)
+                group.start_soon(run, self._receive)
         finally:
             self._clients.discard(client)
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
 
     async def _receive(self, client: _Client) -> None:
         while True:
@@ -141,7 +148,8 @@ class Studio:
             client.wake.clear()
             for content in self._news(client):
                 send = client.socket.send_text if isinstance(content, str) else client.socket.send_bytes
-                await asyncio.wait_for(send(content), _PATIENCE)
+                with anyio.fail_after(_PATIENCE):
+                    await send(content)
 
     def _news(self, client: _Client) -> list[str | bytes]:
         """What the page does not know yet."""
@@ -160,7 +168,3 @@ class Studio:
             client.unseen.append(snapshot.number)
             news.append(self._frame[1])
         return news
-
-
-#: What a connection ends with when the page has gone: closed, or asleep.
-_GONE = (WebSocketDisconnect, asyncio.TimeoutError, ConnectionError)

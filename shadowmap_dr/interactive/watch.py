@@ -39,7 +39,7 @@ class ImageWatch:
         self._taken = self._seen = self._stamp()
 
     def poll(self) -> npt.NDArray[np.float32] | None:
-        """Visibility (H, W), 0 (dark) to 1 (lit), if there is something new, None otherwise. Whatever is in the file raises nothing."""
+        """Visibility (H, W), 0 (dark) to 1 (lit), if there is something new, else None. Nothing in the file raises an error."""
         stamp = self._stamp()
         if stamp is None:
             self.problem = f"{self._path} is missing."

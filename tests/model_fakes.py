@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ class FakeSculptor:
         self.steps = self.calmed = 0
         self.failure: Exception | None = None
         self.hold: threading.Event | None = None
+        self.seconds = 0.0  # that a step takes
 
     def set_target(self, view: int, image: Any) -> None:
         assert view == 0 and image.shape == (SIZE, SIZE)
@@ -33,6 +35,7 @@ class FakeSculptor:
     def step(self) -> np.ndarray:
         if self.hold is not None:
             self.hold.wait(10)
+        time.sleep(self.seconds)
         if self.failure is not None:
             failure, self.failure = self.failure, None
             raise failure
@@ -71,8 +74,6 @@ class FakeSession:
 
 def eventually(condition: Any, seconds: float = 10.0) -> None:
     """Wait until a condition holds, or fail."""
-    import time
-
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, "it has not come to pass"

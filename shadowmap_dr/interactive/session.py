@@ -176,6 +176,8 @@ class Session:
             if target is not None:
                 modeller.set_target(target[0])
                 known = target[1]
+            if modeller.moving:
+                self._set_status("moving")  # before anybody sees a frame of it
             if modeller.step():
                 self._steps += 1
                 self._ticks.append(time.monotonic())

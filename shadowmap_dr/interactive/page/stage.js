@@ -4,7 +4,7 @@ import * as THREE from "./three.module.min.js";
 
 const CLAY = 0xd98a6a, GROUND = 0xe9e1d2;
 const PAPER = [246, 239, 223], INK = [58, 61, 92];
-const START = { turn: 0.62, rise: 0.24, distance: 12.5 };
+const START = { turn: 0.62, rise: 0.24, distance: 11.5 };
 
 export class Stage {
   constructor(canvas) {
@@ -30,7 +30,7 @@ export class Stage {
   open({ width, height, half, right, up, forward, origin }) {
     this.scene.clear();
     this.axes = [right, up, forward].map((v) => new THREE.Vector3(...v));
-    this.middle = new THREE.Vector3(...origin).multiplyScalar(0.5);
+    this.middle = new THREE.Vector3(...origin).multiplyScalar(0.45);
     const wall = new THREE.PlaneGeometry(2 * half, 2 * half);
     const uv = wall.attributes.uv;
     for (let i = 0; i < uv.count; i++) uv.setY(i, 1 - uv.getY(i)); // images begin at the top

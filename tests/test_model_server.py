@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import io
 import json
 import socket
@@ -10,6 +11,7 @@ import threading
 import time
 import zlib
 from collections.abc import Iterator
+from contextlib import ExitStack
 
 import numpy as np
 import pytest
@@ -19,6 +21,7 @@ from PIL import Image
 pytest.importorskip("starlette", reason="Starlette is not installed: pip install '.[interactive]'")
 pytest.importorskip("httpx")
 
+from starlette.requests import Request
 from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 
@@ -180,19 +183,17 @@ def test_nonsense_ends_only_the_connection_it_comes_from(client, message):
 
 
 def test_pages_are_counted(client, board):
-    connections = [live(client) for _ in range(MOST_CLIENTS)]
-    for connection in connections:
-        connection.__enter__()
-        Page(connection)
-    with live(client) as one_too_many, pytest.raises(WebSocketDisconnect) as closed:
-        Page(one_too_many)
-    assert closed.value.code == 1013
-    connections.pop().__exit__(None, None, None)
-    eventually(lambda: len(board._clients) < MOST_CLIENTS)
-    with live(client) as connection:
-        Page(connection)
-    for connection in connections:
-        connection.__exit__(None, None, None)
+    with ExitStack() as most:
+        for _ in range(MOST_CLIENTS - 1):
+            Page(most.enter_context(live(client)))
+        with live(client) as last:
+            Page(last)
+            with live(client) as one_too_many, pytest.raises(WebSocketDisconnect) as closed:
+                Page(one_too_many)
+            assert closed.value.code == 1013
+        eventually(lambda: len(board._clients) < MOST_CLIENTS)
+        with live(client) as connection:
+            Page(connection)
 
 
 def test_downloads_are_the_mesh(client, fake):
@@ -248,16 +249,17 @@ def test_unusable_images_change_nothing(client, board):
     assert board.canvas.version == 0
 
 
-def test_images_are_read_no_further_than_allowed(client, board):
+def test_images_are_read_no_further_than_allowed():
     sent = 0
 
-    def endless():
+    async def endless():
         nonlocal sent
-        for _ in range(400):
-            sent += 1_000_000
-            yield b"\0" * 1_000_000
+        sent += 1_000_000
+        return {"type": "http.request", "body": b"\0" * 1_000_000, "more_body": sent < 100_000_000}
 
-    assert client.post("/image", content=endless(), headers=OWN).status_code == 422
+    with pytest.raises(ShadowmapError, match="bytes"):
+        asyncio.run(server._body(Request({"type": "http", "method": "POST", "headers": []}, endless)))
+    assert sent <= exports.MOST_BYTES + 1_000_000
 
 
 BAD = [

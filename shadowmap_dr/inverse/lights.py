@@ -6,7 +6,7 @@ rendered as one batch of images and of R n shadow maps, and every run has a loss
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import drjit as dr
@@ -126,14 +126,12 @@ class LightBatch:
         scenes = [self.scene if s.filter_size is None else with_shadow(self.scene, filter_size=s.filter_size) for s in stages]
         losses, directions = [], [vectors]
         with dr.suspend_grad():
-            zero = dr.zeros(mi.Vector3f, dr.width(vectors))
-            state = LightState(vectors, zero, zero, dr.zeros(mi.Float, 1), None)
+            moments = [mi.Vector3f(*(_zeros(dr.width(vectors)) for _ in range(3))) for _ in range(2)]
+            state = LightState(vectors, *moments, _zeros(1), None)
             for stage, scene in zip(stages, scenes, strict=True):
                 # Made here, so that the recorded step always starts from a fit.
                 if scene.shadow.method != "none":
-                    state = LightState(
-                        state.to_light, state.m, state.v, state.t, fit_maps(scene, light_views(state.to_light), None)
-                    )
+                    state = replace(state, frusta=_own_arrays(fit_maps(scene, light_views(state.to_light), None)))
                 rate = dr.opaque(mi.Float, stage.step_size)
                 for _ in range(stage.iterations):
                     state, loss = self._step(scene, state, wanted, rate, runs, self._betas)
@@ -176,6 +174,18 @@ def batch_bytes(lights: int, pixels: int, channels: int = 3, map_resolution: int
         map_resolution: texels along each side of a map, times its supersampling.
     """
     return lights * _BYTES_OF_TEXEL * map_resolution**2 + pixels * (lights * _BYTES_OF_LIT_PIXEL + channels * _BYTES_OF_PIXEL)
+
+
+def _zeros(count: int) -> Any:
+    """An array of its own: to a recorded function, constants and arrays that are passed twice are something else."""
+    return dr.opaque(mi.Float, 0, count)
+
+
+def _own_arrays(frusta: Frusta) -> Frusta:
+    """A copy in which no two fields are the same array."""
+    copy = Frusta(*(getattr(frusta, f.name) + _zeros(dr.width(frusta.near)) for f in fields(frusta)))
+    dr.eval(copy)
+    return copy
 
 
 def _step(

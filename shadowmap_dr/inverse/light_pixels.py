@@ -131,6 +131,18 @@ class StillScene:
             return scene
 
 
+def mixed_pixels(pixels: Pixels, colours: list[Any]) -> Any:
+    """Anti-aliased image, flat with interleaved channels, of the colours of its pixels (Float (P,) each). Attached to them."""
+    dr.eval(colours)
+    pixel = dr.arange(mi.UInt32, pixels.count)
+    share = dr.gather(mi.Vector4f, pixels.incoming, pixel)
+    result = [(1 - sum(share)) * colour for colour in colours]
+    for k, neighbour in enumerate((pixel + 1, pixel + pixels.width, pixel - 1, pixel - pixels.width)):
+        taken = share[k] > 0
+        result = [r + share[k] * dr.gather(mi.Float, c, neighbour, taken) for c, r in zip(colours, result, strict=True)]
+    return dr.ravel(mi.Vector3f(*result)) if len(result) == 3 else result[0]
+
+
 def _pixels(buffer: GBuffer, channels: int) -> Pixels:
     surface, camera = buffer.surface, buffer.sensor
     if channels != dr.size_v(mi.UnpolarizedSpectrum):

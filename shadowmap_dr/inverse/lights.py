@@ -6,6 +6,7 @@ rendered as one batch of images and of R n shadow maps, and every run has a loss
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -126,12 +127,9 @@ class LightBatch:
         scenes = [self.scene if s.filter_size is None else with_shadow(self.scene, filter_size=s.filter_size) for s in stages]
         losses, directions = [], [vectors]
         with dr.suspend_grad():
-            moments = [mi.Vector3f(*(_zeros(dr.width(vectors)) for _ in range(3))) for _ in range(2)]
-            state = LightState(vectors, *moments, _zeros(1), None)
+            state = self._first_state(vectors)
             for stage, scene in zip(stages, scenes, strict=True):
-                # Made here, so that the recorded step always starts from a fit.
-                if scene.shadow.method != "none":
-                    state = replace(state, frusta=_own_arrays(fit_maps(scene, light_views(state.to_light), None)))
+                state = self._fitted(state, scene)
                 rate = dr.opaque(mi.Float, stage.step_size)
                 for _ in range(stage.iterations):
                     state, loss = self._step(scene, state, wanted, rate, runs, self._betas)
@@ -142,6 +140,31 @@ class LightBatch:
         shape = (len(directions), runs, self.lights, 3)
         kept = np.stack([np.array(d).T for d in directions]).reshape(shape)
         return LightHistory(np.array([np.array(loss) for loss in losses], np.float32).reshape(-1, runs), kept)
+
+    def stepper(self, starts: npt.ArrayLike, targets: npt.ArrayLike) -> Callable[[], Any]:
+        """A function that does one (recorded) step of all runs each time it is called, for measurements. Returns their losses."""
+        vectors, runs = self._vectors(starts)
+        wanted, rate = self._targets(targets, runs), dr.opaque(mi.Float, 0.01)
+        with dr.suspend_grad():
+            states = [self._first_state(vectors)]
+            states[0] = self._fitted(states[0], self.scene)
+
+        def step() -> Any:
+            with dr.suspend_grad():
+                states[0], losses = self._step(self.scene, states[0], wanted, rate, runs, self._betas)
+            return losses
+
+        return step
+
+    def _first_state(self, vectors: Any) -> LightState:
+        moments = [mi.Vector3f(*(_zeros(dr.width(vectors)) for _ in range(3))) for _ in range(2)]
+        return LightState(vectors, *moments, _zeros(1), None)
+
+    def _fitted(self, state: LightState, scene: StillScene) -> LightState:
+        """With the first fit of the maps: made here, so that the recorded step always starts from one."""
+        if scene.shadow.method == "none":
+            return state
+        return replace(state, frusta=_own_arrays(fit_maps(scene, light_views(state.to_light), None)))
 
     def recordings(self) -> int:
         """How often a step has been recorded so far."""

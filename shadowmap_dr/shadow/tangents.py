@@ -16,11 +16,11 @@ from typing import Any
 
 import drjit as dr
 
-from ..raster import RasterOutput, Topology, visible_triangles
+from ..raster import NO_TRIANGLE, RasterOutput, Topology, visible_triangles
 from ..raster._types import backend, pixel_coordinates
-from ..raster.blend import Mixer
-from ..raster.blend_tangents import mixed_tangents
+from ..raster.blend import incoming_weights
 from ..raster.crossings import Crossings, find_crossings
+from ..raster.planes import depth_at, planes
 from ..raster.topology import NO_VERTEX
 from .camera import Frusta, Views, of_map, project, to_clip, to_light_space
 from .filters import filter_kernel, filter_map
@@ -93,14 +93,11 @@ def tangent_maps(
         raster = visible_triangles(clip, faces, (size, size), batch=count)
         twist = twist_of(views)
         dr.eval(twist)
-        values, tangents, channels = _texels(raster, clip, faces, views, frusta, twist, settings, size)
+        crossings = find_crossings(clip, topology, raster, vertices) if settings.antialias else None
+        rates = None if crossings is None else _rates(clip, crossings, frusta, twist, size)
+        values, tangents = _Texels(raster, clip, faces, views, frusta, twist, settings, size).mixed(crossings, rates)
         dr.eval(values, tangents)
-        if settings.antialias:
-            crossings = find_crossings(clip, topology, raster, vertices)
-            rates = _rates(clip, crossings, frusta, twist, size)
-            mixer = Mixer(values, size, crossings)
-            values, tangents = mixer.values, mixed_tangents(mixer, tangents, *rates)
-            dr.eval(values, tangents)
+        channels = dr.width(values) // (count * size * size)
         if settings.supersampling > 1:
             values = block_means(values, size, channels, settings.supersampling)
             tangents = block_means(tangents, size, 2 * channels, settings.supersampling)
@@ -111,35 +108,112 @@ def tangent_maps(
         return TangentMaps(ShadowMaps(values, views, frusta, settings, channels), tangents, twist)
 
 
-def _texels(
-    raster: RasterOutput, clip: Any, faces: Any, views: Views, frusta: Frusta, twist: Any, settings: ShadowSettings, size: int
-) -> tuple[Any, Any, int]:
-    """Numbers to store (flat), their tangents (flat), and how many numbers there are in a texel."""
-    module = backend(clip)
-    image, row, column = pixel_coordinates(module, raster.batch, size, size)
-    view, frustum = of_map(views, image, views.count), of_map(frusta, image, views.count)
-    twist = dr.gather(module.Float, twist, image)
-    texels = texel_depths(raster, clip, faces, view, frustum, views, size)
-    n, f = frustum.near, frustum.far
-    ndc_x = dr.fma(module.Float(column), 2.0 / size, 1.0 / size - 1.0)
-    ndc_y = dr.fma(module.Float(row), 2.0 / size, 1.0 / size - 1.0)
-    # The light-space point that the texel sees, and the slopes of its triangle there.
-    half_range = 0.5 * (f - n)
-    p = (
-        dr.fma(ndc_x, frustum.half_x, frustum.center_x),
-        dr.fma(ndc_y, frustum.half_y, frustum.center_y),
-        dr.fma(texels.seen, half_range, 0.5 * (f + n)),
-    )
-    slope_x = texels.dx * half_range * (0.5 * size) / frustum.half_x
-    slope_y = texels.dy * half_range * (0.5 * size) / frustum.half_y
-    moves = (raster.valid & (texels.depth > -0.5)) & (texels.depth < FAR + 1)
-    scale = dr.select(moves, dr.rcp(f - frustum.first), 0)
-    # A texel stays where it is while the triangle moves through it.
-    rates = [(dz - slope_x * dx - slope_y * dy) * scale for dx, dy, dz in turned(twist, p)]
+class _Texels:
+    """What the texels of a batch of maps store, and its tangents: anti-aliased in the same kernel.
 
-    method = PREFILTERED[settings.method]
-    values, slopes = _with_slopes(lambda z: method.encode(z, texels.slope_square, settings.order), texels.depth)
-    return interleaved(values), interleaved([slope * rate for rate in rates for slope in slopes]), len(values)
+    Texels hold simple functions of their triangles' planes. Those that are mixed compute their neighbours' numbers once more,
+    which costs less than to write and read those of all texels.
+    """
+
+    def __init__(
+        self,
+        raster: RasterOutput,
+        clip: Any,
+        faces: Any,
+        views: Views,
+        frusta: Frusta,
+        twist: Any,
+        settings: ShadowSettings,
+        size: int,
+    ) -> None:
+        self.module, self.raster, self.size, self.settings = backend(clip), raster, size, settings
+        self.views, self.frusta, self.twist = views, frusta, twist
+        self.method = PREFILTERED[settings.method]
+        self.planes, _ = planes(clip, faces, raster, False)
+        dr.eval(self.planes)
+
+    def mixed(self, crossings: Crossings | None, rates: tuple[Any, Any] | None) -> tuple[Any, Any]:
+        """Flat numbers, and flat tangents: a texel's changes with a, then with b."""
+        module, size = self.module, self.size
+        image, row, column = pixel_coordinates(module, self.raster.batch, size, size)
+        texel = dr.arange(module.UInt32, self.raster.batch * size * size)
+        own, changes = self._own(image, row, column, self.raster.triangle)
+        if crossings is None:
+            return interleaved(own), interleaved(changes)
+        incoming = incoming_weights(crossings, size)
+        channels = len(own)
+
+        def mix(texel: Any, image: Any, row: Any, column: Any, *lanes: Any) -> tuple[Any, ...]:
+            incoming, own, changes = lanes[:4], lanes[4 : 4 + channels], lanes[4 + channels :]
+            claims = sum(incoming)
+            scale = dr.rcp(dr.maximum(1, claims))
+            # Right, lower, left, upper; who holds the weight, and the sign by which it says that the neighbour reaches into here.
+            steps = ((0, 1, texel, 0, -1), (1, 0, texel, 1, -1), (0, -1, texel - 1, 0, 1), (-1, 0, texel - size, 1, 1))
+            others = []
+            for weight, (down, right, *_) in zip(incoming, steps, strict=True):
+                there = weight > 0
+                triangle = dr.gather(module.UInt32, self.raster.triangle, _moved(texel, down * size + right), there)
+                triangle = dr.select(there, triangle, NO_TRIANGLE)
+                others.append(self._own(image, _moved(row, down), _moved(column, right), triangle))
+            mixed = [
+                v + sum(dr.select(w > 0, w * scale * (other[0][c] - v), 0) for w, other in zip(incoming, others, strict=True))
+                for c, v in enumerate(own)
+            ]
+            # A texel that is wholly claimed shares itself out: more for one neighbour is less for all of them.
+            mean = [dr.select(claims >= 1, m, v) for m, v in zip(mixed, own, strict=True)]
+            total = list(changes)
+            for weight, (numbers, tangents), (_, _, holder, axis, sign) in zip(incoming, others, steps, strict=True):
+                there = weight > 0
+                factor = weight * scale
+                rate = dr.gather(module.Array2f, rates[axis], holder, there) * (sign * scale)
+                for k in range(2 * channels):
+                    c = k % channels
+                    change = factor * (tangents[k] - changes[k]) + rate[k // channels] * (numbers[c] - mean[c])
+                    # Not in place, which would change what is the texel's own, too.
+                    total[k] = total[k] + dr.select(there, change, 0)
+            return (*mixed, *total)
+
+        result = dr.if_stmt(
+            (texel, image, row, column, *incoming, *own, *changes),
+            sum(incoming) > 0,
+            mix,
+            lambda texel, image, row, column, *lanes: lanes[4:],
+            mode="symbolic",
+            label="mixed texels",
+        )
+        return interleaved(list(result[:channels])), interleaved(list(result[channels:]))
+
+    def _own(self, image: Any, row: Any, column: Any, triangle: Any) -> tuple[list[Any], list[Any]]:
+        """Numbers that texels store by themselves, and their changes with a, then with b."""
+        module, size = self.module, self.size
+        view, frustum = of_map(self.views, image, self.views.count), of_map(self.frusta, image, self.views.count)
+        twist = dr.gather(module.Float, self.twist, image)
+        hit = triangle != NO_TRIANGLE
+        seen = depth_at(self.planes, image * self.raster.face_count + triangle, row, column, hit)
+        texels = texel_depths(seen, hit, view, frustum, size)
+        n, f = frustum.near, frustum.far
+        ndc_x = dr.fma(module.Float(column), 2.0 / size, 1.0 / size - 1.0)
+        ndc_y = dr.fma(module.Float(row), 2.0 / size, 1.0 / size - 1.0)
+        # The light-space point that the texel sees, and the slopes of its triangle there.
+        half_range = 0.5 * (f - n)
+        p = (
+            dr.fma(ndc_x, frustum.half_x, frustum.center_x),
+            dr.fma(ndc_y, frustum.half_y, frustum.center_y),
+            dr.fma(texels.seen, half_range, 0.5 * (f + n)),
+        )
+        slope_x = texels.dx * half_range * (0.5 * size) / frustum.half_x
+        slope_y = texels.dy * half_range * (0.5 * size) / frustum.half_y
+        # What lies before the depths that are told apart does not move.
+        scale = dr.select(hit & (texels.depth > -0.5), dr.rcp(f - frustum.first), 0)
+        # A texel stays where it is while the triangle moves through it.
+        rates = [(dz - slope_x * dx - slope_y * dy) * scale for dx, dy, dz in turned(twist, p)]
+        values, slopes = _with_slopes(lambda z: self.method.encode(z, texels.slope_square, self.settings.order), texels.depth)
+        return values, [slope * rate for rate in rates for slope in slopes]
+
+
+def _moved(number: Any, by: int) -> Any:
+    """``UInt32`` plus a whole number of either sign."""
+    return number + by if by >= 0 else number - -by
 
 
 def _with_slopes(function: Any, x: Any) -> tuple[list[Any], list[Any]]:

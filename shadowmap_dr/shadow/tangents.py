@@ -66,7 +66,7 @@ def turned(twist: Any, p: Any) -> tuple[tuple[Any, Any, Any], tuple[Any, Any, An
 
 
 def tangent_maps(
-    p_world: Any, faces: Any, topology: Topology, views: Views, frusta: Frusta, settings: ShadowSettings
+    p_world: Any, faces: Any, topology: Topology, views: Views, frusta: Frusta, settings: ShadowSettings, outward: Any = None
 ) -> TangentMaps:
     """Render and filter maps of directional lights, with tangents.
 
@@ -76,6 +76,7 @@ def tangent_maps(
         topology: of the mesh.
         views, frusta: cameras of the M maps, all orthographic, with axes as :func:`directional_view` makes them.
         settings: a pre-filtered method, without ``compat``.
+        outward: ``Bool`` (F,), faces that no light sees from behind before others (:func:`shadowmap_dr.raster.outward_faces`).
 
     Values agree with :func:`shadowmap_dr.shadow.render_maps`, tangents with its derivatives.
     """
@@ -90,7 +91,8 @@ def tangent_maps(
         view = of_map(views, index, count)
         clip = dr.ravel(to_clip(view, of_map(frusta, index, count), to_light_space(view, point)))
         dr.eval(clip)
-        raster = visible_triangles(clip, faces, (size, size), batch=count)
+        # Seen from the front, outlines run clockwise: a light looks along the third of its right-handed axes.
+        raster = visible_triangles(clip, faces, (size, size), batch=count, one_sided=outward)
         twist = twist_of(views)
         dr.eval(twist)
         crossings = find_crossings(clip, topology, raster, vertices) if settings.antialias else None

@@ -35,6 +35,7 @@ app = typer.Typer(
 app.add_typer(cli_gradients.app, name="gradients")
 app.command()(cli_soft.soft)
 app.command()(cli_lights.lights)
+app.command("lights-times")(cli_lights.lights_times)
 
 
 def main() -> None:

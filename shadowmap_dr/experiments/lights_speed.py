@@ -3,23 +3,59 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from rich.console import Console
 
 from .. import timing
-from ..inverse import LightBatch, StillScene
+from ..inverse import LightBatch, StillScene, run_sweep
 from ..inverse.light_pixels import mixed_pixels
+from ..inverse.lights import batch_bytes
 from ..light_maps import light_visibility, make_maps
 from ..renderer import Renderer
 from .lights_problem import LightProblem
 from .lights_scene import make_scene
 
 
-def measure(problem: LightProblem, batches: Sequence[int], seconds: float = 12.0) -> dict[str, Any]:
+def measure_workers(problem: LightProblem, counts: Sequence[int], out: Path) -> dict[str, Any]:
+    """Seconds of a sweep with so many Dask workers on this machine, one Dr.Jit thread each, once warm.
+
+    All do the same batches, of which there are a few for each worker; the first sweep, which compiles, is not timed.
+    """
+    from distributed import LocalCluster
+
+    seconds: dict[int, float] = {}
+    for count in counts:
+        with LocalCluster(n_workers=count, threads_per_worker=1, dashboard_address=None, memory_limit=0) as cluster:
+            for name in ("warm-up", "timed"):
+                began = time.perf_counter()
+                memory = problem.runs * batch_bytes(problem.lights, problem.resolution**2, 3, problem.map_resolution)
+                run_sweep(
+                    [problem],
+                    out / f"{name}-{count}",
+                    scheduler=cluster.scheduler_address,
+                    variant=mi.variant(),
+                    threads=1,
+                    memory=memory // (4 * max(counts)),
+                    console=Console(quiet=True),
+                )
+                seconds[count] = time.perf_counter() - began
+    first = counts[0]
+    return {
+        "seconds": {str(count): value for count, value in seconds.items()},
+        "speed_up": {str(count): seconds[first] / value for count, value in seconds.items()},
+        "settings": problem.settings(),
+        "runs": problem.runs,
+    }
+
+
+def measure(problem: LightProblem, batches: Sequence[int], seconds: float = 6.0) -> dict[str, Any]:
     """Seconds that a step takes for each run.
 
     Contenders take turns: batches of several sizes; ``reverse``, a single run whose frozen step takes its derivatives backwards

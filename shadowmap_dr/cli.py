@@ -36,6 +36,7 @@ app.add_typer(cli_gradients.app, name="gradients")
 app.add_typer(cli_face.app, name="face")
 app.command()(cli_soft.soft)
 app.command()(cli_lights.lights)
+app.command("lights-times")(cli_lights.lights_times)
 app.command()(cli_art.art)
 app.command()(cli_model.model)
 

@@ -1,9 +1,12 @@
 """Inverse problems: what is optimised (parametrisations), how (loops that survive being killed), and sweeps over many runs."""
 
+from .blend_shapes import blend
 from .collection import Collection
 from .light_pixels import StillScene
 from .lights import LightBatch, LightHistory, Stage
 from .loop import History, Method, optimize
+from .morph_fit import MorphFit
+from .morphable import MorphableModel, load_model, save_model
 from .pose import PoseFit, apply_pose
 from .problems import LossProblem, MethodProblem, Problem
 from .remeshing import RemeshingSculptor
@@ -20,6 +23,8 @@ __all__ = [
     "LossProblem",
     "Method",
     "MethodProblem",
+    "MorphFit",
+    "MorphableModel",
     "PoseFit",
     "Problem",
     "RemeshingSculptor",
@@ -28,8 +33,11 @@ __all__ = [
     "Stage",
     "StillScene",
     "apply_pose",
+    "blend",
     "even_sphere",
+    "load_model",
     "optimize",
     "run_sweep",
+    "save_model",
     "shadow_view",
 ]

@@ -72,6 +72,8 @@ def test_killed_runs_go_on_where_they_were(variant, tmp_path):
     trace = make(resumed, 70, checkpoint=checkpoint, fingerprint="a", on_step=lambda n, note: done.append(n))
     assert done[0] == 51 and trace.iterations == 70
     assert [frame.step for frame in trace.frames] == [frame.step for frame in whole.frames]
+    assert {frame.step for frame in trace.frames} == frame_steps(70)
+    np.testing.assert_array_equal(trace.frames[-1].vertices, resumed.vertices())
     np.testing.assert_allclose(trace.loss, whole.loss, rtol=0.02)
     assert trace.looks[-1][0] == 70 and trace.looks[-1][1][0] == pytest.approx(whole.looks[-1][1][0], abs=0.01)
     checkpoint.write_bytes(b"nonsense")

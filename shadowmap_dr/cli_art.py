@@ -24,6 +24,7 @@ def art(
     collection: Annotated[
         str | None, typer.Option(metavar="NAME|FILE", help="Copies of this mesh cast the shadow: moved, turned and scaled.")
     ] = None,
+    copies: Annotated[int, typer.Option(metavar="N", help="Copies at most; their number doubles every 150 steps.")] = 128,
     receiver: Annotated[str, typer.Option(metavar="plane|wavy", help="What the shadow falls on.")] = "plane",
     camera: Annotated[
         str, typer.Option(metavar="orthographic|perspective", help="Seen straight on, or in perspective from the side.")
@@ -32,6 +33,10 @@ def art(
         int | None, typer.Option(help="Steps of the optimiser [default: 400, and 1100 of a collection].")
     ] = None,
     smoothness: Annotated[float, typer.Option(help="How stiff the mesh is; finer meshes need more.")] = 20.0,
+    remesh: Annotated[
+        int | None, typer.Option(metavar="STEPS", help="Mesh the surface anew after so many steps, again and again.")
+    ] = None,
+    fill_holes: Annotated[bool, typer.Option("--fill-holes", help="Fill enclosed holes of the targets.")] = False,
     resolution: Annotated[int, typer.Option(help="Pixels along each side of the shadow images.")] = 256,
     map_resolution: Annotated[
         int | None, typer.Option(help="Texels along each side of the shadow maps [default: as many as pixels].")
@@ -52,9 +57,12 @@ def art(
         targets=(*(target or ()), *(f"text:{letters}" for letters in text or ())),
         mesh=mesh,
         collection=collection,
+        most=copies,
         receiver=receiver,
         camera=camera,
         smoothness=smoothness,
+        remesh=remesh,
+        fill_holes=fill_holes,
         resolution=resolution,
         map_resolution=map_resolution,
         iterations=iterations,

@@ -8,9 +8,12 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from . import report
 from .cli_options import DEFAULT_VARIANT, Variant, set_variant
+from .errors import ShadowmapError
 from .experiments import lights as lights_experiment
-from .experiments import lights_report
+from .experiments import lights_report, lights_speed
+from .experiments.lights_problem import LightProblem
 from .experiments.lights_scene import OBJECTS
 
 _FULL_LIGHTS, _FULL_SIZES, _FULL_RUNS = (1, 2, 3, 4, 5), (1, 3, 5, 9, 15, 0), 150
@@ -86,3 +89,34 @@ def lights(
     summaries = lights_experiment.run_lights(options, variant=variant)
     Console().print(lights_report.table(summaries))
     typer.echo(f"Record, plot and pictures: {out}")
+
+
+def lights_times(
+    object: Annotated[str, typer.Option(metavar="|".join(OBJECTS), help="Object, by name or mesh file.")] = "bunny",
+    count: Annotated[int, typer.Option("--lights", help="Lights, 1 to 5.")] = 1,
+    batch: Annotated[list[int] | None, typer.Option(help="Runs of a batch; repeatable [default: 1, 16, 150].")] = None,
+    workers: Annotated[bool, typer.Option(help="Compare one with two Dask workers, too.")] = True,
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("lights-times"),
+    variant: Variant = DEFAULT_VARIANT,
+) -> None:
+    """Measure how long a step of light estimation takes for a run, in batches and alone, and what more workers bring.
+
+    Writes OUT/times.json. Nothing else should run on the machine.
+    """
+    sizes = tuple(batch or (1, 16, 150))
+    if min(sizes) < 1:
+        raise ShadowmapError(f"a batch of {min(sizes)} runs: give at least 1.")
+    set_variant(variant)
+    steps = lights_speed.measure(LightProblem(object, count, max(sizes)), sizes)
+    times, ratios = steps["seconds"], steps["ratio_of_medians"]
+    rows = [
+        [name, f"{1e3 * entry['median']:.2f}", f"{ratios.get(f'{name} / batch of {max(sizes)}', 1):.2f}"]
+        for name, entry in times.items()
+    ]
+    Console().print(report.table("A step of a run", ["way", "ms", "/ largest batch"], rows))
+    record = {"steps": steps}
+    if workers:
+        record["workers"] = lights_speed.measure_workers(LightProblem(object, count, 32, iterations=60), (1, 2), out)
+        speed_up = record["workers"]["speed_up"]["2"]
+        typer.echo(f"Two workers with a thread each do {speed_up:.2f} times the work of one.")
+    report.write_json(out / "times.json", record)

@@ -80,6 +80,24 @@ def test_recorded_steps_double_the_copies_and_match_the_target(variant):
     assert losses[-1] < 0.4 * alone and overlap(collection.visibility()[0], collection.target(0)) > 0.85
 
 
+def test_recorded_copies_part_side_by_side_and_stay_before_the_receiver(variant):
+    collection = balls(interval=1, most=64)
+    for _ in range(7):
+        collection.step()
+    assert collection.count == 64
+    middles = collection.vertices().reshape(64, -1, 3).mean(1)
+    assert np.abs(middles[:, 2]).max() < 1.02 and len(np.unique(middles.round(3), axis=0)) == 64
+    one, two = balls(interval=1, most=2), balls(interval=1, most=2)
+    one.step()
+    two.step()
+    two.step()
+    first, second = two.vertices().reshape(2, -1, 3).mean(1)
+    np.testing.assert_allclose(0.5 * (first + second), one.vertices().mean(0), atol=0.03)
+    assert np.linalg.norm((first - second)[:2]) == pytest.approx(2 * 0.35 * 0.7, rel=0.1)
+    size = [np.ptp(points, axis=0).max() for points in (one.vertices(), two.vertices()[:66])]
+    assert size[1] == pytest.approx(0.8 * size[0], rel=0.03)
+
+
 def test_recorded_state_goes_on_exactly_with_all_copies(variant):
     first, second = balls(interval=4, most=2), balls(interval=4, most=2)
     for _ in range(6):

@@ -30,6 +30,12 @@ def read_mesh(path: Path) -> tuple[Array, Faces]:
 
     Raises ShadowmapError where it cannot be read, or is no triangle mesh.
     """
+    vertices, faces, _ = read_placed_mesh(path)
+    return vertices, faces
+
+
+def read_placed_mesh(path: Path) -> tuple[Array, Faces, tuple[npt.NDArray[np.float64], float]]:
+    """As `read_mesh`, and where the mesh was: its middle (3,) and a scale; vertices * scale + middle are the file's."""
     trimesh = _trimesh()
     try:
         mesh = trimesh.load_mesh(path, process=False)
@@ -44,11 +50,12 @@ def read_mesh(path: Path) -> tuple[Array, Faces]:
     scale = float((high - low).max())
     if scale <= 0:
         raise ShadowmapError(f"{path} has no extent.")
-    vertices = (vertices - 0.5 * (low + high)) * (2 / scale)
+    middle = 0.5 * (low + high)
+    vertices = (vertices - middle) * (2 / scale)
     unique, index = np.unique(vertices, axis=0, return_inverse=True)
     faces = index.reshape(-1)[faces]
     proper = (faces != np.roll(faces, 1, 1)).all(1)
-    return unique.astype(np.float32), faces[proper].astype(np.uint32)
+    return unique.astype(np.float32), faces[proper].astype(np.uint32), (middle.astype(np.float64), 0.5 * scale)
 
 
 def vertex_colours(vertices: Array) -> npt.NDArray[np.uint8]:

@@ -16,7 +16,8 @@ from ..errors import ShadowmapError
 from ..inverse import LightBatch, Problem, Stage, StillScene
 from ..inverse.lights import batch_bytes
 from ..renderer import Renderer
-from .lights_scene import CONE_DEG, alignment, make_scene, target_and_starts
+from ..shadow import ShadowSettings
+from .lights_scene import CONE_DEG, alignment, check_scene, make_scene, target_and_starts
 
 ReferenceKind = Literal["own", "mitsuba"]
 StrategyKind = Literal["plain", "coarse"]
@@ -153,7 +154,12 @@ class LightProblem(Problem):
 
 
 def check_problem(problem: LightProblem) -> None:
-    """Raise ShadowmapError for settings that cannot be."""
+    """Raise ShadowmapError for settings that cannot be, before any work is done."""
+    check_scene(problem.object, problem.lights, problem.resolution)
+    try:
+        ShadowSettings(filter=problem.filter, filter_size=max(1, problem.filter_size), resolution=problem.map_resolution)
+    except ValueError as error:
+        raise ShadowmapError(str(error)) from None
     for what, value in (("runs", problem.runs), ("iterations", problem.iterations), ("starts", problem.starts)):
         if value < 1:
             raise ShadowmapError(f"{value} {what}: give at least 1.")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
@@ -22,6 +23,18 @@ IRRADIANCE = math.pi
 FloatArray = npt.NDArray[np.float64]
 
 
+def check_scene(name: str, lights: int, resolution: int) -> Path:
+    """The object's file; ShadowmapError if there is no such object, or no such scene."""
+    if not 1 <= lights <= MOST_LIGHTS:
+        raise ShadowmapError(f"{lights} lights: give 1 to {MOST_LIGHTS}.")
+    if not 1 <= resolution <= 4096:
+        raise ShadowmapError(f"a resolution of {resolution} pixels: give 1 to 4096.")
+    path = assets.mesh(name)
+    if path.suffix not in (".ply", ".obj"):
+        raise ShadowmapError(f"cannot load the object {path.name}: the suffix {path.suffix!r} is not one of .ply, .obj.")
+    return path
+
+
 def make_scene(name: str, lights: int, resolution: int) -> Any:
     """``mi.Scene``: an object of [-1, 1]^3 on a diffuse floor, seen from above, under equal directional lights.
 
@@ -30,11 +43,7 @@ def make_scene(name: str, lights: int, resolution: int) -> Any:
         lights: how many, called ``light_0``, ``light_1``, ... All shine straight down.
         resolution: width and height of the image in pixels.
     """
-    if not 1 <= lights <= MOST_LIGHTS:
-        raise ShadowmapError(f"{lights} lights: give 1 to {MOST_LIGHTS}.")
-    if not 1 <= resolution <= 4096:
-        raise ShadowmapError(f"a resolution of {resolution} pixels: give 1 to 4096.")
-    path = assets.mesh(name)
+    path = check_scene(name, lights, resolution)
     try:
         thing = mi.load_dict({"type": path.suffix[1:], "filename": str(path), "face_normals": True})
     except RuntimeError as error:

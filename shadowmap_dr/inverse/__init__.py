@@ -9,6 +9,7 @@ from .morph_fit import MorphFit
 from .morphable import MorphableModel, load_model, save_model
 from .pose import PoseFit, apply_pose
 from .problems import LossProblem, MethodProblem, Problem
+from .remeshing import RemeshingSculptor
 from .sculpt import Sculptor
 from .shadow_views import ShadowView, shadow_view
 from .start_meshes import even_sphere
@@ -26,6 +27,7 @@ __all__ = [
     "MorphableModel",
     "PoseFit",
     "Problem",
+    "RemeshingSculptor",
     "Sculptor",
     "ShadowView",
     "Stage",

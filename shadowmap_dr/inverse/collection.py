@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from ..errors import ShadowmapError
 from .sculpt import checked_target
-from .shadow_images import ShadowImages, image_loss, shadow_images
+from .shadow_images import ShadowImages, device_array, image_loss, shadow_images
 from .shadow_views import ShadowView
 
 # Numbers of each copy: offset (3), quaternion (4: x, y, z, w), logarithm of the scale.
@@ -21,8 +21,8 @@ _NUMBERS = 8
 _FIRST_SCALE = 0.7
 # Two copies take the place of one: how much smaller they are, and how far from its middle, in units of its scale.
 _SHRINK, _ASIDE, _APART = 0.8, 0.35, 0.3
-# Middles of new copies are no farther from the origin, along each axis: receivers are not where objects are.
-_REACH = 1.6
+# Middles of new copies are no farther from the origin along the first view's light, which would not bring them back.
+_REACH = 1.0
 
 Array = npt.NDArray[np.float32]
 
@@ -67,7 +67,7 @@ class Collection:
             raise ShadowmapError(f"{len(targets)} targets for {len(views)} views: give one for each.")
         self.views = tuple(views)
         self._targets = [checked_target(image, view) for image, view in zip(targets, self.views, strict=True)]
-        self._wanted = mi.Float(np.concatenate([image.ravel() for image in self._targets]))
+        self._wanted = device_array(np.concatenate([image.ravel() for image in self._targets]))
         self._rest, self._rest_faces = np.array(vertices, np.float32), np.array(faces, np.uint32)
         self._shadow = {"map_resolution": map_resolution, "filter_size": filter_size, "method": method}
         self._interval, self._most, self._seed = interval, most, seed
@@ -123,7 +123,7 @@ class Collection:
 
     def load_state(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
         """Go on from what `state` returned, whatever number of copies it has."""
-        numbers, m, v = (mi.Float(np.asarray(state[name], np.float32)) for name in ("numbers", "m", "v"))
+        numbers, m, v = (device_array(state[name]) for name in ("numbers", "m", "v"))
         if dr.width(numbers) % _NUMBERS or {dr.width(m), dr.width(v)} != {dr.width(numbers)}:
             raise ShadowmapError(f"a state of {dr.width(numbers)} numbers: it must hold {_NUMBERS} for each copy.")
         self._prepare(dr.width(numbers) // _NUMBERS)
@@ -160,7 +160,9 @@ class Collection:
         offset = (_ASIDE * aside + _APART * view.forward) * size[:, None]
         pair = [rows.copy(), rows.copy()]
         for copy, sign in zip(pair, (1, -1), strict=True):
-            copy[:3] = np.clip(copy[:3] + sign * offset.T, -_REACH, _REACH)
+            copy[:3] += sign * offset.T
+            depth = view.forward @ copy[:3]
+            copy[:3] += view.forward[:, None] * (np.clip(depth, -_REACH, _REACH) - depth)
             copy[7] += np.log(_SHRINK)
         numbers = np.concatenate(pair, 1).ravel()
         zero = np.zeros_like(numbers)

@@ -11,7 +11,7 @@ import mitsuba as mi
 from ..errors import ShadowmapError
 from ..light_maps import boxes_of, shape_planes
 from ..lights import DirectionalLight
-from ..raster import Topology
+from ..raster import Topology, outward_faces
 from ..raster.blend import Mixer
 from ..renderer import GBuffer, Renderer
 from ..shadow import Boxes, ShadowSettings
@@ -62,7 +62,7 @@ class StillScene:
         pixels: what the camera sees.
         irradiance: for each light its colour, Float of width 1 for each channel.
         shadow: how shadows are computed.
-        p_world, faces, topology, vertex_shape, shapes: the mesh of all S shapes.
+        p_world, faces, topology, outward, vertex_shape, shapes: the mesh of all S shapes, and its faces that hide their backs.
         planes, planar, boxes: what is known about the shapes, see :func:`shadowmap_dr.shadow.casting_shapes`.
         seen: points on what is in view, and which of them there are.
     """
@@ -73,6 +73,7 @@ class StillScene:
     p_world: Any
     faces: Any
     topology: Topology
+    outward: Any
     vertex_shape: Any
     shapes: int
     planes: Any
@@ -120,6 +121,7 @@ class StillScene:
                 p_world,
                 geometry.faces,
                 renderer.topology,
+                mi.Bool(outward_faces(renderer.topology, positions.numpy().reshape(-1, 3))),
                 geometry.vertex_shape,
                 len(geometry.shapes),
                 planes,
@@ -129,6 +131,18 @@ class StillScene:
             )
             dr.eval(scene)
             return scene
+
+
+def mixed_pixels(pixels: Pixels, colours: list[Any]) -> Any:
+    """Anti-aliased image, flat with interleaved channels, of the colours of its pixels (Float (P,) each). Attached to them."""
+    dr.eval(colours)
+    pixel = dr.arange(mi.UInt32, pixels.count)
+    share = dr.gather(mi.Vector4f, pixels.incoming, pixel)
+    result = [(1 - sum(share)) * colour for colour in colours]
+    for k, neighbour in enumerate((pixel + 1, pixel + pixels.width, pixel - 1, pixel - pixels.width)):
+        taken = share[k] > 0
+        result = [r + share[k] * dr.gather(mi.Float, c, neighbour, taken) for c, r in zip(colours, result, strict=True)]
+    return dr.ravel(mi.Vector3f(*result)) if len(result) == 3 else result[0]
 
 
 def _pixels(buffer: GBuffer, channels: int) -> Pixels:

@@ -154,7 +154,7 @@ def render_lights(scene: StillScene, to_light: Any, frusta: Frusta | None) -> tu
     if scene.shadow.method == "none":
         return views, lit(scene, views, None), frusta
     frusta = fit_maps(scene, views, frusta)
-    maps = tangent_maps(scene.p_world, scene.faces, scene.topology, views, frusta, scene.shadow)
+    maps = tangent_maps(scene.p_world, scene.faces, scene.topology, views, frusta, scene.shadow, scene.outward)
     return views, lit(scene, views, maps), maps.maps.frusta
 
 

@@ -6,7 +6,8 @@ rendered as one batch of images and of R n shadow maps, and every run has a loss
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import drjit as dr
@@ -126,14 +127,9 @@ class LightBatch:
         scenes = [self.scene if s.filter_size is None else with_shadow(self.scene, filter_size=s.filter_size) for s in stages]
         losses, directions = [], [vectors]
         with dr.suspend_grad():
-            zero = dr.zeros(mi.Vector3f, dr.width(vectors))
-            state = LightState(vectors, zero, zero, dr.zeros(mi.Float, 1), None)
+            state = self._first_state(vectors)
             for stage, scene in zip(stages, scenes, strict=True):
-                # Made here, so that the recorded step always starts from a fit.
-                if scene.shadow.method != "none":
-                    state = LightState(
-                        state.to_light, state.m, state.v, state.t, fit_maps(scene, light_views(state.to_light), None)
-                    )
+                state = self._fitted(state, scene)
                 rate = dr.opaque(mi.Float, stage.step_size)
                 for _ in range(stage.iterations):
                     state, loss = self._step(scene, state, wanted, rate, runs, self._betas)
@@ -144,6 +140,31 @@ class LightBatch:
         shape = (len(directions), runs, self.lights, 3)
         kept = np.stack([np.array(d).T for d in directions]).reshape(shape)
         return LightHistory(np.array([np.array(loss) for loss in losses], np.float32).reshape(-1, runs), kept)
+
+    def stepper(self, starts: npt.ArrayLike, targets: npt.ArrayLike) -> Callable[[], Any]:
+        """A function that does one (recorded) step of all runs each time it is called, for measurements. Returns their losses."""
+        vectors, runs = self._vectors(starts)
+        wanted, rate = self._targets(targets, runs), dr.opaque(mi.Float, 0.01)
+        with dr.suspend_grad():
+            states = [self._first_state(vectors)]
+            states[0] = self._fitted(states[0], self.scene)
+
+        def step() -> Any:
+            with dr.suspend_grad():
+                states[0], losses = self._step(self.scene, states[0], wanted, rate, runs, self._betas)
+            return losses
+
+        return step
+
+    def _first_state(self, vectors: Any) -> LightState:
+        moments = [mi.Vector3f(*(_zeros(dr.width(vectors)) for _ in range(3))) for _ in range(2)]
+        return LightState(vectors, *moments, _zeros(1), None)
+
+    def _fitted(self, state: LightState, scene: StillScene) -> LightState:
+        """With the first fit of the maps: made here, so that the recorded step always starts from one."""
+        if scene.shadow.method == "none":
+            return state
+        return replace(state, frusta=_own_arrays(fit_maps(scene, light_views(state.to_light), None)))
 
     def recordings(self) -> int:
         """How often a step has been recorded so far."""
@@ -157,14 +178,14 @@ class LightBatch:
         if not (np.isfinite(length) & (length > 0)).all():
             raise ShadowmapError("a direction has no length, or one that is not finite: give finite vectors other than zero.")
         unit = (array / length).reshape(-1, 3).astype(np.float32)
-        return mi.Vector3f(*(mi.Float(np.ascontiguousarray(unit[:, c])) for c in range(3))), len(array)
+        return mi.Vector3f(*(_device_array(unit[:, c]) for c in range(3))), len(array)
 
     def _targets(self, targets: npt.ArrayLike, runs: int) -> list[Any]:
         pixels, array = self.scene.pixels, np.asarray(targets, np.float32)
         shape = (runs, pixels.height, pixels.width, pixels.channels)
         if array.shape != shape or not np.isfinite(array).all():
             raise ShadowmapError(f"targets of shape {array.shape}: give finite values in the shape {shape}.")
-        return [mi.Float(np.ascontiguousarray(array[..., c]).ravel()) for c in range(pixels.channels)]
+        return [_device_array(array[..., c]) for c in range(pixels.channels)]
 
 
 def batch_bytes(lights: int, pixels: int, channels: int = 3, map_resolution: int = 0) -> int:
@@ -176,6 +197,25 @@ def batch_bytes(lights: int, pixels: int, channels: int = 3, map_resolution: int
         map_resolution: texels along each side of a map, times its supersampling.
     """
     return lights * _BYTES_OF_TEXEL * map_resolution**2 + pixels * (lights * _BYTES_OF_LIT_PIXEL + channels * _BYTES_OF_PIXEL)
+
+
+def _zeros(count: int) -> Any:
+    """An array of its own: to a recorded function, constants and arrays that are passed twice are something else."""
+    return dr.opaque(mi.Float, 0, count)
+
+
+def _device_array(numbers: FloatArray) -> Any:
+    """A copy in Dr.Jit's memory: where NumPy's lies, by chance, would make recorded functions record anew."""
+    array = mi.Float(np.ascontiguousarray(numbers).ravel()) + dr.opaque(mi.Float, 0)
+    dr.eval(array)
+    return array
+
+
+def _own_arrays(frusta: Frusta) -> Frusta:
+    """A copy in which no two fields are the same array."""
+    copy = Frusta(*(getattr(frusta, f.name) + _zeros(dr.width(frusta.near)) for f in fields(frusta)))
+    dr.eval(copy)
+    return copy
 
 
 def _step(

@@ -93,8 +93,8 @@ class LossProblem(Problem):
         """(P,) start of a run, by its number only."""
 
     @abstractmethod
-    def losses(self, built: Any, parameters: Any, runs: int) -> Any:
-        """Loss of each run, ``Float`` (R,), attached to ``parameters``, ``Float`` (R P); it depends on that run's only."""
+    def losses(self, built: Any, parameters: Any, runs: Sequence[int]) -> Any:
+        """Loss of each of R runs, ``Float`` (R,), attached to ``parameters``, ``Float`` (R P); it depends on that run's only."""
 
     def record(self, run: int, history: History) -> dict[str, Any]:
         """What to keep of a run: start, final parameters and the loss before each step."""
@@ -107,7 +107,7 @@ class LossProblem(Problem):
         self, built: Any, runs: Sequence[int], checkpoint: Path | None, on_step: Callable[[int], None]
     ) -> list[dict[str, Any]]:
         starts = np.stack([np.asarray(self.start(run), np.float64).ravel() for run in runs])
-        fit = _BatchFit(functools.partial(self.losses, built, runs=len(runs)), self.step_size, self.betas)
+        fit = _BatchFit(functools.partial(self.losses, built, runs=tuple(runs)), self.step_size, self.betas)
         settings = {"settings": self.settings(), "runs": list(runs)}
         history = optimize(fit, starts.ravel(), self.steps, checkpoint=checkpoint, settings=settings, on_step=on_step)
         parameters = history.parameters.reshape(len(history.parameters), *starts.shape)

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import ShadowmapError
-from .shadow_images import ShadowImages, image_loss, shadow_images
+from .shadow_images import ShadowImages, device_array, image_loss, shadow_images
 from .shadow_views import ShadowView
 from .smoothness import normal_consistency
 
@@ -122,8 +122,7 @@ class Sculptor:
     def step(self) -> Any:
         """One step; returns the loss before it, ``Float`` (1,), without waiting for it."""
         if self._wanted is None:
-            # A copy: Dr.Jit borrows NumPy's memory where it can, and a step is recorded anew when its alignment changes.
-            self._wanted = dr.copy(mi.Float(np.concatenate([image.ravel() for image in self._targets])))
+            self._wanted = device_array(np.concatenate([image.ravel() for image in self._targets]))
         loss, slope = self._gradient(dr.detach(self._vertices), self._wanted, self._consistency, self._shadows)
         dr.set_grad(self._vertices, slope)
         dr.enqueue(dr.ADMode.Backward, self._vertices)

@@ -143,6 +143,16 @@ def image_loss(shadows: ShadowImages, seen: Any, wanted: Any) -> Any:
     return dr.sum(square)
 
 
+def device_array(values: npt.ArrayLike) -> Any:
+    """``Float`` in memory of Dr.Jit's own.
+
+    Dr.Jit borrows NumPy's memory where it can, and records a function anew when it is called with memory of another alignment.
+    """
+    result = mi.Float(np.ascontiguousarray(values, np.float32)) + dr.opaque(mi.Float, 0)
+    dr.eval(result)
+    return result
+
+
 def _columns(vectors: Sequence[npt.ArrayLike]) -> list[Any]:
     return [mi.Float(np.ascontiguousarray(column)) for column in np.asarray(vectors, np.float32).T]
 

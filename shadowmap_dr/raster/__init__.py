@@ -2,6 +2,7 @@
 
 from ._types import MAX_RESOLUTION, NO_TRIANGLE, RasterOutput
 from .antialias import antialias
+from .closed import outward_faces
 from .crossings import Crossings, find_crossings
 from .interpolate import interpolate
 from .rasterize import rasterize, visible_triangles
@@ -18,6 +19,7 @@ __all__ = [
     "build_topology",
     "find_crossings",
     "interpolate",
+    "outward_faces",
     "rasterize",
     "visible_triangles",
 ]

@@ -249,17 +249,8 @@ class Mixer:
         return pixel + 1, pixel + self.width, pixel - 1, pixel - self.width
 
     def around(self, right: Any, down: Any, sign: int, signed: bool = False) -> tuple[Any, Any, Any, Any]:
-        """How much each neighbour (of :meth:`_neighbours`) reaches into a pixel, or (``sign`` -1) a pixel into each neighbour.
-
-        Pairs that reach beyond the image have weight 0, which is also what the last pixels of the line above and the image
-        before have for the first ones.
-        """
-        Float = self.module.Float
-        pixel = dr.arange(self.module.UInt32, self.pixels)
-        left = dr.gather(Float, right, pixel - 1, pixel >= 1)
-        up = dr.gather(Float, down, pixel - self.width, pixel >= self.width)
-        values = (-sign * right, -sign * down, sign * left, sign * up)
-        return values if signed else tuple(dr.maximum(v, 0) for v in values)
+        """See :func:`around`."""
+        return around(right, down, self.width, sign, signed)
 
     def where(self, active: Any, function: Any, pixel: Any, lanes: tuple[Any, ...], otherwise: list[Any]) -> list[Any]:
         """``function(pixel, *lanes)``, one number for each channel, in packets with active lanes; the last lanes elsewhere."""
@@ -286,6 +277,25 @@ class Mixer:
         result = dr.empty(self.module.Float, self.channels * self.pixels)
         dr.scatter(result, self.module.ArrayXf(channels), dr.arange(self.module.UInt32, self.pixels))
         return result
+
+
+def incoming_weights(crossings: Crossings, width: int) -> tuple[Any, Any, Any, Any]:
+    """How much the right, lower, left and upper neighbour each reach into a pixel of images ``width`` pixels wide."""
+    return around(crossings.right, crossings.down, width, 1)
+
+
+def around(right: Any, down: Any, width: int, sign: int, signed: bool = False) -> tuple[Any, Any, Any, Any]:
+    """How much each neighbour reaches into a pixel, or (``sign`` -1) a pixel into each neighbour.
+
+    Neighbours are the right, lower, left and upper one. Pairs that reach beyond the image have weight 0, which is also what the
+    last pixels of the line above and the image before have for the first ones.
+    """
+    module = backend(right)
+    pixel = dr.arange(module.UInt32, dr.width(right))
+    left = dr.gather(module.Float, right, pixel - 1, pixel >= 1)
+    up = dr.gather(module.Float, down, pixel - width, pixel >= width)
+    values = (-sign * right, -sign * down, sign * left, sign * up)
+    return values if signed else tuple(dr.maximum(v, 0) for v in values)
 
 
 def _scale(claims: Any) -> Any:

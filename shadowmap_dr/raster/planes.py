@@ -33,9 +33,17 @@ def pixel_depth(raster: RasterOutput, positions: Any, faces: Any, reciprocal: An
     """
     depths, _ = planes(positions, faces, raster, False, reciprocal)
     dr.eval(depths)
-    index, row, column = pixels(raster)
-    hit = raster.valid
-    plane = dr.gather(backend(positions).Array4f, depths, index, hit)
+    return depth_at(depths, *pixels(raster), raster.valid)
+
+
+def depth_at(depths: Any, index: Any, row: Any, column: Any, hit: Any) -> tuple[Any, Any, Any]:
+    """What :func:`pixel_depth` returns, for any pixels.
+
+    Args:
+        depths: the first result of :func:`planes`.
+        index: number of the triangle through the batch, where there is one (``hit``).
+    """
+    plane = dr.gather(backend(depths).Array4f, depths, index, hit)
     x, y = offset(plane, row, column)
     depth = dr.select(hit, dr.fma(plane.x, x, dr.fma(plane.y, y, plane.z)), 1)
     return depth, dr.detach(plane.x), dr.detach(plane.y)

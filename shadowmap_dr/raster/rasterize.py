@@ -78,15 +78,17 @@ def visible_triangles(
     batch: int | None = None,
     transparent: Callable[[RasterOutput], Any] | None = None,
     layers: int = 4,
+    one_sided: Any = None,
 ) -> RasterOutput:
     """As :func:`rasterize`, for positions and faces known to be valid, without the cost of barycentrics and depths.
 
-    These are there, and attached, but not prepared: whoever uses them pays for them.
+    These are there, and attached, but not prepared: whoever uses them pays for them. ``one_sided``: ``Bool`` (F,), faces that are
+    drawn only where their corners run from +x to -y, that is, clockwise where y points up. Not with ``transparent``.
     """
     flat, face_indices, batch, vertex_count = check_mesh(positions, faces, batch, False)
     size = (batch, vertex_count, *check_resolution(resolution))
     with dr.suspend_grad():
-        triangle, records = _visible_triangles(dr.detach(flat), face_indices, *size, transparent, layers)
+        triangle, records = _visible_triangles(dr.detach(flat), face_indices, *size, transparent, layers, one_sided)
     return _locate(flat, face_indices, triangle, records, *size)
 
 
@@ -191,11 +193,12 @@ def _visible_triangles(
     width: int,
     transparent: Callable[[RasterOutput], Any] | None,
     layers: int,
+    one_sided: Any = None,
 ) -> tuple[Any, Any]:
     """Triangle index of each pixel, row-major, and the records of all triangles."""
     mesh = (positions, faces, batch, vertex_count, height, width)
     if transparent is None:
-        return _nearest_fragments(*mesh)
+        return _nearest_fragments(*mesh, one_sided=one_sided)
     keys, records = _nearest_fragments(*mesh, peel=True)
     for _ in range(layers - 1):
         seen = _locate(positions, faces, _triangle_of(keys), records, batch, vertex_count, height, width)
@@ -222,12 +225,14 @@ def _nearest_fragments(
     width: int,
     behind: Any = None,
     peel: bool = False,
+    one_sided: Any = None,
 ) -> tuple[Any, Any]:
     """Triangle of each pixel, row-major, and the edge functions and depth planes of all triangles (see ``Triangles``).
 
     Args:
         behind: ``UInt64`` keys: pixels see only what lies behind.
         peel: return fragment keys instead of triangles, and do not leave out what large triangles hide.
+        one_sided: see :func:`visible_triangles`.
     """
     module = backend(positions)
     UInt32, UInt64 = module.UInt32, module.UInt64
@@ -242,6 +247,9 @@ def _nearest_fragments(
 
     x0, y0, x1, y1 = triangles.box
     sides = module.Float(x1 - x0 + (y1 - y0) + 2)
+    if one_sided is not None:
+        _, det = triangles.exact()
+        triangles = replace(triangles, active=triangles.active & ((det < 0) | ~dr.gather(module.Bool, one_sided, triangle)))
     small = triangles.active & ((triangles.fragments <= _LARGE) | (triangles.fragments <= 5 * sides))
     draw(triangles, keys, behind, image * (height * width), triangle, triangles.box, small)
     if height * width <= _LARGE:  # no triangle can be large

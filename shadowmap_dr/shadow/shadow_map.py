@@ -158,7 +158,8 @@ def _texels(
         depth = _radial_depth(view, frustum, raster, row, column, size)
         depth, slope_square = dr.select(hit, depth, frustum.far), 0
     else:
-        texels = texel_depths(raster, clip, faces, view, frustum, views, size)
+        seen = pixel_depth(raster, clip, faces, dr.detach(views.spread) > 0)
+        texels = texel_depths(seen, hit, view, frustum, size)
         depth, slope_square = texels.depth, texels.slope_square
     method = PREFILTERED.get(settings.method)
     if method is None:
@@ -186,17 +187,17 @@ class TexelDepths:
     dy: Any
 
 
-def texel_depths(
-    raster: RasterOutput, clip: Any, faces: Any, view: Views, frustum: Frusta, views: Views, size: int
-) -> TexelDepths:
-    """Depths in maps of ``size`` texels along each side; ``view`` and ``frustum`` are those of each texel's map."""
-    hit = raster.valid
-    seen, dx, dy = pixel_depth(raster, clip, faces, dr.detach(views.spread) > 0)
-    linear, to_linear = linear_depth(view, frustum, seen)
+def texel_depths(seen: tuple[Any, Any, Any], hit: Any, view: Views, frustum: Frusta, size: int) -> TexelDepths:
+    """Depths in maps of ``size`` texels along each side, given what :func:`pixel_depth` returns, and where anything is seen.
+
+    ``view`` and ``frustum`` are those of each texel's map.
+    """
+    depth, dx, dy = seen
+    linear, to_linear = linear_depth(view, frustum, depth)
     with dr.suspend_grad():
         slopes = [dr.detach(to_linear * slope) for slope in (dx, dy)]
         slope_square = dr.select(hit, _slope_square(dr.detach(view), dr.detach(frustum), dr.detach(linear), slopes, size), 0)
-    return TexelDepths(dr.select(hit, linear, FAR), slope_square, seen, dx, dy)
+    return TexelDepths(dr.select(hit, linear, FAR), slope_square, depth, dx, dy)
 
 
 def _two_depths(plain: Any, blended: Any) -> tuple[Any, int]:

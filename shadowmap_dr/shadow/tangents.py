@@ -16,18 +16,15 @@ from typing import Any
 
 import drjit as dr
 
-from ..raster import RasterOutput, Topology, visible_triangles
-from ..raster._types import backend, pixel_coordinates
-from ..raster.blend import Mixer
-from ..raster.blend_tangents import mixed_tangents
-from ..raster.crossings import Crossings, find_crossings
-from ..raster.topology import NO_VERTEX
+from ..raster import Topology, find_crossings, visible_triangles
+from ..raster._types import backend
 from .camera import Frusta, Views, of_map, project, to_clip, to_light_space
 from .filters import filter_kernel, filter_map
 from .lookup import Texels, entries, stored_texel
 from .methods import PREFILTERED
 from .moments import reduced_bleeding
-from .shadow_map import FAR, ShadowMaps, ShadowSettings, block_means, interleaved, texel_depths
+from .shadow_map import FAR, ShadowMaps, ShadowSettings, block_means
+from .tangent_texels import TangentTexels, turned, twist_of, weight_rates
 
 
 @dataclass(frozen=True)
@@ -45,28 +42,8 @@ class TangentMaps:
     twist: Any
 
 
-def twist_of(views: Views) -> Any:
-    """How much each view turns about its axis while its axis moves along ``right`` (``Float``, M)."""
-    module = backend(views.spread)
-    d = [dr.abs(views.forward[c]) for c in range(3)]
-    # The world axis that `directional_view` starts from.
-    use_x = (d[0] <= d[1]) & (d[0] <= d[2])
-    use_y = ~use_x & (d[1] <= d[2])
-
-    def component(vector: Any) -> Any:
-        return dr.select(use_x, vector[0], dr.select(use_y, vector[1], vector[2]))
-
-    return module.Float(component(views.forward) / component(views.up))
-
-
-def turned(twist: Any, p: Any) -> tuple[tuple[Any, Any, Any], tuple[Any, Any, Any]]:
-    """Changes of light-space coordinates (x, y, z) with a, and with b."""
-    zero = type(p[0])(0)
-    return (dr.fma(twist, p[1], -p[2]), -twist * p[0], p[0]), (zero, -p[2], p[1])
-
-
 def tangent_maps(
-    p_world: Any, faces: Any, topology: Topology, views: Views, frusta: Frusta, settings: ShadowSettings
+    p_world: Any, faces: Any, topology: Topology, views: Views, frusta: Frusta, settings: ShadowSettings, outward: Any = None
 ) -> TangentMaps:
     """Render and filter maps of directional lights, with tangents.
 
@@ -76,6 +53,7 @@ def tangent_maps(
         topology: of the mesh.
         views, frusta: cameras of the M maps, all orthographic, with axes as :func:`directional_view` makes them.
         settings: a pre-filtered method, without ``compat``.
+        outward: ``Bool`` (F,), faces that no light sees from behind before others (:func:`shadowmap_dr.raster.outward_faces`).
 
     Values agree with :func:`shadowmap_dr.shadow.render_maps`, tangents with its derivatives.
     """
@@ -90,17 +68,15 @@ def tangent_maps(
         view = of_map(views, index, count)
         clip = dr.ravel(to_clip(view, of_map(frusta, index, count), to_light_space(view, point)))
         dr.eval(clip)
-        raster = visible_triangles(clip, faces, (size, size), batch=count)
+        # Seen from the front, outlines run clockwise: a light looks along the third of its right-handed axes.
+        raster = visible_triangles(clip, faces, (size, size), batch=count, one_sided=outward)
         twist = twist_of(views)
         dr.eval(twist)
-        values, tangents, channels = _texels(raster, clip, faces, views, frusta, twist, settings, size)
+        crossings = find_crossings(clip, topology, raster, vertices) if settings.antialias else None
+        rates = None if crossings is None else weight_rates(clip, crossings, frusta, twist, size)
+        values, tangents = TangentTexels(raster, clip, faces, views, frusta, twist, settings, size).mixed(crossings, rates)
         dr.eval(values, tangents)
-        if settings.antialias:
-            crossings = find_crossings(clip, topology, raster, vertices)
-            rates = _rates(clip, crossings, frusta, twist, size)
-            mixer = Mixer(values, size, crossings)
-            values, tangents = mixer.values, mixed_tangents(mixer, tangents, *rates)
-            dr.eval(values, tangents)
+        channels = dr.width(values) // (count * size * size)
         if settings.supersampling > 1:
             values = block_means(values, size, channels, settings.supersampling)
             tangents = block_means(tangents, size, 2 * channels, settings.supersampling)
@@ -109,83 +85,6 @@ def tangent_maps(
         values, tangents = filter_map(values, kernel, *shape, channels), filter_map(tangents, kernel, *shape, 2 * channels)
         dr.eval(values, tangents)
         return TangentMaps(ShadowMaps(values, views, frusta, settings, channels), tangents, twist)
-
-
-def _texels(
-    raster: RasterOutput, clip: Any, faces: Any, views: Views, frusta: Frusta, twist: Any, settings: ShadowSettings, size: int
-) -> tuple[Any, Any, int]:
-    """Numbers to store (flat), their tangents (flat), and how many numbers there are in a texel."""
-    module = backend(clip)
-    image, row, column = pixel_coordinates(module, raster.batch, size, size)
-    view, frustum = of_map(views, image, views.count), of_map(frusta, image, views.count)
-    twist = dr.gather(module.Float, twist, image)
-    texels = texel_depths(raster, clip, faces, view, frustum, views, size)
-    n, f = frustum.near, frustum.far
-    ndc_x = dr.fma(module.Float(column), 2.0 / size, 1.0 / size - 1.0)
-    ndc_y = dr.fma(module.Float(row), 2.0 / size, 1.0 / size - 1.0)
-    # The light-space point that the texel sees, and the slopes of its triangle there.
-    half_range = 0.5 * (f - n)
-    p = (
-        dr.fma(ndc_x, frustum.half_x, frustum.center_x),
-        dr.fma(ndc_y, frustum.half_y, frustum.center_y),
-        dr.fma(texels.seen, half_range, 0.5 * (f + n)),
-    )
-    slope_x = texels.dx * half_range * (0.5 * size) / frustum.half_x
-    slope_y = texels.dy * half_range * (0.5 * size) / frustum.half_y
-    moves = (raster.valid & (texels.depth > -0.5)) & (texels.depth < FAR + 1)
-    scale = dr.select(moves, dr.rcp(f - frustum.first), 0)
-    # A texel stays where it is while the triangle moves through it.
-    rates = [(dz - slope_x * dx - slope_y * dy) * scale for dx, dy, dz in turned(twist, p)]
-
-    method = PREFILTERED[settings.method]
-    values, slopes = _with_slopes(lambda z: method.encode(z, texels.slope_square, settings.order), texels.depth)
-    return interleaved(values), interleaved([slope * rate for rate in rates for slope in slopes]), len(values)
-
-
-def _with_slopes(function: Any, x: Any) -> tuple[list[Any], list[Any]]:
-    """Several numbers and their derivatives by the one that they are functions of."""
-    with dr.resume_grad():
-        x = dr.detach(x, preserve_type=True) + 0
-        dr.enable_grad(x)
-        values = function(x)
-        dr.set_grad(x, 1)
-        dr.enqueue(dr.ADMode.Forward, x)
-        # A number may be x itself, whose gradient would be cleared on the way.
-        dr.traverse(dr.ADMode.Forward, flags=dr.ADFlag.ClearEdges)
-        slopes = [dr.grad(v) for v in values]
-    return [dr.detach(v) for v in values], slopes
-
-
-def _rates(clip: Any, crossings: Crossings, frusta: Frusta, twist: Any, size: int) -> tuple[Any, Any]:
-    """Changes with a and b (interleaved, 2 for each pixel) of the weights of right and of lower pairs; undefined for weight 0."""
-    module = backend(clip)
-    Array2f, Array4f = module.Array2f, module.Array4f
-    count, pixels = dr.width(twist), dr.width(crossings.right)
-    right, down = dr.empty(module.Float, 2 * pixels), dr.empty(module.Float, 2 * pixels)
-
-    def visit(slot: Any, pair: Any) -> None:
-        ends = dr.gather(module.Array4u, crossings.ends, slot)
-        has = ends.x != NO_VERTEX
-        slope = dr.gather(Array4f, crossings.slopes, slot, has)
-        a, b = (dr.gather(Array4f, clip, v, has) for v in (ends.x, ends.y))
-        at = dr.fma(b - a, slope.x, a)
-        pixel = pair >> 1
-        frustum, own = of_map(frusta, pixel // (size * size), count), dr.gather(module.Float, twist, pixel // (size * size))
-        n, f = frustum.near, frustum.far
-        p = (
-            dr.fma(at.x, frustum.half_x, frustum.center_x),
-            dr.fma(at.y, frustum.half_y, frustum.center_y),
-            0.5 * dr.fma(at.z, f - n, f + n),
-        )
-        per_x, per_y = slope.y / frustum.half_x, slope.z / frustum.half_y
-        rate = Array2f(*(dr.select(has, per_x * dx + per_y * dy, 0) for dx, dy, _ in turned(own, p)))
-        is_down = (pair & 1) != 0
-        dr.scatter(right, rate, pixel, ~is_down)
-        dr.scatter(down, rate, pixel, is_down)
-
-    crossings.pairs.for_each(visit)
-    dr.eval(right, down)
-    return right, down
 
 
 def tangent_visibility(maps: TangentMaps, map_index: Any, p_world: Any, active: Any) -> tuple[Any, Any, Any]:

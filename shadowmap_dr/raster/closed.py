@@ -1,0 +1,41 @@
+"""Which faces no one outside of a mesh ever sees from behind, found once on the host."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .topology import Topology
+
+
+def outward_faces(topology: Topology, positions: np.ndarray) -> np.ndarray:
+    """Faces of the parts of a mesh that are closed and turned outwards (bool, F).
+
+    A ray from outside meets the front of such a part before it meets its back: of what is outermost, faces that turn away need
+    not be drawn.
+
+    Args:
+        topology: of the mesh.
+        positions: (V, 3) vertices.
+
+    A part is closed if each of its edges has exactly two faces, which run along it in opposite directions, and turned outwards
+    if it encloses a positive volume.
+    """
+    faces, welded = (np.asarray(a.numpy(), np.int64).reshape(-1, 3) for a in (topology.faces, topology.welded))
+    parts = np.asarray(topology.parts.numpy(), np.int64)
+    count = int(welded.max()) + 1
+    start, end = welded.ravel(), np.roll(welded, -1, 1).ravel()
+    owner = np.repeat(parts, 3)
+    there, uses = np.unique(start * count + end, return_counts=True)
+    back = end * count + start
+    slot = np.minimum(np.searchsorted(there, back), len(there) - 1)
+    once = uses[np.searchsorted(there, start * count + end)] == 1
+    fine = once & (there[slot] == back) & (uses[slot] == 1)
+    closed = np.ones(topology.part_count, bool)
+    closed[owner[~fine]] = False
+    a, b, c = (np.asarray(positions, np.float64)[faces[:, k]] for k in range(3))
+    # Each part around a point of its own, where least is lost.
+    first = np.zeros((topology.part_count, 3))
+    first[parts] = a
+    origin = first[parts]
+    volume = np.bincount(parts, np.einsum("ij,ij->i", a - origin, np.cross(b - origin, c - origin)), topology.part_count)
+    return (closed & (volume > 0))[parts]

@@ -1,0 +1,117 @@
+"""The light experiment: protocol, matching, records, files, resuming."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from shadowmap_dr.errors import ShadowmapError
+from shadowmap_dr.experiments.lights import LightOptions, run_lights
+from shadowmap_dr.experiments.lights_problem import LightProblem
+from shadowmap_dr.experiments.lights_scene import alignment, random_directions, target_and_starts
+
+
+@pytest.fixture(autouse=True)
+def _variant() -> None:
+    mi.set_variant("llvm_ad_rgb")
+
+
+def options(out: Path, **changes: Any) -> LightOptions:
+    small: dict[str, Any] = {
+        "objects": ("teapot",), "runs": 3, "iterations": 10, "resolution": 24, "map_resolution": 32, "out": out
+    }  # fmt: skip
+    return LightOptions(**{**small, **changes})
+
+
+def test_alignment_matches_greedily_and_one_to_one() -> None:
+    generator = np.random.default_rng(0)
+    for _ in range(20):
+        target, found = (random_directions(generator, 4, 170) for _ in range(2))
+        pairs, left, right = [], set(range(4)), set(range(4))
+        while left:
+            i, j = max(itertools.product(left, right), key=lambda ij: target[ij[0]] @ found[ij[1]])
+            pairs.append(target[i] @ found[j])
+            left.remove(i)
+            right.remove(j)
+        assert alignment(target, found) == pytest.approx(np.mean(pairs))
+        assert alignment(target, 3 * target[::-1]) == pytest.approx(1)
+
+
+def test_directions_fill_their_cone_evenly() -> None:
+    found = random_directions(np.random.default_rng(1), 4000, 60)
+    assert np.allclose(np.linalg.norm(found, axis=1), 1)
+    assert found[:, 1].min() >= np.cos(np.radians(30)) - 1e-9
+    # By solid angle: cosines are uniform.
+    assert found[:, 1].mean() == pytest.approx((1 + np.cos(np.radians(30))) / 2, abs=2e-3)
+    assert np.abs(found[:, [0, 2]].mean(0)).max() < 0.02
+
+
+def test_targets_and_starts_come_from_the_run_alone() -> None:
+    one, other = (LightProblem("spot", 2, 9, filter_size=size, starts=s).directions([4, 7]) for size, s in ((3, 1), (15, 3)))
+    assert np.array_equal(one[0], other[0]) and np.array_equal(one[1][:, 0], other[1][:, 0])
+    assert not np.array_equal(one[0][0], one[0][1])
+    assert not np.allclose(one[0], one[1][:, 0])
+    assert np.array_equal(target_and_starts(0, 4, 2)[0], one[0][0])
+    assert not np.array_equal(target_and_starts(1, 4, 2)[0], one[0][0])
+
+
+def test_records_files_and_resuming(tmp_path: Path) -> None:
+    summaries = run_lights(options(tmp_path, lights=(1, 2), filter_sizes=(3, 0)))
+    stored = json.loads((tmp_path / "lights.json").read_text())
+    assert stored["summaries"] == summaries and len(summaries) == 4
+    for entry in summaries:
+        assert entry["alignment_mean"] == pytest.approx(entry["curve_mean"][-1], abs=1e-5)
+        assert entry["curve_iterations"][-1] == 10 and entry["alignment_mean"] > entry["curve_mean"][0]
+    for name in ("lights.png", "pictures.png"):
+        assert (tmp_path / name).stat().st_size > 1000
+    files = {path: path.stat().st_mtime_ns for path in (tmp_path / "batches").iterdir()}
+    assert len(files) == 4
+    record = json.loads(min(files).read_text())["records"][0]
+    assert record["alignment"] == pytest.approx(alignment(record["target"], record["final"]))
+    # A new setting beside the old ones, whose files stay as they are.
+    more = run_lights(options(tmp_path, filter_sizes=(5,), resume=True))
+    assert len(json.loads((tmp_path / "lights.json").read_text())["summaries"]) == 5 and len(more) == 5
+    assert all(path.stat().st_mtime_ns == time for path, time in files.items())
+    assert str(tmp_path) not in (tmp_path / "lights.json").read_text()
+
+
+def test_more_starts_never_end_worse() -> None:
+    records = {}
+    for starts in (1, 3):
+        problem = LightProblem("teapot", 1, 3, resolution=24, map_resolution=32, iterations=15, starts=starts, cone_deg=150)
+        records[starts] = problem.run_batch(problem.build(), range(3), None, lambda done: None)
+    for one, several in zip(records[1], records[3], strict=True):
+        assert several["loss"] <= one["loss"] * (1 + 1e-3)
+        assert one["target"].tolist() == several["target"].tolist()
+    assert any(several["loss"] < 0.9 * one["loss"] for one, several in zip(records[1], records[3], strict=True))
+
+
+def test_path_traced_targets_show_the_same_lights() -> None:
+    problem = LightProblem("teapot", 2, 1, resolution=32, map_resolution=128, reference="mitsuba", spp=16)
+    batch, (targets, starts) = problem.build(), problem.directions([0])
+    traced, own = problem.target_images(batch, targets, [0])[0], batch.render(targets)[0]
+    assert np.abs(traced - own).mean() < 0.01 * own.mean()
+    assert np.abs(traced - own).mean() < 0.2 * np.abs(traced - batch.render(starts[:, 0])[0]).mean()
+
+
+def test_bad_input_is_named(tmp_path: Path) -> None:
+    for changes, message in (
+        ({"lights": (6,)}, "6 lights"),
+        ({"objects": ()}, "no object"),
+        ({"filter_sizes": (3, 3)}, "twice"),
+        ({"runs": 0}, "0 runs"),
+        ({"cone_deg": 200.0}, "cone of 200"),
+        ({"reference": "other"}, "'other'"),
+        ({"strategy": "fine"}, "'fine'"),
+        ({"objects": ("nothing",)}, "no mesh 'nothing'"),
+        ({"filter_sizes": (4,)}, "odd number"),
+        ({"scheduler": "nobody"}, "'nobody'"),
+    ):
+        with pytest.raises(ShadowmapError, match=message):
+            run_lights(options(tmp_path, **changes))

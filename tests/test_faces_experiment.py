@@ -24,6 +24,7 @@ from shadowmap_dr.experiments.faces_problem import FaceScene, artificial_weights
 from shadowmap_dr.experiments.faces_silhouette import Placement, place, read_silhouette, resample
 from shadowmap_dr.inverse import MorphFit, optimize
 from shadowmap_dr.inverse.morphable import save_model
+from shadowmap_dr.io import write_image
 
 TRUE = np.array([0.9, -1.1, 0.8, 1.2])
 
@@ -177,6 +178,20 @@ def test_transparency_is_background(tmp_path: Path) -> None:
     Image.fromarray(pixels).save(tmp_path / "t.png")
     values = read_silhouette(tmp_path / "t.png")
     assert values[0, 0] == 1 and values[20, 20] == 0
+
+
+def test_exr_files_are_silhouettes_too(tmp_path: Path) -> None:
+    pixels = np.ones((40, 30, 1), np.float32)
+    pixels[15:, 8:20] = 0.02
+    write_image(tmp_path / "s.exr", pixels)
+    values = read_silhouette(tmp_path / "s.exr")
+    assert values.shape == (40, 30) and values[0, 0] == 1 and values[30, 12] == 0
+
+
+def test_missing_libraries_are_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(ShadowmapError, match=r"needs scipy and trimesh: pip install 'shadowmap-dr\[faces\]'"):
+        run_faces(FaceOptions(out=tmp_path))
 
 
 def image(tmp_path: Path, pixels: np.ndarray) -> str:

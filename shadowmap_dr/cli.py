@@ -16,7 +16,7 @@ import numpy as np
 import typer
 from rich.console import Console
 
-from . import __version__, _llvm, assets, cli_art, cli_gradients, cli_model, cli_soft, io
+from . import __version__, _llvm, assets, cli_art, cli_face, cli_gradients, cli_lights, cli_model, cli_soft, io
 from .cli_options import DEFAULT_VARIANT, Variant, set_variant
 from .errors import ShadowmapError
 from .experiments import bench as bench_experiment
@@ -33,7 +33,9 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 app.add_typer(cli_gradients.app, name="gradients")
+app.add_typer(cli_face.app, name="face")
 app.command()(cli_soft.soft)
+app.command()(cli_lights.lights)
 app.command()(cli_art.art)
 app.command()(cli_model.model)
 

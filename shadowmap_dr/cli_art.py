@@ -21,12 +21,22 @@ def art(
     mesh: Annotated[
         str | None, typer.Option(metavar="NAME|FILE", help="What is deformed [default: a sphere of 12,800 triangles].")
     ] = None,
+    collection: Annotated[
+        str | None, typer.Option(metavar="NAME|FILE", help="Copies of this mesh cast the shadow: moved, turned and scaled.")
+    ] = None,
+    copies: Annotated[int, typer.Option(metavar="N", help="Copies at most; their number doubles every 150 steps.")] = 128,
     receiver: Annotated[str, typer.Option(metavar="plane|wavy", help="What the shadow falls on.")] = "plane",
     camera: Annotated[
         str, typer.Option(metavar="orthographic|perspective", help="Seen straight on, or in perspective from the side.")
     ] = "orthographic",
-    iterations: Annotated[int, typer.Option(help="Steps of the optimiser.")] = 400,
+    iterations: Annotated[
+        int | None, typer.Option(help="Steps of the optimiser [default: 400, and 1100 of a collection].")
+    ] = None,
     smoothness: Annotated[float, typer.Option(help="How stiff the mesh is; finer meshes need more.")] = 20.0,
+    remesh: Annotated[
+        int | None, typer.Option(metavar="STEPS", help="Mesh the surface anew after so many steps, again and again.")
+    ] = None,
+    fill_holes: Annotated[bool, typer.Option("--fill-holes", help="Fill enclosed holes of the targets.")] = False,
     resolution: Annotated[int, typer.Option(help="Pixels along each side of the shadow images.")] = 256,
     map_resolution: Annotated[
         int | None, typer.Option(help="Texels along each side of the shadow maps [default: as many as pixels].")
@@ -39,14 +49,20 @@ def art(
 ) -> None:
     """Deform an object until its shadow is a given picture, or its two shadows two pictures.
 
+    Or move, turn and scale copies of one (--collection), which start as one and double every 150 steps.
+
     Writes meshes (PLY, OBJ, GLB), images of shadows and errors, animated pictures, and OUT/art.json.
     """
     options = art_experiment.ArtOptions(
         targets=(*(target or ()), *(f"text:{letters}" for letters in text or ())),
         mesh=mesh,
+        collection=collection,
+        most=copies,
         receiver=receiver,
         camera=camera,
         smoothness=smoothness,
+        remesh=remesh,
+        fill_holes=fill_holes,
         resolution=resolution,
         map_resolution=map_resolution,
         iterations=iterations,

@@ -20,6 +20,7 @@ from .hits import pixel_hits
 from .light_maps import MapPlan, light_visibility, make_maps, plan_maps
 from .lights import AreaLight, Light, SpotLight, SquareSpot
 from .raster import RasterOutput, Topology, antialias, build_topology, visible_triangles
+from .raster.crossings import Crossings, find_crossings
 from .render_settings import RenderSettings
 from .scene import SceneData, load, refresh
 from .sensors import Sensor
@@ -256,20 +257,49 @@ class Renderer:
         raster = visible_triangles(clip, geometry.faces, size, transparent=transparent)
         return _View(sensor, factor, clip, raster)
 
-    def _camera_image(self, view: _View, geometry: Geometry, lighting: _Lighting, facets: Any) -> Any:
+    def _surface(self, view: _View, geometry: Geometry, facets: Any, frames: bool) -> tuple[Surface, Any, Any]:
+        """(what a camera sees, its depth as ``Hits.depth``, how much edges between facets still show or None for all)."""
         sensor, raster = view.sensor, view.raster
-        height, width = raster.height, raster.width
-        hits = pixel_hits(geometry, sensor, raster.triangle, (width, height))
+        hits = pixel_hits(geometry, sensor, raster.triangle, (raster.width, raster.height))
         hits = replace(hits, active=hits.active & within_far_plane(sensor, hits.depth))
         normals, sharpness = normals_at(geometry, hits), None
         if self.flat is not None:
             normals, sharpness = soften_facets(hits, normals, self.topology, facets)
+        return surface_at(self.data, geometry, sensor, hits, *normals, frames=frames), hits.depth, sharpness
+
+    def g_buffer(self, sensor: int = 0) -> GBuffer:
+        """What a camera sees of the scene as it is, for those who shade it themselves again and again. Detached.
+
+        Raises:
+            ShadowmapError: there is no such sensor, or it has several cameras, or a reconstruction filter that is not a box.
+        """
+        with dr.suspend_grad():
+            windows = sample_windows(self._sensors(sensor))
+            if len(windows) != 1 or not windows[0].filter.is_box:
+                raise ShadowmapError(f"sensor {sensor} is no single camera whose film has a box filter: use another one.")
+            geometry = self.data.geometry.in_packets()
+            facets = None if self.flat is None else mean_normals(geometry, self.topology, self.flat)
+            view = self._view(windows[0], geometry, 1)
+            seen, depth, sharpness = self._surface(view, geometry, facets, self.data.needs_frames)
+            size, samples = (view.raster.width, view.raster.height), self.settings.look_ups(view.columns)
+            points = footprint_points(windows[0], size, depth, seen.p_world, seen.n_world, samples)
+            crossings = None
+            if self.settings.antialias:
+                dr.eval(sharpness)
+                crossings = find_crossings(
+                    view.clip, self.topology, view.raster, geometry.vertex_count, self.creases, sharpness, meetings=True
+                )
+            return GBuffer(windows[0], seen, points, crossings, self._seen([view]))
+
+    def _camera_image(self, view: _View, geometry: Geometry, lighting: _Lighting, facets: Any) -> Any:
+        sensor, raster = view.sensor, view.raster
+        height, width = raster.height, raster.width
         textured = any(light.textured for light in lighting.areas)
         frames = self.data.needs_frames or self.settings.ambient > 0 or textured
-        seen = surface_at(self.data, geometry, sensor, hits, *normals, frames=frames)
+        seen, depth, sharpness = self._surface(view, geometry, facets, frames)
         lights = lighting.lights
-        visible = [self._visibility(lighting.maps, light, k, seen, view, hits.depth) for k, light in enumerate(lights)]
-        around = lambda: footprint_points(sensor, (width, height), hits.depth, seen.p_world, seen.n_world, 2)  # noqa: E731
+        visible = [self._visibility(lighting.maps, light, k, seen, view, depth) for k, light in enumerate(lights)]
+        around = lambda: footprint_points(sensor, (width, height), depth, seen.p_world, seen.n_world, 2)  # noqa: E731
         lighting = replace(lighting, lights=softened(lights, seen.p_world, around))
         color = self._radiance(seen, lighting, visible, sensor, raster)
         channels = _film_channels(color, seen.active, sensor)
@@ -316,6 +346,25 @@ class Renderer:
 
     def _uniform_ambient(self) -> tuple[Any, ...]:
         return (_Uniform(self.settings.ambient),) if self.settings.ambient > 0 else ()
+
+
+@dataclass(frozen=True)
+class GBuffer:
+    """What a camera sees, H * W pixels, row-major.
+
+    Attributes:
+        sensor: the camera.
+        surface: what each pixel sees.
+        points: where visibility is looked up, all over the pixel (list of Point3f, H * W each); a pixel's is their mean.
+        crossings: how pixels mix, None without anti-aliasing.
+        seen: points all over what is seen (Point3f, world space) and a mask of those that there are.
+    """
+
+    sensor: Sensor
+    surface: Surface
+    points: list[Any]
+    crossings: Crossings | None
+    seen: tuple[Any, Any]
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from shadowmap_dr.errors import ShadowmapError
+from shadowmap_dr.experiments.maps_scenes import occluder
 from shadowmap_dr.inverse import Sculptor, even_sphere, shadow_view
 from shadowmap_dr.inverse.shadow_images import shadow_images
 from shadowmap_dr.inverse.shadow_views import BESIDE, FOV_DEG, LOOKS_AT, WAVE_HEIGHT, height
@@ -111,6 +112,20 @@ def test_wavy_receivers_have_the_same_shadow_from_the_light(variant):
     np.testing.assert_allclose(*images, atol=2e-5)
 
 
+@pytest.mark.parametrize(("receiver", "camera"), [("plane", "orthographic"), ("wavy", "perspective")])
+def test_shadows_are_where_mitsubas_rays_meet_the_object(variant, receiver, camera):
+    vertices, faces = even_sphere(16)
+    vertices = vertices * np.float32([1.2, 0.7, 1.0]) + np.sin(5 * vertices[:, [1, 2, 0]]) * np.float32(0.25)
+    views = [shadow_view(direction, size=64, receiver=receiver, camera=camera) for direction in ((0, 0, -1), (-1, 0, 0.5))]
+    shadows = shadow_images(vertices, faces, views, map_resolution=128, filter_size=3)
+    scene = mi.load_dict({"type": "scene", "object": occluder("object", vertices.astype(np.float32), faces)})
+    for view, image in zip(views, shadows.images(shadows.visibility(flat(vertices))), strict=True):
+        points = mi.Point3f(*(flat(view.points.reshape(-1, 3)[:, c]) for c in range(3)))
+        lit = ~np.array(scene.ray_test(mi.Ray3f(points, mi.Vector3f(*(-view.forward).tolist())))).reshape(64, 64)
+        assert ((image > 0.5) == lit)[view.seen].mean() > 0.985
+        assert 0.1 < lit[view.seen].mean() < 0.9
+
+
 @pytest.mark.parametrize("camera", ["orthographic", "perspective"])
 def test_shadow_images_have_the_derivative_of_differences(variant, camera):
     vertices, faces = even_sphere(10, 0.8)
@@ -176,6 +191,11 @@ def test_recorded_steps_reach_targets_that_change(variant):
     assert before < 0.6 and overlap(sculptor.visibility()[0], sculptor.target(0)) > 0.93
     assert sculptor.recordings() == recordings and sculptor.steps == 120
     assert inverted_share(sculptor.vertices(), sculptor.faces) < 0.005
+    for size in range(12):  # wherever in memory they happen to be
+        kept = [np.zeros(size + 1, np.float32), square(-0.1 * size, 0.9, -0.9, 0.9)]
+        sculptor.set_target(0, kept[1])
+        sculptor.step()
+    assert sculptor.recordings() == recordings
 
 
 def test_recorded_steps_serve_two_views(variant):
@@ -195,6 +215,19 @@ def test_without_targets_recorded_steps_keep_the_shadow(variant):
     loss = sculptor.step()
     assert float(loss[0]) < 1e-9
     assert np.abs(sculptor.vertices() - even_sphere(8, 0.9)[0]).max() < 0.02
+
+
+def test_recorded_consistency_smooths_the_surface(variant):
+    vertices, faces = even_sphere(8, 0.9)
+    vertices *= np.random.default_rng(0).uniform(0.85, 1.15, (len(vertices), 1)).astype(np.float32)
+    topology = build_topology(faces, vertices, mi.UInt32)
+    rough = []
+    for consistency in (0.0, 0.2):
+        sculptor = Sculptor(vertices, faces, [shadow_view(size=SIZE)], map_resolution=SIZE, smoothness=1, consistency=consistency)
+        for _ in range(10):
+            sculptor.step()
+        rough.append(float(normal_consistency(flat(sculptor.vertices()), topology)[0]))
+    assert rough[1] < 0.7 * rough[0]
 
 
 def test_recorded_state_goes_on_exactly(variant):

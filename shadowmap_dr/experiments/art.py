@@ -18,7 +18,7 @@ from rich.table import Table
 
 from .. import __version__, assets, figures, io, report
 from ..errors import ShadowmapError
-from ..inverse import Sculptor, even_sphere, shadow_view
+from ..inverse import Collection, RemeshingSculptor, Sculptor, even_sphere, shadow_view
 from ..inverse.shadow_views import CAMERAS, RECEIVERS, ShadowView
 from ..timing import machine
 from . import art_files, art_pictures
@@ -26,8 +26,6 @@ from .art_run import Frame, Maker, Trace, intersection_over_union, make
 
 #: Light directions of the first and the second view; y is up in both.
 DIRECTIONS = ((0.0, 0.0, -1.0), (-1.0, 0.0, 0.0))
-#: Pixels along each side of the pictures in animations; frames of a turntable.
-PICTURE_SIZE, TURNS = 320, 40
 # How much of what a camera sees of its receiver a target fills, with the image's margin in mind.
 _FILL = {"orthographic": 0.8, "perspective": 0.92}
 
@@ -39,11 +37,19 @@ class ArtOptions:
     Attributes:
         targets: image files, or names of this package, one for each view; ``text:L`` stands for letters.
         mesh: what is deformed: None for the sphere, a name of this package, or a file.
+        collection: a name or a file of a mesh: many copies of it, moved, turned and scaled, cast the shadow instead.
         receiver, camera: see `shadow_view`.
         resolution: pixels along each side of the shadow images.
         map_resolution: texels along each side of the shadow maps; None: as many as pixels.
-        iterations, step_size, smoothness, consistency: of the `Sculptor`.
+        iterations: steps; None: 400, and 1100 of a collection.
+        step_size, smoothness, consistency: of the `Sculptor`; a `Collection` has its own step size.
+        remesh: steps after which the deformed surface is meshed anew, again and again; None: never.
+        fill_holes: fill enclosed holes of the targets.
+        interval, most: steps after which copies double, and copies at most, see `Collection`.
+        seed: of the collection.
         animate: suffix of the animations (.webp or .gif), None for none.
+        picture_size: pixels along each side of animations, half of those of the still picture.
+        turns: frames of the turntable.
         printable: write an STL file, and report whether the mesh is closed.
         out: folder for the results.
         resume: go on from a checkpoint in it.
@@ -51,15 +57,23 @@ class ArtOptions:
 
     targets: tuple[str, ...]
     mesh: str | None = None
+    collection: str | None = None
     receiver: str = "plane"
     camera: str = "orthographic"
     resolution: int = 256
     map_resolution: int | None = None
-    iterations: int = 400
+    iterations: int | None = None
     step_size: float = 0.2
     smoothness: float = 20.0
     consistency: float = 0.2
+    remesh: int | None = None
+    fill_holes: bool = False
+    interval: int = 150
+    most: int = 128
+    seed: int = 0
     animate: str | None = ".webp"
+    picture_size: int = 320
+    turns: int = 40
     printable: bool = False
     out: Path = Path("art")
     resume: bool = False
@@ -71,8 +85,16 @@ class ArtOptions:
             raise ShadowmapError(f"no receiver {self.receiver!r}: choose from {', '.join(RECEIVERS)}.")
         if self.camera not in CAMERAS:
             raise ShadowmapError(f"no camera {self.camera!r}: choose from {', '.join(CAMERAS)}.")
+        if self.mesh is not None and self.collection is not None:
+            raise ShadowmapError("a mesh to deform and a collection: choose one of the two.")
+        if self.remesh is not None and self.collection is not None:
+            raise ShadowmapError("the copies of a collection are not deformed, and cannot be remeshed: leave one of the two out.")
+        if self.iterations is None:
+            object.__setattr__(self, "iterations", 400 if self.collection is None else 1100)
         if self.iterations < 1:
             raise ShadowmapError(f"{self.iterations} iterations: at least one is needed.")
+        if not 16 <= self.picture_size <= 1024 or self.turns < 1:
+            raise ShadowmapError(f"pictures of {self.picture_size} pixels, {self.turns} of a turn: give 16 to 1024, at least 1.")
         if self.animate is not None and self.animate not in art_pictures.ANIMATIONS:
             raise ShadowmapError(f"no animation {self.animate!r}: choose from {', '.join(art_pictures.ANIMATIONS)}.")
 
@@ -101,19 +123,26 @@ def place(figure_list: list[Any], views: tuple[ShadowView, ...]) -> list[Any]:
     return [figures.fit(figure, view.seen, high=min(heights)) for figure, view in zip(figure_list, views, strict=True)]
 
 
-def start_mesh(options: ArtOptions) -> tuple[Any, Any]:
-    """(V, 3) and (F, 3) of the mesh that is deformed."""
-    return even_sphere() if options.mesh is None else art_files.read_mesh(assets.mesh(options.mesh))
-
-
 def build(options: ArtOptions) -> Maker:
     """What `run_art` lets make its steps."""
     views = views_of(options)
-    targets = place([read_target(target) for target in options.targets], views)
-    return Sculptor(
-        *start_mesh(options), views, targets, step_size=options.step_size, smoothness=options.smoothness,
-        consistency=options.consistency, map_resolution=options.map_resolution or options.resolution,
-    )  # fmt: skip
+    read = [read_target(target) for target in options.targets]
+    targets = place([figures.filled(figure) for figure in read] if options.fill_holes else read, views)
+    texels = options.map_resolution or options.resolution
+    if options.collection is not None:
+        mesh = art_files.read_mesh(assets.mesh(options.collection))
+        return Collection(
+            *mesh, views, targets, interval=options.interval, most=options.most, seed=options.seed, map_resolution=texels,
+            settings={"collection": _name(options.collection)},
+        )  # fmt: skip
+    mesh = even_sphere() if options.mesh is None else art_files.read_mesh(assets.mesh(options.mesh))
+    arguments: dict[str, Any] = {
+        "step_size": options.step_size, "smoothness": options.smoothness, "consistency": options.consistency,
+        "map_resolution": texels, "settings": {"mesh": "sphere" if options.mesh is None else _name(options.mesh)},
+    }  # fmt: skip
+    if options.remesh is not None:
+        return RemeshingSculptor(*mesh, views, targets, interval=options.remesh, **arguments)
+    return Sculptor(*mesh, views, targets, **arguments)
 
 
 def run_art(options: ArtOptions, *, console: Console | None = None) -> dict[str, Any]:
@@ -184,20 +213,17 @@ def _write(options: ArtOptions, maker: Maker, trace: Trace, progress: Any) -> li
     if options.printable:
         art_files.write_printable(out / "mesh.stl", last.vertices, last.faces)
         names.append("mesh.stl")
-    art_pictures.write_picture(
-        out / "picture.png", art_pictures.Stage(last.vertices, last.faces, maker.views, 2 * PICTURE_SIZE).picture()
-    )
+    size = options.picture_size
     names.append("picture.png")
+    art_pictures.write_picture(out / names[-1], art_pictures.Stage(last.vertices, last.faces, maker.views, 2 * size).picture())
     if options.animate is not None:
-        task = progress.add_task("pictures", total=TURNS + len(trace.frames), note="")
-        for kind, pictures, pause in (
-            ("turntable", art_pictures.turntable(last, maker.views, PICTURE_SIZE, TURNS, lambda: progress.advance(task)),
-             art_pictures.FRAME_MS),
-            ("steps", art_pictures.history(trace.frames, maker.views, PICTURE_SIZE, lambda: progress.advance(task)),
-             art_pictures.LAST_MS),
-        ):  # fmt: skip
-            names.append(kind + options.animate)
-            art_pictures.write_animation(out / names[-1], pictures, pause)
+        task = progress.add_task("pictures", total=options.turns + len(trace.frames), note="")
+        pictures = art_pictures.turntable(last, maker.views, size, options.turns, lambda: progress.advance(task))
+        names.append("turntable" + options.animate)
+        art_pictures.write_animation(out / names[-1], pictures)
+        pictures = art_pictures.history(trace.frames, maker.views, size, lambda: progress.advance(task))
+        names.append("steps" + options.animate)
+        art_pictures.write_animation(out / names[-1], pictures, art_pictures.LAST_MS)
     return names
 
 

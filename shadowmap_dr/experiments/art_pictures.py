@@ -25,7 +25,7 @@ FRAME_MS, LAST_MS = 70, 1500
 # Linear colours.
 _OBJECT, _WALLS, _AMBIENT = (0.72, 0.36, 0.26), ((0.8, 0.78, 0.74), (0.55, 0.62, 0.68)), 0.22
 # From where the camera looks, at what, and its horizontal angle, for one receiver and for two.
-_PLACES = {1: ((-6.0, 1.9, 5.6), (0.1, -0.2, -1.7), 44.0), 2: ((8.0, 3.6, 8.0), (-0.9, -0.1, -0.9), 29.0)}
+_PLACES = {1: ((-7.4, 1.9, 5.0), (-0.3, -0.2, -1.9), 40.0), 2: ((8.0, 3.6, 8.0), (-1.1, -0.1, -1.1), 34.0)}
 # Walls reach beyond the picture; where there are two, they end at each other. In multiples of the receiver's half-side.
 _WALL_REACH = 9.0
 _MAP_RESOLUTION = 1024

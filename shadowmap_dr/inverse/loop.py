@@ -117,12 +117,12 @@ def optimize(
     state = None
     if checkpoint is not None and checkpoint.exists():
         history, state = _load(checkpoint, fingerprint)
-    if history.iterations >= iterations:
-        return history
     if state is None:
         method.reset(start)
     else:
         method.load_state(state)
+    if history.iterations >= iterations:
+        return history
 
     losses: list[Any] = []
     parameters: list[Any] = []

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import ShadowmapError
-from .shadow_images import ShadowImages, shadow_images
+from .shadow_images import ShadowImages, device_array, image_loss, shadow_images
 from .shadow_views import ShadowView
 from .smoothness import normal_consistency
 
@@ -92,7 +92,7 @@ class Sculptor:
         elif len(targets) != len(self.views):
             raise ShadowmapError(f"{len(targets)} targets for {len(self.views)} views: give one for each.")
         else:
-            self._targets = [_target(image, view) for image, view in zip(targets, self.views, strict=True)]
+            self._targets = [checked_target(image, view) for image, view in zip(targets, self.views, strict=True)]
         self._wanted = None
 
     @property
@@ -112,7 +112,7 @@ class Sculptor:
         """
         if not 0 <= view < len(self.views):
             raise ShadowmapError(f"no view {view}: there are {len(self.views)}, counted from 0.")
-        self._targets[view] = _target(image, self.views[view])
+        self._targets[view] = checked_target(image, self.views[view])
         self._wanted = None
 
     def target(self, view: int) -> Array:
@@ -122,7 +122,7 @@ class Sculptor:
     def step(self) -> Any:
         """One step; returns the loss before it, ``Float`` (1,), without waiting for it."""
         if self._wanted is None:
-            self._wanted = mi.Float(np.concatenate([image.ravel() for image in self._targets]))
+            self._wanted = device_array(np.concatenate([image.ravel() for image in self._targets]))
         loss, slope = self._gradient(dr.detach(self._vertices), self._wanted, self._consistency, self._shadows)
         dr.set_grad(self._vertices, slope)
         dr.enqueue(dr.ADMode.Backward, self._vertices)
@@ -182,8 +182,7 @@ class Sculptor:
         return {
             **self._settings,
             "vertices": len(self._start), "faces": len(self._faces),
-            "views": [{"direction": view.forward.tolist(), "size": list(view.shape), "receiver": view.receiver,
-                       "camera": view.camera} for view in self.views],
+            "views": [view.describe() for view in self.views],
             "optimizer": "AdamUniform", "step_size": self._step_size, "smoothness": self._smoothness,
             "consistency": float(self._consistency[0]), "shadow_method": shadow.method, "map_resolution": shadow.resolution,
             "filter_size": shadow.filter_size,
@@ -202,8 +201,8 @@ def _large_steps(vertices: Any, faces: Any, smoothness: float) -> Any:
         raise ShadowmapError("deforming meshes needs the package cholespy: pip install 'shadowmap-dr[art]'.") from error
 
 
-def _target(image: npt.ArrayLike, view: ShadowView) -> Array:
-    """A checked copy."""
+def checked_target(image: npt.ArrayLike, view: ShadowView) -> Array:
+    """A copy of a view's target (H, W). Raises ShadowmapError where it has another shape, or values outside of 0..1."""
     pixels = np.array(image, np.float32)
     if pixels.shape != view.shape:
         raise ShadowmapError(f"a target of shape {pixels.shape} for images of shape {view.shape}.")
@@ -218,16 +217,11 @@ def _gradient(vertices: Any, wanted: Any, consistency: Any, shadows: ShadowImage
     dr.enable_grad(vertices)
     seen = shadows.visibility(vertices)
     rough = consistency * normal_consistency(vertices, shadows.topology)
-    # By hand, since the loss and its derivative then read the images together, once.
-    difference = dr.detach(seen) - wanted
-    weighted = shadows.weight * difference
-    square, slope = weighted * difference, 2 * weighted
-    dr.eval(square, slope)
-    dr.set_grad(seen, slope)
+    loss = image_loss(shadows, seen, wanted) + dr.detach(rough)
     dr.set_grad(rough, 1)
     dr.enqueue(dr.ADMode.Backward, seen, rough)
     dr.traverse(dr.ADMode.Backward)
-    return dr.sum(square) + dr.detach(rough), dr.grad(vertices)
+    return loss, dr.grad(vertices)
 
 
 def _look(vertices: Any, shadows: ShadowImages) -> Any:

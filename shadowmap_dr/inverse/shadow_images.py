@@ -130,6 +130,29 @@ def shadow_images(
     )
 
 
+def image_loss(shadows: ShadowImages, seen: Any, wanted: Any) -> Any:
+    """Mean squared difference of images, summed over the views: ``Float`` (1,), detached. Its derivative is set in ``seen``.
+
+    By hand, since the loss and its derivative then read the images together, once. A backward pass from ``seen`` is to follow.
+    """
+    difference = dr.detach(seen) - wanted
+    weighted = shadows.weight * difference
+    square, slope = weighted * difference, 2 * weighted
+    dr.eval(square, slope)
+    dr.set_grad(seen, slope)
+    return dr.sum(square)
+
+
+def device_array(values: npt.ArrayLike) -> Any:
+    """``Float`` in memory of Dr.Jit's own.
+
+    Dr.Jit borrows NumPy's memory where it can, and records a function anew when it is called with memory of another alignment.
+    """
+    result = mi.Float(np.ascontiguousarray(values, np.float32)) + dr.opaque(mi.Float, 0)
+    dr.eval(result)
+    return result
+
+
 def _columns(vectors: Sequence[npt.ArrayLike]) -> list[Any]:
     return [mi.Float(np.ascontiguousarray(column)) for column in np.asarray(vectors, np.float32).T]
 

@@ -6,6 +6,7 @@ Neither light nor receiver nor camera ever moves, so all that is left of them is
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -54,6 +55,10 @@ class ShadowView:
         """(H, W) of the image."""
         height, width = self.seen.shape
         return height, width
+
+    def describe(self) -> dict[str, Any]:
+        """Settings for the record."""
+        return {"direction": self.forward.tolist(), "size": list(self.shape), "receiver": self.receiver, "camera": self.camera}
 
 
 def shadow_view(

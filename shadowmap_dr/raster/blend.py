@@ -25,7 +25,7 @@ def blend(values: Any, positions: Any, raster: RasterOutput, crossings: Crossing
     with dr.suspend_grad():
         dr.eval(values)
     if not dr.is_diff_v(positions):
-        return _Mixer(values, raster.width, crossings).values
+        return Mixer(values, raster.width, crossings).values
     wanted = dr.grad_enabled(values), dr.grad_enabled(positions)
     return dr.custom(_Blend, values, positions, raster.width, crossings, wanted)
 
@@ -34,7 +34,7 @@ class _Blend(dr.CustomOp):
     """Blending as one differentiable operation: the derivatives, too, do work only where pixels were blended."""
 
     def eval(self, values: Any, positions: Any, width: int, crossings: Crossings, wanted: tuple[bool, bool]) -> Any:
-        self.mixer = _Mixer(values, width, crossings)
+        self.mixer = Mixer(values, width, crossings)
         self.wanted, self.vertices = wanted, dr.width(positions)
         return self.mixer.values
 
@@ -53,7 +53,7 @@ class _Blend(dr.CustomOp):
             self.set_grad_in("positions", self.mixer.adjoint_of_positions(adjoint, self.vertices))
 
 
-class _Mixer:
+class Mixer:
     """Blended ``values``, and what their derivatives need. Detached.
 
     A pixel mixes ``scale * weight`` of each neighbour that reaches into it. Up to four may each claim half of an isolated pixel;
@@ -74,8 +74,8 @@ class _Mixer:
 
     def _mix(self) -> Any:
         pixel = dr.arange(self.module.UInt32, self.pixels)
-        incoming = self._around(self.crossings.right, self.crossings.down, 1)
-        own = self._read(self.original, pixel)
+        incoming = self.around(self.crossings.right, self.crossings.down, 1)
+        own = self.read(self.original, pixel)
 
         def mix(pixel: Any, *lanes: Any) -> tuple[Any, ...]:
             incoming, own = lanes[:4], lanes[4:]
@@ -83,36 +83,36 @@ class _Mixer:
             dr.scatter(self.claims, claims, pixel)
             scale = _scale(claims)
             total = list(own)
-            for weight, neighbour in zip(incoming, self._neighbours(pixel), strict=True):
-                other = self._read(self.original, neighbour, weight > 0)
+            for weight, neighbour in zip(incoming, self.neighbours(pixel), strict=True):
+                other = self.read(self.original, neighbour, weight > 0)
                 factor = weight * scale
                 total = [dr.fma(factor, dr.select(weight > 0, v - o, 0), t) for v, o, t in zip(other, own, total, strict=True)]
             return tuple(total)
 
-        return self._written(self._where(sum(incoming) > 0, mix, pixel, (*incoming, *own), own))
+        return self.written(self.where(sum(incoming) > 0, mix, pixel, (*incoming, *own), own))
 
     def adjoint_of_values(self, adjoint: Any) -> Any:
         """Gradient to the values from that of the result."""
         pixel = dr.arange(self.module.UInt32, self.pixels)
         right, down = self.crossings.right, self.crossings.down
-        incoming, outgoing = self._around(right, down, 1), self._around(right, down, -1)
-        own = self._read(adjoint, pixel)
+        incoming, outgoing = self.around(right, down, 1), self.around(right, down, -1)
+        own = self.read(adjoint, pixel)
 
         def spread(pixel: Any, *lanes: Any) -> tuple[Any, ...]:
             incoming, outgoing, own = lanes[:4], lanes[4:8], lanes[8:]
             claims = sum(incoming)
             kept = 1 - claims * _scale(claims)
             total = [kept * o for o in own]
-            for weight, neighbour in zip(outgoing, self._neighbours(pixel), strict=True):
+            for weight, neighbour in zip(outgoing, self.neighbours(pixel), strict=True):
                 factor = weight * _scale(dr.gather(self.module.Float, self.claims, neighbour, weight > 0))
-                other = self._read(adjoint, neighbour, weight > 0)
+                other = self.read(adjoint, neighbour, weight > 0)
                 total = [dr.fma(factor, v, t) for v, t in zip(other, total, strict=True)]
             return tuple(total)
 
         touched = sum(incoming) + sum(outgoing) > 0
-        result = self._where(touched, spread, pixel, (*incoming, *outgoing, *own), own)
+        result = self.where(touched, spread, pixel, (*incoming, *outgoing, *own), own)
         if not self.planar:
-            return self._written(result)
+            return self.written(result)
         dr.eval(result)  # more than one kernel may want it
         return result
 
@@ -173,10 +173,10 @@ class _Mixer:
         taker, giver = dr.select(weight > 0, neighbour, pixel), dr.select(weight > 0, pixel, neighbour)
         claims = dr.gather(self.module.Float, self.claims, taker)
         scale = _scale(claims)
-        g, own = self._read(adjoint, taker), self._read(self.original, taker)
-        other = self._read(self.original, giver)
+        g, own = self.read(adjoint, taker), self.read(self.original, taker)
+        other = self.read(self.original, giver)
         shared = claims >= 1  # shares itself out: more for one neighbour is less for all of them
-        mixed = self._read(self.values, taker, shared)
+        mixed = self.read(self.values, taker, shared)
         mean = [dr.select(shared, m, o) for m, o in zip(mixed, own, strict=True)]
         gain = sum(a * (v - m) for a, v, m in zip(g, other, mean, strict=True))
         return gain * dr.select(weight > 0, scale, -scale)
@@ -186,29 +186,29 @@ class _Mixer:
         module = self.module
         pixel = dr.arange(module.UInt32, self.pixels)
         crossings = self.crossings
-        incoming = self._around(crossings.right, crossings.down, 1)
+        incoming = self.around(crossings.right, crossings.down, 1)
         claims = sum(incoming)
         scale = _scale(claims)
-        own = self._read(self.original, pixel)
-        change = self._read(values, pixel) if values is not None else [module.Float(0)] * self.channels
+        own = self.read(self.original, pixel)
+        change = self.read(values, pixel) if values is not None else [module.Float(0)] * self.channels
         total = list(change)
         if positions is not None:
             right, down = self._tangent_of_weights(positions)
             # A weight's sign tells who takes; its change has the sign of the (right, lower) pair's.
-            rates = self._around(right, down, 1, signed=True)
-            mixed = self._read(self.values, pixel, claims >= 1)
+            rates = self.around(right, down, 1, signed=True)
+            mixed = self.read(self.values, pixel, claims >= 1)
             mean = [dr.select(claims >= 1, m, o) for m, o in zip(mixed, own, strict=True)]
-        for k, (weight, neighbour) in enumerate(zip(incoming, self._neighbours(pixel), strict=True)):
+        for k, (weight, neighbour) in enumerate(zip(incoming, self.neighbours(pixel), strict=True)):
             active = weight > 0
             if values is not None:
-                other = self._read(values, neighbour, active)
+                other = self.read(values, neighbour, active)
                 factor = weight * scale
                 total = [dr.fma(factor, v - c, t) for v, c, t in zip(other, change, total, strict=True)]
             if positions is not None:
-                other = self._read(self.original, neighbour, active)
+                other = self.read(self.original, neighbour, active)
                 factor = dr.select(active, rates[k] * scale, 0)
                 total = [dr.fma(factor, v - m, t) for v, m, t in zip(other, mean, total, strict=True)]
-        return self._written(total)
+        return self.written(total)
 
     def _tangent_of_weights(self, positions: Any) -> tuple[Any, Any]:
         module = self.module
@@ -244,11 +244,11 @@ class _Mixer:
         dr.eval(right, down)
         return right, down
 
-    def _neighbours(self, pixel: Any) -> tuple[Any, Any, Any, Any]:
+    def neighbours(self, pixel: Any) -> tuple[Any, Any, Any, Any]:
         """Right, lower, left, upper."""
         return pixel + 1, pixel + self.width, pixel - 1, pixel - self.width
 
-    def _around(self, right: Any, down: Any, sign: int, signed: bool = False) -> tuple[Any, Any, Any, Any]:
+    def around(self, right: Any, down: Any, sign: int, signed: bool = False) -> tuple[Any, Any, Any, Any]:
         """How much each neighbour (of :meth:`_neighbours`) reaches into a pixel, or (``sign`` -1) a pixel into each neighbour.
 
         Pairs that reach beyond the image have weight 0, which is also what the last pixels of the line above and the image
@@ -261,7 +261,7 @@ class _Mixer:
         values = (-sign * right, -sign * down, sign * left, sign * up)
         return values if signed else tuple(dr.maximum(v, 0) for v in values)
 
-    def _where(self, active: Any, function: Any, pixel: Any, lanes: tuple[Any, ...], otherwise: list[Any]) -> list[Any]:
+    def where(self, active: Any, function: Any, pixel: Any, lanes: tuple[Any, ...], otherwise: list[Any]) -> list[Any]:
         """``function(pixel, *lanes)``, one number for each channel, in packets with active lanes; the last lanes elsewhere."""
         count = len(otherwise)
         result = dr.if_stmt(
@@ -269,7 +269,7 @@ class _Mixer:
         )
         return list(result)
 
-    def _read(self, flat: Any, pixel: Any, active: Any = True) -> list[Any]:
+    def read(self, flat: Any, pixel: Any, active: Any = True) -> list[Any]:
         """All channels of pixels."""
         module = self.module
         if isinstance(flat, list):
@@ -279,7 +279,7 @@ class _Mixer:
             return list(dr.gather(packet, flat, pixel, active))
         return [dr.gather(module.Float, flat, pixel * self.channels + c, active) for c in range(self.channels)]
 
-    def _written(self, channels: list[Any]) -> Any:
+    def written(self, channels: list[Any]) -> Any:
         """Interleave the channels."""
         if self.channels == 1:
             return channels[0]

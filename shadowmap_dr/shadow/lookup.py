@@ -80,7 +80,7 @@ def _compare_all(maps: ShadowMaps, map_index: Any, u: Any, v: Any, depth: Any) -
     """
     module = backend(maps.values)
     s = maps.settings
-    at = _Texels(maps, map_index, u, v)
+    at = Texels(maps, map_index, u, v)
     total = module.Float(0)
     for column, row in separable_terms(filter_kernel(s.filter, s.filter_size)):
         radius = len(row) // 2
@@ -110,7 +110,7 @@ def _moved(weights: list[float], fraction: Any) -> list[Any]:
     return [dr.fma(fraction, float(a - b), float(b)) for a, b in zip(padded[:-1], padded[1:], strict=True)]
 
 
-class _Texels:
+class Texels:
     """The texels around points (u, v in -1..1). Texel centres lie at + 1/2."""
 
     def __init__(self, maps: ShadowMaps, map_index: Any, u: Any, v: Any, active: Any = True) -> None:
@@ -135,25 +135,25 @@ class _Texels:
 
 def _bilinear(maps: ShadowMaps, map_index: Any, u: Any, v: Any, active: Any, outside_reads_zero: bool = False) -> list[Any]:
     """What the four texels around (u, v) store, mixed; attached to the texels and to the coordinates."""
-    at = _Texels(maps, map_index, u, v, active)
+    at = Texels(maps, map_index, u, v, active)
     rows = []
     for j in range(2):
         use = [active & at.inside(i, j) if outside_reads_zero else active for i in range(2)]
-        left, right = (_stored(maps, at.index(i, j), use[i]) for i in range(2))
+        left, right = (stored_texel(maps.values, maps.channels, at.index(i, j), use[i]) for i in range(2))
         rows.append([dr.fma(b - a, at.fx, a) for a, b in zip(left, right, strict=True)])
-    return [value for a, b in zip(*rows, strict=True) for value in _entries(dr.fma(b - a, at.fy, a))]
+    return [value for a, b in zip(*rows, strict=True) for value in entries(dr.fma(b - a, at.fy, a))]
 
 
-def _stored(maps: ShadowMaps, texel: Any, active: Any) -> list[Any]:
+def stored_texel(values: Any, channels: int, texel: Any, active: Any) -> list[Any]:
     """All numbers of a texel, in packets as large as there are."""
-    module = backend(maps.values)
-    size = next(n for n in (4, 2, 1) if maps.channels % n == 0)
+    module = backend(values)
+    size = next(n for n in (4, 2, 1) if channels % n == 0)
     packet = {1: module.Float, 2: module.Array2f, 4: module.Array4f}[size]
-    count = maps.channels // size
-    return [dr.gather(packet, maps.values, texel * count + k, active) for k in range(count)]
+    count = channels // size
+    return [dr.gather(packet, values, texel * count + k, active) for k in range(count)]
 
 
-def _entries(packet: Any) -> list[Any]:
+def entries(packet: Any) -> list[Any]:
     return list(packet) if dr.depth_v(packet) > 1 else [packet]
 
 

@@ -158,19 +158,45 @@ def _texels(
         depth = _radial_depth(view, frustum, raster, row, column, size)
         depth, slope_square = dr.select(hit, depth, frustum.far), 0
     else:
-        seen, dx, dy = pixel_depth(raster, clip, faces, dr.detach(views.spread) > 0)
-        linear, to_linear = linear_depth(view, frustum, seen)
-        depth = dr.select(hit, linear, FAR)
-        with dr.suspend_grad():
-            slopes = [dr.detach(to_linear * slope) for slope in (dx, dy)]
-            slope_square = dr.select(hit, _slope_square(dr.detach(view), dr.detach(frustum), dr.detach(linear), slopes, size), 0)
+        texels = texel_depths(raster, clip, faces, view, frustum, views, size)
+        depth, slope_square = texels.depth, texels.slope_square
     method = PREFILTERED.get(settings.method)
     if method is None:
         if settings.method == "pcf" and settings.antialias:
-            return _interleaved(list(variance_moments(depth))), 2
+            return interleaved(list(variance_moments(depth))), 2
         return depth, 1
     values = method.encode(depth, slope_square, settings.order)
-    return _interleaved(values), len(values)
+    return interleaved(values), len(values)
+
+
+@dataclass(frozen=True)
+class TexelDepths:
+    """What each texel sees, one lane each.
+
+    Attributes:
+        depth: linear depth (:func:`linear_depth`), ``FAR`` where nothing is seen. Attached.
+        slope_square: squared change of it across a texel, detached.
+        seen, dx, dy: depth as :func:`pixel_depth` returns it (attached), and its change by column and by row (detached).
+    """
+
+    depth: Any
+    slope_square: Any
+    seen: Any
+    dx: Any
+    dy: Any
+
+
+def texel_depths(
+    raster: RasterOutput, clip: Any, faces: Any, view: Views, frustum: Frusta, views: Views, size: int
+) -> TexelDepths:
+    """Depths in maps of ``size`` texels along each side; ``view`` and ``frustum`` are those of each texel's map."""
+    hit = raster.valid
+    seen, dx, dy = pixel_depth(raster, clip, faces, dr.detach(views.spread) > 0)
+    linear, to_linear = linear_depth(view, frustum, seen)
+    with dr.suspend_grad():
+        slopes = [dr.detach(to_linear * slope) for slope in (dx, dy)]
+        slope_square = dr.select(hit, _slope_square(dr.detach(view), dr.detach(frustum), dr.detach(linear), slopes, size), 0)
+    return TexelDepths(dr.select(hit, linear, FAR), slope_square, seen, dx, dy)
 
 
 def _two_depths(plain: Any, blended: Any) -> tuple[Any, int]:
@@ -204,7 +230,8 @@ def block_means(values: Any, size: int, channels: int, factor: int) -> Any:
     return total * (1 / factor**2)
 
 
-def _interleaved(values: list[Any]) -> Any:
+def interleaved(values: list[Any]) -> Any:
+    """Flat array with the numbers of several arrays in turns."""
     module = backend(values[0])
     if len(values) == 1:
         return values[0]

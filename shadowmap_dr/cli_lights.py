@@ -1,0 +1,88 @@
+"""The command `shadowmap-dr lights`: directions of lights from images, thousands of runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from .cli_options import DEFAULT_VARIANT, Variant, set_variant
+from .experiments import lights as lights_experiment
+from .experiments import lights_report
+from .experiments.lights_scene import OBJECTS
+
+_FULL_LIGHTS, _FULL_SIZES, _FULL_RUNS = (1, 2, 3, 4, 5), (1, 3, 5, 9, 15, 0), 150
+
+
+def lights(
+    object: Annotated[
+        list[str] | None, typer.Option(metavar="|".join(OBJECTS), help="Object, by name or mesh file; repeatable [default: all].")
+    ] = None,
+    count: Annotated[list[int] | None, typer.Option("--lights", help="Lights, 1 to 5; repeatable [default: 1].")] = None,
+    runs: Annotated[int | None, typer.Option(help="Runs of each object and setting [default: 16].")] = None,
+    filter: Annotated[str, typer.Option(metavar="gaussian|box|wendland", help="Filter of the shadow maps.")] = "gaussian",
+    filter_size: Annotated[
+        list[int] | None, typer.Option("--filter-size", help="Texels of the filter, 1 for none; repeatable [default: 3].")
+    ] = None,
+    shadows: Annotated[
+        bool | None, typer.Option("--shadows/--no-shadows", help="With shadows only, or without only [default: both].")
+    ] = None,
+    map_resolution: Annotated[int, typer.Option(help="Texels along each side of a shadow map.")] = 256,
+    resolution: Annotated[int, typer.Option(help="Image width and height in pixels.")] = 128,
+    iterations: Annotated[int, typer.Option(help="Steps of the optimiser.")] = 200,
+    strategy: Annotated[
+        str, typer.Option(metavar="plain|coarse", help="coarse: larger steps and a larger filter in the first half.")
+    ] = "plain",
+    starts: Annotated[int, typer.Option(help="Starts of each run; the one that ends with the least loss counts.")] = 1,
+    reference: Annotated[str, typer.Option(metavar="own|mitsuba", help="Who renders the targets.")] = "own",
+    spp: Annotated[int, typer.Option(help="Samples per pixel of path-traced targets.")] = 128,
+    cone: Annotated[float, typer.Option(help="Opening angle in degrees of the cone that directions are drawn from.")] = 60,
+    seed: Annotated[int, typer.Option(help="Seed of targets and starts.")] = 0,
+    memory: Annotated[int, typer.Option(help="MiB that a batch of runs may need, about.")] = 2048,
+    scheduler: Annotated[
+        str, typer.Option(metavar="local|processes:N|tcp://HOST:PORT", help="Who does the batches: this process or workers.")
+    ] = "local",
+    threads: Annotated[int, typer.Option(help="Threads of each process, 0 for one for each core.")] = 0,
+    full: Annotated[bool, typer.Option("--full", help="1 to 5 lights, all filters, 150 runs: hours.")] = False,
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("lights"),
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Keep batches that are complete, and summaries of other settings.")
+    ] = False,
+    variant: Variant = DEFAULT_VARIANT,
+) -> None:
+    """Find the directions of lights by comparing images, many runs at once.
+
+    Writes OUT/lights.json, a plot of alignments (lights.png), pictures of some runs, and a file for each batch.
+    """
+    defaults = lights_experiment.LightOptions()
+    sizes = tuple(filter_size or (_FULL_SIZES if full else defaults.filter_sizes))
+    sizes = tuple(size for size in sizes if size or shadows is not True) if shadows is not False else (0,)
+    if filter_size and shadows is None:
+        sizes = (*sizes, 0)
+    options = lights_experiment.LightOptions(
+        objects=tuple(object or defaults.objects),
+        lights=tuple(count or (_FULL_LIGHTS if full else defaults.lights)),
+        filter_sizes=sizes,
+        runs=runs or (_FULL_RUNS if full else defaults.runs),
+        filter=filter,
+        map_resolution=map_resolution,
+        resolution=resolution,
+        iterations=iterations,
+        strategy=strategy,
+        starts=starts,
+        reference=reference,
+        spp=spp,
+        seed=seed,
+        cone_deg=cone,
+        out=out,
+        resume=resume,
+        scheduler=scheduler,
+        threads=threads,
+        memory=memory << 20,
+    )
+    set_variant(variant)
+    summaries = lights_experiment.run_lights(options, variant=variant)
+    Console().print(lights_report.table(summaries))
+    typer.echo(f"Record, plot and pictures: {out}")

@@ -1,0 +1,114 @@
+"""Sweeps: all runs of some problems, in batches, each with a file of its own, so that whatever is killed goes on from there."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from .. import report
+from ..errors import ShadowmapError
+from .problems import Problem
+from .schedulers import check_scheduler, do_units
+from .workshop import Unit
+
+#: Bytes that a batch may need if nobody says otherwise.
+MEMORY = 1 << 31
+
+
+def run_sweep(
+    problems: Sequence[Problem],
+    out: Path,
+    *,
+    scheduler: str = "local",
+    variant: str = "llvm_ad_rgb",
+    threads: int = 0,
+    memory: int = MEMORY,
+    resume: bool = False,
+    console: Console | None = None,
+) -> dict[str, list[dict[str, Any]]]:
+    """Do all runs of some problems.
+
+    Each batch leaves a file ``out/batches/NAME-FIRST-LAST.json`` with the records of its runs, which appears when it is complete.
+
+    Args:
+        problems: with different names.
+        out: folder for results.
+        scheduler: ``local`` (this process), ``processes:N`` (on this machine) or the address of a Dask scheduler
+            (``tcp://host:port``), whose workers must have this package, and the module of the problems, installed.
+        variant: Mitsuba variant, here and in workers.
+        threads: Dr.Jit threads of each process, 0 for as many as there are cores.
+        memory: bytes that a batch may need, about.
+        resume: keep records on disk whose settings are those of their problem. They may come from batches of another size, or
+            from another scheduler. Otherwise files of these problems are deleted first.
+
+    Returns:
+        For each problem's name its records, in the order of the runs.
+
+    Raises:
+        ShadowmapError: names that are no file names, or not different; an unknown scheduler; what a batch raised (results of the
+            others are on disk by then).
+    """
+    check_scheduler(scheduler)
+    names = [problem.name for problem in problems]
+    if len(set(names)) != len(names):
+        raise ShadowmapError(f"two problems of the sweep have the same name in {', '.join(names)}: rename one.")
+    for name in names:
+        if not re.fullmatch(r"[\w.-]+", name):
+            raise ShadowmapError(f"a problem is called {name!r}: use letters, digits, '.', '_' and '-'.")
+    folder = out / "batches"
+    done = {problem.name: _stored(problem, folder) if resume else {} for problem in problems}
+    if not resume:
+        for problem in problems:
+            for path in [*_files(problem, folder), *folder.glob(f"{problem.name}-*.checkpoint.npz")]:
+                path.unlink()
+    units = [unit for problem in problems for unit in _units(problem, done[problem.name], memory)]
+    folder.mkdir(parents=True, exist_ok=True)
+    with report.progress(console or Console(stderr=True)) as progress:
+        total = progress.add_task("batches", total=len(units), note="")
+        task = progress.add_task("", total=None, note="", visible=False)
+
+        def on_step(unit: Unit, steps: int) -> None:
+            progress.update(task, description=unit.title, total=unit.problem.steps, completed=steps, visible=True)
+
+        def on_done(unit: Unit, result: dict[str, Any]) -> None:
+            report.write_json(folder / unit.file, result)
+            done[unit.problem.name] |= dict(zip(result["runs"], result["records"], strict=True))
+            progress.update(total, advance=1)
+
+        do_units(
+            units, scheduler, variant=variant, threads=threads, folder=folder.resolve(), on_done=on_done, on_step=on_step
+        )
+    return {problem.name: [done[problem.name][run] for run in range(problem.runs)] for problem in problems}
+
+
+def _units(problem: Problem, done: dict[int, Any], memory: int) -> list[Unit]:
+    """Batches, as equal in size as can be, of the runs that are still to be done."""
+    left = [run for run in range(problem.runs) if run not in done]
+    if not left:
+        return []
+    count = -(-len(left) // max(1, problem.batch_size(memory)))
+    ends = [len(left) * k // count for k in range(count + 1)]
+    return [Unit(problem, tuple(left[a:b])) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+
+
+def _files(problem: Problem, folder: Path) -> list[Path]:
+    pattern = re.compile(re.escape(problem.name) + r"-\d+-\d+\.json")
+    return [path for path in sorted(folder.glob("*.json")) if pattern.fullmatch(path.name)]
+
+
+def _stored(problem: Problem, folder: Path) -> dict[int, Any]:
+    """Records by run from complete batches with the same settings."""
+    wanted, found = report.plain(problem.settings()), {}
+    for path in _files(problem, folder):
+        try:
+            result = report.read_json(path)
+            if result["settings"] == wanted:
+                pairs = zip(result["runs"], result["records"], strict=True)
+                found |= {run: record for run, record in pairs if run < problem.runs}
+        except (ShadowmapError, KeyError, TypeError, ValueError):
+            continue  # whatever cannot be read is done again
+    return found

@@ -22,6 +22,8 @@ from .inverse import Sculptor, even_sphere, shadow_view
 #: Light direction and what is up in the shadow.
 VIEWS = {"front": ((0, 0, -1), (0, 1, 0)), "side": ((-1, 0, 0), (0, 1, 0)), "top": ((0, -1, 0), (0, 0, -1))}
 _SPHERE = "sphere"
+#: Weight of normal consistency: weak, so that what nobody paints on keeps its details.
+CONSISTENCY = 0.001
 
 
 def model(
@@ -54,8 +56,9 @@ def model(
     shadow = shadow_view(*VIEWS[view], size=resolution)
 
     def build() -> Modeller:
-        # Weak consistency: what of the mesh nobody paints on keeps its details.
-        options = {"step_size": step_size, "smoothness": smoothness, "consistency": 0.02, "map_resolution": resolution}
+        options = {
+            "step_size": step_size, "smoothness": smoothness, "consistency": CONSISTENCY, "map_resolution": resolution
+        }  # fmt: skip
         return Modeller(Sculptor(vertices, faces, [shadow], **options))
 
     def save(moved: Any) -> None:

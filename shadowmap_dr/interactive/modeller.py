@@ -10,8 +10,9 @@ import numpy.typing as npt
 from ..errors import ShadowmapError
 from ..inverse import Sculptor
 
-#: It rests once the loss has not fallen by this share for so many steps, and after so many steps at last.
-IMPROVEMENT, PATIENCE, MOST_STEPS = 0.02, 60, 1000
+#: It rests once the loss has not fallen by this share, and by this much, for so many steps; and after so many steps at last. At
+#: 256 x 256 pixels, the second is a fifth of what one wrong pixel costs.
+IMPROVEMENT, LEAST, PATIENCE, MOST_STEPS = 0.02, 3e-6, 60, 600
 # The loss is waited for only now and then.
 _LOOK_EVERY = 5
 
@@ -80,6 +81,6 @@ class Modeller:
         self.loss = float(loss[0])
         if not np.isfinite(self.loss):
             raise ShadowmapError("the mesh has been lost: its vertices are not finite any more.")
-        if self.loss < (1 - IMPROVEMENT) * self._best:
+        if self.loss < min((1 - IMPROVEMENT) * self._best, self._best - LEAST):
             self._best, self._best_at = self.loss, self._steps
         self.moving = self._steps - self._best_at < PATIENCE and self._steps < MOST_STEPS

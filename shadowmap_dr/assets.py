@@ -1,4 +1,4 @@
-"""Where the scenes and meshes that come with the package are found."""
+"""Where the scenes, meshes and pictures that come with the package are found."""
 
 from __future__ import annotations
 
@@ -34,6 +34,16 @@ def mesh_names() -> list[str]:
 def mesh(name: str) -> Path:
     """Path of a mesh by its name ("spot"), or of a mesh file given by path."""
     return _find(name, ".ply", scenes_dir() / "meshes", mesh_names(), "mesh")
+
+
+def target_names() -> list[str]:
+    """Names that `target` accepts."""
+    return sorted(path.stem for path in (scenes_dir() / "targets").glob("*.png"))
+
+
+def target(name: str) -> Path:
+    """Path of a picture for shadow art by its name ("heart"), or of an image file given by path."""
+    return _find(name, ".png", scenes_dir() / "targets", target_names(), "image")
 
 
 def _find(name: str, suffix: str, folder: Path, known: list[str], kind: str) -> Path:

@@ -16,7 +16,7 @@ import numpy as np
 import typer
 from rich.console import Console
 
-from . import __version__, _llvm, assets, cli_gradients, cli_lights, cli_soft, io
+from . import __version__, _llvm, assets, cli_art, cli_face, cli_gradients, cli_lights, cli_model, cli_soft, io
 from .cli_options import DEFAULT_VARIANT, Variant, set_variant
 from .errors import ShadowmapError
 from .experiments import bench as bench_experiment
@@ -33,9 +33,12 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 app.add_typer(cli_gradients.app, name="gradients")
+app.add_typer(cli_face.app, name="face")
 app.command()(cli_soft.soft)
 app.command()(cli_lights.lights)
 app.command("lights-times")(cli_lights.lights_times)
+app.command()(cli_art.art)
+app.command()(cli_model.model)
 
 
 def main() -> None:
@@ -79,6 +82,7 @@ def info() -> None:
         ("GPU", f"CUDA {dr.detail.cuda_version()}" if gpu else "none"),
         ("scenes", ", ".join(assets.scene_names())),
         ("meshes", ", ".join(assets.mesh_names())),
+        ("targets", ", ".join(assets.target_names())),
     ]
     width = max(len(name) for name, _ in rows)
     for name, value in rows:

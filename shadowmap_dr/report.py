@@ -105,7 +105,8 @@ def image_sheet(
     from matplotlib.figure import Figure
 
     columns = max(len(row) for row in rows.values())
-    figure = Figure(figsize=(size * columns, size * len(rows) + 0.3), layout="constrained")
+    aspect = max(image.shape[0] / image.shape[1] for row in rows.values() for image in row.values())
+    figure = Figure(figsize=(size * columns, size * aspect * len(rows) + 0.3), layout="constrained")
     for i, (row_title, row) in enumerate(rows.items()):
         for j, (column_title, image) in enumerate(row.items()):
             axes = figure.add_subplot(len(rows), columns, i * columns + j + 1)

@@ -245,7 +245,11 @@ def _is_plain(bsdf: Any) -> bool:
         return all(_is_plain(part) for part in parts)
     if bsdf.class_name() != "SmoothDiffuse":
         return False
-    return all(isinstance(part, mi.Texture) and not part.is_spatially_varying() for part in parts)
+    # Mitsuba does not count vertex colours as varying.
+    return all(
+        isinstance(part, mi.Texture) and not part.is_spatially_varying() and part.class_name() != "MeshAttribute"
+        for part in parts
+    )
 
 
 def _is_faceted(points: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> bool:

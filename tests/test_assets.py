@@ -13,10 +13,11 @@ from shadowmap_dr.errors import ShadowmapError
 def test_assets_are_found_by_name_and_path(tmp_path: Path) -> None:
     assert {"pose"} <= set(assets.scene_names())
     assert {"spot", "bunny"} <= set(assets.mesh_names())
-    assert assets.scene("pose").is_file() and assets.mesh("spot").is_file()
+    assert {"heart", "horse"} <= set(assets.target_names())
+    assert assets.scene("pose").is_file() and assets.mesh("spot").is_file() and assets.target("heart").is_file()
     mine = tmp_path / "mine.ply"
     mine.touch()
     assert assets.mesh(str(mine)) == mine
-    for find in (assets.mesh, assets.scene):
+    for find in (assets.mesh, assets.scene, assets.target):
         with pytest.raises(ShadowmapError, match="unknown.*one of"):
             find("unknown")

@@ -55,7 +55,7 @@ def test_info(run: Any) -> None:
 def test_help_names_the_commands(run: Any) -> None:
     result = run("--help")
     assert result.status == 0
-    for command in ("info", "render", "pose", "bench", "soft"):
+    for command in ("info", "render", "pose", "bench", "soft", "art"):
         assert command in result.out
     assert run().status == 2
 

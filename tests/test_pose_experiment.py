@@ -289,11 +289,12 @@ def spot(tmp_path_factory: pytest.TempPathFactory) -> tuple[pose_scene.PoseProbl
 
 
 def test_spot_is_found_from_a_path_traced_image_with_few_recordings(spot: Any) -> None:
-    method = pose.build_method("shadows", *spot)
+    # Of 30 searches with four samples per pixel the worst ended at 0.10 degrees and 0.40; with one, at 0.56 and 1.4.
+    method = pose.build_method("shadows", *spot, samples=4)
     history = optimize(method, pose_scene.start_pose(0, 1), 120)
     rotation, offset = pose_scene.pose_errors(history.parameters)
     assert rotation[0] > 20 and offset[0] > 20
-    assert rotation[-1] < 0.6 and offset[-1] < 1.0
+    assert rotation[-1] < 0.3 and offset[-1] < 0.8
     assert method.recordings() <= 3
 
 

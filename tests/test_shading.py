@@ -150,6 +150,18 @@ def test_meshes_without_normals_or_texcoords(variant: str, normals: bool, texcoo
     assert_agrees_with_mitsuba(mi.load_dict(base_scene(mesh=mesh, other=other), optimize=False))
 
 
+def test_mesh_attribute_alone_in_a_scene(variant: str) -> None:
+    """Vertex colours are no plain colour, though Mitsuba calls them constant: images of nothing else are not black."""
+    mesh = bumpy_mesh("mesh", normals=True, texcoords=False, attribute=True)
+    mesh.set_bsdf(mi.load_dict({"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_paint"}}))
+    scene = mi.load_dict(base_scene(mesh=mesh), optimize=False)
+    assert load(scene).needs_frames
+    integrators = [mi.load_dict({"type": name}) for name in ("shadowmap", "direct")]
+    ours, theirs = (np.array(mi.render(scene, integrator=integrator, spp=16)) for integrator in integrators)
+    assert theirs[..., :3].mean() > 0.1
+    assert abs(ours[..., :3].mean() / theirs[..., :3].mean() - 1) < 0.03
+
+
 def test_mesh_attribute_and_moved_mesh(variant: str) -> None:
     """Vertex colours stay at their vertices when the functional path moves the mesh and Mitsuba does not know of it."""
     mesh = bumpy_mesh("mesh", normals=True, texcoords=False, attribute=True)

@@ -119,10 +119,16 @@ def build(name: str, resolution: int, offset: float = 0.0) -> Any:
     return mi.load_dict(scene, optimize=False)  # else Mitsuba would merge meshes, and they lose their names
 
 
-def occluder(name: str, points: npt.NDArray[np.float32], faces: npt.NDArray[np.uint32]) -> Any:
+def occluder(
+    name: str,
+    points: npt.NDArray[np.float32],
+    faces: npt.NDArray[np.uint32],
+    colour: tuple[float, ...] = (0.5, 0.5, 0.5),
+) -> Any:
     """A ``mi.Mesh`` of (V, 3) vertices and (F, 3) faces, diffuse on both sides."""
     props = mi.Properties()
-    props["bsdf"] = mi.load_dict({"type": "twosided", "bsdf": {"type": "diffuse"}})
+    diffuse = {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(colour)}}
+    props["bsdf"] = mi.load_dict({"type": "twosided", "bsdf": diffuse})
     mesh = mi.Mesh(name, len(points), len(faces), props=props)
     params = mi.traverse(mesh)
     params["vertex_positions"] = np.ascontiguousarray(points, np.float32).ravel()

@@ -1,0 +1,7 @@
+"""Interactive modelling: somebody paints on the shadow of a mesh, and the mesh follows."""
+
+from .canvas import Canvas
+from .modeller import Modeller
+from .session import Session, Snapshot, Status
+
+__all__ = ["Canvas", "Modeller", "Session", "Snapshot", "Status"]

@@ -1,0 +1,126 @@
+"""Meshes and shadows as files in memory, and images as targets, all of bounded size."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from .. import figures
+from ..errors import ShadowmapError
+from ..experiments.art_files import vertex_colours
+from ..io import atomic
+
+#: Formats of meshes, with their media types.
+FORMATS = {"ply": "application/octet-stream", "obj": "text/plain; charset=utf-8", "glb": "model/gltf-binary"}
+#: Most bytes and pixels of an image.
+MOST_BYTES, MOST_PIXELS = 8_000_000, 16_000_000
+# Others, such as vector graphics and documents, have parsers that are none of a server's business.
+_IMAGES = ("PNG", "JPEG", "WEBP", "GIF", "BMP")
+
+Array = npt.NDArray[np.float32]
+
+
+def mesh_bytes(kind: str, vertices: Array, faces: npt.NDArray[np.uint32]) -> bytes:
+    """A mesh of (V, 3) vertices and (F, 3) faces as a file of one of `FORMATS`; GLB has colours."""
+    if kind not in FORMATS:
+        raise ShadowmapError(f"no mesh format {kind!r}: choose from {', '.join(FORMATS)}.")
+    try:
+        import trimesh
+    except ModuleNotFoundError as error:
+        raise ShadowmapError("mesh files need the package trimesh: pip install 'shadowmap-dr[art]'.") from error
+    colours = vertex_colours(vertices) if kind == "glb" else None
+    content = trimesh.Trimesh(vertices, faces, process=False, vertex_colors=colours).export(file_type=kind)
+    return content.encode() if isinstance(content, str) else content
+
+
+def write_mesh(path: Path, vertices: Array, faces: npt.NDArray[np.uint32]) -> None:
+    """Write a mesh as its suffix says. The file is complete at any time."""
+    content = mesh_bytes(path.suffix.lower().removeprefix("."), vertices, faces)
+    with atomic(path) as temporary:
+        temporary.write_bytes(content)
+
+
+def shadow_bytes(shadow: npt.NDArray[np.uint8]) -> bytes:
+    """A shadow (H, W) as a grey PNG file: a pixel's value is its visibility, as `read_shadow` and paint programs take it."""
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    Image.fromarray(shadow).save(buffer, format="PNG")
+    return buffer.getvalue()
+
+
+def write_shadow(path: Path, shadow: npt.NDArray[np.uint8]) -> None:
+    """Write `shadow_bytes`. The file is complete at any time."""
+    content = shadow_bytes(shadow)
+    with atomic(path) as temporary:
+        temporary.write_bytes(content)
+
+
+def read_shadow(data: bytes, size: tuple[int, int]) -> Array:
+    """A painted shadow: visibility (H, W) from an image of any size, grey values as they are; transparent is lit.
+
+    Raises ShadowmapError where the image is damaged (half of a file is), too large, or of another aspect ratio.
+    """
+    image = _open(data)
+    height, width = size
+    if abs(image.width * height - image.height * width) > 0.02 * image.height * width:
+        raise ShadowmapError(f"an image of {image.width} x {image.height} pixels: the shadow has {width} x {height}.")
+    ground = _on_white(image)
+    if ground.size != (width, height):
+        from PIL import Image
+
+        ground = ground.resize((width, height), Image.Resampling.BOX if ground.width > width else Image.Resampling.BICUBIC)
+    return np.asarray(ground, np.float32) / 255
+
+
+def read_target(data: bytes, seen: npt.NDArray[np.bool_]) -> Array:
+    """A target (H, W) from any image: as `read_shadow` if it has the canvas' size; else the figure in it, as large as possible.
+
+    Args:
+        data: PNG, JPEG, WebP, GIF or BMP.
+        seen: (H, W) of the view.
+
+    Raises ShadowmapError where it cannot be read, is too large, or shows no figure.
+    """
+    height, width = seen.shape
+    image = _open(data)
+    if image.size == (width, height) and not _transparent(image):
+        return read_shadow(data, (height, width))
+    image.thumbnail((4 * width, 4 * height))
+    figure = figures.figure_of(np.asarray(image.convert("RGBA"), np.float32) / 255)
+    return figures.fit(figure, seen)
+
+
+def _open(data: bytes) -> Any:
+    """All of an image, decoded."""
+    from PIL import Image
+
+    if len(data) > MOST_BYTES:
+        raise ShadowmapError(f"an image of {len(data)} bytes: {MOST_BYTES} are allowed.")
+    try:
+        image = Image.open(io.BytesIO(data), formats=_IMAGES)
+        if image.width * image.height > MOST_PIXELS:  # before anything is decoded
+            raise ShadowmapError(f"an image of {image.width} x {image.height} pixels: {MOST_PIXELS} are allowed.")
+        image.load()
+        if image.mode.startswith("I"):  # 16 bits, which Pillow would clip rather than scale
+            image = Image.fromarray((np.asarray(image).astype(np.uint32).clip(0, 65535) >> 8).astype(np.uint8))
+        return image
+    except ShadowmapError:
+        raise
+    except Exception as error:  # damaged files make decoders raise whatever they like
+        raise ShadowmapError(f"no image, or a damaged one: give {', '.join(_IMAGES)}.") from error
+
+
+def _transparent(image: Any) -> bool:
+    return image.convert("RGBA").getextrema()[3][0] < 255
+
+
+def _on_white(image: Any) -> Any:
+    from PIL import Image
+
+    coloured = image.convert("RGBA")
+    return Image.alpha_composite(Image.new("RGBA", coloured.size, "white"), coloured).convert("L")

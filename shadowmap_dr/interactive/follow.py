@@ -1,0 +1,74 @@
+"""Modelling with any paint program: a mesh follows an image file."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from . import exports
+from .modeller import Modeller
+from .watch import ImageWatch
+
+#: Seconds between two looks at the file, and between two saves of a mesh that moves.
+LOOK_INTERVAL, SAVE_INTERVAL = 0.1, 2.0
+# Seconds until a file that cannot be used is worth a word: most are complete long before.
+_PATIENCE = 2.0
+
+
+def follow(
+    modeller: Modeller,
+    image: Path,
+    save: Callable[[np.ndarray], None],
+    stop: Callable[[], bool],
+    say: Callable[[str], None] = lambda text: None,
+) -> None:
+    """Write the mesh's shadow into an image file and deform the mesh whenever the file is changed, until told to stop.
+
+    An image that exists already is not written over: the mesh follows it from the start.
+
+    Args:
+        modeller: at rest.
+        image: a .png file.
+        save: called with vertices (V, 3) now and then while the mesh moves, whenever it comes to rest, and at the end.
+        stop: asked between steps.
+        say: told in one line what happens.
+    """
+    watch = ImageWatch(image, modeller.sculptor.views[0].shape)
+    if image.exists():
+        say(f"{image} exists: the mesh follows it.")
+    else:
+        exports.write_shadow(image, np.rint(255 * modeller.shadow().clip(0, 1)).astype(np.uint8))
+        watch.ignore()
+        say(f"{image} is the shadow: edit it.")
+    looked = saved = -np.inf
+    waiting: float | None = None
+    unsaved = True
+    while not stop():
+        now = time.monotonic()
+        if now - looked >= LOOK_INTERVAL:
+            looked = now
+            target = watch.poll()
+            if target is not None:
+                modeller.set_target(target)
+                say(f"{image} has changed.")
+            if watch.problem is None:
+                waiting = None
+            elif waiting is None:
+                waiting = now
+            elif now - waiting >= _PATIENCE:
+                say(watch.problem)
+                waiting = np.inf  # said once
+        moved = modeller.step()
+        unsaved |= moved
+        if unsaved and (not modeller.moving or now - saved >= SAVE_INTERVAL):
+            save(modeller.vertices())
+            if moved and not modeller.moving:
+                say(f"The mesh is at rest after {modeller.sculptor.steps} steps.")
+            unsaved, saved = False, now
+        if not modeller.moving:
+            time.sleep(LOOK_INTERVAL / 2)
+    if unsaved:
+        save(modeller.vertices())

@@ -1,0 +1,149 @@
+"""What server and page tell each other: JSON texts, and binary records for meshes and images.
+
+The page sends JSON objects of these types; anything else ends its connection:
+
+- ``stroke``: id (an integer that the page chooses), seq (an integer, comes back in the next target), mode (``add`` or ``erase``),
+  radius, points ([x, y, x, y, ...] in pixels from the top left corner; further messages with the same id go on with the line).
+- ``undo``, ``redo``, ``clear`` (of the painting), ``reset`` (of painting and mesh), ``restart`` (after a failure).
+- ``seen``: frame, the number of a frame that has been shown; the server sends few that have not been.
+
+The server sends the text messages ``hello`` and ``status``, and records of little-endian 32-bit words, each with its kind in the
+first:
+
+- faces (1): F, then 3 F unsigned integers.
+- frame (2): number, steps, version of the target, loss and steps per second (floats), V, then 3 V floats, then H W bytes of
+  shadow.
+- target (3): version, seq of this page's last stroke, 1 if something can be undone, 1 if redone, then H W bytes.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import ShadowmapError
+from ..inverse import ShadowView
+from .canvas import Canvas, Mode
+from .session import Snapshot, Status
+
+#: Longest text message from a page, and most points in one stroke message.
+MOST_BYTES, MOST_POINTS = 16_384, 512
+_FACES, _FRAME, _TARGET = 1, 2, 3
+# Integers of pages stay exact in JavaScript, and in the words of records.
+_MOST_INTEGER = 2**31 - 1
+
+Command = Literal["undo", "redo", "clear", "reset", "restart"]
+_COMMANDS = ("undo", "redo", "clear", "reset", "restart")
+
+
+class MessageError(ShadowmapError):
+    """A message from a page that makes no sense."""
+
+
+@dataclass(frozen=True)
+class Stroke:
+    """A part of a stroke; see `Canvas.stroke`. Points: (N, 2)."""
+
+    id: int
+    seq: int
+    mode: Mode
+    radius: float
+    points: npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A frame has been shown."""
+
+    frame: int
+
+
+def parse(text: str, size: tuple[int, int]) -> Stroke | Seen | Command:
+    """A page's message.
+
+    Args:
+        text: as received.
+        size: (H, W) of the canvas; strokes may begin and end a little outside of it.
+
+    Raises MessageError.
+    """
+    if len(text) > MOST_BYTES:
+        raise MessageError(f"a message of {len(text)} characters: {MOST_BYTES} are allowed.")
+    try:
+        value = json.loads(text)
+    except (ValueError, RecursionError):
+        raise MessageError("a message that is no JSON.") from None
+    kind = value.get("type") if isinstance(value, dict) else None
+    if kind == "stroke":
+        return _stroke(value, size)
+    if kind == "seen":
+        return Seen(_integer(value, "frame"))
+    if kind in _COMMANDS:
+        return kind
+    raise MessageError("a message of an unknown type.")
+
+
+def _stroke(value: dict[str, Any], size: tuple[int, int]) -> Stroke:
+    height, width = size
+    if value.get("mode") not in ("add", "erase"):
+        raise MessageError("a stroke that neither adds nor erases.")
+    radius, points = value.get("radius"), value.get("points")
+    if not (_number(radius) and 0.5 <= radius <= max(size)):
+        raise MessageError(f"a stroke's radius that is no number from 0.5 to {max(size)}.")
+    if not (isinstance(points, list) and 2 <= len(points) <= 2 * MOST_POINTS and len(points) % 2 == 0):
+        raise MessageError(f"a stroke that has not 1 to {MOST_POINTS} points.")
+    if not all(_number(x) for x in points):
+        raise MessageError("a stroke with points that are no numbers.")
+    line = np.array(points, np.float64).reshape(-1, 2)
+    if (np.abs(line) > 2 * max(height, width)).any():
+        raise MessageError("a stroke far outside of the canvas.")
+    return Stroke(_integer(value, "id"), _integer(value, "seq"), value["mode"], float(radius), line)
+
+
+def _number(value: Any) -> bool:
+    # A comparison also refuses NaN, and integers that no float can hold.
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e9
+
+
+def _integer(value: dict[str, Any], name: str) -> int:
+    number = value.get(name)
+    if not isinstance(number, int) or isinstance(number, bool) or not 0 <= number <= _MOST_INTEGER:
+        raise MessageError(f"{name} is no number from 0 to {_MOST_INTEGER}.")
+    return number
+
+
+def hello(view: ShadowView, name: str) -> str:
+    """The first message: what the mesh is called, the canvas and the receiver. Vectors are in world space."""
+    height, width = view.shape
+    return json.dumps({
+        "type": "hello", "name": name, "height": height, "width": width, "half": view.half, "points": MOST_POINTS,
+        **{axis: getattr(view, axis).tolist() for axis in ("right", "up", "forward", "origin")},
+    })  # fmt: skip
+
+
+def status(state: Status) -> str:
+    """What the optimiser does."""
+    return json.dumps({"type": "status", "phase": state.phase, "message": state.message})
+
+
+def faces(corners: npt.NDArray[np.uint32]) -> bytes:
+    """A record of faces (F, 3)."""
+    return struct.pack("<2I", _FACES, len(corners)) + corners.astype("<u4").tobytes()
+
+
+def frame(snapshot: Snapshot) -> bytes:
+    """A record of a mesh and its shadow."""
+    number, steps, target = (x & 0xFFFFFFFF for x in (snapshot.number, snapshot.steps, snapshot.target))
+    head = struct.pack("<4I2fI", _FRAME, number, steps, target, snapshot.loss, snapshot.speed, len(snapshot.vertices))
+    return head + snapshot.vertices.astype("<f4").tobytes() + snapshot.shadow.tobytes()
+
+
+def target(canvas: Canvas, seq: int) -> bytes:
+    """A record of what has been painted, for a page whose last stroke message had this number."""
+    head = struct.pack("<5I", _TARGET, canvas.version & 0xFFFFFFFF, seq, canvas.can_undo, canvas.can_redo)
+    return head + canvas.pixels().tobytes()

@@ -1,0 +1,138 @@
+"""The web page's server: what it answers, and how it runs on the loopback interface."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from importlib import resources
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.middleware import Middleware
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import PlainTextResponse, Response
+from starlette.routing import Route, WebSocketRoute
+
+from ..errors import ShadowmapError
+from . import exports, messages
+from .guards import Guard
+from .studio import Studio
+
+ADDRESS = "127.0.0.1"
+#: The page's files: name -> media type. Nothing else is ever read for a browser.
+PAGE = {
+    "index.html": "text/html; charset=utf-8",
+    "style.css": "text/css; charset=utf-8",
+    "page.js": "text/javascript; charset=utf-8",
+    "painting.js": "text/javascript; charset=utf-8",
+    "stage.js": "text/javascript; charset=utf-8",
+    "three.core.min.js": "text/javascript; charset=utf-8",
+    "three.module.min.js": "text/javascript; charset=utf-8",
+    "three.LICENSE": "text/plain; charset=utf-8",
+}
+# Connections of all kinds at a time; more are answered "busy".
+_MOST_CONNECTIONS = 64
+
+
+def create_app(studio: Studio) -> Starlette:
+    """The ASGI application: the page, its live connection (``/live``), an upload for images, and downloads."""
+    decoding = asyncio.Semaphore(1)
+
+    async def upload(request: Request) -> Response:
+        try:
+            data = await _body(request)
+            async with decoding:
+                target = await run_in_threadpool(exports.read_target, data, studio.view.seen)
+        except ShadowmapError as error:
+            return PlainTextResponse(str(error), 422)
+        except ClientDisconnect:
+            return Response(status_code=400)
+        studio.canvas.replace(target)
+        studio.paint()
+        return Response(status_code=204)
+
+    async def mesh(request: Request) -> Response:
+        kind = request.path_params["kind"]
+        if kind not in exports.FORMATS:
+            return PlainTextResponse("There is no such format.", 404)
+        async with decoding:
+            content = await run_in_threadpool(exports.mesh_bytes, kind, studio.session.snapshot.vertices, studio.session.faces)
+        return _download(content, exports.FORMATS[kind], f"mesh.{kind}")
+
+    async def shadow(request: Request) -> Response:
+        content = await run_in_threadpool(exports.shadow_bytes, studio.session.snapshot.shadow)
+        return _download(content, "image/png", "shadow.png")
+
+    @asynccontextmanager
+    async def lifespan(app: Starlette) -> AsyncIterator[None]:
+        studio.attach()
+        yield
+
+    page = [Route("/" if name == "index.html" else f"/{name}", _file(name, kind)) for name, kind in PAGE.items()]
+    routes = [
+        *page,
+        Route("/image", upload, methods=["POST"]),
+        Route("/mesh.{kind}", mesh),
+        Route("/shadow.png", shadow),
+        WebSocketRoute("/live", studio.serve),
+    ]
+    return Starlette(routes=routes, middleware=[Middleware(Guard)], lifespan=lifespan)
+
+
+def serve(studio: Studio, port: int = 0, on_start: Callable[[str], None] = lambda url: None) -> None:
+    """Serve on 127.0.0.1 until interrupted (Ctrl-C, SIGTERM), which raises KeyboardInterrupt or returns.
+
+    Args:
+        studio: its session is started, and stays open afterwards.
+        port: 0 for any free one.
+        on_start: called with the page's address once it can be opened.
+
+    Raises ShadowmapError where the port cannot be had.
+    """
+    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    with listener:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            listener.bind((ADDRESS, port))
+            listener.listen(64)
+        except (OSError, OverflowError) as error:
+            raise ShadowmapError(f"cannot serve on port {port}: {getattr(error, 'strerror', None) or error}.") from error
+        server = uvicorn.Server(config(studio))
+        on_start(f"http://{ADDRESS}:{listener.getsockname()[1]}/")
+        server.run(sockets=[listener])
+
+
+def config(studio: Studio) -> uvicorn.Config:
+    """Uvicorn's settings: small messages, few connections, nothing said about itself."""
+    return uvicorn.Config(
+        create_app(studio), log_level="warning", access_log=False, server_header=False, proxy_headers=False,
+        ws_max_size=messages.MOST_BYTES, ws_per_message_deflate=False, limit_concurrency=_MOST_CONNECTIONS,
+        timeout_graceful_shutdown=2,
+    )  # fmt: skip
+
+
+def _file(name: str, kind: str) -> Callable[[Request], Response]:
+    content = (resources.files(__package__) / "page" / name).read_bytes()
+
+    def answer(request: Request) -> Response:
+        return Response(content, media_type=kind)
+
+    return answer
+
+
+def _download(content: bytes, kind: str, name: str) -> Response:
+    return Response(content, media_type=kind, headers={"content-disposition": f'attachment; filename="{name}"'})
+
+
+async def _body(request: Request) -> bytes:
+    """All of a request's body, but never more than an image may have."""
+    parts, size = [], 0
+    async for part in request.stream():
+        parts.append(part)
+        size += len(part)
+        if size > exports.MOST_BYTES:
+            raise ShadowmapError(f"the image has more than {exports.MOST_BYTES} bytes.")
+    return b"".join(parts)

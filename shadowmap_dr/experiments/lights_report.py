@@ -67,6 +67,7 @@ def plot(path: Path, summaries: Sequence[dict[str, Any]]) -> None:
             right.errorbar(positions, mean, yerr=[below, above], marker="o", capsize=3, color=f"C{k}", label=f"n = {lights}")
     right.set_xlabel("texels of the filter (0: no shadows, 1: no filter)")
     right.set_ylabel("alignment at the end")
+    right.ticklabel_format(axis="y", useOffset=False)
     if right.has_data():
         right.legend()
     for axes in (left, right):

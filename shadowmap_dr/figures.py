@@ -23,6 +23,15 @@ _INSIDE, _LEAST_SHARE = 0.5, 1e-4
 Array = npt.NDArray[np.float32]
 
 
+def scaled_to_bytes(image: Any) -> Any:
+    """A Pillow image of at most 8 bits a channel: Pillow itself would clip grey ones of 16 bits rather than scale them."""
+    from PIL import Image
+
+    if not image.mode.startswith("I"):
+        return image
+    return Image.fromarray((np.asarray(image).astype(np.uint32).clip(0, 65535) >> 8).astype(np.uint8))
+
+
 def read_figure(path: str | os.PathLike[str]) -> Array:
     """The figure in an image file.
 
@@ -52,7 +61,7 @@ def read_figure(path: str | os.PathLike[str]) -> Array:
         with Image.open(data) as image:
             if image.width * image.height > _MOST_PIXELS:
                 raise ShadowmapError(f"cannot read {path}: {image.width} x {image.height} pixels are too many.")
-            pixels = np.asarray(image.convert("RGBA"), np.float32) / 255
+            pixels = np.asarray(scaled_to_bytes(image).convert("RGBA"), np.float32) / 255
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise ShadowmapError(f"cannot read {path}: it is no image, or it is damaged.") from error
     try:

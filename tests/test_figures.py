@@ -51,6 +51,15 @@ def test_jpegs_are_figures_too(tmp_path):
     assert ((figures.read_figure(tmp_path / "a.jpg") > 0.5) == drawing()).mean() > 0.99
 
 
+def test_grey_of_16_bits_is_scaled(tmp_path):
+    # Lit ground a little darker than white, and a figure of a third of it: to whoever clips at 255, both are white.
+    pixels = np.full((40, 40), 60000, np.uint16)
+    pixels[10:30, 10:30] = 20000
+    Image.fromarray(pixels).save(tmp_path / "deep.png")
+    figure = figures.read_figure(tmp_path / "deep.png")
+    np.testing.assert_array_equal(figure > 0.5, pixels == 20000)
+
+
 def test_drawings_become_figures(tmp_path):
     pytest.importorskip("resvg_py")
     path = tmp_path / "a.svg"

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import ShadowmapError
+from ..figures import scaled_to_bytes
 from ..io import read_image, to_srgb
 
 FloatArray = npt.NDArray[np.float32]
@@ -105,7 +106,7 @@ def _grey(path: Path) -> FloatArray:
 
     try:
         with Image.open(path) as image:
-            pixels = np.asarray(image.convert("RGBA"), np.float32) / 255
+            pixels = np.asarray(scaled_to_bytes(image).convert("RGBA"), np.float32) / 255
     except (OSError, UnidentifiedImageError, ValueError, Image.DecompressionBombError) as error:
         raise ShadowmapError(f"cannot read {path}: it is no image, or it is damaged.") from error
     alpha = pixels[..., 3]

@@ -106,9 +106,7 @@ def _open(data: bytes) -> Any:
         if image.width * image.height > MOST_PIXELS:  # before anything is decoded
             raise ShadowmapError(f"an image of {image.width} x {image.height} pixels: {MOST_PIXELS} are allowed.")
         image.load()
-        if image.mode.startswith("I"):  # 16 bits, which Pillow would clip rather than scale
-            image = Image.fromarray((np.asarray(image).astype(np.uint32).clip(0, 65535) >> 8).astype(np.uint8))
-        return image
+        return figures.scaled_to_bytes(image)
     except ShadowmapError:
         raise
     except Exception as error:  # damaged files make decoders raise whatever they like

@@ -10,7 +10,9 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from shadowmap_dr.cli import app
 from shadowmap_dr.errors import ShadowmapError
 from shadowmap_dr.experiments.lights import LightOptions, run_lights
 from shadowmap_dr.experiments.lights_problem import LightProblem
@@ -115,3 +117,13 @@ def test_bad_input_is_named(tmp_path: Path) -> None:
     ):
         with pytest.raises(ShadowmapError, match=message):
             run_lights(options(tmp_path, **changes))
+
+
+def test_command_line(tmp_path: Path) -> None:
+    small = ["--object", "teapot", "--runs", "2", "--iterations", "3", "--resolution", "16", "--map-resolution", "32"]
+    runner = CliRunner()
+    for extra, shadows in (([], [True, False]), (["--no-shadows"], [False]), (["--shadows", "--filter-size", "5"], [True])):
+        out = tmp_path / str(len(extra))
+        result = runner.invoke(app, ["lights", *small, *extra, "--out", str(out)])
+        assert result.exit_code == 0, result.output
+        assert [e["shadows"] for e in json.loads((out / "lights.json").read_text())["summaries"]] == shadows

@@ -13,11 +13,11 @@ import typer
 from . import assets, io
 from .cli_options import DEFAULT_VARIANT, Variant, set_variant
 from .errors import ShadowmapError
-from .experiments.art_files import read_placed_mesh
 from .interactive import exports
 from .interactive.follow import follow
 from .interactive.modeller import Modeller
 from .inverse import Sculptor, even_sphere, shadow_view
+from .mesh_files import read_placed_mesh
 
 #: Light direction and what is up in the shadow.
 VIEWS = {"front": ((0, 0, -1), (0, 1, 0)), "side": ((-1, 0, 0), (0, 1, 0)), "top": ((0, -1, 0), (0, 0, -1))}

@@ -10,9 +10,9 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from shadowmap_dr import cli
+from shadowmap_dr import cli, mesh_files
 from shadowmap_dr.errors import ShadowmapError
-from shadowmap_dr.experiments import art, art_files, art_gallery, art_pictures
+from shadowmap_dr.experiments import art, art_gallery, art_pictures
 from shadowmap_dr.experiments.art_run import frame_steps, intersection_over_union, make
 from shadowmap_dr.inverse import RemeshingSculptor, Sculptor, even_sphere, shadow_view
 
@@ -118,7 +118,7 @@ def test_any_mesh_can_be_deformed(variant, tmp_path):
     box = trimesh.creation.box((3, 1, 2)).subdivide().subdivide().subdivide()
     box.apply_translation([5, 6, 7])
     box.export(tmp_path / "box.stl")  # whose triangles share no vertices
-    vertices, faces = art_files.read_mesh(tmp_path / "box.stl")
+    vertices, faces = mesh_files.read_mesh(tmp_path / "box.stl")
     assert trimesh.Trimesh(vertices, faces, process=False).is_watertight
     np.testing.assert_allclose([vertices.min(0), vertices.max(0)], [[-1, -1 / 3, -2 / 3], [1, 1 / 3, 2 / 3]], atol=1e-6)
     options = art.ArtOptions(
@@ -129,7 +129,7 @@ def test_any_mesh_can_be_deformed(variant, tmp_path):
     assert record["views"][0]["iou"] > 0.7 and record["iou_curve"]["iou"][0][0] < record["views"][0]["iou"]
     (tmp_path / "broken.ply").write_text("ply nonsense")
     with pytest.raises(ShadowmapError, match="broken.ply"):
-        art_files.read_mesh(tmp_path / "broken.ply")
+        mesh_files.read_mesh(tmp_path / "broken.ply")
 
 
 def test_recorded_collections_are_pieces_too(variant, tmp_path):
@@ -146,7 +146,7 @@ def test_recorded_collections_are_pieces_too(variant, tmp_path):
 
 def test_errors_are_red_where_the_shadow_is_missing_and_blue_where_it_is_too_much():
     shadow, lit = np.zeros((1, 1)), np.ones((1, 1))
-    both, missing, much, none = (art_files.error_picture(*pair)[0, 0] for pair in (
+    both, missing, much, none = (mesh_files.error_picture(*pair)[0, 0] for pair in (
         (shadow, shadow), (lit, shadow), (shadow, lit), (lit, lit)))
     assert missing[0] > missing[1] + 0.5 and missing[0] > missing[2] + 0.5
     assert much[2] > much[0] + 0.5 and (none == 1).all() and np.ptp(both) == 0 and both[0] < 0.6

@@ -16,12 +16,12 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from .. import __version__, assets, figures, io, report
+from .. import __version__, assets, figures, io, mesh_files, report
 from ..errors import ShadowmapError
 from ..inverse import Collection, RemeshingSculptor, Sculptor, even_sphere, shadow_view
 from ..inverse.shadow_views import CAMERAS, RECEIVERS, ShadowView
 from ..timing import machine
-from . import art_files, art_pictures
+from . import art_pictures
 from .art_run import Frame, Maker, Trace, intersection_over_union, make
 
 #: Light directions of the first and the second view; y is up in both.
@@ -130,12 +130,12 @@ def build(options: ArtOptions) -> Maker:
     targets = place([figures.filled(figure) for figure in read] if options.fill_holes else read, views)
     texels = options.map_resolution or options.resolution
     if options.collection is not None:
-        mesh = art_files.read_mesh(assets.mesh(options.collection))
+        mesh = mesh_files.read_mesh(assets.mesh(options.collection))
         return Collection(
             *mesh, views, targets, interval=options.interval, most=options.most, seed=options.seed, map_resolution=texels,
             settings={"collection": _name(options.collection)},
         )  # fmt: skip
-    mesh = even_sphere() if options.mesh is None else art_files.read_mesh(assets.mesh(options.mesh))
+    mesh = even_sphere() if options.mesh is None else mesh_files.read_mesh(assets.mesh(options.mesh))
     arguments: dict[str, Any] = {
         "step_size": options.step_size, "smoothness": options.smoothness, "consistency": options.consistency,
         "map_resolution": texels, "settings": {"mesh": "sphere" if options.mesh is None else _name(options.mesh)},
@@ -191,7 +191,7 @@ def _results(maker: Maker, trace: Trace) -> dict[str, Any]:
         })  # fmt: skip
     return {
         "views": views,
-        "mesh": art_files.mesh_report(maker.vertices(), maker.faces),
+        "mesh": mesh_files.mesh_report(maker.vertices(), maker.faces),
         "seconds_per_iteration": trace.seconds_per_iteration,
         "seconds": float(sum(trace.seconds)),
         "iou_curve": {"step": [step for step, _ in trace.looks], "iou": [values for _, values in trace.looks]},
@@ -203,15 +203,15 @@ def _write(options: ArtOptions, maker: Maker, trace: Trace, progress: Any) -> li
     """All files but the record; returns their names."""
     out, last = options.out, Frame(trace.iterations, maker.vertices(), maker.faces)
     images = maker.visibility()
-    art_files.write_meshes(out, last.vertices, last.faces, maker.views, images)
+    mesh_files.write_meshes(out, last.vertices, last.faces, maker.views, images)
     names = ["mesh.ply", "mesh.obj", "mesh.glb"]
     for k, image in enumerate(images):
         target = maker.target(k)
-        for kind, picture in (("shadow", image), ("target", target), ("error", art_files.error_picture(image, target))):
+        for kind, picture in (("shadow", image), ("target", target), ("error", mesh_files.error_picture(image, target))):
             names.append(f"{kind}-{k + 1}.png")
             io.write_png(out / names[-1], picture)
     if options.printable:
-        art_files.write_printable(out / "mesh.stl", last.vertices, last.faces)
+        mesh_files.write_printable(out / "mesh.stl", last.vertices, last.faces)
         names.append("mesh.stl")
     size = options.picture_size
     names.append("picture.png")

@@ -11,8 +11,8 @@ import numpy.typing as npt
 
 from .. import figures
 from ..errors import ShadowmapError
-from ..experiments.art_files import vertex_colours
 from ..io import atomic
+from ..mesh_files import vertex_colours
 
 #: Formats of meshes, with their media types.
 FORMATS = {"ply": "application/octet-stream", "obj": "text/plain; charset=utf-8", "glb": "model/gltf-binary"}

@@ -1,4 +1,4 @@
-"""What shadow art leaves behind: meshes in three formats, in colour and for printing, and pictures of shadows and errors."""
+"""Meshes read and placed around the origin; written in colour with the walls of their shadows, and for printing."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .. import io
-from ..errors import ShadowmapError
-from ..inverse.shadow_views import ShadowView, height
-from ..inverse.smoothness import inverted_share
+from . import io
+from .errors import ShadowmapError
+from .inverse.shadow_views import ShadowView, height
+from .inverse.smoothness import inverted_share
 
 #: Largest side of a mesh that is to be printed, in millimetres.
 PRINT_SIZE_MM = 80.0

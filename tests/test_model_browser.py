@@ -156,15 +156,22 @@ def picture(page: Any, name: str) -> np.ndarray:
 NOSE = [(46, 32), (50, 32), (54, 32), (58, 32)]
 
 
+def nose(state: dict[str, Any]) -> float:
+    """How far the 20 outermost vertices reach towards where a nose is painted, on average."""
+    return float(np.sort(state["vertices"][:, 0])[-20:].mean())
+
+
 def test_a_stroke_moves_the_mesh_and_undo_moves_it_back(page, place, tmp_path):
     import trimesh
 
+    first = shown(page, 0)
     before = {name: picture(page, name) for name in ("#shadow", "#object")}
     assert before["#object"].std() > 10  # there is something to be seen
     page.fill("#radius", "4")
     paint(page, NOSE, SIZE)
     state = shown(page, place.studio.canvas.version)
     assert state["vertices"][:, 0].max() > 1.5 and state["match"] > 0.93
+    assert nose(state) > 1.38 and state["dark"] > first["dark"] + 80
     after = {name: picture(page, name) for name in ("#shadow", "#object")}
     for name, picture_ in after.items():
         assert (np.abs(picture_ - before[name]).max(2) > 30).sum() > 200, name
@@ -185,7 +192,8 @@ def test_a_stroke_moves_the_mesh_and_undo_moves_it_back(page, place, tmp_path):
     version = place.studio.canvas.version
     page.keyboard.press("Control+z")
     state = shown(page, version + 1)
-    assert state["vertices"][:, 0].max() < 1.35 and state["match"] > 0.93
+    # What it comes back to is the shadow: a tip that is too thin to cast one may stay out a little longer.
+    assert nose(state) < 1.28 and state["match"] > 0.97 and abs(state["dark"] - first["dark"]) < 20
     assert page.is_disabled("#undo") and page.is_enabled("#redo")
 
 

@@ -153,6 +153,11 @@ def picture(page: Any, name: str) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(page.locator(name).screenshot())).convert("RGB"), np.float32)
 
 
+def clay(image: np.ndarray) -> np.ndarray:
+    """Where the object is seen: it is redder than walls and shadows."""
+    return image[..., 0] > 1.4 * image[..., 2]
+
+
 NOSE = [(46, 32), (50, 32), (54, 32), (58, 32)]
 
 
@@ -175,6 +180,8 @@ def test_a_stroke_moves_the_mesh_and_undo_moves_it_back(page, place, tmp_path):
     after = {name: picture(page, name) for name in ("#shadow", "#object")}
     for name, picture_ in after.items():
         assert (np.abs(picture_ - before[name]).max(2) > 30).sum() > 200, name
+    # Not only the wall, but the clay before it has changed.
+    assert clay(before["#object"]).sum() > 2000 and (clay(before["#object"]) ^ clay(after["#object"])).sum() > 100
     # The nose is dark now, and nothing else is.
     height, width = after["#shadow"].shape[:2]
     assert after["#shadow"][height // 2, int(0.86 * width)].mean() < 110

@@ -181,7 +181,9 @@ def test_hidden_emitters_are_as_in_direct(variant: str, emitter: str) -> None:
 def test_more_samples_per_pixel(variant: str) -> None:
     scene = scene_of(camera=view(), lamp=panel(1.2, 0.3), box=box())
     one, four, sixteen = (render(scene, spp=spp) for spp in (1, 4, 16))
-    assert np.array_equal(one, render(scene)) and not np.array_equal(one, four)
+    # Samples on the lamp are sums of atomic additions, whose order, and so whose rounding, differs from run to run.
+    same = lambda a, b: np.allclose(a, b, rtol=1e-5, atol=1e-6 * sixteen.max())  # noqa: E731
+    assert same(one, render(scene)) and not same(one, four)
     far, near = (float(np.sqrt(np.square(image - sixteen).mean())) for image in (one, four))
     assert near < far < 0.2 * sixteen.mean()
 

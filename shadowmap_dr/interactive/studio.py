@@ -152,19 +152,23 @@ class Studio:
                     await send(content)
 
     def _news(self, client: _Client) -> list[str | bytes]:
-        """What the page does not know yet."""
-        news: list[str | bytes] = []
-        if client.status != self.session.status:
-            client.status = self.session.status
-            news.append(messages.status(client.status))
+        """What the page does not know yet. It hears of a movement before it sees a frame of it, of rest after the last one."""
+        # In this order, the status is not older than the snapshot.
+        snapshot, status = self.session.snapshot, self.session.status
+        target: list[str | bytes] = []
+        frame: list[str | bytes] = []
+        told: list[str | bytes] = []
         if client.target != (self.canvas.version, client.seq):
             client.target = (self.canvas.version, client.seq)
-            news.append(messages.target(self.canvas, client.seq))
-        snapshot = self.session.snapshot
+            target.append(messages.target(self.canvas, client.seq))
         if snapshot.number > client.frame and len(client.unseen) < _UNSEEN:
             if self._frame[0] != snapshot.number:
                 self._frame = (snapshot.number, messages.frame(snapshot))
             client.frame = snapshot.number
             client.unseen.append(snapshot.number)
-            news.append(self._frame[1])
-        return news
+            frame.append(self._frame[1])
+        rests = status.phase == "resting"
+        if client.status != status and not (rests and client.frame < self.session.snapshot.number):
+            client.status = status
+            told.append(messages.status(status))
+        return target + (frame + told if rests else told + frame)

@@ -8,10 +8,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+import trimesh
 
 from shadowmap_dr.experiments.lights_scene import make_scene, target_and_starts
 from shadowmap_dr.inverse import LightBatch, StillScene
-from shadowmap_dr.raster import build_topology, outward_faces
+from shadowmap_dr.raster import build_topology, drawing_order, outward_faces
 from shadowmap_dr.renderer import Renderer
 
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
@@ -62,3 +63,23 @@ def test_images_are_the_same_without_backs(name: str) -> None:
 def _reversed(faces: mi.UInt32) -> mi.UInt32:
     corner = dr.arange(mi.UInt32, dr.width(faces))
     return dr.gather(mi.UInt32, faces, corner // 3 * 3 + (2 - corner % 3))
+
+
+def test_neighbours_in_drawing_order_face_the_same_way_and_have_the_same_size():
+    mesh = trimesh.creation.icosphere(3)
+    scattered = np.random.default_rng(0).permutation(mesh.faces)
+    a, b, c = (mesh.vertices[scattered[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    size = np.linalg.norm(normal, axis=1)
+    turned = normal @ [0.3, 0.8, -0.5] > 0
+
+    def packets(order: np.ndarray) -> tuple[float, float]:
+        """Share of packets that face one way only, and by how much the sizes of a packet differ."""
+        packets = order[: len(order) // 16 * 16].reshape(-1, 16)
+        alike = turned[packets].all(1) | ~turned[packets].any(1)
+        return alike.mean(), np.median(size[packets].max(1) / size[packets].min(1)) - 1
+
+    order = drawing_order(scattered, mesh.vertices)
+    assert sorted(order) == list(range(len(order)))
+    (alike, spread), (before, spread_before) = packets(order), packets(np.arange(len(order)))
+    assert alike > 0.5 > 0.1 > before and spread < 0.5 * spread_before

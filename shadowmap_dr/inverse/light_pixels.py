@@ -11,7 +11,7 @@ import mitsuba as mi
 from ..errors import ShadowmapError
 from ..light_maps import boxes_of, shape_planes
 from ..lights import DirectionalLight
-from ..raster import Topology, outward_faces
+from ..raster import Topology, build_topology, drawing_order, outward_faces
 from ..raster.blend import Mixer
 from ..renderer import GBuffer, Renderer
 from ..shadow import Boxes, ShadowSettings
@@ -112,6 +112,10 @@ class StillScene:
             p_world = dr.gather(mi.Point3f, positions, dr.arange(mi.UInt32, geometry.vertex_count))
             planes, planar = shape_planes(renderer.plan, geometry)
             buffer = renderer.g_buffer(sensor)
+            vertices = positions.numpy().reshape(-1, 3)
+            faces = geometry.faces.numpy().reshape(-1, 3)
+            faces = faces[drawing_order(faces, vertices)]
+            topology = build_topology(faces, vertices, mi.UInt32)
             channels = buffer.sensor.channels
             irradiance = [[mi.Float(light.irradiance[c]) for c in range(channels)] for light in data.lights]
             scene = cls(
@@ -119,9 +123,9 @@ class StillScene:
                 irradiance,
                 shadow,
                 p_world,
-                geometry.faces,
-                renderer.topology,
-                mi.Bool(outward_faces(renderer.topology, positions.numpy().reshape(-1, 3))),
+                mi.UInt32(faces.ravel()),
+                topology,
+                mi.Bool(outward_faces(topology, vertices)),
                 geometry.vertex_shape,
                 len(geometry.shapes),
                 planes,

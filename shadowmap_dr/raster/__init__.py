@@ -2,7 +2,7 @@
 
 from ._types import MAX_RESOLUTION, NO_TRIANGLE, RasterOutput
 from .antialias import antialias
-from .closed import outward_faces
+from .closed import drawing_order, outward_faces
 from .crossings import Crossings, find_crossings
 from .interpolate import interpolate
 from .rasterize import rasterize, visible_triangles
@@ -17,6 +17,7 @@ __all__ = [
     "Topology",
     "antialias",
     "build_topology",
+    "drawing_order",
     "find_crossings",
     "interpolate",
     "outward_faces",

@@ -21,8 +21,9 @@ _DEPTH_GAP = 1e-5
 _DEPTH_GAP_ABSOLUTE = 2e-7
 # Lines through pixel centres that lie this far (in pixels) beyond an edge's ends are tested, too, in spite of rounding.
 _MARGIN = 1.0 / 512.0
-# So many lanes walk along all silhouettes; few, so that threads get equal parts of a short list, too.
+# So many lanes walk along the silhouettes of an image; few, so that threads get equal parts of a short list, too.
 _LANES, _LANES_PER_EDGE = 512, 4
+_MOST_LANES = 32768
 
 
 def register_silhouettes(
@@ -42,7 +43,7 @@ def register_silhouettes(
     UInt32 = module.UInt32
     count, records, edges = _collect(positions, topology, raster, vertex_count)
     # Lanes that share an edge take turns: edges differ in length, and few are silhouettes.
-    lanes, stride = _LANES, _LANES_PER_EDGE
+    lanes, stride = min(_LANES * raster.batch, _MOST_LANES), _LANES_PER_EDGE
 
     def walk(lane: Any) -> tuple[Any]:
         slot, turn = lane // stride, lane % stride

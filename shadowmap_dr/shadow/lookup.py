@@ -84,7 +84,7 @@ def _compare_all(maps: ShadowMaps, map_index: Any, u: Any, v: Any, depth: Any) -
     total = module.Float(0)
     for column, row in separable_terms(filter_kernel(s.filter, s.filter_size)):
         radius = len(row) // 2
-        across, down = _moved(row, at.fx), _moved(column, at.fy)
+        across, down = moved_weights(row, at.fx), moved_weights(column, at.fy)
         for j, weight_down in enumerate(down):
             line = module.Float(0)
             for i, weight in enumerate(across):
@@ -104,7 +104,7 @@ def _compare_texel(maps: ShadowMaps, texel: Any, depth: Any) -> Any:
     return dr.fma(share, soft_comparison(other, depth, bias, _SOFTNESS) - lit, lit)
 
 
-def _moved(weights: list[float], fraction: Any) -> list[Any]:
+def moved_weights(weights: list[float], fraction: Any) -> list[Any]:
     """Weights of a line of taps that is moved by a fraction of a texel: one tap more."""
     padded = np.array([0.0, *weights, 0.0])
     return [dr.fma(fraction, float(a - b), float(b)) for a, b in zip(padded[:-1], padded[1:], strict=True)]

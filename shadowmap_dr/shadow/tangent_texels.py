@@ -13,7 +13,7 @@ from ..raster.blend import incoming_weights
 from ..raster.planes import depth_at, planes
 from .camera import Frusta, Views, of_map
 from .methods import PREFILTERED
-from .shadow_map import ShadowSettings, interleaved, texel_depths
+from .shadow_map import FAR, ShadowSettings, interleaved, texel_depths
 
 
 def twist_of(views: Views) -> Any:
@@ -65,7 +65,22 @@ class TangentTexels:
         module, size = self.module, self.size
         image, row, column = pixel_coordinates(module, self.raster.batch, size, size)
         texel = dr.arange(module.UInt32, self.raster.batch * size * size)
-        own, changes = self._own(image, row, column, self.raster.triangle)
+        free = self.method.encode(module.Float(FAR), module.Float(0), self.settings.order)
+
+        def plain(*lanes: Any) -> tuple[Any, ...]:
+            own, changes = self._own(*lanes)
+            return (*own, *changes)
+
+        # Half of a map may see nothing.
+        result = dr.if_stmt(
+            (image, row, column, self.raster.triangle),
+            self.raster.triangle != NO_TRIANGLE,
+            plain,
+            lambda *lanes: (*free, *(module.Float(0) for _ in range(2 * len(free)))),
+            mode="symbolic",
+            label="texels",
+        )
+        own, changes = list(result[: len(free)]), list(result[len(free) :])
         if crossings is None:
             return interleaved(own), interleaved(changes)
         incoming = incoming_weights(crossings, size)

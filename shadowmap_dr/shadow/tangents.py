@@ -19,8 +19,8 @@ import drjit as dr
 from ..raster import Topology, find_crossings, visible_triangles
 from ..raster._types import backend
 from .camera import Frusta, Views, of_map, project, to_clip, to_light_space
-from .filters import filter_kernel, filter_map
-from .lookup import Texels, entries, stored_texel
+from .filters import filter_kernel, filter_map, separable_terms
+from .lookup import Texels, entries, moved_weights, stored_texel
 from .methods import PREFILTERED
 from .moments import reduced_bleeding
 from .shadow_map import FAR, ShadowMaps, ShadowSettings, block_means
@@ -29,17 +29,23 @@ from .tangent_texels import TangentTexels, turned, twist_of, weight_rates
 
 @dataclass(frozen=True)
 class TangentMaps:
-    """A batch of M filtered maps of directional lights and how they change when the lights turn. Detached.
+    """A batch of M maps of directional lights and how they change when the lights turn. Detached.
 
     Attributes:
-        maps: as :func:`shadowmap_dr.shadow.filter_maps` returns them.
+        maps: as :func:`shadowmap_dr.shadow.filter_maps` returns them, but for the filter if it is left to the look-ups.
         tangents: flat ``Float`` (M * N * N * 2 C): change of a texel's C numbers with a, then with b.
         twist: ``Float`` (M,).
+        taps: (weights along columns, along rows) of the filter that is left to the look-ups, ([1], [1]) if there is none.
     """
 
     maps: ShadowMaps
     tangents: Any
     twist: Any
+    taps: tuple[list[float], list[float]]
+
+
+# A filter that is left to the look-ups costs (k + 1)^2 texels for each of them; beforehand, it costs 2 k for each texel.
+_WIDEST_TAPS = 3
 
 
 def tangent_maps(
@@ -81,10 +87,13 @@ def tangent_maps(
             values = block_means(values, size, channels, settings.supersampling)
             tangents = block_means(tangents, size, 2 * channels, settings.supersampling)
         kernel = filter_kernel(settings.filter, settings.filter_size)
-        shape = (count, settings.resolution, settings.resolution)
-        values, tangents = filter_map(values, kernel, *shape, channels), filter_map(tangents, kernel, *shape, 2 * channels)
-        dr.eval(values, tangents)
-        return TangentMaps(ShadowMaps(values, views, frusta, settings, channels), tangents, twist)
+        terms = separable_terms(kernel)
+        if len(terms) > 1 or len(kernel) > _WIDEST_TAPS:
+            shape = (count, settings.resolution, settings.resolution)
+            values, tangents = filter_map(values, kernel, *shape, channels), filter_map(tangents, kernel, *shape, 2 * channels)
+            dr.eval(values, tangents)
+            terms = [([1.0], [1.0])]
+        return TangentMaps(ShadowMaps(values, views, frusta, settings, channels), tangents, twist, terms[0])
 
 
 def tangent_visibility(maps: TangentMaps, map_index: Any, p_world: Any, active: Any) -> tuple[Any, Any, Any]:
@@ -114,8 +123,11 @@ def tangent_visibility(maps: TangentMaps, map_index: Any, p_world: Any, active: 
         return reduced_bleeding(value, settings.bleeding) if method.bleeds else value
 
     def look_up(index, u, v, depth, *moves):  # noqa: ANN001, ANN002, ANN202
-        at, channels = Texels(maps.maps, index, u, v), maps.maps.channels
-        (values, by_u, by_v), (own, _, _) = (_bilinear(at, *numbers) for numbers in (
+        # Beyond the outermost texels' centres nothing changes.
+        end = 1 - 1 / settings.resolution
+        moves = [dr.select(dr.abs(u if k % 3 == 0 else v) > end, 0, m) if k % 3 < 2 else m for k, m in enumerate(moves)]
+        at, channels = Texels(maps.maps, index, dr.clip(u, -end, end), dr.clip(v, -end, end)), maps.maps.channels
+        (values, by_u, by_v), (own, _, _) = (_filtered(at, *numbers, *maps.taps) for numbers in (
             (maps.maps.values, channels), (maps.tangents, 2 * channels)
         ))  # fmt: skip
         # Texture coordinates are in texels.
@@ -141,15 +153,23 @@ def tangent_visibility(maps: TangentMaps, map_index: Any, p_world: Any, active: 
     )
 
 
-def _bilinear(at: Texels, flat: Any, channels: int) -> tuple[list[Any], list[Any], list[Any]]:
-    """The numbers at points between texels, and their changes by column and by row."""
-    corners = [[stored_texel(flat, channels, at.index(i, j), True) for i in range(2)] for j in range(2)]
-    rows = [[dr.fma(b - a, at.fx, a) for a, b in zip(*row, strict=True)] for row in corners]
-    steps = [[b - a for a, b in zip(*row, strict=True)] for row in corners]
-    values = [dr.fma(b - a, at.fy, a) for a, b in zip(*rows, strict=True)]
-    across = [dr.fma(b - a, at.fy, a) for a, b in zip(*steps, strict=True)]
-    down = [b - a for a, b in zip(*rows, strict=True)]
-    return tuple([number for packet in packets for number in entries(packet)] for packets in (values, across, down))
+def _filtered(at: Texels, flat: Any, channels: int, column: list[float], row: list[float]) -> tuple[list[Any], ...]:
+    """The numbers at points between texels, under a filter that moves with the points, and their changes by column and by row."""
+    across, down = moved_weights(row, at.fx), moved_weights(column, at.fy)
+    slope_across, slope_down = ([a - b for a, b in zip([0.0, *line], [*line, 0.0], strict=True)] for line in (row, column))
+    totals: list[list[Any]] = []
+    for j in range(len(down)):
+        taps = [at.index(i - len(row) // 2, j - len(column) // 2) for i in range(len(across))]
+        packets = [stored_texel(flat, channels, tap, True) for tap in taps]
+        for k, line in enumerate(zip(*packets, strict=True)):
+            value = sum(packet * weight for packet, weight in zip(line, across, strict=True))
+            slope = sum(packet * weight for packet, weight in zip(line, slope_across, strict=True))
+            if j == 0:
+                totals.append([0, 0, 0])
+            total = totals[k]
+            total[0], total[1] = total[0] + value * down[j], total[1] + slope * down[j]
+            total[2] = total[2] + value * slope_down[j]
+    return tuple([number for total in totals for number in entries(total[kind])] for kind in range(3))
 
 
 def _with_gradient(function: Any, values: list[Any], depth: Any) -> tuple[Any, list[Any], Any]:

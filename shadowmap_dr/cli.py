@@ -17,7 +17,7 @@ import typer
 from rich.console import Console
 
 from . import __version__, _llvm, assets, cli_art, cli_face, cli_gradients, cli_lights, cli_model, cli_soft, io
-from .cli_options import DEFAULT_VARIANT, Variant, set_variant
+from .cli_options import DEFAULT_VARIANT, Scheduler, SchedulerThreads, Variant, set_variant
 from .errors import ShadowmapError
 from .experiments import bench as bench_experiment
 from .experiments import bench_common, bench_report, maps_scenes
@@ -171,6 +171,8 @@ def pose(
     samples: Annotated[int, typer.Option(help="Samples per pixel of our own methods.")] = 1,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("pose"),
     resume: Annotated[bool, typer.Option("--resume", help="Keep finished runs, go on with killed ones.")] = False,
+    scheduler: Scheduler = "local",
+    threads: SchedulerThreads = 0,
     variant: Variant = DEFAULT_VARIANT,
 ) -> None:
     """Find an object's pose from an image of it and its shadow, with three methods side by side.
@@ -193,6 +195,8 @@ def pose(
         samples=samples,
         out=out,
         resume=resume,
+        scheduler=scheduler,
+        threads=threads,
     )
     records = pose_experiment.run_pose(options)
     Console().print(pose_experiment.table(records))

@@ -9,7 +9,7 @@ import typer
 from rich.console import Console
 
 from . import report
-from .cli_options import DEFAULT_VARIANT, Variant, set_variant
+from .cli_options import DEFAULT_VARIANT, Scheduler, SchedulerThreads, Variant, set_variant
 from .errors import ShadowmapError
 from .experiments import lights as lights_experiment
 from .experiments import lights_report, lights_speed
@@ -44,10 +44,8 @@ def lights(
     cone: Annotated[float, typer.Option(help="Opening angle in degrees of the cone that directions are drawn from.")] = 60,
     seed: Annotated[int, typer.Option(help="Seed of targets and starts.")] = 0,
     memory: Annotated[int, typer.Option(help="MiB that a batch of runs may need, about.")] = 2048,
-    scheduler: Annotated[
-        str, typer.Option(metavar="local|processes:N|tcp://HOST:PORT", help="Who does the batches: this process or workers.")
-    ] = "local",
-    threads: Annotated[int, typer.Option(help="Threads of each process, 0 for one for each core.")] = 0,
+    scheduler: Scheduler = "local",
+    threads: SchedulerThreads = 0,
     full: Annotated[bool, typer.Option("--full", help="1 to 5 lights, all filters, 150 runs: hours.")] = False,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("lights"),
     resume: Annotated[

@@ -1,4 +1,4 @@
-"""What commands have in common: the option for the Mitsuba variant."""
+"""What commands have in common: the options for the Mitsuba variant and for who does the work."""
 
 from __future__ import annotations
 
@@ -13,6 +13,11 @@ from .errors import ShadowmapError
 DEFAULT_VARIANT = "llvm_ad_rgb"
 
 Variant = Annotated[str, typer.Option(help="Mitsuba variant; the cuda ones need an NVIDIA GPU.")]
+
+Scheduler = Annotated[
+    str, typer.Option(metavar="local|processes:N|tcp://HOST:PORT", help="Who does the runs: this process or workers.")
+]
+SchedulerThreads = Annotated[int, typer.Option("--threads", help="Threads of each process, 0 for one for each core.")]
 
 
 def set_variant(name: str) -> None:

@@ -19,7 +19,7 @@ from fakes import BlobRenderer
 from mitsuba_baselines.pose import MitsubaPose, ProjectiveSetting
 from shadowmap_dr import assets
 from shadowmap_dr.errors import ShadowmapError
-from shadowmap_dr.experiments import pose, pose_scene
+from shadowmap_dr.experiments import pose, pose_record, pose_scene
 from shadowmap_dr.experiments.pose import PoseOptions, run_pose
 from shadowmap_dr.inverse import Method, PoseFit, optimize
 
@@ -124,6 +124,21 @@ def test_resume_keeps_finished_runs_and_adds_new_ones(tmp_path: Path) -> None:
     assert [record["iterations"] for record in json.loads((tmp_path / "pose.json").read_text())] == [3]
 
 
+def test_workers_make_the_same_runs(tmp_path: Path) -> None:
+    pytest.importorskip("distributed")
+    small = {"resolutions": (24,), "iterations": 6}
+    here = run_pose(options(tmp_path / "here", **small))
+    there = run_pose(options(tmp_path / "there", runs=1, scheduler="processes:1", threads=1, **small))
+    more = run_pose(options(tmp_path / "there", resume=True, scheduler="processes:1", threads=1, **small))
+    assert [record for record in more if record["run"] == 0] == there  # not made again
+    for one, other in zip(here, more, strict=True):
+        assert (one["method"], one["run"], one["settings"]) == (other["method"], other["run"], other["settings"])
+        np.testing.assert_allclose(one["final"], other["final"], atol=1e-4)
+        assert other["environment"]["threads"] == 1
+    assert json.loads((tmp_path / "there" / "pose.json").read_text()) == more
+    assert (tmp_path / "there" / "spot-24" / "images.png").stat().st_size
+
+
 def test_failed_optimisation_is_recorded_as_such(tmp_path: Path) -> None:
     class Diverging(PoseFit):
         def parameters(self) -> Any:
@@ -140,10 +155,10 @@ def test_failed_optimisation_is_recorded_as_such(tmp_path: Path) -> None:
 
 def test_time_to_pose_counts_until_the_error_stays_small() -> None:
     seconds = np.ones(4)
-    assert pose.seconds_to_pose(np.array([9, 0.05, 3, 0.09, 0.01]), seconds) == 3
-    assert pose.seconds_to_pose(np.array([9, 0.05, 3, 0.09, 0.2]), seconds) is None
-    assert pose.seconds_to_pose(np.array([0, 0, 0, 0, 0.0]), seconds) == 0
-    assert pose.seconds_to_pose(np.array([1, 1, 0, 0, np.nan]), seconds) is None
+    assert pose_record.seconds_to_pose(np.array([9, 0.05, 3, 0.09, 0.01]), seconds) == 3
+    assert pose_record.seconds_to_pose(np.array([9, 0.05, 3, 0.09, 0.2]), seconds) is None
+    assert pose_record.seconds_to_pose(np.array([0, 0, 0, 0, 0.0]), seconds) == 0
+    assert pose_record.seconds_to_pose(np.array([1, 1, 0, 0, np.nan]), seconds) is None
 
 
 def test_table_has_a_row_for_each_object_resolution_and_method(tmp_path: Path) -> None:

@@ -19,7 +19,8 @@ from ..errors import ShadowmapError
 from ..inverse import Method
 from ..timing import Contender, alternate, compare, timed
 from .bench_common import BenchOptions, Unit, Update, run_child
-from .pose import BETAS, METHODS, STEP_SIZE, build_method, seconds_to_pose
+from .pose_methods import BETAS, METHODS, STEP_SIZE, build_method
+from .pose_record import seconds_to_pose
 from .pose_scene import PoseProblem, make_problem, path_traced_reference, pose_errors, start_pose
 
 OBJECT = "spot"

@@ -11,7 +11,8 @@ import numpy.typing as npt
 
 from ..inverse import PoseFit
 from ..renderer import Renderer
-from .pose import BETAS, RECOVERED_DEG, RECOVERED_X100, STEP_SIZE
+from .pose_methods import BETAS, STEP_SIZE
+from .pose_record import RECOVERED_DEG, RECOVERED_X100
 from .pose_scene import PoseProblem, make_problem, path_traced_reference, pose_errors, start_pose
 
 RESOLUTION, ITERATIONS, OBJECT = 128, 150, "spot"

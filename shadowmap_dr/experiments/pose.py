@@ -8,13 +8,11 @@ projective integrator, with an area light in place of the directional one and th
 from __future__ import annotations
 
 import functools
-import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
@@ -22,26 +20,14 @@ from rich.console import Console
 from rich.progress import Progress, TaskID
 from rich.table import Table
 
-from .. import __version__, assets, io, report
+from .. import io, report
 from ..errors import ShadowmapError
-from ..inverse import History, Method, PoseFit, optimize
-from .pose_scene import (
-    NormalKind,
-    PoseProblem,
-    ReferenceKind,
-    make_problem,
-    path_traced_reference,
-    pose_errors,
-    start_pose,
-)
-
-METHODS = ("shadows", "rasterizer", "mitsuba")
-RECOVERED_DEG, RECOVERED_X100 = 0.2, 0.3
-TIME_TO_POSE_DEG = 0.1
-STEP_SIZE = 0.01
-BETAS = (0.9, 0.999)
-
-Image = npt.NDArray[np.float32]
+from ..inverse import Method, run_sweep
+from ..inverse.schedulers import check_scheduler
+from .pose_methods import METHODS, Builder, Image, build_method, fairness
+from .pose_record import identity, is_of, make_record
+from .pose_scene import NormalKind, PoseProblem, ReferenceKind, make_problem, start_pose
+from .pose_sweep import PoseRuns, make_reference
 
 
 @dataclass(frozen=True)
@@ -60,6 +46,8 @@ class PoseOptions:
     samples: int = 1
     out: Path = Path("pose")
     resume: bool = False
+    scheduler: str = "local"
+    threads: int = 0
 
     def __post_init__(self) -> None:
         for name, values in (("object", self.objects), ("resolution", self.resolutions), ("method", self.methods)):
@@ -79,52 +67,7 @@ class PoseOptions:
             raise ShadowmapError(f"no reference {self.reference!r}: choose mitsuba or own.")
         if self.normals not in ("face", "vertex"):
             raise ShadowmapError(f"no normals {self.normals!r}: choose face or vertex.")
-
-
-Builder = Callable[[str, PoseProblem, Image], Method]
-
-
-def build_method(name: str, problem: PoseProblem, reference: Image, samples: int = 1) -> Method:
-    """One of the three methods for a problem and its reference image; our own ones with so many samples per pixel."""
-    if name == "mitsuba":
-        from mitsuba_baselines import pose as baseline
-
-        setting = baseline.fair_setting(problem.resolution, problem.normals)
-        return baseline.MitsubaPose(
-            assets.scene("pose"),
-            problem.mesh,
-            problem.resolution,
-            setting,
-            reference,
-            step_size=STEP_SIZE,
-            betas=BETAS,
-            shift_z=problem.shift_z,
-            normals=problem.normals,
-        )
-    from ..renderer import Renderer
-
-    settings = shadow_settings(name)
-    renderer = Renderer.from_scene(problem.scene, **settings)
-    if samples != 1:
-        settings["samples_per_pixel"] = samples
-    return PoseFit(
-        renderer,
-        "object",
-        problem.p_rest,
-        reference,
-        step_size=STEP_SIZE,
-        betas=BETAS,
-        shift_z=problem.shift_z,
-        spp=samples,
-        settings=settings,
-    )
-
-
-def shadow_settings(method: str) -> dict[str, Any]:
-    """Options of the `Renderer` that the methods `shadows` and `rasterizer` use."""
-    if method == "rasterizer":
-        return {"shadow_method": "none"}
-    return {"shadow_method": "vsm", "shadow_map_resolution": 256, "shadow_filter": "gaussian", "shadow_filter_size": 3}
+        check_scheduler(self.scheduler)
 
 
 def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Console | None = None) -> list[dict[str, Any]]:
@@ -136,6 +79,9 @@ def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Co
 
     Records that are complete are kept if `options.resume` is set, and a run that was killed goes on from its last
     checkpoint, at most ten iterations before the end. Returns the records of this call's runs, in the order of the file.
+
+    With a scheduler (see :func:`shadowmap_dr.inverse.run_sweep`) its workers make the runs, with methods of :func:`build_method`.
+    Times of runs that shared a machine are not those of runs that had it for themselves.
     """
     console = console or Console(stderr=True)
     if build is build_method:
@@ -148,24 +94,29 @@ def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Co
         if not isinstance(stored, list) or not all(isinstance(record, dict) for record in stored):
             raise ShadowmapError(f"{out / 'pose.json'} is no list of records: choose another folder.")
 
-    problems = [
-        make_problem(name, resolution, shadow_only=options.shadow_only, normals=options.normals, work=out / "objects")
+    problems = {
+        problem.folder: (name, problem)
         for name in options.objects
         for resolution in options.resolutions
-    ]
-    if len({problem.folder for problem in problems}) != len(problems):
+        for problem in [
+            make_problem(name, resolution, shadow_only=options.shadow_only, normals=options.normals, work=out / "objects")
+        ]
+    }
+    if len(problems) != len(options.objects) * len(options.resolutions):
         raise ShadowmapError(f"two of the objects {', '.join(options.objects)} have the same name: rename one file.")
+    if options.scheduler != "local":
+        stored += _sweep(problems, options, stored, console)
 
     result: list[dict[str, Any]] = []
     with report.progress(console) as progress:
-        for problem in problems:
+        for _, problem in problems.values():
             task = progress.add_task(f"{problem.folder} reference and methods", total=None, note="")
             reference = _reference(problem, options, build)
             # Built once and used for all runs: what a method compiled stays warm, and what cannot be built fails at once.
             methods = {name: build(name, problem, reference) for name in options.methods}
             progress.remove_task(task)
             for method in methods.values():
-                if _fairness(method, problem).get("fair") is False:
+                if fairness(method, problem).get("fair") is False:
                     note = "sample counts found at another resolution, where they converge; here nobody has searched"
                     progress.console.print(f"{problem.folder} mitsuba: {note}: {getattr(method, 'setting', '')}", highlight=False)
             records, images = [], {}
@@ -215,6 +166,11 @@ def table(records: Sequence[dict[str, Any]]) -> Table:
     return report.table("Poses found, mean rotation error in degrees, mean offset error x 100, times", columns, rows)
 
 
+def _identity(problem: PoseProblem, name: str, run: int, options: PoseOptions, method: Method) -> dict[str, Any]:
+    seed, iterations, reference = options.seed, options.iterations, options.reference
+    return identity(problem, name, run, method, seed=seed, iterations=iterations, reference=reference)
+
+
 def _run_one(
     problem: PoseProblem,
     name: str,
@@ -225,79 +181,64 @@ def _run_one(
     on_step: Callable[[int], None],
 ) -> dict[str, Any]:
     """The record of a run: a stored one if there is one for exactly these settings, else that of a run made now."""
-    start = start_pose(options.seed, run)
-    identity = report.plain(
-        {
-            "object": problem.name,
-            "resolution": problem.resolution,
-            "method": name,
-            "run": run,
-            "seed": options.seed,
-            "start": start,
-            "iterations": options.iterations,
-            "reference": options.reference,
-            "shadow_only": problem.shadow_only,
-            "normals": problem.normals,
-            "settings": {"object_digest": problem.digest, **method.describe(), **_fairness(method, problem)},
-        }
-    )
+    wanted = _identity(problem, name, run, options, method)
     for record in stored:
-        if all(record.get(key) == value for key, value in identity.items()):
+        if is_of(record, wanted):
             return record
     path = _checkpoint(problem, name, run, options)
     if not options.resume:
         path.unlink(missing_ok=True)
-    history = optimize(method, start, options.iterations, checkpoint=path, settings=identity, on_step=on_step)
-    return {**identity, **_results(history), "environment": _environment()}
+    return make_record(method, wanted, path, on_step)
 
 
-def _fairness(method: Method, problem: PoseProblem) -> dict[str, bool]:
-    """For Mitsuba's method: whether a search found its sample counts to be the cheapest ones that converge."""
-    setting = getattr(method, "setting", None)
-    if setting is None:
-        return {}
-    from mitsuba_baselines.pose import is_fair
-
-    return {"fair": is_fair(setting, problem.resolution, problem.normals)}
+def _sweep(
+    problems: Mapping[str, tuple[str, PoseProblem]], options: PoseOptions, stored: Sequence[dict[str, Any]], console: Console
+) -> list[dict[str, Any]]:
+    """Records of the runs that are not among the stored ones, made by the workers of a scheduler."""
+    build = functools.partial(build_method, samples=options.samples)
+    missing = []
+    for folder, (object_, problem) in problems.items():
+        # Workers find it here, or make it again where they do not see this folder.
+        reference = _reference(problem, options, build)
+        for name in options.methods:
+            method = build(name, problem, reference)
+            wanted = [_identity(problem, name, run, options, method) for run in range(options.runs)]
+            numbers = [run for run, own in enumerate(wanted) if not any(is_of(record, own) for record in stored)]
+            missing.append(
+                PoseRuns(
+                    object=object_ if object_ == problem.name else str(Path(object_).resolve()),
+                    folder=folder,
+                    resolution=problem.resolution,
+                    method=name,
+                    numbers=tuple(numbers),
+                    iterations=options.iterations,
+                    seed=options.seed,
+                    reference=options.reference,
+                    shadow_only=options.shadow_only,
+                    normals=options.normals,
+                    samples=options.samples,
+                    out=str(options.out.resolve()),
+                )
+            )
+    found = run_sweep(
+        [runs for runs in missing if runs.numbers],
+        options.out,
+        scheduler=options.scheduler,
+        variant=mi.variant(),
+        threads=options.threads,
+        resume=options.resume,
+        console=console,
+    )
+    return [record for records in found.values() for record in records]
 
 
 def _show(progress: Progress, task: TaskID, done: int) -> None:
     progress.update(task, completed=done, note="")
 
 
-def _results(history: History) -> dict[str, Any]:
-    rotation, translation = pose_errors(history.parameters)
-    return report.plain(
-        {
-            "final": history.final,
-            "rotation_error_deg": rotation[-1],
-            "translation_error_x100": translation[-1],
-            "recovered": bool(rotation[-1] < RECOVERED_DEG and translation[-1] < RECOVERED_X100),
-            "seconds_per_iteration": history.seconds_per_iteration,
-            "seconds_total": history.seconds_total,
-            "seconds_to_pose": seconds_to_pose(rotation, history.seconds),
-            "loss_curve": history.loss,
-            "rotation_error_curve": rotation,
-            "translation_error_curve": translation,
-        }
-    )
-
-
-def seconds_to_pose(rotation_deg: npt.NDArray[np.float64], seconds: npt.NDArray[np.float64]) -> float | None:
-    """Seconds until the rotation error is at most 0.1 degrees and stays there, None if it never does."""
-    outside = np.flatnonzero(~(rotation_deg <= TIME_TO_POSE_DEG))
-    first = int(outside[-1]) + 1 if len(outside) else 0
-    return float(seconds[:first].sum()) if first < len(rotation_deg) else None
-
-
 def _reference(problem: PoseProblem, options: PoseOptions, build: Builder) -> Image:
     folder = options.out / problem.folder
-    if options.reference == "mitsuba":
-        image = path_traced_reference(problem, folder / "reference.exr")
-    else:
-        blank = np.zeros((problem.resolution, problem.resolution, 3), np.float32)
-        image = build("shadows", problem, blank).render(np.zeros(3))
-        io.write_image(folder / "reference-own.exr", image)
+    image = make_reference(problem, options.reference, folder, build)
     io.write_png(folder / "reference.png", image)
     return image
 
@@ -360,14 +301,3 @@ def _outcome(record: dict[str, Any]) -> str:
     values = (_mean([record], key, "{:.3f}") for key in ("rotation_error_deg", "translation_error_x100"))
     time = _mean([record], "seconds_per_iteration", "{:.4f}")
     return "rotation {} deg, offset x 100 {}, {} s per iteration".format(*values, time)
-
-
-def _environment() -> dict[str, Any]:
-    return {
-        "shadowmap_dr": __version__,
-        "mitsuba": mi.__version__,
-        "drjit": dr.__version__,
-        "variant": mi.variant(),
-        "threads": dr.thread_count(),
-        "load_average": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
-    }

@@ -21,7 +21,7 @@ from .. import io, report
 from ..cli_options import DEFAULT_VARIANT
 from ..errors import ShadowmapError
 from ..io import atomic
-from .pose import METHODS, build_method
+from .pose_methods import METHODS, build_method
 from .pose_scene import make_problem
 
 Render = Callable[[npt.NDArray[np.float64]], npt.NDArray[Any]]

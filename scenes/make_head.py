@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from shadowmap_dr.inverse.morphable import MorphableModel, save_model
+from shadowmap_dr.inverse.faces.morphable import MorphableModel, save_model
 
 HERE = Path(__file__).parent / "heads"
 HEADS = 1000

@@ -19,10 +19,12 @@ from rich.console import Console
 from . import __version__, _llvm, assets, cli_art, cli_face, cli_gradients, cli_lights, cli_model, cli_soft, io
 from .cli_options import DEFAULT_VARIANT, Scheduler, SchedulerThreads, Variant, set_variant
 from .errors import ShadowmapError
-from .experiments import bench as bench_experiment
-from .experiments import bench_common, bench_report, maps_scenes
-from .experiments import maps as maps_experiment
-from .experiments import pose as pose_experiment
+from .experiments.bench import common as bench_common
+from .experiments.bench import experiment as bench_experiment
+from .experiments.bench import report as bench_report
+from .experiments.maps import experiment as maps_experiment
+from .experiments.maps import scenes as maps_scenes
+from .experiments.pose import experiment as pose_experiment
 
 app = typer.Typer(
     name="shadowmap-dr",

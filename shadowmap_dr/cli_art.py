@@ -9,7 +9,7 @@ import typer
 from rich.console import Console
 
 from .cli_options import DEFAULT_VARIANT, Variant, set_variant
-from .experiments import art as art_experiment
+from .experiments.art import experiment as art_experiment
 
 
 def art(

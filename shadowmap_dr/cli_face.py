@@ -11,10 +11,12 @@ from rich.console import Console
 from . import io
 from .cli_options import DEFAULT_VARIANT, Variant, set_variant
 from .errors import ShadowmapError
-from .experiments import faces as faces_experiment
-from .experiments import faces_image, faces_problem, faces_report
-from .inverse import convert as convert_model
-from .inverse.morphable import save_model
+from .experiments.faces import experiment as faces_experiment
+from .experiments.faces import image as faces_image
+from .experiments.faces import problem as faces_problem
+from .experiments.faces import report as faces_report
+from .inverse.faces import convert as convert_model
+from .inverse.faces.morphable import save_model
 
 app = typer.Typer(help="Find a head from its profile shadow.", invoke_without_command=True)
 

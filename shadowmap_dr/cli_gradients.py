@@ -9,10 +9,11 @@ import typer
 from rich.console import Console
 
 from .cli_options import DEFAULT_VARIANT, Variant, set_variant
-from .experiments import gradients_convergence as convergence_experiment
-from .experiments import gradients_jacobian as jacobian_experiment
-from .experiments import gradients_plane as plane_experiment
-from .experiments import gradients_report, gradients_scenes
+from .experiments.gradients import convergence as convergence_experiment
+from .experiments.gradients import jacobian as jacobian_experiment
+from .experiments.gradients import plane as plane_experiment
+from .experiments.gradients import report as gradients_report
+from .experiments.gradients import scenes as gradients_scenes
 
 app = typer.Typer(help="Measure the derivatives of shadows, and what can be found with them.", no_args_is_help=True)
 

@@ -11,10 +11,11 @@ from rich.console import Console
 from . import report
 from .cli_options import DEFAULT_VARIANT, Scheduler, SchedulerThreads, Variant, set_variant
 from .errors import ShadowmapError
-from .experiments import lights as lights_experiment
-from .experiments import lights_report, lights_speed
-from .experiments.lights_problem import LightProblem
-from .experiments.lights_scene import OBJECTS
+from .experiments.lights import experiment as lights_experiment
+from .experiments.lights import report as lights_report
+from .experiments.lights import speed as lights_speed
+from .experiments.lights.problem import LightProblem
+from .experiments.lights.scene import OBJECTS
 
 _FULL_LIGHTS, _FULL_SIZES, _FULL_RUNS = (1, 2, 3, 4, 5), (1, 3, 5, 9, 15, 0), 150
 

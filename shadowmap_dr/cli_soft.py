@@ -10,8 +10,9 @@ from rich.console import Console
 
 from .cli_options import DEFAULT_VARIANT, Variant, set_variant
 from .errors import ShadowmapError
-from .experiments import soft as soft_experiment
-from .experiments import soft_report, soft_scenes
+from .experiments.soft import experiment as soft_experiment
+from .experiments.soft import report as soft_report
+from .experiments.soft import scenes as soft_scenes
 
 _FULL_SAMPLES, _FULL_SPP, _FULL_RESOLUTION = ((16, 32), (32, 64), (64, 128), (128, 256)), 2048, 192
 

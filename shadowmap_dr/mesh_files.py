@@ -11,8 +11,8 @@ import numpy.typing as npt
 
 from . import io
 from .errors import ShadowmapError
-from .inverse.shadow_views import ShadowView, height
-from .inverse.smoothness import inverted_share
+from .inverse.art.shadow_views import ShadowView, height
+from .inverse.art.smoothness import inverted_share
 
 #: Largest side of a mesh that is to be printed, in millimetres.
 PRINT_SIZE_MM = 80.0

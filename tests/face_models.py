@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from shadowmap_dr.inverse.morphable import MorphableModel
+from shadowmap_dr.inverse.faces.morphable import MorphableModel
 
 
 def egg(level: int = 3) -> MorphableModel:

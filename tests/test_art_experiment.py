@@ -12,8 +12,10 @@ from typer.testing import CliRunner
 
 from shadowmap_dr import cli, mesh_files
 from shadowmap_dr.errors import ShadowmapError
-from shadowmap_dr.experiments import art, art_gallery, art_pictures
-from shadowmap_dr.experiments.art_run import frame_steps, intersection_over_union, make
+from shadowmap_dr.experiments.art import experiment as art
+from shadowmap_dr.experiments.art import gallery as art_gallery
+from shadowmap_dr.experiments.art import pictures as art_pictures
+from shadowmap_dr.experiments.art.run import frame_steps, intersection_over_union, make
 from shadowmap_dr.inverse import RemeshingSculptor, Sculptor, even_sphere, shadow_view
 
 trimesh = pytest.importorskip("trimesh")

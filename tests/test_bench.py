@@ -18,8 +18,13 @@ from rich.console import Console
 
 from shadowmap_dr import assets, timing
 from shadowmap_dr.errors import ShadowmapError
-from shadowmap_dr.experiments import bench, bench_breakdown, bench_common, bench_meshes, bench_raster, bench_report
-from shadowmap_dr.experiments.bench_common import BenchOptions, Sizes, Unit, run_child
+from shadowmap_dr.experiments.bench import breakdown as bench_breakdown
+from shadowmap_dr.experiments.bench import common as bench_common
+from shadowmap_dr.experiments.bench import experiment as bench
+from shadowmap_dr.experiments.bench import meshes as bench_meshes
+from shadowmap_dr.experiments.bench import raster as bench_raster
+from shadowmap_dr.experiments.bench import report as bench_report
+from shadowmap_dr.experiments.bench.common import BenchOptions, Sizes, Unit, run_child
 from shadowmap_dr.scene import load
 
 TINY = Sizes(
@@ -124,7 +129,7 @@ def test_passes_exist() -> None:
 
 
 def test_running_the_passes_one_by_one_changes_no_derivative(tmp_path: Path) -> None:
-    from shadowmap_dr.experiments.bench_scaling import Case
+    from shadowmap_dr.experiments.bench.scaling import Case
 
     fit = Case(mesh="teapot-1k", resolution=16).fit(tmp_path)
     bench_breakdown.unfrozen_step(fit)
@@ -154,7 +159,7 @@ def test_steps_and_poses(tmp_path: Path) -> None:
 
 
 def test_limit_for_mitsuba_cuts_runs_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from shadowmap_dr.experiments import bench_steps
+    from shadowmap_dr.experiments.bench import steps as bench_steps
 
     class Slow:
         setting = bench_steps_setting()
@@ -311,9 +316,9 @@ def test_unusable_options(tmp_path: Path, changes: dict[str, Any], message: str)
 
 def test_child_that_fails_or_hangs(tmp_path: Path) -> None:
     case = {"resolution": 8, "mesh": "no-such-mesh"}
-    result = run_child("bench_scaling:measure_case", {"case": case, "work": str(tmp_path), "rounds": 1}, 100)
+    result = run_child("bench.scaling:measure_case", {"case": case, "work": str(tmp_path), "rounds": 1}, 100)
     assert "no-such-mesh" in result["failed"] or "mesh" in result["failed"]
-    assert run_child("bench_scaling:measure_case", {}, 0.01)["failed"].startswith("ended after")
+    assert run_child("bench.scaling:measure_case", {}, 0.01)["failed"].startswith("ended after")
 
 
 @pytest.mark.parametrize("kind", ["teapot-1k", "spot-23k", "torus-48k", "slivers-50", "even-50", "screen-filling-7", "bunny*1"])

@@ -16,7 +16,7 @@ from PIL import Image
 from test_pose_experiment import build
 
 from shadowmap_dr import cli, cli_gradients, io
-from shadowmap_dr.experiments import pose as experiment
+from shadowmap_dr.experiments.pose import experiment
 
 
 class Result:
@@ -209,7 +209,7 @@ def test_pose_prints_a_table_and_writes_records(run: Any, monkeypatch: pytest.Mo
 def test_bench_prints_a_table_and_writes_a_record(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     from test_bench import TINY
 
-    from shadowmap_dr.experiments import bench_common
+    from shadowmap_dr.experiments.bench import common as bench_common
 
     monkeypatch.setattr(bench_common, "QUICK", TINY)
     result = run("bench", "--quick", "--only", "breakdown", "--out", "o/b.json")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from shadowmap_dr.experiments.lights_scene import make_scene, target_and_starts
+from shadowmap_dr.experiments.lights.scene import make_scene, target_and_starts
 from shadowmap_dr.inverse import LightBatch, StillScene
 from shadowmap_dr.raster import build_topology, drawing_order, outward_faces
 from shadowmap_dr.renderer import Renderer

@@ -8,7 +8,7 @@ import pytest
 
 from shadowmap_dr.errors import ShadowmapError
 from shadowmap_dr.inverse import Collection, even_sphere, shadow_view
-from shadowmap_dr.inverse import collection as module
+from shadowmap_dr.inverse.art import collection as module
 
 SIZE = 48
 BOX = (

@@ -17,13 +17,13 @@ from PIL import Image
 
 from shadowmap_dr import cli
 from shadowmap_dr.errors import ShadowmapError
-from shadowmap_dr.experiments.faces import FaceOptions, run_faces
-from shadowmap_dr.experiments.faces_information import contrasts, image_derivatives, posterior_covariance
-from shadowmap_dr.experiments.faces_metrics import distances, surface_distance
-from shadowmap_dr.experiments.faces_problem import FaceScene, artificial_weights, default_model
-from shadowmap_dr.experiments.faces_silhouette import Placement, place, read_silhouette, resample
+from shadowmap_dr.experiments.faces.experiment import FaceOptions, run_faces
+from shadowmap_dr.experiments.faces.information import contrasts, image_derivatives, posterior_covariance
+from shadowmap_dr.experiments.faces.metrics import distances, surface_distance
+from shadowmap_dr.experiments.faces.problem import FaceScene, artificial_weights, default_model
+from shadowmap_dr.experiments.faces.silhouette import Placement, place, read_silhouette, resample
 from shadowmap_dr.inverse import MorphFit, optimize
-from shadowmap_dr.inverse.morphable import save_model
+from shadowmap_dr.inverse.faces.morphable import save_model
 from shadowmap_dr.io import write_image
 
 TRUE = np.array([0.9, -1.1, 0.8, 1.2])

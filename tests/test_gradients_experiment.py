@@ -15,26 +15,24 @@ from mitsuba_baselines.projective import projective_derivative
 from mitsuba_baselines.proxy import calibrate, with_proxy
 from mitsuba_baselines.reference import path_traced
 from shadowmap_dr.errors import ShadowmapError
-from shadowmap_dr.experiments import (
-    gradients_convergence,
-    gradients_jacobian,
-    gradients_plane,
-    gradients_report,
-    gradients_scenes,
-)
-from shadowmap_dr.experiments.bench_meshes import Mesh
-from shadowmap_dr.experiments.gradients_convergence import ConvergenceOptions, run_convergence
-from shadowmap_dr.experiments.gradients_fit import ShadowFit
-from shadowmap_dr.experiments.gradients_images import (
+from shadowmap_dr.experiments.bench.meshes import Mesh
+from shadowmap_dr.experiments.gradients import convergence as gradients_convergence
+from shadowmap_dr.experiments.gradients import jacobian as gradients_jacobian
+from shadowmap_dr.experiments.gradients import plane as gradients_plane
+from shadowmap_dr.experiments.gradients import report as gradients_report
+from shadowmap_dr.experiments.gradients import scenes as gradients_scenes
+from shadowmap_dr.experiments.gradients.convergence import ConvergenceOptions, run_convergence
+from shadowmap_dr.experiments.gradients.fit import ShadowFit
+from shadowmap_dr.experiments.gradients.images import (
     blurred_by_map,
     central_derivative,
     forward_derivative,
     reverse_error,
     texel_in_pixels,
 )
-from shadowmap_dr.experiments.gradients_jacobian import JacobianOptions, run_jacobian
-from shadowmap_dr.experiments.gradients_plane import PlaneOptions, run_plane
-from shadowmap_dr.experiments.gradients_scenes import MOTIONS
+from shadowmap_dr.experiments.gradients.jacobian import JacobianOptions, run_jacobian
+from shadowmap_dr.experiments.gradients.plane import PlaneOptions, run_plane
+from shadowmap_dr.experiments.gradients.scenes import MOTIONS
 from shadowmap_dr.inverse import optimize
 from shadowmap_dr.renderer import Renderer
 

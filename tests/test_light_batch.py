@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from shadowmap_dr.errors import ShadowmapError
-from shadowmap_dr.experiments.lights_scene import make_scene, target_and_starts
+from shadowmap_dr.experiments.lights.scene import make_scene, target_and_starts
 from shadowmap_dr.inverse import LightBatch, Stage, StillScene
 from shadowmap_dr.renderer import Renderer
 

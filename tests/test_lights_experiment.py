@@ -14,9 +14,9 @@ from typer.testing import CliRunner
 
 from shadowmap_dr.cli import app
 from shadowmap_dr.errors import ShadowmapError
-from shadowmap_dr.experiments.lights import LightOptions, run_lights
-from shadowmap_dr.experiments.lights_problem import LightProblem
-from shadowmap_dr.experiments.lights_scene import alignment, random_directions, target_and_starts
+from shadowmap_dr.experiments.lights.experiment import LightOptions, run_lights
+from shadowmap_dr.experiments.lights.problem import LightProblem
+from shadowmap_dr.experiments.lights.scene import alignment, random_directions, target_and_starts
 
 
 @pytest.fixture(autouse=True)

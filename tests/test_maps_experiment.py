@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from shadowmap_dr.errors import ShadowmapError
-from shadowmap_dr.experiments import maps, maps_scenes
-from shadowmap_dr.experiments.maps import MapsOptions, run_maps
-from shadowmap_dr.experiments.maps_metrics import Texel, contour_shift, metrics, texel_in_pixels
+from shadowmap_dr.experiments.maps import experiment as maps
+from shadowmap_dr.experiments.maps import scenes as maps_scenes
+from shadowmap_dr.experiments.maps.experiment import MapsOptions, run_maps
+from shadowmap_dr.experiments.maps.metrics import Texel, contour_shift, metrics, texel_in_pixels
 from shadowmap_dr.shadow import directional_view
 
 

@@ -12,9 +12,9 @@ from face_models import egg
 
 from shadowmap_dr.assets import scenes_dir
 from shadowmap_dr.errors import ShadowmapError
-from shadowmap_dr.experiments.faces_problem import default_model
-from shadowmap_dr.inverse.convert import ConvertOptions, convert
-from shadowmap_dr.inverse.morphable import MorphableModel, load_model, save_model
+from shadowmap_dr.experiments.faces.problem import default_model
+from shadowmap_dr.inverse.faces.convert import ConvertOptions, convert
+from shadowmap_dr.inverse.faces.morphable import MorphableModel, load_model, save_model
 
 
 def make_head() -> Any:

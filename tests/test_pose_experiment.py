@@ -19,8 +19,10 @@ from fakes import BlobRenderer
 from mitsuba_baselines.pose import MitsubaPose, ProjectiveSetting
 from shadowmap_dr import assets
 from shadowmap_dr.errors import ShadowmapError
-from shadowmap_dr.experiments import pose, pose_record, pose_scene
-from shadowmap_dr.experiments.pose import PoseOptions, run_pose
+from shadowmap_dr.experiments.pose import experiment as pose
+from shadowmap_dr.experiments.pose import record as pose_record
+from shadowmap_dr.experiments.pose import scene as pose_scene
+from shadowmap_dr.experiments.pose.experiment import PoseOptions, run_pose
 from shadowmap_dr.inverse import Method, PoseFit, optimize
 
 REQUIRED = {

@@ -10,7 +10,7 @@ import pytest
 
 from shadowmap_dr import report
 from shadowmap_dr.errors import ShadowmapError
-from shadowmap_dr.experiments import pose_landscape
+from shadowmap_dr.experiments.pose import landscape as pose_landscape
 
 X, Y = np.meshgrid(np.linspace(-1, 1, 24), np.linspace(-1, 1, 24))
 

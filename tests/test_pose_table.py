@@ -13,7 +13,7 @@ import pytest
 
 from shadowmap_dr import report
 from shadowmap_dr.errors import ShadowmapError
-from shadowmap_dr.experiments import pose_table
+from shadowmap_dr.experiments.pose import table as pose_table
 
 
 def record(method: str, run: int, degrees: float | None, **changes: Any) -> dict[str, Any]:
@@ -100,7 +100,7 @@ def test_program_writes_record_table_and_plots(tmp_path: Path) -> None:
     hidden = record("shadows", 0, 0.1, shadow_only=True)
     for name, records in {"a": [record("shadows", 0, 0.1)], "b": [record("mitsuba", 0, 0.125), hidden]}.items():
         report.write_json(tmp_path / name / "pose.json", records)
-    command = [sys.executable, "-m", "shadowmap_dr.experiments.pose_table", "a", "b", "--timed", "a", "--out", "out"]
+    command = [sys.executable, "-m", "shadowmap_dr.experiments.pose.table", "a", "b", "--timed", "a", "--out", "out"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
     out = tmp_path / "out"
     assert {path.name for path in out.iterdir()} == {"pose.json", "pose-table.md", "pose-seen.png", "pose-shadow-only.png"}

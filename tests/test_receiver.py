@@ -9,7 +9,7 @@ import pytest
 from face_models import egg
 
 from shadowmap_dr.errors import ShadowmapError
-from shadowmap_dr.experiments.faces_problem import FaceScene, light_directions, path_traced_shadow
+from shadowmap_dr.experiments.faces.problem import FaceScene, light_directions, path_traced_shadow
 from shadowmap_dr.receiver import ReceiverShadows, Window
 from shadowmap_dr.shadow import ShadowSettings
 

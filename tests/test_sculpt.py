@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from shadowmap_dr.errors import ShadowmapError
-from shadowmap_dr.experiments.maps_scenes import occluder
+from shadowmap_dr.experiments.maps.scenes import occluder
 from shadowmap_dr.inverse import Sculptor, even_sphere, shadow_view
-from shadowmap_dr.inverse.shadow_images import shadow_images
-from shadowmap_dr.inverse.shadow_views import BESIDE, FOV_DEG, LOOKS_AT, WAVE_HEIGHT, height
-from shadowmap_dr.inverse.smoothness import inverted_share, normal_consistency
+from shadowmap_dr.inverse.art.shadow_images import shadow_images
+from shadowmap_dr.inverse.art.shadow_views import BESIDE, FOV_DEG, LOOKS_AT, WAVE_HEIGHT, height
+from shadowmap_dr.inverse.art.smoothness import inverted_share, normal_consistency
 from shadowmap_dr.raster import build_topology
 
 SIZE = 48

@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 
 from shadowmap_dr.errors import ShadowmapError
-from shadowmap_dr.experiments import soft, soft_report, soft_scenes
-from shadowmap_dr.experiments.soft import SoftOptions, Traced, run_soft
+from shadowmap_dr.experiments.soft import experiment as soft
+from shadowmap_dr.experiments.soft import report as soft_report
+from shadowmap_dr.experiments.soft import scenes as soft_scenes
+from shadowmap_dr.experiments.soft.experiment import SoftOptions, Traced, run_soft
 
 
 def noisy(mean: np.ndarray, sigma: float, seed: int) -> np.ndarray:

@@ -9,8 +9,8 @@ import argparse
 import tempfile
 from pathlib import Path
 
-from shadowmap_dr.experiments.pose_methods import METHODS, build_method
-from shadowmap_dr.experiments.pose_scene import make_problem, path_traced_reference, start_pose
+from shadowmap_dr.experiments.pose.methods import METHODS, build_method
+from shadowmap_dr.experiments.pose.scene import make_problem, path_traced_reference, start_pose
 from shadowmap_dr.timing import Contender, OtherWork, alternate, compare
 
 # isort: split

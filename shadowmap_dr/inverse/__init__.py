@@ -1,18 +1,18 @@
 """Inverse problems: what is optimised (parametrisations), how (loops that survive being killed), and sweeps over many runs."""
 
-from .blend_shapes import blend
-from .collection import Collection
-from .light_pixels import StillScene
-from .lights import LightBatch, LightHistory, Stage
+from .art.collection import Collection
+from .art.remeshing import RemeshingSculptor
+from .art.sculpt import Sculptor
+from .art.shadow_views import ShadowView, shadow_view
+from .art.start_meshes import even_sphere
+from .faces.blend_shapes import blend
+from .faces.morph_fit import MorphFit
+from .faces.morphable import MorphableModel, load_model, save_model
+from .lights.batch import LightBatch, LightHistory, Stage
+from .lights.pixels import StillScene
 from .loop import History, Method, optimize
-from .morph_fit import MorphFit
-from .morphable import MorphableModel, load_model, save_model
 from .pose import PoseFit, apply_pose
 from .problems import LossProblem, MethodProblem, Problem
-from .remeshing import RemeshingSculptor
-from .sculpt import Sculptor
-from .shadow_views import ShadowView, shadow_view
-from .start_meshes import even_sphere
 from .sweep import run_sweep
 
 __all__ = [

@@ -1,0 +1,1 @@
+"""Shadow art: designs, their pictures, and the gallery."""

@@ -1,0 +1,246 @@
+"""Shadow art: an object is deformed until its shadows are what one or two images show.
+
+Protocol: a sphere of 12,800 triangles (or any mesh) between directional lights and receivers; 400 steps; intersection over union
+with the target where visibility is below one half. Targets with enclosed holes are compared with the filled target, too: a sphere
+has no holes.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from ... import __version__, assets, figures, io, mesh_files, report
+from ...errors import ShadowmapError
+from ...inverse import Collection, RemeshingSculptor, Sculptor, even_sphere, shadow_view
+from ...inverse.art.shadow_views import CAMERAS, RECEIVERS, ShadowView
+from ...timing import machine
+from . import pictures as art_pictures
+from .run import Frame, Maker, Trace, intersection_over_union, make
+
+#: Light directions of the first and the second view; y is up in both.
+DIRECTIONS = ((0.0, 0.0, -1.0), (-1.0, 0.0, 0.0))
+# How much of what a camera sees of its receiver a target fills, with the image's margin in mind.
+_FILL = {"orthographic": 0.8, "perspective": 0.92}
+
+
+@dataclass(frozen=True)
+class ArtOptions:
+    """What to make.
+
+    Attributes:
+        targets: image files, or names of this package, one for each view; ``text:L`` stands for letters.
+        mesh: what is deformed: None for the sphere, a name of this package, or a file.
+        collection: a name or a file of a mesh: many copies of it, moved, turned and scaled, cast the shadow instead.
+        receiver, camera: see `shadow_view`.
+        resolution: pixels along each side of the shadow images.
+        map_resolution: texels along each side of the shadow maps; None: as many as pixels.
+        iterations: steps; None: 400, and 1100 of a collection.
+        step_size, smoothness, consistency: of the `Sculptor`; a `Collection` has its own step size.
+        remesh: steps after which the deformed surface is meshed anew, again and again; None: never.
+        fill_holes: fill enclosed holes of the targets.
+        interval, most: steps after which copies double, and copies at most, see `Collection`.
+        seed: of the collection.
+        animate: suffix of the animations (.webp or .gif), None for none.
+        picture_size: pixels along each side of animations, half of those of the still picture.
+        turns: frames of the turntable.
+        printable: write an STL file, and report whether the mesh is closed.
+        out: folder for the results.
+        resume: go on from a checkpoint in it.
+    """
+
+    targets: tuple[str, ...]
+    mesh: str | None = None
+    collection: str | None = None
+    receiver: str = "plane"
+    camera: str = "orthographic"
+    resolution: int = 256
+    map_resolution: int | None = None
+    iterations: int | None = None
+    step_size: float = 0.2
+    smoothness: float = 20.0
+    consistency: float = 0.2
+    remesh: int | None = None
+    fill_holes: bool = False
+    interval: int = 150
+    most: int = 128
+    seed: int = 0
+    animate: str | None = ".webp"
+    picture_size: int = 320
+    turns: int = 40
+    printable: bool = False
+    out: Path = Path("art")
+    resume: bool = False
+
+    def __post_init__(self) -> None:
+        if not 1 <= len(self.targets) <= len(DIRECTIONS):
+            raise ShadowmapError(f"{len(self.targets)} targets: give one, or two for two views.")
+        if self.receiver not in RECEIVERS:
+            raise ShadowmapError(f"no receiver {self.receiver!r}: choose from {', '.join(RECEIVERS)}.")
+        if self.camera not in CAMERAS:
+            raise ShadowmapError(f"no camera {self.camera!r}: choose from {', '.join(CAMERAS)}.")
+        if self.mesh is not None and self.collection is not None:
+            raise ShadowmapError("a mesh to deform and a collection: choose one of the two.")
+        if self.remesh is not None and self.collection is not None:
+            raise ShadowmapError("the copies of a collection are not deformed, and cannot be remeshed: leave one of the two out.")
+        if self.iterations is None:
+            object.__setattr__(self, "iterations", 400 if self.collection is None else 1100)
+        if self.iterations < 1:
+            raise ShadowmapError(f"{self.iterations} iterations: at least one is needed.")
+        if not 16 <= self.picture_size <= 1024 or self.turns < 1:
+            raise ShadowmapError(f"pictures of {self.picture_size} pixels, {self.turns} of a turn: give 16 to 1024, at least 1.")
+        if self.animate is not None and self.animate not in art_pictures.ANIMATIONS:
+            raise ShadowmapError(f"no animation {self.animate!r}: choose from {', '.join(art_pictures.ANIMATIONS)}.")
+
+
+def read_target(target: str) -> Any:
+    """The figure (H, W) of a target of `ArtOptions`."""
+    if target.startswith("text:"):
+        return figures.text_figure(target.removeprefix("text:"))
+    return figures.read_figure(assets.target(target))
+
+
+def views_of(options: ArtOptions) -> tuple[ShadowView, ...]:
+    """A view for each target."""
+    return tuple(
+        shadow_view(direction, size=options.resolution, receiver=options.receiver, camera=options.camera)
+        for direction in DIRECTIONS[: len(options.targets)]
+    )
+
+
+def place(figure_list: list[Any], views: tuple[ShadowView, ...]) -> list[Any]:
+    """Target images: as large as they can be, but of equal height in all views, which share the vertical axis."""
+    fill = _FILL[views[0].camera]
+    if len(views) == 1:
+        return [figures.fit(figure_list[0], views[0].seen, fill)]
+    heights = [figures.figure_height(figure, view.seen, fill) for figure, view in zip(figure_list, views, strict=True)]
+    return [figures.fit(figure, view.seen, high=min(heights)) for figure, view in zip(figure_list, views, strict=True)]
+
+
+def build(options: ArtOptions) -> Maker:
+    """What `run_art` lets make its steps."""
+    views = views_of(options)
+    read = [read_target(target) for target in options.targets]
+    targets = place([figures.filled(figure) for figure in read] if options.fill_holes else read, views)
+    texels = options.map_resolution or options.resolution
+    if options.collection is not None:
+        mesh = mesh_files.read_mesh(assets.mesh(options.collection))
+        return Collection(
+            *mesh, views, targets, interval=options.interval, most=options.most, seed=options.seed, map_resolution=texels,
+            settings={"collection": _name(options.collection)},
+        )  # fmt: skip
+    mesh = even_sphere() if options.mesh is None else mesh_files.read_mesh(assets.mesh(options.mesh))
+    arguments: dict[str, Any] = {
+        "step_size": options.step_size, "smoothness": options.smoothness, "consistency": options.consistency,
+        "map_resolution": texels, "settings": {"mesh": "sphere" if options.mesh is None else _name(options.mesh)},
+    }  # fmt: skip
+    if options.remesh is not None:
+        return RemeshingSculptor(*mesh, views, targets, interval=options.remesh, **arguments)
+    return Sculptor(*mesh, views, targets, **arguments)
+
+
+def run_art(options: ArtOptions, *, console: Console | None = None) -> dict[str, Any]:
+    """Make one piece; writes all files into ``options.out`` and returns the record of `art.json`."""
+    console = console or Console(stderr=True)
+    path = io.check_output(options.out / "art.json", (".json",))
+    checkpoint = options.out / "checkpoint.npz"
+    if not options.resume:
+        checkpoint.unlink(missing_ok=True)
+    maker = build(options)
+    settings = {"targets": [_name(target) for target in options.targets], "iterations": options.iterations, **maker.describe()}
+    with report.progress(console) as progress:
+        task = progress.add_task("steps", total=options.iterations, note="")
+        trace = make(
+            maker, options.iterations, checkpoint=checkpoint, fingerprint=_fingerprint(settings, maker),
+            on_step=lambda done, note: progress.update(task, completed=done, note=note),
+        )  # fmt: skip
+        record = report.plain({"settings": settings, "machine": machine(), "shadowmap_dr": __version__, **_results(maker, trace)})
+        written = _write(options, maker, trace, progress)
+    record["files"] = written
+    report.write_json(path, record)
+    checkpoint.unlink(missing_ok=True)
+    return record
+
+
+def _name(target: str) -> str:
+    return target if target.startswith("text:") else Path(target).name
+
+
+def _fingerprint(settings: dict[str, Any], maker: Maker) -> str:
+    images = [float(np.square(maker.target(k) - 0.3).sum(dtype=np.float64)) for k in range(len(maker.views))]
+    return json.dumps([report.plain(settings), images], sort_keys=True)
+
+
+def _results(maker: Maker, trace: Trace) -> dict[str, Any]:
+    views = []
+    for k, (view, image) in enumerate(zip(maker.views, maker.visibility(), strict=True)):
+        target = maker.target(k)
+        whole = 1 - figures.filled(1 - target)
+        holes = np.count_nonzero((whole < 0.5) & (target > 0.5)) / max(np.count_nonzero(whole < 0.5), 1)
+        views.append({
+            "iou": intersection_over_union(image, target, view.seen),
+            "iou_filled": intersection_over_union(image, whole, view.seen),
+            "holes": holes,
+            "mean_square": float(np.square(image - target)[view.seen].mean()),
+        })  # fmt: skip
+    return {
+        "views": views,
+        "mesh": mesh_files.mesh_report(maker.vertices(), maker.faces),
+        "seconds_per_iteration": trace.seconds_per_iteration,
+        "seconds": float(sum(trace.seconds)),
+        "iou_curve": {"step": [step for step, _ in trace.looks], "iou": [values for _, values in trace.looks]},
+        "loss_curve": trace.loss[::10],
+    }
+
+
+def _write(options: ArtOptions, maker: Maker, trace: Trace, progress: Any) -> list[str]:
+    """All files but the record; returns their names."""
+    out, last = options.out, Frame(trace.iterations, maker.vertices(), maker.faces)
+    images = maker.visibility()
+    mesh_files.write_meshes(out, last.vertices, last.faces, maker.views, images)
+    names = ["mesh.ply", "mesh.obj", "mesh.glb"]
+    for k, image in enumerate(images):
+        target = maker.target(k)
+        for kind, picture in (("shadow", image), ("target", target), ("error", mesh_files.error_picture(image, target))):
+            names.append(f"{kind}-{k + 1}.png")
+            io.write_png(out / names[-1], picture)
+    if options.printable:
+        mesh_files.write_printable(out / "mesh.stl", last.vertices, last.faces)
+        names.append("mesh.stl")
+    size = options.picture_size
+    names.append("picture.png")
+    art_pictures.write_picture(out / names[-1], art_pictures.Stage(last.vertices, last.faces, maker.views, 2 * size).picture())
+    if options.animate is not None:
+        task = progress.add_task("pictures", total=options.turns + len(trace.frames), note="")
+        pictures = art_pictures.turntable(last, maker.views, size, options.turns, lambda: progress.advance(task))
+        names.append("turntable" + options.animate)
+        art_pictures.write_animation(out / names[-1], pictures)
+        pictures = art_pictures.history(trace.frames, maker.views, size, lambda: progress.advance(task))
+        names.append("steps" + options.animate)
+        art_pictures.write_animation(out / names[-1], pictures, art_pictures.LAST_MS)
+    return names
+
+
+def table(record: dict[str, Any]) -> Table:
+    """For the terminal."""
+    rows = []
+    for name, view in zip(record["settings"]["targets"], record["views"], strict=True):
+        whole = f"{view['iou_filled']:.4f}" if view["holes"] > 0 else "the same"
+        rows.append([name, f"{view['iou']:.4f}", whole, f"{100 * view['holes']:.1f} %"])
+    return report.table("Shadows and targets: intersection over union", ["target", "IoU", "target without holes", "holes"], rows)
+
+
+def summary(record: dict[str, Any]) -> str:
+    """One line about mesh and time."""
+    mesh, settings = record["mesh"], record["settings"]
+    closed = "watertight" if mesh["watertight"] else "not watertight"
+    return (
+        f"{mesh['faces']} triangles, {closed}, {100 * mesh['inverted_triangles']:.2f} % inverted; "
+        f"{settings['iterations']} steps in {record['seconds']:.1f} s ({1000 * record['seconds_per_iteration']:.1f} ms each)"
+    )

@@ -1,0 +1,134 @@
+"""Pictures of shadow art: the object before its receivers, a turntable, and how it came about."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
+
+from ... import io
+from ...errors import ShadowmapError
+from ...inverse.art.shadow_views import DISTANCE, HALF, ShadowView, height
+from ...renderer import Renderer
+from ..maps.scenes import occluder
+from .run import Frame
+
+ANIMATIONS = (".webp", ".gif")
+#: Milliseconds that a frame of an animation stays, and the last one of a history.
+FRAME_MS, LAST_MS = 70, 1500
+
+# Linear colours.
+_OBJECT, _WALLS, _AMBIENT = (0.72, 0.36, 0.26), ((0.8, 0.78, 0.74), (0.55, 0.62, 0.68)), 0.22
+# From where the camera looks, at what, and its horizontal angle, for one receiver and for two.
+_PLACES = {1: ((-7.4, 1.9, 5.0), (-0.3, -0.2, -1.9), 40.0), 2: ((8.0, 3.6, 8.0), (-1.1, -0.1, -1.1), 34.0)}
+# Walls reach beyond the picture; where there are two, they end at each other. In multiples of the receiver's half-side.
+_WALL_REACH = 9.0
+_MAP_RESOLUTION = 1024
+
+Pixels = npt.NDArray[np.uint8]
+
+
+class Stage:
+    """A scene with an object of given faces, its receivers and their lights, seen from aside.
+
+    Args:
+        vertices, faces: (V, 3) and (F, 3).
+        views: one or two.
+        size: width and height of pictures.
+    """
+
+    def __init__(self, vertices: npt.ArrayLike, faces: npt.ArrayLike, views: Sequence[ShadowView], size: int = 320) -> None:
+        points = np.asarray(vertices, np.float32)
+        origin, target, fov = _PLACES[min(len(views), 2)]
+        film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+        place = mi.ScalarTransform4f().look_at(list(origin), list(target), [0, 1, 0])
+        scene: dict[str, Any] = {
+            "type": "scene",
+            "camera": {"type": "perspective", "fov": fov, "to_world": place, "film": film},
+            "object": occluder("object", points, np.asarray(faces, np.uint32), _OBJECT),
+        }
+        for k, view in enumerate(views):
+            scene[f"light{k}"] = {
+                "type": "directional", "direction": view.forward.tolist(),
+                "irradiance": {"type": "rgb", "value": float(np.pi) * 0.85},
+            }  # fmt: skip
+            scene[f"receiver{k}"] = occluder(f"receiver{k}", *_wall(view, len(views) > 1), _WALLS[k])
+        self._renderer = Renderer.from_scene(
+            mi.load_dict(scene, optimize=False), shadow_map_resolution=_MAP_RESOLUTION, shadow_filter_size=5, ambient=_AMBIENT
+        )
+        self._points = points
+
+    def picture(self, vertices: npt.ArrayLike | None = None) -> Pixels:
+        """(H, W, 3) sRGB of the object with these vertices (V, 3), or those that it had in the beginning."""
+        points = self._points if vertices is None else np.asarray(vertices, np.float32)
+        with dr.suspend_grad():
+            image = self._renderer.render({"object": mi.Float(np.ascontiguousarray(points).ravel())}, spp=4)
+        return np.round(255 * io.to_srgb(np.array(image)[..., :3])).astype(np.uint8)
+
+
+def turntable(frame: Frame, views: Sequence[ShadowView], size: int, count: int = 40,
+              on_frame: Callable[[], None] = lambda: None) -> list[Pixels]:  # fmt: skip
+    """A whole turn of the object about the vertical axis; the shadows are right only at its start."""
+    stage, pictures = Stage(frame.vertices, frame.faces, views, size), []
+    for angle in 2 * np.pi * np.arange(count) / count:
+        s, c = np.sin(angle), np.cos(angle)
+        pictures.append(stage.picture(frame.vertices @ np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]], np.float32)))
+        on_frame()
+    return pictures
+
+
+def history(frames: Sequence[Frame], views: Sequence[ShadowView], size: int,
+            on_frame: Callable[[], None] = lambda: None) -> list[Pixels]:  # fmt: skip
+    """A picture for each frame."""
+    stage: Stage | None = None
+    previous: npt.NDArray[np.uint32] | None = None
+    pictures = []
+    for frame in frames:
+        if stage is None or previous is None or not np.array_equal(frame.faces, previous):
+            stage, previous = Stage(frame.vertices, frame.faces, views, size), frame.faces
+        pictures.append(stage.picture(frame.vertices))
+        on_frame()
+    return pictures
+
+
+def write_animation(path: Path, pictures: Sequence[Pixels], last_ms: int = FRAME_MS) -> None:
+    """An animated image, .webp or .gif, that repeats for ever."""
+    from PIL import Image
+
+    if path.suffix.lower() not in ANIMATIONS:
+        raise ShadowmapError(f"no animation {path}: the suffix is not one of {', '.join(ANIMATIONS)}.")
+    images = [Image.fromarray(picture) for picture in pictures]
+    options: dict[str, Any] = {"quality": 70, "method": 4} if path.suffix.lower() == ".webp" else {"optimize": True}
+    if path.suffix.lower() == ".gif":
+        images = [image.quantize(128, dither=Image.Dither.NONE) for image in images]
+    duration = [FRAME_MS] * (len(images) - 1) + [last_ms]
+    with io.atomic(path) as temporary:
+        images[0].save(temporary, save_all=True, append_images=images[1:], duration=duration, loop=0, **options)
+
+
+def write_picture(path: Path, picture: Pixels) -> None:
+    """An 8-bit sRGB image."""
+    from PIL import Image
+
+    with io.atomic(path) as temporary:
+        Image.fromarray(picture).save(temporary)
+
+
+def _wall(view: ShadowView, corner: bool, cells: int = 256) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint32]]:
+    """The plane, or waves, that the receiver is a part of. At a corner it ends where the other receiver's plane is."""
+    reach, end = _WALL_REACH * view.half, DISTANCE * view.half / HALF
+    # The first view's other wall is on its left, the second's on its right.
+    first = view.right[0] > 0.5
+    left, right = (-end if corner and first else -reach), (end if corner and not first else reach)
+    x, y = (a.ravel() for a in np.meshgrid(np.linspace(left, right, cells + 1), np.linspace(-reach, reach, cells + 1)))
+    local = np.stack([x, y, height(view.receiver, x, view.half)], 1)
+    points = view.origin + local @ np.stack([view.right, view.up, -view.forward])
+    lowest = (np.arange(cells)[:, None] * (cells + 1) + np.arange(cells)).ravel()
+    above = lowest + cells + 1
+    faces = np.concatenate([np.stack([lowest, lowest + 1, above + 1], 1), np.stack([lowest, above + 1, above], 1)])
+    return points.astype(np.float32), faces.astype(np.uint32)

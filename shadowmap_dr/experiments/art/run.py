@@ -1,0 +1,196 @@
+"""The loop of shadow art: steps, how well shadows match on the way, frames for an animation, checkpoints."""
+
+from __future__ import annotations
+
+import time
+import zipfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import drjit as dr
+import numpy as np
+import numpy.typing as npt
+
+from ...errors import ShadowmapError
+from ...inverse.art.shadow_views import ShadowView
+from ...inverse.loop import WARM_UP_STEPS
+from ...io import atomic
+
+#: Steps between two looks at the shadows, and between two checkpoints.
+LOOK_INTERVAL, CHECKPOINT_INTERVAL = 10, 50
+#: Frames of the animation, at most.
+FRAMES = 48
+
+Array = npt.NDArray[np.float32]
+
+
+class Maker(Protocol):
+    """Something whose shadows become more like their targets step by step."""
+
+    views: tuple[ShadowView, ...]
+
+    @property
+    def faces(self) -> npt.NDArray[np.uint32]:
+        """(F, 3); a step may change them."""
+
+    def step(self) -> Any:
+        """One step. Returns the loss before it, an array with one entry."""
+
+    def vertices(self) -> Array:
+        """(V, 3), world space."""
+
+    def visibility(self) -> list[Array]:
+        """(H, W) for each view."""
+
+    def target(self, view: int) -> Array:
+        """(H, W)."""
+
+    def state(self) -> dict[str, npt.NDArray[Any]]:
+        """All that `load_state` needs to go on exactly from here."""
+
+    def load_state(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
+        """Go on from what `state` returned."""
+
+    def describe(self) -> dict[str, Any]:
+        """Settings for the record, as JSON values."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The mesh after so many steps: (V, 3) and (F, 3)."""
+
+    step: int
+    vertices: Array
+    faces: npt.NDArray[np.uint32]
+
+
+@dataclass
+class Trace:
+    """What happened.
+
+    Attributes:
+        loss: before each step.
+        seconds: wall-clock time of each step; `warm` is False for those that compile or record.
+        looks: step, and the intersection over union of each view after it.
+        frames: meshes on the way, the first and the last included.
+    """
+
+    loss: list[float] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+    warm: list[bool] = field(default_factory=list)
+    looks: list[tuple[int, list[float]]] = field(default_factory=list)
+    frames: list[Frame] = field(default_factory=list)
+
+    @property
+    def iterations(self) -> int:
+        return len(self.loss)
+
+    @property
+    def seconds_per_iteration(self) -> float:
+        """Median of the warm steps."""
+        warm = [s for s, w in zip(self.seconds, self.warm, strict=True) if w]
+        return float(np.median(warm or self.seconds))
+
+
+def intersection_over_union(image: npt.ArrayLike, target: npt.ArrayLike, seen: npt.NDArray[np.bool_] | None = None) -> float:
+    """Of what is dark (visibility below one half) in two (H, W) images, where ``seen``; 1 where both are lit all over."""
+    dark, wanted = np.asarray(image) < 0.5, np.asarray(target) < 0.5
+    if seen is not None:
+        dark, wanted = dark & seen, wanted & seen
+    union = np.count_nonzero(dark | wanted)
+    return np.count_nonzero(dark & wanted) / union if union else 1.0
+
+
+def frame_steps(iterations: int) -> frozenset[int]:
+    """After which steps a frame is kept: more of them in the beginning, when most happens."""
+    share = np.linspace(0, 1, min(FRAMES, iterations + 1))
+    return frozenset(int(s) for s in np.round(iterations * share**2))
+
+
+def make(
+    maker: Maker,
+    iterations: int,
+    *,
+    checkpoint: Path | None = None,
+    fingerprint: str = "",
+    on_step: Callable[[int, str], None] = lambda done, note: None,
+) -> Trace:
+    """Run a number of steps.
+
+    Args:
+        maker: at its start.
+        checkpoint: file to write every 50 steps, and to go on from if it exists.
+        fingerprint: identifies the run; a checkpoint with another one is an error.
+        on_step: told the number of finished steps and how well the shadows match.
+
+    Raises ShadowmapError if the checkpoint belongs to another run, cannot be read, or cannot be written.
+    """
+    if iterations < 1:
+        raise ShadowmapError(f"{iterations} iterations: at least one is needed.")
+    trace, wanted = Trace(), frame_steps(iterations)
+    if checkpoint is not None and checkpoint.exists():
+        trace, state = _load(checkpoint, fingerprint)
+        maker.load_state(state)
+    if not trace.frames:
+        trace.frames.append(Frame(0, maker.vertices(), maker.faces))
+    last_change = first = trace.iterations
+    faces = len(maker.faces)
+    note = ""
+    for i in range(first, iterations):
+        began = time.perf_counter()
+        loss = maker.step()
+        dr.sync_thread()
+        trace.seconds.append(time.perf_counter() - began)
+        trace.warm.append(i - last_change >= WARM_UP_STEPS)
+        trace.loss.append(float(np.asarray(loss).reshape(-1)[0]))
+        done = i + 1
+        if len(maker.faces) != faces:
+            faces, last_change = len(maker.faces), done
+        if done % LOOK_INTERVAL == 0 or done == iterations:
+            images = maker.visibility()
+            trace.looks.append((done, [
+                intersection_over_union(image, maker.target(k), maker.views[k].seen) for k, image in enumerate(images)
+            ]))  # fmt: skip
+            note = "IoU " + ", ".join(f"{value:.3f}" for value in trace.looks[-1][1])
+        if done in wanted:
+            trace.frames.append(Frame(done, maker.vertices(), maker.faces))
+        if checkpoint is not None and (done % CHECKPOINT_INTERVAL == 0 or done == iterations):
+            _save(checkpoint, fingerprint, trace, maker.state())
+        on_step(done, note)
+    return trace
+
+
+def _save(path: Path, fingerprint: str, trace: Trace, state: Mapping[str, npt.NDArray[Any]]) -> None:
+    arrays: dict[str, npt.NDArray[Any]] = {f"state/{name}": np.asarray(array) for name, array in state.items()}
+    arrays |= {f"trace/{name}": np.array(getattr(trace, name)) for name in ("loss", "seconds", "warm")}
+    arrays["looks/step"] = np.array([step for step, _ in trace.looks])
+    arrays["looks/iou"] = np.array([values for _, values in trace.looks])
+    previous: npt.NDArray[np.uint32] | None = None
+    for k, frame in enumerate(trace.frames):
+        arrays[f"frame/{k}/step"], arrays[f"frame/{k}/vertices"] = np.array(frame.step), frame.vertices
+        if previous is None or not np.array_equal(frame.faces, previous):
+            arrays[f"frame/{k}/faces"] = previous = frame.faces
+    with atomic(path) as temporary, temporary.open("wb") as file:
+        np.savez(file, fingerprint=np.array(fingerprint), **arrays)
+
+
+def _load(path: Path, fingerprint: str) -> tuple[Trace, dict[str, npt.NDArray[Any]]]:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        found = str(arrays.pop("fingerprint"))
+        trace = Trace(*(arrays[f"trace/{name}"].tolist() for name in ("loss", "seconds", "warm")))
+        trace.looks = list(zip(arrays["looks/step"].tolist(), arrays["looks/iou"].tolist(), strict=True))
+        faces: npt.NDArray[np.uint32] | None = None
+        for k in range(sum(name.endswith("/vertices") and name.startswith("frame/") for name in arrays)):
+            faces = arrays.get(f"frame/{k}/faces", faces)
+            if faces is None:
+                raise KeyError("faces")
+            trace.frames.append(Frame(int(arrays[f"frame/{k}/step"]), arrays[f"frame/{k}/vertices"], faces))
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        raise ShadowmapError(f"cannot read the checkpoint {path}: delete it to start this run anew.") from error
+    if found != fingerprint:
+        raise ShadowmapError(f"the checkpoint {path} belongs to a run with other settings: delete it or choose another folder.")
+    return trace, {name.removeprefix("state/"): array for name, array in arrays.items() if name.startswith("state/")}

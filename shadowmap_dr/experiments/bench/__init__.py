@@ -1,0 +1,1 @@
+"""The benchmark: steps, rasterization, how costs grow, and where the time goes."""

@@ -1,0 +1,44 @@
+"""The process that `bench.common.run_child` starts: reads a task from the standard input, writes results, one a line."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import sys
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ... import report
+
+
+def main() -> None:
+    task = json.load(sys.stdin)
+    if not task["variant"].startswith("cuda"):  # which reserves far more addresses than it uses
+        _limit_memory()
+    mi.set_variant(task["variant"])
+    dr.set_thread_count(task["threads"])
+    module, name = task["function"].split(":")
+    function = getattr(importlib.import_module(f"shadowmap_dr.experiments.{module}"), name)
+
+    def emit(result: dict[str, Any]) -> None:
+        print(json.dumps(report.plain(result), allow_nan=False), flush=True)
+
+    emit(function(**task["arguments"], emit=emit))
+
+
+def _limit_memory() -> None:
+    """Fail before the machine has no memory left, for the system might end other processes then."""
+    try:
+        import resource
+
+        limit = int(0.75 * os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    except (ImportError, OSError, ValueError):
+        pass  # not on this system
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,178 @@
+"""What the parts of the benchmark share: what to measure, and how a part of it is described."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ...errors import ShadowmapError
+
+SECTIONS = ("steps", "raster", "scaling", "breakdown")
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How much is measured.
+
+    Attributes:
+        resolutions: of steps, times to pose and breakdowns.
+        rounds: measured steps of each of our contenders; `mitsuba_rounds` those of Mitsuba's.
+        default_steps: steps of Mitsuba's default setting for each resolution.
+        starts, iterations: of the times to pose.
+        path_traced: whether the reference images are path-traced or, faster, our own.
+        meshes, raster_resolutions: of rasterization alone, see `bench.meshes.make`.
+        worst: worst cases, with the well-behaved mesh that each is compared with; see `bench.meshes`.
+        full_raster: mesh and resolutions for the forward and backward pass through the raster functions.
+        call_seconds: a rasterization that is predicted to take longer than this is left out.
+        series: quantity -> values; see `bench.scaling`.
+        large: mesh and resolution of the largest step.
+        batch, batch_resolution: number and size of small images.
+    """
+
+    resolutions: tuple[int, ...] = (128, 512, 1024)
+    rounds: int = 50
+    mitsuba_rounds: int = 10
+    default_steps: Mapping[int, int] = field(default_factory=lambda: {128: 5, 512: 3, 1024: 2})
+    starts: int = 10
+    iterations: int = 150
+    path_traced: bool = True
+    meshes: tuple[str, ...] = ("teapot-1k", "spot-6k", "torus-48k", "spot-94k", "spot-375k", "spot-1.5M")
+    raster_resolutions: tuple[int, ...] = (128, 512, 1024, 2048)
+    worst: Mapping[str, str] = field(default_factory=lambda: {"slivers-100k": "even-100k", "screen-filling-10k": "spot-6k"})
+    full_raster: tuple[str, tuple[int, ...]] = ("spot-6k", (128, 512, 1024))
+    call_seconds: float = 20.0
+    series: Mapping[str, tuple[Any, ...]] = field(
+        default_factory=lambda: {
+            "triangles": ("teapot-1k", "spot-6k", "spot-23k", "spot-94k", "spot-375k", "spot-1.5M"),
+            "resolution": (64, 128, 256, 512, 1024, 2048),
+            "map_resolution": (64, 128, 256, 512, 1024, 2048),
+            "filter_size": (3, 5, 9, 17, 33),
+            "lights": (1, 2, 4, 8),
+        }
+    )
+    passes: int = 2
+    large: tuple[str, int] | None = ("spot-1.5M", 1024)
+    batch: tuple[int, ...] = (1, 4, 8, 16, 32)
+    batch_resolution: int = 64
+
+
+FULL = Sizes()
+QUICK = Sizes(
+    resolutions=(128,),
+    rounds=15,
+    mitsuba_rounds=3,
+    default_steps={128: 1},
+    starts=2,
+    path_traced=False,
+    meshes=("teapot-1k", "spot-6k", "torus-48k"),
+    raster_resolutions=(128, 512),
+    worst={},
+    full_raster=("spot-6k", (128, 512)),
+    call_seconds=2.0,
+    series={
+        "triangles": ("teapot-1k", "spot-6k", "spot-23k"),
+        "resolution": (64, 128, 256),
+        "map_resolution": (128, 256, 512),
+        "filter_size": (3, 9),
+        "lights": (1, 8),
+    },
+    passes=1,
+    large=None,
+    batch=(1, 8),
+)
+
+
+@dataclass(frozen=True)
+class BenchOptions:
+    """What to run.
+
+    Attributes:
+        quick: few steps, small sizes.
+        out: JSON file; a plot and the files that the benchmark works with lie beside it.
+        only: names of sections; the others' results stay as they are in the file.
+        resume: keep what the file has of a run with the same options.
+        mitsuba_seconds: limit for each part of the work that waits for Mitsuba's integrator.
+        sizes: what is measured, by default as `quick` says.
+    """
+
+    quick: bool = False
+    out: Path = Path("bench.json")
+    only: tuple[str, ...] = SECTIONS
+    resume: bool = False
+    mitsuba_seconds: float = 900.0
+    sizes: Sizes | None = None
+
+    def __post_init__(self) -> None:
+        for name in self.only:
+            if name not in SECTIONS:
+                raise ShadowmapError(f"no section {name!r}: choose from {', '.join(SECTIONS)}.")
+        if not self.only:
+            raise ShadowmapError(f"no section given: choose from {', '.join(SECTIONS)}.")
+        if not 0 < self.mitsuba_seconds < float("inf"):
+            raise ShadowmapError(f"--mitsuba-seconds {self.mitsuba_seconds}: give a positive number of seconds.")
+
+    @property
+    def what(self) -> Sizes:
+        """The sizes in force."""
+        return self.sizes or (QUICK if self.quick else FULL)
+
+    @property
+    def work(self) -> Path:
+        """Folder of meshes and reference images, which stay for the next run."""
+        return self.out.parent / f"{self.out.stem}-files"
+
+
+#: Told how much of how much is done, and a note.
+Update = Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A part of a section that is measured at one go and stored when it is complete.
+
+    `run` gets the units of the section that are complete so far, and an `Update`. It returns a JSON value.
+    """
+
+    name: str
+    run: Callable[[Mapping[str, Any], Update], dict[str, Any]]
+
+
+def run_child(function: str, arguments: Mapping[str, Any], seconds: float) -> dict[str, Any]:
+    """Calls a function in a process of its own, where memory is counted from nothing and a crash ends nothing else.
+
+    Args:
+        function: `module:name` within `shadowmap_dr.experiments`; it takes the arguments and `emit`, which stores a
+            preliminary result, and returns a dictionary.
+        arguments: JSON values.
+        seconds: after this time the process is ended.
+
+    Returns:
+        The result. If the process failed, the last preliminary one with the entry `failed`, a line that says why.
+    """
+    package = str(Path(__file__).resolve().parent.parent.parent)
+    paths = filter(None, (package, os.environ.get("PYTHONPATH")))
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
+    task = {"function": function, "arguments": arguments, "variant": mi.variant(), "threads": dr.thread_count()}
+    command = [sys.executable, "-m", "shadowmap_dr.experiments.bench.child"]
+    try:
+        process = subprocess.run(
+            command, input=json.dumps(task).encode(), capture_output=True, env=environment, timeout=seconds, check=False
+        )
+        output, failure = process.stdout, None
+        if process.returncode:
+            lines = process.stderr.decode(errors="replace").strip().splitlines()
+            failure = f"status {process.returncode}: {lines[-1] if lines else 'no message'}"
+    except subprocess.TimeoutExpired as error:
+        output, failure = error.stdout or b"", f"ended after {seconds:.0f} s"
+    results = [line for line in output.decode(errors="replace").splitlines() if line.startswith("{") and line.endswith("}")]
+    result: dict[str, Any] = json.loads(results[-1]) if results else {}
+    return result if failure is None else {**result, "failed": failure}

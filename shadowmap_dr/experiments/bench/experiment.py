@@ -1,0 +1,143 @@
+"""The benchmark behind `shadowmap-dr bench`: steps, rasterization, growth, and where the time goes.
+
+A section is measured in units. Each is stored in the JSON file when it is complete, so that nothing is lost with a run that
+is killed, and goes on after the last complete one with `resume`.
+"""
+
+from __future__ import annotations
+
+import shlex
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+from rich.console import Console
+
+from ... import __version__, io, report
+from ...errors import ShadowmapError
+from ...timing import OtherWork, load, machine
+from . import breakdown as bench_breakdown
+from . import raster as bench_raster
+from . import report as bench_report
+from . import scaling as bench_scaling
+from . import steps as bench_steps
+from .common import BenchOptions, Unit
+
+FORMAT = "shadowmap-dr bench 1"
+
+UNITS: dict[str, Callable[[BenchOptions], list[Unit]]] = {
+    "steps": bench_steps.units,
+    "raster": bench_raster.units,
+    "scaling": bench_scaling.units,
+    "breakdown": bench_breakdown.units,
+}
+
+
+def run_bench(options: BenchOptions, *, console: Console | None = None) -> dict[str, Any]:
+    """Measure the sections and write `options.out` and a plot beside it (`.png`).
+
+    A unit that fails is stored with the entry `failed` and does not keep the others from being measured.
+
+    Returns:
+        What is in the JSON file: `sections` (by name, each with `command`, `settings`, `machine` and `units`),
+        `machine`, `load_before` and `load_after`, and `figures`, the rows of the table.
+    """
+    console = console or Console(stderr=True)
+    io.check_output(options.out, (".json",))
+    record = _stored(options)
+    command = shlex.join(["shadowmap-dr", *sys.argv[1:]])
+    record |= {"format": FORMAT, "machine": machine(), "load_before": load()}
+    settings = _settings(options)
+    plan = {name: UNITS[name](options) for name in UNITS if name in options.only}
+    for name in plan:
+        section = record["sections"].get(name, {})
+        keep = options.resume and section.get("settings") == settings
+        units = {key: value for key, value in section.get("units", {}).items() if "failed" not in value} if keep else {}
+        record["sections"][name] = {"command": command, "settings": settings, "machine": machine(), "units": units}
+    _write(options, record)
+
+    with report.progress(console) as progress:
+        for name, units in plan.items():
+            task = progress.add_task(name, total=len(units), note="")
+            done = record["sections"][name]["units"]
+            for number, unit in enumerate(units):
+                progress.update(task, completed=number)
+                if unit.name in done:
+                    continue
+                inner = progress.add_task(f"{name} {unit.name}", total=None, note="")
+
+                def update(count: int, total: int, note: str, inner: Any = inner) -> None:
+                    progress.update(inner, completed=count, total=total, note=note)
+
+                done[unit.name] = _measured(unit, done, update)
+                progress.remove_task(inner)
+                _write(options, record)
+                line = f"{name} {unit.name}: {bench_report.outcome(done[unit.name])}"
+                progress.console.print(line, highlight=False, markup=False)
+                # What a unit leaves behind would count as memory of the next.
+                dr.flush_malloc_cache()
+            progress.remove_task(task)
+    record["load_after"] = load()
+    record["figures"] = [row.plain() for row in bench_report.rows(record)]
+    _write(options, record)
+    bench_report.plot(options.out.with_suffix(".png"), record)
+    return record
+
+
+def failures(record: dict[str, Any], sections: tuple[str, ...]) -> list[str]:
+    """What could not be measured, a line for each."""
+    return [
+        f"{name} {key}: {unit['failed']}"
+        for name in sections
+        for key, unit in record["sections"][name]["units"].items()
+        if "failed" in unit
+    ]
+
+
+def _measured(unit: Unit, done: dict[str, Any], update: Callable[[int, int, str], None]) -> dict[str, Any]:
+    before, began, others = load(), time.perf_counter(), OtherWork()
+    try:
+        result = unit.run(done, update)
+    except (RuntimeError, ShadowmapError, MemoryError) as error:
+        text = " ".join(str(error).split()) or type(error).__name__
+        result = {"failed": text}
+    surroundings = {
+        "load_before": before,
+        "load_after": load(),
+        "cores_used_by_others": others.cores(),
+        "wall_seconds": time.perf_counter() - began,
+    }
+    return report.plain({**result, **surroundings})
+
+
+def _settings(options: BenchOptions) -> dict[str, Any]:
+    """What results must have been measured with to be kept."""
+    return report.plain(
+        {
+            "quick": options.quick,
+            "mitsuba_seconds": options.mitsuba_seconds,
+            "sizes": vars(options.what),
+            "variant": mi.variant(),
+            "threads": dr.thread_count(),
+            "shadowmap_dr": __version__,
+            "mitsuba": mi.__version__,
+            "drjit": dr.__version__,
+        }
+    )
+
+
+def _stored(options: BenchOptions) -> dict[str, Any]:
+    """The record in the file, or an empty one."""
+    if not options.out.exists():
+        return {"sections": {}}
+    record = report.read_json(options.out)
+    if not isinstance(record, dict) or record.get("format") != FORMAT or not isinstance(record.get("sections"), dict):
+        raise ShadowmapError(f"{options.out} is no record of a benchmark: choose another file.")
+    return record
+
+
+def _write(options: BenchOptions, record: dict[str, Any]) -> None:
+    report.write_json(options.out, record)

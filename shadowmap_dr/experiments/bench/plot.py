@@ -1,0 +1,128 @@
+"""Plot of the benchmark: how costs grow, beside Embree's, and the passes of a step."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+from ...io import atomic
+
+_LABELS = {
+    "triangles": "triangles",
+    "resolution": "pixels",
+    "map_resolution": "texels of the shadow map",
+    "filter_size": "filter size in texels",
+    "lights": "directional lights",
+}
+
+
+def plot(path: str | os.PathLike[str], record: dict[str, Any]) -> None:
+    """Draw a panel for each thing that the record knows about. Times are medians, bars their quartiles."""
+    from matplotlib.figure import Figure  # without pyplot there is no global state and no display is needed
+
+    sections = {name: _complete(section["units"]) for name, section in record["sections"].items()}
+    scaling, raster = sections.get("scaling", {}), sections.get("raster", {})
+    panels: list[Any] = [(_series, scaling[name]) for name in _LABELS if name in scaling]
+    if "batch" in scaling:
+        panels.append((_batch, scaling["batch"]))
+    rasters = [unit for unit in raster.values() if "embree trace" in unit.get("seconds", {})]
+    if rasters:
+        panels.append((_raster, rasters))
+    steps = [unit for key, unit in sections.get("steps", {}).items() if key.startswith("step")]
+    if steps:
+        panels.append((_steps, steps))
+    for unit in sections.get("breakdown", {}).values():
+        if unit["method"] != "none":
+            panels.append((_passes, unit))
+    columns = min(4, max(1, len(panels)))
+    rows = max(1, -(-len(panels) // columns))
+    figure = Figure(figsize=(4.6 * columns, 3.8 * rows), layout="constrained")
+    for k, (draw, data) in enumerate(panels):
+        draw(figure.add_subplot(rows, columns, k + 1), data)
+    with atomic(path) as temporary:
+        figure.savefig(temporary, dpi=120)
+
+
+def _complete(units: dict[str, Any]) -> dict[str, Any]:
+    return {key: unit for key, unit in units.items() if "failed" not in unit and "skipped" not in unit}
+
+
+def _series(axes: Any, unit: dict[str, Any]) -> None:
+    points = [point for point in unit["points"] if "seconds" in point]
+    sizes = [point["size"] for point in points]
+    _curve(axes, sizes, [point["seconds"] for point in points], "C0", "time")
+    exponent = unit["exponent"]
+    axes.set_title("" if exponent is None else f"exponent {exponent:.2f}", fontsize=9)
+    _logarithmic(axes, _LABELS[unit["quantity"]], "step [ms]")
+    _ticks(axes, sizes)
+    memory = axes.twinx()
+    memory.plot(sizes, [point["peak_memory"] / 2**30 for point in points], "s--", color="C3", markersize=3, linewidth=1)
+    memory.set_ylabel("peak memory [GiB]", color="C3")
+    memory.set_ylim(bottom=0)
+
+
+def _batch(axes: Any, unit: dict[str, Any]) -> None:
+    for k, kind in enumerate(("raster", "sensors")):
+        values = unit[kind]["images_per_second"]
+        axes.plot([int(count) for count in values], list(values.values()), "o-", color=f"C{k}", label=kind, markersize=4)
+    _logarithmic(axes, f"images of {unit['resolution']} x {unit['resolution']} in a step", "images a second")
+    _ticks(axes, unit["batches"])
+    axes.legend(fontsize=8)
+
+
+def _raster(axes: Any, units: list[dict[str, Any]]) -> None:
+    usual = [unit for unit in units if not unit["mesh"].startswith(("slivers", "screen-filling"))] or units
+    for k, resolution in enumerate(sorted({unit["resolution"] for unit in usual})):
+        own = sorted((unit for unit in usual if unit["resolution"] == resolution), key=lambda unit: unit["triangles"])
+        sizes = [unit["triangles"] for unit in own]
+        _curve(axes, sizes, [unit["seconds"]["ours"] for unit in own], f"C{k}", f"{resolution}")
+        embree = [1e3 * unit["seconds"]["embree update and trace"]["median"] for unit in own]
+        axes.plot(sizes, embree, ":", color=f"C{k}")
+    axes.set_title("dotted: Embree, update and trace", fontsize=9)
+    _logarithmic(axes, "triangles", "rasterization [ms]")
+    axes.legend(fontsize=8)
+
+
+def _steps(axes: Any, units: list[dict[str, Any]]) -> None:
+    for k, (name, label) in enumerate((("shadows", "with shadows"), ("rasterizer", "without"), ("mitsuba", "Mitsuba"))):
+        own = [unit for unit in units if name in unit["seconds"]]
+        _curve(axes, [unit["resolution"] for unit in own], [unit["seconds"][name] for unit in own], f"C{k}", label)
+    default = [unit for unit in units if "median" in unit.get("mitsuba default", {})]
+    medians = [1e3 * unit["mitsuba default"]["median"] for unit in default]
+    axes.plot([unit["resolution"] for unit in default], medians, "o-", color="C3", label="Mitsuba's default", markersize=4)
+    _logarithmic(axes, "image width in pixels", "step [ms]")
+    _ticks(axes, [unit["resolution"] for unit in units])
+    axes.legend(fontsize=8)
+
+
+def _passes(axes: Any, unit: dict[str, Any]) -> None:
+    passes = unit["passes"][::-1]
+    names = [entry["pass"] for entry in passes]
+    forward, backward = ([1e3 * entry[f"{way}_seconds"] for entry in passes] for way in ("forward", "backward"))
+    axes.barh(names, forward, color="C0", label="forward")
+    axes.barh(names, backward, left=forward, color="C1", label="backward")
+    axes.set_xlabel("kernels [ms]")
+    axes.set_title(f"{unit['resolution']} x {unit['resolution']}", fontsize=9)
+    axes.tick_params(axis="y", labelsize=7)
+    axes.legend(fontsize=8)
+
+
+def _curve(axes: Any, sizes: list[float], seconds: list[dict[str, float]], colour: str, label: str) -> None:
+    medians = [1e3 * entry["median"] for entry in seconds]
+    spread = [[1e3 * (e["median"] - e["q1"]) for e in seconds], [1e3 * (e["q3"] - e["median"]) for e in seconds]]
+    axes.errorbar(sizes, medians, yerr=spread, fmt="o-", color=colour, label=label, markersize=4, capsize=2)
+
+
+def _logarithmic(axes: Any, x_label: str, y_label: str) -> None:
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_xlabel(x_label)
+    axes.set_ylabel(y_label)
+    axes.grid(True, alpha=0.3)
+
+
+def _ticks(axes: Any, values: list[float]) -> None:
+    """Ticks where there are points, and nowhere else."""
+    short = [f"{v / 1e6:.3g}M" if v >= 1e6 else f"{v / 1e3:.3g}k" if v >= 1e4 else f"{v:g}" for v in values]
+    axes.set_xticks(values, short, fontsize=8)
+    axes.set_xticks([], minor=True)

@@ -1,0 +1,1 @@
+"""Faces from profile shadows: heads, metrics, what a silhouette tells, and reports."""

@@ -1,0 +1,228 @@
+"""Faces from profile shadows: the weights of a morphable model are found from the shadow of a head, or a silhouette."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from rich.console import Console
+from rich.progress import Progress
+
+from ... import io, report
+from ...errors import ShadowmapError
+from ...inverse import History, optimize
+from ...inverse.faces.morphable import MorphableModel
+from ...timing import machine
+from . import pictures as faces_pictures
+from . import report as faces_report
+from .information import image_derivatives, posterior_covariance, recovery
+from .metrics import check_libraries, surface_distance
+from .problem import LIGHTS, MODES, FaceScene, FloatArray, Mode, artificial_weights, default_model, path_traced_shadow
+
+SEEDS = (1, 6, 8, 131)
+#: Strength of the prior. A tenth and three times as much change the mean errors of the four heads by less than a tenth
+#: (docs/faces.md).
+PRIOR = 3e-5
+STEP_SIZE, TRANSLATION_STEP = 0.2, 0.01
+Reference = Literal["own", "mitsuba"]
+
+
+@dataclass(frozen=True)
+class FaceOptions:
+    """What to run. Everything is run for each mode, number of shadows and head.
+
+    Attributes:
+        seeds: artificial heads.
+        lights: numbers of shadows, 1 or 3.
+        modes: see `faces.problem.MODES`.
+        model: morphable model (.npz); None: the head of this package.
+        iterations: steps of Adam.
+        prior: strength of the prior on the weights, see `MorphFit`.
+        translate: look for the head's place as well.
+        reference: shadow images of this library, or path-traced ones.
+        height: rows of the image.
+        map_resolution, filter_size: of the shadow maps, texels.
+        spp: samples per pixel of path-traced images.
+        samples: points on each surface of which distances are taken.
+        out: folder for the results.
+        resume: keep finished runs, go on with killed ones.
+    """
+
+    seeds: tuple[int, ...] = SEEDS
+    lights: tuple[int, ...] = LIGHTS
+    modes: tuple[Mode, ...] = ("identity",)
+    model: Path | None = None
+    iterations: int = 400
+    prior: float = PRIOR
+    translate: bool = False
+    reference: Reference = "own"
+    height: int = 192
+    map_resolution: int = 256
+    filter_size: int = 3
+    spp: int = 512
+    samples: int = 30_000
+    out: Path = field(default=Path("face"))
+    resume: bool = False
+
+    def __post_init__(self) -> None:
+        for name, values, known in (
+            ("head", self.seeds, None), ("number of shadows", self.lights, LIGHTS), ("mode", self.modes, MODES)
+        ):
+            if not values:
+                raise ShadowmapError(f"no {name} given: name at least one.")
+            for value in values:
+                if known is not None and value not in known:
+                    raise ShadowmapError(f"no {name} {value!r}: choose from {', '.join(map(str, known))}.")
+                if values.count(value) > 1:
+                    raise ShadowmapError(f"the {name} {value} is given twice: name each once.")
+        for seed in self.seeds:
+            if seed < 0:
+                raise ShadowmapError(f"a head of seed {seed}: give 0 or more.")
+        check_numbers(self.iterations, self.prior)
+        for name, number, least in (("samples per pixel", self.spp, 1), ("points on a surface", self.samples, 100)):
+            if number < least:
+                raise ShadowmapError(f"{number} {name}: give at least {least}.")
+        if self.reference not in ("own", "mitsuba"):
+            raise ShadowmapError(f"no reference {self.reference!r}: choose own or mitsuba.")
+
+
+def check_numbers(iterations: int, prior: float) -> None:
+    """ShadowmapError for what no fit can be run with."""
+    if iterations < 1:
+        raise ShadowmapError(f"{iterations} iterations: give at least 1.")
+    if not (np.isfinite(prior) and prior >= 0):
+        raise ShadowmapError(f"a prior of {prior}: give a finite number, 0 or more.")
+
+
+@dataclass(frozen=True)
+class Head:
+    """An artificial head: its seed, weights, and vertices (V, 3); and those of what a fit starts from."""
+
+    seed: int
+    identity: Any
+    expression: Any
+    vertices: FloatArray
+    start: FloatArray
+
+    @classmethod
+    def make(cls, model: MorphableModel, seed: int, mode: Mode) -> Head:
+        identity, expression = artificial_weights(model, seed, mode)
+        start = model.vertices(identity) if mode == "expression" else model.mean
+        return cls(seed, identity, expression, model.vertices(identity, expression), start)
+
+    def weights(self, mode: Mode) -> Any:
+        """What a fit of this mode should find."""
+        return {"identity": self.identity, "expression": self.expression}.get(
+            mode, np.concatenate([self.identity, self.expression])
+        )
+
+
+def run_faces(options: FaceOptions, *, console: Console | None = None) -> dict[str, Any]:
+    """Run all, and write results below `options.out`.
+
+    Files: `faces.json` (settings and a record for each run), `faces.md` (tables), for each mode `MODE-profiles-1.png` and
+    `-3.png` (shadows), `MODE-errors.png` (distances drawn on the heads), `convergence.png`, heads as `.ply`. Returns the record.
+    """
+    check_libraries()
+    console = console or Console(stderr=True)
+    path = io.check_output(options.out / "faces.json", (".json",))
+    model = default_model(options.model)
+    scenes = {
+        lights: FaceScene.build(model, lights, options.height, options.map_resolution, options.filter_size)
+        for lights in options.lights
+    }
+    record = _started(path, options, model)
+    with report.progress(console) as progress:
+        task = progress.add_task("heads", total=len(options.modes) * len(options.lights) * len(options.seeds), note="")
+        for mode in options.modes:
+            sheets = faces_pictures.Sheets(model, mode)
+            for seed in options.seeds:
+                head = Head.make(model, seed, mode)
+                for lights in options.lights:
+                    progress.update(task, note=f"{mode}, head {seed}, {lights} shadow{'s' * (lights > 1)}")
+                    _one(scenes[lights], head, mode, options, record, path, progress, sheets)
+                    progress.advance(task)
+            sheets.write(options.out)
+    faces_report.write(options.out, record)
+    return record
+
+
+def _one(
+    scene: FaceScene, head: Head, mode: Mode, options: FaceOptions, record: dict[str, Any], path: Path, progress: Progress,
+    sheets: faces_pictures.Sheets,
+) -> None:
+    """Run one fit, unless it has been run; note its record, and its pictures."""
+    key = f"{mode} | {scene.lights} | {head.seed}"
+    if options.reference == "own":
+        target = scene.shadow(head.vertices)
+    else:
+        target = path_traced_shadow(scene, head.vertices, options.spp)
+    fit = scene.fit(
+        mode, target, identity=head.identity, prior=options.prior, translate=options.translate, step_size=STEP_SIZE,
+        translation_step=TRANSLATION_STEP,
+    )
+    if key not in record["runs"]:
+        checkpoint = options.out / "checkpoints" / f"{mode}-{scene.lights}-{head.seed}.npz"
+        if not options.resume:
+            checkpoint.unlink(missing_ok=True)
+        start = np.zeros(fit.count + (2 if options.translate else 0))
+        steps = progress.add_task("steps", total=options.iterations, note="")
+        show = functools.partial(_show, progress, steps)
+        settings = {**record["settings"], "run": key}
+        history = optimize(fit, start, options.iterations, checkpoint=checkpoint, settings=settings, on_step=show)
+        progress.remove_task(steps)
+        record["runs"][key] = _measured(scene, head, mode, options, fit, history)
+        report.write_json(path, record)
+        checkpoint.unlink(missing_ok=True)
+    final = np.array(record["runs"][key]["final"], np.float64)
+    found = fit.vertices(final)
+    faces_pictures.write_ply(options.out / "heads" / f"{mode}-{head.seed}-{scene.lights}.ply", found, scene.model.faces)
+    sheets.add(
+        head.seed, scene.lights, head.vertices, head.start, found, target[..., None], fit.render(np.zeros_like(final)),
+        fit.render(final),
+    )
+
+
+def _measured(scene: FaceScene, head: Head, mode: Mode, options: FaceOptions, fit: Any, history: History) -> dict[str, Any]:
+    faces, mask = scene.model.faces, scene.model.mask
+    found, true = fit.vertices(history.final), np.asarray(head.weights(mode))
+    weights = history.final[: fit.count]
+    difference = fit.render(history.final)[..., 0] - np.array(fit.reference)
+    result = {
+        "mode": mode, "lights": scene.lights, "seed": head.seed,
+        "distance": vars(surface_distance(found, head.vertices, faces, mask, samples=options.samples)),
+        "start_distance": vars(surface_distance(head.start, head.vertices, faces, mask, samples=options.samples)),
+        "image_error": float(np.sqrt(np.mean(np.square(difference)))),
+        "weight_error": float(np.sqrt(np.mean(np.square(weights - true)))),
+        "seconds_per_iteration": history.seconds_per_iteration, "seconds_total": history.seconds_total,
+        "final": history.final, "true": true, "loss_curve": history.loss,
+    }
+    if mode == "expression" and options.prior > 0:
+        left = posterior_covariance(image_derivatives(fit, np.zeros(len(history.final))), options.prior)
+        result["recovery"] = recovery(scene.model.expression_names, left, true, weights)
+    return report.plain(result)
+
+
+def _started(path: Path, options: FaceOptions, model: MorphableModel) -> dict[str, Any]:
+    """The record of an earlier call with the same settings, or an empty one."""
+    settings = report.plain({
+        "model": faces_report.digest(model), "iterations": options.iterations, "prior": options.prior,
+        "translate": options.translate, "reference": options.reference,
+        "spp": options.spp if options.reference != "own" else None,
+        "height": options.height, "map_resolution": options.map_resolution, "filter_size": options.filter_size,
+        "samples": options.samples, "step_size": STEP_SIZE, "translation_step": TRANSLATION_STEP,
+    })
+    if options.resume and path.exists():
+        record = report.read_json(path)
+        if not isinstance(record, Mapping) or record.get("settings") != settings or "runs" not in record:
+            raise ShadowmapError(f"{path} belongs to a run with other settings: choose another folder, or leave out --resume.")
+        return dict(record)
+    return {"settings": settings, "machine": machine(), "runs": {}}
+
+
+def _show(progress: Progress, task: Any, done: int) -> None:
+    progress.update(task, completed=done)

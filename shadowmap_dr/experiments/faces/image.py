@@ -1,0 +1,101 @@
+"""A head from a silhouette in an image file."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from ... import io, report
+from ...inverse import optimize
+from ...timing import machine
+from . import pictures as faces_pictures
+from . import report as faces_report
+from .experiment import STEP_SIZE, TRANSLATION_STEP, check_numbers
+from .problem import FaceScene, Mode, default_model
+from .silhouette import place, read_silhouette, resample
+
+#: Ten times as strong as for artificial heads: a silhouette from elsewhere is not exactly the shadow of any head of a model.
+PRIOR = 3e-4
+
+
+@dataclass(frozen=True)
+class ImageOptions:
+    """A silhouette and how to fit it; the other attributes are those of `faces.FaceOptions`.
+
+    Attributes:
+        image: file; what is not head may be white or black, or transparent.
+        mode: ``identity`` or ``both``.
+    """
+
+    image: Path
+    mode: Mode = "identity"
+    model: Path | None = None
+    iterations: int = 400
+    prior: float = PRIOR
+    height: int = 192
+    map_resolution: int = 256
+    filter_size: int = 3
+    out: Path = Path("face")
+    resume: bool = False
+
+    def __post_init__(self) -> None:
+        check_numbers(self.iterations, self.prior)
+
+
+def run_image(options: ImageOptions, *, console: Console | None = None) -> dict[str, Any]:
+    """Fit a head to the silhouette, its place included; the record.
+
+    Writes into `options.out`, with the image's name in front: `-face.json`, `-shadows.png` (the silhouette as it was laid over
+    the shadow of the mean head, that shadow, the result), `-heads.png`, `-face.ply`.
+    """
+    console = console or Console(stderr=True)
+    name = options.image.stem
+    path = io.check_output(options.out / f"{name}-face.json", (".json",))
+    silhouette = read_silhouette(options.image)
+    model = default_model(options.model)
+    scene = FaceScene.build(model, 1, options.height, options.map_resolution, options.filter_size)
+    placement = place(silhouette, scene.shadow(model.mean))
+    target = resample(silhouette, scene.shadows.shape, placement)
+    fit = scene.fit(
+        options.mode, target, translate=True, prior=options.prior, step_size=STEP_SIZE, translation_step=TRANSLATION_STEP
+    )
+    settings = report.plain({
+        "image": options.image.name, "mode": options.mode, "model": faces_report.digest(model), "iterations": options.iterations,
+        "height": options.height, "map_resolution": options.map_resolution, "filter_size": options.filter_size,
+        "placement": vars(placement), **fit.describe(),
+    })
+    checkpoint = options.out / "checkpoints" / f"{name}.npz"
+    if not options.resume:
+        checkpoint.unlink(missing_ok=True)
+    start = np.zeros(fit.count + 2)
+    with report.progress(console) as progress:
+        task = progress.add_task("steps", total=options.iterations, note="")
+        show = functools.partial(_show, progress, task)
+        history = optimize(fit, start, options.iterations, checkpoint=checkpoint, settings=settings, on_step=show)
+    images = {"target": target[..., None], "mean head": fit.render(start), "result": fit.render(history.final)}
+    images["difference"] = np.abs(images["result"] - images["target"])
+    record = report.plain({
+        "settings": settings, "machine": machine(),
+        "image_error": float(np.sqrt(np.mean(images["difference"] ** 2))),
+        "image_error_start": float(np.sqrt(np.mean(np.square(images["mean head"] - images["target"])))),
+        "weights": history.final[: fit.count], "translation": history.final[fit.count :],
+        "seconds_per_iteration": history.seconds_per_iteration, "loss_curve": history.loss,
+    })
+    report.write_json(path, record)
+    found = fit.vertices(history.final)
+    heads = {"mean head": model.mean, "result": found}
+    drawn = {title: faces_pictures.picture(vertices, model.faces, model.mask) for title, vertices in heads.items()}
+    report.image_sheet(options.out / f"{name}-shadows.png", {"shadow": images})
+    report.image_sheet(options.out / f"{name}-heads.png", {"head": drawn})
+    faces_pictures.write_ply(options.out / f"{name}-face.ply", found, model.faces)
+    checkpoint.unlink(missing_ok=True)
+    return record
+
+
+def _show(progress: Any, task: Any, done: int) -> None:
+    progress.update(task, completed=done)

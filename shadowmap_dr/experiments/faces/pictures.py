@@ -1,0 +1,132 @@
+"""Pictures of the experiment on faces: profile shadows side by side, and distances drawn on the heads."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
+
+from ... import report
+from ...inverse.faces.morphable import MorphableModel
+from ...io import atomic, to_srgb
+from .metrics import distances
+
+#: Distance that has the last colour of the map (head within [-1, 1]^3).
+COLOUR_END = 0.05
+_SIZE = 220
+_GREY = 0.6
+# Beside and before the head, which faces +x, so that profile and face are seen.
+_EYE, _FOV_DEG = (4.2, 0.9, 4.6), 18.0
+
+
+class Sheets:
+    """Collects the pictures of a mode; heads are rows."""
+
+    def __init__(self, model: MorphableModel, mode: str) -> None:
+        self._model, self._mode = model, mode
+        self._profiles: dict[int, dict[str, dict[str, Any]]] = {}
+        self._heads: dict[int, dict[str, Any]] = {}
+
+    def add(
+        self, seed: int, lights: int, true: Any, start: Any, found: Any, target: Any, shadow_start: Any, shadow_found: Any
+    ) -> None:
+        """Vertices (V, 3) of the true head, the start and the result; (H, W, 1) shadows of the three."""
+        self._profiles.setdefault(lights, {})[f"head {seed}"] = {
+            "target": target, "start": shadow_start, "result": shadow_found, "difference": np.abs(shadow_found - target)
+        }
+        heads = self._heads.setdefault(seed, {"true": true, "start": start})
+        heads[lights] = found
+
+    def write(self, out: Path) -> None:
+        """`MODE-profiles-N.png` for each number N of shadows, and `MODE-errors.png`."""
+        for lights, rows in self._profiles.items():
+            report.image_sheet(out / f"{self._mode}-profiles-{lights}.png", rows)
+        rows = {}
+        for seed, heads in self._heads.items():
+            faces = self._model.faces
+            row = {"head": picture(heads["true"], faces, self._model.mask)}
+            for key in ("start", *sorted(k for k in heads if isinstance(k, int))):
+                title = f"{key} shadow{'s' * (key > 1)}" if isinstance(key, int) else key
+                error = distances(heads[key], heads["true"], faces)
+                row[title] = picture(heads[key], faces, self._model.mask, error)
+            rows[f"head {seed}"] = row
+        error_sheet(out / f"{self._mode}-errors.png", rows)
+
+
+def picture(
+    vertices: npt.ArrayLike, faces: npt.ArrayLike, mask: npt.ArrayLike, error: npt.ArrayLike | None = None, size: int = _SIZE
+) -> npt.NDArray[np.float32]:
+    """Linear picture (size, size, 3) of a head from the side and the front, above the neck; coloured by ``error`` (V,)."""
+    from matplotlib import colormaps
+
+    p, f, m = np.asarray(vertices, np.float32), np.asarray(faces), np.asarray(mask, bool)
+    f = f[m[f].all(1)]
+    if error is None:
+        colours = np.full((len(p), 3), _GREY)
+    else:
+        encoded = colormaps["viridis"](np.clip(np.asarray(error) / COLOUR_END, 0, 1))[:, :3]
+        colours = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    mesh = _mesh(p, f)
+    mesh.add_attribute("vertex_paint", 3, np.ascontiguousarray(colours, np.float32).ravel())
+    mesh.set_bsdf(mi.load_dict({
+        "type": "twosided",
+        "material": {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_paint"}},
+    }))
+    middle = [float(x) for x in 0.5 * (p[m].min(0) + p[m].max(0))]
+    eye = [a + b for a, b in zip(_EYE, middle, strict=True)]
+    scene = mi.load_dict({
+        "type": "scene",
+        "camera": {
+            "type": "perspective", "fov": _FOV_DEG, "to_world": mi.ScalarTransform4f().look_at(eye, middle, [0, 1, 0]),
+            "film": {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}, "pixel_format": "rgba"},
+        },
+        "head": mesh,
+        "key": {"type": "directional", "direction": [-1.0, -0.9, -0.5], "irradiance": {"type": "rgb", "value": 1.6}},
+        "fill": {"type": "directional", "direction": [-0.3, -0.2, -1.0], "irradiance": {"type": "rgb", "value": 1.4}},
+    }, optimize=False)
+    image = np.array(mi.render(scene, integrator=mi.load_dict({"type": "shadowmap"}), spp=9))
+    return image[..., :3] + (1 - image[..., 3:4])  # before white
+
+
+def error_sheet(path: str | os.PathLike[str], rows: dict[str, dict[str, npt.NDArray[np.float32]]]) -> None:
+    """A grid of pictures with the scale of the colours beside it."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+    from matplotlib.figure import Figure  # without pyplot there is no global state and no display is needed
+
+    columns = max(len(row) for row in rows.values())
+    figure = Figure(figsize=(2.2 * columns + 0.8, 2.2 * len(rows) + 0.3), layout="constrained")
+    grid = np.atleast_2d(figure.subplots(len(rows), columns, squeeze=False))
+    for i, (row_title, row) in enumerate(rows.items()):
+        for j, (title, image) in enumerate(row.items()):
+            axes = grid[i, j]
+            axes.imshow(to_srgb(image), interpolation="nearest")
+            axes.set_title(title if i == 0 else "", fontsize=9)
+            axes.set_ylabel(row_title if j == 0 else "", fontsize=9)
+        for axes in grid[i]:
+            axes.set_xticks([])
+            axes.set_yticks([])
+    scale = ScalarMappable(Normalize(0, COLOUR_END), "viridis")
+    figure.colorbar(scale, ax=list(grid[:, -1]), label="distance from the head", extend="max", shrink=0.8)
+    with atomic(path) as temporary:
+        figure.savefig(temporary, dpi=120)
+
+
+def write_ply(path: str | os.PathLike[str], vertices: npt.ArrayLike, faces: npt.ArrayLike) -> None:
+    """Write a mesh as a binary PLY file."""
+    mesh = _mesh(np.asarray(vertices, np.float32), np.asarray(faces))
+    with atomic(path) as temporary:
+        mesh.write_ply(str(temporary))
+
+
+def _mesh(vertices: npt.NDArray[np.float32], faces: npt.NDArray[Any]) -> Any:
+    mesh = mi.Mesh("head", len(vertices), len(faces))
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = mi.Float(vertices.ravel())
+    parameters["faces"] = mi.UInt32(faces.ravel().astype(np.uint32))
+    parameters.update()
+    return mesh

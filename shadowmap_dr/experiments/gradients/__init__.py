@@ -1,0 +1,1 @@
+"""Derivatives of shadows: images of them, convergence, and the minimal plane."""

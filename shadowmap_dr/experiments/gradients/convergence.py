@@ -1,0 +1,227 @@
+"""From how far away is an occluder recovered? It is displaced sideways, and only its shadow is seen."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from ... import io, report
+from ...errors import ShadowmapError
+from ...inverse import optimize
+from ...renderer import Renderer
+from ...timing import machine
+from ..bench.meshes import Mesh
+from . import scenes as gradients_scenes
+from .fit import ShadowFit
+from .images import Image, check_maps
+from .report import markdown
+
+#: Error in texels below which an occluder counts as recovered, and largest error that is hoped for.
+RECOVERED, HOPED_FOR = 1.0, 0.1
+OCCLUDERS = ("plane", "ring")
+# Above the perspective camera, which must not see the occluder.
+_Z = 1.0
+_SIZES = {"plane": 0.25, "ring": 0.3}
+MAX_DISPLACEMENT = 0.7
+STEP_SIZE, _DECAY = 0.02, 0.005
+
+
+@dataclass(frozen=True)
+class ConvergenceOptions:
+    """What to run. Everything is run for each occluder, camera, filter size and displacement.
+
+    Attributes:
+        occluders: names in `OCCLUDERS`: a square of side 0.5, a ring 0.57 wide.
+        cameras: names in `gradients.scenes.CAMERAS`.
+        filter_sizes: texels along each side of the Gaussian; 1 for none.
+        displacements: along x, world units.
+        map_resolution: texels along each side of the map.
+        resolution: pixels along each side of the image.
+        iterations: steps of Adam, the last of which are 200 times as small as the first.
+        spp: samples per pixel of the path-traced reference.
+        out: folder for the results.
+        resume: keep runs that an earlier call with the same sizes has finished.
+    """
+
+    occluders: tuple[str, ...] = OCCLUDERS
+    cameras: tuple[str, ...] = ("orthographic", "perspective")
+    filter_sizes: tuple[int, ...] = (1, 3, 15)
+    displacements: tuple[float, ...] = (0.1, 0.3, 0.5, 0.65)
+    map_resolution: int = 256
+    resolution: int = 512
+    iterations: int = 250
+    spp: int = 128
+    out: Path = Path("gradients")
+    resume: bool = False
+
+    def __post_init__(self) -> None:
+        for kind, names, known in (("occluder", self.occluders, OCCLUDERS), ("camera", self.cameras, gradients_scenes.CAMERAS)):
+            for name in names:
+                if name not in known:
+                    raise ShadowmapError(f"no {kind} {name!r}: choose from {', '.join(known)}.")
+        for kind, values in (("occluder", self.occluders), ("camera", self.cameras), ("filter size", self.filter_sizes),
+                             ("displacement", self.displacements)):
+            if not values:
+                raise ShadowmapError(f"no {kind} given: name at least one.")
+        for value in self.displacements:
+            if not 0 < value <= MAX_DISPLACEMENT:
+                raise ShadowmapError(f"a displacement of {value}: give more than 0 and at most {MAX_DISPLACEMENT}.")
+        check_maps((self.map_resolution,), self.filter_sizes)
+        if self.resolution < 16 or self.iterations < 1 or self.spp < 1:
+            raise ShadowmapError("resolution, iterations and samples must be at least 16, 1 and 1.")
+
+
+def run_convergence(options: ConvergenceOptions, *, console: Console | None = None) -> dict[str, Any]:
+    """Run all; writes `convergence.json`, `convergence.md`, a plot and pictures into `options.out`, and returns the record."""
+    console = console or Console(stderr=True)
+    path = io.check_output(options.out / "convergence.json", (".json",))
+    record = _started(path, options)
+    groups = [(name, camera, taps) for name in options.occluders for camera in options.cameras for taps in options.filter_sizes]
+    sheet: dict[str, dict[str, Image]] = {}
+    with report.progress(console) as progress:
+        task = progress.add_task("runs", total=len(groups) * len(options.displacements), note="")
+        for name, camera, taps in groups:
+            progress.update(task, note=f"{name}, {camera}, filter {taps}")
+            todo = [d for d in options.displacements if _key(name, camera, taps, d) not in record["runs"]]
+            pictured = f"{name}, {camera}"
+            if not todo and pictured in sheet:
+                progress.advance(task, len(options.displacements))
+                continue
+            fit, texel = _fit(name, camera, taps, options)
+            if pictured not in sheet:
+                start = max(options.displacements)
+                sheet[pictured] = {"reference": fit.reference, f"displaced by {start}": fit.method.render((start,)),
+                                   "own, in place": fit.method.render((0.0,))}
+            progress.advance(task, len(options.displacements) - len(todo))
+            for displacement in todo:
+                history = optimize(fit.method, (displacement,), options.iterations)
+                errors = np.abs(history.parameters[:, 0]) / texel
+                record["runs"][_key(name, camera, taps, displacement)] = {
+                    "occluder": name, "camera": camera, "filter": taps, "displacement": displacement, "texel": texel,
+                    "error_texels": float(errors[-1]), "recovered": bool(errors[-1] < RECOVERED),
+                    "seconds_per_iteration": history.seconds_per_iteration, "error_curve_texels": errors,
+                    "loss_curve": history.loss,
+                }
+                report.write_json(path, record)
+                progress.advance(task)
+    record = report.plain(record)
+    report.write_json(path, record)
+    report.image_sheet(options.out / "convergence-images.png", sheet)
+    report.plot_curves(options.out / "convergence.png", _curves(record))
+    with io.atomic(options.out / "convergence.md") as temporary:
+        temporary.write_text(read_convergence(record), encoding="utf-8")
+    return record
+
+
+def _started(path: Path, options: ConvergenceOptions) -> dict[str, Any]:
+    identity = {"map_resolution": options.map_resolution, "resolution": options.resolution, "iterations": options.iterations,
+                "spp": options.spp, "step_size": STEP_SIZE, "decay": _DECAY}
+    if options.resume and path.exists():
+        record = report.read_json(path)
+        if record.get("settings") != identity:
+            raise ShadowmapError(f"{path} belongs to a run with other settings: choose another folder, or leave out --resume.")
+        return record
+    return {"settings": identity, "machine": machine(), "runs": {}}
+
+
+def _key(name: str, camera: str, taps: int, displacement: float) -> str:
+    return f"{name} | {camera} | {taps} | {displacement:g}"
+
+
+@dataclass(frozen=True)
+class _Fit:
+    method: ShadowFit
+    reference: Image
+
+
+def _fit(name: str, camera: str, taps: int, options: ConvergenceOptions) -> tuple[_Fit, float]:
+    """Method for an occluder that moves along x, its path-traced target, and the width of a texel in world units."""
+    from mitsuba_baselines.reference import path_traced
+
+    mesh = occluder(name)
+    scene = gradients_scenes.build(mesh, options.resolution, camera)
+    reference = path_traced(scene, spp=options.spp).image
+    filters = {"shadow_filter": "gaussian" if taps > 1 else "none", "shadow_filter_size": taps}
+    renderer = Renderer.from_scene(scene, shadow_map_resolution=options.map_resolution, **filters)
+    basis = np.zeros((1, *mesh.vertices.shape))
+    basis[0, :, 0] = 1
+    method = ShadowFit(renderer, mesh.vertices, basis, reference, step_size=STEP_SIZE, decay=(_DECAY, options.iterations))
+    frusta = renderer.frusta
+    assert frusta is not None  # the renderer has a shadow map
+    return _Fit(method, reference), 2 * float(max(frusta.half_x[0], frusta.half_y[0])) / options.map_resolution
+
+
+def occluder(name: str) -> Mesh:
+    """One of `OCCLUDERS`, in its target position."""
+    if name == "plane":
+        return gradients_scenes.plane(_SIZES[name], _Z)
+    return gradients_scenes.ring(8000, _Z, _SIZES[name])
+
+
+def _curves(record: Mapping[str, Any]) -> dict[str, dict[str, list[list[float]]]]:
+    """Error over iterations, a panel for each occluder and camera, a colour for each filter."""
+    panels: dict[str, dict[str, list[list[float]]]] = {}
+    for run in record["runs"].values():
+        label = f"filter {run['filter']}" if run["filter"] > 1 else "no filter"
+        panel = panels.setdefault(f"error [texels]: {run['occluder']}, {run['camera']}", {})
+        panel.setdefault(label, []).append(run["error_curve_texels"])
+    return panels
+
+
+def convergence_rows(record: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
+    """A row for each occluder, camera and filter: how far it is recovered from, and how well."""
+    groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
+    for run in record["runs"].values():
+        groups.setdefault((run["occluder"], run["camera"], run["filter"]), []).append(run)
+    rows = []
+    for (name, camera, taps), runs in groups.items():
+        runs = sorted(runs, key=lambda run: run["displacement"])
+        far = largest_recovered(runs)
+        found = [run["error_texels"] for run in runs if run["recovered"]]
+        rows.append([f"{name}, {camera}, {taps if taps > 1 else 'none'}", f"{len(found)}/{len(runs)}",
+                     f"{far:g}" if far else "-", f"{max(found):.3f}" if found else "-"])
+    return ["occluder, camera, filter", "recovered", "from up to", "largest error"], rows
+
+
+def largest_recovered(runs: list[Mapping[str, Any]]) -> float:
+    """Largest displacement from which, and from all smaller ones, the occluder was recovered; 0 if there is none."""
+    largest = 0.0
+    for run in sorted(runs, key=lambda run: run["displacement"]):
+        if not run["recovered"]:
+            break
+        largest = run["displacement"]
+    return largest
+
+
+def convergence_table(record: Mapping[str, Any]) -> Table:
+    """For the terminal."""
+    return report.table("Displaced occluders (error of the recovered ones in texels)", *convergence_rows(record))
+
+
+def read_convergence(record: Mapping[str, Any]) -> str:
+    """Markdown: the table, and what it says."""
+    s, runs = record["settings"], list(record["runs"].values())
+    found = [run for run in runs if run["recovered"]]
+    near = [run for run in found if run["error_texels"] <= HOPED_FOR]
+    lines = ["# An occluder recovered from its shadow", "",
+             f"Displaced along x, path-traced reference ({s['spp']} samples, {s['resolution']} x {s['resolution']} pixels), "
+             f"map of {s['map_resolution']} texels, {s['iterations']} steps of Adam. Recovered: within a texel.", ""]
+    lines += markdown(*convergence_rows(record)) + [""]
+    lines.append(f"{len(found)} of {len(runs)} runs recover the occluder, {len(near)} of these to {HOPED_FOR} texel.")
+    worst = max(found, key=lambda run: run["error_texels"], default=None)
+    if worst is not None and worst["error_texels"] > HOPED_FOR:
+        lines.append(f"The worst of them: {worst['occluder']}, {worst['camera']}, filter {worst['filter']}, "
+                     f"{worst['error_texels']:.3f} texels.")
+    for name in dict.fromkeys(run["occluder"] for run in runs):
+        width = float(np.ptp(occluder(name).vertices[:, 0]))
+        lost = [run["displacement"] for run in runs if run["occluder"] == name and not run["recovered"]]
+        kept = [run["displacement"] for run in runs if run["occluder"] == name and run["recovered"]]
+        lines.append(f"The {name} is {width:.2f} wide; it was recovered from up to {max(kept, default=0):g}, "
+                     + (f"and lost, in some case, from {min(lost):g}." if lost else "and never lost."))
+    return "\n".join(lines) + "\n"

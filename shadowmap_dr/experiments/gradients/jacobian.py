@@ -1,0 +1,246 @@
+"""Are the derivatives of shadows right? Derivative images against central differences, our own and path-traced, and Mitsuba's."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from rich.console import Console
+
+from ... import io, report
+from ...errors import ShadowmapError
+from ...renderer import Renderer
+from ...timing import machine
+from ..bench.meshes import Mesh
+from . import report as gradients_report
+from . import scenes as gradients_scenes
+from .images import (
+    Image,
+    blurred_by_map,
+    central_derivative,
+    check_maps,
+    forward_derivative,
+    image_of,
+    reverse_error,
+    texel_in_pixels,
+)
+from .references import Sampling, path_traced_derivative, projective_image
+from .scenes import MOTIONS
+
+#: What may be compared: a label, and options of the `Renderer`.
+CANDIDATES: dict[str, dict[str, Any]] = {
+    "default": {},
+    "no anti-aliasing": {"shadow_antialias": False},
+    "2 x 2 texels": {"shadow_supersampling": 2},
+    "4 x 4 texels": {"shadow_supersampling": 4},
+    "4 x 4 look-ups": {"shadow_samples": 4},
+    "plain vsm": {"shadow_method": "vsm", "shadow_receiver_range": False},
+    "plain vsm, 2 x 2": {"shadow_method": "vsm", "shadow_receiver_range": False, "shadow_supersampling": 2},
+    "msm": {"shadow_method": "msm"},
+}
+# Faces of the coarse occluder in the test of tessellation, and how often each is divided in four: 64-fold.
+_COARSE_FACES, _DIVISIONS, _TARGET_PIXELS = 2000, 3, 8.0
+
+
+@dataclass(frozen=True)
+class JacobianOptions:
+    """What to run. Everything is run for each candidate, motion, map size and filter size.
+
+    Attributes:
+        motions: names in `gradients.scenes.MOTIONS`.
+        candidates: names in `CANDIDATES`.
+        map_resolutions: texels along each side of the map.
+        filter_sizes: texels along each side of the Gaussian; 1 for none.
+        resolution: pixels along each side of the image.
+        faces: of the occluder, roughly.
+        spp: samples per pixel of the path-traced images.
+        mitsuba_passes: passes of Mitsuba's projective integrator, 0 to leave it out.
+        out: folder for the results.
+        resume: keep what an earlier run with the same occluder, image and samples has measured.
+    """
+
+    motions: tuple[str, ...] = tuple(MOTIONS)
+    candidates: tuple[str, ...] = ("default",)
+    map_resolutions: tuple[int, ...] = (256, 1024)
+    filter_sizes: tuple[int, ...] = (1, 3, 5, 9, 15)
+    resolution: int = 512
+    faces: int = 130_000
+    spp: int = 128
+    mitsuba_passes: int = 2
+    out: Path = Path("gradients")
+    resume: bool = False
+
+    def __post_init__(self) -> None:
+        for kind, names, known in (("motion", self.motions, MOTIONS), ("candidate", self.candidates, CANDIDATES)):
+            for name in names:
+                if name not in known:
+                    raise ShadowmapError(f"no {kind} {name!r}: choose from {', '.join(known)}.")
+        for kind, values in (("motion", self.motions), ("candidate", self.candidates), ("map size", self.map_resolutions),
+                             ("filter size", self.filter_sizes)):
+            if not values:
+                raise ShadowmapError(f"no {kind} given: name at least one.")
+        check_maps(self.map_resolutions, self.filter_sizes)
+        if self.resolution < 16 or self.faces < 20 or self.spp < 2:
+            raise ShadowmapError("resolution, faces and samples must be at least 16, 20 and 2.")
+        if self.mitsuba_passes < 0 or self.mitsuba_passes == 1:
+            raise ShadowmapError(f"{self.mitsuba_passes} passes of Mitsuba: give 0 for none, or at least 2.")
+
+
+def run_jacobian(options: JacobianOptions, *, console: Console | None = None) -> dict[str, Any]:
+    """Measure all; writes `jacobian.json`, `jacobian.md`, pictures and a plot into `options.out` and returns the record."""
+    console = console or Console(stderr=True)
+    path = io.check_output(options.out / "jacobian.json", (".json",))
+    record = _started(path, options)
+    mesh = gradients_scenes.ring(options.faces)
+    record["settings"]["faces"] = len(mesh.faces)
+    sampling = Sampling(options.resolution, options.spp, options.out / "references", options.resume)
+    moving = [name for name in options.motions if not MOTIONS[name].along_light]
+    work = [
+        (label, name, size, taps)
+        for label in options.candidates
+        for name in options.motions
+        for size in options.map_resolutions
+        for taps in options.filter_sizes
+        if _key(label, name, size, taps) not in record["entries"]
+    ]
+    with report.progress(console) as progress:
+        def track(title: str, items: list[Any]) -> Iterable[Any]:
+            task = progress.add_task(title, total=len(items), note="")
+            for item in items:
+                progress.update(task, note=" ".join(map(str, item)) if isinstance(item, tuple) else str(item))
+                yield item
+                progress.advance(task)
+
+        traced = {}
+        for name in track("path-traced differences", list(options.motions)):
+            traced[name], record["references"][name] = path_traced_derivative(mesh, name, sampling)
+        mitsuba = {}
+        for name in track("Mitsuba, projective", moving if options.mitsuba_passes else []):
+            mitsuba[name], record["mitsuba"][name] = projective_image(mesh, name, sampling, options.mitsuba_passes)
+            report.write_json(path, record)
+        for label, name, size, taps in track("derivative images", work):
+            entry = _measure(mesh, label, name, size, taps, traced[name], options)
+            record["entries"][_key(label, name, size, taps)] = entry
+            report.write_json(path, record)
+        for name in track("64-fold tessellation", [name for name in moving if name not in record["tessellation"]]):
+            record["tessellation"][name] = _tessellation(name, options)
+        report.write_json(path, record)
+        pictures = {name: _pictures(mesh, name, traced, mitsuba, options) for name in track("pictures", list(options.motions))}
+    gradients_report.signed_sheet(options.out / "jacobian.png", pictures)
+    gradients_report.plot_agreement(options.out / "jacobian-agreement.png", record)
+    with io.atomic(options.out / "jacobian.md") as temporary:
+        temporary.write_text(gradients_report.read_jacobian(record), encoding="utf-8")
+    return record
+
+
+def _started(path: Path, options: JacobianOptions) -> dict[str, Any]:
+    """A new record, or the stored one to go on with."""
+    identity = {"resolution": options.resolution, "requested_faces": options.faces, "spp": options.spp}
+    if options.resume and path.exists():
+        record = report.read_json(path)
+        found = {key: record.get("settings", {}).get(key) for key in identity}
+        if found != identity:
+            raise ShadowmapError(f"{path} belongs to a run with {found}: choose another folder, or leave out --resume.")
+        return record
+    empty: dict[str, Any] = {"settings": identity, "machine": machine(), "candidates": CANDIDATES}
+    return empty | {"references": {}, "mitsuba": {}, "entries": {}, "tessellation": {}}
+
+
+def _key(label: str, motion: str, size: int, taps: int) -> str:
+    return f"{label} | {motion} | {size} | {taps}"
+
+
+def make_renderer(scene: Any, label: str, size: int, taps: int) -> Renderer:
+    """A renderer for a candidate with maps of so many texels; ``taps`` is the Gaussian's size, 1 for no filter."""
+    filters = {"shadow_filter": "gaussian" if taps > 1 else "none", "shadow_filter_size": taps}
+    return Renderer.from_scene(scene, shadow_map_resolution=size, **filters, **CANDIDATES[label])
+
+
+def _measure(
+    mesh: Mesh, label: str, name: str, size: int, taps: int, traced: Image, options: JacobianOptions
+) -> dict[str, Any]:
+    """Agreement of one derivative image with all that it can be compared with."""
+    motion, resolution = MOTIONS[name], options.resolution
+    renderer = make_renderer(gradients_scenes.build(mesh, resolution), label, size, taps)
+    rate = motion.rate(mesh)
+    _, derivative = forward_derivative(renderer, rate)
+    texel = texel_in_pixels(renderer, resolution)
+    entry: dict[str, Any] = {
+        "candidate": label, "motion": name, "map": size, "filter": taps,
+        "texel_pixels": list(texel), "norm": float(np.linalg.norm(derivative)),
+        "reverse_error": reverse_error(renderer, rate, derivative),
+    }
+    if motion.along_light:
+        # Relative to a motion across the light of the same speed.
+        _, across = forward_derivative(renderer, MOTIONS["x"].rate(mesh))
+        return entry | {"relative_norm": entry["norm"] / max(float(np.linalg.norm(across)), 1e-300)}
+    footprint = taps * max(texel)
+    own = central_derivative(renderer, mesh, motion, motion.step(mesh, resolution))
+    blurred = blurred_by_map(traced, renderer)
+    return entry | {
+        "own": _agreement(derivative, own, footprint),
+        "traced": _agreement(derivative, traced, footprint),
+        "traced_blurred": _agreement(derivative, blurred, footprint),
+        # What the blur of the map alone leaves of the agreement with a sharp shadow: no map with this filter comes closer.
+        "blur": _agreement(blurred, traced, footprint),
+    }
+
+
+def _agreement(derivative: Image, reference: Image, footprint: float) -> dict[str, float]:
+    from mitsuba_baselines.derivatives import agreement
+
+    # A derivative or a reference of zero (no anti-aliasing) agrees with nothing.
+    return asdict(agreement(derivative, reference, footprint)) if np.any(reference) else {"cosine": 0.0, "scale": 0.0}
+
+
+def _tessellation(name: str, options: JacobianOptions) -> dict[str, float]:
+    """Relative change of derivative image and gradient when each triangle of a coarse occluder is divided into 64."""
+    coarse = gradients_scenes.ring(_COARSE_FACES)
+    motion = MOTIONS[name]
+    # The gradient is that of the squared difference to the image of the same occluder, moved by several pixels.
+    target_mesh = motion.moved(coarse, motion.step(coarse, options.resolution, 2 * _TARGET_PIXELS))
+    images, gradients, faces = [], [], []
+    for divisions in (0, _DIVISIONS):
+        mesh, aim = (gradients_scenes.tessellated(each, divisions) for each in (coarse, target_mesh))
+        renderer = make_renderer(gradients_scenes.build(mesh, options.resolution), "default", 256, 3)
+        value, derivative = forward_derivative(renderer, motion.rate(mesh))
+        target = image_of(renderer, aim)
+        images.append(derivative)
+        faces.append(len(mesh.faces))
+        gradients.append(float(((value - target).astype(np.float64) * derivative).sum()))
+    a, b = images
+    return {
+        "faces": faces[0], "divided_faces": faces[1],
+        "image_change": float(np.linalg.norm(a - b) / np.linalg.norm(a)),
+        "gradient_change": abs(gradients[1] / gradients[0] - 1),
+    }
+
+
+def _pictures(
+    mesh: Mesh, name: str, traced: dict[str, Image], mitsuba: dict[str, Image], options: JacobianOptions
+) -> dict[str, npt.NDArray[np.floating[Any]]]:
+    """Derivative images side by side, (H, W) each: the references, and forward mode for all filters of the first map size."""
+    motion, size = MOTIONS[name], options.map_resolutions[0]
+    scene = gradients_scenes.build(mesh, options.resolution)
+    blank = np.zeros((options.resolution, options.resolution))
+    row = {"path-traced differences": traced[name][..., 0]}
+    if options.mitsuba_passes:
+        row["Mitsuba, area light"] = mitsuba[name][..., 0] if name in mitsuba else blank
+    taps = options.filter_sizes[min(1, len(options.filter_sizes) - 1)]
+    renderer = make_renderer(scene, options.candidates[0], size, taps)
+    row[f"own differences, {taps}"] = central_derivative(renderer, mesh, motion, motion.step(mesh, options.resolution))[..., 0]
+    for taps in options.filter_sizes:
+        renderer = make_renderer(scene, options.candidates[0], size, taps)
+        label = f"filter {taps}" if taps > 1 else "no filter"
+        row[label] = forward_derivative(renderer, motion.rate(mesh))[1][..., 0]
+    return {title: _middle(image) for title, image in row.items()}
+
+
+def _middle(image: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.floating[Any]]:
+    """An image without the eighth along each side that no shadow reaches."""
+    border = len(image) // 8
+    return image[border : len(image) - border, border : len(image) - border]

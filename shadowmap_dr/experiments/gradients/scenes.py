@@ -1,0 +1,161 @@
+"""Scene of the experiments on gradients: a receiver, an occluder above it, parallel light, a camera that sees the shadow only.
+
+Its image *is* the visibility: a white diffuse receiver that faces a light of irradiance pi has radiance 1 where it is lit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
+
+from ...errors import ShadowmapError
+from ..bench.meshes import Mesh, subdivided, torus
+from ..maps.scenes import occluder
+
+#: z of the receiver, and half of its side.
+RECEIVER_Z, RECEIVER_HALF = -2.0, 1.0
+#: orthographic: parallel to the light, between occluder and receiver. perspective: beside the light, and not parallel to it.
+#: pinhole: a perspective camera in the place of the orthographic one, whose image of the receiver is the same, pixel by pixel:
+#: Mitsuba's projective integrators refuse orthographic cameras.
+CAMERAS = ("orthographic", "perspective", "pinhole")
+_BETWEEN_Z = -1.0
+_BESIDE, _FOV_DEG = (1.0, 0.0, 0.75), 50.0
+
+Array = npt.NDArray[np.float32]
+
+
+def build(mesh: Mesh, resolution: int, camera: str = "orthographic") -> Any:
+    """``mi.Scene`` with the shapes ``receiver`` and ``occluder``, the emitter ``light`` (along -z) and the sensor ``camera``.
+
+    Args:
+        mesh: occluder, world space.
+        resolution: pixels along each side of the image, one channel.
+        camera: see `CAMERAS`.
+    """
+    if camera not in CAMERAS:
+        raise ShadowmapError(f"no camera {camera!r}: choose from {', '.join(CAMERAS)}.")
+    t = mi.ScalarTransform4f
+    film: dict[str, Any] = {
+        "type": "hdrfilm", "width": resolution, "height": resolution, "rfilter": {"type": "box"}, "pixel_format": "luminance",
+        "component_format": "float32", "sample_border": camera == "pinhole",  # which Mitsuba wants for derivatives of shapes
+    }
+    if camera == "orthographic":
+        place = t().look_at([0, 0, _BETWEEN_Z], [0, 0, RECEIVER_Z], [0, 1, 0]) @ t().scale([RECEIVER_HALF, RECEIVER_HALF, 1])
+        sensor: dict[str, Any] = {"type": "orthographic", "to_world": place}
+    elif camera == "pinhole":
+        place = t().look_at([0, 0, _BETWEEN_Z], [0, 0, RECEIVER_Z], [0, 1, 0])
+        fov = 2 * np.degrees(np.arctan(RECEIVER_HALF / (_BETWEEN_Z - RECEIVER_Z)))
+        sensor = {"type": "perspective", "fov": float(fov), "to_world": place}
+    else:
+        place = t().look_at(list(_BESIDE), [0, 0, RECEIVER_Z], [0, 1, 0])
+        sensor = {"type": "perspective", "fov": _FOV_DEG, "to_world": place}
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "camera": {**sensor, "near_clip": 0.01, "far_clip": 10.0, "film": film,
+                       "sampler": {"type": "multijitter", "sample_count": 64}},
+            "light": {"type": "directional", "direction": [0, 0, -1], "irradiance": {"type": "rgb", "value": float(np.pi)}},
+            "receiver": {
+                "type": "rectangle",
+                "to_world": t().translate([0, 0, RECEIVER_Z]) @ t().scale(RECEIVER_HALF),
+                "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}},
+            },
+            "occluder": occluder("occluder", mesh.vertices, mesh.faces),
+        },
+        optimize=False,
+    )
+
+
+def ring(faces: int = 130_000, z: float = 0.0, radius: float = 0.6) -> Mesh:
+    """A bumpy ring of about so many triangles, turned by a few degrees about all axes, around the z axis at a height z."""
+    across = max(3, round(float(np.sqrt(faces / 3.25))))
+    across -= across % 2
+    around = max(3, round(faces / (2 * across)))
+    mesh = torus(around, across)
+    turned = radius * mesh.vertices.astype(np.float64) @ _rotation(np.radians([7.0, -5.0, 4.0])).T
+    return Mesh((turned + [0.0, 0.0, z]).astype(np.float32), mesh.faces)
+
+
+def plane(half: float, z: float) -> Mesh:
+    """A square parallel to the receiver, two triangles."""
+    corners = np.array([[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]], np.float32)
+    return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]], np.uint32))
+
+
+def tessellated(mesh: Mesh, times: int) -> Mesh:
+    """The same surface with each triangle in 4 ** times."""
+    for _ in range(times):
+        mesh = subdivided(mesh)
+    return mesh
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A rigid motion, or a change of size, with one parameter t, about the middle of the mesh's bounding box.
+
+    Attributes:
+        velocity: (3,) world units per unit of t.
+        spin: (3,) rotation vector, radians per unit of t.
+        growth: relative change of size per unit of t.
+    """
+
+    velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    spin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    growth: float = 0.0
+
+    def moved(self, mesh: Mesh, t: float) -> Mesh:
+        """The mesh at a value of the parameter."""
+        points, middle = self._points(mesh)
+        turned = (points - middle) @ _rotation(t * np.array(self.spin)).T * (1 + t * self.growth)
+        return Mesh((middle + turned + t * np.array(self.velocity)).astype(np.float32), mesh.faces)
+
+    def rate(self, mesh: Mesh) -> npt.NDArray[np.float64]:
+        """(V, 3): derivative of the vertices at t = 0."""
+        points, middle = self._points(mesh)
+        return np.cross(np.array(self.spin), points - middle) + self.growth * (points - middle) + np.array(self.velocity)
+
+    def step(self, mesh: Mesh, resolution: int, pixels: float = 1.0) -> float:
+        """Half the distance in t of two renderings between which no point of the shadow moves by more than so many pixels.
+
+        Where the shadow does not move at all (along the light) the distance of the points themselves counts.
+        """
+        rate = self.rate(mesh)
+        across = float(np.linalg.norm(rate[:, :2], axis=1).max())
+        speed = across if across > 0 else float(np.linalg.norm(rate, axis=1).max())
+        return 0.5 * pixels * 2 * RECEIVER_HALF / resolution / speed
+
+    @property
+    def along_light(self) -> bool:
+        """Whether the shadow stays as it is, since all points move along the light."""
+        return self.growth == 0 and not any(self.spin) and not any(self.velocity[:2])
+
+    @staticmethod
+    def _points(mesh: Mesh) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        points = mesh.vertices.astype(np.float64)
+        return points, 0.5 * (points.min(0) + points.max(0))
+
+
+#: What the shadow is differentiated by.
+MOTIONS: Mapping[str, Motion] = {
+    "x": Motion(velocity=(1, 0, 0)),
+    "y": Motion(velocity=(0, 1, 0)),
+    "z": Motion(velocity=(0, 0, 1)),
+    "rotation": Motion(spin=(1 / 3, 2 / 3, 2 / 3)),
+    "scale": Motion(growth=1.0),
+}
+
+
+def _rotation(vector: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """(3, 3) matrix of a rotation vector (Rodrigues)."""
+    v = np.asarray(vector, np.float64)
+    angle = float(np.linalg.norm(v))
+    if angle == 0:
+        return np.eye(3)
+    x, y, z = v / angle
+    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k

@@ -1,0 +1,1 @@
+"""Directions of lights from images, in sweeps."""

@@ -1,0 +1,156 @@
+"""Light estimation: the directions of n lights are found by comparing images of an object and its shadow, thousands of times.
+
+Protocol: an object on a floor, seen from above, under n directional lights of known, equal irradiance. Targets and starts are
+drawn from a cone about the vertical, by the number of the run only: all settings and objects have the same. Adam on unit vectors,
+mean squared error. Estimated and true directions are matched greedily; their mean dot product is the alignment.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from ... import io, report, timing
+from ...errors import ShadowmapError
+from ...inverse import run_sweep
+from ...inverse.sweep import MEMORY
+from .problem import LightProblem, ReferenceKind, StrategyKind, check_problem
+from .report import pictures, plot
+from .scene import CONE_DEG, OBJECTS
+
+
+@dataclass(frozen=True)
+class LightOptions:
+    """What to run: every object with every number of lights and filter size; see :class:`LightProblem` for the rest.
+
+    ``filter_sizes``: 1 for no filter, 0 for no shadows.
+    """
+
+    objects: tuple[str, ...] = OBJECTS
+    lights: tuple[int, ...] = (1,)
+    filter_sizes: tuple[int, ...] = (3, 0)
+    runs: int = 16
+    filter: str = "gaussian"
+    map_resolution: int = 256
+    resolution: int = 128
+    iterations: int = 200
+    strategy: StrategyKind = "plain"
+    starts: int = 1
+    reference: ReferenceKind = "own"
+    spp: int = 128
+    seed: int = 0
+    cone_deg: float = CONE_DEG
+    out: Path = Path("lights")
+    resume: bool = False
+    scheduler: str = "local"
+    threads: int = 0
+    memory: int = MEMORY
+
+    def __post_init__(self) -> None:
+        for name, values in (("object", self.objects), ("number of lights", self.lights), ("filter size", self.filter_sizes)):
+            if not values:
+                raise ShadowmapError(f"no {name} given: name at least one.")
+            if len(set(values)) != len(values):
+                raise ShadowmapError(f"a {name} is given twice in {', '.join(map(str, values))}: name each once.")
+        if self.memory < 1:
+            raise ShadowmapError(f"{self.memory} bytes of memory: give at least 1.")
+        if self.threads < 0:
+            raise ShadowmapError(f"{self.threads} threads: give 1 or more, or 0 for all.")
+        for problem in self.problems():
+            check_problem(problem)
+
+    def problems(self) -> list[LightProblem]:
+        """One for each setting and object, settings first."""
+        return [
+            LightProblem(
+                name,
+                lights,
+                self.runs,
+                filter_size=size,
+                filter=self.filter,
+                map_resolution=self.map_resolution,
+                resolution=self.resolution,
+                iterations=self.iterations,
+                strategy=self.strategy,
+                starts=self.starts,
+                reference=self.reference,
+                spp=self.spp,
+                seed=self.seed,
+                cone_deg=self.cone_deg,
+            )
+            for lights in self.lights
+            for size in self.filter_sizes
+            for name in self.objects
+        ]
+
+
+def run_lights(options: LightOptions, *, variant: str = "llvm_ad_rgb", console: Console | None = None) -> list[dict[str, Any]]:
+    """Run the experiment and write its results below `options.out`.
+
+    Files: `lights.json` (one summary for each setting), `lights.png` (alignment over iterations and over filter sizes),
+    `pictures.png` (the first run of each object), and a file for each batch in `batches`. Summaries of settings that other calls
+    with the same folder have left in `lights.json` stay if `options.resume` is set. Returns the summaries.
+    """
+    path = io.check_output(options.out / "lights.json", (".json",))
+    problems = options.problems()
+    stored = _stored(path) if options.resume else []
+    found = run_sweep(
+        problems,
+        options.out,
+        scheduler=options.scheduler,
+        variant=variant,
+        threads=options.threads,
+        memory=options.memory,
+        resume=options.resume,
+        console=console,
+    )
+    groups: dict[str, list[LightProblem]] = {}
+    for problem in problems:
+        groups.setdefault(problem.setting, []).append(problem)
+    summaries = [summary(group, [found[problem.name] for problem in group]) for group in groups.values()]
+    new = [entry["setting"] for entry in summaries]
+    summaries = [entry for entry in stored if entry["setting"] not in new] + summaries
+    report.write_json(path, {"summaries": summaries, "machine": timing.machine()})
+    plot(options.out / "lights.png", summaries)
+    shown = next(iter(groups.values()))
+    pictures(options.out / "pictures.png", shown, [found[problem.name] for problem in shown])
+    return summaries
+
+
+def summary(problems: Sequence[LightProblem], records: Sequence[Sequence[dict[str, Any]]]) -> dict[str, Any]:
+    """Statistics over all objects and runs of one setting."""
+    final = np.array([[record["alignment"] for record in own] for own in records])
+    curves = np.array([record["alignment_curve"] for own in records for record in own])
+    settings = {key: value for key, value in problems[0].settings().items() if key not in ("object", "steps")}
+    return report.plain(
+        {
+            "setting": problems[0].setting,
+            **settings,
+            "shadows": problems[0].shadows,
+            "objects": [problem.object for problem in problems],
+            "runs": problems[0].runs,
+            "alignment_mean": final.mean(),
+            "alignment_std": final.std(),
+            "alignment_median": np.median(final),
+            "alignment_least": final.min(),
+            "share_from_0.995": (final >= 0.995).mean(),
+            "alignment_by_object": {p.object: row.mean() for p, row in zip(problems, final, strict=True)},
+            "curve_iterations": np.linspace(0, problems[0].iterations, curves.shape[1]),
+            "curve_mean": curves.mean(0),
+            "curve_std": curves.std(0),
+        }
+    )
+
+
+def _stored(path: Path) -> list[dict[str, Any]]:
+    if not path.exists():
+        return []
+    value = report.read_json(path)
+    if not isinstance(value, dict) or not isinstance(value.get("summaries"), list):
+        raise ShadowmapError(f"{path} holds no summaries of this experiment: choose another folder.")
+    return value["summaries"]

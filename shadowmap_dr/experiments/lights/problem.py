@@ -1,0 +1,189 @@
+"""Light estimation as a problem for sweeps: one object under n lights with one setting, and all its runs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
+
+from ...errors import ShadowmapError
+from ...inverse import LightBatch, Problem, Stage, StillScene
+from ...inverse.lights.batch import batch_bytes
+from ...renderer import Renderer
+from ...shadow import ShadowSettings
+from .scene import CONE_DEG, alignment, check_scene, make_scene, target_and_starts
+
+ReferenceKind = Literal["own", "mitsuba"]
+StrategyKind = Literal["plain", "coarse"]
+
+STEP_SIZE = 0.01
+#: With the strategy ``coarse`` half of the iterations have this step size and filter.
+COARSE_STEP_SIZE, COARSE_FILTER = 0.05, 15
+# A record's curve has every so many iterations.
+_CURVE_STRIDE = 5
+
+
+@dataclass(frozen=True)
+class LightProblem(Problem):
+    """All runs of one object with one setting.
+
+    Attributes:
+        object: name of a mesh.
+        lights: n, of each run.
+        runs: how many.
+        filter_size: texels along each side of the filter of the shadow maps, 1 for none; 0: no shadows at all.
+        filter, map_resolution: of the shadow maps.
+        resolution: of the images.
+        iterations: steps of the optimiser.
+        strategy: ``plain``, or ``coarse``: the first half of the iterations with larger steps and a larger filter.
+        starts: of each run; the one that ends with the least loss counts.
+        reference: who renders the targets. ``spp``: samples of each pixel and light, if Mitsuba does.
+        seed, cone_deg: see :func:`shadowmap_dr.experiments.lights.scene.target_and_starts`.
+    """
+
+    object: str
+    lights: int
+    runs: int
+    filter_size: int = 3
+    filter: str = "gaussian"
+    map_resolution: int = 256
+    resolution: int = 128
+    iterations: int = 200
+    strategy: StrategyKind = "plain"
+    starts: int = 1
+    reference: ReferenceKind = "own"
+    spp: int = 128
+    seed: int = 0
+    cone_deg: float = CONE_DEG
+
+    @property
+    def name(self) -> str:
+        return f"{Path(self.object).stem}-{self.setting}"
+
+    @property
+    def setting(self) -> str:
+        """What distinguishes this from other settings of the same object, as a part of file names."""
+        shadow = f"k{self.filter_size}-{self.filter}-m{self.map_resolution}" if self.shadows else "no-shadows"
+        parts = [f"n{self.lights}", shadow, f"r{self.resolution}", f"i{self.iterations}", f"c{self.cone_deg:g}", self.reference]
+        parts += ["coarse"] if self.strategy == "coarse" else []
+        parts += [f"s{self.starts}"] if self.starts > 1 else []
+        return "-".join([*parts, f"seed{self.seed}"])
+
+    @property
+    def shadows(self) -> bool:
+        """Whether there are any."""
+        return self.filter_size > 0
+
+    @property
+    def steps(self) -> int:
+        return self.iterations
+
+    @property
+    def stages(self) -> tuple[Stage, ...]:
+        """Steps, filters and step sizes."""
+        if self.strategy == "plain":
+            return (Stage(self.iterations, None, STEP_SIZE),)
+        first = self.iterations // 2
+        larger = max(COARSE_FILTER, self.filter_size) if self.shadows else None
+        return Stage(first, larger, COARSE_STEP_SIZE), Stage(self.iterations - first, None, STEP_SIZE)
+
+    def batch_size(self, memory: int) -> int:
+        size = self.map_resolution if self.shadows else 0
+        return max(1, memory // (self.starts * batch_bytes(self.lights, self.resolution**2, 3, size)))
+
+    def directions(self, runs: Sequence[int]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """Targets (R, n, 3) and starts (R, starts, n, 3) of some runs."""
+        pairs = [target_and_starts(self.seed, run, self.lights, self.starts, self.cone_deg) for run in runs]
+        return np.stack([target for target, _ in pairs]), np.stack([starts for _, starts in pairs])
+
+    def build(self) -> LightBatch:
+        scene = make_scene(self.object, self.lights, self.resolution)
+        return LightBatch(StillScene.of(Renderer.from_scene(scene, **self.renderer_settings())))
+
+    def renderer_settings(self) -> dict[str, Any]:
+        """Options of the `Renderer`."""
+        if not self.shadows:
+            return {"shadow_method": "none"}
+        plain = self.filter_size == 1
+        return {
+            "shadow_method": "vsm",
+            "shadow_map_resolution": self.map_resolution,
+            "shadow_filter": "none" if plain else self.filter,
+            "shadow_filter_size": self.filter_size,
+        }
+
+    def target_images(self, batch: LightBatch, targets: npt.NDArray[np.float64], runs: Sequence[int]) -> npt.NDArray[np.float32]:
+        """(R, H, W, 3) linear images under the target lights."""
+        if self.reference == "own":
+            return batch.render(targets)
+        scene = make_scene(self.object, self.lights, self.resolution)
+        return np.stack([_path_traced(scene, target, self.spp, run) for target, run in zip(targets, runs, strict=True)])
+
+    def run_batch(
+        self, built: LightBatch, runs: Sequence[int], checkpoint: Path | None, on_step: Callable[[int], None]
+    ) -> list[dict[str, Any]]:
+        targets, starts = self.directions(runs)
+        images = np.repeat(self.target_images(built, targets, runs), self.starts, 0)
+        history = built.run(starts.reshape(-1, self.lights, 3), images, self.stages, on_step)
+        # (steps, R, starts, ...)
+        losses = history.losses.reshape(self.iterations, len(runs), self.starts)
+        directions = history.directions.reshape(self.iterations + 1, len(runs), self.starts, self.lights, 3)
+        records = []
+        for k, run in enumerate(runs):
+            best = int(np.argmin(losses[-1, k]))
+            path = directions[:, k, best]
+            shown = range(0, self.iterations + 1, _CURVE_STRIDE)
+            records.append(
+                {
+                    "run": run,
+                    "target": targets[k],
+                    "start": starts[k, best],
+                    "final": path[-1],
+                    "alignment": alignment(targets[k], path[-1]),
+                    "alignment_curve": [round(alignment(targets[k], path[i]), 6) for i in shown],
+                    "loss": losses[-1, k, best],
+                }
+            )
+        return records
+
+
+def check_problem(problem: LightProblem) -> None:
+    """Raise ShadowmapError for settings that cannot be, before any work is done."""
+    check_scene(problem.object, problem.lights, problem.resolution)
+    try:
+        ShadowSettings(filter=problem.filter, filter_size=max(1, problem.filter_size), resolution=problem.map_resolution)
+    except ValueError as error:
+        raise ShadowmapError(str(error)) from None
+    for what, value in (("runs", problem.runs), ("iterations", problem.iterations), ("starts", problem.starts)):
+        if value < 1:
+            raise ShadowmapError(f"{value} {what}: give at least 1.")
+    if not 0 < problem.cone_deg <= 178:
+        raise ShadowmapError(f"a cone of {problem.cone_deg:g} degrees: give more than 0 and at most 178.")
+    if problem.seed < 0:
+        raise ShadowmapError(f"the seed {problem.seed}: give 0 or more.")
+    if problem.reference not in ("own", "mitsuba"):
+        raise ShadowmapError(f"no reference {problem.reference!r}: choose own or mitsuba.")
+    if problem.strategy not in ("plain", "coarse"):
+        raise ShadowmapError(f"no strategy {problem.strategy!r}: choose plain or coarse.")
+    if problem.spp < 1:
+        raise ShadowmapError(f"{problem.spp} samples per pixel: give at least 1.")
+
+
+def _path_traced(scene: Any, target: npt.NDArray[np.float64], spp: int, seed: int) -> npt.NDArray[np.float32]:
+    """Path-traced image under lights in the directions ``target`` (n, 3)."""
+    from mitsuba_baselines.reference import path_traced
+
+    parameters = mi.traverse(scene)
+    for k, direction in enumerate(target):
+        up = [1, 0, 0] if abs(direction[0]) < math.sqrt(0.5) else [0, 0, 1]
+        parameters[f"light_{k}.to_world"] = mi.Transform4f().look_at(
+            origin=mi.Point3f(0), target=mi.Point3f(*(-float(c) for c in direction)), up=mi.Vector3f(*up)
+        )
+    parameters.update()
+    return np.asarray(path_traced(scene, spp=spp, seed=seed, passes=1).image, np.float32)

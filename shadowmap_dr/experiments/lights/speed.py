@@ -1,0 +1,132 @@
+"""How long a step of light estimation takes for a run: in batches, alone, and the way of a renderer that knows no batches."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from rich.console import Console
+
+from ... import timing
+from ...inverse import LightBatch, StillScene, run_sweep
+from ...inverse.lights.batch import batch_bytes
+from ...inverse.lights.pixels import mixed_pixels
+from ...light_maps import light_visibility, make_maps
+from ...renderer import Renderer
+from .problem import LightProblem
+from .scene import make_scene
+
+
+def measure_workers(problem: LightProblem, counts: Sequence[int], out: Path) -> dict[str, Any]:
+    """Seconds of a sweep with so many Dask workers on this machine, one Dr.Jit thread each, once warm.
+
+    All do the same batches, of which there are a few for each worker; the first sweep, which compiles, is not timed.
+    """
+    from distributed import LocalCluster
+
+    seconds: dict[int, float] = {}
+    for count in counts:
+        with LocalCluster(n_workers=count, threads_per_worker=1, dashboard_address=None, memory_limit=0) as cluster:
+            for name in ("warm-up", "timed"):
+                began = time.perf_counter()
+                memory = problem.runs * batch_bytes(problem.lights, problem.resolution**2, 3, problem.map_resolution)
+                run_sweep(
+                    [problem],
+                    out / f"{name}-{count}",
+                    scheduler=cluster.scheduler_address,
+                    variant=mi.variant(),
+                    threads=1,
+                    memory=memory // (4 * max(counts)),
+                    console=Console(quiet=True),
+                )
+                seconds[count] = time.perf_counter() - began
+    first = counts[0]
+    return {
+        "seconds": {str(count): value for count, value in seconds.items()},
+        "speed_up": {str(count): seconds[first] / value for count, value in seconds.items()},
+        "settings": problem.settings(),
+        "runs": problem.runs,
+    }
+
+
+def measure(problem: LightProblem, batches: Sequence[int], seconds: float = 6.0) -> dict[str, Any]:
+    """Seconds that a step takes for each run.
+
+    Contenders take turns: batches of several sizes; ``reverse``, a single run whose frozen step takes its derivatives backwards
+    through ordinary shadow maps, but reuses the G-buffer, too; ``renderer``, the frozen step of a user who calls ``render``.
+    All do the same step up to Adam, which costs next to nothing.
+    """
+    renderer = Renderer.from_scene(make_scene(problem.object, problem.lights, problem.resolution), **problem.renderer_settings())
+    still = StillScene.of(renderer)
+    batch = LightBatch(still)
+    targets, starts = problem.directions(range(max(batches)))
+    images = batch.render(targets)
+    contenders = {f"batch of {size}": batch.stepper(starts[:size, 0], images[:size]) for size in batches}
+    contenders["reverse"] = _single(_reverse_image, (renderer, still), starts[0, 0], images[0])
+    contenders["renderer"] = _single(_rendered_image, (renderer,), starts[0, 0], images[0])
+    sizes = [*batches, 1, 1]
+    samples = timing.alternate(
+        {name: timing.Contender(call, rounds=40, burst=4, seconds=seconds) for name, call in contenders.items()}
+    )
+    per_run = {name: [s / size for s in samples[name]] for name, size in zip(contenders, sizes, strict=True)}
+    largest = f"batch of {max(batches)}"
+    ratios = [(name, largest) for name in contenders if name != largest]
+    return {**timing.compare(per_run, ratios), "settings": problem.settings(), "machine": timing.machine()}
+
+
+def _single(image: Callable[..., Any], scene: tuple[Any, ...], start: np.ndarray, target: np.ndarray) -> Callable[[], Any]:
+    wanted = mi.Float(np.ascontiguousarray(target).ravel())
+    vectors = [mi.Vector3f(*(float(c) for c in direction)) for direction in start]
+
+    def step(scene: tuple[Any, ...], vectors: list[Any], wanted: Any) -> Any:
+        dr.enable_grad(vectors)
+        pixels = image(*scene, vectors)
+        difference = dr.detach(pixels) - wanted
+        square, slope = dr.square(difference), difference * (2 / dr.width(difference))
+        dr.eval(square, slope)
+        dr.set_grad(pixels, slope)
+        dr.enqueue(dr.ADMode.Backward, pixels)
+        dr.traverse(dr.ADMode.Backward)
+        return dr.mean(square), [dr.grad(vector) for vector in vectors]
+
+    frozen = dr.freeze(step)
+    copies = [mi.Vector3f(*(v[c] + dr.opaque(mi.Float, 0) for c in range(3))) for v in vectors]
+    dr.eval(copies)
+    return lambda: frozen(scene, [mi.Vector3f(v) for v in copies], wanted)
+
+
+def _lights(renderer: Renderer, to_light: list[Any]) -> list[Any]:
+    old = renderer.data.lights
+    return [dataclasses.replace(light, direction=-dr.normalize(v)) for light, v in zip(old, to_light, strict=True)]
+
+
+def _rendered_image(renderer: Renderer, to_light: list[Any]) -> Any:
+    return renderer.render(lights={light.name: light for light in _lights(renderer, to_light)}).array
+
+
+def _reverse_image(renderer: Renderer, still: StillScene, to_light: list[Any]) -> Any:
+    """The image from a G-buffer that exists already, with ordinary maps."""
+    pixels, lights = still.pixels, _lights(renderer, to_light)
+    maps = None
+    if still.shadow.method != "none":
+        common = (renderer.data.geometry, renderer.topology, still.shadow)
+        maps = make_maps(renderer.plan, lights, *common, renderer.frusta, None, still.seen)
+        renderer.frusta = maps.frusta
+    total = [mi.Float(0) for _ in range(pixels.channels)]
+    for k, light in enumerate(lights):
+        axis = dr.gather(mi.Vector3f, dr.ravel(-light.direction), dr.zeros(mi.UInt32, pixels.count))
+        cosine = dr.dot(pixels.n_shading, axis)
+        active = pixels.active & (cosine > 0) & (dr.dot(pixels.n_world, axis) > 0)
+        shown = mi.Float(1)
+        if maps is not None:
+            shown = sum(light_visibility(maps, renderer.plan, light, k, p, active) for p in pixels.points) / len(pixels.points)
+        for c in range(pixels.channels):
+            total[c] = total[c] + dr.select(active, cosine * shown * still.irradiance[k][c], 0)
+    colours = [value * colour for value, colour in zip(total, pixels.colours, strict=True)]
+    return mixed_pixels(pixels, colours)

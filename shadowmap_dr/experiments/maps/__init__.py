@@ -1,0 +1,1 @@
+"""All shadow maps on scenes that are hard for them."""

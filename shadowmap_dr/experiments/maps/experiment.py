@@ -1,0 +1,243 @@
+"""Which shadow map is best: all methods side by side on scenes that are hard for them, against path tracing."""
+
+from __future__ import annotations
+
+import functools
+import statistics
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
+from rich.console import Console
+from rich.table import Table
+
+from ... import io, report
+from ...errors import ShadowmapError
+from ...renderer import Renderer
+from ...shadow import directional_view
+from ...timing import Contender, alternate, machine
+from . import pose as maps_pose
+from . import scenes as maps_scenes
+from .metrics import Image, Texel, metrics, texel_in_pixels
+
+#: What is compared: a label, and options of the `Renderer`.
+CANDIDATES: dict[str, dict[str, Any]] = {
+    "plain vsm": {"shadow_method": "vsm", "shadow_receiver_range": False},
+    "vsm": {"shadow_method": "vsm"},
+    "vsm, cut": {"shadow_method": "vsm", "shadow_bleeding": 0.2},
+    "pcf": {"shadow_method": "pcf"},
+    "esm": {"shadow_method": "esm"},
+    "evsm2": {"shadow_method": "evsm2"},
+    "evsm4": {"shadow_method": "evsm4"},
+    "evsm4, cut": {"shadow_method": "evsm4", "shadow_bleeding": 0.1},
+    "msm": {"shadow_method": "msm"},
+    "msm, cut": {"shadow_method": "msm", "shadow_bleeding": 0.1},
+    "csm": {"shadow_method": "csm", "shadow_order": 8},
+}
+_REFERENCE_SPP = 1024
+
+
+@dataclass(frozen=True)
+class MapsOptions:
+    """What to run.
+
+    Attributes:
+        scenes: names in `maps.scenes.SCENES`.
+        candidates: names in `CANDIDATES`.
+        resolution: of images, pixels; several for each texel, so that edges can be located.
+        map_resolution, filter_size: of the shadow maps.
+        reference_spp: samples of the path-traced images.
+        rounds: measured renderings of each candidate.
+        pose_runs: poses to be found with each candidate, from shadows alone; 0 leaves this out.
+        out: folder for the results.
+    """
+
+    scenes: tuple[str, ...] = tuple(maps_scenes.SCENES)
+    candidates: tuple[str, ...] = tuple(CANDIDATES)
+    resolution: int = 512
+    map_resolution: int = 256
+    filter_size: int = 3
+    reference_spp: int = _REFERENCE_SPP
+    rounds: int = 30
+    pose_runs: int = 10
+    out: Path = Path("maps")
+
+    def __post_init__(self) -> None:
+        for kind, names, known in (("scene", self.scenes, maps_scenes.SCENES), ("method", self.candidates, CANDIDATES)):
+            if not names:
+                raise ShadowmapError(f"no {kind} given: name at least one.")
+            for name in names:
+                if name not in known:
+                    raise ShadowmapError(f"no {kind} {name!r}: choose from {', '.join(known)}.")
+        if self.resolution < 8 or self.reference_spp < 1 or self.rounds < 1 or self.pose_runs < 0:
+            raise ShadowmapError("resolution, samples, rounds and runs must be at least 8, 1, 1 and 0.")
+
+
+def run_maps(options: MapsOptions, *, console: Console | None = None) -> dict[str, Any]:
+    """Measure all candidates on all scenes; writes `maps.json` and `maps.png` into `options.out` and returns the record."""
+    console = console or Console(stderr=True)
+    io.check_output(options.out / "maps.json", (".json",))
+    record: dict[str, Any] = {"settings": asdict(options), "machine": machine(), "candidates": CANDIDATES, "scenes": {}}
+    sheet: dict[str, dict[str, Image]] = {}
+    with report.progress(console) as progress:
+        for name in options.scenes:
+            task = progress.add_task(name, total=len(options.candidates) + 1, note="reference")
+            scene = maps_scenes.build(name, options.resolution)
+            reference, mask = reference_visibility(scene, options.reference_spp)
+            derivative = _reference_derivative(name, options)
+            p_world = _positions(scene)
+            progress.update(task, advance=1)
+            record["scenes"][name], sheet[name] = {}, {"path traced": reference[..., None]}
+            for label in options.candidates:
+                progress.update(task, note=label)
+                renderer = _renderer(scene, label, options)
+                image = visibility_image(renderer)
+                texel = _texel(name, p_world, renderer, mask)
+                entry = {"texel_pixels": asdict(texel)} | metrics(image, reference, mask, texel, options.filter_size)
+                footprint = options.filter_size * texel.longest
+                record["scenes"][name][label] = entry | _derivative_agreement(name, label, derivative, footprint, options)
+                sheet[name][label] = image[..., None]
+                progress.update(task, advance=1)
+            _add_times(record["scenes"][name], scene, options)
+            report.write_json(options.out / "maps.json", record)
+        if options.pose_runs:
+            record["poses"] = _poses(options, progress)
+            report.write_json(options.out / "maps.json", record)
+    report.image_sheet(options.out / "maps.png", sheet, size=1.8)
+    return record
+
+
+def _poses(options: MapsOptions, progress: Any) -> dict[str, Any]:
+    """Poses found with each candidate."""
+    task = progress.add_task("poses", total=len(options.candidates) * options.pose_runs, note="reference")
+    problem, reference = maps_pose.shadow_problem(options.out / "pose")
+    result = {}
+    for label in options.candidates:
+        progress.update(task, note=label)
+        advance = functools.partial(progress.update, task, advance=1)
+        result[label] = maps_pose.poses_found(problem, reference, _settings(label, options), options.pose_runs, advance)
+    return result
+
+
+def _settings(label: str, options: MapsOptions) -> dict[str, Any]:
+    """Of the `Renderer`."""
+    sizes = {"shadow_map_resolution": options.map_resolution, "shadow_filter_size": options.filter_size}
+    return {**sizes, **CANDIDATES[label]}
+
+
+def _renderer(scene: Any, label: str, options: MapsOptions) -> Renderer:
+    return Renderer.from_scene(scene, **_settings(label, options), aovs=("visibility",))
+
+
+def visibility_image(renderer: Renderer) -> Image:
+    """(H, W): how much of the light each pixel's surface gets, 0 to 1."""
+    return np.array(renderer.render())[..., 3]
+
+
+def reference_visibility(scene: Any, spp: int) -> tuple[Image, npt.NDArray[np.bool_]]:
+    """Path-traced visibility (H, W), as the ratio of images with and without shadows, and where that makes sense."""
+    from mitsuba_baselines.reference import path_traced
+    from mitsuba_baselines.unshadowed import unshadowed
+
+    lit = path_traced(scene, spp=spp).image.mean(-1)
+    full = unshadowed(scene, spp=min(spp, 64)).image.mean(-1)
+    mask = full > 0.05 * full.max()
+    return np.where(mask, np.clip(lit / np.where(mask, full, 1), 0, 1), 0).astype(np.float32), mask
+
+
+def _step(options: MapsOptions) -> float:
+    """Half the distance of the two renderings of a central difference: their shadows lie a pixel apart."""
+    return 0.5 * 2 * maps_scenes.HALF / options.resolution
+
+
+def _reference_derivative(name: str, options: MapsOptions) -> Image:
+    from mitsuba_baselines.derivatives import central_difference
+
+    build = functools.partial(maps_scenes.build, name, options.resolution)
+    return central_difference(build, _step(options), spp=max(1, options.reference_spp)).image
+
+
+def _positions(scene: Any) -> Image:
+    """(H, W, 3): what each pixel sees, world space."""
+    return np.array(Renderer.from_scene(scene, shadow_method="none", aovs=("position",)).render())[..., 3:6]
+
+
+def _texel(name: str, p_world: Image, renderer: Renderer, mask: npt.NDArray[np.bool_]) -> Texel:
+    """Of a renderer's maps, on what is seen. They are fitted to the scene: the size of the image says nothing about it."""
+    assert renderer.frusta is not None  # all candidates have maps
+    view = directional_view(mi.Vector3f(*maps_scenes.SCENES[name][1]))
+    return texel_in_pixels(p_world, view, renderer.frusta, renderer.settings.shadow.resolution, mask)
+
+
+def _derivative_agreement(
+    name: str, label: str, reference: Image, footprint: float, options: MapsOptions
+) -> dict[str, float]:
+    """Forward derivative of the image by the offset of what casts the shadow, against path-traced central differences.
+
+    ``footprint``: width of the filter in pixels.
+    """
+    from mitsuba_baselines.derivatives import agreement
+
+    scene = maps_scenes.build(name, options.resolution)
+    renderer = _renderer(scene, label, options)
+    step = _step(options)
+    rates = {}
+    low, high = (maps_scenes.SCENES[name][0](sign * step) for sign in (-1, 1))
+    for key, (points, _) in high.items():
+        rates[key] = (points.astype(np.float64) - low[key][0]).ravel() / (2 * step)
+    offset = dr.opaque(mi.Float, 0.0)  # a literal zero would take on the size of what it is first multiplied with
+    dr.enable_grad(offset)
+    positions = {
+        key: dr.ravel(renderer.data.geometry.shape_positions(key)) + mi.Float(rate.astype(np.float32)) * offset
+        for key, rate in rates.items()
+    }
+    image = renderer.render(positions)
+    dr.forward(offset)
+    derivative = np.array(dr.grad(image))[..., :3]
+    result = agreement(derivative, reference, footprint)
+    return {"derivative_cosine": result.cosine, "derivative_scale": result.scale}
+
+
+def _add_times(entries: dict[str, dict[str, Any]], scene: Any, options: MapsOptions) -> None:
+    """Seconds of a frozen rendering, less those of one without shadows: map, filter and look-ups. All take turns."""
+
+    def contender(settings: dict[str, Any]) -> Contender:
+        renderer = Renderer.from_scene(scene, **settings)
+        render = dr.freeze(lambda renderer: renderer.render().array)
+        return Contender(lambda: dr.eval(render(renderer)), options.rounds)
+
+    calls = {label: contender(_settings(label, options)) for label in entries}
+    calls["none"] = contender({"shadow_method": "none"})
+    samples = alternate(calls)
+    base = statistics.median(samples["none"])
+    seconds = {label: statistics.median(samples[label]) - base for label in entries}
+    for label, entry in entries.items():
+        entry["seconds"] = seconds[label]
+        if "plain vsm" in seconds:
+            entry["seconds_over_plain_vsm"] = seconds[label] / seconds["plain vsm"]
+
+
+def table(record: dict[str, Any]) -> Table:
+    """A row for each scene and method."""
+    columns = ["scene, method", "RMSE", "shadowed", "bleeding", "acne", "shift", "cosine", "scale", "time"]
+    rows: list[Sequence[str]] = []
+    for scene, entries in record["scenes"].items():
+        for label, e in entries.items():
+            ratio = e.get("seconds_over_plain_vsm")
+            rows.append(
+                [
+                    f"{scene}, {label}",
+                    *(f"{e[key]:.3f}" for key in ("rmse", "rmse_shadowed", "bleeding", "acne", "contour_shift_texels")),
+                    *(f"{e[key]:.3f}" for key in ("derivative_cosine", "derivative_scale")),
+                    f"{ratio:.2f}x" if ratio is not None else f"{1e3 * e['seconds']:.2f} ms",
+                ]
+            )
+    for label, e in record.get("poses", {}).items():
+        errors = f"{e['median_rotation_deg']:.3f} deg, {e['median_offset_x100']:.3f}"
+        rows.append([f"poses, {label}", f"{e['found']} of {e['runs']}", errors, *[""] * (len(columns) - 3)])
+    return report.table("Shadow maps against path tracing (shift in texels, time over plain vsm)", columns, rows)

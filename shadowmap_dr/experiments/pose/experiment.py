@@ -1,0 +1,303 @@
+"""Pose estimation: three methods find an object's pose from an image of it and its shadow on a wall.
+
+Protocol: the object in front of a wall is turned about the vertical axis and shifted in the plane of the wall; the target
+pose is zero. Methods: `shadows` (this library), `rasterizer` (the same without shadows) and `mitsuba` (Mitsuba's
+projective integrator, with an area light in place of the directional one and the cheapest setting that converges).
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
+from rich.console import Console
+from rich.progress import Progress, TaskID
+from rich.table import Table
+
+from ... import io, report
+from ...errors import ShadowmapError
+from ...inverse import Method, run_sweep
+from ...inverse.schedulers import check_scheduler
+from .methods import METHODS, Builder, Image, build_method, fairness
+from .record import identity, is_of, make_record
+from .scene import NormalKind, PoseProblem, ReferenceKind, make_problem, start_pose
+from .sweep import PoseRuns, make_reference
+
+
+@dataclass(frozen=True)
+class PoseOptions:
+    """What to run. Everything is run for each object, resolution, run and method."""
+
+    objects: tuple[str, ...] = ("spot",)
+    resolutions: tuple[int, ...] = (128,)
+    methods: tuple[str, ...] = METHODS
+    runs: int = 1
+    seed: int = 0
+    iterations: int = 150
+    reference: ReferenceKind = "mitsuba"
+    shadow_only: bool = False
+    normals: NormalKind = "face"
+    samples: int = 1
+    out: Path = Path("pose")
+    resume: bool = False
+    scheduler: str = "local"
+    threads: int = 0
+
+    def __post_init__(self) -> None:
+        for name, values in (("object", self.objects), ("resolution", self.resolutions), ("method", self.methods)):
+            if not values:
+                raise ShadowmapError(f"no {name} given: name at least one.")
+            if len(set(values)) != len(values):
+                raise ShadowmapError(f"a {name} is given twice in {', '.join(map(str, values))}: name each once.")
+        for method in self.methods:
+            if method not in METHODS:
+                raise ShadowmapError(f"no method {method!r}: choose from {', '.join(METHODS)}.")
+        for name, value in (("runs", self.runs), ("iterations", self.iterations), ("samples per pixel", self.samples)):
+            if value < 1:
+                raise ShadowmapError(f"{value} {name}: give at least 1.")
+        if self.seed < 0:
+            raise ShadowmapError(f"the seed {self.seed}: give 0 or more.")
+        if self.reference not in ("mitsuba", "own"):
+            raise ShadowmapError(f"no reference {self.reference!r}: choose mitsuba or own.")
+        if self.normals not in ("face", "vertex"):
+            raise ShadowmapError(f"no normals {self.normals!r}: choose face or vertex.")
+        check_scheduler(self.scheduler)
+
+
+def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Console | None = None) -> list[dict[str, Any]]:
+    """Run the experiment and write its results below `options.out`.
+
+    Files: `pose.json` (a list with one record for each object, resolution, method and run), and for each object and
+    resolution a folder with the reference, the images at start and end and their difference from the reference, a plot
+    of the convergence (`convergence.png`) and a sheet with the images of the first run (`images.png`).
+
+    Records that are complete are kept if `options.resume` is set, and a run that was killed goes on from its last
+    checkpoint, at most ten iterations before the end. Returns the records of this call's runs, in the order of the file.
+
+    With a scheduler (see :func:`shadowmap_dr.inverse.run_sweep`) its workers make the runs, with methods of :func:`build_method`.
+    Times of runs that shared a machine are not those of runs that had it for themselves.
+    """
+    console = console or Console(stderr=True)
+    if build is build_method:
+        build = functools.partial(build_method, samples=options.samples)
+    out = options.out
+    io.check_output(out / "pose.json", (".json",))
+    stored: list[dict[str, Any]] = []
+    if options.resume and (out / "pose.json").exists():
+        stored = report.read_json(out / "pose.json")
+        if not isinstance(stored, list) or not all(isinstance(record, dict) for record in stored):
+            raise ShadowmapError(f"{out / 'pose.json'} is no list of records: choose another folder.")
+
+    problems = {
+        problem.folder: (name, problem)
+        for name in options.objects
+        for resolution in options.resolutions
+        for problem in [
+            make_problem(name, resolution, shadow_only=options.shadow_only, normals=options.normals, work=out / "objects")
+        ]
+    }
+    if len(problems) != len(options.objects) * len(options.resolutions):
+        raise ShadowmapError(f"two of the objects {', '.join(options.objects)} have the same name: rename one file.")
+    if options.scheduler != "local":
+        stored += _sweep(problems, options, stored, console)
+
+    result: list[dict[str, Any]] = []
+    with report.progress(console) as progress:
+        for _, problem in problems.values():
+            task = progress.add_task(f"{problem.folder} reference and methods", total=None, note="")
+            reference = _reference(problem, options, build)
+            # Built once and used for all runs: what a method compiled stays warm, and what cannot be built fails at once.
+            methods = {name: build(name, problem, reference) for name in options.methods}
+            progress.remove_task(task)
+            for method in methods.values():
+                if fairness(method, problem).get("fair") is False:
+                    note = "sample counts found at another resolution, where they converge; here nobody has searched"
+                    progress.console.print(f"{problem.folder} mitsuba: {note}: {getattr(method, 'setting', '')}", highlight=False)
+            records, images = [], {}
+            for run in range(options.runs):
+                for name in options.methods:
+                    title = f"{problem.folder} {name} run {run}"
+                    task = progress.add_task(title, total=options.iterations, note="")
+                    step = functools.partial(_show, progress, task)
+                    record = _run_one(problem, name, run, options, methods[name], stored, step)
+                    final = record["final"] if None not in record["final"] else start_pose(options.seed, run)
+                    pictures = _pictures(methods[name], record["start"], final, reference)
+                    for picture, image in pictures.items():
+                        io.write_png(out / problem.folder / f"{name}-run{run}-{picture}.png", image)
+                    if run == 0:
+                        images[name] = pictures
+                    records.append(record)
+                    stored = [*(other for other in stored if _key(other) != _key(record)), record]
+                    report.write_json(out / "pose.json", stored)
+                    _checkpoint(problem, name, run, options).unlink(missing_ok=True)
+                    progress.remove_task(task)
+                    progress.console.print(f"{title}: {_outcome(record)}", highlight=False)
+            _plots(problem, options, records, images, reference)
+            result += records
+    return result
+
+
+def table(records: Sequence[dict[str, Any]]) -> Table:
+    """Mean errors and times over the runs, a row for each object, resolution and method (the paper's Table 1)."""
+    rows = []
+    for group in _groups(records):
+        first = group[0]
+        recovered = sum(record["recovered"] for record in group)
+        smooth = _normals(first) == "vertex"
+        rows.append(
+            [
+                first["object"] + (" (shadow)" if first["shadow_only"] else "") + (" (smooth)" if smooth else ""),
+                str(first["resolution"]),
+                first["method"],
+                f"{recovered}/{len(group)}",
+                _mean(group, "rotation_error_deg", "{:.3f}"),
+                _mean(group, "translation_error_x100", "{:.3f}"),
+                _mean(group, "seconds_per_iteration", "{:.4f}"),
+                _mean(group, "seconds_total", "{:.1f}"),
+            ]
+        )
+    columns = ["object", "pixels", "method", "found", "degrees", "offset", "s/step", "s total"]
+    return report.table("Poses found, mean rotation error in degrees, mean offset error x 100, times", columns, rows)
+
+
+def _identity(problem: PoseProblem, name: str, run: int, options: PoseOptions, method: Method) -> dict[str, Any]:
+    seed, iterations, reference = options.seed, options.iterations, options.reference
+    return identity(problem, name, run, method, seed=seed, iterations=iterations, reference=reference)
+
+
+def _run_one(
+    problem: PoseProblem,
+    name: str,
+    run: int,
+    options: PoseOptions,
+    method: Method,
+    stored: Sequence[dict[str, Any]],
+    on_step: Callable[[int], None],
+) -> dict[str, Any]:
+    """The record of a run: a stored one if there is one for exactly these settings, else that of a run made now."""
+    wanted = _identity(problem, name, run, options, method)
+    for record in stored:
+        if is_of(record, wanted):
+            return record
+    path = _checkpoint(problem, name, run, options)
+    if not options.resume:
+        path.unlink(missing_ok=True)
+    return make_record(method, wanted, path, on_step)
+
+
+def _sweep(
+    problems: Mapping[str, tuple[str, PoseProblem]], options: PoseOptions, stored: Sequence[dict[str, Any]], console: Console
+) -> list[dict[str, Any]]:
+    """Records of the runs that are not among the stored ones, made by the workers of a scheduler."""
+    build = functools.partial(build_method, samples=options.samples)
+    missing = []
+    for folder, (object_, problem) in problems.items():
+        # Workers find it here, or make it again where they do not see this folder.
+        reference = _reference(problem, options, build)
+        for name in options.methods:
+            method = build(name, problem, reference)
+            wanted = [_identity(problem, name, run, options, method) for run in range(options.runs)]
+            numbers = [run for run, own in enumerate(wanted) if not any(is_of(record, own) for record in stored)]
+            missing.append(
+                PoseRuns(
+                    object=object_ if object_ == problem.name else str(Path(object_).resolve()),
+                    folder=folder,
+                    resolution=problem.resolution,
+                    method=name,
+                    numbers=tuple(numbers),
+                    iterations=options.iterations,
+                    seed=options.seed,
+                    reference=options.reference,
+                    shadow_only=options.shadow_only,
+                    normals=options.normals,
+                    samples=options.samples,
+                    out=str(options.out.resolve()),
+                )
+            )
+    found = run_sweep(
+        [runs for runs in missing if runs.numbers],
+        options.out,
+        scheduler=options.scheduler,
+        variant=mi.variant(),
+        threads=options.threads,
+        resume=options.resume,
+        console=console,
+    )
+    return [record for records in found.values() for record in records]
+
+
+def _show(progress: Progress, task: TaskID, done: int) -> None:
+    progress.update(task, completed=done, note="")
+
+
+def _reference(problem: PoseProblem, options: PoseOptions, build: Builder) -> Image:
+    folder = options.out / problem.folder
+    image = make_reference(problem, options.reference, folder, build)
+    io.write_png(folder / "reference.png", image)
+    return image
+
+
+def _pictures(method: Method, start: npt.ArrayLike, final: npt.ArrayLike, reference: Image) -> dict[str, Image]:
+    result = method.render(final)
+    return {"start": method.render(start), "result": result, "difference": np.abs(result - reference)}
+
+
+def _plots(
+    problem: PoseProblem,
+    options: PoseOptions,
+    records: Sequence[dict[str, Any]],
+    images: dict[str, dict[str, Image]],
+    reference: Image,
+) -> None:
+    panels = {
+        "rotation error [degrees]": "rotation_error_curve",
+        "offset error x 100": "translation_error_curve",
+        "loss": "loss_curve",
+    }
+    curves = {
+        label: {name: [record[key] for record in records if record["method"] == name] for name in options.methods}
+        for label, key in panels.items()
+    }
+    report.plot_curves(options.out / problem.folder / "convergence.png", curves)
+    rows = {name: {"reference": reference, **pictures} for name, pictures in images.items()}
+    report.image_sheet(options.out / problem.folder / "images.png", rows)
+
+
+def _checkpoint(problem: PoseProblem, name: str, run: int, options: PoseOptions) -> Path:
+    return options.out / problem.folder / f"{name}-run{run}-seed{options.seed}.checkpoint.npz"
+
+
+def _key(record: dict[str, Any]) -> tuple[Any, ...]:
+    """What a record is about: a newer one with the same key takes its place."""
+    names = ("object", "resolution", "method", "run", "seed", "reference", "shadow_only")
+    return (*(record.get(name) for name in names), _normals(record))
+
+
+def _normals(record: dict[str, Any]) -> str:
+    """Records from before there was a choice are of flat shading."""
+    return record.get("normals", "face")
+
+
+def _groups(records: Sequence[dict[str, Any]]) -> Iterator[list[dict[str, Any]]]:
+    groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+    for record in records:
+        key = (record["object"], record["resolution"], record["shadow_only"], _normals(record), record["method"])
+        groups.setdefault(key, []).append(record)
+    yield from groups.values()
+
+
+def _mean(group: Sequence[dict[str, Any]], key: str, form: str) -> str:
+    values = [record[key] for record in group]
+    return "failed" if any(value is None for value in values) else form.format(sum(values) / len(values))
+
+
+def _outcome(record: dict[str, Any]) -> str:
+    values = (_mean([record], key, "{:.3f}") for key in ("rotation_error_deg", "translation_error_x100"))
+    time = _mean([record], "seconds_per_iteration", "{:.4f}")
+    return "rotation {} deg, offset x 100 {}, {} s per iteration".format(*values, time)

@@ -1,0 +1,163 @@
+"""Slices through the loss of a pose: where a run ended, and what lies between there and the target.
+
+``python -m shadowmap_dr.experiments.pose.landscape FOLDER --object hand --run 0 --out FILE.png`` draws the loss over the
+rotation for a run whose record and reference image lie in a folder of the pose experiment.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
+
+from ... import io, report
+from ...cli_options import DEFAULT_VARIANT
+from ...errors import ShadowmapError
+from ...io import atomic
+from .methods import METHODS, build_method
+from .scene import make_problem
+
+Render = Callable[[npt.NDArray[np.float64]], npt.NDArray[Any]]
+#: Central differences for the offset, and the farthest that one step moves it, in scene units.
+_DIFFERENCE, _LONGEST = 0.01, 0.05
+
+
+def slices(
+    render: Render, reference: npt.ArrayLike, angles: npt.ArrayLike, end: npt.ArrayLike, steps: int = 3
+) -> dict[str, npt.NDArray[np.float64]]:
+    """Loss over the rotation along three lines.
+
+    Args:
+        render: image (H, W, C) at (rotation in radians, x, y).
+        reference: image to be matched.
+        angles: (N,) rotations in radians, in order.
+        end: (3,) where a run ended.
+        steps: of Gauss and Newton's method for the best offset at each angle, which starts from that of the angle before.
+
+    Returns:
+        (N,) mean squared differences: `target` with the offset zero, `end` with that of the end, `best` with the best one (the
+        least of what was tried: these two, and searches from both ends of the range); and `best_offset`, (N, 2).
+    """
+    reference, angles, end = (np.asarray(value, np.float64) for value in (reference, angles, end))
+
+    def loss(pose: npt.NDArray[np.float64]) -> float:
+        return float(np.mean((render(pose) - reference) ** 2))
+
+    lines = {"target": np.zeros((len(angles), 2)), "end": np.tile(end[1:], (len(angles), 1))}
+    result = {name: np.array([loss(np.array([angle, *offset])) for angle, offset in zip(angles, offsets, strict=True)])
+              for name, offsets in lines.items()}
+    best = np.minimum(result["target"], result["end"])
+    where = np.where((result["target"] <= result["end"])[:, None], lines["target"], lines["end"])
+    for order in (range(len(angles)), range(len(angles) - 1, -1, -1)):
+        offset = where[order[0]]
+        for i in order:
+            found, value = _best_offset(render, reference, angles[i], offset, steps, loss)
+            if value < best[i]:
+                best[i], where[i] = value, found
+            offset = where[i].copy()
+    return {**result, "best": best, "best_offset": where}
+
+
+def _best_offset(
+    render: Render, reference: npt.NDArray[np.float64], angle: float, offset: npt.NDArray[np.float64], steps: int,
+    loss: Callable[[npt.NDArray[np.float64]], float],
+) -> tuple[npt.NDArray[np.float64], float]:
+    """Offset and loss after some steps of Gauss and Newton's method at a fixed angle."""
+    best = offset, loss(np.array([angle, *offset]))
+    for _ in range(steps):
+        pose = np.array([angle, *offset])
+        residual = (render(pose) - reference).ravel()
+        columns = [(render(pose + move) - render(pose - move)).ravel() / (2 * _DIFFERENCE)
+                   for move in _DIFFERENCE * np.eye(3)[1:]]
+        change = np.linalg.lstsq(np.stack(columns, axis=1), -residual, rcond=None)[0]
+        offset = offset + change * min(1.0, _LONGEST / max(float(np.hypot(*change)), 1e-12))
+        value = loss(np.array([angle, *offset]))
+        if value >= best[1]:
+            break
+        best = offset, value
+    return best
+
+
+def plot_slices(
+    path: str | os.PathLike[str], title: str, angles: npt.ArrayLike, lines: Mapping[str, npt.ArrayLike], record: Mapping[str, Any]
+) -> None:
+    """Draw the slices with the way that a run took, and the run's errors over its steps."""
+    from matplotlib.figure import Figure  # without pyplot there is no global state and no display is needed
+
+    figure = Figure(figsize=(11, 4), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    labels = {"target": "offset zero", "end": "offset where the run ended", "best": "best offset"}
+    for colour, (name, label) in enumerate(labels.items()):
+        left.plot(np.degrees(angles), lines[name], f"C{colour}", linewidth=1.3, label=label)
+    rotation, losses = np.asarray(record["rotation_error_curve"], np.float64), np.asarray(record["loss_curve"], np.float64)
+    side = np.sign(record["start"][0])
+    left.plot(side * rotation[: len(losses)], losses, "k.", markersize=3, label="the run (on the side where it started)")
+    left.plot(np.degrees(record["final"][0]), losses[-1], "kx", markersize=8, label="its end")
+    left.set_xlabel("rotation [degrees]")
+    left.set_ylabel("loss")
+    left.set_yscale("log")
+    left.set_title(title, fontsize=10)
+    left.grid(True, alpha=0.3)
+    left.legend(fontsize=8, loc="lower right")
+    right.plot(rotation, "k", linewidth=1.2, label="rotation error [degrees]")
+    right.plot(np.asarray(record["translation_error_curve"], np.float64), "C3", linewidth=1.2, label="offset error x 100")
+    right.set_xlabel("step")
+    right.set_yscale("log")
+    right.grid(True, alpha=0.3)
+    right.legend(fontsize=8)
+    with atomic(path) as temporary:
+        figure.savefig(temporary, dpi=110)
+
+
+def landscape(
+    folder: Path, wanted: Mapping[str, Any], out: Path, *, renderer: str | None = None, width_deg: float = 35.0, count: int = 71
+) -> dict[str, Any]:
+    """Draw the slices for the record of a folder in which `wanted` (object, resolution, method, run, ...) holds.
+
+    The images are those of the run's own method unless another one is named as `renderer`: Mitsuba's are slow and noisy.
+    Returns angles in degrees and the slices. Raises ShadowmapError if there is no such record or no reference image.
+    """
+    records = report.read_json(folder / "pose.json")
+    record = next((entry for entry in records if all(entry.get(key) == value for key, value in wanted.items())), None)
+    if record is None:
+        raise ShadowmapError(f"{folder / 'pose.json'} has no run with " + ", ".join(f"{k} {v}" for k, v in wanted.items()) + ".")
+    problem = make_problem(record["object"], record["resolution"], shadow_only=record["shadow_only"],
+                           normals=record.get("normals", "face"), work=folder / "objects")
+    name = "reference.exr" if record["reference"] == "mitsuba" else "reference-own.exr"
+    reference = io.read_image(folder / problem.folder / name)
+    renderer = renderer or record["method"]
+    method = build_method(renderer, problem, reference, record["settings"].get("samples_per_pixel", 1))
+    angles = np.radians(np.linspace(-width_deg, width_deg, count))
+    lines = slices(method.render, reference, angles, record["final"])
+    title = f"{problem.folder}, {record['method']}, run {record['run']}"
+    plot_slices(out, title + (f" (lines: {renderer})" if renderer != record["method"] else ""), angles, lines, record)
+    return {"angles_deg": np.degrees(angles), **lines}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m shadowmap_dr.experiments.pose.landscape", description=__doc__.split("\n")[0])
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="results of the pose experiment")
+    parser.add_argument("--object", default="spot")
+    parser.add_argument("--resolution", type=int, default=128)
+    parser.add_argument("--method", choices=METHODS, default="shadows")
+    parser.add_argument("--renderer", choices=METHODS, help="whose images make the loss, if not the method's own")
+    parser.add_argument("--run", type=int, default=0)
+    parser.add_argument("--out", type=Path, default=Path("landscape.png"), help="picture to write")
+    options = parser.parse_args()
+    mi.set_variant(DEFAULT_VARIANT)
+    wanted = {key: getattr(options, key) for key in ("object", "resolution", "method", "run")}
+    try:
+        landscape(options.folder, wanted, options.out, renderer=options.renderer)
+    except ShadowmapError as error:
+        sys.exit(f"error: {error}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,73 @@
+"""The three methods of pose estimation: ours, ours without shadows, and Mitsuba's."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ... import assets
+from ...inverse import Method, PoseFit
+from .scene import PoseProblem
+
+METHODS = ("shadows", "rasterizer", "mitsuba")
+STEP_SIZE = 0.01
+BETAS = (0.9, 0.999)
+
+Image = npt.NDArray[np.float32]
+Builder = Callable[[str, PoseProblem, Image], Method]
+
+
+def build_method(name: str, problem: PoseProblem, reference: Image, samples: int = 1) -> Method:
+    """One of the three methods for a problem and its reference image; our own ones with so many samples per pixel."""
+    if name == "mitsuba":
+        from mitsuba_baselines import pose as baseline
+
+        setting = baseline.fair_setting(problem.resolution, problem.normals)
+        return baseline.MitsubaPose(
+            assets.scene("pose"),
+            problem.mesh,
+            problem.resolution,
+            setting,
+            reference,
+            step_size=STEP_SIZE,
+            betas=BETAS,
+            shift_z=problem.shift_z,
+            normals=problem.normals,
+        )
+    from ...renderer import Renderer
+
+    settings = shadow_settings(name)
+    renderer = Renderer.from_scene(problem.scene, **settings)
+    if samples != 1:
+        settings["samples_per_pixel"] = samples
+    return PoseFit(
+        renderer,
+        "object",
+        problem.p_rest,
+        reference,
+        step_size=STEP_SIZE,
+        betas=BETAS,
+        shift_z=problem.shift_z,
+        spp=samples,
+        settings=settings,
+    )
+
+
+def shadow_settings(method: str) -> dict[str, Any]:
+    """Options of the `Renderer` that the methods `shadows` and `rasterizer` use."""
+    if method == "rasterizer":
+        return {"shadow_method": "none"}
+    return {"shadow_method": "vsm", "shadow_map_resolution": 256, "shadow_filter": "gaussian", "shadow_filter_size": 3}
+
+
+def fairness(method: Method, problem: PoseProblem) -> dict[str, bool]:
+    """For Mitsuba's method: whether a search found its sample counts to be the cheapest ones that converge."""
+    setting = getattr(method, "setting", None)
+    if setting is None:
+        return {}
+    from mitsuba_baselines.pose import is_fair
+
+    return {"fair": is_fair(setting, problem.resolution, problem.normals)}

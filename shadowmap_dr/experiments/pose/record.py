@@ -1,0 +1,92 @@
+"""The record of a run of pose estimation: what identifies it, and what came out."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
+
+from ... import __version__, report
+from ...inverse import History, Method, optimize
+from .methods import fairness
+from .scene import PoseProblem, ReferenceKind, pose_errors, start_pose
+
+RECOVERED_DEG, RECOVERED_X100 = 0.2, 0.3
+TIME_TO_POSE_DEG = 0.1
+
+
+def identity(
+    problem: PoseProblem, name: str, run: int, method: Method, *, seed: int, iterations: int, reference: ReferenceKind
+) -> dict[str, Any]:
+    """What a run's record says before the run is made: two records that agree in this are of the same run."""
+    return report.plain(
+        {
+            "object": problem.name,
+            "resolution": problem.resolution,
+            "method": name,
+            "run": run,
+            "seed": seed,
+            "start": start_pose(seed, run),
+            "iterations": iterations,
+            "reference": reference,
+            "shadow_only": problem.shadow_only,
+            "normals": problem.normals,
+            "settings": {"object_digest": problem.digest, **method.describe(), **fairness(method, problem)},
+        }
+    )
+
+
+def is_of(record: dict[str, Any], wanted: dict[str, Any]) -> bool:
+    """Whether a record is of the run with an identity."""
+    return all(record.get(key) == value for key, value in wanted.items())
+
+
+def make_record(
+    method: Method, wanted: dict[str, Any], checkpoint: Path | None, on_step: Callable[[int], None]
+) -> dict[str, Any]:
+    """Make the run with an identity."""
+    iterations, start = wanted["iterations"], wanted["start"]
+    history = optimize(method, start, iterations, checkpoint=checkpoint, settings=wanted, on_step=on_step)
+    return {**wanted, **_results(history), "environment": _environment()}
+
+
+def _results(history: History) -> dict[str, Any]:
+    rotation, translation = pose_errors(history.parameters)
+    return report.plain(
+        {
+            "final": history.final,
+            "rotation_error_deg": rotation[-1],
+            "translation_error_x100": translation[-1],
+            "recovered": bool(rotation[-1] < RECOVERED_DEG and translation[-1] < RECOVERED_X100),
+            "seconds_per_iteration": history.seconds_per_iteration,
+            "seconds_total": history.seconds_total,
+            "seconds_to_pose": seconds_to_pose(rotation, history.seconds),
+            "loss_curve": history.loss,
+            "rotation_error_curve": rotation,
+            "translation_error_curve": translation,
+        }
+    )
+
+
+def seconds_to_pose(rotation_deg: npt.NDArray[np.float64], seconds: npt.NDArray[np.float64]) -> float | None:
+    """Seconds until the rotation error is at most 0.1 degrees and stays there, None if it never does."""
+    outside = np.flatnonzero(~(rotation_deg <= TIME_TO_POSE_DEG))
+    first = int(outside[-1]) + 1 if len(outside) else 0
+    return float(seconds[:first].sum()) if first < len(rotation_deg) else None
+
+
+def _environment() -> dict[str, Any]:
+    return {
+        "shadowmap_dr": __version__,
+        "mitsuba": mi.__version__,
+        "drjit": dr.__version__,
+        "variant": mi.variant(),
+        "threads": dr.thread_count(),
+        "load_average": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
+    }

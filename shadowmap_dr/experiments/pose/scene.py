@@ -1,0 +1,177 @@
+"""What pose estimation starts from: the object, the scene around it, the reference image, the start poses."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
+
+from ... import assets, io
+from ...errors import ShadowmapError
+
+ReferenceKind = Literal["mitsuba", "own"]
+NormalKind = Literal["face", "vertex"]
+
+REFERENCE_SPP = 512
+MAX_OFFSET = 0.25
+MAX_ROTATION_DEG = 30.0
+# In the shadow-only case the object moves along the light, behind the camera, so that its shadow stays where it was.
+SHADOW_ONLY_SHIFT = 10.0
+MESH_SUFFIXES = (".ply", ".obj")
+MAX_RESOLUTION = 4096
+
+_REFERENCE_KEY = "shadowmap_dr:reference"
+
+
+@dataclass(frozen=True)
+class PoseProblem:
+    """One object at one resolution.
+
+    Attributes:
+        name: the object's name in records.
+        mesh: PLY file of the object in its target pose (rotation and offset zero).
+        p_rest: (V, 3) float32 vertex positions, in [-1, 1]^3.
+        resolution: width and height of the image in pixels.
+        shadow_only: the camera sees the object's shadow, but not the object.
+        normals: the object is shaded with the normals of its faces, or smoothly with those of its vertices.
+        scene: Mitsuba scene with the object in its target pose, as `scenes/pose.xml` describes it.
+    """
+
+    name: str
+    mesh: Path
+    p_rest: npt.NDArray[np.float32]
+    resolution: int
+    shadow_only: bool
+    normals: NormalKind
+    scene: Any
+
+    @property
+    def shift_z(self) -> float:
+        """Offset of the object along the light's direction of travel, reversed, in scene units."""
+        return SHADOW_ONLY_SHIFT if self.shadow_only else 0.0
+
+    @property
+    def digest(self) -> str:
+        """Short hash of the object's vertices, which tells objects with the same name apart."""
+        return hashlib.sha256(self.p_rest.tobytes()).hexdigest()[:12]
+
+    @property
+    def folder(self) -> str:
+        """Name of the folder for this problem's results."""
+        smooth = "-vertex-normals" if self.normals == "vertex" else ""
+        return f"{self.name}-{self.resolution}" + ("-shadow-only" if self.shadow_only else "") + smooth
+
+
+def make_problem(
+    name: str, resolution: int, *, shadow_only: bool = False, normals: NormalKind = "face", work: Path
+) -> PoseProblem:
+    """Load an object and build the scene around it.
+
+    Args:
+        name: name of a mesh of this package, or a .ply or .obj file, which is centred and scaled into [-1, 1]^3.
+        resolution: 1 to 4096 pixels.
+        shadow_only, normals: see PoseProblem.
+        work: folder for the scaled copy of a mesh file.
+    """
+    if not 1 <= resolution <= MAX_RESOLUTION:
+        raise ShadowmapError(f"a resolution of {resolution} pixels: give 1 to {MAX_RESOLUTION}.")
+    label, mesh = (name, assets.mesh(name)) if name in assets.mesh_names() else _import_mesh(assets.mesh(name), work)
+    plain = _load_mesh(mesh)
+    p_rest = _positions(plain)
+    problem = PoseProblem(label, mesh, p_rest, resolution, shadow_only, normals, None)
+    if shadow_only:
+        # A file of its own: Mitsuba's directional light learns the extent of the scene only when the scene is loaded.
+        mesh = work / f"{label}-shadow-only.ply"
+        _write_mesh(plain, p_rest + np.float32([0, 0, problem.shift_z]), mesh)
+    flat = "true" if normals == "face" else "false"
+    try:
+        scene = mi.load_file(
+            str(assets.scene("pose")), object=str(mesh), resolution=str(resolution), face_normals=flat, optimize=False
+        )
+    except RuntimeError as error:
+        raise ShadowmapError(f"cannot load the object {name}: {' '.join(str(error).split())}") from error
+    return replace(problem, scene=scene)
+
+
+def start_pose(seed: int, run: int) -> npt.NDArray[np.float64]:
+    """Start of a run, (3,): rotation in radians within +-30 degrees, x and y within +-0.25."""
+    generator = np.random.default_rng(seed + run)
+    x, y = generator.uniform(-MAX_OFFSET, MAX_OFFSET, 2)
+    rotation = math.radians(generator.uniform(-MAX_ROTATION_DEG, MAX_ROTATION_DEG))
+    return np.array([rotation, x, y])
+
+
+def pose_errors(parameters: npt.ArrayLike) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Errors of poses (..., 3) against the target zero: |rotation| in degrees, 100 x length of the offset."""
+    poses = np.asarray(parameters, np.float64)
+    return np.abs(np.degrees(poses[..., 0])), 100 * np.hypot(poses[..., 1], poses[..., 2])
+
+
+def path_traced_reference(problem: PoseProblem, path: Path) -> npt.NDArray[np.float32]:
+    """The path-traced image of the target pose under the true directional light, (H, W, 3), kept in the file `path`."""
+    from mitsuba_baselines.reference import path_traced
+
+    settings = {
+        "object": problem.digest,
+        "resolution": problem.resolution,
+        "shadow_only": problem.shadow_only,
+        "normals": problem.normals,
+        "spp": REFERENCE_SPP,
+        "mitsuba": mi.__version__,
+    }
+    if path.exists():
+        try:
+            _, metadata = io.read_exr(path)
+            if json.loads(metadata.get(_REFERENCE_KEY, "{}")) == settings:
+                return io.read_image(path)
+        except (ShadowmapError, json.JSONDecodeError):
+            pass  # a file that cannot be read is made again
+    image = np.asarray(path_traced(problem.scene, spp=REFERENCE_SPP).image, np.float32)
+    io.write_image(path, image, {_REFERENCE_KEY: json.dumps(settings)})
+    return image
+
+
+def _import_mesh(path: Path, work: Path) -> tuple[str, Path]:
+    """Name and PLY file of a mesh file of the user's, centred and scaled into [-1, 1]^3."""
+    mesh = _load_mesh(path)
+    positions = _positions(mesh).astype(np.float64)
+    if mesh.face_count() == 0 or not len(positions):
+        raise ShadowmapError(f"the object {path} has no triangles: give a triangle mesh.")
+    if not np.isfinite(positions).all():
+        raise ShadowmapError(f"the object {path} has vertices that are not finite (NaN or inf): repair the file.")
+    low, high = positions.min(axis=0), positions.max(axis=0)
+    extent = float((high - low).max())
+    if extent <= 0:
+        raise ShadowmapError(f"the object {path} has no extent: all its vertices lie at {tuple(low)}.")
+    target = work / f"{path.stem}.ply"
+    _write_mesh(mesh, (positions - (low + high) / 2) * (2 / extent), target)
+    return path.stem, target
+
+
+def _load_mesh(path: Path) -> Any:
+    kind = path.suffix.lower()
+    if kind not in MESH_SUFFIXES:
+        raise ShadowmapError(f"cannot load the object {path}: the suffix {kind!r} is not one of {', '.join(MESH_SUFFIXES)}.")
+    try:
+        return mi.load_dict({"type": kind[1:], "filename": str(path), "face_normals": True})
+    except RuntimeError as error:
+        raise ShadowmapError(f"cannot load the object {path}: {' '.join(str(error).split())}") from error
+
+
+def _positions(mesh: Any) -> npt.NDArray[np.float32]:
+    return np.array(mi.traverse(mesh)["vertex_positions"], np.float32).reshape(-1, 3)
+
+
+def _write_mesh(mesh: Any, positions: npt.NDArray[Any], path: Path) -> None:
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = mi.Float(positions.astype(np.float32).ravel())
+    parameters.update()
+    with io.atomic(path) as temporary:
+        mesh.write_ply(str(temporary))

@@ -1,0 +1,92 @@
+"""Runs of pose estimation as a sweep: those that are missing are done by the workers of a scheduler."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ... import io
+from ...inverse import Method, Problem
+from .methods import Builder, Image, build_method
+from .record import identity, make_record
+from .scene import NormalKind, PoseProblem, ReferenceKind, make_problem, path_traced_reference
+
+
+@dataclass(frozen=True)
+class PoseRuns(Problem):
+    """Some runs with one object, one resolution and one method.
+
+    Attributes:
+        object: name of a mesh of this package, or a mesh file that workers can read.
+        folder: name of the problem's folder in ``out``.
+        method: one of METHODS.
+        numbers: of the runs: their starts follow from these.
+        out: folder with reference images; workers that do not see it make their own.
+        resolution, iterations, seed, reference, shadow_only, normals, samples: as in `PoseOptions`.
+    """
+
+    object: str
+    folder: str
+    resolution: int
+    method: str
+    numbers: tuple[int, ...]
+    iterations: int
+    seed: int
+    reference: ReferenceKind
+    shadow_only: bool
+    normals: NormalKind
+    samples: int
+    out: str
+
+    @property
+    def name(self) -> str:
+        return f"{self.folder}-{self.method}"
+
+    @property
+    def runs(self) -> int:
+        return len(self.numbers)
+
+    @property
+    def steps(self) -> int:
+        return self.iterations
+
+    def settings(self) -> dict[str, Any]:
+        own = dataclasses.asdict(self)
+        return {name: value for name, value in own.items() if name != "out"}
+
+    def build(self) -> tuple[PoseProblem, Method]:
+        out = Path(self.out)
+        problem = make_problem(
+            self.object, self.resolution, shadow_only=self.shadow_only, normals=self.normals, work=out / "objects"
+        )
+        image = make_reference(problem, self.reference, out / self.folder, self._build)
+        return problem, self._build(self.method, problem, image)
+
+    def _build(self, name: str, problem: PoseProblem, reference: Image) -> Method:
+        return build_method(name, problem, reference, samples=self.samples)
+
+    def run_batch(
+        self, built: tuple[PoseProblem, Method], runs: Sequence[int], checkpoint: Path | None, on_step: Callable[[int], None]
+    ) -> list[dict[str, Any]]:
+        problem, method = built
+        options = {"seed": self.seed, "iterations": self.iterations, "reference": self.reference}
+        records = []
+        for run in runs:
+            wanted = identity(problem, self.method, self.numbers[run], method, **options)
+            records.append(make_record(method, wanted, checkpoint, on_step))
+        return records
+
+
+def make_reference(problem: PoseProblem, kind: ReferenceKind, folder: Path, build: Builder) -> Image:
+    """The reference image of a problem, and a copy of it in a folder; a path-traced one is made once."""
+    if kind == "mitsuba":
+        return path_traced_reference(problem, folder / "reference.exr")
+    blank = np.zeros((problem.resolution, problem.resolution, 3), np.float32)
+    image = build("shadows", problem, blank).render(np.zeros(3))
+    io.write_image(folder / "reference-own.exr", image)
+    return image

@@ -1,0 +1,1 @@
+"""Images under area lights and environments, beside path-traced ones."""

@@ -1,0 +1,129 @@
+"""What the experiment with extended lights leaves behind: a table, a reading of it and a sheet of pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from rich.table import Table
+
+from ... import io, report
+
+Image = npt.NDArray[np.floating[Any]]
+
+# Differences are shown multiplied by this, around a medium grey.
+_ENLARGED = 4.0
+_GREY = 0.2
+
+
+def rows(record: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
+    """Column titles, and a row for each scene."""
+    pairs = [tuple(pair) for pair in record["settings"]["samples"]]
+    columns = ["scene", "lights, materials", *(f"{a} / {b}" for a, b in pairs), "bias", "one map", "ours", "direct", "ratio"]
+    table = []
+    for name, entry in record["scenes"].items():
+        errors, times = entry["errors"], entry.get("times")
+        row = [f"({name})" if entry["glossy"] else name, entry["about"], *(f"{100 * e['error']:.2f} %" for e in errors)]
+        row.append(f"{100 * errors[-1]['bias']:+.2f} %")
+        single = entry.get("one_map")
+        row.append(f"{100 * single['error']:.2f} %" if single else "-")
+        if times:
+            seconds = times["seconds"]
+            row += [_time(seconds["ours"]), f"{_time(seconds['path traced'])} ({times['path_traced_spp']})"]
+            row.append(f"{times['ratio']:.1f}x")
+        else:
+            row += ["-"] * 3
+        table.append(row)
+    return columns, table
+
+
+def table(record: Mapping[str, Any]) -> Table:
+    """For the terminal."""
+    columns, lines = rows(record)
+    keep = [k for k in range(len(columns)) if k != 1]
+    title = "Relative error by samples (area light / sky), and time at equal error (samples per pixel)"
+    return report.table(title, [columns[k] for k in keep], [[line[k] for k in keep] for line in lines])
+
+
+def reading(record: Mapping[str, Any], bar: float = 0.02) -> list[str]:
+    """What the numbers say, in sentences."""
+    scenes = record["scenes"]
+    rough = {name: entry for name, entry in scenes.items() if not entry["glossy"]}
+    above = {n: e["errors"][-1]["error"] for n, e in rough.items() if e["errors"][-1]["error"] > bar}
+    rising = [name for name, entry in rough.items() if not falling([e["error"] for e in entry["errors"]])]
+    lines = [f"{len(rough) - len(above)} of {len(rough)} scenes without gloss are within {100 * bar:g} %."]
+    if above:
+        lines.append("Above it: " + ", ".join(f"{name} ({100 * error:.2f} %)" for name, error in above.items()) + ".")
+    lines.append(f"Errors that do not fall with samples: {', '.join(rising) or 'none'}.")
+    return lines
+
+
+def falling(errors: Sequence[float]) -> bool:
+    """Whether errors fall with each step, up to a tenth of the last one, and altogether."""
+    if len(errors) < 2:
+        return True
+    return errors[-1] < errors[0] and all(b <= a + 0.1 * errors[-1] for a, b in zip(errors, errors[1:], strict=False))
+
+
+def write(record: Mapping[str, Any], out: Path) -> None:
+    """`soft.md` and `soft.png`."""
+    columns, lines = rows(record)
+    text = ["# Extended lights", "", *reading(record), "", _markdown(columns), _markdown(["---"] * len(columns))]
+    text += [_markdown(line) for line in lines]
+    with io.atomic(out / "soft.md") as temporary:
+        temporary.write_text("\n".join(text) + "\n", encoding="utf-8")
+    sheet = {}
+    for name in record["scenes"]:
+        pictures = load_pictures(out / "pictures" / f"{name}.exr")
+        if pictures:
+            difference = _GREY + _ENLARGED * (pictures["ours"] - pictures["path traced"]) * _exposure(pictures["path traced"])
+            shown = {title: image * _exposure(pictures["path traced"]) for title, image in pictures.items()}
+            sheet[name] = {**shown, f"difference x {_ENLARGED:g}": difference}
+    if sheet:
+        report.image_sheet(out / "soft.png", _paired(sheet))
+
+
+def save_pictures(path: Path, pictures: Mapping[str, Image]) -> None:
+    """Write images (H, W, 3) of the same size as channels of one EXR file."""
+    channels = {f"{title}.{'RGB'[k]}": image[..., k].astype(np.float32) for title, image in pictures.items() for k in range(3)}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    io.write_exr(path, channels)
+
+
+def load_pictures(path: Path) -> dict[str, Image]:
+    """What :func:`save_pictures` wrote; nothing if there is no such file."""
+    if not path.exists():
+        return {}
+    channels, _ = io.read_exr(path)
+    titles = dict.fromkeys(key.rpartition(".")[0] for key in channels)
+    order = sorted(titles, key=lambda title: title != "path traced")
+    return {title: np.stack([channels[f"{title}.{c}"] for c in "RGB"], -1) for title in order}
+
+
+def _exposure(image: Image) -> float:
+    """Factor that makes an image neither too dark nor too bright to be seen."""
+    return 0.5 / max(float(np.quantile(image, 0.8)), 1e-6)
+
+
+def _paired(sheet: Mapping[str, Mapping[str, Image]]) -> dict[str, dict[str, Image]]:
+    """Two scenes in each row, so that the sheet is not too long."""
+    names = list(sheet)
+    result: dict[str, dict[str, Image]] = {}
+    for first, second in zip(names[0::2], [*names[1::2], None], strict=False):
+        row = dict(sheet[first])
+        if second is not None:
+            # The same titles once more, told apart by a space.
+            row |= {f"{title} ": image for title, image in sheet[second].items()}
+        result[f"{first} | {second}" if second else first] = row
+    return result
+
+
+def _time(seconds: float) -> str:
+    return f"{seconds:.2f} s" if seconds >= 1 else f"{1e3 * seconds:.0f} ms"
+
+
+def _markdown(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cells) + " |"

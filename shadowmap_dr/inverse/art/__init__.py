@@ -1,0 +1,1 @@
+"""Meshes and collections whose shadows match images."""

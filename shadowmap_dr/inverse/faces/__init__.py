@@ -1,0 +1,1 @@
+"""Morphable models: their format, converters, and the fit to shadows."""

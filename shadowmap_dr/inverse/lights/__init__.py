@@ -1,0 +1,1 @@
+"""Directions of lights, many runs at once."""

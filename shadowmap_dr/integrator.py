@@ -18,6 +18,7 @@ from .aovs import aov_names
 from .errors import ShadowmapError
 from .film import put_into_film
 from .omissions import warn_of
+from .pending import Inputs, Waiting, backward
 from .render_settings import RenderSettings
 from .renderer import Renderer
 from .scene import SceneData, load
@@ -175,6 +176,7 @@ class SceneRenderer:
     lights: tuple[str, ...]
     renderer: Renderer
     fits: list[tuple[Any, Frusta | None, SoftFrusta]] = field(default_factory=list)
+    waiting: Waiting = field(default_factory=Waiting)
 
     @classmethod
     def build(cls, scene: Any, sensor: Any, options: Options, settings: RenderSettings, warn: bool = True) -> SceneRenderer:
@@ -198,8 +200,11 @@ class SceneRenderer:
         self.statics = statics
         return True
 
-    def render(self, scene: Any, sensor: Any, spp: int) -> Any:
-        """Image (mi.TensorXf), attached to the scene's parameters unless gradients are suspended."""
+    def render(self, scene: Any, sensor: Any, spp: int, inputs: Inputs | None = None) -> Any:
+        """Image (mi.TensorXf), attached to the scene's parameters unless gradients are suspended.
+
+        If ``inputs`` is given, the image is attached to these instead of the vertices, lights and cameras.
+        """
         current = self.renderer.with_data(replace(self.renderer.data, scene=scene)).refresh()
         current = current.with_data(replace(current.data, sensors=(sensors_of(sensor),)))
         # Each sensor goes on from its own fit. Fitting it again to the same vertices and lights keeps it bit by bit, so the
@@ -209,6 +214,10 @@ class SceneRenderer:
             warn_of(lenses_of(sensor), stacklevel=2)
         known = next((fit for fit in self.fits if fit[0] is sensor), (sensor, self.renderer.frusta, self.renderer.soft_frusta))
         _, current.frusta, current.soft_frusta = known
+        if inputs is not None:
+            frusta, soft_frusta = current.frusta, current.soft_frusta
+            current = current.with_data(inputs.instead_of(current.data))
+            current.frusta, current.soft_frusta = frusta, soft_frusta
         image = current.render(spp=spp)
         self.fits = [(sensor, current.frusta, current.soft_frusta), *others][:_REMEMBERED_SENSORS]
         return image
@@ -264,13 +273,37 @@ class Shell:
         options = Options.from_properties(props)
         return cls(options, options.render_settings())
 
-    def image(self, scene: Any, sensor: Any, spp: int) -> Any:
+    def primal(self, scene: Any, sensor: Any, spp: int) -> Any:
+        """Detached image of ``mi.render``, which will ask for its derivatives later if parameters are attached."""
+        if dr.flag(dr.JitFlag.FreezingScope):
+            with dr.suspend_grad():
+                return self.image(scene, sensor, spp)
+        with dr.resume_grad():
+            waiting, inputs = self._record(scene, sensor).waiting, Inputs()
+            waiting.forget_older(scene)
+            image = self.image(scene, sensor, spp, inputs)
+            if dr.grad_enabled(image):
+                waiting.add(sensor, spp or 1, image, inputs)
+            return dr.detach(image)
+
+    def backward(self, scene: Any, sensor: Any, spp: int, gradient: Any) -> None:
+        """Add the gradients of <image, gradient> to the scene's parameters."""
+        with dr.resume_grad():
+            pending = self._record(scene, sensor).waiting.take(scene, sensor, spp or 1)
+            if pending is not None:
+                pending.backward(gradient)
+                return
+            image = self.image(scene, sensor, spp)
+            if dr.grad_enabled(image):
+                backward(image, gradient)
+
+    def image(self, scene: Any, sensor: Any, spp: int, inputs: Inputs | None = None) -> Any:
         """Attached image. ``spp`` 0 means not given: one sample, anti-aliased."""
         if spp < 0:
             raise ShadowmapError(f"spp is {spp}: give a positive number, or 0 for one anti-aliased sample.")
         record = self._record(scene, sensor)
         self.light_names = record.lights
-        return record.render(scene, sensor, spp or 1)
+        return record.render(scene, sensor, spp or 1, inputs)
 
     def channel_names(self) -> list[str]:
         """Names of the further channels, in order; those of ``visibility`` follow the lights of the scene rendered last."""
@@ -323,10 +356,11 @@ def make_class() -> type:
         ) -> Any:
             """Image (H, W, C) without gradients. Unless called through ``mi.render``, it is put into the sensor's film too."""
             sensor = sensor_of(scene, sensor)
+            if develop and not evaluate:  # through mi.render
+                return self.shell.primal(scene, sensor, spp)
             with dr.suspend_grad():
                 image = self.shell.image(scene, sensor, spp)
-                if evaluate or not develop:
-                    put_into_film(sensor.film(), image, self.aov_names())
+                put_into_film(sensor.film(), image, self.aov_names())
             return image if develop else mi.TensorXf()
 
         def render_forward(self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> Any:
@@ -340,12 +374,7 @@ def make_class() -> type:
 
         def render_backward(self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> None:
             """Add the gradients of <image, grad_in> to the parameters."""
-            with dr.resume_grad():
-                image = self.shell.image(scene, sensor_of(scene, sensor), spp)
-                if dr.grad_enabled(image):
-                    dr.set_grad(image, grad_in)
-                    dr.enqueue(dr.ADMode.Backward, image)
-                    dr.traverse(dr.ADMode.Backward)
+            self.shell.backward(scene, sensor_of(scene, sensor), spp, grad_in)
             dr.eval()
 
         def aov_names(self) -> list[str]:

@@ -35,6 +35,15 @@ def variant(request: pytest.FixtureRequest) -> Iterator[str]:
     yield name
 
 
+@pytest.fixture(scope="module", autouse=True)
+def memory_is_given_back() -> Iterator[None]:
+    """Dr.Jit keeps what it once had: without this, workers grow to many gigabytes over the tests."""
+    yield
+    gc.collect()
+    dr.sync_thread()
+    dr.flush_malloc_cache()
+
+
 @pytest.fixture(autouse=True)
 def no_garbage_while_frozen(request: pytest.FixtureRequest) -> Iterator[None]:
     """Scenes of earlier tests, collected between two calls of a frozen function, would change the registry that it checks."""

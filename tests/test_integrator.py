@@ -292,8 +292,13 @@ def test_derivatives_see_the_frusta_of_the_image(variant: str) -> None:
         before = _frusta(integrator)
         mi.render(scene, params, integrator=integrator, sensor=1)
         assert not np.array_equal(before, _frusta(integrator))
-        dr.backward(dr.sum(image), flags=dr.ADFlag.ClearNone)
+        loss, gradients = dr.sum(image), []
+        for _ in range(2):  # with what the image has left behind, and without
+            dr.set_grad(params[key], 0.0)
+            dr.backward(loss, flags=dr.ADFlag.ClearInterior)
+            gradients.append(dr.grad(params[key]).numpy())
         assert np.array_equal(before, _frusta(integrator))
+        np.testing.assert_allclose(gradients[0], gradients[1], atol=1e-5 * np.abs(gradients[1]).max())
         mi.render(scene, params, integrator=integrator, sensor=1)
         dr.set_grad(params[key], 1.0)
         integrator.render_forward(scene, params)
@@ -309,8 +314,12 @@ def _frusta(integrator: Any) -> np.ndarray:
 def test_scenes_are_not_kept_alive(variant: str) -> None:
     scene = small_scene(integrator={"type": "shadowmap"})
     mi.render(scene).numpy()
+    params = mi.traverse(scene)
+    dr.enable_grad(params["ball.vertex_positions"])
+    params.update()
+    mi.render(scene, params).numpy()  # no one asks for its derivatives
     alive = weakref.ref(scene.integrator())
-    del scene
+    del scene, params
     gc.collect()
     assert alive() is None
     integrator = shadowmap()

@@ -1,0 +1,128 @@
+"""Images that wait for their backward pass.
+
+``mi.render`` asks an integrator for an image first, and for its derivatives later, when it has to render again unless it has kept
+what the image was computed from.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from .records import attached_arrays, map_arrays, with_arrays
+from .scene import SceneData
+from .traversal import parameters
+
+#: Samples of pixels of all images that wait; each may hold half a kilobyte.
+MOST_SAMPLES = 1 << 20
+
+
+class Inputs:
+    """Vertices, lights and cameras of a scene as leaves of an AD graph of their own.
+
+    What waits for a backward pass must not hang on the scene's parameters meanwhile: forward passes would run through it.
+    """
+
+    def __init__(self) -> None:
+        self._outer: list[Any] = []
+        self._leaves: list[Any] = []
+
+    def instead_of(self, data: SceneData) -> SceneData:
+        """The same data with leaves in the place of what is attached."""
+        self._outer = attached_arrays(data)
+        self._leaves = [dr.detach(array) + 0 for array in self._outer]
+        dr.enable_grad(self._leaves)
+        return with_arrays(data, self._leaves)
+
+    def backward(self) -> None:
+        """Pass the leaves' gradients on to the scene's parameters."""
+        for outer, leaf in zip(self._outer, self._leaves, strict=True):
+            dr.accum_grad(outer, dr.grad(leaf))
+        dr.enqueue(dr.ADMode.Backward, self._outer)
+        dr.traverse(dr.ADMode.Backward)
+
+
+@dataclass(frozen=True)
+class Pending:
+    """An image that waits, what it is attached to, and the sensor's parameters at the time."""
+
+    sensor: Any
+    spp: int
+    image: Any
+    inputs: Inputs
+    camera: dict[str, Any]
+
+    @property
+    def samples(self) -> int:
+        """Of all pixels, about: what the memory for the image grows with."""
+        height, width = self.image.shape[:2]
+        return height * width * self.spp
+
+    def is_of(self, sensor: Any, spp: int) -> bool:
+        """Whether it shows what a sensor sees now."""
+        return sensor is self.sensor and spp == self.spp and _numbers(_held(sensor)) == _numbers(self.camera)
+
+    def backward(self, gradient: Any) -> None:
+        """Add the gradients of <image, gradient> to the scene's parameters."""
+        backward(self.image, gradient)
+        self.inputs.backward()
+
+
+class Waiting:
+    """The images of one state of a scene that wait for their backward passes: one for each sensor, as far as memory allows."""
+
+    def __init__(self) -> None:
+        self._parameters: dict[str, Any] = {}
+        self._images: list[Pending] = []
+
+    def forget_older(self, scene: Any) -> None:
+        """Drop images of the scene before its parameters changed."""
+        now = _held(scene)
+        if _numbers(now) != _numbers(self._parameters):
+            self._parameters, self._images = now, []
+
+    def add(self, sensor: Any, spp: int, image: Any, inputs: Inputs) -> None:
+        """Let an attached image wait. Those that have waited longest make room for it."""
+        new = Pending(sensor, spp, image, inputs, _held(sensor))
+        others = [other for other in self._images if other.sensor is not sensor]
+        self._images = [*others, new]
+        while sum(one.samples for one in self._images) > MOST_SAMPLES:
+            self._images.pop(0)
+
+    def take(self, scene: Any, sensor: Any, spp: int) -> Pending | None:
+        """The image of a scene as a sensor sees it now, if it waits. It does so no longer."""
+        self.forget_older(scene)
+        found = next((one for one in self._images if one.is_of(sensor, spp)), None)
+        self._images = [one for one in self._images if one is not found]
+        return found
+
+
+def backward(image: Any, gradient: Any) -> None:
+    """Add the gradients of <image, gradient> to all that an image is attached to."""
+    dr.set_grad(image, gradient)
+    dr.enqueue(dr.ADMode.Backward, image)
+    dr.traverse(dr.ADMode.Backward)
+
+
+def _held(node: Any) -> dict[str, Any]:
+    """Parameters, copied: Mitsuba's change with the object. What is held keeps its variables' numbers from being used again."""
+    return map_arrays(parameters(node), lambda array: type(array)(array))
+
+
+def _numbers(held: dict[str, Any]) -> list[Any]:
+    """What tells variables apart, and what holds them, in a fixed order."""
+    found: list[Any] = []
+
+    def collect(array: Any) -> Any:
+        if dr.depth_v(array) > 1 and not dr.is_tensor_v(array):
+            for part in array:
+                collect(part)
+        else:
+            part = array.array if dr.is_tensor_v(array) else array
+            found.append((part.index, getattr(part, "index_ad", 0)))
+        return array
+
+    map_arrays(held, collect)
+    return [*found, *(value for value in held.values() if isinstance(value, bool | int | float | str))]

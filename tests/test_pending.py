@@ -1,0 +1,106 @@
+"""Images that wait for their backward pass: they are rendered once, and only the scene that they show counts."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from test_integrator import camera, shadowmap, small_scene
+
+from shadowmap_dr import pending
+from shadowmap_dr.renderer import Renderer
+
+KEY = "ball.vertex_positions"
+
+
+@pytest.fixture
+def renderings(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Samples per pixel of all renderings."""
+    seen: list[int] = []
+    render = Renderer.render
+
+    def counted(self: Renderer, *args: Any, **options: Any) -> Any:
+        seen.append(options["spp"])
+        return render(self, *args, **options)
+
+    monkeypatch.setattr(Renderer, "render", counted)
+    return seen
+
+
+def scene_of_two() -> Any:
+    aside = mi.ScalarTransform4f().look_at([3, -3, 2.2], [0, 0, 0.5], [0, 0, 1])
+    return small_scene(aside={**camera(), "to_world": aside})
+
+
+def moved(params: Any, by: float) -> Any:
+    """New vertices, put into the scene."""
+    vertices = dr.detach(params[KEY]) + by
+    dr.enable_grad(vertices)
+    params[KEY] = vertices
+    params.update()
+    return vertices
+
+
+def gradient(variables: Any, loss: Any) -> np.ndarray:
+    dr.backward(loss)
+    return dr.grad(variables).numpy()
+
+
+def test_backward_passes_do_not_render_again(variant: str, renderings: list[int]) -> None:
+    scene, integrator = scene_of_two(), shadowmap()
+    params = mi.traverse(scene)
+    for by in (0.0, 0.1):
+        vertices = moved(params, by)
+        loss = sum(dr.sum(mi.render(scene, params, integrator=integrator, sensor=k, spp=4)) for k in range(2))
+        found = gradient(vertices, loss)
+    assert renderings == [4] * 4
+    vertices = moved(params, 0.0)
+    images = [integrator.shell.image(scene, scene.sensors()[k], 4) for k in range(2)]
+    expected = gradient(vertices, sum(dr.sum(image) for image in images))
+    assert np.abs(expected).max() > 1
+    np.testing.assert_allclose(found, expected, atol=2e-3 * np.abs(expected).max())
+
+
+def test_what_has_changed_meanwhile_is_rendered_again(variant: str, renderings: list[int]) -> None:
+    scene, integrator = scene_of_two(), shadowmap()
+    params = mi.traverse(scene)
+    moved(params, 0.0)
+    image = mi.render(scene, params, integrator=integrator)
+    vertices = moved(params, 0.3)
+    late = gradient(vertices, dr.sum(image))
+    assert len(renderings) == 2
+    vertices = moved(params, 0.0)
+    expected = gradient(vertices, dr.sum(mi.render(scene, params, integrator=integrator)))
+    assert len(renderings) == 3 and np.abs(expected).max() > 1
+    np.testing.assert_allclose(late, expected, atol=1e-3 * np.abs(expected).max())
+    # Another camera, or other samples, are other images.
+    mi.render(scene, params, integrator=integrator, spp=1)
+    integrator.render_backward(scene, params, dr.ones(mi.TensorXf, (64, 64, 3)), spp=4)
+    integrator.render_backward(scene, params, dr.ones(mi.TensorXf, (64, 64, 3)), sensor=1, spp=1)
+    assert renderings[3:] == [1, 4, 1]
+
+
+def test_memory_is_bounded(variant: str, renderings: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pending, "MOST_SAMPLES", 64 * 64)
+    scene, integrator = scene_of_two(), shadowmap()
+    params = mi.traverse(scene)
+    vertices = moved(params, 0.0)
+    loss = sum(dr.sum(mi.render(scene, params, integrator=integrator, sensor=k)) for k in range(2))
+    gradient(vertices, loss)
+    assert len(renderings) == 3  # the last one waited
+    gradient(vertices, dr.sum(mi.render(scene, params, integrator=integrator, spp=4)))
+    assert renderings[3:] == [4, 4]
+
+
+def test_forward_passes_do_not_run_through_images_that_wait(variant: str) -> None:
+    scene, integrator = scene_of_two(), shadowmap()
+    params = mi.traverse(scene)
+    moved(params, 0.0)
+    mi.render(scene, params, integrator=integrator)
+    image = integrator.shell.scenes[0].waiting._images[0].image
+    dr.set_grad(params[KEY], 1.0)
+    derivative = dr.forward_to(mi.render(scene, params, integrator=integrator, sensor=1)).numpy()
+    assert np.abs(derivative).max() > 0.1 and not dr.grad(image).array.numpy().any()

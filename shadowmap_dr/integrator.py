@@ -275,16 +275,17 @@ class Shell:
 
     def primal(self, scene: Any, sensor: Any, spp: int) -> Any:
         """Detached image of ``mi.render``, which will ask for its derivatives later if parameters are attached."""
-        if dr.flag(dr.JitFlag.FreezingScope):
-            with dr.suspend_grad():
-                return self.image(scene, sensor, spp)
         with dr.resume_grad():
-            waiting, inputs = self._record(scene, sensor).waiting, Inputs()
+            waiting = self._record(scene, sensor).waiting
             waiting.forget_older(scene)
-            image = self.image(scene, sensor, spp, inputs)
-            if dr.grad_enabled(image):
-                waiting.add(sensor, spp or 1, image, inputs)
-            return dr.detach(image)
+            if waiting.welcomes(sensor) and not dr.flag(dr.JitFlag.FreezingScope):
+                inputs = Inputs()
+                image = self.image(scene, sensor, spp, inputs)
+                if dr.grad_enabled(image):
+                    waiting.add(sensor, spp or 1, image, inputs)
+                return dr.detach(image)
+        with dr.suspend_grad():
+            return self.image(scene, sensor, spp)
 
     def backward(self, scene: Any, sensor: Any, spp: int, gradient: Any) -> None:
         """Add the gradients of <image, gradient> to the scene's parameters."""

@@ -18,6 +18,13 @@ from .traversal import parameters
 #: Samples of pixels of all images that wait; each may hold half a kilobyte.
 MOST_SAMPLES = 1 << 20
 
+# Parameters that an image is attached to through what is read from the scene, and in no other way. Materials and textures are
+# evaluated by Mitsuba itself.
+_READ = (
+    "vertex_positions", "vertex_normals", "vertex_texcoords", "control_points", "to_world",
+    "position", "intensity.value", "irradiance.value", "radiance.value", "cutoff_angle", "beam_width",
+)  # fmt: skip
+
 
 class Inputs:
     """Vertices, lights and cameras of a scene as leaves of an AD graph of their own.
@@ -82,6 +89,12 @@ class Waiting:
         now = _held(scene)
         if _numbers(now) != _numbers(self._parameters):
             self._parameters, self._images = now, []
+
+    def welcomes(self, sensor: Any) -> bool:
+        """Whether an image of the scene as it is now would be attached to :class:`Inputs` alone."""
+        held = {**self._parameters, **_held(sensor)}
+        attached = [name for name, value in held.items() if dr.grad_enabled(value)]
+        return bool(attached) and all(name.endswith(_READ) for name in attached)
 
     def add(self, sensor: Any, spp: int, image: Any, inputs: Inputs) -> None:
         """Let an attached image wait. Those that have waited longest make room for it."""

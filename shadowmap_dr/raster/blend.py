@@ -8,6 +8,7 @@ import drjit as dr
 
 from ._types import RasterOutput, backend
 from .crossings import Crossings
+from .pairs import each_number
 from .topology import NO_VERTEX
 
 
@@ -73,47 +74,71 @@ class Mixer:
         dr.eval(self.values, self.claims)
 
     def _mix(self) -> Any:
-        pixel = dr.arange(self.module.UInt32, self.pixels)
-        incoming = self.around(self.crossings.right, self.crossings.down, 1)
-        own = self.read(self.original, pixel)
+        # Few pixels are blended: all are copied, those are overwritten.
+        result = self.copied(self.original)
+        dr.eval(result)
 
-        def mix(pixel: Any, *lanes: Any) -> tuple[Any, ...]:
-            incoming, own = lanes[:4], lanes[4:]
-            claims = sum(incoming)
-            dr.scatter(self.claims, claims, pixel)
-            scale = _scale(claims)
-            total = list(own)
-            for weight, neighbour in zip(incoming, self.neighbours(pixel), strict=True):
-                other = self.read(self.original, neighbour, weight > 0)
-                factor = weight * scale
-                total = [dr.fma(factor, dr.select(weight > 0, v - o, 0), t) for v, o, t in zip(other, own, total, strict=True)]
-            return tuple(total)
+        def visit(slot: Any, pair: Any) -> None:
+            down, pixel, weight = self._pair(pair)
 
-        return self.written(self.where(sum(incoming) > 0, mix, pixel, (*incoming, *own), own))
+            def mix(pixel: Any, down: Any, weight: Any) -> Any:
+                taker = dr.select(weight > 0, self._neighbour(pixel, down), pixel)
+                incoming = self.around(self.crossings.right, self.crossings.down, 1, at=taker)
+                claims = sum(incoming)
+                # Of the pairs of which a pixel takes, one does the work.
+                first = self._is_first(incoming, taker != pixel, down)
+                dr.scatter(self.claims, claims, taker, first)
+                scale = _scale(claims)
+                own = self.read(self.original, taker)
+                total = own
+                for share, neighbour in zip(incoming, self.neighbours(taker), strict=True):
+                    other = self.read(self.original, neighbour, share > 0)
+                    factor = share * scale
+                    total = [dr.fma(factor, dr.select(share > 0, v - o, 0), t) for v, o, t in zip(other, own, total, strict=True)]
+                dr.scatter(result, self.packet(total), taker, first)
+                return weight
+
+            dr.if_stmt((pixel, down, weight), weight != 0, mix, lambda pixel, down, weight: weight, mode="symbolic")
+
+        self.crossings.pairs.for_each(visit)
+        return result
 
     def adjoint_of_values(self, adjoint: Any) -> Any:
         """Gradient to the values from that of the result."""
-        pixel = dr.arange(self.module.UInt32, self.pixels)
-        right, down = self.crossings.right, self.crossings.down
-        incoming, outgoing = self.around(right, down, 1), self.around(right, down, -1)
-        own = self.read(adjoint, pixel)
+        result = self.read(adjoint, dr.arange(self.module.UInt32, self.pixels)) if self.planar else self.copied(adjoint)
+        dr.eval(result)
 
-        def spread(pixel: Any, *lanes: Any) -> tuple[Any, ...]:
-            incoming, outgoing, own = lanes[:4], lanes[4:8], lanes[8:]
-            claims = sum(incoming)
-            kept = 1 - claims * _scale(claims)
-            total = [kept * o for o in own]
-            for weight, neighbour in zip(outgoing, self.neighbours(pixel), strict=True):
-                factor = weight * _scale(dr.gather(self.module.Float, self.claims, neighbour, weight > 0))
-                other = self.read(adjoint, neighbour, weight > 0)
-                total = [dr.fma(factor, v, t) for v, t in zip(other, total, strict=True)]
-            return tuple(total)
+        def visit(slot: Any, end: Any) -> None:
+            down, pixel, weight = self._pair(self.crossings.pairs.at(slot))
 
-        touched = sum(incoming) + sum(outgoing) > 0
-        result = self.where(touched, spread, pixel, (*incoming, *outgoing, *own), own)
-        if not self.planar:
-            return self.written(result)
-        dr.eval(result)  # more than one kernel may want it
+            def spread(pixel: Any, down: Any, weight: Any, end: Any) -> Any:
+                second = end != 0
+                pixel = dr.select(second, self._neighbour(pixel, down), pixel)
+                signed = self.around(self.crossings.right, self.crossings.down, 1, True, pixel)
+                incoming, outgoing = [dr.maximum(w, 0) for w in signed], [dr.maximum(-w, 0) for w in signed]
+                first = self._is_first([dr.abs(w) for w in signed], second, down)
+                claims = sum(incoming)
+                kept = 1 - claims * _scale(claims)
+                total = [kept * o for o in self.read(adjoint, pixel)]
+                for share, neighbour in zip(outgoing, self.neighbours(pixel), strict=True):
+                    factor = share * _scale(dr.gather(self.module.Float, self.claims, neighbour, share > 0))
+                    other = self.read(adjoint, neighbour, share > 0)
+                    total = [dr.fma(factor, v, t) for v, t in zip(other, total, strict=True)]
+                if self.planar:
+                    for channel, value in zip(result, total, strict=True):
+                        dr.scatter(channel, value, pixel, first)
+                else:
+                    dr.scatter(result, self.packet(total), pixel, first)
+                return weight
+
+            dr.if_stmt(
+                (pixel, down, weight, end), weight != 0, spread, lambda pixel, down, weight, end: weight, mode="symbolic"
+            )
+
+        # Both pixels of each pair.
+        pairs = self.crossings.pairs
+        each_number(2 * (pairs.front + pairs.back), pairs.lanes, lambda number: visit(number >> 1, number & 1))
+        dr.eval(result)
         return result
 
     def adjoint_of_positions(self, adjoint: Any, size: int) -> Any:
@@ -162,6 +187,21 @@ class Mixer:
         below = dr.gather(self.module.Float, self.crossings.down, pixel, down)
         return down, pixel, dr.select(down, below, dr.gather(self.module.Float, self.crossings.right, pixel, ~down))
 
+    def _neighbour(self, pixel: Any, down: Any) -> Any:
+        """The second pixel of a pair."""
+        return pixel + dr.select(down, self.module.UInt32(self.width), 1)
+
+    def _is_first(self, shares: list[Any], second: Any, down: Any) -> Any:
+        """Whether a pair is the first with a share among those around one of its pixels (``second``: its second pixel).
+
+        ``shares`` are those of the right, lower, left and upper neighbour.
+        """
+        before = [shares[0] > 0]
+        for share in shares[1:3]:
+            before.append(before[-1] | (share > 0))
+        # The other pixel of the pair: right, lower; left, upper.
+        return ~dr.select(second, dr.select(down, before[2], before[1]), down & before[0])
+
     def _bare(self, slot: Any) -> Any:
         """Whether a pair has no edge."""
         return dr.gather(self.module.UInt32, self.crossings.ends, 4 * slot) == NO_VERTEX
@@ -169,7 +209,7 @@ class Mixer:
     def _gain(self, adjoint: Any, pixel: Any, down: Any, weight: Any) -> Any:
         """Gradient to the weight of a pair."""
         # The neighbour takes from the pixel where the weight is positive, else the other way round.
-        neighbour = pixel + dr.select(down, self.module.UInt32(self.width), 1)
+        neighbour = self._neighbour(pixel, down)
         taker, giver = dr.select(weight > 0, neighbour, pixel), dr.select(weight > 0, pixel, neighbour)
         claims = dr.gather(self.module.Float, self.claims, taker)
         scale = _scale(claims)
@@ -248,17 +288,9 @@ class Mixer:
         """Right, lower, left, upper."""
         return pixel + 1, pixel + self.width, pixel - 1, pixel - self.width
 
-    def around(self, right: Any, down: Any, sign: int, signed: bool = False) -> tuple[Any, Any, Any, Any]:
+    def around(self, right: Any, down: Any, sign: int, signed: bool = False, at: Any = None) -> tuple[Any, Any, Any, Any]:
         """See :func:`around`."""
-        return around(right, down, self.width, sign, signed)
-
-    def where(self, active: Any, function: Any, pixel: Any, lanes: tuple[Any, ...], otherwise: list[Any]) -> list[Any]:
-        """``function(pixel, *lanes)``, one number for each channel, in packets with active lanes; the last lanes elsewhere."""
-        count = len(otherwise)
-        result = dr.if_stmt(
-            (pixel, *lanes), active, function, lambda pixel, *lanes: tuple(lanes[-count:]), mode="symbolic", label="blend"
-        )
-        return list(result)
+        return around(right, down, self.width, sign, signed, at)
 
     def read(self, flat: Any, pixel: Any, active: Any = True) -> list[Any]:
         """All channels of pixels."""
@@ -270,30 +302,47 @@ class Mixer:
             return list(dr.gather(packet, flat, pixel, active))
         return [dr.gather(module.Float, flat, pixel * self.channels + c, active) for c in range(self.channels)]
 
+    def packet(self, channels: list[Any]) -> Any:
+        """Channels as what is scattered at once."""
+        return channels[0] if self.channels == 1 else self.module.ArrayXf(channels)
+
     def written(self, channels: list[Any]) -> Any:
         """Interleave the channels."""
         if self.channels == 1:
             return channels[0]
         result = dr.empty(self.module.Float, self.channels * self.pixels)
-        dr.scatter(result, self.module.ArrayXf(channels), dr.arange(self.module.UInt32, self.pixels))
+        dr.scatter(result, self.packet(channels), dr.arange(self.module.UInt32, self.pixels))
         return result
 
+    def copied(self, values: Any) -> Any:
+        """Interleaved copy, to be written to. Not Dr.Jit's, which one thread would make."""
+        if isinstance(values, list) and len(values) > 1:
+            return self.written(values)
+        flat = values[0] if isinstance(values, list) else values
+        UInt32 = self.module.UInt32
+        # Nothing that Dr.Jit could see to be the same array.
+        bits = dr.reinterpret_array(UInt32, flat) ^ (dr.arange(UInt32, dr.width(flat)) >> 31)
+        return dr.reinterpret_array(self.module.Float, bits)
 
 def incoming_weights(crossings: Crossings, width: int) -> tuple[Any, Any, Any, Any]:
     """How much the right, lower, left and upper neighbour each reach into a pixel of images ``width`` pixels wide."""
     return around(crossings.right, crossings.down, width, 1)
 
 
-def around(right: Any, down: Any, width: int, sign: int, signed: bool = False) -> tuple[Any, Any, Any, Any]:
-    """How much each neighbour reaches into a pixel, or (``sign`` -1) a pixel into each neighbour.
+def around(
+    right: Any, down: Any, width: int, sign: int, signed: bool = False, at: Any = None
+) -> tuple[Any, Any, Any, Any]:
+    """How much each neighbour reaches into a pixel, or (``sign`` -1) a pixel into each neighbour; all pixels, or those ``at``.
 
     Neighbours are the right, lower, left and upper one. Pairs that reach beyond the image have weight 0, which is also what the
     last pixels of the line above and the image before have for the first ones.
     """
     module = backend(right)
-    pixel = dr.arange(module.UInt32, dr.width(right))
+    pixel = dr.arange(module.UInt32, dr.width(right)) if at is None else at
     left = dr.gather(module.Float, right, pixel - 1, pixel >= 1)
     up = dr.gather(module.Float, down, pixel - width, pixel >= width)
+    if at is not None:
+        right, down = (dr.gather(module.Float, weights, at) for weights in (right, down))
     values = (-sign * right, -sign * down, sign * left, sign * up)
     return values if signed else tuple(dr.maximum(v, 0) for v in values)
 

@@ -19,7 +19,7 @@ from .tiles import STRIP, TileGrid, TileLists, build_tile_lists, nearest_covers,
 #: A triangle that covers more pixels than this, and is not thin, goes through the lists of tiles.
 _LARGE = 512
 #: More pixels than this are cleared by all threads.
-_MANY = 1 << 21
+_MANY = 1 << 20
 
 
 def rasterize(

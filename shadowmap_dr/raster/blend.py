@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
 
 from ._types import RasterOutput, backend
 from .crossings import Crossings
+from .neighbours import around
 from .pairs import each_number
 from .topology import NO_VERTEX
 
@@ -74,7 +76,22 @@ class Mixer:
         dr.eval(self.values, self.claims)
 
     def _mix(self) -> Any:
-        # Few pixels are blended: all are copied, those are overwritten.
+        if not self.planar:
+            return self._mix_few()
+        pixel = dr.arange(self.module.UInt32, self.pixels)
+        incoming = self.around(self.crossings.right, self.crossings.down, 1)
+        own = self.read(self.original, pixel)
+
+        def mix(pixel: Any, *lanes: Any) -> tuple[Any, ...]:
+            incoming, own = lanes[:4], lanes[4:]
+            claims = sum(incoming)
+            dr.scatter(self.claims, claims, pixel)
+            return tuple(self._mixed(pixel, incoming, claims, own))
+
+        return self.written(self._where(sum(incoming) > 0, mix, pixel, (*incoming, *own), own))
+
+    def _mix_few(self) -> Any:
+        # Of interleaved values all are copied, and those of the few blended pixels overwritten.
         result = self.copied(self.original)
         dr.eval(result)
 
@@ -88,14 +105,8 @@ class Mixer:
                 # Of the pairs of which a pixel takes, one does the work.
                 first = self._is_first(incoming, taker != pixel, down)
                 dr.scatter(self.claims, claims, taker, first)
-                scale = _scale(claims)
-                own = self.read(self.original, taker)
-                total = own
-                for share, neighbour in zip(incoming, self.neighbours(taker), strict=True):
-                    other = self.read(self.original, neighbour, share > 0)
-                    factor = share * scale
-                    total = [dr.fma(factor, dr.select(share > 0, v - o, 0), t) for v, o, t in zip(other, own, total, strict=True)]
-                dr.scatter(result, self.packet(total), taker, first)
+                mixed = self._mixed(taker, incoming, claims, self.read(self.original, taker))
+                dr.scatter(result, self.packet(mixed), taker, first)
                 return weight
 
             dr.if_stmt((pixel, down, weight), weight != 0, mix, lambda pixel, down, weight: weight, mode="symbolic")
@@ -103,9 +114,34 @@ class Mixer:
         self.crossings.pairs.for_each(visit)
         return result
 
+    def _mixed(self, pixel: Any, incoming: Sequence[Any], claims: Any, own: Sequence[Any]) -> list[Any]:
+        scale = _scale(claims)
+        total = list(own)
+        for weight, neighbour in zip(incoming, self.neighbours(pixel), strict=True):
+            other = self.read(self.original, neighbour, weight > 0)
+            factor = weight * scale
+            total = [dr.fma(factor, dr.select(weight > 0, v - o, 0), t) for v, o, t in zip(other, own, total, strict=True)]
+        return total
+
     def adjoint_of_values(self, adjoint: Any) -> Any:
         """Gradient to the values from that of the result."""
-        result = self.read(adjoint, dr.arange(self.module.UInt32, self.pixels)) if self.planar else self.copied(adjoint)
+        if not self.planar:
+            return self._adjoint_of_few(adjoint)
+        pixel = dr.arange(self.module.UInt32, self.pixels)
+        right, down = self.crossings.right, self.crossings.down
+        incoming, outgoing = self.around(right, down, 1), self.around(right, down, -1)
+        own = self.read(adjoint, pixel)
+
+        def spread(pixel: Any, *lanes: Any) -> tuple[Any, ...]:
+            return tuple(self._spread(adjoint, pixel, lanes[:4], lanes[4:8], lanes[8:]))
+
+        touched = sum(incoming) + sum(outgoing) > 0
+        result = self._where(touched, spread, pixel, (*incoming, *outgoing, *own), own)
+        dr.eval(result)  # more than one kernel may want it
+        return result
+
+    def _adjoint_of_few(self, adjoint: Any) -> Any:
+        result = self.copied(adjoint)
         dr.eval(result)
 
         def visit(slot: Any, end: Any) -> None:
@@ -117,29 +153,30 @@ class Mixer:
                 signed = self.around(self.crossings.right, self.crossings.down, 1, True, pixel)
                 incoming, outgoing = [dr.maximum(w, 0) for w in signed], [dr.maximum(-w, 0) for w in signed]
                 first = self._is_first([dr.abs(w) for w in signed], second, down)
-                claims = sum(incoming)
-                kept = 1 - claims * _scale(claims)
-                total = [kept * o for o in self.read(adjoint, pixel)]
-                for share, neighbour in zip(outgoing, self.neighbours(pixel), strict=True):
-                    factor = share * _scale(dr.gather(self.module.Float, self.claims, neighbour, share > 0))
-                    other = self.read(adjoint, neighbour, share > 0)
-                    total = [dr.fma(factor, v, t) for v, t in zip(other, total, strict=True)]
-                if self.planar:
-                    for channel, value in zip(result, total, strict=True):
-                        dr.scatter(channel, value, pixel, first)
-                else:
-                    dr.scatter(result, self.packet(total), pixel, first)
+                total = self._spread(adjoint, pixel, incoming, outgoing, self.read(adjoint, pixel))
+                dr.scatter(result, self.packet(total), pixel, first)
                 return weight
 
-            dr.if_stmt(
-                (pixel, down, weight, end), weight != 0, spread, lambda pixel, down, weight, end: weight, mode="symbolic"
-            )
+            lanes = (pixel, down, weight, end)
+            dr.if_stmt(lanes, weight != 0, spread, lambda pixel, down, weight, end: weight, mode="symbolic")
 
         # Both pixels of each pair.
         pairs = self.crossings.pairs
         each_number(2 * (pairs.front + pairs.back), pairs.lanes, lambda number: visit(number >> 1, number & 1))
         dr.eval(result)
         return result
+
+    def _spread(
+        self, adjoint: Any, pixel: Any, incoming: Sequence[Any], outgoing: Sequence[Any], own: Sequence[Any]
+    ) -> list[Any]:
+        claims = sum(incoming)
+        kept = 1 - claims * _scale(claims)
+        total = [kept * o for o in own]
+        for weight, neighbour in zip(outgoing, self.neighbours(pixel), strict=True):
+            factor = weight * _scale(dr.gather(self.module.Float, self.claims, neighbour, weight > 0))
+            other = self.read(adjoint, neighbour, weight > 0)
+            total = [dr.fma(factor, v, t) for v, t in zip(other, total, strict=True)]
+        return total
 
     def adjoint_of_positions(self, adjoint: Any, size: int) -> Any:
         """Gradient to the flat positions from that of the result."""
@@ -292,6 +329,14 @@ class Mixer:
         """See :func:`around`."""
         return around(right, down, self.width, sign, signed, at)
 
+    def _where(self, active: Any, function: Any, pixel: Any, lanes: tuple[Any, ...], otherwise: list[Any]) -> list[Any]:
+        """``function(pixel, *lanes)``, one number for each channel, in packets with active lanes; the last lanes elsewhere."""
+        count = len(otherwise)
+        result = dr.if_stmt(
+            (pixel, *lanes), active, function, lambda pixel, *lanes: tuple(lanes[-count:]), mode="symbolic", label="blend"
+        )
+        return list(result)
+
     def read(self, flat: Any, pixel: Any, active: Any = True) -> list[Any]:
         """All channels of pixels."""
         module = self.module
@@ -314,37 +359,12 @@ class Mixer:
         dr.scatter(result, self.packet(channels), dr.arange(self.module.UInt32, self.pixels))
         return result
 
-    def copied(self, values: Any) -> Any:
-        """Interleaved copy, to be written to. Not Dr.Jit's, which one thread would make."""
-        if isinstance(values, list) and len(values) > 1:
-            return self.written(values)
-        flat = values[0] if isinstance(values, list) else values
+    def copied(self, flat: Any) -> Any:
+        """A copy that may be written to. Not Dr.Jit's, which one thread would make."""
         UInt32 = self.module.UInt32
         # Nothing that Dr.Jit could see to be the same array.
         bits = dr.reinterpret_array(UInt32, flat) ^ (dr.arange(UInt32, dr.width(flat)) >> 31)
         return dr.reinterpret_array(self.module.Float, bits)
-
-def incoming_weights(crossings: Crossings, width: int) -> tuple[Any, Any, Any, Any]:
-    """How much the right, lower, left and upper neighbour each reach into a pixel of images ``width`` pixels wide."""
-    return around(crossings.right, crossings.down, width, 1)
-
-
-def around(
-    right: Any, down: Any, width: int, sign: int, signed: bool = False, at: Any = None
-) -> tuple[Any, Any, Any, Any]:
-    """How much each neighbour reaches into a pixel, or (``sign`` -1) a pixel into each neighbour; all pixels, or those ``at``.
-
-    Neighbours are the right, lower, left and upper one. Pairs that reach beyond the image have weight 0, which is also what the
-    last pixels of the line above and the image before have for the first ones.
-    """
-    module = backend(right)
-    pixel = dr.arange(module.UInt32, dr.width(right)) if at is None else at
-    left = dr.gather(module.Float, right, pixel - 1, pixel >= 1)
-    up = dr.gather(module.Float, down, pixel - width, pixel >= width)
-    if at is not None:
-        right, down = (dr.gather(module.Float, weights, at) for weights in (right, down))
-    values = (-sign * right, -sign * down, sign * left, sign * up)
-    return values if signed else tuple(dr.maximum(v, 0) for v in values)
 
 
 def _scale(claims: Any) -> Any:

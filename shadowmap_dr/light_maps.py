@@ -110,11 +110,13 @@ def make_maps(
     previous: Frusta | None,
     transparent: Callable[[RasterOutput], Any] | None = None,
     seen: Any = None,
+    outward: Any = None,
 ) -> ShadowMaps:
     """Render and filter the maps of all lights as one batch. Attached to lights and vertices.
 
     ``transparent`` is the alpha test of :func:`shadowmap_dr.raster.rasterize`, ``previous`` the fit of an earlier call,
-    ``seen`` points on what the cameras see (Point3f, world space) and a mask of those that count.
+    ``seen`` points on what the cameras see (Point3f, world space) and a mask of those that count, ``outward`` faces (Bool, F) of
+    which the maps of directional lights show the fronts only (:func:`shadowmap_dr.raster.outward_faces`).
     """
     views = [view for light, kind in zip(lights, plan.kinds, strict=True) for view in _views(plan, light, kind, settings)]
     stacked = stack_views(views)
@@ -144,8 +146,28 @@ def make_maps(
             settings.receiver_range,
         )
         frusta = _from_beams_on(plan, frusta)
-    maps = render_maps(p_light, lanes, geometry.faces, topology, stacked, frusta, settings, transparent)
+    culled = None if transparent is not None else _culled(plan, count, outward)
+    maps = render_maps(p_light, lanes, geometry.faces, topology, stacked, frusta, settings, transparent, culled)
     return filter_maps(maps)
+
+
+def _culled(plan: MapPlan, count: int, outward: Any) -> Any:
+    """Faces of each map (Bool, for all maps or for all faces of each) of which only fronts are drawn, or None.
+
+    Only the maps of directional lights begin before all casters: others may begin inside of one, and see its backs.
+    """
+    directional = [first for kind, first in zip(plan.kinds, plan.first, strict=True) if kind == "directional"]
+    if outward is None or not directional:
+        return None
+    if len(directional) == count:
+        return outward
+    faces = dr.width(outward)
+    lane = dr.arange(mi.UInt32, count * faces)
+    which = lane // faces
+    chosen = mi.Bool(False)
+    for first in directional:
+        chosen |= which == first
+    return chosen & dr.gather(mi.Bool, outward, lane - which * faces)
 
 
 def _views(plan: MapPlan, light: Light, kind: str, settings: ShadowSettings) -> tuple[LightView, ...]:

@@ -19,7 +19,7 @@ from .geometry import Geometry
 from .hits import pixel_hits
 from .light_maps import MapPlan, light_visibility, make_maps, plan_maps
 from .lights import AreaLight, Light, SpotLight, SquareSpot
-from .raster import RasterOutput, Topology, antialias, build_topology, visible_triangles
+from .raster import RasterOutput, Topology, antialias, build_topology, outward_faces, visible_triangles
 from .raster.crossings import Crossings, find_crossings
 from .render_settings import RenderSettings
 from .scene import SceneData, load, refresh
@@ -57,6 +57,7 @@ class Renderer:
         settings: how to render.
         flat: faces that are shaded flat, or None.
         creases: ``Bool`` (3 F,), edges of faces at which shading jumps, or None.
+        outward: ``Bool`` (F,), faces that shadow maps show from the front only, or None.
         soft: how extended lights (area lights, environments) are sampled, and which maps these samples have.
         frusta: fit of the shadow maps in the last rendering, None before the first. ``soft_frusta``: of those of extended lights.
     """
@@ -67,6 +68,7 @@ class Renderer:
     settings: RenderSettings
     flat: Any = None
     creases: Any = None
+    outward: Any = None
     soft: tuple[SoftPlan, ...] = ()
     frusta: Frusta | None = None
     soft_frusta: SoftFrusta = (None, None)
@@ -85,6 +87,7 @@ class Renderer:
         shadow_order: int = 4,
         shadow_supersampling: int = 1,
         shadow_receiver_range: bool = True,
+        shadow_cull_backfaces: bool = False,
         compat: bool = False,
         tessellation: int = 64,
         **settings: Any,
@@ -109,6 +112,7 @@ class Renderer:
                 order=shadow_order,
                 supersampling=shadow_supersampling,
                 receiver_range=shadow_receiver_range,
+                cull_backfaces=shadow_cull_backfaces,
             )
         except ValueError as error:
             raise ShadowmapError(str(error)) from None
@@ -127,7 +131,8 @@ class Renderer:
         single = settings.emitter_shadows == "single"
         soft = plan_soft(lights, geometry, settings.emitter_samples, settings.environment_samples, single)
         check_sizes(soft, geometry, settings.soft_map_resolution)
-        renderer = cls(data, topology, plan, settings, flat_faces(geometry, topology), creases, soft)
+        outward = mi.Bool(outward_faces(topology, positions.reshape(-1, 3))) if settings.shadow.cull_backfaces else None
+        renderer = cls(data, topology, plan, settings, flat_faces(geometry, topology), creases, outward, soft)
         # The first fit is made here, so that a step which is recorded later always starts from one.
         if data.sensors:
             with dr.suspend_grad():
@@ -221,7 +226,7 @@ class Renderer:
             transparent, seen = self._transparent(geometry, views[0].sensor), self._seen(views)
             common = (geometry, self.topology)
             if lights:
-                maps = make_maps(self.plan, lights, *common, settings.shadow, self.frusta, transparent, seen)
+                maps = make_maps(self.plan, lights, *common, settings.shadow, self.frusta, transparent, seen, self.outward)
                 self.frusta = maps.frusta
             if samples:
                 shadow = settings.soft_shadow

@@ -14,9 +14,10 @@ from shadowmap_dr.shadow import filter_kernel, filter_map
 @pytest.mark.parametrize("size", [1, 3, 5, 9, 15])
 @pytest.mark.parametrize("name", ["box", "gaussian", "wendland", "none"])
 @pytest.mark.parametrize("compat", [False, True])
-def test_matches_scipy_and_is_its_own_adjoint(variant: str, name: str, size: int, compat: bool) -> None:
+@pytest.mark.parametrize("width", [19, 20])
+def test_matches_scipy_and_is_its_own_adjoint(variant: str, name: str, size: int, compat: bool, width: int) -> None:
     rng = np.random.default_rng(size)
-    maps, height, width, channels = 2, 17, 20, 2
+    maps, height, channels = 2, 17, 2
     image = rng.normal(size=(maps, height, width, channels)).astype(np.float32)
     kernel = filter_kernel(name, size, compat)
     x = mi.Float(image.ravel())

@@ -87,3 +87,15 @@ def pixel_coordinates(module: ModuleType, batch: int, height: int, width: int) -
     column = index - row_flat * width
     image = row_flat // height
     return image, row_flat - image * height, column
+
+
+def zeros(module: ModuleType, size: int, count: int) -> list[Any]:
+    """``count`` evaluated ``Float`` arrays of zeros, to be written to.
+
+    One kernel of all threads writes them: one thread would fill an array with a constant. ``size`` is at most 2^28.
+    """
+    lane = dr.arange(module.UInt32, size)
+    # Different, for Dr.Jit must not see that they are the same.
+    arrays = [module.Float(lane >> (31 - k)) for k in range(count)]
+    dr.eval(arrays)
+    return arrays

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
 
 from ._types import RasterOutput, backend
 from .crossings import Crossings
+from .neighbours import around
+from .pairs import each_number
 from .topology import NO_VERTEX
 
 
@@ -73,6 +76,8 @@ class Mixer:
         dr.eval(self.values, self.claims)
 
     def _mix(self) -> Any:
+        if not self.planar:
+            return self._mix_few()
         pixel = dr.arange(self.module.UInt32, self.pixels)
         incoming = self.around(self.crossings.right, self.crossings.down, 1)
         own = self.read(self.original, pixel)
@@ -81,40 +86,97 @@ class Mixer:
             incoming, own = lanes[:4], lanes[4:]
             claims = sum(incoming)
             dr.scatter(self.claims, claims, pixel)
-            scale = _scale(claims)
-            total = list(own)
-            for weight, neighbour in zip(incoming, self.neighbours(pixel), strict=True):
-                other = self.read(self.original, neighbour, weight > 0)
-                factor = weight * scale
-                total = [dr.fma(factor, dr.select(weight > 0, v - o, 0), t) for v, o, t in zip(other, own, total, strict=True)]
-            return tuple(total)
+            return tuple(self._mixed(pixel, incoming, claims, own))
 
-        return self.written(self.where(sum(incoming) > 0, mix, pixel, (*incoming, *own), own))
+        return self.written(self._where(sum(incoming) > 0, mix, pixel, (*incoming, *own), own))
+
+    def _mix_few(self) -> Any:
+        # Of interleaved values all are copied, and those of the few blended pixels overwritten.
+        result = self.copied(self.original)
+        dr.eval(result)
+
+        def visit(slot: Any, pair: Any) -> None:
+            down, pixel, weight = self._pair(pair)
+
+            def mix(pixel: Any, down: Any, weight: Any) -> Any:
+                taker = dr.select(weight > 0, self._neighbour(pixel, down), pixel)
+                incoming = self.around(self.crossings.right, self.crossings.down, 1, at=taker)
+                claims = sum(incoming)
+                # Of the pairs of which a pixel takes, one does the work.
+                first = self._is_first(incoming, taker != pixel, down)
+                dr.scatter(self.claims, claims, taker, first)
+                mixed = self._mixed(taker, incoming, claims, self.read(self.original, taker))
+                dr.scatter(result, self.packet(mixed), taker, first)
+                return weight
+
+            dr.if_stmt((pixel, down, weight), weight != 0, mix, lambda pixel, down, weight: weight, mode="symbolic")
+
+        self.crossings.pairs.for_each(visit)
+        return result
+
+    def _mixed(self, pixel: Any, incoming: Sequence[Any], claims: Any, own: Sequence[Any]) -> list[Any]:
+        scale = _scale(claims)
+        total = list(own)
+        for weight, neighbour in zip(incoming, self.neighbours(pixel), strict=True):
+            other = self.read(self.original, neighbour, weight > 0)
+            factor = weight * scale
+            total = [dr.fma(factor, dr.select(weight > 0, v - o, 0), t) for v, o, t in zip(other, own, total, strict=True)]
+        return total
 
     def adjoint_of_values(self, adjoint: Any) -> Any:
         """Gradient to the values from that of the result."""
+        if not self.planar:
+            return self._adjoint_of_few(adjoint)
         pixel = dr.arange(self.module.UInt32, self.pixels)
         right, down = self.crossings.right, self.crossings.down
         incoming, outgoing = self.around(right, down, 1), self.around(right, down, -1)
         own = self.read(adjoint, pixel)
 
         def spread(pixel: Any, *lanes: Any) -> tuple[Any, ...]:
-            incoming, outgoing, own = lanes[:4], lanes[4:8], lanes[8:]
-            claims = sum(incoming)
-            kept = 1 - claims * _scale(claims)
-            total = [kept * o for o in own]
-            for weight, neighbour in zip(outgoing, self.neighbours(pixel), strict=True):
-                factor = weight * _scale(dr.gather(self.module.Float, self.claims, neighbour, weight > 0))
-                other = self.read(adjoint, neighbour, weight > 0)
-                total = [dr.fma(factor, v, t) for v, t in zip(other, total, strict=True)]
-            return tuple(total)
+            return tuple(self._spread(adjoint, pixel, lanes[:4], lanes[4:8], lanes[8:]))
 
         touched = sum(incoming) + sum(outgoing) > 0
-        result = self.where(touched, spread, pixel, (*incoming, *outgoing, *own), own)
-        if not self.planar:
-            return self.written(result)
+        result = self._where(touched, spread, pixel, (*incoming, *outgoing, *own), own)
         dr.eval(result)  # more than one kernel may want it
         return result
+
+    def _adjoint_of_few(self, adjoint: Any) -> Any:
+        result = self.copied(adjoint)
+        dr.eval(result)
+
+        def visit(slot: Any, end: Any) -> None:
+            down, pixel, weight = self._pair(self.crossings.pairs.at(slot))
+
+            def spread(pixel: Any, down: Any, weight: Any, end: Any) -> Any:
+                second = end != 0
+                pixel = dr.select(second, self._neighbour(pixel, down), pixel)
+                signed = self.around(self.crossings.right, self.crossings.down, 1, True, pixel)
+                incoming, outgoing = [dr.maximum(w, 0) for w in signed], [dr.maximum(-w, 0) for w in signed]
+                first = self._is_first([dr.abs(w) for w in signed], second, down)
+                total = self._spread(adjoint, pixel, incoming, outgoing, self.read(adjoint, pixel))
+                dr.scatter(result, self.packet(total), pixel, first)
+                return weight
+
+            lanes = (pixel, down, weight, end)
+            dr.if_stmt(lanes, weight != 0, spread, lambda pixel, down, weight, end: weight, mode="symbolic")
+
+        # Both pixels of each pair.
+        pairs = self.crossings.pairs
+        each_number(2 * (pairs.front + pairs.back), pairs.lanes, lambda number: visit(number >> 1, number & 1))
+        dr.eval(result)
+        return result
+
+    def _spread(
+        self, adjoint: Any, pixel: Any, incoming: Sequence[Any], outgoing: Sequence[Any], own: Sequence[Any]
+    ) -> list[Any]:
+        claims = sum(incoming)
+        kept = 1 - claims * _scale(claims)
+        total = [kept * o for o in own]
+        for weight, neighbour in zip(outgoing, self.neighbours(pixel), strict=True):
+            factor = weight * _scale(dr.gather(self.module.Float, self.claims, neighbour, weight > 0))
+            other = self.read(adjoint, neighbour, weight > 0)
+            total = [dr.fma(factor, v, t) for v, t in zip(other, total, strict=True)]
+        return total
 
     def adjoint_of_positions(self, adjoint: Any, size: int) -> Any:
         """Gradient to the flat positions from that of the result."""
@@ -162,6 +224,21 @@ class Mixer:
         below = dr.gather(self.module.Float, self.crossings.down, pixel, down)
         return down, pixel, dr.select(down, below, dr.gather(self.module.Float, self.crossings.right, pixel, ~down))
 
+    def _neighbour(self, pixel: Any, down: Any) -> Any:
+        """The second pixel of a pair."""
+        return pixel + dr.select(down, self.module.UInt32(self.width), 1)
+
+    def _is_first(self, shares: list[Any], second: Any, down: Any) -> Any:
+        """Whether a pair is the first with a share among those around one of its pixels (``second``: its second pixel).
+
+        ``shares`` are those of the right, lower, left and upper neighbour.
+        """
+        before = [shares[0] > 0]
+        for share in shares[1:3]:
+            before.append(before[-1] | (share > 0))
+        # The other pixel of the pair: right, lower; left, upper.
+        return ~dr.select(second, dr.select(down, before[2], before[1]), down & before[0])
+
     def _bare(self, slot: Any) -> Any:
         """Whether a pair has no edge."""
         return dr.gather(self.module.UInt32, self.crossings.ends, 4 * slot) == NO_VERTEX
@@ -169,7 +246,7 @@ class Mixer:
     def _gain(self, adjoint: Any, pixel: Any, down: Any, weight: Any) -> Any:
         """Gradient to the weight of a pair."""
         # The neighbour takes from the pixel where the weight is positive, else the other way round.
-        neighbour = pixel + dr.select(down, self.module.UInt32(self.width), 1)
+        neighbour = self._neighbour(pixel, down)
         taker, giver = dr.select(weight > 0, neighbour, pixel), dr.select(weight > 0, pixel, neighbour)
         claims = dr.gather(self.module.Float, self.claims, taker)
         scale = _scale(claims)
@@ -248,11 +325,11 @@ class Mixer:
         """Right, lower, left, upper."""
         return pixel + 1, pixel + self.width, pixel - 1, pixel - self.width
 
-    def around(self, right: Any, down: Any, sign: int, signed: bool = False) -> tuple[Any, Any, Any, Any]:
+    def around(self, right: Any, down: Any, sign: int, signed: bool = False, at: Any = None) -> tuple[Any, Any, Any, Any]:
         """See :func:`around`."""
-        return around(right, down, self.width, sign, signed)
+        return around(right, down, self.width, sign, signed, at)
 
-    def where(self, active: Any, function: Any, pixel: Any, lanes: tuple[Any, ...], otherwise: list[Any]) -> list[Any]:
+    def _where(self, active: Any, function: Any, pixel: Any, lanes: tuple[Any, ...], otherwise: list[Any]) -> list[Any]:
         """``function(pixel, *lanes)``, one number for each channel, in packets with active lanes; the last lanes elsewhere."""
         count = len(otherwise)
         result = dr.if_stmt(
@@ -270,32 +347,24 @@ class Mixer:
             return list(dr.gather(packet, flat, pixel, active))
         return [dr.gather(module.Float, flat, pixel * self.channels + c, active) for c in range(self.channels)]
 
+    def packet(self, channels: list[Any]) -> Any:
+        """Channels as what is scattered at once."""
+        return channels[0] if self.channels == 1 else self.module.ArrayXf(channels)
+
     def written(self, channels: list[Any]) -> Any:
         """Interleave the channels."""
         if self.channels == 1:
             return channels[0]
         result = dr.empty(self.module.Float, self.channels * self.pixels)
-        dr.scatter(result, self.module.ArrayXf(channels), dr.arange(self.module.UInt32, self.pixels))
+        dr.scatter(result, self.packet(channels), dr.arange(self.module.UInt32, self.pixels))
         return result
 
-
-def incoming_weights(crossings: Crossings, width: int) -> tuple[Any, Any, Any, Any]:
-    """How much the right, lower, left and upper neighbour each reach into a pixel of images ``width`` pixels wide."""
-    return around(crossings.right, crossings.down, width, 1)
-
-
-def around(right: Any, down: Any, width: int, sign: int, signed: bool = False) -> tuple[Any, Any, Any, Any]:
-    """How much each neighbour reaches into a pixel, or (``sign`` -1) a pixel into each neighbour.
-
-    Neighbours are the right, lower, left and upper one. Pairs that reach beyond the image have weight 0, which is also what the
-    last pixels of the line above and the image before have for the first ones.
-    """
-    module = backend(right)
-    pixel = dr.arange(module.UInt32, dr.width(right))
-    left = dr.gather(module.Float, right, pixel - 1, pixel >= 1)
-    up = dr.gather(module.Float, down, pixel - width, pixel >= width)
-    values = (-sign * right, -sign * down, sign * left, sign * up)
-    return values if signed else tuple(dr.maximum(v, 0) for v in values)
+    def copied(self, flat: Any) -> Any:
+        """A copy that may be written to. Not Dr.Jit's, which one thread would make."""
+        UInt32 = self.module.UInt32
+        # Nothing that Dr.Jit could see to be the same array.
+        bits = dr.reinterpret_array(UInt32, flat) ^ (dr.arange(UInt32, dr.width(flat)) >> 31)
+        return dr.reinterpret_array(self.module.Float, bits)
 
 
 def _scale(claims: Any) -> Any:

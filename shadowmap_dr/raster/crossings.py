@@ -7,7 +7,7 @@ from typing import Any
 
 import drjit as dr
 
-from ._types import NO_TRIANGLE, RasterOutput, backend
+from ._types import NO_TRIANGLE, RasterOutput, backend, zeros
 from .creases import find_creases
 from .meetings import Meetings
 from .pairs import PairList, differing_pairs, empty_list
@@ -105,9 +105,10 @@ def _measure(
     module = backend(positions)
     Float, UInt32, Array4f = module.Float, module.UInt32, module.Array4f
     pixels = dr.width(raster.triangle)
+    right, down = zeros(module, pixels, 2)
     found = Crossings(
-        dr.zeros(Float, pixels),
-        dr.zeros(Float, pixels),
+        right,
+        down,
         pairs,
         dr.empty(UInt32, 8 * pixels),
         dr.empty(Float, 8 * pixels),

@@ -15,6 +15,8 @@ from ._types import RasterOutput, backend
 
 # A list's slots are dealt out in rounds to one lane for this many: short lists end after the first round.
 _ROUNDS = 8
+# So many neighbouring lanes work on so many neighbouring numbers.
+_PACKET = 16
 
 
 @dataclass(frozen=True)
@@ -38,8 +40,12 @@ class PairList:
 
     def for_each(self, visit: Callable[[Any, Any], None]) -> None:
         """Call ``visit(slot, pair)``, which writes somewhere, for all pairs in the list: full packets, whatever the image."""
-        lanes = -(-dr.width(self.pairs) // _ROUNDS)
-        each_number(self.front + self.back, lanes, lambda slot: visit(slot, self.at(slot)))
+        each_number(self.front + self.back, self.lanes, lambda slot: visit(slot, self.at(slot)))
+
+    @property
+    def lanes(self) -> int:
+        """How many lanes deal with the list in turns."""
+        return -(-dr.width(self.pairs) // _ROUNDS)
 
     def at(self, slot: Any) -> Any:
         """The pair in a slot."""
@@ -48,14 +54,26 @@ class PairList:
 
 
 def each_number(count: Any, lanes: int, visit: Callable[[Any], None]) -> None:
-    """Call ``visit(number)``, which writes somewhere, for all ``UInt32`` below ``count``, ``lanes`` at a time."""
+    """Call ``visit(number)``, which writes somewhere, for all ``UInt32`` below ``count``, at most about ``lanes`` at a time.
 
-    def one(number: Any) -> tuple[Any]:
+    Neighbouring lanes get neighbouring numbers, in packets, and each packet of lanes as many packets as any other: threads share
+    the lanes out run by run, and all of them shall be busy even if there are few numbers.
+    """
+    module = backend(count)
+    UInt32, UInt64 = module.UInt32, module.UInt64
+    packets = -(-lanes // _PACKET)
+    lane = dr.arange(UInt32, packets * _PACKET)
+    packet = lane // _PACKET
+    total = (count + (_PACKET - 1)) // _PACKET
+    first, end = (UInt32(UInt64(p) * UInt64(total) // packets) * _PACKET for p in (packet, packet + 1))
+    within = lane - packet * _PACKET
+
+    def one(number: Any, end: Any) -> tuple[Any, Any]:
         visit(number)
-        return (number + lanes,)
+        return number + _PACKET, end
 
-    start = dr.arange(backend(count).UInt32, lanes)
-    dr.while_loop((start,), lambda number: number < count, one, mode="symbolic", label="pairs")
+    state = (first + within, dr.minimum(end, count))
+    dr.while_loop(state, lambda number, end: number < end, one, mode="symbolic", label="pairs")
 
 
 def empty_list(raster: RasterOutput) -> tuple[PairList, Any]:

@@ -19,7 +19,7 @@ from .tiles import STRIP, TileGrid, TileLists, build_tile_lists, nearest_covers,
 #: A triangle that covers more pixels than this, and is not thin, goes through the lists of tiles.
 _LARGE = 512
 #: More pixels than this are cleared by all threads.
-_MANY = 1 << 21
+_MANY = 1 << 20
 
 
 def rasterize(
@@ -83,7 +83,8 @@ def visible_triangles(
     """As :func:`rasterize`, for positions and faces known to be valid, without the cost of barycentrics and depths.
 
     These are there, and attached, but not prepared: whoever uses them pays for them. ``one_sided``: ``Bool`` (F,), faces that are
-    drawn only where their corners run from +x to -y, that is, clockwise where y points up. Not with ``transparent``.
+    drawn only where their corners run from +x to -y, that is, clockwise where y points up; or (B F,), those of each image. Not
+    with ``transparent``.
     """
     flat, face_indices, batch, vertex_count = check_mesh(positions, faces, batch, False)
     size = (batch, vertex_count, *check_resolution(resolution))
@@ -249,7 +250,8 @@ def _nearest_fragments(
     sides = module.Float(x1 - x0 + (y1 - y0) + 2)
     if one_sided is not None:
         _, det = triangles.exact()
-        triangles = replace(triangles, active=triangles.active & ((det < 0) | ~dr.gather(module.Bool, one_sided, triangle)))
+        culled = dr.gather(module.Bool, one_sided, triangle if dr.width(one_sided) == face_count else index)
+        triangles = replace(triangles, active=triangles.active & ((det < 0) | ~culled))
     small = triangles.active & ((triangles.fragments <= _LARGE) | (triangles.fragments <= 5 * sides))
     draw(triangles, keys, behind, image * (height * width), triangle, triangles.box, small)
     if height * width <= _LARGE:  # no triangle can be large

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
@@ -95,29 +96,62 @@ def _convolve(values: Any, weights: list[float], axis: int, shape: tuple[int, in
     if axis == 0 and width * channels % 4 == 0:
         # What lies side by side is treated alike: columns in packets of four numbers.
         width, channels = width * channels // 4, 4
+    dr.eval(values)
+    if axis == 1 and channels == 2 and width % 2 == 0:
+        return _convolve_pairs(values, weights, maps * height, width, transpose)
     module = backend(values)
     # Texels of many numbers are several packets, that is, several lanes.
     parts = max(1, channels // 4)
     channels //= parts
     packet = {1: module.Float, 2: module.Array2f, 4: module.Array4f}[channels]
     n, stride = (height, width) if axis == 0 else (width, parts)
-    radius = len(weights) // 2
     lane = dr.arange(module.UInt32, maps * height * width * parts)
     at = module.Int32((lane // stride) % n)
-    dr.eval(values)
-    total = dr.zeros(packet)
+
+    def read(k: int) -> Any:
+        clamped = dr.clip(at + k, 0, n - 1)
+        return dr.gather(packet, values, module.UInt32(module.Int32(lane) + (clamped - at) * stride))
+
+    total = _weighted(read, at, n, weights, transpose)
+    return total if channels == 1 else dr.ravel(total)
+
+
+def _convolve_pairs(values: Any, weights: list[float], rows: int, width: int, transpose: bool) -> Any:
+    """Rows of texels of two numbers each, two texels a lane, which share what they read."""
+    module = backend(values)
+    Int32, UInt32 = module.Int32, module.UInt32
+    lane = dr.arange(UInt32, rows * width // 2)
+    at = Int32(2 * (lane % (width // 2)))
+    own = dr.gather(module.Array4f, values, lane)
+    texels = {0: module.Array2f(own.x, own.y), 1: module.Array2f(own.z, own.w)}
+
+    def read(k: int) -> Any:
+        """The texel k columns from the first of the two."""
+        if k not in texels:
+            texels[k] = dr.gather(module.Array2f, values, UInt32(2 * Int32(lane) + (dr.clip(at + k, 0, width - 1) - at)))
+        return texels[k]
+
+    first = _weighted(read, at, width, weights, transpose)
+    second = _weighted(lambda k: read(k + 1), at + 1, width, weights, transpose)
+    return dr.ravel(module.Array4f(*first, *second))
+
+
+def _weighted(read: Callable[[int], Any], at: Any, n: int, weights: list[float], transpose: bool) -> Any:
+    """Sum over the taps; ``read(k)`` is what lies k places from ``at`` (0 to n - 1), or at the border if that is nearer."""
+    module = backend(at)
+    radius = len(weights) // 2
+    total = None
     for k in range(-radius, radius + 1):
-        source = at - k if transpose else at + k
-        inside = (source >= 0) & (source < n)
-        clamped = dr.clip(source, 0, n - 1)
-        index = module.UInt32(module.Int32(lane) + (clamped - at) * stride)
         weight = module.Float(weights[k + radius])
         if transpose:
             # Border lanes also receive what taps beyond the border read from them.
+            source = at - k
+            inside = (source >= 0) & (source < n)
             weight = dr.select(inside, weight, 0)
             for j in range(-radius, radius + 1):
                 w = weights[j + radius]
                 weight += dr.select(inside & (at == 0) & (source + j < 0), w, 0)
                 weight += dr.select(inside & (at == n - 1) & (source + j > n - 1), w, 0)
-        total += dr.gather(packet, values, index) * weight
-    return total if channels == 1 else dr.ravel(total)
+        term = read(-k if transpose else k) * weight
+        total = term if total is None else total + term
+    return total

@@ -42,6 +42,10 @@ class ShadowSettings:
             exact, and so many times as many texels are rasterized. For pre-filtered methods.
         receiver_range: maps tell depths apart only from a little before the first receiver in view on: how far before it casters
             lie does not matter, and does not bleed.
+        cull_backfaces: leave faces that turn away from the light out of the maps of directional lights, if they belong to parts
+            that were closed and turned outwards when the scene was loaded. Saves a third of drawing. Shadows are the same as long
+            as these parts do not turn inside out, not even in a fold. Not with ``compat``; without effect in scenes with alpha
+            tested materials.
         compat: the conventions of Worchel and Alexa's code: unnormalised radial depth, fixed frusta, dark outside of them, their
             kernels, minimum variance 1e-4.
     """
@@ -57,6 +61,7 @@ class ShadowSettings:
     order: int = 4
     supersampling: int = 1
     receiver_range: bool = True
+    cull_backfaces: bool = False
 
     def __post_init__(self) -> None:
         if self.method == "auto":
@@ -73,6 +78,8 @@ class ShadowSettings:
             raise ValueError(f"the order of the Fourier series is {self.order}; it must be an even number from 2 to 16")
         if not 1 <= self.resolution <= 4096:
             raise ValueError(f"shadow map resolution is {self.resolution}; it must lie between 1 and 4096")
+        if self.compat and self.cull_backfaces:
+            raise ValueError("compat has fixed frusta, which may begin inside of a caster: do not combine it with cull_backfaces")
         if not 1 <= self.supersampling <= 8 or self.supersampling * self.resolution > MAX_RESOLUTION:
             raise ValueError(
                 f"shadow map supersampling is {self.supersampling}; it must lie between 1 and 8, "
@@ -120,6 +127,7 @@ def render_maps(
     frusta: Frusta,
     settings: ShadowSettings,
     transparent: Callable[[RasterOutput], Any] | None = None,
+    culled: Any = None,
 ) -> ShadowMaps:
     """Step 1: rasterize all maps at once and store what the method needs of the depths in each texel.
 
@@ -130,12 +138,14 @@ def render_maps(
         topology: of the mesh.
         views, frusta: cameras of the M maps.
         transparent: alpha test, see :func:`shadowmap_dr.raster.rasterize`.
+        culled: ``Bool`` (F,), or (M F,) by map: faces that are left out where they turn away. Not with ``transparent``.
     """
     count, size = views.count, settings.resolution * settings.supersampling
     clip = to_clip(of_map(views, map_index, count), of_map(frusta, map_index, count), p_light)
     clip = dr.ravel(clip)
     dr.eval(clip)
-    raster = visible_triangles(clip, faces, (size, size), batch=count, transparent=transparent)
+    # Seen from the front, outlines run clockwise: a light looks along the third of its right-handed axes.
+    raster = visible_triangles(clip, faces, (size, size), batch=count, transparent=transparent, one_sided=culled)
     values, channels = _texels(raster, clip, faces, views, frusta, settings, size)
     if settings.antialias and settings.method != "standard":
         dr.eval(values)

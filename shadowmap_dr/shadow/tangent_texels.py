@@ -9,7 +9,7 @@ import drjit as dr
 
 from ..raster import NO_TRIANGLE, NO_VERTEX, Crossings, RasterOutput
 from ..raster._types import backend, pixel_coordinates
-from ..raster.blend import incoming_weights
+from ..raster.neighbours import incoming_weights
 from ..raster.planes import depth_at, planes
 from .camera import Frusta, Views, of_map
 from .methods import PREFILTERED

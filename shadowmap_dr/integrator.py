@@ -21,7 +21,7 @@ from .omissions import warn_of
 from .pending import Inputs, Waiting, backward
 from .render_settings import RenderSettings
 from .renderer import Renderer
-from .scene import SceneData, load
+from .scene import SceneData, load, refresh
 from .sensors import lenses_of, sensors_of
 from .shadow import Frusta, ShadowSettings
 from .soft import SoftFrusta
@@ -204,13 +204,17 @@ class SceneRenderer:
         self.statics = statics
         return True
 
+    def data(self, scene: Any, sensor: Any) -> SceneData:
+        """What is read from the scene as it is now, with one sensor, attached to the scene's parameters."""
+        current = refresh(replace(self.renderer.data, scene=scene))
+        return replace(current, sensors=(sensors_of(sensor),))
+
     def render(self, scene: Any, sensor: Any, spp: int, inputs: Inputs | None = None) -> Any:
         """Image (mi.TensorXf), attached to the scene's parameters unless gradients are suspended.
 
         If ``inputs`` is given, the image is attached to these instead of the vertices, lights and cameras.
         """
-        current = self.renderer.with_data(replace(self.renderer.data, scene=scene)).refresh()
-        current = current.with_data(replace(current.data, sensors=(sensors_of(sensor),)))
+        current = self.renderer.with_data(self.data(scene, sensor))
         # Each sensor goes on from its own fit. Fitting it again to the same vertices and lights keeps it bit by bit, so the
         # derivatives of a step see the frusta of its image, whatever other sensors have taken in between.
         others = [fit for fit in self.fits if fit[0] is not sensor]
@@ -294,9 +298,10 @@ class Shell:
     def backward(self, scene: Any, sensor: Any, spp: int, gradient: Any) -> None:
         """Add the gradients of <image, gradient> to the scene's parameters."""
         with dr.resume_grad():
-            pending = self._record(scene, sensor).waiting.take(scene, sensor, spp or 1)
+            record = self._record(scene, sensor)
+            pending = record.waiting.take(scene, sensor, spp or 1)
             if pending is not None:
-                pending.backward(gradient)
+                pending.backward(gradient, record.data(scene, sensor))
                 return
             image = self.image(scene, sensor, spp)
             if dr.grad_enabled(image):

@@ -29,25 +29,25 @@ _READ = (
 class Inputs:
     """Vertices, lights and cameras of a scene as leaves of an AD graph of their own.
 
-    What waits for a backward pass must not hang on the scene's parameters meanwhile: forward passes would run through it.
+    What waits for a backward pass must not hang on the scene's parameters meanwhile, not even through what has been read from
+    them: forward passes would run through it, and clear gradients on their way.
     """
 
     def __init__(self) -> None:
-        self._outer: list[Any] = []
         self._leaves: list[Any] = []
 
     def instead_of(self, data: SceneData) -> SceneData:
         """The same data with leaves in the place of what is attached."""
-        self._outer = attached_arrays(data)
-        self._leaves = [dr.detach(array) + 0 for array in self._outer]
+        self._leaves = [dr.detach(array) + 0 for array in attached_arrays(data)]
         dr.enable_grad(self._leaves)
         return with_arrays(data, self._leaves)
 
-    def backward(self) -> None:
-        """Pass the leaves' gradients on to the scene's parameters."""
-        for outer, leaf in zip(self._outer, self._leaves, strict=True):
-            dr.accum_grad(outer, dr.grad(leaf))
-        dr.enqueue(dr.ADMode.Backward, self._outer)
+    def backward(self, data: SceneData) -> None:
+        """Pass the leaves' gradients on to the scene's parameters, through the same data, read again."""
+        outer = attached_arrays(data)
+        for array, leaf in zip(outer, self._leaves, strict=True):
+            dr.accum_grad(array, dr.grad(leaf))
+        dr.enqueue(dr.ADMode.Backward, outer)
         dr.traverse(dr.ADMode.Backward)
 
 
@@ -71,10 +71,10 @@ class Pending:
         """Whether it shows what a sensor sees now."""
         return sensor is self.sensor and spp == self.spp and _numbers(_held(sensor)) == _numbers(self.camera)
 
-    def backward(self, gradient: Any) -> None:
-        """Add the gradients of <image, gradient> to the scene's parameters."""
+    def backward(self, gradient: Any, data: SceneData) -> None:
+        """Add the gradients of <image, gradient> to the scene's parameters. ``data``: as read for the image."""
         backward(self.image, gradient)
-        self.inputs.backward()
+        self.inputs.backward(data)
 
 
 class Waiting:

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+import test_soft_lights as soft
 from test_integrator import camera, shadowmap, small_scene
 
 from shadowmap_dr import pending
@@ -104,3 +105,54 @@ def test_forward_passes_do_not_run_through_images_that_wait(variant: str) -> Non
     dr.set_grad(params[KEY], 1.0)
     derivative = dr.forward_to(mi.render(scene, params, integrator=integrator, sensor=1)).numpy()
     assert np.abs(derivative).max() > 0.1 and not dr.grad(image).array.numpy().any()
+
+
+SKY = np.random.default_rng(3).uniform(0, 1, (8, 16, 3)).astype(np.float32)
+
+
+def lit_scene(kind: str) -> Any:
+    if kind == "sky":
+        lights: dict[str, Any] = {"sky": {"type": "envmap", "bitmap": mi.Bitmap(SKY)}}
+    else:
+        slanted = mi.ScalarTransform4f().look_at([0.3, 1.4, 0.2], [0, 0, 0], [0, 0, 1])
+        lights = {
+            "lamp": soft.panel(1.2, 0.3),
+            "bulb": {"type": "point", "position": [0.5, 1.2, 0.5], "intensity": 0.3},
+            "torch": {"type": "spot", "to_world": slanted, "intensity": 1.0},
+        }
+    return soft.scene_of(camera=soft.view(), box=soft.box(), **lights)
+
+
+@pytest.mark.parametrize(
+    ("kind", "key"),
+    [
+        *(("sky", key) for key in ("sky.to_world", "camera.to_world", "box.vertex_positions")),
+        *(("lamps", key) for key in ("lamp.to_world", "lamp.emitter.radiance.value", "bulb.position", "bulb.intensity.value")),
+        *(("lamps", key) for key in ("torch.to_world", "torch.cutoff_angle", "box.vertex_normals", "floor.to_world")),
+    ],
+)
+def test_forward_agrees_with_backward_that_has_waited(variant: str, kind: str, key: str) -> None:
+    """Both go on from a number that parameters are computed from, through what Mitsuba has derived from them."""
+    derivatives = []
+    for forward in (True, False):
+        scene = lit_scene(kind)
+        integrator = shadowmap(emitter_samples=4, environment_samples=8)
+        params = mi.traverse(scene)
+        shift = dr.opaque(mi.Float, 0)
+        dr.enable_grad(shift)
+        if isinstance(params[key], mi.Transform4f):
+            turn = mi.Transform4f().rotate([0.2, 1, 0], 10 * shift)
+            params[key] = params[key] @ turn @ mi.Transform4f().translate(mi.Vector3f(shift, 0.3 * shift, 0))
+        else:
+            params[key] = type(params[key])(params[key] + shift)
+        params.update()
+        image = mi.render(scene, params, integrator=integrator)
+        assert len(integrator.shell.scenes[0].waiting._images) == 1
+        weight = np.random.default_rng(1).uniform(0, 1, image.shape).astype(np.float32)
+        if forward:
+            dr.forward(shift)
+            derivatives.append(float((dr.grad(image).numpy() * weight).sum()))
+        else:
+            dr.backward(dr.sum(image * mi.TensorXf(weight), axis=None))
+            derivatives.append(float(dr.grad(shift)[0]))
+    assert abs(derivatives[1]) > 1e-3 and derivatives[0] == pytest.approx(derivatives[1], rel=1e-3)

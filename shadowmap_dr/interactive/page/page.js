@@ -14,6 +14,7 @@ const painting = new Painting($("shadow"), $("brush"), sendStroke);
 let stage = null, socket = null, opened = null;
 let sequence = 0; // of the last stroke message
 let latest = null; // the newest frame, until it is shown
+let resting = false; // whether that is the last one before a rest
 let planned = false;
 
 try {
@@ -49,12 +50,15 @@ function onText(message) {
     opened = message;
     sequence = 0;
     latest = null;
+    resting = false;
     painting.open(message.width, message.height, message.points);
     stage?.open(message);
     $("name").textContent = message.name;
     $("alert").hidden = Boolean(stage);
   } else if (message.type === "status") {
-    setPhase(message.phase);
+    // What is shown rests when its last frame is shown.
+    resting = message.phase === "resting" && latest !== null;
+    if (!resting) setPhase(message.phase);
     if (message.phase === "failed") warn(`The optimiser has stopped: ${message.message}`, true);
     else if (stage) $("alert").hidden = true;
   }
@@ -104,6 +108,10 @@ function show() {
   $("match").textContent = `${(100 * match).toFixed(1)} % of the shadow is as wanted`;
   // For programs that watch the page.
   if (frame) document.dispatchEvent(new CustomEvent("frame", { detail: { ...frame, match } }));
+  if (resting) {
+    resting = false;
+    setPhase("resting");
+  }
 }
 
 function setPhase(phase) {

@@ -252,6 +252,24 @@ def test_interpolate_matches_the_plane_and_is_differentiable(variant: str) -> No
     np.testing.assert_allclose(dr.grad(a).numpy().sum(0), [size * size] * 2, rtol=1e-5)
 
 
+def test_what_does_not_fit_a_raster_never_reaches_a_gather(variant: str) -> None:
+    square = np.array([[0, 0, 0, 1], [1, 0, 0, 1], [1, 1, 0, 1], [0, 1, 0, 1]], np.float32)
+    faces = np.array([[0, 1, 2], [0, 2, 3]], np.uint32)
+    clip, topology = mi.TensorXf(square), topology_of(faces, square[:, :3])
+    out = rasterize(clip, mi.TensorXu(faces), (8, 8))
+    with pytest.raises(ValueError, match="attribute row 3, but there are only 3"):
+        interpolate(clip[:3], out, mi.TensorXu(faces))
+    with pytest.raises(ValueError, match="3 indices, but 2 triangles"):
+        interpolate(clip, out, mi.TensorXu(faces[:1]))
+    # Other indices for the same triangles, as texture coordinates have them, are fine.
+    assert interpolate(clip[:1], out, mi.TensorXu(0 * faces)).shape == (8, 8, 4)
+    value = dr.select(out.valid, mi.Float(1), mi.Float(0))
+    with pytest.raises(ValueError, match="4 vertices, but 2 faces were rasterized and there are 3 vertices"):
+        antialias(value, out, clip[:3], topology)
+    with pytest.raises(ValueError, match="1 faces and 3 vertices, but 2 faces"):
+        antialias(value, out, clip, topology_of(faces[:1], square[:, :3]))
+
+
 def test_crossings_can_be_shared(variant: str) -> None:
     faces = np.array([[0, 1, 2]], np.uint32)
     clip = mi.TensorXf(TRIANGLE)

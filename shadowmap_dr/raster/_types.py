@@ -8,6 +8,7 @@ from types import ModuleType
 from typing import Any
 
 import drjit as dr
+import numpy as np
 
 #: Triangle index of a pixel that no triangle covers.
 NO_TRIANGLE = 0xFFFFFFFF
@@ -78,6 +79,13 @@ class RasterOutput:
     def valid(self) -> Any:
         """Mask of the pixels that see a triangle."""
         return self.triangle != NO_TRIANGLE
+
+
+def check_range(faces: Any, count: int, what: str) -> None:
+    """Raise ValueError if faces refer to a ``what`` (vertex, row) of number ``count`` or more. Reads back one number."""
+    largest = int(np.max(dr.max(faces).numpy()))
+    if largest >= count:
+        raise ValueError(f"faces refer to {what} {largest}, but there are only {count}")
 
 
 def pixel_coordinates(module: ModuleType, batch: int, height: int, width: int) -> tuple[Any, Any, Any]:

@@ -44,12 +44,15 @@ def antialias(
         The blended values in the shape of ``values``; flat, with interleaved channels, for a list. Gradients flow to ``values``
         and, through the position of the silhouettes, to ``positions``.
 
+    Raises:
+        ValueError: values, positions or topology do not fit the raster.
+
     Source: the idea of blending along the axis that crosses the edge is that of Laine et al., "Modular Primitives for
     High-Performance Differentiable Rendering", 2020, section 3.6; the search for edges and the weights are different.
     """
     is_tensor = dr.is_tensor_v(values)
     flat = _checked_values(values, raster)
-    positions, vertex_count = _flat_positions(positions, raster)
+    positions, vertex_count = _flat_positions(positions, raster, topology)
     if crossings is None:
         crossings = find_crossings(positions, topology, raster, vertex_count, creases, crease_weights, meetings)
     blended = blend(flat, positions, raster, crossings)
@@ -71,8 +74,14 @@ def _checked_values(values: Any, raster: RasterOutput) -> Any:
     return flat
 
 
-def _flat_positions(positions: Any, raster: RasterOutput) -> tuple[Any, int]:
+def _flat_positions(positions: Any, raster: RasterOutput, topology: Topology) -> tuple[Any, int]:
     flat = positions.array if dr.is_tensor_v(positions) else positions
     if dr.width(flat) % (4 * raster.batch) != 0:
         raise ValueError(f"positions hold {dr.width(flat)} numbers, which is not {raster.batch} image(s) of (V, 4) vertices")
-    return flat, dr.width(flat) // (4 * raster.batch)
+    vertices = dr.width(flat) // (4 * raster.batch)
+    if dr.width(topology.faces) != 3 * raster.face_count or topology.vertex_count > vertices:
+        raise ValueError(
+            f"the topology is that of {dr.width(topology.faces) // 3} faces and {topology.vertex_count} vertices, "
+            f"but {raster.face_count} faces were rasterized and there are {vertices} vertices"
+        )
+    return flat, vertices

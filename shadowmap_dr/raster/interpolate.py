@@ -6,20 +6,26 @@ from typing import Any
 
 import drjit as dr
 
-from ._types import RasterOutput, backend, pixel_coordinates
+from ._types import RasterOutput, backend, check_range, pixel_coordinates
 
 
-def interpolate(attributes: Any, raster: RasterOutput, faces: Any) -> Any:
+def interpolate(attributes: Any, raster: RasterOutput, faces: Any, *, check_indices: bool = True) -> Any:
     """Interpolate vertex attributes over the visible triangles, perspective-correct.
 
     Args:
         attributes: tensor (V, C), the same for all images, or (B, V, C).
         raster: rasterizer output.
-        faces: vertex indices, tensor (F, 3) or flat, as given to the rasterizer.
+        faces: indices into ``attributes``, tensor (F, 3) or flat: those given to the rasterizer, or others for the same
+            triangles (such as those of texture coordinates).
+        check_indices: verify that no index is out of range, which reads back one number; a caller that has checked its
+            (constant) faces before switches it off, as it must inside ``dr.freeze``.
 
     Returns:
         Tensor (H, W, C), or (B, H, W, C) for more than one image; 0 where nothing is seen. Gradients flow to ``attributes`` and,
         through the barycentrics, to the positions that were rasterized.
+
+    Raises:
+        ValueError: attributes or faces do not fit the images or each other; an index is out of range.
     """
     shape = tuple(attributes.shape)
     if len(shape) not in (2, 3) or 0 in shape:
@@ -28,6 +34,10 @@ def interpolate(attributes: Any, raster: RasterOutput, faces: Any) -> Any:
         raise ValueError(f"attributes of shape {shape} do not fit {raster.batch} image(s)")
     module = backend(attributes)
     face_indices = faces.array if dr.is_tensor_v(faces) else faces
+    if dr.width(face_indices) != 3 * raster.face_count:
+        raise ValueError(f"faces hold {dr.width(face_indices)} indices, but {raster.face_count} triangles were rasterized")
+    if check_indices:
+        check_range(face_indices, shape[-2], "attribute row")
     channels = shape[-1]
     image, _, _ = pixel_coordinates(module, raster.batch, raster.height, raster.width)
     first = image * shape[1] if len(shape) == 3 else 0

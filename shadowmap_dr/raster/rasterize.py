@@ -8,9 +8,8 @@ from types import ModuleType
 from typing import Any
 
 import drjit as dr
-import numpy as np
 
-from ._types import MAX_RESOLUTION, NO_TRIANGLE, RasterOutput, backend, pixel_coordinates
+from ._types import MAX_RESOLUTION, NO_TRIANGLE, RasterOutput, backend, check_range, pixel_coordinates
 from .barycentrics import pixel_barycentrics
 from .fragments import EMPTY, draw
 from .setup import centred, covers, edge_lines, fragment_key, gather_triangle, set_up
@@ -125,9 +124,7 @@ def check_mesh(positions: Any, faces: Any, batch: int | None, check_indices: boo
     faces = backend(flat).UInt32(faces)
     vertex_count = count // (4 * batch)
     if check_indices:
-        largest = int(np.max(dr.max(faces).numpy()))
-        if largest >= vertex_count:
-            raise ValueError(f"faces refer to vertex {largest}, but there are only {vertex_count} vertices")
+        check_range(faces, vertex_count, "vertex")
     return flat, faces, batch, vertex_count
 
 

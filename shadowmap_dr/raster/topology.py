@@ -25,6 +25,7 @@ class Topology:
         part_count: how many different numbers there are.
         beyond: ``UInt32`` (3 F,) for the edge from corner k to k + 1 of each face the third vertex of the face on its other side,
             ``NO_VERTEX`` where there is none or more than one.
+        vertex_count: how many vertices there are at least: one more than the largest index.
     """
 
     edges: Any
@@ -35,6 +36,7 @@ class Topology:
     parts: Any
     part_count: int
     beyond: Any
+    vertex_count: int
 
 
 def build_topology(faces: np.ndarray, positions: np.ndarray, dtype: type) -> Topology:
@@ -61,6 +63,7 @@ def build_topology(faces: np.ndarray, positions: np.ndarray, dtype: type) -> Top
     proper = (welded != np.roll(welded, 1, 1)).all(1)
     where = np.flatnonzero(proper)
     beyond = np.full(3 * len(proper), NO_VERTEX)
+    vertex_count = int(faces.max()) + 1
     faces, welded = faces[proper], welded[proper]
 
     a, b, opposite = (np.concatenate([faces[:, (k + s) % 3] for k in range(3)]) for s in (0, 1, 2))
@@ -83,6 +86,7 @@ def build_topology(faces: np.ndarray, positions: np.ndarray, dtype: type) -> Top
         *flat,
         part_count,
         dtype(beyond.astype(np.uint32)),
+        vertex_count,
     )
 
 

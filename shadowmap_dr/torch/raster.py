@@ -114,7 +114,7 @@ def interpolate(attributes: torch.Tensor, raster: Raster, faces: torch.Tensor) -
     indices = index_array(faces)
 
     def run(attributes: Any, u: Any, v: Any) -> tuple[Any, ...]:
-        result = _raster.interpolate(attributes, replace(found, u=u.array, v=v.array), indices)
+        result = _raster.interpolate(attributes, replace(found, u=u.array, v=v.array), indices, check_indices=False)
         return (type(result)(result.array, (*shape, result.shape[-1])),)
 
     return cross(Repeated(run), attributes, raster.u, raster.v)[0]

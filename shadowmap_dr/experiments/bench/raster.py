@@ -116,7 +116,7 @@ def _visible(p_rest: Any, moving: Any, matrix: Any, faces: Any, offset: Any, *, 
 def _forward(p_rest: Any, moving: Any, matrix: Any, faces: Any, offset: Any, *, size: int) -> Any:
     clip = to_clip(p_rest, moving, matrix, offset)
     raster = rasterize(clip, faces, (size, size), batch=dr.width(offset), check_indices=False)
-    return interpolate(mi.TensorXf(p_rest, (dr.width(p_rest) // 3, 3)), raster, faces).array
+    return interpolate(mi.TensorXf(p_rest, (dr.width(p_rest) // 3, 3)), raster, faces, check_indices=False).array
 
 
 def _forward_backward(
@@ -127,7 +127,7 @@ def _forward_backward(
     dr.enable_grad(p_world)
     clip = to_clip(p_world, moving, matrix, offset)
     raster = rasterize(clip, faces, (size, size), batch=dr.width(offset), check_indices=False)
-    image = interpolate(mi.TensorXf(p_world, (dr.width(p_world) // 3, 3)), raster, faces)
+    image = interpolate(mi.TensorXf(p_world, (dr.width(p_world) // 3, 3)), raster, faces, check_indices=False)
     image = antialias(image, raster, clip, topology)
     loss = dr.mean(dr.square(image.array - target))
     dr.backward(loss)

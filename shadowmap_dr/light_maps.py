@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from .beams import Beam, Projector
+from .errors import ShadowmapError
 from .geometry import Geometry
 from .lights import DirectionalLight, Light, PointLight, SpotLight
 from .raster import RasterOutput, Topology
@@ -59,6 +60,11 @@ class MapPlan:
     center: tuple[float, float, float]
     radius: float
 
+    @property
+    def maps(self) -> int:
+        """How many maps there are."""
+        return sum(6 if kind == "cube" else 1 for kind in self.kinds)
+
 
 def plan_maps(lights: Sequence[Light], geometry: Geometry) -> MapPlan:
     """Decide (on the host, once) which maps the lights need and what is known about the shapes."""
@@ -81,6 +87,23 @@ def plan_maps(lights: Sequence[Light], geometry: Geometry) -> MapPlan:
         tuple(float(c) for c in center),
         float(np.linalg.norm(positions - center, axis=1).max()) or 1.0,
     )
+
+
+def check_sizes(maps: int, texels: int, geometry: Geometry, lights: str, remedy: str) -> None:
+    """Refuse (ShadowmapError) maps that would not fit into arrays: lanes are counted with 32 bits.
+
+    Args:
+        maps: how many there are.
+        texels: along each side of one of them.
+        geometry: the scene's.
+        lights: whose maps they are, for the message.
+        remedy: what to do about it, for the message.
+    """
+    if maps * max(geometry.vertex_count, geometry.face_count, 4 * texels * texels) >= 2**31:
+        raise ShadowmapError(
+            f"{maps} shadow maps of {lights}, {texels} x {texels} texels, {geometry.face_count} triangles, are too many: "
+            f"{remedy}."
+        )
 
 
 def _kind_of(light: Light) -> str:

@@ -17,7 +17,7 @@ from .facets import crease_edges, flat_faces, mean_normals, soften_facets
 from .film import develop, sample_grid, sample_windows
 from .geometry import Geometry
 from .hits import pixel_hits
-from .light_maps import MapPlan, light_visibility, make_maps, plan_maps
+from .light_maps import MapPlan, check_sizes, light_visibility, make_maps, plan_maps
 from .lights import AreaLight, Light, SpotLight, SquareSpot
 from .raster import RasterOutput, Topology, antialias, build_topology, outward_faces, visible_triangles
 from .raster.crossings import Crossings, find_crossings
@@ -31,7 +31,7 @@ from .soft import (
     SoftFrusta,
     SoftMaps,
     SoftPlan,
-    check_sizes,
+    check_soft_sizes,
     make_soft_maps,
     plan_soft,
     samples_of,
@@ -130,7 +130,10 @@ class Renderer:
         lights = (*data.areas, *data.environments)
         single = settings.emitter_shadows == "single"
         soft = plan_soft(lights, geometry, settings.emitter_samples, settings.environment_samples, single)
-        check_sizes(soft, geometry, settings.soft_map_resolution)
+        if settings.shadow.method != "none":
+            texels = settings.shadow.resolution * settings.shadow.supersampling
+            check_sizes(plan.maps, texels, geometry, "lights", "lower shadow_map_resolution, or leave out lights")
+            check_soft_sizes(soft, geometry, settings.soft_map_resolution)
         outward = mi.Bool(outward_faces(topology, positions.reshape(-1, 3))) if settings.shadow.cull_backfaces else None
         renderer = cls(data, topology, plan, settings, flat_faces(geometry, topology), creases, outward, soft)
         # The first fit is made here, so that a step which is recorded later always starts from one.

@@ -44,6 +44,19 @@ def scene_with(mesh: mi.Mesh, **more: dict) -> mi.Scene:
     )
 
 
+def test_more_maps_than_arrays_can_hold_are_refused(variant: str) -> None:
+    """Lanes are counted with 32 bits: beyond, indices would wrap around."""
+    bulbs = {f"bulb{k}": {"type": "point", "position": [k, 0, 3], "intensity": 1.0} for k in range(6)}
+    scene = scene_with(sheet(2), **bulbs)
+    with pytest.raises(ShadowmapError, match="37 shadow maps of lights, 4096 x 4096 texels, 8 triangles, are too many: lower"):
+        Renderer.from_scene(scene, shadow_map_resolution=4096)
+    with pytest.raises(ShadowmapError, match="37 shadow maps of lights, 4096 x 4096"):
+        Renderer.from_scene(scene, shadow_map_resolution=512, shadow_supersampling=8)
+    Renderer.from_scene(scene, shadow_map_resolution=4096, shadow_method="none")
+    with pytest.raises(ShadowmapError, match="maps of extended lights, 4096 x 4096 .*emitter_samples"):
+        Renderer.from_scene(scene_with(sheet(2), sky={"type": "constant"}), soft_map_resolution=4096)
+
+
 def test_a_flat_sheet_that_gets_a_bump_casts_its_shadow(variant: str) -> None:
     """A planar shape with nothing behind it gets no texels, but only for as long as it is planar."""
     flat, bumpy = (scene_with(sheet(height=h)) for h in (0.0, 0.8))

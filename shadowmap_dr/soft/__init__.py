@@ -1,6 +1,6 @@
 """Extended lights: area lights and environments as many samples, each with a shadow map."""
 
-from .maps import SoftFrusta, SoftLight, SoftMaps, SoftPlan, check_sizes, make_soft_maps, plan_soft, samples_of
+from .maps import SoftFrusta, SoftLight, SoftMaps, SoftPlan, check_soft_sizes, make_soft_maps, plan_soft, samples_of
 from .samples import LightSamples
 from .shading import soft_light
 
@@ -10,7 +10,7 @@ __all__ = [
     "SoftLight",
     "SoftMaps",
     "SoftPlan",
-    "check_sizes",
+    "check_soft_sizes",
     "make_soft_maps",
     "plan_soft",
     "samples_of",

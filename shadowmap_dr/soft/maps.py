@@ -11,9 +11,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..errors import ShadowmapError
 from ..geometry import Geometry
-from ..light_maps import MapPlan, boxes_of, shape_planes
+from ..light_maps import MapPlan, boxes_of, check_sizes, shape_planes
 from ..lights import AreaLight, Environment
 from ..raster import RasterOutput, Topology
 from ..shadow import (
@@ -90,15 +89,10 @@ def plan_soft(
     return tuple(plans)
 
 
-def check_sizes(plans: Sequence[SoftPlan], geometry: Geometry, texels: int) -> None:
-    """Refuse (ShadowmapError) what would not fit into arrays: lanes are counted with 32 bits."""
-    maps = sum(plan.maps for plan in plans)
-    largest = max(geometry.vertex_count, geometry.face_count, 4 * texels * texels)
-    if maps * largest >= 2**31:
-        raise ShadowmapError(
-            f"{maps} shadow maps of extended lights, {texels} x {texels} texels, {geometry.face_count} triangles, are too many: "
-            "lower emitter_samples, environment_samples or soft_map_resolution."
-        )
+def check_soft_sizes(plans: Sequence[SoftPlan], geometry: Geometry, texels: int) -> None:
+    """Refuse (ShadowmapError) what would not fit into arrays."""
+    remedy = "lower emitter_samples, environment_samples or soft_map_resolution"
+    check_sizes(sum(plan.maps for plan in plans), texels, geometry, "extended lights", remedy)
 
 
 def samples_of(light: SoftLight, plan: SoftPlan, geometry: Geometry) -> LightSamples:

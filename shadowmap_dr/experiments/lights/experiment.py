@@ -8,7 +8,7 @@ mean squared error. Estimated and true directions are matched greedily; their me
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +19,14 @@ from ... import io, report, timing
 from ...errors import ShadowmapError
 from ...inverse import run_sweep
 from ...inverse.sweep import MEMORY
-from .problem import LightProblem, ReferenceKind, StrategyKind, check_problem
+from .problem import LightProblem, LightSetting, check_problem
 from .report import pictures, plot
-from .scene import CONE_DEG, OBJECTS
+from .scene import OBJECTS
 
 
 @dataclass(frozen=True)
-class LightOptions:
-    """What to run: every object with every number of lights and filter size; see :class:`LightProblem` for the rest.
+class LightOptions(LightSetting):
+    """What to run: every object with every number of lights and filter size.
 
     ``filter_sizes``: 1 for no filter, 0 for no shadows.
     """
@@ -35,16 +35,6 @@ class LightOptions:
     lights: tuple[int, ...] = (1,)
     filter_sizes: tuple[int, ...] = (3, 0)
     runs: int = 16
-    filter: str = "gaussian"
-    map_resolution: int = 256
-    resolution: int = 128
-    iterations: int = 200
-    strategy: StrategyKind = "plain"
-    starts: int = 1
-    reference: ReferenceKind = "own"
-    spp: int = 128
-    seed: int = 0
-    cone_deg: float = CONE_DEG
     out: Path = Path("lights")
     resume: bool = False
     scheduler: str = "local"
@@ -66,23 +56,9 @@ class LightOptions:
 
     def problems(self) -> list[LightProblem]:
         """One for each setting and object, settings first."""
+        common = {f.name: getattr(self, f.name) for f in fields(LightSetting)}
         return [
-            LightProblem(
-                name,
-                lights,
-                self.runs,
-                filter_size=size,
-                filter=self.filter,
-                map_resolution=self.map_resolution,
-                resolution=self.resolution,
-                iterations=self.iterations,
-                strategy=self.strategy,
-                starts=self.starts,
-                reference=self.reference,
-                spp=self.spp,
-                seed=self.seed,
-                cone_deg=self.cone_deg,
-            )
+            LightProblem(name, lights, self.runs, filter_size=size, **common)
             for lights in self.lights
             for size in self.filter_sizes
             for name in self.objects

@@ -29,15 +29,11 @@ COARSE_STEP_SIZE, COARSE_FILTER = 0.05, 15
 _CURVE_STRIDE = 5
 
 
-@dataclass(frozen=True)
-class LightProblem(Problem):
-    """All runs of one object with one setting.
+@dataclass(frozen=True, kw_only=True)
+class LightSetting:
+    """What all problems of an experiment have in common.
 
     Attributes:
-        object: name of a mesh.
-        lights: n, of each run.
-        runs: how many.
-        filter_size: texels along each side of the filter of the shadow maps, 1 for none; 0: no shadows at all.
         filter, map_resolution: of the shadow maps.
         resolution: of the images.
         iterations: steps of the optimiser.
@@ -47,10 +43,6 @@ class LightProblem(Problem):
         seed, cone_deg: see :func:`shadowmap_dr.experiments.lights.scene.target_and_starts`.
     """
 
-    object: str
-    lights: int
-    runs: int
-    filter_size: int = 3
     filter: str = "gaussian"
     map_resolution: int = 256
     resolution: int = 128
@@ -61,6 +53,23 @@ class LightProblem(Problem):
     spp: int = 128
     seed: int = 0
     cone_deg: float = CONE_DEG
+
+
+@dataclass(frozen=True)
+class LightProblem(Problem, LightSetting):
+    """All runs of one object with one setting.
+
+    Attributes:
+        object: name of a mesh.
+        lights: n, of each run.
+        runs: how many.
+        filter_size: texels along each side of the filter of the shadow maps, 1 for none; 0: no shadows at all.
+    """
+
+    object: str
+    lights: int
+    runs: int
+    filter_size: int = 3
 
     @property
     def name(self) -> str:

@@ -8,7 +8,7 @@ the plan of its shadow maps, their frusta) lives in the integrator that renders 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import drjit as dr
@@ -17,15 +17,10 @@ import mitsuba as mi
 from .aovs import aov_names
 from .errors import ShadowmapError
 from .film import put_into_film
-from .omissions import warn_of
-from .pending import Inputs, Waiting, backward
+from .pending import Inputs, backward
 from .render_settings import RenderSettings
-from .renderer import Renderer
-from .scene import SceneData, load, refresh
-from .sensors import lenses_of, sensors_of
-from .shadow import Frusta, ShadowSettings
-from .soft import SoftFrusta
-from .traversal import parameters
+from .scene_renderer import SceneRenderer, same_objects
+from .shadow import ShadowSettings
 
 PLUGIN = "shadowmap"
 
@@ -33,8 +28,6 @@ PLUGIN = "shadowmap"
 _SYNONYMS = {"sh_normal": "normal"}
 # Scenes that one integrator remembers; each holds the scene's shapes in memory.
 _REMEMBERED_SCENES = 4
-# Sensors whose fit of the shadow maps is remembered.
-_REMEMBERED_SENSORS = 64
 
 
 @dataclass(frozen=True)
@@ -65,6 +58,9 @@ class Options:
                            the channel ``label``
     tessellation           triangles around spheres, disks and cylinders, at least 3; curves have half as many around them, and
                            B-splines an eighth of it along each segment
+    recorded               ``mi.render`` and its backward pass are recorded with ``dr.freeze`` and replayed while only numbers
+                           change: up to twice as fast where passes are short, slower where they are long, since the backward
+                           pass renders again. Backward passes to materials and textures are not recorded
     compat                 conventions of Worchel and Alexa's code
     """
 
@@ -88,6 +84,7 @@ class Options:
     hide_emitters: bool = False
     aovs: str = ""
     tessellation: int = 64
+    recorded: bool = False
     compat: bool = False
 
     @classmethod
@@ -161,112 +158,6 @@ def _typed(name: str, value: Any, kind: type) -> Any:
 
 
 @dataclass
-class SceneRenderer:
-    """What stays the same between renderings of a scene.
-
-    The scene itself is not kept: it may own the integrator that owns this record.
-
-    parts     shapes, BSDFs and emitters of the scene; kept alive here, so that comparing them by identity is safe
-    statics   arrays that decided on the topology and on the shadow maps: faces, segments of curves, cutoff angles of spot lights
-    sizes     number of vertices and faces of each mesh, of control points of each curve
-    lights    names of the lights
-    renderer  without what is re-read for each rendering
-    fits      (sensor, frusta of the shadow maps, of those of extended lights) of the last image that it took, latest first
-    """
-
-    parts: tuple[Any, ...]
-    statics: tuple[Any, ...]
-    sizes: tuple[int, ...]
-    lights: tuple[str, ...]
-    renderer: Renderer
-    fits: list[tuple[Any, Frusta | None, SoftFrusta]] = field(default_factory=list)
-    waiting: Waiting = field(default_factory=Waiting)
-
-    @classmethod
-    def build(cls, scene: Any, sensor: Any, options: Options, settings: RenderSettings, warn: bool = True) -> SceneRenderer:
-        """Read a scene. Raises ShadowmapError for what is broken; ``warn``: of what is left out."""
-        if dr.flag(dr.JitFlag.FreezingScope):
-            raise ShadowmapError("A scene cannot be read while a function is frozen: render it once with this integrator before.")
-        with dr.suspend_grad():
-            data = replace(load(scene, tessellation=options.tessellation, warn=warn), sensors=(sensors_of(sensor),))
-            renderer = Renderer.from_data(data, settings)
-        lights = tuple(light.name for light in data.lights)
-        return cls(_parts(scene, data), _statics(scene, data), _sizes(data), lights, renderer.with_data(_without_scene(data)))
-
-    def matches(self, scene: Any) -> bool:
-        """Whether this record was made for the scene; it is none the worse for moved vertices or other parameter values."""
-        data = self.renderer.data
-        if not _same_objects(self.parts, _parts(scene, data)) or self.sizes != _sizes(data):
-            return False
-        statics = _statics(scene, data)
-        if not _same_arrays(self.statics, statics):
-            return False
-        self.statics = statics
-        return True
-
-    def data(self, scene: Any, sensor: Any) -> SceneData:
-        """What is read from the scene as it is now, with one sensor, attached to the scene's parameters."""
-        current = refresh(replace(self.renderer.data, scene=scene))
-        return replace(current, sensors=(sensors_of(sensor),))
-
-    def render(self, scene: Any, sensor: Any, spp: int, inputs: Inputs | None = None) -> Any:
-        """Image (mi.TensorXf), attached to the scene's parameters unless gradients are suspended.
-
-        If ``inputs`` is given, the image is attached to these instead of the vertices, lights and cameras.
-        """
-        current = self.renderer.with_data(self.data(scene, sensor))
-        # Each sensor goes on from its own fit. Fitting it again to the same vertices and lights keeps it bit by bit, so the
-        # derivatives of a step see the frusta of its image, whatever other sensors have taken in between.
-        others = [fit for fit in self.fits if fit[0] is not sensor]
-        if len(others) == len(self.fits) and not any(sensor is known for known in scene.sensors()):
-            warn_of(lenses_of(sensor), stacklevel=2)
-        known = next((fit for fit in self.fits if fit[0] is sensor), (sensor, self.renderer.frusta, self.renderer.soft_frusta))
-        _, current.frusta, current.soft_frusta = known
-        if inputs is not None:
-            frusta, soft_frusta = current.frusta, current.soft_frusta
-            current = current.with_data(inputs.instead_of(current.data))
-            current.frusta, current.soft_frusta = frusta, soft_frusta
-        image = current.render(spp=spp)
-        self.fits = [(sensor, current.frusta, current.soft_frusta), *others][:_REMEMBERED_SENSORS]
-        return image
-
-
-def _parts(scene: Any, data: SceneData) -> tuple[Any, ...]:
-    bsdfs = [source.shape.bsdf() for source in data.sources]
-    return (*scene.shapes(), *scene.emitters(), *bsdfs)
-
-
-def _statics(scene: Any, data: SceneData) -> tuple[Any, ...]:
-    topology = [array for source in data.sources for array in source.statics()]
-    cones = [e for e in scene.emitters() if e.class_name() == "SpotLight"]
-    return (*topology, *(dr.detach(mi.Float(parameters(cone)["cutoff_angle"])) for cone in cones))
-
-
-def _sizes(data: SceneData) -> tuple[int, ...]:
-    return tuple(size for source in data.sources for size in source.sizes())
-
-
-def _without_scene(data: SceneData) -> SceneData:
-    """Drop what ``refresh`` reads again."""
-    geometry = replace(data.geometry, positions=None, normals=None, texcoords=None, rest_positions=None)
-    return replace(data, scene=None, geometry=geometry, sensors=(), lights=(), areas=(), environments=())
-
-
-def _same_objects(first: tuple[Any, ...], second: tuple[Any, ...]) -> bool:
-    return len(first) == len(second) and all(a is b for a, b in zip(first, second, strict=True))
-
-
-def _same_arrays(first: tuple[Any, ...], second: tuple[Any, ...]) -> bool:
-    """Equality of arrays that are read back only if they are not the very same."""
-    if len(first) != len(second):
-        return False
-    for a, b in zip(first, second, strict=True):
-        if a.index != b.index and (len(a) != len(b) or not dr.all(a == b)):
-            return False
-    return True
-
-
-@dataclass
 class Shell:
     """The integrator without Mitsuba's base class: the same for all variants."""
 
@@ -283,6 +174,12 @@ class Shell:
 
     def primal(self, scene: Any, sensor: Any, spp: int) -> Any:
         """Detached image of ``mi.render``, which will ask for its derivatives later if parameters are attached."""
+        if self._replays:
+            _check_samples(spp)
+            with dr.resume_grad():
+                record = self._record(scene, sensor)
+                self.light_names = record.lights
+                return record.replay(scene, sensor, spp or 1)
         with dr.resume_grad():
             waiting = self._record(scene, sensor).waiting
             waiting.forget_older(scene)
@@ -299,6 +196,8 @@ class Shell:
         """Add the gradients of <image, gradient> to the scene's parameters."""
         with dr.resume_grad():
             record = self._record(scene, sensor)
+            if self._replays and record.replay_backward(scene, sensor, spp or 1, gradient):
+                return
             pending = record.waiting.take(scene, sensor, spp or 1)
             if pending is not None:
                 pending.backward(gradient, record.data(scene, sensor))
@@ -309,11 +208,14 @@ class Shell:
 
     def image(self, scene: Any, sensor: Any, spp: int, inputs: Inputs | None = None) -> Any:
         """Attached image. ``spp`` 0 means not given: one sample, anti-aliased."""
-        if spp < 0:
-            raise ShadowmapError(f"spp is {spp}: give a positive number, or 0 for one anti-aliased sample.")
+        _check_samples(spp)
         record = self._record(scene, sensor)
         self.light_names = record.lights
         return record.render(scene, sensor, spp or 1, inputs)
+
+    @property
+    def _replays(self) -> bool:
+        return self.options.recorded and not dr.flag(dr.JitFlag.FreezingScope)
 
     def channel_names(self) -> list[str]:
         """Names of the further channels, in order; those of ``visibility`` follow the lights of the scene rendered last."""
@@ -329,10 +231,15 @@ class Shell:
         else:
             # The scene is told from others by its shapes: it may be here again with another topology.
             shapes = tuple(scene.shapes())
-            known = any(_same_objects(other.parts[: len(shapes)], shapes) for other in self.scenes)
-            record = SceneRenderer.build(scene, sensor, self.options, self.settings, warn=not known)
+            known = any(same_objects(other.parts[: len(shapes)], shapes) for other in self.scenes)
+            record = SceneRenderer.build(scene, sensor, self.settings, self.options.tessellation, warn=not known)
         self.scenes = [record, *(other for other in self.scenes if other is not record)][:_REMEMBERED_SCENES]
         return record
+
+
+def _check_samples(spp: int) -> None:
+    if spp < 0:
+        raise ShadowmapError(f"spp is {spp}: give a positive number, or 0 for one anti-aliased sample.")
 
 
 def sensor_of(scene: Any, sensor: Any) -> Any:

@@ -6,6 +6,7 @@ what the image was computed from.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -92,8 +93,7 @@ class Waiting:
 
     def welcomes(self, sensor: Any) -> bool:
         """Whether an image of the scene as it is now would be attached to :class:`Inputs` alone."""
-        held = {**self._parameters, **_held(sensor)}
-        attached = [name for name, value in held.items() if dr.grad_enabled(value)]
+        attached = _attached({**self._parameters, **_held(sensor)})
         return bool(attached) and all(name.endswith(_READ) for name in attached)
 
     def add(self, sensor: Any, spp: int, image: Any, inputs: Inputs) -> None:
@@ -110,6 +110,15 @@ class Waiting:
         found = next((one for one in self._images if one.is_of(sensor, spp)), None)
         self._images = [one for one in self._images if one is not found]
         return found
+
+
+def attached_names(scene: Any, sensor: Any) -> tuple[str, ...]:
+    """Names of the parameters through which gradients flow."""
+    return _attached({**parameters(scene), **parameters(sensor)})
+
+
+def _attached(held: Mapping[str, Any]) -> tuple[str, ...]:
+    return tuple(name for name, value in held.items() if dr.grad_enabled(value))
 
 
 def backward(image: Any, gradient: Any) -> None:

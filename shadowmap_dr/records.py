@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from itertools import count
 from typing import Any
 
 import drjit as dr
@@ -40,15 +41,22 @@ def map_arrays(value: Any, function: Callable[[Any], Any]) -> Any:
 
 def attached_arrays(record: Any) -> list[Any]:
     """The arrays of a tree through which gradients flow, in a fixed order."""
-    found: list[Any] = []
+    return attached_places(record)[1]
+
+
+def attached_places(record: Any) -> tuple[tuple[int, ...], list[Any]]:
+    """(where :func:`map_arrays` comes to arrays through which gradients flow, counted from 0, and these arrays)."""
+    places, found, place = [], [], count()
 
     def collect(array: Any) -> Any:
+        here = next(place)
         if _attached(array):
+            places.append(here)
             found.append(array)
         return array
 
     map_arrays(record, collect)
-    return found
+    return tuple(places), found
 
 
 def with_arrays(record: Any, arrays: list[Any]) -> Any:

@@ -18,6 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from . import __version__, _llvm
+from .garbage import uncollected
 
 #: Calls before the measured ones, which compile kernels and fill caches.
 WARM_UP = 5
@@ -107,13 +108,8 @@ def alternate(
 def quiet_garbage() -> Iterator[None]:
     """No garbage collection within: a pause would be timed, and freeing scenes makes frozen functions record anew."""
     gc.collect()
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
+    with uncollected():
         yield
-    finally:
-        if enabled:
-            gc.enable()
 
 
 def summary(seconds: Sequence[float]) -> dict[str, Any]:

@@ -30,6 +30,15 @@ def test_a_mesh_takes_the_shape_of_its_shadow(tmp_path: Path) -> None:
     assert views[0].shape == (384, 384, 3) and np.abs(views[0] - views[1]).mean() > 2
 
 
+def test_ways_to_render_are_timed_in_turns() -> None:
+    script = ROOT / "docs" / "examples" / "plugin_speed.py"
+    command = [sys.executable, script, "--resolution", "16", "--rounds", "2"]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=ROOT)
+    assert result.returncode == 0, result.stderr
+    steps = dict(re.findall(r"^(.+): ([0-9.]+) ms a step", result.stdout, re.MULTILINE))
+    assert list(steps) == ["plug-in", "plug-in, recorded", "renderer, recorded"] and min(map(float, steps.values())) > 0
+
+
 def test_steps_are_timed_in_turns() -> None:
     script = ROOT / "docs" / "examples" / "pose_speed.py"
     command = [sys.executable, script, "--resolution", "16", "--rounds", "1"]

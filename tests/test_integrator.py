@@ -19,7 +19,7 @@ import trimesh
 
 import shadowmap_dr
 from shadowmap_dr import ShadowmapError
-from shadowmap_dr import integrator as plugin
+from shadowmap_dr import scene_renderer as plugin
 
 SIZE = 64
 # Shadows a little softer than a pixel: images of this size would alias a sharper map, and so would their differences.

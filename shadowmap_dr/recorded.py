@@ -1,0 +1,86 @@
+"""Renderings that are recorded once and replayed while only numbers change."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import count
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from .garbage import uncollected
+from .pending import backward
+from .records import attached_places, map_arrays
+from .renderer import Renderer
+
+
+class Recorded:
+    """The image of a renderer and the gradients of its data, each recorded with ``dr.freeze``.
+
+    Dr.Jit records anew where more than numbers has changed: sizes, types, settings, and how many objects there are in Mitsuba.
+    The backward pass renders again, since nothing that is computed in one recording can wait for the other.
+    """
+
+    def __init__(self) -> None:
+        self._image, self._gradients = dr.freeze(_image), dr.freeze(_gradients)
+
+    def image(self, spp: int, renderer: Renderer) -> tuple[Any, Any, Any]:
+        """(detached image, fit of the shadow maps, of those of extended lights)."""
+        with dr.suspend_grad(), uncollected():
+            return self._image(spp, plain(renderer))
+
+    def backward(self, spp: int, gradient: Any, renderer: Renderer) -> None:
+        """Add the gradients of <image, gradient> to all that the renderer's data are attached to."""
+        places, outer = attached_places(renderer.data)
+        if not outer:
+            return
+        with uncollected():
+            found = self._gradients(spp, places, dr.detach(gradient), plain(renderer))
+        for array, inner in zip(outer, found, strict=True):
+            dr.accum_grad(array, inner)
+        dr.enqueue(dr.ADMode.Backward, outer)
+        dr.traverse(dr.ADMode.Backward)
+
+    @property
+    def recordings(self) -> int:
+        """How many there have been."""
+        return self._image.n_recordings + self._gradients.n_recordings
+
+
+# The renderer comes last: Dr.Jit 1.5 does not tell recordings apart by Python's numbers and strings that follow it.
+def _image(spp: int, renderer: Renderer) -> tuple[Any, Any, Any]:
+    image = renderer.render(spp=spp)
+    return image, renderer.frusta, renderer.soft_frusta
+
+
+def _gradients(spp: int, places: tuple[int, ...], gradient: Any, renderer: Renderer) -> list[Any]:
+    """Gradients of the arrays at some places of the renderer's data."""
+    leaves = []
+    place = count()
+
+    def attached(array: Any) -> Any:
+        if next(place) not in places:
+            return array
+        leaf = dr.detach(array) + 0
+        dr.enable_grad(leaf)
+        leaves.append(leaf)
+        return leaf
+
+    backward(renderer.with_data(map_arrays(renderer.data, attached)).render(spp=spp), gradient)
+    return [dr.grad(leaf) for leaf in leaves]
+
+
+def plain(renderer: Renderer) -> Renderer:
+    """A renderer with detached data that differ in numbers only between cameras of one kind.
+
+    All numbers lie in memory, since constants would be part of a recording, and so would that a camera's numbers are those of one
+    of the scene's.
+    """
+    data = map_arrays(renderer.data, dr.detach)
+    one = dr.opaque(mi.Float, 1)  # Dr.Jit would leave out a product with the constant
+    copies = map_arrays(data.sensors, lambda array: array * one)
+    data = replace(data, sensors=tuple(tuple(replace(camera, name="") for camera in cameras) for cameras in copies))
+    renderer = replace(renderer, data=data)
+    dr.make_opaque(data, renderer.frusta, renderer.soft_frusta)
+    return renderer

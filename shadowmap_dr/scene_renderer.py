@@ -1,0 +1,164 @@
+"""What the plug-in keeps of a scene from one rendering to the next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from .errors import ShadowmapError
+from .omissions import warn_of
+from .pending import Inputs, Waiting, attached_names
+from .recorded import Recorded, plain
+from .render_settings import RenderSettings
+from .renderer import Renderer
+from .scene import SceneData, load, refresh
+from .sensors import lenses_of, sensors_of
+from .shadow import Frusta
+from .soft import SoftFrusta
+from .traversal import parameters
+
+# Sensors whose fit of the shadow maps is remembered.
+_REMEMBERED_SENSORS = 64
+
+
+@dataclass
+class SceneRenderer:
+    """What stays the same between renderings of a scene.
+
+    The scene itself is not kept: it may own the integrator that owns this record.
+
+    parts     shapes, BSDFs and emitters of the scene; kept alive here, so that comparing them by identity is safe
+    statics   arrays that decided on the topology and on the shadow maps: faces, segments of curves, cutoff angles of spot lights
+    sizes     number of vertices and faces of each mesh, of control points of each curve
+    lights    names of the lights
+    renderer  without what is re-read for each rendering
+    fits      (sensor, frusta of the shadow maps, of those of extended lights) of the last image that it took, latest first
+    waiting   images that wait for their backward passes
+    recorded  both passes, replayed if the plug-in's user wants it; ``recordable``: for names of attached parameters, whether
+              gradients flow through nothing but what is read from the scene
+    """
+
+    parts: tuple[Any, ...]
+    statics: tuple[Any, ...]
+    sizes: tuple[int, ...]
+    lights: tuple[str, ...]
+    renderer: Renderer
+    fits: list[tuple[Any, Frusta | None, SoftFrusta]] = field(default_factory=list)
+    waiting: Waiting = field(default_factory=Waiting)
+    recorded: Recorded = field(default_factory=Recorded)
+    recordable: dict[tuple[str, ...], bool] = field(default_factory=dict)
+
+    @classmethod
+    def build(cls, scene: Any, sensor: Any, settings: RenderSettings, tessellation: int, warn: bool = True) -> SceneRenderer:
+        """Read a scene. Raises ShadowmapError for what is broken; ``warn``: of what is left out."""
+        if dr.flag(dr.JitFlag.FreezingScope):
+            raise ShadowmapError("A scene cannot be read while a function is frozen: render it once with this integrator before.")
+        with dr.suspend_grad():
+            data = replace(load(scene, tessellation=tessellation, warn=warn), sensors=(sensors_of(sensor),))
+            renderer = Renderer.from_data(data, settings)
+        lights = tuple(light.name for light in data.lights)
+        return cls(_parts(scene, data), _statics(scene, data), _sizes(data), lights, renderer.with_data(_without_scene(data)))
+
+    def matches(self, scene: Any) -> bool:
+        """Whether this record was made for the scene; it is none the worse for moved vertices or other parameter values."""
+        data = self.renderer.data
+        if not same_objects(self.parts, _parts(scene, data)) or self.sizes != _sizes(data):
+            return False
+        statics = _statics(scene, data)
+        if not _same_arrays(self.statics, statics):
+            return False
+        self.statics = statics
+        return True
+
+    def data(self, scene: Any, sensor: Any) -> SceneData:
+        """What is read from the scene as it is now, with one sensor, attached to the scene's parameters."""
+        current = refresh(replace(self.renderer.data, scene=scene))
+        return replace(current, sensors=(sensors_of(sensor),))
+
+    def render(self, scene: Any, sensor: Any, spp: int, inputs: Inputs | None = None) -> Any:
+        """Image (mi.TensorXf), attached to the scene's parameters unless gradients are suspended.
+
+        If ``inputs`` is given, the image is attached to these instead of the vertices, lights and cameras.
+        """
+        current = self._current(scene, sensor)
+        if inputs is not None:
+            current = current.with_data(inputs.instead_of(current.data))
+        image = current.render(spp=spp)
+        self._remember(scene, sensor, current.frusta, current.soft_frusta)
+        return image
+
+    def replay(self, scene: Any, sensor: Any, spp: int) -> Any:
+        """The same image, detached, recorded when it is first taken."""
+        image, frusta, soft_frusta = self.recorded.image(spp, self._current(scene, sensor))
+        self._remember(scene, sensor, frusta, soft_frusta)
+        return image
+
+    def replay_backward(self, scene: Any, sensor: Any, spp: int, gradient: Any) -> bool:
+        """Add the gradients of <image, gradient> to the scene's parameters, recorded, too.
+
+        False, and nothing done, if they flow through more than what is read from the scene: materials, textures and the radiance
+        of extended lights are evaluated by Mitsuba itself.
+        """
+        current = self._current(scene, sensor)
+        attached = attached_names(scene, sensor)
+        if attached not in self.recordable:
+            self.recordable[attached] = not dr.grad_enabled(plain(current).render(spp=spp))
+        if self.recordable[attached]:
+            self.recorded.backward(spp, gradient, current)
+        return self.recordable[attached]
+
+    def _current(self, scene: Any, sensor: Any) -> Renderer:
+        """The renderer for the scene as it is now.
+
+        Each sensor goes on from its own fit. Fitting it again to the same vertices and lights keeps it bit by bit, so the
+        derivatives of a step see the frusta of its image, whatever other sensors have taken in between.
+        """
+        kept = self.renderer
+        fits = ((frusta, soft_frusta) for known, frusta, soft_frusta in self.fits if known is sensor)
+        frusta, soft_frusta = next(fits, (kept.frusta, kept.soft_frusta))
+        return replace(kept, data=self.data(scene, sensor), frusta=frusta, soft_frusta=soft_frusta)
+
+    def _remember(self, scene: Any, sensor: Any, frusta: Frusta | None, soft_frusta: SoftFrusta) -> None:
+        """Keep the fit of an image for the next one of this sensor, and warn of lenses when it is seen first."""
+        others = [fit for fit in self.fits if fit[0] is not sensor]
+        if len(others) == len(self.fits) and not any(sensor is known for known in scene.sensors()):
+            warn_of(lenses_of(sensor), stacklevel=3)
+        self.fits = [(sensor, frusta, soft_frusta), *others][:_REMEMBERED_SENSORS]
+
+
+def _parts(scene: Any, data: SceneData) -> tuple[Any, ...]:
+    bsdfs = [source.shape.bsdf() for source in data.sources]
+    return (*scene.shapes(), *scene.emitters(), *bsdfs)
+
+
+def _statics(scene: Any, data: SceneData) -> tuple[Any, ...]:
+    topology = [array for source in data.sources for array in source.statics()]
+    cones = [e for e in scene.emitters() if e.class_name() == "SpotLight"]
+    return (*topology, *(dr.detach(mi.Float(parameters(cone)["cutoff_angle"])) for cone in cones))
+
+
+def _sizes(data: SceneData) -> tuple[int, ...]:
+    return tuple(size for source in data.sources for size in source.sizes())
+
+
+def _without_scene(data: SceneData) -> SceneData:
+    """Drop what ``refresh`` reads again."""
+    geometry = replace(data.geometry, positions=None, normals=None, texcoords=None, rest_positions=None)
+    return replace(data, scene=None, geometry=geometry, sensors=(), lights=(), areas=(), environments=())
+
+
+def same_objects(first: tuple[Any, ...], second: tuple[Any, ...]) -> bool:
+    return len(first) == len(second) and all(a is b for a, b in zip(first, second, strict=True))
+
+
+def _same_arrays(first: tuple[Any, ...], second: tuple[Any, ...]) -> bool:
+    """Equality of arrays that are read back only if they are not the very same."""
+    if len(first) != len(second):
+        return False
+    for a, b in zip(first, second, strict=True):
+        if a.index != b.index and (len(a) != len(b) or not dr.all(a == b)):
+            return False
+    return True

@@ -1,0 +1,165 @@
+"""``recorded``: what is replayed is what would have been rendered, whatever has changed meanwhile."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from test_integrator import camera, full_scene, shadowmap, small_scene
+from test_pending import lit_scene
+
+from shadowmap_dr import ShadowmapError
+from shadowmap_dr.renderer import Renderer
+
+VERTICES = "ball.vertex_positions"
+FEW = {"emitter_samples": 4, "environment_samples": 8}
+
+
+def both(**options: Any) -> tuple[Any, Any]:
+    """The plug-in as it is, and recorded."""
+    return shadowmap(**options), shadowmap(recorded=True, **options)
+
+
+def recordings(integrator: Any) -> int:
+    return sum(record.recorded.recordings for record in integrator.shell.scenes)
+
+
+def step(scene: Any, integrator: Any, key: str, value: Any, **arguments: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Image with a new value of a parameter, and the gradients of a weighted sum of it."""
+    params = mi.traverse(scene)
+    value = type(value)(value)
+    dr.enable_grad(value)
+    params[key] = value
+    params.update()
+    image = mi.render(scene, params, integrator=integrator, **arguments)
+    weight = np.random.default_rng(1).uniform(0, 1, image.shape).astype(np.float32)
+    dr.backward(dr.sum(image * mi.TensorXf(weight), axis=None))
+    return image.numpy(), np.concatenate([np.ravel(dr.grad(part).numpy()) for part in _arrays(value)])
+
+
+def _arrays(value: Any) -> list[Any]:
+    return [value.matrix] if isinstance(value, mi.Transform4f) else [value]
+
+
+def assert_same(plain: tuple[np.ndarray, np.ndarray], replayed: tuple[np.ndarray, np.ndarray]) -> None:
+    np.testing.assert_allclose(replayed[0], plain[0], atol=1e-5)
+    assert np.abs(plain[1]).max() > 1e-3
+    np.testing.assert_allclose(replayed[1], plain[1], atol=2e-4 * np.abs(plain[1]).max())
+
+
+def test_steps_are_replayed(variant: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = small_scene(aside={**camera(), "to_world": mi.ScalarTransform4f().look_at([3, -3, 2.2], [0, 0, 0.5], [0, 0, 1])})
+    plain, recorded = both()
+    vertices = mi.Float(dr.detach(mi.traverse(scene)[VERTICES]))
+    counts = []
+    for by in (0.0, 0.02, 0.1, -0.3):
+        for sensor in (0, 1):
+            assert_same(*(step(scene, one, VERTICES, vertices + by, sensor=sensor) for one in (plain, recorded)))
+        counts.append(recordings(recorded))
+    # The second camera is the first one with other numbers. At first Mitsuba's own arrays still change their kind.
+    assert 2 <= counts[1] <= 6 and counts[1:] == 3 * counts[1:2]
+    monkeypatch.setattr(Renderer, "render", lambda self, **options: pytest.fail("not replayed"))
+    step(scene, recorded, VERTICES, vertices + 0.05)
+
+
+@pytest.mark.parametrize(
+    ("kind", "key"),
+    [
+        ("sky", "sky.to_world"),
+        ("sky", "box.vertex_positions"),
+        ("sky", "camera.to_world"),
+        ("lamps", "lamp.to_world"),
+        ("lamps", "lamp.emitter.radiance.value"),
+        ("lamps", "bulb.position"),
+        ("lamps", "torch.cutoff_angle"),
+        ("lamps", "floor.to_world"),
+    ],
+)
+def test_lights_and_cameras_have_gradients(variant: str, kind: str, key: str) -> None:
+    scene = lit_scene(kind)
+    value = mi.traverse(scene)[key]
+    value = type(value)(value)
+    plain, recorded = both(**FEW)
+    for by in (0.0, 0.01, 0.02):
+        if isinstance(value, mi.Transform4f):
+            new = value @ mi.Transform4f().translate([by, 0, by])
+        else:
+            new = type(value)(value + by)
+        assert_same(*(step(scene, integrator, key, new) for integrator in (plain, recorded)))
+
+
+def test_materials_may_change_and_have_gradients(variant: str) -> None:
+    scene = full_scene()
+    params = mi.traverse(scene)
+    texture = next(key for key in params.keys() if key.endswith("reflectance.data"))
+    plain, recorded = both()
+    vertices = mi.Float(dr.detach(params[VERTICES]))
+    images = []
+    for value in (0.2, 0.7):
+        params[texture] = dr.full(mi.TensorXf, value, (4, 4, 3))
+        params.update()
+        expected, found = (step(scene, integrator, VERTICES, vertices) for integrator in (plain, recorded))
+        assert_same(expected, found)
+        images.append(found[0])
+    assert np.abs(images[1] - images[0]).max() > 0.1
+    # The backward pass to what Mitsuba evaluates itself is not recorded.
+    new = mi.TensorXf(np.random.default_rng(2).uniform(0.2, 0.8, (4, 4, 3)).astype(np.float32))
+    params[VERTICES] = vertices
+    assert_same(*(step(scene, integrator, texture, new) for integrator in (plain, recorded)))
+
+
+def test_other_sizes_are_recorded_anew(variant: str) -> None:
+    plain, recorded = both()
+    scene = small_scene()
+    vertices = mi.Float(dr.detach(mi.traverse(scene)[VERTICES]))
+    film = mi.traverse(scene)["camera.film.size"]
+    for arguments in ({"spp": 1}, {"spp": 4}, {"spp": 1}):
+        assert_same(*(step(scene, integrator, VERTICES, vertices, **arguments) for integrator in (plain, recorded)))
+    params = mi.traverse(scene)
+    params["camera.film.size"] = film // 2
+    params.update()
+    expected, found = (step(scene, integrator, VERTICES, vertices) for integrator in (plain, recorded))
+    assert found[0].shape == (32, 32, 3)
+    assert_same(expected, found)
+
+
+def test_other_scenes_come_and_go(variant: str) -> None:
+    """Mitsuba's objects have numbers, which recordings may have seen."""
+    plain, recorded = both()
+    scene, others = small_scene(), [full_scene() for _ in range(2)]
+    vertices = mi.Float(dr.detach(mi.traverse(scene)[VERTICES]))
+    for by in (0.0, 0.1, 0.2, 0.3):
+        assert_same(*(step(scene, integrator, VERTICES, vertices + by) for integrator in (plain, recorded)))
+        if by == 0.1:
+            others += [full_scene()]
+        elif others:
+            others.pop(0)
+
+
+def test_aovs_and_bad_samples(variant: str) -> None:
+    scene = small_scene()
+    plain, recorded = both(aovs="depth,visibility")
+    images = [mi.render(scene, integrator=integrator).numpy() for integrator in (plain, recorded)]
+    assert images[1].shape == images[0].shape and recorded.aov_names() == plain.aov_names()
+    np.testing.assert_allclose(images[1], images[0], atol=1e-5)
+    with pytest.raises(ShadowmapError, match="spp is -1"):
+        recorded.shell.primal(scene, scene.sensors()[0], -1)
+
+
+def test_within_a_frozen_function(variant: str) -> None:
+    """A user's own recording goes before."""
+    scene = small_scene()
+    plain, recorded = both()
+    mi.render(scene, integrator=recorded)
+    before = recordings(recorded)
+
+    @dr.freeze
+    def image(scene: Any) -> Any:
+        return mi.render(scene, integrator=recorded)
+
+    for _ in range(3):
+        np.testing.assert_allclose(image(scene).numpy(), mi.render(scene, integrator=plain).numpy(), atol=1e-5)
+    assert recordings(recorded) == before

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
 from typing import Any
 
 import drjit as dr
@@ -137,6 +139,19 @@ def test_other_scenes_come_and_go(variant: str) -> None:
             others += [full_scene()]
         elif others:
             others.pop(0)
+
+
+def test_scenes_are_not_kept_alive(variant: str) -> None:
+    scene = small_scene(integrator={"type": "shadowmap", "recorded": True})
+    params = mi.traverse(scene)
+    dr.enable_grad(params[VERTICES])
+    params.update()
+    dr.backward(dr.sum(mi.render(scene, params)))
+    assert recordings(scene.integrator()) == 2
+    alive = weakref.ref(scene.integrator())
+    del scene, params
+    gc.collect()
+    assert alive() is None
 
 
 def test_aovs_and_bad_samples(variant: str) -> None:

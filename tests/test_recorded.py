@@ -57,12 +57,12 @@ def test_steps_are_replayed(variant: str, monkeypatch: pytest.MonkeyPatch) -> No
     plain, recorded = both()
     vertices = mi.Float(dr.detach(mi.traverse(scene)[VERTICES]))
     counts = []
-    for by in (0.0, 0.02, 0.1, -0.3):
+    for by in (0.0, 0.02, 0.1, -0.3, 0.2, -0.1):
         for sensor in (0, 1):
             assert_same(*(step(scene, one, VERTICES, vertices + by, sensor=sensor) for one in (plain, recorded)))
         counts.append(recordings(recorded))
-    # The second camera is the first one with other numbers. At first Mitsuba's own arrays still change their kind.
-    assert 2 <= counts[1] <= 6 and counts[1:] == 3 * counts[1:2]
+    # The second camera is the first one with other numbers. At first Mitsuba's own arrays, and fits, still change their kind.
+    assert 2 <= counts[0] <= 4 and counts[3] <= 8 and counts[3:] == 3 * counts[3:4]
     monkeypatch.setattr(Renderer, "render", lambda self, **options: pytest.fail("not replayed"))
     step(scene, recorded, VERTICES, vertices + 0.05)
 

@@ -44,36 +44,50 @@ def label_of(entry: dict[str, Any]) -> str:
 
 
 def plot(path: Path, summaries: Sequence[dict[str, Any]]) -> None:
-    """Alignment over iterations, and at the end over the size of the filter; bands and bars are standard deviations."""
+    """Alignment over iterations for each number of lights, and at the end over the size of the filter.
+
+    Bands and bars are standard deviations; of more than three curves in one picture only the first one has a band.
+    """
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(11, 4.2), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    for k, entry in enumerate(summaries):
-        x, mean, std = (np.array(entry[key]) for key in ("curve_iterations", "curve_mean", "curve_std"))
-        left.plot(x, mean, color=f"C{k % 10}", ls="-" if k < 10 else "--", label=f"n = {entry['lights']}, {label_of(entry)}")
-        left.fill_between(x, mean - std, np.minimum(mean + std, 1), color=f"C{k % 10}", alpha=0.12, linewidth=0)
-    left.set_xlabel("iteration")
-    left.set_ylabel("alignment")
-    left.legend(fontsize=6)
-    for k, lights in enumerate(sorted({entry["lights"] for entry in summaries})):
-        own = [entry for entry in summaries if entry["lights"] == lights and _is_plain(entry)]
-        own.sort(key=lambda entry: entry["filter_size"])
-        sizes = [entry["filter_size"] for entry in own]
-        mean, std = (np.array([entry[f"alignment_{key}"] for entry in own]) for key in ("mean", "std"))
-        if own:
-            positions = np.array(sizes) + 0.15 * k  # side by side
-            below, above = std, np.minimum(std, 1 - mean)
-            right.errorbar(positions, mean, yerr=[below, above], marker="o", capsize=3, color=f"C{k}", label=f"n = {lights}")
-    right.set_xlabel("texels of the filter (0: no shadows, 1: no filter)")
-    right.set_ylabel("alignment at the end")
-    right.ticklabel_format(axis="y", useOffset=False)
-    if right.has_data():
-        right.legend()
-    for axes in (left, right):
+    numbers = sorted({entry["lights"] for entry in summaries})
+    columns = min(3, len(numbers) + 1)
+    rows = -(-(len(numbers) + 1) // columns)
+    figure = Figure(figsize=(5 * columns, 3.8 * rows), layout="constrained")
+    panels = list(figure.subplots(rows, columns, squeeze=False).flat)
+    for axes, lights in zip(panels, numbers, strict=False):
+        own = sorted((entry for entry in summaries if entry["lights"] == lights), key=lambda entry: entry["filter_size"])
+        for k, entry in enumerate(own):
+            x, mean, std = (np.array(entry[key]) for key in ("curve_iterations", "curve_mean", "curve_std"))
+            axes.plot(x, mean, color=f"C{k % 10}", label=label_of(entry))
+            if len(own) <= 3 or k == 0:
+                axes.fill_between(x, mean - std, np.minimum(mean + std, 1), color=f"C{k % 10}", alpha=0.12, linewidth=0)
+        axes.set(title=f"n = {lights}", xlabel="iteration", ylabel="alignment")
+        axes.legend(fontsize=7, loc="lower right")
+    _plot_sizes(panels[len(numbers)], [entry for entry in summaries if _is_plain(entry)])
+    for axes in panels[len(numbers) + 1 :]:
+        axes.set_axis_off()
+    for axes in panels[: len(numbers) + 1]:
         axes.grid(True, alpha=0.3)
     with atomic(path) as temporary:
-        figure.savefig(temporary, dpi=130)
+        figure.savefig(temporary, dpi=100)
+
+
+def _plot_sizes(axes: Any, summaries: Sequence[dict[str, Any]]) -> None:
+    """Alignment at the end over the size of the filter, a line for each number of lights and type of filter."""
+    series: dict[tuple[int, str], list[dict[str, Any]]] = {}
+    for entry in sorted(summaries, key=lambda entry: (entry["lights"], entry["filter_size"])):
+        series.setdefault((entry["lights"], entry["filter"]), []).append(entry)
+    for k, ((lights, filter), own) in enumerate(series.items()):
+        mean, std = (np.array([entry[f"alignment_{key}"] for entry in own]) for key in ("mean", "std"))
+        positions = np.array([entry["filter_size"] for entry in own]) + 0.15 * k  # side by side
+        label = f"n = {lights}" + ("" if filter == "gaussian" else f", {filter}")
+        bars = [std, np.minimum(std, 1 - mean)]
+        axes.errorbar(positions, mean, yerr=bars, marker="o", ms=4, capsize=2, color=f"C{k}", label=label)
+    axes.set(xlabel="texels of the filter (0: no shadows, 1: no filter)", ylabel="alignment at the end")
+    axes.ticklabel_format(axis="y", useOffset=False)
+    if series:
+        axes.legend(fontsize=7, loc="lower right")
 
 
 def pictures(path: Path, problems: Sequence[LightProblem], records: Sequence[Sequence[dict[str, Any]]]) -> None:

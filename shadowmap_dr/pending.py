@@ -45,11 +45,7 @@ class Inputs:
 
     def backward(self, data: SceneData) -> None:
         """Pass the leaves' gradients on to the scene's parameters, through the same data, read again."""
-        outer = attached_arrays(data)
-        for array, leaf in zip(outer, self._leaves, strict=True):
-            dr.accum_grad(array, dr.grad(leaf))
-        dr.enqueue(dr.ADMode.Backward, outer)
-        dr.traverse(dr.ADMode.Backward)
+        pass_on(attached_arrays(data), [dr.grad(leaf) for leaf in self._leaves])
 
 
 @dataclass(frozen=True)
@@ -119,6 +115,14 @@ def attached_names(scene: Any, sensor: Any) -> tuple[str, ...]:
 
 def _attached(held: Mapping[str, Any]) -> tuple[str, ...]:
     return tuple(name for name, value in held.items() if dr.grad_enabled(value))
+
+
+def pass_on(arrays: list[Any], gradients: list[Any]) -> None:
+    """Add gradients to all that arrays are attached to."""
+    for array, gradient in zip(arrays, gradients, strict=True):
+        dr.accum_grad(array, gradient)
+    dr.enqueue(dr.ADMode.Backward, arrays)
+    dr.traverse(dr.ADMode.Backward)
 
 
 def backward(image: Any, gradient: Any) -> None:

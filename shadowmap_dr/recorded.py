@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .garbage import uncollected
-from .pending import backward
+from .pending import backward, pass_on
 from .records import attached_places, map_arrays
 from .renderer import Renderer
 
@@ -37,10 +37,7 @@ class Recorded:
             return
         with uncollected():
             found = self._gradients(spp, places, dr.detach(gradient), plain(renderer))
-        for array, inner in zip(outer, found, strict=True):
-            dr.accum_grad(array, inner)
-        dr.enqueue(dr.ADMode.Backward, outer)
-        dr.traverse(dr.ADMode.Backward)
+        pass_on(outer, found)
 
     @property
     def recordings(self) -> int:

@@ -205,8 +205,7 @@ def test_stored_comparison_is_of_these_problems() -> None:
     assert list(stored) == list(compare.PROBLEMS)
     for name, record in stored.items():
         assert record["race"]["bar"] == dict(compare.PROBLEMS[name].bar)
-        assert record["race"]["counts"] == list(compare.counts_for_race(name, record))
+        assert record["race"]["counts"] == record["fair"]
         passed = [entry["solved"] for entry in record["search"] if entry["counts"] == record["fair"]]
-        tried = {tuple(entry["counts"]) for entry in record["search"]}
-        assert (len(passed) >= 3 and all(passed)) or (not record["fair"] and tried == set(compare.PROBLEMS[name].candidates))
+        assert len(passed) >= 3 and all(passed)
         assert record["race"]["methods"].keys() == set(compare.METHODS)

@@ -112,7 +112,24 @@ def test_program_writes_record_table_and_plots(tmp_path: Path) -> None:
     assert len(stored["rows"]) == 3 and len(stored["comparison"]) == 1
 
 
-@pytest.mark.parametrize("content", ["{}", "[1]", '[{"object": "spot"}]', "nonsense"])
+def test_a_table_goes_on_from_what_an_earlier_one_has(tmp_path: Path) -> None:
+    first = [record("shadows", run, 0.1, rotation_error_curve=[10, 1.23456, 0.1]) for run in range(2)]
+    old = pose_table.write(tmp_path / "old", [*first, record("mitsuba", 0, 0.3)], timed=first)
+    again = record("shadows", 1, 0.2, seconds_per_iteration=7.0)
+    failed = record("rasterizer", 0, None, rotation_error_curve=[10, None, None])
+    report.write_json(tmp_path / "new" / "pose.json", [again, failed])
+    table = pose_table.write(tmp_path / "out", pose_table.read([tmp_path / "old", tmp_path / "new"]))
+    found = {row.method: row.errors("rotation_error_deg").tolist() for row in table}
+    assert found == {"shadows": [0.1, 0.2], "rasterizer": [np.inf], "mitsuba": [0.3]}
+    by_method = {row["method"]: row for row in report.read_json(tmp_path / "out" / "pose.json")["rows"]}
+    assert by_method["shadows"]["runs"]["rotation_error_curve"] == [[10, 1.23, 0.1], [10, 1, 0.2]]
+    assert by_method["rasterizer"]["runs"]["rotation_error_curve"] == [[10, None, None]]
+    assert by_method["shadows"]["seconds_per_step"] == 0.25  # somebody took the time for the earlier table
+    mitsuba, = (row for row in old if row.method == "mitsuba")
+    assert by_method["mitsuba"] == mitsuba.plain()
+
+
+@pytest.mark.parametrize("content", ['{"rows": [{}]}', '{"rows": [1]}', "{}", "[1]", '[{"object": "spot"}]', "nonsense"])
 def test_unusable_folders(tmp_path: Path, content: str) -> None:
     with pytest.raises(ShadowmapError, match="no file"):
         pose_table.read([tmp_path])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -33,7 +34,9 @@ def plot_convergence(
             axes = grid[i, j]
             for method, runs in curves.get((name, resolution), {}).items():
                 errors = np.array(runs, np.float64)  # None, of a run that failed, becomes NaN
-                low, middle, high = np.nanpercentile(errors, (25, 50, 75), axis=0)
+                with warnings.catch_warnings():  # no run may have come as far as a step: a gap in the plot
+                    warnings.simplefilter("ignore", RuntimeWarning)
+                    low, middle, high = np.nanpercentile(errors, (25, 50, 75), axis=0)
                 line, = axes.plot(middle, COLOURS.get(method, "0.3"), linewidth=1.4, label=method)
                 axes.fill_between(np.arange(len(middle)), low, high, color=line.get_color(), alpha=0.25, linewidth=0)
                 handles[method] = line

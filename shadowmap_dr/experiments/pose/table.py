@@ -1,7 +1,8 @@
 """The table of poses found: all records of the pose experiment together, compared with Mitsuba's on the same starts.
 
 ``python -m shadowmap_dr.experiments.pose.table FOLDER... --out docs/results`` reads the `pose.json` of each folder and writes
-`pose.json` (all rows, compact), `pose-table.md` (the same for readers) and plots of the convergence `pose-*.png`.
+`pose.json` (all rows, compact), `pose-table.md` (the same for readers) and plots of the convergence `pose-*.png`. A FOLDER may
+hold an earlier table: what it has is kept, and runs of folders named after it take the place of its own.
 """
 
 from __future__ import annotations
@@ -50,8 +51,11 @@ _SUMMARY = {
     "with shadows, object out of view": ("shadow-only", "shadows"),
 }
 _ERRORS = ("rotation_error_deg", "translation_error_x100")
+_CURVE = "rotation_error_curve"
 _PER_RUN = ("run", "start", "final", *_ERRORS, "recovered")
 _SETTINGS = ("seed", "iterations", "settings")
+#: Of the errors along a run, which only plots need (they take most of the file's room).
+_CURVE_DIGITS = 3
 
 
 @dataclass
@@ -80,12 +84,28 @@ class Row:
         return {
             "case": self.case, "object": self.object, "resolution": self.resolution, "method": self.method,
             **CASES[self.case], **{key: records[0][key] for key in _SETTINGS}, "environment": environment,
-            "runs": {key: [record[key] for record in records] for key in _PER_RUN},
+            "runs": {
+                **{key: [record[key] for record in records] for key in _PER_RUN},
+                _CURVE: [_rounded(record.get(_CURVE)) for record in records],
+            },
             "mean": {key: float(np.mean(self.errors(key))) for key in _ERRORS},
             "median": {key: float(np.median(self.errors(key))) for key in _ERRORS},
             "recovered": self.recovered(), "share_recovered": self.recovered() / len(records),
             "seconds_per_step": self.seconds,
         }  # fmt: skip
+
+
+def _rounded(curve: Sequence[float | None] | None) -> list[float | None] | None:
+    """A curve to a few significant digits; None, and its entries that are, stay."""
+    return curve and [None if value is None else float(f"{value:.{_CURVE_DIGITS}g}") for value in curve]
+
+
+def _records(row: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """What `Row.plain` wrote, as records again."""
+    names = (*CASES["seen"], *_SETTINGS, "environment", "object", "resolution", "method", "seconds_per_step")
+    shared = {name: row[name] for name in names}
+    runs = row["runs"]
+    return [{**shared, **dict(zip(runs, values, strict=True))} for values in zip(*runs.values(), strict=True)]
 
 
 def rows(records: Iterable[Mapping[str, Any]], timed: Iterable[Mapping[str, Any]] = ()) -> list[Row]:
@@ -114,7 +134,7 @@ def rows(records: Iterable[Mapping[str, Any]], timed: Iterable[Mapping[str, Any]
             if any(record[name] != first[name] for name in _SETTINGS[1:]):
                 which = f"runs {first['run']} and {run} of {row.method} for {row.object} at {row.resolution}"
                 raise ShadowmapError(f"{which} were made with different settings: run one of them again.")
-        row.seconds = float(np.median(seconds[key])) if key in seconds else None
+        row.seconds = float(np.median(seconds[key])) if key in seconds else first.get("seconds_per_step")
     order = (list(CASES).index, str, int, METHODS.index)
     return sorted(result.values(), key=lambda row: tuple(
         rank(value) for rank, value in zip(order, (row.case, row.object, row.resolution, row.method), strict=True)))
@@ -209,11 +229,21 @@ def _cells(table: Sequence[Row]) -> list[str]:
 
 
 def read(folders: Iterable[str | Path]) -> list[dict[str, Any]]:
-    """The records of all folders (or files), in order."""
+    """The records of all folders (or files), in order. A file may be an earlier table (`write`).
+
+    Raises:
+        ShadowmapError: a file is missing, or is neither a list of records nor a table.
+    """
     result: list[dict[str, Any]] = []
     for folder in map(Path, folders):
         path = folder / "pose.json" if folder.is_dir() else folder
         records = report.read_json(path)
+        if isinstance(records, dict) and "rows" in records:
+            try:
+                result += [record for row in records["rows"] for record in _records(row)]
+            except (KeyError, TypeError, ValueError) as error:
+                raise ShadowmapError(f"{path} is no table of the pose experiment ({error!r}).") from error
+            continue
         if not isinstance(records, list) or not all(isinstance(entry, dict) and _ERRORS[0] in entry for entry in records):
             raise ShadowmapError(f"{path} is no list of records of the pose experiment.")
         result += records
@@ -232,7 +262,9 @@ def write(out: Path, records: Sequence[Mapping[str, Any]], timed: Sequence[Mappi
         for row in table:
             if row.case == case:
                 panel = curves.setdefault((row.object, row.resolution), {})
-                panel[row.method] = [record["rotation_error_curve"] for record in row.runs.values()]
+                drawn = [record[_CURVE] for record in row.runs.values() if record.get(_CURVE)]
+                if drawn:
+                    panel[row.method] = drawn
         plot_convergence(out / f"pose-{case}.png", curves)
     return table
 

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from test_integrator import camera, floor, render, shadowmap, small_scene
+from integrator_scenes import camera, floor, render, shadowmap, small_scene
 
 from shadowmap_dr import Renderer, ShadowmapError
 from shadowmap_dr.sensors import sensors_of

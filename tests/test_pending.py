@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import test_soft_lights as soft
-from test_integrator import camera, shadowmap, small_scene
+from integrator_scenes import camera, shadowmap, small_scene
 
 from shadowmap_dr import pending
 from shadowmap_dr.renderer import Renderer

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from test_integrator import camera, full_scene, shadowmap, small_scene
+from integrator_scenes import camera, full_scene, shadowmap, small_scene
 from test_pending import lit_scene
 
 from shadowmap_dr import ShadowmapError

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -163,6 +164,16 @@ def test_search_takes_the_cheapest_counts_that_succeed_with_all_seeds(monkeypatc
     record = {"fair": None, "search": [{"counts": list(counts), "solved": solved} for counts, solved in entries]}
     assert compare.counts_for_race("fake", record) == (1, 1, 4, 14)
     assert compare.counts_for_race("fake", {**record, "fair": [1, 1, 8, 18]}) == (1, 1, 8, 18)
+
+
+def test_guiding_is_part_of_a_setting(variant: str) -> None:
+    import compare
+
+    assert compare.projective((1, 2, 3, 4)) == {"type": "direct_projective", "sppc": 1, "sppp": 2, "sppi": 3, "guiding": "none"}
+    assert compare.projective((1, 2, 3, 4, "grid"))["guiding"] == "grid"
+    guided = [counts for problem in compare.PROBLEMS.values() for counts in problem.candidates if len(counts) == 5]
+    for counts in guided:
+        assert mi.load_dict(compare.projective(counts)).guiding == counts[4]
 
 
 def test_solved_means_ten_steps_in_a_row() -> None:

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import drjit as dr
 import numpy as np
@@ -36,6 +36,8 @@ TURN = 2.0
 WARM_UP = 2
 # Ours: the faster loop, the loop of all integrators with the plug-in's parameter `recorded`, and without.
 METHODS = ("shadowmap, frozen", "shadowmap, recorded", "shadowmap", "direct_projective")
+# sppc, sppp, sppi, samples of the image in the loss, and the guiding if there is any.
+Counts: TypeAlias = tuple[int, int, int, int] | tuple[int, int, int, int, str]
 
 
 @dataclass(frozen=True)
@@ -44,12 +46,12 @@ class Problem:
 
     bar         largest errors, as the notebook's `error` names them
     steps       after which a method has failed
-    candidates  sppc, sppp, sppi, samples of the image in the loss: from the cheapest on
+    candidates  of Mitsuba's settings, the cheapest step first
     """
 
     bar: Mapping[str, float]
     steps: int
-    candidates: tuple[tuple[int, int, int, int], ...]
+    candidates: tuple[Counts, ...]
 
 
 PROBLEMS = {
@@ -68,7 +70,7 @@ PROBLEMS = {
         200,
         (
             (0, 0, 1, 1), (0, 0, 1, 4), (0, 0, 2, 4), (0, 0, 4, 16), (0, 0, 16, 16), (0, 0, 64, 64), (0, 0, 256, 64),
-            (0, 0, 1024, 64),
+            (0, 0, 16, 16, "grid"), (0, 0, 64, 64, "grid"), (0, 0, 256, 64, "grid"), (0, 0, 1024, 64),
         ),  # fmt: skip
     ),
 }
@@ -118,10 +120,10 @@ def load(name: str, image_samples: int, **parameters: Any) -> dict[str, Any]:
     return run(HERE / f"{name}.ipynb", skip={"run"}, image_samples=image_samples, **parameters)
 
 
-def projective(counts: tuple[int, ...]) -> dict[str, Any]:
+def projective(counts: Counts) -> dict[str, Any]:
     """Mitsuba's integrator with sample counts."""
-    sppc, sppp, sppi, _ = counts
-    return {"type": "direct_projective", "sppc": sppc, "sppp": sppp, "sppi": sppi, "guiding": "none"}
+    sppc, sppp, sppi, _, *guiding = counts
+    return {"type": "direct_projective", "sppc": sppc, "sppp": sppp, "sppi": sppi, "guiding": guiding[0] if guiding else "none"}
 
 
 def search(
@@ -158,14 +160,14 @@ def search(
     save()
 
 
-def counts_for_race(name: str, record: dict[str, Any]) -> tuple[int, ...]:
+def counts_for_race(name: str, record: dict[str, Any]) -> Counts:
     """The fair sample counts; where a search has found none, those that solved the problem with most seeds, the cheapest of them.
 
     A method with the latter would have to start again now and then: what is measured is the least that it takes.
     """
     if record.get("fair"):
         return tuple(record["fair"])
-    solved: dict[tuple[int, ...], int] = {}
+    solved: dict[Counts, int] = {}
     for entry in record.get("search", ()):
         counts = tuple(entry["counts"])
         solved[counts] = solved.get(counts, 0) + entry["solved"]
@@ -175,7 +177,7 @@ def counts_for_race(name: str, record: dict[str, Any]) -> tuple[int, ...]:
 
 
 def race(
-    name: str, problem: Problem, fair: tuple[int, ...], on_step: Callable[[str], None] = lambda note: None, **parameters: Any
+    name: str, problem: Problem, fair: Counts, on_step: Callable[[str], None] = lambda note: None, **parameters: Any
 ) -> dict[str, Any]:
     """All methods in turns, from the same start until each has solved the problem or has used up its steps."""
     names = load(name, fair[3], **parameters)

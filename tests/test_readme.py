@@ -10,7 +10,7 @@ import mitsuba as mi
 import pytest
 
 import shadowmap_dr
-from shadowmap_dr.integrator import Options
+from shadowmap_dr.integrator_options import Options
 
 ROOT = Path(__file__).resolve().parent.parent
 

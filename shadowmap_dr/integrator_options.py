@@ -1,0 +1,142 @@
+"""Parameters of the plug-in ``shadowmap``: their names, types and defaults in XML, and what the renderer makes of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+from .errors import ShadowmapError
+from .render_settings import RenderSettings
+from .shadow import ShadowSettings
+
+PLUGIN = "shadowmap"
+
+# Names that Mitsuba's own `aov` integrator has for channels of ours.
+_SYNONYMS = {"sh_normal": "normal"}
+
+
+@dataclass(frozen=True)
+class Options:
+    """Parameters of the plug-in, as in XML or a dictionary.
+
+    shadow_map_resolution  texels along each side of a shadow map, 1 to 4096
+    shadow_method          ``auto`` (``evsm4``), ``vsm``, ``esm``, ``evsm2``, ``evsm4``, ``msm``, ``csm``, ``pcf``, ``standard``
+                           (no shadow gradients) or ``none`` (no shadows); see ``shadowmap_dr.shadow.ShadowSettings``
+    shadow_filter          ``box``, ``gaussian``, ``wendland`` or ``none``
+    shadow_filter_size     odd number of texels
+    shadow_antialias       anti-alias shadow maps; without it casters get no gradient from the outlines of their shadows
+    shadow_bleeding        visibilities below this count as 0, against light that bleeds through (``vsm``, ``evsm``, ``msm``)
+    shadow_order           terms of the Fourier series of ``csm``, 2 to 16
+    shadow_supersampling   texels along each side that are averaged into one of the map, 1 to 8 (pre-filtered methods)
+    shadow_receiver_range  tell depths apart only from the first receiver on, against light that bleeds through
+    shadow_cull_backfaces  leave the backs of closed shapes out of the maps of directional lights: faster, and the same as long as
+                           no shape turns inside out, not even in a fold
+    emitter_samples        points on each area light that cast shadows
+    environment_samples    directions of an environment that cast shadows
+    soft_map_resolution    texels along each side of their shadow maps
+    emitter_shadows        ``samples``, or ``single``: one map for each area light, penumbrae estimated from it
+    shadow_samples         look-ups along each side of a pixel, 1 to 8; 0 chooses
+    antialias              anti-alias the image; without it outlines have no gradient
+    ambient                radiance of unshadowed light from all directions, beside that of the scene's environment
+    hide_emitters          the camera looks through area lights, and sees black instead of environments; both light the scene
+    aovs                   further channels, separated by commas: names of ``shadowmap_dr.aovs.AOVS``, or ``label:name`` to call
+                           the channel ``label``
+    tessellation           triangles around spheres, disks and cylinders, at least 3; curves have half as many around them, and
+                           B-splines an eighth of it along each segment
+    recorded               ``mi.render`` and its backward pass are recorded with ``dr.freeze`` and replayed while only numbers
+                           change: up to twice as fast where passes are short, slower where they are long, since the backward
+                           pass renders again. Backward passes to materials and textures are not recorded
+    compat                 conventions of Worchel and Alexa's code
+    """
+
+    shadow_map_resolution: int = 256
+    shadow_method: str = "auto"
+    shadow_filter: str = "gaussian"
+    shadow_filter_size: int = 3
+    shadow_antialias: bool = True
+    shadow_bleeding: float = 0.0
+    shadow_order: int = 4
+    shadow_supersampling: int = 1
+    shadow_receiver_range: bool = True
+    shadow_cull_backfaces: bool = False
+    shadow_samples: int = 0
+    emitter_samples: int = 32
+    environment_samples: int = 64
+    soft_map_resolution: int = 128
+    emitter_shadows: str = "samples"
+    antialias: bool = True
+    ambient: float = 0.0
+    hide_emitters: bool = False
+    aovs: str = ""
+    tessellation: int = 64
+    recorded: bool = False
+    compat: bool = False
+
+    @classmethod
+    def from_properties(cls, props: Any) -> Options:
+        """Read ``mi.Properties``. Raises ShadowmapError for an unknown parameter or a value of another type."""
+        defaults = {f.name: f.default for f in fields(cls)}
+        values = {}
+        for name in props.keys():  # noqa: SIM118  (Properties is no dictionary)
+            if name not in defaults:
+                raise ShadowmapError(f"'{PLUGIN}' has no parameter '{name}': it has {', '.join(sorted(defaults))}.")
+            values[name] = _typed(name, props[name], type(defaults[name]))
+        return cls(**values)
+
+    @property
+    def labelled_aovs(self) -> tuple[tuple[str, str], ...]:
+        """(label, name) of each further channel."""
+        pairs = []
+        for entry in filter(None, (part.strip() for part in self.aovs.split(","))):
+            label, _, name = entry.rpartition(":")
+            name = name.strip()
+            pairs.append((label.strip() or name, _SYNONYMS.get(name, name)))
+        labels = [label for label, _ in pairs]
+        for label in labels:
+            if labels.count(label) > 1:
+                raise ShadowmapError(f"aovs is {self.aovs!r}: '{label}' is there twice; label one of them, as in a:depth.")
+        return tuple(pairs)
+
+    def render_settings(self) -> RenderSettings:
+        """The same as the renderer wants it. Raises ShadowmapError for values out of range."""
+        if self.tessellation < 3:
+            raise ShadowmapError(f"tessellation is {self.tessellation}: spheres need at least 3 triangles around them.")
+        try:
+            shadow = ShadowSettings(
+                method=self.shadow_method,
+                resolution=self.shadow_map_resolution,
+                filter=self.shadow_filter,
+                filter_size=self.shadow_filter_size,
+                antialias=self.shadow_antialias,
+                compat=self.compat,
+                bleeding=self.shadow_bleeding,
+                order=self.shadow_order,
+                supersampling=self.shadow_supersampling,
+                receiver_range=self.shadow_receiver_range,
+                cull_backfaces=self.shadow_cull_backfaces,
+            )
+        except ValueError as error:
+            raise ShadowmapError(str(error)) from None
+        return RenderSettings(
+            shadow=shadow,
+            antialias=self.antialias,
+            ambient=self.ambient,
+            hide_emitters=self.hide_emitters,
+            shadow_samples=self.shadow_samples,
+            emitter_samples=self.emitter_samples,
+            environment_samples=self.environment_samples,
+            soft_map_resolution=self.soft_map_resolution,
+            emitter_shadows=self.emitter_shadows,
+            aovs=tuple(name for _, name in self.labelled_aovs),
+        )
+
+
+def _typed(name: str, value: Any, kind: type) -> Any:
+    # A bool is an int to Python, not to us; and numbers may be written without a decimal point.
+    if type(value) is kind:
+        return value
+    if kind is float and type(value) is int:
+        return float(value)
+    words = {int: "an integer", float: "a number", bool: "a boolean", str: "a string"}
+    shown = repr(value) if isinstance(value, bool | int | float | str) else type(value).__name__
+    raise ShadowmapError(f"'{name}' of '{PLUGIN}' is {shown}, but must be {words[kind]}.")

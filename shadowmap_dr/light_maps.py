@@ -33,10 +33,9 @@ from .shadow import (
     shape_boxes,
     spot_view,
     stack_views,
-    to_light_space,
+    vertices_in_maps,
     visibility,
 )
-from .shadow.camera import of_map
 
 #: Spot lights and projectors with a wider cone (half-angle in degrees) use the faces of a cube.
 WIDEST_SPOT = 60.0
@@ -143,13 +142,7 @@ def make_maps(
     """
     views = [view for light, kind in zip(lights, plan.kinds, strict=True) for view in _views(plan, light, kind, settings)]
     stacked = stack_views(views)
-    count, vertices = len(views), geometry.vertex_count
-    lane = dr.arange(mi.UInt32, count * vertices)
-    map_index = lane // vertices if count > 1 else mi.UInt32(0)
-    vertex = lane - map_index * vertices
-    p_world = dr.gather(mi.Point3f, geometry.positions, vertex)
-    lanes = map_index if count > 1 else dr.zeros(mi.UInt32, vertices)
-    p_light = to_light_space(of_map(stacked, lanes, count), p_world)
+    p_light, lanes, vertex = vertices_in_maps(stacked, geometry.positions)
     if settings.compat:
         frusta = _compat_frusta(plan, stacked)
     else:
@@ -169,7 +162,7 @@ def make_maps(
             settings.receiver_range,
         )
         frusta = _from_beams_on(plan, frusta)
-    culled = None if transparent is not None else _culled(plan, count, outward)
+    culled = None if transparent is not None else _culled(plan, stacked.count, outward)
     maps = render_maps(p_light, lanes, geometry.faces, topology, stacked, frusta, settings, transparent, culled)
     return filter_maps(maps)
 

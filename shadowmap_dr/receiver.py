@@ -27,10 +27,9 @@ from .shadow import (
     filter_maps,
     render_maps,
     stack_views,
-    to_light_space,
+    vertices_in_maps,
     visibility,
 )
-from .shadow.camera import of_map
 
 # Space around the window in a map in shares of its size, and thickness of the slab before the receiver in which casters are not
 # allowed for in shares of the reach.
@@ -131,11 +130,8 @@ class ReceiverShadows:
             ``Float`` (H * W,) in 0..1, top row first: with one light 1 where it is lit, 0 in full shadow. Gradients flow to
             the positions.
         """
-        count, vertices = self.views.count, dr.width(positions) // 3
-        lane = dr.arange(mi.UInt32, count * vertices)
-        light = lane // vertices
-        p = dr.gather(mi.Point3f, positions, lane - light * vertices)
-        p_light = to_light_space(of_map(self.views, light, count), p)
+        count = self.views.count
+        p_light, light, _ = vertices_in_maps(self.views, positions)
         maps = filter_maps(render_maps(p_light, light, self.faces, self.topology, self.views, self.frusta, self.settings))
         dr.eval(maps.values)
         total = mi.Float(0)

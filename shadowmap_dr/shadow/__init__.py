@@ -10,6 +10,7 @@ from .camera import (
     spot_view,
     stack_views,
     to_light_space,
+    vertices_in_maps,
 )
 from .casters import Boxes, casting_shapes, shape_boxes
 from .filters import FILTERS, filter_kernel, filter_map
@@ -46,5 +47,6 @@ __all__ = [
     "standard_visibility",
     "to_light_space",
     "variance_moments",
+    "vertices_in_maps",
     "visibility",
 ]

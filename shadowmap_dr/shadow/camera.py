@@ -166,6 +166,26 @@ def to_light_space(view: Views, p_world: Any) -> Any:
     return backend(p_world).Array3f(dr.dot(d, view.right), dr.dot(d, view.up), dr.dot(d, view.forward))
 
 
+def vertices_in_maps(views: Views, positions: Any) -> tuple[Any, Any, Any]:
+    """All vertices in the light space of each map, map after map.
+
+    Args:
+        views: of the M maps.
+        positions: flat ``Float`` (3V,), world space.
+
+    Returns:
+        ``Array3f`` of width M * V (:func:`to_light_space`), attached to positions and lights, and the map and the vertex of each
+        of these lanes (``UInt32``).
+    """
+    module, count = backend(positions), views.count
+    number = dr.width(positions) // 3
+    lane = dr.arange(module.UInt32, count * number)
+    map_index = lane // number if count > 1 else dr.zeros(module.UInt32, number)
+    vertex = lane - map_index * number
+    p_world = dr.gather(module.Array3f, positions, vertex)
+    return to_light_space(of_map(views, map_index, count), p_world), map_index, vertex
+
+
 def to_clip(view: Views, frustum: Frusta, p_light: Any) -> Any:
     """Clip-space position (``Array4f``) in a map: its ndc square is the frustum's rectangle, depths near..far are -1..1."""
     perspective = view.spread > 0

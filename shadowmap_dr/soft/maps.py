@@ -29,6 +29,7 @@ from ..shadow import (
     render_maps,
     shape_bounds,
     to_light_space,
+    vertices_in_maps,
 )
 from ..shadow.camera import of_map
 from ..shadow.casters import SUNK
@@ -157,11 +158,7 @@ def _make(
     hidden = dr.concat([dr.full(mi.UInt32, plan.hides, plan.maps) for plan in plans])
     dr.eval(views, hidden)
     frusta = _fit(views, hidden, scene, geometry, settings, previous, seen)
-    vertices = geometry.vertex_count
-    lane = dr.arange(mi.UInt32, views.count * vertices)
-    which = lane // vertices
-    vertex = lane - which * vertices
-    p_light = to_light_space(of_map(views, which, views.count), dr.gather(mi.Point3f, geometry.positions, vertex))
+    p_light, which, vertex = vertices_in_maps(views, geometry.positions)
     if any(plan.hides != _NONE for plan in plans):
         own = dr.gather(mi.UInt32, hidden, which) == dr.gather(mi.UInt32, geometry.vertex_shape, vertex)
         # Behind the light's camera, where no triangle is drawn.

@@ -14,7 +14,6 @@ from .. import shadow as _shadow
 from ..errors import ShadowmapError
 from ..raster._types import backend
 from ..shadow import Frusta, LightView, ShadowSettings, Views
-from ..shadow.camera import of_map
 from .bridge import Repeated, cross, drjit_turn, index_array, vector
 from .checks import check_devices, check_floats, check_same
 from .raster import Topology
@@ -116,12 +115,8 @@ def render_maps(
         given = dict(zip(tensors, arrays, strict=True))
         views = [view for k, light in enumerate(lights) for view in _light_views(light, k, given, settings)]
         stacked = _shadow.stack_views(views)
-        count, number = len(views), topology.vertex_count
-        module = backend(vertices)
-        lane = dr.arange(module.UInt32, count * number)
-        map_index = lane // number
-        p_world = dr.gather(module.Array3f, vertices.array, lane - map_index * number)
-        p_light = _shadow.to_light_space(of_map(stacked, map_index, count), p_world)
+        count = len(views)
+        p_light, map_index, _ = _shadow.vertices_in_maps(stacked, vertices.array)
         frusta = _fit(stacked, p_light, map_index, settings, previous, given.get("seen"))
         maps = _shadow.render_maps(p_light, map_index, indices, topology._edges, stacked, frusta, settings)
         kept.append((dr.detach(replace(stacked, right=None, up=None, forward=None, origin=None)), frusta))

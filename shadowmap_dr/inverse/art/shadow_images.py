@@ -13,8 +13,7 @@ import numpy.typing as npt
 
 from ...errors import ShadowmapError
 from ...raster import Topology, build_topology
-from ...shadow import Frusta, ShadowSettings, Views, filter_maps, render_maps, to_light_space, visibility
-from ...shadow.camera import of_map
+from ...shadow import Frusta, ShadowSettings, Views, filter_maps, render_maps, vertices_in_maps, visibility
 from .shadow_views import ShadowView
 
 # All casters lie before the receiver, by half of its half-side at least, and within twelve of these. Maps tell no depths apart
@@ -60,12 +59,7 @@ class ShadowImages:
         Returns:
             ``Float``, visibility from 0 (dark) to 1 (lit) of all pixels of all images, row-major, top row first.
         """
-        count = self.views.count
-        number = dr.width(vertices) // 3
-        lane = dr.arange(mi.UInt32, count * number)
-        map_index = lane // number if count > 1 else dr.zeros(mi.UInt32, number)
-        p_world = dr.gather(mi.Point3f, vertices, lane - map_index * number)
-        p_light = to_light_space(of_map(self.views, map_index, count), p_world)
+        p_light, map_index, _ = vertices_in_maps(self.views, vertices)
         maps = render_maps(p_light, map_index, self.faces, self.topology, self.views, self.frusta, self.settings)
         return visibility(filter_maps(maps), self.which, self.points)
 

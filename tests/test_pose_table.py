@@ -129,6 +129,15 @@ def test_a_table_goes_on_from_what_an_earlier_one_has(tmp_path: Path) -> None:
     assert by_method["mitsuba"] == mitsuba.plain()
 
 
+def test_runs_of_several_seeds_and_plots_that_could_only_be_drawn_in_part_are_kept(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    pose_table.write(out, [record("shadows", 0, 0.1, seed=seed) for seed in (0, 1)])
+    assert [(run["seed"], run["run"]) for run in pose_table.read([out])] == [(0, 0), (1, 0)]
+    (out / "pose-seen.png").write_text("of all runs")
+    pose_table.write(out, [*pose_table.read([out]), record("mitsuba", 0, 0.3, rotation_error_curve=None)])
+    assert (out / "pose-seen.png").read_text() == "of all runs"
+
+
 @pytest.mark.parametrize("content", ['{"rows": [{}]}', '{"rows": [1]}', "{}", "[1]", '[{"object": "spot"}]', "nonsense"])
 def test_unusable_folders(tmp_path: Path, content: str) -> None:
     with pytest.raises(ShadowmapError, match="no file"):

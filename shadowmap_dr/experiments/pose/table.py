@@ -52,7 +52,7 @@ _SUMMARY = {
 }
 _ERRORS = ("rotation_error_deg", "translation_error_x100")
 _CURVE = "rotation_error_curve"
-_PER_RUN = ("run", "start", "final", *_ERRORS, "recovered")
+_PER_RUN = ("seed", "run", "start", "final", *_ERRORS, "recovered")
 _SETTINGS = ("seed", "iterations", "settings")
 #: Of the errors along a run, which only plots need (they take most of the file's room).
 _CURVE_DIGITS = 3
@@ -251,20 +251,23 @@ def read(folders: Iterable[str | Path]) -> list[dict[str, Any]]:
 
 
 def write(out: Path, records: Sequence[Mapping[str, Any]], timed: Sequence[Mapping[str, Any]] = ()) -> list[Row]:
-    """Write `pose.json`, `pose-table.md` and plots into the folder `out`; returns the rows."""
+    """Write `pose.json`, `pose-table.md` and plots into the folder `out`; returns the rows.
+
+    Cases in which the curve of a run is not known (tables from before curves were kept) get no plot: the one in `out` stays.
+    """
     table = rows(records, timed)
     io.check_output(out / "pose.json", (".json",))
     report.write_json(out / "pose.json", {"rows": [row.plain() for row in table], "comparison": comparison(table)})
     with io.atomic(out / "pose-table.md") as temporary:
         temporary.write_text(document(table), encoding="utf-8")
     for case in dict.fromkeys(row.case for row in table):
+        if not all(record.get(_CURVE) for row in table if row.case == case for record in row.runs.values()):
+            continue
         curves: dict[tuple[str, int], dict[str, list[list[float]]]] = {}
         for row in table:
             if row.case == case:
                 panel = curves.setdefault((row.object, row.resolution), {})
-                drawn = [record[_CURVE] for record in row.runs.values() if record.get(_CURVE)]
-                if drawn:
-                    panel[row.method] = drawn
+                panel[row.method] = [record[_CURVE] for record in row.runs.values()]
         plot_convergence(out / f"pose-{case}.png", curves)
     return table
 

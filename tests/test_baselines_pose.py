@@ -199,8 +199,27 @@ def test_search_goes_on_within_a_candidate(monkeypatch: pytest.MonkeyPatch) -> N
     assert whole["setting"]["sppi"] == 4 and not whole["untried"]
 
     measured.clear()
-    _, saved = search(stop_after=5)  # two runs and the candidate, then two runs of the other one
+    # The costs of the two, two runs and the candidate, then two runs of the other one.
+    _, saved = search(stop_after=7)
     resumed, _ = search(saved[-1])
     assert measured == [(str(bad), 0), (str(bad), 1), (str(good), 0), (str(good), 1), (str(good), 2)]
     assert resumed["setting"] == whole["setting"]
     assert [len(entry["runs"]) for entry in resumed["measurements"]] == [2, 3]
+
+
+def test_search_skips_what_costs_more_than_a_known_setting(monkeypatch: pytest.MonkeyPatch) -> None:
+    measured: list[str] = []
+
+    def measure(method: MitsubaPose, run: int, iterations: int) -> dict[str, float]:
+        measured.append(str(method.setting))
+        return {"run": run, "mean_error_deg_last_20": 0.01, "offset_x100": 0.1, "seconds_per_iteration": method.setting.sppi}
+
+    monkeypatch.setattr(pose, "_measure", measure)
+    monkeypatch.setattr(pose, "_timed", lambda step: 0.1 * step.__self__.setting.sppi)
+    known, cheap, dear = (ProjectiveSetting(1, 1, count, spp=1) for count in (4, 2, 9))
+    earlier = pose.find_fair_setting(16, candidates=(known,))
+    measured.clear()
+    found = pose.find_fair_setting(16, candidates=(dear,), earlier=earlier)
+    assert not measured and found["setting"] == asdict(known) and found["untried"] == {str(dear): pytest.approx(0.9)}
+    found = pose.find_fair_setting(16, candidates=(dear, cheap), earlier=earlier)
+    assert set(measured) == {str(cheap)} and found["setting"] == asdict(cheap)

@@ -132,9 +132,10 @@ def load(scene: Any, *, tessellation: int = 64, warn: bool = True) -> SceneData:
     return replace(data, geometry=replace(data.geometry, as_loaded=True))
 
 
-def refresh(data: SceneData) -> SceneData:
+def refresh(data: SceneData, sensors: tuple[Any, ...] | None = None) -> SceneData:
     """Read again what scene parameters may have changed: vertices, normals, texture coordinates, lights and sensors.
 
+    ``sensors``: of Mitsuba, in place of all of the scene's, for whoever needs but one of many.
     Values are attached where the scene's parameters are. Topology must be that of ``load``; BSDFs need no refresh, since they
     are always evaluated by Mitsuba itself. Nothing is read back to the host.
     """
@@ -155,7 +156,7 @@ def refresh(data: SceneData) -> SceneData:
     return replace(
         data,
         geometry=geometry,
-        sensors=tuple(sensors_of(sensor) for sensor in data.scene.sensors()),
+        sensors=tuple(sensors_of(sensor) for sensor in (data.scene.sensors() if sensors is None else sensors)),
         lights=lights_of(data.scene),
         areas=area_lights_of(data.scene, [source.shape for source in data.sources]),
         environments=environments_of(data.scene),

@@ -75,8 +75,7 @@ class SceneRenderer:
 
     def data(self, scene: Any, sensor: Any) -> SceneData:
         """What is read from the scene as it is now, with one sensor, attached to the scene's parameters."""
-        current = refresh(replace(self.renderer.data, scene=scene))
-        return replace(current, sensors=(sensors_of(sensor),))
+        return refresh(replace(self.renderer.data, scene=scene), sensors=(sensor,))
 
     def render(self, scene: Any, sensor: Any, spp: int, inputs: Inputs | None = None) -> Any:
         """Image (mi.TensorXf), attached to the scene's parameters unless gradients are suspended.

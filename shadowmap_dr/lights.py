@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .beams import Beam, Projector, beam_of, projector_of, towards
+from .environments import ENVIRONMENTS, SUNSKY, Environment, SunSky, environment_of
 from .traversal import children, parameters
 
 _DEGREE = math.pi / 180.0
@@ -134,34 +135,8 @@ class AreaLight:
         return mi.UnpolarizedSpectrum(self.emitter.eval(si, active)) * self.scale
 
 
-@dataclass(frozen=True)
-class Environment:
-    """Light from infinitely far away, from all directions: Mitsuba's ``constant`` or ``envmap`` emitter."""
-
-    name: str
-    emitter: Any
-
-    @property
-    def rows(self) -> int:
-        """Rows of its image, 0 if it has none."""
-        data = parameters(self.emitter).get("data")
-        return 0 if data is None else int(data.shape[0])
-
-    def to_world(self, direction: Any) -> Any:
-        """World-space direction (Vector3f) of one in the environment's own space. Attached to its rotation."""
-        to_world = parameters(self.emitter).get("to_world")
-        return direction if to_world is None else mi.Vector3f(mi.Matrix3f(to_world.matrix) @ direction)
-
-    def radiance(self, direction: Any, active: Any = True) -> Any:
-        """Radiance (colour) that arrives *from* the unit world-space ``direction`` (Vector3f). Attached to the emitter."""
-        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(direction))
-        si.wi = -direction
-        return self.emitter.eval(si, mi.Bool(active))
-
-
 Light = DirectionalLight | PointLight | SpotLight | Projector | Beam
 
-_ENVIRONMENTS = ("ConstantBackgroundEmitter", "EnvironmentMapEmitter")
 _LIGHTS = ("DirectionalEmitter", "PointLight", "SpotLight", "Projector")
 _BEAMS = ("Rectangle", "Disk")
 
@@ -169,12 +144,13 @@ _BEAMS = ("Rectangle", "Disk")
 def objection(emitter: Any) -> str | None:
     """Why a ``mi.Emitter`` is not supported, as the end of a sentence about it; None if it is."""
     kind = emitter.class_name()
-    if kind in _LIGHTS or kind in _ENVIRONMENTS or kind == "AreaLight":
+    if kind in _LIGHTS or kind in ENVIRONMENTS or kind == "AreaLight":
         return None
     if kind == "DirectionalArea":
         shape = emitter.get_shape().class_name()
         return None if shape in _BEAMS else f"shines along the normals of a {shape}: only rectangles and disks may"
-    wanted = "constant or envmap" if emitter.is_environment() else "area, directional, spot or point lights, or projectors"
+    around = emitter.is_environment()
+    wanted = "constant, envmap or sunsky" if around else "area, directional, spot or point lights, or projectors"
     return f"is not supported: use {wanted}"
 
 
@@ -182,12 +158,13 @@ def lights_of(scene: Any) -> tuple[Light, ...]:
     """Records of the lights of a ``mi.Scene`` without extent, of its projectors and beams, in the scene's order.
 
     Area lights and environments have functions of their own; what is not supported (:func:`objection`) is left out. Names are
-    Mitsuba ids; lights without one are called ``light_0``, ... Fields are attached where the emitters' parameters are.
+    Mitsuba ids; lights without one are called ``light_0``, ... The sun of a sky called ``sky`` is the light ``sky.sun``. Fields
+    are attached where the emitters' parameters are.
     """
     return tuple(
         _light_of(emitter, name)
         for name, emitter in named_emitters(scene)
-        if emitter.class_name() in (*_LIGHTS, "DirectionalArea") and objection(emitter) is None
+        if emitter.class_name() in (*_LIGHTS, "DirectionalArea", SUNSKY) and objection(emitter) is None
     )
 
 
@@ -210,8 +187,9 @@ def area_lights_of(scene: Any, shapes: Sequence[Any]) -> tuple[AreaLight, ...]:
 
 
 def environments_of(scene: Any) -> tuple[Environment, ...]:
-    """Records of the ``constant`` and ``envmap`` emitters of a ``mi.Scene`` (at most one)."""
-    return tuple(Environment(name, emitter) for name, emitter in named_emitters(scene) if emitter.class_name() in _ENVIRONMENTS)
+    """Records of the ``constant``, ``envmap`` and ``sunsky`` emitters of a ``mi.Scene`` (at most one)."""
+    found = ((name, emitter) for name, emitter in named_emitters(scene) if emitter.class_name() in ENVIRONMENTS)
+    return tuple(environment_of(emitter, name) for name, emitter in found)
 
 
 def named_emitters(scene: Any) -> list[tuple[str, Any]]:
@@ -220,6 +198,8 @@ def named_emitters(scene: Any) -> list[tuple[str, Any]]:
 
 
 def _light_of(emitter: Any, name: str) -> Light:
+    if emitter.class_name() == SUNSKY:
+        return DirectionalLight(f"{name}.sun", *SunSky(name, emitter).sun())
     kind, values, parts = emitter.class_name(), parameters(emitter), dict(children(emitter))
     if kind == "DirectionalEmitter":
         matrix = values["to_world"].matrix

@@ -14,9 +14,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .environments import Environment
 from .errors import ShadowmapError, UnsupportedShape
 from .geometry import Geometry, ShapeInfo, pack_face_info
-from .lights import AreaLight, Environment, Light, area_lights_of, environments_of, lights_of
+from .lights import AreaLight, Light, area_lights_of, environments_of, lights_of
 from .omissions import omissions_of, warn_of
 from .sensors import Sensor, sensors_of
 from .sources import CurveSource, ShapeSource, source_of
@@ -30,7 +31,7 @@ class SceneData:
     sensors       one tuple for each sensor of the scene; a batch sensor's holds several cameras, all others one
     lights        directional, spot and point lights, projectors and beams
     areas         area lights
-    environments  constant and envmap emitters (at most one)
+    environments  constant, envmap and sunsky emitters (at most one)
     shape_ptr, bsdf_ptr   mi.ShapePtr, mi.BSDFPtr (S,), by the index that ``geometry.face_shape`` holds
     needs_frames  whether any BSDF asks for more than the cosines of directions: tangents, texture coordinates
     """

@@ -16,9 +16,10 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from .environments import Environment
 from .geometry import FACETED, FLIP_GEOMETRIC, FLIP_SHADING, HAS_NORMALS, HAS_TEXCOORDS, READS_ATTRIBUTES, Geometry, normalize_or
 from .hits import Hits, corner_values, hits_at
-from .lights import AreaLight, Environment, Light
+from .lights import AreaLight, Light
 from .scene import SceneData
 from .sensors import Sensor
 from .spread import spread

@@ -183,9 +183,9 @@ def test_beam_is_along_the_normals(variant: str, kind: str, mirror: bool, flip: 
 
 def test_unsupported_emitters_are_left_out(variant: str) -> None:
     ball = {"type": "sphere", "glow": {"type": "directionalarea"}}
-    scene = mi.load_dict({"type": "scene", "ball": ball, "sky": {"type": "sunsky"}, "sun": emitters()["sun"]})
+    scene = mi.load_dict({"type": "scene", "ball": ball, "sky": {"type": "timed_sunsky"}, "sun": emitters()["sun"]})
     assert [light.name for light in lights_of(scene)] == ["sun"]
     assert environments_of(scene) == ()
     reasons = {emitter.class_name(): objection(emitter) for emitter in scene.emitters()}
     assert reasons["DirectionalEmitter"] is None
-    assert "rectangles and disks" in reasons["DirectionalArea"] and "envmap" in reasons["SunskyEmitter"]
+    assert "rectangles and disks" in reasons["DirectionalArea"] and "envmap" in reasons["TimedSunskyEmitter"]

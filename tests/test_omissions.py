@@ -40,7 +40,7 @@ def unsupported() -> dict[str, tuple[dict[str, Any], dict[str, Any], str]]:
     glass = {"type": "dielectric", "id": "glass"}
     return {
         "shape": ({"blob": blob()}, {}, r"'blob' \(SDFGrid\)"),
-        "sky": ({"sky": {"type": "sunsky"}}, {}, r"'sky' \(SunskyEmitter\)"),
+        "sky": ({"sky": {"type": "timed_sunsky"}}, {}, r"'sky' \(TimedSunskyEmitter\)"),
         "beam": (
             {"ball": ball(glow={"type": "directionalarea"})},
             {"ball": ball()},

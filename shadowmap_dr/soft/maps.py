@@ -11,9 +11,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..environments import Environment
 from ..geometry import Geometry
 from ..light_maps import MapPlan, boxes_of, check_sizes, shape_planes
-from ..lights import AreaLight, Environment
+from ..lights import AreaLight
 from ..raster import RasterOutput, Topology
 from ..shadow import (
     Frusta,

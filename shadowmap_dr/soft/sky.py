@@ -9,8 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..environments import Environment
 from ..geometry import Geometry
-from ..lights import Environment
 from .clusters import sky_clusters
 from .samples import LightSamples, brightness, cluster_sums
 
@@ -44,7 +44,7 @@ def plan_sky(light: Environment, count: int, geometry: Geometry) -> SkyPlan:
     rows = int(np.clip(light.rows, *_ROWS))
     with dr.suspend_grad():
         local, solid_angle = _grid(rows)
-        radiance = mi.UnpolarizedSpectrum(light.radiance(light.to_world(local)))
+        radiance = mi.UnpolarizedSpectrum(light.diffuse_radiance(light.to_world(local)))
         bright = brightness(light.name, radiance, dr.width(solid_angle))
         weight = solid_angle.numpy().astype(np.float64)
         directions, world = (np.stack([c.numpy() for c in v], -1).astype(np.float64) for v in (local, light.to_world(local)))
@@ -109,7 +109,7 @@ def _floors(geometry: Geometry) -> list[tuple[np.ndarray, float]]:
 def sky_samples(light: Environment, plan: SkyPlan) -> LightSamples:
     """The samples of an environment as it is now. Attached to its radiance, all of it, and to its rotation."""
     local, solid_angle = _grid(plan.rows)
-    radiance = mi.UnpolarizedSpectrum(light.radiance(light.to_world(local)))
+    radiance = mi.UnpolarizedSpectrum(light.diffuse_radiance(light.to_world(local)))
     count = dr.width(plan.direction)
     power = cluster_sums(radiance * solid_angle, plan.cluster, count)
     towards = light.to_world(plan.direction)

@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Any
 
 import mitsuba as mi
 
 
 def parameters(node: Any) -> dict[str, Any]:
-    """Current (possibly AD-attached) parameters of a Mitsuba object and its children, by their relative names."""
+    """Current (possibly AD-attached) parameters of a Mitsuba object and its children, by their relative names.
+
+    Those without a value are left out: a ``hair`` material has some, and Mitsuba 3.9 raises a TypeError when one asks for them.
+    """
     table = mi.traverse(node)
-    return {key: table[key] for key in table.keys()}
+    found = {}
+    for key in table.keys():
+        with suppress(TypeError):
+            found[key] = table[key]
+    return found
 
 
 def children(node: Any) -> list[tuple[str, Any]]:

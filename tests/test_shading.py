@@ -13,6 +13,7 @@ import pytest
 from shadowmap_dr.geometry import NO_TRIANGLE
 from shadowmap_dr.scene import SceneData, load, refresh
 from shadowmap_dr.shading import ambient_light, background, direct_light, opacity, surface
+from shadowmap_dr.traversal import parameters
 
 SIZE = 48
 
@@ -69,6 +70,8 @@ BSDFS: dict[str, Any] = {
     },
     "bumpmap": lambda: {"type": "bumpmap", "arbitrary": bitmap(5, 1), "scale": 0.3, "bsdf": {"type": "diffuse"}},
     "blend": lambda: {"type": "blendbsdf", "weight": bitmap(6, 1), "a": {"type": "diffuse"}, "b": {"type": "roughplastic"}},
+    "principledthin": lambda: {"type": "principledthin", "roughness": 0.5, "diff_trans": 0.8},
+    "hair": lambda: {"type": "hair"},
 }
 
 
@@ -138,6 +141,13 @@ def test_bsdfs(variant: str, bsdf: str) -> None:
     mesh = bumpy_mesh("mesh", normals=True, texcoords=True)
     mesh.set_bsdf(mi.load_dict(BSDFS[bsdf]()))
     assert_agrees_with_mitsuba(mi.load_dict(base_scene(mesh=mesh), optimize=False))
+
+
+def test_a_material_with_parameters_that_have_no_value(variant: str) -> None:
+    ball = {"type": "sphere", "bsdf": {"type": "hair"}}
+    data = load(mi.load_dict(base_scene(ball=ball), optimize=False))
+    assert len(data.geometry.shapes) == 1
+    assert "to_world" in parameters(data.sources[0].shape)
 
 
 @pytest.mark.parametrize("normals", [False, True])

@@ -17,6 +17,36 @@ def pieces(count: int, seed: int = 0, kind: str = "even") -> tuple[np.ndarray, n
     return points, weights
 
 
+def test_clusters_keep_to_one_side_of_an_edge() -> None:
+    """The faces of a box far from everything; where something is near, clusters stay compact instead."""
+    rng = np.random.default_rng(0)
+    face = np.repeat(np.arange(6), 200)
+    points, normals = rng.uniform(-1, 1, (1200, 3)), np.zeros((1200, 3))
+    axis, sign = face // 2, 1.0 - 2 * (face % 2)
+    points[np.arange(1200), axis] = sign
+    normals[np.arange(1200), axis] = sign
+
+    def mixed(reach: float) -> float:
+        cluster, _ = surface_clusters(points, np.ones(1200), 32, normals, np.full(1200, reach))
+        return float(np.mean([len(np.unique(face[cluster == k])) > 1 for k in range(32)]))
+
+    assert mixed(4.0) <= 0.2 and mixed(0.0) >= 0.4
+
+
+def test_bent_parts_are_halved_before_flat_ones() -> None:
+    """Half of the weight is a flat square, half a tube: the tube gets most of the clusters."""
+    rng = np.random.default_rng(0)
+    flat = np.concatenate([rng.uniform(-1, 1, (800, 2)), np.zeros((800, 1))], axis=1)
+    angle = rng.uniform(0, 2 * np.pi, 800)
+    around = np.stack([np.cos(angle), np.sin(angle), np.zeros(800)], axis=1)
+    tube = 0.1 * around + np.stack([np.full(800, 5.0), np.zeros(800), rng.uniform(-1, 1, 800)], axis=1)
+    normals = np.concatenate([np.tile([0.0, 0.0, 1.0], (800, 1)), around])
+    points, weights = np.concatenate([flat, tube]), np.ones(1600)
+    cluster, _ = surface_clusters(points, weights, 12, normals, np.full(1600, 3.0))
+    of_tube = len(np.unique(cluster[800:]))
+    assert of_tube >= 8 and not set(cluster[800:]) & set(cluster[:800])
+
+
 @pytest.mark.parametrize("kind", ["even", "random", "steep"])
 @pytest.mark.parametrize("count", [1, 2, 7, 32, 100])
 def test_clusters_of_a_surface_weigh_about_the_same(count: int, kind: str) -> None:

@@ -19,6 +19,8 @@ _PIECES = 16
 _TEXTURED, _MOST = 64, 1 << 17
 # Importance of what faces away from everything, in units of the mean.
 _AWAY = 0.1
+# A part of an emitter that faces opposite ways is as bad as one that is twice as long, in units of the distance to what is near.
+_OPPOSITE = 0.35
 # Points on the rest of the scene that are asked whether they see a piece.
 _PROBES = 256
 
@@ -65,7 +67,7 @@ def plan_area(light: AreaLight, geometry: Geometry, count: int) -> AreaPlan:
         shine = _brightness(light, geometry, face + info.face_start, u, v)
     weights = fraction * areas[face] * importance * (shine + _AWAY * max(shine.mean(), 1e-30))
     weights = np.maximum(weights, 1e-12 * max(weights.max(), 1e-300))
-    cluster, chosen = surface_clusters(centres, weights, count)
+    cluster, chosen = surface_clusters(centres, weights, count, normals[face], _OPPOSITE * _distances(centres, probes))
     return AreaPlan(
         face=mi.UInt32((face + info.face_start).astype(np.uint32)),
         u=mi.Float(u.astype(np.float32)),
@@ -177,6 +179,14 @@ def _probes(geometry: Geometry, positions: np.ndarray, faces: np.ndarray, own: s
     chosen = corners[np.minimum(np.concatenate([by_area, by_count]), len(others) - 1)]
     weights = random.dirichlet((1.0, 1.0, 1.0), len(chosen))
     return (chosen * weights[:, :, None]).sum(1)
+
+
+def _distances(centres: np.ndarray, probes: np.ndarray) -> np.ndarray:
+    """Distance (P,) from each piece to the nearest probe."""
+    if not len(probes):
+        return np.zeros(len(centres))
+    blocks = np.array_split(centres, max(1, len(centres) // 4096))
+    return np.concatenate([np.linalg.norm(probes - b[:, None], axis=-1).min(1) for b in blocks])
 
 
 def _importance(centres: np.ndarray, normals: np.ndarray, probes: np.ndarray) -> np.ndarray:

@@ -6,25 +6,48 @@ import heapq
 
 import numpy as np
 
+# How much more urgent it is to halve a part of a surface that faces all ways than a flat one of the same weight.
+_BENT = 20.0
 
-def surface_clusters(positions: np.ndarray, weights: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+
+def surface_clusters(
+    positions: np.ndarray, weights: np.ndarray, count: int, normals: np.ndarray | None = None, reach: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Divide pieces of a surface among ``count`` clusters that are compact and weigh about the same, by repeated halving.
 
-    positions (P, 3), weights (P,) > 0, P >= count. Returns (cluster of each piece (P,) uint32, representative piece of each
-    cluster (count,) int64: the one nearest to the weighted mean).
+    Args:
+        positions, weights: (P, 3), (P,) > 0, P >= count.
+        normals, reach: (P, 3), unit, and (P,): pieces around which facing two ways is as bad as being so far apart.
+            None: clusters may reach around edges.
+
+    Returns:
+        Cluster of each piece, (P,) uint32, and the representative piece of each cluster, (count,) int64: the one nearest to the
+        weighted mean of positions.
     """
-    heap = [(-float(weights.sum()), 0, np.arange(len(positions)))]
+    def urgency(members: np.ndarray) -> float:
+        """Which cluster is halved next: the heaviest, and sooner where normals differ."""
+        total = float(weights[members].sum())
+        if normals is None:
+            return total
+        facing = float(np.linalg.norm((normals[members] * weights[members, None]).sum(0)))
+        return total + _BENT * (total - facing)
+
+    heap = [(-urgency(np.arange(len(positions))), 0, np.arange(len(positions)))]
     done: list[np.ndarray] = []
     for step in range(1, count):
         while len(heap[0][2]) == 1:
             done.append(heapq.heappop(heap)[2])
         _, _, members = heapq.heappop(heap)
-        axis = int(np.argmax(np.ptp(positions[members], axis=0)))
-        members = members[np.argsort(positions[members, axis], kind="stable")]
+        places = positions[members]
+        if normals is not None and reach is not None:
+            scale = np.average(reach[members], weights=weights[members])
+            places = np.concatenate([places, scale * normals[members]], axis=1)
+        axis = int(np.argmax(np.ptp(places, axis=0)))
+        members = members[np.argsort(places[:, axis], kind="stable")]
         cut = _halfway(np.concatenate([[0.0], weights[members].cumsum()]))
         for k, part in enumerate((members[:cut], members[cut:])):
             # The second number keeps heaps from comparing arrays.
-            heapq.heappush(heap, (-float(weights[part].sum()), 2 * step + k, part))
+            heapq.heappush(heap, (-urgency(part), 2 * step + k, part))
     cluster = np.zeros(len(positions), np.uint32)
     best = np.zeros(count, np.int64)
     for k, members in enumerate([*done, *(entry[2] for entry in heap)]):

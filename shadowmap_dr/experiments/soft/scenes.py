@@ -205,6 +205,30 @@ def _glowing_hand() -> Parts:
     }
 
 
+def _lightbox() -> Parts:
+    return {
+        "floor": _floor(_tiles()),
+        "head": _mesh("suzanne", (-0.4, 0.55, 0.0), 0.75, turn=25),
+        "ball": _ball((0.9, 0.35, 0.9), 0.35, _plastic(0.3, 0.3, 0.5, 0.3)),
+        "lamp": {
+            "type": "cube", "to_world": _t().translate([1.1, 2.2, 0.6]) @ _t().rotate([0.3, 1, 0.2], 35) @ _t().scale(0.3),
+            "emitter": _area(14, 13, 11),
+        },
+    }  # fmt: skip
+
+
+def _tube() -> Parts:
+    return {
+        "floor": _floor(),
+        "wall": _wall((0, 1.5, -1.8), [0, 1, 0], 0, [4, 1.6, 1]),
+        "teapot": _mesh("teapot", (-0.5, 0.45, 0.2), 0.8, _diffuse(0.6, 0.5, 0.4), turn=20),
+        "box": _box((1.0, 0.3, 0.6), 0.3, 25),
+        "lamp": {
+            "type": "cylinder", "p0": [-1.4, 2.4, 0.9], "p1": [1.4, 2.2, 0.3], "radius": 0.08, "emitter": _area(14, 15, 17),
+        },
+    }  # fmt: skip
+
+
 def _painted() -> Parts:
     """A lamp like a stained window: bars in three colours on black."""
     image = np.zeros((8, 8, 3), np.float32)
@@ -283,6 +307,17 @@ def _dusk() -> Parts:
     }
 
 
+def _noon() -> Parts:
+    return {
+        "floor": _floor(_diffuse(0.5, 0.45, 0.4), 20.0),
+        "spot": _mesh("spot", (-0.4, 0.75, 0), 0.75, turn=140),
+        "ball": _ball((1.0, 0.4, 0.6), 0.4, _plastic(0.35, 0.5, 0.2, 0.2)),
+        "sky": {
+            "type": "sunsky", "sun_direction": [0.5, 0.7, 0.6], "turbidity": 4.0, "to_world": _t().rotate([1, 0, 0], -90),
+        },
+    }  # fmt: skip
+
+
 def _everything() -> Parts:
     return {
         "floor": _floor(_tiles()),
@@ -348,6 +383,8 @@ SCENES: Mapping[str, SoftScene] = {
     "disk": SoftScene(_disk, "disk"),
     "globe": SoftScene(_globe, "sphere; plastic 0.3"),
     "glowing_hand": SoftScene(_glowing_hand, "a mesh, not convex, in view", _LOW_VIEW),
+    "lightbox": SoftScene(_lightbox, "cube; plastic 0.3"),
+    "tube": SoftScene(_tube, "thin cylinder"),
     "painted": SoftScene(_painted, "textured rectangle"),
     "two_colours": SoftScene(_two_colours, "rectangle and sphere of different colours"),
     "lantern": SoftScene(_lantern, "sphere in the middle of the scene", ((1.6, 3.0, 4.6), (0.0, 0.4, -0.2))),
@@ -355,6 +392,7 @@ SCENES: Mapping[str, SoftScene] = {
     "overcast": SoftScene(_overcast, "constant"),
     "sunny": SoftScene(_sunny, "envmap with a small, bright sun, turned; plastic 0.3"),
     "dusk": SoftScene(_dusk, "envmap with a large sun; metal 0.3, principled 0.4 and 0.5"),
+    "noon": SoftScene(_noon, "sunsky; plastic 0.35"),
     "everything": SoftScene(_everything, "rectangle, envmap, directional, spot and point; plastic 0.35"),
     "metals": SoftScene(_metals, "rectangle; metal 0.3, plastic 0.4, principled 0.35", _LOW_VIEW),
     "gallery": SoftScene(_gallery, "disk, rectangle and sphere; metal 0.35, plastic 0.3", _LOW_VIEW),

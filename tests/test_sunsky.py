@@ -102,8 +102,8 @@ def test_the_suns_irradiance_is_that_of_its_disc(variant: str) -> None:
         across = np.sqrt(1 - cosines**2)
         local = mi.Vector3f(*((across * np.cos(around)), (across * np.sin(around)), cosines))
         directions = mi.Frame3f(-sun.direction).to_world(local)
-        sky = environments_of(scene)[0]
-        disc = np.array(sky.radiance(directions)) - np.array(sky.diffuse_radiance(directions))
+        sky, sunless = (environments_of(s)[0] for s in (scene, _scene(sun_scale=0.0, sun_aperture=aperture)))
+        disc = np.array(sky.radiance(directions)) - np.array(sunless.radiance(directions))
         expected = disc.mean(-1) * 2 * np.pi * (1 - np.cos(cone))
         np.testing.assert_allclose(np.array(sun.irradiance).ravel(), expected, rtol=0.02)
 

@@ -11,6 +11,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from .errors import ShadowmapError
 from .traversal import parameters
 
 SUNSKY = "SunskyEmitter"
@@ -105,4 +106,6 @@ def _sun_radius(emitter: Any) -> float:
     Kept, since to ask reads numbers back: the angle never changes.
     """
     found = re.search(r"Sun aperture = ([-+.\deE]+)", str(emitter))
-    return math.radians(float(found.group(1)) / 2) if found else math.radians(0.5358 / 2)
+    if found is None:
+        raise ShadowmapError(f"emitter '{emitter.id()}' does not tell its sun_aperture: use another version of Mitsuba, or envmap.")
+    return math.radians(float(found.group(1)) / 2)

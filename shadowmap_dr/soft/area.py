@@ -62,12 +62,12 @@ def plan_area(light: AreaLight, geometry: Geometry, count: int) -> AreaPlan:
     a, b, c = (corners[face, k] for k in range(3))
     centres = a + u[:, None] * (b - a) + v[:, None] * (c - a)
     probes = _probes(geometry, positions, faces, own)
-    importance = _importance(centres, normals[face], probes)
+    importance, nearest = _importance(centres, normals[face], probes)
     with dr.suspend_grad():
         shine = _brightness(light, geometry, face + info.face_start, u, v)
     weights = fraction * areas[face] * importance * (shine + _AWAY * max(shine.mean(), 1e-30))
     weights = np.maximum(weights, 1e-12 * max(weights.max(), 1e-300))
-    cluster, chosen = surface_clusters(centres, weights, count, normals[face], _OPPOSITE * _distances(centres, probes))
+    cluster, chosen = surface_clusters(centres, weights, count, normals[face], _OPPOSITE * nearest)
     return AreaPlan(
         face=mi.UInt32((face + info.face_start).astype(np.uint32)),
         u=mi.Float(u.astype(np.float32)),
@@ -181,22 +181,18 @@ def _probes(geometry: Geometry, positions: np.ndarray, faces: np.ndarray, own: s
     return (chosen * weights[:, :, None]).sum(1)
 
 
-def _distances(centres: np.ndarray, probes: np.ndarray) -> np.ndarray:
-    """Distance (P,) from each piece to the nearest probe."""
-    if not len(probes):
-        return np.zeros(len(centres))
-    blocks = np.array_split(centres, max(1, len(centres) // 4096))
-    return np.concatenate([np.linalg.norm(probes - b[:, None], axis=-1).min(1) for b in blocks])
+def _importance(centres: np.ndarray, normals: np.ndarray, probes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(how much of the scene each piece (P) sees, at its mean 1; its distance from the nearest probe, 0 if there is none).
 
-
-def _importance(centres: np.ndarray, normals: np.ndarray, probes: np.ndarray) -> np.ndarray:
-    """How much of the scene each piece (P) sees, at its mean 1: the mean cosine towards the probes, and a little more."""
+    The former is the mean cosine towards the probes, and a little more.
+    """
     if not len(probes):
-        return np.ones(len(centres))
-    seen = np.zeros(len(centres))
+        return np.ones(len(centres)), np.zeros(len(centres))
+    seen, nearest = np.zeros(len(centres)), np.zeros(len(centres))
     for block in np.array_split(np.arange(len(centres)), max(1, len(centres) // 4096)):
         to = probes[None] - centres[block, None]
         distance = np.maximum(np.linalg.norm(to, axis=-1), 1e-12)
         seen[block] = np.maximum((to * normals[block, None]).sum(-1) / distance, 0).mean(-1)
+        nearest[block] = distance.min(-1)
     mean = seen.mean()
-    return seen / mean + _AWAY if mean > 0 else np.ones(len(centres))
+    return seen / mean + _AWAY if mean > 0 else np.ones(len(centres)), nearest

@@ -107,5 +107,5 @@ def _sun_radius(emitter: Any) -> float:
     """
     found = re.search(r"Sun aperture = ([-+.\deE]+)", str(emitter))
     if found is None:
-        raise ShadowmapError(f"emitter '{emitter.id()}' does not tell its sun_aperture: use another version of Mitsuba, or envmap.")
+        raise ShadowmapError(f"emitter '{emitter.id()}' does not tell its sun_aperture: use another Mitsuba, or envmap.")
     return math.radians(float(found.group(1)) / 2)

@@ -22,6 +22,9 @@ def ball(subdivisions: int = 2) -> Any:
     params["vertex_positions"] = (np.asarray(sphere.vertices) + [0, 0, 0.9]).astype(np.float32).ravel()
     params["faces"] = np.asarray(sphere.faces).astype(np.uint32).ravel()
     params.update()
+    # Mitsuba sums face normals in any order: those of two equal balls may differ in the last bit, and so would their pictures.
+    params["vertex_normals"] = np.asarray(sphere.vertices / 0.5).astype(np.float32).ravel()
+    params.update()
     return mesh
 
 

@@ -9,8 +9,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from gradients.scenes import shaded_lamp
 
 from shadowmap_dr import Renderer, ShadowmapError
+from shadowmap_dr.soft import maps
 
 SIZE = 24
 ALBEDO = 0.5
@@ -138,6 +140,20 @@ def test_lamp_in_the_middle_looks_around_itself(variant: str) -> None:
     assert difference(image, reference) < 0.05
     unshadowed = render(scene, spp=4, shadow_method="none", **options)
     assert difference(unshadowed, reference) > 0.1
+
+
+@pytest.mark.parametrize("veil", [False, True])
+def test_emitter_that_is_not_convex_shadows_itself(variant: str, monkeypatch: pytest.MonkeyPatch, veil: bool) -> None:
+    """Also where the maps of a scene look through holes."""
+    T = mi.ScalarTransform4f
+    holes = {"type": "mask", "opacity": {"type": "checkerboard", "color0": 0.0, "color1": 1.0}, "b": {"type": "diffuse"}}
+    above = {"type": "rectangle", "to_world": T().translate([0, 2, 0]) @ T().rotate([1, 0, 0], -90), "bsdf": holes}
+    scene = scene_of(camera=camera(height=0.4, half=1.2), lamp=shaded_lamp((0, 0.8, 0)), veil=above if veil else None)
+    options = {"spp": 4, "emitter_samples": 256, "soft_map_resolution": 64}
+    image, reference = render(scene, **options), traced(scene, 4096)
+    assert difference(image, reference) < 0.02
+    monkeypatch.setattr(maps, "sees_itself", lambda parts, geometry: False)
+    assert difference(render(scene, **options), reference) > 0.04
 
 
 def test_emitters_of_all_kinds_at_once(variant: str) -> None:

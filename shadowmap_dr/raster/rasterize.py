@@ -82,8 +82,7 @@ def visible_triangles(
     """As :func:`rasterize`, for positions and faces known to be valid, without the cost of barycentrics and depths.
 
     These are there, and attached, but not prepared: whoever uses them pays for them. ``one_sided``: ``Bool`` (F,), faces that are
-    drawn only where their corners run from +x to -y, that is, clockwise where y points up; or (B F,), those of each image. Not
-    with ``transparent``.
+    drawn only where their corners run from +x to -y, that is, clockwise where y points up; or (B F,), those of each image.
     """
     flat, face_indices, batch, vertex_count = check_mesh(positions, faces, batch, False)
     size = (batch, vertex_count, *check_resolution(resolution))
@@ -197,13 +196,13 @@ def _visible_triangles(
     mesh = (positions, faces, batch, vertex_count, height, width)
     if transparent is None:
         return _nearest_fragments(*mesh, one_sided=one_sided)
-    keys, records = _nearest_fragments(*mesh, peel=True)
+    keys, records = _nearest_fragments(*mesh, peel=True, one_sided=one_sided)
     for _ in range(layers - 1):
         seen = _locate(positions, faces, _triangle_of(keys), records, batch, vertex_count, height, width)
         through = seen.valid & dr.detach(transparent(seen))
         behind = dr.select(through, keys, type(keys)(EMPTY))
         dr.eval(behind)
-        farther, records = _nearest_fragments(*mesh, behind=behind, peel=True)
+        farther, records = _nearest_fragments(*mesh, behind=behind, peel=True, one_sided=one_sided)
         keys = dr.select(through, farther, keys)
         dr.eval(keys)
     return _triangle_of(keys), records

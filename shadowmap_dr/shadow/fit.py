@@ -168,7 +168,10 @@ def _fit(
     # What is seen is known from samples: a little may lie before them.
     spread = dr.select(dr.isfinite(window[5]), window[5] - receivers, 0)
     depth = dr.maximum(dr.maximum(z1 - receivers, least), 0.1 * spread)
-    near, far = z0 - 0.05 * dr.maximum(z1 - z0, least), dr.maximum(z1 + 0.05 * depth, receivers)
+    near = z0 - 0.05 * dr.maximum(z1 - z0, least)
+    # Where all casters end before what is seen, so does the far plane. If a floor lay right on it, rounding would decide whether it
+    # is drawn: its depth in the map would have a derivative, which that of a point on it, moved to the plane, has not.
+    far = dr.maximum(z1, receivers - 0.1 * depth) + 0.05 * depth
     far = dr.select(perspective, dr.maximum(far, 1e-6), far)
     near = dr.select(perspective, dr.maximum(near, 1e-3 * far), near)
     first = dr.maximum(near, receivers - _BEFORE * depth)
@@ -195,8 +198,9 @@ def _still_fits(views: Views, old: Frusta, new: Frusta, needed: tuple[Any, ...],
     keep |= (views.fixed > 0) & (new.half_x == old.half_x)
     # Where casters surround a light, its near plane follows from the far one alone, and need not follow it closely.
     around = (views.spread > 0) & (z0 < new.near)
-    for value, bound in ((dr.maximum(z0, new.near), old.near), (dr.maximum(receivers, new.first), old.first)):
-        keep &= value >= dr.select(around, 0.5 * bound, bound)
+    keep &= dr.maximum(z0, new.near) >= dr.select(around, 0.5 * old.near, old.near)
+    # Receivers before the range in which depths are told apart would lose their shadows.
+    keep &= dr.maximum(receivers, new.first) >= dr.select(around & (old.first <= old.near), 0.5 * old.first, old.first)
     keep &= z1 <= old.far
     keep &= new.far - new.first >= _KEEP_FILL * (old.far - old.first)
     return keep

@@ -138,7 +138,7 @@ def render_maps(
         topology: of the mesh.
         views, frusta: cameras of the M maps.
         transparent: alpha test, see :func:`shadowmap_dr.raster.rasterize`.
-        culled: ``Bool`` (F,), or (M F,) by map: faces that are left out where they turn away. Not with ``transparent``.
+        culled: ``Bool`` (F,), or (M F,) by map: faces that are left out where they turn away.
     """
     count, size = views.count, settings.resolution * settings.supersampling
     clip = to_clip(of_map(views, map_index, count), of_map(frusta, map_index, count), p_light)

@@ -21,6 +21,8 @@ _TEXTURED, _MOST = 64, 1 << 17
 _AWAY = 0.1
 # A part of an emitter that faces opposite ways is as bad as one that is twice as long, in units of the distance to what is near.
 _OPPOSITE = 0.35
+# How far a part of an emitter must lie before the plane of another to be seen from it, in units of the emitter's extent.
+_DENT = 1e-3
 # Points on the rest of the scene that are asked whether they see a piece.
 _PROBES = 256
 
@@ -77,6 +79,24 @@ def plan_area(light: AreaLight, geometry: Geometry, count: int) -> AreaPlan:
         chosen=mi.UInt32(chosen.astype(np.uint32)),
         shape=light.shape,
     )
+
+
+def sees_itself(plan: AreaPlan, geometry: Geometry) -> bool:
+    """Whether from some of the samples one looks at the shining side of another part of the emitter."""
+    info = geometry.shapes[plan.shape]
+    if info.planar:
+        return False
+    positions = dr.detach(geometry.positions).numpy().reshape(-1, 3).astype(np.float64)
+    own = slice(info.face_start, info.face_start + info.face_count)
+    corners = positions[geometry.faces.numpy().reshape(-1, 3)[own]]
+    normals, _ = _normals(corners, info)
+    chosen = plan.chosen.numpy()
+    face = plan.face.numpy()[chosen] - info.face_start
+    u, v = (x.numpy()[chosen, None] for x in (plan.u, plan.v))
+    a, b, c = (corners[face, k] for k in range(3))
+    places = a + u * (b - a) + v * (c - a)
+    height = places @ normals.T - (corners[:, 0] * normals).sum(1)
+    return bool(height.max() > _DENT * np.ptp(corners.reshape(-1, 3), axis=0).max())
 
 
 def area_samples(light: AreaLight, plan: AreaPlan, geometry: Geometry) -> LightSamples:

@@ -34,7 +34,7 @@ from ..shadow import (
 )
 from ..shadow.camera import of_map
 from ..shadow.casters import SUNK
-from .area import AreaPlan, area_samples, plan_area
+from .area import AreaPlan, area_samples, plan_area, sees_itself
 from .penumbra import Pyramid
 from .samples import LightSamples, SampleTable
 from .sky import SkyPlan, plan_sky, sky_samples
@@ -56,7 +56,8 @@ class SoftPlan:
 
     ``kind``: ``distant`` or ``near`` (one map for each sample), ``cube`` (six), or ``single`` (one in all, see
     :mod:`shadowmap_dr.soft.penumbra`). ``first``: number of the first map, single ones and others counted apart.
-    ``target``: point that the maps of a ``near`` light face. ``hides``: shape that casts no shadow of this light, its own.
+    ``target``: point that the maps of a ``near`` light face. ``hides``: shape that casts no shadow of this light: its own, unless
+    parts of it see others of it, ``facing``; then these cast shadows with the sides that shine.
     """
 
     parts: AreaPlan | SkyPlan
@@ -65,6 +66,7 @@ class SoftPlan:
     first: int
     target: tuple[float, float, float]
     hides: int
+    facing: tuple[int, int] = (0, 0)
 
     @property
     def maps(self) -> int:
@@ -82,9 +84,13 @@ def plan_soft(
         if isinstance(light, Environment):
             plan = SoftPlan(plan_sky(light, sky_count, geometry), "distant", sky_count, 0, (0.0, 0.0, 0.0), _NONE)
         else:
+            parts = plan_area(light, geometry, area_count)
             target, kind = _aim(geometry, light.shape)
             kind = "single" if single and kind == "near" else kind
-            plan = SoftPlan(plan_area(light, geometry, area_count), kind, area_count, 0, target, light.shape)
+            plan = SoftPlan(parts, kind, area_count, 0, target, light.shape)
+            if kind != "single" and sees_itself(parts, geometry):
+                info = geometry.shapes[light.shape]
+                plan = replace(plan, kind="cube", hides=_NONE, facing=(info.face_start, info.face_start + info.face_count))
         alone = plan.kind == "single"
         plans.append(replace(plan, first=first[alone]))
         first[alone] += plan.maps
@@ -164,7 +170,18 @@ def _make(
         own = dr.gather(mi.UInt32, hidden, which) == dr.gather(mi.UInt32, geometry.vertex_shape, vertex)
         # Behind the light's camera, where no triangle is drawn.
         p_light = dr.select(own, type(p_light)(0, 0, -1), p_light)
-    return render_maps(p_light, which, geometry.faces, topology, views, frusta, settings, transparent)
+    return render_maps(p_light, which, geometry.faces, topology, views, frusta, settings, transparent, _facing(plans, geometry))
+
+
+def _facing(plans: Sequence[SoftPlan], geometry: Geometry) -> Any:
+    """Faces (Bool, for all faces of each map) that cast shadows only where they face the light, or None."""
+    if not any(plan.facing[1] for plan in plans):
+        return None
+    first, last = (dr.concat([dr.full(mi.UInt32, plan.facing[k], plan.maps) for plan in plans]) for k in range(2))
+    lane = dr.arange(mi.UInt32, dr.width(first) * geometry.face_count)
+    which = lane // geometry.face_count
+    face = lane - which * geometry.face_count
+    return (face >= dr.gather(mi.UInt32, first, which)) & (face < dr.gather(mi.UInt32, last, which))
 
 
 def map_of(plan: SoftPlan, table: SampleTable, sample: Any, p_world: Any) -> Any:

@@ -15,12 +15,14 @@ import numpy as np
 Change = Callable[[Any, Any], Any]
 
 
-def translated(x: float, y: float, z: float) -> Change:
-    """Vertices or a position moved along a direction."""
+def translated(x: float, y: float, z: float, first: int = 0) -> Change:
+    """Vertices, from number ``first`` on, or a position moved along a direction."""
 
     def change(rest: Any, t: Any) -> Any:
         if isinstance(rest, mi.Float):
-            return dr.ravel(dr.unravel(mi.Point3f, rest) + mi.Vector3f(x, y, z) * t)
+            p = dr.unravel(mi.Point3f, rest)
+            moves = dr.arange(mi.UInt32, dr.width(p)) >= first
+            return dr.ravel(p + dr.select(moves, mi.Vector3f(x, y, z) * t, 0))
         return rest + mi.Vector3f(x, y, z) * t
 
     return change

@@ -80,9 +80,13 @@ def cow(bsdf: Any = None, face_normals: bool = True) -> dict[str, Any]:
             "bsdf": bsdf or diffuse(0.6)}  # fmt: skip
 
 
-def mesh(name: str, vertices: np.ndarray, faces: np.ndarray, bsdf: Any = None, normals: bool = False) -> Any:
+def mesh(
+    name: str, vertices: np.ndarray, faces: np.ndarray, bsdf: Any = None, normals: bool = False, emitter: Any = None
+) -> Any:
     """A ``mi.Mesh``, smooth if ``normals``, which Mitsuba then works out from its faces."""
     props = mi.Properties()
+    if emitter is not None:
+        props["emitter"] = mi.load_dict(emitter)
     props["face_normals"] = not normals
     made = mi.Mesh(name, len(vertices), len(faces), props, has_vertex_normals=normals)
     params = mi.traverse(made)
@@ -91,6 +95,15 @@ def mesh(name: str, vertices: np.ndarray, faces: np.ndarray, bsdf: Any = None, n
     params.update()
     made.set_bsdf(mi.load_dict(bsdf or diffuse(0.6)))
     return made
+
+
+def shaded_lamp(at: Any = (0, 0, 0), radiance: float = 2.0) -> Any:
+    """A mesh of two boxes that shine: a small one, vertices 0 to 7, and a plate, which hides it from the right."""
+    boxes = [trimesh.creation.box((0.2, 0.2, 0.2)), trimesh.creation.box((0.04, 0.7, 0.7))]
+    boxes[1].apply_translation([0.35, 0, 0])
+    joined = trimesh.util.concatenate(boxes)
+    emitter = {"type": "area", "radiance": {"type": "rgb", "value": radiance}}
+    return mesh("lamp", np.asarray(joined.vertices) + np.asarray(at), joined.faces, emitter=emitter)
 
 
 def curve(kind: str, name: str, points: Any, bsdf: Any = None) -> Any:

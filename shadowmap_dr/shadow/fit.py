@@ -169,8 +169,8 @@ def _fit(
     spread = dr.select(dr.isfinite(window[5]), window[5] - receivers, 0)
     depth = dr.maximum(dr.maximum(z1 - receivers, least), 0.1 * spread)
     near = z0 - 0.05 * dr.maximum(z1 - z0, least)
-    # Where all casters end before what is seen, so does the far plane. If a floor lay right on it, rounding would decide whether it
-    # is drawn: its depth in the map would have a derivative, which that of a point on it, moved to the plane, has not.
+    # Where all casters end before what is seen, so does the far plane. If a floor lay right on it, rounding would decide whether
+    # it is drawn: its depth in the map would have a derivative, which that of a point on it, moved to the plane, has not.
     far = dr.maximum(z1, receivers - 0.1 * depth) + 0.05 * depth
     far = dr.select(perspective, dr.maximum(far, 1e-6), far)
     near = dr.select(perspective, dr.maximum(near, 1e-3 * far), near)

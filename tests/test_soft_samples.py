@@ -8,9 +8,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from gradients.scenes import shaded_lamp
 
 from shadowmap_dr.scene import load
 from shadowmap_dr.soft import LightSamples, plan_soft, samples_of
+from shadowmap_dr.soft.maps import NO_SHAPE
 
 
 def scene_of(**parts: Any) -> Any:
@@ -171,3 +173,15 @@ def test_samples_follow_the_emitter(variant: str) -> None:
     np.testing.assert_allclose(np.array(dr.grad(found.place)), expected, atol=1e-5)
     np.testing.assert_allclose(np.array(dr.grad(found.power)), 2 * np.array(before.power), rtol=1e-4)
     np.testing.assert_allclose(np.array(dr.grad(found.normal)), 0, atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["rectangle", "disk", "sphere", "cube", "cylinder", "two boxes"])
+def test_only_emitters_that_see_themselves_are_in_their_own_maps(variant: str, kind: str) -> None:
+    data = load(scene_of(lamp=shaded_lamp((0, 2, 0)) if kind == "two boxes" else lamp(kind)))
+    (plan,) = plan_soft(data.areas, data.geometry, 32, 32)
+    info = data.geometry.shapes[data.areas[0].shape]
+    if kind == "two boxes":
+        assert plan.kind == "cube" and plan.facing == (info.face_start, info.face_start + info.face_count)
+        assert plan.hides == NO_SHAPE
+    else:
+        assert plan.facing == (0, 0) and plan.hides == data.areas[0].shape

@@ -82,9 +82,12 @@ def plan_area(light: AreaLight, geometry: Geometry, count: int) -> AreaPlan:
 
 
 def sees_itself(plan: AreaPlan, geometry: Geometry) -> bool:
-    """Whether from some of the samples one looks at the shining side of another part of the emitter."""
+    """Whether from some of the samples one looks at the shining side of another part of the emitter.
+
+    Not asked of shapes that shine on the side from which their triangles wind the other way: maps show the other sides only.
+    """
     info = geometry.shapes[plan.shape]
-    if info.planar:
+    if info.planar or info.flip_geometric:
         return False
     positions = dr.detach(geometry.positions).numpy().reshape(-1, 3).astype(np.float64)
     own = slice(info.face_start, info.face_start + info.face_count)
@@ -95,8 +98,9 @@ def sees_itself(plan: AreaPlan, geometry: Geometry) -> bool:
     u, v = (x.numpy()[chosen, None] for x in (plan.u, plan.v))
     a, b, c = (corners[face, k] for k in range(3))
     places = a + u * (b - a) + v * (c - a)
-    height = places @ normals.T - (corners[:, 0] * normals).sum(1)
-    return bool(height.max() > _DENT * np.ptp(corners.reshape(-1, 3), axis=0).max())
+    offsets = (corners[:, 0] * normals).sum(1)
+    highest = max(float((normals @ place - offsets).max()) for place in places)
+    return highest > _DENT * np.ptp(corners.reshape(-1, 3), axis=0).max()
 
 
 def area_samples(light: AreaLight, plan: AreaPlan, geometry: Geometry) -> LightSamples:

@@ -44,8 +44,8 @@ SoftFrusta = tuple[Frusta | None, Frusta | None]
 
 # Half-angle in degrees that one perspective map may cover: beyond it, a light looks around itself with the faces of a cube.
 _WIDEST = 75.0
-# No shape is left out of a map.
-_NONE = 0xFFFFFFFF
+#: No shape is left out of a map.
+NO_SHAPE = 0xFFFFFFFF
 # Seen points that the fit of a map looks at.
 _SEEN = 1024
 
@@ -82,7 +82,7 @@ def plan_soft(
     first = {True: 0, False: 0}
     for light in lights:
         if isinstance(light, Environment):
-            plan = SoftPlan(plan_sky(light, sky_count, geometry), "distant", sky_count, 0, (0.0, 0.0, 0.0), _NONE)
+            plan = SoftPlan(plan_sky(light, sky_count, geometry), "distant", sky_count, 0, (0.0, 0.0, 0.0), NO_SHAPE)
         else:
             parts = plan_area(light, geometry, area_count)
             target, kind = _aim(geometry, light.shape)
@@ -90,7 +90,7 @@ def plan_soft(
             plan = SoftPlan(parts, kind, area_count, 0, target, light.shape)
             if kind != "single" and sees_itself(parts, geometry):
                 info = geometry.shapes[light.shape]
-                plan = replace(plan, kind="cube", hides=_NONE, facing=(info.face_start, info.face_start + info.face_count))
+                plan = replace(plan, kind="cube", hides=NO_SHAPE, facing=(info.face_start, info.face_start + info.face_count))
         alone = plan.kind == "single"
         plans.append(replace(plan, first=first[alone]))
         first[alone] += plan.maps
@@ -166,7 +166,7 @@ def _make(
     dr.eval(views, hidden)
     frusta = _fit(views, hidden, scene, geometry, settings, previous, seen)
     p_light, which, vertex = vertices_in_maps(views, geometry.positions)
-    if any(plan.hides != _NONE for plan in plans):
+    if any(plan.hides != NO_SHAPE for plan in plans):
         own = dr.gather(mi.UInt32, hidden, which) == dr.gather(mi.UInt32, geometry.vertex_shape, vertex)
         # Behind the light's camera, where no triangle is drawn.
         p_light = dr.select(own, type(p_light)(0, 0, -1), p_light)

@@ -200,7 +200,7 @@ def test_vertices_may_have_several_forms(renderer: Renderer) -> None:
     expected = renderer.render(vertex_positions={"ball": points}).numpy()
     for same in (flat, mi.TensorXf(flat, shape=(count, 3)), flat.numpy().reshape(-1, 3)):
         # Normals of moved vertices are sums in any order.
-        np.testing.assert_allclose(renderer.render(vertex_positions={"ball": same}).numpy(), expected, atol=1e-5)
+        np.testing.assert_allclose(renderer.render(vertex_positions={"ball": same}).numpy(), expected, rtol=0, atol=1e-6)
 
 
 def test_replacements_agree_with_scenes_built_so(variant: str) -> None:

@@ -12,7 +12,7 @@ import pytest
 from gradients.scenes import shaded_lamp
 
 from shadowmap_dr import Renderer, ShadowmapError
-from shadowmap_dr.soft import maps
+from shadowmap_dr.soft import area as emitters
 
 SIZE = 24
 ALBEDO = 0.5
@@ -152,7 +152,7 @@ def test_emitter_that_is_not_convex_shadows_itself(variant: str, monkeypatch: py
     options = {"spp": 4, "emitter_samples": 256, "soft_map_resolution": 64}
     image, reference = render(scene, **options), traced(scene, 4096)
     assert difference(image, reference) < 0.02
-    monkeypatch.setattr(maps, "sees_itself", lambda parts, geometry: False)
+    monkeypatch.setattr(emitters, "_dented", lambda *arguments: False)
     assert difference(render(scene, **options), reference) > 0.04
 
 

@@ -37,6 +37,8 @@ class AreaPlan:
     cluster   UInt32 (P,), which of the N clusters it belongs to
     chosen    UInt32 (N,), the piece in whose centre a cluster's sample lies
     shape     index of the emitter's shape
+    dented    whether parts of the emitter look at the shining side of others. False if it shines on the side from which its
+              triangles wind the other way: maps show the other sides only
     """
 
     face: Any
@@ -46,6 +48,7 @@ class AreaPlan:
     cluster: Any
     chosen: Any
     shape: int
+    dented: bool
 
 
 def plan_area(light: AreaLight, geometry: Geometry, count: int) -> AreaPlan:
@@ -78,29 +81,8 @@ def plan_area(light: AreaLight, geometry: Geometry, count: int) -> AreaPlan:
         cluster=mi.UInt32(cluster),
         chosen=mi.UInt32(chosen.astype(np.uint32)),
         shape=light.shape,
+        dented=not info.planar and not info.flip_geometric and _dented(centres[chosen], corners, normals),
     )
-
-
-def sees_itself(plan: AreaPlan, geometry: Geometry) -> bool:
-    """Whether from some of the samples one looks at the shining side of another part of the emitter.
-
-    Not asked of shapes that shine on the side from which their triangles wind the other way: maps show the other sides only.
-    """
-    info = geometry.shapes[plan.shape]
-    if info.planar or info.flip_geometric:
-        return False
-    positions = dr.detach(geometry.positions).numpy().reshape(-1, 3).astype(np.float64)
-    own = slice(info.face_start, info.face_start + info.face_count)
-    corners = positions[geometry.faces.numpy().reshape(-1, 3)[own]]
-    normals, _ = _normals(corners, info)
-    chosen = plan.chosen.numpy()
-    face = plan.face.numpy()[chosen] - info.face_start
-    u, v = (x.numpy()[chosen, None] for x in (plan.u, plan.v))
-    a, b, c = (corners[face, k] for k in range(3))
-    places = a + u * (b - a) + v * (c - a)
-    offsets = (corners[:, 0] * normals).sum(1)
-    highest = max(float((normals @ place - offsets).max()) for place in places)
-    return highest > _DENT * np.ptp(corners.reshape(-1, 3), axis=0).max()
 
 
 def area_samples(light: AreaLight, plan: AreaPlan, geometry: Geometry) -> LightSamples:
@@ -203,6 +185,13 @@ def _probes(geometry: Geometry, positions: np.ndarray, faces: np.ndarray, own: s
     chosen = corners[np.minimum(np.concatenate([by_area, by_count]), len(others) - 1)]
     weights = random.dirichlet((1.0, 1.0, 1.0), len(chosen))
     return (chosen * weights[:, :, None]).sum(1)
+
+
+def _dented(places: np.ndarray, corners: np.ndarray, normals: np.ndarray) -> bool:
+    """Whether some of the places (N, 3) on a surface lie before the planes of its triangles (F, 3, 3)."""
+    offsets = (corners[:, 0] * normals).sum(1)
+    highest = max(float((normals @ place - offsets).max()) for place in places)
+    return highest > _DENT * np.ptp(corners.reshape(-1, 3), axis=0).max()
 
 
 def _importance(centres: np.ndarray, normals: np.ndarray, probes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

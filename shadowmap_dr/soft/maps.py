@@ -34,7 +34,7 @@ from ..shadow import (
 )
 from ..shadow.camera import of_map
 from ..shadow.casters import SUNK
-from .area import AreaPlan, area_samples, plan_area, sees_itself
+from .area import AreaPlan, area_samples, plan_area
 from .penumbra import Pyramid
 from .samples import LightSamples, SampleTable
 from .sky import SkyPlan, plan_sky, sky_samples
@@ -88,7 +88,7 @@ def plan_soft(
             target, kind = _aim(geometry, light.shape)
             kind = "single" if single and kind == "near" else kind
             plan = SoftPlan(parts, kind, area_count, 0, target, light.shape)
-            if kind != "single" and sees_itself(parts, geometry):
+            if kind != "single" and parts.dented:
                 info = geometry.shapes[light.shape]
                 plan = replace(plan, kind="cube", hides=NO_SHAPE, facing=(info.face_start, info.face_start + info.face_count))
         alone = plan.kind == "single"

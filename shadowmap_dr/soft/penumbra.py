@@ -79,30 +79,31 @@ def penumbra_visibility(pyramid: Pyramid, which: Any, radius: Any, p_world: Any,
     a point does not hide it. In 0..1; 1 for points that are not ``active``. Attached to points, casters, light and radius, but
     not to the tangent plane, nor through the level of the pyramid.
     """
-    inputs = (pyramid, radius, mi.Point3f(p_world))
-    arrays, start = attached_arrays(inputs), dr.zeros(mi.Vector2f, dr.width(p_world))
+    lanes = (radius, mi.Point3f(p_world))
+    inputs, start = (lanes, pyramid), dr.zeros(mi.Vector2f, dr.width(p_world))
 
     def occluders(index: Any, arrays: list[Any]) -> Any:
-        pyramid, radius, p_world = with_arrays(inputs, arrays)
+        (radius, p_world), pyramid = with_arrays(inputs, arrays)
         at = _Place.of(pyramid, which, p_world, n_world, active)
         moments, depth = at.look_up(pyramid, which, index, at.footprint(radius, at.nearest), attached=False)
         lit = chebyshev_visibility(moments, depth)
         return dr.select(moments.x < depth, mi.Vector2f(1 - lit, moments.x - lit * depth), 0)
 
-    blocked, depths = sum_over(occluders, _TAPS, start, arrays, [])
+    blocked, depths = sum_over(occluders, _TAPS, start, attached_arrays(inputs), [], len(attached_arrays(lanes)))
     some = blocked > 1e-4
     mean = dr.select(some, depths / dr.select(some, blocked, 1), -0.5)
     dr.eval(mean, some)
-    found = (*inputs, mean)
+    lanes = (*lanes, mean)
+    found = (lanes, pyramid)
 
     def passing(index: Any, arrays: list[Any]) -> Any:
-        pyramid, radius, p_world, mean = with_arrays(found, arrays)
+        (radius, p_world, mean), pyramid = with_arrays(found, arrays)
         at = _Place.of(pyramid, which, p_world, n_world, active)
         nearer = at.frustum.first + (mean + 0.5) * (at.frustum.far - at.frustum.first)
         moments, depth = at.look_up(pyramid, which, index, at.footprint(radius, dr.maximum(nearer, at.nearest)))
         return mi.Vector2f(chebyshev_visibility(moments, depth), 0)
 
-    total, _ = sum_over(passing, _TAPS, start, attached_arrays(found), [])
+    total, _ = sum_over(passing, _TAPS, start, attached_arrays(found), [], len(attached_arrays(lanes)))
     return dr.select(mi.Bool(active) & some, total * (1 / _TAPS), 1)
 
 

@@ -48,7 +48,8 @@ def soft_light(
         return dr.select(active, value, 0)
 
     start = dr.zeros(mi.UnpolarizedSpectrum, dr.width(seen.shape))
-    light = sum_over(one_sample, samples.count, start, attached_arrays(inputs), _attached_parameters(bsdfs))
+    lanes = len(attached_arrays(seen))
+    light = sum_over(one_sample, samples.count, start, attached_arrays(inputs), _attached_parameters(bsdfs), lanes)
     if maps is None or plan.kind != "single":
         return light
     radius = samples.radius_towards(seen.p_world)

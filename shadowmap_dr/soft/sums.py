@@ -9,15 +9,18 @@ import drjit as dr
 import mitsuba as mi
 
 
-def sum_over(term: Callable[[Any, list[Any]], Any], count: int, zero: Any, arrays: list[Any], implicit: list[Any]) -> Any:
+def sum_over(
+    term: Callable[[Any, list[Any]], Any], count: int, zero: Any, arrays: list[Any], implicit: list[Any], lanes: int
+) -> Any:
     """Sum of ``term(index, arrays)`` (of the type and width of ``zero``) over the indices (UInt32) below ``count``.
 
     Terms are worked out once more for derivatives, instead of being kept. Gradients flow to ``arrays``, which ``term`` must take
-    from its argument, and to ``implicit``, which it reaches by itself.
+    from its argument, and to ``implicit``, which it reaches by itself. The first ``lanes`` arrays are as wide as ``zero`` (or of
+    width 1), and each lane uses its own numbers; from the others it gathers.
     """
     if not arrays and not implicit:
         return _loop(lambda index: term(index, arrays), count, zero)
-    return dr.custom(_Sum, arrays, implicit, term, count, zero)
+    return dr.custom(_Sum, arrays, implicit, lanes, term, count, zero)
 
 
 def _loop(term: Callable[[Any], Any], count: int, zero: Any, label: str = "soft light") -> Any:
@@ -26,18 +29,19 @@ def _loop(term: Callable[[Any], Any], count: int, zero: Any, label: str = "soft 
         lambda index, total: index < count,
         lambda index, total: (index + 1, total + term(index)),
         mode="symbolic",
-        # Iterations depend on each other through the sum only: Dr.Jit's way back needs no memory then.
-        max_iterations=-1,
         label=label,
     )
     return total
 
 
 class _Sum(dr.CustomOp):
-    """The loop with derivatives of its own: Dr.Jit 1.5 fails in forward mode where a loop reads what others read too."""
+    """The loop with derivatives of its own.
 
-    def eval(self, arrays: list[Any], implicit: list[Any], term: Any, count: int, zero: Any) -> Any:
-        self._arrays = arrays
+    Dr.Jit 1.5 fails in forward mode where a loop reads what others read too, and backwards where terms call BSDFs of Mitsuba's.
+    """
+
+    def eval(self, arrays: list[Any], implicit: list[Any], lanes: int, term: Any, count: int, zero: Any) -> Any:
+        self._arrays, self._lanes = arrays, lanes
         self._call = (term, count, zero)
         self.add_input(implicit)
         return _loop(lambda index: term(index, arrays), count, zero)
@@ -60,11 +64,30 @@ class _Sum(dr.CustomOp):
 
     def backward(self) -> None:
         term, count, zero = self._call
-        leaves = self._leaves()
-        with dr.resume_grad():
-            total = _loop(lambda index: term(index, leaves), count, zero)
-            dr.backward_from(total * self.grad_out())
-        self.set_grad_in("arrays", [dr.grad(leaf) for leaf in leaves])
+        leaves, gradient = self._leaves(), self.grad_out()
+        width = dr.width(zero)
+        # A lane's part of these is added up from term to term; the others receive theirs where the terms gather from them.
+        own = leaves[: self._lanes]
+        wide = [dr.repeat(dr.detach(leaf), width // dr.width(leaf)) for leaf in own]
+        dr.eval(wide, gradient)
+
+        def add(index: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
+            with dr.resume_grad():
+                mine = [type(array)(array) for array in wide]
+                dr.enable_grad(mine)
+                dr.backward_from(term(index, mine + leaves[self._lanes :]) * gradient)
+            return index + 1, [total + dr.grad(array) for total, array in zip(sums, mine, strict=True)]
+
+        start = [dr.zeros(type(array), width) for array in wide]
+        _, sums = dr.while_loop(
+            (dr.zeros(mi.UInt32, width), start),
+            lambda index, sums: index < count,
+            add,
+            mode="symbolic",
+            label="soft light, backward",
+        )
+        sums = [dr.block_sum(total, width // dr.width(leaf)) for total, leaf in zip(sums, own, strict=True)]
+        self.set_grad_in("arrays", sums + [dr.grad(leaf) for leaf in leaves[self._lanes :]])
 
     def _leaves(self) -> list[Any]:
         leaves = [type(array)(dr.detach(array)) for array in self._arrays]

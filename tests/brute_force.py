@@ -64,11 +64,15 @@ def perspective(fov_deg: float = 60.0, near: float = 0.1, far: float = 20.0) -> 
     return np.array([[c, 0, 0, 0], [0, c, 0, 0], [0, 0, a, b], [0, 0, -1.0, 0]])
 
 
-def random_soup(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, int, int]:
-    """Random triangles before (and behind) a random camera, with shared vertices, slivers, tiny and huge triangles."""
+def random_soup(rng: np.random.Generator, sizes: np.random.Generator) -> tuple[np.ndarray, np.ndarray, int, int]:
+    """Random triangles before (and behind) a random camera, with shared vertices, slivers, tiny and huge triangles.
+
+    How many they are and how large the image is comes from `sizes`: kernels are compiled for each size anew.
+    """
     kind = rng.integers(5)
-    v = int(rng.integers(3, 40))
-    f = int(rng.integers(1, 60))
+    v = int(sizes.integers(3, 40))
+    f = int(sizes.integers(1, 60))
+    height, width = (int(r) for r in sizes.integers(1, 70, 2))
     extent = [1.0, 1.0, 0.1, 5.0, 1.0][kind]
     world = rng.uniform(-extent, extent, (v, 3))
     if kind == 3:  # through the camera plane
@@ -83,5 +87,4 @@ def random_soup(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, int, 
         clip[:, 2] = (homogeneous[:, 2] + 3) / 2
     else:
         clip = homogeneous @ perspective(rng.uniform(30, 110)).T
-    height, width = (int(r) for r in rng.integers(1, 70, 2))
     return clip.astype(np.float32), rng.integers(0, v, (f, 3)).astype(np.uint32), height, width

@@ -24,7 +24,7 @@ def as_ids(out) -> np.ndarray:  # noqa: ANN001
 def test_random_soups_match_the_twin(variant: str, block: int) -> None:
     wrong = total = 0
     for seed in range(block * 40, block * 40 + 40):
-        pos, faces, height, width = brute_force.random_soup(np.random.default_rng(seed))
+        pos, faces, height, width = brute_force.random_soup(*(np.random.default_rng(n) for n in (seed, seed // 8)))
         out = run(pos, faces, height, width)
         ref = brute_force.rasterize(pos, faces, height, width)
         ids = as_ids(out)
@@ -48,8 +48,8 @@ def test_large_triangles_match_the_twin(variant: str, capacity: int, monkeypatch
     """Triangles that cover many tiles, tilted so that they hide each other in parts; also with lists that overflow."""
     monkeypatch.setattr(tiles, "CAPACITY", capacity)
     for seed in range(12):
-        rng = np.random.default_rng(500 + seed)
-        count, height, width = 40, int(rng.integers(60, 150)), int(rng.integers(60, 150))
+        rng, sizes = np.random.default_rng(500 + seed), np.random.default_rng(seed // 4)
+        count, height, width = 40, int(sizes.integers(60, 150)), int(sizes.integers(60, 150))
         pos = np.c_[rng.uniform(-2.5, 2.5, (3 * count, 2)), rng.uniform(-1.3, 1.3, 3 * count), np.ones(3 * count)]
         if seed % 2:
             pos *= rng.uniform(0.3, 2, (3 * count, 1))

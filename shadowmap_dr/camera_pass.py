@@ -1,4 +1,4 @@
-"""What the camera sees: clip-space vertices, the G-buffer, and the spots on the surface that a pixel looks at."""
+"""What the camera sees: clip-space vertices, the G-buffer, and points all over it."""
 
 from __future__ import annotations
 
@@ -91,38 +91,3 @@ def _orthographic_reach(sensor: Sensor, center: tuple[float, float, float], radi
 def within_far_plane(sensor: Sensor, depth: Any) -> Any:
     """Mask of the pixels whose surface (``Hits.depth``) lies before a perspective camera's far plane."""
     return depth <= dr.detach(sensor.far) if sensor.kind == "perspective" else mi.Bool(True)
-
-
-def footprint_points(sensor: Sensor, size: tuple[int, int], depth: Any, p_world: Any, n_world: Any, count: int) -> list[Any]:
-    """``count`` x ``count`` points spread over a pixel's footprint on the tangent plane of what it sees (Point3f each).
-
-    Attached to ``p_world`` only: the spread itself is detached.
-    """
-    if count == 1:
-        return [p_world]
-    with dr.suspend_grad():
-        width, height = size
-        matrix = dr.detach(sensor.to_world.matrix)
-        right, up, forward = (dr.normalize(mi.Vector3f(matrix[0, k], matrix[1, k], matrix[2, k])) for k in range(3))
-        projection = dr.detach(sensor.projection)
-        if sensor.kind == "perspective":
-            scale = dr.detach(depth)
-            view = dr.normalize(dr.detach(p_world) - dr.detach(sensor.origin))
-        else:
-            # An orthographic camera's scale lies in its transformation, whose columns were normalised above.
-            scale = mi.Float(1)
-            right *= dr.norm(mi.Vector3f(matrix[0, 0], matrix[1, 0], matrix[2, 0]))
-            up *= dr.norm(mi.Vector3f(matrix[0, 1], matrix[1, 1], matrix[2, 1]))
-            view = forward
-        right *= 2 / (width * dr.abs(projection[0, 0])) * scale
-        up *= 2 / (height * dr.abs(projection[1, 1])) * scale
-        n = dr.detach(n_world)
-        slope = dr.dot(n, view)
-        # Seen at a grazing angle the footprint grows without bound; four pixels long is as much as makes sense.
-        slope = dr.select(slope < 0, dr.minimum(slope, -0.25), dr.maximum(slope, 0.25))
-        offsets = []
-        for j in range(count):
-            for i in range(count):
-                lateral = right * ((i + 0.5) / count - 0.5) + up * ((j + 0.5) / count - 0.5)
-                offsets.append(lateral - view * (dr.dot(n, lateral) / slope))
-    return [p_world + offset for offset in offsets]

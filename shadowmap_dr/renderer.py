@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -11,10 +12,11 @@ import mitsuba as mi
 
 from .aovs import collect_aovs
 from .beams import softened
-from .camera_pass import camera_clip, footprint_points, seen_points, within_far_plane, without_shapes
+from .camera_pass import camera_clip, seen_points, within_far_plane, without_shapes
 from .errors import ShadowmapError
 from .facets import crease_edges, flat_faces, mean_normals, soften_facets
 from .film import develop, sample_grid, sample_windows
+from .footprint import Spots, footprint_points
 from .geometry import Geometry
 from .hits import pixel_hits
 from .light_maps import MapPlan, check_sizes, light_visibility, make_maps, plan_maps
@@ -306,7 +308,7 @@ class Renderer:
         frames = self.data.needs_frames or self.settings.ambient > 0 or textured
         seen, depth, sharpness = self._surface(view, geometry, facets, frames)
         lights = lighting.lights
-        visible = [self._visibility(lighting.maps, light, k, seen, view, depth) for k, light in enumerate(lights)]
+        visible = self._visibilities(lighting, seen, view, depth)
         around = lambda: footprint_points(sensor, (width, height), depth, seen.p_world, seen.n_world, 2)  # noqa: E731
         lighting = replace(lighting, lights=softened(lights, seen.p_world, around))
         color = self._radiance(seen, lighting, visible, sensor, raster)
@@ -325,14 +327,16 @@ class Renderer:
             image = dr.concat([image, mi.TensorXf(_interleave(named), shape=(height, width, len(named)))], axis=2)
         return image
 
-    def _visibility(self, maps: Any, light: Light, index: int, seen: Surface, view: _View, depth: Any) -> Any:
+    def _visibilities(self, lighting: _Lighting, seen: Surface, view: _View, depth: Any) -> list[Any]:
+        """Of each light, from all pixels."""
+        maps = lighting.maps
         if maps is None:
-            return mi.Float(1)
-        samples = self.settings.look_ups(view.columns)
-        size = (view.raster.width, view.raster.height)
-        points = footprint_points(view.sensor, size, depth, seen.p_world, seen.n_world, samples)
-        total = sum(light_visibility(maps, self.plan, light, index, p, seen.active) for p in points)
-        return total * (1 / len(points))
+            return [mi.Float(1) for _ in lighting.lights]
+        size, count = (view.raster.width, view.raster.height), self.settings.look_ups(view.columns)
+        spots = Spots.of(view.sensor, size, depth, seen.p_world, seen.n_world, seen.active, count)
+        return [
+            spots.mean(partial(light_visibility, maps, self.plan, light, index)) for index, light in enumerate(lighting.lights)
+        ]
 
     def _radiance(self, seen: Surface, lighting: _Lighting, visible: list[Any], sensor: Sensor, raster: RasterOutput) -> Any:
         compat = self.settings.shadow.compat

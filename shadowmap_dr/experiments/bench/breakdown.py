@@ -33,7 +33,7 @@ PASSES = (
     ("normals", "renderer:normals_at"),
     ("facets: blend", "renderer:soften_facets"),
     ("surface", "renderer:surface_at"),
-    ("shadow look-up", "renderer:Renderer._visibility"),
+    ("shadow look-up", "renderer:Renderer._visibilities"),
     ("shading", "renderer:Renderer._radiance"),
     ("anti-aliasing", "renderer:antialias"),
 )

@@ -1,0 +1,147 @@
+"""The spots on a surface that a pixel looks at, and the mean of what is found there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from .sensors import Sensor
+
+#: Up to this many by this many spots are arrays of their own.
+_WRITTEN_OUT = 2
+
+
+def footprint_points(sensor: Sensor, size: tuple[int, int], depth: Any, p_world: Any, n_world: Any, count: int) -> list[Any]:
+    """``count`` x ``count`` points spread over a pixel's footprint on the tangent plane of what it sees (Point3f each).
+
+    Attached to ``p_world`` only: the spread itself is detached.
+    """
+    if count == 1:
+        return [p_world]
+    with dr.suspend_grad():
+        axes = _Axes.of(sensor, size, depth, p_world, n_world)
+        offsets = [axes.offset((i + 0.5) / count - 0.5, (j + 0.5) / count - 0.5) for j in range(count) for i in range(count)]
+    return [p_world + offset for offset in offsets]
+
+
+@dataclass(frozen=True)
+class Spots:
+    """The points of :func:`footprint_points` for all pixels, for means over what is found there.
+
+    Many spots of few pixels are one array: the first of all pixels, the second of all, and so on. Written out one by one, they
+    would all be compiled, which takes time that grows faster than their number. Few spots are an array each: larger images
+    have those, and no use for more lanes.
+
+    Attributes:
+        points: Point3f (C N,) each, attached to the pixels' own points.
+        active: Bool (C N,).
+        copies: C, the number of spots in one array.
+    """
+
+    points: list[Any]
+    active: Any
+    copies: int
+
+    @classmethod
+    def of(
+        cls, sensor: Sensor, size: tuple[int, int], depth: Any, p_world: Any, n_world: Any, active: Any, count: int
+    ) -> Spots:
+        """``count`` x ``count`` spots of each of N pixels; arguments as of :func:`footprint_points`, and Bool (N,)."""
+        if count <= _WRITTEN_OUT:
+            return cls(footprint_points(sensor, size, depth, p_world, n_world, count), active, 1)
+        copies = count * count
+        dr.eval(p_world, n_world, depth, active)
+        points = dr.custom(_Copies, p_world, copies, False)
+        with dr.suspend_grad():
+            number = dr.arange(mi.UInt32, copies * dr.width(p_world)) // dr.width(p_world)
+            row = number // count
+            depth, n_world = (_copied(dr.detach(array), copies) for array in (depth, n_world))
+            axes = _Axes.of(sensor, size, depth, points, n_world)
+            across, down = ((mi.Float(k) + 0.5) / count - 0.5 for k in (number - row * count, row))
+            offset = axes.offset(across, down)
+        return cls([points + offset], _copied(active, copies), copies)
+
+    def mean(self, look_up: Callable[[Any, Any], Any]) -> Any:
+        """Mean (Float, N) of what ``look_up`` finds at points (Point3f, Bool). Attached."""
+        total = sum(look_up(points, self.active) for points in self.points)
+        if self.copies > 1:
+            total = dr.custom(_Copies, total, self.copies, True)
+        return total * (1 / (self.copies * len(self.points)))
+
+
+class _Copies(dr.CustomOp):
+    """Copies of an array one after the other, or (``transpose``) the sum of such copies: each is the adjoint of the other.
+
+    Dr.Jit's own adjoint of a repeated gather would add up with atomics.
+    """
+
+    def eval(self, array: Any, copies: int, transpose: bool) -> Any:
+        self._arguments = copies, transpose
+        return self._apply(array, transpose)
+
+    def forward(self) -> None:
+        self.set_grad_out(self._apply(self.grad_in("array"), self._arguments[1]))
+
+    def backward(self) -> None:
+        self.set_grad_in("array", self._apply(self.grad_out(), not self._arguments[1]))
+
+    def _apply(self, array: Any, transpose: bool) -> Any:
+        return (_sum_of_copies if transpose else _copied)(array, self._arguments[0])
+
+
+def _copied(array: Any, copies: int) -> Any:
+    width = dr.width(array)
+    lane = dr.arange(mi.UInt32, copies * width)
+    return dr.gather(type(array), array, lane - lane // width * width)
+
+
+def _sum_of_copies(array: Any, copies: int) -> Any:
+    width = dr.width(array) // copies
+    lane = dr.arange(mi.UInt32, width)
+    return sum(dr.gather(type(array), array, lane + k * width) for k in range(copies))
+
+
+@dataclass(frozen=True)
+class _Axes:
+    """Where a pixel's right and upper side lie in the world, seen at the depth of its surface (Vector3f each), and how it slants.
+
+    ``view`` is the direction in which it is seen, ``normal`` its own, ``slope`` their cosine, kept away from 0.
+    """
+
+    right: Any
+    up: Any
+    view: Any
+    normal: Any
+    slope: Any
+
+    @classmethod
+    def of(cls, sensor: Sensor, size: tuple[int, int], depth: Any, p_world: Any, n_world: Any) -> _Axes:
+        width, height = size
+        matrix = dr.detach(sensor.to_world.matrix)
+        right, up, forward = (dr.normalize(mi.Vector3f(matrix[0, k], matrix[1, k], matrix[2, k])) for k in range(3))
+        projection = dr.detach(sensor.projection)
+        if sensor.kind == "perspective":
+            scale = dr.detach(depth)
+            view = dr.normalize(dr.detach(p_world) - dr.detach(sensor.origin))
+        else:
+            # An orthographic camera's scale lies in its transformation, whose columns were normalised above.
+            scale = mi.Float(1)
+            right *= dr.norm(mi.Vector3f(matrix[0, 0], matrix[1, 0], matrix[2, 0]))
+            up *= dr.norm(mi.Vector3f(matrix[0, 1], matrix[1, 1], matrix[2, 1]))
+            view = forward
+        right *= 2 / (width * dr.abs(projection[0, 0])) * scale
+        up *= 2 / (height * dr.abs(projection[1, 1])) * scale
+        n = dr.detach(n_world)
+        slope = dr.dot(n, view)
+        # Seen at a grazing angle the footprint grows without bound; four pixels long is as much as makes sense.
+        slope = dr.select(slope < 0, dr.minimum(slope, -0.25), dr.maximum(slope, 0.25))
+        return cls(right, up, view, n, slope)
+
+    def offset(self, across: Any, down: Any) -> Any:
+        """From the pixel's centre to a place in its footprint (Vector3f), in shares of its width and height."""
+        lateral = self.right * across + self.up * down
+        return lateral - self.view * (dr.dot(self.normal, lateral) / self.slope)

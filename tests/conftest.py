@@ -22,6 +22,20 @@ def pytest_configure(config: pytest.Config) -> None:
     dr.set_thread_count(max(2, (os.cpu_count() or 1) // workers))
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    # Tests of one scene of the gradient suite after one another: they share derivative images, the first of them takes new ones.
+    places = [place for place, item in enumerate(items) if item.path.name == "test_gradients.py"]
+    for place, item in zip(places, sorted((items[place] for place in places), key=_scene_of), strict=True):
+        items[place] = item
+
+
+def _scene_of(item: pytest.Item) -> tuple[str, str, bool]:
+    values = getattr(item, "callspec", None)
+    values = values.params if values else {}
+    scene = values["traced"].case if "traced" in values else values.get("case", "")
+    return values.get("variant", ""), scene, "reverse_mode" not in item.name
+
+
 @pytest.fixture(params=["llvm_ad_rgb", "cuda_ad_rgb"])
 def variant(request: pytest.FixtureRequest) -> Iterator[str]:
     """Sets the Mitsuba variant for a test and names it; tests that use it run once for each backend at hand."""

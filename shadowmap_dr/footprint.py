@@ -18,7 +18,7 @@ _WRITTEN_OUT = 2
 def footprint_points(sensor: Sensor, size: tuple[int, int], depth: Any, p_world: Any, n_world: Any, count: int) -> list[Any]:
     """``count`` x ``count`` points spread over a pixel's footprint on the tangent plane of what it sees (Point3f each).
 
-    Attached to ``p_world`` only: the spread itself is detached.
+    Attached to ``p_world`` only: the spread itself is detached. ``depth`` is that of :class:`~shadowmap_dr.hits.Hits`, or None.
     """
     if count == 1:
         return [p_world]
@@ -59,8 +59,8 @@ class Spots:
         with dr.suspend_grad():
             number = dr.arange(mi.UInt32, copies * dr.width(p_world)) // dr.width(p_world)
             row = number // count
-            depth, n_world = (_copied(dr.detach(array), copies) for array in (depth, n_world))
-            axes = _Axes.of(sensor, size, depth, points, n_world)
+            depth = None if depth is None else _copied(dr.detach(depth), copies)
+            axes = _Axes.of(sensor, size, depth, points, _copied(dr.detach(n_world), copies))
             across, down = ((mi.Float(k) + 0.5) / count - 0.5 for k in (number - row * count, row))
             offset = axes.offset(across, down)
         return cls([points + offset], _copied(active, copies), copies)

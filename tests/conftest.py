@@ -8,8 +8,9 @@ from collections.abc import Iterator
 
 import pytest
 
-# NumPy's own threads, one for each core in each worker, would wait for work by spinning. Before numpy is imported.
+# Threads of NumPy's and PyTorch's own, one for each core in each worker, would spin while they wait. Before these are imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import shadowmap_dr  # noqa: F401  (selects the LLVM library before mitsuba is imported)
 

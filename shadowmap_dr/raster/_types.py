@@ -88,13 +88,23 @@ def check_range(faces: Any, count: int, what: str) -> None:
         raise ValueError(f"faces refer to {what} {largest}, but there are only {count}")
 
 
+def by_image(index: Any, size: int, batch: int) -> tuple[Any, Any]:
+    """Which image of a batch an index (``UInt32``) below ``batch * size`` belongs to, and the index within that image.
+
+    The only image of a batch is a constant: no divisions, and no sizes of meshes in kernels, which then serve other meshes, too.
+    """
+    if batch == 1:
+        return type(index)(0), index
+    image = index // size
+    return image, index - image * size
+
+
 def pixel_coordinates(module: ModuleType, batch: int, height: int, width: int) -> tuple[Any, Any, Any]:
     """Image index, row and column (``UInt32``) of every entry of a flat row-major batch of images."""
     index = dr.arange(module.UInt32, batch * height * width)
     row_flat = index // width
-    column = index - row_flat * width
-    image = row_flat // height
-    return image, row_flat - image * height, column
+    image, row = by_image(row_flat, height, batch)
+    return image, row, index - row_flat * width
 
 
 def zeros(module: ModuleType, size: int, count: int) -> list[Any]:

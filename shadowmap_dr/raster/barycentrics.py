@@ -6,7 +6,7 @@ from typing import Any
 
 import drjit as dr
 
-from ._types import NO_TRIANGLE, RasterOutput, backend
+from ._types import NO_TRIANGLE, RasterOutput, backend, by_image
 from .planes import offset, pixels, planes
 
 # Pixels of a lane, as many as a packet holds.
@@ -37,8 +37,7 @@ def _strips(raster: RasterOutput, depths: Any, weights: Any) -> tuple[Any, Any, 
     lane = dr.arange(UInt32, count // _STRIP)
     line = lane * _STRIP // raster.width
     column = lane * _STRIP - line * raster.width
-    image = line // raster.height
-    row = line - image * raster.height
+    image, row = by_image(line, raster.height, raster.batch)
     base = image * raster.face_count
     triangle = dr.gather(module.Array4u, raster.triangle, lane)
     shared = dr.minimum(dr.minimum(triangle[0], triangle[1]), dr.minimum(triangle[2], triangle[3]))  # NO_TRIANGLE is the largest

@@ -60,8 +60,8 @@ def find_creases(
         second = dr.select(two, second, 0)
         return a, b, dr.select(two, c, NO_VERTEX), dr.select(two, d, NO_VERTEX), 1 - second, second
 
-    def nothing(image: Any, *_: Any) -> tuple[Any, Any, Any, Any, Any, Any]:
-        none, zero = dr.full(UInt32, NO_VERTEX, dr.width(image)), dr.zeros(module.Float, dr.width(image))
+    def nothing(image: Any, pixel: Any, *_: Any) -> tuple[Any, Any, Any, Any, Any, Any]:
+        none, zero = dr.full(UInt32, NO_VERTEX, dr.width(pixel)), dr.zeros(module.Float, dr.width(pixel))
         return none, none, none, none, zero, zero
 
     arguments = (image, pixel, here, neighbour, down)

@@ -7,7 +7,7 @@ from typing import Any
 
 import drjit as dr
 
-from ._types import NO_TRIANGLE, RasterOutput, backend, zeros
+from ._types import NO_TRIANGLE, RasterOutput, backend, by_image, zeros
 from .creases import find_creases
 from .meetings import Meetings
 from .pairs import PairList, differing_pairs, empty_list
@@ -120,8 +120,8 @@ def _measure(
         down, pixel = (pair & 1) != 0, pair >> 1
         step = dr.select(down, UInt32(raster.width), 1)
         row_flat = pixel // raster.width
-        image = row_flat // raster.height
-        column, row = pixel - row_flat * raster.width, row_flat - image * raster.height
+        image, row = by_image(row_flat, raster.height, raster.batch)
+        column = pixel - row_flat * raster.width
         key = dr.gather(module.UInt64, keys, pair)
         silhouette = key != 0
         ends = dr.gather(module.Array2u, topology.edges, ~UInt32(key & 0xFFFFFFFF), silhouette)

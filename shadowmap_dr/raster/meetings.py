@@ -15,7 +15,7 @@ from typing import Any
 
 import drjit as dr
 
-from ._types import NO_TRIANGLE, RasterOutput, backend
+from ._types import NO_TRIANGLE, RasterOutput, backend, by_image
 from .pairs import each_number
 from .setup import edge_lines, gather_triangle
 from .topology import NO_VERTEX, Topology
@@ -40,6 +40,7 @@ class Meetings:
         faces: ``UInt32`` (3 F,).
         parts, beyond: ``UInt32`` (F,) and (3 F,), see :class:`Topology`.
         triangle: what each pixel sees.
+        batch: number of images.
         height, width, vertex_count: of an image.
         unconnected: whether faces of different parts may meet.
         creases, crease_weights: see :func:`shadowmap_dr.raster.crossings.find_crossings`. Without, faces of one part do not meet.
@@ -51,6 +52,7 @@ class Meetings:
     parts: Any
     beyond: Any
     triangle: Any
+    batch: int
     height: int
     width: int
     vertex_count: int
@@ -71,7 +73,7 @@ class Meetings:
         creases: Any = None,
         crease_weights: Any = None,
     ) -> Meetings:
-        size = raster.height, raster.width, vertex_count
+        size = raster.batch, raster.height, raster.width, vertex_count
         surfaces = topology.faces, topology.parts, topology.beyond, raster.triangle
         UInt32 = backend(raster.triangle).UInt32
         found = dr.empty(UInt32, 2 * dr.width(raster.triangle)), dr.zeros(UInt32, 1)
@@ -132,8 +134,8 @@ class Meetings:
         module = backend(self.positions)
         Float, Float64, UInt32 = module.Float, module.Float64, module.UInt32
         row_flat = pixel // self.width
-        image = row_flat // self.height
-        column, row = pixel - row_flat * self.width, row_flat - image * self.height
+        image, row = by_image(row_flat, self.height, self.batch)
+        column = pixel - row_flat * self.width
         first = image * self.vertex_count
         # Centre of the pixel, and the way to its neighbour, in NDC.
         x, y = (2 * Float64(column) + (1 - self.width)) / self.width, (2 * Float64(row) + (1 - self.height)) / self.height

@@ -10,7 +10,7 @@ from typing import Any
 
 import drjit as dr
 
-from ._types import MAX_RESOLUTION, RasterOutput, backend, pixel_coordinates
+from ._types import MAX_RESOLUTION, RasterOutput, backend, by_image, pixel_coordinates
 from .setup import edge_lines, gather_triangle
 
 # Smallest determinant (twice the area in NDC times all w) of a triangle that a pixel may see.
@@ -79,9 +79,9 @@ def planes(
     Float, Float64, UInt32 = module.Float, module.Float64, module.UInt32
     width, height = raster.width, raster.height
     index = dr.arange(UInt32, raster.batch * raster.face_count)
-    image = index // raster.face_count
+    image, triangle = by_image(index, raster.face_count, raster.batch)
     vertex_count = dr.width(positions) // (4 * raster.batch)
-    corners = gather_triangle(positions, faces, index - image * raster.face_count, image * vertex_count, True)
+    corners = gather_triangle(positions, faces, triangle, image * vertex_count, True)
     heights = [p.z for p in corners]
     if reciprocal is not None:
         inverted = dr.gather(module.Bool, reciprocal, image)

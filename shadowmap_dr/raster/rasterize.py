@@ -9,7 +9,7 @@ from typing import Any
 
 import drjit as dr
 
-from ._types import MAX_RESOLUTION, NO_TRIANGLE, RasterOutput, backend, check_range, pixel_coordinates
+from ._types import MAX_RESOLUTION, NO_TRIANGLE, RasterOutput, backend, by_image, check_range, pixel_coordinates
 from .barycentrics import pixel_barycentrics
 from .fragments import EMPTY, draw
 from .setup import centred, covers, edge_lines, fragment_key, gather_triangle, set_up
@@ -236,8 +236,7 @@ def _nearest_fragments(
     face_count = dr.width(faces) // 3
     keys = _empty_keys(module, batch * height * width)
     index = dr.arange(UInt32, batch * face_count)
-    image = index // face_count
-    triangle = index - image * face_count
+    image, triangle = by_image(index, face_count, batch)
     triangles = set_up(gather_triangle(positions, faces, triangle, image * vertex_count, True), height, width)
     # Not one array: Dr.Jit would write its parts in kernels of their own.
     records = tuple(dr.ravel(coefficients) for coefficients in (triangles.a, triangles.b, triangles.c))
@@ -261,8 +260,8 @@ def _nearest_fragments(
     dr.eval(records, keys, nearest, large, first, last)
 
     def exact_lines(index: Any) -> Any:
-        image = index // face_count
-        return edge_lines(gather_triangle(positions, faces, index - image * face_count, image * vertex_count, True))
+        image, triangle = by_image(index, face_count, batch)
+        return edge_lines(gather_triangle(positions, faces, triangle, image * vertex_count, True))
 
     a, b, c = (dr.gather(module.Array4f, record, index, large) for record in records)
     box = tuple(module.Int32(corner) for corner in (first & 0xFFFF, first >> 16, last & 0xFFFF, last >> 16))

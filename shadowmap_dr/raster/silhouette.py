@@ -11,7 +11,7 @@ from typing import Any
 
 import drjit as dr
 
-from ._types import NO_TRIANGLE, RasterOutput, backend
+from ._types import NO_TRIANGLE, RasterOutput, backend, by_image
 from .pairs import PairList
 from .topology import NO_VERTEX, Topology
 
@@ -66,8 +66,7 @@ def _collect(positions: Any, topology: Topology, raster: RasterOutput, vertex_co
     width, height = raster.width, raster.height
     total = raster.batch * topology.count
     index = dr.arange(UInt32, total)
-    image = index // topology.count
-    edge = index - image * topology.count
+    image, edge = by_image(index, topology.count, raster.batch)
     a, b, side, active = _silhouettes(positions, topology, image, edge, vertex_count)
     a, b, active = _project(a, b, active, width, height)
     share = _horizontal_share(b.x - a.x, b.y - a.y, active)
@@ -103,8 +102,7 @@ def _walk(
     Float, UInt32, UInt64 = module.Float, module.UInt32, module.UInt64
     width, height = raster.width, raster.height
     side, share = a.w, b.w
-    image = index // topology.count
-    edge = index - image * topology.count
+    image, edge = by_image(index, topology.count, raster.batch)
     first_row, rows = _lines(a.y, b.y, share > 0, height)
     first_column, columns = _lines(a.x, b.x, share < 1, width)
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import drjit as dr
 
-from ._types import backend
+from ._types import backend, by_image
 from .fragments import draw
 from .setup import Triangles, centred, depth_key, rounding_error
 
@@ -132,8 +132,8 @@ def strips(grid: TileGrid, module: ModuleType) -> Strips:
     within = lane & ((1 << (2 * TILE - 2)) - 1)
     tile = lane >> (2 * TILE - 2)
     row_of_tiles = tile // grid.columns
-    image = row_of_tiles // grid.rows
-    row = ((row_of_tiles - image * grid.rows) << TILE) + (within >> (TILE - 2))
+    image, row_within = by_image(row_of_tiles, grid.rows, grid.batch)
+    row = (row_within << TILE) + (within >> (TILE - 2))
     column = ((tile - row_of_tiles * grid.columns) << TILE) + ((within & ((1 << (TILE - 2)) - 1)) * STRIP)
     index = (image * grid.height + row) * grid.width + column
     return Strips(image, row, column, tile, index, grid.batch, grid.height, grid.width)

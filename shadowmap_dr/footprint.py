@@ -11,8 +11,9 @@ import mitsuba as mi
 
 from .sensors import Sensor
 
-#: Up to this many by this many spots are arrays of their own.
+#: Up to this many by this many spots are arrays of their own; so are more, if one array of all would be longer than that.
 _WRITTEN_OUT = 2
+_MOST_LANES = 1 << 22
 
 
 def footprint_points(sensor: Sensor, size: tuple[int, int], depth: Any, p_world: Any, n_world: Any, count: int) -> list[Any]:
@@ -33,8 +34,8 @@ class Spots:
     """The points of :func:`footprint_points` for all pixels, for means over what is found there.
 
     Many spots of few pixels are one array: the first of all pixels, the second of all, and so on. Written out one by one, they
-    would all be compiled, which takes time that grows faster than their number. Few spots are an array each: larger images
-    have those, and no use for more lanes.
+    would all be compiled, which takes time that grows faster than their number. Few spots are an array each, and so are those
+    of large images, which have no use for more lanes, and none of the memory for them.
 
     Attributes:
         points: Point3f (C N,) each, attached to the pixels' own points.
@@ -51,9 +52,9 @@ class Spots:
         cls, sensor: Sensor, size: tuple[int, int], depth: Any, p_world: Any, n_world: Any, active: Any, count: int
     ) -> Spots:
         """``count`` x ``count`` spots of each of N pixels; arguments as of :func:`footprint_points`, and Bool (N,)."""
-        if count <= _WRITTEN_OUT:
-            return cls(footprint_points(sensor, size, depth, p_world, n_world, count), active, 1)
         copies = count * count
+        if count <= _WRITTEN_OUT or copies * dr.width(p_world) > _MOST_LANES:
+            return cls(footprint_points(sensor, size, depth, p_world, n_world, count), active, 1)
         dr.eval(p_world, n_world, depth, active)
         points = dr.custom(_Copies, p_world, copies, False)
         with dr.suspend_grad():

@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from shadowmap_dr import footprint
 from shadowmap_dr.footprint import Spots, footprint_points
 from shadowmap_dr.sensors import Sensor, sensors_of
 
@@ -88,10 +89,15 @@ def test_means_and_their_derivatives_are_those_of_sums_written_out(variant: str,
     assert np.abs(results[0][1]).max() > 1
 
 
-def test_many_spots_are_one_array(variant: str) -> None:
-    """As arrays of their own, nine look-ups would be compiled nine times."""
+def test_many_spots_are_one_array(variant: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As arrays of their own, nine look-ups would be compiled nine times. Of a large image they are: memory is dearer."""
     mitsuba_sensor, sensor = camera("perspective")
     points, normal, depth = seen(mitsuba_sensor)
+
+    def spots(count: int) -> Spots:
+        return Spots.of(sensor, (SIZE, SIZE + 2), depth, points, normal, mi.Bool(True), count)
+
     for count, arrays in ((1, 1), (2, 4), (3, 1), (8, 1)):
-        spots = Spots.of(sensor, (SIZE, SIZE + 2), depth, points, normal, mi.Bool(True), count)
-        assert len(spots.points) == arrays and arrays * spots.copies == count**2
+        assert len(spots(count).points) == arrays and arrays * spots(count).copies == count**2
+    monkeypatch.setattr(footprint, "_MOST_LANES", 9 * dr.width(points))
+    assert (len(spots(3).points), len(spots(4).points)) == (1, 16)

@@ -16,6 +16,7 @@ import numpy as np
 
 from .errors import ShadowmapError
 from .geometry import normalize_or
+from .raster._memory import device_array
 from .tubes import Circles, Layout
 
 # Half the latitude, in radians, that a joint of a linear curve spans beyond its bend. Without it its circles would coincide on a
@@ -51,7 +52,7 @@ class BSplines:
                 local += list(places)
                 v += list((number + places) / len(segments))
         layout = Layout.of(around, np.array(first), np.array(v), np.zeros(len(v), bool))
-        return cls(mi.UInt32(np.array(start, np.uint32)), mi.Float(np.array(local, np.float32))), layout
+        return cls(device_array(mi.UInt32, start), device_array(mi.Float, local)), layout
 
     def circles(self, control_points: Any) -> Circles:
         """Circles for control points (x, y, z, radius), flat Float (4P,), attached to them."""
@@ -123,8 +124,8 @@ class Polylines:
             rows += curve
         table = np.array(rows, np.float64)
         layout = Layout.of(around, np.array(first), table[:, 6], np.abs(table[:, 5]) == 1)
-        indices = (mi.UInt32(column.astype(np.uint32)) for column in table.T[:3])
-        return cls(*indices, *(mi.Float(column.astype(np.float32)) for column in table.T[3:6])), layout
+        indices = (device_array(mi.UInt32, column) for column in table.T[:3])
+        return cls(*indices, *(device_array(mi.Float, column) for column in table.T[3:6])), layout
 
     def circles(self, control_points: Any) -> Circles:
         """Circles for control points (x, y, z, radius), flat Float (4P,), attached to them."""

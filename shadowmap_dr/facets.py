@@ -18,6 +18,7 @@ import numpy as np
 from .geometry import HAS_NORMALS, Geometry, normalize_or
 from .hits import Hits
 from .raster import Topology
+from .raster._memory import device_array
 
 # Facets below the first size (in pixels) are shaded with mean normals, those above the second with their own.
 _SMALL, _LARGE = 1.5, 3.0
@@ -47,7 +48,7 @@ def flat_faces(geometry: Geometry, topology: Topology) -> FlatFaces | None:
     places = topology.welded.numpy().reshape(-1, 3)[faces].ravel()
     order = np.argsort(places, kind="stable")
     start = np.searchsorted(places[order], np.arange(geometry.vertex_count + 1))
-    return FlatFaces(mi.UInt32(start.astype(np.uint32)), mi.UInt32(faces[order // 3]), mi.Bool(chosen))
+    return FlatFaces(device_array(mi.UInt32, start), device_array(mi.UInt32, faces[order // 3]), device_array(mi.Bool, chosen))
 
 
 def crease_edges(geometry: Geometry, topology: Topology) -> Any:

@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from .errors import ShadowmapError
 from .raster import Topology, build_topology
+from .raster._memory import device_array
 from .shadow import (
     Frusta,
     LightView,
@@ -109,14 +110,14 @@ class ReceiverShadows:
         rows, columns = window.pixels(height)
         x = window.low[0] + (np.arange(columns) + 0.5) / columns * window.size[0]
         y = window.high[1] - (np.arange(rows) + 0.5) / rows * window.size[1]
-        x, y = (np.ascontiguousarray(a.ravel(), np.float32) for a in np.meshgrid(x, y))
-        points = mi.Point3f(mi.Float(x), mi.Float(y), dr.full(mi.Float, window.z, len(x)))
+        x, y = (device_array(mi.Float, a) for a in np.meshgrid(x, y))
+        points = mi.Point3f(x, y, dr.full(mi.Float, window.z, len(x)))
         triangles = np.asarray(faces).reshape(-1, 3)
         views = stack_views([_view(direction) for direction in directions])
         frusta = _frusta(directions, window, reach)
         dr.eval(points, views, frusta)
         return cls(
-            points, mi.UInt32(triangles.ravel().astype(np.uint32)), build_topology(triangles, np.asarray(positions), mi.UInt32),
+            points, device_array(mi.UInt32, triangles), build_topology(triangles, np.asarray(positions), mi.UInt32),
             views, frusta, settings, (rows, columns),
         )
 
@@ -162,4 +163,4 @@ def _frusta(directions: Sequence[tuple[float, float, float]], window: Window, re
     half = np.broadcast_to(0.5 * (1 + 2 * _MARGIN) * np.array(window.size), center.shape)
     depths = [np.full(len(center), depth - window.z) for depth in (-reach, -0.5 * gap, -gap)]
     values = (center[:, 0], center[:, 1], half[:, 0], half[:, 1], *depths)
-    return Frusta(*(mi.Float(np.ascontiguousarray(value, np.float32)) for value in values))
+    return Frusta(*(device_array(mi.Float, value) for value in values))

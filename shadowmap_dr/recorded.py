@@ -11,6 +11,7 @@ import mitsuba as mi
 
 from .garbage import uncollected
 from .pending import backward, pass_on
+from .raster._memory import own_memory
 from .records import attached_places, map_arrays
 from .renderer import Renderer
 
@@ -36,13 +37,18 @@ class Recorded:
         if not outer:
             return
         with uncollected():
-            found = self._gradients(spp, places, dr.detach(gradient), plain(renderer))
+            found = self._gradients(spp, places, _owned(gradient), plain(renderer))
         pass_on(outer, found)
 
     @property
     def recordings(self) -> int:
         """How many there have been."""
         return self._image.n_recordings + self._gradients.n_recordings
+
+
+def _owned(gradient: Any) -> Any:
+    """The detached gradient, not in memory of NumPy's or PyTorch's, whose alignment a recording would be particular about."""
+    return own_memory(gradient) if gradient.array.state == dr.VarState.Evaluated else dr.detach(gradient)
 
 
 # The renderer comes last: Dr.Jit 1.5 does not tell recordings apart by Python's numbers and strings that follow it.

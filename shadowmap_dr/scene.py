@@ -19,6 +19,7 @@ from .errors import ShadowmapError, UnsupportedShape
 from .geometry import Geometry, ShapeInfo, pack_face_info
 from .lights import AreaLight, Light, area_lights_of, environments_of, lights_of
 from .omissions import omissions_of, warn_of
+from .raster._memory import device_array
 from .sensors import Sensor, sensors_of
 from .sources import CurveSource, ShapeSource, source_of
 from .traversal import children
@@ -107,11 +108,11 @@ def load(scene: Any, *, tessellation: int = 64, warn: bool = True) -> SceneData:
         normals=None,
         texcoords=None,
         rest_positions=None,
-        faces=mi.UInt32(np.concatenate(faces).ravel()),
-        face_shape=mi.UInt32(np.repeat(shape_index, face_counts)),
-        face_info=mi.UInt32(pack_face_info(tuple(infos))),
-        vertex_shape=mi.UInt32(np.repeat(shape_index, vertex_counts)),
-        shape_face_start=mi.UInt32([i.face_start for i in infos]),
+        faces=device_array(mi.UInt32, np.concatenate(faces)),
+        face_shape=device_array(mi.UInt32, np.repeat(shape_index, face_counts)),
+        face_info=device_array(mi.UInt32, pack_face_info(tuple(infos))),
+        vertex_shape=device_array(mi.UInt32, np.repeat(shape_index, vertex_counts)),
+        shape_face_start=device_array(mi.UInt32, [i.face_start for i in infos]),
         shapes=tuple(infos),
     )
     data = SceneData(

@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from .geometry import normalize_or
+from .raster._memory import device_array
 
 # Least part of a normal that points away from the curve, relative to a straight tube's: where a curve bends more than its tube
 # allows, the tube's inner side is folded, and normals would change sides.
@@ -47,11 +48,11 @@ class Layout:
         angle = 2 * np.pi * np.arange(corners) / corners
         return cls(
             corners=corners,
-            previous=mi.UInt32(np.maximum(number - 1, first).astype(np.uint32)),
-            first=mi.UInt32(first.astype(np.uint32)),
-            v=mi.Float(v.astype(np.float32)),
-            shift=mi.Float(np.where(points, 0.5, 0).astype(np.float32)),
-            directions=mi.Float(np.stack([np.cos(angle), np.sin(angle)], -1).astype(np.float32).ravel()),
+            previous=device_array(mi.UInt32, np.maximum(number - 1, first)),
+            first=device_array(mi.UInt32, first),
+            v=device_array(mi.Float, v),
+            shift=device_array(mi.Float, np.where(points, 0.5, 0)),
+            directions=device_array(mi.Float, np.stack([np.cos(angle), np.sin(angle)], -1)),
         )
 
     def faces(self) -> np.ndarray:

@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from integrator_scenes import camera, full_scene, shadowmap, small_scene
+from test_memory import unaligned
 from test_pending import lit_scene
 
 from shadowmap_dr import ShadowmapError
@@ -67,6 +68,28 @@ def test_steps_are_replayed(variant: str, monkeypatch: pytest.MonkeyPatch) -> No
         assert 2 <= counts[0] <= 4 and counts[3] <= 8 and counts[3:] == 3 * counts[3:4]
         monkeypatch.setattr(Renderer, "render", lambda self, **options: pytest.fail("not replayed"))
         step(scene, recorded, VERTICES, vertices + 0.05)
+
+
+def test_gradients_may_lie_anywhere(variant: str) -> None:
+    """Dr.Jit borrows NumPy's memory, and would record anew for other alignments."""
+    scene, (_, recorded) = small_scene(), both()
+    params = mi.traverse(scene)
+    vertices = mi.Float(dr.detach(params[VERTICES]))
+    weight = np.random.default_rng(1).uniform(0, 1, (64, 64, 3)).astype(np.float32)
+    counts, gradients = [], []
+    with quiet_garbage():
+        for k, offset in enumerate((0, 0, 0, 1, 4)):
+            moved = vertices + 0.01 * (k % 2 + 1)
+            dr.enable_grad(moved)
+            params[VERTICES] = moved
+            params.update()
+            image = mi.render(scene, params, integrator=recorded)
+            dr.backward(dr.sum(image * mi.TensorXf(unaligned(weight, offset)), axis=None))
+            counts.append(recordings(recorded))
+            gradients.append(dr.grad(moved).numpy())
+    assert counts[2:] == 3 * counts[2:3]
+    assert np.abs(gradients[1]).max() > 1e-3
+    np.testing.assert_allclose(gradients[3], gradients[1], atol=2e-4 * np.abs(gradients[1]).max())
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import ShadowmapError
+from ..raster._memory import device_array
 
 
 def apply_pose(p_rest: Any, pose: Any, shift_z: float = 0.0) -> Any:
@@ -69,8 +70,8 @@ class PoseFit:
             raise ShadowmapError(f"a reference of shape {image.shape}: give finite values in the shape (H, W, C).")
         self._initial_renderer = renderer
         self._shape = shape
-        self._p_rest = mi.Float(np.asarray(p_rest, np.float32).ravel())
-        self._reference = mi.TensorXf(image)
+        self._p_rest = device_array(mi.Float, p_rest)
+        self._reference = mi.TensorXf(device_array(mi.Float, image), image.shape)
         self._step_size, self._betas, self._shift_z = step_size, betas, shift_z
         self._spp = {} if spp == 1 else {"spp": spp}  # the default need not be known to the renderer
         self._settings = dict(settings or {})
@@ -92,7 +93,7 @@ class PoseFit:
 
     def render(self, parameters: npt.ArrayLike) -> npt.NDArray[np.float32]:
         """Linear image (H, W, C) at the given parameters. No gradients."""
-        pose = mi.Float(np.asarray(parameters, np.float32))
+        pose = device_array(mi.Float, parameters)
         positions = apply_pose(self._p_rest, pose, self._shift_z)
         with dr.suspend_grad():
             # A copy, since a renderer keeps the fit of its shadow maps from one image to the next.
@@ -100,7 +101,7 @@ class PoseFit:
 
     def gradient(self, parameters: npt.ArrayLike) -> npt.NDArray[np.float32]:
         """(3,) derivative of the loss with respect to the parameters; leaves the state of the fit alone."""
-        pose = mi.Float(np.asarray(parameters, np.float32))
+        pose = device_array(mi.Float, parameters)
         dr.enable_grad(pose)
         _gradient(copy.copy(self._renderer), pose, self._p_rest, self._reference, self._shape, self._shift_z, self._spp)
         return np.array(dr.grad(pose))
@@ -116,17 +117,18 @@ class PoseFit:
 
     def load_state(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
         """Go on from what `state` returned."""
-        pose = mi.Float(np.asarray(state["parameters"], np.float32))
+        pose = device_array(mi.Float, state["parameters"])
         if dr.width(pose) != 3:
             raise ShadowmapError(f"a pose of {dr.width(pose)} numbers: give rotation (radians), x and y.")
         self._optimizer = mi.ad.Adam(lr=self._step_size, beta_1=self._betas[0], beta_2=self._betas[1], params={"pose": pose})
         value, promoted, rate, (t, m, v, v_max) = self._optimizer.state["pose"]
-        t = type(t)(np.asarray(state["t"], np.uint32))
-        m, v = (type(m)(np.asarray(state[name], np.float32)) for name in ("m", "v"))
+        t = device_array(type(t), state["t"])
+        m, v = (device_array(type(m), state[name]) for name in ("m", "v"))
         self._optimizer.state["pose"] = value, promoted, rate, (t, m, v, v_max)
         # The fit of the shadow maps follows the object with some inertia: each run starts from the same fit, or from its own.
         self._renderer = copy.copy(self._initial_renderer)
-        stored = {name.removeprefix("frusta."): mi.Float(value) for name, value in state.items() if name.startswith("frusta.")}
+        fit = {name.removeprefix("frusta."): value for name, value in state.items() if name.startswith("frusta.")}
+        stored = {name: device_array(mi.Float, value) for name, value in fit.items()}
         if stored:
             self._renderer.frusta = replace(self._renderer.frusta, **stored)
 

@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import ShadowmapError
+from ..raster._memory import device_array
 from .loop import History, Method, optimize
 
 FloatArray = npt.NDArray[np.float64]
@@ -196,7 +197,7 @@ class _BatchFit:
         return {"losses": self.loss_curves(), **{name: np.array(value) for name, value in state.items()}}
 
     def load_state(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
-        values = (mi.Float(np.asarray(state[name], np.float32)) for name in ("parameters", "m", "v", "t"))
+        values = (device_array(mi.Float, state[name]) for name in ("parameters", "m", "v", "t"))
         self._parameters, self._m, self._v, self._t = values
         self._losses = list(state["losses"])
 

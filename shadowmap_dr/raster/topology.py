@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from ._memory import device_array
+
 #: Stands for "no second face" in :attr:`Topology.opposite`.
 NO_VERTEX = 0xFFFFFFFF
 
@@ -59,7 +61,7 @@ def build_topology(faces: np.ndarray, positions: np.ndarray, dtype: type) -> Top
     _, weld = np.unique(positions.view([("", np.float32)] * 3).ravel(), return_inverse=True)
     welded = weld[faces]
     parts, part_count = _parts(welded)
-    flat = [dtype(np.ascontiguousarray(t.ravel().astype(np.uint32))) for t in (faces, welded, parts)]
+    flat = [device_array(dtype, t) for t in (faces, welded, parts)]
     proper = (welded != np.roll(welded, 1, 1)).all(1)
     where = np.flatnonzero(proper)
     beyond = np.full(3 * len(proper), NO_VERTEX)
@@ -80,12 +82,12 @@ def build_topology(faces: np.ndarray, positions: np.ndarray, dtype: type) -> Top
     beyond[slot[pair]], beyond[slot[partner]] = opposite[partner], opposite[pair]
     second = np.concatenate([opposite[partner], np.full(len(alone), NO_VERTEX)])
     return Topology(
-        dtype(np.stack([a[edges], b[edges]], 1).ravel().astype(np.uint32)),
-        dtype(np.stack([opposite[edges], second], 1).ravel().astype(np.uint32)),
+        device_array(dtype, np.stack([a[edges], b[edges]], 1)),
+        device_array(dtype, np.stack([opposite[edges], second], 1)),
         len(edges),
         *flat,
         part_count,
-        dtype(beyond.astype(np.uint32)),
+        device_array(dtype, beyond),
         vertex_count,
     )
 

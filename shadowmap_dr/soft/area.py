@@ -11,6 +11,7 @@ import numpy as np
 
 from ..geometry import Geometry, ShapeInfo
 from ..lights import AreaLight
+from ..raster._memory import device_array
 from .clusters import surface_clusters
 from .samples import BEND, LightSamples, brightness, cluster_sums
 
@@ -74,12 +75,12 @@ def plan_area(light: AreaLight, geometry: Geometry, count: int) -> AreaPlan:
     weights = np.maximum(weights, 1e-12 * max(weights.max(), 1e-300))
     cluster, chosen = surface_clusters(centres, weights, count, normals[face], _OPPOSITE * nearest)
     return AreaPlan(
-        face=mi.UInt32((face + info.face_start).astype(np.uint32)),
-        u=mi.Float(u.astype(np.float32)),
-        v=mi.Float(v.astype(np.float32)),
-        fraction=mi.Float(fraction.astype(np.float32)),
-        cluster=mi.UInt32(cluster),
-        chosen=mi.UInt32(chosen.astype(np.uint32)),
+        face=device_array(mi.UInt32, face + info.face_start),
+        u=device_array(mi.Float, u),
+        v=device_array(mi.Float, v),
+        fraction=device_array(mi.Float, fraction),
+        cluster=device_array(mi.UInt32, cluster),
+        chosen=device_array(mi.UInt32, chosen),
         shape=light.shape,
         dented=not info.planar and not info.flip_geometric and _dented(centres[chosen], corners, normals),
     )
@@ -135,7 +136,7 @@ def _uv(geometry: Geometry, face: Any, u: Any, v: Any, info: ShapeInfo) -> Any:
 
 
 def _brightness(light: AreaLight, geometry: Geometry, face: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    arguments = (mi.UInt32(face.astype(np.uint32)), mi.Float(u.astype(np.float32)), mi.Float(v.astype(np.float32)))
+    arguments = (device_array(mi.UInt32, face), device_array(mi.Float, u), device_array(mi.Float, v))
     radiance = light.radiance(_uv(geometry, *arguments, geometry.shapes[light.shape]))
     return brightness(light.name, radiance, len(face))
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from ..environments import Environment
 from ..geometry import Geometry
+from ..raster._memory import device_array
 from .clusters import sky_clusters
 from .samples import LightSamples, brightness, cluster_sums
 
@@ -61,7 +62,7 @@ def plan_sky(light: Environment, count: int, geometry: Geometry) -> SkyPlan:
     heaviest = directions[order[np.searchsorted(cluster[order], np.arange(count))]]
     cancelled = length < 1e-3 * np.bincount(cluster, energy, count)
     centre = np.where(cancelled[:, None], heaviest, centre / np.maximum(length, 1e-300)[:, None])
-    return SkyPlan(rows, mi.UInt32(cluster), mi.Vector3f(centre.T.astype(np.float32)))
+    return SkyPlan(rows, device_array(mi.UInt32, cluster), mi.Vector3f(*(device_array(mi.Float, column) for column in centre.T)))
 
 
 def _divided(energy: np.ndarray, hidden: np.ndarray, count: int) -> np.ndarray:

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...errors import ShadowmapError
+from ...raster._memory import device_array
 from ...renderer import Renderer
 from .images import SHAPE
 
@@ -52,9 +53,9 @@ class ShadowFit:
         if image.ndim != 3 or not np.isfinite(image).all():
             raise ShadowmapError(f"a reference of shape {image.shape}: give finite values in the shape (H, W, C).")
         self._initial, self._renderer = renderer, renderer
-        self._rest = mi.Float(rest.ravel())
-        self._basis = [mi.Float(direction.ravel()) for direction in directions]
-        self._reference = mi.TensorXf(image)
+        self._rest = device_array(mi.Float, rest)
+        self._basis = [device_array(mi.Float, direction) for direction in directions]
+        self._reference = mi.TensorXf(device_array(mi.Float, image), image.shape)
         self._step_size, self._decay, self._settings = step_size, decay, dict(settings or {})
         self._step = dr.freeze(_step)
         self.reset(np.zeros(len(directions)))
@@ -109,7 +110,8 @@ class ShadowFit:
         self._t = int(np.asarray(state["t"]).reshape(-1)[0])
         # The fit of the shadow map follows the occluder with some inertia: each run starts from the same one, or from its own.
         self._renderer = copy.copy(self._initial)
-        stored = {name.removeprefix("frusta."): mi.Float(value) for name, value in state.items() if name.startswith("frusta.")}
+        fit = {name.removeprefix("frusta."): value for name, value in state.items() if name.startswith("frusta.")}
+        stored = {name: device_array(mi.Float, value) for name, value in fit.items()}
         if stored and self._renderer.frusta is not None:
             self._renderer.frusta = replace(self._renderer.frusta, **stored)
 

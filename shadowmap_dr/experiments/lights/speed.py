@@ -18,6 +18,7 @@ from ...inverse import LightBatch, StillScene, run_sweep
 from ...inverse.lights.batch import batch_bytes
 from ...inverse.lights.pixels import mixed_pixels
 from ...light_maps import light_visibility, make_maps
+from ...raster._memory import device_array
 from ...renderer import Renderer
 from .problem import LightProblem
 from .scene import make_scene
@@ -81,7 +82,7 @@ def measure(problem: LightProblem, batches: Sequence[int], seconds: float = 6.0)
 
 
 def _single(image: Callable[..., Any], scene: tuple[Any, ...], start: np.ndarray, target: np.ndarray) -> Callable[[], Any]:
-    wanted = mi.Float(np.ascontiguousarray(target).ravel())
+    wanted = device_array(mi.Float, target)
     vectors = [mi.Vector3f(*(float(c) for c in direction)) for direction in start]
 
     def step(scene: tuple[Any, ...], vectors: list[Any], wanted: Any) -> Any:

@@ -11,8 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ...errors import ShadowmapError
+from ...raster._memory import device_array
 from .sculpt import checked_target
-from .shadow_images import ShadowImages, device_array, image_loss, shadow_images
+from .shadow_images import ShadowImages, image_loss, shadow_images
 from .shadow_views import ShadowView
 
 # Numbers of each copy: offset (3), quaternion (4: x, y, z, w), logarithm of the scale.
@@ -67,7 +68,7 @@ class Collection:
             raise ShadowmapError(f"{len(targets)} targets for {len(views)} views: give one for each.")
         self.views = tuple(views)
         self._targets = [checked_target(image, view) for image, view in zip(targets, self.views, strict=True)]
-        self._wanted = device_array(np.concatenate([image.ravel() for image in self._targets]))
+        self._wanted = device_array(mi.Float, np.concatenate([image.ravel() for image in self._targets]))
         self._rest, self._rest_faces = np.array(vertices, np.float32), np.array(faces, np.uint32)
         self._shadow = {"map_resolution": map_resolution, "filter_size": filter_size, "method": method}
         self._interval, self._most, self._seed = interval, most, seed
@@ -123,7 +124,7 @@ class Collection:
 
     def load_state(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
         """Go on from what `state` returned, whatever number of copies it has."""
-        numbers, m, v = (device_array(state[name]) for name in ("numbers", "m", "v"))
+        numbers, m, v = (device_array(mi.Float, state[name]) for name in ("numbers", "m", "v"))
         if dr.width(numbers) % _NUMBERS or {dr.width(m), dr.width(v)} != {dr.width(numbers)}:
             raise ShadowmapError(f"a state of {dr.width(numbers)} numbers: it must hold {_NUMBERS} for each copy.")
         self._prepare(dr.width(numbers) // _NUMBERS)
@@ -147,7 +148,7 @@ class Collection:
         # Apart from each other, so that no two copies are taken for one where they touch.
         apart = self._rest + np.arange(count, dtype=np.float32)[:, None, None] * np.float32(4)
         self._shadows = shadow_images(apart.reshape(-1, 3), self.faces, self.views, **self._shadow)
-        self._points = mi.Point3f(*(mi.Float(np.tile(self._rest[:, c], count)) for c in range(3)))
+        self._points = mi.Point3f(*(device_array(mi.Float, np.tile(self._rest[:, c], count)) for c in range(3)))
         self._gradient, self._look = dr.freeze(_gradient), dr.freeze(_look)
 
     def _double(self) -> None:

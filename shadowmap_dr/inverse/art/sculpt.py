@@ -11,7 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ...errors import ShadowmapError
-from .shadow_images import ShadowImages, device_array, image_loss, shadow_images
+from ...raster._memory import device_array
+from .shadow_images import ShadowImages, image_loss, shadow_images
 from .shadow_views import ShadowView
 from .smoothness import normal_consistency
 
@@ -122,7 +123,7 @@ class Sculptor:
     def step(self) -> Any:
         """One step; returns the loss before it, ``Float`` (1,), without waiting for it."""
         if self._wanted is None:
-            self._wanted = device_array(np.concatenate([image.ravel() for image in self._targets]))
+            self._wanted = device_array(mi.Float, np.concatenate([image.ravel() for image in self._targets]))
         loss, slope = self._gradient(dr.detach(self._vertices), self._wanted, self._consistency, self._shadows)
         dr.set_grad(self._vertices, slope)
         dr.enqueue(dr.ADMode.Backward, self._vertices)
@@ -162,12 +163,12 @@ class Sculptor:
 
     def load_state(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
         """Go on from what `state` returned, possibly in another process. Targets stay as they are."""
-        u, m, v = (mi.Float(np.asarray(state[name], np.float32)) for name in ("u", "m", "v"))
+        u, m, v = (device_array(mi.Float, state[name]) for name in ("u", "m", "v"))
         if {dr.width(u), dr.width(m), dr.width(v)} != {3 * self._solver.n_verts}:
             raise ShadowmapError(f"a state of {dr.width(u)} numbers for a mesh of {3 * self._solver.n_verts}.")
         self._optimizer = mi.ad.Adam(lr=self._step_size, uniform=True, params={"u": u})
         value, promoted, rate, (t, *_, v_max) = self._optimizer.state["u"]
-        t = type(t)(np.asarray(state["t"], np.uint32))
+        t = device_array(type(t), state["t"])
         self._optimizer.state["u"] = value, promoted, rate, (t, m, v, v_max)
         self._steps = int(np.asarray(state["steps"]).reshape(-1)[0])
         self._solve()

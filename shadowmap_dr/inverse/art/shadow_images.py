@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from ...errors import ShadowmapError
 from ...raster import Topology, build_topology
+from ...raster._memory import device_array
 from ...shadow import Frusta, ShadowSettings, Views, filter_maps, render_maps, vertices_in_maps, visibility
 from .shadow_views import ShadowView
 
@@ -108,11 +109,11 @@ def shadow_images(
         raise ShadowmapError("a view's camera sees nothing of its receiver.")
     points = np.concatenate([_in_plane(view) for view in views])
     return ShadowImages(
-        mi.UInt32(corners.ravel().astype(np.uint32)),
+        device_array(mi.UInt32, corners),
         topology,
-        mi.Point3f(*(mi.Float(np.ascontiguousarray(points[:, c], np.float32)) for c in range(3))),
-        mi.UInt32(np.concatenate([np.full(pixels.size, k, np.uint32) for k, pixels in enumerate(seen)])),
-        mi.Float(np.concatenate([pixels / pixels.sum() for pixels in seen]).astype(np.float32)),
+        mi.Point3f(*(device_array(mi.Float, points[:, c]) for c in range(3))),
+        device_array(mi.UInt32, np.concatenate([np.full(pixels.size, k) for k, pixels in enumerate(seen)])),
+        device_array(mi.Float, np.concatenate([pixels / pixels.sum() for pixels in seen])),
         tuple(view.shape for view in views),
         Views(
             *(mi.Point3f(*_columns([getattr(view, name) for view in views])) for name in ("right", "up", "forward", "origin")),
@@ -137,18 +138,8 @@ def image_loss(shadows: ShadowImages, seen: Any, wanted: Any) -> Any:
     return dr.sum(square)
 
 
-def device_array(values: npt.ArrayLike) -> Any:
-    """``Float`` in memory of Dr.Jit's own.
-
-    Dr.Jit borrows NumPy's memory where it can, and records a function anew when it is called with memory of another alignment.
-    """
-    result = mi.Float(np.ascontiguousarray(values, np.float32)) + dr.opaque(mi.Float, 0)
-    dr.eval(result)
-    return result
-
-
 def _columns(vectors: Sequence[npt.ArrayLike]) -> list[Any]:
-    return [mi.Float(np.ascontiguousarray(column)) for column in np.asarray(vectors, np.float32).T]
+    return [device_array(mi.Float, column) for column in np.asarray(vectors).T]
 
 
 def _frusta(views: Sequence[ShadowView]) -> Frusta:

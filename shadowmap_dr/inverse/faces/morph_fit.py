@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...errors import ShadowmapError
+from ...raster._memory import device_array
 from ...receiver import ReceiverShadows
 from .blend_shapes import blend
 
@@ -66,9 +67,9 @@ class MorphFit:
             moves[0, :, 0] = moves[1, :, 1] = 1
             directions = np.concatenate([directions, moves])
         self._shadows = shadows
-        self._rest, self._basis = mi.Float(positions.ravel()), mi.Float(np.ascontiguousarray(directions).ravel())
+        self._rest, self._basis = device_array(mi.Float, positions), device_array(mi.Float, directions)
         self.reference = image
-        self._reference = mi.Float(image.ravel())
+        self._reference = device_array(mi.Float, image)
         self._prior = dr.opaque(mi.Float, prior)
         self._rates = {"weights": step_size} | ({"translation": translation_step} if translate else {})
         self._settings = {**(settings or {}), "prior": float(prior), "translate": translate}
@@ -134,10 +135,10 @@ class MorphFit:
         begin = 0
         for k, (name, size) in enumerate(sizes.items()):
             part = slice(begin, begin + size)
-            self._optimizer[name] = mi.Float(split["parameters"][part].astype(np.float32))
+            self._optimizer[name] = device_array(mi.Float, split["parameters"][part])
             value, promoted, rate, (t, m, v, v_max) = self._optimizer.state[name]
-            t = type(t)(split["t"][k : k + 1].astype(np.uint32))
-            m, v = (type(m)(split[key][part].astype(np.float32)) for key in ("m", "v"))
+            t = device_array(type(t), split["t"][k : k + 1])
+            m, v = (device_array(type(m), split[key][part]) for key in ("m", "v"))
             self._optimizer.state[name] = value, promoted, rate, (t, m, v, v_max)
             begin += size
         self._optimizer.set_learning_rate(self._rates)
@@ -159,7 +160,7 @@ class MorphFit:
         total = sum(self._sizes().values())
         if len(values) != total:
             raise ShadowmapError(f"{len(values)} parameters: give {total}.")
-        return mi.Float(values)
+        return device_array(mi.Float, values)
 
 
 def _all_parameters(optimizer: Any) -> Any:

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...errors import ShadowmapError
+from ...raster._memory import device_array
 from ...shadow import Frusta
 from .pixels import StillScene
 from .shading import fit_maps, images, light_views, losses_and_gradients, render_lights, with_shadow
@@ -178,14 +179,14 @@ class LightBatch:
         if not (np.isfinite(length) & (length > 0)).all():
             raise ShadowmapError("a direction has no length, or one that is not finite: give finite vectors other than zero.")
         unit = (array / length).reshape(-1, 3).astype(np.float32)
-        return mi.Vector3f(*(_device_array(unit[:, c]) for c in range(3))), len(array)
+        return mi.Vector3f(*(device_array(mi.Float, unit[:, c]) for c in range(3))), len(array)
 
     def _targets(self, targets: npt.ArrayLike, runs: int) -> list[Any]:
         pixels, array = self.scene.pixels, np.asarray(targets, np.float32)
         shape = (runs, pixels.height, pixels.width, pixels.channels)
         if array.shape != shape or not np.isfinite(array).all():
             raise ShadowmapError(f"targets of shape {array.shape}: give finite values in the shape {shape}.")
-        return [_device_array(array[..., c]) for c in range(pixels.channels)]
+        return [device_array(mi.Float, array[..., c]) for c in range(pixels.channels)]
 
 
 def batch_bytes(lights: int, pixels: int, channels: int = 3, map_resolution: int = 0) -> int:
@@ -202,13 +203,6 @@ def batch_bytes(lights: int, pixels: int, channels: int = 3, map_resolution: int
 def _zeros(count: int) -> Any:
     """An array of its own: to a recorded function, constants and arrays that are passed twice are something else."""
     return dr.opaque(mi.Float, 0, count)
-
-
-def _device_array(numbers: FloatArray) -> Any:
-    """A copy in Dr.Jit's memory: where NumPy's lies, by chance, would make recorded functions record anew."""
-    array = mi.Float(np.ascontiguousarray(numbers).ravel()) + dr.opaque(mi.Float, 0)
-    dr.eval(array)
-    return array
 
 
 def _own_arrays(frusta: Frusta) -> Frusta:

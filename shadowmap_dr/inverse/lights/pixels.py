@@ -12,6 +12,7 @@ from ...errors import ShadowmapError
 from ...light_maps import boxes_of, shape_planes
 from ...lights import DirectionalLight
 from ...raster import Topology, build_topology, drawing_order, outward_faces
+from ...raster._memory import device_array
 from ...raster.blend import Mixer
 from ...renderer import GBuffer, Renderer
 from ...shadow import Boxes, ShadowSettings
@@ -123,9 +124,9 @@ class StillScene:
                 irradiance,
                 shadow,
                 p_world,
-                mi.UInt32(faces.ravel()),
+                device_array(mi.UInt32, faces),
                 topology,
-                mi.Bool(outward_faces(topology, vertices)),
+                device_array(mi.Bool, outward_faces(topology, vertices)),
                 geometry.vertex_shape,
                 len(geometry.shapes),
                 planes,

@@ -14,23 +14,25 @@ from .raster import NO_TRIANGLE, RasterOutput
 from .sensors import Sensor
 from .spread import spread
 
+# Depth range of orthographic cameras, in units of the farthest vertex's distance.
+_ROOM = 1.01
 # About so many pixels along each side are looked at to find out which part of the scene is in view.
 _SEEN_ACROSS = 128
 
 
-def camera_clip(sensor: Sensor, geometry: Geometry, center: tuple[float, float, float], radius: float) -> Any:
+def camera_clip(sensor: Sensor, geometry: Geometry) -> Any:
     """Clip-space vertices (Float, 4 V) for the rasterizer. Attached to vertices and camera.
 
     Depths differ from ``Sensor.view_projection``, whose near and far planes (0.01 and 10,000 by default) leave little of
     single precision: a perspective camera stores -near / distance, which keeps full relative precision at any distance, and an
-    orthographic one spreads its range over the scene (a sphere, with room around it) instead of up to the far plane.
+    orthographic one spreads its range over the scene instead of up to the far plane.
     """
     projection, view = sensor.projection, sensor.view
     near = dr.detach(sensor.near)
     if sensor.kind == "perspective":
         depth = [0.0, 0.0, 0.0, -near]
     else:
-        reach = _orthographic_reach(sensor, center, radius)
+        reach = _orthographic_reach(sensor, geometry)
         depth = [0.0, 0.0, 2 / reach, -1 - 2 * near / reach]
     rows = [[projection[r, c] for c in range(4)] for r in (0, 1, 3)]
     to_clip = mi.Matrix4f(rows[0], rows[1], depth, rows[2]) @ view
@@ -52,7 +54,7 @@ def without_shapes(clip: Any, geometry: Geometry, shapes: Sequence[int]) -> Any:
     return dr.select(hidden, dr.select((lane & 3) == 3, mi.Float(-1), 0), clip)
 
 
-def seen_points(sensor: Sensor, raster: RasterOutput, center: tuple[float, float, float], radius: float) -> tuple[Any, Any]:
+def seen_points(sensor: Sensor, raster: RasterOutput, geometry: Geometry) -> tuple[Any, Any]:
     """Points on what a camera sees (Point3f, world space) and which of them there are, at most about 128 x 128. Detached.
 
     They come from the rasterizer's depth planes, without the cost of interpolating the whole image.
@@ -77,15 +79,18 @@ def seen_points(sensor: Sensor, raster: RasterOutput, center: tuple[float, float
             local = mi.Point3f((x - projection[0, 2]) / projection[0, 0] * z, (y - projection[1, 2]) / projection[1, 1] * z, z)
             hit &= z <= dr.detach(sensor.far)
         else:
-            z = dr.fma(0.5 * depth + 0.5, _orthographic_reach(sensor, center, radius), near)
+            z = dr.fma(0.5 * depth + 0.5, _orthographic_reach(sensor, geometry), near)
             local = mi.Point3f((x - projection[0, 3]) / projection[0, 0], (y - projection[1, 3]) / projection[1, 1], z)
         return mi.Transform4f(dr.detach(sensor.to_world.matrix)) @ local, hit
 
 
-def _orthographic_reach(sensor: Sensor, center: tuple[float, float, float], radius: float) -> Any:
-    """Depth range of an orthographic camera, detached: the scene with room around it, or up to the far plane."""
-    reach = dr.norm(dr.detach(sensor.origin) - mi.Point3f(*center)) + radius
-    return dr.minimum(dr.detach(sensor.far) - dr.detach(sensor.near), 4 * reach)
+def _orthographic_reach(sensor: Sensor, geometry: Geometry) -> Any:
+    """Depth range of an orthographic camera, detached: as far as there are vertices, or up to the far plane."""
+    with dr.suspend_grad():
+        p = dr.gather(mi.Point3f, geometry.positions, dr.arange(mi.UInt32, geometry.vertex_count))
+        distance = dr.norm(p - sensor.origin)
+        farthest = dr.max(dr.select(dr.isfinite(distance), distance, 0))
+        return dr.minimum(sensor.far - sensor.near, _ROOM * farthest)
 
 
 def within_far_plane(sensor: Sensor, depth: Any) -> Any:

@@ -16,7 +16,7 @@ import mitsuba as mi
 
 from .beams import Beam, Projector, beam_of, projector_of, towards
 from .environments import ENVIRONMENTS, SUNSKY, Environment, SunSky, environment_of
-from .traversal import children, parameters
+from .traversal import children, parameters, varies
 
 _DEGREE = math.pi / 180.0
 
@@ -181,7 +181,7 @@ def area_lights_of(scene: Any, shapes: Sequence[Any]) -> tuple[AreaLight, ...]:
             index = next((k for k, other in enumerate(shapes) if other is shape or other == shape), None)
             textures = [part for _, part in children(emitter) if isinstance(part, mi.Texture)]
             if index is not None:
-                textured = any(texture.is_spatially_varying() for texture in textures)
+                textured = any(varies(texture) for texture in textures)
                 found.append(AreaLight(shape.id() or name, index, emitter, textured))
     return tuple(found)
 

@@ -228,7 +228,7 @@ class Renderer:
         samples = tuple(samples_of(light, plan, geometry) for light, plan in zip(extended, self.soft, strict=True))
         maps = soft_maps = None
         if settings.shadow.method != "none" and (lights or samples):
-            transparent, seen = self._transparent(geometry, views[0].sensor), self._seen(views)
+            transparent, seen = self._transparent(geometry, views[0].sensor), self._seen(views, geometry)
             common = (geometry, self.topology)
             if lights:
                 maps = make_maps(self.plan, lights, *common, settings.shadow, self.frusta, transparent, seen, self.outward)
@@ -239,9 +239,9 @@ class Renderer:
                 self.soft_frusta = soft_maps.frusta
         return _Lighting(lights, maps, areas, samples, soft_maps)
 
-    def _seen(self, views: list[_View]) -> tuple[Any, Any]:
+    def _seen(self, views: list[_View], geometry: Geometry) -> tuple[Any, Any]:
         """Points on what the cameras see, and which of them there are."""
-        found = [seen_points(view.sensor, view.raster, self.plan.center, self.plan.radius) for view in views]
+        found = [seen_points(view.sensor, view.raster, geometry) for view in views]
         if len(found) == 1:
             return found[0]
         points = mi.Point3f(*(dr.concat([p[c] for p, _ in found]) for c in range(3)))
@@ -258,7 +258,7 @@ class Renderer:
         return transparent
 
     def _view(self, sensor: Sensor, geometry: Geometry, factor: int) -> _View:
-        clip = camera_clip(sensor, geometry, self.plan.center, self.plan.radius)
+        clip = camera_clip(sensor, geometry)
         if self.settings.hide_emitters and self.data.areas:
             clip = without_shapes(clip, geometry, [light.shape for light in self.data.areas])
         dr.eval(clip)
@@ -299,7 +299,7 @@ class Renderer:
                 crossings = find_crossings(
                     view.clip, self.topology, view.raster, geometry.vertex_count, self.creases, sharpness, meetings=True
                 )
-            return GBuffer(windows[0], seen, points, crossings, self._seen([view]))
+            return GBuffer(windows[0], seen, points, crossings, self._seen([view], geometry))
 
     def _camera_image(self, view: _View, geometry: Geometry, lighting: _Lighting, facets: Any) -> Any:
         sensor, raster = view.sensor, view.raster

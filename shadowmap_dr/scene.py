@@ -22,7 +22,7 @@ from .omissions import omissions_of, warn_of
 from .raster._memory import device_array
 from .sensors import Sensor, sensors_of
 from .sources import CurveSource, ShapeSource, source_of
-from .traversal import children
+from .traversal import children, varies
 
 
 @dataclass(frozen=True)
@@ -250,7 +250,7 @@ def _is_plain(bsdf: Any) -> bool:
         return False
     # Mitsuba does not count vertex colours as varying.
     return all(
-        isinstance(part, mi.Texture) and not part.is_spatially_varying() and part.class_name() != "MeshAttribute"
+        isinstance(part, mi.Texture) and not varies(part) and part.class_name() != "MeshAttribute"
         for part in parts
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -19,6 +20,7 @@ from .sensors import lenses_of, sensors_of
 from .shadow import Frusta
 from .soft import SoftFrusta
 from .traversal import parameters
+from .unseen import Unseen
 
 # Sensors whose fit of the shadow maps is remembered.
 _REMEMBERED_SENSORS = 64
@@ -32,13 +34,14 @@ class SceneRenderer:
 
     parts     shapes, BSDFs and emitters of the scene; kept alive here, so that comparing them by identity is safe
     statics   arrays that decided on the topology and on the shadow maps: faces, segments of curves, cutoff angles of spot lights
-    sizes     number of vertices and faces of each mesh, of control points of each curve
+    sizes     numbers of vertices and faces, of control points of each curve, and which buffers there are: ``ShapeSource.sizes``
     lights    names of the lights
     renderer  without what is re-read for each rendering
     fits      (sensor, frusta of the shadow maps, of those of extended lights) of the last image that it took, latest first
     waiting   images that wait for their backward passes
     recorded  both passes, replayed if the plug-in's user wants it; ``recordable``: for names of attached parameters, whether
               gradients flow through nothing but what is read from the scene
+    unseen    what recordings do not see, and ``unseen_then`` its values when they were made
     """
 
     parts: tuple[Any, ...]
@@ -50,6 +53,8 @@ class SceneRenderer:
     waiting: Waiting = field(default_factory=Waiting)
     recorded: Recorded = field(default_factory=Recorded)
     recordable: dict[tuple[str, ...], bool] = field(default_factory=dict)
+    unseen: Unseen = field(default_factory=lambda: Unseen(()))
+    unseen_then: tuple[Hashable, ...] = ()
 
     @classmethod
     def build(cls, scene: Any, sensor: Any, settings: RenderSettings, tessellation: int, warn: bool = True) -> SceneRenderer:
@@ -60,7 +65,9 @@ class SceneRenderer:
             data = replace(load(scene, tessellation=tessellation, warn=warn), sensors=(sensors_of(sensor),))
             renderer = Renderer.from_data(data, settings)
         lights = tuple(light.name for light in data.lights)
-        return cls(_parts(scene, data), _statics(scene, data), _sizes(data), lights, renderer.with_data(_without_scene(data)))
+        unseen = Unseen((*scene.emitters(), *_bsdfs(data)))
+        record = cls(_parts(scene, data), _statics(scene, data), _sizes(data), lights, renderer.with_data(_without_scene(data)))
+        return replace(record, unseen=unseen)
 
     def matches(self, scene: Any) -> bool:
         """Whether this record was made for the scene; it is none the worse for moved vertices or other parameter values."""
@@ -91,6 +98,7 @@ class SceneRenderer:
 
     def replay(self, scene: Any, sensor: Any, spp: int) -> Any:
         """The same image, detached, recorded when it is first taken."""
+        self._forget_stale_recordings()
         image, frusta, soft_frusta = self.recorded.image(spp, self._current(scene, sensor))
         self._remember(scene, sensor, frusta, soft_frusta)
         return image
@@ -106,8 +114,15 @@ class SceneRenderer:
         if attached not in self.recordable:
             self.recordable[attached] = not dr.grad_enabled(plain(current).render(spp=spp))
         if self.recordable[attached]:
+            self._forget_stale_recordings()
             self.recorded.backward(spp, gradient, current)
         return self.recordable[attached]
+
+    def _forget_stale_recordings(self) -> None:
+        """Recordings hold for the values of materials and lights that they do not see."""
+        now = self.unseen.now()
+        if now != self.unseen_then:
+            self.recorded, self.unseen_then = Recorded(), now
 
     def _current(self, scene: Any, sensor: Any) -> Renderer:
         """The renderer for the scene as it is now.
@@ -129,8 +144,11 @@ class SceneRenderer:
 
 
 def _parts(scene: Any, data: SceneData) -> tuple[Any, ...]:
-    bsdfs = [source.shape.bsdf() for source in data.sources]
-    return (*scene.shapes(), *scene.emitters(), *bsdfs)
+    return (*scene.shapes(), *scene.emitters(), *_bsdfs(data))
+
+
+def _bsdfs(data: SceneData) -> list[Any]:
+    return [source.shape.bsdf() for source in data.sources]
 
 
 def _statics(scene: Any, data: SceneData) -> tuple[Any, ...]:

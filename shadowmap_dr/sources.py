@@ -49,7 +49,7 @@ class ShapeSource:
         return ()
 
     def sizes(self) -> tuple[int, ...]:
-        """Lengths of arrays that decided on the topology, likewise."""
+        """Lengths of arrays and flags that decided on the topology and on what is read, likewise."""
         return ()
 
     @property
@@ -84,7 +84,8 @@ class MeshSource(ShapeSource):
         return (mesh_buffers(self.shape)[0],)
 
     def sizes(self) -> tuple[int, ...]:
-        return self.shape.vertex_count(), self.shape.face_count()
+        mesh = self.shape
+        return mesh.vertex_count(), mesh.face_count(), mesh.has_vertex_normals(), mesh.has_vertex_texcoords()
 
 
 @dataclass(frozen=True)
@@ -95,6 +96,10 @@ class AnalyticSource(ShapeSource):
     """
 
     local: Buffers
+
+    def sizes(self) -> tuple[int, ...]:
+        # Mitsuba turns a sphere's normals over where ``to_world`` comes to mirror it.
+        return (self.shape.has_flipped_normals(),)
 
     def own(self) -> Buffers:
         return _placed(self.local, parameters(self.shape)["to_world"])

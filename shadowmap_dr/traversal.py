@@ -35,6 +35,12 @@ def children(node: Any) -> list[tuple[str, Any]]:
     return found
 
 
+def varies(texture: Any) -> bool:
+    """Whether a ``mi.Texture`` may differ from place to place, attributes of meshes aside. Those written in Python may say what
+    they like: the base class says no for them."""
+    return texture.is_spatially_varying() or type(texture) is not mi.Texture
+
+
 def mesh_buffers(mesh: Any) -> tuple[Any, Any, Any, Any]:
     """(faces UInt32 (3F,), positions Float (3V,), normals Float (3V,) or (0,), texcoords Float (2V,) or (0,)) of a ``mi.Mesh``.
 

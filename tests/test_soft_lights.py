@@ -92,6 +92,60 @@ def test_one_sided(variant: str) -> None:
     assert np.all(render(scene_of(lamp=panel())) > 0.1)
 
 
+@pytest.mark.parametrize("kind", ["rectangle", "cube"])
+def test_mirrored_meshes_shine_where_their_normals_point(variant: str, kind: str) -> None:
+    """Their triangles wind the other way, which Mitsuba does not ask about."""
+    T = mi.ScalarTransform4f
+    thin = T().scale([1, 1, 0.1]) if kind == "cube" else T()
+    lamp = panel(kind=kind)
+    images = {}
+    for name, mirror in (("as it is", [1, 1, 1]), ("sideways", [-1, 1, 1]), ("upside down", [1, 1, -1])):
+        place = lamp["to_world"] @ thin @ T().scale(mirror)
+        images[name] = render(scene_of(lamp={**lamp, "to_world": place}))
+    assert images["as it is"].min() > 0.1
+    np.testing.assert_allclose(images["sideways"], images["as it is"], rtol=0.02)
+    if kind == "rectangle":
+        assert np.all(images["upside down"] == 0)
+    else:
+        np.testing.assert_allclose(images["upside down"], images["as it is"], rtol=0.02)
+
+
+@pytest.mark.parametrize("where", ["floor", "lamp"])
+def test_textures_written_in_python_may_vary(variant: str, where: str) -> None:
+    """Mitsuba's base class says that they do not, if they say nothing."""
+
+    class Stripes(mi.Texture):
+        def __init__(self, props: Any) -> None:
+            mi.Texture.__init__(self, props)
+
+        def eval(self, si: Any, active: Any = True) -> Any:
+            return mi.Color3f(dr.select(dr.sin(20 * si.uv.x) > 0, 0.1, 0.9))
+
+        def mean(self) -> Any:
+            return mi.Float(0.5)
+
+        def to_string(self) -> str:
+            return "Stripes"
+
+    class HonestStripes(Stripes):
+        def is_spatially_varying(self) -> bool:
+            return True
+
+    images = []
+    for kind in (Stripes, HonestStripes):
+        name = f"{kind.__name__}_{variant}".lower()
+        mi.register_texture(name, kind)
+        floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], -90)}
+        lamp = panel(down=where == "floor")
+        if where == "floor":
+            floor["bsdf"] = {"type": "diffuse", "reflectance": {"type": name}}
+        else:
+            lamp["emitter"] = {"type": "area", "radiance": {"type": name}}
+        images.append(render(scene_of(camera=view(), floor=floor, lamp=lamp)))
+    assert images[1].std() > 0.1 * images[1].mean()
+    np.testing.assert_allclose(images[0], images[1], atol=1e-5)
+
+
 def test_emitter_is_seen_from_its_front_only(variant: str) -> None:
     front, back = (
         render(scene_of(camera=view(), floor=None, lamp=panel(0.4, down=down, emitter=area(3, 2, 1)))) for down in (False, True)

@@ -34,7 +34,7 @@ class AreaPlan:
 
     face      UInt32 (P,), triangle of the soup that a piece lies in
     u, v      Float (P,), barycentrics of its centre
-    fraction  Float (P,), its share of the triangle's area
+    fraction  Float (P,), its share of the triangle's area, negative where the emitter shines on the side that winds the other way
     cluster   UInt32 (P,), which of the N clusters it belongs to
     chosen    UInt32 (N,), the piece in whose centre a cluster's sample lies
     shape     index of the emitter's shape
@@ -62,7 +62,9 @@ def plan_area(light: AreaLight, geometry: Geometry, count: int) -> AreaPlan:
     faces = geometry.faces.numpy().reshape(-1, 3)
     own = slice(info.face_start, info.face_start + info.face_count)
     corners = positions[faces[own]]
-    normals, areas = _normals(corners, info)
+    normals, areas = _normals(corners)
+    sign = _shining_side(geometry, info, normals, faces[own])
+    normals *= sign[:, None]
     pieces = _PIECES * count
     face, (u, v), fraction = _pieces(areas, max(pieces, min(_TEXTURED * pieces, _MOST)) if light.textured else pieces)
     a, b, c = (corners[face, k] for k in range(3))
@@ -78,11 +80,11 @@ def plan_area(light: AreaLight, geometry: Geometry, count: int) -> AreaPlan:
         face=device_array(mi.UInt32, face + info.face_start),
         u=device_array(mi.Float, u),
         v=device_array(mi.Float, v),
-        fraction=device_array(mi.Float, fraction),
+        fraction=device_array(mi.Float, fraction * sign[face]),
         cluster=device_array(mi.UInt32, cluster),
         chosen=device_array(mi.UInt32, chosen),
         shape=light.shape,
-        dented=not info.planar and not info.flip_geometric and _dented(centres[chosen], corners, normals),
+        dented=not info.planar and bool((sign > 0).all()) and _dented(centres[chosen], corners, normals),
     )
 
 
@@ -90,7 +92,7 @@ def area_samples(light: AreaLight, plan: AreaPlan, geometry: Geometry) -> LightS
     """The samples of an emitter where it is now. Attached to its vertices and its radiance."""
     info, count = geometry.shapes[plan.shape], dr.width(plan.chosen)
     _, e1, e2 = _triangles(geometry, plan.face)
-    vector = dr.cross(e1, e2) * (plan.fraction * (-0.5 if info.flip_geometric else 0.5))
+    vector = dr.cross(e1, e2) * (0.5 * plan.fraction)
     area = dr.norm(vector)
     radiance = light.radiance(_uv(geometry, plan.face, plan.u, plan.v, info))
     face = dr.gather(mi.UInt32, plan.face, plan.chosen)
@@ -141,12 +143,25 @@ def _brightness(light: AreaLight, geometry: Geometry, face: np.ndarray, u: np.nd
     return brightness(light.name, radiance, len(face))
 
 
-def _normals(corners: np.ndarray, info: ShapeInfo) -> tuple[np.ndarray, np.ndarray]:
+def _normals(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(unit normals (F, 3), areas (F,)) of triangles (F, 3, 3)."""
     n = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(n, axis=1)
     n /= np.maximum(length, 1e-300)[:, None]
-    return -n if info.flip_geometric else n, 0.5 * length
+    return n, 0.5 * length
+
+
+def _shining_side(geometry: Geometry, info: ShapeInfo, normals: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """1 or -1 (F,): whether triangles with these normals (F, 3) shine on that side of them.
+
+    Mitsuba's lights shine where vertex normals point, which meshes with a mirroring ``to_world`` have on the other side.
+    """
+    side = np.full(len(faces), -1.0 if info.flip_geometric else 1.0)
+    if info.has_normals:
+        smooth = dr.detach(geometry.normals).numpy().reshape(-1, 3)[faces].sum(1)
+        cosine = (smooth * normals).sum(1) * (-1 if info.flip_shading else 1)
+        side = np.where(cosine == 0, side, np.sign(cosine))
+    return side
 
 
 def _pieces(areas: np.ndarray, count: int) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray], np.ndarray]:

@@ -1,0 +1,61 @@
+"""What a recording does not see of a scene: values that Mitsuba holds outside of the arrays that Dr.Jit compares."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterable
+from contextlib import suppress
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+
+class Unseen:
+    """Values that are parts of recordings like constants, so that these hold for no others.
+
+    They are Python's numbers and Mitsuba's scalar transformations (``to_uv`` of a bitmap, ``eta`` of a plastic, ``scale`` of a
+    bump map), and arrays that Mitsuba 3.9 does not show to Dr.Jit: textures inside of bump maps, and what a ``sunsky`` makes
+    tables from.
+
+    Args:
+        nodes: Mitsuba's BSDFs and emitters. They are kept alive.
+    """
+
+    def __init__(self, nodes: Iterable[Any]) -> None:
+        self._held = []
+        for node in {id(node): node for node in nodes}.values():
+            table = mi.traverse(node)
+            for key in table.keys():
+                with suppress(TypeError):  # raised for parameters without a value
+                    if not _is_seen(node, key, table[key]):
+                        self._held.append((table, key))
+
+    def now(self) -> tuple[Hashable, ...]:
+        """The values as they are: those of two calls are equal if nothing has changed in between."""
+        return tuple(_plain(table[key]) for table, key in self._held)
+
+
+def _is_seen(node: Any, key: str, value: Any) -> bool:
+    if key.endswith("sampling_weight"):
+        return True  # means nothing here
+    if node.class_name().startswith("Sunsky") and key in ("turbidity", "albedo.value"):
+        return False
+    if "nested_texture." in key:
+        return False
+    return dr.is_array_v(value) or isinstance(value, mi.Transform4f)
+
+
+def _plain(value: Any) -> Hashable:
+    if dr.is_array_v(value):
+        return dr.detach(value).array.index if dr.is_tensor_v(value) else tuple(_leaves(dr.detach(value)))
+    matrix = getattr(value, "matrix", None)
+    return repr(value) if matrix is None else np.array(matrix).tobytes()
+
+
+def _leaves(array: Any) -> Iterable[int]:
+    if dr.depth_v(array) == 1:
+        yield array.index
+    else:
+        for part in array:
+            yield from _leaves(part)

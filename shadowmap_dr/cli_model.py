@@ -14,7 +14,7 @@ from . import assets, io
 from .cli_options import DEFAULT_VARIANT, Variant, set_variant
 from .errors import ShadowmapError
 from .interactive import exports
-from .interactive.follow import follow
+from .interactive.follow import follow, kept
 from .interactive.modeller import Modeller
 from .inverse import Sculptor, even_sphere, shadow_view
 from .mesh_files import read_placed_mesh
@@ -75,28 +75,30 @@ def model(
 
 def _serve(build: Any, shadow: Any, name: str, port: int, save: Any) -> None:
     try:
-        from .interactive.server import serve
+        from .interactive.server import listen, serve
         from .interactive.studio import Studio
     except ModuleNotFoundError as error:
         raise ShadowmapError(f"--serve needs the package {error.name}: pip install 'shadowmap-dr[interactive]'.") from error
     from .interactive.session import Session
 
-    session = Session(build)
-    session.start()
-    try:
-        serve(Studio(session, shadow, name), port, lambda url: typer.echo(f"Open {url} (Ctrl-C ends)"))
-    except KeyboardInterrupt:
-        pass
-    finally:
-        session.close()
-        save(session.snapshot.vertices)
+    with listen(port) as listener, _interrupts() as stopped:
+        session = Session(build)
+        session.start()
+        try:
+            with kept(session, save):
+                studio = Studio(session, shadow, name)
+                serve(studio, listener, lambda: bool(stopped), lambda url: typer.echo(f"Open {url} (Ctrl-C ends)"))
+        finally:
+            session.close()
+            save(session.snapshot.vertices)
 
 
 @contextmanager
 def _interrupts() -> Iterator[list[int]]:
-    """Collects interrupts, which then do not break into a step."""
+    """Collects interrupts, which then do not break into a step. A terminal that is closed is one of them."""
     caught: list[int] = []
-    before = {number: signal.signal(number, lambda n, _: caught.append(n)) for number in (signal.SIGINT, signal.SIGTERM)}
+    numbers = {getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)}
+    before = {number: signal.signal(number, lambda n, _: caught.append(n)) for number in numbers}
     try:
         yield caught
     finally:

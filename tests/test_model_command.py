@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import builtins
+import signal
+import socket
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -42,3 +46,32 @@ def test_missing_packages_are_named(variant, tmp_path, monkeypatch):
     monkeypatch.delitem(__import__("sys").modules, "shadowmap_dr.interactive.server", raising=False)
     with pytest.raises(ShadowmapError, match=r"uvicorn.*pip install 'shadowmap-dr\[interactive\]'"):
         cli_model.model("sphere", serve=True, port=0)
+
+
+def test_a_port_that_is_taken_leaves_files_alone(variant, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("m.ply").write_text("precious")
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen(1)
+        with pytest.raises(ShadowmapError, match="cannot serve on port"):
+            cli_model.model("sphere", serve=True, port=other.getsockname()[1], resolution=32, output=Path("m.ply"))
+    assert Path("m.ply").read_text() == "precious"
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="no terminals that hang up")
+@pytest.mark.parametrize("number", ["SIGTERM", "SIGHUP"])
+def test_a_served_mesh_is_saved_when_the_program_is_told_to_end(tmp_path, number):
+    command = [sys.executable, "-c", "from shadowmap_dr.cli import main; main()", "model", "sphere", "--serve", "--port", "0"]
+    process = subprocess.Popen(
+        [*command, "--resolution", "32", "-o", "m.ply"], cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    try:
+        assert process.stdout.readline().startswith("Open http://127.0.0.1:")
+        process.send_signal(getattr(signal, number))
+        out, err = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 0, err
+    assert out == "Mesh: m.ply\n" and "Traceback" not in err
+    assert (tmp_path / "m.ply").read_bytes().startswith(b"ply")

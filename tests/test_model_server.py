@@ -401,10 +401,10 @@ def test_a_page_that_reads_nothing_does_not_hold_up_others(running, board, fake,
     deaf.close()
 
 
-def test_ports_that_are_taken_are_an_error(board):
+def test_ports_that_are_taken_are_an_error():
     with socket.socket() as other:
         other.bind((server.ADDRESS, 0))
         other.listen(1)
         port = other.getsockname()[1]
         with pytest.raises(ShadowmapError, match=f"cannot serve on port {port}"):
-            server.serve(board, port)
+            server.listen(port)

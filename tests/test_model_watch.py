@@ -12,11 +12,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from model_fakes import SIZE, FakeSculptor, eventually
+from model_fakes import SIZE, FakeSculptor, FakeSession, eventually
 from PIL import Image
 
+from shadowmap_dr.errors import ShadowmapError
 from shadowmap_dr.interactive import Modeller, exports
-from shadowmap_dr.interactive.follow import follow
+from shadowmap_dr.interactive.follow import follow, kept
 from shadowmap_dr.interactive.watch import ImageWatch
 
 
@@ -169,3 +170,23 @@ def test_the_program_saves_the_mesh_when_interrupted(tmp_path):
     # In the file's own place and size: a ball of radius 5 around x = 10, with a nose.
     assert mesh.is_watertight and mesh.bounds[1, 0] > 16 and mesh.bounds[:, 1] == pytest.approx([-5, 5], abs=0.4)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["ball.obj", "out.ply", "s.png"]
+
+
+def test_a_sessions_mesh_is_saved_while_it_moves(monkeypatch):
+    monkeypatch.setattr("shadowmap_dr.interactive.follow.SAVE_INTERVAL", 0.01)
+    fake, saved = FakeSession(), []
+
+    def save(vertices):
+        saved.append(vertices[0, 0])
+        if len(saved) == 1:
+            raise ShadowmapError("the disk is full")
+
+    fake.session.start()
+    with kept(fake.session, save):
+        for version, value in enumerate((0.25, 0.75), 1):
+            fake.session.set_target(np.full((SIZE, SIZE), value, np.float32), version)
+            eventually(lambda value=value: saved and saved[-1] == pytest.approx(value))
+        count = len(saved)
+        time.sleep(0.1)
+        assert len(saved) == count  # what does not change is not saved again
+    fake.session.close()

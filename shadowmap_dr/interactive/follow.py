@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import logging
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
+from ..errors import ShadowmapError
 from . import exports
 from .modeller import Modeller
+from .session import Session
 from .watch import ImageWatch
 
 #: Seconds between two looks at the file, and between two saves of a mesh that moves.
 LOOK_INTERVAL, SAVE_INTERVAL = 0.1, 2.0
+log = logging.getLogger(__name__)
+
 # Seconds until a file that cannot be used is worth a word: most are complete long before.
 _PATIENCE = 2.0
 
@@ -72,3 +79,28 @@ def follow(
             time.sleep(LOOK_INTERVAL / 2)
     if unsaved:
         save(modeller.vertices())
+
+
+@contextmanager
+def kept(session: Session, save: Callable[[np.ndarray], None]) -> Iterator[None]:
+    """Saves what has become of a session's mesh now and then, in a thread of its own, until the end of the context."""
+    ending = threading.Event()
+
+    def work() -> None:
+        saved = session.snapshot.number
+        while not ending.wait(SAVE_INTERVAL):
+            snapshot = session.snapshot
+            if snapshot.number != saved:
+                saved = snapshot.number
+                try:
+                    save(snapshot.vertices)
+                except ShadowmapError as error:  # there may be room again next time, or at the end
+                    log.warning("%s", error)
+
+    thread = threading.Thread(target=work, name="keeper", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ending.set()
+        thread.join()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import socket
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from contextlib import AbstractContextManager, asynccontextmanager, nullcontext
 from importlib import resources
 
 import uvicorn
@@ -82,27 +82,46 @@ def create_app(studio: Studio) -> Starlette:
     return Starlette(routes=routes, middleware=[Middleware(Guard)], lifespan=lifespan)
 
 
-def serve(studio: Studio, port: int = 0, on_start: Callable[[str], None] = lambda url: None) -> None:
-    """Serve on 127.0.0.1 until interrupted (Ctrl-C, SIGTERM), which raises KeyboardInterrupt or returns.
+def listen(port: int = 0) -> socket.socket:
+    """A socket that waits for pages on 127.0.0.1, on any free port for 0. ShadowmapError where the port cannot be had."""
+    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    try:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind((ADDRESS, port))
+        listener.listen(64)
+    except (OSError, OverflowError) as error:
+        listener.close()
+        raise ShadowmapError(f"cannot serve on port {port}: {getattr(error, 'strerror', None) or error}.") from error
+    return listener
+
+
+def serve(
+    studio: Studio, listener: socket.socket, stop: Callable[[], bool], on_start: Callable[[str], None] = lambda url: None
+) -> None:
+    """Serve until told to stop. Signals are left to the caller.
 
     Args:
         studio: its session is started, and stays open afterwards.
-        port: 0 for any free one.
+        listener: from :func:`listen`; stays open, too.
+        stop: asked ten times a second.
         on_start: called with the page's address once it can be opened.
-
-    Raises ShadowmapError where the port cannot be had.
     """
-    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-    with listener:
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            listener.bind((ADDRESS, port))
-            listener.listen(64)
-        except (OSError, OverflowError) as error:
-            raise ShadowmapError(f"cannot serve on port {port}: {getattr(error, 'strerror', None) or error}.") from error
-        server = uvicorn.Server(config(studio))
-        on_start(f"http://{ADDRESS}:{listener.getsockname()[1]}/")
-        server.run(sockets=[listener])
+    on_start(f"http://{ADDRESS}:{listener.getsockname()[1]}/")
+    _Server(config(studio), stop).run(sockets=[listener])
+
+
+class _Server(uvicorn.Server):
+    """Asks whether to stop, where uvicorn's own has handlers for signals, which it raises again at the end."""
+
+    def __init__(self, settings: uvicorn.Config, stop: Callable[[], bool]) -> None:
+        super().__init__(settings)
+        self._stop = stop
+
+    def capture_signals(self) -> AbstractContextManager[None]:
+        return nullcontext()
+
+    async def on_tick(self, counter: int) -> bool:
+        return await super().on_tick(counter) or self._stop()
 
 
 def config(studio: Studio) -> uvicorn.Config:

@@ -251,17 +251,25 @@ def find_fair_setting(
         report: Called with a line about each measurement.
         save: Called with the record so far after each run and each candidate.
 
+    Raises ShadowmapError if the earlier search was one of something else.
+
     Returns:
         A record of JSON values: `setting` (None if no candidate converged), `measurements` with the mean errors in
         degrees, the final offsets and the median seconds per iteration of each candidate, the seconds per iteration of
         those not tried, the proxy and the machine.
     """
+    protocol = {"resolution": resolution, "mesh": mesh, "normals": normals, "starts": starts, "iterations": iterations,
+                "threshold_deg": threshold_deg}
+    for name, value in protocol.items():
+        # Searches from before there was a choice are with flat shading.
+        found = (earlier or {}).get(name, "face" if name == "normals" else value)
+        if found != value:
+            raise ShadowmapError(f"the earlier search had {name} {found}, not {value}: choose another file for this one.")
     scene_path, mesh_path = assets.scene("pose"), assets.mesh(mesh)
     scene = _load(scene_path, mesh_path, resolution, normals)
     reference, proxy = path_traced(scene, spp=512).image, calibrate(scene)
     record: dict[str, Any] = {
-        "resolution": resolution, "mesh": mesh, "normals": normals, "starts": starts, "iterations": iterations,
-        "threshold_deg": threshold_deg, "measurements": list((earlier or {}).get("measurements", [])),
+        **protocol, "measurements": list((earlier or {}).get("measurements", [])),
         "untried": dict((earlier or {}).get("untried", {})),
         "proxy": proxy.record(), "mitsuba": mi.__version__, "variant": mi.variant(), "threads": dr.thread_count(),
     }

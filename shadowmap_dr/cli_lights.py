@@ -8,14 +8,15 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from . import report
-from .cli_options import DEFAULT_VARIANT, Scheduler, SchedulerThreads, Variant, set_variant
+from . import io, report
+from .cli_options import DEFAULT_VARIANT, Scheduler, SchedulerThreads, Variant, given, set_variant
 from .errors import ShadowmapError
 from .experiments.lights import experiment as lights_experiment
 from .experiments.lights import report as lights_report
 from .experiments.lights import speed as lights_speed
 from .experiments.lights.problem import LightProblem
 from .experiments.lights.scene import OBJECTS
+from .inverse.schedulers import check_scheduler
 
 _FULL_LIGHTS, _FULL_SIZES, _FULL_RUNS = (1, 2, 3, 4, 5), (1, 3, 5, 9, 15, 0), 150
 
@@ -58,6 +59,10 @@ def lights(
 
     Writes OUT/lights.json, a plot of alignments (lights.png), pictures of some runs, and a file for each batch.
     """
+    if filter_size and min(filter_size) < 1:
+        raise ShadowmapError(f"a filter of {min(filter_size)} texels: give 1 or more, or --no-shadows.")
+    if filter_size and shadows is False:
+        raise ShadowmapError("--filter-size and --no-shadows: leave one of the two out.")
     defaults = lights_experiment.LightOptions()
     sizes = tuple(filter_size or (_FULL_SIZES if full else defaults.filter_sizes))
     sizes = tuple(size for size in sizes if size or shadows is not True) if shadows is not False else (0,)
@@ -67,7 +72,7 @@ def lights(
         objects=tuple(object or defaults.objects),
         lights=tuple(count or (_FULL_LIGHTS if full else defaults.lights)),
         filter_sizes=sizes,
-        runs=runs or (_FULL_RUNS if full else defaults.runs),
+        runs=given(runs, _FULL_RUNS if full else defaults.runs),
         filter=filter,
         map_resolution=map_resolution,
         resolution=resolution,
@@ -105,6 +110,9 @@ def lights_times(
     sizes = tuple(batch or (1, 16, 150))
     if min(sizes) < 1:
         raise ShadowmapError(f"a batch of {min(sizes)} runs: give at least 1.")
+    path = io.check_output(out / "times.json", (".json",))
+    if workers:
+        check_scheduler("processes:1")
     set_variant(variant)
     steps = lights_speed.measure(LightProblem(object, count, max(sizes)), sizes)
     times, ratios = steps["seconds"], steps["ratio_of_medians"]
@@ -114,8 +122,9 @@ def lights_times(
     ]
     Console().print(report.table("A step of a run", ["way", "ms", "/ largest batch"], rows))
     record = {"steps": steps}
+    report.write_json(path, record)
     if workers:
         record["workers"] = lights_speed.measure_workers(LightProblem(object, count, 32, iterations=60), (1, 2), out)
         speed_up = record["workers"]["speed_up"]["2"]
+        report.write_json(path, record)
         typer.echo(f"Two workers with a thread each do {speed_up:.2f} times the work of one.")
-    report.write_json(out / "times.json", record)

@@ -207,6 +207,16 @@ def test_search_goes_on_within_a_candidate(monkeypatch: pytest.MonkeyPatch) -> N
     assert [len(entry["runs"]) for entry in resumed["measurements"]] == [2, 3]
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [{"mesh": "bunny"}, {"resolution": 32}, {"normals": "vertex"}, {"starts": 4}, {"iterations": 9}, {"threshold_deg": 1}],
+)
+def test_searches_of_something_else_are_not_continued(changes: dict) -> None:
+    earlier = {"resolution": 16, "mesh": "spot", "starts": 3, "iterations": 150, "threshold_deg": 0.1, "measurements": []}
+    with pytest.raises(ShadowmapError, match=next(iter(changes))):
+        pose.find_fair_setting(**{"resolution": 16, "candidates": (), "earlier": earlier, **changes})
+
+
 def test_search_skips_what_costs_more_than_a_known_setting(monkeypatch: pytest.MonkeyPatch) -> None:
     measured: list[str] = []
 

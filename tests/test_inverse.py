@@ -126,6 +126,18 @@ def test_foreign_and_damaged_checkpoints_are_refused(variant: str, tmp_path: Pat
             optimize(fit(), START, 2, checkpoint=path, settings={"a": 1})
 
 
+def test_checkpoints_of_other_runs_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "run.npz"
+    optimize(Counter(), np.ones(3), 20, checkpoint=path)
+    for start, steps, message in ((np.zeros(3), 30, "began elsewhere"), (np.ones(2), 30, "began"), (np.ones(3), 10, "20 steps")):
+        with pytest.raises(ShadowmapError, match=message):
+            optimize(Counter(), start, steps, checkpoint=path)
+    arrays = dict(np.load(path))
+    np.savez(path, **{name: array for name, array in arrays.items() if not name.startswith("state/")})
+    with pytest.raises(ShadowmapError, match=r"run\.npz lacks 'value'"):
+        optimize(Counter(), np.ones(3), 30, checkpoint=path)
+
+
 class Counter:
     """A method on the host: counts down by a tenth."""
 

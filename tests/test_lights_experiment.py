@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from shadowmap_dr import assets
 from shadowmap_dr.cli import app
 from shadowmap_dr.errors import ShadowmapError
 from shadowmap_dr.experiments.lights.experiment import LightOptions, run_lights
@@ -81,6 +82,17 @@ def test_records_files_and_resuming(tmp_path: Path) -> None:
     assert len(json.loads((tmp_path / "lights.json").read_text())["summaries"]) == 5 and len(more) == 5
     assert all(path.stat().st_mtime_ns == time for path, time in files.items())
     assert str(tmp_path) not in (tmp_path / "lights.json").read_text()
+
+
+def test_runs_with_another_content_of_a_mesh_file_are_made_again(tmp_path: Path) -> None:
+    path = tmp_path / "thing.ply"
+    found = []
+    for name in ("spot", "teapot"):
+        path.write_bytes(assets.mesh(name).read_bytes())
+        found.append(run_lights(options(tmp_path, objects=(str(path),), resume=True))[-1])
+    anew = run_lights(options(tmp_path / "anew", objects=(str(path),)))[-1]
+    assert found[1]["alignment_mean"] == anew["alignment_mean"] != found[0]["alignment_mean"]
+    assert "object_digest" not in LightProblem("spot", 1, 1).settings()
 
 
 def test_more_starts_never_end_worse() -> None:

@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -122,8 +123,47 @@ def test_resume_keeps_finished_runs_and_adds_new_ones(tmp_path: Path) -> None:
     run_pose(options(tmp_path, runs=2, resume=True), build=build)
     after = json.loads((tmp_path / "pose.json").read_text())
     assert before[0] in after and len(after) == 4
+    longer = run_pose(options(tmp_path, methods=("shadows",), runs=1, iterations=30, resume=True), build=build)
+    assert json.loads((tmp_path / "pose.json").read_text()) == [*after, *longer]  # others' runs stay
     run_pose(options(tmp_path, methods=("shadows",), runs=1, iterations=3), build=build)
     assert [record["iterations"] for record in json.loads((tmp_path / "pose.json").read_text())] == [3]
+
+
+def test_runs_with_other_samples_are_others(tmp_path: Path) -> None:
+    def sampled(samples: int) -> Any:
+        def build_sampled(name: str, problem: Any, reference: Any) -> Method:
+            method = build(name, problem, reference)
+            settings = {**method.describe(), **({"samples_per_pixel": samples} if samples > 1 else {})}
+            method.describe = lambda: settings
+            return method
+
+        return build_sampled
+
+    small = {"methods": ("shadows",), "runs": 1, "iterations": 3, "resume": True}
+    for samples in (1, 4):
+        run_pose(options(tmp_path, **small), build=sampled(samples))
+    stored = json.loads((tmp_path / "pose.json").read_text())
+    assert [record["settings"].get("samples_per_pixel") for record in stored] == [None, 4]
+
+
+def test_threads_are_those_asked_for(tmp_path: Path) -> None:
+    before = dr.thread_count()
+    try:
+        record = run_pose(options(tmp_path, methods=("shadows",), runs=1, iterations=3, threads=1), build=build)[0]
+        assert record["environment"]["threads"] == 1
+    finally:
+        dr.set_thread_count(before)
+
+
+def test_a_killed_sweep_goes_on_with_more_runs(tmp_path: Path) -> None:
+    pytest.importorskip("distributed")
+    small = {"resolutions": (24,), "iterations": 6, "methods": ("shadows",), "scheduler": "processes:1", "threads": 1}
+    run_pose(options(tmp_path, runs=2, **small))
+    (tmp_path / "pose.json").unlink()
+    files = {path: path.stat().st_mtime_ns for path in (tmp_path / "batches").iterdir()}
+    more = run_pose(options(tmp_path, runs=3, resume=True, **small))
+    assert [record["run"] for record in more] == [0, 1, 2]
+    assert all(path.stat().st_mtime_ns == time for path, time in files.items())
 
 
 def test_workers_make_the_same_runs(tmp_path: Path) -> None:
@@ -278,6 +318,7 @@ def test_unusable_meshes(tmp_path: Path, name: str, content: str) -> None:
         {"reference": "photo"},
         {"normals": "smooth"},
         {"samples": 0},
+        {"threads": -1},
     ],
 )
 def test_unusable_options(tmp_path: Path, changes: dict[str, Any]) -> None:

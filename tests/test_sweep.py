@@ -83,6 +83,17 @@ def test_a_batch_goes_on_from_its_checkpoint(tmp_path: Path) -> None:
     assert not list((tmp_path / "batches").glob("*.checkpoint.npz"))
 
 
+def test_what_is_not_resumed_begins_anew_and_leaves_others_alone(tmp_path: Path) -> None:
+    batches = tmp_path / "batches"
+    batches.mkdir()
+    own = [batches / f"poses-000000-000000.{ending}" for ending in ("checkpoint.npz", "checkpoint-run0.npz")]
+    others = [batches / "poses-more-000000-000001.checkpoint.npz", batches / "poses-more-000000-000000.json"]
+    for path in (*own, *others):
+        path.write_bytes(b"not a checkpoint")
+    run_sweep([BlobPoses(1)], tmp_path)  # would refuse to go on from what it cannot read
+    assert sorted(batches.iterdir()) == sorted([*others, batches / "poses-000000-000000.json"])
+
+
 def test_pose_estimation_is_a_sweep(tmp_path: Path) -> None:
     found = run_sweep([BlobPoses(3)], tmp_path)["poses"]
     for record in found:

@@ -108,19 +108,26 @@ def optimize(
         settings: JSON values that identify the run; a checkpoint with other ones is an error.
         on_step: called with the number of finished steps.
 
-    Raises ShadowmapError if the checkpoint belongs to another run, or cannot be written.
+    Raises ShadowmapError if the checkpoint belongs to another run, has more steps, or cannot be read or written.
     """
     if iterations < 1:
         raise ShadowmapError(f"{iterations} iterations: at least one is needed.")
     fingerprint = json.dumps(dict(settings or {}), sort_keys=True)
-    history = History(np.empty(0), np.asarray(start, np.float64)[None], np.empty(0), np.empty(0, np.bool_))
+    history = History(np.empty(0), np.asarray(start, np.float64).reshape(1, -1), np.empty(0), np.empty(0, np.bool_))
     state = None
     if checkpoint is not None and checkpoint.exists():
         history, state = _load(checkpoint, fingerprint)
+        if not np.array_equal(history.parameters[0], np.ravel(start)):
+            raise ShadowmapError(f"the checkpoint {checkpoint} began elsewhere: delete it or choose another file.")
+        if history.iterations > iterations:
+            raise ShadowmapError(f"the checkpoint {checkpoint} has {history.iterations} steps: delete it, or ask for as many.")
     if state is None:
         method.reset(start)
     else:
-        method.load_state(state)
+        try:
+            method.load_state(state)
+        except KeyError as error:
+            raise ShadowmapError(f"the checkpoint {checkpoint} lacks {error}: delete it to start this run anew.") from error
     if history.iterations >= iterations:
         return history
 

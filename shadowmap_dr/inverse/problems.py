@@ -32,7 +32,7 @@ class Problem(ABC):
 
     Attributes:
         name: what files and progress bars call it: letters, digits, '.', '_' and '-'.
-        runs: how many runs there are, numbered from 0.
+        runs: how many runs there are, numbered from 0 unless ``run_numbers`` says otherwise.
         steps: of each run.
     """
 
@@ -49,6 +49,10 @@ class Problem(ABC):
             raise ShadowmapError(f"problem '{self.name}' is no dataclass: give it a method settings().")
         own = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "runs"}
         return {"steps": self.steps, **own}
+
+    def run_numbers(self) -> Sequence[int]:
+        """The numbers of the runs, in the order of the results."""
+        return range(self.runs)
 
     def batch_size(self, memory: int) -> int:
         """How many runs to do at once so that they need about ``memory`` bytes at most."""

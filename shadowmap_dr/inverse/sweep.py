@@ -63,7 +63,7 @@ def run_sweep(
     done = {problem.name: _stored(problem, folder) if resume else {} for problem in problems}
     if not resume:
         for problem in problems:
-            for path in [*_files(problem, folder), *folder.glob(f"{problem.name}-*.checkpoint.npz")]:
+            for path in [*_files(problem, folder), *_files(problem, folder, r"\.checkpoint(-run\d+)?\.npz")]:
                 path.unlink()
     units = [unit for problem in problems for unit in _units(problem, done[problem.name], memory)]
     folder.mkdir(parents=True, exist_ok=True)
@@ -82,12 +82,12 @@ def run_sweep(
         do_units(
             units, scheduler, variant=variant, threads=threads, folder=folder.resolve(), on_done=on_done, on_step=on_step
         )
-    return {problem.name: [done[problem.name][run] for run in range(problem.runs)] for problem in problems}
+    return {problem.name: [done[problem.name][run] for run in problem.run_numbers()] for problem in problems}
 
 
 def _units(problem: Problem, done: dict[int, Any], memory: int) -> list[Unit]:
     """Batches, as equal in size as can be, of the runs that are still to be done."""
-    left = [run for run in range(problem.runs) if run not in done]
+    left = [run for run in problem.run_numbers() if run not in done]
     if not left:
         return []
     count = -(-len(left) // max(1, problem.batch_size(memory)))
@@ -95,9 +95,10 @@ def _units(problem: Problem, done: dict[int, Any], memory: int) -> list[Unit]:
     return [Unit(problem, tuple(left[a:b])) for a, b in zip(ends[:-1], ends[1:], strict=True)]
 
 
-def _files(problem: Problem, folder: Path) -> list[Path]:
-    pattern = re.compile(re.escape(problem.name) + r"-\d+-\d+\.json")
-    return [path for path in sorted(folder.glob("*.json")) if pattern.fullmatch(path.name)]
+def _files(problem: Problem, folder: Path, ending: str = r"\.json") -> list[Path]:
+    """Files of a problem's batches: not those of problems whose names begin with its own."""
+    pattern = re.compile(re.escape(problem.name) + r"-\d+-\d+" + ending)
+    return [path for path in sorted(folder.glob("*")) if pattern.fullmatch(path.name)]
 
 
 def _stored(problem: Problem, folder: Path) -> dict[int, Any]:
@@ -108,7 +109,7 @@ def _stored(problem: Problem, folder: Path) -> dict[int, Any]:
             result = report.read_json(path)
             if result["settings"] == wanted:
                 pairs = zip(result["runs"], result["records"], strict=True)
-                found |= {run: record for run, record in pairs if run < problem.runs}
+                found |= {run: record for run, record in pairs if run in problem.run_numbers()}
         except (ShadowmapError, KeyError, TypeError, ValueError):
             continue  # whatever cannot be read is done again
     return found

@@ -102,7 +102,7 @@ def summary(problems: Sequence[LightProblem], records: Sequence[Sequence[dict[st
     """Statistics over all objects and runs of one setting."""
     final = np.array([[record["alignment"] for record in own] for own in records])
     curves = np.array([record["alignment_curve"] for own in records for record in own])
-    settings = {key: value for key, value in problems[0].settings().items() if key not in ("object", "steps")}
+    settings = {key: value for key, value in problems[0].settings().items() if key not in ("object", "object_digest", "steps")}
     return report.plain(
         {
             "setting": problems[0].setting,

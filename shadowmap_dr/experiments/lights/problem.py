@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
+from ... import assets
 from ...errors import ShadowmapError
 from ...inverse import LightBatch, Problem, Stage, StillScene
 from ...inverse.lights.batch import batch_bytes
@@ -92,6 +94,12 @@ class LightProblem(Problem, LightSetting):
     @property
     def steps(self) -> int:
         return self.iterations
+
+    def settings(self) -> dict[str, Any]:
+        if self.object in assets.mesh_names():
+            return super().settings()
+        content = assets.mesh(self.object).read_bytes()  # a file of the same name may have become another one
+        return {**super().settings(), "object_digest": hashlib.sha256(content).hexdigest()[:12]}
 
     @property
     def stages(self) -> tuple[Stage, ...]:

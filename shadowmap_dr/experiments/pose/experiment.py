@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
@@ -63,6 +64,8 @@ class PoseOptions:
                 raise ShadowmapError(f"{value} {name}: give at least 1.")
         if self.seed < 0:
             raise ShadowmapError(f"the seed {self.seed}: give 0 or more.")
+        if self.threads < 0:
+            raise ShadowmapError(f"{self.threads} threads: give 1 or more, or 0 for all.")
         if self.reference not in ("mitsuba", "own"):
             raise ShadowmapError(f"no reference {self.reference!r}: choose mitsuba or own.")
         if self.normals not in ("face", "vertex"):
@@ -104,7 +107,10 @@ def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Co
     }
     if len(problems) != len(options.objects) * len(options.resolutions):
         raise ShadowmapError(f"two of the objects {', '.join(options.objects)} have the same name: rename one file.")
-    if options.scheduler != "local":
+    if options.scheduler == "local":
+        if options.threads:
+            dr.set_thread_count(options.threads)
+    else:
         stored += _sweep(problems, options, stored, console)
 
     result: list[dict[str, Any]] = []
@@ -275,8 +281,9 @@ def _checkpoint(problem: PoseProblem, name: str, run: int, options: PoseOptions)
 
 def _key(record: dict[str, Any]) -> tuple[Any, ...]:
     """What a record is about: a newer one with the same key takes its place."""
-    names = ("object", "resolution", "method", "run", "seed", "reference", "shadow_only")
-    return (*(record.get(name) for name in names), _normals(record))
+    names = ("object", "resolution", "method", "run", "seed", "iterations", "reference", "shadow_only")
+    samples = record.get("settings", {}).get("samples_per_pixel", 1)
+    return (*(record.get(name) for name in names), samples, _normals(record))
 
 
 def _normals(record: dict[str, Any]) -> str:

@@ -57,7 +57,10 @@ class PoseRuns(Problem):
 
     def settings(self) -> dict[str, Any]:
         own = dataclasses.asdict(self)
-        return {name: value for name, value in own.items() if name != "out"}
+        return {name: value for name, value in own.items() if name not in ("out", "numbers")}
+
+    def run_numbers(self) -> tuple[int, ...]:
+        return self.numbers
 
     def build(self) -> tuple[PoseProblem, Method]:
         out = Path(self.out)
@@ -77,7 +80,7 @@ class PoseRuns(Problem):
         options = {"seed": self.seed, "iterations": self.iterations, "reference": self.reference}
         records = []
         for run in runs:
-            wanted = identity(problem, self.method, self.numbers[run], method, **options)
+            wanted = identity(problem, self.method, run, method, **options)
             records.append(make_record(method, wanted, checkpoint, on_step))
         return records
 

@@ -17,7 +17,7 @@ import typer
 from rich.console import Console
 
 from . import __version__, _llvm, assets, cli_art, cli_face, cli_gradients, cli_lights, cli_model, cli_soft, io
-from .cli_options import DEFAULT_VARIANT, Scheduler, SchedulerThreads, Variant, set_variant
+from .cli_options import ANY, COLOURED, DEFAULT_VARIANT, Scheduler, SchedulerThreads, Variant, set_variant
 from .errors import ShadowmapError
 from .experiments.bench import common as bench_common
 from .experiments.bench import experiment as bench_experiment
@@ -113,7 +113,7 @@ def render(
     if aovs is not None and output.suffix.lower() != ".exr":
         raise ShadowmapError(f"--aovs {aovs}: {output.suffix} files hold colours only, choose an .exr file.")
     values = _definitions(define or [])
-    set_variant(variant)
+    set_variant(variant, ANY)
     loaded = _load(assets.scene(scene), values)
     if size is not None:
         loaded = _resized(loaded, *_size(size))
@@ -236,7 +236,7 @@ def maps(
         pose_runs=pose_runs,
         out=out,
     )
-    set_variant(variant)
+    set_variant(variant, COLOURED)
     Console().print(maps_experiment.table(maps_experiment.run_maps(options)))
     typer.echo(f"Record and pictures: {out}")
 
@@ -266,7 +266,7 @@ def bench(
         resume=resume,
         mitsuba_seconds=mitsuba_seconds,
     )
-    set_variant(variant)
+    set_variant(variant, COLOURED)
     record = bench_experiment.run_bench(options)
     Console().print(bench_report.table(record))
     typer.echo(f"Record: {out}, plot: {out.with_suffix('.png')}")

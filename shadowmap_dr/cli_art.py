@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from .cli_options import DEFAULT_VARIANT, Variant, set_variant
+from .cli_options import COLOURED, DEFAULT_VARIANT, Variant, set_variant
 from .experiments.art import experiment as art_experiment
 
 
@@ -71,7 +71,7 @@ def art(
         out=out,
         resume=resume,
     )
-    set_variant(variant)
+    set_variant(variant, COLOURED)
     record = art_experiment.run_art(options)
     Console().print(art_experiment.table(record))
     typer.echo(art_experiment.summary(record))

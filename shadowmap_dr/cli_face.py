@@ -9,7 +9,7 @@ import typer
 from rich.console import Console
 
 from . import io
-from .cli_options import DEFAULT_VARIANT, Variant, set_variant
+from .cli_options import COLOURED, DEFAULT_VARIANT, Variant, set_variant
 from .errors import ShadowmapError
 from .experiments.faces import experiment as faces_experiment
 from .experiments.faces import image as faces_image
@@ -78,7 +78,7 @@ def face(
             prior=faces_image.PRIOR if prior is None else prior,
             map_resolution=map_resolution, filter_size=filter_size, out=out, resume=resume,
         )
-        set_variant(variant)
+        set_variant(variant, COLOURED)
         record = faces_image.run_image(options)
         typer.echo(f"root mean square difference of the shadows: {record['image_error_start']:.4f} at the start, "
                    f"{record['image_error']:.4f} at the end")
@@ -91,7 +91,7 @@ def face(
         reference=reference, height=height,
         map_resolution=map_resolution, filter_size=filter_size, out=out, resume=resume,
     )
-    set_variant(variant)
+    set_variant(variant, COLOURED)
     record = faces_experiment.run_faces(artificial)
     for table in faces_report.tables(record):
         Console().print(table)

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from .cli_options import DEFAULT_VARIANT, Variant, set_variant
+from .cli_options import DEFAULT_VARIANT, Variant, given, set_variant
 from .experiments.gradients import convergence as convergence_experiment
 from .experiments.gradients import jacobian as jacobian_experiment
 from .experiments.gradients import plane as plane_experiment
@@ -64,7 +64,7 @@ def jacobian(
         filter_sizes=tuple(filter_size or defaults.filter_sizes),
         resolution=resolution,
         faces=faces,
-        spp=spp or (_FULL_SPP if full else defaults.spp),
+        spp=given(spp, _FULL_SPP if full else defaults.spp),
         mitsuba_passes=mitsuba_passes,
         out=out,
         resume=resume,

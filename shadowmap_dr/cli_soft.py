@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from .cli_options import DEFAULT_VARIANT, Variant, set_variant
+from .cli_options import COLOURED, DEFAULT_VARIANT, Variant, given, set_variant
 from .errors import ShadowmapError
 from .experiments.soft import experiment as soft_experiment
 from .experiments.soft import report as soft_report
@@ -49,15 +49,15 @@ def soft(
     options = soft_experiment.SoftOptions(
         scenes=tuple(scene or defaults.scenes),
         samples=tuple(_pair(text) for text in samples) if samples else _FULL_SAMPLES if full else defaults.samples,
-        resolution=resolution or (_FULL_RESOLUTION if full else defaults.resolution),
+        resolution=given(resolution, _FULL_RESOLUTION if full else defaults.resolution),
         map_resolution=map_resolution,
         spp=spp,
-        reference_spp=reference_spp or (_FULL_SPP if full else defaults.reference_spp),
+        reference_spp=given(reference_spp, _FULL_SPP if full else defaults.reference_spp),
         timed=times,
         out=out,
         resume=resume,
     )
-    set_variant(variant)
+    set_variant(variant, COLOURED)
     record = soft_experiment.run_soft(options)
     Console().print(soft_report.table(record))
     typer.echo("\n".join(soft_report.reading(record)))

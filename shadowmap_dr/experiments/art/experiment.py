@@ -128,7 +128,7 @@ def build(options: ArtOptions) -> Maker:
     views = views_of(options)
     read = [read_target(target) for target in options.targets]
     targets = place([figures.filled(figure) for figure in read] if options.fill_holes else read, views)
-    texels = options.map_resolution or options.resolution
+    texels = options.resolution if options.map_resolution is None else options.map_resolution
     if options.collection is not None:
         mesh = mesh_files.read_mesh(assets.mesh(options.collection))
         return Collection(

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import sys
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
@@ -382,11 +383,16 @@ def main() -> None:
     parser.add_argument("--normals", choices=("face", "vertex"), default="face", help="flat or smooth shading of the object")
     parser.add_argument("--candidates", nargs="+", metavar="C/P/I[/GUIDING[/SPP]]", help="settings to try instead of the usual")
     parser.add_argument("--output", type=Path, default=STORE, help="JSON file to extend; a search in it goes on")
-    options = parser.parse_args()
+    try:
+        _search(parser.parse_args())
+    except (ShadowmapError, OSError, json.JSONDecodeError) as error:
+        sys.exit(f"error: {error}")
+
+
+def _search(options: argparse.Namespace) -> None:
     candidates = CANDIDATES
     if options.candidates:
-        parts = [text.split("/") for text in options.candidates]
-        candidates = tuple(ProjectiveSetting(*map(int, part[:3]), *part[3:4], *map(int, part[4:])) for part in parts)
+        candidates = tuple(_candidate(text) for text in options.candidates)
     mi.set_variant("llvm_ad_rgb")
     table = json.loads(options.output.read_text()) if options.output.is_file() else {}
     key = str(options.search) if options.normals == "face" else f"{options.search} {options.normals} normals"
@@ -399,6 +405,14 @@ def main() -> None:
     record = find_fair_setting(options.search, mesh=options.mesh, normals=options.normals, candidates=candidates,
                                earlier=table.get(key), save=save, report=lambda line: print(line, flush=True))
     print(f"fair setting at {key}: {record['setting']}")
+
+
+def _candidate(text: str) -> ProjectiveSetting:
+    part = text.split("/")
+    try:
+        return ProjectiveSetting(*map(int, part[:3]), *part[3:4], *map(int, part[4:]))
+    except (TypeError, ValueError) as error:
+        raise ShadowmapError(f"--candidates {text}: give C/P/I, C/P/I/GUIDING or C/P/I/GUIDING/SPP.") from error
 
 
 if __name__ == "__main__":

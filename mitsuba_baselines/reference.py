@@ -174,14 +174,17 @@ def load(path: str | Path) -> Reference:
     """Reads what `save` wrote; an EXR of other origin has empty settings.
 
     Raises:
-        ShadowmapError: No such file.
+        ShadowmapError: No such file, or a damaged one.
     """
     if not Path(path).is_file():
         raise ShadowmapError(f"no file {str(path)!r}: make references with tests/references/make.py.")
-    bitmap = mi.Bitmap(str(path))
-    metadata = bitmap.metadata()
-    settings = json.loads(metadata[SETTINGS_KEY]) if SETTINGS_KEY in metadata else {}
-    image = np.array(bitmap.convert(component_format=mi.Struct.Type.Float32, srgb_gamma=False))
+    try:
+        bitmap = mi.Bitmap(str(path))
+        metadata = bitmap.metadata()
+        settings = json.loads(metadata[SETTINGS_KEY]) if SETTINGS_KEY in metadata else {}
+        image = np.array(bitmap.convert(component_format=mi.Struct.Type.Float32, srgb_gamma=False))
+    except (RuntimeError, ValueError) as error:
+        raise ShadowmapError(f"cannot read {path}: {' '.join(str(error).split())}") from error
     return Reference(image, settings)
 
 

@@ -17,7 +17,7 @@ from .interactive import exports
 from .interactive.follow import follow, kept
 from .interactive.modeller import Modeller
 from .inverse import Sculptor, even_sphere, shadow_view
-from .mesh_files import read_placed_mesh
+from .mesh_files import read_placed_mesh, trimesh_package
 
 #: Light direction and what is up in the shadow.
 VIEWS = {"front": ((0, 0, -1), (0, 1, 0)), "side": ((-1, 0, 0), (0, 1, 0)), "top": ((0, -1, 0), (0, 0, -1))}
@@ -50,6 +50,7 @@ def model(
     io.check_output(output, tuple(f".{kind}" for kind in exports.FORMATS))
     if not serve:
         io.check_output(image, (".png",))
+    trimesh_package()
     path = None if mesh == _SPHERE else assets.mesh(mesh)
     set_variant(variant)
     vertices, faces, (middle, scale) = (*even_sphere(), ((0, 0, 0), 1.0)) if path is None else read_placed_mesh(path)

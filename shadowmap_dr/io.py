@@ -1,13 +1,15 @@
-"""Reading and writing of images. Files appear under their name only when they are complete."""
+"""Reading and writing of images, arrays and meshes. Files appear under their name only when they are complete."""
 
 from __future__ import annotations
 
 import errno
 import os
 import tempfile
-from collections.abc import Iterator, Mapping
+import zipfile
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -100,9 +102,30 @@ def read_exr(path: str | os.PathLike[str]) -> tuple[dict[str, Array], dict[str, 
         with OpenEXR.File(str(path), separate_channels=True) as file:
             channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
             metadata = {name: value for name, value in file.header().items() if isinstance(value, str)}
-    except (RuntimeError, OSError) as error:
+    except Exception as error:  # whatever the library comes across in a damaged header
         raise ShadowmapError(f"cannot read {path}: it is no OpenEXR file, or it is damaged.") from error
     return channels, metadata
+
+
+def read_arrays(path: str | os.PathLike[str], only: Collection[str] | None = None) -> dict[str, npt.NDArray[Any]]:
+    """The arrays of an .npz file by name (those of the names in ``only``). ShadowmapError where it cannot be read."""
+    try:
+        if not zipfile.is_zipfile(path):  # NumPy would call other files pickled objects
+            raise ValueError("no archive")
+        with np.load(path, allow_pickle=False) as file:
+            return {name: file[name] for name in file.files if only is None or name in only}
+    except Exception as error:  # whatever NumPy and the decompressor come across in a damaged file
+        reason = "objects are not read" if "pickle" in str(error) else "it is no .npz file, or it is damaged"
+        raise ShadowmapError(f"cannot read {path}: {reason}; give an .npz file of plain arrays.") from error
+
+
+def write_ply(path: str | os.PathLike[str], mesh: Any) -> None:
+    """Write a ``mi.Mesh`` as a binary PLY file."""
+    with atomic(path) as temporary:
+        try:
+            mesh.write_ply(str(temporary))
+        except RuntimeError as error:  # Mitsuba's, of a full disk and others
+            raise OutputError(f"cannot write {path}: {' '.join(str(error).split())}") from error
 
 
 def write_png(path: str | os.PathLike[str], image: Array) -> None:

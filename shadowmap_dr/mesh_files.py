@@ -36,7 +36,7 @@ def read_mesh(path: Path) -> tuple[Array, Faces]:
 
 def read_placed_mesh(path: Path) -> tuple[Array, Faces, tuple[npt.NDArray[np.float64], float]]:
     """As `read_mesh`, and where the mesh was: its middle (3,) and a scale; vertices * scale + middle are the file's."""
-    trimesh = _trimesh()
+    trimesh = trimesh_package()
     try:
         mesh = trimesh.load_mesh(path, process=False)
         if isinstance(mesh, trimesh.Scene):
@@ -46,6 +46,8 @@ def read_placed_mesh(path: Path) -> tuple[Array, Faces, tuple[npt.NDArray[np.flo
         raise ShadowmapError(f"cannot read {path}: it is no mesh, or it is damaged.") from error
     if not len(faces) or not np.isfinite(vertices).all():
         raise ShadowmapError(f"{path} has no triangles, or vertices that are not finite.")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise ShadowmapError(f"{path} has {len(vertices)} vertices, but its triangles go from {faces.min()} to {faces.max()}.")
     low, high = vertices.min(0), vertices.max(0)
     scale = float((high - low).max())
     if scale <= 0:
@@ -55,6 +57,8 @@ def read_placed_mesh(path: Path) -> tuple[Array, Faces, tuple[npt.NDArray[np.flo
     unique, index = np.unique(vertices, axis=0, return_inverse=True)
     faces = index.reshape(-1)[faces]
     proper = (faces != np.roll(faces, 1, 1)).all(1)
+    if not proper.any():
+        raise ShadowmapError(f"all triangles of {path} have two corners at the same place.")
     return unique.astype(np.float32), faces[proper].astype(np.uint32), (middle.astype(np.float64), 0.5 * scale)
 
 
@@ -68,7 +72,7 @@ def vertex_colours(vertices: Array) -> npt.NDArray[np.uint8]:
 
 def write_meshes(folder: Path, vertices: Array, faces: Faces, views: Sequence[ShadowView], images: Sequence[Array]) -> None:
     """`mesh.ply`, `mesh.obj`, and `mesh.glb`: the object with colours, and the receivers with the shadows (H, W) on them."""
-    trimesh = _trimesh()
+    trimesh = trimesh_package()
     plain = trimesh.Trimesh(vertices, faces, process=False)
     coloured = trimesh.Trimesh(vertices, faces, process=False, vertex_colors=vertex_colours(vertices))
     scene = trimesh.Scene({"object": coloured})
@@ -82,7 +86,7 @@ def write_meshes(folder: Path, vertices: Array, faces: Faces, views: Sequence[Sh
 
 def write_printable(path: Path, vertices: Array, faces: Faces) -> None:
     """A binary STL in millimetres, z up, standing on z = 0, outside out."""
-    trimesh = _trimesh()
+    trimesh = trimesh_package()
     scale = PRINT_SIZE_MM / float(np.ptp(vertices, axis=0).max())
     upright = np.stack([vertices[:, 0], -vertices[:, 2], vertices[:, 1]], 1) * scale
     mesh = trimesh.Trimesh(upright - [0, 0, upright[:, 2].min()], faces, process=False)
@@ -94,7 +98,7 @@ def write_printable(path: Path, vertices: Array, faces: Faces) -> None:
 
 def mesh_report(vertices: Array, faces: Faces) -> dict[str, Any]:
     """Whether a mesh can be printed: closed, oriented, volume (cubic scene units), share of inverted triangles."""
-    mesh = _trimesh().Trimesh(vertices, faces, process=False)
+    mesh = trimesh_package().Trimesh(vertices, faces, process=False)
     return {
         "vertices": len(vertices),
         "faces": len(faces),
@@ -116,7 +120,7 @@ def error_picture(image: Array, target: Array) -> npt.NDArray[np.float32]:
 def _wall(view: ShadowView, image: Array) -> Any:
     from PIL import Image
 
-    trimesh = _trimesh()
+    trimesh = trimesh_package()
     line = np.linspace(-1, 1, _WALL_CELLS + 1)
     x, y = (a.ravel() for a in np.meshgrid(line, line))
     z = height(view.receiver, view.half * x, view.half)
@@ -132,7 +136,8 @@ def _wall(view: ShadowView, image: Array) -> Any:
     return trimesh.Trimesh(points, faces, visual=visual, process=False)
 
 
-def _trimesh() -> Any:
+def trimesh_package() -> Any:
+    """The module `trimesh`; ShadowmapError where it is not installed. To be asked before hours of work end in a mesh file."""
     try:
         import trimesh
     except ModuleNotFoundError as error:

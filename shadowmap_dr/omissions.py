@@ -63,7 +63,8 @@ def _delta_materials(shapes: Sequence[tuple[str, Any]], mirrored: bool) -> list[
         flags, what = bsdf.flags(), f"BSDF '{bsdf.id()}' ({bsdf.class_name()}) of {_named('shape', users)}"
         delta = mi.has_flag(flags, mi.BSDFFlags.DeltaReflection) or mi.has_flag(flags, mi.BSDFFlags.DeltaTransmission)
         if not mi.has_flag(flags, mi.BSDFFlags.Smooth):
-            found.append(f"{what} has no smooth component and renders black")
+            shown = "is looked and shone through" if mi.has_flag(flags, mi.BSDFFlags.Null) else "renders black"
+            found.append(f"{what} has no smooth component and {shown}")
         elif delta and mirrored:
             found.append(f"{what} shows no mirror images of lights, only its smooth component")
     return found

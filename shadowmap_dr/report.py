@@ -44,6 +44,20 @@ def read_json(path: str | os.PathLike[str]) -> Any:
         raise ShadowmapError(f"cannot read {path}: {' '.join(str(error).split())}.") from error
 
 
+def read_record(path: str | os.PathLike[str], settings: Mapping[str, Any], *parts: str) -> dict[str, Any]:
+    """The record of an earlier call, to go on with: a mapping with these ``settings``, and mappings of the names ``parts``.
+
+    ShadowmapError where the file holds no such record, or one of other settings.
+    """
+    record, advice = read_json(path), "choose another folder, or leave out --resume"
+    if not isinstance(record, dict) or not all(isinstance(record.get(part), dict) for part in ("settings", *parts)):
+        raise ShadowmapError(f"{path} is no record of this experiment: {advice}.")
+    found = {key: record["settings"].get(key) for key in settings}
+    if found != plain(settings):
+        raise ShadowmapError(f"{path} belongs to a run with other settings, {found}: {advice}.")
+    return record
+
+
 def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
     """A table for the terminal: the first column left-aligned, all others right-aligned."""
     result = Table(title=title, title_justify="left", box=SIMPLE_HEAD)  # narrow enough for 80 columns

@@ -134,6 +134,17 @@ def test_any_mesh_can_be_deformed(variant, tmp_path):
         mesh_files.read_mesh(tmp_path / "broken.ply")
 
 
+@pytest.mark.parametrize(
+    ("face", "message"), [("0 1 7", "go from 0 to 7"), ("0 1 -1", "go from -1 to 1"), ("0 1 1", "two corners at the same place")]
+)
+def test_meshes_with_wrong_triangles_are_named(tmp_path, face, message):
+    head = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\nelement face 1\n"
+    head += "property list uchar int vertex_indices\nend_header\n"
+    (tmp_path / "bad.ply").write_text(f"{head}0 0 0\n1 0 0\n0 1 0\n3 {face}\n")
+    with pytest.raises(ShadowmapError, match=rf"bad\.ply.*{message}"):
+        mesh_files.read_mesh(tmp_path / "bad.ply")
+
+
 def test_recorded_collections_are_pieces_too(variant, tmp_path):
     options = art.ArtOptions(
         ("text:I",), collection="teapot", resolution=SIZE, iterations=20, interval=8, most=4, out=tmp_path / "out", **TINY

@@ -198,6 +198,8 @@ def test_small_jacobian(variant: str, tmp_path: Path, monkeypatch: pytest.Monkey
     measured = []
     measure = gradients_jacobian._measure
     monkeypatch.setattr(gradients_jacobian, "_measure", lambda *args: measured.append(args[1:5]) or measure(*args))
+    damaged = tmp_path / "references" / "x.exr"
+    damaged.write_bytes(damaged.read_bytes()[:500])  # made again
     wider = JacobianOptions(**SMALL, filter_sizes=(1, 3), candidates=("default", "no anti-aliasing"), out=tmp_path, resume=True)
     second = run_jacobian(wider)
     assert ("default", "x", 64, 3) not in measured and ("default", "x", 64, 1) in measured

@@ -105,6 +105,59 @@ def test_unreadable_inputs(tmp_path: Path) -> None:
         io.write_png(tmp_path / "a.png", np.zeros((2, 2, 7)))
 
 
+def test_damaged_images_and_arrays_are_named(tmp_path: Path) -> None:
+    """Libraries raise whatever they come across in a damaged file."""
+    io.write_image(tmp_path / "good.exr", np.random.default_rng(0).random((6, 5, 3)), {"about": "this"})
+    np.savez_compressed(tmp_path / "good.npz", numbers=np.arange(40.0), words=np.array(["a", "b"]))
+    for kind, read in ((".exr", io.read_exr), (".npz", io.read_arrays)):
+        good, path = (tmp_path / f"good{kind}").read_bytes(), tmp_path / f"bad{kind}"
+        refused = 0
+        for k in np.random.default_rng(1).integers(0, len(good), 300):
+            path.write_bytes(good[:k] + bytes([good[k] ^ 0xFF]) + good[k + 1 :])
+            try:
+                read(path)
+            except ShadowmapError as error:
+                assert path.name in str(error) and "\n" not in str(error)
+                refused += 1
+        assert refused > 50
+
+
+def test_arrays_come_by_name(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", x=np.arange(3), y=np.eye(2))
+    assert list(io.read_arrays(tmp_path / "a.npz")) == ["x", "y"]
+    np.testing.assert_array_equal(io.read_arrays(tmp_path / "a.npz", ("y", "z"))["y"], np.eye(2))
+    np.save(tmp_path / "b.npy", np.eye(2))
+    np.savez(tmp_path / "c.npz", x=np.array([{}]))
+    for name, reason in (("b.npy", "no .npz file"), ("c.npz", "objects are not read"), ("d.npz", "no .npz file")):
+        with pytest.raises(ShadowmapError, match=f"{name}.*{reason}"):
+            io.read_arrays(tmp_path / name)
+
+
+def test_meshes_on_a_full_disk(tmp_path: Path) -> None:
+    """Mitsuba's own error is no OSError."""
+
+    class Mesh:
+        def write_ply(self, path: str) -> None:
+            Path(path).write_bytes(b"half of it")
+            raise RuntimeError("[FileStream]\n no space left")
+
+    with pytest.raises(OutputError, match=r"cannot write .*a\.ply: \[FileStream\] no space left"):
+        io.write_ply(tmp_path / "a.ply", Mesh())
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize("content", ["[]", "3", '{"settings": null, "runs": {}}', '{"settings": {"a": 1}}', '{"runs": {}}'])
+def test_records_of_something_else(tmp_path: Path, content: str) -> None:
+    path = tmp_path / "record.json"
+    path.write_text(content)
+    with pytest.raises(ShadowmapError, match=r"record\.json is no record of this experiment.*leave out --resume"):
+        report.read_record(path, {"a": 1}, "runs")
+    path.write_text('{"settings": {"a": [1, 2], "b": 3}, "runs": {"x": 1}}')
+    assert report.read_record(path, {"a": (1, 2)}, "runs")["runs"] == {"x": 1}
+    with pytest.raises(ShadowmapError, match=r"record\.json belongs to a run with other settings"):
+        report.read_record(path, {"a": (1, 3)}, "runs")
+
+
 def test_json_of_numpy_values(tmp_path: Path) -> None:
     value = {"a": np.float32(0.5), "b": np.arange(3), "c": (np.int64(2), True, None), "d": float("nan"), "e": tmp_path}
     report.write_json(tmp_path / "a.json", value)

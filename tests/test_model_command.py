@@ -33,19 +33,21 @@ def test_bad_input_is_one_line(variant, tmp_path, monkeypatch, arguments, reason
     assert not Path("shadow.png").exists() and not Path("model.ply").exists()
 
 
-def test_missing_packages_are_named(variant, tmp_path, monkeypatch):
+@pytest.mark.parametrize(("package", "extra"), [("uvicorn", "interactive"), ("trimesh", "art")])
+def test_missing_packages_are_named(variant, tmp_path, monkeypatch, package, extra):
     monkeypatch.chdir(tmp_path)
     load = builtins.__import__
 
     def without(name, *arguments, **options):
-        if name.split(".")[0] == "uvicorn":
-            raise ModuleNotFoundError("No module named 'uvicorn'", name="uvicorn")
+        if name.split(".")[0] == package:
+            raise ModuleNotFoundError(f"No module named '{package}'", name=package)
         return load(name, *arguments, **options)
 
     monkeypatch.setattr(builtins, "__import__", without)
     monkeypatch.delitem(__import__("sys").modules, "shadowmap_dr.interactive.server", raising=False)
-    with pytest.raises(ShadowmapError, match=r"uvicorn.*pip install 'shadowmap-dr\[interactive\]'"):
+    with pytest.raises(ShadowmapError, match=rf"{package}.*pip install 'shadowmap-dr\[{extra}\]'"):
         cli_model.model("sphere", serve=True, port=0)
+    assert not Path("model.ply").exists()
 
 
 def test_a_port_that_is_taken_leaves_files_alone(variant, tmp_path, monkeypatch):

@@ -169,9 +169,10 @@ def test_bad_folders(tmp_path: Path) -> None:
     write_obj(tmp_path / "identity000.obj", PYRAMID[:4], quads=False)
     with pytest.raises(ShadowmapError, match="identity000.obj has 4 vertices, the mean 5"):
         convert(tmp_path, ConvertOptions())
-    (tmp_path / "identity000.obj").write_text("v 1 2 x\n")
-    with pytest.raises(ShadowmapError, match="no OBJ file"):
-        convert(tmp_path, ConvertOptions())
+    for line in ("v 1 2 x", "f 1 2 99999999999", "v 1 2 3\nf"):
+        (tmp_path / "identity000.obj").write_text(f"{line}\n")
+        with pytest.raises(ShadowmapError, match=r"identity000.obj"):
+            convert(tmp_path, ConvertOptions())
 
 
 def test_basel_like_arrays(tmp_path: Path) -> None:
@@ -209,6 +210,10 @@ def test_basel_like_arrays(tmp_path: Path) -> None:
         ({"shape_std": np.ones(3)}, "4 components, but there are 3 deviations"),
         ({"shape_mean": np.ones(7)}, "shape_mean has 7 numbers"),
         ({"triangles": np.zeros((5, 4), int)}, r"triangles of shape \(5, 4\)"),
+        ({"triangles": np.full((5, 3), 0.5)}, "no whole numbers"),
+        ({"triangles": np.full((5, 3), np.nan)}, "no whole numbers"),
+        ({"shape_mean": np.ones(42, complex)}, "shape_mean holds complex128"),
+        ({"shape_std": np.array(["a"] * 4)}, "shape_std holds <U1"),
     ],
 )
 def test_bad_arrays(changes: dict[str, Any], message: str, tmp_path: Path) -> None:

@@ -53,11 +53,16 @@ def unsupported() -> dict[str, tuple[dict[str, Any], dict[str, Any], str]]:
             {"ball": ball(bsdf={"type": "diffuse", "reflectance": 0.0})},
             r"'glass' \(SmoothDielectric\) of shape 'ball' has no smooth component and renders black",
         ),
+        "thin glass": (
+            {"ball": ball(bsdf={"type": "thindielectric", "id": "pane"})},
+            {"ball": ball(bsdf={"type": "mask", "opacity": 0.0, "bsdf": {"type": "diffuse"}})},
+            r"'pane' \(ThinDielectric\) of shape 'ball' has no smooth component and is looked and shone through",
+        ),
         "plastic": ({"lamp": lamp(), "ball": ball(bsdf={"type": "plastic"})}, {}, "'ball' shows no mirror images of lights"),
     }
 
 
-@pytest.mark.parametrize("name", ["shape", "sky", "beam", "shape with light", "medium", "glass", "plastic"])
+@pytest.mark.parametrize("name", ["shape", "sky", "beam", "shape with light", "medium", "glass", "thin glass", "plastic"])
 def test_is_named_and_left_out(variant: str, name: str) -> None:
     parts, rendered, words = unsupported()[name]
     messages, image = warnings_of(scene(**parts))

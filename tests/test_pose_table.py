@@ -138,7 +138,10 @@ def test_runs_of_several_seeds_and_plots_that_could_only_be_drawn_in_part_are_ke
     assert (out / "pose-seen.png").read_text() == "of all runs"
 
 
-@pytest.mark.parametrize("content", ['{"rows": [{}]}', '{"rows": [1]}', "{}", "[1]", '[{"object": "spot"}]', "nonsense"])
+@pytest.mark.parametrize(
+    "content",
+    ['{"rows": [{}]}', '{"rows": [1]}', "{}", "[1]", '[{"object": "spot"}]', '[{"rotation_error_deg": 1}]', "nonsense"],
+)
 def test_unusable_folders(tmp_path: Path, content: str) -> None:
     with pytest.raises(ShadowmapError, match="no file"):
         pose_table.read([tmp_path])

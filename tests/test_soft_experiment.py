@@ -91,6 +91,12 @@ def test_small_run(variant: str, tmp_path: Path) -> None:
     assert again["scenes"] == stored["scenes"]
     with pytest.raises(ShadowmapError, match="other settings"):
         run_soft(replace(options, resume=True, spp=1))
+    # Entries that are none are made again.
+    (tmp_path / "s" / "soft.json").write_text(json.dumps({**stored, "scenes": {"desk": {}}}))
+    assert run_soft(replace(options, resume=True))["scenes"]["desk"]["errors"]
+    (tmp_path / "s" / "soft.json").write_text("[]")
+    with pytest.raises(ShadowmapError, match="no record"):
+        run_soft(replace(options, resume=True))
 
 
 @pytest.mark.parametrize(

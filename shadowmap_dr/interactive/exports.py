@@ -12,7 +12,7 @@ import numpy.typing as npt
 from .. import figures
 from ..errors import ShadowmapError
 from ..io import atomic
-from ..mesh_files import vertex_colours
+from ..mesh_files import trimesh_package, vertex_colours
 
 #: Formats of meshes, with their media types.
 FORMATS = {"ply": "application/octet-stream", "obj": "text/plain; charset=utf-8", "glb": "model/gltf-binary"}
@@ -28,10 +28,7 @@ def mesh_bytes(kind: str, vertices: Array, faces: npt.NDArray[np.uint32]) -> byt
     """A mesh of (V, 3) vertices and (F, 3) faces as a file of one of `FORMATS`; GLB has colours."""
     if kind not in FORMATS:
         raise ShadowmapError(f"no mesh format {kind!r}: choose from {', '.join(FORMATS)}.")
-    try:
-        import trimesh
-    except ModuleNotFoundError as error:
-        raise ShadowmapError("mesh files need the package trimesh: pip install 'shadowmap-dr[art]'.") from error
+    trimesh = trimesh_package()
     colours = vertex_colours(vertices) if kind == "glb" else None
     content = trimesh.Trimesh(vertices, faces, process=False, vertex_colors=colours).export(file_type=kind)
     return content.encode() if isinstance(content, str) else content

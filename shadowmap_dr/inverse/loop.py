@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import time
-import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import ShadowmapError
-from ..io import atomic
+from ..io import atomic, read_arrays
 
 WARM_UP_STEPS = 5
 CHECKPOINT_INTERVAL = 10
@@ -168,11 +167,10 @@ def _save(path: Path, fingerprint: str, history: History, state: Mapping[str, np
 
 def _load(path: Path, fingerprint: str) -> tuple[History, dict[str, npt.NDArray[Any]]]:
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
+        arrays = read_arrays(path)
         found = str(arrays.pop("fingerprint"))
         history = History(**{k.removeprefix("history/"): v for k, v in arrays.items() if k.startswith("history/")})
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+    except (ShadowmapError, ValueError, KeyError, TypeError) as error:
         raise ShadowmapError(f"cannot read the checkpoint {path}: delete it to start this run anew.") from error
     if found != fingerprint:
         raise ShadowmapError(f"the checkpoint {path} belongs to a run with other settings: delete it or choose another folder.")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,7 +15,7 @@ import numpy.typing as npt
 from ...errors import ShadowmapError
 from ...inverse.art.shadow_views import ShadowView
 from ...inverse.loop import WARM_UP_STEPS
-from ...io import atomic
+from ...io import atomic, read_arrays
 
 #: Steps between two looks at the shadows, and between two checkpoints.
 LOOK_INTERVAL, CHECKPOINT_INTERVAL = 10, 50
@@ -178,8 +177,7 @@ def _save(path: Path, fingerprint: str, trace: Trace, state: Mapping[str, npt.ND
 
 def _load(path: Path, fingerprint: str) -> tuple[Trace, dict[str, npt.NDArray[Any]]]:
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
+        arrays = read_arrays(path)
         found = str(arrays.pop("fingerprint"))
         trace = Trace(*(arrays[f"trace/{name}"].tolist() for name in ("loss", "seconds", "warm")))
         trace.looks = list(zip(arrays["looks/step"].tolist(), arrays["looks/iou"].tolist(), strict=True))
@@ -189,7 +187,7 @@ def _load(path: Path, fingerprint: str) -> tuple[Trace, dict[str, npt.NDArray[An
             if faces is None:
                 raise KeyError("faces")
             trace.frames.append(Frame(int(arrays[f"frame/{k}/step"]), arrays[f"frame/{k}/vertices"], faces))
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+    except (ShadowmapError, ValueError, KeyError, TypeError) as error:
         raise ShadowmapError(f"cannot read the checkpoint {path}: delete it to start this run anew.") from error
     if found != fingerprint:
         raise ShadowmapError(f"the checkpoint {path} belongs to a run with other settings: delete it or choose another folder.")

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from ... import assets
 from ...errors import ShadowmapError
-from ...io import atomic
+from ...io import write_ply
 
 Array = npt.NDArray[Any]
 
@@ -161,8 +161,7 @@ def stored(kind: str, folder: Path) -> Path:
         params["vertex_positions"] = mi.Float(mesh.vertices.ravel())
         params["faces"] = mi.UInt32(mesh.faces.ravel())
         params.update()
-        with atomic(path) as temporary:
-            target.write_ply(str(temporary))
+        write_ply(path, target)
     return path
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -217,10 +216,7 @@ def _started(path: Path, options: FaceOptions, model: MorphableModel) -> dict[st
         "samples": options.samples, "step_size": STEP_SIZE, "translation_step": TRANSLATION_STEP,
     })
     if options.resume and path.exists():
-        record = report.read_json(path)
-        if not isinstance(record, Mapping) or record.get("settings") != settings or "runs" not in record:
-            raise ShadowmapError(f"{path} belongs to a run with other settings: choose another folder, or leave out --resume.")
-        return dict(record)
+        return report.read_record(path, settings, "runs")
     return {"settings": settings, "machine": machine(), "runs": {}}
 
 

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from ... import report
+from ... import io, report
 from ...inverse.faces.morphable import MorphableModel
 from ...io import atomic, to_srgb
 from .metrics import distances
@@ -119,8 +119,7 @@ def error_sheet(path: str | os.PathLike[str], rows: dict[str, dict[str, npt.NDAr
 def write_ply(path: str | os.PathLike[str], vertices: npt.ArrayLike, faces: npt.ArrayLike) -> None:
     """Write a mesh as a binary PLY file."""
     mesh = _mesh(np.asarray(vertices, np.float32), np.asarray(faces))
-    with atomic(path) as temporary:
-        mesh.write_ply(str(temporary))
+    io.write_ply(path, mesh)
 
 
 def _mesh(vertices: npt.NDArray[np.float32], faces: npt.NDArray[Any]) -> Any:

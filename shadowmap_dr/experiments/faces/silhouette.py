@@ -102,12 +102,12 @@ def _grey(path: Path) -> FloatArray:
         raise ShadowmapError(f"no image {str(path)!r}: the file does not exist.")
     if path.suffix.lower() == ".exr":
         return to_srgb(read_image(path).mean(2))
-    from PIL import Image, UnidentifiedImageError
+    from PIL import Image
 
     try:
         with Image.open(path) as image:
             pixels = np.asarray(scaled_to_bytes(image).convert("RGBA"), np.float32) / 255
-    except (OSError, UnidentifiedImageError, ValueError, Image.DecompressionBombError) as error:
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise ShadowmapError(f"cannot read {path}: it is no image, or it is damaged.") from error
     alpha = pixels[..., 3]
     grey = pixels[..., :3].mean(2)

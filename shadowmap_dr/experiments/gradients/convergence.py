@@ -123,10 +123,7 @@ def _started(path: Path, options: ConvergenceOptions) -> dict[str, Any]:
     identity = {"map_resolution": options.map_resolution, "resolution": options.resolution, "iterations": options.iterations,
                 "spp": options.spp, "step_size": STEP_SIZE, "decay": _DECAY}
     if options.resume and path.exists():
-        record = report.read_json(path)
-        if record.get("settings") != identity:
-            raise ShadowmapError(f"{path} belongs to a run with other settings: choose another folder, or leave out --resume.")
-        return record
+        return report.read_record(path, identity, "runs")
     return {"settings": identity, "machine": machine(), "runs": {}}
 
 

@@ -141,11 +141,7 @@ def _started(path: Path, options: JacobianOptions) -> dict[str, Any]:
     """A new record, or the stored one to go on with."""
     identity = {"resolution": options.resolution, "requested_faces": options.faces, "spp": options.spp}
     if options.resume and path.exists():
-        record = report.read_json(path)
-        found = {key: record.get("settings", {}).get(key) for key in identity}
-        if found != identity:
-            raise ShadowmapError(f"{path} belongs to a run with {found}: choose another folder, or leave out --resume.")
-        return record
+        return report.read_record(path, identity, "references", "mitsuba", "entries", "tessellation")
     empty: dict[str, Any] = {"settings": identity, "machine": machine(), "candidates": CANDIDATES}
     return empty | {"references": {}, "mitsuba": {}, "entries": {}, "tessellation": {}}
 

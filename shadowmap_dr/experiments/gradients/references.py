@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ...errors import ShadowmapError
 from ..bench.meshes import Mesh
 from . import scenes as gradients_scenes
 from .images import Image
@@ -105,9 +107,10 @@ def _kept(
     from mitsuba_baselines import reference
 
     if reuse and path.exists():
-        stored = reference.load(path)
-        if stored.settings.get("identity") == identity:
-            return np.atleast_3d(stored.image), stored.settings
+        with suppress(ShadowmapError):  # a file that cannot be read is made again
+            stored = reference.load(path)
+            if stored.settings.get("identity") == identity:
+                return np.atleast_3d(stored.image), stored.settings
     image, settings = make()
     settings = settings | {"identity": identity}
     reference.save(path, reference.Reference(image, settings))

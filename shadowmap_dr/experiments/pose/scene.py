@@ -129,8 +129,10 @@ def path_traced_reference(problem: PoseProblem, path: Path) -> npt.NDArray[np.fl
     if path.exists():
         try:
             _, metadata = io.read_exr(path)
-            if json.loads(metadata.get(_REFERENCE_KEY, "{}")) == settings:
-                return io.read_image(path)
+            image = io.read_image(path)
+            colours = 1 if "mono" in mi.variant() else 3
+            if json.loads(metadata.get(_REFERENCE_KEY, "{}")) == settings and image.shape[2] == colours:
+                return image
         except (ShadowmapError, json.JSONDecodeError):
             pass  # a file that cannot be read is made again
     image = np.asarray(path_traced(problem.scene, spp=REFERENCE_SPP).image, np.float32)
@@ -173,5 +175,4 @@ def _write_mesh(mesh: Any, positions: npt.NDArray[Any], path: Path) -> None:
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = mi.Float(positions.astype(np.float32).ravel())
     parameters.update()
-    with io.atomic(path) as temporary:
-        mesh.write_ply(str(temporary))
+    io.write_ply(path, mesh)

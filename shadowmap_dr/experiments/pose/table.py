@@ -244,7 +244,8 @@ def read(folders: Iterable[str | Path]) -> list[dict[str, Any]]:
             except (KeyError, TypeError, ValueError) as error:
                 raise ShadowmapError(f"{path} is no table of the pose experiment ({error!r}).") from error
             continue
-        if not isinstance(records, list) or not all(isinstance(entry, dict) and _ERRORS[0] in entry for entry in records):
+        needed = {"object", "resolution", "method", "environment", *_PER_RUN, *_SETTINGS}
+        if not isinstance(records, list) or not all(isinstance(entry, dict) and needed <= entry.keys() for entry in records):
             raise ShadowmapError(f"{path} is no list of records of the pose experiment.")
         result += records
     return result

@@ -137,8 +137,8 @@ def run_soft(options: SoftOptions, *, console: Console | None = None) -> dict[st
 
             entry, pictures = measure(name, options, step)
             record["scenes"][name] = entry
-            soft_report.save_pictures(options.out / "pictures" / f"{name}.exr", pictures)
             report.write_json(path, record)
+            soft_report.save_pictures(options.out / "pictures" / f"{name}.exr", pictures)
     record["scenes"] = {name: record["scenes"][name] for name in soft_scenes.SCENES if name in record["scenes"]}
     report.write_json(path, record)
     soft_report.write(record, options.out)
@@ -148,10 +148,8 @@ def run_soft(options: SoftOptions, *, console: Console | None = None) -> dict[st
 def _kept(path: Path, options: SoftOptions) -> dict[str, Any]:
     if not options.resume or not path.exists():
         return {}
-    old = report.read_json(path)
-    if old.get("settings") != options.settings:
-        raise ShadowmapError(f"{path} belongs to a run with other settings: choose another folder, or leave out --resume.")
-    return dict(old["scenes"])
+    scenes = report.read_record(path, options.settings, "scenes")["scenes"]
+    return {name: entry for name, entry in scenes.items() if isinstance(entry, dict) and "errors" in entry}
 
 
 def measure(name: str, options: SoftOptions, step: Callable[..., None]) -> tuple[dict[str, Any], dict[str, Image]]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,11 +12,15 @@ import numpy as np
 import numpy.typing as npt
 
 from ...errors import ShadowmapError
+from ...io import read_arrays
 from .morphable import MorphableModel, from_arrays
 
 FACING = ("+x", "-x", "+z", "-z")
 #: File of the mean shape in ICT-FaceKit's folder; files of identity components are called `identity000.obj` and so on.
 NEUTRAL, IDENTITY = "generic_neutral_mesh.obj", re.compile(r"identity\d+$")
+
+# Arrays that `from_basel` reads.
+_USED = {"triangles", *(f"{kind}_{what}" for kind in ("shape", "expression") for what in ("mean", "basis", "std", "variance"))}
 
 Array = npt.NDArray[Any]
 
@@ -119,11 +122,12 @@ def read_obj(path: Path) -> tuple[Array, npt.NDArray[np.int32]]:
                     corners = [c - 1 if c > 0 else len(vertices) + c for c in corners]
                     faces += [(corners[0], corners[k], corners[k + 1]) for k in range(1, len(corners) - 1)]
         points = np.array(vertices, np.float64).reshape(-1, 3)
-    except (OSError, ValueError) as error:
+        triangles = np.array(faces, np.int32)
+    except (OSError, ValueError, IndexError, OverflowError) as error:
         raise ShadowmapError(f"cannot read {path}: it is no OBJ file, or it is damaged.") from error
     if not len(points) or not faces:
         raise ShadowmapError(f"cannot read {path}: it has {len(points)} vertices and {len(faces)} triangles.")
-    return points, np.array(faces, np.int32)
+    return points, triangles
 
 
 def _same(path: Path, mean: Array) -> Array:
@@ -134,11 +138,11 @@ def _same(path: Path, mean: Array) -> Array:
 
 
 def _arrays(path: Path) -> dict[str, Array]:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
-    except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
-        raise ShadowmapError(f"cannot read {path}: give an .npz file of plain arrays.") from error
+    arrays = read_arrays(path)
+    for name, array in arrays.items():
+        if name in _USED and array.dtype.kind not in "iuf":
+            raise ShadowmapError(f"{path}: {name} holds {array.dtype}: give real numbers.")
+    return arrays
 
 
 def _points(arrays: dict[str, Array], name: str) -> Array:
@@ -167,6 +171,8 @@ def _components(path: Path, arrays: dict[str, Array], kind: str, vertices: int) 
 def _triangles(path: Path, triangles: Array, vertices: int) -> Array:
     if triangles.ndim != 2 or 3 not in triangles.shape or triangles.dtype.kind not in "iuf":
         raise ShadowmapError(f"{path}: triangles of shape {triangles.shape}: give (F, 3) or (3, F).")
+    if not (np.isfinite(triangles) & (triangles == np.floor(triangles))).all():
+        raise ShadowmapError(f"{path}: triangles have corners that are no whole numbers: give indices of vertices.")
     faces = (triangles if triangles.shape[1] == 3 else triangles.T).astype(np.int64)
     # Some of these models count from 1.
     return faces - 1 if faces.size and faces.min() == 1 and faces.max() == vertices else faces

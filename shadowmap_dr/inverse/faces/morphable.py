@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...errors import ShadowmapError
-from ...io import atomic
+from ...io import atomic, read_arrays
 
 #: Arrays that every model file holds, and what may be left out.
 REQUIRED, OPTIONAL = ("mean", "faces", "identity"), ("expression", "identity_names", "expression_names", "mask")
@@ -103,14 +102,7 @@ def load_model(path: str | os.PathLike[str]) -> MorphableModel:
     path = Path(path)
     if not path.is_file():
         raise ShadowmapError(f"no morphable model {str(path)!r}: the file does not exist.")
-    try:
-        if not zipfile.is_zipfile(path):  # NumPy would call other files pickled objects
-            raise ValueError("no archive")
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files if name in (*REQUIRED, *OPTIONAL)}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        reason = "objects are not read" if "pickle" in str(error) else "it is no .npz file, or it is damaged"
-        raise ShadowmapError(f"cannot read the morphable model {path}: {reason}.") from error
+    arrays = read_arrays(path, (*REQUIRED, *OPTIONAL))
     missing = [name for name in REQUIRED if name not in arrays]
     if missing:
         raise ShadowmapError(f"cannot read the morphable model {path}: it has no array {', '.join(missing)}.")

@@ -269,6 +269,12 @@ def _is_planar(points: np.ndarray) -> bool:
     return bool(spread[0] <= 1e-10 * spread[2])
 
 
+def with_positions(data: SceneData) -> Geometry:
+    """The geometry with the vertices as they are now, attached, and nothing else that :func:`refresh` reads."""
+    buffers = (_vertex_buffers(source, info) for source, info in zip(data.sources, data.geometry.shapes, strict=True))
+    return replace(data.geometry, positions=dr.concat([positions for positions, *_ in buffers]))
+
+
 def _vertex_buffers(source: ShapeSource, info: ShapeInfo) -> tuple[Any, Any, Any, Any]:
     """(positions, normals, texcoords, rest positions) of one shape: flat, world space (rest: own space), attached."""
     own = source.own()

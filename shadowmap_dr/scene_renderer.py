@@ -10,15 +10,16 @@ import drjit as dr
 import mitsuba as mi
 
 from .errors import ShadowmapError
+from .lights import environments_of
 from .omissions import warn_of
 from .pending import Inputs, Waiting, attached_names
 from .recorded import Recorded, plain
 from .render_settings import RenderSettings
 from .renderer import Renderer
-from .scene import SceneData, load, refresh
+from .scene import SceneData, load, refresh, with_positions
 from .sensors import lenses_of, sensors_of
 from .shadow import Frusta
-from .soft import SoftFrusta
+from .soft import SkyWatch, SoftFrusta, still_aimed
 from .traversal import parameters
 from .unseen import Unseen
 
@@ -41,6 +42,7 @@ class SceneRenderer:
     waiting   images that wait for their backward passes
     recorded  both passes, replayed if the plug-in's user wants it; ``recordable``: for names of attached parameters, whether
               gradients flow through nothing but what is read from the scene
+    sky       where its environments shone
     unseen    what recordings do not see, and ``unseen_then`` its values when they were made
     """
 
@@ -55,6 +57,7 @@ class SceneRenderer:
     recordable: dict[tuple[str, ...], bool] = field(default_factory=dict)
     unseen: Unseen = field(default_factory=lambda: Unseen(()))
     unseen_then: tuple[Hashable, ...] = ()
+    sky: SkyWatch = field(default_factory=lambda: SkyWatch(()))
 
     @classmethod
     def build(cls, scene: Any, sensor: Any, settings: RenderSettings, tessellation: int, warn: bool = True) -> SceneRenderer:
@@ -64,13 +67,17 @@ class SceneRenderer:
         with dr.suspend_grad():
             data = replace(load(scene, tessellation=tessellation, warn=warn), sensors=(sensors_of(sensor),))
             renderer = Renderer.from_data(data, settings)
+            sky, unseen = SkyWatch(data.environments), Unseen((*scene.emitters(), *_bsdfs(data)))
         lights = tuple(light.name for light in data.lights)
-        unseen = Unseen((*scene.emitters(), *_bsdfs(data)))
         record = cls(_parts(scene, data), _statics(scene, data), _sizes(data), lights, renderer.with_data(_without_scene(data)))
-        return replace(record, unseen=unseen)
+        return replace(record, sky=sky, unseen=unseen)
 
     def matches(self, scene: Any) -> bool:
-        """Whether this record was made for the scene; it is none the worse for moved vertices or other parameter values."""
+        """Whether this record was made for the scene; it is none the worse for moved vertices or other parameter values.
+
+        Where a lamp, or what is around it, has moved so far that its shadow maps miss some of it, or where the sky shines from
+        elsewhere, it is.
+        """
         data = self.renderer.data
         if not same_objects(self.parts, _parts(scene, data)) or self.sizes != _sizes(data):
             return False
@@ -78,7 +85,10 @@ class SceneRenderer:
         if not _same_arrays(self.statics, statics):
             return False
         self.statics = statics
-        return True
+        if dr.flag(dr.JitFlag.FreezingScope):
+            return True  # nothing can be read back
+        with dr.suspend_grad():
+            return self.sky.same(environments_of(scene)) and still_aimed(self.renderer.soft, lambda: with_positions(data))
 
     def data(self, scene: Any, sensor: Any) -> SceneData:
         """What is read from the scene as it is now, with one sensor, attached to the scene's parameters."""

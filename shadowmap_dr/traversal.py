@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable, Iterator
 from contextlib import suppress
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 
 def parameters(node: Any) -> dict[str, Any]:
@@ -39,6 +42,26 @@ def varies(texture: Any) -> bool:
     """Whether a ``mi.Texture`` may differ from place to place, attributes of meshes aside. Those written in Python may say what
     they like: the base class says no for them."""
     return texture.is_spatially_varying() or type(texture) is not mi.Texture
+
+
+def fingerprint(value: Any) -> Hashable:
+    """Something that changes when a parameter is given another value. That of an array is about which array it is."""
+    if dr.is_array_v(value):
+        return tuple(_indices(dr.detach(value)))
+    matrix = getattr(value, "matrix", None)
+    if matrix is None:
+        return repr(value)
+    return fingerprint(matrix) if dr.is_jit_v(matrix) else np.array(matrix).tobytes()
+
+
+def _indices(array: Any) -> Iterator[int]:
+    if dr.is_tensor_v(array):
+        yield array.array.index
+    elif dr.depth_v(array) == 1:
+        yield array.index
+    else:
+        for part in array:
+            yield from _indices(part)
 
 
 def mesh_buffers(mesh: Any) -> tuple[Any, Any, Any, Any]:

@@ -8,7 +8,8 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
+
+from .traversal import fingerprint
 
 
 class Unseen:
@@ -33,7 +34,7 @@ class Unseen:
 
     def now(self) -> tuple[Hashable, ...]:
         """The values as they are: those of two calls are equal if nothing has changed in between."""
-        return tuple(_plain(table[key]) for table, key in self._held)
+        return tuple(fingerprint(table[key]) for table, key in self._held)
 
 
 def _is_seen(node: Any, key: str, value: Any) -> bool:
@@ -44,18 +45,3 @@ def _is_seen(node: Any, key: str, value: Any) -> bool:
     if "nested_texture." in key:
         return False
     return dr.is_array_v(value) or isinstance(value, mi.Transform4f)
-
-
-def _plain(value: Any) -> Hashable:
-    if dr.is_array_v(value):
-        return dr.detach(value).array.index if dr.is_tensor_v(value) else tuple(_leaves(dr.detach(value)))
-    matrix = getattr(value, "matrix", None)
-    return repr(value) if matrix is None else np.array(matrix).tobytes()
-
-
-def _leaves(array: Any) -> Iterable[int]:
-    if dr.depth_v(array) == 1:
-        yield array.index
-    else:
-        for part in array:
-            yield from _leaves(part)

@@ -139,3 +139,63 @@ def test_unchanged_scenes_stay_recorded(variant: str) -> None:
         image(scene, integrator)
         counts.append(sum(record.recorded.recordings for record in integrator.shell.scenes))
     assert counts[3:] == 3 * counts[3:4] and counts[0] == 1
+
+
+def lamp(place: Any, kind: str = "rectangle") -> dict[str, Any]:
+    return {"type": kind, "to_world": place, "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 8.0}}}
+
+
+@pytest.mark.parametrize("options", [{}, {"emitter_shadows": "single"}, {"recorded": True}])
+def test_lamps_that_move_far_with_everything(variant: str, options: dict[str, Any]) -> None:
+    """Their maps face what casts shadows."""
+    T = mi.ScalarTransform4f
+    down = T().translate([0, 0, 3]) @ T().rotate([1, 0, 0], 180) @ T().scale(0.4)
+    scene, away = small_scene(sun=None, lamp=lamp(down)), T().translate([30, 0, 0])
+    used, fresh = (shadowmap(**FEW, **options) for _ in range(2))
+    before = image(scene, used)
+    params = mi.traverse(scene)
+    for key, place in (("lamp", down), ("floor", floor()["to_world"]), ("camera", camera()["to_world"])):
+        params[f"{key}.to_world"] = mi.Transform4f(away @ place)
+    params["ball.vertex_positions"] = params["ball.vertex_positions"] + mi.Float(np.tile([30, 0, 0], 162))
+    params.update()
+    found = image(scene, used)
+    np.testing.assert_allclose(found, image(scene, fresh), atol=1e-4)
+    np.testing.assert_allclose(found, before, atol=0.02 * before.max())
+
+
+def test_lamps_that_come_to_stand_among_objects(variant: str) -> None:
+    T = mi.ScalarTransform4f
+    posts = {
+        f"post_{k}": {"type": "cube", "to_world": T().translate([x, 0, 0.4]) @ T().scale([0.2, 0.4, 0.4])}
+        for k, x in enumerate((-1, 1))
+    }
+    scene = small_scene(ball=None, sun=None, lamp=lamp(T().translate([0, 0, 6]) @ T().scale(0.15), "sphere"), **posts)
+    assert_noticed(scene, "lamp.to_world", lambda _: mi.Transform4f(T().translate([0, 0, 0.5]) @ T().scale(0.15)))
+
+
+def test_a_sky_in_which_a_sun_appears(variant: str) -> None:
+    def sunny(data: Any) -> Any:
+        values = np.array(data)
+        values[3, 9] = 400
+        return mi.TensorXf(values)
+
+    dull = mi.Bitmap(np.full((16, 32, 3), 0.5, np.float32))
+    upright = mi.ScalarTransform4f().rotate([1, 0, 0], 90)
+    scene = small_scene(sun=None, sky={"type": "envmap", "bitmap": dull, "to_world": upright})
+    assert_noticed(scene, "sky.data", sunny)
+
+
+def test_small_changes_of_lamps_and_skies_keep_what_was_planned(variant: str) -> None:
+    """Derivatives are those of an image that changes smoothly."""
+    T = mi.ScalarTransform4f
+    bright = mi.Bitmap(np.random.default_rng(0).uniform(0.2, 1, (16, 32, 3)).astype(np.float32))
+    down = T().translate([0, 0, 3]) @ T().rotate([1, 0, 0], 180) @ T().scale(0.4)
+    scene = small_scene(sun=None, sky={"type": "envmap", "bitmap": bright}, lamp=lamp(down))
+    integrator = shadowmap(**FEW)
+    image(scene, integrator)
+    record = integrator.shell.scenes[0]
+    change(scene, "sky.data", lambda data: data * mi.TensorXf(np.random.default_rng(1).uniform(0.9, 1.1, data.shape)))
+    change(scene, "lamp.to_world", lambda _: mi.Transform4f(T().translate([0.3, 0.2, 0]) @ down))
+    change(scene, "sky.to_world", lambda _: mi.Transform4f(T().rotate([0, 1, 0], 50)))
+    image(scene, integrator)
+    assert integrator.shell.scenes[0] is record and len(integrator.shell.scenes) == 1

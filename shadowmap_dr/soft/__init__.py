@@ -1,11 +1,13 @@
 """Extended lights: area lights and environments as many samples, each with a shadow map."""
 
-from .maps import SoftFrusta, SoftLight, SoftMaps, SoftPlan, check_soft_sizes, make_soft_maps, plan_soft, samples_of
+from .maps import SoftFrusta, SoftLight, SoftMaps, SoftPlan, check_soft_sizes, make_soft_maps, plan_soft, samples_of, still_aimed
 from .samples import LightSamples
 from .shading import soft_light
+from .sky import SkyWatch
 
 __all__ = [
     "LightSamples",
+    "SkyWatch",
     "SoftFrusta",
     "SoftLight",
     "SoftMaps",
@@ -15,4 +17,5 @@ __all__ = [
     "plan_soft",
     "samples_of",
     "soft_light",
+    "still_aimed",
 ]

@@ -9,7 +9,6 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from ..environments import Environment
 from ..geometry import Geometry
@@ -33,7 +32,7 @@ from ..shadow import (
     vertices_in_maps,
 )
 from ..shadow.camera import of_map
-from ..shadow.casters import SUNK
+from .aim import WIDEST, aim, sees_all, shape_vertices
 from .area import AreaPlan, area_samples, plan_area
 from .penumbra import Pyramid
 from .samples import LightSamples, SampleTable
@@ -42,8 +41,6 @@ from .sky import SkyPlan, plan_sky, sky_samples
 SoftLight = AreaLight | Environment
 SoftFrusta = tuple[Frusta | None, Frusta | None]
 
-# Half-angle in degrees that one perspective map may cover: beyond it, a light looks around itself with the faces of a cube.
-_WIDEST = 75.0
 #: No shape is left out of a map.
 NO_SHAPE = 0xFFFFFFFF
 # Seen points that the fit of a map looks at.
@@ -56,8 +53,9 @@ class SoftPlan:
 
     ``kind``: ``distant`` or ``near`` (one map for each sample), ``cube`` (six), or ``single`` (one in all, see
     :mod:`shadowmap_dr.soft.penumbra`). ``first``: number of the first map, single ones and others counted apart.
-    ``target``: point that the maps of a ``near`` light face. ``hides``: shape that casts no shadow of this light: its own, unless
-    parts of it see others of it, ``facing``; then these cast shadows with the sides that shine.
+    ``target``: point that the maps of a ``near`` or ``single`` light face, in the middle of the shapes ``casters``.
+    ``hides``: shape that casts no shadow of this light: its own, unless parts of it see others of it, ``facing``; then these cast
+    shadows with the sides that shine.
     """
 
     parts: AreaPlan | SkyPlan
@@ -67,6 +65,7 @@ class SoftPlan:
     target: tuple[float, float, float]
     hides: int
     facing: tuple[int, int] = (0, 0)
+    casters: tuple[int, ...] = ()
 
     @property
     def maps(self) -> int:
@@ -85,9 +84,9 @@ def plan_soft(
             plan = SoftPlan(plan_sky(light, sky_count, geometry), "distant", sky_count, 0, (0.0, 0.0, 0.0), NO_SHAPE)
         else:
             parts = plan_area(light, geometry, area_count)
-            target, kind = _aim(geometry, light.shape)
-            kind = "single" if single and kind == "near" else kind
-            plan = SoftPlan(parts, kind, area_count, 0, target, light.shape)
+            aimed = aim(shape_vertices(geometry), geometry.shapes, light.shape)
+            kind = "cube" if aimed.surrounded else "single" if single else "near"
+            plan = SoftPlan(parts, kind, area_count, 0, aimed.target, light.shape, casters=aimed.casters)
             if kind != "single" and parts.dented:
                 info = geometry.shapes[light.shape]
                 plan = replace(plan, kind="cube", hides=NO_SHAPE, facing=(info.face_start, info.face_start + info.face_count))
@@ -95,6 +94,16 @@ def plan_soft(
         plans.append(replace(plan, first=first[alone]))
         first[alone] += plan.maps
     return tuple(plans)
+
+
+def still_aimed(plans: Sequence[SoftPlan], geometry: Callable[[], Geometry]) -> bool:
+    """Whether the maps of lights that have one for each sample, or one in all, still cover what they are meant to.
+
+    If there are such lights, the geometry is asked for, and its vertices are read back to the host.
+    """
+    aimed = [plan for plan in plans if plan.kind in ("near", "single")]
+    vertices = shape_vertices(geometry()) if aimed else []
+    return all(sees_all(vertices[plan.hides], [vertices[k] for k in plan.casters], plan.target) for plan in aimed)
 
 
 def check_soft_sizes(plans: Sequence[SoftPlan], geometry: Geometry, texels: int) -> None:
@@ -191,41 +200,6 @@ def map_of(plan: SoftPlan, table: SampleTable, sample: Any, p_world: Any) -> Any
     return plan.first + sample
 
 
-def _aim(geometry: Geometry, own: int) -> tuple[tuple[float, float, float], str]:
-    """Centre of what can cast shadows on something, and whether one map sees all of it from anywhere on the emitter."""
-    positions = dr.detach(geometry.positions).numpy().reshape(-1, 3).astype(np.float64)
-    parts = [positions[i.vertex_start : i.vertex_start + i.vertex_count] for i in geometry.shapes]
-    emitter, others = parts[own], [k for k in range(len(parts)) if k != own]
-    casters = [k for k in others if _may_cast(geometry, parts, k, others, emitter.mean(0))]
-    points = np.concatenate([parts[k] for k in casters or others or [own]])
-    centre = 0.5 * (points.min(0) + points.max(0))
-    corners = _box(emitter)
-    widest = 0.0
-    for corner in np.concatenate([corners, emitter[:: max(1, len(emitter) // 64)]]):
-        to, axis = points - corner, centre - corner
-        length = np.linalg.norm(to, axis=1) * np.linalg.norm(axis)
-        cosine = (to @ axis) / np.maximum(length, 1e-12)
-        widest = max(widest, float(np.degrees(np.arccos(np.clip(cosine.min(), -1, 1)))))
-    return tuple(float(c) for c in centre), "near" if widest <= _WIDEST - 5 else "cube"
-
-
-def _may_cast(geometry: Geometry, parts: list[np.ndarray], k: int, others: list[int], light: np.ndarray) -> bool:
-    """Whether a shape has anything behind it, as seen from the light: walls and floors have not."""
-    if not geometry.shapes[k].planar:
-        return True
-    own = parts[k]
-    _, _, axes = np.linalg.svd(own - own.mean(0), full_matrices=False)
-    normal, size = axes[-1], np.ptp(np.concatenate(parts), axis=0).max()
-    side = (light - own.mean(0)) @ normal
-    behind = [((parts[o] - own.mean(0)) @ normal) * -np.sign(side) for o in others if o != k]
-    return any(float(b.max() - SUNK * np.ptp(b)) > 1e-3 * size for b in behind)
-
-
-def _box(points: np.ndarray) -> np.ndarray:
-    low, high = points.min(0), points.max(0)
-    return np.stack([np.where([i & 1, i & 2, i & 4], high, low) for i in range(8)])
-
-
 def _views(plan: SoftPlan, samples: LightSamples, settings: ShadowSettings) -> Views:
     """Cameras of a light's samples, attached to their places and directions."""
     count = plan.maps
@@ -238,7 +212,7 @@ def _views(plan: SoftPlan, samples: LightSamples, settings: ShadowSettings) -> V
         # Which way a camera faces has no influence on what it sees, so it need not be differentiated.
         with dr.suspend_grad():
             view = directional_view(mi.Vector3f(*plan.target) - dr.detach(place))
-        spread = dr.full(mi.Float, math.tan(math.radians(_WIDEST)), count)
+        spread = dr.full(mi.Float, math.tan(math.radians(WIDEST)), count)
         return Views(view.right, view.up, view.forward, place, spread, zero)
     lane = dr.arange(mi.UInt32, count)
     sample, face = lane // 6, lane % 6

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 from ..environments import Environment
 from ..geometry import Geometry
 from ..raster._memory import device_array
+from ..traversal import fingerprint, parameters
 from .clusters import sky_clusters
 from .samples import LightSamples, brightness, cluster_sums
 
@@ -19,6 +21,8 @@ from .samples import LightSamples, brightness, cluster_sums
 _ROWS = (64, 1024)
 # Importance of dark parts, in units of the mean: light may appear there during an optimisation.
 _DARK = 0.05
+# A sky is divided anew when so much of its energy has come to shine elsewhere.
+_MOVED = 0.25
 # Importance of what lies behind a floor.
 _HIDDEN = 0.1
 
@@ -43,11 +47,9 @@ def plan_sky(light: Environment, count: int, geometry: Geometry) -> SkyPlan:
     Light from below a floor that everything stands on reaches nothing: parts down there are large.
     """
     rows = int(np.clip(light.rows, *_ROWS))
+    bright, weight = _measured(light, rows)
     with dr.suspend_grad():
-        local, solid_angle = _grid(rows)
-        radiance = mi.UnpolarizedSpectrum(light.diffuse_radiance(light.to_world(local)))
-        bright = brightness(light.name, radiance, dr.width(solid_angle))
-        weight = solid_angle.numpy().astype(np.float64)
+        local, _ = _grid(rows)
         directions, world = (np.stack([c.numpy() for c in v], -1).astype(np.float64) for v in (local, light.to_world(local)))
     average = (bright * weight).sum() / weight.sum()
     energy = (bright + _DARK * average if average > 0 else np.ones_like(bright)) * weight
@@ -77,6 +79,51 @@ def _divided(energy: np.ndarray, hidden: np.ndarray, count: int) -> np.ndarray:
     upper = int(np.clip(round(count * weights[0] / sum(weights)), 1, count - 1))
     parts = sky_clusters(energy[:edge], upper), sky_clusters(energy[edge:], count - upper) + np.uint32(upper)
     return np.concatenate(parts)
+
+
+def _measured(light: Environment, rows: int) -> tuple[np.ndarray, np.ndarray]:
+    """(brightness, solid angle) of the cells of a grid, read back."""
+    with dr.suspend_grad():
+        local, solid_angle = _grid(rows)
+        radiance = mi.UnpolarizedSpectrum(light.diffuse_radiance(light.to_world(local)))
+        return brightness(light.name, radiance, dr.width(solid_angle)), solid_angle.numpy().astype(np.float64)
+
+
+class SkyWatch:
+    """Whether a sky still shines about where it did when it was divided into parts; it may have been turned meanwhile.
+
+    Args:
+        lights: environments of a scene, as they are.
+    """
+
+    def __init__(self, lights: Sequence[Environment]) -> None:
+        self._rows = [int(np.clip(light.rows, *_ROWS)) for light in lights]
+        self._shares = [_shares(light, rows) for light, rows in zip(lights, self._rows, strict=True)]
+        self._versions = [_version(light) for light in lights]
+
+    def same(self, lights: Sequence[Environment]) -> bool:
+        """``lights``: the environments now. Reads them back only if one has changed since it was asked last."""
+        for k, (light, rows) in enumerate(zip(lights, self._rows, strict=True)):
+            version = _version(light)
+            if version == self._versions[k]:
+                continue
+            if 0.5 * np.abs(_shares(light, rows) - self._shares[k]).sum() > _MOVED:
+                return False
+            self._versions[k] = version
+        return True
+
+
+def _shares(light: Environment, rows: int) -> np.ndarray:
+    """Share of the cells in a sky's energy."""
+    bright, weight = _measured(light, rows)
+    energy = bright * weight
+    return energy / energy.sum() if energy.sum() > 0 else weight / weight.sum()
+
+
+def _version(light: Environment) -> tuple[Any, ...]:
+    """Something that changes when the parameters do, other than ``to_world``."""
+    held = (value for key, value in parameters(light.emitter).items() if key not in ("to_world", "sampling_weight"))
+    return tuple(fingerprint(value) for value in held)
 
 
 def _floors(geometry: Geometry) -> list[tuple[np.ndarray, float]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -56,7 +55,7 @@ class SceneRenderer:
     recorded: Recorded = field(default_factory=Recorded)
     recordable: dict[tuple[str, ...], bool] = field(default_factory=dict)
     unseen: Unseen = field(default_factory=lambda: Unseen(()))
-    unseen_then: tuple[Hashable, ...] = ()
+    unseen_then: tuple[Any, ...] = ()
     sky: SkyWatch = field(default_factory=lambda: SkyWatch(()))
 
     @classmethod

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any
 
@@ -44,24 +44,39 @@ def varies(texture: Any) -> bool:
     return texture.is_spatially_varying() or type(texture) is not mi.Texture
 
 
-def fingerprint(value: Any) -> Hashable:
-    """Something that changes when a parameter is given another value. That of an array is about which array it is."""
+def fingerprint(value: Any) -> Any:
+    """Something that is equal to that of another value only if a parameter has not been given another one in between.
+
+    Of arrays it tells which they are, not what is in them, and keeps them alive, so that no others can be taken for them.
+    """
     if dr.is_array_v(value):
-        return tuple(_indices(dr.detach(value)))
+        return tuple(_Same(leaf) for leaf in _leaves(dr.detach(value)))
     matrix = getattr(value, "matrix", None)
     if matrix is None:
         return repr(value)
     return fingerprint(matrix) if dr.is_jit_v(matrix) else np.array(matrix).tobytes()
 
 
-def _indices(array: Any) -> Iterator[int]:
+class _Same:
+    """An array that is equal to itself alone."""
+
+    def __init__(self, array: Any) -> None:
+        self.array = array
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and self.array.index == other.array.index
+
+    __hash__ = None  # type: ignore[assignment]
+
+
+def _leaves(array: Any) -> Iterator[Any]:
     if dr.is_tensor_v(array):
-        yield array.array.index
+        yield array.array
     elif dr.depth_v(array) == 1:
-        yield array.index
+        yield array
     else:
         for part in array:
-            yield from _indices(part)
+            yield from _leaves(part)
 
 
 def mesh_buffers(mesh: Any) -> tuple[Any, Any, Any, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable
+from collections.abc import Iterable
 from contextlib import suppress
 from typing import Any
 
@@ -32,7 +32,7 @@ class Unseen:
                     if not _is_seen(node, key, table[key]):
                         self._held.append((table, key))
 
-    def now(self) -> tuple[Hashable, ...]:
+    def now(self) -> tuple[Any, ...]:
         """The values as they are: those of two calls are equal if nothing has changed in between."""
         return tuple(fingerprint(table[key]) for table, key in self._held)
 

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from integrator_scenes import camera, floor, shadowmap, small_scene, sun
 
+from shadowmap_dr.traversal import fingerprint
+
 FEW = {"emitter_samples": 4, "environment_samples": 16}
 
 
@@ -139,6 +141,21 @@ def test_unchanged_scenes_stay_recorded(variant: str) -> None:
         image(scene, integrator)
         counts.append(sum(record.recorded.recordings for record in integrator.shell.scenes))
     assert counts[3:] == 3 * counts[3:4] and counts[0] == 1
+
+
+def test_fingerprints_are_those_of_one_array(variant: str) -> None:
+    """Dr.Jit gives the numbers of arrays that are gone to new ones."""
+    array = mi.TensorXf(np.zeros((2, 3), np.float32))
+    first = fingerprint(array)
+    assert first == fingerprint(array) == fingerprint(mi.TensorXf(array))
+    del array
+    for k in range(50):
+        other = mi.Float([k])
+        assert fingerprint(other) != first
+        del other
+    T = mi.ScalarTransform3f
+    for one, two in ((1.0, 1.0 + 1e-15), (T(), T().scale(1.0001)), (True, False), (mi.Vector3f(1, 2, 3), mi.Vector3f(1, 2, 4))):
+        assert fingerprint(one) == fingerprint(one) != fingerprint(two)
 
 
 def lamp(place: Any, kind: str = "rectangle") -> dict[str, Any]:

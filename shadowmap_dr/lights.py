@@ -144,7 +144,11 @@ _BEAMS = ("Rectangle", "Disk")
 def objection(emitter: Any) -> str | None:
     """Why a ``mi.Emitter`` is not supported, as the end of a sentence about it; None if it is."""
     kind = emitter.class_name()
-    if kind in _LIGHTS or kind in ENVIRONMENTS or kind == "AreaLight":
+    if kind == "AreaLight":
+        # Mitsuba's own direct light from one is far too dark: it has no way to sample such a texture.
+        attributes = any(part.class_name() == "MeshAttribute" for _, part in children(emitter))
+        return "has a mesh_attribute for its radiance, which does not shine: use a bitmap" if attributes else None
+    if kind in _LIGHTS or kind in ENVIRONMENTS:
         return None
     if kind == "DirectionalArea":
         shape = emitter.get_shape().class_name()
@@ -172,11 +176,11 @@ def area_lights_of(scene: Any, shapes: Sequence[Any]) -> tuple[AreaLight, ...]:
     """Records of the area lights of a ``mi.Scene``.
 
     ``shapes``: its ``mi.Shape`` objects in the order of the soup; the lights of others are left out. Lights have the names of
-    their shapes: emitters inside of shapes are all called the same.
+    their shapes: emitters inside of shapes are all called the same. What is not supported (:func:`objection`) is left out.
     """
     found = []
     for name, emitter in named_emitters(scene):
-        if emitter.class_name() == "AreaLight":
+        if emitter.class_name() == "AreaLight" and objection(emitter) is None:
             shape = emitter.get_shape()
             index = next((k for k, other in enumerate(shapes) if other is shape or other == shape), None)
             textures = [part for _, part in children(emitter) if isinstance(part, mi.Texture)]

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from shadowmap_dr.beams import Projector
-from shadowmap_dr.lights import environments_of, lights_of, objection
+from shadowmap_dr.lights import area_lights_of, environments_of, lights_of, objection
+from shadowmap_dr.scene import load
 from shadowmap_dr.traversal import children
 
 
@@ -189,3 +190,12 @@ def test_unsupported_emitters_are_left_out(variant: str) -> None:
     reasons = {emitter.class_name(): objection(emitter) for emitter in scene.emitters()}
     assert reasons["DirectionalEmitter"] is None
     assert "rectangles and disks" in reasons["DirectionalArea"] and "envmap" in reasons["TimedSunskyEmitter"]
+
+
+def test_attributes_of_meshes_do_not_shine(variant: str) -> None:
+    """Said in the warning about the scene, instead of a black lamp without a word."""
+    glow = {"type": "area", "radiance": {"type": "mesh_attribute", "name": "vertex_color"}}
+    scene = mi.load_dict({"type": "scene", "cube": {"type": "cube", "glow": glow}})
+    assert area_lights_of(scene, scene.shapes()) == ()
+    with pytest.warns(UserWarning, match="AreaLight. has a mesh_attribute for its radiance"):
+        load(scene)

@@ -1,20 +1,44 @@
-"""Records of lights that throw a picture or a beam: projectors, and flat shapes that shine along their normal only."""
+"""Lights with an outline; records of those that throw a picture or a beam: projectors, and flat shapes that shine straight."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import drjit as dr
 import mitsuba as mi
 
 from .geometry import normalize_or
+from .spread import spread
 
 # Width of the rim in which light fades, half of it on either side of the outline: through it a moving outline has derivatives.
 # In units of the picture, and of the narrower half of a beam's cross-section. In images it is at least as wide as a pixel.
 _PICTURE_RIM = 1 / 1024
 _BEAM_RIM = 0.005
+# Of a rim without any width, in units of the rim: it is divided by.
+_NARROWEST = 1e-7
+
+
+@runtime_checkable
+class Outlined(Protocol):
+    """A light with an outline at which it fades: projectors, beams, spot lights.
+
+    rim     width of the rim in which it fades, half of it on either side of the outline (Float, or number)
+    widest  the rim is never made wider than this (detached)
+    """
+
+    @property
+    def rim(self) -> Any: ...
+
+    @property
+    def widest(self) -> Any: ...
+
+    def illuminate(self, p_world: Any, active: Any = True, inside: Any = None) -> tuple[Any, Any]:
+        """(wo, weight), as of all lights; ``inside``: what :func:`share_inside` returns, if known."""
+
+    def distances(self, p_world: Any) -> list[Any]:
+        """Distances from the edges that bound the light (Float), positive inside, in units of ``rim``. Attached."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +59,7 @@ class Projector:
     scale: Any
     tangents: Any
     rim: float = _PICTURE_RIM
+    widest: float = 0.5
 
     @property
     def position(self) -> Any:
@@ -116,6 +141,11 @@ class Beam:
         return dr.select(inwards ^ self.flipped, -normal, normal)
 
     @property
+    def widest(self) -> Any:
+        """Float, world units: the rim is never made wider than this."""
+        return dr.detach(self.reach)
+
+    @property
     def reach(self) -> Any:
         """Float, world units: nothing of the beam is farther from its axis."""
         return dr.norm(axis(self.to_world, 0)) + dr.norm(axis(self.to_world, 1)) + self.rim
@@ -160,9 +190,9 @@ class Beam:
 
 @dataclass(frozen=True)
 class Softened:
-    """A projector or beam on a surface, where the share of its light that the outline lets through is known: Float (N,)."""
+    """A light with an outline on a surface, where the share of its light that is let through is known: Float (N,)."""
 
-    light: Projector | Beam
+    light: Outlined
     inside: Any
 
     def illuminate(self, p_world: Any, active: Any = True) -> tuple[Any, Any]:
@@ -171,21 +201,21 @@ class Softened:
 
 
 def softened(lights: Sequence[Any], p_world: Any, footprints: Callable[[], Sequence[Any]]) -> tuple[Any, ...]:
-    """The same lights; the outlines of projectors and beams among them are as soft as pixels are wide.
+    """The same lights; the outlines of those that have one are at least as soft as pixels are wide.
 
     ``p_world`` Point3f (N,); ``footprints`` gives points half way to the corners of each pixel (Point3f (N,) each), and is called
     only where there are such lights. One sample per pixel is enough then for derivatives of moving outlines.
     """
-    if not any(isinstance(light, Projector | Beam) for light in lights):
+    if not any(isinstance(light, Outlined) for light in lights):
         return tuple(lights)
-    around = footprints()
+    around, width = footprints(), dr.width(p_world)
+    wide = (spread(light, width) if isinstance(light, Outlined) else light for light in lights)
     return tuple(
-        Softened(light, share_inside(light, p_world, around)) if isinstance(light, Projector | Beam) else light
-        for light in lights
+        Softened(light, share_inside(light, p_world, around)) if isinstance(light, Outlined) else light for light in wide
     )
 
 
-def share_inside(light: Projector | Beam, p_world: Any, around: Sequence[Any] = ()) -> Any:
+def share_inside(light: Outlined, p_world: Any, around: Sequence[Any] = ()) -> Any:
     """Share of the light (Float, N) that the outline lets through: 1 inside, 0 outside, a ramp in between. Attached.
 
     ``around``: points half way to the corners of the pixel around each of ``p_world``; the ramp is as wide as the pixel, or else
@@ -193,14 +223,13 @@ def share_inside(light: Projector | Beam, p_world: Any, around: Sequence[Any] = 
     """
     distances = light.distances(p_world)
     with dr.suspend_grad():
-        widest = 0.5 if isinstance(light, Projector) else light.reach
-        widths = [mi.Float(light.rim) for _ in distances]
+        widths = [mi.Float(_NARROWEST) for _ in distances]
         for other in around:
             for k, (here, there) in enumerate(zip(distances, light.distances(other), strict=True)):
-                widths[k] = dr.maximum(widths[k], dr.minimum(4 * dr.abs(dr.detach(there) - dr.detach(here)), widest))
+                widths[k] = dr.maximum(widths[k], dr.minimum(4 * dr.abs(dr.detach(there) - dr.detach(here)), light.widest))
     share = mi.Float(1)
     for distance, width in zip(distances, widths, strict=True):
-        share *= dr.clip(0.5 + distance / width, 0, 1)
+        share *= dr.clip(0.5 + distance / dr.maximum(width, light.rim), 0, 1)
     return share
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from .beams import Beam, Projector, beam_of, projector_of, towards
+from .beams import Beam, Projector, beam_of, picture, projector_of, share_inside, towards
 from .environments import ENVIRONMENTS, SUNSKY, Environment, SunSky, environment_of
 from .traversal import children, parameters, varies
 
@@ -78,23 +78,47 @@ class SpotLight:
         matrix = self.to_world.matrix
         return dr.normalize(mi.Vector3f(matrix[0, 2], matrix[1, 2], matrix[2, 2]))
 
-    def illuminate(self, p_world: Any, active: Any = True) -> tuple[Any, Any]:
-        """(wo, weight) with weight = intensity * falloff * texture / distance^2."""
+    @property
+    def rim(self) -> Any:
+        """Float, radians: width of the rim in which light falls off from full to none. Attached to both angles."""
+        return (self.cutoff_angle - self._full) * _DEGREE
+
+    @property
+    def widest(self) -> Any:
+        """Float, radians: the rim is never made wider than this."""
+        return dr.detach(self.cutoff_angle) * _DEGREE
+
+    def illuminate(self, p_world: Any, active: Any = True, inside: Any = None) -> tuple[Any, Any]:
+        """(wo, weight) with weight = intensity * falloff * texture / distance^2.
+
+        ``p_world`` Point3f (N,), world space. ``inside``: the falloff, if known (:func:`~shadowmap_dr.beams.share_inside`), Float
+        (N,). Attached to points and all fields.
+        """
         wo, inverse_squared = towards(p_world, self.position)
-        matrix = mi.Matrix3f(self.to_world.matrix)
-        local = dr.normalize(mi.Vector3f(dr.rcp(matrix) @ mi.Vector3f(-wo)))
-        cutoff, beam = self.cutoff_angle * _DEGREE, self.beam_width * _DEGREE
-        angle = dr.safe_acos(local.z)
-        falloff = dr.select(local.z >= dr.cos(beam), 1.0, (cutoff - angle) / (cutoff - beam))
-        lit = (local.z > dr.cos(cutoff)) & mi.Bool(active)
-        weight = self.intensity * (falloff * inverse_squared)
+        local = self._local(wo)
+        inside = share_inside(self, p_world) if inside is None else inside
+        lit = (inside > 0) & mi.Bool(active)
+        weight = self.intensity * (inside * inverse_squared)
         if self.texture is not None:
-            # Lanes outside the cone may have z = 0: keep their coordinates finite.
-            scale = 0.5 * dr.rcp(dr.select(lit, local.z, 1.0) * dr.tan(cutoff))
-            si = dr.zeros(mi.SurfaceInteraction3f, dr.width(local))
-            si.uv = mi.Point2f(0.5 + local.x * scale, 0.5 + local.y * scale)
-            weight = weight * self.texture.eval(si, lit)
+            # Lanes outside the cone may have z = 0, and those within a pixel of it lie off the texture: it may not begin anew.
+            scale = 0.5 * dr.rcp(dr.select(lit, local.z, 1.0) * dr.tan(self.cutoff_angle * _DEGREE))
+            uv = mi.Point2f(0.5 + local.x * scale, 0.5 + local.y * scale)
+            weight = weight * picture(self.texture, dr.clip(uv, 0, 1), lit)
         return wo, weight & lit
+
+    def distances(self, p_world: Any) -> list[Any]:
+        """Angle between the middle of the rim and points (Float), positive inside, in radians. Attached."""
+        angle = dr.safe_acos(self._local(towards(p_world, self.position)[0]).z)
+        return [0.5 * (self.cutoff_angle + self._full) * _DEGREE - angle]
+
+    @property
+    def _full(self) -> Any:
+        """Angle up to which intensity is full, in degrees: a beam wider than the cone ends where that does."""
+        return dr.minimum(self.beam_width, self.cutoff_angle)
+
+    def _local(self, wo: Any) -> Any:
+        """Unit direction in the light's own space in which light travels that arrives from ``wo``."""
+        return dr.normalize(mi.Vector3f(dr.rcp(mi.Matrix3f(self.to_world.matrix)) @ mi.Vector3f(-wo)))
 
 
 @dataclass(frozen=True)

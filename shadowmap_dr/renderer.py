@@ -310,7 +310,9 @@ class Renderer:
         lights = lighting.lights
         visible = self._visibilities(lighting, seen, view, depth)
         around = lambda: footprint_points(sensor, (width, height), depth, seen.p_world, seen.n_world, 2)  # noqa: E731
-        lighting = replace(lighting, lights=softened(lights, seen.p_world, around))
+        compat = self.settings.shadow.compat
+        shining = [SquareSpot(light) if compat and isinstance(light, SpotLight) else light for light in lights]
+        lighting = replace(lighting, lights=softened(shining, seen.p_world, around))
         color = self._radiance(seen, lighting, visible, sensor, raster)
         channels = _film_channels(color, seen.active, sensor)
         named = collect_aovs(self.settings.aovs, seen, raster, lights, visible)
@@ -342,8 +344,7 @@ class Renderer:
         compat = self.settings.shadow.compat
         color = dr.zeros(mi.UnpolarizedSpectrum, dr.width(seen.shape))
         for light, fraction in zip(lighting.lights, visible, strict=True):
-            square = compat and isinstance(light, SpotLight)
-            color += direct_light(seen, SquareSpot(light) if square else light, fraction, gate=not compat)
+            color += direct_light(seen, light, fraction, gate=not compat)
         bsdfs = [source.shape.bsdf() for source in self.data.sources]
         for plan, samples in zip(self.soft, lighting.samples, strict=True):
             color += soft_light(seen, plan, samples, lighting.soft_maps, bsdfs, gate=not compat)

@@ -39,6 +39,11 @@ def spot_with_slide() -> dict[str, Any]:
     return {**scenes.spot(), "texture": slide(1)}
 
 
+def sharp_spot() -> dict[str, Any]:
+    """One without a falloff: Mitsuba lets beams be wider than their cones."""
+    return {**scenes.spot(), "cutoff_angle": 20.0, "beam_width": 30.0}
+
+
 def lit_by(size: int = 64, **lights: Any) -> Any:
     return scenes.scene(size, box=scenes.box(), **lights)
 
@@ -126,6 +131,10 @@ def moved(start: Any, x: Any) -> Any:
     return mi.Transform4f().translate([x, 0, 0.4 * x]) @ mi.Transform4f(start)
 
 
+def widened(start: Any, x: Any) -> Any:
+    return mi.Float(start) + 10 * x
+
+
 def brighter(start: Any, x: Any) -> Any:
     return start * (1 + x)
 
@@ -143,6 +152,9 @@ DERIVATIVES: dict[str, tuple[Callable[[], Any], str, Callable[[Any, Any], Any]]]
     "projector picture": (projector, "light.irradiance.data", repainted),
     "spot picture": (spot_with_slide, "light.texture.data", repainted),
     "spot turned": (spot_with_slide, "light.to_world", turned),
+    "sharp spot turned": (sharp_spot, "light.to_world", turned),
+    "sharp spot moved": (sharp_spot, "light.to_world", moved),
+    "sharp spot widened": (sharp_spot, "light.cutoff_angle", widened),
     "rectangle moved": (beam, "light.to_world", moved),
     "rectangle turned": (beam, "light.to_world", turned),
     "rectangle radiance": (beam, "light.emitter.radiance.value", brighter),

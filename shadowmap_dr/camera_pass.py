@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .geometry import Geometry
-from .raster import NO_TRIANGLE, RasterOutput
+from .raster import DEPTH_GAP, NO_TRIANGLE, RasterOutput
 from .sensors import Sensor
 from .spread import spread
 
@@ -88,9 +88,16 @@ def _orthographic_reach(sensor: Sensor, geometry: Geometry) -> Any:
     """Depth range of an orthographic camera, detached: as far as there are vertices, or up to the far plane."""
     with dr.suspend_grad():
         p = dr.gather(mi.Point3f, geometry.positions, dr.arange(mi.UInt32, geometry.vertex_count))
-        distance = dr.norm(p - sensor.origin)
-        farthest = dr.max(dr.select(dr.isfinite(distance), distance, 0))
+        # In the camera's own units: its transformation may scale. Never 0, also if there is nothing before it.
+        z = dr.abs((mi.Transform4f(sensor.view) @ p).z)
+        farthest = dr.maximum(dr.max(dr.select(dr.isfinite(z), z, 0)), sensor.near)
         return dr.minimum(sensor.far - sensor.near, _ROOM * farthest)
+
+
+def least_gap(sensor: Sensor) -> float:
+    """How far, in NDC depth, an edge must at least lie before what it borders (:func:`~shadowmap_dr.raster.find_crossings`)."""
+    # The depths of a perspective camera are as precise, relatively, far away as they are near by.
+    return 0.0 if sensor.kind == "perspective" else DEPTH_GAP
 
 
 def within_far_plane(sensor: Sensor, depth: Any) -> Any:

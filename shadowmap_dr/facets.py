@@ -54,7 +54,8 @@ def flat_faces(geometry: Geometry, topology: Topology) -> FlatFaces | None:
 def crease_edges(geometry: Geometry, topology: Topology) -> Any:
     """``Bool`` (3 F,): whether shading jumps at the edge from corner k to k + 1 of a face. None if at none (on the host, once).
 
-    It does at the edges of flat faces, and between faces whose vertex normals differ at the edge they share.
+    It does at the edges of flat faces, and between smooth ones that belong to different shapes, or whose vertex normals differ at
+    the edge they share.
     """
     shapes = geometry.face_shape.numpy()
     flat = np.array([not info.has_normals for info in geometry.shapes])[shapes]
@@ -74,7 +75,7 @@ def crease_edges(geometry: Geometry, topology: Topology) -> Any:
     )
     smooth = np.array([info.has_normals for info in geometry.shapes])[shapes]
     hard = np.repeat(flat, 3)
-    split = (jump > _NORMAL_JUMP) & smooth[one // 3] & smooth[other // 3]
+    split = ((jump > _NORMAL_JUMP) | (shapes[one // 3] != shapes[other // 3])) & smooth[one // 3] & smooth[other // 3]
     hard[one[split]] = hard[other[split]] = True
     return mi.Bool(hard) if hard.any() else None
 

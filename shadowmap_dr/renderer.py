@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -12,7 +12,7 @@ import mitsuba as mi
 
 from .aovs import collect_aovs
 from .beams import softened
-from .camera_pass import camera_clip, seen_points, within_far_plane, without_shapes
+from .camera_pass import camera_clip, least_gap, seen_points, within_far_plane, without_shapes
 from .errors import ShadowmapError
 from .facets import crease_edges, flat_faces, mean_normals, soften_facets
 from .film import develop, sample_grid, sample_windows
@@ -21,7 +21,7 @@ from .geometry import Geometry
 from .hits import pixel_hits
 from .light_maps import MapPlan, check_sizes, light_visibility, make_maps, plan_maps
 from .lights import AreaLight, Light, SpotLight, SquareSpot
-from .raster import RasterOutput, Topology, antialias, build_topology, outward_faces, visible_triangles
+from .raster import RasterOutput, Topology, antialias, build_topology, outward_faces, parted, visible_triangles
 from .raster.crossings import Crossings, find_crossings
 from .render_settings import RenderSettings
 from .scene import SceneData, load, refresh
@@ -125,7 +125,7 @@ class Renderer:
         """Build a renderer for scene records."""
         geometry = data.geometry
         positions = dr.detach(geometry.positions).numpy()
-        topology = build_topology(geometry.faces.numpy(), positions, mi.UInt32)
+        topology = build_topology(geometry.faces.numpy(), positions, mi.UInt32, geometry.vertex_shape.numpy())
         if not topology.count:
             raise ShadowmapError("There is nothing to render: all triangles of the scene have two corners at the same place.")
         plan, creases = plan_maps(data.lights, geometry), crease_edges(geometry, topology)
@@ -229,7 +229,7 @@ class Renderer:
         maps = soft_maps = None
         if settings.shadow.method != "none" and (lights or samples):
             transparent, seen = self._transparent(geometry, views[0].sensor), self._seen(views, geometry)
-            common = (geometry, self.topology)
+            common = (geometry, self._topology(geometry))
             if lights:
                 maps = make_maps(self.plan, lights, *common, settings.shadow, self.frusta, transparent, seen, self.outward)
                 self.frusta = maps.frusta
@@ -259,13 +259,21 @@ class Renderer:
 
     def _view(self, sensor: Sensor, geometry: Geometry, factor: int) -> _View:
         clip = camera_clip(sensor, geometry)
-        if self.settings.hide_emitters and self.data.areas:
-            clip = without_shapes(clip, geometry, [light.shape for light in self.data.areas])
+        hidden = [light.shape for light in self.data.areas] if self.settings.hide_emitters else []
+        if hidden:
+            clip = without_shapes(clip, geometry, hidden)
         dr.eval(clip)
         size = (sensor.height * factor, sensor.width * factor)
         transparent = self._transparent(geometry, sensor)
         raster = visible_triangles(clip, geometry.faces, size, transparent=transparent)
-        return _View(sensor, factor, clip, raster)
+        return _View(sensor, factor, clip, raster, self._topology(geometry, hidden))
+
+    def _topology(self, geometry: Geometry, hidden: Sequence[int] = ()) -> Topology:
+        """The topology of shapes where they are now, without those that are hidden."""
+        if geometry.as_loaded and not geometry.changed and not hidden:
+            return self.topology
+        points = dr.gather(mi.Point3f, dr.detach(geometry.positions), dr.arange(mi.UInt32, geometry.vertex_count))
+        return parted(self.topology, points, geometry.vertex_shape, hidden)
 
     def _surface(self, view: _View, geometry: Geometry, facets: Any, frames: bool) -> tuple[Surface, Any, Any]:
         """(what a camera sees, its depth as ``Hits.depth``, how much edges between facets still show or None for all)."""
@@ -297,7 +305,14 @@ class Renderer:
             if self.settings.antialias:
                 dr.eval(sharpness)
                 crossings = find_crossings(
-                    view.clip, self.topology, view.raster, geometry.vertex_count, self.creases, sharpness, meetings=True
+                    view.clip,
+                    view.topology,
+                    view.raster,
+                    geometry.vertex_count,
+                    self.creases,
+                    sharpness,
+                    meetings=True,
+                    gap=least_gap(windows[0]),
                 )
             return GBuffer(windows[0], seen, points, crossings, self._seen([view], geometry))
 
@@ -320,7 +335,14 @@ class Renderer:
             # In one pass over the pixels, since both need much of the same.
             dr.eval(channels, sharpness)
             flat = antialias(
-                channels, raster, view.clip, self.topology, creases=self.creases, crease_weights=sharpness, meetings=True
+                channels,
+                raster,
+                view.clip,
+                view.topology,
+                creases=self.creases,
+                crease_weights=sharpness,
+                meetings=True,
+                gap=least_gap(sensor),
             )
             image = mi.TensorXf(flat, shape=(height, width, len(channels)))
         else:
@@ -393,12 +415,16 @@ class _Lighting:
 
 @dataclass(frozen=True)
 class _View:
-    """One camera's visibility: clip-space vertices and what each sample sees, ``factor`` x ``factor`` samples a pixel."""
+    """One camera's visibility: clip-space vertices and what each sample sees, ``factor`` x ``factor`` samples a pixel.
+
+    ``topology``: edges of the shapes that it sees, where they are now.
+    """
 
     sensor: Sensor
     factor: int
     clip: Any
     raster: RasterOutput
+    topology: Topology
 
     @property
     def columns(self) -> int:

@@ -3,12 +3,14 @@
 from ._types import MAX_RESOLUTION, NO_TRIANGLE, RasterOutput
 from .antialias import antialias
 from .closed import drawing_order, outward_faces
-from .crossings import Crossings, find_crossings
+from .crossings import DEPTH_GAP, Crossings, find_crossings
 from .interpolate import interpolate
 from .rasterize import rasterize, visible_triangles
+from .seams import parted
 from .topology import NO_VERTEX, Topology, build_topology
 
 __all__ = [
+    "DEPTH_GAP",
     "MAX_RESOLUTION",
     "NO_TRIANGLE",
     "NO_VERTEX",
@@ -21,6 +23,7 @@ __all__ = [
     "find_crossings",
     "interpolate",
     "outward_faces",
+    "parted",
     "rasterize",
     "visible_triangles",
 ]

@@ -8,7 +8,7 @@ import drjit as dr
 
 from ._types import RasterOutput
 from .blend import blend
-from .crossings import Crossings, find_crossings
+from .crossings import DEPTH_GAP, Crossings, find_crossings
 from .topology import Topology
 
 
@@ -22,6 +22,7 @@ def antialias(
     creases: Any = None,
     crease_weights: Any = None,
     meetings: bool = False,
+    gap: float = DEPTH_GAP,
 ) -> Any:
     """Blend each pixel with the neighbours from which a silhouette separates it, by the share of the pixel they cover.
 
@@ -39,6 +40,7 @@ def antialias(
         creases, crease_weights: edges of faces that are blended (and differentiated) like silhouettes, and how much, see
             :func:`find_crossings`.
         meetings: blend (and differentiate) where surfaces meet without an edge, too, see :func:`find_crossings`.
+        gap: how far silhouettes must lie before what they border, see :func:`find_crossings`.
 
     Returns:
         The blended values in the shape of ``values``; flat, with interleaved channels, for a list. Gradients flow to ``values``
@@ -54,7 +56,7 @@ def antialias(
     flat = _checked_values(values, raster)
     positions, vertex_count = _flat_positions(positions, raster, topology)
     if crossings is None:
-        crossings = find_crossings(positions, topology, raster, vertex_count, creases, crease_weights, meetings)
+        crossings = find_crossings(positions, topology, raster, vertex_count, creases, crease_weights, meetings, gap)
     blended = blend(flat, positions, raster, crossings)
     return type(values)(blended, shape=values.shape) if is_tensor else blended
 

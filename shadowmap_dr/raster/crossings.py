@@ -9,10 +9,13 @@ import drjit as dr
 
 from ._types import NO_TRIANGLE, RasterOutput, backend, by_image, zeros
 from .creases import find_creases
-from .meetings import Meetings
+from .meetings import LEAST_WEIGHT, Meetings, beyond_middle
 from .pairs import PairList, differing_pairs, empty_list
 from .silhouette import register_silhouettes
 from .topology import NO_VERTEX, Topology
+
+#: How far (NDC depth) an edge must lie before the surface that it borders, with depths as those of the usual matrices.
+DEPTH_GAP = 2e-7
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,7 @@ def find_crossings(
     creases: Any = None,
     crease_weights: Any = None,
     meetings: bool = False,
+    gap: float = DEPTH_GAP,
 ) -> Crossings:
     """Find the edges between neighbouring pixels.
 
@@ -60,6 +64,8 @@ def find_crossings(
         crease_weights: ``Float`` for each pixel, between 0 and 1: how much creases count there; 1 if not given.
         meetings: also look for the lines along which surfaces that are not connected pass through each other or touch. Depths,
             and what follows from them alone, do not jump there.
+        gap: how far (NDC depth) a silhouette must at least lie before what it borders, besides 1e-5 of the depth there. 0 suits
+            depths of which all digits count, such as -near / distance; more those that are close to 1 far away.
 
     A silhouette is an edge whose faces all lie on one side of it in the image. It separates two pixels that see different
     triangles when it crosses the segment between their centres and lies before the surface that the uncovered one sees
@@ -79,10 +85,10 @@ def find_crossings(
         meet = None
         if creases is None and not meetings:
             pairs, keys = empty_list(raster)
-            register_silhouettes(positions, topology, raster, vertex_count, keys, pairs)
+            register_silhouettes(positions, topology, raster, vertex_count, keys, pairs, gap)
         else:
             pairs, keys = differing_pairs(raster)
-            register_silhouettes(positions, topology, raster, vertex_count, keys, None)
+            register_silhouettes(positions, topology, raster, vertex_count, keys, None, gap)
             crease_weights = None if crease_weights is None else dr.detach(crease_weights)
             dr.eval(crease_weights)
         dr.eval(keys, pairs)
@@ -151,12 +157,16 @@ def _measure(
             meetings.add(slot, dr.select(bare, here, NO_TRIANGLE), there, soft)
         first = image * vertex_count
         a, b, c, d = (dr.select(end == NO_VERTEX, NO_VERTEX, end + first) for end in (a, b, c, d))
-        value, slopes = _weight(positions, a, b, raster, row, column, down, weight)
+        # A silhouette on a pixel's centre may separate that pixel from both of its neighbours, but moves once.
+        inside = silhouette & (dr.select(down, row, column) > 0)
+        before = dr.gather(module.UInt64, keys, pair - dr.select(down, UInt32(2 * raster.width), 2), inside)
+        counted = inside & (before != 0) & (UInt32(before & 0xFFFFFFFF) == UInt32(key & 0xFFFFFFFF))
+        value, slopes = _weight(positions, a, b, raster, row, column, down, weight, counted)
 
         def second(slot, c, d, row, column, down, weight_2, value):  # noqa: ANN001, ANN202
-            more, slopes = _weight(positions, c, d, raster, row, column, down, weight_2)
+            more, slopes = _weight(positions, c, d, raster, row, column, down, weight_2, module.Bool(False))
             dr.scatter(found.second_slopes, slopes, slot)
-            return value + more
+            return dr.select((value != 0) & (value + more == 0), value * LEAST_WEIGHT, value + more)
 
         if creases is not None:
             value = dr.if_stmt(
@@ -196,11 +206,12 @@ def _meet(found: Crossings, meetings: Meetings, raster: RasterOutput) -> None:
 
 
 def _weight(
-    positions: Any, a: Any, b: Any, raster: RasterOutput, row: Any, column: Any, down: Any, weight: Any
+    positions: Any, a: Any, b: Any, raster: RasterOutput, row: Any, column: Any, down: Any, weight: Any, counted: Any
 ) -> tuple[Any, Any]:
     """Signed weight of a pair of pixels between which an edge crosses, 0 where there is none, and its derivatives ("slopes").
 
-    The homogeneous form is valid, in value and derivative, for edges that reach behind the camera.
+    ``counted``: whether an edge on the first pixel's centre belongs to the pair before, too, which has the derivative then. The
+    homogeneous form is valid, in value and derivative, for edges that reach behind the camera.
     """
     module = backend(positions)
     Float, Array4f = module.Float, module.Array4f
@@ -227,12 +238,11 @@ def _weight(
     weight = dr.select(has, weight * _share(p, q, down, raster), 0)
 
     # d value = sum over both ends of (1 - s, s) / w * (d along - tilt * d across - (value - tilt * ndc) * d w)
-    # An edge on a pixel's centre belongs to two pairs (t = 0 and 1), but moves once.
-    slope = dr.select((t > 0) & (t <= 1), weight * 0.5 * size / w, 0)
+    slope = dr.select(((t > 0) | ((t == 0) & ~counted)) & (t <= 1), weight * 0.5 * size / w, 0)
     tilt = ((p_along - q_along) - value * (p.w - q.w)) / span
     across = -slope * tilt
     slopes = Array4f(s, dr.select(down, across, slope), dr.select(down, slope, across), -dr.fma(value, slope, ndc * across))
-    return weight * (dr.clip(t, 0, 1) - 0.5), slopes
+    return weight * beyond_middle(dr.clip(t, 0, 1)), slopes
 
 
 def _share(p: Any, q: Any, down: Any, raster: RasterOutput) -> Any:

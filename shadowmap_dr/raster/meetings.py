@@ -27,6 +27,8 @@ _LEAST_FOLD = 0.02
 # Faces beside two triangles may leave both their planes by this part of the bend between them; at twice that there is no crease.
 # On curved surfaces they leave them by more: with one facet in between, by about a half.
 _BENT = 0.05
+# Weight of a pair whose edge lies on the border between its pixels, which mixes nothing: what is 0 has no edge, nor derivatives.
+LEAST_WEIGHT = 1e-12
 # So many lanes take turns at the pairs that are listed; few, so that threads get equal parts of a short list, too.
 _LANES = 1024
 
@@ -181,7 +183,7 @@ class Meetings:
             (vertices, [Float(v) for v in plane], [Float(dr.fma(m, x, dr.fma(n, y, o))) for m, n, o in lines])
             for vertices, lines, plane in found
         ]
-        return Float(share * (t - 0.5)), Float(-share * slope), triangles
+        return Float(share) * beyond_middle(Float(t)), Float(-share * slope), triangles
 
     def _bent(self, triangle: Any, first: Any, corners: Any, planes: list[Any], along: Callable[[Any], Any]) -> Any:
         """How far from both planes the faces beside a triangle turn, as changes of depth on the way to the neighbour: the most.
@@ -198,6 +200,14 @@ class Meetings:
             apart = dr.minimum(*(dr.abs(slope - along(plane)) for plane in planes))
             most = dr.maximum(most, dr.select(has, apart, 0))
         return most
+
+
+def beyond_middle(t: Any) -> Any:
+    """How far (pixels) something lies beyond the border between two pixels, from where it is (0 to 1) between their centres.
+
+    Never 0: see ``LEAST_WEIGHT``.
+    """
+    return dr.select(t == 0.5, LEAST_WEIGHT, t - 0.5)
 
 
 def _plane(corners: tuple[Any, Any, Any]) -> tuple[list[list[Any]], list[Any]]:

@@ -15,10 +15,8 @@ from ._types import NO_TRIANGLE, RasterOutput, backend, by_image
 from .pairs import PairList
 from .topology import NO_VERTEX, Topology
 
-# An edge must lie this far (relative, and absolute in NDC depth) before the surface that it borders: it is a
-# discontinuity, not a crease. The relative part suits depths that are reciprocal in distance.
-_DEPTH_GAP = 1e-5
-_DEPTH_GAP_ABSOLUTE = 2e-7
+# An edge must lie this far (relative) before the surface that it borders: it is a discontinuity, not a crease.
+_RELATIVE_GAP = 1e-5
 # Lines through pixel centres that lie this far (in pixels) beyond an edge's ends are tested, too, in spite of rounding.
 _MARGIN = 1.0 / 512.0
 # So many lanes walk along the silhouettes of an image; few, so that threads get equal parts of a short list, too.
@@ -27,7 +25,7 @@ _MOST_LANES = 32768
 
 
 def register_silhouettes(
-    positions: Any, topology: Topology, raster: RasterOutput, vertex_count: int, keys: Any, found: PairList | None
+    positions: Any, topology: Topology, raster: RasterOutput, vertex_count: int, keys: Any, found: PairList | None, gap: float
 ) -> None:
     """Let all silhouette edges write to the pairs of pixels that they separate.
 
@@ -38,6 +36,7 @@ def register_silhouettes(
             edges' keys: how much of the uncovered pixel the edge's surface hides as the upper half (a float's bits), the
             complement of the edge's index as the lower. The outermost edge wins: the result does not depend on the order.
         found: list to which pairs are added when the first edge registers.
+        gap: NDC depth by which edges lie before what they border, at least.
     """
     module = backend(positions)
     UInt32 = module.UInt32
@@ -49,7 +48,7 @@ def register_silhouettes(
         slot, turn = lane // stride, lane % stride
         a, b = (dr.gather(module.Array4f, records, 2 * slot + k) for k in range(2))
         index = dr.gather(UInt32, edges, slot)
-        _walk(a, b, index, turn, stride, topology, raster, keys, found)
+        _walk(a, b, index, turn, stride, topology, raster, keys, found, gap)
         return (lane + lanes,)
 
     dr.while_loop((dr.arange(UInt32, lanes),), lambda lane: lane < count * stride, walk, mode="symbolic", label="silhouettes")
@@ -96,6 +95,7 @@ def _walk(
     raster: RasterOutput,
     keys: Any,
     found: PairList | None,
+    gap: float,
 ) -> None:
     """Visit every ``stride``-th of the lines through pixel centres that edges cross, beginning with ``line``."""
     module = backend(a)
@@ -138,7 +138,7 @@ def _walk(
         hidden = dr.select(covers_here, neighbour, here)
         x, y = dr.select(down, fixed, crossing), dr.select(down, crossing, fixed)
         depth = _depth_on_plane(raster, image, hidden, x, y, ok)
-        ok &= z < depth - dr.fma(dr.abs(depth), _DEPTH_GAP, _DEPTH_GAP_ABSOLUTE)
+        ok &= z < depth - dr.fma(dr.abs(depth), _RELATIVE_GAP, gap)
 
         reach = dr.select(covers_here, t, 1 - t)
         key = (UInt64(dr.reinterpret_array(UInt32, reach)) << 32) | UInt64(~edge)

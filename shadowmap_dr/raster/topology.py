@@ -8,9 +8,7 @@ from typing import Any
 import numpy as np
 
 from ._memory import device_array
-
-#: Stands for "no second face" in :attr:`Topology.opposite`.
-NO_VERTEX = 0xFFFFFFFF
+from .seams import NO_VERTEX, Seams
 
 
 @dataclass(frozen=True)
@@ -28,6 +26,7 @@ class Topology:
         beyond: ``UInt32`` (3 F,) for the edge from corner k to k + 1 of each face the third vertex of the face on its other side,
             ``NO_VERTEX`` where there is none or more than one.
         vertex_count: how many vertices there are at least: one more than the largest index.
+        seams: where shapes border on each other, or None if they do nowhere.
     """
 
     edges: Any
@@ -39,9 +38,10 @@ class Topology:
     part_count: int
     beyond: Any
     vertex_count: int
+    seams: Seams | None = None
 
 
-def build_topology(faces: np.ndarray, positions: np.ndarray, dtype: type) -> Topology:
+def build_topology(faces: np.ndarray, positions: np.ndarray, dtype: type, shapes: np.ndarray | None = None) -> Topology:
     """Find the edges of a mesh (on the host, once).
 
     Args:
@@ -49,6 +49,8 @@ def build_topology(faces: np.ndarray, positions: np.ndarray, dtype: type) -> Top
         positions: (V, 3) vertices. Vertices at the same place count as one: seams of texture coordinates or normals
             duplicate vertices, but are no boundaries of the surface.
         dtype: the ``UInt32`` type of the Dr.Jit backend in use.
+        shapes: (V,) number of the shape that each vertex belongs to. Shapes may move apart: where they border on each other, and
+            nowhere else, their faces have common edges, but they are parts of their own. :func:`parted` tells which still do.
 
     Degenerate faces (with two corners at the same place) are left out.
     """
@@ -60,7 +62,9 @@ def build_topology(faces: np.ndarray, positions: np.ndarray, dtype: type) -> Top
         raise ValueError(f"faces refer to vertices {faces.min()}..{faces.max()}, but there are {len(positions)}")
     _, weld = np.unique(positions.view([("", np.float32)] * 3).ravel(), return_inverse=True)
     welded = weld[faces]
-    parts, part_count = _parts(welded)
+    owners = np.zeros(len(positions), np.int64) if shapes is None else np.asarray(shapes, np.int64)
+    places = welded if shapes is None else welded * (owners.max() + 1) + owners[faces]
+    parts, part_count = _parts(np.unique(places, return_inverse=True)[1].reshape(-1, 3))
     flat = [device_array(dtype, t) for t in (faces, welded, parts)]
     proper = (welded != np.roll(welded, 1, 1)).all(1)
     where = np.flatnonzero(proper)
@@ -71,25 +75,40 @@ def build_topology(faces: np.ndarray, positions: np.ndarray, dtype: type) -> Top
     a, b, opposite = (np.concatenate([faces[:, (k + s) % 3] for k in range(3)]) for s in (0, 1, 2))
     wa, wb = (np.concatenate([welded[:, (k + s) % 3] for k in range(3)]) for s in (0, 1))
     key = np.minimum(wa, wb) * len(positions) + np.maximum(wa, wb)
-    order = np.argsort(key, kind="stable")
-    _, first, size = np.unique(key[order], return_index=True, return_counts=True)
-
-    pair = order[first[size == 2]]
-    partner = order[first[size == 2] + 1]
-    alone = order[np.repeat(size != 2, size)]
-    edges = np.concatenate([pair, alone])
+    # Two faces of one shape, or else the only ones of two.
+    pair, partner, alone = _pairs(np.arange(len(key)), key * (owners.max() + 1) + owners[a])
+    one, two, alone = _pairs(alone, key)
     slot = np.concatenate([3 * where + k for k in range(3)])
-    beyond[slot[pair]], beyond[slot[partner]] = opposite[partner], opposite[pair]
-    second = np.concatenate([opposite[partner], np.full(len(alone), NO_VERTEX)])
+    for mine, other in ((pair, partner), (one, two)):
+        beyond[slot[mine]], beyond[slot[other]] = opposite[other], opposite[mine]
+    # Those between shapes come last, and each of them again, without extent, as an edge of its other face.
+    edges = np.concatenate([pair, alone, one])
+    second = np.concatenate([opposite[partner], np.full(len(alone), NO_VERTEX), opposite[two]])
+    ends, thirds = np.stack([a[edges], b[edges]], 1), np.stack([opposite[edges], second], 1)
+    seams = None
+    if len(one):
+        other = np.stack([a[two], b[two]], 1)
+        other = np.where((wa[one] == wa[two])[:, None], other, other[:, ::-1])
+        seams = Seams.of(dtype, ends[-len(one) :], other, thirds[-len(one) :], np.stack([slot[one], slot[two]], 1))
+        ends = np.concatenate([ends, np.zeros_like(other)])
+        thirds = np.concatenate([thirds, np.full_like(other, NO_VERTEX)])
     return Topology(
-        device_array(dtype, np.stack([a[edges], b[edges]], 1)),
-        device_array(dtype, np.stack([opposite[edges], second], 1)),
-        len(edges),
+        device_array(dtype, ends),
+        device_array(dtype, thirds),
+        len(ends),
         *flat,
         part_count,
         device_array(dtype, beyond),
         vertex_count,
+        seams,
     )
+
+
+def _pairs(index: np.ndarray, key: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Those of ``index`` whose key exactly one other has, too (the first and the second of each two), and the rest."""
+    order = index[np.argsort(key[index], kind="stable")]
+    _, first, size = np.unique(key[order], return_index=True, return_counts=True)
+    return order[first[size == 2]], order[first[size == 2] + 1], order[np.repeat(size != 2, size)]
 
 
 def _parts(welded: np.ndarray) -> tuple[np.ndarray, int]:

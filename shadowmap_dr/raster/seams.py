@@ -1,0 +1,78 @@
+"""Edges at which faces of different shapes border on each other: one surface for as long as both shapes stay where they are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+
+from ._memory import device_array
+from ._types import backend
+
+if TYPE_CHECKING:
+    from .topology import Topology
+
+#: Stands for "no second face" in :attr:`Topology.opposite`.
+NO_VERTEX = 0xFFFFFFFF
+# Vertices of two shapes that are no farther apart than this part of their coordinates are at one place still, but for rounding.
+_ROUNDING = 1e-5
+
+
+@dataclass(frozen=True)
+class Seams:
+    """The last edges of a :class:`Topology`: those of S seams, and for each an edge of the other shape, without any extent.
+
+    Attributes:
+        mine, other: ``UInt32`` (2 S,) ends of each seam, as vertices of its one and its other face, in the same order.
+        opposite: ``UInt32`` (2 S,) third vertices of both faces.
+        slots: ``UInt32`` (2 S,) where in :attr:`Topology.beyond` both faces have the edge.
+        count: S.
+    """
+
+    mine: Any
+    other: Any
+    opposite: Any
+    slots: Any
+    count: int
+
+    @classmethod
+    def of(cls, dtype: type, mine: np.ndarray, other: np.ndarray, opposite: np.ndarray, slots: np.ndarray) -> Seams:
+        """From NumPy arrays (S, 2) each."""
+        return cls(*(device_array(dtype, array) for array in (mine, other, opposite, slots)), len(mine))
+
+
+def parted(topology: Topology, points: Any, shapes: Any, hidden: Sequence[int] = ()) -> Topology:
+    """The topology of a mesh whose shapes may have moved since they bordered on each other.
+
+    Args:
+        topology: made with the ``shapes`` of its vertices.
+        points: ``Array3f`` (V,), vertices as they are now, in any space. Detached.
+        shapes: ``UInt32`` (V,), whose they are.
+        hidden: shapes whose faces are not drawn: others that border on them end there.
+    """
+    seams = topology.seams
+    if seams is None:
+        return topology
+    module = backend(topology.edges)
+    UInt32, Array2u, Array3f = module.UInt32, module.Array2u, module.Array3f
+    index = dr.arange(UInt32, seams.count)
+    mine, other, opposite, slots = (dr.gather(Array2u, a, index) for a in (seams.mine, seams.other, seams.opposite, seams.slots))
+    points = Array3f(dr.detach(points))
+    apart = module.Bool(False)
+    for a, b in zip(mine, other, strict=True):
+        p, q = (dr.gather(Array3f, points, v) for v in (a, b))
+        apart |= dr.max(dr.abs(p - q)) > _ROUNDING * dr.max(dr.abs(p))
+    for shape in hidden:
+        apart |= (dr.gather(UInt32, shapes, mine.x) == shape) | (dr.gather(UInt32, shapes, other.x) == shape)
+    first = topology.count - 2 * seams.count + index
+    edges, opposites, beyond = (UInt32(dr.copy(a)) for a in (topology.edges, topology.opposite, topology.beyond))
+    dr.scatter(opposites, Array2u(opposite.x, dr.select(apart, NO_VERTEX, opposite.y)), first)
+    dr.scatter(edges, dr.select(apart, other, 0), first + seams.count)
+    dr.scatter(opposites, Array2u(dr.select(apart, opposite.y, NO_VERTEX), NO_VERTEX), first + seams.count)
+    for slot in slots:
+        dr.scatter(beyond, UInt32(NO_VERTEX), slot, apart)
+    dr.eval(edges, opposites, beyond)
+    return replace(topology, edges=edges, opposite=opposites, beyond=beyond)

@@ -46,29 +46,25 @@ def test_shapes_on_the_grid_grow_as_others_do(variant: str, corners: np.ndarray,
     assert growth(corners, (0, 0), forward) == pytest.approx(expected, rel=2e-3)
 
 
-def test_an_edge_on_a_row_of_centres_moves_once(variant: str) -> None:
-    """Also if triangles beside it are different ones for each pixel: the right half is a strip of many."""
-    steps = np.linspace(-1, 1, 2 * SIZE + 1)
-    left = np.c_[np.full_like(steps, PIXEL / 2), steps, np.zeros_like(steps), np.ones_like(steps)]
-    right = left + [1, 0, 0, 0]
-    k, n = np.arange(2 * SIZE), len(steps)
-    faces = np.r_[np.c_[k, n + k, k + 1], np.c_[k + 1, n + k, n + k + 1]].astype(np.uint32)
-    world = np.r_[left, right].astype(np.float32)
-    for behind in (False, True):
-        points, triangles = world, faces
-        if behind:  # a wall of many triangles, too
-            wall = (world - [1, 0, 0, 0]) * [3, 1, 1, 1] + [0, 0, 0.5, 0]
-            points, triangles = np.r_[world, wall].astype(np.float32), np.r_[faces, faces + len(world)]
-        move = mi.Float(0)
-        dr.enable_grad(move)
-        x = mi.Float(points[:, 0].copy()) + dr.select(dr.arange(mi.UInt32, len(points)) < len(world), move, 0)
-        clip = mi.TensorXf(dr.ravel(mi.Point4f(x, *(mi.Float(points[:, c].copy()) for c in (1, 2, 3)))), shape=(len(points), 4))
-        colours = np.r_[np.full(len(faces), 1.0), np.full(len(triangles) - len(faces), 0.25)]
-        image, _ = render(clip, triangles, topology_of(triangles, points[:, :3]), SIZE, colours)
-        dr.forward(move)
-        # One column of pixels is swept by one pixel.
-        expected = -SIZE * (SIZE / 2) * (0.75 if behind else 1)
-        assert float(dr.grad(image).numpy().sum()) == pytest.approx(expected, rel=0.02)
+@pytest.mark.parametrize("side", [1, -1], ids=["right edge", "left edge"])
+def test_an_edge_on_a_column_of_centres_moves_once(variant: str, side: int) -> None:
+    """Also if what is behind it consists of many triangles, so that all pixels beside it see different ones."""
+    near = np.array([[PIXEL / 2, -1, 0, 1], [PIXEL / 2, 1, 0, 1], [-2 * side, 1, 0, 1], [-2 * side, -1, 0, 1]])
+    x = np.linspace(-1, 1, 2 * SIZE + 1)
+    wall = np.r_[[np.c_[x, np.full_like(x, y), np.full_like(x, 0.5), np.ones_like(x)] for y in (-1, 1)]].reshape(-1, 4)
+    k, n = np.arange(2 * SIZE), len(x)
+    columns = np.r_[np.c_[k, k + 1, n + k], np.c_[k + 1, n + k + 1, n + k]]
+    points, faces = np.r_[near, wall].astype(np.float32), np.r_[FACES, columns + 4].astype(np.uint32)
+    move = mi.Float(0)
+    dr.enable_grad(move)
+    coordinates = [mi.Float(points[:, c].copy()) for c in range(4)]
+    coordinates[0] += dr.select(dr.arange(mi.UInt32, len(points)) < 2, move, 0)
+    clip = mi.TensorXf(dr.ravel(mi.Point4f(*coordinates)), shape=points.shape)
+    colours = np.where(np.arange(len(faces)) < 2, 1.0, 0.25)
+    image, _ = render(clip, faces, topology_of(faces, points[:, :3]), SIZE, colours)
+    dr.forward(move)
+    # A column of pixels is swept by half an image's width.
+    assert float(dr.grad(image).numpy().sum()) == pytest.approx(0.75 * side * SIZE * SIZE / 2, rel=0.02)
 
 
 def test_a_ridge_between_two_columns(variant: str) -> None:

@@ -157,14 +157,10 @@ def _measure(
             meetings.add(slot, dr.select(bare, here, NO_TRIANGLE), there, soft)
         first = image * vertex_count
         a, b, c, d = (dr.select(end == NO_VERTEX, NO_VERTEX, end + first) for end in (a, b, c, d))
-        # A silhouette on a pixel's centre may separate that pixel from both of its neighbours, but moves once.
-        inside = silhouette & (dr.select(down, row, column) > 0)
-        before = dr.gather(module.UInt64, keys, pair - dr.select(down, UInt32(2 * raster.width), 2), inside)
-        counted = inside & (before != 0) & (UInt32(before & 0xFFFFFFFF) == UInt32(key & 0xFFFFFFFF))
-        value, slopes = _weight(positions, a, b, raster, row, column, down, weight, counted)
+        value, slopes = _weight(positions, a, b, raster, row, column, down, weight)
 
         def second(slot, c, d, row, column, down, weight_2, value):  # noqa: ANN001, ANN202
-            more, slopes = _weight(positions, c, d, raster, row, column, down, weight_2, module.Bool(False))
+            more, slopes = _weight(positions, c, d, raster, row, column, down, weight_2)
             dr.scatter(found.second_slopes, slopes, slot)
             return dr.select((value != 0) & (value + more == 0), value * LEAST_WEIGHT, value + more)
 
@@ -206,12 +202,11 @@ def _meet(found: Crossings, meetings: Meetings, raster: RasterOutput) -> None:
 
 
 def _weight(
-    positions: Any, a: Any, b: Any, raster: RasterOutput, row: Any, column: Any, down: Any, weight: Any, counted: Any
+    positions: Any, a: Any, b: Any, raster: RasterOutput, row: Any, column: Any, down: Any, weight: Any
 ) -> tuple[Any, Any]:
     """Signed weight of a pair of pixels between which an edge crosses, 0 where there is none, and its derivatives ("slopes").
 
-    ``counted``: whether an edge on the first pixel's centre belongs to the pair before, too, which has the derivative then. The
-    homogeneous form is valid, in value and derivative, for edges that reach behind the camera.
+    The homogeneous form is valid, in value and derivative, for edges that reach behind the camera.
     """
     module = backend(positions)
     Float, Array4f = module.Float, module.Array4f
@@ -238,7 +233,9 @@ def _weight(
     weight = dr.select(has, weight * _share(p, q, down, raster), 0)
 
     # d value = sum over both ends of (1 - s, s) / w * (d along - tilt * d across - (value - tilt * ndc) * d w)
-    slope = dr.select(((t > 0) | ((t == 0) & ~counted)) & (t <= 1), weight * 0.5 * size / w, 0)
+    # An edge on a pixel's centre may belong to two pairs (t = 0 and 1): half of the pixel is what the one neighbour sees, half
+    # what the other does, and as it moves the one half grows by as much as the other shrinks.
+    slope = dr.select((t >= 0) & (t <= 1), weight * 0.5 * size / w, 0)
     tilt = ((p_along - q_along) - value * (p.w - q.w)) / span
     across = -slope * tilt
     slopes = Array4f(s, dr.select(down, across, slope), dr.select(down, slope, across), -dr.fma(value, slope, ndc * across))

@@ -43,7 +43,8 @@ class ShapeInfo:
     are negated before use. ``reads_attributes``: it has mesh attributes, which Mitsuba finds through rest-pose positions.
     ``planar``: all its vertices lay in one plane when the scene was loaded. ``see_through``: its BSDF (``mask``, ``null``) lets
     some light pass straight on, as ``shading.opacity`` tells for each point. ``faceted``: its vertex normals were those of its
-    faces, as on a cube or a rectangle, when the scene was loaded.
+    faces, as on a cube or rectangle, when the scene was loaded. ``against_winding``: its vertex normals, before ``flip_shading``,
+    are on the other side of (p1 - p0) x (p2 - p0), and stay there when its vertices are replaced.
     """
 
     name: str
@@ -60,6 +61,7 @@ class ShapeInfo:
     planar: bool = False
     see_through: bool = False
     faceted: bool = False
+    against_winding: bool = False
 
     @property
     def flags(self) -> int:
@@ -199,7 +201,7 @@ class Geometry:
             if info.has_normals:
                 smooth = vertex_normals(merged, _faces_of(self.faces, info), self.vertex_count)
                 own = dr.arange(mi.UInt32, info.vertex_count) + info.vertex_start
-                smooth = dr.gather(mi.Normal3f, smooth, own)
+                smooth = dr.gather(mi.Normal3f, smooth, own) * (-1 if info.against_winding else 1)
                 normals = _write_vertices(normals, smooth, info.vertex_start, info.vertex_count, self.vertex_count)
         return replace(self, positions=merged, normals=normals, changed=changed, packets=None)
 

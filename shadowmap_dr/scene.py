@@ -223,6 +223,8 @@ def describe(name: str, source: ShapeSource, faces: np.ndarray, vertex_start: in
     flipped = shape.has_flipped_normals() != source.inverted
     has_normals = own.normals is not None
     faceted = isinstance(shape, mi.Mesh) and has_normals and not mirrored
+    # Mitsuba takes normals from the winding once vertices change, but a rectangle's never do.
+    turned = shape.class_name() == "Rectangle" and has_normals and _is_turned(points, faces, own.normals.numpy().reshape(-1, 3))
     return ShapeInfo(
         name=name,
         plugin=shape.class_name(),
@@ -236,6 +238,7 @@ def describe(name: str, source: ShapeSource, faces: np.ndarray, vertex_start: in
         flip_shading=flipped,
         reads_attributes=isinstance(shape, mi.Mesh) and shape.has_mesh_attributes(),
         planar=_is_planar(points),
+        against_winding=mirrored != turned,
         see_through=mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null),
         faceted=faceted and _is_faceted(points, faces, own.normals.numpy().reshape(-1, 3)),
     )
@@ -261,6 +264,12 @@ def _is_faceted(points: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> b
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     return bool((length > 0).all() and np.abs(normals[faces] - (normal / length)[:, None]).max() < 1e-6)
+
+
+def _is_turned(points: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> bool:
+    """Whether the vertex normals are on the other side than the winding of the faces says."""
+    a, b, c = (points[faces[:, k]] for k in range(3))
+    return bool((np.cross(b - a, c - a) * normals[faces].sum(1)).sum() < 0)
 
 
 def _is_planar(points: np.ndarray) -> bool:

@@ -8,8 +8,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from integrator_scenes import small_scene
 
-from shadowmap_dr import ShadowmapError, assets
+from shadowmap_dr import Renderer, ShadowmapError, assets
 from shadowmap_dr.geometry import normalize_or, vertex_normals
 from shadowmap_dr.scene import SceneData, load
 from shadowmap_dr.spread import spread
@@ -174,3 +175,25 @@ def test_spread_changes_neither_values_nor_gradients(variant: str, width: int) -
         grads.append(np.concatenate([dr.grad(part).numpy().ravel() for part in parts]))
     assert np.any(grads[0] != 0)
     assert np.allclose(grads[0], grads[1], rtol=1e-4)
+
+
+def mirrored(kind: str) -> dict[str, Any]:
+    """A shape as parts of a scene, through a transformation that mirrors it."""
+    T = mi.ScalarTransform4f
+    place = T().translate([0, 0, 0.8]).rotate([1, 0.3, 0], 40).scale([-0.6, 0.6, 0.6])
+    if kind != "instance":
+        return {"mirrored": {"type": kind, "to_world": place, "bsdf": {"type": "diffuse"}}}
+    group = {"type": "shapegroup", "ball": {"type": "ply", "filename": str(assets.mesh("suzanne")), "bsdf": {"type": "diffuse"}}}
+    return {"group": group, "mirrored": {"type": "instance", "group": {"type": "ref", "id": "group"}, "to_world": place}}
+
+
+@pytest.mark.parametrize("kind", ["sphere", "cylinder", "disk", "rectangle", "instance"])
+def test_normals_of_mirrored_shapes_stay_on_their_side(variant: str, kind: str) -> None:
+    """Vertices that are replaced by the very same ones change nothing."""
+    made = small_scene(ball=None, **mirrored(kind))
+    renderer = Renderer.from_scene(made, shadow_method="none")
+    (name,) = (shape.name for shape in renderer.data.geometry.shapes if shape.name.startswith("mirrored"))
+    expected = np.array(renderer.render())
+    same = renderer.render(vertex_positions={name: renderer.data.geometry.shape_positions(name)})
+    # Mitsuba's normals of the mesh are summed in another order.
+    np.testing.assert_allclose(np.array(same), expected, atol=0.01 if kind in ("sphere", "cylinder") else 1e-3)

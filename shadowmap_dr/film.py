@@ -23,7 +23,7 @@ def sample_windows(cameras: Sequence[Sensor]) -> tuple[Sensor, ...]:
     """
     border = cameras[0].border
     if border == 0:
-        return tuple(cameras)
+        return _checked(tuple(cameras))
     windows = []
     for k, camera in enumerate(cameras):
         left, right = border * (k == 0), border * (k == len(cameras) - 1)
@@ -31,7 +31,15 @@ def sample_windows(cameras: Sequence[Sensor]) -> tuple[Sensor, ...]:
         x, y = camera.crop_offset
         size = (width + left + right, height + 2 * border)
         windows.append(replace(camera, crop_size=size, crop_offset=(x - left, y - border)))
-    return tuple(windows)
+    return _checked(tuple(windows))
+
+
+def _checked(windows: tuple[Sensor, ...]) -> tuple[Sensor, ...]:
+    for window in windows:
+        if max(window.width, window.height) > MAX_RESOLUTION:
+            size = f"A picture of {window.width} x {window.height} pixels"
+            raise ShadowmapError(f"{size} is too large: render it in crop windows of {MAX_RESOLUTION} pixels a side at most.")
+    return windows
 
 
 def sample_grid(spp: int, windows: Sequence[Sensor]) -> int:

@@ -141,7 +141,7 @@ class Renderer:
         # The first fit is made here, so that a step which is recorded later always starts from one.
         if data.sensors:
             with dr.suspend_grad():
-                views = [renderer._view(camera, geometry, 1) for camera in data.sensors[0]]
+                views = [renderer._view(camera, geometry, 1) for camera in sample_windows(data.sensors[0])]
                 renderer._lighting(views, geometry, None)
         return renderer
 

@@ -259,3 +259,8 @@ def test_records_with_other_films(variant: str) -> None:
     image = renderer.render(sensor=replace(box, filter=gaussian.filter, sample_border=True)).numpy()
     assert np.allclose(image, render(small_scene(camera=filtered("gaussian", sample_border=True))), atol=0.02)
     assert not np.allclose(image, renderer.render().numpy(), atol=0.02)
+
+
+def test_films_larger_than_the_rasterizer_are_refused(variant: str) -> None:
+    with pytest.raises(ShadowmapError, match="A picture of 5000 x 4 pixels is too large: render it in crop windows of 4096"):
+        Renderer.from_scene(small_scene(camera=camera(width=5000, height=4)))

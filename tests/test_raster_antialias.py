@@ -227,6 +227,23 @@ def test_what_does_not_fit_a_raster_never_reaches_a_gather(variant: str) -> None
         antialias(value, out, clip[:3], topology)
     with pytest.raises(ValueError, match="1 faces and 3 vertices, but 2 faces"):
         antialias(value, out, clip, topology_of(faces[:1], square[:, :3]))
+    with pytest.raises(ValueError, match="creases hold 3 flags, but 2 faces have 6 edges"):
+        antialias(value, out, clip, topology, creases=mi.Bool([True] * 3))
+    hard = mi.Bool([True] * 6)
+    with pytest.raises(ValueError, match="crease_weights hold 2 numbers"):
+        antialias(value, out, clip, topology, creases=hard, crease_weights=mi.Float(1, 1))
+    uniform = antialias(value, out, clip, topology, creases=hard, crease_weights=mi.Float(1)).numpy()
+    assert (uniform == antialias(value, out, clip, topology, creases=hard).numpy()).all()
+    small = rasterize(clip, mi.TensorXu(faces), (4, 4))
+    with pytest.raises(ValueError, match="crossings are those of 16 pixels"):
+        antialias(value, out, clip, topology, crossings=find_crossings(clip.array, topology, small, 4))
+    with pytest.raises(ValueError, match=r"values have shape \(1, 8, 8\); expected \(H, W, C\)"):
+        antialias(mi.TensorXf(value, shape=(1, 8, 8)), out, clip, topology)
+    with pytest.raises(ValueError, match="the topology has no edges"):
+        antialias(value, out, clip, topology_of(faces, 0 * square[:, :3]))
+    for broken, message in (((faces, square), r"positions have shape \(4, 4\)"), ((faces.T, square[:, :3]), "faces have shape")):
+        with pytest.raises(ValueError, match=message):
+            build_topology(*broken, mi.UInt32)
 
 
 def test_crossings_can_be_shared(variant: str) -> None:

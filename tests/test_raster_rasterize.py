@@ -177,6 +177,18 @@ def test_bad_input_is_named(variant: str) -> None:
         run(pos[:, :3], face, 4, 4)
     with pytest.raises(ValueError, match="faces"):
         run(pos, face[:0], 4, 4)
+    p, f = mi.TensorXf(pos), mi.TensorXu(face)
+    for arguments, message in (
+        ((pos, f, (4, 4)), "positions are of type ndarray"),
+        ((mi.TensorXd(pos), f, (4, 4)), "positions are of type TensorXf64"),
+        ((p, face, (4, 4)), "faces are of type ndarray"),
+        ((p, f, (8.7, 4)), "whole pixels"),
+        ((p, f, 4), "whole pixels"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            rasterize(*arguments)
+    with pytest.raises(ValueError, match="batch is 0"):
+        rasterize(p.array, f, (4, 4), batch=0)
 
 
 def test_degenerate_and_non_finite_triangles_are_not_drawn(variant: str) -> None:

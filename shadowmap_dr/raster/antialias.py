@@ -47,7 +47,7 @@ def antialias(
         and, through the position of the silhouettes, to ``positions``.
 
     Raises:
-        ValueError: values, positions or topology do not fit the raster.
+        ValueError: values, positions, topology, creases or crossings do not fit the raster; the topology has no edges.
 
     Source: the idea of blending along the axis that crosses the edge is that of Laine et al., "Modular Primitives for
     High-Performance Differentiable Rendering", 2020, section 3.6; the search for edges and the weights are different.
@@ -56,7 +56,10 @@ def antialias(
     flat = _checked_values(values, raster)
     positions, vertex_count = _flat_positions(positions, raster, topology)
     if crossings is None:
+        crease_weights = _checked_creases(creases, crease_weights, raster)
         crossings = find_crossings(positions, topology, raster, vertex_count, creases, crease_weights, meetings, gap)
+    elif dr.width(crossings.right) != raster.batch * raster.height * raster.width:
+        raise ValueError(f"crossings are those of {dr.width(crossings.right)} pixels, but {_size_of(raster)} are given")
     blended = blend(flat, positions, raster, crossings)
     return type(values)(blended, shape=values.shape) if is_tensor else blended
 
@@ -64,16 +67,37 @@ def antialias(
 def _checked_values(values: Any, raster: RasterOutput) -> Any:
     """Flat values, or a list of channels of full width."""
     pixels = raster.batch * raster.height * raster.width
-    where = f"{raster.batch} image(s) of {raster.height} x {raster.width} pixels"
+    where = _size_of(raster)
     if isinstance(values, list | tuple):
         if not values or any(dr.width(channel) not in (1, pixels) for channel in values):
             raise ValueError(f"channels hold {[dr.width(channel) for channel in values]} numbers for {where}")
         return [channel if dr.width(channel) == pixels else channel + dr.zeros(type(channel), pixels) for channel in values]
-    flat = values.array if dr.is_tensor_v(values) else values
+    flat = values
+    if dr.is_tensor_v(values):
+        size, shape = (raster.batch, raster.height, raster.width), tuple(values.shape)
+        if shape[:-1] != size and (raster.batch > 1 or shape[:-1] != size[1:]):
+            raise ValueError(f"values have shape {shape}; expected (H, W, C) or (B, H, W, C) for {where}")
+        flat = values.array
     count = dr.width(flat)
     if count == 0 or count % pixels != 0:
         raise ValueError(f"values hold {count} numbers for {where}")
     return flat
+
+
+def _checked_creases(creases: Any, weights: Any, raster: RasterOutput) -> Any:
+    """Weights of creases, one for each pixel; None for 1."""
+    pixels, edges = raster.batch * raster.height * raster.width, 3 * raster.face_count
+    if creases is not None and dr.width(creases) != edges:
+        raise ValueError(f"creases hold {dr.width(creases)} flags, but {raster.face_count} faces have {edges} edges")
+    if weights is None or dr.width(weights) == pixels:
+        return weights
+    if dr.width(weights) != 1:
+        raise ValueError(f"crease_weights hold {dr.width(weights)} numbers for {_size_of(raster)}")
+    return weights + dr.zeros(type(weights), pixels)
+
+
+def _size_of(raster: RasterOutput) -> str:
+    return f"{raster.batch} image(s) of {raster.height} x {raster.width} pixels"
 
 
 def _flat_positions(positions: Any, raster: RasterOutput, topology: Topology) -> tuple[Any, int]:

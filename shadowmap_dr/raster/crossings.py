@@ -79,6 +79,8 @@ def find_crossings(
     An edge steeper than 60 degrees counts for horizontal pairs only, one flatter than 30 degrees for vertical pairs only, so that
     the two directions together blend each piece of outline once.
     """
+    if topology.count == 0:
+        raise ValueError("the topology has no edges: all faces of the mesh have two corners at the same place")
     with dr.suspend_grad():
         positions = dr.detach(positions)
         meetings = meetings and topology.part_count > 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from operator import index
 from types import ModuleType
 from typing import Any
 
@@ -93,7 +94,10 @@ def visible_triangles(
 
 def check_resolution(resolution: tuple[int, int]) -> tuple[int, int]:
     """Validate (height, width)."""
-    height, width = (int(r) for r in resolution)
+    try:
+        height, width = (index(r) for r in resolution)
+    except TypeError:
+        raise ValueError(f"resolution is {resolution!r}; give (height, width) in whole pixels") from None
     if not (1 <= height <= MAX_RESOLUTION and 1 <= width <= MAX_RESOLUTION):
         raise ValueError(f"resolution is {height} x {width}; both sides must lie between 1 and {MAX_RESOLUTION}")
     return height, width
@@ -101,6 +105,11 @@ def check_resolution(resolution: tuple[int, int]) -> tuple[int, int]:
 
 def check_mesh(positions: Any, faces: Any, batch: int | None, check_indices: bool) -> tuple[Any, Any, int, int]:
     """Validate and flatten vertices and faces; returns (flat positions, flat faces, batch, vertices per image)."""
+    for name, array, kind in (("positions", positions, dr.VarType.Float32), ("faces", faces, None)):
+        known = dr.is_tensor_v(array) or dr.depth_v(array) == 1
+        if not known or not dr.is_jit_v(array) or dr.type_v(array) != (kind or dr.type_v(array)):
+            wanted = "single-precision" if kind else "integer"
+            raise ValueError(f"{name} are of type {type(array).__name__}; expected a Dr.Jit tensor or flat array, {wanted}")
     if dr.is_tensor_v(positions):
         shape = tuple(positions.shape)
         if len(shape) not in (2, 3) or shape[-1] != 4:
@@ -110,7 +119,9 @@ def check_mesh(positions: Any, faces: Any, batch: int | None, check_indices: boo
             raise ValueError(f"batch={batch} contradicts positions of shape {shape}")
         batch, flat = images, positions.array
     else:
-        flat, batch = positions, batch or 1
+        flat, batch = positions, 1 if batch is None else batch
+        if batch < 1:
+            raise ValueError(f"batch is {batch}; give 1 or more images")
     if dr.is_tensor_v(faces):
         if len(faces.shape) != 2 or faces.shape[1] != 3:
             raise ValueError(f"faces have shape {tuple(faces.shape)}; expected (F, 3)")

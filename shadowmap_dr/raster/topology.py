@@ -53,9 +53,12 @@ def build_topology(faces: np.ndarray, positions: np.ndarray, dtype: type, shapes
             nowhere else, their faces have common edges, but they are parts of their own. :func:`parted` tells which still do.
 
     Degenerate faces (with two corners at the same place) are left out.
+
+    Raises:
+        ValueError: arrays of other shapes, no faces, an index out of range.
     """
-    faces = np.asarray(faces).reshape(-1, 3).astype(np.int64)
-    positions = np.ascontiguousarray(np.asarray(positions, dtype=np.float32).reshape(-1, 3)) + np.float32(0)  # -0 -> 0
+    faces = _in_threes("faces", np.asarray(faces)).astype(np.int64)
+    positions = np.ascontiguousarray(_in_threes("positions", np.asarray(positions, dtype=np.float32))) + np.float32(0)  # -0 -> 0
     if faces.size == 0:
         raise ValueError("faces are empty; a topology needs at least one triangle")
     if faces.min() < 0 or faces.max() >= len(positions):
@@ -102,6 +105,12 @@ def build_topology(faces: np.ndarray, positions: np.ndarray, dtype: type, shapes
         vertex_count,
         seams,
     )
+
+
+def _in_threes(name: str, values: np.ndarray) -> np.ndarray:
+    if (values.ndim == 2 and values.shape[1] == 3) or (values.ndim == 1 and values.size % 3 == 0):
+        return values.reshape(-1, 3)
+    raise ValueError(f"{name} have shape {values.shape}; expected ({name[0].replace('p', 'v').upper()}, 3)")
 
 
 def _pairs(index: np.ndarray, key: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

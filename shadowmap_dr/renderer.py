@@ -9,6 +9,7 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from .aovs import collect_aovs
 from .beams import softened
@@ -125,7 +126,10 @@ class Renderer:
         """Build a renderer for scene records."""
         geometry = data.geometry
         positions = dr.detach(geometry.positions).numpy()
-        topology = build_topology(geometry.faces.numpy(), positions, mi.UInt32, geometry.vertex_shape.numpy())
+        veils = np.array([info.see_through for info in geometry.shapes])[geometry.face_shape.numpy()]
+        topology = build_topology(
+            geometry.faces.numpy(), positions, mi.UInt32, geometry.vertex_shape.numpy(), veils if veils.any() else None
+        )
         if not topology.count:
             raise ShadowmapError("There is nothing to render: all triangles of the scene have two corners at the same place.")
         plan, creases = plan_maps(data.lights, geometry), crease_edges(geometry, topology)

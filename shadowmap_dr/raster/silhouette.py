@@ -140,6 +140,14 @@ def _walk(
         depth = _depth_on_plane(raster, image, hidden, x, y, ok)
         ok &= z < depth - dr.fma(dr.abs(depth), _RELATIVE_GAP, gap)
 
+        if topology.veils is not None:
+            # What is seen through hides nothing: an edge of it counts where its own surface is seen beside it.
+            owner = dr.gather(UInt32, topology.owners, edge, ok)
+            seen = dr.select(covers_here, here, neighbour)
+            own = ok & (seen != NO_TRIANGLE)
+            own &= dr.gather(UInt32, topology.parts, seen, own) == dr.gather(UInt32, topology.parts, owner, own)
+            ok &= own | ~dr.gather(module.Bool, topology.veils, owner, ok)
+
         reach = dr.select(covers_here, t, 1 - t)
         key = (UInt64(dr.reinterpret_array(UInt32, reach)) << 32) | UInt64(~edge)
         pair = 2 * pixel + dr.select(down, UInt32(1), 0)

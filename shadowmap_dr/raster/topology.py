@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
 import numpy as np
 
 from ._memory import device_array
@@ -27,6 +28,8 @@ class Topology:
             ``NO_VERTEX`` where there is none or more than one.
         vertex_count: how many vertices there are at least: one more than the largest index.
         seams: where shapes border on each other, or None if they do nowhere.
+        veils: ``Bool`` (F,), faces that one may see through, or None if there are none. Where one does, their edges hide nothing.
+        owners: ``UInt32`` (E,) a face of each edge; None without ``veils``.
     """
 
     edges: Any
@@ -39,9 +42,17 @@ class Topology:
     beyond: Any
     vertex_count: int
     seams: Seams | None = None
+    veils: Any = None
+    owners: Any = None
 
 
-def build_topology(faces: np.ndarray, positions: np.ndarray, dtype: type, shapes: np.ndarray | None = None) -> Topology:
+def build_topology(
+    faces: np.ndarray,
+    positions: np.ndarray,
+    dtype: type,
+    shapes: np.ndarray | None = None,
+    veils: np.ndarray | None = None,
+) -> Topology:
     """Find the edges of a mesh (on the host, once).
 
     Args:
@@ -51,6 +62,7 @@ def build_topology(faces: np.ndarray, positions: np.ndarray, dtype: type, shapes
         dtype: the ``UInt32`` type of the Dr.Jit backend in use.
         shapes: (V,) number of the shape that each vertex belongs to. Shapes may move apart: where they border on each other, and
             nowhere else, their faces have common edges, but they are parts of their own. :func:`parted` tells which still do.
+        veils: (F,) which faces one may see through.
 
     Degenerate faces (with two corners at the same place) are left out.
 
@@ -88,7 +100,7 @@ def build_topology(faces: np.ndarray, positions: np.ndarray, dtype: type, shapes
     edges = np.concatenate([pair, alone, one])
     second = np.concatenate([opposite[partner], np.full(len(alone), NO_VERTEX), opposite[two]])
     ends, thirds = np.stack([a[edges], b[edges]], 1), np.stack([opposite[edges], second], 1)
-    seams = None
+    seams, owner = None, np.concatenate([slot[edges], slot[two]]) // 3
     if len(one):
         other = np.stack([a[two], b[two]], 1)
         other = np.where((wa[one] == wa[two])[:, None], other, other[:, ::-1])
@@ -104,6 +116,7 @@ def build_topology(faces: np.ndarray, positions: np.ndarray, dtype: type, shapes
         device_array(dtype, beyond),
         vertex_count,
         seams,
+        *(None, None) if veils is None else (device_array(dr.mask_t(dtype), veils), device_array(dtype, owner)),
     )
 
 

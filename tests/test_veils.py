@@ -1,0 +1,67 @@
+"""Surfaces that one may see through: where one does, their outlines hide nothing and have no derivatives."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from shadowmap_dr import Renderer
+
+SIZE = 64
+
+
+def scene(opacity: Any = None) -> Any:
+    """A card above a floor, and close above it a larger veil with an opacity, or none."""
+    T = mi.ScalarTransform4f
+    red = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.9, 0.2, 0.1]}}}
+    green = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.1, 0.3, 0.2]}}
+    film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
+    look = T().look_at([0, -0.3, 5], [0, 0, 0], [0, 1, 0])
+    parts: dict[str, Any] = {
+        "camera": {"type": "perspective", "fov": 40, "to_world": look, "film": film},
+        "card": {"type": "rectangle", "to_world": T().rotate([0, 0, 1], 20).scale(0.5), "bsdf": red},
+        "floor": {"type": "rectangle", "to_world": T().translate([0, 0, -0.5]).scale(3), "bsdf": green},
+        "sun": {"type": "directional", "direction": [0.1, 0.05, -1]},
+    }
+    if opacity is not None:
+        place = T().translate([0, 0, 0.01]).rotate([0, 0, 1], 20).scale(0.52)
+        veil = red if opacity == "opaque" else {"type": "mask", "opacity": opacity, "bsdf": red}
+        parts["veil"] = {"type": "rectangle", "to_world": place, "bsdf": veil}
+    return mi.load_dict({"type": "scene", **parts}, optimize=False)
+
+
+def image_and_derivative(made: Any, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Of moving a shape to the right."""
+    renderer = Renderer.from_scene(made, shadow_map_resolution=128)
+    x = mi.Float(0)
+    dr.enable_grad(x)
+    moved = renderer.data.geometry.shape_positions(name) + mi.Vector3f(1, 0, 0) * x
+    image = renderer.render(vertex_positions={name: moved})
+    dr.forward(x)
+    return np.array(image), np.array(dr.grad(image))
+
+
+def test_what_is_not_seen_has_no_outline(variant: str) -> None:
+    expected, derivative = image_and_derivative(scene(), "card")
+    found, other = image_and_derivative(scene(0.0), "card")
+    assert np.abs(derivative).sum() > 100
+    # Shadow maps cover a little more.
+    np.testing.assert_allclose(found, expected, atol=0.01)
+    assert np.abs(other - derivative).sum() < 0.03 * np.abs(derivative).sum()
+    assert np.abs(image_and_derivative(scene(0.0), "veil")[1]).sum() < 0.01 * np.abs(derivative).sum()
+
+
+def test_what_is_seen_of_a_veil_has_its_outline(variant: str) -> None:
+    expected, derivative = image_and_derivative(scene("opaque"), "veil")
+    found, other = image_and_derivative(scene(1.0), "veil")
+    np.testing.assert_allclose(found, expected, atol=1e-4)
+    np.testing.assert_allclose(other, derivative, atol=1e-3 * np.abs(derivative).max())
+    # Of a veil with a hole in the middle that shows the card, too.
+    hole = np.ones((16, 16, 1), np.float32)
+    hole[4:12, 4:12] = 0
+    texture = {"type": "bitmap", "bitmap": mi.Bitmap(hole), "raw": True, "filter_type": "nearest"}
+    _, other = image_and_derivative(scene(texture), "veil")
+    assert np.abs(other - derivative).sum() < 0.02 * np.abs(derivative).sum()

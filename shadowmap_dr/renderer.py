@@ -133,9 +133,7 @@ class Renderer:
         if not topology.count:
             raise ShadowmapError("There is nothing to render: all triangles of the scene have two corners at the same place.")
         plan, creases = plan_maps(data.lights, geometry), crease_edges(geometry, topology)
-        lights = (*data.areas, *data.environments)
-        single = settings.emitter_shadows == "single"
-        soft = plan_soft(lights, geometry, settings.emitter_samples, settings.environment_samples, single)
+        soft = _plan_soft(data, settings)
         if settings.shadow.method != "none":
             texels = settings.shadow.resolution * settings.shadow.supersampling
             check_sizes(plan.maps, texels, geometry, "lights", "lower shadow_map_resolution, or leave out lights")
@@ -152,6 +150,10 @@ class Renderer:
     def with_data(self, data: SceneData) -> Renderer:
         """The same renderer for re-read records (:func:`shadowmap_dr.scene.refresh`) of the same scene."""
         return replace(self, data=data)
+
+    def planned_anew(self) -> Renderer:
+        """The same renderer with area lights and environments divided, and their maps aimed, as its records are now."""
+        return replace(self, soft=_plan_soft(self.data, self.settings), soft_frusta=(None, None))
 
     def refresh(self) -> Renderer:
         """The same renderer with the scene's current vertices, lights and sensors, attached where they carry gradients."""
@@ -444,6 +446,11 @@ class _Uniform:
 
     def radiance(self, direction: Any, active: Any = True) -> Any:
         return dr.select(active, mi.UnpolarizedSpectrum(self.value), 0)
+
+
+def _plan_soft(data: SceneData, settings: RenderSettings) -> tuple[SoftPlan, ...]:
+    lights, single = (*data.areas, *data.environments), settings.emitter_shadows == "single"
+    return plan_soft(lights, data.geometry, settings.emitter_samples, settings.environment_samples, single)
 
 
 def _film_channels(color: Any, active: Any, sensor: Sensor) -> list[Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from typing import Any
 
 import drjit as dr
@@ -26,6 +27,7 @@ from torch_scene import (  # noqa: E402
 
 import shadowmap_dr.torch as sdr  # noqa: E402
 from shadowmap_dr import raster  # noqa: E402
+from shadowmap_dr.torch.bridge import drjit_turn  # noqa: E402
 
 SIZE = (40, 48)
 
@@ -278,3 +280,19 @@ def test_indices_out_of_range_are_refused(bad: int) -> None:
     refused("but there are 8 vertices", lambda: sdr.build_topology(faces, VERTICES))
     refused("but there are 8 rows of attributes", lambda: sdr.interpolate(VERTICES, found, faces))
     refused("but there are 7 rows of attributes", lambda: sdr.interpolate(VERTICES[1:], found, FACES))
+
+
+def test_threads_take_turns() -> None:
+    """Dr.Jit's scopes count up across threads: two at once would get each other's."""
+    inside = threading.Event()
+
+    def other() -> None:
+        with drjit_turn(torch.device("cpu")):
+            inside.set()
+
+    thread = threading.Thread(target=other)
+    with drjit_turn(torch.device("cpu")), drjit_turn(torch.device("cpu")):  # one thread may enter twice
+        thread.start()
+        assert not inside.wait(0.3)
+    assert inside.wait(30)
+    thread.join()

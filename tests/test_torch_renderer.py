@@ -255,7 +255,75 @@ def test_wrong_input_is_refused(renderer: sdr.Renderer) -> None:
     refused("parameters: 'camera.film.size' is a", parameters={"camera.film.size": torch.ones(2)})
     refused("sensor 3, spp 1: there are 1 sensors", sensor=3)
     refused("sensor 0, spp 0: there are 1 sensors", spp=0)
+    refused("lights['sun']['direction']: [0.0, 0.0, 0.0]; give", lights={"sun": {"direction": torch.zeros(3)}})
+    refused("vertex_positions: Tensor, but must be Mapping", vertex_positions=vertices)
+    refused("lights['sun']: Tensor, but must be Mapping", lights={"sun": DIRECTION})
+    refused("parameters: list, but must be Mapping", parameters=[])
+    refused("sensor: float, but must be int", sensor=0.5)
+    with pytest.raises(ShadowmapError, match="renderer: Scene, but must be Renderer"):
+        sdr.Renderer(build())
     refused("vertex_positions['ball']: on meta", vertex_positions={"ball": vertices.to("meta")})
+
+
+def sky(column: int) -> torch.Tensor:
+    """An environment with a sun at a column."""
+    pixels = torch.full((16, 32, 3), 0.05)
+    pixels[4:6, column : column + 2] = 50
+    return pixels
+
+
+def test_skies_may_change(renderer: sdr.Renderer) -> None:
+    """A sun elsewhere lights from there, from the first call on; gradients are those of that call's image."""
+    film = {"type": "hdrfilm", "width": 32, "height": 32, "rfilter": {"type": "box"}}
+    view = mi.ScalarTransform4f().look_at([2, -3, 4], [0, 0, 0], [0, 0, 1])
+    up = mi.ScalarTransform4f().rotate([1, 0, 0], 90)
+
+    def with_sky(pixels: torch.Tensor) -> Any:
+        return mi.load_dict({
+            "type": "scene",
+            "ball": ball(),
+            "floor": {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(3)},
+            "camera": {"type": "perspective", "fov": 45, "to_world": view, "film": film},
+            "sky": {"type": "envmap", "bitmap": mi.Bitmap(pixels.numpy()), "to_world": up},
+        })  # fmt: skip
+
+    options = {"environment_samples": 32, "shadow_map_resolution": 64, "soft_map_resolution": 64}
+    used = sdr.Renderer.from_scene(with_sky(sky(2)), frozen=renderer._frozen is not None, **options)
+    data = torch.from_numpy(np.array(mi.traverse(with_sky(sky(20)))["sky.data"])).requires_grad_()
+    first = used.render()
+    found = used.render(parameters={"sky.data": data})
+    expected = shadowmap_dr.Renderer.from_scene(with_sky(sky(20)), **options).render()
+    assert (found - first).abs().max() > 0.1
+    np.testing.assert_allclose(found.detach().numpy(), np.array(expected), atol=2e-3 * float(np.array(expected).max()))
+    # In between, an image in the old light: the backward pass is still that of the other one.
+    np.testing.assert_allclose(used.render().numpy(), first.numpy(), atol=1e-4)
+    found.sum().backward()
+    # The image is linear in the sky.
+    assert float((data.grad * data.detach()).sum()) == pytest.approx(float(found.detach().sum()), rel=2e-3)
+
+
+def test_lights_may_become_wider_than_their_map(renderer: sdr.Renderer) -> None:
+    """The shadows of a spot light stay, whatever its angle becomes."""
+    spot = {
+        "type": "spot",
+        "to_world": mi.ScalarTransform4f().look_at([0.5, 0.3, 3], [0, 0, 0], [0, 1, 0]),
+        "cutoff_angle": 30.0,
+        "intensity": 20.0,
+    }
+    film = {"type": "hdrfilm", "width": 32, "height": 32, "rfilter": {"type": "box"}}
+    view = mi.ScalarTransform4f().look_at([2, -3, 4], [0, 0, 0], [0, 0, 1])
+    camera = {"type": "perspective", "fov": 45, "to_world": view, "film": film}
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(3)}
+
+    def scene(angle: float) -> Any:
+        parts = {"ball": ball(), "floor": floor, "camera": camera, "spot": {**spot, "cutoff_angle": angle}}
+        return mi.load_dict({"type": "scene", **parts})
+
+    used = sdr.Renderer.from_scene(scene(30.0), shadow_map_resolution=256)
+    given = {"cutoff_angle": torch.tensor([120.0]), "beam_width": torch.tensor([90.0])}
+    found = used.render(lights={"spot": given}).numpy()
+    expected = np.array(shadowmap_dr.Renderer.from_scene(scene(120.0), shadow_map_resolution=256).render())
+    assert np.abs(found - expected).mean() < 0.02 * expected.mean()
 
 
 def test_wrong_variant_is_refused(renderer: sdr.Renderer) -> None:

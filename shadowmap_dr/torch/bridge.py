@@ -7,6 +7,7 @@ each backward pass makes a graph of its own.
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import ModuleType
@@ -17,6 +18,9 @@ import torch
 
 from ..raster._types import backend
 from .checks import backend_of
+
+# Held by the thread in which Dr.Jit works.
+_TURN = threading.RLock()
 
 
 class Operation(Protocol):
@@ -124,13 +128,15 @@ def drjit_turn(device: torch.device) -> Iterator[ModuleType]:
     module = backend_of(device)
     if device.type == "cuda":
         torch.cuda.current_stream(device).synchronize()
-    # PyTorch may call from another thread than before: Dr.Jit orders what it traces by scopes, which count up across threads.
-    dr.detail.new_scope(dr.backend_v(module.Float))
-    try:
-        yield module
-    finally:
-        dr.sync_thread()
+    # Dr.Jit orders what it traces by scopes, which count up across threads. So one thread at a time, each in scopes of its own:
+    # PyTorch may call from another one than before.
+    with _TURN:
         dr.detail.new_scope(dr.backend_v(module.Float))
+        try:
+            yield module
+        finally:
+            dr.sync_thread()
+            dr.detail.new_scope(dr.backend_v(module.Float))
 
 
 class _Crossing(torch.autograd.Function):

@@ -53,6 +53,13 @@ def check_devices(**tensors: torch.Tensor) -> torch.device:
     return tensor.device
 
 
+def check_kind(name: str, value: Any, *kinds: type) -> None:
+    """Refuse objects of other kinds than these."""
+    if not isinstance(value, kinds) or isinstance(value, bool):
+        wanted = " or ".join(kind.__name__ for kind in kinds)
+        raise ShadowmapError(f"{name}: {type(value).__name__}, but must be {wanted}.")
+
+
 def check_same(what: str, given: Any, expected: Any, hint: str) -> None:
     """Refuse sizes that contradict each other."""
     if given != expected:

@@ -13,7 +13,7 @@ from ..errors import ShadowmapError
 from ..raster import RasterOutput
 from ..raster.rasterize import check_resolution
 from .bridge import Repeated, cross, drjit_turn, index_array, to_torch
-from .checks import check_devices, check_floats, check_indices, check_same
+from .checks import check_devices, check_floats, check_indices, check_kind, check_same
 
 
 @dataclass(frozen=True)
@@ -103,6 +103,7 @@ def interpolate(attributes: torch.Tensor, raster: Raster, faces: torch.Tensor) -
         float32 (B, H, W, C), 0 where nothing is seen. Attached to ``attributes`` and, through ``raster.u`` and ``raster.v``, to
         the positions that were rasterized.
     """
+    check_kind("raster", raster, Raster)
     found = raster._found
     shape = (found.batch, found.height, found.width)
     check_floats("attributes", attributes, ("V", "C"), (found.batch, "V", "C"))
@@ -149,6 +150,8 @@ def antialias(image: torch.Tensor, raster: Raster, positions: torch.Tensor, topo
     Returns:
         float32 (B, H, W, C), attached to ``image`` and, through the places of silhouettes, to ``positions``.
     """
+    check_kind("raster", raster, Raster)
+    check_kind("topology", topology, Topology)
     found = raster._found
     count = topology.vertex_count
     check_floats("image", image, (found.batch, found.height, found.width, "C"))

@@ -13,8 +13,9 @@ import torch
 
 from ..errors import ShadowmapError
 from ..renderer import Renderer as _Renderer
+from ..soft import SkyWatch, still_aimed
 from .bridge import attached, cross, drjit_turn, gradients, number, to_torch
-from .checks import check_devices, check_floats
+from .checks import check_devices, check_floats, check_kind
 
 
 class Renderer:
@@ -35,7 +36,9 @@ class Renderer:
             frozen: record what the passes do (``dr.freeze``) and replay it while only numbers change, which is several times as
                 fast for small images. Calls with ``parameters`` are never recorded.
         """
+        check_kind("renderer", renderer, _Renderer)
         self._renderer = replace(renderer)
+        self._sky = SkyWatch(renderer.data.environments)
         self._variant = mi.variant()
         self._frozen = (dr.freeze(_forward), dr.freeze(_backward)) if frozen else None
 
@@ -84,6 +87,12 @@ class Renderer:
         Raises:
             ShadowmapError: unknown names, tensors that do not fit, a variant that does not fit the tensors.
         """
+        for name, value in (("vertex_positions", vertex_positions), ("lights", lights), ("parameters", parameters)):
+            check_kind(name, {} if value is None else value, Mapping)
+        for name, value in (lights or {}).items():
+            check_kind(f"lights['{name}']", value, Mapping)
+        check_kind("sensor", sensor, int)
+        check_kind("spp", spp, int, float)
         given = self._inputs(vertex_positions, lights, parameters)
         if not 0 <= sensor < len(self._renderer.data.sensors) or spp < 1:
             count = len(self._renderer.data.sensors)
@@ -94,6 +103,15 @@ class Renderer:
         with drjit_turn(torch.device("cpu" if self._variant.startswith("llvm") else "cuda")):
             (image,) = operation.forward([], [])
             return to_torch(image, copy=False)
+
+    def _planned(self, renderer: _Renderer) -> _Renderer:
+        """The renderer, with extended lights divided anew where they have changed much since they were."""
+        data = renderer.data
+        with dr.suspend_grad():
+            if not self._sky.same(data.environments) or not still_aimed(renderer.soft, lambda: data.geometry):
+                renderer, self._sky = renderer.planned_anew(), SkyWatch(data.environments)
+                self._renderer.soft = renderer.soft
+        return renderer
 
     def _inputs(
         self,
@@ -116,6 +134,8 @@ class Renderer:
                 if key not in known:
                     raise ShadowmapError(f"Light '{name}' has no '{key}' that a tensor could replace: {', '.join(known)}.")
                 check_floats(f"lights['{name}']['{key}']", value, *_shapes_of(f"lights: '{key}'", getattr(record, key)))
+                if key == "direction" and not bool(value.any()):
+                    raise ShadowmapError(f"lights['{name}']['direction']: {value.tolist()}; give a vector that is not zero.")
                 given[_Place("light", name, key)] = value
         if parameters:
             current = mi.traverse(self._renderer.data.scene)
@@ -153,14 +173,17 @@ class _Rendering:
         self.owner, self.places, self.camera = owner, places, (sensor, spp)
         changes_scene = any(place.kind == "parameter" for place in places)
         self.functions = (_forward, _backward) if changes_scene or owner._frozen is None else owner._frozen
+        # What the forward pass has decided and the backward pass takes up.
+        self.fixed: dict[str, Any] = {}
 
     def forward(self, arrays: list[Any], wanted: list[bool]) -> Sequence[Any]:
         with dr.suspend_grad(), self._scene(arrays) as renderer:
-            image, frusta = self.functions[0](self.places, *self.camera, arrays, renderer)
+            image, fit = self.functions[0](self.places, *self.camera, arrays, renderer)
             # While the scene is as it should be.
-            dr.eval(image, frusta)
-        self.arrays, self.wanted, self.frusta = arrays, wanted, frusta
-        self.owner._renderer.frusta = frusta
+            dr.eval(image, fit)
+        self.arrays, self.wanted = arrays, wanted
+        self.fixed = {"soft": renderer.soft, "frusta": fit[0], "soft_frusta": fit[1]}
+        self.owner._renderer.frusta, self.owner._renderer.soft_frusta = fit
         return (image,)
 
     def backward(self, adjoints: Sequence[Any]) -> Sequence[Any]:
@@ -173,18 +196,18 @@ class _Rendering:
     def _scene(self, arrays: list[Any]) -> Iterator[_Renderer]:
         """The renderer for this call, while the scene has the parameters that it is to have."""
         # Fitting maps again to what they have been fitted to keeps them bit by bit, as the derivatives want it.
-        frusta = getattr(self, "frusta", self.owner._renderer.frusta)
-        renderer = replace(self.owner._renderer, frusta=frusta)
+        renderer = replace(self.owner._renderer, **self.fixed)
         values = {place.name: array for place, array in zip(self.places, arrays, strict=True) if place.kind == "parameter"}
         if not values:
-            yield renderer
+            yield renderer if self.fixed else self.owner._planned(renderer)
             return
         table = mi.traverse(renderer.data.scene)
         # Copies: what the table returns changes with the scene.
         before = {name: type(table[name])(table[name]) for name in values}
         try:
             _set(table, {name: _converted(before[name], array) for name, array in values.items()})
-            yield renderer.refresh()
+            renderer = renderer.refresh()
+            yield renderer if self.fixed else self.owner._planned(renderer)
         finally:
             _set(table, before)
 
@@ -197,7 +220,7 @@ def _set(table: Any, values: Mapping[str, Any]) -> None:
 
 # The renderer comes last: Dr.Jit 1.5 does not tell recordings apart by Python's numbers and strings that follow it.
 def _forward(places: tuple[_Place, ...], sensor: int, spp: int, arrays: list[Any], renderer: _Renderer) -> tuple[Any, Any]:
-    """Image and the fit of the shadow maps."""
+    """Image and the fits of the shadow maps and of those of extended lights."""
     given = list(zip(places, arrays, strict=True))
     vertices = {place.name: array for place, array in given if place.kind == "vertices"}
     lights: dict[str, Any] = {}
@@ -206,7 +229,7 @@ def _forward(places: tuple[_Place, ...], sensor: int, spp: int, arrays: list[Any
             light = lights.get(place.name, renderer.light(place.name))
             lights[place.name] = replace(light, **{place.field: _converted(getattr(light, place.field), array)})
     image = renderer.render(vertices, lights, sensor, spp)
-    return image, renderer.frusta
+    return image, (renderer.frusta, renderer.soft_frusta)
 
 
 def _backward(

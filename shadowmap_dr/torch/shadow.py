@@ -15,7 +15,7 @@ from ..errors import ShadowmapError
 from ..raster._types import backend
 from ..shadow import Frusta, LightView, ShadowSettings, Views
 from .bridge import Repeated, cross, drjit_turn, index_array, vector
-from .checks import check_devices, check_floats, check_same
+from .checks import check_devices, check_floats, check_kind, check_same
 from .raster import Topology
 
 # Spot lights with a wider cone (half-angle in degrees) use the faces of a cube.
@@ -93,7 +93,9 @@ def render_maps(
     Returns:
         Unfiltered maps, attached to ``vertices`` and to the tensors of the lights.
     """
-    settings = settings or ShadowSettings()
+    settings = ShadowSettings() if settings is None else settings
+    check_kind("topology", topology, Topology)
+    check_kind("settings", settings, ShadowSettings)
     if settings.method == "none" or settings.compat:
         raise ShadowmapError("settings: the method 'none' and compat are for the Renderer only; choose another method.")
     lights = list(lights) if isinstance(lights, Sequence) else [lights]
@@ -107,6 +109,7 @@ def render_maps(
     check_devices(vertices=vertices, topology=topology.faces, **tensors)
     sizes = [6 if _has_cube(light) else 1 for light in lights]
     if previous is not None:
+        check_kind("previous", previous, ShadowMaps)
         check_same("maps of previous", previous.axes.shape[1], sum(sizes), "give maps of the same lights")
     indices = index_array(topology.faces)
     kept: list[tuple[Views, Frusta]] = []
@@ -157,6 +160,7 @@ def visibility(maps: ShadowMaps, points: torch.Tensor, light: int = 0) -> torch.
     """
     _check_maps(maps)
     check_floats("points", points, ("...", 3))
+    check_kind("light", light, int)
     if not 0 <= light < len(maps.first):
         raise ShadowmapError(f"light: {light}, but there are {len(maps.first)} lights, counted from 0.")
     check_devices(points=points, maps=maps.values, axes=maps.axes)
@@ -189,6 +193,8 @@ def _checked(light: Light, number: int) -> dict[str, torch.Tensor]:
         check_floats(f"lights[{number}].{name}", value, (3,))
         if not bool(torch.isfinite(value).all()) or (name == "direction" and not bool(value.any())):
             raise ShadowmapError(f"lights[{number}].{name}: {value.tolist()}; give three finite numbers that make sense.")
+    if isinstance(light, SpotLight):
+        check_kind(f"lights[{number}].cutoff_angle", light.cutoff_angle, int, float)
     if isinstance(light, SpotLight) and not 0 < light.cutoff_angle <= 180:
         raise ShadowmapError(f"lights[{number}].cutoff_angle: {light.cutoff_angle}; give degrees above 0, up to 180.")
     return tensors
@@ -232,6 +238,7 @@ def _full(value: Any, width: int) -> Any:
 
 
 def _check_maps(maps: ShadowMaps) -> None:
+    check_kind("maps", maps, ShadowMaps)
     size, count = maps.settings.resolution, len(maps._frusta.near)
     check_floats("maps.values", maps.values, (count, size, size, maps._channels))
     check_floats("maps.axes", maps.axes, (len(_AXES), count, 3))

@@ -145,4 +145,6 @@ class _Axes:
     def offset(self, across: Any, down: Any) -> Any:
         """From the pixel's centre to a place in its footprint (Vector3f), in shares of its width and height."""
         lateral = self.right * across + self.up * down
-        return lateral - self.view * (dr.dot(self.normal, lateral) / self.slope)
+        offset = lateral - self.view * (dr.dot(self.normal, lateral) / self.slope)
+        # On the surface also where the footprint has been cut short: beside it there is shadow.
+        return offset - self.normal * dr.dot(self.normal, offset)

@@ -39,7 +39,9 @@ from .shadow import (
 
 #: Spot lights and projectors with a wider cone (half-angle in degrees) use the faces of a cube.
 WIDEST_SPOT = 60.0
-# Casters of a beam's shadows are as far from its shape, at least, in units of the scene's radius: it must not shadow itself.
+# Half-angle in degrees that one map covers, whatever becomes of its light.
+_WIDEST_MAP = 80.0
+# Casters of a beam's shadows are as far from its shape, at least, in units of its reach: it must not shadow itself.
 _BEAM_START = 1e-3
 
 
@@ -120,7 +122,8 @@ def _spread(light: SpotLight | Projector) -> Any:
     """Tangent of the half-angle that its map has to cover (Float), detached."""
     if isinstance(light, Projector):
         return dr.detach(light.spread)
-    return dr.tan(dr.detach(light.cutoff_angle) * (math.pi / 180))
+    # A light of one map that has become wider since is lit beyond it.
+    return dr.tan(dr.minimum(dr.detach(light.cutoff_angle), _WIDEST_MAP) * (math.pi / 180))
 
 
 def make_maps(
@@ -161,7 +164,7 @@ def make_maps(
             seen,
             settings.receiver_range,
         )
-        frusta = _from_beams_on(plan, frusta)
+        frusta = _from_beams_on(plan, lights, frusta)
     culled = None if transparent is not None else _culled(plan, stacked.count, outward)
     maps = render_maps(p_light, lanes, geometry.faces, topology, stacked, frusta, settings, transparent, culled)
     return filter_maps(maps)
@@ -210,24 +213,32 @@ def _within_beams(plan: MapPlan, lights: Sequence[Light], p_light: Any, map_inde
     result = p_light
     for k, light in enumerate(lights):
         if isinstance(light, Beam):
-            reach, start = dr.detach(light.reach), _BEAM_START * plan.radius
+            reach, start = dr.detach(light.reach), _start_of(light)
             x, y = dr.clip(p_light.x, -reach, reach), dr.clip(p_light.y, -reach, reach)
             moved = type(p_light)(x, y, dr.maximum(p_light.z, start))
             result = dr.select(map_index == plan.first[k], moved, result)
     return result
 
 
-def _from_beams_on(plan: MapPlan, frusta: Frusta) -> Frusta:
+def _start_of(light: Beam) -> Any:
+    """How far from a beam's shape (Float, detached) its casters begin: beyond what rounding may do to the shape itself."""
+    place = dr.detach(light.position)
+    far = dr.maximum(dr.maximum(dr.abs(place.x), dr.abs(place.y)), dr.abs(place.z))
+    return dr.fma(_BEAM_START, dr.detach(light.reach), 1e-5 * far)
+
+
+def _from_beams_on(plan: MapPlan, lights: Sequence[Light], frusta: Frusta) -> Frusta:
     """Frusta that begin in front of a beam's shape, so that what lies behind it casts no shadow, nor the shape itself."""
     if "beam" not in plan.kinds:
         return frusta
-    index, start = dr.arange(mi.UInt32, dr.width(frusta.near)), _BEAM_START * plan.radius
-    beam = mi.Bool(False)
-    for kind, first in zip(plan.kinds, plan.first, strict=True):
-        beam |= (index == first) & (kind == "beam")
-    near = dr.select(beam, dr.maximum(frusta.near, start), frusta.near)
+    index = dr.arange(mi.UInt32, dr.width(frusta.near))
+    start = mi.Float(-dr.inf)
+    for light, first in zip(lights, plan.first, strict=True):
+        if isinstance(light, Beam):
+            start = dr.select(index == first, _start_of(light), start)
+    near = dr.maximum(frusta.near, start)
     first = dr.maximum(frusta.first, near)
-    frusta = replace(frusta, near=near, first=first, far=dr.maximum(frusta.far, first + 0.1 * start))
+    frusta = replace(frusta, near=near, first=first, far=dr.maximum(frusta.far, first + 0.1 * dr.maximum(start, 0)))
     dr.eval(frusta)
     return frusta
 

@@ -54,6 +54,21 @@ def test_spots_are_where_rays_through_the_pixel_meet_the_surface(variant: str, k
         assert float(dr.max(dr.norm(spot - wanted))[0]) < 0.01 * pixel
 
 
+@pytest.mark.parametrize("kind", ["perspective", "orthographic"])
+def test_spots_lie_on_surfaces_seen_from_the_side(variant: str, kind: str) -> None:
+    """Footprints are cut short there."""
+    _, sensor = camera(kind)
+    points, _, depth = seen_by(kind, camera(kind)[0])
+    along = points - sensor.origin if kind == "perspective" else sensor.to_world @ mi.Vector3f(0, 0, 1)
+    view = dr.normalize(mi.Vector3f(along))
+    side = dr.normalize(dr.cross(view, mi.Vector3f(0.2, 1, 0.1)))
+    normal = dr.normalize(side - 0.03 * view)
+    for spot in footprint_points(sensor, (SIZE, SIZE + 2), depth, points, normal, 2):
+        away = spot - points
+        assert float(dr.min(dr.norm(away))[0]) > 1e-4
+        assert float(dr.max(dr.abs(dr.dot(away, normal)) / dr.norm(away))[0]) < 1e-3
+
+
 @pytest.mark.parametrize("count", [1, 2, 3, 4])
 @pytest.mark.parametrize("kind", ["perspective", "orthographic"])
 def test_means_and_their_derivatives_are_those_of_sums_written_out(variant: str, kind: str, count: int) -> None:

@@ -117,3 +117,75 @@ def test_floor_seen_from_close_by_is_lit(variant: str, height: float) -> None:
     )
     shadowed, plain = (Renderer.from_scene(scene, shadow_method=method).render().numpy() for method in ("auto", "none"))
     np.testing.assert_allclose(shadowed, plain, rtol=1e-3)
+
+
+def lit(parts: dict, look: tuple, **options: str) -> tuple[np.ndarray, np.ndarray]:
+    """Image of a scene and Mitsuba's, without indirect light."""
+    film = {"type": "hdrfilm", "width": 64, "height": 64, "rfilter": {"type": "box"}}
+    look = mi.ScalarTransform4f().look_at(*look, [0, 0, 1])
+    camera = {"type": "perspective", "fov": 45, "to_world": look, "film": film}
+    scene = mi.load_dict({"type": "scene", "camera": camera, **parts}, optimize=False)
+    direct = mi.load_dict({"type": "direct", "emitter_samples": 1, "bsdf_samples": 0})
+    return np.array(Renderer.from_scene(scene, **options).render(spp=4)), np.array(mi.render(scene, integrator=direct, spp=64))
+
+
+def wall(to_world: mi.ScalarTransform4f) -> dict:
+    white = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.8}}
+    return {"type": "rectangle", "to_world": to_world, "bsdf": {"type": "twosided", "bsdf": white}}
+
+
+@pytest.mark.parametrize("width", [3, 8], ids=["narrower", "wider"])
+@pytest.mark.parametrize("x", [3.0, 4.2, 4.6])
+def test_walls_near_the_end_of_a_floor_cast_shadows(variant: str, x: float, width: float) -> None:
+    """Little of the floor lies behind them, but not because it has sunk in."""
+    T = mi.ScalarTransform4f
+    parts = {
+        "floor": wall(T().scale(5)),
+        "wall": wall(T().translate([x, 0, 0.5]).rotate([0, 1, 0], 90).scale([0.5, width, 1])),
+        "sun": {"type": "directional", "direction": [1, 0, -1], "irradiance": 3.0},
+    }
+    found, expected = lit(parts, ([12, -6, 10], [3.5, 0, 0]))
+    assert np.abs(found - expected).mean() < 0.015 * expected.mean()
+    assert (np.abs(found - expected).max(2) > 0.25 * expected.max()).mean() < 0.003
+
+
+@pytest.mark.parametrize("size", [10, 1000, 10_000])
+def test_cards_above_floors_of_any_size_cast_shadows(variant: str, size: float) -> None:
+    T = mi.ScalarTransform4f
+    sun = {"type": "directional", "direction": [0.3, 0, -1], "irradiance": 3.0}
+    parts = {"floor": wall(T().scale(size)), "card": wall(T().translate([0, 0, 1])), "sun": sun}
+    found, expected = lit(parts, ([4, -6, 5], [0, 0, 0]))
+    assert np.abs(found - expected).mean() < 0.01 * expected.mean()
+
+
+@pytest.mark.parametrize("size", [5, 10_000])
+def test_beams_meet_what_is_near_them_in_scenes_of_any_size(variant: str, size: float) -> None:
+    T = mi.ScalarTransform4f
+    glow = {"type": "directionalarea", "radiance": {"type": "rgb", "value": 3.0}}
+    parts = {
+        "floor": wall(T().scale(size)),
+        "cube": {"type": "cube", "to_world": T().translate([0, 0, 2]).scale(0.3)},
+        "lamp": {"type": "rectangle", "to_world": T().translate([0, 0, 4]).rotate([1, 0, 0], 180), "glow": glow},
+    }
+    film = {"type": "hdrfilm", "width": 64, "height": 64, "rfilter": {"type": "box"}}
+    look = T().look_at([2, -3, 1], [0, 0, 0], [0, 0, 1])
+    parts["camera"] = {"type": "perspective", "fov": 40, "to_world": look, "film": film}
+    scene = mi.load_dict({"type": "scene", **parts}, optimize=False)
+    image = np.array(Renderer.from_scene(scene, aovs=("visibility", "position")).render())
+    place = np.abs(image[..., 4:6]).max(2)
+    floor = (np.abs(image[..., 6]) < 0.01) & (place > 0)  # where nothing is seen, the place is 0
+    below, beside = floor & (place < 0.15), floor & (place > 0.5) & (place < 0.8)
+    assert below.any() and beside.any()
+    assert image[below, 3].max() < 0.05 and image[beside, 3].min() > 0.9
+
+
+@pytest.mark.parametrize("method", ["auto", "vsm", "msm"])
+def test_floors_seen_at_grazing_angles_are_lit(variant: str, method: str) -> None:
+    """Look-ups all over a pixel that is many times as long as wide lie on the floor, too."""
+    parts = {
+        "floor": wall(mi.ScalarTransform4f().scale(10)),
+        "ball": {"type": "sphere", "center": [0, 0, 0.6], "radius": 0.6},
+        "bulb": {"type": "point", "position": [-2, -3, 3], "intensity": 40.0},
+    }
+    found, expected = lit(parts, ([4, -6, 1.5], [0, 0, 1]), shadow_method=method)
+    assert np.abs(found - expected).mean() < 0.012 * expected.mean()

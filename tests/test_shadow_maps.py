@@ -221,7 +221,14 @@ def test_moment_and_standard_formulas(variant: str) -> None:
 
 @pytest.mark.parametrize(
     ("change", "word"),
-    [({"method": "magic"}, "magic"), ({"filter": "median"}, "median"), ({"filter_size": 4}, "4"), ({"resolution": 0}, "0")],
+    [
+        ({"method": "magic"}, "magic"),
+        ({"filter": "median"}, "median"),
+        ({"filter_size": 4}, "4"),
+        ({"resolution": 0}, "0"),
+        ({"resolution": 64.5}, "resolution is 64.5; give a whole number"),
+        ({"supersampling": "2"}, "supersampling is '2'; give a whole number"),
+    ],
 )
 def test_bad_settings_are_named(change: dict, word: str) -> None:
     with pytest.raises(ValueError, match=word):

@@ -10,8 +10,12 @@ import drjit as dr
 from ..raster._types import backend
 from .camera import Views, of_map
 
-#: Share of a shape's extent that may lie behind a floor without the floor casting a shadow on it.
+#: Share of a shape's extent that may lie behind a floor on which it stands without the floor casting a shadow on it.
 SUNK = 0.1
+#: What stands on a floor keeps this far from its border, as a share of the floor's own size.
+BORDER = 0.01
+#: Shapes touch if they are this close: as a share of the smaller one's size, and, for rounding, of their coordinates.
+TOUCH, ROUNDING = 1e-4, 1e-6
 
 
 @dataclass(frozen=True)
@@ -66,35 +70,44 @@ def casting_shapes(views: Views, planes: tuple[Any, Any], planar: Any, boxes: Bo
         views, shapes = dr.detach(views), boxes.count
         (normal, point) = planes
         dr.eval(normal, point, planar)
-        reach, size = _reach(normal, point, boxes), dr.max(dr.max(boxes.high - boxes.low))
+        reach = _reach(normal, point, boxes)
         index = dr.arange(module.UInt32, views.count * shapes)
         which = index // shapes
         shape = index - which * shapes
         view = of_map(views, which, views.count)
         n, p = (module.Array3f(*(dr.gather(module.Float, v[c], shape) for c in range(3))) for v in (normal, point))
         above = dr.dot(n, dr.select(view.spread > 0, view.origin - p, -view.forward)) > 0
-        behind = dr.gather(module.Float, reach, shape * 2 + dr.select(above, module.UInt32(1), 0)) > 1e-3 * size
+        behind = dr.gather(module.Float, reach, shape * 2 + dr.select(above, module.UInt32(1), 0)) > 0
         casts = ~dr.gather(module.Bool, planar, shape) | behind
         return casts if hidden is None else casts & (shape != dr.gather(module.UInt32, hidden, which))
 
 
 def _reach(normal: Any, point: Any, boxes: Boxes) -> Any:
-    """How far the boxes of the other shapes reach on either side of each shape's plane (``Float``, 2 S).
+    """How far the boxes of the other shapes reach on either side of each shape's plane (``Float``, 2 S); at most 0 if they touch.
 
-    The first tenth does not count: something that stands on the floor may sink in a little, which shall not change the maps.
+    The first tenth of what stands on the plane does not count: it may sink in a little, which shall not change the maps.
     """
     module, shapes = backend(boxes.low), boxes.count
+    Float = module.Float
     pair = dr.arange(module.UInt32, shapes * shapes)
     own = pair // shapes
     other = pair - own * shapes
-    before, behind, extent = module.Float(0), module.Float(0), module.Float(0)
+    sizes = [dr.max(dr.gather(module.Array3f, dr.ravel(boxes.high - boxes.low), which)) for which in (own, other)]
+    before, behind, extent, far, stands = Float(0), Float(0), Float(0), Float(0), module.Bool(True)
     for c in range(3):
-        n, p = dr.gather(module.Float, normal[c], own), dr.gather(module.Float, point[c], own)
-        low, high = dr.gather(module.Float, boxes.low[c], other), dr.gather(module.Float, boxes.high[c], other)
+        n, p = dr.gather(Float, normal[c], own), dr.gather(Float, point[c], own)
+        low, high = dr.gather(Float, boxes.low[c], other), dr.gather(Float, boxes.high[c], other)
         before += n * (dr.select(n > 0, high, low) - p)
         behind -= n * (dr.select(n > 0, low, high) - p)
         extent += dr.abs(n) * (high - low)
-    reach = dr.full(module.Float, -dr.inf, 2 * shapes)
+        far = dr.maximum(far, dr.maximum(dr.abs(low), dr.abs(high)))
+        # Within the plane's own outline, along its normal as far as it likes.
+        left, right = dr.gather(Float, boxes.low[c], own), dr.gather(Float, boxes.high[c], own)
+        border, room = BORDER * (right - left), dr.abs(n) * sizes[1]
+        stands &= (low >= left + border - room) & (high <= right - border + room)
+    touch = dr.fma(TOUCH, dr.minimum(*sizes), ROUNDING * far)
+    sunk = dr.select(stands, SUNK * extent, 0)
+    reach = dr.full(Float, -dr.inf, 2 * shapes)
     for k, value in enumerate((before, behind)):
-        dr.scatter_reduce(dr.ReduceOp.Max, reach, dr.fma(-SUNK, extent, value), own * 2 + k, own != other)
+        dr.scatter_reduce(dr.ReduceOp.Max, reach, value - sunk - touch, own * 2 + k, own != other)
     return reach

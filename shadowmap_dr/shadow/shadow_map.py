@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from operator import index
 from typing import Any
 
 import drjit as dr
@@ -64,6 +65,11 @@ class ShadowSettings:
     cull_backfaces: bool = False
 
     def __post_init__(self) -> None:
+        for name in ("resolution", "filter_size", "order", "supersampling"):
+            try:
+                object.__setattr__(self, name, index(getattr(self, name)))
+            except TypeError:
+                raise ValueError(f"shadow map {name} is {getattr(self, name)!r}; give a whole number") from None
         if self.method == "auto":
             object.__setattr__(self, "method", "vsm" if self.compat else DEFAULT)
         if self.method not in METHODS:

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..geometry import Geometry, ShapeInfo
-from ..shadow.casters import SUNK
+from ..shadow.casters import BORDER, ROUNDING, SUNK, TOUCH
 
 #: Half-angle in degrees that one perspective map may cover: beyond it, a light looks around itself with the faces of a cube.
 WIDEST = 75.0
@@ -71,11 +71,19 @@ def _may_cast(shapes: Sequence[ShapeInfo], parts: Sequence[Points], k: int, othe
     if not shapes[k].planar:
         return True
     own = parts[k]
-    _, _, axes = np.linalg.svd(own - own.mean(0), full_matrices=False)
-    normal, size = axes[-1], np.ptp(np.concatenate(parts), axis=0).max()
-    side = (light - own.mean(0)) @ normal
-    behind = [((parts[o] - own.mean(0)) @ normal) * -np.sign(side) for o in others if o != k]
-    return any(float(b.max() - SUNK * np.ptp(b)) > 1e-3 * size for b in behind)
+    middle = own.mean(0)
+    _, _, axes = np.linalg.svd(own - middle, full_matrices=False)
+    side = np.sign((light - middle) @ axes[-1])
+    floor = (own - middle) @ axes.T
+    for other in (parts[o] for o in others if o != k):
+        placed = (other - middle) @ axes.T
+        border = BORDER * np.ptp(floor, axis=0)
+        stands = ((placed.min(0) >= floor.min(0) + border) & (placed.max(0) <= floor.max(0) - border))[:2].all()
+        behind = -side * placed[:, 2]
+        touch = TOUCH * min(np.ptp(own, axis=0).max(), np.ptp(other, axis=0).max()) + ROUNDING * np.abs(other).max()
+        if behind.max() - (SUNK * np.ptp(behind) if stands else 0) > touch:
+            return True
+    return False
 
 
 def _box(points: Points) -> Points:

@@ -40,6 +40,7 @@ AT_ONE_SAMPLE = {
     "sun_cow": ("light_direction", "irradiance"),
     "spot_cow": ("spot_position", "spot_cone", "spot_beam", "spot_intensity", "texture"),
     "crossing_boxes": tuple(CASES_BY_NAME["crossing_boxes"].parameters),
+    "fine": ("caster_translation",),
 }
 # What four are enough for.
 AT_FOUR_SAMPLES = {
@@ -52,7 +53,6 @@ FEW_SAMPLES = [
 BEYOND = [
     ("sun_box", "caster_rotation", {}, 1, "most pixels miss a face that is half a pixel wide, and with it its edges"),
     ("sun_cow", "caster_scale", {}, 1, "single pixels see facets from the side, on which what they show changes fast"),
-    ("fine", "caster_translation", {}, 1, "82,000 flat facets of a fifth of a pixel"),
     ("sky_box", "floor_height", {}, 16, "shadows of single directions have edges, and what moves against all of them sees all"),
 ]
 # Steps of own differences that are shorter than those of path-traced ones: single directions of a sky draw narrow bands.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -14,6 +14,39 @@ from .errors import ShadowmapError
 from .raster import MAX_RESOLUTION
 from .reconstruction import reconstruct
 from .sensors import Sensor
+
+
+@dataclass(frozen=True)
+class Margin:
+    """Pixels of the film around a crop window, with which its outermost ones are blended where edges pass between them."""
+
+    left: int = 0
+    top: int = 0
+    right: int = 0
+    bottom: int = 0
+
+    @classmethod
+    def of(cls, cameras: Sequence[Sensor]) -> Margin:
+        """One pixel on each side that is not the film's own, so that a picture is the same whether it is cut before or after."""
+        (camera, *others), room = cameras, MAX_RESOLUTION - 2
+        if others or camera.border > 0 or max(camera.crop_size) > room:
+            return cls()
+        (width, height), (w, h), (x, y) = camera.film_size, camera.crop_size, camera.crop_offset
+        return cls(int(x > 0), int(y > 0), int(x + w < width), int(y + h < height))
+
+    def around(self, camera: Sensor) -> Sensor:
+        """A camera whose window has the margin, too."""
+        (width, height), (x, y) = camera.crop_size, camera.crop_offset
+        size = width + self.left + self.right, height + self.top + self.bottom
+        return replace(camera, crop_size=size, crop_offset=(x - self.left, y - self.top))
+
+    def cut(self, picture: Any, factor: int) -> Any:
+        """A picture (rows, columns, C) of ``factor`` x ``factor`` samples a pixel without the margin."""
+        if self == Margin():
+            return picture
+        rows, columns = picture.shape[:2]
+        first, last = (self.top * factor, self.left * factor), (rows - self.bottom * factor, columns - self.right * factor)
+        return picture[first[0] : last[0], first[1] : last[1]]
 
 
 def sample_windows(cameras: Sequence[Sensor]) -> tuple[Sensor, ...]:

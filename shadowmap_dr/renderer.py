@@ -16,7 +16,7 @@ from .beams import softened
 from .camera_pass import camera_clip, least_gap, seen_points, within_far_plane, without_shapes
 from .errors import ShadowmapError
 from .facets import crease_edges, flat_faces, mean_normals, soften_facets
-from .film import develop, sample_grid, sample_windows
+from .film import Margin, develop, sample_grid, sample_windows
 from .footprint import Spots, footprint_points
 from .geometry import Geometry
 from .hits import pixel_hits
@@ -186,11 +186,13 @@ class Renderer:
         geometry = geometry.in_packets()
         # Before all else that is attached: derivatives are taken in the reverse order, and pixels should need one pass only.
         facets = None if self.flat is None else mean_normals(geometry, self.topology, self.flat)
-        windows = sample_windows(self._sensors(sensor))
+        cameras = self._sensors(sensor)
+        margin = Margin.of(cameras) if self.settings.antialias else Margin()
+        windows = [margin.around(window) for window in sample_windows(cameras)]
         factor = sample_grid(spp, windows)
         views = [self._view(window, geometry, factor) for window in windows]
         lighting = self._lighting(views, geometry, lights)
-        pictures = [self._camera_image(view, geometry, lighting, facets) for view in views]
+        pictures = [margin.cut(self._camera_image(view, geometry, lighting, facets), factor) for view in views]
         return develop(pictures, windows[0], factor)
 
     def light(self, name: str) -> Light | AreaLight:

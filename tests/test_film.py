@@ -264,3 +264,33 @@ def test_records_with_other_films(variant: str) -> None:
 def test_films_larger_than_the_rasterizer_are_refused(variant: str) -> None:
     with pytest.raises(ShadowmapError, match="A picture of 5000 x 4 pixels is too large: render it in crop windows of 4096"):
         Renderer.from_scene(small_scene(camera=camera(width=5000, height=4)))
+
+
+@pytest.mark.parametrize("name", ["box", "gaussian"])
+@pytest.mark.parametrize("spp", [1, 4])
+def test_crop_windows_are_pieces_of_the_film(variant: str, name: str, spp: int) -> None:
+    """Image and derivatives; also of a single pixel that an edge passes by."""
+
+    def piece(**window: int) -> tuple[np.ndarray, np.ndarray]:
+        seen = filtered(name, 32, **{f"crop_{key}": value for key, value in window.items()})
+        renderer = Renderer.from_scene(small_scene(camera=seen), shadow_method="none")
+        x = mi.Float(0)
+        dr.enable_grad(x)
+        moved = renderer.data.geometry.shape_positions("ball") + mi.Vector3f(1, 0, 0) * x
+        image = renderer.render(vertex_positions={"ball": moved}, spp=spp)
+        dr.forward(x)
+        return np.array(image), np.array(dr.grad(image))
+
+    image, derivative = piece()
+    if name != "box":  # whose samples beyond a window the film does not want
+        image, derivative = image[8:24, 8:24], derivative[8:24, 8:24]
+        found, other = piece(width=16, height=16, offset_x=8, offset_y=8)
+        inner = slice(3, -3), slice(3, -3)
+        np.testing.assert_allclose(found[inner], image[inner], atol=1e-5)
+        np.testing.assert_allclose(other[inner], derivative[inner], atol=1e-4)
+        return
+    row, column = np.unravel_index(np.abs(derivative).sum(2).argmax(), (32, 32))
+    for x, y, width, height in ((0, 0, 16, 20), (16, 0, 16, 20), (0, 20, 16, 12), (16, 20, 16, 12), (column, row, 1, 1)):
+        found, other = piece(width=width, height=height, offset_x=int(x), offset_y=int(y))
+        np.testing.assert_allclose(found, image[y : y + height, x : x + width], atol=1e-5)
+        np.testing.assert_allclose(other, derivative[y : y + height, x : x + width], atol=1e-4)

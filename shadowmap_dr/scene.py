@@ -268,7 +268,7 @@ def _is_faceted(points: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> b
 
 def _is_turned(points: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> bool:
     """Whether the vertex normals are on the other side than the winding of the faces says."""
-    a, b, c = (points[faces[:, k]] for k in range(3))
+    a, b, c = (points[faces[:, k]].astype(np.float64) for k in range(3))
     return bool((np.cross(b - a, c - a) * normals[faces].sum(1)).sum() < 0)
 
 

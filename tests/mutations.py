@@ -162,7 +162,7 @@ MUTATIONS = (
              ("test_raster_creases.py::test_planes_of_a_curved_surface_are_not_extended[llvm_ad_rgb-2-30]",)),
     Mutation("move one of two surfaces that meet", "raster.meetings", "Meetings.slopes", _only_the_first_triangle,
              ("test_raster_creases.py::test_surfaces_that_meet_without_an_edge[llvm_ad_rgb]",)),
-    Mutation("detach the spot light's cone", "lights", "SpotLight.illuminate", _detached_cone,
+    Mutation("detach the spot light's cone", "beams", "share_inside", _detached_cone,
              (DIFFERENCES.format("spot_cow-spot_cone"),)),
     Mutation("detach an orthographic camera's rays", "sensors", "Sensor.pixel_rays", _detached_rays,
              (DIFFERENCES.format("orthographic_cow-camera_turn"),)),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -20,29 +20,27 @@ _BEAM_RIM = 0.005
 _NARROWEST = 1e-7
 
 
-@runtime_checkable
-class Outlined(Protocol):
+class Outlined:
     """A light with an outline at which it fades: projectors, beams, spot lights.
 
     rim     width of the rim in which it fades, half of it on either side of the outline (Float, or number)
     widest  the rim is never made wider than this (detached)
     """
 
-    @property
-    def rim(self) -> Any: ...
-
-    @property
-    def widest(self) -> Any: ...
+    rim: Any
+    widest: Any
 
     def illuminate(self, p_world: Any, active: Any = True, inside: Any = None) -> tuple[Any, Any]:
         """(wo, weight), as of all lights; ``inside``: what :func:`share_inside` returns, if known."""
+        raise NotImplementedError
 
     def distances(self, p_world: Any) -> list[Any]:
         """Distances from the edges that bound the light (Float), positive inside, in units of ``rim``. Attached."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True)
-class Projector:
+class Projector(Outlined):
     """A picture thrown along the local +z axis: Mitsuba's ``projector``.
 
     to_world    Transform4f
@@ -106,7 +104,7 @@ class Projector:
 
 
 @dataclass(frozen=True)
-class Beam:
+class Beam(Outlined):
     """Parallel light from a rectangle or a disk: Mitsuba's ``directionalarea``.
 
     Mitsuba's particle tracer shows the beam; its other integrators cannot find it.

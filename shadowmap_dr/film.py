@@ -26,9 +26,12 @@ class Margin:
     bottom: int = 0
 
     @classmethod
-    def of(cls, cameras: Sequence[Sensor]) -> Margin:
-        """One pixel on each side that is not the film's own, so that a picture is the same whether it is cut before or after."""
-        (camera, *others), room = cameras, MAX_RESOLUTION - 2
+    def of(cls, cameras: Sequence[Sensor], factor: int) -> Margin:
+        """One pixel on each side that is not the film's own, so that a picture is the same whether it is cut before or after.
+
+        ``factor`` x ``factor`` samples a pixel; none where the rasterizer has no room for more.
+        """
+        (camera, *others), room = cameras, MAX_RESOLUTION // factor - 2
         if others or camera.border > 0 or max(camera.crop_size) > room:
             return cls()
         (width, height), (w, h), (x, y) = camera.film_size, camera.crop_size, camera.crop_offset

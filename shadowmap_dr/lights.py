@@ -14,7 +14,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from .beams import Beam, Projector, beam_of, picture, projector_of, share_inside, towards
+from .beams import Beam, Outlined, Projector, beam_of, picture, projector_of, share_inside, towards
 from .environments import ENVIRONMENTS, SUNSKY, Environment, SunSky, environment_of
 from .traversal import children, parameters, varies
 
@@ -49,7 +49,7 @@ class PointLight:
 
 
 @dataclass(frozen=True)
-class SpotLight:
+class SpotLight(Outlined):
     """Cone of light along the local +z axis.
 
     to_world      Transform4f

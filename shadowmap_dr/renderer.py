@@ -137,7 +137,6 @@ class Renderer:
         if settings.shadow.method != "none":
             texels = settings.shadow.resolution * settings.shadow.supersampling
             check_sizes(plan.maps, texels, geometry, "lights", "lower shadow_map_resolution, or leave out lights")
-            check_soft_sizes(soft, geometry, settings.soft_map_resolution)
         outward = mi.Bool(outward_faces(topology, positions.reshape(-1, 3))) if settings.shadow.cull_backfaces else None
         renderer = cls(data, topology, plan, settings, flat_faces(geometry, topology), creases, outward, soft)
         # The first fit is made here, so that a step which is recorded later always starts from one.
@@ -187,10 +186,10 @@ class Renderer:
         # Before all else that is attached: derivatives are taken in the reverse order, and pixels should need one pass only.
         facets = None if self.flat is None else mean_normals(geometry, self.topology, self.flat)
         cameras = self._sensors(sensor)
-        margin = Margin.of(cameras) if self.settings.antialias else Margin()
-        windows = [margin.around(window) for window in sample_windows(cameras)]
+        windows = sample_windows(cameras)
         factor = sample_grid(spp, windows)
-        views = [self._view(window, geometry, factor) for window in windows]
+        margin = Margin.of(cameras, factor) if self.settings.antialias else Margin()
+        views = [self._view(margin.around(window), geometry, factor) for window in windows]
         lighting = self._lighting(views, geometry, lights)
         pictures = [margin.cut(self._camera_image(view, geometry, lighting, facets), factor) for view in views]
         return develop(pictures, windows[0], factor)
@@ -278,7 +277,7 @@ class Renderer:
 
     def _topology(self, geometry: Geometry, hidden: Sequence[int] = ()) -> Topology:
         """The topology of shapes where they are now, without those that are hidden."""
-        if geometry.as_loaded and not geometry.changed and not hidden:
+        if geometry.as_loaded and geometry.positions is self.data.geometry.positions and not hidden:
             return self.topology
         points = dr.gather(mi.Point3f, dr.detach(geometry.positions), dr.arange(mi.UInt32, geometry.vertex_count))
         return parted(self.topology, points, geometry.vertex_shape, hidden)
@@ -452,7 +451,10 @@ class _Uniform:
 
 def _plan_soft(data: SceneData, settings: RenderSettings) -> tuple[SoftPlan, ...]:
     lights, single = (*data.areas, *data.environments), settings.emitter_shadows == "single"
-    return plan_soft(lights, data.geometry, settings.emitter_samples, settings.environment_samples, single)
+    soft = plan_soft(lights, data.geometry, settings.emitter_samples, settings.environment_samples, single)
+    if settings.shadow.method != "none":
+        check_soft_sizes(soft, data.geometry, settings.soft_map_resolution)
+    return soft
 
 
 def _film_channels(color: Any, active: Any, sensor: Sensor) -> list[Any]:

@@ -13,6 +13,7 @@ import pytest
 from integrator_scenes import camera, floor, render, shadowmap, small_scene
 
 from shadowmap_dr import Renderer, ShadowmapError
+from shadowmap_dr.film import Margin
 from shadowmap_dr.sensors import sensors_of
 
 SIZE = 32
@@ -294,3 +295,11 @@ def test_crop_windows_are_pieces_of_the_film(variant: str, name: str, spp: int) 
         found, other = piece(width=width, height=height, offset_x=int(x), offset_y=int(y))
         np.testing.assert_allclose(found, image[y : y + height, x : x + width], atol=1e-5)
         np.testing.assert_allclose(other, derivative[y : y + height, x : x + width], atol=1e-4)
+
+
+def test_crop_windows_have_as_many_samples_as_they_would_have_alone(variant: str) -> None:
+    """What lies around them is left out where there is no room for it."""
+    (seen,) = sensors_of(mi.load_dict(camera(4096, crop_width=2048, crop_height=1024, crop_offset_x=5, crop_offset_y=7)))
+    assert Margin.of((seen,), 1) == Margin(1, 1, 1, 1) and Margin.of((seen,), 2) == Margin()
+    corner = replace(seen, crop_offset=(0, 3072))
+    assert Margin.of((corner,), 1) == Margin(0, 1, 1, 0)

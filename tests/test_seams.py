@@ -54,6 +54,17 @@ def test_shapes_that_part(variant: str) -> None:
     np.testing.assert_allclose(other, derivative, atol=1e-3 * np.abs(derivative).max())
 
 
+def test_shapes_that_part_from_a_scene_with_gradients(variant: str) -> None:
+    """That was loaded while a parameter of it carried some."""
+    expected, _ = image_and_derivative(scene(GAP), "right", 0)
+    made = scene(0)
+    params = mi.traverse(made)
+    dr.enable_grad(params["left.to_world"])
+    params.update()
+    found, _ = image_and_derivative(made, "right", GAP)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
 @pytest.mark.parametrize("recorded", [False, True], ids=["plain", "recorded"])
 def test_shapes_that_part_in_the_plug_in(variant: str, recorded: bool) -> None:
     made = scene(0)

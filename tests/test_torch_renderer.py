@@ -260,6 +260,7 @@ def test_wrong_input_is_refused(renderer: sdr.Renderer) -> None:
     refused("lights['sun']: Tensor, but must be Mapping", lights={"sun": DIRECTION})
     refused("parameters: list, but must be Mapping", parameters=[])
     refused("sensor: float, but must be int", sensor=0.5)
+    assert renderer.render(sensor=np.int64(0), spp=np.float32(1)).shape == (SIZE, SIZE, 3)
     with pytest.raises(ShadowmapError, match="renderer: Scene, but must be Renderer"):
         sdr.Renderer(build())
     refused("vertex_positions['ball']: on meta", vertex_positions={"ball": vertices.to("meta")})

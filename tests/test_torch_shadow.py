@@ -147,7 +147,7 @@ def test_wrong_shadows_are_refused() -> None:
     wide = sdr.SpotLight(POSITION, DIRECTION, 200.0)
     refused("lights[0].cutoff_angle: 200.0", lambda: sdr.render_maps(VERTICES, topology, wide))
     learned = sdr.SpotLight(POSITION, DIRECTION, torch.tensor(40.0, requires_grad=True))
-    refused("lights[0].cutoff_angle: Tensor, but must be int or float", lambda: sdr.render_maps(VERTICES, topology, learned))
+    refused("lights[0].cutoff_angle: Tensor, but must be float", lambda: sdr.render_maps(VERTICES, topology, learned))
     refused("topology: Tensor, but must be Topology", lambda: sdr.render_maps(VERTICES, FACES, light_of("spot")))
     refused("settings: dict, but must be ShadowSettings", lambda: sdr.render_maps(VERTICES, topology, light_of("spot"), {}))
     refused("light: float, but must be int", lambda: sdr.visibility(maps, receivers(3), 0.5))

@@ -7,6 +7,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import pytest
 
 from shadowmap_dr import Renderer
 
@@ -65,3 +66,33 @@ def test_what_is_seen_of_a_veil_has_its_outline(variant: str) -> None:
     texture = {"type": "bitmap", "bitmap": mi.Bitmap(hole), "raw": True, "filter_type": "nearest"}
     _, other = image_and_derivative(scene(texture), "veil")
     assert np.abs(other - derivative).sum() < 0.02 * np.abs(derivative).sum()
+
+
+@pytest.mark.parametrize("first", ["front", "side"])
+def test_veils_that_border_on_what_is_opaque(variant: str, first: str) -> None:
+    """The opaque one ends at a corner beyond which a veil goes on, turned away: whichever comes first."""
+    T = mi.ScalarTransform4f
+    film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
+    red = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.9, 0.2, 0.1]}}}
+
+    def corner(side: Any) -> Any:
+        aside = T().translate([0.5, 0, -0.5]).rotate([0, 1, 0], 90).scale(0.5)
+        quads = {
+            "front": {"type": "rectangle", "to_world": T().scale(0.5), "bsdf": red},
+            "side": {"type": "rectangle", "to_world": aside, "bsdf": side},
+        }
+        order = [first, *(name for name in quads if name != first)]
+        look = T().look_at([-0.7, 0.1, 4], [0, 0, 0], [0, 1, 0])
+        parts = {
+            "camera": {"type": "perspective", "fov": 30, "to_world": look, "film": film},
+            **{name: quads[name] for name in order},
+            "floor": {"type": "rectangle", "to_world": T().translate([0, 0, -2]).scale(4)},
+            "sun": {"type": "directional", "direction": [0.1, 0.05, -1]},
+        }
+        return mi.load_dict({"type": "scene", **parts}, optimize=False)
+
+    expected, derivative = image_and_derivative(corner(red), "front")
+    found, other = image_and_derivative(corner({"type": "mask", "opacity": 1.0, "bsdf": red}), "front")
+    assert np.abs(derivative).sum() > 30
+    np.testing.assert_allclose(found, expected, atol=1e-3)
+    assert np.abs(other - derivative).sum() < 0.03 * np.abs(derivative).sum()

@@ -105,10 +105,11 @@ def check_resolution(resolution: tuple[int, int]) -> tuple[int, int]:
 
 def check_mesh(positions: Any, faces: Any, batch: int | None, check_indices: bool) -> tuple[Any, Any, int, int]:
     """Validate and flatten vertices and faces; returns (flat positions, flat faces, batch, vertices per image)."""
-    for name, array, kind in (("positions", positions, dr.VarType.Float32), ("faces", faces, None)):
-        known = dr.is_tensor_v(array) or dr.depth_v(array) == 1
-        if not known or not dr.is_jit_v(array) or dr.type_v(array) != (kind or dr.type_v(array)):
-            wanted = "single-precision" if kind else "integer"
+    for name, array in (("positions", positions), ("faces", faces)):
+        flat = dr.is_jit_v(array) and (dr.is_tensor_v(array) or dr.depth_v(array) == 1)
+        fits = flat and (dr.type_v(array) == dr.VarType.Float32 if name == "positions" else dr.is_integral_v(array))
+        if not fits:
+            wanted = "single-precision" if name == "positions" else "integer"
             raise ValueError(f"{name} are of type {type(array).__name__}; expected a Dr.Jit tensor or flat array, {wanted}")
     if dr.is_tensor_v(positions):
         shape = tuple(positions.shape)

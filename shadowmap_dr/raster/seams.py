@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 #: Stands for "no second face" in :attr:`Topology.opposite`.
 NO_VERTEX = 0xFFFFFFFF
-# Vertices of two shapes that are no farther apart than this part of their coordinates are at one place still, but for rounding.
-_ROUNDING = 1e-5
+# Vertices of two shapes are at one place still, but for rounding, up to this part of their coordinates, and of the edge's length.
+_ROUNDING, _SHORT = 1e-6, 1e-5
 
 
 @dataclass(frozen=True)
@@ -61,18 +61,24 @@ def parted(topology: Topology, points: Any, shapes: Any, hidden: Sequence[int] =
     index = dr.arange(UInt32, seams.count)
     mine, other, opposite, slots = (dr.gather(Array2u, a, index) for a in (seams.mine, seams.other, seams.opposite, seams.slots))
     points = Array3f(dr.detach(points))
+    here, there = ([dr.gather(Array3f, points, v) for v in side] for side in (mine, other))
+    least = _SHORT * dr.norm(here[1] - here[0])
     apart = module.Bool(False)
-    for a, b in zip(mine, other, strict=True):
-        p, q = (dr.gather(Array3f, points, v) for v in (a, b))
-        apart |= dr.max(dr.abs(p - q)) > _ROUNDING * dr.max(dr.abs(p))
+    for p, q in zip(here, there, strict=True):
+        apart |= dr.max(dr.abs(p - q)) > dr.fma(_ROUNDING, dr.max(dr.abs(p)), least)
     for shape in hidden:
         apart |= (dr.gather(UInt32, shapes, mine.x) == shape) | (dr.gather(UInt32, shapes, other.x) == shape)
     first = topology.count - 2 * seams.count + index
     edges, opposites, beyond = (UInt32(dr.copy(a)) for a in (topology.edges, topology.opposite, topology.beyond))
+    owners = topology.owners
+    if owners is not None:
+        owners = UInt32(dr.copy(owners))
+        one = dr.gather(Array2u, topology.owners, first)
+        dr.scatter(owners, dr.select(apart, one.x, one.y), 2 * first + 1)
     dr.scatter(opposites, Array2u(opposite.x, dr.select(apart, NO_VERTEX, opposite.y)), first)
     dr.scatter(edges, dr.select(apart, other, 0), first + seams.count)
     dr.scatter(opposites, Array2u(dr.select(apart, opposite.y, NO_VERTEX), NO_VERTEX), first + seams.count)
     for slot in slots:
         dr.scatter(beyond, UInt32(NO_VERTEX), slot, apart)
-    dr.eval(edges, opposites, beyond)
-    return replace(topology, edges=edges, opposite=opposites, beyond=beyond)
+    dr.eval(edges, opposites, beyond, owners)
+    return replace(topology, edges=edges, opposite=opposites, beyond=beyond, owners=owners)

@@ -142,11 +142,13 @@ def _walk(
 
         if topology.veils is not None:
             # What is seen through hides nothing: an edge of it counts where its own surface is seen beside it.
-            owner = dr.gather(UInt32, topology.owners, edge, ok)
             seen = dr.select(covers_here, here, neighbour)
-            own = ok & (seen != NO_TRIANGLE)
-            own &= dr.gather(UInt32, topology.parts, seen, own) == dr.gather(UInt32, topology.parts, owner, own)
-            ok &= own | ~dr.gather(module.Bool, topology.veils, owner, ok)
+            hit, counts = ok & (seen != NO_TRIANGLE), module.Bool(False)
+            part = dr.gather(UInt32, topology.parts, seen, hit)
+            for owner in dr.gather(module.Array2u, topology.owners, edge, ok):
+                counts |= hit & (part == dr.gather(UInt32, topology.parts, owner, hit))
+                counts |= ~dr.gather(module.Bool, topology.veils, owner, ok)
+            ok &= counts
 
         reach = dr.select(covers_here, t, 1 - t)
         key = (UInt64(dr.reinterpret_array(UInt32, reach)) << 32) | UInt64(~edge)

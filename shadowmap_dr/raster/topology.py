@@ -29,7 +29,7 @@ class Topology:
         vertex_count: how many vertices there are at least: one more than the largest index.
         seams: where shapes border on each other, or None if they do nowhere.
         veils: ``Bool`` (F,), faces that one may see through, or None if there are none. Where one does, their edges hide nothing.
-        owners: ``UInt32`` (E,) a face of each edge; None without ``veils``.
+        owners: ``UInt32`` (2 E,) faces of each edge, twice the same where they are of one shape; None without ``veils``.
     """
 
     edges: Any
@@ -69,8 +69,8 @@ def build_topology(
     Raises:
         ValueError: arrays of other shapes, no faces, an index out of range.
     """
-    faces = _in_threes("faces", np.asarray(faces)).astype(np.int64)
-    positions = np.ascontiguousarray(_in_threes("positions", np.asarray(positions, dtype=np.float32))) + np.float32(0)  # -0 -> 0
+    faces = _in_threes("faces", "F", np.asarray(faces)).astype(np.int64)
+    positions = np.ascontiguousarray(_in_threes("positions", "V", np.asarray(positions, np.float32))) + np.float32(0)  # -0 -> 0
     if faces.size == 0:
         raise ValueError("faces are empty; a topology needs at least one triangle")
     if faces.min() < 0 or faces.max() >= len(positions):
@@ -100,13 +100,14 @@ def build_topology(
     edges = np.concatenate([pair, alone, one])
     second = np.concatenate([opposite[partner], np.full(len(alone), NO_VERTEX), opposite[two]])
     ends, thirds = np.stack([a[edges], b[edges]], 1), np.stack([opposite[edges], second], 1)
-    seams, owner = None, np.concatenate([slot[edges], slot[two]]) // 3
+    seams, owner = None, np.stack([slot[edges], np.concatenate([slot[pair], slot[alone], slot[two]])], 1) // 3
     if len(one):
         other = np.stack([a[two], b[two]], 1)
         other = np.where((wa[one] == wa[two])[:, None], other, other[:, ::-1])
         seams = Seams.of(dtype, ends[-len(one) :], other, thirds[-len(one) :], np.stack([slot[one], slot[two]], 1))
         ends = np.concatenate([ends, np.zeros_like(other)])
         thirds = np.concatenate([thirds, np.full_like(other, NO_VERTEX)])
+        owner = np.concatenate([owner, np.stack([slot[two], slot[two]], 1) // 3])
     return Topology(
         device_array(dtype, ends),
         device_array(dtype, thirds),
@@ -120,10 +121,10 @@ def build_topology(
     )
 
 
-def _in_threes(name: str, values: np.ndarray) -> np.ndarray:
+def _in_threes(name: str, count: str, values: np.ndarray) -> np.ndarray:
     if (values.ndim == 2 and values.shape[1] == 3) or (values.ndim == 1 and values.size % 3 == 0):
         return values.reshape(-1, 3)
-    raise ValueError(f"{name} have shape {values.shape}; expected ({name[0].replace('p', 'v').upper()}, 3)")
+    raise ValueError(f"{name} have shape {values.shape}; expected ({count}, 3)")
 
 
 def _pairs(index: np.ndarray, key: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

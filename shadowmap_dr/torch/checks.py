@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from numbers import Integral, Real
 from types import ModuleType
 from typing import Any
 
@@ -55,9 +56,16 @@ def check_devices(**tensors: torch.Tensor) -> torch.device:
 
 def check_kind(name: str, value: Any, *kinds: type) -> None:
     """Refuse objects of other kinds than these."""
-    if not isinstance(value, kinds) or isinstance(value, bool):
+    if not isinstance(value, kinds):
         wanted = " or ".join(kind.__name__ for kind in kinds)
         raise ShadowmapError(f"{name}: {type(value).__name__}, but must be {wanted}.")
+
+
+def number_of(name: str, value: Any, kind: type[int] | type[float]) -> Any:
+    """A number, NumPy's too, as an int (of a whole one) or a float. Refuses all else."""
+    if not isinstance(value, Integral if kind is int else Real) or isinstance(value, bool):
+        raise ShadowmapError(f"{name}: {type(value).__name__}, but must be {kind.__name__}.")
+    return kind(value)
 
 
 def check_same(what: str, given: Any, expected: Any, hint: str) -> None:

@@ -15,7 +15,7 @@ from ..errors import ShadowmapError
 from ..renderer import Renderer as _Renderer
 from ..soft import SkyWatch, still_aimed
 from .bridge import attached, cross, drjit_turn, gradients, number, to_torch
-from .checks import check_devices, check_floats, check_kind
+from .checks import check_devices, check_floats, check_kind, number_of
 
 
 class Renderer:
@@ -38,6 +38,8 @@ class Renderer:
         """
         check_kind("renderer", renderer, _Renderer)
         self._renderer = replace(renderer)
+        # What calls with parameters take over from each other: extended lights as they have been divided, and where skies shone.
+        self._planned: dict[str, Any] = {}
         self._sky = SkyWatch(renderer.data.environments)
         self._variant = mi.variant()
         self._frozen = (dr.freeze(_forward), dr.freeze(_backward)) if frozen else None
@@ -91,27 +93,17 @@ class Renderer:
             check_kind(name, {} if value is None else value, Mapping)
         for name, value in (lights or {}).items():
             check_kind(f"lights['{name}']", value, Mapping)
-        check_kind("sensor", sensor, int)
-        check_kind("spp", spp, int, float)
+        sensor, spp = number_of("sensor", sensor, int), number_of("spp", spp, float)
         given = self._inputs(vertex_positions, lights, parameters)
         if not 0 <= sensor < len(self._renderer.data.sensors) or spp < 1:
             count = len(self._renderer.data.sensors)
-            raise ShadowmapError(f"sensor {sensor}, spp {spp}: there are {count} sensors, counted from 0; spp is 1 or more.")
+            raise ShadowmapError(f"sensor {sensor}, spp {spp:g}: there are {count} sensors, counted from 0; spp is 1 or more.")
         operation = _Rendering(self, tuple(given), sensor, spp)
         if given:
             return cross(operation, *given.values())[0]
         with drjit_turn(torch.device("cpu" if self._variant.startswith("llvm") else "cuda")):
             (image,) = operation.forward([], [])
             return to_torch(image, copy=False)
-
-    def _planned(self, renderer: _Renderer) -> _Renderer:
-        """The renderer, with extended lights divided anew where they have changed much since they were."""
-        data = renderer.data
-        with dr.suspend_grad():
-            if not self._sky.same(data.environments) or not still_aimed(renderer.soft, lambda: data.geometry):
-                renderer, self._sky = renderer.planned_anew(), SkyWatch(data.environments)
-                self._renderer.soft = renderer.soft
-        return renderer
 
     def _inputs(
         self,
@@ -171,8 +163,9 @@ class _Rendering:
 
     def __init__(self, owner: Renderer, places: tuple[_Place, ...], sensor: int, spp: int) -> None:
         self.owner, self.places, self.camera = owner, places, (sensor, spp)
-        changes_scene = any(place.kind == "parameter" for place in places)
-        self.functions = (_forward, _backward) if changes_scene or owner._frozen is None else owner._frozen
+        self.changes_scene = any(place.kind == "parameter" for place in places)
+        self.functions = (_forward, _backward) if self.changes_scene or owner._frozen is None else owner._frozen
+        self.sky = owner._sky
         # What the forward pass has decided and the backward pass takes up.
         self.fixed: dict[str, Any] = {}
 
@@ -183,7 +176,12 @@ class _Rendering:
             dr.eval(image, fit)
         self.arrays, self.wanted = arrays, wanted
         self.fixed = {"soft": renderer.soft, "frusta": fit[0], "soft_frusta": fit[1]}
-        self.owner._renderer.frusta, self.owner._renderer.soft_frusta = fit
+        # All at once, and only now that nothing can fail any more.
+        self.owner._renderer.frusta = fit[0]
+        if self.changes_scene:
+            self.owner._planned, self.owner._sky = {"soft": renderer.soft, "soft_frusta": fit[1]}, self.sky
+        else:
+            self.owner._renderer.soft_frusta = fit[1]
         return (image,)
 
     def backward(self, adjoints: Sequence[Any]) -> Sequence[Any]:
@@ -196,10 +194,10 @@ class _Rendering:
     def _scene(self, arrays: list[Any]) -> Iterator[_Renderer]:
         """The renderer for this call, while the scene has the parameters that it is to have."""
         # Fitting maps again to what they have been fitted to keeps them bit by bit, as the derivatives want it.
-        renderer = replace(self.owner._renderer, **self.fixed)
+        renderer = replace(self.owner._renderer, **(self.fixed or (self.owner._planned if self.changes_scene else {})))
         values = {place.name: array for place, array in zip(self.places, arrays, strict=True) if place.kind == "parameter"}
         if not values:
-            yield renderer if self.fixed else self.owner._planned(renderer)
+            yield renderer
             return
         table = mi.traverse(renderer.data.scene)
         # Copies: what the table returns changes with the scene.
@@ -207,9 +205,18 @@ class _Rendering:
         try:
             _set(table, {name: _converted(before[name], array) for name, array in values.items()})
             renderer = renderer.refresh()
-            yield renderer if self.fixed else self.owner._planned(renderer)
+            yield renderer if self.fixed else self._divided(renderer)
         finally:
             _set(table, before)
+
+    def _divided(self, renderer: _Renderer) -> _Renderer:
+        """The renderer, with extended lights divided anew where they have changed much since they were."""
+        data = renderer.data
+        with dr.suspend_grad():
+            if self.sky.same(data.environments) and still_aimed(renderer.soft, lambda: data.geometry):
+                return renderer
+            self.sky = SkyWatch(data.environments)
+            return renderer.planned_anew()
 
 
 def _set(table: Any, values: Mapping[str, Any]) -> None:

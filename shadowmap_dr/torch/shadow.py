@@ -15,7 +15,7 @@ from ..errors import ShadowmapError
 from ..raster._types import backend
 from ..shadow import Frusta, LightView, ShadowSettings, Views
 from .bridge import Repeated, cross, drjit_turn, index_array, vector
-from .checks import check_devices, check_floats, check_kind, check_same
+from .checks import check_devices, check_floats, check_kind, check_same, number_of
 from .raster import Topology
 
 # Spot lights with a wider cone (half-angle in degrees) use the faces of a cube.
@@ -160,7 +160,7 @@ def visibility(maps: ShadowMaps, points: torch.Tensor, light: int = 0) -> torch.
     """
     _check_maps(maps)
     check_floats("points", points, ("...", 3))
-    check_kind("light", light, int)
+    light = number_of("light", light, int)
     if not 0 <= light < len(maps.first):
         raise ShadowmapError(f"light: {light}, but there are {len(maps.first)} lights, counted from 0.")
     check_devices(points=points, maps=maps.values, axes=maps.axes)
@@ -194,7 +194,7 @@ def _checked(light: Light, number: int) -> dict[str, torch.Tensor]:
         if not bool(torch.isfinite(value).all()) or (name == "direction" and not bool(value.any())):
             raise ShadowmapError(f"lights[{number}].{name}: {value.tolist()}; give three finite numbers that make sense.")
     if isinstance(light, SpotLight):
-        check_kind(f"lights[{number}].cutoff_angle", light.cutoff_angle, int, float)
+        number_of(f"lights[{number}].cutoff_angle", light.cutoff_angle, float)
     if isinstance(light, SpotLight) and not 0 < light.cutoff_angle <= 180:
         raise ShadowmapError(f"lights[{number}].cutoff_angle: {light.cutoff_angle}; give degrees above 0, up to 180.")
     return tensors

@@ -34,6 +34,16 @@ def scene(opacity: Any = None) -> Any:
     return mi.load_dict({"type": "scene", **parts}, optimize=False)
 
 
+def quad(name: str, corners: list[list[float]], bsdf: dict[str, Any]) -> Any:
+    props = mi.Properties()
+    props["bsdf"] = mi.load_dict(bsdf)
+    mesh = mi.Mesh(name, 4, 2, props=props)
+    params = mi.traverse(mesh)
+    params["vertex_positions"], params["faces"] = np.ravel(corners).astype(np.float32), [0, 1, 2, 0, 2, 3]
+    params.update()
+    return mesh
+
+
 def image_and_derivative(made: Any, name: str) -> tuple[np.ndarray, np.ndarray]:
     """Of moving a shape to the right."""
     renderer = Renderer.from_scene(made, shadow_map_resolution=128)
@@ -76,10 +86,9 @@ def test_veils_that_border_on_what_is_opaque(variant: str, first: str) -> None:
     red = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.9, 0.2, 0.1]}}}
 
     def corner(side: Any) -> Any:
-        aside = T().translate([0.5, 0, -0.5]).rotate([0, 1, 0], 90).scale(0.5)
         quads = {
-            "front": {"type": "rectangle", "to_world": T().scale(0.5), "bsdf": red},
-            "side": {"type": "rectangle", "to_world": aside, "bsdf": side},
+            "front": quad("front", [[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]], red),
+            "side": quad("side", [[0.5, -0.5, 0], [0.5, -0.5, -1], [0.5, 0.5, -1], [0.5, 0.5, 0]], side),
         }
         order = [first, *(name for name in quads if name != first)]
         look = T().look_at([-0.7, 0.1, 4], [0, 0, 0], [0, 1, 0])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -142,8 +142,9 @@ class Renderer:
         # The first fit is made here, so that a step which is recorded later always starts from one.
         if data.sensors:
             with dr.suspend_grad():
-                views = [renderer._view(camera, geometry, 1) for camera in sample_windows(data.sensors[0])]
-                renderer._lighting(views, geometry, None)
+                seen, casting = renderer._topologies(geometry)
+                views = [renderer._view(camera, geometry, seen, 1) for camera in sample_windows(data.sensors[0])]
+                renderer._lighting(views, geometry, casting, None)
         return renderer
 
     def with_data(self, data: SceneData) -> Renderer:
@@ -189,8 +190,9 @@ class Renderer:
         windows = sample_windows(cameras)
         factor = sample_grid(spp, windows)
         margin = Margin.of(cameras, factor) if self.settings.antialias else Margin()
-        views = [self._view(margin.around(window), geometry, factor) for window in windows]
-        lighting = self._lighting(views, geometry, lights)
+        seen, casting = self._topologies(geometry)
+        views = [self._view(margin.around(window), geometry, seen, factor) for window in windows]
+        lighting = self._lighting(views, geometry, casting, lights)
         pictures = [margin.cut(self._camera_image(view, geometry, lighting, facets), factor) for view in views]
         return develop(pictures, windows[0], factor)
 
@@ -227,7 +229,9 @@ class Renderer:
             raise ShadowmapError(f"There is no sensor {sensor}: the scene has {len(self.data.sensors)}, counted from 0.")
         return self.data.sensors[sensor]
 
-    def _lighting(self, views: list[_View], geometry: Geometry, replacements: Mapping[str, Any] | None) -> _Lighting:
+    def _lighting(
+        self, views: list[_View], geometry: Geometry, topology: Topology, replacements: Mapping[str, Any] | None
+    ) -> _Lighting:
         """All lights and their shadow maps."""
         data, settings = self.data, self.settings
         lights, areas = self._replaced(data.lights, replacements), self._replaced(data.areas, replacements)
@@ -236,7 +240,7 @@ class Renderer:
         maps = soft_maps = None
         if settings.shadow.method != "none" and (lights or samples):
             transparent, seen = self._transparent(geometry, views[0].sensor), self._seen(views, geometry)
-            common = (geometry, self._topology(geometry))
+            common = (geometry, topology)
             if lights:
                 maps = make_maps(self.plan, lights, *common, settings.shadow, self.frusta, transparent, seen, self.outward)
                 self.frusta = maps.frusta
@@ -264,23 +268,27 @@ class Renderer:
 
         return transparent
 
-    def _view(self, sensor: Sensor, geometry: Geometry, factor: int) -> _View:
+    def _view(self, sensor: Sensor, geometry: Geometry, topology: Topology, factor: int) -> _View:
         clip = camera_clip(sensor, geometry)
-        hidden = [light.shape for light in self.data.areas] if self.settings.hide_emitters else []
-        if hidden:
-            clip = without_shapes(clip, geometry, hidden)
+        if self._hidden():
+            clip = without_shapes(clip, geometry, self._hidden())
         dr.eval(clip)
         size = (sensor.height * factor, sensor.width * factor)
         transparent = self._transparent(geometry, sensor)
         raster = visible_triangles(clip, geometry.faces, size, transparent=transparent)
-        return _View(sensor, factor, clip, raster, self._topology(geometry, hidden))
+        return _View(sensor, factor, clip, raster, topology)
 
-    def _topology(self, geometry: Geometry, hidden: Sequence[int] = ()) -> Topology:
-        """The topology of shapes where they are now, without those that are hidden."""
-        if geometry.as_loaded and geometry.positions is self.data.geometry.positions and not hidden:
-            return self.topology
+    def _hidden(self) -> list[int]:
+        """Shapes that cameras do not see."""
+        return [light.shape for light in self.data.areas] if self.settings.hide_emitters else []
+
+    def _topologies(self, geometry: Geometry) -> tuple[Topology, Topology]:
+        """The topology of shapes where they are now: of those that cameras see, and of those that cast shadows."""
+        casting, hidden, shape = self.topology, self._hidden(), geometry.vertex_shape
         points = dr.gather(mi.Point3f, dr.detach(geometry.positions), dr.arange(mi.UInt32, geometry.vertex_count))
-        return parted(self.topology, points, geometry.vertex_shape, hidden)
+        if not (geometry.as_loaded and geometry.positions is self.data.geometry.positions):
+            casting = parted(casting, points, shape)
+        return parted(self.topology, points, shape, hidden) if hidden else casting, casting
 
     def _surface(self, view: _View, geometry: Geometry, facets: Any, frames: bool) -> tuple[Surface, Any, Any]:
         """(what a camera sees, its depth as ``Hits.depth``, how much edges between facets still show or None for all)."""
@@ -304,7 +312,7 @@ class Renderer:
                 raise ShadowmapError(f"sensor {sensor} is no single camera whose film has a box filter: use another one.")
             geometry = self.data.geometry.in_packets()
             facets = None if self.flat is None else mean_normals(geometry, self.topology, self.flat)
-            view = self._view(windows[0], geometry, 1)
+            view = self._view(windows[0], geometry, self._topologies(geometry)[0], 1)
             seen, depth, sharpness = self._surface(view, geometry, facets, self.data.needs_frames)
             size, samples = (view.raster.width, view.raster.height), self.settings.look_ups(view.columns)
             points = footprint_points(windows[0], size, depth, seen.p_world, seen.n_world, samples)

@@ -9,6 +9,8 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
+from shadowmap_dr import Renderer
+
 SIZE = 64
 # Shadows a little softer than a pixel: images of this size would alias a sharper map, and so would their differences.
 SOFT = {"shadow_map_resolution": 64, "shadow_filter_size": 5}
@@ -85,3 +87,16 @@ def translated(base: Any, t: Any) -> Any:
 
 def scaled(base: Any, t: Any) -> Any:
     return mi.TensorXf(base.array * (1 + t), base.shape) if dr.is_tensor_v(base) else base * (1 + t)
+
+
+def image_and_derivative(
+    scene: Any, name: str, direction: tuple[float, float, float], start: float = 0.0, **options: Any
+) -> tuple[np.ndarray, np.ndarray]:
+    """An image with one shape moved by ``start`` along ``direction``, and its derivative with respect to moving it on."""
+    renderer = Renderer.from_scene(scene, **options)
+    x = mi.Float(start)
+    dr.enable_grad(x)
+    moved = renderer.data.geometry.shape_positions(name) + mi.Vector3f(*direction) * x
+    image = renderer.render(vertex_positions={name: moved})
+    dr.forward(x)
+    return np.array(image), np.array(dr.grad(image))

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from integrator_scenes import image_and_derivative
 
 from shadowmap_dr import Renderer
 from shadowmap_dr.raster import build_topology, parted
@@ -34,21 +35,14 @@ def place(x: float) -> Any:
     return mi.ScalarTransform4f().translate([x, 0.1, 0]).scale([0.8, 0.8, 1])
 
 
-def image_and_derivative(made: Any, name: str, gap: float, **options: Any) -> tuple[np.ndarray, np.ndarray]:
-    """With one square moved by ``gap``, and of moving it on."""
-    renderer = Renderer.from_scene(made, shadow_method="none", **options)
-    x = mi.Float(gap)
-    dr.enable_grad(x)
-    moved = renderer.data.geometry.shape_positions(name) + mi.Vector3f(1, 0, 0) * x
-    image = renderer.render(vertex_positions={name: moved})
-    dr.forward(x)
-    return np.array(image), np.array(dr.grad(image))
+def moved_right(made: Any, name: str, gap: float, **options: Any) -> tuple[np.ndarray, np.ndarray]:
+    return image_and_derivative(made, name, (1, 0, 0), gap, shadow_method="none", **options)
 
 
 def test_shapes_that_part(variant: str) -> None:
     """What they touched when the scene was loaded does not matter."""
-    expected, derivative = image_and_derivative(scene(GAP), "right", 0)
-    found, other = image_and_derivative(scene(0), "right", GAP)
+    expected, derivative = moved_right(scene(GAP), "right", 0)
+    found, other = moved_right(scene(0), "right", GAP)
     assert np.abs(derivative).sum() > 10
     np.testing.assert_allclose(found, expected, atol=1e-5)
     np.testing.assert_allclose(other, derivative, atol=1e-3 * np.abs(derivative).max())
@@ -56,12 +50,12 @@ def test_shapes_that_part(variant: str) -> None:
 
 def test_shapes_that_part_from_a_scene_with_gradients(variant: str) -> None:
     """That was loaded while a parameter of it carried some."""
-    expected, _ = image_and_derivative(scene(GAP), "right", 0)
+    expected, _ = moved_right(scene(GAP), "right", 0)
     made = scene(0)
     params = mi.traverse(made)
     dr.enable_grad(params["left.to_world"])
     params.update()
-    found, _ = image_and_derivative(made, "right", GAP)
+    found, _ = moved_right(made, "right", GAP)
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
@@ -83,8 +77,8 @@ def test_shapes_that_part_in_the_plug_in(variant: str, recorded: bool) -> None:
 def test_shapes_beside_hidden_lamps_end_there(variant: str, x: float) -> None:
     lamp = {"glow": {"type": "area", "radiance": {"type": "rgb", "value": 1.0}}}
     options = {"hide_emitters": True, "emitter_samples": 1}
-    expected, derivative = image_and_derivative(scene(5, x), "left", 0, **options)
-    found, other = image_and_derivative(scene(0, x, **lamp), "left", 0, **options)
+    expected, derivative = moved_right(scene(5, x), "left", 0, **options)
+    found, other = moved_right(scene(0, x, **lamp), "left", 0, **options)
     middle = slice(SIZE // 4, -SIZE // 4), slice(SIZE // 4, -SIZE // 4)
     assert np.abs(derivative[middle]).sum() > 10
     np.testing.assert_allclose(found[middle], expected[middle], atol=1e-5)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from integrator_scenes import image_and_derivative
 
 from shadowmap_dr import Renderer
 
@@ -30,29 +30,22 @@ def scene(unit: float = 1.0, zoom: Any = 1.0, **camera: Any) -> Any:
     })  # fmt: skip
 
 
-def image_and_derivative(made: Any, unit: float) -> tuple[np.ndarray, np.ndarray]:
-    """Of lifting the tile by one unit."""
-    renderer = Renderer.from_scene(made, shadow_map_resolution=128)
-    x = mi.Float(0)
-    dr.enable_grad(x)
-    lifted = renderer.data.geometry.shape_positions("tile") + mi.Vector3f(0, 0, unit) * x
-    image = renderer.render(vertex_positions={"tile": lifted})
-    dr.forward(x)
-    return np.array(image), np.array(dr.grad(image))
+def lifted(made: Any, unit: float) -> tuple[np.ndarray, np.ndarray]:
+    return image_and_derivative(made, "tile", (0, 0, unit), shadow_map_resolution=128)
 
 
 @pytest.mark.parametrize("unit", [0.01, 1000.0, 10_000.0])
 def test_units_do_not_matter(variant: str, unit: float) -> None:
     """Nor that the near plane, 0.01 from the camera, is then a millionth of the way to what it sees."""
-    expected, derivative = image_and_derivative(scene(), 1)
-    found, other = image_and_derivative(scene(unit), unit)
+    expected, derivative = lifted(scene(), 1)
+    found, other = lifted(scene(unit), unit)
     assert np.abs(found - expected).mean() < 2e-3 * expected.mean()
     assert np.abs(other - derivative).sum() < 0.03 * np.abs(derivative).sum()
 
 
 def test_the_near_plane_does_not_matter(variant: str) -> None:
-    expected, derivative = image_and_derivative(scene(near_clip=0.1), 1)
-    found, other = image_and_derivative(scene(near_clip=1e-5), 1)
+    expected, derivative = lifted(scene(near_clip=0.1), 1)
+    found, other = lifted(scene(near_clip=1e-5), 1)
     np.testing.assert_allclose(found, expected, atol=1e-4)
     assert np.abs(other - derivative).sum() < 0.01 * np.abs(derivative).sum()
 

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-
-from shadowmap_dr import Renderer
+from integrator_scenes import image_and_derivative
 
 SIZE = 64
 
@@ -44,37 +42,30 @@ def quad(name: str, corners: list[list[float]], bsdf: dict[str, Any]) -> Any:
     return mesh
 
 
-def image_and_derivative(made: Any, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Of moving a shape to the right."""
-    renderer = Renderer.from_scene(made, shadow_map_resolution=128)
-    x = mi.Float(0)
-    dr.enable_grad(x)
-    moved = renderer.data.geometry.shape_positions(name) + mi.Vector3f(1, 0, 0) * x
-    image = renderer.render(vertex_positions={name: moved})
-    dr.forward(x)
-    return np.array(image), np.array(dr.grad(image))
+def moved_right(made: Any, name: str) -> tuple[np.ndarray, np.ndarray]:
+    return image_and_derivative(made, name, (1, 0, 0), shadow_map_resolution=128)
 
 
 def test_what_is_not_seen_has_no_outline(variant: str) -> None:
-    expected, derivative = image_and_derivative(scene(), "card")
-    found, other = image_and_derivative(scene(0.0), "card")
+    expected, derivative = moved_right(scene(), "card")
+    found, other = moved_right(scene(0.0), "card")
     assert np.abs(derivative).sum() > 100
     # Shadow maps cover a little more.
     np.testing.assert_allclose(found, expected, atol=0.01)
     assert np.abs(other - derivative).sum() < 0.03 * np.abs(derivative).sum()
-    assert np.abs(image_and_derivative(scene(0.0), "veil")[1]).sum() < 0.01 * np.abs(derivative).sum()
+    assert np.abs(moved_right(scene(0.0), "veil")[1]).sum() < 0.01 * np.abs(derivative).sum()
 
 
 def test_what_is_seen_of_a_veil_has_its_outline(variant: str) -> None:
-    expected, derivative = image_and_derivative(scene("opaque"), "veil")
-    found, other = image_and_derivative(scene(1.0), "veil")
+    expected, derivative = moved_right(scene("opaque"), "veil")
+    found, other = moved_right(scene(1.0), "veil")
     np.testing.assert_allclose(found, expected, atol=1e-4)
     np.testing.assert_allclose(other, derivative, atol=1e-3 * np.abs(derivative).max())
     # Of a veil with a hole in the middle that shows the card, too.
     hole = np.ones((16, 16, 1), np.float32)
     hole[4:12, 4:12] = 0
     texture = {"type": "bitmap", "bitmap": mi.Bitmap(hole), "raw": True, "filter_type": "nearest"}
-    _, other = image_and_derivative(scene(texture), "veil")
+    _, other = moved_right(scene(texture), "veil")
     assert np.abs(other - derivative).sum() < 0.02 * np.abs(derivative).sum()
 
 
@@ -100,8 +91,8 @@ def test_veils_that_border_on_what_is_opaque(variant: str, first: str) -> None:
         }
         return mi.load_dict({"type": "scene", **parts}, optimize=False)
 
-    expected, derivative = image_and_derivative(corner(red), "front")
-    found, other = image_and_derivative(corner({"type": "mask", "opacity": 1.0, "bsdf": red}), "front")
+    expected, derivative = moved_right(corner(red), "front")
+    found, other = moved_right(corner({"type": "mask", "opacity": 1.0, "bsdf": red}), "front")
     assert np.abs(derivative).sum() > 30
     np.testing.assert_allclose(found, expected, atol=1e-3)
     assert np.abs(other - derivative).sum() < 0.03 * np.abs(derivative).sum()

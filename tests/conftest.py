@@ -12,7 +12,7 @@ import pytest
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import shadowmap_dr  # noqa: F401  (selects the LLVM library before mitsuba is imported)
+import quick_kernels  # noqa: F401  (selects the LLVM library before mitsuba is imported, and how it compiles)
 
 # isort: split
 import drjit as dr

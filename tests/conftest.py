@@ -12,7 +12,7 @@ import pytest
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import quick_kernels  # noqa: F401  (selects the LLVM library before mitsuba is imported, and how it compiles)
+import quick_kernels  # selects the LLVM library before mitsuba is imported, and how it compiles
 
 # isort: split
 import drjit as dr
@@ -24,6 +24,13 @@ def pytest_configure(config: pytest.Config) -> None:
     # forever when it reads or writes an EXR file.
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
     dr.set_thread_count(max(2, (os.cpu_count() or 1) // workers))
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_runtest_makereport() -> Iterator[None]:
+    report = (yield).get_result()
+    written = [(name, quick_kernels.without_messages(text)) for name, text in report.sections]
+    report.sections = [(name, text) for name, text in written if text]
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -2,7 +2,8 @@
 
 Kernels of tests are compiled without LLVM's optional passes: thousands of kernels that run once each, in 40 % of the time. What
 is tested is the code that Dr.Jit is given, which is the same. Processes that tests start (the command line, examples,
-tutorials) compile as users' do what no test has compiled yet; so do all tests with ``SHADOWMAP_TESTS_OPTIMIZE=1``.
+tutorials) compile as users' do what no test has compiled yet; so do all tests with ``SHADOWMAP_TESTS_OPTIMIZE=1``. With
+``pytest -s``, LLVM is seen to name each pass that it leaves out.
 """
 
 from __future__ import annotations
@@ -13,8 +14,8 @@ from pathlib import Path
 
 #: Dr.Jit finds kernels again by what they compute, however they were compiled: those of users are to stay quick to run.
 FOLDER = Path(__file__).parent.parent / ".pytest_cache" / "kernels"
-# Options of LLVM's own tools, which the library has, too. The second one keeps it from naming each pass that it leaves out.
-_OPTIONS = (b"-opt-bisect-limit=0", b"-opt-bisect-verbose=false")
+# An option of LLVM's own tools, which the library has, too.
+_NO_PASSES = b"-opt-bisect-limit=0"
 
 
 def _leave_out_passes() -> None:
@@ -24,8 +25,13 @@ def _leave_out_passes() -> None:
 
     library = _llvm.loaded_library()
     if library is not None and _llvm.loaded_version() is not None:
-        arguments = (ctypes.c_char_p * (1 + len(_OPTIONS)))(b"tests", *_OPTIONS)
+        arguments = (ctypes.c_char_p * 2)(b"tests", _NO_PASSES)
         ctypes.CDLL(library).LLVMParseCommandLineOptions(len(arguments), arguments, b"")
+
+
+def without_messages(output: str) -> str:
+    """What a test wrote, without what LLVM says of each pass that it leaves out."""
+    return "".join(line for line in output.splitlines(keepends=True) if not line.startswith("BISECT: "))
 
 
 if os.environ.get("SHADOWMAP_TESTS_OPTIMIZE", "0") == "0":

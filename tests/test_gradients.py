@@ -40,7 +40,7 @@ AT_ONE_SAMPLE = {
     "sun_cow": ("light_direction", "irradiance"),
     "spot_cow": ("spot_position", "spot_cone", "spot_beam", "spot_intensity", "texture"),
     "crossing_boxes": tuple(CASES_BY_NAME["crossing_boxes"].parameters),
-    "fine": ("caster_translation",),
+    "fine": ("caster_translation", "caster_scale", "camera_turn"),
 }
 # What four are enough for.
 AT_FOUR_SAMPLES = {

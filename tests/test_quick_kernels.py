@@ -10,7 +10,7 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 import pytest
-from quick_kernels import FOLDER
+from quick_kernels import FOLDER, without_messages
 
 
 @pytest.mark.skipif(os.environ.get("SHADOWMAP_TESTS_OPTIMIZE", "0") != "0", reason="kernels are users' by wish")
@@ -25,3 +25,8 @@ def test_kernels_of_tests_have_a_folder_of_their_own(tmp_path: Path) -> None:
     code = "import shadowmap_dr, drjit as dr, mitsuba as mi; mi.set_variant('llvm_ad_rgb'); dr.eval(mi.Float(1, 2) * 2)"
     subprocess.run([sys.executable, "-c", code], check=True, env={**os.environ, "HOME": str(tmp_path)})
     assert not list(tmp_path.rglob("*.bin"))
+
+
+def test_what_llvm_says_of_passes_is_not_a_tests_output() -> None:
+    said = "BISECT: NOT running pass (7) Stack Slot Coloring on function (drjit_0)\n"
+    assert without_messages(said + "one\n" + said + "two BISECT: \n") == "one\ntwo BISECT: \n"

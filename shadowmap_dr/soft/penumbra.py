@@ -89,7 +89,7 @@ def penumbra_visibility(pyramid: Pyramid, which: Any, radius: Any, p_world: Any,
         lit = chebyshev_visibility(moments, depth)
         return dr.select(moments.x < depth, mi.Vector2f(1 - lit, moments.x - lit * depth), 0)
 
-    blocked, depths = sum_over(occluders, _TAPS, start, attached_arrays(inputs), [], len(attached_arrays(lanes)))
+    blocked, depths = sum_over(occluders, _TAPS, start, attached_arrays(inputs), [], len(attached_arrays(lanes)), active)
     some = blocked > 1e-4
     mean = dr.select(some, depths / dr.select(some, blocked, 1), -0.5)
     dr.eval(mean, some)
@@ -103,7 +103,7 @@ def penumbra_visibility(pyramid: Pyramid, which: Any, radius: Any, p_world: Any,
         moments, depth = at.look_up(pyramid, which, index, at.footprint(radius, dr.maximum(nearer, at.nearest)))
         return mi.Vector2f(chebyshev_visibility(moments, depth), 0)
 
-    total, _ = sum_over(passing, _TAPS, start, attached_arrays(found), [], len(attached_arrays(lanes)))
+    total, _ = sum_over(passing, _TAPS, start, attached_arrays(found), [], len(attached_arrays(lanes)), active)
     return dr.select(mi.Bool(active) & some, total * (1 / _TAPS), 1)
 
 

@@ -49,7 +49,7 @@ def soft_light(
 
     start = dr.zeros(mi.UnpolarizedSpectrum, dr.width(seen.shape))
     lanes = len(attached_arrays(seen))
-    light = sum_over(one_sample, samples.count, start, attached_arrays(inputs), _attached_parameters(bsdfs), lanes)
+    light = sum_over(one_sample, samples.count, start, attached_arrays(inputs), _attached_parameters(bsdfs), lanes, seen.active)
     if maps is None or plan.kind != "single":
         return light
     radius = samples.radius_towards(seen.p_world)

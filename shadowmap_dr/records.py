@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from itertools import count
 from typing import Any
@@ -23,12 +24,16 @@ def map_arrays(value: Any, function: Callable[[Any], Any]) -> Any:
         matrix = function(value.matrix)
         return value if matrix is value.matrix else mi.Transform4f(mi.Matrix4f(matrix))
     if isinstance(value, tuple | list):
-        return type(value)(map_arrays(item, function) for item in value)
+        return type(value)([map_arrays(item, function) for item in value])
     if isinstance(value, dict):
         return {key: map_arrays(item, function) for key, item in value.items()}
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = {field.name: map_arrays(getattr(value, field.name), function) for field in dataclasses.fields(value)}
-        return dataclasses.replace(value, **fields)
+    fields = _fields(type(value))
+    if fields is not None:
+        old = [getattr(value, name) for name in fields]
+        new = [map_arrays(item, function) for item in old]
+        if all(a is b for a, b in zip(old, new, strict=True)):
+            return value
+        return dataclasses.replace(value, **dict(zip(fields, new, strict=True)))
     names = getattr(type(value), "DRJIT_STRUCT", None)
     if names is None:
         return value
@@ -37,6 +42,12 @@ def map_arrays(value: Any, function: Callable[[Any], Any]) -> Any:
     for name in names:
         setattr(changed, name, map_arrays(getattr(value, name), function))
     return changed
+
+
+@functools.cache
+def _fields(kind: type) -> tuple[str, ...] | None:
+    """Names of the fields of a dataclass, None for other classes. Asked for again and again, at every step of an optimisation."""
+    return tuple(field.name for field in dataclasses.fields(kind)) if dataclasses.is_dataclass(kind) else None
 
 
 def attached_arrays(record: Any) -> list[Any]:

@@ -16,11 +16,11 @@ def parameters(node: Any) -> dict[str, Any]:
 
     Those without a value are left out: a ``hair`` material has some, and Mitsuba 3.9 raises a TypeError when one asks for them.
     """
-    table = mi.traverse(node)
     found = {}
-    for key in table.keys():
+    # Without the indexing of `mi.SceneParameters`, which takes as long again to remember what was asked for.
+    for name, (value, kind, owner, _) in mi.traverse(node).properties.items():
         with suppress(TypeError):
-            found[key] = table[key]
+            found[name] = value if kind is None else mi.get_property(value, kind, owner)
     return found
 
 

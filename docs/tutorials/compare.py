@@ -36,6 +36,9 @@ TURN = 2.0
 WARM_UP = 2
 # Ours: the faster loop, the loop of all integrators with the plug-in's parameter `recorded`, and without.
 METHODS = ("shadowmap, frozen", "shadowmap, recorded", "shadowmap", "direct_projective")
+# The second and the third where the notebook's batch sensor shows all views together. Mitsuba's projective integrators cannot
+# look through one.
+ONE_CALL = ("shadowmap, recorded, one call", "shadowmap, one call")
 # sppc, sppp, sppi, samples of the image in the loss, and the guiding if there is any.
 Counts: TypeAlias = tuple[int, int, int, int] | tuple[int, int, int, int, str]
 
@@ -182,21 +185,23 @@ def race(
     """All methods in turns, from the same start until each has solved the problem or has used up its steps."""
     names = load(name, fair[3], **parameters)
     ours, theirs = names["integrator"], projective(fair)
+    methods = (*(ONE_CALL if "together" in names else ()), *METHODS)
 
     def start(method: str, steps: int) -> Iterator[Any]:
         if method == "direct_projective":
             return names["optimise"](theirs, steps)
         if method == "shadowmap, frozen":
             return names["optimise_frozen"](ours, steps)
-        return names["optimise"]({**ours, "recorded": method == "shadowmap, recorded"}, steps)
+        views = {"views": names["together"]} if method in ONE_CALL else {}
+        return names["optimise"]({**ours, "recorded": "recorded" in method}, steps, **views)
 
-    traces = {method: Trace() for method in METHODS}
+    traces = {method: Trace() for method in methods}
     other = timing.OtherWork()
     with timing.quiet_garbage():
-        for method in METHODS:  # compiles kernels
+        for method in methods:  # compiles kernels
             for _ in islice(start(method, WARM_UP), WARM_UP):
                 on_step(f"{method}: warm-up")
-        running = {method: start(method, problem.steps) for method in METHODS}
+        running = {method: start(method, problem.steps) for method in methods}
         while running:
             for method in list(running):
                 trace, began = traces[method], sum(traces[method].seconds)
@@ -210,7 +215,7 @@ def race(
     for method, trace in traces.items():
         records[method] |= {"errors": trace.errors, "seconds_of_steps": trace.seconds}
     taken = {method: entry["seconds"] for method, entry in records.items()}
-    ratios = {m: taken["direct_projective"] / taken[m] for m in METHODS[:-1] if taken["direct_projective"] and taken[m]}
+    ratios = {m: taken["direct_projective"] / taken[m] for m in methods[:-1] if taken["direct_projective"] and taken[m]}
     return {
         "bar": dict(problem.bar), "counts": list(fair), "integrator": ours, "methods": records, "times_faster": ratios,
         "load": timing.load(), "cores_of_others": other.cores(), "machine": timing.machine(),
@@ -225,15 +230,18 @@ def plot(path: Path, records: Mapping[str, Any]) -> None:
     from matplotlib import pyplot
 
     shown = {name: record["race"] for name, record in records.items() if "race" in record}
-    figure, axes = pyplot.subplots(1, len(shown), figsize=(4 * len(shown), 3.2), squeeze=False)
+    figure, axes = pyplot.subplots(1, len(shown), figsize=(4 * len(shown), 3.5), squeeze=False)
+    colours = {method: f"C{k}" for k, method in enumerate((*METHODS, *ONE_CALL))}
+    handles: dict[str, Any] = {}
     for axis, (name, result) in zip(axes[0], shown.items(), strict=True):
         measure, bar = next(iter(result["bar"].items()))
         for method, entry in result["methods"].items():
-            axis.loglog(np.cumsum(entry["seconds_of_steps"]), [e[measure] for e in entry["errors"]], label=method)
+            seconds, errors = np.cumsum(entry["seconds_of_steps"]), [e[measure] for e in entry["errors"]]
+            handles[method] = axis.loglog(seconds, errors, color=colours[method])[0]
         axis.axhline(bar, color="gray", linewidth=0.8, linestyle=":")
         axis.set(title=name, xlabel="seconds", ylabel=measure)
-    axes[0, 0].legend(fontsize="small")
-    figure.tight_layout()
+    figure.tight_layout(rect=(0, 0.1, 1, 1))
+    figure.legend(handles.values(), handles.keys(), loc="lower center", ncols=len(handles), fontsize="small", frameon=False)
     with atomic(path) as temporary:
         figure.savefig(temporary, dpi=90)
     pyplot.close(figure)

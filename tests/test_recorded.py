@@ -70,6 +70,38 @@ def test_steps_are_replayed(variant: str, monkeypatch: pytest.MonkeyPatch) -> No
         step(scene, recorded, VERTICES, vertices + 0.05)
 
 
+def test_views_in_one_call(variant: str) -> None:
+    """Through a batch sensor: the images, and the derivatives of their sum, of its cameras one by one, under the sky and the sun.
+
+    But for the fit of the maps, which is one for all that the cameras see.
+    """
+    aside = {**camera(), "to_world": mi.ScalarTransform4f().look_at([3, -3, 2.2], [0, 0, 0.5], [0, 0, 1])}
+    film = {**camera()["film"], "width": 128, "height": 64}
+    views = {"type": "batch", "film": film, "a": camera(), "b": aside}
+    sky = {"type": "constant", "radiance": {"type": "rgb", "value": 0.5}}
+    scene = small_scene(aside=aside, views=views, sky=sky)
+    vertices = mi.Float(dr.detach(mi.traverse(scene)[VERTICES]))
+    together = shadowmap(recorded=True, environment_samples=8)
+    weight = np.random.default_rng(1).uniform(0, 1, (64, 128, 3)).astype(np.float32)
+    for by in (0.0, 0.02, 0.05):
+        found = []
+        for integrator, sensors in ((shadowmap(environment_samples=8), (0, 1)), (together, (2,))):
+            params = mi.traverse(scene)
+            moved = mi.Float(vertices + by)
+            dr.enable_grad(moved)
+            params[VERTICES] = moved
+            params.update()
+            images = [mi.render(scene, params, sensor=sensor, integrator=integrator) for sensor in sensors]
+            image = dr.concat(images, axis=1)
+            dr.backward(dr.sum(image * mi.TensorXf(weight), axis=None))
+            found.append((image.numpy(), dr.grad(moved).numpy()))
+        (image, gradient), (one_image, one_gradient) = found
+        assert np.abs(one_image - image).mean() < 2e-3 * image.mean()
+        length = np.linalg.norm(gradient)
+        assert gradient @ one_gradient > 0.99 * length * np.linalg.norm(one_gradient)
+        assert np.linalg.norm(one_gradient) == pytest.approx(length, rel=0.02)
+
+
 def test_gradients_may_lie_anywhere(variant: str) -> None:
     """Dr.Jit borrows NumPy's memory, and would record anew for other alignments."""
     scene, (_, recorded) = small_scene(), both()

@@ -102,6 +102,8 @@ SOFT_CASES = (
         **CASTER, **RECEIVER, **CAMERA,
         "sky_turn": Parameter("sky.to_world", swung((0, 1, 0)), 0.03),
         "sky_pixels": Parameter("sky.data", lightened(2, 6, 8, 13), 0.3)}, OPTIONS),
+    # Against all directions at once, each of whose shadows has an edge, a floor moves: enough directions for edges to overlap.
+    Case("sky_floor", lambda: under(None, sky=sky_map()), RECEIVER, {"environment_samples": 512}, 4),
 )  # fmt: skip
 
 # Compared with stored path-traced differences.
@@ -113,4 +115,5 @@ SOFT_TRACED = {
     "shaded_lamp": ("plate_shift",),
     "constant_box": ("floor_height", "caster_translation"),
     "sky_box": ("caster_translation", "sky_turn", "sky_pixels", "camera_shift"),
+    "sky_floor": ("floor_height",),
 }

@@ -382,9 +382,9 @@ class Renderer:
         color = dr.zeros(mi.UnpolarizedSpectrum, dr.width(seen.shape))
         for light, fraction in zip(lighting.lights, visible, strict=True):
             color += direct_light(seen, light, fraction, gate=not compat)
-        bsdfs = [source.shape.bsdf() for source in self.data.sources]
+        nodes = [*(source.shape.bsdf() for source in self.data.sources), *self.data.with_attributes()]
         for plan, samples in zip(self.soft, lighting.samples, strict=True):
-            color += soft_light(seen, plan, samples, lighting.soft_maps, bsdfs, gate=not compat)
+            color += soft_light(seen, plan, samples, lighting.soft_maps, nodes, gate=not compat)
         for uniform in self._uniform_ambient():
             color += ambient_light(seen, uniform, _AMBIENT_DIRECTIONS)
         if not self.settings.hide_emitters:

@@ -57,6 +57,10 @@ class SceneData:
         known = ", ".join(repr(light.name) for light in lights) or "none"
         raise ShadowmapError(f"There is no light '{name}' in the scene; its lights: {known}.")
 
+    def with_attributes(self) -> list[Any]:
+        """Mitsuba's meshes that have attributes, such as colours of vertices, which materials may read."""
+        return [source.shape for source, info in zip(self.sources, self.geometry.shapes, strict=True) if info.reads_attributes]
+
     def curve_vertices(self, name: str, control_points: Any) -> Any:
         """See :meth:`shadowmap_dr.Renderer.curve_vertices`."""
         index = [info.name for info in self.geometry.shapes].index(self.geometry.shape(name).name)

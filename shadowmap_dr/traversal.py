@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import suppress
 from typing import Any
 
 import drjit as dr
@@ -14,14 +13,12 @@ import numpy as np
 def parameters(node: Any) -> dict[str, Any]:
     """Current (possibly AD-attached) parameters of a Mitsuba object and its children, by their relative names.
 
-    Those without a value are left out: a ``hair`` material has some, and Mitsuba 3.9 raises a TypeError when one asks for them.
+    Those without a value are left out: a ``hair`` material has some.
     """
-    found = {}
     # Without the indexing of `mi.SceneParameters`, which takes as long again to remember what was asked for.
-    for name, (value, kind, owner, _) in mi.traverse(node).properties.items():
-        with suppress(TypeError):
-            found[name] = value if kind is None else mi.get_property(value, kind, owner)
-    return found
+    properties = mi.traverse(node).properties.items()
+    found = {name: value if kind is None else mi.get_property(value, kind, owner) for name, (value, kind, owner, _) in properties}
+    return {name: value for name, value in found.items() if value is not None}
 
 
 def children(node: Any) -> list[tuple[str, Any]]:

@@ -185,6 +185,20 @@ def test_other_sizes_are_recorded_anew(variant: str) -> None:
     assert_same(expected, found)
 
 
+def test_a_sky_of_another_resolution_is_recorded_anew(variant: str) -> None:
+    """Mitsuba keeps the resolution where Dr.Jit does not see it."""
+    rng = np.random.default_rng(5)
+    sky = {"type": "envmap", "bitmap": mi.Bitmap(rng.uniform(0.1, 2, (8, 17, 3)).astype(np.float32))}
+    scene = small_scene(light=sky)
+    params = mi.traverse(scene)
+    plain, recorded = both(**FEW)
+    for rows in (8, 8, 16, 16, 32, 8, 16):
+        params["light.data"] = mi.TensorXf(1 + 0.3 * rng.uniform(0, 1, (rows, 2 * rows + 1, 3)).astype(np.float32))
+        params.update()
+        images = [mi.render(scene, integrator=one).numpy() for one in (plain, recorded)]
+        np.testing.assert_allclose(*images, atol=1e-5)
+
+
 def test_other_scenes_come_and_go(variant: str) -> None:
     """Mitsuba's objects have numbers, which recordings may have seen."""
     plain, recorded = both()

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 from gradients import scenes, soft_cases
-from gradients.changes import moved, translated
+from gradients.changes import brighter, moved, translated
 from gradients.model import Case, Model, Parameter
 
 from mitsuba_baselines import derivatives
@@ -78,3 +80,45 @@ def test_several_at_once(variant: str) -> None:
     for name, parameter in together.case.parameters.items():
         alone = model(ROUGH, soft_cases.panel(), {name: parameter})
         assert alone.gradients(weight)[name] == pytest.approx(gradients[name], rel=1e-3, abs=1e-4)
+
+
+def plain_floor() -> dict[str, Any]:
+    return {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.5, 0.4, 0.3]}}
+
+
+@pytest.mark.parametrize("moves", ["colours alone", "with the caster"])
+@pytest.mark.parametrize("light", LIGHTS)
+def test_plain_colours(variant: str, light: str, moves: str) -> None:
+    """Where nothing else is in the scene, the colours of all shapes lie in one table, which is not as wide as the image."""
+    colours = {
+        "floor": Parameter("floor.bsdf.reflectance.value", brighter, 0.05),
+        "box": Parameter("object.bsdf.reflectance.value", brighter, 0.05),
+    }
+    parameters = colours if moves == "colours alone" else {**colours, **CASTER}
+    assert_right(model(plain_floor(), LIGHTS[light](), parameters, plain_floor()))
+
+
+@pytest.mark.parametrize("recorded", [False, True])
+@pytest.mark.parametrize("light", LIGHTS)
+def test_colours_of_vertices_alone(variant: str, light: str, recorded: bool) -> None:
+    """They belong to the shape, not to its material."""
+    box = {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_color"}}
+    scene = scenes.scene(32, floor=scenes.floor(plain_floor()), light=LIGHTS[light](), object=scenes.box(box))
+    shape = next(shape for shape in scene.shapes() if shape.id() == "object")
+    colours = np.random.default_rng(0).uniform(0.2, 0.9, 3 * shape.vertex_count())
+    shape.add_attribute("vertex_color", 3, colours.tolist())
+    params = mi.traverse(scene)
+    integrator = mi.load_dict({"type": "shadowmap", "recorded": recorded, **OPTIONS})
+
+    def brightness(by: float, attached: bool = False) -> Any:
+        values = mi.Float(colours + by)
+        if attached:
+            dr.enable_grad(values)
+        params["object.vertex_color"] = values
+        params.update()
+        return dr.sum(mi.render(scene, params, integrator=integrator), axis=None)
+
+    dr.backward(brightness(0, True))
+    total = float(dr.grad(params["object.vertex_color"]).numpy().sum())
+    difference = float((brightness(0.05).array[0] - brightness(-0.05).array[0]) / 0.1)
+    assert difference > 1 and total == pytest.approx(difference, rel=1e-3)

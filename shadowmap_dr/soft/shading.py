@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -23,20 +24,24 @@ def soft_light(
     plan: SoftPlan,
     samples: LightSamples,
     maps: SoftMaps | None,
-    bsdfs: Sequence[Any],
+    nodes: Sequence[Any],
     *,
     gate: bool = True,
 ) -> Any:
     """Radiance (colour, P) towards the camera of one extended light.
 
-    ``maps`` None: unshadowed. ``bsdfs``: all that ``seen`` may call. ``gate``: see :func:`shadowmap_dr.shading.direct_light`.
+    ``maps`` None: unshadowed. ``nodes``: all BSDFs that ``seen`` may call, and shapes whose
+    attributes these read. ``gate``: see :func:`shadowmap_dr.shading.direct_light`.
     Gradients flow to all of surface, samples, maps and BSDFs.
     """
     sampled = None if maps is None or plan.kind == "single" else maps.sampled
-    inputs = (seen, samples.table(), sampled)
+    # The colours of plain shapes are no lane's own: all gather from them.
+    own = replace(seen, plain=None)
+    inputs = (own, seen.plain, samples.table(), sampled)
 
     def one_sample(index: Any, arrays: list[Any]) -> Any:
-        seen, table, maps = with_arrays(inputs, arrays)
+        seen, plain, table, maps = with_arrays(inputs, arrays)
+        seen = replace(seen, plain=plain)
         wo_world, weight = table.illuminate(index, seen.p_world)
         wo = seen.si.to_local(wo_world)
         active = seen.active & (dr.max(dr.detach(weight)) > 0)
@@ -48,17 +53,17 @@ def soft_light(
         return dr.select(active, value, 0)
 
     start = dr.zeros(mi.UnpolarizedSpectrum, dr.width(seen.shape))
-    lanes = len(attached_arrays(seen))
-    light = sum_over(one_sample, samples.count, start, attached_arrays(inputs), _attached_parameters(bsdfs), lanes, seen.active)
+    lanes = len(attached_arrays(own))
+    light = sum_over(one_sample, samples.count, start, attached_arrays(inputs), _attached_parameters(nodes), lanes, seen.active)
     if maps is None or plan.kind != "single":
         return light
     radius = samples.radius_towards(seen.p_world)
     return light * penumbra_visibility(maps.single, mi.UInt32(plan.first), radius, seen.p_world, seen.n_world, seen.active)
 
 
-def _attached_parameters(bsdfs: Sequence[Any]) -> list[Any]:
-    """What BSDFs hold that gradients may flow to."""
+def _attached_parameters(nodes: Sequence[Any]) -> list[Any]:
+    """What objects of Mitsuba's hold that gradients may flow to."""
     found = []
-    for bsdf in dict.fromkeys(bsdfs):
-        found += [v for v in parameters(bsdf).values() if dr.is_array_v(v) and dr.is_float_v(v) and dr.grad_enabled(v)]
+    for node in dict.fromkeys(nodes):
+        found += [v for v in parameters(node).values() if dr.is_array_v(v) and dr.is_float_v(v) and dr.grad_enabled(v)]
     return found

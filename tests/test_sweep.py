@@ -9,6 +9,8 @@ import subprocess
 import sys
 import time
 from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +19,9 @@ import numpy as np
 import pytest
 from fake_problems import BlobPoses, Bowls
 
-from shadowmap_dr.errors import ShadowmapError
+from shadowmap_dr.errors import OutputError, ShadowmapError
 from shadowmap_dr.inverse import run_sweep
+from shadowmap_dr.inverse.workshop import stem
 
 TESTS = Path(__file__).parent
 
@@ -57,16 +60,79 @@ def test_batches_have_files_and_their_size_does_not_matter(tmp_path: Path) -> No
 def test_only_runs_that_are_missing_are_done_again(tmp_path: Path) -> None:
     log = tmp_path / "log"
     first = run_sweep([Bowls(4, size=2, log=folder(log))], tmp_path)["bowls"]
-    (tmp_path / "batches" / "bowls-000002-000003.json").write_text("broken")
+    (path,) = (tmp_path / "batches").glob("bowls-*-000002-000003.json")
+    path.write_text("broken")
     # Two more runs, and batches of another size.
     again = run_sweep([Bowls(6, size=4, log=str(log))], tmp_path, resume=True)["bowls"]
     assert begun(log) == {"0-1": 1, "2-3": 1, "2-5": 1}
     assert again[:2] == first[:2] and len(again) == 6
-    # Other settings, or no wish to resume: all of them.
+    # Other settings: all of them, and what there is stays.
     run_sweep([Bowls(2, steps=41, log=str(log))], tmp_path, resume=True)
+    assert begun(log)["0-1"] == 2
+    assert run_sweep([Bowls(6, log=str(log))], tmp_path, resume=True)["bowls"] == again
+    assert begun(log) == {"0-1": 2, "2-3": 1, "2-5": 1}
+    # No wish to resume: all of them, and what there was with these settings goes.
     run_sweep([Bowls(2, log=str(log))], tmp_path)
     assert begun(log)["0-1"] == 3
-    assert len(list((tmp_path / "batches").iterdir())) == 1
+    assert len(list((tmp_path / "batches").iterdir())) == 2
+
+
+def test_records_of_another_variant_are_not_taken(tmp_path: Path) -> None:
+    log = folder(tmp_path / "log")
+    for variant in ("llvm_ad_mono", "llvm_ad_rgb", "llvm_ad_mono"):
+        (record,) = run_sweep([Bowls(1, log=log)], tmp_path, variant=variant, resume=True)["bowls"]
+        assert record["variant"] == variant
+    assert begun(Path(log)) == {"0-0": 2}
+
+
+def test_a_batch_that_fails_leaves_the_others(tmp_path: Path) -> None:
+    log = folder(tmp_path / "log")
+    with pytest.raises(ValueError, match="run 2 fails"):
+        run_sweep([Bowls(6, log=log, fails=2)], tmp_path)
+    assert begun(Path(log)) == {"0-1": 1, "2-3": 1, "4-5": 1}
+    run_sweep([Bowls(6, log=log)], tmp_path, resume=True)
+    assert begun(Path(log)) == {"0-1": 1, "2-3": 2, "4-5": 1}
+
+
+def test_a_full_disk_ends_the_sweep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    log = folder(tmp_path / "log")
+
+    def full(*_: Any, **__: Any) -> None:
+        raise OutputError("cannot write a checkpoint: No space left on device.")
+
+    monkeypatch.setattr("shadowmap_dr.inverse.loop._save", full)
+    with pytest.raises(OutputError, match="No space left"):
+        run_sweep([Bowls(6, log=log)], tmp_path)
+    assert begun(Path(log)) == {"0-1": 1}
+
+
+def test_checkpoints_stay_until_the_result_is_on_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: Any) -> None:
+        raise OutputError("cannot write the result")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("shadowmap_dr.report.write_json", full)
+        with pytest.raises(OutputError):
+            run_sweep([BlobPoses(1)], tmp_path)
+    (path,) = (tmp_path / "batches").iterdir()
+    assert path.name.endswith(".checkpoint-run0.npz")
+    run_sweep([BlobPoses(1)], tmp_path, resume=True)
+    (path,) = (tmp_path / "batches").iterdir()
+    assert path.suffix == ".json"
+
+
+def test_settings_may_be_paths(tmp_path: Path) -> None:
+    assert solved(run_sweep([Placed(2, steps=80)], tmp_path)["bowls"])
+
+
+@dataclass(frozen=True)
+class Placed(Bowls):
+    """A problem with a setting that JSON does not know."""
+
+    place: Path = Path("somewhere")
+
+    def settings(self) -> dict[str, Any]:
+        return {**super().settings(), "place": self.place}
 
 
 def test_a_batch_goes_on_from_its_checkpoint(tmp_path: Path) -> None:
@@ -86,12 +152,13 @@ def test_a_batch_goes_on_from_its_checkpoint(tmp_path: Path) -> None:
 def test_what_is_not_resumed_begins_anew_and_leaves_others_alone(tmp_path: Path) -> None:
     batches = tmp_path / "batches"
     batches.mkdir()
-    own = [batches / f"poses-000000-000000.{ending}" for ending in ("checkpoint.npz", "checkpoint-run0.npz")]
+    mine = stem(BlobPoses(1), "llvm_ad_rgb")
+    own = [batches / f"{mine}-000000-000000.{ending}" for ending in ("checkpoint.npz", "checkpoint-run0.npz")]
     others = [batches / "poses-more-000000-000001.checkpoint.npz", batches / "poses-more-000000-000000.json"]
     for path in (*own, *others):
         path.write_bytes(b"not a checkpoint")
     run_sweep([BlobPoses(1)], tmp_path)  # would refuse to go on from what it cannot read
-    assert sorted(batches.iterdir()) == sorted([*others, batches / "poses-000000-000000.json"])
+    assert sorted(batches.iterdir()) == sorted([*others, batches / f"{mine}-000000-000000.json"])
 
 
 def test_pose_estimation_is_a_sweep(tmp_path: Path) -> None:
@@ -113,14 +180,14 @@ def test_a_killed_sweep_goes_on(tmp_path: Path) -> None:
     process = subprocess.Popen([sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": path}, stderr=subprocess.DEVNULL)
     try:
         for _ in range(600):
-            if (tmp_path / "batches" / "bowls-000000-000001.json").exists():
+            if list((tmp_path / "batches").glob("bowls-*-000000-000001.json")):
                 break
             assert process.poll() is None
             time.sleep(0.1)
     finally:
         process.send_signal(signal.SIGKILL)
         process.wait()
-    assert not (tmp_path / "batches" / "bowls-000004-000005.json").exists()
+    assert not list((tmp_path / "batches").glob("bowls-*-000004-000005.json"))
     found = run_sweep([Bowls(6, log=log)], tmp_path, resume=True)["bowls"]
     assert len(found) == 6 and begun(Path(log))["0-1"] == 1 and begun(Path(log))["4-5"] == 1
 
@@ -154,8 +221,39 @@ def test_workers_of_a_scheduler_elsewhere(tmp_path: Path) -> None:
     assert len(found) == 4 and begun(Path(log)) == {"0-1": 1, "2-3": 2}
 
 
+def test_two_sweeps_share_a_cluster(tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed")
+    with (
+        distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None, memory_limit=0) as cluster,
+        ThreadPoolExecutor(2) as pool,
+    ):
+        # Units of the same name, at once.
+        lengths = (30, 45)
+        sweeps = [
+            pool.submit(run_sweep, [Bowls(2, steps=n, pause=0.01)], tmp_path / str(n), scheduler=cluster.scheduler_address)
+            for n in lengths
+        ]
+        for n, sweep in zip(lengths, sweeps, strict=True):
+            assert [len(record["loss_curve"]) for record in sweep.result()["bowls"]] == [n, n]
+
+
+def test_a_scheduler_that_dies_is_named(tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed")
+    log = folder(tmp_path / "log")
+    cluster = distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None, memory_limit=0)
+    with ThreadPoolExecutor(1) as pool:
+        sweep = pool.submit(run_sweep, [Bowls(2, log=log, pause=1)], tmp_path, scheduler=cluster.scheduler_address)
+        for _ in range(600):
+            if begun(Path(log)):
+                break
+            time.sleep(0.1)
+        cluster.close()
+        with pytest.raises(ShadowmapError, match="scheduler at tcp://.* is gone"):
+            sweep.result(60)
+
+
 def test_bad_input_is_named(tmp_path: Path) -> None:
-    for scheduler in ("slurm", "processes:none", "processes:0", "tcp:1"):
+    for scheduler in ("slurm", "processes:none", "processes:0", "tcp:1", "tcp://", "tcp://localhost:abc", "tls://localhost:1"):
         with pytest.raises(ShadowmapError, match=scheduler):
             run_sweep([Bowls(1)], tmp_path, scheduler=scheduler)
     with pytest.raises(ShadowmapError, match="same name"):

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from ..errors import ShadowmapError
 from ..io import atomic, read_arrays
+from ..report import plain
 
 WARM_UP_STEPS = 5
 CHECKPOINT_INTERVAL = 10
@@ -111,7 +112,7 @@ def optimize(
     """
     if iterations < 1:
         raise ShadowmapError(f"{iterations} iterations: at least one is needed.")
-    fingerprint = json.dumps(dict(settings or {}), sort_keys=True)
+    fingerprint = json.dumps(plain(settings or {}), sort_keys=True)
     history = History(np.empty(0), np.asarray(start, np.float64).reshape(1, -1), np.empty(0), np.empty(0, np.bool_))
     state = None
     if checkpoint is not None and checkpoint.exists():

@@ -71,7 +71,8 @@ class Problem(ABC):
         Args:
             built: from :meth:`build`.
             runs: their numbers. Results depend on these alone, not on which other runs are in the batch.
-            checkpoint: file from which a killed batch may go on, None where there is no place for one. Removed afterwards.
+            checkpoint: file from which a killed batch may go on, None where there is no place for one. Others may lie beside it,
+                with names that begin with its stem. All are deleted when the result is on disk.
             on_step: to be told how many steps are done.
 
         Returns:
@@ -151,8 +152,6 @@ class MethodProblem(Problem):
                 built, self.start(run), self.steps, checkpoint=own, settings=settings, on_step=on_step
             )
             records.append(self.record(run, history))
-            if own is not None:
-                own.unlink(missing_ok=True)
         return records
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import threading
+import uuid
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from ..errors import ShadowmapError
+from ..errors import OutputError, ShadowmapError
 from .workshop import Unit, Workshop
 
 #: How a scheduler is named.
@@ -36,7 +38,6 @@ def do_units(
     units: Sequence[Unit],
     scheduler: str,
     *,
-    variant: str,
     threads: int,
     folder: Path,
     on_done: Report,
@@ -47,35 +48,57 @@ def do_units(
     A unit whose worker died is done again by another one. ``on_step`` is called by the scheduler ``local`` only.
     Raises what a unit raised, after all others are done.
     """
-    if scheduler == "local":
-        workshop = Workshop(variant, threads)
-        for unit in units:
-            on_done(unit, workshop.do(unit, folder, lambda done, unit=unit: on_step(unit, done)))
-        return
+    failed = (_do_here if scheduler == "local" else _do_elsewhere)(units, scheduler, threads, folder, on_done, on_step)
+    if failed:
+        error = failed[0]
+        if scheduler == "local":
+            raise error
+        if isinstance(error, ShadowmapError):
+            raise error
+        lines = " ".join(str(error).split())
+        raise ShadowmapError(f"{len(failed)} batches failed, the first one with {type(error).__name__}: {lines}") from error
+
+
+def _do_here(
+    units: Sequence[Unit], _: str, threads: int, folder: Path, on_done: Report, on_step: Callable[[Unit, int], None]
+) -> list[Exception]:
+    workshop, failed = Workshop(threads), []
+    for unit in units:
+        try:
+            result = workshop.do(unit, folder, lambda done, unit=unit: on_step(unit, done))
+        except OutputError:
+            raise  # where a checkpoint cannot be written, no other could be
+        except Exception as error:
+            failed.append(error)
+            continue
+        on_done(unit, result)
+    return failed
+
+
+def _do_elsewhere(
+    units: Sequence[Unit], scheduler: str, threads: int, folder: Path, on_done: Report, _: Callable[[Unit, int], None]
+) -> list[Exception]:
     from distributed import as_completed
 
-    failed: list[BaseException] = []
+    failed: list[Exception] = []
     with _client(scheduler) as client:
-        plugin = _plugin(variant, threads)
-        client.register_plugin(plugin, name=plugin.name)
-        # Not pure: units that are equal are different work all the same; and none keeps its result on the worker.
+        # Other sweeps on the same cluster may have units of the same name, whose results are not ours.
+        sweep = uuid.uuid4().hex
         futures = {
-            client.submit(_do, unit, str(folder), plugin.name, pure=False, key=unit.file, retries=0): unit for unit in units
+            client.submit(_do, unit, str(folder), threads, pure=False, key=f"{unit.file}-{sweep}", retries=0): unit
+            for unit in units
         }
         for future in as_completed(list(futures)):
             unit = futures.pop(future)
+            if future.cancelled():
+                raise ShadowmapError(f"the Dask scheduler at {scheduler} is gone: start it and go on from complete batches.")
             error = future.exception()
             if error is None:
                 on_done(unit, future.result())
             else:
                 failed.append(error)
             future.release()
-    if failed:
-        error = failed[0]
-        if isinstance(error, ShadowmapError):
-            raise error
-        lines = " ".join(str(error).split())
-        raise ShadowmapError(f"{len(failed)} batches failed, the first one with {type(error).__name__}: {lines}") from error
+    return failed
 
 
 @contextmanager
@@ -95,27 +118,20 @@ def _client(scheduler: str) -> Iterator[Any]:
         return
     try:
         client = Client(scheduler, timeout=20)
-    except OSError as error:
+    except (OSError, ValueError, TypeError) as error:  # the last two for ports that are none, and missing certificates
         raise ShadowmapError(f"no Dask scheduler answers at {scheduler}: start one, or give its address.") from error
     with client:
         yield client
 
 
-def _plugin(variant: str, threads: int) -> Any:
-    from distributed import WorkerPlugin
-
-    class WorkshopPlugin(WorkerPlugin):
-        """Gives each worker a workshop."""
-
-        name = f"shadowmap-dr-{variant}-{threads}"
-
-        def setup(self, worker: Any) -> None:
-            self.workshop = Workshop(variant, threads)
-
-    return WorkshopPlugin()
+#: The workshop of this process, if it is a worker, for as long as nobody asks for another number of threads.
+_WORKSHOP: list[Workshop] = []
+_LOCK = threading.Lock()
 
 
-def _do(unit: Unit, folder: str, plugin: str) -> dict[str, Any]:
-    from distributed import get_worker
-
-    return get_worker().plugins[plugin].workshop.do(unit, Path(folder))
+def _do(unit: Unit, folder: str, threads: int) -> dict[str, Any]:
+    with _LOCK:
+        if not _WORKSHOP or _WORKSHOP[0].threads != threads:
+            _WORKSHOP[:] = [Workshop(threads)]
+        workshop = _WORKSHOP[0]
+    return workshop.do(unit, Path(folder))

@@ -13,10 +13,12 @@ from .. import report
 from ..errors import ShadowmapError
 from .problems import Problem
 from .schedulers import check_scheduler, do_units
-from .workshop import Unit
+from .workshop import Unit, stem
 
 #: Bytes that a batch may need if nobody says otherwise.
 MEMORY = 1 << 31
+#: How the names of checkpoints end: those of batches, and of single runs of a batch.
+_CHECKPOINT = r"\.checkpoint(-run\d+)?\.npz"
 
 
 def run_sweep(
@@ -32,18 +34,19 @@ def run_sweep(
 ) -> dict[str, list[dict[str, Any]]]:
     """Do all runs of some problems.
 
-    Each batch leaves a file ``out/batches/NAME-FIRST-LAST.json`` with the records of its runs, which appears when it is complete.
+    Each batch leaves a file ``out/batches/NAME-DIGEST-FIRST-LAST.json`` with the records of its runs, which appears when it is
+    complete. DIGEST is one of the settings and the variant: files of the same problem with other settings are left alone.
 
     Args:
         problems: with different names.
         out: folder for results.
         scheduler: ``local`` (this process), ``processes:N`` (on this machine) or the address of a Dask scheduler
-            (``tcp://host:port``), whose workers must have this package, and the module of the problems, installed.
+            (``tcp://host:port``). Scheduler and workers must have this package, and the module of the problems, installed.
         variant: Mitsuba variant, here and in workers.
         threads: Dr.Jit threads of each process, 0 for as many as there are cores.
         memory: bytes that a batch may need, about.
         resume: keep records on disk whose settings are those of their problem. They may come from batches of another size, or
-            from another scheduler. Otherwise files of these problems are deleted first.
+            from another scheduler. Otherwise files of these problems with these settings are deleted first.
 
     Returns:
         For each problem's name its records, in the order of the runs.
@@ -60,12 +63,12 @@ def run_sweep(
         if not re.fullmatch(r"[\w.-]+", name):
             raise ShadowmapError(f"a problem is called {name!r}: use letters, digits, '.', '_' and '-'.")
     folder = out / "batches"
-    done = {problem.name: _stored(problem, folder) if resume else {} for problem in problems}
+    done = {problem.name: stored_records(problem, out, variant) if resume else {} for problem in problems}
     if not resume:
         for problem in problems:
-            for path in [*_files(problem, folder), *_files(problem, folder, r"\.checkpoint(-run\d+)?\.npz")]:
+            for path in [*_files(problem, folder, variant), *_files(problem, folder, variant, _CHECKPOINT)]:
                 path.unlink()
-    units = [unit for problem in problems for unit in _units(problem, done[problem.name], memory)]
+    units = [unit for problem in problems for unit in _units(problem, variant, done[problem.name], memory)]
     folder.mkdir(parents=True, exist_ok=True)
     with report.progress(console or Console(stderr=True)) as progress:
         total = progress.add_task("batches", total=len(units), note="")
@@ -76,38 +79,41 @@ def run_sweep(
 
         def on_done(unit: Unit, result: dict[str, Any]) -> None:
             report.write_json(folder / unit.file, result)
+            for path in folder.glob(f"{Path(unit.file).stem}.checkpoint*"):
+                path.unlink(missing_ok=True)
             done[unit.problem.name] |= dict(zip(result["runs"], result["records"], strict=True))
             progress.update(total, advance=1)
 
-        do_units(
-            units, scheduler, variant=variant, threads=threads, folder=folder.resolve(), on_done=on_done, on_step=on_step
-        )
+        do_units(units, scheduler, threads=threads, folder=folder.resolve(), on_done=on_done, on_step=on_step)
+    for problem in problems:  # those of batches of another size, which were killed
+        for path in _files(problem, folder, variant, _CHECKPOINT):
+            path.unlink(missing_ok=True)
     return {problem.name: [done[problem.name][run] for run in problem.run_numbers()] for problem in problems}
 
 
-def _units(problem: Problem, done: dict[int, Any], memory: int) -> list[Unit]:
+def _units(problem: Problem, variant: str, done: dict[int, Any], memory: int) -> list[Unit]:
     """Batches, as equal in size as can be, of the runs that are still to be done."""
     left = [run for run in problem.run_numbers() if run not in done]
     if not left:
         return []
     count = -(-len(left) // max(1, problem.batch_size(memory)))
     ends = [len(left) * k // count for k in range(count + 1)]
-    return [Unit(problem, tuple(left[a:b])) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+    return [Unit(problem, tuple(left[a:b]), variant) for a, b in zip(ends[:-1], ends[1:], strict=True)]
 
 
-def _files(problem: Problem, folder: Path, ending: str = r"\.json") -> list[Path]:
+def _files(problem: Problem, folder: Path, variant: str, ending: str = r"\.json") -> list[Path]:
     """Files of a problem's batches: not those of problems whose names begin with its own."""
-    pattern = re.compile(re.escape(problem.name) + r"-\d+-\d+" + ending)
+    pattern = re.compile(re.escape(stem(problem, variant)) + r"-\d+-\d+" + ending)
     return [path for path in sorted(folder.glob("*")) if pattern.fullmatch(path.name)]
 
 
-def _stored(problem: Problem, folder: Path) -> dict[int, Any]:
-    """Records by run from complete batches with the same settings."""
+def stored_records(problem: Problem, out: Path, variant: str) -> dict[int, Any]:
+    """Records by run from complete batches below ``out`` that were made with the problem's settings in a variant."""
     wanted, found = report.plain(problem.settings()), {}
-    for path in _files(problem, folder):
+    for path in _files(problem, out / "batches", variant):
         try:
             result = report.read_json(path)
-            if result["settings"] == wanted:
+            if result["settings"] == wanted and result["variant"] == variant:
                 pairs = zip(result["runs"], result["records"], strict=True)
                 found |= {run: record for run, record in pairs if run in problem.run_numbers()}
         except (ShadowmapError, KeyError, TypeError, ValueError):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import threading
 import time
@@ -20,10 +21,11 @@ from .problems import Problem
 
 @dataclass(frozen=True)
 class Unit:
-    """One batch: some runs of a problem."""
+    """One batch: some runs of a problem in a Mitsuba variant."""
 
     problem: Problem
     runs: tuple[int, ...]
+    variant: str
 
     @property
     def title(self) -> str:
@@ -33,36 +35,41 @@ class Unit:
     @property
     def file(self) -> str:
         """Name of the result's file."""
-        return f"{self.problem.name}-{self.runs[0]:06d}-{self.runs[-1]:06d}.json"
+        return f"{stem(self.problem, self.variant)}-{self.runs[0]:06d}-{self.runs[-1]:06d}.json"
+
+
+def stem(problem: Problem, variant: str) -> str:
+    """What the names of a problem's files begin with: its name, and a digest of all that decides on its results."""
+    content = json.dumps([plain(problem.settings()), variant], sort_keys=True)
+    return f"{problem.name}-{hashlib.sha256(content.encode()).hexdigest()[:8]}"
 
 
 class Workshop:
     """Does units, one at a time, in this process.
 
     Args:
-        variant: Mitsuba variant.
         threads: of Dr.Jit, 0 for as many as there are. With a single one, Mitsuba 3.9 waits forever when it reads or writes an
             EXR file: problems must not do that.
     """
 
-    def __init__(self, variant: str, threads: int = 0) -> None:
-        self._variant, self._threads = variant, threads
+    def __init__(self, threads: int = 0) -> None:
+        self.threads = threads
         self._key, self._built = "", None
         self._lock = threading.Lock()
 
     def do(self, unit: Unit, folder: Path | None, on_step: Callable[[int], None] = lambda done: None) -> dict[str, Any]:
-        """The content of the unit's result file: settings, runs, records, seconds.
+        """The content of the unit's result file: settings, variant, runs, records, seconds.
 
-        ``folder``: for checkpoints; where it does not exist (workers on other machines), there are none.
+        ``folder``: for checkpoints; where it does not exist (workers on other machines), there are none. They stay: whoever has
+        written the result deletes them.
         """
         with self._lock, quiet_garbage():
             # Both belong to a thread, and workers may use another one each time.
-            if mi.variant() != self._variant:
-                mi.set_variant(self._variant)
-            if self._threads and dr.thread_count() != self._threads:
-                dr.set_thread_count(self._threads)
-            settings = plain(unit.problem.settings())
-            key = json.dumps([unit.problem.name, settings], sort_keys=True)
+            if mi.variant() != unit.variant:
+                mi.set_variant(unit.variant)
+            if self.threads and dr.thread_count() != self.threads:
+                dr.set_thread_count(self.threads)
+            key = stem(unit.problem, unit.variant)
             began = time.perf_counter()
             if key != self._key:
                 self._key, self._built = "", None  # the old one's memory first
@@ -72,12 +79,11 @@ class Workshop:
             if folder is not None and folder.is_dir():
                 checkpoint = folder / f"{Path(unit.file).stem}.checkpoint.npz"
             records = unit.problem.run_batch(self._built, unit.runs, checkpoint, on_step)
-            if checkpoint is not None:
-                checkpoint.unlink(missing_ok=True)
             ended = time.perf_counter()
         return plain(
             {
-                "settings": settings,
+                "settings": unit.problem.settings(),
+                "variant": unit.variant,
                 "runs": unit.runs,
                 "records": records,
                 "seconds": {"build": built - began, "runs": ended - built},

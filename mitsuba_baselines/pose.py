@@ -25,11 +25,13 @@ import numpy.typing as npt
 from shadowmap_dr import assets
 from shadowmap_dr.errors import ShadowmapError
 from shadowmap_dr.inverse.pose import apply_pose
+from shadowmap_dr.io import atomic
 
 from .proxy import Proxy, calibrate, with_proxy
 from .reference import path_traced
 
 STORE = Path(__file__).with_name("fair_settings.json")
+MAX_RESOLUTION = 4096
 GUIDINGS = ("none", "grid", "octree")
 
 
@@ -75,7 +77,9 @@ class MitsubaPose:
         step_size, betas: Of Adam.
         seed: Of the sampling; step i uses seeds of its own.
         shift_z: Constant offset in z on top of the pose.
-        proxy: Area light to use; default: calibrated here for this scene and resolution.
+        proxy: Area light to use; default: calibrated here for this scene and resolution. (With `shift_z`, Mitsuba's directional
+            light in that scene knows only the extent that the scene was loaded with, which `image_residual` suffers from:
+            give a proxy calibrated with a scene whose mesh file lies where the object is.)
         normals: "face" or "vertex": flat or smooth shading of the object, the scene's parameter `$face_normals`.
 
     Raises:
@@ -100,7 +104,6 @@ class MitsubaPose:
         if image.ndim != 3 or image.shape[:2] != (resolution, resolution) or not np.isfinite(image).all():
             raise ShadowmapError(f"a reference of shape {image.shape}: give finite values of shape "
                                  f"({resolution}, {resolution}, C).")
-        self._resolution, self._normals = resolution, normals
         self.setting, self.step_size, self.betas, self.seed, self.shift_z = setting, step_size, betas, seed, shift_z
         scene = _load(scene_path, mesh_path, resolution, normals)
         params = mi.traverse(scene)
@@ -179,7 +182,6 @@ class MitsubaPose:
         return {
             "integrator": "direct_projective", **asdict(self.setting), "optimizer": "Adam", "step_size": self.step_size,
             "betas": list(self.betas), "seed": self.seed, "proxy": self.proxy.record(),
-            "meets_fair_criterion": is_fair(self.setting, self._resolution, self._normals),
         }
 
     def _place(self, pose: Any) -> None:
@@ -221,9 +223,13 @@ def fair_setting(resolution: int, normals: str = "face") -> ProjectiveSetting:
     return replace(setting, **counts)
 
 
-def is_fair(setting: ProjectiveSetting, resolution: int, normals: str = "face") -> bool:
-    """True if a stored search at this very resolution found the setting to be the cheapest one that meets the criterion."""
-    return _nearest(resolution, normals) == (resolution, setting)
+def is_fair(setting: ProjectiveSetting, resolution: int, normals: str = "face", mesh: str = "spot") -> bool:
+    """True if a stored search with this very mesh and resolution found the setting to be the cheapest one that converges."""
+    return any(
+        entry["setting"] == asdict(setting) and entry["resolution"] == resolution and entry.get("mesh", "spot") == mesh
+        and entry.get("normals", "face") == normals
+        for entry in _stored().values()
+    )
 
 
 def find_fair_setting(
@@ -359,14 +365,25 @@ def _timed(step: Callable[[], Any]) -> float:
 
 def _load(scene_path: str | Path, mesh_path: str | Path, resolution: int, normals: str) -> Any:
     flat = "true" if normals == "face" else "false"
-    return mi.load_file(str(scene_path), optimize=False, object=str(mesh_path), resolution=resolution, face_normals=flat)
+    try:
+        return mi.load_file(str(scene_path), optimize=False, object=str(mesh_path), resolution=resolution, face_normals=flat)
+    except RuntimeError as error:
+        raise ShadowmapError(f"cannot load {scene_path} with {mesh_path}: {' '.join(str(error).split())}") from error
+
+
+def _stored(path: Path | None = None) -> dict[str, dict[str, Any]]:
+    """Searches by name, those of this package if no file is given."""
+    path = path or STORE
+    table = json.loads(path.read_text()) if path.is_file() else {}
+    if not isinstance(table, dict) or not all(isinstance(entry, dict) for entry in table.values()):
+        raise ShadowmapError(f"{path} holds no searches: choose another file.")
+    return table
 
 
 def _nearest(resolution: int, normals: str) -> tuple[int, ProjectiveSetting]:
     """The resolution nearest to the given one at which a stored search found a setting, and the setting."""
-    table = json.loads(STORE.read_text()) if STORE.is_file() else {}
     found = {
-        entry["resolution"]: ProjectiveSetting(**entry["setting"]) for entry in table.values()
+        entry["resolution"]: ProjectiveSetting(**entry["setting"]) for entry in _stored().values()
         if entry["setting"] and entry.get("normals", "face") == normals
     }
     if not found:
@@ -386,24 +403,26 @@ def main() -> None:
     try:
         _search(parser.parse_args())
     except (ShadowmapError, OSError, json.JSONDecodeError) as error:
-        sys.exit(f"error: {error}")
+        sys.exit(f"error: {' '.join(str(error).split())}")
 
 
 def _search(options: argparse.Namespace) -> None:
     candidates = CANDIDATES
     if options.candidates:
-        candidates = tuple(_candidate(text) for text in options.candidates)
+        candidates = tuple(dict.fromkeys(_candidate(text) for text in options.candidates))
+    if not 1 <= options.search <= MAX_RESOLUTION:
+        raise ShadowmapError(f"a resolution of {options.search} pixels: give 1 to {MAX_RESOLUTION}.")
     mi.set_variant("llvm_ad_rgb")
-    table = json.loads(options.output.read_text()) if options.output.is_file() else {}
     key = str(options.search) if options.normals == "face" else f"{options.search} {options.normals} normals"
 
     def save(record: dict[str, Any]) -> None:
-        temporary = options.output.with_suffix(".tmp")
-        temporary.write_text(json.dumps({**table, key: record}, indent=1) + "\n")
-        os.replace(temporary, options.output)
+        # Read again each time: another search may have written its own record meanwhile.
+        table = {**_stored(options.output), key: record}
+        with atomic(options.output) as temporary:
+            temporary.write_text(json.dumps(table, indent=1) + "\n")
 
     record = find_fair_setting(options.search, mesh=options.mesh, normals=options.normals, candidates=candidates,
-                               earlier=table.get(key), save=save, report=lambda line: print(line, flush=True))
+                               earlier=_stored(options.output).get(key), save=save, report=lambda line: print(line, flush=True))
     print(f"fair setting at {key}: {record['setting']}")
 
 
@@ -411,6 +430,8 @@ def _candidate(text: str) -> ProjectiveSetting:
     part = text.split("/")
     try:
         return ProjectiveSetting(*map(int, part[:3]), *part[3:4], *map(int, part[4:]))
+    except ShadowmapError:
+        raise
     except (TypeError, ValueError) as error:
         raise ShadowmapError(f"--candidates {text}: give C/P/I, C/P/I/GUIDING or C/P/I/GUIDING/SPP.") from error
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -14,7 +12,8 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from shadowmap_dr.errors import OutputError, ShadowmapError
+from shadowmap_dr import io
+from shadowmap_dr.errors import ShadowmapError
 
 SETTINGS_KEY = "shadowmap_settings"
 SAMPLES_PER_LAUNCH = 1 << 24
@@ -151,23 +150,10 @@ def save(path: str | Path, reference: Reference, *, half: bool = False) -> None:
     Raises:
         OutputError: The file cannot be written.
     """
-    path = Path(path)
-    bitmap = mi.Bitmap(np.ascontiguousarray(reference.image, dtype=np.float32))
-    if half:
-        bitmap = bitmap.convert(component_format=mi.Struct.Type.Float16, srgb_gamma=False)
-    bitmap.metadata()[SETTINGS_KEY] = json.dumps(reference.settings)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(suffix=".exr", dir=path.parent)
-        os.close(handle)
-        try:
-            bitmap.write(temporary)
-            os.chmod(temporary, 0o644)
-            os.replace(temporary, path)
-        finally:
-            Path(temporary).unlink(missing_ok=True)
-    except (OSError, RuntimeError) as error:
-        raise OutputError(f"could not write {path}: {error}") from error
+    # Not with mi.Bitmap, which waits forever where Dr.Jit has a single thread.
+    pixels = reference.image.astype(np.float16 if half else np.float32)
+    names = io.colour_channels(pixels.shape[2])
+    io.write_exr(path, {name: pixels[..., i] for i, name in enumerate(names)}, {SETTINGS_KEY: json.dumps(reference.settings)})
 
 
 def load(path: str | Path) -> Reference:
@@ -178,13 +164,12 @@ def load(path: str | Path) -> Reference:
     """
     if not Path(path).is_file():
         raise ShadowmapError(f"no file {str(path)!r}: make references with tests/references/make.py.")
+    channels, metadata = io.read_exr(path)
     try:
-        bitmap = mi.Bitmap(str(path))
-        metadata = bitmap.metadata()
-        settings = json.loads(metadata[SETTINGS_KEY]) if SETTINGS_KEY in metadata else {}
-        image = np.array(bitmap.convert(component_format=mi.Struct.Type.Float32, srgb_gamma=False))
-    except (RuntimeError, ValueError) as error:
-        raise ShadowmapError(f"cannot read {path}: {' '.join(str(error).split())}") from error
+        settings = json.loads(metadata.get(SETTINGS_KEY, "{}"))
+        image = np.stack([channels[name] for name in io.colour_channels(len(channels))], -1).astype(np.float32)
+    except (KeyError, ValueError) as error:
+        raise ShadowmapError(f"cannot read {path}: its channels or settings are not those of a reference.") from error
     return Reference(image, settings)
 
 

@@ -101,7 +101,7 @@ def render(
     integrator: Annotated[str, typer.Option(help="Integrator plug-in, or 'scene' for the scene's own.")] = "shadowmap",
     size: Annotated[str | None, typer.Option(metavar="WxH", help="Image size in pixels.")] = None,
     spp: Annotated[int | None, typer.Option(min=1, help="Samples per pixel [default: the integrator's].")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the sampler.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Seed of the sampler.")] = 0,
     aovs: Annotated[
         str | None,
         typer.Option(help="Further channels, separated by commas, as the integrator (or Mitsuba's aov) names them."),

@@ -42,7 +42,7 @@ def lights(
     ] = "plain",
     starts: Annotated[int, typer.Option(help="Starts of each run; the one that ends with the least loss counts.")] = 1,
     reference: Annotated[str, typer.Option(metavar="own|mitsuba", help="Who renders the targets.")] = "own",
-    spp: Annotated[int, typer.Option(help="Samples per pixel of path-traced targets.")] = 128,
+    spp: Annotated[int, typer.Option(help="Samples per pixel of path-traced targets.")] = 512,
     cone: Annotated[float, typer.Option(help="Opening angle in degrees of the cone that directions are drawn from.")] = 60,
     seed: Annotated[int, typer.Option(help="Seed of targets and starts.")] = 0,
     memory: Annotated[int, typer.Option(help="MiB that a batch of runs may need, about.")] = 2048,
@@ -107,7 +107,7 @@ def lights_times(
 
     Writes OUT/times.json. Nothing else should run on the machine.
     """
-    sizes = tuple(batch or (1, 16, 150))
+    sizes = tuple(dict.fromkeys(batch or (1, 16, 150)))
     if min(sizes) < 1:
         raise ShadowmapError(f"a batch of {min(sizes)} runs: give at least 1.")
     path = io.check_output(out / "times.json", (".json",))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import mitsuba as mi
@@ -126,6 +128,19 @@ def test_save_and_load(variant: str, tmp_path: Path, half: bool) -> None:
     np.testing.assert_allclose(read.image, made.image, rtol=5e-4 if half else 0)
     assert read.settings == made.settings
     assert [path.name for path in (tmp_path / "sub").iterdir()] == ["image.exr"]
+
+
+def test_files_need_no_second_thread(tmp_path: Path) -> None:
+    """Mitsuba's own reading and writing waits forever where Dr.Jit has a single one."""
+    code = (
+        "import sys, shadowmap_dr, drjit as dr, mitsuba as mi, numpy as np; mi.set_variant('llvm_ad_rgb')\n"
+        "dr.set_thread_count(1)\n"
+        "from mitsuba_baselines import reference\n"
+        "reference.save(sys.argv[1], reference.Reference(np.ones((4, 5, 3), np.float32), {'spp': 7}))\n"
+        "found = reference.load(sys.argv[1])\n"
+        "assert found.image.shape == (4, 5, 3) and (found.image == 1).all() and found.settings == {'spp': 7}\n"
+    )
+    subprocess.run([sys.executable, "-c", code, str(tmp_path / "a.exr")], check=True, timeout=120)
 
 
 def test_errors_name_the_offender(variant: str, tmp_path: Path) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -154,6 +156,46 @@ def test_fair_setting_is_stored() -> None:
     assert (coarse.sppc, coarse.sppi) == (4 * setting.sppc, 4 * setting.sppi)
     assert (fine.sppc, fine.sppi) == (1, 1) and not is_fair(fine, 1 << 12)
     assert not is_fair(ProjectiveSetting(1, 1, 1), 128)
+    assert not is_fair(setting, 128, mesh="bunny")  # nor with this object
+
+
+def test_searches_keep_what_others_write_meanwhile(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    store = tmp_path / "fair.json"
+    store.write_text("{}")
+
+    def search(resolution: int, *, save: Any, candidates: Any, earlier: Any, **_: Any) -> dict[str, Any]:
+        assert earlier is None and len(candidates) == 1
+        store.write_text(json.dumps({**json.loads(store.read_text()), "16": {"setting": None}}))
+        save({"resolution": resolution, "setting": None})
+        return {"setting": None}
+
+    monkeypatch.setattr(pose, "find_fair_setting", search)
+    monkeypatch.setattr(sys, "argv", ["pose", "--search", "32", "--output", str(store), "--candidates", "1/1/1", "1/1/1"])
+    pose.main()
+    assert set(json.loads(store.read_text())) == {"16", "32"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--search", "0"], "a resolution of 0 pixels"),
+        (["--search", "99999999"], "a resolution of 99999999 pixels"),
+        (["--search", "16", "--candidates", "0/1/1"], "sample counts 0/1/1"),
+        (["--search", "16", "--candidates", "a/b"], "give C/P/I"),
+        (["--search", "16", "--mesh", "damaged.ply"], "cannot load"),
+        (["--search", "16", "--output", "list.json"], "list.json holds no searches"),
+    ],
+)
+def test_searches_name_bad_input(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, arguments: list[str], message: str
+) -> None:
+    (tmp_path / "damaged.ply").write_text("ply\nnothing")
+    (tmp_path / "list.json").write_text("[]")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["pose", "--output", "new.json", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        pose.main()
+    assert str(ended.value).startswith("error: ") and message in str(ended.value) and "\n" not in str(ended.value)
 
 
 def test_fair_settings_are_kept_by_kind_of_normals(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

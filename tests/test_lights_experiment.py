@@ -10,14 +10,17 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
+import trimesh
 from typer.testing import CliRunner
 
 from shadowmap_dr import assets
 from shadowmap_dr.cli import app
 from shadowmap_dr.errors import ShadowmapError
-from shadowmap_dr.experiments.lights.experiment import LightOptions, run_lights
-from shadowmap_dr.experiments.lights.problem import LightProblem
+from shadowmap_dr.experiments.lights.experiment import LightOptions, run_lights, summary
+from shadowmap_dr.experiments.lights.problem import LightProblem, curve_iterations
 from shadowmap_dr.experiments.lights.scene import alignment, random_directions, target_and_starts
+from shadowmap_dr.inverse.lights.shading import with_shadow
+from shadowmap_dr.shadow.filters import filter_kernel
 
 
 @pytest.fixture(autouse=True)
@@ -95,6 +98,65 @@ def test_runs_with_another_content_of_a_mesh_file_are_made_again(tmp_path: Path)
     assert "object_digest" not in LightProblem("spot", 1, 1).settings()
 
 
+def test_settings_without_effect_make_no_other_runs(tmp_path: Path) -> None:
+    first = run_lights(options(tmp_path, filter_sizes=(3, 0)))
+    files = {path: path.stat().st_mtime_ns for path in (tmp_path / "batches").iterdir()}
+    # Boxes and samples: the shadows are others, what has none is the same, and so are targets that are not path-traced.
+    again = run_lights(options(tmp_path, filter_sizes=(3, 0), filter="box", map_resolution=64, spp=4, resume=True))
+    assert all(path.stat().st_mtime_ns == time for path, time in files.items())
+    assert len(list((tmp_path / "batches").iterdir())) == len(files) + 1
+    assert [(entry["filter_size"], entry["filter"]) for entry in again] == [(3, "gaussian"), (3, "box"), (0, "gaussian")]
+    assert again[2] == first[1]
+    other, same = (LightProblem("spot", 1, 1, spp=spp, reference="mitsuba") for spp in (4, 16))
+    assert other.name != same.name and other.settings() != same.settings()
+
+
+def test_fewer_runs_or_objects_do_not_shrink_a_summary(tmp_path: Path) -> None:
+    (first,) = run_lights(options(tmp_path, objects=("teapot", "spot"), filter_sizes=(0,), runs=2))
+    for changes in ({"runs": 1}, {"objects": ("spot",), "runs": 2}):
+        (again,) = run_lights(options(tmp_path, filter_sizes=(0,), resume=True, **changes))
+        assert again == first
+    (more,) = run_lights(options(tmp_path, objects=("suzanne",), filter_sizes=(0,), runs=2, resume=True))
+    assert more["objects"] == ["teapot", "spot", "suzanne"] and more["runs"] == 2
+    # More runs of one object: no summary can have all of them for all objects.
+    (longer,) = run_lights(options(tmp_path, objects=("spot",), filter_sizes=(0,), runs=3, resume=True))
+    assert longer["objects"] == ["spot"] and longer["runs"] == 3
+
+
+def test_curves_end_with_the_last_step() -> None:
+    assert curve_iterations(10) == [0, 5, 10] and curve_iterations(9) == [0, 5, 9] and curve_iterations(3) == [0, 3]
+    problem = LightProblem("teapot", 1, 2, filter_size=0, resolution=16, iterations=3)
+    records = problem.run_batch(problem.build(), range(2), None, lambda done: None)
+    for record in records:
+        curve = record["alignment_curve"]
+        assert len(curve) == 2 and curve[-1] == pytest.approx(record["alignment"], abs=1e-5)
+    assert summary([problem], [records])["curve_iterations"] == [0, 3]
+
+
+def test_coarse_first_has_a_larger_filter_even_if_there_is_none_later() -> None:
+    problem = LightProblem("teapot", 1, 1, filter_size=1, map_resolution=32, resolution=8, strategy="coarse")
+    scene = problem.build().scene
+    shadows = [with_shadow(scene, filter_size=stage.filter_size or 1).shadow for stage in problem.stages]
+    assert [len(filter_kernel(s.filter, s.filter_size)) for s in shadows] == [15, 1]
+
+
+def test_mesh_files_are_brought_into_view(tmp_path: Path) -> None:
+    name = str(tmp_path / "far away.ply")
+    mesh = trimesh.load(assets.mesh("spot"), process=False)
+    mesh.apply_scale(37)
+    mesh.apply_translation([900, -50, 3])
+    mesh.export(name)
+    size = {"filter_size": 3, "resolution": 24, "map_resolution": 32}
+    moved, spot = (LightProblem(thing, 1, 1, **size) for thing in (name, "spot"))
+    assert " " not in moved.name
+    images = [problem.build().render(problem.directions([0])[0]) for problem in (moved, spot)]
+    # The package's has another centre than that of its box, by less than a pixel.
+    assert np.abs(images[0] - images[1]).mean() < 0.02
+    trimesh.Trimesh(np.ones((3, 3)), [[0, 1, 2]], process=False).export(name)
+    with pytest.raises(ShadowmapError, match="no extent: all its vertices lie at \\(1.0, 1.0, 1.0\\)"):
+        moved.build()
+
+
 def test_more_starts_never_end_worse() -> None:
     records = {}
     for starts in (1, 3):
@@ -125,6 +187,10 @@ def test_bad_input_is_named(tmp_path: Path) -> None:
         ({"strategy": "fine"}, "'fine'"),
         ({"objects": ("nothing",)}, "no mesh 'nothing'"),
         ({"filter_sizes": (4,)}, "odd number"),
+        ({"strategy": "coarse", "map_resolution": 16}, "filter size 15 is too large"),
+        ({"filter": "none"}, "no filter 'none'"),
+        ({"threads": 10**8}, "100000000 threads"),
+        ({"spp": 10**11}, "100000000000 samples"),
         ({"scheduler": "nobody"}, "'nobody'"),
     ):
         with pytest.raises(ShadowmapError, match=message):

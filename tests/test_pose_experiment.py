@@ -181,6 +181,18 @@ def test_workers_make_the_same_runs(tmp_path: Path) -> None:
     assert (tmp_path / "there" / "spot-24" / "images.png").stat().st_size
 
 
+def test_which_record_is_of_a_run() -> None:
+    proxy = {"distance": 1200.0, "irradiance_residual": 1e-4, "image_residual": 0.0018}
+    wanted = {"object": "spot", "run": 3, "variant": "llvm_ad_rgb", "settings": {"proxy": proxy, "fair": True}}
+    measured_again = {**wanted, "settings": {"proxy": {**proxy, "image_residual": 0.0019}}, "final": [0, 0, 0]}
+    assert pose_record.is_of(measured_again, wanted)
+    older = {**{k: v for k, v in wanted.items() if k != "variant"}, "environment": {"variant": "llvm_ad_rgb"}}
+    assert pose_record.is_of(older, wanted)
+    assert not pose_record.is_of({**older, "environment": {"variant": "llvm_ad_mono"}}, wanted)
+    assert not pose_record.is_of({**wanted, "settings": {"proxy": {**proxy, "distance": 1300.0}}}, wanted)
+    assert not pose_record.is_of({**wanted, "variant": "llvm_ad_mono"}, wanted)
+
+
 def test_failed_optimisation_is_recorded_as_such(tmp_path: Path) -> None:
     class Diverging(PoseFit):
         def parameters(self) -> Any:

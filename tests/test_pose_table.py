@@ -67,6 +67,27 @@ def test_runs_with_different_settings_are_no_row() -> None:
         pose_table.rows([record("shadows", 0, 0.1), record("shadows", 1, 0.1, iterations=3)])
 
 
+def test_what_was_measured_of_settings_makes_no_difference_but_the_variant_does() -> None:
+    def proxy(residual: float) -> dict[str, Any]:
+        return {"settings": {"proxy": {"distance": 3, "image_residual": residual}, "fair": residual > 1.5}}
+
+    (row,) = pose_table.rows([record("mitsuba", run, 0.1, **proxy(residual)) for run, residual in enumerate((1, 2))])
+    assert len(row.runs) == 2
+    other = record("mitsuba", 1, 0.1, **proxy(1), environment={"variant": "cuda_ad_rgb"})
+    with pytest.raises(ShadowmapError, match="different settings"):
+        pose_table.rows([record("mitsuba", 0, 0.1, **proxy(1)), other])
+
+
+def test_times_may_come_from_an_earlier_table(tmp_path: Path) -> None:
+    records = [record("shadows", 0, 0.1)]
+    pose_table.write(tmp_path, records, [record("shadows", 0, 0.1, seconds_per_iteration=0.125)])
+    (row,) = pose_table.rows(records, pose_table.read([tmp_path]))
+    assert row.seconds == 0.125
+    pose_table.write(tmp_path, records)
+    (row,) = pose_table.rows(records, pose_table.read([tmp_path]))
+    assert row.seconds is None
+
+
 def test_mitsuba_is_compared_on_the_starts_that_both_have() -> None:
     ours = [record("shadows", run, degrees) for run, degrees in enumerate((0.10, 0.11, 0.14, 5.0, 6.0))]
     theirs = [record("mitsuba", run, 0.10) for run in range(3)] + [record("mitsuba", 4, 9.0, start=[1, 1, 1])]

@@ -15,6 +15,8 @@ from .workshop import Unit, Workshop
 #: How a scheduler is named.
 SCHEDULERS = "local, processes:N or tcp://HOST:PORT"
 
+MOST_THREADS = 1024
+
 Report = Callable[[Unit, dict[str, Any]], None]
 
 
@@ -32,6 +34,12 @@ def check_scheduler(name: str) -> None:
         import distributed  # noqa: F401
     except ImportError as error:
         raise ShadowmapError(f"scheduler {name!r} needs Dask: pip install 'shadowmap-dr[distributed]'.") from error
+
+
+def check_threads(threads: int) -> None:
+    """Raise ShadowmapError for a number of Dr.Jit threads that cannot be."""
+    if not 0 <= threads <= MOST_THREADS:
+        raise ShadowmapError(f"{threads} threads: give 1 to {MOST_THREADS}, or 0 for all.")
 
 
 def do_units(

@@ -8,18 +8,19 @@ mean squared error. Estimated and true directions are matched greedily; their me
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.console import Console
 
-from ... import io, report, timing
+from ... import assets, io, report, timing
 from ...errors import ShadowmapError
 from ...inverse import run_sweep
-from ...inverse.sweep import MEMORY
-from .problem import LightProblem, LightSetting, check_problem
+from ...inverse.schedulers import check_threads
+from ...inverse.sweep import MEMORY, stored_records
+from .problem import LightProblem, LightSetting, check_problem, curve_iterations
 from .report import pictures, plot
 from .scene import OBJECTS
 
@@ -49,19 +50,21 @@ class LightOptions(LightSetting):
                 raise ShadowmapError(f"a {name} is given twice in {', '.join(map(str, values))}: name each once.")
         if self.memory < 1:
             raise ShadowmapError(f"{self.memory} bytes of memory: give at least 1.")
-        if self.threads < 0:
-            raise ShadowmapError(f"{self.threads} threads: give 1 or more, or 0 for all.")
+        check_threads(self.threads)
         for problem in self.problems():
             check_problem(problem)
 
     def problems(self) -> list[LightProblem]:
         """One for each setting and object, settings first."""
         common = {f.name: getattr(self, f.name) for f in fields(LightSetting)}
+        # Workers may have another working directory.
+        known = assets.mesh_names()
+        objects = [str(Path(name).resolve()) if name not in known and Path(name).is_file() else name for name in self.objects]
         return [
             LightProblem(name, lights, self.runs, filter_size=size, **common)
             for lights in self.lights
             for size in self.filter_sizes
-            for name in self.objects
+            for name in objects
         ]
 
 
@@ -70,7 +73,8 @@ def run_lights(options: LightOptions, *, variant: str = "llvm_ad_rgb", console: 
 
     Files: `lights.json` (one summary for each setting), `lights.png` (alignment over iterations and over filter sizes),
     `pictures.png` (the first run of each object), and a file for each batch in `batches`. Summaries of settings that other calls
-    with the same folder have left in `lights.json` stay if `options.resume` is set. Returns the summaries.
+    with the same folder have left in `lights.json` stay if `options.resume` is set, and summaries of the same settings go on to
+    count the objects and runs of which batches are in the folder. Returns the summaries.
     """
     path = io.check_output(options.out / "lights.json", (".json",))
     problems = options.problems()
@@ -88,7 +92,11 @@ def run_lights(options: LightOptions, *, variant: str = "llvm_ad_rgb", console: 
     groups: dict[str, list[LightProblem]] = {}
     for problem in problems:
         groups.setdefault(problem.setting, []).append(problem)
-    summaries = [summary(group, [found[problem.name] for problem in group]) for group in groups.values()]
+    summaries = []
+    for setting, group in groups.items():
+        earlier = next((entry for entry in stored if entry["setting"] == setting), None)
+        wider = _widened(group, earlier, options.out, variant) if earlier else None
+        summaries.append(summary(*(wider or (group, [found[problem.name] for problem in group]))))
     new = [entry["setting"] for entry in summaries]
     summaries = [entry for entry in stored if entry["setting"] not in new] + summaries
     report.write_json(path, {"summaries": summaries, "machine": timing.machine()})
@@ -102,7 +110,8 @@ def summary(problems: Sequence[LightProblem], records: Sequence[Sequence[dict[st
     """Statistics over all objects and runs of one setting."""
     final = np.array([[record["alignment"] for record in own] for own in records])
     curves = np.array([record["alignment_curve"] for own in records for record in own])
-    settings = {key: value for key, value in problems[0].settings().items() if key not in ("object", "object_digest", "steps")}
+    settings = {"filter": "gaussian", **problems[0].settings()}
+    settings = {key: value for key, value in settings.items() if key not in ("object", "object_digest", "steps")}
     return report.plain(
         {
             "setting": problems[0].setting,
@@ -116,7 +125,7 @@ def summary(problems: Sequence[LightProblem], records: Sequence[Sequence[dict[st
             "alignment_least": final.min(),
             "share_from_0.995": (final >= 0.995).mean(),
             "alignment_by_object": {p.object: row.mean() for p, row in zip(problems, final, strict=True)},
-            "curve_iterations": np.linspace(0, problems[0].iterations, curves.shape[1]),
+            "curve_iterations": curve_iterations(problems[0].iterations),
             "curve_mean": curves.mean(0),
             "curve_std": curves.std(0),
         }
@@ -127,6 +136,26 @@ def _stored(path: Path) -> list[dict[str, Any]]:
     if not path.exists():
         return []
     value = report.read_json(path)
-    if not isinstance(value, dict) or not isinstance(value.get("summaries"), list):
+    summaries = value.get("summaries") if isinstance(value, dict) else None
+    needed = {"setting", "lights", "filter", "filter_size", "cone_deg", "strategy", "starts", "reference", "objects", "runs"}
+    needed |= {"alignment_mean", "alignment_std", "alignment_least", "share_from_0.995"}
+    needed |= {"curve_iterations", "curve_mean", "curve_std"}
+    if not isinstance(summaries, list) or not all(isinstance(entry, dict) and needed <= entry.keys() for entry in summaries):
         raise ShadowmapError(f"{path} holds no summaries of this experiment: choose another folder.")
-    return value["summaries"]
+    return summaries
+
+
+def _widened(
+    group: Sequence[LightProblem], earlier: dict[str, Any], out: Path, variant: str
+) -> tuple[list[LightProblem], list[list[dict[str, Any]]]] | None:
+    """Problems and records of a setting's earlier summary and of this call, None if the folder does not have all of them."""
+    runs = max(group[0].runs, earlier["runs"])
+    objects = list(dict.fromkeys([*earlier["objects"], *(problem.object for problem in group)]))
+    problems = [replace(group[0], object=name, runs=runs) for name in objects]
+    try:
+        found = [stored_records(problem, out, variant) for problem in problems]
+    except ShadowmapError:
+        return None  # a mesh file is not there any more
+    if any(len(own) < runs for own in found):
+        return None
+    return problems, [[own[run] for run in range(runs)] for own in found]

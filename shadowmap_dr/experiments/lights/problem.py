@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +26,8 @@ ReferenceKind = Literal["own", "mitsuba"]
 StrategyKind = Literal["plain", "coarse"]
 
 STEP_SIZE = 0.01
+FILTERS = ("gaussian", "box", "wendland")
+MOST_SAMPLES = 1 << 16
 #: With the strategy ``coarse`` half of the iterations have this step size and filter.
 COARSE_STEP_SIZE, COARSE_FILTER = 0.05, 15
 # A record's curve has every so many iterations.
@@ -41,7 +44,7 @@ class LightSetting:
         iterations: steps of the optimiser.
         strategy: ``plain``, or ``coarse``: the first half of the iterations with larger steps and a larger filter.
         starts: of each run; the one that ends with the least loss counts.
-        reference: who renders the targets. ``spp``: samples of each pixel and light, if Mitsuba does.
+        reference: who renders the targets. ``spp``: samples of each pixel and light, if Mitsuba does, rounded up to a square.
         seed, cone_deg: see :func:`shadowmap_dr.experiments.lights.scene.target_and_starts`.
     """
 
@@ -52,7 +55,7 @@ class LightSetting:
     strategy: StrategyKind = "plain"
     starts: int = 1
     reference: ReferenceKind = "own"
-    spp: int = 128
+    spp: int = 512
     seed: int = 0
     cone_deg: float = CONE_DEG
 
@@ -62,7 +65,7 @@ class LightProblem(Problem, LightSetting):
     """All runs of one object with one setting.
 
     Attributes:
-        object: name of a mesh.
+        object: name of a mesh of this package, or path of a mesh file, which is centred and scaled into [-1, 1]^3.
         lights: n, of each run.
         runs: how many.
         filter_size: texels along each side of the filter of the shadow maps, 1 for none; 0: no shadows at all.
@@ -75,13 +78,14 @@ class LightProblem(Problem, LightSetting):
 
     @property
     def name(self) -> str:
-        return f"{Path(self.object).stem}-{self.setting}"
+        return f"{re.sub(r'[^A-Za-z0-9_.-]', '_', Path(self.object).stem)}-{self.setting}"
 
     @property
     def setting(self) -> str:
         """What distinguishes this from other settings of the same object, as a part of file names."""
         shadow = f"k{self.filter_size}-{self.filter}-m{self.map_resolution}" if self.shadows else "no-shadows"
-        parts = [f"n{self.lights}", shadow, f"r{self.resolution}", f"i{self.iterations}", f"c{self.cone_deg:g}", self.reference]
+        reference = f"mitsuba{self.spp}" if self.reference == "mitsuba" else self.reference
+        parts = [f"n{self.lights}", shadow, f"r{self.resolution}", f"i{self.iterations}", f"c{self.cone_deg:g}", reference]
         parts += ["coarse"] if self.strategy == "coarse" else []
         parts += [f"s{self.starts}"] if self.starts > 1 else []
         return "-".join([*parts, f"seed{self.seed}"])
@@ -96,10 +100,15 @@ class LightProblem(Problem, LightSetting):
         return self.iterations
 
     def settings(self) -> dict[str, Any]:
+        own = super().settings()
+        unused = [] if self.shadows else ["filter", "map_resolution"]
+        unused += ["spp"] if self.reference == "own" else []
+        for name in unused:  # that they have other values makes no other runs
+            del own[name]
         if self.object in assets.mesh_names():
-            return super().settings()
+            return own
         content = assets.mesh(self.object).read_bytes()  # a file of the same name may have become another one
-        return {**super().settings(), "object_digest": hashlib.sha256(content).hexdigest()[:12]}
+        return {**own, "object_digest": hashlib.sha256(content).hexdigest()[:12]}
 
     @property
     def stages(self) -> tuple[Stage, ...]:
@@ -127,11 +136,11 @@ class LightProblem(Problem, LightSetting):
         """Options of the `Renderer`."""
         if not self.shadows:
             return {"shadow_method": "none"}
-        plain = self.filter_size == 1
+        # A filter of one texel is none, until a stage makes it larger.
         return {
             "shadow_method": "vsm",
             "shadow_map_resolution": self.map_resolution,
-            "shadow_filter": "none" if plain else self.filter,
+            "shadow_filter": self.filter,
             "shadow_filter_size": self.filter_size,
         }
 
@@ -155,7 +164,7 @@ class LightProblem(Problem, LightSetting):
         for k, run in enumerate(runs):
             best = int(np.argmin(losses[-1, k]))
             path = directions[:, k, best]
-            shown = range(0, self.iterations + 1, _CURVE_STRIDE)
+            shown = curve_iterations(self.iterations)
             records.append(
                 {
                     "run": run,
@@ -170,13 +179,16 @@ class LightProblem(Problem, LightSetting):
         return records
 
 
+def curve_iterations(iterations: int) -> list[int]:
+    """Numbers of the steps after which a run's curve has its points: every fifth, and the last."""
+    return [*range(0, iterations, _CURVE_STRIDE), iterations]
+
+
 def check_problem(problem: LightProblem) -> None:
     """Raise ShadowmapError for settings that cannot be, before any work is done."""
     check_scene(problem.object, problem.lights, problem.resolution)
-    try:
-        ShadowSettings(filter=problem.filter, filter_size=max(1, problem.filter_size), resolution=problem.map_resolution)
-    except ValueError as error:
-        raise ShadowmapError(str(error)) from None
+    if problem.filter not in FILTERS:
+        raise ShadowmapError(f"no filter {problem.filter!r}: choose {', '.join(FILTERS)}; one of 1 texel is none.")
     for what, value in (("runs", problem.runs), ("iterations", problem.iterations), ("starts", problem.starts)):
         if value < 1:
             raise ShadowmapError(f"{value} {what}: give at least 1.")
@@ -188,8 +200,13 @@ def check_problem(problem: LightProblem) -> None:
         raise ShadowmapError(f"no reference {problem.reference!r}: choose own or mitsuba.")
     if problem.strategy not in ("plain", "coarse"):
         raise ShadowmapError(f"no strategy {problem.strategy!r}: choose plain or coarse.")
-    if problem.spp < 1:
-        raise ShadowmapError(f"{problem.spp} samples per pixel: give at least 1.")
+    if not 1 <= problem.spp <= MOST_SAMPLES:
+        raise ShadowmapError(f"{problem.spp} samples per pixel: give 1 to {MOST_SAMPLES}.")
+    for size in (problem.filter_size, *(stage.filter_size for stage in problem.stages)):
+        try:
+            ShadowSettings(filter=problem.filter, filter_size=max(1, size or 1), resolution=problem.map_resolution)
+        except ValueError as error:
+            raise ShadowmapError(str(error)) from None
 
 
 def _path_traced(scene: Any, target: npt.NDArray[np.float64], spp: int, seed: int) -> npt.NDArray[np.float32]:

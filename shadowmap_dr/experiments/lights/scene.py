@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from ... import assets
 from ...errors import ShadowmapError
+from ..objects import check_suffix, load_mesh, placement
 
 OBJECTS = ("bunny", "dragon", "hand", "spot", "teapot", "suzanne")
 #: Opening angle (degrees) of the cone about the vertical in which the directions to the lights lie.
@@ -30,8 +31,7 @@ def check_scene(name: str, lights: int, resolution: int) -> Path:
     if not 1 <= resolution <= 4096:
         raise ShadowmapError(f"a resolution of {resolution} pixels: give 1 to 4096.")
     path = assets.mesh(name)
-    if path.suffix not in (".ply", ".obj"):
-        raise ShadowmapError(f"cannot load the object {path.name}: the suffix {path.suffix!r} is not one of .ply, .obj.")
+    check_suffix(path)
     return path
 
 
@@ -39,17 +39,18 @@ def make_scene(name: str, lights: int, resolution: int) -> Any:
     """``mi.Scene``: an object of [-1, 1]^3 on a diffuse floor, seen from above, under equal directional lights.
 
     Args:
-        name: name of a mesh of this package, or a mesh file in the same position.
+        name: name of a mesh of this package, or a mesh file, which is centred and scaled into [-1, 1]^3.
         lights: how many, called ``light_0``, ``light_1``, ... All shine straight down.
         resolution: width and height of the image in pixels.
     """
     path = check_scene(name, lights, resolution)
-    try:
-        thing = mi.load_dict({"type": path.suffix[1:], "filename": str(path), "face_normals": True})
-    except RuntimeError as error:
-        raise ShadowmapError(f"cannot load the object {name}: {' '.join(str(error).split())}") from error
-    ground = float(thing.bbox().min.y)
+    thing = load_mesh(path)
     transform = mi.ScalarTransform4f
+    ground, place = float(thing.bbox().min.y), transform()
+    if name not in assets.mesh_names():
+        centre, scale = placement(thing, path)
+        ground = scale * (ground - float(centre[1]))
+        place = transform().scale(scale).translate((-centre).tolist())
     grey = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}
     film = {"type": "hdrfilm", "width": resolution, "height": resolution, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
     camera = transform().look_at(origin=[0, 6.5, 4], target=[0, ground + 0.5, 0], up=[0, 1, 0])
@@ -64,9 +65,10 @@ def make_scene(name: str, lights: int, resolution: int) -> Any:
             "bsdf": grey,
         },
         "object": {
-            "type": path.suffix[1:],
+            "type": check_suffix(path),
             "filename": str(path),
             "face_normals": True,
+            "to_world": place,
             "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.7}},
         },
     }

@@ -24,7 +24,7 @@ from rich.table import Table
 from ... import io, report
 from ...errors import ShadowmapError
 from ...inverse import Method, run_sweep
-from ...inverse.schedulers import check_scheduler
+from ...inverse.schedulers import check_scheduler, check_threads
 from .methods import METHODS, Builder, Image, build_method, fairness
 from .record import identity, is_of, make_record
 from .scene import NormalKind, PoseProblem, ReferenceKind, make_problem, start_pose
@@ -64,8 +64,7 @@ class PoseOptions:
                 raise ShadowmapError(f"{value} {name}: give at least 1.")
         if self.seed < 0:
             raise ShadowmapError(f"the seed {self.seed}: give 0 or more.")
-        if self.threads < 0:
-            raise ShadowmapError(f"{self.threads} threads: give 1 or more, or 0 for all.")
+        check_threads(self.threads)
         if self.reference not in ("mitsuba", "own"):
             raise ShadowmapError(f"no reference {self.reference!r}: choose mitsuba or own.")
         if self.normals not in ("face", "vertex"):
@@ -94,7 +93,10 @@ def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Co
     stored: list[dict[str, Any]] = []
     if options.resume and (out / "pose.json").exists():
         stored = report.read_json(out / "pose.json")
-        if not isinstance(stored, list) or not all(isinstance(record, dict) for record in stored):
+        if not isinstance(stored, list) or not all(
+            isinstance(record, dict) and isinstance(record.get("settings"), dict) and isinstance(record.get("environment"), dict)
+            for record in stored
+        ):
             raise ShadowmapError(f"{out / 'pose.json'} is no list of records: choose another folder.")
 
     problems = {
@@ -123,7 +125,7 @@ def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Co
             progress.remove_task(task)
             for method in methods.values():
                 if fairness(method, problem).get("fair") is False:
-                    note = "sample counts found at another resolution, where they converge; here nobody has searched"
+                    note = "sample counts found with another object or resolution; that they converge here has not been shown"
                     progress.console.print(f"{problem.folder} mitsuba: {note}: {getattr(method, 'setting', '')}", highlight=False)
             records, images = [], {}
             for run in range(options.runs):
@@ -283,7 +285,8 @@ def _key(record: dict[str, Any]) -> tuple[Any, ...]:
     """What a record is about: a newer one with the same key takes its place."""
     names = ("object", "resolution", "method", "run", "seed", "iterations", "reference", "shadow_only")
     samples = record.get("settings", {}).get("samples_per_pixel", 1)
-    return (*(record.get(name) for name in names), samples, _normals(record))
+    variant = record.get("variant", record.get("environment", {}).get("variant"))
+    return (*(record.get(name) for name in names), samples, _normals(record), variant)
 
 
 def _normals(record: dict[str, Any]) -> str:

@@ -36,6 +36,7 @@ def build_method(name: str, problem: PoseProblem, reference: Image, samples: int
             betas=BETAS,
             shift_z=problem.shift_z,
             normals=problem.normals,
+            proxy=baseline.calibrate(problem.scene),
         )
     from ...renderer import Renderer
 
@@ -70,4 +71,5 @@ def fairness(method: Method, problem: PoseProblem) -> dict[str, bool]:
         return {}
     from mitsuba_baselines.pose import is_fair
 
-    return {"fair": is_fair(setting, problem.resolution, problem.normals)}
+    searched = is_fair(setting, problem.resolution, problem.normals, problem.name)
+    return {"fair": searched and not problem.shadow_only}

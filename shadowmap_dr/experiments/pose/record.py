@@ -35,6 +35,7 @@ def identity(
             "start": start_pose(seed, run),
             "iterations": iterations,
             "reference": reference,
+            "variant": mi.variant(),
             "shadow_only": problem.shadow_only,
             "normals": problem.normals,
             "settings": {"object_digest": problem.digest, **method.describe(), **fairness(method, problem)},
@@ -44,7 +45,19 @@ def identity(
 
 def is_of(record: dict[str, Any], wanted: dict[str, Any]) -> bool:
     """Whether a record is of the run with an identity."""
-    return all(record.get(key) == value for key, value in wanted.items())
+    environment = record.get("environment")
+    # Records from before there was a choice.
+    older = {"variant": environment.get("variant")} if isinstance(environment, dict) else {}
+    found = essence({**older, **record})
+    return all(found.get(key) == value for key, value in essence(wanted).items())
+
+
+def essence(value: Any) -> Any:
+    """Settings without what was measured of them, whose last digits depend on the number of threads, and without verdicts."""
+    if isinstance(value, dict):
+        left_out = ("fair", "meets_fair_criterion")
+        return {k: essence(v) for k, v in value.items() if not (k in left_out or k.endswith("_residual"))}
+    return [essence(entry) for entry in value] if isinstance(value, list) else value
 
 
 def make_record(
@@ -52,7 +65,7 @@ def make_record(
 ) -> dict[str, Any]:
     """Make the run with an identity."""
     iterations, start = wanted["iterations"], wanted["start"]
-    history = optimize(method, start, iterations, checkpoint=checkpoint, settings=wanted, on_step=on_step)
+    history = optimize(method, start, iterations, checkpoint=checkpoint, settings=essence(wanted), on_step=on_step)
     return {**wanted, **_results(history), "environment": _environment()}
 
 

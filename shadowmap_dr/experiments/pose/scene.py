@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from ... import assets, io
 from ...errors import ShadowmapError
+from ..objects import load_mesh, placement, positions
 
 ReferenceKind = Literal["mitsuba", "own"]
 NormalKind = Literal["face", "vertex"]
@@ -24,7 +25,6 @@ MAX_OFFSET = 0.25
 MAX_ROTATION_DEG = 30.0
 # In the shadow-only case the object moves along the light, behind the camera, so that its shadow stays where it was.
 SHADOW_ONLY_SHIFT = 10.0
-MESH_SUFFIXES = (".ply", ".obj")
 MAX_RESOLUTION = 4096
 
 _REFERENCE_KEY = "shadowmap_dr:reference"
@@ -83,8 +83,8 @@ def make_problem(
     if not 1 <= resolution <= MAX_RESOLUTION:
         raise ShadowmapError(f"a resolution of {resolution} pixels: give 1 to {MAX_RESOLUTION}.")
     label, mesh = (name, assets.mesh(name)) if name in assets.mesh_names() else _import_mesh(assets.mesh(name), work)
-    plain = _load_mesh(mesh)
-    p_rest = _positions(plain)
+    plain = load_mesh(mesh)
+    p_rest = positions(plain)
     problem = PoseProblem(label, mesh, p_rest, resolution, shadow_only, normals, None)
     if shadow_only:
         # A file of its own: Mitsuba's directional light learns the extent of the scene only when the scene is loaded.
@@ -142,33 +142,11 @@ def path_traced_reference(problem: PoseProblem, path: Path) -> npt.NDArray[np.fl
 
 def _import_mesh(path: Path, work: Path) -> tuple[str, Path]:
     """Name and PLY file of a mesh file of the user's, centred and scaled into [-1, 1]^3."""
-    mesh = _load_mesh(path)
-    positions = _positions(mesh).astype(np.float64)
-    if mesh.face_count() == 0 or not len(positions):
-        raise ShadowmapError(f"the object {path} has no triangles: give a triangle mesh.")
-    if not np.isfinite(positions).all():
-        raise ShadowmapError(f"the object {path} has vertices that are not finite (NaN or inf): repair the file.")
-    low, high = positions.min(axis=0), positions.max(axis=0)
-    extent = float((high - low).max())
-    if extent <= 0:
-        raise ShadowmapError(f"the object {path} has no extent: all its vertices lie at {tuple(low)}.")
+    mesh = load_mesh(path)
+    centre, scale = placement(mesh, path)
     target = work / f"{path.stem}.ply"
-    _write_mesh(mesh, (positions - (low + high) / 2) * (2 / extent), target)
+    _write_mesh(mesh, (positions(mesh) - centre) * scale, target)
     return path.stem, target
-
-
-def _load_mesh(path: Path) -> Any:
-    kind = path.suffix.lower()
-    if kind not in MESH_SUFFIXES:
-        raise ShadowmapError(f"cannot load the object {path}: the suffix {kind!r} is not one of {', '.join(MESH_SUFFIXES)}.")
-    try:
-        return mi.load_dict({"type": kind[1:], "filename": str(path), "face_normals": True})
-    except RuntimeError as error:
-        raise ShadowmapError(f"cannot load the object {path}: {' '.join(str(error).split())}") from error
-
-
-def _positions(mesh: Any) -> npt.NDArray[np.float32]:
-    return np.array(mi.traverse(mesh)["vertex_positions"], np.float32).reshape(-1, 3)
 
 
 def _write_mesh(mesh: Any, positions: npt.NDArray[Any], path: Path) -> None:

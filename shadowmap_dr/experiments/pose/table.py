@@ -20,6 +20,7 @@ from ... import io, report
 from ...errors import ShadowmapError
 from ..gradients.report import markdown
 from .plot import plot_convergence
+from .record import essence
 
 #: How far a median of ours may lie above Mitsuba's: degrees, and 100 x offset.
 ALLOWED_DEG, ALLOWED_X100 = 0.05, 0.05
@@ -126,18 +127,24 @@ def rows(records: Iterable[Mapping[str, Any]], timed: Iterable[Mapping[str, Any]
             row.runs[record["seed"], record["run"]] = dict(record)
     seconds: dict[tuple[Any, ...], list[float]] = {}
     for record in timed:
-        seconds.setdefault(_row_key(record) or (), []).append(record["seconds_per_iteration"])
+        name = "seconds_per_iteration" if "seconds_per_iteration" in record else "seconds_per_step"  # of a run; of a table's row
+        if record[name] is not None:
+            seconds.setdefault(_row_key(record) or (), []).append(record[name])
     for key, row in result.items():
         row.runs = dict(sorted(row.runs.items()))
         first = next(iter(row.runs.values()))
         for (_, run), record in row.runs.items():
-            if any(record[name] != first[name] for name in _SETTINGS[1:]):
+            if _made_with(record) != _made_with(first):
                 which = f"runs {first['run']} and {run} of {row.method} for {row.object} at {row.resolution}"
                 raise ShadowmapError(f"{which} were made with different settings: run one of them again.")
         row.seconds = float(np.median(seconds[key])) if key in seconds else first.get("seconds_per_step")
     order = (list(CASES).index, str, int, METHODS.index)
     return sorted(result.values(), key=lambda row: tuple(
         rank(value) for rank, value in zip(order, (row.case, row.object, row.resolution, row.method), strict=True)))
+
+
+def _made_with(record: Mapping[str, Any]) -> list[Any]:
+    return [record["environment"].get("variant"), *(essence(record[name]) for name in _SETTINGS[1:])]
 
 
 def _row_key(record: Mapping[str, Any]) -> tuple[str, str, int, str] | None:

@@ -232,6 +232,11 @@ def is_fair(setting: ProjectiveSetting, resolution: int, normals: str = "face", 
     )
 
 
+def is_searched(normals: str = "face") -> bool:
+    """Whether a stored search has found a setting with normals "face" or "vertex", at any resolution."""
+    return any(entry["setting"] and entry.get("normals", "face") == normals for entry in _stored().values())
+
+
 def find_fair_setting(
     resolution: int,
     *,

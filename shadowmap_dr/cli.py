@@ -25,6 +25,7 @@ from .experiments.bench import report as bench_report
 from .experiments.maps import experiment as maps_experiment
 from .experiments.maps import scenes as maps_scenes
 from .experiments.pose import experiment as pose_experiment
+from .experiments.pose.methods import usual_methods
 
 app = typer.Typer(
     name="shadowmap-dr",
@@ -157,7 +158,8 @@ def pose(
     method: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="|".join(pose_experiment.METHODS), help="Method; repeatable [default: all; the first two with --shadow-only]."
+            metavar="|".join(pose_experiment.METHODS),
+            help="Method; repeatable [default: all; the first two with --shadow-only or --normals vertex].",
         ),
     ] = None,
     runs: Annotated[int, typer.Option(help="Runs with different starts.")] = 1,
@@ -182,12 +184,10 @@ def pose(
     Spot at 128 x 128 pixels unless told otherwise. Writes OUT/pose.json, images and a convergence plot.
     """
     set_variant(variant)
-    # Mitsuba's integrator hardly ever samples silhouettes of shadows this sharp; it needs to see the object.
-    default = pose_experiment.METHODS[:2] if shadow_only else pose_experiment.METHODS
     options = pose_experiment.PoseOptions(
         objects=tuple(object_ or ["spot"]),
         resolutions=tuple(resolution or [128]),
-        methods=tuple(method or default),
+        methods=tuple(method or usual_methods(shadow_only, normals)),
         runs=runs,
         seed=seed,
         iterations=iterations,

@@ -16,6 +16,7 @@ from mitsuba_baselines import pose, proxy, reference
 from mitsuba_baselines.pose import MitsubaPose, ProjectiveSetting, fair_setting, is_fair, pose_start
 from shadowmap_dr import assets
 from shadowmap_dr.errors import ShadowmapError
+from shadowmap_dr.experiments.pose.methods import METHODS, usual_methods
 
 RESOLUTION = 32
 
@@ -206,8 +207,10 @@ def test_fair_settings_are_kept_by_kind_of_normals(monkeypatch: pytest.MonkeyPat
     store.write_text(json.dumps(entries))
     with pytest.raises(ShadowmapError, match="--normals vertex"):
         fair_setting(128, "vertex")
+    assert usual_methods() == METHODS and usual_methods(normals="vertex") == usual_methods(shadow_only=True) == METHODS[:2]
     entries["128 vertex normals"] = {"resolution": 128, "normals": "vertex", "setting": asdict(smooth)}
     store.write_text(json.dumps(entries))
+    assert usual_methods(normals="vertex") == METHODS
     assert fair_setting(128) == flat and fair_setting(128, "vertex") == smooth
     assert is_fair(smooth, 128, "vertex") and not is_fair(smooth, 128) and not is_fair(flat, 128, "vertex")
 

@@ -5,12 +5,21 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 import pytest
+import trimesh
 
 from shadowmap_dr import report
 from shadowmap_dr.errors import ShadowmapError
 from shadowmap_dr.experiments.pose import landscape as pose_landscape
+from shadowmap_dr.experiments.pose.experiment import PoseOptions, run_pose
+
+
+@pytest.fixture(autouse=True)
+def _variant() -> None:
+    mi.set_variant("llvm_ad_rgb")
+
 
 X, Y = np.meshgrid(np.linspace(-1, 1, 24), np.linspace(-1, 1, 24))
 
@@ -60,3 +69,21 @@ def test_program_draws_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     with pytest.raises(SystemExit, match="no file"):
         pose_landscape.main()
     assert len(report.read_json(tmp_path / "pose.json")) == 1
+
+
+def test_meshes_of_users_are_those_of_their_runs(tmp_path: Path) -> None:
+    path = tmp_path / "brick.ply"
+    trimesh.creation.box((1, 2, 3)).export(path)
+    options = PoseOptions(
+        (str(path),), (16,), ("shadows",), iterations=2, reference="own", out=tmp_path / "runs"
+    )
+    run_pose(options)
+    wanted = {"object": "brick", "resolution": 16, "method": "shadows", "run": 0}
+    lines = pose_landscape.landscape(options.out, wanted, tmp_path / "a.png", count=3)
+    assert lines["target"][1] < 1e-9 < lines["target"].max()
+    trimesh.creation.box((3, 2, 1)).export(options.out / "objects" / "brick.ply")
+    with pytest.raises(ShadowmapError, match="brick is not the one of the run any more"):
+        pose_landscape.landscape(options.out, wanted, tmp_path / "a.png", count=3)
+    (options.out / "pose.json").write_text("{}")
+    with pytest.raises(ShadowmapError, match="no list of records"):
+        pose_landscape.landscape(options.out, wanted, tmp_path / "a.png", count=3)

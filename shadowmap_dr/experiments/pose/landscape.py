@@ -125,11 +125,16 @@ def landscape(
     Returns angles in degrees and the slices. Raises ShadowmapError if there is no such record or no reference image.
     """
     records = report.read_json(folder / "pose.json")
+    if not isinstance(records, list) or not all(isinstance(entry, dict) for entry in records):
+        raise ShadowmapError(f"{folder / 'pose.json'} is no list of records: give a folder of the pose experiment.")
     record = next((entry for entry in records if all(entry.get(key) == value for key, value in wanted.items())), None)
     if record is None:
         raise ShadowmapError(f"{folder / 'pose.json'} has no run with " + ", ".join(f"{k} {v}" for k, v in wanted.items()) + ".")
+    copy = folder / "objects" / f"{record['object']}.ply"  # of a mesh file of the user's
     problem = make_problem(record["object"], record["resolution"], shadow_only=record["shadow_only"],
-                           normals=record.get("normals", "face"), work=folder / "objects")
+                           normals=record.get("normals", "face"), work=folder / "objects", scaled=copy if copy.exists() else None)
+    if problem.digest != record["settings"].get("object_digest", problem.digest):
+        raise ShadowmapError(f"the object {record['object']} is not the one of the run any more: run it again.")
     name = "reference.exr" if record["reference"] == "mitsuba" else "reference-own.exr"
     reference = io.read_image(folder / problem.folder / name)
     renderer = renderer or record["method"]

@@ -20,6 +20,16 @@ Image = npt.NDArray[np.float32]
 Builder = Callable[[str, PoseProblem, Image], Method]
 
 
+def usual_methods(shadow_only: bool = False, normals: str = "face") -> tuple[str, ...]:
+    """The methods that are run if nobody names any: Mitsuba's only where it can find a pose."""
+    if shadow_only:
+        # Its integrator hardly ever samples silhouettes of shadows this sharp; it needs to see the object.
+        return METHODS[:2]
+    from mitsuba_baselines.pose import is_searched
+
+    return METHODS if is_searched(normals) else METHODS[:2]
+
+
 def build_method(name: str, problem: PoseProblem, reference: Image, samples: int = 1) -> Method:
     """One of the three methods for a problem and its reference image; our own ones with so many samples per pixel."""
     if name == "mitsuba":

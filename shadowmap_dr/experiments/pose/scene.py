@@ -70,7 +70,13 @@ class PoseProblem:
 
 
 def make_problem(
-    name: str, resolution: int, *, shadow_only: bool = False, normals: NormalKind = "face", work: Path
+    name: str,
+    resolution: int,
+    *,
+    shadow_only: bool = False,
+    normals: NormalKind = "face",
+    work: Path,
+    scaled: Path | None = None,
 ) -> PoseProblem:
     """Load an object and build the scene around it.
 
@@ -79,10 +85,14 @@ def make_problem(
         resolution: 1 to 4096 pixels.
         shadow_only, normals: see PoseProblem.
         work: folder for the scaled copy of a mesh file.
+        scaled: such a copy, to be taken as it is for the object of this name.
     """
     if not 1 <= resolution <= MAX_RESOLUTION:
         raise ShadowmapError(f"a resolution of {resolution} pixels: give 1 to {MAX_RESOLUTION}.")
-    label, mesh = (name, assets.mesh(name)) if name in assets.mesh_names() else _import_mesh(assets.mesh(name), work)
+    if scaled is not None:
+        label, mesh = name, scaled
+    else:
+        label, mesh = (name, assets.mesh(name)) if name in assets.mesh_names() else _import_mesh(assets.mesh(name), work)
     plain = load_mesh(mesh)
     p_rest = positions(plain)
     problem = PoseProblem(label, mesh, p_rest, resolution, shadow_only, normals, None)

@@ -91,7 +91,7 @@ def _orthographic_reach(sensor: Sensor, geometry: Geometry) -> Any:
         # In the camera's own units: its transformation may scale. Never 0, also if there is nothing before it.
         z = dr.abs((mi.Transform4f(sensor.view) @ p).z)
         farthest = dr.maximum(dr.max(dr.select(dr.isfinite(z), z, 0)), sensor.near)
-        return dr.minimum(sensor.far - sensor.near, _ROOM * farthest)
+        return dr.minimum(sensor.reach, _ROOM * farthest)
 
 
 def least_gap(sensor: Sensor) -> float:

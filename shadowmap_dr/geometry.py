@@ -251,7 +251,10 @@ def _faces_of(faces: Any, info: ShapeInfo) -> Any:
 def _checked_positions(name: str, value: Any, count: int) -> Any:
     """Bring positions to Float (3Vs,) or an array of three components; sizes are known without evaluating anything."""
     if not dr.is_array_v(value):
-        value = mi.TensorXf(value)
+        try:
+            value = mi.TensorXf(np.asarray(value, np.float32))  # Dr.Jit never comes back from a string
+        except (TypeError, ValueError) as error:
+            raise ShadowmapError(f"Positions of shape '{name}' are {value!r:.60}: give an array of {count} points.") from error
     if dr.is_tensor_v(value):
         if tuple(value.shape) not in ((count, 3), (3 * count,)):
             raise ShadowmapError(

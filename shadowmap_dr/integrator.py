@@ -140,10 +140,13 @@ def make_class() -> type:
         def render(
             self, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, develop: bool = True, evaluate: bool = True
         ) -> Any:
-            """Image (H, W, C) without gradients. Unless called through ``mi.render``, it is put into the sensor's film too."""
+            """Image (H, W, C) without gradients. It is put into the sensor's film too, but not while a function is frozen."""
             sensor = sensor_of(scene, sensor)
             if develop and not evaluate:  # through mi.render
-                return self.shell.primal(scene, sensor, spp)
+                image = self.shell.primal(scene, sensor, spp)
+                if not dr.flag(dr.JitFlag.FreezingScope):
+                    put_into_film(sensor.film(), image, self.aov_names())
+                return image
             with dr.suspend_grad():
                 image = self.shell.image(scene, sensor, spp)
                 put_into_film(sensor.film(), image, self.aov_names())
@@ -162,6 +165,10 @@ def make_class() -> type:
             """Add the gradients of <image, grad_in> to the parameters."""
             self.shell.backward(scene, sensor_of(scene, sensor), spp, grad_in)
             dr.eval()
+
+        def sample(self, *_: Any, **__: Any) -> Any:
+            """Refuses what integrators that hold others ask of these."""
+            raise ShadowmapError(f"'{PLUGIN}' cannot be nested in an integrator: for further channels, use its parameter aovs.")
 
         def aov_names(self) -> list[str]:
             """Names of the channels after colour and alpha."""

@@ -13,6 +13,8 @@ PLUGIN = "shadowmap"
 
 # Names that Mitsuba's own `aov` integrator has for channels of ours.
 _SYNONYMS = {"sh_normal": "normal"}
+# Channels of the image itself.
+COLOURS = ("R", "G", "B", "A", "Y")
 
 
 @dataclass(frozen=True)
@@ -93,6 +95,8 @@ class Options:
             pairs.append((label.strip() or name, _SYNONYMS.get(name, name)))
         labels = [label for label, _ in pairs]
         for label in labels:
+            if label in COLOURS:
+                raise ShadowmapError(f"aovs is {self.aovs!r}: '{label}' is a channel of the image itself, label it otherwise.")
             if labels.count(label) > 1:
                 raise ShadowmapError(f"aovs is {self.aovs!r}: '{label}' is there twice; label one of them, as in a:depth.")
         return tuple(pairs)

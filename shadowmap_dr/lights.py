@@ -232,7 +232,8 @@ def _light_of(emitter: Any, name: str) -> Light:
     if kind == "DirectionalEmitter":
         matrix = values["to_world"].matrix
         direction = mi.Vector3f(matrix[0, 2], matrix[1, 2], matrix[2, 2])
-        return DirectionalLight(name, dr.normalize(direction), colour_of(parts["irradiance"]))
+        length = dr.norm(direction)  # Mitsuba's becomes brighter with a transformation that scales
+        return DirectionalLight(name, direction / length, colour_of(parts["irradiance"]) * length)
     if kind == "PointLight":
         return PointLight(name, mi.Point3f(values["position"]), colour_of(parts["intensity"]))
     if kind == "Projector":

@@ -44,6 +44,8 @@ class RenderSettings:
     aovs: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        if isinstance(self.aovs, str):
+            raise ShadowmapError(f"aovs is {self.aovs!r}: give names in a tuple, as in ('{self.aovs}',).")
         for name in self.aovs:
             if name not in AOVS:
                 raise ShadowmapError(f"There is no AOV '{name}': choose from {', '.join(AOVS)}.")

@@ -225,6 +225,8 @@ class Renderer:
     def _sensors(self, sensor: int | Sensor) -> tuple[Sensor, ...]:
         if isinstance(sensor, Sensor):
             return (sensor,)
+        if not isinstance(sensor, int):
+            raise ShadowmapError(f"the sensor is a {type(sensor).__name__}: give its number in the scene, or a Sensor record.")
         if not 0 <= sensor < len(self.data.sensors):
             raise ShadowmapError(f"There is no sensor {sensor}: the scene has {len(self.data.sensors)}, counted from 0.")
         return self.data.sensors[sensor]

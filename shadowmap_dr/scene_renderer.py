@@ -7,6 +7,7 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from .errors import ShadowmapError
 from .lights import environments_of
@@ -42,6 +43,7 @@ class SceneRenderer:
     recorded  both passes, replayed if the plug-in's user wants it; ``recordable``: for names of attached parameters, whether
               gradients flow through nothing but what is read from the scene
     sky       where its environments shone
+    checked   vertices that were found to be finite
     unseen    what recordings do not see, and ``unseen_then`` its values when they were made
     """
 
@@ -57,6 +59,7 @@ class SceneRenderer:
     unseen: Unseen = field(default_factory=lambda: Unseen(()))
     unseen_then: tuple[Any, ...] = ()
     sky: SkyWatch = field(default_factory=lambda: SkyWatch(()))
+    checked: Any = None
 
     @classmethod
     def build(cls, scene: Any, sensor: Any, settings: RenderSettings, tessellation: int, warn: bool = True) -> SceneRenderer:
@@ -99,6 +102,7 @@ class SceneRenderer:
         If ``inputs`` is given, the image is attached to these instead of the vertices, lights and cameras.
         """
         current = self._current(scene, sensor)
+        self._check_vertices(current)
         if inputs is not None:
             current = current.with_data(inputs.instead_of(current.data))
         image = current.render(spp=spp)
@@ -108,7 +112,9 @@ class SceneRenderer:
     def replay(self, scene: Any, sensor: Any, spp: int) -> Any:
         """The same image, detached, recorded when it is first taken."""
         self._forget_stale_recordings()
-        image, frusta, soft_frusta = self.recorded.image(spp, self._current(scene, sensor))
+        current = self._current(scene, sensor)
+        self._check_vertices(current)
+        image, frusta, soft_frusta = self.recorded.image(spp, current)
         self._remember(scene, sensor, frusta, soft_frusta)
         return image
 
@@ -143,6 +149,20 @@ class SceneRenderer:
         fits = ((frusta, soft_frusta) for known, frusta, soft_frusta in self.fits if known is sensor)
         frusta, soft_frusta = next(fits, (kept.frusta, kept.soft_frusta))
         return replace(kept, data=self.data(scene, sensor), frusta=frusta, soft_frusta=soft_frusta)
+
+    def _check_vertices(self, current: Renderer) -> None:
+        """Raise ShadowmapError for vertices that are not finite: triangles would be gone, and their derivatives with them."""
+        geometry = current.data.geometry
+        positions = dr.detach(geometry.positions)
+        if dr.flag(dr.JitFlag.FreezingScope) or (self.checked is not None and positions.index == self.checked.index):
+            return
+        if not dr.all(dr.isfinite(positions)):
+            points = positions.numpy().reshape(-1, 3)
+            vertex = int(np.flatnonzero(~np.isfinite(points).all(1))[0])
+            info = geometry.shapes[int(geometry.vertex_shape[vertex])]
+            where = f"Vertex {vertex - info.vertex_start} of shape '{info.name}' is {points[vertex].tolist()}"
+            raise ShadowmapError(f"{where}: positions must be finite.")
+        self.checked = positions
 
     def _remember(self, scene: Any, sensor: Any, frusta: Frusta | None, soft_frusta: SoftFrusta) -> None:
         """Keep the fit of an image for the next one of this sensor, and warn of lenses when it is seen first."""

@@ -98,6 +98,19 @@ class Sensor:
         return dr.rcp(mi.Matrix4f(self.to_world.matrix))
 
     @property
+    def reach(self) -> Any:
+        """Float, camera space: how far behind the near plane the far plane is.
+
+        An orthographic camera of Mitsuba's, whose transformation scales along its axis, begins at ``near`` in its own units,
+        and its rays are as long as ``far - near`` in those of the world.
+        """
+        between = mi.Float(self.far) - mi.Float(self.near)
+        if self.kind == "perspective":
+            return between
+        matrix = dr.detach(mi.Matrix4f(self.to_world.matrix))
+        return between / dr.norm(mi.Vector3f(matrix[0, 2], matrix[1, 2], matrix[2, 2]))
+
+    @property
     def projection(self) -> Any:
         """Matrix4f, camera space to clip space, crop window and principal point included."""
         (film_w, film_h), (crop_w, crop_h), (crop_x, crop_y) = self.film_size, self.crop_size, self.crop_offset
@@ -112,8 +125,9 @@ class Sensor:
         # Film position 0.5 + 0.5 * ndc - principal point, then the crop, then back to [-1, 1].
         cx = zoom[0] * (1.0 - 2.0 * self.principal_point.x - 2.0 * crop_x / film_w) - 1.0
         cy = zoom[1] * (1.0 - 2.0 * self.principal_point.y - 2.0 * crop_y / film_h) - 1.0
-        near, far = mi.Float(self.near), mi.Float(self.far)
-        inverse_depth = dr.rcp(far - near)
+        near = mi.Float(self.near)
+        far = mi.Float(self.far) if self.kind == "perspective" else near + self.reach
+        inverse_depth = dr.rcp(self.reach)
         if self.kind == "perspective":
             return mi.Matrix4f(
                 [sx, 0, cx, 0],

@@ -138,6 +138,8 @@ def test_wrong_sizes_are_named(variant: str, size: int) -> None:
         dr.zeros(mi.Point3f, size),
         dr.zeros(mi.TensorXf, (size, 3)),
         dr.zeros(mi.TensorXf, (3, 24)),
+        "ball.ply",
+        [[0, 1], [2]],
     ]
     for value in wrong:
         with pytest.raises(ShadowmapError, match="'box'"):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import traceback
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -121,3 +123,22 @@ def test_modes_without_attached_parameters(variant: str) -> None:
     params = mi.traverse(scene)
     assert not integrator.render_forward(scene, params).numpy().any()
     integrator.render_backward(scene, params, dr.ones(mi.TensorXf, (SIZE, SIZE, 3)))
+
+
+@pytest.mark.parametrize("recorded", [False, True])
+def test_vertices_that_become_nan_are_named(variant: str, recorded: bool) -> None:
+    """A diverged optimisation: the triangles would just be gone, and all derivatives zero."""
+    scene, integrator = small_scene(camera=camera(16)), shadowmap(recorded=recorded)
+    params = mi.traverse(scene)
+    vertices = mi.Float(params["ball.vertex_positions"])
+    for value, where in ((np.nan, 7), (np.inf, 3)):
+        params["ball.vertex_positions"] = mi.Float(vertices)
+        params.update()
+        mi.render(scene, params, integrator=integrator)
+        broken = vertices.numpy().copy()
+        broken[3 * where + 1] = value
+        params["ball.vertex_positions"] = mi.Float(broken)
+        params.update()
+        with pytest.raises(RuntimeError) as error:
+            mi.render(scene, params, integrator=integrator)
+        assert f"Vertex {where} of shape 'ball' is [" in "".join(traceback.format_exception(error.value))

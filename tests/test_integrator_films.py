@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import traceback
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -116,3 +118,24 @@ def test_film_holds_the_image(variant: str, pixel_format: str) -> None:
     film = scene.sensors()[0].film()
     assert np.allclose(film.develop().numpy(), mi.render(scene).numpy(), atol=1e-6)
     assert "depth" in str(film.bitmap(raw=False).struct_())
+
+
+@pytest.mark.parametrize("recorded", [False, True])
+def test_film_holds_the_image_of_mi_render(variant: str, recorded: bool) -> None:
+    scene = small_scene(camera=camera(24))
+    params, film = mi.traverse(scene), scene.sensors()[0].film()
+    integrator = shadowmap(recorded=recorded)
+    mi.render(scene, integrator=mi.load_dict({"type": "direct"}), spp=4)
+    for irradiance in (1.0, 0.5):
+        params["sun.irradiance.value"] = mi.Color3f(irradiance)
+        params.update()
+        image = mi.render(scene, params, integrator=integrator).numpy()
+        assert np.allclose(film.develop().numpy(), image, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["aov", "moment"])
+def test_nested_in_another_integrator(variant: str, kind: str) -> None:
+    outer = {"type": kind, "inner": {"type": "shadowmap"}} | ({"aovs": "d:depth"} if kind == "aov" else {})
+    with pytest.raises(RuntimeError) as error:
+        mi.render(small_scene(camera=camera(8)), integrator=mi.load_dict(outer), spp=1)
+    assert "use its parameter aovs" in "".join(traceback.format_exception(error.value))

@@ -77,6 +77,7 @@ def test_defaults_are_those_of_the_renderer(variant: str) -> None:
         ({"ambient": {"type": "rgb", "value": 1.0}}, "but must be a number"),
         ({"aovs": "depth,albedo"}, "no AOV 'albedo': choose from depth, position"),
         ({"aovs": "depth,depth"}, "'depth' is there twice"),
+        ({"aovs": "R:depth"}, "'R' is a channel of the image itself"),
         ({"tessellation": 2}, "tessellation is 2"),
     ],
 )

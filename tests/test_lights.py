@@ -119,6 +119,25 @@ def test_gradients_equal_mitsubas(variant: str, name: str, key: str) -> None:
     assert np.allclose(gradient(*light.illuminate(points())), expected, rtol=1e-3)
 
 
+def test_scaled_directional_light(variant: str) -> None:
+    """Mitsuba's unit vector to it is none, and a diffuse surface so many times brighter."""
+    start = mi.Transform4f().look_at([-3, 2, 4], [0, 0.3, -1], [0, 1, 0])
+    scene = mi.load_dict({"type": "scene", "light": {"type": "directional", "irradiance": 2.0}})
+    params, x = mi.traverse(scene), mi.Float(3.0)
+    dr.enable_grad(x)
+    params["light.to_world"] = start @ mi.Transform4f().rotate([0.6, 0.8, 0], 10 * x) @ mi.Transform4f().scale(mi.Vector3f(1, 2, x))
+    params.update()
+    ours, mitsubas = lights_of(scene)[0].illuminate(points(1)), sample(scene.emitters()[0], points(1))
+    assert np.isclose(dr.norm(ours[0]).numpy(), 1) and np.isclose(dr.norm(mitsubas[0]).numpy(), 3)
+    found = []
+    for wo, weight in (ours, mitsubas):
+        value = dr.dot(wo, mi.Vector3f(1, -2, 0.5)) * weight.x
+        dr.clear_grad(x)
+        dr.backward(value, flags=dr.ADFlag.ClearInterior)
+        found.append([value.numpy()[0], x.grad.numpy()[0]])
+    assert np.allclose(*found, rtol=1e-4) and min(map(abs, found[1])) > 0.1
+
+
 def test_replaced_direction_has_gradient(variant: str) -> None:
     (sun,) = lights_of(mi.load_dict({"type": "scene", "light": emitters()["sun"]}))
     x = mi.Float(0.3)

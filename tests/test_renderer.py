@@ -401,6 +401,10 @@ def test_unknown_names(renderer: Renderer) -> None:
         renderer.render(lights={"moon": renderer.light("sun")})
     with pytest.raises(ShadowmapError, match="There is no sensor 1: the scene has 1, counted from 0"):
         renderer.render(sensor=1)
+    with pytest.raises(ShadowmapError, match="give its number in the scene"):
+        renderer.render(sensor=mi.load_dict({"type": "perspective"}))
+    with pytest.raises(ShadowmapError, match=r"give names in a tuple, as in \('depth',\)"):
+        Renderer.from_scene(renderer.data.scene, aovs="depth")
     with pytest.raises(ShadowmapError, match="There is no sensor -1"):
         renderer.render(sensor=-1)
 

@@ -42,6 +42,16 @@ CAMERAS: dict[str, Any] = {
 }
 
 
+@pytest.mark.parametrize("along", [0.25, 1.0, 4.0])
+def test_far_plane_of_a_scaled_orthographic_camera(variant: str, along: float) -> None:
+    to_world = look_at() @ mi.ScalarTransform4f().scale([2, 2, along])
+    sensor = mi.load_dict({"type": "orthographic", "to_world": to_world, "near_clip": 0.5, "far_clip": 9, "film": film()})
+    (record,) = sensors_of(sensor)
+    ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(0.3, 0.6), mi.Point2f(0.5))
+    ends = [to_ndc(record, ray(t)).z[0] for t in (0.0, ray.maxt)]
+    assert np.allclose(ends, [-1, 1], atol=1e-5)
+
+
 def to_ndc(sensor: Any, p_world: Any) -> Any:
     clip = sensor.view_projection @ mi.Vector4f(p_world.x, p_world.y, p_world.z, 1.0)
     return clip / clip.w

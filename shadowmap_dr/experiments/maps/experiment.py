@@ -19,7 +19,7 @@ from rich.table import Table
 from ... import io, report
 from ...errors import ShadowmapError
 from ...renderer import Renderer
-from ...shadow import directional_view
+from ...shadow import ShadowSettings, directional_view
 from ...timing import Contender, alternate, machine
 from . import pose as maps_pose
 from . import scenes as maps_scenes
@@ -76,6 +76,10 @@ class MapsOptions:
                     raise ShadowmapError(f"no {kind} {name!r}: choose from {', '.join(known)}.")
         if self.resolution < 8 or self.reference_spp < 1 or self.rounds < 1 or self.pose_runs < 0:
             raise ShadowmapError("resolution, samples, rounds and runs must be at least 8, 1, 1 and 0.")
+        try:
+            ShadowSettings(resolution=self.map_resolution, filter_size=self.filter_size)
+        except ValueError as error:
+            raise ShadowmapError(str(error)) from None
 
 
 def run_maps(options: MapsOptions, *, console: Console | None = None) -> dict[str, Any]:

@@ -238,7 +238,8 @@ def _from_beams_on(plan: MapPlan, lights: Sequence[Light], frusta: Frusta) -> Fr
             start = dr.select(index == first, _start_of(light), start)
     near = dr.maximum(frusta.near, start)
     first = dr.maximum(frusta.first, near)
-    frusta = replace(frusta, near=near, first=first, far=dr.maximum(frusta.far, first + 0.1 * dr.maximum(start, 0)))
+    least = first + 0.1 * dr.maximum(start, 0)
+    frusta = replace(frusta, near=near, first=first, far=dr.maximum(frusta.far, least), last=dr.maximum(frusta.last, least))
     dr.eval(frusta)
     return frusta
 
@@ -248,8 +249,8 @@ def _compat_frusta(plan: MapPlan, views: Any) -> Frusta:
     spread = dr.detach(views.spread)
     zero = dr.zeros(mi.Float, views.count)
     half = dr.select(spread > 0, spread, 1.2 * plan.radius)
-    near = zero + 0.01 * plan.radius
-    return Frusta(zero, zero, half, half, near, zero + 4 * plan.radius, near)
+    near, far = zero + 0.01 * plan.radius, zero + 4 * plan.radius
+    return Frusta(zero, zero, half, half, near, far, near, far)
 
 
 def boxes_of(geometry: Geometry) -> Boxes:

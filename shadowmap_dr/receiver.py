@@ -162,5 +162,5 @@ def _frusta(directions: Sequence[tuple[float, float, float]], window: Window, re
     center = 0.5 * (np.array(window.low) + np.array(window.high)) - shift
     half = np.broadcast_to(0.5 * (1 + 2 * _MARGIN) * np.array(window.size), center.shape)
     depths = [np.full(len(center), depth - window.z) for depth in (-reach, -0.5 * gap, -gap)]
-    values = (center[:, 0], center[:, 1], half[:, 0], half[:, 1], *depths)
+    values = (center[:, 0], center[:, 1], half[:, 0], half[:, 1], *depths, depths[1])
     return Frusta(*(device_array(mi.Float, value) for value in values))

@@ -189,3 +189,35 @@ def test_floors_seen_at_grazing_angles_are_lit(variant: str, method: str) -> Non
     }
     found, expected = lit(parts, ([4, -6, 1.5], [0, 0, 1]), shadow_method=method)
     assert np.abs(found - expected).mean() < 0.012 * expected.mean()
+
+
+@pytest.mark.parametrize("filter_size", [3, 9])
+def test_no_line_where_a_floor_leaves_the_depth_range(variant: str, filter_size: int) -> None:
+    """Maps tell depths apart up to the last caster; the floor goes on behind that, and is lit on both sides."""
+    place, transform = np.array([-10, -3.3, 10]), mi.ScalarTransform4f()
+    view = transform.look_at([1.5, -3.5, 2.5], [0, 0, 0.3], [0, 0, 1])
+    film = {"type": "hdrfilm", "width": 64, "height": 64, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "camera": {"type": "perspective", "fov": 45, "to_world": view, "film": film},
+            "floor": {"type": "rectangle", "to_world": transform.scale([3, 3, 1])},
+            "box": {"type": "cube", "to_world": transform.translate([0, 0, 0.8]).scale(0.3)},
+            "light": {"type": "point", "position": place.tolist(), "intensity": 300.0},
+        },
+        optimize=False,
+    )
+    renderer = Renderer.from_scene(scene, aovs=("position", "visibility"), shadow_filter_size=filter_size)
+    image = renderer.render().numpy()
+    p, visibility = image[..., 3:6].astype(np.float64), image[..., 6]
+
+    def meets(half: float) -> np.ndarray:
+        """Whether the way to the light passes through a box of this size (slabs)."""
+        ends = np.stack([([0, 0, 0.8] - p + sign * half) / (place - p) for sign in (-1, 1)])
+        return ends.min(0).max(-1) <= ends.max(0).min(-1)
+
+    floor = (np.abs(p[..., 2]) < 1e-4) & (image[..., 0] > 0)
+    # A texel is 0.085 wide here.
+    lit, shadowed = floor & ~meets(0.35 + 0.06 * filter_size), floor & meets(0.25 - 0.02 * filter_size)
+    assert lit.sum() > 1000 and visibility[lit].min() > 0.99
+    assert shadowed.sum() >= 10 and visibility[shadowed].max() < 0.1

@@ -169,7 +169,7 @@ def test_compat_follows_the_authors_formulas(variant: str, kind: str) -> None:
     spread = mi.Float(0.5) if kind == "spot" else zero
     view = spot_view(mi.Point3f(0, 0, 4), *axes, spread)
     half = 0.5 if kind == "spot" else 1.0
-    frusta = Frusta(zero, zero, half * one, half * one, one, mi.Float(8), one)
+    frusta = Frusta(zero, zero, half * one, half * one, one, mi.Float(8), one, mi.Float(8))
     maps = shadow_scene.make_maps([view], points(quad), quad, faces, settings, frusta=frusta)
 
     ndc = (2 * np.arange(size) + 1) / size - 1

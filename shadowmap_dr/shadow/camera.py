@@ -61,7 +61,8 @@ class Frusta:
 
     A point with light-space coordinates (x, y, z) has image coordinates (x, y) in an orthographic and (x, y) / z in a perspective
     view; the map covers ``center +- half`` in them and depths from ``near`` to ``far``. It tells depths apart from ``first`` on:
-    what lies before that lies before all receivers, and it does not matter how far.
+    what lies before that lies before all receivers, and it does not matter how far. Behind ``last`` nothing casts
+    a shadow.
     """
 
     center_x: Any
@@ -71,6 +72,7 @@ class Frusta:
     near: Any
     far: Any
     first: Any
+    last: Any
 
 
 def directional_view(direction: Any) -> LightView:

@@ -13,6 +13,11 @@ from ..raster._types import backend
 FILTERS = ("box", "gaussian", "wendland", "none")
 
 
+def reach_of(filter_size: int) -> float:
+    """How many texels away from a point a look-up reads, at most: those under the filter, and between them."""
+    return 0.5 * filter_size + 1
+
+
 def filter_kernel(name: str, size: int, compat: bool = False) -> np.ndarray:
     """Weights (size, size), float64, summing to 1.
 

@@ -13,7 +13,7 @@ from ..raster import MAX_RESOLUTION, RasterOutput, Topology, antialias, visible_
 from ..raster._types import backend, pixel_coordinates
 from ..raster.planes import pixel_depth
 from .camera import Frusta, Views, linear_depth, of_map, to_clip
-from .filters import FILTERS, filter_kernel, filter_map
+from .filters import FILTERS, filter_kernel, filter_map, reach_of
 from .methods import DEFAULT, METHODS, PREFILTERED
 from .moments import other_depth, variance_moments
 
@@ -175,7 +175,7 @@ def _texels(
         depth, slope_square = dr.select(hit, depth, frustum.far), 0
     else:
         seen = pixel_depth(raster, clip, faces, dr.detach(views.spread) > 0)
-        texels = texel_depths(seen, hit, view, frustum, size)
+        texels = texel_depths(seen, hit, view, frustum, settings)
         depth, slope_square = texels.depth, texels.slope_square
     method = PREFILTERED.get(settings.method)
     if method is None:
@@ -191,11 +191,13 @@ class TexelDepths:
     """What each texel sees, one lane each.
 
     Attributes:
-        depth: linear depth (:func:`linear_depth`), ``FAR`` where nothing is seen. Attached.
+        shown: whether it sees anything of which the depth is kept.
+        depth: linear depth (:func:`linear_depth`), ``FAR`` where there is nothing such. Attached.
         slope_square: squared change of it across a texel, detached.
         seen, dx, dy: depth as :func:`pixel_depth` returns it (attached), and its change by column and by row (detached).
     """
 
+    shown: Any
     depth: Any
     slope_square: Any
     seen: Any
@@ -203,17 +205,26 @@ class TexelDepths:
     dy: Any
 
 
-def texel_depths(seen: tuple[Any, Any, Any], hit: Any, view: Views, frustum: Frusta, size: int) -> TexelDepths:
-    """Depths in maps of ``size`` texels along each side, given what :func:`pixel_depth` returns, and where anything is seen.
+def texel_depths(seen: tuple[Any, Any, Any], hit: Any, view: Views, frustum: Frusta, settings: ShadowSettings) -> TexelDepths:
+    """Depths in maps, given what :func:`pixel_depth` returns, and where anything is seen.
 
     ``view`` and ``frustum`` are those of each texel's map.
+
+    Floors that cast no shadows may leave the depth range. If their depths just ended with it, all that is there would be darkened
+    along the line where they do: means of depths that end at the far plane lie before the floor, whose own depth ends there, too.
+    So the last of them, which look-ups mix with empty texels, are empty themselves, and that lets more light through, not less.
     """
+    size = settings.resolution * settings.supersampling
     depth, dx, dy = seen
     linear, to_linear = linear_depth(view, frustum, depth)
     with dr.suspend_grad():
         slopes = [dr.detach(to_linear * slope) for slope in (dx, dy)]
-        slope_square = dr.select(hit, _slope_square(dr.detach(view), dr.detach(frustum), dr.detach(linear), slopes, size), 0)
-    return TexelDepths(dr.select(hit, linear, FAR), slope_square, depth, dx, dy)
+        slope_square = _slope_square(dr.detach(view), dr.detach(frustum), dr.detach(linear), slopes, size)
+        last = (frustum.last - frustum.first) / (frustum.far - frustum.first) - 0.5
+        ends = dr.fma(reach_of(settings.filter_size) * settings.supersampling, dr.sqrt(slope_square), dr.detach(linear)) > FAR
+        shown = hit & ~(ends & (dr.detach(linear) > last) & (frustum.last < frustum.far))
+        slope_square = dr.select(shown, slope_square, 0)
+    return TexelDepths(shown, dr.select(shown, linear, FAR), slope_square, depth, dx, dy)
 
 
 def _two_depths(plain: Any, blended: Any) -> tuple[Any, int]:

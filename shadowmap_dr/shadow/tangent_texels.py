@@ -133,7 +133,7 @@ class TangentTexels:
         twist = dr.gather(module.Float, self.twist, image)
         hit = triangle != NO_TRIANGLE
         seen = depth_at(self.planes, image * self.raster.face_count + triangle, row, column, hit)
-        texels = texel_depths(seen, hit, view, frustum, size)
+        texels = texel_depths(seen, hit, view, frustum, self.settings)
         n, f = frustum.near, frustum.far
         ndc_x = dr.fma(module.Float(column), 2.0 / size, 1.0 / size - 1.0)
         ndc_y = dr.fma(module.Float(row), 2.0 / size, 1.0 / size - 1.0)
@@ -147,7 +147,7 @@ class TangentTexels:
         slope_x = texels.dx * half_range * (0.5 * size) / frustum.half_x
         slope_y = texels.dy * half_range * (0.5 * size) / frustum.half_y
         # What lies before the depths that are told apart does not move.
-        scale = dr.select(hit & (texels.depth > -0.5), dr.rcp(f - frustum.first), 0)
+        scale = dr.select(texels.shown & (texels.depth > -0.5), dr.rcp(f - frustum.first), 0)
         # A texel stays where it is while the triangle moves through it.
         rates = [(dz - slope_x * dx - slope_y * dy) * scale for dx, dy, dz in turned(twist, p)]
         values, slopes = _with_slopes(lambda z: self.method.encode(z, texels.slope_square, self.settings.order), texels.depth)

@@ -144,7 +144,7 @@ def _columns(vectors: Sequence[npt.ArrayLike]) -> list[Any]:
 
 def _frusta(views: Sequence[ShadowView]) -> Frusta:
     """The whole receiver, with texels where an orthographic camera has pixels."""
-    rows = [(0.0, 0.0, view.half, view.half, -_NEAR * view.half, 0.0, -_FIRST * view.half) for view in views]
+    rows = [(0.0, 0.0, view.half, view.half, -_NEAR * view.half, 0.0, -_FIRST * view.half, 0.0) for view in views]
     return Frusta(*_columns(rows))
 
 

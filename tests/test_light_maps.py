@@ -191,33 +191,58 @@ def test_floors_seen_at_grazing_angles_are_lit(variant: str, method: str) -> Non
     assert np.abs(found - expected).mean() < 0.012 * expected.mean()
 
 
-@pytest.mark.parametrize("filter_size", [3, 9])
-def test_no_line_where_a_floor_leaves_the_depth_range(variant: str, filter_size: int) -> None:
+@pytest.mark.parametrize("light", ["point", "spot"])
+def test_no_line_where_a_floor_leaves_the_depth_range(variant: str, light: str) -> None:
     """Maps tell depths apart up to the last caster; the floor goes on behind that, and is lit on both sides."""
-    place, transform = np.array([-10, -3.3, 10]), mi.ScalarTransform4f()
-    view = transform.look_at([1.5, -3.5, 2.5], [0, 0, 0.3], [0, 0, 1])
+    place, centre, half, turn = np.array([2.81, 2.9, 2.35]), [0, 0, 1.22], np.array([1.32, 0.34, 0.28]), 82.4
+    T = mi.ScalarTransform4f
+    emitters = {
+        "point": {"type": "point", "position": place.tolist()},
+        "spot": {"type": "spot", "to_world": T().look_at(place.tolist(), centre, [0, 0, 1]), "cutoff_angle": 50},
+    }
+    view = T().look_at([0.1, -2.5, 5], [0, 0, 0], [0, 0, 1])
     film = {"type": "hdrfilm", "width": 64, "height": 64, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
     scene = mi.load_dict(
         {
             "type": "scene",
-            "camera": {"type": "perspective", "fov": 45, "to_world": view, "film": film},
-            "floor": {"type": "rectangle", "to_world": transform.scale([3, 3, 1])},
-            "box": {"type": "cube", "to_world": transform.translate([0, 0, 0.8]).scale(0.3)},
-            "light": {"type": "point", "position": place.tolist(), "intensity": 300.0},
+            "camera": {"type": "perspective", "fov": 60, "to_world": view, "film": film},
+            "floor": {"type": "rectangle", "to_world": T().scale([3, 3, 1])},
+            "box": {"type": "cube", "to_world": T().translate(centre).rotate([0, 0, 1], turn).scale(half.tolist())},
+            "light": emitters[light],
         },
         optimize=False,
     )
-    renderer = Renderer.from_scene(scene, aovs=("position", "visibility"), shadow_filter_size=filter_size)
-    image = renderer.render().numpy()
+    image = Renderer.from_scene(scene, aovs=("position", "visibility")).render().numpy()
     p, visibility = image[..., 3:6].astype(np.float64), image[..., 6]
+    c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
+    axes = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
 
-    def meets(half: float) -> np.ndarray:
-        """Whether the way to the light passes through a box of this size (slabs)."""
-        ends = np.stack([([0, 0, 0.8] - p + sign * half) / (place - p) for sign in (-1, 1)])
+    def meets(more: float) -> np.ndarray:
+        """Whether the way to the light passes through the box, made larger on all sides (slabs)."""
+        ends = np.stack([(sign * (half + more) - (p - centre) @ axes.T) / ((place - p) @ axes.T) for sign in (-1, 1)])
         return ends.min(0).max(-1) <= ends.max(0).min(-1)
 
-    floor = (np.abs(p[..., 2]) < 1e-4) & (image[..., 0] > 0)
-    # A texel is 0.085 wide here.
-    lit, shadowed = floor & ~meets(0.35 + 0.06 * filter_size), floor & meets(0.25 - 0.02 * filter_size)
+    floor = (np.abs(p[..., 2]) < 1e-4) & (np.abs(p[..., :2]).max(-1) < 2.9)
+    lit, shadowed = floor & ~meets(0.15), floor & meets(-0.1)
     assert lit.sum() > 1000 and visibility[lit].min() > 0.99
-    assert shadowed.sum() >= 10 and visibility[shadowed].max() < 0.1
+    assert shadowed.sum() > 50 and visibility[shadowed].max() < 0.05
+
+
+@pytest.mark.parametrize("distance", [10, 1000])
+def test_shadows_of_far_point_lights_are_as_sharp_as_those_of_near_ones(variant: str, distance: float) -> None:
+    """Maps of a point light cover the casters, as those of others do, however small they are as seen from the light."""
+    towards, film = np.array([-1.5, -2, 4]), {"type": "hdrfilm", "width": 48, "height": 48, "rfilter": {"type": "box"}}
+    view = mi.ScalarTransform4f().look_at([1.5, -3.5, 2.5], [0, 0, 0.3], [0, 0, 1])
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "camera": {"type": "perspective", "fov": 45, "to_world": view, "film": film},
+            "floor": {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale([3, 3, 1])},
+            "ball": {"type": "sphere", "center": [0, 0, 0.8], "radius": 0.6},
+            "lamp": {"type": "point", "position": (distance * towards).tolist(), "intensity": 30.0 * distance**2},
+        },
+        optimize=False,
+    )
+    ours = mi.render(scene, integrator=mi.load_dict({"type": "shadowmap"}), spp=16).numpy()
+    traced = mi.render(scene, integrator=mi.load_dict({"type": "direct"}), spp=256).numpy()
+    assert np.abs(ours - traced).mean() < 0.006 * traced.mean()

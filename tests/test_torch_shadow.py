@@ -63,7 +63,9 @@ def test_visibility_is_that_of_drjit(method: str) -> None:
 
 def moving(kind: str, **given: torch.Tensor) -> torch.Tensor:
     """Visibility on a wall, with a fit of the maps that stays."""
-    settings = replace(SETTINGS, filter_size=9, resolution=256 if kind == "directional" else 512)
+    # Penumbrae wider than the distance between receivers, which sample them.
+    size, taps = {"directional": (256, 9), "point": (512, 31)}.get(kind, (512, 9))
+    settings = replace(SETTINGS, filter_size=taps, resolution=size)
     vertices = given.pop("vertices", VERTICES)
     maps = made(vertices, light_of(kind, **given), settings, made(VERTICES, light_of(kind), settings))
     return sdr.visibility(maps, receivers(200))[..., None]

@@ -7,6 +7,7 @@ of the light's image plane the map covers) is detached and stable, so that an op
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -28,7 +29,7 @@ class LightView:
         right, up, forward: ``Array3f`` of width 1, orthonormal, world space; light travels along ``forward``.
         origin: ``Array3f``, world space: the light's position, or any point for a directional light.
         spread: tangent of the half-angle that the map may cover, or 0 for an orthographic map.
-        fixed: always cover exactly ``spread`` (a cube face) instead of fitting within it.
+        limit: image coordinates beyond which the map need not reach in any case, not even for a margin: those of a cube's face.
     """
 
     right: Any
@@ -36,7 +37,7 @@ class LightView:
     forward: Any
     origin: Any
     spread: Any
-    fixed: bool = False
+    limit: Any = math.inf
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ class Views:
     forward: Any
     origin: Any
     spread: Any
-    fixed: Any
+    limit: Any
 
     @property
     def count(self) -> int:
@@ -106,7 +107,7 @@ def cube_views(position: Any, resolution: int, filter_size: int) -> tuple[LightV
     for k in range(3):
         for sign in (1.0, -1.0):
             forward, right = axis(k, sign), axis((k + 1) % 3, 1.0)
-            views.append(LightView(right, dr.cross(forward, right), forward, position, spread, True))
+            views.append(LightView(right, dr.cross(forward, right), forward, position, spread, spread))
     return tuple(views)
 
 
@@ -142,7 +143,7 @@ def stack_views(views: Sequence[LightView]) -> Views:
         stack3("forward"),
         stack3("origin"),
         stack([v.spread for v in views]),
-        stack([module.Float(1.0 if v.fixed else 0.0) for v in views]),
+        stack([module.Float(v.limit) for v in views]),
     )
 
 

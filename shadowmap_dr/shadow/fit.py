@@ -155,10 +155,8 @@ def _fit(
     z0, z1 = dr.select(nothing, 0.0, z0), dr.select(nothing, 1.0, z1)
 
     perspective = views.spread > 0
-    s = views.spread
-    full = views.fixed > 0
-    x0, y0 = dr.select(full, -s, dr.maximum(x0, window[0])), dr.select(full, -s, dr.maximum(y0, window[1]))
-    x1, y1 = dr.select(full, s, dr.minimum(x1, window[2])), dr.select(full, s, dr.minimum(y1, window[3]))
+    x0, y0 = dr.maximum(x0, window[0]), dr.maximum(y0, window[1])
+    x1, y1 = dr.minimum(x1, window[2]), dr.minimum(y1, window[3])
     # Behind all that is seen, casters are of no account; but seen receivers may end before the first of them.
     z1 = dr.maximum(dr.minimum(z1, window[5]), z0)
     # How far casters lie before all that is seen does not matter. All of them may.
@@ -169,7 +167,10 @@ def _fit(
     def widen(lo: Any, hi: Any) -> tuple[Any, Any]:
         half = 0.5 * (hi - lo)
         grown = half * max(1 + 2 * _MARGIN, 1 / (1 - 2 * (filter_size / 2 + 2) / resolution))
-        return 0.5 * (lo + hi), dr.select(full, half, grown)
+        middle = 0.5 * (lo + hi)
+        lo, hi = dr.maximum(middle - grown, -views.limit), dr.minimum(middle + grown, views.limit)
+        limited = dr.isfinite(views.limit)
+        return dr.select(limited, 0.5 * (lo + hi), middle), dr.select(limited, 0.5 * (hi - lo), grown)
 
     (cx, hx), (cy, hy) = widen(x0, x1), widen(y0, y1)
     # A flat caster that faces the light has no depth of its own. In a range of next to nothing all that tilts it would be a huge
@@ -198,12 +199,13 @@ def _still_fits(views: Views, old: Frusta, new: Frusta, needed: tuple[Any, ...],
     room = 2 * (filter_size / 2 + 1) / resolution
 
     def holds(lo: Any, hi: Any, center: Any, half: Any) -> Any:
-        return (lo >= center - half * (1 - room)) & (hi <= center + half * (1 - room))
+        # A map that reaches its limit needs no room there.
+        limit = views.limit * (1 - 1e-5)
+        below = (lo >= center - half * (1 - room)) | (center - half <= -limit)
+        return below & ((hi <= center + half * (1 - room)) | (center + half >= limit))
 
     keep = holds(x0, x1, old.center_x, old.half_x) & holds(y0, y1, old.center_y, old.half_y)
     keep &= (new.half_x >= _KEEP_FILL * old.half_x) & (new.half_y >= _KEEP_FILL * old.half_y)
-    # A face of a cube never moves laterally.
-    keep |= (views.fixed > 0) & (new.half_x == old.half_x)
     # Where casters surround a light, its near plane follows from the far one alone, and need not follow it closely.
     around = (views.spread > 0) & (z0 < new.near)
     keep &= dr.maximum(z0, new.near) >= dr.select(around, 0.5 * old.near, old.near)

@@ -206,14 +206,14 @@ def _views(plan: SoftPlan, samples: LightSamples, settings: ShadowSettings) -> V
     zero = dr.zeros(mi.Float, count)
     if plan.kind == "distant":
         view = directional_view(samples.place)
-        return Views(view.right, view.up, view.forward, mi.Vector3f(zero), zero, zero)
+        return Views(view.right, view.up, view.forward, mi.Vector3f(zero), zero, zero + dr.inf)
     if plan.kind in ("near", "single"):
         place = samples.centre() if plan.kind == "single" else samples.place
         # Which way a camera faces has no influence on what it sees, so it need not be differentiated.
         with dr.suspend_grad():
             view = directional_view(mi.Vector3f(*plan.target) - dr.detach(place))
         spread = dr.full(mi.Float, math.tan(math.radians(WIDEST)), count)
-        return Views(view.right, view.up, view.forward, place, spread, zero)
+        return Views(view.right, view.up, view.forward, place, spread, zero + dr.inf)
     lane = dr.arange(mi.UInt32, count)
     sample, face = lane // 6, lane % 6
     faces = cube_views(mi.Point3f(0), settings.resolution, settings.filter_size)
@@ -226,7 +226,7 @@ def _views(plan: SoftPlan, samples: LightSamples, settings: ShadowSettings) -> V
 
     origin = mi.Vector3f(*(dr.gather(mi.Float, samples.place[c], sample) for c in range(3)))
     spread = dr.full(mi.Float, 0, count) + faces[0].spread
-    return Views(pick("right"), pick("up"), pick("forward"), origin, spread, dr.full(mi.Float, 1, count))
+    return Views(pick("right"), pick("up"), pick("forward"), origin, spread, spread)
 
 
 def _stack(parts: list[Views]) -> Views:

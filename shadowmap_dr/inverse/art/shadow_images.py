@@ -118,7 +118,7 @@ def shadow_images(
         Views(
             *(mi.Point3f(*_columns([getattr(view, name) for view in views])) for name in ("right", "up", "forward", "origin")),
             dr.zeros(mi.Float, len(views)),
-            dr.zeros(mi.Float, len(views)),
+            dr.full(mi.Float, dr.inf, len(views)),
         ),
         _frusta(views),
         settings,

@@ -23,7 +23,7 @@ def light_views(to_light: Any) -> Views:
     """Cameras of directional lights, given the directions *to* them (Vector3f, M, any length)."""
     view, count = directional_view(-mi.Vector3f(to_light)), dr.width(to_light)
     zero = dr.zeros(mi.Float, count)
-    views = Views(view.right, view.up, view.forward, mi.Vector3f(zero, zero, zero), zero, zero)
+    views = Views(view.right, view.up, view.forward, mi.Vector3f(zero, zero, zero), zero, zero + dr.inf)
     dr.eval(views)
     return views
 

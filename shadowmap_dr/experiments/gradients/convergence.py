@@ -56,7 +56,7 @@ class ConvergenceOptions:
     map_resolution: int = 256
     resolution: int = 512
     iterations: int = 250
-    spp: int = 128
+    spp: int = 512
     out: Path = Path("gradients")
     resume: bool = False
 

@@ -46,7 +46,7 @@ class PlaneOptions:
     filter_size: int = 3
     resolution: int = 512
     iterations: int = 150
-    spp: int = 128
+    spp: int = 512
     out: Path = Path("gradients")
 
     def __post_init__(self) -> None:

@@ -53,7 +53,6 @@ FEW_SAMPLES = [
 BEYOND = [
     ("sun_box", "caster_rotation", {}, 1, "most pixels miss a face that is half a pixel wide, and with it its edges"),
     ("sun_cow", "caster_scale", {}, 1, "single pixels see facets from the side, on which what they show changes fast"),
-    ("sky_box", "floor_height", {}, 16, "shadows of single directions have edges, and what moves against all of them sees all"),
 ]
 # Steps of own differences that are shorter than those of path-traced ones: single directions of a sky draw narrow bands.
 SHORT_STEPS = {("constant_box", "floor_height"): 0.0025}

@@ -122,8 +122,9 @@ def test_scene_itself_stays_as_it_is(renderer: Renderer) -> None:
     params = mi.traverse(renderer.data.scene)
     before = params["ball.vertex_positions"].numpy().copy()
     at_rest = renderer.render().numpy()
-    moved = renderer.render(vertex_positions={"ball": rest(renderer) + mi.Vector3f(0.3, 0, 0)}).numpy()
-    assert not np.array_equal(at_rest, moved)
+    # As far as the maps' fit stays what it is.
+    moved = renderer.render(vertex_positions={"ball": rest(renderer) + mi.Vector3f(0.03, 0, 0)}).numpy()
+    assert not np.allclose(at_rest, moved, atol=0.02)
     assert np.array_equal(renderer.render().numpy(), at_rest)
     assert np.array_equal(params["ball.vertex_positions"].numpy(), before)
 

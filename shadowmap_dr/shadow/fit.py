@@ -9,16 +9,14 @@ import drjit as dr
 
 from ..raster._types import backend
 from .camera import Frusta, Views, of_map, to_light_space
-from .filters import reach_of
 
 # A frustum is kept while the scene fits and fills at least this fraction of it.
 _KEEP_FILL = 0.6
 _MARGIN = 0.10
 # Least depth range of a frustum in units of its lateral extent.
 _FLATTEST = 1e-2
-# From behind all casters to the far plane, where floors leave the depth range (see `texel_depths`): part of the range, or as far
-# as a floor gets under the filter, if its depth changes by so many texels' width for each texel.
-_BEHIND_LAST, _STEEP = 0.04, 1.5
+# Part of the depth range between the last depth at which there may be casters and the far plane (see `texel_depths`).
+_BEHIND_LAST = 0.04
 # Depths are told apart from this far before the first receiver on, in units of the range from there on.
 _BEFORE = 1.0
 
@@ -163,16 +161,6 @@ def _fit(
     receivers = dr.select(dr.isfinite(window[4]), dr.maximum(window[4], z0), z0)
     # Casters outside of the window leave an empty rectangle; any small one will do.
     x1, y1 = dr.maximum(x1, x0 + 1e-4 * (1 + dr.abs(x0))), dr.maximum(y1, y0 + 1e-4 * (1 + dr.abs(y0)))
-
-    def widen(lo: Any, hi: Any) -> tuple[Any, Any]:
-        half = 0.5 * (hi - lo)
-        grown = half * max(1 + 2 * _MARGIN, 1 / (1 - 2 * (filter_size / 2 + 2) / resolution))
-        middle = 0.5 * (lo + hi)
-        lo, hi = dr.maximum(middle - grown, -views.limit), dr.minimum(middle + grown, views.limit)
-        limited = dr.isfinite(views.limit)
-        return dr.select(limited, 0.5 * (lo + hi), middle), dr.select(limited, 0.5 * (hi - lo), grown)
-
-    (cx, hx), (cy, hy) = widen(x0, x1), widen(y0, y1)
     # A flat caster that faces the light has no depth of its own. In a range of next to nothing all that tilts it would be a huge
     # change, of which the derivative of visibility is the small difference.
     lateral = dr.maximum(x1 - x0, y1 - y0) * dr.select(perspective, dr.abs(z1), 1)
@@ -186,11 +174,19 @@ def _fit(
     last = dr.maximum(z1, receivers - 0.1 * depth) + 0.05 * depth
     last = dr.select(perspective, dr.maximum(last, 1e-6), last)
     first = dr.maximum(near, receivers - _BEFORE * depth)
-    texel = 2 / resolution * dr.maximum(hx, hy) * dr.select(perspective, last, 1)
-    far = last + dr.maximum(_BEHIND_LAST * (last - first), _STEEP * reach_of(filter_size) * texel)
+    far = last + _BEHIND_LAST * (last - first)
     near = dr.select(perspective, dr.maximum(near, 1e-3 * far), near)
     first = dr.maximum(near, receivers - _BEFORE * depth)
 
+    def widen(lo: Any, hi: Any) -> tuple[Any, Any]:
+        half = 0.5 * (hi - lo)
+        grown = half * max(1 + 2 * _MARGIN, 1 / (1 - 2 * (filter_size / 2 + 2) / resolution))
+        middle = 0.5 * (lo + hi)
+        lo, hi = dr.maximum(middle - grown, -views.limit), dr.minimum(middle + grown, views.limit)
+        limited = dr.isfinite(views.limit)
+        return dr.select(limited, 0.5 * (lo + hi), middle), dr.select(limited, 0.5 * (hi - lo), grown)
+
+    (cx, hx), (cy, hy) = widen(x0, x1), widen(y0, y1)
     return Frusta(cx, cy, hx, hy, near, far, first, last), (x0, y0, x1, y1, z0, z1, receivers)
 
 

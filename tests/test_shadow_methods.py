@@ -101,6 +101,30 @@ def test_hamburger_bound(variant: str) -> None:
     assert np.abs(got - want).mean() < 1e-3
 
 
+def test_large_derivatives_of_the_hamburger_bound_are_true(variant: str) -> None:
+    """Receivers around one surface: a root that passes through infinity must not leave differences of huge numbers.
+
+    Oracle: central differences in double precision, where derivatives are largest.
+    """
+    rng = np.random.default_rng(7)
+    n, step = 200_000, 1e-8
+    depth = rng.uniform(-0.5, 0.5, n)
+    inputs = PREFILTERED["msm"].encode(floats(depth), floats(10.0 ** rng.uniform(-6, -3, n)), 0)
+    inputs.append(floats(depth + 0.02 * rng.normal(size=n)))
+    dr.enable_grad(inputs)
+    dr.backward(dr.sum(PREFILTERED["msm"].resolve(inputs[:4], inputs[4])))
+    got = np.array([dr.grad(i).numpy() for i in inputs])
+
+    def value(at: np.ndarray) -> float:
+        moments = at[:4] + 3e-6 * (np.array([0, 0.375, 0, 0.375]) - at[:4])
+        return 1 - hankel_bound(moments, 2 * at[4])
+
+    largest = np.argsort(-np.abs(got).max(0))[:40]
+    places = np.array([i.numpy() for i in inputs], float)[:, largest].T
+    want = np.array([[(value(p + d) - value(p - d)) / (2 * step) for d in step * np.eye(5)] for p in places]).T
+    assert np.abs(got[:, largest] - want).max() < 0.25 * np.abs(want).max()
+
+
 def random_texels(method: str) -> tuple[list[Any], np.ndarray]:
     """Filtered values of random depths, degenerate ones (one depth, all far, all near) and nonsense, and receivers."""
     rng = np.random.default_rng(1)

@@ -34,6 +34,7 @@ class Sizes:
         full_raster: mesh and resolutions for the forward and backward pass through the raster functions.
         call_seconds: a rasterization that is predicted to take longer than this is left out.
         series: quantity -> values; see `bench.scaling`.
+        light_resolutions: sizes of images, beside that of the series, for which the numbers of lights are compared.
         large: mesh and resolution of the largest step.
         batch, batch_resolution: number and size of small images.
     """
@@ -59,6 +60,7 @@ class Sizes:
             "lights": (1, 2, 4, 8),
         }
     )
+    light_resolutions: tuple[int, ...] = (512, 1024)
     passes: int = 2
     large: tuple[str, int] | None = ("spot-1.5M", 1024)
     batch: tuple[int, ...] = (1, 4, 8, 16, 32)
@@ -85,6 +87,7 @@ QUICK = Sizes(
         "filter_size": (3, 9),
         "lights": (1, 8),
     },
+    light_resolutions=(),
     passes=1,
     large=None,
     batch=(1, 8),

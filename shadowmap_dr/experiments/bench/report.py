@@ -229,9 +229,13 @@ def _scaling_rows(key: str, unit: dict[str, Any]) -> Iterator[Row]:
     if value is not None:
         aims = _aim(value, EXPONENT if key in ("triangles", "resolution") else None, "<= {:g}", least=False)
         yield Row(f"growth with {key}", "exponent", f"{value:.2f}", f"last two {end:.2f}", "", *aims)
-    eight = unit.get("in turns", {}).get("ratio_of_medians", {}).get("8 / 1")
-    if eight is not None:
-        yield Row("eight lights over one", "", "", "", f"{eight:.2f}x", *_aim(eight, EIGHT_LIGHTS, "<= {:g}x", least=False))
+    if key != "lights":
+        return
+    own = str(unit["points"][0]["case"]["resolution"])
+    for size, compared in {own: unit["in turns"], **unit.get("in turns, larger images", {})}.items():
+        eight = compared["ratio_of_medians"].get("8 / 1")
+        if eight is not None:
+            yield Row("eight lights over one", size, "", "", f"{eight:.2f}x", *_aim(eight, EIGHT_LIGHTS, "<= {:g}x", least=False))
 
 
 def _breakdown_rows(key: str, unit: dict[str, Any]) -> Iterator[Row]:

@@ -85,11 +85,21 @@ def measure_series(options: BenchOptions, name: str, done: Mapping[str, Any], up
     # The fixed cost of a step flattens the small end; the large end says how it goes on.
     result["exponent_of_the_last_two"] = exponent(sizes[-2:], medians[-2:])
     if name == "lights":
-        update(0, 1, "all numbers of lights in turns")
-        fits = {str(case.lights): case.fit(options.work) for case in cases}
-        samples = alternate({key: Contender(fit.step, options.what.rounds) for key, fit in fits.items()}, update)
-        result["in turns"] = compare(samples, [(key, "1") for key in fits if key != "1"])
+        result["in turns"] = _in_turns(options, cases, update)
+        # What a light adds does not depend much on the image; the rest of a step does.
+        result["in turns, larger images"] = {
+            str(resolution): _in_turns(options, [replace(case, resolution=resolution) for case in cases], update)
+            for resolution in options.what.light_resolutions
+        }
     return result
+
+
+def _in_turns(options: BenchOptions, cases: list[Case], update: Update) -> dict[str, Any]:
+    """Steps with one and with several lights."""
+    update(0, 1, f"all numbers of lights in turns at {cases[0].resolution}")
+    fits = {str(case.lights): case.fit(options.work) for case in cases}
+    samples = alternate({key: Contender(fit.step, options.what.rounds) for key, fit in fits.items()}, update)
+    return compare(samples, [(key, "1") for key in fits if key != "1"])
 
 
 def measure_large(options: BenchOptions, done: Mapping[str, Any], update: Update) -> dict[str, Any]:

@@ -92,6 +92,8 @@ class Geometry:
     shape_face_start  UInt32 (S,)  ``ShapeInfo.face_start`` as an array
     changed        names of the shapes that ``with_positions`` replaced, if only their vertices may carry gradients; else None
     as_loaded      whether the other shapes are as they were when the scene was loaded
+    stand_ins      UInt32 (V,) which vertex each one's place is taken from, None if all have faces: those without, which nobody
+                   sees, lie where another one of their shape does, so that they stretch no bounds (``settled``)
     packets        Float (4V,), positions with a fourth number, through which derivatives take the way back (``in_packets``)
     """
 
@@ -107,6 +109,7 @@ class Geometry:
     shapes: tuple[ShapeInfo, ...]
     changed: tuple[str, ...] | None = None
     as_loaded: bool = False
+    stand_ins: Any = None
     packets: Any = None
 
     @property
@@ -203,7 +206,11 @@ class Geometry:
                 own = dr.arange(mi.UInt32, info.vertex_count) + info.vertex_start
                 smooth = dr.gather(mi.Normal3f, smooth, own) * (-1 if info.against_winding else 1)
                 normals = _write_vertices(normals, smooth, info.vertex_start, info.vertex_count, self.vertex_count)
-        return replace(self, positions=merged, normals=normals, changed=changed, packets=None)
+        return replace(self, positions=self.settled(merged), normals=normals, changed=changed, packets=None)
+
+    def settled(self, positions: Any) -> Any:
+        """Positions (Float, 3V) of which those of vertices without faces are another vertex's."""
+        return positions if self.stand_ins is None else dr.ravel(dr.gather(mi.Point3f, positions, self.stand_ins))
 
 
 def vertex_normals(positions: Any, faces: Any, vertex_count: int) -> Any:
@@ -229,6 +236,15 @@ def vertex_normals(positions: Any, faces: Any, vertex_count: int) -> Any:
     # The weights are angles: a sum of this size is the rounding error of faces that lie back to back.
     total = dr.select(dr.squared_norm(total) > 1e-10, total, 0.0)
     return dr.ravel(normalize_or(total, mi.Vector3f(1.0, 0.0, 0.0)))
+
+
+def stand_ins(faces: np.ndarray, first_faces: np.ndarray, vertex_shape: np.ndarray) -> np.ndarray | None:
+    """``Geometry.stand_ins``, uint32 (V,), for faces (F, 3), the first face of each shape, and each vertex's shape (V,)."""
+    used = np.zeros(len(vertex_shape), np.bool_)
+    used[faces] = True
+    if used.all():
+        return None
+    return np.where(used, np.arange(len(used)), faces[first_faces, 0][vertex_shape]).astype(np.uint32)
 
 
 def pack_face_info(shapes: tuple[ShapeInfo, ...]) -> np.ndarray:

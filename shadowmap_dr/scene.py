@@ -16,7 +16,7 @@ import numpy as np
 
 from .environments import Environment
 from .errors import ShadowmapError, UnsupportedShape
-from .geometry import Geometry, ShapeInfo, pack_face_info
+from .geometry import Geometry, ShapeInfo, pack_face_info, stand_ins
 from .lights import AreaLight, Light, area_lights_of, environments_of, lights_of
 from .omissions import omissions_of, warn_of
 from .raster._memory import device_array
@@ -107,17 +107,20 @@ def load(scene: Any, *, tessellation: int = 64, warn: bool = True) -> SceneData:
         raise ShadowmapError(f"There is nothing to render in the scene: {why}.")
     face_counts, vertex_counts = [i.face_count for i in infos], [i.vertex_count for i in infos]
     shape_index = np.arange(len(infos), dtype=np.uint32)
+    merged, vertex_shape = np.concatenate(faces), np.repeat(shape_index, vertex_counts)
+    settled = stand_ins(merged, np.array([i.face_start for i in infos]), vertex_shape)
     geometry = Geometry(
         positions=None,  # the four buffers that may change are read by ``refresh``
         normals=None,
         texcoords=None,
         rest_positions=None,
-        faces=device_array(mi.UInt32, np.concatenate(faces)),
+        faces=device_array(mi.UInt32, merged),
         face_shape=device_array(mi.UInt32, np.repeat(shape_index, face_counts)),
         face_info=device_array(mi.UInt32, pack_face_info(tuple(infos))),
-        vertex_shape=device_array(mi.UInt32, np.repeat(shape_index, vertex_counts)),
+        vertex_shape=device_array(mi.UInt32, vertex_shape),
         shape_face_start=device_array(mi.UInt32, [i.face_start for i in infos]),
         shapes=tuple(infos),
+        stand_ins=None if settled is None else device_array(mi.UInt32, settled),
     )
     data = SceneData(
         scene=scene,
@@ -151,7 +154,7 @@ def refresh(data: SceneData, sensors: tuple[Any, ...] | None = None) -> SceneDat
     rest = rest if any(info.reads_attributes for info in data.geometry.shapes) else None
     geometry = replace(
         data.geometry,
-        positions=positions,
+        positions=data.geometry.settled(positions),
         normals=normals,
         texcoords=texcoords,
         rest_positions=rest,
@@ -241,7 +244,7 @@ def describe(name: str, source: ShapeSource, faces: np.ndarray, vertex_start: in
         flip_geometric=flipped != mirrored,
         flip_shading=flipped,
         reads_attributes=isinstance(shape, mi.Mesh) and shape.has_mesh_attributes(),
-        planar=_is_planar(points),
+        planar=_is_planar(points, faces),
         against_winding=mirrored != turned,
         see_through=mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null),
         faceted=faceted and _is_faceted(points, faces, own.normals.numpy().reshape(-1, 3)),
@@ -276,7 +279,10 @@ def _is_turned(points: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> bo
     return bool((np.cross(b - a, c - a) * normals[faces].sum(1)).sum() < 0)
 
 
-def _is_planar(points: np.ndarray) -> bool:
+def _is_planar(points: np.ndarray, faces: np.ndarray) -> bool:
+    used = np.zeros(len(points), np.bool_)
+    used[faces] = True
+    points = points[used]
     centred = points.astype(np.float64) - points.mean(0, dtype=np.float64)
     spread = np.linalg.eigvalsh(centred.T @ centred)
     return bool(spread[0] <= 1e-10 * spread[2])
@@ -285,7 +291,7 @@ def _is_planar(points: np.ndarray) -> bool:
 def with_positions(data: SceneData) -> Geometry:
     """The geometry with the vertices as they are now, attached, and nothing else that :func:`refresh` reads."""
     buffers = (_vertex_buffers(source, info) for source, info in zip(data.sources, data.geometry.shapes, strict=True))
-    return replace(data.geometry, positions=dr.concat([positions for positions, *_ in buffers]))
+    return replace(data.geometry, positions=data.geometry.settled(dr.concat([positions for positions, *_ in buffers])))
 
 
 def _vertex_buffers(source: ShapeSource, info: ShapeInfo) -> tuple[Any, Any, Any, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -246,3 +247,42 @@ def test_shadows_of_far_point_lights_are_as_sharp_as_those_of_near_ones(variant:
     ours = mi.render(scene, integrator=mi.load_dict({"type": "shadowmap"}), spp=16).numpy()
     traced = mi.render(scene, integrator=mi.load_dict({"type": "direct"}), spp=256).numpy()
     assert np.abs(ours - traced).mean() < 0.006 * traced.mean()
+
+
+@pytest.mark.parametrize("moved", [False, True], ids=["loaded", "moved"])
+def test_vertices_without_faces_leave_maps_as_they_are(variant: str, moved: bool) -> None:
+    """Vertices that nobody sees, a hundred thousand units away: maps would stretch to them."""
+
+    def render(stray: bool) -> tuple[np.ndarray, np.ndarray]:
+        vertices = np.array([[-1, -1, 1], [1, -1, 1], [0, 1, 1.2]], np.float32)
+        if stray:
+            vertices = np.vstack([[1e5, 2e5, 3e5], vertices, [-1e5, 0, 0]]).astype(np.float32)
+        mesh = mi.Mesh("card", len(vertices), 1)
+        params = mi.traverse(mesh)
+        params["vertex_positions"] = mi.Float(vertices.ravel())
+        params["faces"] = mi.UInt32([1, 2, 3] if stray else [0, 1, 2])
+        params.update()
+        scene = mi.load_dict({
+            "type": "scene",
+            "camera": {
+                "type": "perspective", "to_world": mi.ScalarTransform4f().look_at([3, 0, 5], [0, 0, 0], [0, 1, 0]),
+                "film": {"type": "hdrfilm", "width": 24, "height": 24, "rfilter": {"type": "box"}},
+            },
+            "floor": {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(4)},
+            "card": mesh,
+            "sun": {"type": "directional", "direction": [0.2, 0.1, -1], "irradiance": 3.0},
+        })  # fmt: skip
+        renderer = Renderer.from_scene(scene, shadow_map_resolution=64)
+        start = mi.Float((vertices + [0.3, 0, 0]).astype(np.float32).ravel())
+        dr.enable_grad(start)
+        image = renderer.render(vertex_positions={"card": start} if moved else None)
+        if not moved:
+            return np.array(image), np.zeros(0)
+        dr.backward(dr.sum(dr.square(image.array)))
+        gradient = np.array(dr.grad(start)).reshape(-1, 3)
+        return np.array(image), gradient[1:4] if stray else gradient
+
+    (with_image, with_gradient), (image, gradient) = render(True), render(False)
+    assert image.std() > 0.05
+    assert np.abs(with_image - image).max() < 1e-5
+    assert np.abs(with_gradient - gradient).max(initial=0) <= 1e-4 * np.abs(gradient).max(initial=0)

@@ -238,13 +238,19 @@ def vertex_normals(positions: Any, faces: Any, vertex_count: int) -> Any:
     return dr.ravel(normalize_or(total, mi.Vector3f(1.0, 0.0, 0.0)))
 
 
-def stand_ins(faces: np.ndarray, first_faces: np.ndarray, vertex_shape: np.ndarray) -> np.ndarray | None:
-    """``Geometry.stand_ins``, uint32 (V,), for faces (F, 3), the first face of each shape, and each vertex's shape (V,)."""
-    used = np.zeros(len(vertex_shape), np.bool_)
+def stand_ins(
+    faces: np.ndarray, vertex_shape: np.ndarray, shapes: tuple[ShapeInfo, ...], meshes: np.ndarray
+) -> np.ndarray | None:
+    """``Geometry.stand_ins``, uint32 (V,), for faces (F, 3) and each vertex's shape (V,).
+
+    ``meshes`` (S,) tells which shapes come from elsewhere: all vertices of what is tessellated here lie on their surfaces.
+    """
+    used = ~meshes[vertex_shape]
     used[faces] = True
     if used.all():
         return None
-    return np.where(used, np.arange(len(used)), faces[first_faces, 0][vertex_shape]).astype(np.uint32)
+    some = faces[[info.face_start for info in shapes], 0]
+    return np.where(used, np.arange(len(used)), some[vertex_shape]).astype(np.uint32)
 
 
 def pack_face_info(shapes: tuple[ShapeInfo, ...]) -> np.ndarray:

@@ -108,7 +108,7 @@ def load(scene: Any, *, tessellation: int = 64, warn: bool = True) -> SceneData:
     face_counts, vertex_counts = [i.face_count for i in infos], [i.vertex_count for i in infos]
     shape_index = np.arange(len(infos), dtype=np.uint32)
     merged, vertex_shape = np.concatenate(faces), np.repeat(shape_index, vertex_counts)
-    settled = stand_ins(merged, np.array([i.face_start for i in infos]), vertex_shape)
+    settled = stand_ins(merged, vertex_shape, tuple(infos), np.array([isinstance(s.shape, mi.Mesh) for s in sources]))
     geometry = Geometry(
         positions=None,  # the four buffers that may change are read by ``refresh``
         normals=None,

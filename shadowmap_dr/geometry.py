@@ -238,6 +238,13 @@ def vertex_normals(positions: Any, faces: Any, vertex_count: int) -> Any:
     return dr.ravel(normalize_or(total, mi.Vector3f(1.0, 0.0, 0.0)))
 
 
+def with_faces(faces: np.ndarray, count: int) -> np.ndarray:
+    """Which of ``count`` vertices belong to any of the faces (F, 3), bool."""
+    found = np.zeros(count, np.bool_)
+    found[faces] = True
+    return found
+
+
 def stand_ins(
     faces: np.ndarray, vertex_shape: np.ndarray, shapes: tuple[ShapeInfo, ...], meshes: np.ndarray
 ) -> np.ndarray | None:
@@ -245,8 +252,7 @@ def stand_ins(
 
     ``meshes`` (S,) tells which shapes come from elsewhere: all vertices of what is tessellated here lie on their surfaces.
     """
-    used = ~meshes[vertex_shape]
-    used[faces] = True
+    used = with_faces(faces, len(vertex_shape)) | ~meshes[vertex_shape]
     if used.all():
         return None
     some = faces[[info.face_start for info in shapes], 0]

@@ -16,7 +16,7 @@ import numpy as np
 
 from .environments import Environment
 from .errors import ShadowmapError, UnsupportedShape
-from .geometry import Geometry, ShapeInfo, pack_face_info, stand_ins
+from .geometry import Geometry, ShapeInfo, pack_face_info, stand_ins, with_faces
 from .lights import AreaLight, Light, area_lights_of, environments_of, lights_of
 from .omissions import omissions_of, warn_of
 from .raster._memory import device_array
@@ -280,9 +280,7 @@ def _is_turned(points: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> bo
 
 
 def _is_planar(points: np.ndarray, faces: np.ndarray) -> bool:
-    used = np.zeros(len(points), np.bool_)
-    used[faces] = True
-    points = points[used]
+    points = points[with_faces(faces, len(points))]
     centred = points.astype(np.float64) - points.mean(0, dtype=np.float64)
     spread = np.linalg.eigvalsh(centred.T @ centred)
     return bool(spread[0] <= 1e-10 * spread[2])

@@ -272,17 +272,17 @@ def find_fair_setting(
     """
     protocol = {"resolution": resolution, "mesh": mesh, "normals": normals, "starts": starts, "iterations": iterations,
                 "threshold_deg": threshold_deg}
+    earlier = earlier or protocol
     for name, value in protocol.items():
         # Searches from before there was a choice are with flat shading.
-        found = (earlier or {}).get(name, "face" if name == "normals" else value)
+        found = earlier.get(name, "face" if name == "normals" else value)
         if found != value:
             raise ShadowmapError(f"the earlier search had {name} {found}, not {value}: choose another file for this one.")
     scene_path, mesh_path = assets.scene("pose"), assets.mesh(mesh)
     scene = _load(scene_path, mesh_path, resolution, normals)
     reference, proxy = path_traced(scene, spp=512).image, calibrate(scene)
     record: dict[str, Any] = {
-        **protocol, "measurements": list((earlier or {}).get("measurements", [])),
-        "untried": dict((earlier or {}).get("untried", {})),
+        **protocol, "measurements": list(earlier.get("measurements", [])), "untried": dict(earlier.get("untried", {})),
         "proxy": proxy.record(), "mitsuba": mi.__version__, "variant": mi.variant(), "threads": dr.thread_count(),
     }
     record["setting"] = _cheapest(record["measurements"], starts, threshold_deg)

@@ -262,6 +262,14 @@ def test_searches_of_something_else_are_not_continued(changes: dict) -> None:
         pose.find_fair_setting(**{"resolution": 16, "candidates": (), "earlier": earlier, **changes})
 
 
+@pytest.mark.parametrize("normals", ["face", "vertex"])
+def test_searches_begin_without_an_earlier_one(normals: str) -> None:
+    found = pose.find_fair_setting(16, normals=normals, candidates=())
+    assert found["normals"] == normals and found["setting"] is None and found["measurements"] == []
+    again = pose.find_fair_setting(16, normals=normals, candidates=(), earlier=json.loads(json.dumps(found)))
+    assert again.keys() == found.keys()
+
+
 def test_search_skips_what_costs_more_than_a_known_setting(monkeypatch: pytest.MonkeyPatch) -> None:
     measured: list[str] = []
 

@@ -44,6 +44,6 @@ with tempfile.TemporaryDirectory() as folder:
     for name, seconds in result["seconds"].items():
         print(f"{name}: {1e3 * seconds['median']:.2f} ms a step (quartiles {1e3 * seconds['q1']:.2f}, {1e3 * seconds['q3']:.2f})")
     for name, ratio in result["ratio_of_medians"].items():
-        print(f"{name}: {ratio:.3g}x")
+        print(f"{name}: {ratio:.{1 if ratio < 10 else 0}f}x")
     cores = others.cores()
     print("" if cores is None else f"cores that other work used meanwhile: {cores:.1f}")

@@ -268,7 +268,9 @@ def _aim(value: float, aim: float | None, form: str, *, least: bool) -> tuple[st
 
 
 def _time(seconds: float) -> str:
-    if seconds >= 1:
+    if seconds >= 999.5:
+        return f"{seconds:.0f} s"  # 1234 s, not 1.23e+03
+    if seconds >= 0.9995:
         return f"{seconds:.3g} s"
     return f"{1e3 * seconds:.3g} ms"
 

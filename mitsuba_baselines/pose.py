@@ -63,6 +63,17 @@ class ProjectiveSetting:
     def __str__(self) -> str:
         return f"{self.sppc}/{self.sppp}/{self.sppi} {self.guiding}, {self.spp}"
 
+    @classmethod
+    def parse(cls, text: str) -> ProjectiveSetting:
+        """From "sppc/sppp/sppi", optionally with "/guiding" and "/spp". Raises ShadowmapError for anything else."""
+        part = text.split("/")
+        try:
+            return cls(*map(int, part[:3]), *part[3:4], *map(int, part[4:]))
+        except ShadowmapError:
+            raise
+        except (TypeError, ValueError) as error:
+            raise ShadowmapError(f"sample counts {text}: give C/P/I, C/P/I/GUIDING or C/P/I/GUIDING/SPP.") from error
+
 
 class MitsubaPose:
     """Fits the pose of a mesh to a reference image with Mitsuba's projective integrator and Adam.
@@ -414,7 +425,7 @@ def main() -> None:
 def _search(options: argparse.Namespace) -> None:
     candidates = CANDIDATES
     if options.candidates:
-        candidates = tuple(dict.fromkeys(_candidate(text) for text in options.candidates))
+        candidates = tuple(dict.fromkeys(ProjectiveSetting.parse(text) for text in options.candidates))
     if not 1 <= options.search <= MAX_RESOLUTION:
         raise ShadowmapError(f"a resolution of {options.search} pixels: give 1 to {MAX_RESOLUTION}.")
     mi.set_variant("llvm_ad_rgb")
@@ -429,16 +440,6 @@ def _search(options: argparse.Namespace) -> None:
     record = find_fair_setting(options.search, mesh=options.mesh, normals=options.normals, candidates=candidates,
                                earlier=_stored(options.output).get(key), save=save, report=lambda line: print(line, flush=True))
     print(f"fair setting at {key}: {record['setting']}")
-
-
-def _candidate(text: str) -> ProjectiveSetting:
-    part = text.split("/")
-    try:
-        return ProjectiveSetting(*map(int, part[:3]), *part[3:4], *map(int, part[4:]))
-    except ShadowmapError:
-        raise
-    except (TypeError, ValueError) as error:
-        raise ShadowmapError(f"--candidates {text}: give C/P/I, C/P/I/GUIDING or C/P/I/GUIDING/SPP.") from error
 
 
 if __name__ == "__main__":

@@ -41,9 +41,10 @@ def test_ways_to_render_are_timed_in_turns() -> None:
 
 def test_steps_are_timed_in_turns() -> None:
     script = ROOT / "docs" / "examples" / "pose_speed.py"
-    command = [sys.executable, script, "--resolution", "16", "--rounds", "1"]
+    command = [sys.executable, script, "--resolution", "16", "--rounds", "1", "--setting", "2/2/8/none/4"]
     result = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=ROOT)
     assert result.returncode == 0, result.stderr
+    assert "2/2/8 none, 4" in result.stdout
     steps = {name: float(value) for name, value in re.findall(r"^(\w+): ([0-9.]+) ms a step", result.stdout, re.MULTILINE)}
     assert steps.keys() == {"shadows", "rasterizer", "mitsuba"} and min(steps.values()) > 0
     ratios = {pair: float(value) for pair, value in re.findall(r"^(\w+ / \w+): ([0-9.]+)x$", result.stdout, re.MULTILINE)}

@@ -1,6 +1,6 @@
 """Time of an optimisation step with shadows, without, and with Mitsuba's projective integrator at its fair setting, in turns.
 
-    python docs/examples/pose_speed.py --normals vertex [--resolution 128] [--rounds 10]
+    python docs/examples/pose_speed.py --normals vertex [--resolution 128] [--rounds 10] [--setting 1/1/64/none/64]
 """
 
 from __future__ import annotations
@@ -9,7 +9,8 @@ import argparse
 import tempfile
 from pathlib import Path
 
-from shadowmap_dr.experiments.pose.methods import build_method, usual_methods
+from mitsuba_baselines.pose import ProjectiveSetting
+from shadowmap_dr.experiments.pose.methods import METHODS, build_method, usual_methods
 from shadowmap_dr.experiments.pose.scene import make_problem, path_traced_reference, start_pose
 from shadowmap_dr.timing import Contender, OtherWork, alternate, compare
 
@@ -21,6 +22,7 @@ parser.add_argument("--object", default="spot")
 parser.add_argument("--resolution", type=int, default=128)
 parser.add_argument("--normals", choices=("face", "vertex"), default="face")
 parser.add_argument("--rounds", type=int, default=10, help="steps of Mitsuba's; ours make five times as many")
+parser.add_argument("--setting", metavar="C/P/I[/GUIDING[/SPP]]", help="sample counts of Mitsuba's instead of the fair ones")
 options = parser.parse_args()
 
 mi.set_variant("llvm_ad_rgb")
@@ -28,8 +30,9 @@ with tempfile.TemporaryDirectory() as folder:
     problem = make_problem(options.object, options.resolution, normals=options.normals, work=Path(folder))
     reference = path_traced_reference(problem, Path(folder) / "reference.exr")
     contenders = {}
-    for name in usual_methods(normals=options.normals):
-        method = build_method(name, problem, reference)
+    setting = ProjectiveSetting.parse(options.setting) if options.setting else None
+    for name in METHODS if setting else usual_methods(normals=options.normals):
+        method = build_method(name, problem, reference, setting=setting)
         method.reset(start_pose(0, 0))
         if name == "mitsuba":
             print(f"Mitsuba: {method.setting}")

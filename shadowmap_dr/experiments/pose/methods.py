@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -11,6 +11,9 @@ import numpy.typing as npt
 from ... import assets
 from ...inverse import Method, PoseFit
 from .scene import PoseProblem
+
+if TYPE_CHECKING:
+    from mitsuba_baselines.pose import ProjectiveSetting
 
 METHODS = ("shadows", "rasterizer", "mitsuba")
 STEP_SIZE = 0.01
@@ -30,12 +33,19 @@ def usual_methods(shadow_only: bool = False, normals: str = "face") -> tuple[str
     return METHODS if is_searched(normals) else METHODS[:2]
 
 
-def build_method(name: str, problem: PoseProblem, reference: Image, samples: int = 1) -> Method:
-    """One of the three methods for a problem and its reference image; our own ones with so many samples per pixel."""
+def build_method(
+    name: str, problem: PoseProblem, reference: Image, samples: int = 1, setting: ProjectiveSetting | None = None
+) -> Method:
+    """One of the three methods for a problem and its reference image.
+
+    Args:
+        samples: Per pixel, of our own methods.
+        setting: Sample counts of Mitsuba's; default: the fair ones, or what stands in for them.
+    """
     if name == "mitsuba":
         from mitsuba_baselines import pose as baseline
 
-        setting = baseline.fair_setting(problem.resolution, problem.normals)
+        setting = setting or baseline.fair_setting(problem.resolution, problem.normals)
         return baseline.MitsubaPose(
             assets.scene("pose"),
             problem.mesh,

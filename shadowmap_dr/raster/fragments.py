@@ -6,6 +6,7 @@ with an atomic minimum over ``(depth, triangle)`` keys. Nothing is sorted and no
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
@@ -18,14 +19,20 @@ EMPTY = 0xFFFFFFFFFFFFFFFF
 
 
 def draw(
-    triangles: Triangles, keys: Any, behind: Any, first_pixel: Any, triangle: Any, box: tuple[Any, Any, Any, Any], active: Any
+    triangles: Triangles,
+    keys: Any,
+    behind: Any,
+    pixel_index: Callable[[Any, Any], Any],
+    triangle: Any,
+    box: tuple[Any, Any, Any, Any],
+    active: Any,
 ) -> None:
     """Merge the fragments of triangles within a box each into an image of keys.
 
     Args:
         keys: ``UInt64`` for each pixel of the batch, written.
         behind: None or ``UInt64`` for each pixel: only fragments with a larger key count.
-        first_pixel: index of the first pixel of the triangle's image.
+        pixel_index: where the keys of a (row, column) of the triangle's image are.
         triangle: index that goes into the keys.
         box: inclusive bounds (first column, first row, last column, last row), inside the image.
         active: triangles to draw.
@@ -57,7 +64,7 @@ def draw(
         values = dr.fma(t.a, x, at_middle)
         covered = (column <= end) & covers(values, row, column, t.height, t.width, t.exact)
         key = fragment_key(values.w, triangle)
-        pixel = first_pixel + UInt32(row) * t.width + UInt32(column)
+        pixel = pixel_index(UInt32(row), UInt32(column))
         if behind is not None:
             covered &= key > dr.gather(module.UInt64, behind, pixel, covered)
         # A copy of the image for each thread, Dr.Jit's usual way, would cost far more than a few atomic operations.

@@ -14,7 +14,7 @@ from ._types import MAX_RESOLUTION, NO_TRIANGLE, RasterOutput, backend, by_image
 from .barycentrics import pixel_barycentrics
 from .fragments import EMPTY, draw
 from .setup import centred, covers, edge_lines, fragment_key, gather_triangle, set_up
-from .tiles import STRIP, TileGrid, TileLists, build_tile_lists, nearest_covers, strips
+from .tiles import STRIP, Strips, TileGrid, TileLists, build_tile_lists, nearest_covers, strips
 
 #: A triangle that covers more pixels than this, and is not thin, goes through the lists of tiles.
 _LARGE = 512
@@ -246,7 +246,10 @@ def _nearest_fragments(
     module = backend(positions)
     UInt32, UInt64 = module.UInt32, module.UInt64
     face_count = dr.width(faces) // 3
-    keys = _empty_keys(module, batch * height * width)
+    grid = TileGrid(batch, height, width)
+    # The keys of a tile lie side by side: what is near in the image is near in memory, in both directions.
+    tiled = not peel and height * width > _LARGE
+    keys = _empty_keys(module, grid.pixel_count if tiled else batch * height * width)
     index = dr.arange(UInt32, batch * face_count)
     image, triangle = by_image(index, face_count, batch)
     triangles = set_up(gather_triangle(positions, faces, triangle, image * vertex_count, True), height, width)
@@ -260,12 +263,15 @@ def _nearest_fragments(
         culled = dr.gather(module.Bool, one_sided, triangle if dr.width(one_sided) == face_count else index)
         triangles = replace(triangles, active=triangles.active & ((det < 0) | ~culled))
     small = triangles.active & ((triangles.fragments <= _LARGE) | (triangles.fragments <= 5 * sides))
-    draw(triangles, keys, behind, image * (height * width), triangle, triangles.box, small)
+
+    def pixel_index(row: Any, column: Any) -> Any:
+        return grid.pixel(image, row, column) if tiled else (image * height + row) * width + column
+
+    draw(triangles, keys, behind, pixel_index, triangle, triangles.box, small)
     if height * width <= _LARGE:  # no triangle can be large
         dr.eval(records, keys)
         return keys if peel else _triangle_of(keys), records
 
-    grid = TileGrid(batch, height, width)
     large = triangles.active & ~small
     nearest = nearest_covers(grid, triangles, image, large) if not peel else None
     first, last = (UInt32(x) | (UInt32(y) << 16) for x, y in ((x0, y0), (x1, y1)))
@@ -278,8 +284,9 @@ def _nearest_fragments(
     a, b, c = (dr.gather(module.Array4f, record, index, large) for record in records)
     box = tuple(module.Int32(corner) for corner in (first & 0xFFFF, first >> 16, last & 0xFFFF, last >> 16))
     again = replace(triangles, a=a, b=b, c=c, box=box, exact=lambda: exact_lines(index))
-    lists = build_tile_lists(grid, again, index, image, triangle, large, nearest, keys, behind)
-    merged = _merge_large(lists, keys, behind, records, exact_lines, face_count, UInt64 if peel else UInt32)
+    lists = build_tile_lists(grid, again, index, image, triangle, large, nearest, keys, behind, pixel_index)
+    strip, kind = strips(grid, module), UInt64 if peel else UInt32
+    merged = _merge_large(lists, strip, strip.gather(keys, tiled), behind, records, exact_lines, face_count, kind)
     return merged, records
 
 
@@ -294,18 +301,23 @@ def _empty_keys(module: ModuleType, count: int) -> Any:
 
 
 def _merge_large(
-    lists: TileLists, keys: Any, behind: Any, records: Any, exact_lines: Callable[[Any], Any], face_count: int, kind: Any
+    lists: TileLists,
+    strip: Strips,
+    best: list[Any],
+    behind: Any,
+    records: Any,
+    exact_lines: Callable[[Any], Any],
+    face_count: int,
+    kind: Any,
 ) -> Any:
     """The nearer of what small triangles left at each pixel and of the large ones in its tile's list.
 
     As keys or triangle indices, by the ``kind`` of the result: ``UInt64`` or ``UInt32``.
     """
-    module = backend(keys)
-    UInt32 = module.UInt32
     grid = lists.grid
-    strip = strips(grid, module)
+    module = backend(best[0])
+    UInt32 = module.UInt32
     x, y = centred(module, strip.row, strip.column, grid.height, grid.width)
-    best = strip.gather(keys)
     beyond = strip.gather(behind) if behind is not None else None
     # Lanes beyond the image walk along with their tile: uniform control flow costs nothing.
     position = strip.tile * lists.capacity

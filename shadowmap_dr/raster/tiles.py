@@ -6,6 +6,7 @@ at once. What a list has no room for is drawn fragment by fragment, so that no a
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
@@ -58,6 +59,16 @@ class TileGrid:
     def _block_columns(self) -> int:
         return -(-self.columns // BLOCK)
 
+    @property
+    def pixel_count(self) -> int:
+        """Of all tiles, what lies beyond the image included."""
+        return self.count << (2 * TILE)
+
+    def pixel(self, image: Any, row: Any, column: Any) -> Any:
+        """Number of a pixel where those of a tile follow each other, row by row."""
+        within = ((row & ((1 << TILE) - 1)) << TILE) + (column & ((1 << TILE) - 1))
+        return (self.tile(image, row >> TILE, column >> TILE) << (2 * TILE)) + within
+
     def tile(self, image: Any, row: Any, column: Any) -> Any:
         """Number of the tile in a row and column of tiles."""
         return (image * self.rows + row) * self.columns + column
@@ -97,8 +108,11 @@ class Strips:
     height: int
     width: int
 
-    def gather(self, flat: Any) -> list[Any]:
-        """What a row-major batch of images (``UInt64``) holds for the pixels of each strip; undefined beyond the image."""
+    def gather(self, flat: Any, tiled: bool = False) -> list[Any]:
+        """What a batch of images (``UInt64``) holds for the pixels of each strip; undefined beyond the image. The images are
+        row-major or, if ``tiled``, in the order of `TileGrid.pixel`."""
+        if tiled:  # the order of the strips themselves
+            return list(dr.gather(backend(flat).Array4u64, flat, dr.arange(type(self.tile), dr.width(flat) // STRIP)))
         inside = self.row < self.height
         if self.width % STRIP == 0:
             return list(dr.gather(backend(flat).Array4u64, flat, self.index // STRIP, inside & (self.column < self.width)))
@@ -157,7 +171,16 @@ def nearest_covers(grid: TileGrid, triangles: Triangles, image: Any, active: Any
 
 
 def build_tile_lists(
-    grid: TileGrid, triangles: Triangles, index: Any, image: Any, triangle: Any, active: Any, nearest: Any, keys: Any, behind: Any
+    grid: TileGrid,
+    triangles: Triangles,
+    index: Any,
+    image: Any,
+    triangle: Any,
+    active: Any,
+    nearest: Any,
+    keys: Any,
+    behind: Any,
+    pixel_index: Callable[[Any, Any], Any],
 ) -> TileLists:
     """Enter large triangles into the lists of the tiles where they may be seen.
 
@@ -168,14 +191,13 @@ def build_tile_lists(
         image: image of each triangle.
         active: the large ones.
         nearest: from :func:`nearest_covers`, or None to keep hidden triangles too.
-        keys, behind: see :func:`shadowmap_dr.raster.fragments.draw`, for triangles that find a list full.
+        keys, behind, pixel_index: see :func:`shadowmap_dr.raster.fragments.draw`, for triangles that find a list full.
     """
     module = backend(triangles.a)
     Int32 = module.Int32
     count = dr.zeros(module.UInt32, grid.count)
     items = dr.empty(module.UInt32, grid.count * CAPACITY)
     dr.eval(count, items)
-    first_pixel = image * (grid.height * grid.width)
 
     def visit(row: Any, column: Any, is_tile: Any) -> Any:
         span = _Span(triangles, row, column, is_tile)
@@ -193,7 +215,7 @@ def build_tile_lists(
         left, top = Int32(column << TILE), Int32(row << TILE)
         size = (1 << TILE) - 1
         box = (dr.maximum(x0, left), dr.maximum(y0, top), dr.minimum(x1, left + size), dr.minimum(y1, top + size))
-        draw(triangles, keys, behind, first_pixel, triangle, box, wanted & ~fits)
+        draw(triangles, keys, behind, pixel_index, triangle, box, wanted & ~fits)
         return seen
 
     _for_each_tile(triangles.box, active, visit)

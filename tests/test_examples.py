@@ -52,3 +52,12 @@ def test_steps_are_timed_in_turns() -> None:
     for pair, ratio in ratios.items():  # plain numbers, also above a thousand
         above, below = pair.split(" / ")
         assert ratio == pytest.approx(steps[above] / steps[below], rel=0.02, abs=0.6)
+
+
+def test_steps_are_timed_again_and_again() -> None:
+    script = ROOT / "docs" / "examples" / "step_phases.py"
+    command = [sys.executable, script, "--resolution", "16", "24", "--seconds", "0.1"]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=ROOT)
+    assert result.returncode == 0, result.stderr
+    times = re.findall(r"(\d+) threads: ([0-9.]+) ([0-9.]+)", result.stdout)
+    assert times and times[-1][0] == "1" and all(float(value) > 0 for row in times for value in row)

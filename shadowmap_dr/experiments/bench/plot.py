@@ -14,6 +14,8 @@ _LABELS = {
     "filter_size": "filter size in texels",
     "lights": "directional lights",
 }
+#: Meshes that stand beside the curves of rasterization, and their markers.
+_ODD = {"slivers": "x", "even": "+", "screen-filling": "v"}
 
 
 def plot(path: str | os.PathLike[str], record: dict[str, Any]) -> None:
@@ -71,14 +73,17 @@ def _batch(axes: Any, unit: dict[str, Any]) -> None:
 
 
 def _raster(axes: Any, units: list[dict[str, Any]]) -> None:
-    usual = [unit for unit in units if not unit["mesh"].startswith(("slivers", "screen-filling"))] or units
-    for k, resolution in enumerate(sorted({unit["resolution"] for unit in usual})):
-        own = sorted((unit for unit in usual if unit["resolution"] == resolution), key=lambda unit: unit["triangles"])
+    for k, resolution in enumerate(sorted({unit["resolution"] for unit in units})):
+        own = sorted((unit for unit in units if unit["resolution"] == resolution), key=lambda unit: unit["triangles"])
+        for unit in own:
+            if (kind := unit["mesh"].rsplit("-", 1)[0]) in _ODD:
+                axes.plot(unit["triangles"], 1e3 * unit["seconds"]["ours"]["median"], _ODD[kind], color=f"C{k}", markersize=5)
+        own = [unit for unit in own if unit["mesh"].rsplit("-", 1)[0] not in _ODD]
         sizes = [unit["triangles"] for unit in own]
         _curve(axes, sizes, [unit["seconds"]["ours"] for unit in own], f"C{k}", f"{resolution}")
         embree = [1e3 * unit["seconds"]["embree update and trace"]["median"] for unit in own]
         axes.plot(sizes, embree, ":", color=f"C{k}")
-    axes.set_title("dotted: Embree, update and trace", fontsize=9)
+    axes.set_title("dotted: Embree; ours for slivers x, even +, filling v", fontsize=9)
     _logarithmic(axes, "triangles", "rasterization [ms]")
     axes.legend(fontsize=8)
 

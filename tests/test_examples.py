@@ -39,19 +39,20 @@ def test_ways_to_render_are_timed_in_turns() -> None:
     assert list(steps) == ["plug-in", "plug-in, recorded", "renderer, recorded"] and min(map(float, steps.values())) > 0
 
 
-def test_steps_are_timed_in_turns() -> None:
+@pytest.mark.parametrize("setting", [[], ["--setting", "2/2/8/none/4"]])  # the fair one: ratios above a thousand
+def test_steps_are_timed_in_turns(setting: list[str]) -> None:
     script = ROOT / "docs" / "examples" / "pose_speed.py"
-    command = [sys.executable, script, "--resolution", "16", "--rounds", "1", "--setting", "2/2/8/none/4"]
+    command = [sys.executable, script, "--resolution", "16", "--rounds", "1", *setting]
     result = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=ROOT)
     assert result.returncode == 0, result.stderr
-    assert "2/2/8 none, 4" in result.stdout
+    assert ("2/2/8 none, 4" in result.stdout) == bool(setting)
     steps = {name: float(value) for name, value in re.findall(r"^(\w+): ([0-9.]+) ms a step", result.stdout, re.MULTILINE)}
     assert steps.keys() == {"shadows", "rasterizer", "mitsuba"} and min(steps.values()) > 0
     ratios = {pair: float(value) for pair, value in re.findall(r"^(\w+ / \w+): ([0-9.]+)x$", result.stdout, re.MULTILINE)}
     assert ratios.keys() == {"mitsuba / shadows", "mitsuba / rasterizer", "shadows / rasterizer"}
     for pair, ratio in ratios.items():  # plain numbers, also above a thousand
         above, below = pair.split(" / ")
-        assert ratio == pytest.approx(steps[above] / steps[below], rel=0.02, abs=0.6)
+        assert ratio == pytest.approx(steps[above] / steps[below], rel=0.02, abs=0.06 if ratio < 10 else 0.6)
 
 
 def test_steps_are_timed_again_and_again() -> None:

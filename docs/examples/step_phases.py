@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from statistics import median
 
@@ -15,6 +16,7 @@ import numpy as np
 
 from shadowmap_dr.experiments.pose.methods import build_method
 from shadowmap_dr.experiments.pose.scene import make_problem, start_pose
+from shadowmap_dr.timing import timed
 
 # isort: split
 import drjit as dr  # after shadowmap_dr, which chooses the LLVM library
@@ -38,14 +40,11 @@ with tempfile.TemporaryDirectory() as folder:
             method.step()
 
 
-def milliseconds(method) -> float:  # noqa: ANN001
+def milliseconds(step: Callable[[], float]) -> float:
     """Median over a quarter of a second, or over five steps."""
-    times, begun = [], time.perf_counter()
-    while len(times) < 5 or time.perf_counter() < begun + 0.25:
-        before = time.perf_counter()
-        method.step()
-        dr.sync_thread()
-        times.append(time.perf_counter() - before)
+    times: list[float] = []
+    while len(times) < 5 or sum(times) < 0.25:
+        times.append(timed(step))
     return 1e3 * median(times)
 
 
@@ -55,5 +54,5 @@ while time.perf_counter() < begun + options.seconds:
     for count in dict.fromkeys((threads, 1)):
         dr.set_thread_count(count)
         methods[0].step()  # threads begin
-        line.append(f"{count} threads: " + " ".join(f"{milliseconds(method):.2f}" for method in methods))
+        line.append(f"{count} threads: " + " ".join(f"{milliseconds(method.step):.2f}" for method in methods))
     print(f"{time.perf_counter() - begun:.0f} s, ms a step, " + "; ".join(line), flush=True)

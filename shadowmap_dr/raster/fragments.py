@@ -31,7 +31,7 @@ def draw(
 
     Args:
         keys: ``UInt64`` for each pixel of the batch, written.
-        behind: None or ``UInt64`` for each pixel: only fragments with a larger key count.
+        behind: None or ``UInt64`` for each pixel, in the order of ``keys``: only fragments with a larger key count.
         pixel_index: where the keys of a (row, column) of the triangle's image are.
         triangle: index that goes into the keys.
         box: inclusive bounds (first column, first row, last column, last row), inside the image.

@@ -76,9 +76,9 @@ def _raster(axes: Any, units: list[dict[str, Any]]) -> None:
     for k, resolution in enumerate(sorted({unit["resolution"] for unit in units})):
         own = sorted((unit for unit in units if unit["resolution"] == resolution), key=lambda unit: unit["triangles"])
         for unit in own:
-            if (kind := unit["mesh"].rsplit("-", 1)[0]) in _ODD:
-                axes.plot(unit["triangles"], 1e3 * unit["seconds"]["ours"]["median"], _ODD[kind], color=f"C{k}", markersize=5)
-        own = [unit for unit in own if unit["mesh"].rsplit("-", 1)[0] not in _ODD]
+            if marker := _marker(unit):
+                axes.plot(unit["triangles"], 1e3 * unit["seconds"]["ours"]["median"], marker, color=f"C{k}", markersize=5)
+        own = [unit for unit in own if not _marker(unit)]
         sizes = [unit["triangles"] for unit in own]
         _curve(axes, sizes, [unit["seconds"]["ours"] for unit in own], f"C{k}", f"{resolution}")
         embree = [1e3 * unit["seconds"]["embree update and trace"]["median"] for unit in own]
@@ -86,6 +86,10 @@ def _raster(axes: Any, units: list[dict[str, Any]]) -> None:
     axes.set_title("dotted: Embree; ours for slivers x, even +, filling v", fontsize=9)
     _logarithmic(axes, "triangles", "rasterization [ms]")
     axes.legend(fontsize=8)
+
+
+def _marker(unit: dict[str, Any]) -> str | None:
+    return _ODD.get(unit["mesh"].rsplit("-", 1)[0])
 
 
 def _steps(axes: Any, units: list[dict[str, Any]]) -> None:

@@ -48,14 +48,16 @@ def main() -> None:
     """Entry point: every expected failure is one line on the standard error stream and a non-zero exit status."""
     try:
         status = typer.main.get_command(app)(standalone_mode=False)
+        sys.stdout.flush()  # here, where a failure is still one line
     except ShadowmapError as error:
         _fail(str(error), 1)
     except KeyboardInterrupt:
         _fail("interrupted", 130)
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the reader of our output has gone
+    except BrokenPipeError:  # the reader of our output has gone
+        _drop_output()
         sys.exit(1)
     except OSError as error:  # for instance a full disk behind the standard output
+        _drop_output()
         _fail(str(error), 1)
     except Exception as error:
         if hasattr(error, "format_message"):  # wrong usage, reported by the option parser
@@ -65,6 +67,14 @@ def main() -> None:
             _fail("interrupted", 130)
         raise
     sys.exit(status if isinstance(status, int) else 0)
+
+
+def _drop_output() -> None:
+    """What is still buffered and cannot be written goes nowhere: the interpreter would try again at exit, and complain."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 @app.command()

@@ -191,11 +191,21 @@ def test_bad_input_is_one_clear_line(run: Any, tmp_path: Path, arguments: list[s
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full here")
-def test_full_disk_behind_the_standard_output() -> None:
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_full_disk_behind_the_standard_output(unbuffered: str) -> None:
     with open("/dev/full", "w") as full:
-        result = program("info", stdout=full)
+        result = program("info", stdout=full, env={**os.environ, "PYTHONUNBUFFERED": unbuffered})
     assert result.returncode == 1
     assert result.stderr.strip().splitlines() == ["error: [Errno 28] No space left on device"]
+
+
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_a_reader_that_has_gone(unbuffered: str) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "w") as pipe:
+        result = program("info", stdout=pipe, env={**os.environ, "PYTHONUNBUFFERED": unbuffered})
+    assert result.returncode == 1 and result.stderr == ""
 
 
 def test_full_disk_behind_the_image(tmp_path: Path) -> None:

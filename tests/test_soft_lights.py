@@ -347,6 +347,33 @@ def test_dark_emitter_has_no_light(variant: str) -> None:
     assert np.all(image == 0)
 
 
+@pytest.mark.parametrize("light", ["lamp", "textured lamp", "sky", "sky image"])
+def test_light_that_is_off_has_a_derivative(variant: str, light: str) -> None:
+    """Images are linear in radiance: the derivative is the same whatever it is, so that an optimiser can turn a light on."""
+    white = mi.Bitmap(np.ones((4, 4, 3), np.float32))
+    bitmap = {"type": "area", "radiance": {"type": "bitmap", "bitmap": white, "raw": True}}
+    parts, key = {
+        "lamp": ({"lamp": panel(1.2, 0.3, emitter=area(1.0))}, "lamp.emitter.radiance.value"),
+        "textured lamp": ({"lamp": panel(1.2, 0.3, emitter=bitmap)}, "lamp.emitter.radiance.data"),
+        "sky": ({"sky": {"type": "constant", "radiance": {"type": "rgb", "value": 1.0}}}, "sky.radiance.value"),
+        "sky image": ({"sky": {"type": "envmap", "bitmap": mi.Bitmap(np.ones((8, 16, 3), np.float32))}}, "sky.data"),
+    }[light]
+    found = []
+    for value in (1.0, 0.0, -0.5):
+        scene = scene_of(box=box(), **parts)
+        params = mi.traverse(scene)
+        radiance = params[key] * 0 + value
+        dr.enable_grad(radiance)
+        params[key] = radiance
+        params.update()
+        integrator = mi.load_dict({"type": "shadowmap", "emitter_samples": 4, "environment_samples": 16})
+        dr.backward(dr.sum(mi.render(scene, params, integrator=integrator)))
+        found.append(np.array(dr.grad(radiance), np.float64).sum())
+    assert found[0] > 10
+    # A sky that is black is divided into other parts than a bright one.
+    np.testing.assert_allclose(found[1:], found[0], rtol=0.02 if light == "sky image" else 1e-3)
+
+
 def test_more_samples_than_triangles(variant: str) -> None:
     """A lamp of two triangles and 200 samples, and one of 320 triangles and one sample."""
     lamp = scenery(sky=None)

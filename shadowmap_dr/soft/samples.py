@@ -84,8 +84,9 @@ class SampleTable:
         packet = dr.gather(mi.Vector4f, dr.detach(self.packets[0]), index)
         return mi.Vector3f(packet.x, packet.y, packet.z)
 
-    def illuminate(self, index: Any, p_world: Any) -> tuple[Any, Any]:
-        """(wo, weight): unit direction from points to sample ``index`` (UInt32), and its irradiance on a surface that faces it.
+    def illuminate(self, index: Any, p_world: Any) -> tuple[Any, Any, Any]:
+        """(wo, weight, reached): unit direction from points to sample ``index`` (UInt32), its irradiance on a surface that faces
+        it, and where (Bool) its light arrives. That does not ask for its radiance, whose derivative is there even if it is zero.
 
         ``p_world`` Point3f (P,), world space. Attached to points and samples. One-sided, as Mitsuba's area lights are.
         """
@@ -94,7 +95,7 @@ class SampleTable:
         power = mi.UnpolarizedSpectrum(*(colour[k] for k in range(channels)))
         where = mi.Vector3f(place.x, place.y, place.z)
         if self.distant:
-            return -where, power
+            return -where, power, mi.Bool(True)
         offset = where - mi.Vector3f(p_world)
         squared = dr.squared_norm(offset)
         # A point on the light's own surface may be the sample itself.
@@ -105,7 +106,8 @@ class SampleTable:
         cosine = -dr.dot(normal, wo)
         cosine = _mean_cosine(cosine, _spread(normal, n.w, rest[1], wo)) if len(rest) > 1 else dr.maximum(cosine, 0)
         # The share of a disk of this area in the view of a point on its axis: exact at any distance, and never infinite.
-        return wo, power * (cosine * dr.rcp(dr.maximum(squared + place.w * (1 / math.pi), 1e-20)))
+        form = cosine * dr.rcp(dr.maximum(squared + place.w * (1 / math.pi), 1e-20))
+        return wo, power * form, dr.detach(form) > 0
 
 
 def _spread(normal: Any, xx: Any, others: Any, wo: Any) -> Any:

@@ -42,9 +42,9 @@ def soft_light(
     def one_sample(index: Any, arrays: list[Any]) -> Any:
         seen, plain, table, maps = with_arrays(inputs, arrays)
         seen = replace(seen, plain=plain)
-        wo_world, weight = table.illuminate(index, seen.p_world)
+        wo_world, weight, reached = table.illuminate(index, seen.p_world)
         wo = seen.si.to_local(wo_world)
-        active = seen.active & (dr.max(dr.detach(weight)) > 0)
+        active = seen.active & reached
         if gate:
             active &= passes_gate(seen, wo_world, wo)
         value = seen.evaluate(wo, active) * weight

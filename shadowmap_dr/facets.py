@@ -22,8 +22,6 @@ from .raster._memory import device_array
 
 # Facets below the first size (in pixels) are shaded with mean normals, those above the second with their own.
 _SMALL, _LARGE = 1.5, 3.0
-# Vertex normals that differ by less (in any component) are the same for the eye.
-_NORMAL_JUMP = 0.02
 
 
 @dataclass(frozen=True)
@@ -49,35 +47,6 @@ def flat_faces(geometry: Geometry, topology: Topology) -> FlatFaces | None:
     order = np.argsort(places, kind="stable")
     start = np.searchsorted(places[order], np.arange(geometry.vertex_count + 1))
     return FlatFaces(device_array(mi.UInt32, start), device_array(mi.UInt32, faces[order // 3]), device_array(mi.Bool, chosen))
-
-
-def crease_edges(geometry: Geometry, topology: Topology) -> Any:
-    """``Bool`` (3 F,): whether shading jumps at the edge from corner k to k + 1 of a face. None if at none (on the host, once).
-
-    It does at the edges of flat faces, and between smooth ones that belong to different shapes, or whose vertex normals differ at
-    the edge they share.
-    """
-    shapes = geometry.face_shape.numpy()
-    flat = np.array([not info.has_normals for info in geometry.shapes])[shapes]
-    normals = dr.detach(geometry.normals).numpy().reshape(-1, 3)
-    faces, welded = (np.asarray(a.numpy(), np.int64).reshape(-1, 3) for a in (geometry.faces, topology.welded))
-    start, end = welded.ravel(), np.roll(welded, -1, 1).ravel()
-    key = np.minimum(start, end) * len(normals) + np.maximum(start, end)
-    order = np.argsort(key, kind="stable")
-    same = key[order][1:] == key[order][:-1]
-    one, other = order[:-1][same], order[1:][same]
-    # Normals of both at both ends: the other's half-edge may run either way.
-    first, second = normals[faces.ravel()], normals[np.roll(faces, -1, 1).ravel()]
-    reverse = (start[one] != start[other])[:, None]
-    jump = np.maximum(
-        np.abs(first[one] - np.where(reverse, second[other], first[other])).max(1),
-        np.abs(second[one] - np.where(reverse, first[other], second[other])).max(1),
-    )
-    smooth = np.array([info.has_normals for info in geometry.shapes])[shapes]
-    hard = np.repeat(flat, 3)
-    split = ((jump > _NORMAL_JUMP) | (shapes[one // 3] != shapes[other // 3])) & smooth[one // 3] & smooth[other // 3]
-    hard[one[split]] = hard[other[split]] = True
-    return mi.Bool(hard) if hard.any() else None
 
 
 def mean_normals(geometry: Geometry, topology: Topology, flat: FlatFaces) -> Any:

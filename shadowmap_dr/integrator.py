@@ -158,7 +158,9 @@ def make_class() -> type:
                 image = self.shell.image(scene, sensor_of(scene, sensor), spp)
                 if not dr.grad_enabled(image):
                     return dr.zeros(mi.TensorXf, image.shape)
-                dr.forward_to(image)
+                # Gradients stay where they have come to: what hangs on the same parts of the graph, such as vertex normals that
+                # Mitsuba has computed from vertices, gets there once only, and other images need it.
+                dr.forward_to(image, flags=dr.ADFlag.ClearEdges)
                 return dr.grad(image)
 
         def render_backward(self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> None:

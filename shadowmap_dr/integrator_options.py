@@ -21,7 +21,7 @@ COLOURS = ("R", "G", "B", "A", "Y")
 class Options:
     """Parameters of the plug-in, as in XML or a dictionary.
 
-    shadow_map_resolution  texels along each side of a shadow map, 1 to 4096
+    shadow_map_resolution  texels along each side of a shadow map, six more than the filter has at least, 4096 at most
     shadow_method          ``auto`` (``evsm4``), ``vsm``, ``esm``, ``evsm2``, ``evsm4``, ``msm``, ``csm``, ``pcf``, ``standard``
                            (no shadow gradients) or ``none`` (no shadows); see ``shadowmap_dr.shadow.ShadowSettings``
     shadow_filter          ``box``, ``gaussian``, ``wendland`` or ``none``

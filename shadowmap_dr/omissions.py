@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import warnings
 from collections.abc import Sequence
 from typing import Any
@@ -13,6 +14,8 @@ from .sensors import lenses_of
 
 # Names that a warning lists.
 _LISTED = 4
+# Packages whose own code a warning does not point to.
+_CALLED = ("shadowmap_dr", "mitsuba", "drjit")
 
 
 def omissions_of(scene: Any, shapes: Sequence[tuple[str, Any]], unsupported: Sequence[str]) -> tuple[str, ...]:
@@ -38,10 +41,13 @@ def omissions_of(scene: Any, shapes: Sequence[tuple[str, Any]], unsupported: Seq
     return tuple(found)
 
 
-def warn_of(omissions: Sequence[str], stacklevel: int) -> None:
-    """One ``UserWarning`` that names all omissions; nothing if there are none."""
+def warn_of(omissions: Sequence[str]) -> None:
+    """One ``UserWarning`` that names all omissions, and points to who called this package or Mitsuba; nothing without any."""
     if omissions:
-        warnings.warn(f"Not all in the scene is supported: {'; '.join(omissions)}.", stacklevel=stacklevel + 1)
+        level, frame = 1, inspect.currentframe()
+        while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] in _CALLED:
+            level, frame = level + 1, frame.f_back
+        warnings.warn(f"Not all in the scene is supported: {'; '.join(omissions)}.", stacklevel=level)
 
 
 def _has_extended_lights(scene: Any) -> bool:

@@ -121,15 +121,20 @@ def pass_on(arrays: list[Any], gradients: list[Any]) -> None:
     """Add gradients to all that arrays are attached to."""
     for array, gradient in zip(arrays, gradients, strict=True):
         dr.accum_grad(array, gradient)
-    dr.enqueue(dr.ADMode.Backward, arrays)
-    dr.traverse(dr.ADMode.Backward)
+    _traverse(arrays)
 
 
 def backward(image: Any, gradient: Any) -> None:
     """Add the gradients of <image, gradient> to all that an image is attached to."""
     dr.set_grad(image, gradient)
-    dr.enqueue(dr.ADMode.Backward, image)
-    dr.traverse(dr.ADMode.Backward)
+    _traverse(image)
+
+
+def _traverse(end: Any) -> None:
+    """Backwards from what has gradients. The graph stays: another image may hang on the same parts of it, such as those that
+    Mitsuba's shapes hold of what their vertices were computed from."""
+    dr.enqueue(dr.ADMode.Backward, end)
+    dr.traverse(dr.ADMode.Backward, flags=dr.ADFlag.ClearVertices)
 
 
 def _held(node: Any) -> dict[str, Any]:

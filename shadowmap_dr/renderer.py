@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Any
 
@@ -14,8 +14,9 @@ import numpy as np
 from .aovs import collect_aovs
 from .beams import softened
 from .camera_pass import camera_clip, least_gap, seen_points, within_far_plane, without_shapes
+from .creases import Creases
 from .errors import ShadowmapError
-from .facets import crease_edges, flat_faces, mean_normals, soften_facets
+from .facets import flat_faces, mean_normals, soften_facets
 from .film import Margin, develop, sample_grid, sample_windows
 from .footprint import Spots, footprint_points
 from .geometry import Geometry
@@ -59,7 +60,7 @@ class Renderer:
         plan: which shadow maps there are.
         settings: how to render.
         flat: faces that are shaded flat, or None.
-        creases: ``Bool`` (3 F,), edges of faces at which shading jumps, or None.
+        creases: edges of faces at which shading jumps. Attributes of meshes count as they were when the scene was read.
         outward: ``Bool`` (F,), faces that shadow maps show from the front only, or None.
         soft: how extended lights (area lights, environments) are sampled, and which maps these samples have.
         frusta: fit of the shadow maps in the last rendering, None before the first. ``soft_frusta``: of those of extended lights.
@@ -70,7 +71,7 @@ class Renderer:
     plan: MapPlan
     settings: RenderSettings
     flat: Any = None
-    creases: Any = None
+    creases: Creases | None = None
     outward: Any = None
     soft: tuple[SoftPlan, ...] = ()
     frusta: Frusta | None = None
@@ -103,6 +104,10 @@ class Renderer:
         Raises:
             ShadowmapError: what the scene has and this renderer does not support, by name; invalid settings.
         """
+        known = [setting.name for setting in fields(RenderSettings) if setting.name != "shadow"]
+        for name in settings:
+            if name not in known:
+                raise ShadowmapError(f"There is no setting '{name}'; beside those of shadow maps there are {', '.join(known)}.")
         try:
             shadow = ShadowSettings(
                 method=shadow_method,
@@ -132,7 +137,7 @@ class Renderer:
         )
         if not topology.count:
             raise ShadowmapError("There is nothing to render: all triangles of the scene have two corners at the same place.")
-        plan, creases = plan_maps(data.lights, geometry), crease_edges(geometry, topology)
+        plan, creases = plan_maps(data.lights, geometry), Creases.of(geometry, topology, data.sources)
         soft = _plan_soft(data, settings)
         if settings.shadow.method != "none":
             texels = settings.shadow.resolution * settings.shadow.supersampling
@@ -154,6 +159,11 @@ class Renderer:
     def planned_anew(self) -> Renderer:
         """The same renderer with area lights and environments divided, and their maps aimed, as its records are now."""
         return replace(self, soft=_plan_soft(self.data, self.settings), soft_frusta=(None, None))
+
+    def coloured_anew(self) -> Renderer:
+        """The same renderer with the edges at which attributes of meshes jump as they are now."""
+        sources = self.data.sources
+        return replace(self, creases=self.creases and self.creases.with_attributes(self.data.geometry, sources))
 
     def refresh(self) -> Renderer:
         """The same renderer with the scene's current vertices, lights and sensors, attached where they carry gradients."""
@@ -193,7 +203,8 @@ class Renderer:
         seen, casting = self._topologies(geometry)
         views = [self._view(margin.around(window), geometry, seen, factor) for window in windows]
         lighting = self._lighting(views, geometry, casting, lights)
-        pictures = [margin.cut(self._camera_image(view, geometry, lighting, facets), factor) for view in views]
+        shapes = (geometry, facets, self._creases(geometry))
+        pictures = [margin.cut(self._camera_image(view, lighting, *shapes), factor) for view in views]
         return develop(pictures, windows[0], factor)
 
     def light(self, name: str) -> Light | AreaLight:
@@ -326,14 +337,18 @@ class Renderer:
                     view.topology,
                     view.raster,
                     geometry.vertex_count,
-                    self.creases,
+                    self._creases(geometry),
                     sharpness,
                     meetings=True,
                     gap=least_gap(windows[0]),
                 )
             return GBuffer(windows[0], seen, points, crossings, self._seen([view], geometry))
 
-    def _camera_image(self, view: _View, geometry: Geometry, lighting: _Lighting, facets: Any) -> Any:
+    def _creases(self, geometry: Geometry) -> Any:
+        """Edges at which shading jumps, ``Bool`` (3 F,), if images are anti-aliased and there are any."""
+        return None if self.creases is None or not self.settings.antialias else self.creases.now(geometry)
+
+    def _camera_image(self, view: _View, lighting: _Lighting, geometry: Geometry, facets: Any, creases: Any) -> Any:
         sensor, raster = view.sensor, view.raster
         height, width = raster.height, raster.width
         textured = any(light.textured for light in lighting.areas)
@@ -356,7 +371,7 @@ class Renderer:
                 raster,
                 view.clip,
                 view.topology,
-                creases=self.creases,
+                creases=creases,
                 crease_weights=sharpness,
                 meetings=True,
                 gap=least_gap(sensor),

@@ -22,7 +22,10 @@ from .omissions import omissions_of, warn_of
 from .raster._memory import device_array
 from .sensors import Sensor, sensors_of
 from .sources import CurveSource, ShapeSource, source_of
-from .traversal import children, varies
+from .traversal import children, is_plain
+
+# Unit directions of rays that ask instances for their shapes. A cylinder does not answer one that lies in its axis.
+_PROBING = ((0.48, 0.36, 0.8), (-0.6, 0.64, 0.48))
 
 
 @dataclass(frozen=True)
@@ -88,6 +91,9 @@ def load(scene: Any, *, tessellation: int = 64, warn: bool = True) -> SceneData:
             f"Mitsuba variant '{mi.variant()}' is not supported: set one whose name ends in _ad_rgb or _ad_mono, "
             "for instance llvm_ad_rgb."
         )
+    if not isinstance(scene, mi.Scene):
+        given = repr(scene) if isinstance(scene, str) else f"a {type(scene).__name__}"
+        raise ShadowmapError(f"{given} is no mi.Scene of the variant {mi.variant()}: load it with mi.load_file or mi.load_dict.")
     if not isinstance(tessellation, int) or tessellation < 3:
         raise ShadowmapError(f"tessellation is {tessellation!r}, but must be an integer of at least 3.")
     infos, sources, faces, unsupported = [], [], [], []
@@ -132,12 +138,12 @@ def load(scene: Any, *, tessellation: int = 64, warn: bool = True) -> SceneData:
         shape_ptr=dr.concat([mi.ShapePtr(source.shape) for source in sources]),
         bsdf_ptr=dr.concat([mi.BSDFPtr(source.shape.bsdf()) for source in sources]),
         sources=tuple(sources),
-        needs_frames=not all(_is_plain(source.shape.bsdf()) for source in sources),
+        needs_frames=not all(is_plain(source.shape.bsdf()) for source in sources),
     )
     data = refresh(data)
     if warn:
         shapes = [(info.name, source.shape) for info, source in zip(infos, sources, strict=True)]
-        warn_of(omissions_of(scene, shapes, unsupported), stacklevel=2)
+        warn_of(omissions_of(scene, shapes, unsupported))
     return replace(data, geometry=replace(data.geometry, as_loaded=True))
 
 
@@ -196,19 +202,32 @@ def _unique(name: str, taken: set[str]) -> str:
 def _group_of(instance: Any, name: str, groups: list[list[tuple[str, Any]]]) -> list[Any]:
     """Shapes of the group that an instance shows.
 
-    An instance does not tell its group; but an intersection record made by hand shows which shape would have been hit.
+    An instance does not tell its group; but if there are several, an intersection record made by hand shows which shape would
+    have been hit.
     """
+    shown = [[child for _, child in group if isinstance(child, mi.Shape)] for group in groups]
+    if len(shown) == 1:
+        return shown[0]
     hit = dr.zeros(mi.PreliminaryIntersection3f)
     hit.t, hit.valid, hit.instance = mi.Float(1.0), mi.Bool(True), mi.ShapePtr(instance)
     # Without FollowShape no shape is found where the instance's to_world is attached.
     flags = mi.RayFlags.Minimal | mi.RayFlags.FollowShape
-    # From afar: curves are not hit from behind, and so they face the ray wherever they are.
-    si = hit.compute_surface_interaction(mi.Ray3f(mi.Point3f(0.0, 0.0, -1e6), mi.Vector3f(0.0, 0.0, 1.0)), flags)
-    first = dr.reinterpret_array(mi.UInt32, si.shape)[0]
-    for group in groups:
-        shapes = [child for _, child in group if isinstance(child, mi.Shape)]
-        if shapes and dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shapes[0]))[0] == first:
-            return shapes
+    for direction in _PROBING:
+        # From afar: curves are not hit from behind, and so they face the ray wherever they are.
+        ray = mi.Ray3f(mi.Point3f(direction) * -1e6, mi.Vector3f(direction))
+        try:
+            si = hit.compute_surface_interaction(ray, flags)
+        except RuntimeError as error:
+            if "Cannot differentiate instance" not in str(error):
+                raise
+            what = "an instance and what it shows both carry gradients, here or in another scene that is still there"
+            raise ShadowmapError(
+                f"The shapes of instance '{name}' cannot be read, since Mitsuba refuses where {what}: render once before that."
+            ) from error
+        first = dr.reinterpret_array(mi.UInt32, si.shape)[0]
+        for shapes in shown:
+            if shapes and dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shapes[0]))[0] == first:
+                return shapes
     raise ShadowmapError(f"The shape group of instance '{name}' was not found in the scene.")
 
 
@@ -248,20 +267,6 @@ def describe(name: str, source: ShapeSource, faces: np.ndarray, vertex_start: in
         against_winding=mirrored != turned,
         see_through=mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null),
         faceted=faceted and _is_faceted(points, faces, own.normals.numpy().reshape(-1, 3)),
-    )
-
-
-def _is_plain(bsdf: Any) -> bool:
-    """Whether a BSDF is known to depend on nothing but the cosines of directions: diffuse, of the same colour everywhere."""
-    parts = [part for _, part in children(bsdf)]
-    if bsdf.class_name() == "TwoSidedBRDF":
-        return all(_is_plain(part) for part in parts)
-    if bsdf.class_name() != "SmoothDiffuse":
-        return False
-    # Mitsuba does not count vertex colours as varying.
-    return all(
-        isinstance(part, mi.Texture) and not varies(part) and part.class_name() != "MeshAttribute"
-        for part in parts
     )
 
 

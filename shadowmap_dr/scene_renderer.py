@@ -11,6 +11,7 @@ import numpy as np
 
 from .errors import ShadowmapError
 from .lights import environments_of
+from .mirroring import MirrorWatch
 from .omissions import warn_of
 from .pending import Inputs, Waiting, attached_names
 from .recorded import Recorded, plain
@@ -43,8 +44,10 @@ class SceneRenderer:
     recorded  both passes, replayed if the plug-in's user wants it; ``recordable``: for names of attached parameters, whether
               gradients flow through nothing but what is read from the scene
     sky       where its environments shone
+    mirrors   which shapes were mirrored
     checked   vertices that were found to be finite
     unseen    what recordings do not see, and ``unseen_then`` its values when they were made
+    colours   attributes of meshes, and ``colours_then`` their values when the renderer's creases were found
     """
 
     parts: tuple[Any, ...]
@@ -58,7 +61,10 @@ class SceneRenderer:
     recordable: dict[tuple[str, ...], bool] = field(default_factory=dict)
     unseen: Unseen = field(default_factory=lambda: Unseen(()))
     unseen_then: tuple[Any, ...] = ()
+    colours: Unseen = field(default_factory=lambda: Unseen(()))
+    colours_then: tuple[Any, ...] = ()
     sky: SkyWatch = field(default_factory=lambda: SkyWatch(()))
+    mirrors: MirrorWatch = field(default_factory=lambda: MirrorWatch(()))
     checked: Any = None
 
     @classmethod
@@ -72,7 +78,9 @@ class SceneRenderer:
             sky, unseen = SkyWatch(data.environments), Unseen((*scene.emitters(), *_bsdfs(data), *data.with_attributes()))
         lights = tuple(light.name for light in data.lights)
         record = cls(_parts(scene, data), _statics(scene, data), _sizes(data), lights, renderer.with_data(_without_scene(data)))
-        return replace(record, sky=sky, unseen=unseen)
+        mirrors = MirrorWatch([shape for source in data.sources for shape in source.transformed()])
+        colours = Unseen(data.with_attributes())
+        return replace(record, sky=sky, mirrors=mirrors, unseen=unseen, colours=colours, colours_then=colours.now())
 
     def matches(self, scene: Any) -> bool:
         """Whether this record was made for the scene; it is none the worse for moved vertices or other parameter values.
@@ -90,7 +98,8 @@ class SceneRenderer:
         if dr.flag(dr.JitFlag.FreezingScope):
             return True  # nothing can be read back
         with dr.suspend_grad():
-            return self.sky.same(environments_of(scene)) and still_aimed(self.renderer.soft, lambda: with_positions(data))
+            still = self.mirrors.same() and self.sky.same(environments_of(scene))
+            return still and still_aimed(self.renderer.soft, lambda: with_positions(data))
 
     def data(self, scene: Any, sensor: Any) -> SceneData:
         """What is read from the scene as it is now, with one sensor, attached to the scene's parameters."""
@@ -145,6 +154,9 @@ class SceneRenderer:
         Each sensor goes on from its own fit. Fitting it again to the same vertices and lights keeps it bit by bit, so the
         derivatives of a step see the frusta of its image, whatever other sensors have taken in between.
         """
+        colours = self.colours.now()
+        if colours != self.colours_then:
+            self.renderer, self.colours_then = self.renderer.coloured_anew(), colours
         kept = self.renderer
         fits = ((frusta, soft_frusta) for known, frusta, soft_frusta in self.fits if known is sensor)
         frusta, soft_frusta = next(fits, (kept.frusta, kept.soft_frusta))
@@ -168,7 +180,7 @@ class SceneRenderer:
         """Keep the fit of an image for the next one of this sensor, and warn of lenses when it is seen first."""
         others = [fit for fit in self.fits if fit[0] is not sensor]
         if len(others) == len(self.fits) and not any(sensor is known for known in scene.sensors()):
-            warn_of(lenses_of(sensor), stacklevel=3)
+            warn_of(lenses_of(sensor))
         self.fits = [(sensor, frusta, soft_frusta), *others][:_REMEMBERED_SENSORS]
 
 

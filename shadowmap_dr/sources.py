@@ -15,6 +15,8 @@ import numpy as np
 
 from . import curves, tessellate, tubes
 from .errors import ShadowmapError, UnsupportedShape
+from .mirroring import mirrors
+from .raster._memory import device_array
 from .traversal import mesh_buffers, parameters
 
 _ANALYTIC = {"Sphere": tessellate.sphere, "Disk": tessellate.disk, "Cylinder": tessellate.cylinder}
@@ -65,7 +67,12 @@ class ShapeSource:
     @property
     def instance_mirrored(self) -> bool:
         """Whether the instance's transformation reverses the triangles' winding. Read back to the host."""
-        return self.instance is not None and _mirrors(self.instance)
+        return self.instance is not None and mirrors(self.instance)
+
+    def transformed(self) -> tuple[Any, ...]:
+        """Objects of Mitsuba's whose ``to_world`` places the shape. Where one comes to mirror it, or no longer does, the scene
+        has to be loaded again."""
+        return () if self.instance is None else (self.instance,)
 
     def placed(self, own: Buffers) -> Buffers:
         """The same vertices in world space: after the instance's transformation."""
@@ -89,6 +96,23 @@ class MeshSource(ShapeSource):
 
 
 @dataclass(frozen=True)
+class RectangleSource(MeshSource):
+    """A rectangle, which is a ``mi.Mesh`` with ``to_world`` for its only parameter.
+
+    Its vertices are computed here. Those that Mitsuba holds hang on ``to_world`` by a part of the AD graph that is made when it
+    is updated, and gone once derivatives have passed through: a second image would be left without.
+    """
+
+    local: Buffers
+
+    def own(self) -> Buffers:
+        return _placed(self.local, parameters(self.shape)["to_world"])
+
+    def transformed(self) -> tuple[Any, ...]:
+        return (self.shape, *super().transformed())
+
+
+@dataclass(frozen=True)
 class AnalyticSource(ShapeSource):
     """A sphere, disk or cylinder: ``local``, a mesh that does not change, and the shape's ``to_world``.
 
@@ -104,9 +128,12 @@ class AnalyticSource(ShapeSource):
     def own(self) -> Buffers:
         return _placed(self.local, parameters(self.shape)["to_world"])
 
+    def transformed(self) -> tuple[Any, ...]:
+        return (self.shape, *super().transformed())
+
     @property
     def mirrored(self) -> bool:
-        return _mirrors(self.shape)
+        return mirrors(self.shape)
 
     @property
     def inverted(self) -> bool:
@@ -152,12 +179,20 @@ def source_of(name: str, shape: Any, instance: Any, tessellation: int) -> tuple[
     ``tessellation``: triangles around spheres, disks and cylinders. Curves have half as many around them and, if they are
     B-splines, an eighth of it along each segment. Raises ``ShadowmapError`` for other shapes and for curves that are broken.
     """
-    if isinstance(shape, mi.Mesh):
-        return MeshSource(shape, instance), mesh_buffers(shape)[0].numpy().reshape(-1, 3)
     kind = shape.class_name()
+    if isinstance(shape, mi.Mesh):
+        faces, _, _, texcoords = mesh_buffers(shape)
+        if kind == "Rectangle":
+            # In its own space a rectangle's corners are those of its texture's, from -1 to 1.
+            uv = texcoords.numpy().reshape(-1, 2)
+            local = (np.insert(2 * uv - 1, 2, 0, 1), np.tile(np.float32([0, 0, 1]), (len(uv), 1)), uv)
+            source: MeshSource = RectangleSource(shape, instance, Buffers(*(device_array(mi.Float, a) for a in local)))
+        else:
+            source = MeshSource(shape, instance)
+        return source, faces.numpy().reshape(-1, 3)
     if kind in _ANALYTIC:
         mesh = _ANALYTIC[kind](tessellation)
-        local = Buffers(*(mi.Float(a.ravel()) for a in (mesh.positions, mesh.normals, mesh.texcoords)))
+        local = Buffers(*(device_array(mi.Float, a) for a in (mesh.positions, mesh.normals, mesh.texcoords)))
         return AnalyticSource(shape, instance, local), mesh.faces
     if kind in _CURVES:
         held = parameters(shape)
@@ -169,11 +204,6 @@ def source_of(name: str, shape: Any, instance: Any, tessellation: int) -> tuple[
     raise UnsupportedShape(
         f"shape '{name}' ({kind}) is not supported: use meshes, spheres, disks, cylinders, bsplinecurve, linearcurve, instances."
     )
-
-
-def _mirrors(shape: Any) -> bool:
-    matrix = np.array(parameters(shape)["to_world"].matrix).reshape(4, 4)
-    return bool(np.linalg.det(matrix[:3, :3]) < 0)
 
 
 def _placed(buffers: Buffers, to_world: Any) -> Buffers:

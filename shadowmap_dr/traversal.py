@@ -9,6 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+_BUFFERS = ("vertex_count", "face_count", "vertex_positions", "vertex_normals", "vertex_texcoords")
+
 
 def parameters(node: Any) -> dict[str, Any]:
     """Current (possibly AD-attached) parameters of a Mitsuba object and its children, by their relative names.
@@ -39,6 +41,20 @@ def varies(texture: Any) -> bool:
     """Whether a ``mi.Texture`` may differ from place to place, attributes of meshes aside. Those written in Python may say what
     they like: the base class says no for them."""
     return texture.is_spatially_varying() or type(texture) is not mi.Texture
+
+
+def is_plain(bsdf: Any) -> bool:
+    """Whether a BSDF is known to depend on nothing but the cosines of directions: diffuse, of the same colour everywhere."""
+    parts = [part for _, part in children(bsdf)]
+    if bsdf.class_name() == "TwoSidedBRDF":
+        return all(is_plain(part) for part in parts)
+    if bsdf.class_name() != "SmoothDiffuse":
+        return False
+    # Mitsuba does not count vertex colours as varying.
+    return all(
+        isinstance(part, mi.Texture) and not varies(part) and part.class_name() != "MeshAttribute"
+        for part in parts
+    )
 
 
 def fingerprint(value: Any) -> Any:
@@ -74,6 +90,16 @@ def _leaves(array: Any) -> Iterator[Any]:
     else:
         for part in array:
             yield from _leaves(part)
+
+
+def is_attribute(node: Any, key: str) -> bool:
+    """Whether a parameter is an attribute of a mesh: colours of vertices or faces, for instance."""
+    return isinstance(node, mi.Mesh) and key.startswith(("vertex_", "face_")) and key not in _BUFFERS
+
+
+def attributes(mesh: Any) -> dict[str, Any]:
+    """Attributes of a ``mi.Mesh`` by name: flat Float, of all vertices (``vertex_...``) or of all faces (``face_...``)."""
+    return {name: value for name, value in parameters(mesh).items() if is_attribute(mesh, name)}
 
 
 def mesh_buffers(mesh: Any) -> tuple[Any, Any, Any, Any]:

@@ -9,9 +9,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from .traversal import fingerprint
-
-_BUFFERS = ("vertex_count", "face_count", "vertex_positions", "vertex_normals", "vertex_texcoords")
+from .traversal import fingerprint, is_attribute
 
 
 class Unseen:
@@ -48,10 +46,6 @@ def _is_seen(node: Any, key: str, value: Any) -> bool:
         return True  # means nothing here
     if node.class_name().startswith("Sunsky") and key in ("turbidity", "albedo.value"):
         return False
-    if "nested_texture." in key or _is_attribute(node, key):
+    if "nested_texture." in key or is_attribute(node, key):
         return False
     return dr.is_array_v(value) or isinstance(value, mi.Transform4f)
-
-
-def _is_attribute(node: Any, key: str) -> bool:
-    return isinstance(node, mi.Mesh) and key.startswith(("vertex_", "face_")) and key not in _BUFFERS

@@ -70,6 +70,23 @@ def test_a_sphere_that_is_mirrored(variant: str) -> None:
     assert_noticed(scene, "ball.to_world", lambda _: mi.Transform4f(place @ mi.ScalarTransform4f().scale([-0.5, 0.5, 0.5])))
 
 
+@pytest.mark.parametrize("kind", ["rectangle", "disk", "cylinder"])
+def test_lamps_that_are_mirrored_and_no_longer(variant: str, kind: str) -> None:
+    """Light comes from the same side; a cylinder's changes sides with its normals."""
+    place = mi.ScalarTransform4f().look_at([-2, 0, 2], [0, 0, 0], [0, 1, 0])
+    emitter = {"type": "area", "radiance": {"type": "rgb", "value": 10.0}}
+    lamp = {"type": kind, "to_world": place @ mi.ScalarTransform4f().scale(0.4), "emitter": emitter}
+    scene = small_scene(sun=None, lamp=lamp)
+    used = shadowmap(**FEW)
+    for side in (0.4, -0.4, 0.4, -0.4):
+        change(scene, "lamp.to_world", lambda _: mi.Transform4f(place @ mi.ScalarTransform4f().scale([side, 0.4, 0.4])))  # noqa: B023
+        found = image(scene, used)
+        assert found.mean() > 0.02
+        np.testing.assert_allclose(found, image(scene, shadowmap(**FEW)), atol=1e-4)
+        direct = np.array(mi.render(scene, integrator=mi.load_dict({"type": "direct"}), spp=64))
+        assert found.mean() == pytest.approx(direct.mean(), rel=0.05)
+
+
 def test_objects_that_leave_an_orthographic_cameras_neighbourhood(variant: str) -> None:
     to_world = camera()["to_world"]
     seen = {**camera(), "type": "orthographic", "to_world": to_world @ mi.ScalarTransform4f().scale([2, 2, 1])}

@@ -107,3 +107,10 @@ def test_scenes_read_by_hand_warn_once_too(variant: str) -> None:
         with pytest.warns(UserWarning, match="'blob'") as caught:
             call(scene(blob=blob()))
         assert len(caught) == 1
+
+
+def test_warnings_point_to_the_caller(variant: str) -> None:
+    for call in (load, Renderer.from_scene, lambda made: mi.render(made, integrator=mi.load_dict(OPTIONS))):
+        with pytest.warns(UserWarning, match="'blob'") as caught:
+            call(scene(blob=blob()))
+        assert caught[0].filename == __file__

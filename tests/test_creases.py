@@ -1,0 +1,118 @@
+"""Lines on smooth meshes at which colours jump: derivatives across them, also where the jump comes later."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from integrator_scenes import camera, shadowmap
+
+from shadowmap_dr import Renderer
+
+# Two rectangles side by side, with vertices of their own along the line x = 0.
+VERTICES = np.array([[-1, -1], [0, -1], [0, 1], [-1, 1], [0, -1], [1, -1], [1, 1], [0, 1]], np.float32)
+FACES = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], np.uint32)
+RED, BLUE = (0.9, 0.1, 0.1), (0.1, 0.2, 0.9)
+
+
+def material(kind: str) -> dict[str, Any]:
+    if kind == "texture":
+        pixels = np.array([[RED, RED, BLUE, BLUE]], np.float32)
+        return {"type": "diffuse", "reflectance": {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True}}
+    if kind == "plain":
+        return {"type": "diffuse"}
+    return {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": f"{kind}_color"}}
+
+
+def attribute(kind: str, *colours: tuple[float, ...]) -> Any:
+    """The first colour on the left and the last one on the right."""
+    return mi.Float(np.repeat(np.float32([colours[0], colours[-1]]), 4 if kind == "vertex" else 2, axis=0).ravel())
+
+
+def scene_of(kind: str, smooth: bool = True) -> Any:
+    props = mi.Properties()
+    props["mesh_bsdf"] = mi.load_dict(material(kind))
+    mesh = mi.Mesh("mesh", 8, 4, has_vertex_normals=smooth, has_vertex_texcoords=kind == "texture", props=props)
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = np.insert(VERTICES, 2, 0, axis=1).ravel()
+    params["faces"] = FACES.ravel()
+    if kind == "texture":
+        params["vertex_texcoords"] = np.repeat(np.float32([[0.1, 0.5], [0.9, 0.5]]), 4, axis=0).ravel()
+    params.update()
+    if kind in ("vertex", "face"):
+        mesh.add_attribute(f"{kind}_color", 3, np.array(attribute(kind, RED, BLUE)))
+    to_world = mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])
+    sun = {"type": "directional", "direction": [0.6, 0, -1], "irradiance": 3.0}
+    return mi.load_dict({"type": "scene", "mesh": mesh, "sun": sun, "camera": {**camera(), "to_world": to_world}})
+
+
+def fold(vertices: Any) -> Any:
+    points = dr.unravel(mi.Point3f, vertices)
+    return dr.ravel(mi.Point3f(points.x, points.y, -0.6 * dr.abs(points.x)))
+
+
+def assert_agrees(scene: Any, integrator: Any) -> None:
+    """The derivative by a motion across the line, summed up around it, is that of differences, and not zero."""
+    params = mi.traverse(scene)
+    rest = mi.Float(params["mesh.vertex_positions"])
+
+    def around_the_line(image: Any) -> np.ndarray:
+        return np.array(image)[20:44, 28:36].sum((0, 1))
+
+    def move(x: Any) -> Any:
+        params["mesh.vertex_positions"] = dr.ravel(dr.unravel(mi.Point3f, rest) + mi.Vector3f(1, 0, 0) * x)
+        params.update()
+        return mi.render(scene, params, integrator=integrator, spp=16)
+
+    step = 0.03
+    expected = (around_the_line(move(mi.Float(step))) - around_the_line(move(mi.Float(-step)))) / (2 * step)
+    x = mi.Float(0)
+    dr.enable_grad(x)
+    image = move(x)
+    dr.forward(x)
+    assert np.abs(expected).max() > 50
+    np.testing.assert_allclose(around_the_line(dr.grad(image)), expected, rtol=0.02, atol=0.5)
+
+
+@pytest.mark.parametrize("smooth", [True, False])
+@pytest.mark.parametrize("kind", ["vertex", "face", "texture"])
+def test_colours_that_jump(variant: str, kind: str, smooth: bool) -> None:
+    assert_agrees(scene_of(kind, smooth), shadowmap(shadow_method="none"))
+
+
+@pytest.mark.parametrize("recorded", [False, True])
+def test_a_fold_that_comes_later(variant: str, recorded: bool) -> None:
+    """The mesh was flat when the integrator saw it first."""
+    scene, integrator = scene_of("plain"), shadowmap(shadow_method="none", recorded=recorded)
+    mi.render(scene, integrator=integrator)
+    params = mi.traverse(scene)
+    params["mesh.vertex_positions"] = fold(params["mesh.vertex_positions"])
+    params.update()
+    assert_agrees(scene, integrator)
+
+
+@pytest.mark.parametrize("kind", ["vertex", "face", "texture"])
+def test_colours_that_come_to_jump(variant: str, kind: str) -> None:
+    scene, integrator = scene_of(kind), shadowmap(shadow_method="none")
+    params = mi.traverse(scene)
+    key = "mesh.vertex_texcoords" if kind == "texture" else f"mesh.{kind}_color"
+    later = mi.Float(params[key])
+    params[key] = dr.full(mi.Float, 0.5, dr.width(later))
+    params.update()
+    mi.render(scene, integrator=integrator)
+    params[key] = later
+    params.update()
+    assert_agrees(scene, integrator)
+
+
+def test_smooth_surfaces_have_no_creases_where_nothing_jumps(variant: str) -> None:
+    """Were equal colours blended across the line, what moves along with the shading would count twice there."""
+    renderer = Renderer.from_scene(scene_of("plain"))
+    assert not dr.any(renderer.creases.now(renderer.data.geometry))
+    folded = renderer.data.geometry.with_positions({"mesh": fold(renderer.data.geometry.positions)})
+    edges = np.array(renderer.creases.now(folded)).reshape(-1, 3)
+    # The edge from (0, -1) to (0, 1) of both triangles that have one.
+    assert edges.sum() == 2 and edges[0, 1] and edges[3, 2]

@@ -16,6 +16,7 @@ import mitsuba as mi
 
 from .beams import Beam, Outlined, Projector, beam_of, picture, projector_of, share_inside, towards
 from .environments import ENVIRONMENTS, SUNSKY, Environment, SunSky, environment_of
+from .shadow.camera import unit
 from .traversal import children, parameters, varies
 
 _DEGREE = math.pi / 180.0
@@ -31,7 +32,7 @@ class DirectionalLight:
 
     def illuminate(self, p_world: Any, active: Any = True) -> tuple[Any, Any]:
         """(wo, weight): unit direction to the light (Vector3f) and its irradiance on a surface that faces it."""
-        return -dr.normalize(mi.Vector3f(self.direction)), self.irradiance & mi.Bool(active)
+        return -unit(mi.Vector3f(self.direction)), self.irradiance & mi.Bool(active)
 
 
 @dataclass(frozen=True)

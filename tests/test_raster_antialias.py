@@ -23,6 +23,23 @@ def test_coverage_of_a_triangle(variant: str) -> None:
     assert abs(image.sum() - exact.sum()) < 0.25  # pixels
 
 
+def test_corners_that_are_infinite_leave_the_image_alone(variant: str) -> None:
+    """Their triangle is not drawn; by x / inf its edges would come to lie in the middle of the image."""
+    infinite = [[-3.764865, -1.066467, -0.14111, 1], [0.323671, 0.045687, 0.348858, np.inf], [-4.147308, 10.328762, 0.5424, 1]]
+    others = [[0.50032, -10.742145, -0.056785, 1], [-5.730114, -1.278489, 0.445056, 1], [2.726582, -6.0363622, -0.0007753, 1]]
+    seen = [[-8.347701, -1.8677, -0.345356, 1], [-3.4027061, 5.7366743, -0.2280241, 1], [-0.0433376, 0.4401731, 0.0433294, 1]]
+    pos = np.array([*infinite, *others, *seen], np.float32)
+    faces, size = np.arange(9, dtype=np.uint32).reshape(3, 3), 8
+    clip, ones = mi.TensorXf(pos), mi.TensorXf(np.ones((size, size, 1), np.float32))
+    dr.enable_grad(clip, ones)
+    raster = rasterize(clip, mi.TensorXu(faces), (size, size))
+    assert 0 not in raster.triangle.numpy() and 2 in raster.triangle.numpy()
+    image = antialias(ones, raster, clip, topology_of(faces, pos[:, :3].copy()))
+    dr.backward(dr.sum(image))
+    assert np.all(image.numpy() == 1)
+    assert np.all(np.isfinite(dr.grad(clip).numpy())) and np.all(np.isfinite(dr.grad(ones).numpy()))
+
+
 @pytest.mark.parametrize("angle", np.radians([0, 7, 29, 45, 61, 90, 133]))
 def test_moving_a_straight_edge_sweeps_its_exact_area(variant: str, angle: float) -> None:
     """Translate a large rotated square; the derivative of the weighted image is the boundary integral."""

@@ -198,6 +198,34 @@ def test_degenerate_and_non_finite_triangles_are_not_drawn(variant: str) -> None
     assert (as_ids(run(pos, faces, 16, 16)) == -1).all()
 
 
+def test_corners_with_w_zero(variant: str) -> None:
+    """The edge between two of them is infinitely far away: a floor may begin right below the camera."""
+    pos = np.array([[-1, -1, 0, 0], [1, -1, 0, 0], [0, 1, 0, 1], [0.5, -1, 0, 0]], np.float32)
+    for faces in ([[0, 1, 2]], [[1, 0, 2]], [[0, 3, 2], [2, 3, 1]]):
+        faces = np.array(faces, np.uint32)
+        ref = brute_force.rasterize(pos, faces, 32, 32)
+        decided = ref["margin_px"] > 1 / 256
+        assert (ref["triangle"] >= 0).sum() > 600
+        assert (as_ids(run(pos, faces, 32, 32)) == ref["triangle"])[decided].all()
+
+
+def test_triangles_that_reach_far_behind_the_near_plane(variant: str) -> None:
+    rng = np.random.default_rng(0)
+    seen = 0
+    for _ in range(100):
+        pos = np.c_[rng.uniform(-1, 1, (3, 3)), rng.uniform(0.5, 2, 3)]
+        pos[:, 2] *= pos[:, 3]
+        away = rng.normal(size=4)
+        away[2] = -abs(away[2]) - 0.5
+        pos[rng.integers(3)] = 1e8 * away
+        pos = pos.astype(np.float32)
+        ref = brute_force.rasterize(pos, np.array([[0, 1, 2]]), 64, 64)
+        decided = (ref["margin_px"] > 0.05) & (ref["margin_depth"] > 0.01)
+        seen += (ref["triangle"] >= 0).sum()
+        assert (as_ids(run(pos, np.array([[0, 1, 2]], np.uint32), 64, 64)) == ref["triangle"])[decided].all()
+    assert seen > 10_000
+
+
 @pytest.mark.parametrize("near_camera", [False, True])
 def test_a_million_triangles(variant: str, near_camera: bool) -> None:
     n = 708

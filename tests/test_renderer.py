@@ -410,6 +410,41 @@ def test_unknown_names(renderer: Renderer) -> None:
         renderer.render(sensor=-1)
 
 
+def test_scenes_and_settings_that_are_none(variant: str) -> None:
+    with pytest.raises(ShadowmapError, match="'scene.xml' is no mi.Scene of the variant .*: load it"):
+        Renderer.from_scene("scene.xml")
+    with pytest.raises(ShadowmapError, match="a NoneType is no mi.Scene"):
+        Renderer.from_scene(None)
+    with pytest.raises(ShadowmapError, match="There is no setting 'shadow_bias'; beside those of shadow maps"):
+        Renderer.from_scene(build(), shadow_bias=1)
+
+
+@pytest.mark.parametrize("length", [1e-25, 1e-3, 1e25])
+def test_directions_of_any_length(renderer: Renderer, length: float) -> None:
+    """Squares of their components may be out of range."""
+    sun = renderer.light("sun")
+    image = renderer.render().numpy()
+    direction = mi.Vector3f(sun.direction) * length
+    dr.enable_grad(direction)
+    scaled = renderer.render(lights={"sun": replace(sun, direction=direction)})
+    np.testing.assert_allclose(scaled.numpy(), image, atol=1e-3)
+    dr.backward(dr.mean(scaled))
+    assert all(np.isfinite(np.array(dr.grad(direction))))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("axis", range(3))
+def test_a_vertex_that_is_not_finite_takes_its_triangles_only(renderer: Renderer, axis: int, value: float) -> None:
+    """And not the shadow of the whole mesh, whose bounds it is in."""
+    points = rest(renderer).numpy().reshape(-1, 3).copy()
+    # On the lower side, where neither the camera nor a light sees its triangles.
+    lowest = int(points[:, 2].argmin())
+    expected = renderer.render(vertex_positions={"ball": mi.Float(points.ravel())}).numpy()
+    points[lowest, axis] = value
+    found = renderer.render(vertex_positions={"ball": mi.Float(points.ravel())}).numpy()
+    assert (np.abs(found - expected).max(2) > 0.05).sum() <= 2
+
+
 def test_wrong_kinds_and_sizes(renderer: Renderer) -> None:
     with pytest.raises(ShadowmapError, match="Light 'sun' is a DirectionalLight, not a PointLight"):
         renderer.render(lights={"sun": renderer.light("lamp")})

@@ -96,7 +96,7 @@ def check_resolution(resolution: tuple[int, int]) -> tuple[int, int]:
     """Validate (height, width)."""
     try:
         height, width = (index(r) for r in resolution)
-    except TypeError:
+    except (TypeError, ValueError):
         raise ValueError(f"resolution is {resolution!r}; give (height, width) in whole pixels") from None
     if not (1 <= height <= MAX_RESOLUTION and 1 <= width <= MAX_RESOLUTION):
         raise ValueError(f"resolution is {height} x {width}; both sides must lie between 1 and {MAX_RESOLUTION}")

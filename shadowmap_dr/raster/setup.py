@@ -12,6 +12,8 @@ from ._types import backend
 
 # Boxes are widened by this many pixels so that rounding in the single-precision edge functions cannot lose a pixel.
 _BOX_MARGIN = 1.0 / 512.0
+# Distance, in pixels, of an edge that is infinitely far away.
+_DISTANT = 1e9
 
 
 @dataclass(frozen=True)
@@ -65,8 +67,10 @@ def set_up(corners: tuple[Any, Any, Any], height: int, width: int) -> Triangles:
     coefficients: list[list[Any]] = [[], [], []]
     for a, b, c in lines:
         norm = dr.sqrt(a * a * (sx * sx) + b * b * (sy * sy))
-        active &= norm > 0
-        scale = sign / dr.select(norm > 0, norm, 1)
+        # Between two corners with w = 0 the edge is infinitely far away: all of the image is on one side of it.
+        distant = norm == 0
+        scale = sign / dr.select(distant, 1, norm)
+        c = dr.select(distant, dr.sign(c) * _DISTANT, c)
         for store, value in zip(coefficients, (a * sx * scale, b * sy * scale, c * scale), strict=True):
             store.append(Float(value))
     plane = [sum(zs[k] * lines[k][c] for k in range(3)) * inv_det for c in range(3)]
@@ -190,8 +194,12 @@ def _screen_bounds(corners: tuple[Any, Any, Any], height: int, width: int) -> tu
         include(p.x, p.y, p.w, d >= 0)
     for a, b in ((0, 1), (1, 2), (2, 0)):
         crosses = (near[a] >= 0) != (near[b] >= 0)
-        s = near[a] / dr.select(crosses, near[a] - near[b], 1)
-        q = dr.fma(corners[b] - corners[a], s, corners[a])
+        # From the end in front: the other one may be so far behind that where the edge crosses would be lost in rounding.
+        front = near[a] >= 0
+        d = dr.select(front, near[a], near[b])
+        p, back = dr.select(front, corners[a], corners[b]), dr.select(front, corners[b], corners[a])
+        s = d / dr.select(crosses, d - dr.select(front, near[b], near[a]), 1)
+        q = dr.fma(back - p, s, p)
         include(q.x, q.y, q.w, crosses)
 
     # Clamp before the conversion to integers: a vertex near the camera plane projects beyond their range.

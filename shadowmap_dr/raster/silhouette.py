@@ -199,11 +199,13 @@ def _project(a: Any, b: Any, active: Any, width: int, height: int) -> tuple[Any,
     """Clip edges at the near plane and project them: (x, y in pixels from the image's centre, NDC depth), and which are left."""
     module = backend(a)
     near_a, near_b = a.z + a.w, b.z + b.w
-    active = active & ((near_a > 0) | (near_b > 0))
+    # Infinite ones would be projected to the middle of the image.
+    active = active & dr.isfinite(near_a + a.x + a.y + near_b + b.x + b.y) & ((near_a > 0) | (near_b > 0))
 
     def clip(p: Any, q: Any, near_p: Any, near_q: Any) -> Any:
-        s = near_p / dr.select(near_p < 0, near_p - near_q, 1)
-        return dr.select(near_p < 0, dr.fma(q - p, s, p), p)
+        # From the end in front, as rasterization does.
+        s = near_q / dr.select(near_p < 0, near_q - near_p, 1)
+        return dr.select(near_p < 0, dr.fma(p - q, s, q), p)
 
     a, b = clip(a, b, near_a, near_b), clip(b, a, near_b, near_a)
     active &= (a.w > 0) & (b.w > 0)

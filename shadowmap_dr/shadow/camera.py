@@ -76,9 +76,19 @@ class Frusta:
     last: Any
 
 
+def unit(vector: Any) -> Any:
+    """A vector (``Array3f`` or the like, any length but 0) made unit, attached. Its components' squares may be out of range."""
+    largest = dr.max(dr.abs(dr.detach(vector)))
+    # The power of two that makes it about 1, made of the exponent's bits: multiplying by it changes no digit.
+    module = backend(largest)
+    exponent = dr.reinterpret_array(module.UInt32, largest) & 0x7F800000
+    scale = dr.reinterpret_array(module.Float, 0x7F000000 - exponent)
+    return dr.normalize(vector * scale)
+
+
 def directional_view(direction: Any) -> LightView:
     """View along a light direction (``Array3f``, any length). The other axes follow from it without a twist of their own."""
-    forward = dr.normalize(direction)
+    forward = unit(direction)
     # The world axis least aligned with the (detached) direction starts the frame.
     d = dr.abs(dr.detach(forward))
     use_x = (d.x <= d.y) & (d.x <= d.z)

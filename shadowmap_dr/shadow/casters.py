@@ -44,8 +44,9 @@ def shape_boxes(p_world: Any, shape: Any, count: int) -> Boxes:
         p = dr.detach(p_world)
         # All maxima, and all in one buffer, since a reduction costs more to start than to run.
         extremes = dr.full(module.Float, -dr.inf, 6 * count)
+        drawn = dr.isfinite(p.x + p.y + p.z)
         for k, value in enumerate((p.x, p.y, p.z, -p.x, -p.y, -p.z)):
-            dr.scatter_reduce(dr.ReduceOp.Max, extremes, value, shape * 6 + k)
+            dr.scatter_reduce(dr.ReduceOp.Max, extremes, value, shape * 6 + k, drawn)
         row = dr.arange(module.UInt32, count) * 6
         values = [dr.gather(module.Float, extremes, row + k) for k in range(6)]
         boxes = Boxes(module.Array3f(*(-v for v in values[3:])), module.Array3f(*values[:3]))

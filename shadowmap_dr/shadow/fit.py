@@ -60,7 +60,9 @@ def shape_bounds(view: Views, p_light: Any, map_index: Any, shape_index: Any, sh
         # A vertex behind a spot light bounds nothing: its shape may reach anywhere in the image.
         sides = [dr.select(behind, dr.inf, value) for value in (-x, -y, x, y)]
         values = [*sides[:2], -p.z, *sides[2:], p.z]
-        return Bounds(_maxima(values, map_index * shape_count + shape_index, view.count * shape_count))
+        # What is not finite is not drawn, and bounds nothing.
+        drawn = dr.isfinite(p.x + p.y + p.z)
+        return Bounds(_maxima(values, map_index * shape_count + shape_index, view.count * shape_count, drawn))
 
 
 def fit_frusta(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from operator import index
@@ -70,6 +71,10 @@ class ShadowSettings:
                 object.__setattr__(self, name, index(getattr(self, name)))
             except TypeError:
                 raise ValueError(f"shadow map {name} is {getattr(self, name)!r}; give a whole number") from None
+        for name in ("bias", "bleeding"):
+            value = getattr(self, name)
+            if not isinstance(value, int | float) or not math.isfinite(value):
+                raise ValueError(f"shadow map {name} is {value!r}; give a finite number")
         if self.method == "auto":
             object.__setattr__(self, "method", "vsm" if self.compat else DEFAULT)
         if self.method not in METHODS:

@@ -190,6 +190,23 @@ def test_gradients_are_those_of_their_own_call(renderer: sdr.Renderer) -> None:
         torch.testing.assert_close(vertices.grad, alone.grad, rtol=1e-3, atol=1e-3 * float(alone.grad.abs().max()))
 
 
+def test_frozen_or_not_later_images_leave_gradients_alone(renderer: sdr.Renderer) -> None:
+    """A backward pass sees the fit of its own image's shadow maps."""
+    rest = renderer.vertices("ball")
+    renderer.render({"ball": rest})
+    gradients = []
+    for later in (False, True):
+        moved = (rest + torch.tensor([0.05, 0.05, 0.05])).requires_grad_()
+        loss = (weights() * renderer.render({"ball": moved})).sum()
+        if later:
+            with torch.no_grad():
+                renderer.render({"ball": rest + torch.tensor([0.1, 0.1, 0.1])})
+        loss.backward()
+        gradients.append(moved.grad)
+        renderer.render({"ball": rest})
+    torch.testing.assert_close(*gradients, rtol=1e-3, atol=1e-3 * float(gradients[0].abs().max()))
+
+
 def test_frozen_or_not_no_graph_stays_behind(renderer: sdr.Renderer, capfd: pytest.CaptureFixture[str]) -> None:
     """Dr.Jit never frees some of those that are dropped; when the process ends, it would crash on them."""
     vertices = renderer.vertices("ball").requires_grad_()
@@ -255,7 +272,11 @@ def test_wrong_input_is_refused(renderer: sdr.Renderer) -> None:
     refused("parameters: 'camera.film.size' is a", parameters={"camera.film.size": torch.ones(2)})
     refused("sensor 3, spp 1: there are 1 sensors", sensor=3)
     refused("sensor 0, spp 0: there are 1 sensors", spp=0)
+    refused("sensor 0, spp nan: there are 1 sensors", spp=float("nan"))
+    refused("sensor 0, spp inf: there are 1 sensors", spp=float("inf"))
     refused("lights['sun']['direction']: [0.0, 0.0, 0.0]; give", lights={"sun": {"direction": torch.zeros(3)}})
+    refused("lights['sun']['direction']: [nan, nan, nan]; give", lights={"sun": {"direction": torch.full((3,), torch.nan)}})
+    refused("Mitsuba refuses new values of camera.to_world", parameters={"camera.to_world": torch.zeros(4, 4)})
     refused("vertex_positions: Tensor, but must be Mapping", vertex_positions=vertices)
     refused("lights['sun']: Tensor, but must be Mapping", lights={"sun": DIRECTION})
     refused("parameters: list, but must be Mapping", parameters=[])

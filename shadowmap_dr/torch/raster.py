@@ -133,6 +133,8 @@ def build_topology(faces: torch.Tensor, positions: torch.Tensor) -> Topology:
     check_indices("faces", faces, len(positions))
     with drjit_turn(check_devices(faces=faces, positions=positions)) as module:
         edges = _raster.build_topology(faces.detach().cpu().numpy(), positions.detach().cpu().numpy(), module.UInt32)
+    if not edges.count:
+        raise ShadowmapError("faces: all triangles have two corners at the same place, so that the mesh has no edges.")
     return Topology(faces.detach().to(torch.int32).clone(), len(positions), edges)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
@@ -12,6 +13,7 @@ import mitsuba as mi
 import torch
 
 from ..errors import ShadowmapError
+from ..records import map_arrays
 from ..renderer import Renderer as _Renderer
 from ..soft import SkyWatch, still_aimed
 from .bridge import attached, cross, drjit_turn, gradients, number, to_torch
@@ -95,7 +97,7 @@ class Renderer:
             check_kind(f"lights['{name}']", value, Mapping)
         sensor, spp = number_of("sensor", sensor, int), number_of("spp", spp, float)
         given = self._inputs(vertex_positions, lights, parameters)
-        if not 0 <= sensor < len(self._renderer.data.sensors) or spp < 1:
+        if not 0 <= sensor < len(self._renderer.data.sensors) or not 1 <= spp < math.inf:
             count = len(self._renderer.data.sensors)
             raise ShadowmapError(f"sensor {sensor}, spp {spp:g}: there are {count} sensors, counted from 0; spp is 1 or more.")
         operation = _Rendering(self, tuple(given), sensor, spp)
@@ -126,8 +128,8 @@ class Renderer:
                 if key not in known:
                     raise ShadowmapError(f"Light '{name}' has no '{key}' that a tensor could replace: {', '.join(known)}.")
                 check_floats(f"lights['{name}']['{key}']", value, *_shapes_of(f"lights: '{key}'", getattr(record, key)))
-                if key == "direction" and not bool(value.any()):
-                    raise ShadowmapError(f"lights['{name}']['direction']: {value.tolist()}; give a vector that is not zero.")
+                if key == "direction" and not (bool(value.any()) and bool(value.isfinite().all())):
+                    raise ShadowmapError(f"lights['{name}']['direction']: {value.tolist()}; give a finite one other than zero.")
                 given[_Place("light", name, key)] = value
         if parameters:
             current = mi.traverse(self._renderer.data.scene)
@@ -195,6 +197,9 @@ class _Rendering:
         """The renderer for this call, while the scene has the parameters that it is to have."""
         # Fitting maps again to what they have been fitted to keeps them bit by bit, as the derivatives want it.
         renderer = replace(self.owner._renderer, **(self.fixed or (self.owner._planned if self.changes_scene else {})))
+        # Copies, since a replayed function writes into the records that it is given: another image's backward pass may need them.
+        fits = (renderer.frusta, renderer.soft_frusta)
+        renderer.frusta, renderer.soft_frusta = map_arrays(fits, lambda array: type(array)(array))
         values = {place.name: array for place, array in zip(self.places, arrays, strict=True) if place.kind == "parameter"}
         if not values:
             yield renderer
@@ -203,7 +208,11 @@ class _Rendering:
         # Copies: what the table returns changes with the scene.
         before = {name: type(table[name])(table[name]) for name in values}
         try:
-            _set(table, {name: _converted(before[name], array) for name, array in values.items()})
+            try:
+                _set(table, {name: _converted(before[name], array) for name, array in values.items()})
+            except RuntimeError as error:
+                why = " ".join(str(error).split())
+                raise ShadowmapError(f"Mitsuba refuses new values of {', '.join(values)}: {why}") from error
             renderer = renderer.refresh()
             yield renderer if self.fixed else self._divided(renderer)
         finally:

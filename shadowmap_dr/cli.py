@@ -18,7 +18,7 @@ from rich.console import Console
 
 from . import __version__, _llvm, assets, cli_art, cli_face, cli_gradients, cli_lights, cli_model, cli_soft, io
 from .cli_options import ANY, COLOURED, DEFAULT_VARIANT, Scheduler, SchedulerThreads, Variant, set_variant
-from .errors import ShadowmapError
+from .errors import ShadowmapError, is_interrupt
 from .experiments.bench import common as bench_common
 from .experiments.bench import experiment as bench_experiment
 from .experiments.bench import report as bench_report
@@ -63,7 +63,7 @@ def main() -> None:
         if hasattr(error, "format_message"):  # wrong usage, reported by the option parser
             message = error.format_message()
             _fail(message, 2) if message else sys.exit(2)  # without any argument the help has been shown
-        if type(error).__name__ == "Abort":
+        if type(error).__name__ == "Abort" or is_interrupt(error):
             _fail("interrupted", 130)
         raise
     sys.exit(status if isinstance(status, int) else 0)
@@ -111,7 +111,7 @@ def render(
     ] = None,
     integrator: Annotated[str, typer.Option(help="Integrator plug-in, or 'scene' for the scene's own.")] = "shadowmap",
     size: Annotated[str | None, typer.Option(metavar="WxH", help="Image size in pixels.")] = None,
-    spp: Annotated[int | None, typer.Option(min=1, help="Samples per pixel [default: the integrator's].")] = None,
+    spp: Annotated[int | None, typer.Option(min=1, max=1 << 24, help="Samples per pixel [default: the integrator's].")] = None,
     seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Seed of the sampler.")] = 0,
     aovs: Annotated[
         str | None,

@@ -20,3 +20,12 @@ class LLVMError(ShadowmapError, ImportError):
 
 class OutputError(ShadowmapError, OSError):
     """A result could not be written (unwritable directory, full disk, unknown suffix)."""
+
+
+def is_interrupt(error: BaseException | None) -> bool:
+    """Whether an error is Ctrl-C, or what Dr.Jit makes of it where it comes while a recorded function is replayed."""
+    while error is not None:
+        if isinstance(error, KeyboardInterrupt):
+            return True
+        error = error.__cause__ or error.__context__
+    return False

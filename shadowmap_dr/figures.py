@@ -95,6 +95,10 @@ def text_figure(text: str) -> Array:
     if not text.strip() or len(text) > 40:
         raise ShadowmapError(f"a text of {len(text)} characters: give 1 to 40, not only blanks.")
     font = ImageFont.truetype(font_manager.findfont("DejaVu Sans:bold"), 400)
+    known = font_manager.get_font(font.path).get_charmap()
+    missing = [letter for letter in dict.fromkeys(text) if not letter.isspace() and ord(letter) not in known]
+    if missing:
+        raise ShadowmapError(f"the font {font.getname()[0]} has no {' '.join(missing)}: give an image of the text instead.")
     canvas = ImageDraw.Draw(Image.new("L", (1, 1)))
     left, top, right, bottom = (int(x) for x in canvas.multiline_textbbox((0, 0), text, font=font))
     image = Image.new("L", (right - left + 2, bottom - top + 2), 0)

@@ -208,6 +208,20 @@ def test_a_reader_that_has_gone(unbuffered: str) -> None:
     assert result.returncode == 1 and result.stderr == ""
 
 
+def test_interrupts_within_recordings_are_interrupts(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Dr.Jit makes an error of its own of Ctrl-C."""
+
+    def interrupted(*_: Any, **__: Any) -> None:
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt as error:
+            raise RuntimeError("FlatVariables::...") from error
+
+    monkeypatch.setattr(experiment, "run_pose", interrupted)
+    result = run("pose", "--out", "o")
+    assert result.status == 130 and result.err == "error: interrupted\n"
+
+
 def test_full_disk_behind_the_image(tmp_path: Path) -> None:
     code = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000))\nfrom shadowmap_dr.cli import main; main()"
     arguments = ["render", "pose", "-o", str(tmp_path / "a.exr"), "--integrator", "direct", "--spp", "4"]

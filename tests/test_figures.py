@@ -101,6 +101,8 @@ def test_letters_are_cut_out_closely():
     for text in ("", "  ", "x" * 41):
         with pytest.raises(ShadowmapError):
             figures.text_figure(text)
+    with pytest.raises(ShadowmapError, match="DejaVu Sans has no 你 好: give an image"):
+        figures.text_figure("a 你好")
 
 
 def test_only_enclosed_holes_are_filled():

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -149,6 +150,56 @@ def test_a_batch_goes_on_from_its_checkpoint(tmp_path: Path) -> None:
     assert not list((tmp_path / "batches").glob("*.checkpoint.npz"))
 
 
+def test_checkpoints_hold_for_their_runs_only(tmp_path: Path) -> None:
+    """Batches of another size, done in between, leave gaps in a batch that begins and ends where a killed one did."""
+    log = folder(tmp_path / "log")
+    with pytest.raises(RuntimeError, match="stopped"):
+        run_sweep([Bowls(8, size=8, log=log, stops=25)], tmp_path)
+    with pytest.raises(ValueError, match="run 0 fails"):
+        run_sweep([Bowls(4, size=2, log=log, fails=0)], tmp_path, resume=True)
+    Path(log, "stopped").unlink()
+    with pytest.raises(RuntimeError, match="stopped"):
+        run_sweep([Bowls(8, size=8, log=log, stops=25)], tmp_path, resume=True)
+    found = run_sweep([Bowls(8, size=8, log=log)], tmp_path, resume=True)["bowls"]
+    whole = run_sweep([Bowls(8, size=8)], tmp_path / "whole")["bowls"]
+    assert np.allclose(*([record["final"] for record in records] for records in (found, whole)), atol=1e-5)
+    assert begun(Path(log)) == {"0-7": 3, "0-1": 1, "2-3": 1}
+    assert not list((tmp_path / "batches").glob("*.npz"))
+
+
+def test_an_interrupt_within_a_recording_ends_the_sweep(tmp_path: Path) -> None:
+    """Dr.Jit makes an error of its own of it."""
+    log = folder(tmp_path / "log")
+    with pytest.raises(KeyboardInterrupt):
+        run_sweep([Interrupted(6, log=log)], tmp_path)
+    assert begun(Path(log)) == {"0-1": 1}
+
+
+@dataclass(frozen=True)
+class Interrupted(Bowls):
+    """Ctrl-C comes in the middle of a step."""
+
+    def losses(self, built: Any, parameters: Any, runs: Any) -> Any:
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt as error:
+            raise RuntimeError("FlatVariables::...") from error
+
+
+def test_losses_of_another_number_than_runs_are_named(tmp_path: Path) -> None:
+    with pytest.raises(ShadowmapError, match="losses returned 1 numbers for 2 runs"):
+        run_sweep([Summed(2)], tmp_path)
+    assert not list((tmp_path / "batches").iterdir())
+
+
+@dataclass(frozen=True)
+class Summed(Bowls):
+    """One loss for all runs."""
+
+    def losses(self, built: Any, parameters: Any, runs: Any) -> Any:
+        return dr.sum(super().losses(built, parameters, runs))
+
+
 def test_what_is_not_resumed_begins_anew_and_leaves_others_alone(tmp_path: Path) -> None:
     batches = tmp_path / "batches"
     batches.mkdir()
@@ -260,3 +311,10 @@ def test_bad_input_is_named(tmp_path: Path) -> None:
         run_sweep([Bowls(1), Bowls(2)], tmp_path)
     with pytest.raises(ShadowmapError, match="'a/b'"):
         run_sweep([Bowls(1, name="a/b")], tmp_path)
+    with pytest.raises(ShadowmapError, match="-1 threads"):
+        run_sweep([Bowls(1)], tmp_path, threads=-1)
+    with pytest.raises(ShadowmapError, match="no Mitsuba variant 'magic'"):
+        run_sweep([Bowls(1)], tmp_path, variant="magic")
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match="cannot write .*file/batches"):
+        run_sweep([Bowls(1)], tmp_path / "file")

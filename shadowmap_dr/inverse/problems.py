@@ -113,7 +113,7 @@ class LossProblem(Problem):
         self, built: Any, runs: Sequence[int], checkpoint: Path | None, on_step: Callable[[int], None]
     ) -> list[dict[str, Any]]:
         starts = np.stack([np.asarray(self.start(run), np.float64).ravel() for run in runs])
-        fit = _BatchFit(functools.partial(self.losses, built, runs=tuple(runs)), self.step_size, self.betas)
+        fit = _BatchFit(functools.partial(self.losses, built, runs=tuple(runs)), len(runs), self.step_size, self.betas)
         settings = {"settings": self.settings(), "runs": list(runs)}
         history = optimize(fit, starts.ravel(), self.steps, checkpoint=checkpoint, settings=settings, on_step=on_step)
         parameters = history.parameters.reshape(len(history.parameters), *starts.shape)
@@ -158,8 +158,8 @@ class MethodProblem(Problem):
 class _BatchFit:
     """Adam on all parameters of a batch: a `Method` of the optimisation loop whose loss is the sum of all runs' losses."""
 
-    def __init__(self, losses: Callable[[Any], Any], step_size: float, betas: tuple[float, float]) -> None:
-        self._loss, self._step_size, self._betas = losses, step_size, betas
+    def __init__(self, losses: Callable[[Any], Any], runs: int, step_size: float, betas: tuple[float, float]) -> None:
+        self._loss, self._runs, self._step_size, self._betas = losses, runs, step_size, betas
         self._losses: list[Any] = []
         self.reset(np.zeros(1))
 
@@ -176,6 +176,8 @@ class _BatchFit:
         parameters = mi.Float(self._parameters)
         dr.enable_grad(parameters)
         losses = self._loss(parameters)
+        if dr.width(losses) != self._runs:
+            raise ShadowmapError(f"losses returned {dr.width(losses)} numbers for {self._runs} runs: give one for each.")
         dr.backward(dr.sum(losses))
         gradient = dr.grad(parameters)
         losses = dr.detach(losses)

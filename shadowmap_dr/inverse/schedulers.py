@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from ..errors import OutputError, ShadowmapError
+from ..errors import OutputError, ShadowmapError, is_interrupt
 from .workshop import Unit, Workshop
 
 #: How a scheduler is named.
@@ -77,6 +77,8 @@ def _do_here(
         except OutputError:
             raise  # where a checkpoint cannot be written, no other could be
         except Exception as error:
+            if is_interrupt(error):
+                raise KeyboardInterrupt from error
             failed.append(error)
             continue
         on_done(unit, result)

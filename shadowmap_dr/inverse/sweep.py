@@ -7,18 +7,19 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
 from rich.console import Console
 
 from .. import report
-from ..errors import ShadowmapError
+from ..errors import OutputError, ShadowmapError
 from .problems import Problem
-from .schedulers import check_scheduler, do_units
+from .schedulers import check_scheduler, check_threads, do_units
 from .workshop import Unit, stem
 
 #: Bytes that a batch may need if nobody says otherwise.
 MEMORY = 1 << 31
 #: How the names of checkpoints end: those of batches, and of single runs of a batch.
-_CHECKPOINT = r"\.checkpoint(-run\d+)?\.npz"
+_CHECKPOINT = r"\.checkpoint(-[0-9a-f]{8})?(-run\d+)?\.npz"
 
 
 def run_sweep(
@@ -56,6 +57,9 @@ def run_sweep(
             others are on disk by then).
     """
     check_scheduler(scheduler)
+    check_threads(threads)
+    if variant not in mi.variants():
+        raise ShadowmapError(f"no Mitsuba variant {variant!r}: choose one of {', '.join(mi.variants())}.")
     names = [problem.name for problem in problems]
     if len(set(names)) != len(names):
         raise ShadowmapError(f"two problems of the sweep have the same name in {', '.join(names)}: rename one.")
@@ -69,7 +73,10 @@ def run_sweep(
             for path in [*_files(problem, folder, variant), *_files(problem, folder, variant, _CHECKPOINT)]:
                 path.unlink()
     units = [unit for problem in problems for unit in _units(problem, variant, done[problem.name], memory)]
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"cannot write {folder}: {error.strerror or error}.") from error
     with report.progress(console or Console(stderr=True)) as progress:
         total = progress.add_task("batches", total=len(units), note="")
         task = progress.add_task("", total=None, note="", visible=False)

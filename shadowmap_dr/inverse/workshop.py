@@ -37,6 +37,13 @@ class Unit:
         """Name of the result's file."""
         return f"{stem(self.problem, self.variant)}-{self.runs[0]:06d}-{self.runs[-1]:06d}.json"
 
+    @property
+    def checkpoint(self) -> str:
+        """Name of its checkpoint's file. Batches of another size may have left gaps, and checkpoints hold for their runs only."""
+        whole = len(self.runs) == self.runs[-1] - self.runs[0] + 1
+        which = "" if whole else "-" + hashlib.sha256(repr(self.runs).encode()).hexdigest()[:8]
+        return f"{Path(self.file).stem}.checkpoint{which}.npz"
+
 
 def stem(problem: Problem, variant: str) -> str:
     """What the names of a problem's files begin with: its name, and a digest of all that decides on its results."""
@@ -77,7 +84,7 @@ class Workshop:
             built = time.perf_counter()
             checkpoint = None
             if folder is not None and folder.is_dir():
-                checkpoint = folder / f"{Path(unit.file).stem}.checkpoint.npz"
+                checkpoint = folder / unit.checkpoint
             records = unit.problem.run_batch(self._built, unit.runs, checkpoint, on_step)
             ended = time.perf_counter()
         return plain(

@@ -200,6 +200,8 @@ def _large_steps(vertices: Any, faces: Any, smoothness: float) -> Any:
         return mi.ad.LargeSteps(vertices, faces, lambda_=smoothness)
     except ModuleNotFoundError as error:
         raise ShadowmapError("deforming meshes needs the package cholespy: pip install 'shadowmap-dr[art]'.") from error
+    except ValueError as error:
+        raise ShadowmapError(f"a smoothness of {smoothness:g} is too large for this mesh: use a smaller one.") from error
 
 
 def checked_target(image: npt.ArrayLike, view: ShadowView) -> Array:

@@ -23,6 +23,9 @@ from .shading import fit_maps, images, light_views, losses_and_gradients, render
 
 FloatArray = npt.NDArray[np.float32]
 
+# Steps that may be waiting for the device. With more, an interrupt is heard late, and progress shown too early.
+_AHEAD = 10
+
 # Bytes of one shadow map with all that belongs to it, for each texel (measured, `vsm`).
 _BYTES_OF_TEXEL = 150
 # The same for each pixel of a run's image, and for each pixel and light.
@@ -118,7 +121,7 @@ class LightBatch:
             starts: (R, n, 3) directions to the lights.
             targets: (R, H, W, C) linear images.
             stages: one after the other; moments stay.
-            on_step: told how many steps are done, without waiting for them.
+            on_step: told how many steps have been started, at most :data:`_AHEAD` of which are not done yet.
 
         Raises:
             ShadowmapError: arrays of other shapes, or that are not finite.
@@ -136,6 +139,8 @@ class LightBatch:
                     state, loss = self._step(scene, state, wanted, rate, runs, self._betas)
                     losses.append(loss)
                     directions.append(state.to_light)
+                    if len(losses) % _AHEAD == 0:
+                        dr.sync_thread()
                     on_step(len(losses))
             dr.sync_thread()
         shape = (len(directions), runs, self.lights, 3)

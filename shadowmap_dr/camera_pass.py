@@ -64,8 +64,10 @@ def seen_points(sensor: Sensor, raster: RasterOutput, geometry: Geometry) -> tup
         stride = max(1, math.ceil(math.sqrt(height * width) / _SEEN_ACROSS))
         columns, rows = -(-width // stride), -(-height // stride)
         lane = dr.arange(mi.UInt32, rows * columns)
-        row = dr.minimum((lane // columns) * stride + stride // 2, height - 1)
-        column = dr.minimum((lane % columns) * stride + stride // 2, width - 1)
+        down, across = lane // columns, lane % columns
+        # One pixel of each cell of a lattice, at another place in each: thin things may lie along a row.
+        row = dr.minimum(down * stride + (5 * across + 2 * down) % stride, height - 1)
+        column = dr.minimum(across * stride + (5 * down + 2 * across) % stride, width - 1)
         triangle = dr.gather(mi.UInt32, raster.triangle, row * width + column)
         hit = triangle != NO_TRIANGLE
         plane = raster.depth_plane(0, triangle, hit)

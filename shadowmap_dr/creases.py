@@ -17,10 +17,12 @@ import numpy as np
 from .geometry import Geometry
 from .raster import Topology
 from .raster._memory import device_array
-from .traversal import attributes, is_plain
+from .traversal import attributes, fingerprint, is_attribute, is_plain
 
 # Numbers that differ by less (in any component) are the same for the eye.
-_NORMAL_JUMP, _ATTRIBUTE_JUMP, _TEXCOORD_JUMP = 0.02, 1e-3, 1e-4
+_NORMAL_JUMP, _COLOUR_JUMP = 0.02, 1e-3
+# Where along an edge the colours of both sides are compared.
+_LOOKED_AT = (0.02, 0.5, 0.98)
 
 
 @dataclass(frozen=True)
@@ -29,13 +31,11 @@ class Pairs:
 
     one, other    UInt32 (K,), half-edges
     ends          ((UInt32 (K,), UInt32 (K,)), likewise): vertices of one and of the other at the edge's first end; at its second
-    textured      Bool (K,), whether the material there may read texture coordinates
     """
 
     one: Any
     other: Any
     ends: tuple[tuple[Any, Any], tuple[Any, Any]]
-    textured: Any
 
     def mark(self, edges: Any, jump: Any) -> None:
         """Set the flags (Bool, 3 F) of the edges for which ``jump`` (Bool, K) holds, on both sides."""
@@ -57,16 +57,18 @@ class Creases:
     """Where shading jumps. A PyTree that may cross ``dr.freeze``.
 
     always      Bool (3 F,), edges from corner k to k + 1 of a face at which it does whatever moves: at flat faces, between shapes
-    coloured    the same, and where attributes of meshes (colours of vertices, of faces) differ: :meth:`with_attributes`. None if
-                there is no edge at all at which shading may ever jump
+    coloured    the same, and where colours of meshes (attributes, textures, emission) differ: :meth:`with_colours`. None if there
+                is no edge at all at which shading may ever jump
     seams       edges of smooth shapes whose faces have vertices of their own there, None if there are none
     attributed  (number of the shape, the edges of it at which its attributes may differ)
+    textured    (number of the shape, the edges of it at which its texture coordinates may differ)
     """
 
     always: Any
     coloured: Any
     seams: Pairs | None
     attributed: tuple[tuple[int, Pairs], ...]
+    textured: tuple[tuple[int, Pairs], ...]
 
     @classmethod
     def of(cls, geometry: Geometry, topology: Topology, sources: Sequence[Any]) -> Creases:
@@ -80,30 +82,42 @@ class Creases:
         between = (shape != next_shape) & smooth[shape] & smooth[next_shape]
         always[one[between]] = always[other[between]] = True
         own_vertices = (ends[:, :, 0] != ends[:, :, 1]).any(1)
-        textured = np.array([info.has_texcoords for info in geometry.shapes])
-        textured &= np.array([not is_plain(source.shape.bsdf()) for source in sources])
 
         def pairs(chosen: np.ndarray) -> Pairs:
             ids = [[device_array(mi.UInt32, ends[chosen, end, side]) for side in range(2)] for end in range(2)]
             edges = [device_array(mi.UInt32, half[chosen]) for half in (one, other)]
-            return Pairs(*edges, tuple(map(tuple, ids)), device_array(mi.Bool, textured[shape[chosen]]))
+            return Pairs(*edges, tuple(map(tuple, ids)))
 
-        attributed = []
+        attributed, textured = [], []
         for index, (info, source) in enumerate(zip(geometry.shapes, sources, strict=True)):
+            own = within & (shape == index)
             if info.reads_attributes and info.has_normals:
                 of_faces = any(name.startswith("face_") for name in attributes(source.shape))
-                chosen = within & (shape == index) & (own_vertices | of_faces)
+                chosen = own & (own_vertices | of_faces)
                 if chosen.any():
                     attributed.append((index, pairs(chosen)))
+            if info.has_texcoords and _may_vary(source.shape) and (own & own_vertices).any():
+                textured.append((index, pairs(own & own_vertices)))
         seams, fixed = within & own_vertices, device_array(mi.Bool, always)
-        found = cls(fixed, fixed, pairs(seams) if seams.any() else None, tuple(attributed))
+        found = cls(fixed, fixed, pairs(seams) if seams.any() else None, tuple(attributed), tuple(textured))
         if not attributed and not seams.any() and not always.any():
             return replace(found, coloured=None)
-        return found.with_attributes(geometry, sources)
+        return found.with_colours(geometry, sources)
 
-    def with_attributes(self, geometry: Geometry, sources: Sequence[Any]) -> Creases:
-        """The same for the attributes that meshes have now."""
-        if not self.attributed:
+    def coloured_shapes(self, sources: Sequence[Any]) -> list[Any]:
+        """Mitsuba's objects on which :meth:`with_colours` depends: shapes with attributes; textured ones and their materials."""
+        found = [sources[index].shape for index, _ in self.attributed]
+        for index, _ in self.textured:
+            shape = sources[index].shape
+            found += [shape, shape.bsdf(), *([shape.emitter()] if shape.is_emitter() else [])]
+        return found
+
+    def with_colours(self, geometry: Geometry, sources: Sequence[Any]) -> Creases:
+        """The same for the attributes, texture coordinates and textures that meshes have now.
+
+        Texture coordinates that jump are not enough: on both sides of most seams of a texture, there is the same colour.
+        """
+        if not self.attributed and not self.textured:
             return self
         edges = mi.Bool(self.always)
         with dr.suspend_grad():
@@ -113,27 +127,83 @@ class Creases:
                     values = dr.detach(mi.Float(values))
                     if name.startswith("vertex_"):
                         size = dr.width(values) // info.vertex_count
-                        jump = pairs.jump(values, size, _ATTRIBUTE_JUMP, info.vertex_start)
+                        jump = pairs.jump(values, size, _COLOUR_JUMP, info.vertex_start)
                     else:
                         size = dr.width(values) // info.face_count
                         faces = (half // 3 - info.face_start for half in (pairs.one, pairs.other))
-                        jump = replace(pairs, ends=(tuple(faces),)).jump(values, size, _ATTRIBUTE_JUMP)
+                        jump = replace(pairs, ends=(tuple(faces),)).jump(values, size, _COLOUR_JUMP)
                     pairs.mark(edges, jump)
+            for index, pairs in self.textured:
+                texcoords = mi.Float(sources[index].own().texcoords)
+                pairs.mark(edges, _other_colours(sources[index].shape, texcoords, pairs, geometry.shapes[index].vertex_start))
             dr.eval(edges)
         return replace(self, coloured=edges)
 
     def now(self, geometry: Geometry) -> Any:
-        """``Bool`` (3 F,): whether shading jumps at the edge from corner k to k + 1 of a face, with these normals and texture
-        coordinates. None if there are no such edges whatever moves. Detached."""
+        """``Bool`` (3 F,): whether shading jumps at the edge from corner k to k + 1 of a face, with these normals. None if there
+        are no such edges whatever moves. Detached."""
         if self.seams is None:
             return self.coloured
         with dr.suspend_grad():
             edges, seams = mi.Bool(self.coloured), self.seams
-            jump = seams.jump(dr.detach(geometry.normals), 3, _NORMAL_JUMP)
-            jump |= seams.textured & seams.jump(dr.detach(geometry.texcoords), 2, _TEXCOORD_JUMP)
-            seams.mark(edges, jump)
+            seams.mark(edges, seams.jump(dr.detach(geometry.normals), 3, _NORMAL_JUMP))
             dr.eval(edges)
         return edges
+
+
+def _may_vary(shape: Any) -> bool:
+    """Whether texture coordinates may decide on what a shape looks like."""
+    return not is_plain(shape.bsdf()) or shape.is_emitter()
+
+
+def _other_colours(shape: Any, texcoords: Any, pairs: Pairs, first: int) -> Any:
+    """Bool (K,): whether a shape has different colours on both sides of edges, seen and lit from right above. Detached.
+
+    ``texcoords``: of its own vertices (Float, 2 each), whose first one is vertex ``first``.
+    """
+    ends = [[dr.gather(mi.Point2f, dr.detach(texcoords), v - first) for v in sides] for sides in pairs.ends]
+    places = [dr.lerp(ends[0][side], ends[1][side], t) for t in _LOOKED_AT for side in range(2)]
+    si = dr.zeros(mi.SurfaceInteraction3f, len(places) * dr.width(pairs.one))
+    si.uv = mi.Point2f(*(dr.concat([place[c] for place in places]) for c in range(2)))
+    si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
+    si.sh_frame, si.n, si.wi = mi.Frame3f(mi.Vector3f(0, 0, 1)), mi.Normal3f(0, 0, 1), mi.Vector3f(0, 0, 1)
+    colours = [shape.bsdf().eval(mi.BSDFContext(), si, si.wi)]
+    if shape.is_emitter():
+        colours.append(shape.emitter().eval(si))
+    lane, found = dr.arange(mi.UInt32, dr.width(pairs.one)), dr.full(mi.Bool, False, dr.width(pairs.one))
+    for colour in colours:
+        for channel in mi.UnpolarizedSpectrum(colour):
+            values = channel + dr.zeros(mi.Float, dr.width(si.uv))
+            dr.eval(values)
+            for k in range(len(_LOOKED_AT)):
+                one, other = (dr.gather(mi.Float, values, lane + (2 * k + side) * dr.width(lane)) for side in range(2))
+                found |= dr.abs(one - other) > _COLOUR_JUMP * (1 + dr.abs(one))
+    return found
+
+
+class ColourWatch:
+    """Values on which creases depend that images may change, but for normals: see :meth:`Creases.coloured_shapes`.
+
+    Args:
+        nodes: Mitsuba's shapes, BSDFs and emitters. They are kept alive.
+    """
+
+    def __init__(self, nodes: Sequence[Any]) -> None:
+        tables = [(node, mi.traverse(node)) for node in {id(node): node for node in nodes}.values()]
+        self._held = [(table, key) for node, table in tables for key in table.keys() if _colours(node, key)]
+        self._then = self._now()
+
+    def same(self) -> bool:
+        """Whether they are as when this was last asked, or at the start."""
+        then, self._then = self._then, self._now()
+        return self._then == then
+
+    def _now(self) -> list[Any]:
+        return [fingerprint(table[key]) for table, key in self._held]
+
+
+def _colours(node: Any, key: str) -> bool:
+    return not isinstance(node, mi.Shape) or key == "vertex_texcoords" or is_attribute(node, key)
 
 
 def _edges(geometry: Geometry, topology: Topology) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

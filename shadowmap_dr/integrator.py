@@ -50,13 +50,14 @@ class Shell:
                 self.light_names = record.lights
                 return record.replay(scene, sensor, spp or 1)
         with dr.resume_grad():
-            waiting = self._record(scene, sensor).waiting
+            record = self._record(scene, sensor)
+            waiting = record.waiting
             waiting.forget_older(scene)
             if waiting.welcomes(sensor) and not dr.flag(dr.JitFlag.FreezingScope):
                 inputs = Inputs()
                 image = self.image(scene, sensor, spp, inputs)
                 if dr.grad_enabled(image):
-                    waiting.add(sensor, spp or 1, image, inputs)
+                    waiting.add(sensor, spp or 1, record.renderer.texels, image, inputs)
                 return dr.detach(image)
         with dr.suspend_grad():
             return self.image(scene, sensor, spp)

@@ -18,6 +18,8 @@ from .traversal import parameters
 
 #: Samples of pixels of all images that wait; each may hold half a kilobyte.
 MOST_SAMPLES = 1 << 20
+#: So many texels of shadow maps hold as much as one of these samples.
+_TEXELS = 6
 
 # Parameters that an image is attached to through what is read from the scene, and in no other way. Materials and textures are
 # evaluated by Mitsuba itself.
@@ -50,19 +52,25 @@ class Inputs:
 
 @dataclass(frozen=True)
 class Pending:
-    """An image that waits, what it is attached to, and the sensor's parameters at the time."""
+    """An image that waits, what it is attached to, and the sensor's parameters at the time. ``texels``: of its shadow maps."""
 
     sensor: Any
     spp: int
+    texels: int
     image: Any
     inputs: Inputs
     camera: dict[str, Any]
 
     @property
     def samples(self) -> int:
-        """Of all pixels, about: what the memory for the image grows with."""
+        """Of all pixels, about."""
         height, width = self.image.shape[:2]
         return height * width * self.spp
+
+    @property
+    def weight(self) -> int:
+        """What the memory for the image grows with, in samples."""
+        return self.samples + self.texels // _TEXELS
 
     def is_of(self, sensor: Any, spp: int) -> bool:
         """Whether it shows what a sensor sees now."""
@@ -92,12 +100,13 @@ class Waiting:
         attached = _attached({**self._parameters, **_held(sensor)})
         return bool(attached) and all(name.endswith(_READ) for name in attached)
 
-    def add(self, sensor: Any, spp: int, image: Any, inputs: Inputs) -> None:
+    def add(self, sensor: Any, spp: int, texels: int, image: Any, inputs: Inputs) -> None:
         """Let an attached image wait. Those that have waited longest make room for it."""
-        new = Pending(sensor, spp, image, inputs, _held(sensor))
+        new = Pending(sensor, spp, texels, image, inputs, _held(sensor))
         others = [other for other in self._images if other.sensor is not sensor]
-        self._images = [*others, new]
-        while sum(one.samples for one in self._images) > MOST_SAMPLES:
+        self._images = [*others, new] if new.samples <= MOST_SAMPLES else others
+        # Whatever its maps are, the latest one waits: with a single view, nothing would be saved by rendering it again.
+        while len(self._images) > 1 and sum(one.weight for one in self._images) > MOST_SAMPLES:
             self._images.pop(0)
 
     def take(self, scene: Any, sensor: Any, spp: int) -> Pending | None:

@@ -60,7 +60,8 @@ class Renderer:
         plan: which shadow maps there are.
         settings: how to render.
         flat: faces that are shaded flat, or None.
-        creases: edges of faces at which shading jumps. Attributes of meshes count as they were when the scene was read.
+        creases: edges of faces at which shading jumps. Attributes and textures of meshes count as they were when the scene was
+            read.
         outward: ``Bool`` (F,), faces that shadow maps show from the front only, or None.
         soft: how extended lights (area lights, environments) are sampled, and which maps these samples have.
         frusta: fit of the shadow maps in the last rendering, None before the first. ``soft_frusta``: of those of extended lights.
@@ -160,10 +161,18 @@ class Renderer:
         """The same renderer with area lights and environments divided, and their maps aimed, as its records are now."""
         return replace(self, soft=_plan_soft(self.data, self.settings), soft_frusta=(None, None))
 
+    @property
+    def texels(self) -> int:
+        """Of all shadow maps, before supersampled ones are made smaller."""
+        if self.settings.shadow.method == "none":
+            return 0
+        side = self.settings.shadow.resolution * self.settings.shadow.supersampling
+        return self.plan.maps * side**2 + sum(plan.maps for plan in self.soft) * self.settings.soft_map_resolution**2
+
     def coloured_anew(self) -> Renderer:
-        """The same renderer with the edges at which attributes of meshes jump as they are now."""
+        """The same renderer with the edges at which colours of meshes jump as they are now."""
         sources = self.data.sources
-        return replace(self, creases=self.creases and self.creases.with_attributes(self.data.geometry, sources))
+        return replace(self, creases=self.creases and self.creases.with_colours(self.data.geometry, sources))
 
     def refresh(self) -> Renderer:
         """The same renderer with the scene's current vertices, lights and sensors, attached where they carry gradients."""

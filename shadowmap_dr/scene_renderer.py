@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .creases import ColourWatch
 from .errors import ShadowmapError
 from .lights import environments_of
 from .mirroring import MirrorWatch
@@ -24,8 +25,9 @@ from .soft import SkyWatch, SoftFrusta, still_aimed
 from .traversal import parameters
 from .unseen import Unseen
 
-# Sensors whose fit of the shadow maps is remembered.
-_REMEMBERED_SENSORS = 64
+# Sensors whose fit of the shadow maps is remembered, and how many of these may not be the scene's own: some make a new one for
+# each image, and all that are remembered are kept alive. How many objects there are is also a part of what recordings hold for.
+_REMEMBERED_SENSORS, _OTHERS = 64, 8
 
 
 @dataclass
@@ -47,7 +49,7 @@ class SceneRenderer:
     mirrors   which shapes were mirrored
     checked   vertices that were found to be finite
     unseen    what recordings do not see, and ``unseen_then`` its values when they were made
-    colours   attributes of meshes, and ``colours_then`` their values when the renderer's creases were found
+    colours   of meshes, for which the renderer's creases were found
     """
 
     parts: tuple[Any, ...]
@@ -61,8 +63,7 @@ class SceneRenderer:
     recordable: dict[tuple[str, ...], bool] = field(default_factory=dict)
     unseen: Unseen = field(default_factory=lambda: Unseen(()))
     unseen_then: tuple[Any, ...] = ()
-    colours: Unseen = field(default_factory=lambda: Unseen(()))
-    colours_then: tuple[Any, ...] = ()
+    colours: ColourWatch = field(default_factory=lambda: ColourWatch(()))
     sky: SkyWatch = field(default_factory=lambda: SkyWatch(()))
     mirrors: MirrorWatch = field(default_factory=lambda: MirrorWatch(()))
     checked: Any = None
@@ -79,8 +80,8 @@ class SceneRenderer:
         lights = tuple(light.name for light in data.lights)
         record = cls(_parts(scene, data), _statics(scene, data), _sizes(data), lights, renderer.with_data(_without_scene(data)))
         mirrors = MirrorWatch([shape for source in data.sources for shape in source.transformed()])
-        colours = Unseen(data.with_attributes())
-        return replace(record, sky=sky, mirrors=mirrors, unseen=unseen, colours=colours, colours_then=colours.now())
+        colours = ColourWatch(renderer.creases.coloured_shapes(data.sources))
+        return replace(record, sky=sky, mirrors=mirrors, unseen=unseen, colours=colours)
 
     def matches(self, scene: Any) -> bool:
         """Whether this record was made for the scene; it is none the worse for moved vertices or other parameter values.
@@ -154,9 +155,8 @@ class SceneRenderer:
         Each sensor goes on from its own fit. Fitting it again to the same vertices and lights keeps it bit by bit, so the
         derivatives of a step see the frusta of its image, whatever other sensors have taken in between.
         """
-        colours = self.colours.now()
-        if colours != self.colours_then:
-            self.renderer, self.colours_then = self.renderer.coloured_anew(), colours
+        if not (dr.flag(dr.JitFlag.FreezingScope) or self.colours.same()):
+            self.renderer = self.renderer.coloured_anew()
         kept = self.renderer
         fits = ((frusta, soft_frusta) for known, frusta, soft_frusta in self.fits if known is sensor)
         frusta, soft_frusta = next(fits, (kept.frusta, kept.soft_frusta))
@@ -181,7 +181,13 @@ class SceneRenderer:
         others = [fit for fit in self.fits if fit[0] is not sensor]
         if len(others) == len(self.fits) and not any(sensor is known for known in scene.sensors()):
             warn_of(lenses_of(sensor))
-        self.fits = [(sensor, frusta, soft_frusta), *others][:_REMEMBERED_SENSORS]
+        own, room, kept = scene.sensors(), _OTHERS, []
+        for fit in [(sensor, frusta, soft_frusta), *others]:
+            strange = not any(fit[0] is known for known in own)
+            room -= strange
+            if not strange or room >= 0:
+                kept.append(fit)
+        self.fits = kept[:_REMEMBERED_SENSORS]
 
 
 def _parts(scene: Any, data: SceneData) -> tuple[Any, ...]:

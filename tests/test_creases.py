@@ -33,13 +33,16 @@ def attribute(kind: str, *colours: tuple[float, ...]) -> Any:
 
 
 def scene_of(kind: str, smooth: bool = True) -> Any:
+    textured = kind in ("texture", "emission")
     props = mi.Properties()
-    props["mesh_bsdf"] = mi.load_dict(material(kind))
-    mesh = mi.Mesh("mesh", 8, 4, has_vertex_normals=smooth, has_vertex_texcoords=kind == "texture", props=props)
+    props["mesh_bsdf"] = mi.load_dict(material("plain" if kind == "emission" else kind))
+    if kind == "emission":
+        props["mesh_emitter"] = mi.load_dict({"type": "area", "radiance": material("texture")["reflectance"]})
+    mesh = mi.Mesh("mesh", 8, 4, has_vertex_normals=smooth, has_vertex_texcoords=textured, props=props)
     params = mi.traverse(mesh)
     params["vertex_positions"] = np.insert(VERTICES, 2, 0, axis=1).ravel()
     params["faces"] = FACES.ravel()
-    if kind == "texture":
+    if textured:
         params["vertex_texcoords"] = np.repeat(np.float32([[0.1, 0.5], [0.9, 0.5]]), 4, axis=0).ravel()
     params.update()
     if kind in ("vertex", "face"):
@@ -78,7 +81,7 @@ def assert_agrees(scene: Any, integrator: Any) -> None:
 
 
 @pytest.mark.parametrize("smooth", [True, False])
-@pytest.mark.parametrize("kind", ["vertex", "face", "texture"])
+@pytest.mark.parametrize("kind", ["vertex", "face", "texture", "emission"])
 def test_colours_that_jump(variant: str, kind: str, smooth: bool) -> None:
     assert_agrees(scene_of(kind, smooth), shadowmap(shadow_method="none"))
 
@@ -116,3 +119,23 @@ def test_smooth_surfaces_have_no_creases_where_nothing_jumps(variant: str) -> No
     edges = np.array(renderer.creases.now(folded)).reshape(-1, 3)
     # The edge from (0, -1) to (0, 1) of both triangles that have one.
     assert edges.sum() == 2 and edges[0, 1] and edges[3, 2]
+
+
+def test_seams_of_textures_that_go_on_across_them(variant: str) -> None:
+    """All around a ball, from u = 1 to 0: what the colours' own slope says is counted once there, as everywhere."""
+    u = (np.arange(64) + 0.5) / 64
+    waves = np.tile((0.5 + 0.45 * np.sin(2 * np.pi * u))[None, :, None], (8, 1, 3)).astype(np.float32)
+    bsdf = {"type": "diffuse", "reflectance": {"type": "bitmap", "bitmap": mi.Bitmap(waves), "raw": True}}
+    to_world = mi.ScalarTransform4f().look_at([0, -4, 0], [0, 0, 0], [0, 0, 1])
+    ball = {"type": "sphere", "to_world": mi.ScalarTransform4f().rotate([0, 0, 1], -90), "bsdf": bsdf}
+    sun = {"type": "directional", "direction": [0, 1, -0.2], "irradiance": 3.0}
+    scene = mi.load_dict({"type": "scene", "ball": ball, "sun": sun, "camera": {**camera(fov=32), "to_world": to_world}})
+    params, integrator = mi.traverse(scene), shadowmap(shadow_method="none")
+    start, angle = mi.Transform4f(params["ball.to_world"]), mi.Float(0)
+    dr.enable_grad(angle)
+    params["ball.to_world"] = mi.Transform4f().rotate([0, 0, 1], angle) @ start
+    params.update()
+    image = mi.render(scene, params, integrator=integrator)
+    dr.forward(angle)
+    columns = np.abs(dr.grad(image).numpy()[24:40, 28:36].sum((0, 2)))
+    assert columns.min() > 0.1 and columns.max() < 1.1 * columns.min()

@@ -136,7 +136,8 @@ def test_scenes_are_not_kept_alive(variant: str) -> None:
     scene = small_scene()
     for _ in range(70):
         render(scene, integrator, sensor=mi.load_dict(camera(1)))
-    assert len(integrator.shell.scenes[0].fits) <= 64
+    # One that is new for each image is soon forgotten.
+    assert len(integrator.shell.scenes[0].fits) <= 9
 
 
 def test_frozen_loop(variant: str) -> None:

@@ -286,3 +286,24 @@ def test_vertices_without_faces_leave_maps_as_they_are(variant: str, moved: bool
     assert image.std() > 0.05
     assert np.abs(with_image - image).max() < 1e-5
     assert np.abs(with_gradient - gradient).max(initial=0) <= 1e-4 * np.abs(gradient).max(initial=0)
+
+
+def test_what_is_thin_in_a_large_image_keeps_its_shadow(variant: str) -> None:
+    """A bar three pixels thick, along the rows of the image, in the shadow of a plate: its depths belong to the map's range."""
+    size, place = 512, mi.ScalarTransform4f
+    row = 2 - 260.5 * 4 / size  # of which one pixel in four was looked at, not this
+    bar = {"type": "rectangle", "to_world": place().translate([0, row, 2]).scale([1.8, 6 / size, 1])}
+    plate = {"type": "rectangle", "to_world": place().translate([2.2, 0, 2.6]).scale([1.2, 0.9, 1])}
+    view = place().look_at([-0.2, 0, 2.5], [-0.2, 0, 0], [0, 1, 0]) @ place().scale([2, 2, 1])
+    film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}}
+    parts = {
+        "floor": {"type": "rectangle", "to_world": place().scale(4)},
+        "sun": {"type": "directional", "direction": [-1, 0, -0.6]},
+        "camera": {"type": "orthographic", "to_world": view, "near_clip": 0.01, "far_clip": 10.0, "film": film},
+    }
+    scene = mi.load_dict({"type": "scene", **parts, "bar": bar, "plate": plate})
+    integrator = mi.load_dict({"type": "shadowmap", "aovs": "visibility"})
+    visibility = mi.render(scene, integrator=integrator).numpy()[259:262, 30:480, -1]
+    dark = mi.render(scene, integrator=mi.load_dict({"type": "direct"}), spp=4).numpy()[259:262, 30:480, 0] == 0
+    assert 500 < dark.sum() < 800
+    assert (visibility[dark] < 0.5).mean() > 0.95

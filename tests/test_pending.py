@@ -96,6 +96,22 @@ def test_memory_is_bounded(variant: str, renderings: list[int], monkeypatch: pyt
     assert renderings[3:] == [4, 4]
 
 
+def test_maps_count_as_memory(variant: str) -> None:
+    """Images of a scene with many maps hold much more than their pixels."""
+    above = mi.ScalarTransform4f().translate([0, 0, 3])
+    lamp = {"type": "rectangle", "to_world": above, "emitter": {"type": "area", "radiance": 1.0}}
+    scene, integrator = small_scene(lamp=lamp), shadowmap(emitter_samples=32, soft_map_resolution=256)
+    params = mi.traverse(scene)
+    moved(params, 0.0)
+    views = [mi.load_dict(camera()) for _ in range(6)]
+    images = [mi.render(scene, params, sensor=view, integrator=integrator) for view in views]
+    (record,) = integrator.shell.scenes
+    assert record.renderer.texels == 256**2 + 32 * 256**2
+    waiting = record.waiting._images
+    assert len(images) == 6 and 1 <= len(waiting) <= 3
+    assert sum(one.weight for one in waiting) <= pending.MOST_SAMPLES
+
+
 def test_forward_passes_do_not_run_through_images_that_wait(variant: str) -> None:
     scene, integrator = scene_of_two(), shadowmap()
     params = mi.traverse(scene)

@@ -419,7 +419,7 @@ def test_scenes_and_settings_that_are_none(variant: str) -> None:
         Renderer.from_scene(build(), shadow_bias=1)
 
 
-@pytest.mark.parametrize("length", [1e-25, 1e-3, 1e25])
+@pytest.mark.parametrize("length", [1e-25, 1e-3, 1e25, 3e38])
 def test_directions_of_any_length(renderer: Renderer, length: float) -> None:
     """Squares of their components may be out of range."""
     sun = renderer.light("sun")

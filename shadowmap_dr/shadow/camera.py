@@ -81,7 +81,7 @@ def unit(vector: Any) -> Any:
     largest = dr.max(dr.abs(dr.detach(vector)))
     # The power of two that makes it about 1, made of the exponent's bits: multiplying by it changes no digit.
     module = backend(largest)
-    exponent = dr.reinterpret_array(module.UInt32, largest) & 0x7F800000
+    exponent = dr.minimum(dr.reinterpret_array(module.UInt32, largest) & 0x7F800000, 0x7E800000)
     scale = dr.reinterpret_array(module.Float, 0x7F000000 - exponent)
     return dr.normalize(vector * scale)
 

@@ -17,7 +17,7 @@ import numpy as np
 from .geometry import Geometry
 from .raster import Topology
 from .raster._memory import device_array
-from .traversal import attributes, fingerprint, is_attribute, is_plain
+from .traversal import Watch, attributes, is_attribute, is_plain
 
 # Numbers that differ by less (in any component) are the same for the eye.
 _NORMAL_JUMP, _COLOUR_JUMP = 0.02, 1e-3
@@ -104,13 +104,17 @@ class Creases:
             return replace(found, coloured=None)
         return found.with_colours(geometry, sources)
 
-    def coloured_shapes(self, sources: Sequence[Any]) -> list[Any]:
-        """Mitsuba's objects on which :meth:`with_colours` depends: shapes with attributes; textured ones and their materials."""
-        found = [sources[index].shape for index, _ in self.attributed]
+    def watch(self, sources: Sequence[Any]) -> Watch:
+        """All on which :meth:`with_colours` depends: attributes, texture coordinates, materials and emission of shapes."""
+        nodes = [sources[index].shape for index, _ in self.attributed]
         for index, _ in self.textured:
             shape = sources[index].shape
-            found += [shape, shape.bsdf(), *([shape.emitter()] if shape.is_emitter() else [])]
-        return found
+            nodes += [shape, shape.bsdf(), *([shape.emitter()] if shape.is_emitter() else [])]
+
+        def counts(node: Any, key: str) -> bool:
+            return not isinstance(node, mi.Shape) or key == "vertex_texcoords" or is_attribute(node, key)
+
+        return Watch(nodes, counts)
 
     def with_colours(self, geometry: Geometry, sources: Sequence[Any]) -> Creases:
         """The same for the attributes, texture coordinates and textures that meshes have now.
@@ -171,39 +175,13 @@ def _other_colours(shape: Any, texcoords: Any, pairs: Pairs, first: int) -> Any:
     if shape.is_emitter():
         colours.append(shape.emitter().eval(si))
     lane, found = dr.arange(mi.UInt32, dr.width(pairs.one)), dr.full(mi.Bool, False, dr.width(pairs.one))
-    for colour in colours:
-        for channel in mi.UnpolarizedSpectrum(colour):
-            values = channel + dr.zeros(mi.Float, dr.width(si.uv))
-            dr.eval(values)
-            for k in range(len(_LOOKED_AT)):
-                one, other = (dr.gather(mi.Float, values, lane + (2 * k + side) * dr.width(lane)) for side in range(2))
-                found |= dr.abs(one - other) > _COLOUR_JUMP * (1 + dr.abs(one))
+    channels = [channel + dr.zeros(mi.Float, dr.width(si.uv)) for colour in colours for channel in mi.UnpolarizedSpectrum(colour)]
+    dr.eval(channels)
+    for channel in channels:
+        for k in range(len(_LOOKED_AT)):
+            one, other = (dr.gather(mi.Float, channel, lane + (2 * k + side) * dr.width(lane)) for side in range(2))
+            found |= dr.abs(one - other) > _COLOUR_JUMP * (1 + dr.abs(one))
     return found
-
-
-class ColourWatch:
-    """Values on which creases depend that images may change, but for normals: see :meth:`Creases.coloured_shapes`.
-
-    Args:
-        nodes: Mitsuba's shapes, BSDFs and emitters. They are kept alive.
-    """
-
-    def __init__(self, nodes: Sequence[Any]) -> None:
-        tables = [(node, mi.traverse(node)) for node in {id(node): node for node in nodes}.values()]
-        self._held = [(table, key) for node, table in tables for key in table.keys() if _colours(node, key)]
-        self._then = self._now()
-
-    def same(self) -> bool:
-        """Whether they are as when this was last asked, or at the start."""
-        then, self._then = self._then, self._now()
-        return self._then == then
-
-    def _now(self) -> list[Any]:
-        return [fingerprint(table[key]) for table, key in self._held]
-
-
-def _colours(node: Any, key: str) -> bool:
-    return not isinstance(node, mi.Shape) or key == "vertex_texcoords" or is_attribute(node, key)
 
 
 def _edges(geometry: Geometry, topology: Topology) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -142,3 +142,30 @@ def put_into_film(film: Any, image: Any, aovs: list[str]) -> None:
     planes += [image[..., base:]] if image.shape[2] > base else []
     block = mi.ImageBlock(dr.concat(planes, axis=2), offset=film.crop_offset(), rfilter=None, border=False)
     film.put_block(block)
+
+
+def film_channels(color: Any, active: Any, sensor: Sensor) -> list[Any]:
+    """Channels (Float) of what a sensor's film holds of a colour: one or three, and where something was hit, if it has alpha."""
+    channels = [color[k] for k in range(len(color))]
+    if sensor.channels == 1 and len(channels) == 3:
+        channels = [mi.luminance(color)]
+    elif sensor.channels == 3 and len(channels) == 1:
+        channels = channels * 3
+    if sensor.alpha:
+        channels.append(dr.select(active, mi.Float(1), 0))
+    return channels
+
+
+def interleave(channels: list[Any]) -> Any:
+    """Flat pixel-interleaved buffer of some channels, all of the same width."""
+    if len(channels) == 1:
+        return channels[0]
+    if len(channels) == 3:
+        return dr.ravel(mi.Vector3f(*channels))
+    count = len(channels)
+    width = max(dr.width(c) for c in channels)
+    index = dr.arange(mi.UInt32, width) * count
+    result = dr.zeros(mi.Float, count * width)
+    for k, channel in enumerate(channels):
+        dr.scatter(result, channel, index + k)
+    return result

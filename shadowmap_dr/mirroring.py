@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .traversal import fingerprint, parameters
+from .traversal import Watch, parameters
 
 
 def mirrors(shape: Any) -> bool:
@@ -21,19 +21,12 @@ class MirrorWatch:
 
     def __init__(self, shapes: Sequence[Any]) -> None:
         self._shapes = tuple(dict.fromkeys(shapes))
-        self._then = self._transformations()
+        self._transformations = Watch(self._shapes, lambda _, key: key == "to_world")
         self._mirrored = self._now()
 
     def same(self) -> bool:
         """Whether the same ones are mirrored as at the start."""
-        transformations = self._transformations()
-        if transformations == self._then:
-            return True
-        self._then = transformations
-        return self._now() == self._mirrored
-
-    def _transformations(self) -> list[Any]:
-        return [fingerprint(parameters(shape)["to_world"]) for shape in self._shapes]
+        return self._transformations.same() or self._now() == self._mirrored
 
     def _now(self) -> list[bool]:
         return [mirrors(shape) for shape in self._shapes]

@@ -17,7 +17,7 @@ from .camera_pass import camera_clip, least_gap, seen_points, within_far_plane, 
 from .creases import Creases
 from .errors import ShadowmapError
 from .facets import flat_faces, mean_normals, soften_facets
-from .film import Margin, develop, sample_grid, sample_windows
+from .film import Margin, develop, film_channels, interleave, sample_grid, sample_windows
 from .footprint import Spots, footprint_points
 from .geometry import Geometry
 from .hits import pixel_hits
@@ -370,7 +370,7 @@ class Renderer:
         shining = [SquareSpot(light) if compat and isinstance(light, SpotLight) else light for light in lights]
         lighting = replace(lighting, lights=softened(shining, seen.p_world, around))
         color = self._radiance(seen, lighting, visible, sensor, raster)
-        channels = _film_channels(color, seen.active, sensor)
+        channels = film_channels(color, seen.active, sensor)
         named = collect_aovs(self.settings.aovs, seen, raster, lights, visible)
         if self.settings.antialias:
             # In one pass over the pixels, since both need much of the same.
@@ -387,9 +387,9 @@ class Renderer:
             )
             image = mi.TensorXf(flat, shape=(height, width, len(channels)))
         else:
-            image = mi.TensorXf(_interleave(channels), shape=(height, width, len(channels)))
+            image = mi.TensorXf(interleave(channels), shape=(height, width, len(channels)))
         if named:
-            image = dr.concat([image, mi.TensorXf(_interleave(named), shape=(height, width, len(named)))], axis=2)
+            image = dr.concat([image, mi.TensorXf(interleave(named), shape=(height, width, len(named)))], axis=2)
         return image
 
     def _visibilities(self, lighting: _Lighting, seen: Surface, view: _View, depth: Any) -> list[Any]:
@@ -489,29 +489,3 @@ def _plan_soft(data: SceneData, settings: RenderSettings) -> tuple[SoftPlan, ...
     if settings.shadow.method != "none":
         check_soft_sizes(soft, data.geometry, settings.soft_map_resolution)
     return soft
-
-
-def _film_channels(color: Any, active: Any, sensor: Sensor) -> list[Any]:
-    channels = [color[k] for k in range(len(color))]
-    if sensor.channels == 1 and len(channels) == 3:
-        channels = [mi.luminance(color)]
-    elif sensor.channels == 3 and len(channels) == 1:
-        channels = channels * 3
-    if sensor.alpha:
-        channels.append(dr.select(active, mi.Float(1), 0))
-    return channels
-
-
-def _interleave(channels: list[Any]) -> Any:
-    """Flat pixel-interleaved buffer of some channels, all of the same width."""
-    if len(channels) == 1:
-        return channels[0]
-    if len(channels) == 3:
-        return dr.ravel(mi.Vector3f(*channels))
-    count = len(channels)
-    width = max(dr.width(c) for c in channels)
-    index = dr.arange(mi.UInt32, width) * count
-    result = dr.zeros(mi.Float, count * width)
-    for k, channel in enumerate(channels):
-        dr.scatter(result, channel, index + k)
-    return result

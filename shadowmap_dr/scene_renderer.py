@@ -9,7 +9,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .creases import ColourWatch
 from .errors import ShadowmapError
 from .lights import environments_of
 from .mirroring import MirrorWatch
@@ -22,7 +21,7 @@ from .scene import SceneData, load, refresh, with_positions
 from .sensors import lenses_of, sensors_of
 from .shadow import Frusta
 from .soft import SkyWatch, SoftFrusta, still_aimed
-from .traversal import parameters
+from .traversal import Watch, parameters
 from .unseen import Unseen
 
 # Sensors whose fit of the shadow maps is remembered, and how many of these may not be the scene's own: some make a new one for
@@ -63,7 +62,7 @@ class SceneRenderer:
     recordable: dict[tuple[str, ...], bool] = field(default_factory=dict)
     unseen: Unseen = field(default_factory=lambda: Unseen(()))
     unseen_then: tuple[Any, ...] = ()
-    colours: ColourWatch = field(default_factory=lambda: ColourWatch(()))
+    colours: Watch | None = None
     sky: SkyWatch = field(default_factory=lambda: SkyWatch(()))
     mirrors: MirrorWatch = field(default_factory=lambda: MirrorWatch(()))
     checked: Any = None
@@ -80,8 +79,7 @@ class SceneRenderer:
         lights = tuple(light.name for light in data.lights)
         record = cls(_parts(scene, data), _statics(scene, data), _sizes(data), lights, renderer.with_data(_without_scene(data)))
         mirrors = MirrorWatch([shape for source in data.sources for shape in source.transformed()])
-        colours = ColourWatch(renderer.creases.coloured_shapes(data.sources))
-        return replace(record, sky=sky, mirrors=mirrors, unseen=unseen, colours=colours)
+        return replace(record, sky=sky, mirrors=mirrors, unseen=unseen, colours=renderer.creases.watch(data.sources))
 
     def matches(self, scene: Any) -> bool:
         """Whether this record was made for the scene; it is none the worse for moved vertices or other parameter values.
@@ -155,7 +153,7 @@ class SceneRenderer:
         Each sensor goes on from its own fit. Fitting it again to the same vertices and lights keeps it bit by bit, so the
         derivatives of a step see the frusta of its image, whatever other sensors have taken in between.
         """
-        if not (dr.flag(dr.JitFlag.FreezingScope) or self.colours.same()):
+        if not (dr.flag(dr.JitFlag.FreezingScope) or self.colours is None or self.colours.same()):
             self.renderer = self.renderer.coloured_anew()
         kept = self.renderer
         fits = ((frusta, soft_frusta) for known, frusta, soft_frusta in self.fits if known is sensor)

@@ -96,11 +96,11 @@ class MeshSource(ShapeSource):
 
 
 @dataclass(frozen=True)
-class RectangleSource(MeshSource):
-    """A rectangle, which is a ``mi.Mesh`` with ``to_world`` for its only parameter.
+class PlacedSource(ShapeSource):
+    """A shape whose only parameter is ``to_world``: ``local`` is a mesh that does not change.
 
-    Its vertices are computed here. Those that Mitsuba holds hang on ``to_world`` by a part of the AD graph that is made when it
-    is updated, and gone once derivatives have passed through: a second image would be left without.
+    A rectangle is one, although a ``mi.Mesh``. The vertices that Mitsuba holds of it hang on ``to_world`` by a part of the AD
+    graph that is made when it is updated, and gone once derivatives have passed through: a second image would be left without.
     """
 
     local: Buffers
@@ -113,23 +113,12 @@ class RectangleSource(MeshSource):
 
 
 @dataclass(frozen=True)
-class AnalyticSource(ShapeSource):
-    """A sphere, disk or cylinder: ``local``, a mesh that does not change, and the shape's ``to_world``.
-
-    Mitsuba has all other parameters in ``to_world`` (``center``, ``radius``, ``p0``, ``p1``).
-    """
-
-    local: Buffers
+class AnalyticSource(PlacedSource):
+    """A sphere, disk or cylinder. Mitsuba has all other parameters in ``to_world`` (``center``, ``radius``, ``p0``, ``p1``)."""
 
     def sizes(self) -> tuple[int, ...]:
         # Mitsuba turns a sphere's normals over where ``to_world`` comes to mirror it.
         return (self.shape.has_flipped_normals(),)
-
-    def own(self) -> Buffers:
-        return _placed(self.local, parameters(self.shape)["to_world"])
-
-    def transformed(self) -> tuple[Any, ...]:
-        return (self.shape, *super().transformed())
 
     @property
     def mirrored(self) -> bool:
@@ -180,16 +169,14 @@ def source_of(name: str, shape: Any, instance: Any, tessellation: int) -> tuple[
     B-splines, an eighth of it along each segment. Raises ``ShadowmapError`` for other shapes and for curves that are broken.
     """
     kind = shape.class_name()
+    if kind == "Rectangle":
+        faces, _, _, texcoords = (buffer.numpy() for buffer in mesh_buffers(shape))
+        # In its own space a rectangle's corners are those of its texture's, from -1 to 1.
+        uv = texcoords.reshape(-1, 2)
+        mesh = (np.insert(2 * uv - 1, 2, 0, 1), np.tile(np.float32([0, 0, 1]), (len(uv), 1)), uv)
+        return PlacedSource(shape, instance, Buffers(*(device_array(mi.Float, a) for a in mesh))), faces.reshape(-1, 3)
     if isinstance(shape, mi.Mesh):
-        faces, _, _, texcoords = mesh_buffers(shape)
-        if kind == "Rectangle":
-            # In its own space a rectangle's corners are those of its texture's, from -1 to 1.
-            uv = texcoords.numpy().reshape(-1, 2)
-            local = (np.insert(2 * uv - 1, 2, 0, 1), np.tile(np.float32([0, 0, 1]), (len(uv), 1)), uv)
-            source: MeshSource = RectangleSource(shape, instance, Buffers(*(device_array(mi.Float, a) for a in local)))
-        else:
-            source = MeshSource(shape, instance)
-        return source, faces.numpy().reshape(-1, 3)
+        return MeshSource(shape, instance), mesh_buffers(shape)[0].numpy().reshape(-1, 3)
     if kind in _ANALYTIC:
         mesh = _ANALYTIC[kind](tessellation)
         local = Buffers(*(device_array(mi.Float, a) for a in (mesh.positions, mesh.normals, mesh.texcoords)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import drjit as dr
@@ -90,6 +90,28 @@ def _leaves(array: Any) -> Iterator[Any]:
     else:
         for part in array:
             yield from _leaves(part)
+
+
+class Watch:
+    """Parameters of Mitsuba's objects, read again and again to see whether any has been given another value.
+
+    Args:
+        nodes: the objects. They are kept alive.
+        chosen: (object, name of a parameter of its) -> whether it counts.
+    """
+
+    def __init__(self, nodes: Iterable[Any], chosen: Callable[[Any, str], bool]) -> None:
+        tables = [(node, mi.traverse(node)) for node in {id(node): node for node in nodes}.values()]
+        self._held = [(table, key) for node, table in tables for key in table.keys() if chosen(node, key)]
+        self._then = self._now()
+
+    def same(self) -> bool:
+        """Whether all are as when this was last asked, or at the start."""
+        then, self._then = self._then, self._now()
+        return self._then == then
+
+    def _now(self) -> list[Any]:
+        return [fingerprint(table[key]) for table, key in self._held]
 
 
 def is_attribute(node: Any, key: str) -> bool:

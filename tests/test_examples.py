@@ -62,3 +62,16 @@ def test_steps_are_timed_again_and_again() -> None:
     assert result.returncode == 0, result.stderr
     times = re.findall(r"(\d+) threads: ([0-9.]+) ([0-9.]+)", result.stdout)
     assert times and times[-1][0] == "1" and all(float(value) > 0 for row in times for value in row)
+
+
+def test_limits_are_measured() -> None:
+    script = ROOT / "docs" / "examples" / "limits.py"
+    command = [sys.executable, script, "--size", "24", "--samples", "1"]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=ROOT)
+    assert result.returncode == 0, result.stderr
+    lines = re.findall(r"^(.+), 1 samples: cosine (-?[0-9.]+), scale (-?[0-9.]+)$", result.stdout, re.MULTILINE)
+    assert len(lines) == 12
+    found = {name: (float(cosine), float(scale)) for name, cosine, scale in lines}
+    # What is right, and one that is not.
+    assert found["textured sheet of 12 x 12 squares, with vertex normals"] == pytest.approx((1, 1), abs=0.02)
+    assert found["card 1e-05 above a floor"] == (0, 0)

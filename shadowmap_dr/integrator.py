@@ -18,7 +18,7 @@ from .aovs import aov_names
 from .errors import ShadowmapError
 from .film import put_into_film
 from .integrator_options import PLUGIN, Options
-from .pending import Inputs, backward
+from .pending import Inputs, Waiting, backward
 from .render_settings import RenderSettings
 from .scene_renderer import SceneRenderer, same_objects
 
@@ -53,7 +53,10 @@ class Shell:
             record = self._record(scene, sensor)
             waiting = record.waiting
             waiting.forget_older(scene)
-            if waiting.welcomes(sensor) and not dr.flag(dr.JitFlag.FreezingScope):
+            # Where attributes of meshes are read, Mitsuba finds out with its own vertices where on a triangle they are wanted:
+            # the image would hang on these.
+            alone = not record.renderer.data.with_attributes() and waiting.welcomes(sensor)
+            if alone and not dr.flag(dr.JitFlag.FreezingScope):
                 inputs = Inputs()
                 image = self.image(scene, sensor, spp, inputs)
                 if dr.grad_enabled(image):
@@ -155,6 +158,7 @@ def make_class() -> type:
 
         def render_forward(self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> Any:
             """Derivative of the image (H, W, C) in the direction of the gradients that the parameters hold."""
+            Waiting.forget_all()
             with dr.resume_grad():
                 image = self.shell.image(scene, sensor_of(scene, sensor), spp)
                 if not dr.grad_enabled(image):

@@ -6,9 +6,10 @@ what the image was computed from.
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import drjit as dr
 
@@ -85,9 +86,20 @@ class Pending:
 class Waiting:
     """The images of one state of a scene that wait for their backward passes: one for each sensor, as far as memory allows."""
 
+    #: All there are.
+    _everywhere: ClassVar[weakref.WeakSet[Waiting]] = weakref.WeakSet()
+
     def __init__(self) -> None:
         self._parameters: dict[str, Any] = {}
         self._images: list[Pending] = []
+        self._everywhere.add(self)
+
+    @classmethod
+    def forget_all(cls) -> None:
+        """Drop all images, of all scenes. Calls of materials go to those of all scenes, so that images may hang on meshes whose
+        attributes any of them reads; and forward passes come to what hangs there, and fail."""
+        for waiting in cls._everywhere:
+            waiting._images = []
 
     def forget_older(self, scene: Any) -> None:
         """Drop images of the scene before its parameters changed."""

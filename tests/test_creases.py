@@ -139,3 +139,19 @@ def test_seams_of_textures_that_go_on_across_them(variant: str) -> None:
     dr.forward(angle)
     columns = np.abs(dr.grad(image).numpy()[24:40, 28:36].sum((0, 2)))
     assert columns.min() > 0.1 and columns.max() < 1.1 * columns.min()
+
+
+def test_other_scenes_with_attributes_are_no_hindrance(variant: str) -> None:
+    """Calls of materials go to those of all scenes. What images hang on thereby must not be met by forward passes."""
+    kept = []
+    for kind, smooth in (("vertex", True), ("vertex", False), ("face", True), ("texture", False), ("vertex", True)):
+        scene, integrator = scene_of(kind, smooth), shadowmap(shadow_method="none")
+        params = mi.traverse(scene)
+        x = mi.Float(0)
+        dr.enable_grad(x)
+        params["mesh.vertex_positions"] = params["mesh.vertex_positions"] + x
+        params.update()
+        image = mi.render(scene, params, integrator=integrator)
+        dr.forward(x)
+        assert np.abs(dr.grad(image).numpy()).max() > 0.1
+        kept.append((scene, params, integrator, image, x))

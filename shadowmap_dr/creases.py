@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from .geometry import Geometry
-from .raster import Topology
+from .raster import Folds, Topology
 from .raster._memory import device_array
 from .traversal import Watch, attributes, is_attribute, is_plain
 
@@ -37,10 +37,10 @@ class Pairs:
     other: Any
     ends: tuple[tuple[Any, Any], tuple[Any, Any]]
 
-    def mark(self, edges: Any, jump: Any) -> None:
+    def mark(self, edges: Any, jump: Any, value: bool = True) -> None:
         """Set the flags (Bool, 3 F) of the edges for which ``jump`` (Bool, K) holds, on both sides."""
-        dr.scatter(edges, mi.Bool(True), self.one, jump)
-        dr.scatter(edges, mi.Bool(True), self.other, jump)
+        dr.scatter(edges, mi.Bool(value), self.one, jump)
+        dr.scatter(edges, mi.Bool(value), self.other, jump)
 
     def jump(self, values: Any, size: int, least: float, first: int = 0) -> Any:
         """Bool (K,): whether values of vertices (Float, ``size`` each, from that of ``first`` on) differ by more than that."""
@@ -57,15 +57,20 @@ class Creases:
     """Where shading jumps. A PyTree that may cross ``dr.freeze``.
 
     always      Bool (3 F,), edges from corner k to k + 1 of a face at which it does whatever moves: at flat faces, between shapes
-    coloured    the same, and where colours of meshes (attributes, textures, emission) differ: :meth:`with_colours`. None if there
-                is no edge at all at which shading may ever jump
+    bendable    Bool (3 F,), those of them between flat faces of one shape, at which it only does if the surface is bent there, or
+                None if there are none
+    coloured    as ``always``, and where colours of meshes (attributes, textures, emission) differ: :meth:`with_colours`. None if
+                there is no edge at all at which shading may ever jump
+    folds       as ``bendable``, but for where colours of meshes differ
     seams       edges of smooth shapes whose faces have vertices of their own there, None if there are none
     attributed  (number of the shape, the edges of it at which its attributes may differ)
     textured    (number of the shape, the edges of it at which its texture coordinates may differ)
     """
 
     always: Any
+    bendable: Any
     coloured: Any
+    folds: Any
     seams: Pairs | None
     attributed: tuple[tuple[int, Pairs], ...]
     textured: tuple[tuple[int, Pairs], ...]
@@ -77,10 +82,11 @@ class Creases:
         smooth = np.array([info.has_normals for info in geometry.shapes])
         one, other, ends = _edges(geometry, topology)
         shape, next_shape = shapes[one // 3], shapes[other // 3]
-        within = (shape == next_shape) & smooth[shape]
+        within = shape == next_shape
         always = np.repeat(~smooth[shapes], 3)
-        between = (shape != next_shape) & smooth[shape] & smooth[next_shape]
-        always[one[between]] = always[other[between]] = True
+        bendable = always.copy()
+        always[one[~within]] = always[other[~within]] = True
+        bendable[one[~within]] = bendable[other[~within]] = False
         own_vertices = (ends[:, :, 0] != ends[:, :, 1]).any(1)
 
         def pairs(chosen: np.ndarray) -> Pairs:
@@ -91,15 +97,16 @@ class Creases:
         attributed, textured = [], []
         for index, (info, source) in enumerate(zip(geometry.shapes, sources, strict=True)):
             own = within & (shape == index)
-            if info.reads_attributes and info.has_normals:
+            if info.reads_attributes:
                 of_faces = any(name.startswith("face_") for name in attributes(source.shape))
                 chosen = own & (own_vertices | of_faces)
                 if chosen.any():
                     attributed.append((index, pairs(chosen)))
             if info.has_texcoords and _may_vary(source.shape) and (own & own_vertices).any():
                 textured.append((index, pairs(own & own_vertices)))
-        seams, fixed = within & own_vertices, device_array(mi.Bool, always)
-        found = cls(fixed, fixed, pairs(seams) if seams.any() else None, tuple(attributed), tuple(textured))
+        seams, fixed = within & smooth[shape] & own_vertices, device_array(mi.Bool, always)
+        flat = device_array(mi.Bool, bendable) if bendable.any() else None
+        found = cls(fixed, flat, fixed, flat, pairs(seams) if seams.any() else None, tuple(attributed), tuple(textured))
         if not attributed and not seams.any() and not always.any():
             return replace(found, coloured=None)
         return found.with_colours(geometry, sources)
@@ -123,7 +130,8 @@ class Creases:
         """
         if not self.attributed and not self.textured:
             return self
-        edges = mi.Bool(self.always)
+        edges, folds = mi.Bool(self.always), self.bendable
+        jumps = []
         with dr.suspend_grad():
             for index, pairs in self.attributed:
                 info = geometry.shapes[index]
@@ -136,12 +144,19 @@ class Creases:
                         size = dr.width(values) // info.face_count
                         faces = (half // 3 - info.face_start for half in (pairs.one, pairs.other))
                         jump = replace(pairs, ends=(tuple(faces),)).jump(values, size, _COLOUR_JUMP)
-                    pairs.mark(edges, jump)
+                    jumps.append((pairs, jump))
             for index, pairs in self.textured:
                 texcoords = mi.Float(sources[index].own().texcoords)
-                pairs.mark(edges, _other_colours(sources[index].shape, texcoords, pairs, geometry.shapes[index].vertex_start))
-            dr.eval(edges)
-        return replace(self, coloured=edges)
+                first = geometry.shapes[index].vertex_start
+                jumps.append((pairs, _other_colours(sources[index].shape, texcoords, pairs, first)))
+            for pairs, jump in jumps:
+                pairs.mark(edges, jump)
+            if folds is not None:
+                folds = mi.Bool(folds)
+                for pairs, jump in jumps:
+                    pairs.mark(folds, jump, False)
+            dr.eval(edges, folds)
+        return replace(self, coloured=edges, folds=folds)
 
     def now(self, geometry: Geometry) -> Any:
         """``Bool`` (3 F,): whether shading jumps at the edge from corner k to k + 1 of a face, with these normals. None if there
@@ -153,6 +168,10 @@ class Creases:
             seams.mark(edges, seams.jump(dr.detach(geometry.normals), 3, _NORMAL_JUMP))
             dr.eval(edges)
         return edges
+
+    def folds_of(self, normals: Any) -> Folds | None:
+        """Which of these edges shading jumps at only if the surface is bent there, for normals of flat faces (Float, 4 F)."""
+        return None if self.folds is None else Folds(self.folds, normals)
 
 
 def _may_vary(shape: Any) -> bool:

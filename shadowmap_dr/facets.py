@@ -49,8 +49,8 @@ def flat_faces(geometry: Geometry, topology: Topology) -> FlatFaces | None:
     return FlatFaces(device_array(mi.UInt32, start), device_array(mi.UInt32, faces[order // 3]), device_array(mi.Bool, chosen))
 
 
-def mean_normals(geometry: Geometry, topology: Topology, flat: FlatFaces) -> Any:
-    """Sums of the flat faces' normals, as long as the faces are large, at each place (Float, 4 V, by welded vertex). Attached.
+def facet_normals(geometry: Geometry, flat: FlatFaces) -> Any:
+    """Normals of the flat faces, as long as (twice) the faces are large, 0 for others (Float, 4 F). Attached.
 
     Four numbers and not three (the last is 0), since packets of four are read faster.
     """
@@ -60,6 +60,11 @@ def mean_normals(geometry: Geometry, topology: Topology, flat: FlatFaces) -> Any
     n = dr.cross(p[1] - p[0], p[2] - p[0])
     normals = dr.ravel(mi.Vector4f(n.x, n.y, n.z, 0))
     dr.eval(normals)
+    return normals
+
+
+def mean_normals(normals: Any, topology: Topology, flat: FlatFaces) -> Any:
+    """Sums of the flat faces' normals (:func:`facet_normals`) at each place (Float, 4 V, by welded vertex). Attached."""
     return dr.custom(_Sums, normals, topology, flat)
 
 

@@ -16,7 +16,7 @@ from .beams import softened
 from .camera_pass import camera_clip, least_gap, seen_points, within_far_plane, without_shapes
 from .creases import Creases
 from .errors import ShadowmapError
-from .facets import flat_faces, mean_normals, soften_facets
+from .facets import facet_normals, flat_faces, mean_normals, soften_facets
 from .film import Margin, develop, film_channels, interleave, sample_grid, sample_windows
 from .footprint import Spots, footprint_points
 from .geometry import Geometry
@@ -204,7 +204,7 @@ class Renderer:
             geometry = geometry.with_positions(vertex_positions)
         geometry = geometry.in_packets()
         # Before all else that is attached: derivatives are taken in the reverse order, and pixels should need one pass only.
-        facets = None if self.flat is None else mean_normals(geometry, self.topology, self.flat)
+        facets = self._facets(geometry)
         cameras = self._sensors(sensor)
         windows = sample_windows(cameras)
         factor = sample_grid(spp, windows)
@@ -212,7 +212,7 @@ class Renderer:
         seen, casting = self._topologies(geometry)
         views = [self._view(margin.around(window), geometry, seen, factor) for window in windows]
         lighting = self._lighting(views, geometry, casting, lights)
-        shapes = (geometry, facets, self._creases(geometry))
+        shapes = (geometry, facets, self._creases(geometry, facets))
         pictures = [margin.cut(self._camera_image(view, lighting, *shapes), factor) for view in views]
         return develop(pictures, windows[0], factor)
 
@@ -319,7 +319,7 @@ class Renderer:
         hits = replace(hits, active=hits.active & within_far_plane(sensor, hits.depth))
         normals, sharpness = normals_at(geometry, hits), None
         if self.flat is not None:
-            normals, sharpness = soften_facets(hits, normals, self.topology, facets)
+            normals, sharpness = soften_facets(hits, normals, self.topology, facets[1])
         return surface_at(self.data, geometry, sensor, hits, *normals, frames=frames), hits.depth, sharpness
 
     def g_buffer(self, sensor: int = 0) -> GBuffer:
@@ -333,7 +333,7 @@ class Renderer:
             if len(windows) != 1 or not windows[0].filter.is_box:
                 raise ShadowmapError(f"sensor {sensor} is no single camera whose film has a box filter: use another one.")
             geometry = self.data.geometry.in_packets()
-            facets = None if self.flat is None else mean_normals(geometry, self.topology, self.flat)
+            facets = self._facets(geometry)
             view = self._view(windows[0], geometry, self._topologies(geometry)[0], 1)
             seen, depth, sharpness = self._surface(view, geometry, facets, self.data.needs_frames)
             size, samples = (view.raster.width, view.raster.height), self.settings.look_ups(view.columns)
@@ -346,16 +346,25 @@ class Renderer:
                     view.topology,
                     view.raster,
                     geometry.vertex_count,
-                    self._creases(geometry),
-                    sharpness,
+                    crease_weights=sharpness,
                     meetings=True,
                     gap=least_gap(windows[0]),
+                    **self._creases(geometry, facets),
                 )
             return GBuffer(windows[0], seen, points, crossings, self._seen([view], geometry))
 
-    def _creases(self, geometry: Geometry) -> Any:
-        """Edges at which shading jumps, ``Bool`` (3 F,), if images are anti-aliased and there are any."""
-        return None if self.creases is None or not self.settings.antialias else self.creases.now(geometry)
+    def _facets(self, geometry: Geometry) -> Any:
+        """(normals of flat faces, their sums at each place), None if there are none."""
+        if self.flat is None:
+            return None
+        normals = facet_normals(geometry, self.flat)
+        return dr.detach(normals), mean_normals(normals, self.topology, self.flat)
+
+    def _creases(self, geometry: Geometry, facets: Any) -> dict[str, Any]:
+        """Edges at which shading jumps, if images are anti-aliased and there are any, as arguments of ``find_crossings``."""
+        if self.creases is None or not self.settings.antialias:
+            return {}
+        return {"creases": self.creases.now(geometry), "folds": self.creases.folds_of(facets and facets[0])}
 
     def _camera_image(self, view: _View, lighting: _Lighting, geometry: Geometry, facets: Any, creases: Any) -> Any:
         sensor, raster = view.sensor, view.raster
@@ -380,7 +389,7 @@ class Renderer:
                 raster,
                 view.clip,
                 view.topology,
-                creases=creases,
+                **creases,
                 crease_weights=sharpness,
                 meetings=True,
                 gap=least_gap(sensor),

@@ -158,6 +158,8 @@ MUTATIONS = (
              (DIFFERENCES.format("crossing_boxes-camera_shift"), DIFFERENCES.format("fine_box-caster_rise"))),
     Mutation("take edges beside a ridge for it", "raster.creases", "find_creases", _halves,
              ("test_raster_creases.py::test_tessellation_of_a_crease_does_not_change_it[llvm_ad_rgb-ridge]",)),
+    Mutation("take triangles of one plane for creases", "raster.creases", "Folds.flat", _never,
+             ("test_creases.py::test_slopes_of_colours_within_flat_faces_count_once[llvm_ad_rgb-0.0-1]",)),
     Mutation("take curved surfaces for flat ones", "raster.meetings", "Meetings._bent", _nowhere,
              ("test_raster_creases.py::test_planes_of_a_curved_surface_are_not_extended[llvm_ad_rgb-2-30]",)),
     Mutation("move one of two surfaces that meet", "raster.meetings", "Meetings.slopes", _only_the_first_triangle,

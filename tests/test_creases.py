@@ -97,9 +97,10 @@ def test_a_fold_that_comes_later(variant: str, recorded: bool) -> None:
     assert_agrees(scene, integrator)
 
 
+@pytest.mark.parametrize("smooth", [True, False])
 @pytest.mark.parametrize("kind", ["vertex", "face", "texture"])
-def test_colours_that_come_to_jump(variant: str, kind: str) -> None:
-    scene, integrator = scene_of(kind), shadowmap(shadow_method="none")
+def test_colours_that_come_to_jump(variant: str, kind: str, smooth: bool) -> None:
+    scene, integrator = scene_of(kind, smooth), shadowmap(shadow_method="none")
     params = mi.traverse(scene)
     key = "mesh.vertex_texcoords" if kind == "texture" else f"mesh.{kind}_color"
     later = mi.Float(params[key])
@@ -109,6 +110,54 @@ def test_colours_that_come_to_jump(variant: str, kind: str) -> None:
     params[key] = later
     params.update()
     assert_agrees(scene, integrator)
+
+
+def textured_sheet(count: int, bend: float) -> Any:
+    """Count x count squares from -2 to 2, flat-shaded, with a texture that changes slowly; a roof whose ridge is x = 0."""
+    wave = 0.5 + 0.4 * np.sin(2 * np.pi * (np.arange(64) + 0.5) / 64)
+    bitmap = mi.Bitmap(np.tile(wave[None, :, None], (8, 1, 3)).astype(np.float32))
+    y, x = np.meshgrid(*2 * [np.linspace(-2, 2, count + 1)], indexing="ij")
+    first = np.arange(count * (count + 1)).reshape(count, -1)[:, :count].ravel()
+    faces = [first, first + 1, first + count + 2], [first, first + count + 2, first + count + 1]
+    props = mi.Properties()
+    bsdf = {"type": "diffuse", "reflectance": {"type": "bitmap", "bitmap": bitmap, "raw": True}}
+    props["bsdf"] = mi.load_dict({"type": "twosided", "bsdf": bsdf})
+    mesh = mi.Mesh("mesh", (count + 1) ** 2, 2 * count**2, has_vertex_texcoords=True, props=props)
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = np.float32(np.stack([x, y, -bend * np.abs(x)], -1)).ravel()
+    params["vertex_texcoords"] = np.float32(np.stack([x / 4 + 0.5, y / 4 + 0.5], -1)).ravel()
+    params["faces"] = np.concatenate([np.stack(f, 1) for f in faces]).astype(np.uint32).ravel()
+    params.update()
+    to_world = mi.ScalarTransform4f().look_at([0, -0.5, 4], [0, 0, 0], [0, 1, 0])
+    sun = {"type": "directional", "direction": [0.6, 0.3, -1], "irradiance": 3.0}
+    return mi.load_dict({"type": "scene", "mesh": mesh, "sun": sun, "camera": {**camera(), "to_world": to_world}})
+
+
+@pytest.mark.parametrize(("bend", "samples"), [(0.0, 1), (0.4, 16)])
+def test_slopes_of_colours_within_flat_faces_count_once(variant: str, bend: float, samples: int) -> None:
+    """Edges between triangles of one plane are none. The ridge of a roof that they make up is one."""
+    scene, integrator = textured_sheet(16, bend), shadowmap(shadow_method="none")
+    params = mi.traverse(scene)
+    rest = mi.Float(params["mesh.vertex_positions"])
+
+    def move(x: Any, spp: int) -> Any:
+        params["mesh.vertex_positions"] = dr.ravel(dr.unravel(mi.Point3f, rest) + mi.Vector3f(1, 0, 0) * x)
+        params.update()
+        return mi.render(scene, params, integrator=integrator, spp=spp)
+
+    step = 0.03
+    ends = [move(mi.Float(side * step), 64).numpy().sum(-1) for side in (1, -1)]
+    expected = (ends[0] - ends[1])[6:-6, 6:-6] / (2 * step)
+    x = mi.Float(0)
+    dr.enable_grad(x)
+    image = move(x, samples)
+    dr.forward(x)
+    found = dr.grad(image).numpy().sum(-1)[6:-6, 6:-6]
+    # Added up over five columns: the ridge is one pixel wide here, and as wide as the steps there.
+    found, expected = (np.convolve(a.sum(0), np.ones(5), "valid") for a in (found, expected))
+    cosine = (found * expected).sum() / np.linalg.norm(found) / np.linalg.norm(expected)
+    scale = (found * expected).sum() / (expected**2).sum()
+    assert cosine > 0.98 and abs(scale - 1) < 0.02, (cosine, scale)
 
 
 def test_smooth_surfaces_have_no_creases_where_nothing_jumps(variant: str) -> None:

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from shadowmap_dr.facets import flat_faces, mean_normals
+from shadowmap_dr.facets import facet_normals, flat_faces, mean_normals
 from shadowmap_dr.geometry import Geometry
 from shadowmap_dr.raster import build_topology
 from shadowmap_dr.scene import load
@@ -51,7 +51,7 @@ def test_sums_and_derivatives(variant: str) -> None:
     flat = flat_faces(geometry, topology)
     positions = mi.Float(geometry.positions)
     dr.enable_grad(positions)
-    sums = mean_normals(replace(geometry, positions=positions), topology, flat)
+    sums = mean_normals(facet_normals(replace(geometry, positions=positions), flat), topology, flat)
     places = topology.welded.numpy().reshape(-1, 3)[flat_shape.face_start :][: flat_shape.face_count]
     found = sums.numpy().reshape(-1, 4)
     want = expected(POINTS.astype(np.float64), FLAT)

@@ -38,35 +38,14 @@ FRONT, ABOVE = camera([0, -4, 0], [0, 0, 0], [0, 0, 1]), camera([0, -0.5, 4], [0
 SUN = {"type": "directional", "direction": [0, 0.3, -1], "irradiance": 3.0}
 
 
-def mesh_of(vertices: Any, faces: Any, bsdf: dict[str, Any], smooth: bool, texcoords: Any = None) -> Any:
-    props = mi.Properties()
-    props["bsdf"] = mi.load_dict(bsdf)
-    textured = texcoords is not None
-    mesh = mi.Mesh("mesh", len(vertices), len(faces), has_vertex_normals=smooth, has_vertex_texcoords=textured, props=props)
-    params = mi.traverse(mesh)
-    params["vertex_positions"] = np.float32(vertices).ravel()
-    params["faces"] = np.uint32(faces).ravel()
-    if textured:
-        params["vertex_texcoords"] = np.float32(texcoords).ravel()
-    params.update()
-    return mesh
-
-
-def sheet(count: int, smooth: bool) -> Any:
-    """A plane of count x count squares, with a texture that changes slowly."""
-    wave = 0.5 + 0.45 * np.sin(2 * np.pi * (np.arange(64) + 0.5) / 64)
-    bitmap = mi.Bitmap(np.tile(wave[None, :, None], (8, 1, 3)).astype(np.float32))
-    y, x = np.meshgrid(*2 * [np.linspace(-2, 2, count + 1)], indexing="ij")
-    first = np.arange(count * (count + 1)).reshape(count, -1)[:, :count].ravel()
-    faces = [first, first + 1, first + count + 2], [first, first + count + 2, first + count + 1]
-    places = np.stack([x, y, 0 * x], -1).reshape(-1, 3)
-    bsdf = {"type": "diffuse", "reflectance": {"type": "bitmap", "bitmap": bitmap, "raw": True}}
-    return mesh_of(places, np.concatenate([np.stack(f, 1) for f in faces]), bsdf, smooth, places[:, :2] / 4 + 0.5)
-
-
 def ball(subdivisions: int) -> Any:
     sphere = trimesh.creation.icosphere(subdivisions=subdivisions, radius=0.8)
-    return mesh_of(np.asarray(sphere.vertices), sphere.faces, {"type": "diffuse"}, smooth=True)
+    mesh = mi.Mesh("mesh", len(sphere.vertices), len(sphere.faces), has_vertex_normals=True)
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = np.float32(sphere.vertices).ravel()
+    params["faces"] = np.uint32(sphere.faces).ravel()
+    params.update()
+    return mesh
 
 
 def moved(key: str, axis: list[float]) -> Callable[[Any, Any, Any], Any]:
@@ -119,10 +98,6 @@ for level in (1, 2):
     side = {"type": "point", "position": [4, 0, 0], "intensity": 30.0}
     parts = {"camera": FRONT, "lamp": side, "mesh": ball(level)}
     name = f"ball of {20 * 4**level} smooth triangles lit from the side"
-    measure(name, parts, "mesh.vertex_positions", moved("mesh", [1, 0, 0]))
-for smooth in (False, True):
-    parts = {"camera": ABOVE, "sun": SUN, "mesh": sheet(12, smooth)}
-    name = f"textured sheet of 12 x 12 squares, {'with' if smooth else 'without'} vertex normals"
     measure(name, parts, "mesh.vertex_positions", moved("mesh", [1, 0, 0]))
 plastic = {"type": "twosided", "bsdf": {"type": "plastic"}}
 for radius in (0.5, 0.12):

@@ -3,6 +3,7 @@
 from ._types import MAX_RESOLUTION, NO_TRIANGLE, RasterOutput
 from .antialias import antialias
 from .closed import drawing_order, outward_faces
+from .creases import Folds
 from .crossings import DEPTH_GAP, Crossings, find_crossings
 from .interpolate import interpolate
 from .rasterize import rasterize, visible_triangles
@@ -15,6 +16,7 @@ __all__ = [
     "NO_TRIANGLE",
     "NO_VERTEX",
     "Crossings",
+    "Folds",
     "RasterOutput",
     "Topology",
     "antialias",

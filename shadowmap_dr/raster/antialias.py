@@ -8,6 +8,7 @@ import drjit as dr
 
 from ._types import RasterOutput
 from .blend import blend
+from .creases import Folds
 from .crossings import DEPTH_GAP, Crossings, find_crossings
 from .topology import Topology
 
@@ -23,6 +24,7 @@ def antialias(
     crease_weights: Any = None,
     meetings: bool = False,
     gap: float = DEPTH_GAP,
+    folds: Folds | None = None,
 ) -> Any:
     """Blend each pixel with the neighbours from which a silhouette separates it, by the share of the pixel they cover.
 
@@ -41,6 +43,7 @@ def antialias(
             :func:`find_crossings`.
         meetings: blend (and differentiate) where surfaces meet without an edge, too, see :func:`find_crossings`.
         gap: how far silhouettes must lie before what they border, see :func:`find_crossings`.
+        folds: which of the creases are none between faces in one plane, see :func:`find_crossings`.
 
     Returns:
         The blended values in the shape of ``values``; flat, with interleaved channels, for a list. Gradients flow to ``values``
@@ -57,7 +60,7 @@ def antialias(
     positions, vertex_count = _flat_positions(positions, raster, topology)
     if crossings is None:
         crease_weights = _checked_creases(creases, crease_weights, raster)
-        crossings = find_crossings(positions, topology, raster, vertex_count, creases, crease_weights, meetings, gap)
+        crossings = find_crossings(positions, topology, raster, vertex_count, creases, crease_weights, meetings, gap, folds)
     elif dr.width(crossings.right) != raster.batch * raster.height * raster.width:
         raise ValueError(f"crossings are those of {dr.width(crossings.right)} pixels, but {_size_of(raster)} are given")
     blended = blend(flat, positions, raster, crossings)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -11,10 +12,42 @@ from .topology import NO_VERTEX, Topology
 
 # Planes that cross so far (relative) beyond two edges still cross at the nearer one, in spite of rounding.
 _SLACK = 0.05
+# Sine of the angle up to which two faces lie in one plane: rounding of small triangles, and no bend that anybody sees.
+_FLAT = 1e-3
+
+
+@dataclass(frozen=True)
+class Folds:
+    """Creases that are none where the surface is not bent: within a flat face of many triangles, colours do not jump.
+
+    What they change by from one pixel to the next, because of a texture, say, would count twice if its triangles had edges.
+
+    Attributes:
+        edges: ``Bool`` (3 F,), which of the creases from corner k to k + 1 of a face these are.
+        normals: ``Float`` (4 F,), normals of the faces, of any length, and a number that is not read. Detached.
+    """
+
+    edges: Any
+    normals: Any
+
+    def flat(self, here: Any, neighbour: Any) -> Any:
+        """Whether two faces lie in one plane, if they have a point in common."""
+        Array3f, Array4f = (getattr(backend(here), name) for name in ("Array3f", "Array4f"))
+        n, m = (dr.gather(Array4f, self.normals, face) for face in (here, neighbour))
+        n, m = Array3f(n.x, n.y, n.z), Array3f(m.x, m.y, m.z)
+        return dr.squared_norm(dr.cross(n, m)) <= _FLAT**2 * dr.squared_norm(n) * dr.squared_norm(m)
 
 
 def find_creases(
-    creases: Any, topology: Topology, raster: RasterOutput, image: Any, pixel: Any, here: Any, neighbour: Any, down: Any
+    creases: Any,
+    folds: Folds | None,
+    topology: Topology,
+    raster: RasterOutput,
+    image: Any,
+    pixel: Any,
+    here: Any,
+    neighbour: Any,
+    down: Any,
 ) -> tuple[Any, Any, Any, Any, Any, Any]:
     """Creases between pixels and their right or (where ``down``) lower neighbours.
 
@@ -25,7 +58,7 @@ def find_creases(
     the bend is there, at the second, or in between. If they do not cross there, each edge counts half.
 
     Args:
-        creases: see :func:`find_crossings`.
+        creases, folds: see :func:`find_crossings`.
         topology, raster: the mesh and what the pixels see.
         image, pixel: which pixels, and in which images of the batch.
         here, neighbour: triangles that the pixels and their neighbours see.
@@ -45,6 +78,10 @@ def find_creases(
         corner_in, way_in, other_depth, other_slope = _way_out(raster, image, neighbour, x, y, down, -1)
         hard_out = dr.gather(Bool, creases, 3 * here + corner_out)
         hard_in = dr.gather(Bool, creases, 3 * neighbour + corner_in)
+        if folds is not None:
+            bent = ~folds.flat(here, neighbour)
+            hard_out &= bent | ~dr.gather(Bool, folds.edges, 3 * here + corner_out)
+            hard_in &= bent | ~dr.gather(Bool, folds.edges, 3 * neighbour + corner_in)
         a, b = _ends(topology, here, corner_out, hard_out)
         c, d = _ends(topology, neighbour, corner_in, hard_in)
         # Twice the same edge, or only the second: one edge is what is left.

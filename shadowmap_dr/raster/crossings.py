@@ -8,7 +8,7 @@ from typing import Any
 import drjit as dr
 
 from ._types import NO_TRIANGLE, RasterOutput, backend, by_image, zeros
-from .creases import find_creases
+from .creases import Folds, find_creases
 from .meetings import LEAST_WEIGHT, Meetings, beyond_middle
 from .pairs import PairList, differing_pairs, empty_list
 from .silhouette import register_silhouettes
@@ -51,6 +51,7 @@ def find_crossings(
     crease_weights: Any = None,
     meetings: bool = False,
     gap: float = DEPTH_GAP,
+    folds: Folds | None = None,
 ) -> Crossings:
     """Find the edges between neighbouring pixels.
 
@@ -64,6 +65,7 @@ def find_crossings(
         crease_weights: ``Float`` for each pixel, between 0 and 1: how much creases count there; 1 if not given.
         meetings: also look for the lines along which surfaces that are not connected pass through each other or touch. Depths,
             and what follows from them alone, do not jump there.
+        folds: which of the creases are none between faces in one plane. None: no one.
         gap: how far (NDC depth) a silhouette must at least lie before what it borders, besides 1e-5 of the depth there. 0 suits
             depths of which all digits count, such as -near / distance; more those that are close to 1 far away.
 
@@ -96,7 +98,7 @@ def find_crossings(
         dr.eval(keys, pairs)
         if creases is not None or meetings:
             meet = Meetings.of(positions, topology, raster, vertex_count, meetings, creases, crease_weights)
-        return _measure(positions, topology, raster, vertex_count, keys, pairs, creases, crease_weights, meet)
+        return _measure(positions, topology, raster, vertex_count, keys, pairs, creases, folds, crease_weights, meet)
 
 
 def _measure(
@@ -107,6 +109,7 @@ def _measure(
     keys: Any,
     pairs: PairList,
     creases: Any,
+    folds: Folds | None,
     crease_weights: Any,
     meetings: Meetings | None,
 ) -> Crossings:
@@ -141,7 +144,9 @@ def _measure(
 
             def crease(image, pixel, step, down, a, b, soft):  # noqa: ANN001, ANN202
                 here, neighbour = (dr.gather(UInt32, raster.triangle, p) for p in (pixel, pixel + step))
-                a, b, c, d, weight, weight_2 = find_creases(creases, topology, raster, image, pixel, here, neighbour, down)
+                a, b, c, d, weight, weight_2 = find_creases(
+                    creases, folds, topology, raster, image, pixel, here, neighbour, down
+                )
                 return a, b, c, d, soft * weight, soft * weight_2
 
             none = dr.full(UInt32, NO_VERTEX, dr.width(pair))

@@ -70,8 +70,7 @@ def test_limits_are_measured() -> None:
     result = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=ROOT)
     assert result.returncode == 0, result.stderr
     lines = re.findall(r"^(.+), 1 samples: cosine (-?[0-9.]+), scale (-?[0-9.]+)$", result.stdout, re.MULTILINE)
-    assert len(lines) == 10
+    assert len(lines) == 8
     found = {name: (float(cosine), float(scale)) for name, cosine, scale in lines}
-    # What is right, and one that is not.
-    assert found["card 0.001 above a floor"] == pytest.approx((1, 1), abs=0.1)
-    assert found["card 1e-05 above a floor"] == (0, 0)
+    # The right direction, and not the right size.
+    assert found["ball lit from the camera, grows"] == (pytest.approx(1, abs=0.01), pytest.approx(1.2, abs=0.1))

@@ -177,3 +177,42 @@ def test_surfaces_that_lie_on_each_other_do_not_meet(variant: str) -> None:
     image = antialias(value, out, clip, topology, meetings=True)
     dr.backward(dr.sum(dr.square(image)))
     assert dr.grad(rise)[0] == 0
+
+
+# A square on a larger one, a rounding error before it; and two walls side by side without common corners: at an edge that the
+# camera sees from outside, and in one plane. With the depths of their corners.
+BIG = np.array([[-0.9, -0.9], [0.9, -0.9], [0.9, 0.9], [-0.9, 0.9]])
+LEFT, RIGHT = BIG * [0.5, 1] - [0.45, 0], BIG * [0.5, 0.7] + [0.45, 0]
+TOUCHING = {
+    "card": (BIG, [0, 0, 0, 0], 0.6 * BIG, [-1e-6] * 4),
+    "corner": (LEFT, [0.3, 0, 0, 0.3], RIGHT, [0, 0.2, 0.2, 0]),
+    "row": (LEFT, [0.3, 0, 0, 0.3], RIGHT, [0, -0.3, -0.3, 0]),
+}
+
+
+@pytest.mark.parametrize("case", TOUCHING)
+def test_a_surface_ends_on_another_one(variant: str, case: str) -> None:
+    """Where shapes touch that have no vertices in common: what one gains and the other loses is what the line sweeps."""
+    size = 64
+    first, first_depth, second, second_depth = TOUCHING[case]
+    world = np.c_[np.r_[first, second], np.r_[first_depth, second_depth] + 0.2].astype(np.float32)
+    faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], np.uint32)
+    topology = topology_of(faces, world)
+    moved = np.r_[0, 0, 0, 0, 1, 0, 0, 1] if case == "card" else np.r_[0, 1, 1, 0, 1, 0, 0, 1]
+
+    def gradient(meetings: bool) -> float:
+        slide = mi.Float(0)
+        dr.enable_grad(slide)
+        x, y, z = (mi.Float(world[:, k].copy()) for k in range(3))
+        clip = mi.TensorXf(dr.ravel(mi.Point4f(x - slide * mi.Float(np.float32(moved)), y, z, 1)), shape=(8, 4))
+        out = rasterize(clip, mi.TensorXu(faces), (size, size))
+        value = dr.gather(mi.Float, mi.Float([1, 1, 0.25, 0.25]), out.triangle, out.valid)
+        dr.backward(dr.sum(antialias(value, out, clip, topology, meetings=meetings)))
+        return dr.grad(slide)[0]
+
+    pixels = (size / 2) ** 2
+    line, above = second[2, 1] - second[1, 1], first[2, 1] - first[1, 1] - (second[2, 1] - second[1, 1])
+    # Beside the smaller wall the larger one ends before nothing.
+    outline = 0 if case == "card" else -above * pixels
+    assert gradient(True) == pytest.approx(outline + (0.25 - 1) * line * pixels, rel=0.05)
+    assert gradient(False) == pytest.approx(outline, rel=0.05, abs=1e-3)

@@ -104,11 +104,6 @@ for radius in (0.5, 0.12):
     shape = {"type": "cylinder", "p0": [-0.8, 0, 0], "p1": [0.8, 0, 0], "radius": radius, "bsdf": plastic}
     parts = {"camera": ABOVE, "sun": SUN, "tube": shape}
     measure(f"tube of plastic, radius {radius}", parts, "tube.to_world", moved("tube.to_world", [0, 1, 0]))
-for gap in (1e-5, 1e-3):
-    red = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.1, 0.1]}}
-    card = {"type": "rectangle", "to_world": T().translate([0, 0, gap]).scale(0.6), "bsdf": red}
-    parts = {"camera": ABOVE, "sun": SUN, "floor": {"type": "rectangle", "to_world": T().scale(2)}, "card": card}
-    measure(f"card {gap:g} above a floor", parts, "card.to_world", moved("card.to_world", [1, 0, 0]))
 for unit in (1.0, 1e-4, 1e-6):
     small = T().scale(unit)
     view = {**ABOVE, "to_world": small @ ABOVE["to_world"] @ T().scale(1 / unit)}

@@ -11,7 +11,7 @@ from ._types import NO_TRIANGLE, RasterOutput, backend, by_image, zeros
 from .creases import Folds, find_creases
 from .meetings import LEAST_WEIGHT, Meetings, beyond_middle
 from .pairs import PairList, differing_pairs, empty_list
-from .silhouette import register_silhouettes
+from .silhouette import BEFORE, register_silhouettes
 from .topology import NO_VERTEX, Topology
 
 #: How far (NDC depth) an edge must lie before the surface that it borders, with depths as those of the usual matrices.
@@ -72,6 +72,7 @@ def find_crossings(
     A silhouette is an edge whose faces all lie on one side of it in the image. It separates two pixels that see different
     triangles when it crosses the segment between their centres and lies before the surface that the uncovered one sees
     (extended to the crossing). Among several the outermost is taken: up to it the uncovered pixel's surface is hidden.
+    With ``meetings`` the edge may also lie on that surface, if this is of another part and the two do not meet in a valley.
 
     Between two pixels whose triangles touch, the edges through which one leaves the first triangle and enters the other are
     creases. If these are two edges, with something unseen in between, each counts as much as the surface bends there. Between
@@ -92,7 +93,7 @@ def find_crossings(
             register_silhouettes(positions, topology, raster, vertex_count, keys, pairs, gap)
         else:
             pairs, keys = differing_pairs(raster)
-            register_silhouettes(positions, topology, raster, vertex_count, keys, None, gap)
+            register_silhouettes(positions, topology, raster, vertex_count, keys, None, gap, meetings)
             crease_weights = None if crease_weights is None else dr.detach(crease_weights)
             dr.eval(crease_weights)
         dr.eval(keys, pairs)
@@ -159,7 +160,7 @@ def _measure(
                 label="no silhouette",
             )
         if meetings is not None:
-            bare = a == NO_VERTEX
+            bare = (a == NO_VERTEX) | (silhouette & (key < BEFORE))
             here, there = (dr.gather(UInt32, raster.triangle, p, bare) for p in (pixel, pixel + step))
             meetings.add(slot, dr.select(bare, here, NO_TRIANGLE), there, soft)
         first = image * vertex_count
@@ -194,14 +195,15 @@ def _measure(
 
 
 def _meet(found: Crossings, meetings: Meetings, raster: RasterOutput) -> None:
-    """Write the weights of pairs whose triangles meet other than in an edge."""
-    UInt32 = backend(found.ends).UInt32
+    """Write the weights of pairs whose triangles meet other than in an edge, which then takes the place of one that touches."""
+    UInt32, Array4u = (getattr(backend(found.ends), name) for name in ("UInt32", "Array4u"))
 
     def visit(slot: Any) -> None:
         pair = found.pairs.at(slot)
         down, pixel = (pair & 1) != 0, pair >> 1
         value = meetings.weight(pixel, down)
-        met = meetings.possible(pixel, dr.select(down, UInt32(raster.width), 1))
+        met = meetings.possible(pixel, dr.select(down, UInt32(raster.width), 1)) & (value != 0)
+        dr.scatter(found.ends, Array4u(NO_VERTEX), slot, met)
         dr.scatter(found.right, value, pixel, met & ~down)
         dr.scatter(found.down, value, pixel, met & down)
 

@@ -17,6 +17,8 @@ from .topology import NO_VERTEX, Topology
 
 # An edge must lie this far (relative) before the surface that it borders: it is a discontinuity, not a crease.
 _RELATIVE_GAP = 1e-5
+#: Part of the keys of edges that do. Others may be those of a surface that lies on another one.
+BEFORE = 1 << 62
 # Lines through pixel centres that lie this far (in pixels) beyond an edge's ends are tested, too, in spite of rounding.
 _MARGIN = 1.0 / 512.0
 # So many lanes walk along the silhouettes of an image; few, so that threads get equal parts of a short list, too.
@@ -25,7 +27,14 @@ _MOST_LANES = 32768
 
 
 def register_silhouettes(
-    positions: Any, topology: Topology, raster: RasterOutput, vertex_count: int, keys: Any, found: PairList | None, gap: float
+    positions: Any,
+    topology: Topology,
+    raster: RasterOutput,
+    vertex_count: int,
+    keys: Any,
+    found: PairList | None,
+    gap: float,
+    touching: bool = False,
 ) -> None:
     """Let all silhouette edges write to the pairs of pixels that they separate.
 
@@ -33,10 +42,12 @@ def register_silhouettes(
         positions: flat clip-space vertices, as rasterized. Detached.
         topology, raster, vertex_count: the mesh and what the pixels see.
         keys: ``UInt64``, one number for each pair (see :mod:`shadowmap_dr.raster.pairs`), 0 at first. Gets the largest of the
-            edges' keys: how much of the uncovered pixel the edge's surface hides as the upper half (a float's bits), the
-            complement of the edge's index as the lower. The outermost edge wins: the result does not depend on the order.
+            edges' keys: how much of the uncovered pixel the edge's surface hides as the upper half (a float's bits, and
+            ``BEFORE``), the complement of the edge's index as the lower. The outermost edge wins: the result does not depend on
+            the order.
         found: list to which pairs are added when the first edge registers.
         gap: NDC depth by which edges lie before what they border, at least.
+        touching: whether edges also register that do not lie before, but on a surface of another part.
     """
     module = backend(positions)
     UInt32 = module.UInt32
@@ -48,7 +59,7 @@ def register_silhouettes(
         slot, turn = lane // stride, lane % stride
         a, b = (dr.gather(module.Array4f, records, 2 * slot + k) for k in range(2))
         index = dr.gather(UInt32, edges, slot)
-        _walk(a, b, index, turn, stride, topology, raster, keys, found, gap)
+        _walk(a, b, index, turn, stride, topology, raster, keys, found, gap, touching)
         return (lane + lanes,)
 
     dr.while_loop((dr.arange(UInt32, lanes),), lambda lane: lane < count * stride, walk, mode="symbolic", label="silhouettes")
@@ -96,6 +107,7 @@ def _walk(
     keys: Any,
     found: PairList | None,
     gap: float,
+    touching: bool,
 ) -> None:
     """Visit every ``stride``-th of the lines through pixel centres that edges cross, beginning with ``line``."""
     module = backend(a)
@@ -138,7 +150,13 @@ def _walk(
         hidden = dr.select(covers_here, neighbour, here)
         x, y = dr.select(down, fixed, crossing), dr.select(down, crossing, fixed)
         depth = _depth_on_plane(raster, image, hidden, x, y, ok)
-        ok &= z < depth - dr.fma(dr.abs(depth), _RELATIVE_GAP, gap)
+        least = dr.fma(dr.abs(depth), _RELATIVE_GAP, gap)
+        before = z < depth - least
+        on = module.Bool(False)
+        if touching:
+            on = ok & ~before & (z < depth + least) & (here != NO_TRIANGLE) & (neighbour != NO_TRIANGLE)
+            on &= dr.gather(UInt32, topology.parts, here, on) != dr.gather(UInt32, topology.parts, neighbour, on)
+        ok &= before | on
 
         if topology.veils is not None:
             # What is seen through hides nothing: an edge of it counts where its own surface is seen beside it.
@@ -152,6 +170,8 @@ def _walk(
 
         reach = dr.select(covers_here, t, 1 - t)
         key = (UInt64(dr.reinterpret_array(UInt32, reach)) << 32) | UInt64(~edge)
+        if touching:
+            key |= dr.select(before, UInt64(BEFORE), 0)
         pair = 2 * pixel + dr.select(down, UInt32(1), 0)
         # Not "Auto", which would give each thread a copy of a small buffer.
         dr.scatter_reduce(dr.ReduceOp.Max, keys, key, pair, ok, mode=dr.ReduceMode.Direct)

@@ -385,14 +385,12 @@ class Renderer:
             # In one pass over the pixels, since both need much of the same.
             dr.eval(channels, sharpness)
             flat = antialias(
-                channels,
-                raster,
-                view.clip,
-                view.topology,
+                *(channels, raster, view.clip, view.topology),
                 **creases,
                 crease_weights=sharpness,
                 meetings=True,
                 gap=least_gap(sensor),
+                continued=True,
             )
             image = mi.TensorXf(flat, shape=(height, width, len(channels)))
         else:

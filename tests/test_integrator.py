@@ -87,13 +87,13 @@ def test_optimiser_moves_the_ball_back(variant: str) -> None:
     key = "ball.vertex_positions"
     rest = mi.Float(params[key])
     adam = mi.ad.Adam(lr=0.02, params={"shift": mi.Float(0.2)})
-    for _ in range(25):
+    for _ in range(45):
         params[key] = rest + adam["shift"] * mi.Float(np.tile(np.float32([1, 0, 0]), dr.width(rest) // 3))
         params.update()
         loss = dr.mean(dr.square(mi.render(scene, params, integrator=integrator) - reference))
         dr.backward(loss)
         adam.step()
-    assert abs(adam["shift"][0]) < 0.05
+    assert abs(adam["shift"][0]) < 0.03
 
 
 def test_instances(variant: str) -> None:

@@ -10,6 +10,7 @@ from ._types import RasterOutput
 from .blend import blend
 from .creases import Folds
 from .crossings import DEPTH_GAP, Crossings, find_crossings
+from .jumps import Surroundings
 from .topology import Topology
 
 
@@ -25,6 +26,7 @@ def antialias(
     meetings: bool = False,
     gap: float = DEPTH_GAP,
     folds: Folds | None = None,
+    continued: bool = False,
 ) -> Any:
     """Blend each pixel with the neighbours from which a silhouette separates it, by the share of the pixel they cover.
 
@@ -44,6 +46,8 @@ def antialias(
         meetings: blend (and differentiate) where surfaces meet without an edge, too, see :func:`find_crossings`.
         gap: how far silhouettes must lie before what they border, see :func:`find_crossings`.
         folds: which of the creases are none between faces in one plane, see :func:`find_crossings`.
+        continued: take derivatives by the edges' places as if values changed up to them as they do on the other sides of the
+            pixels, instead of not at all (:mod:`shadowmap_dr.raster.jumps`).
 
     Returns:
         The blended values in the shape of ``values``; flat, with interleaved channels, for a list. Gradients flow to ``values``
@@ -58,12 +62,14 @@ def antialias(
     is_tensor = dr.is_tensor_v(values)
     flat = _checked_values(values, raster)
     positions, vertex_count = _flat_positions(positions, raster, topology)
+    crease_weights = _checked_creases(creases, crease_weights, raster)
     if crossings is None:
-        crease_weights = _checked_creases(creases, crease_weights, raster)
         crossings = find_crossings(positions, topology, raster, vertex_count, creases, crease_weights, meetings, gap, folds)
     elif dr.width(crossings.right) != raster.batch * raster.height * raster.width:
         raise ValueError(f"crossings are those of {dr.width(crossings.right)} pixels, but {_size_of(raster)} are given")
-    blended = blend(flat, positions, raster, crossings)
+    sharpness = None if crease_weights is None else dr.detach(crease_weights)
+    seen = (raster.triangle, topology.parts, creases, raster.height, raster.width, sharpness)
+    blended = blend(flat, positions, raster, crossings, Surroundings(*seen) if continued else None)
     return type(values)(blended, shape=values.shape) if is_tensor else blended
 
 

@@ -9,12 +9,15 @@ import drjit as dr
 
 from ._types import RasterOutput, backend
 from .crossings import Crossings
+from .jumps import Surroundings
 from .neighbours import around
 from .pairs import each_number
 from .topology import NO_VERTEX
 
 
-def blend(values: Any, positions: Any, raster: RasterOutput, crossings: Crossings) -> Any:
+def blend(
+    values: Any, positions: Any, raster: RasterOutput, crossings: Crossings, surroundings: Surroundings | None = None
+) -> Any:
     """Apply the weights of all pairs of pixels.
 
     Args:
@@ -22,6 +25,7 @@ def blend(values: Any, positions: Any, raster: RasterOutput, crossings: Crossing
         positions: flat clip-space vertices of all images. Attached.
         raster: what the pixels see.
         crossings: for the same positions.
+        surroundings: if colours are to be continued up to the edges, see :mod:`shadowmap_dr.raster.jumps`.
 
     Returns blended values, flat and interleaved.
     """
@@ -30,14 +34,22 @@ def blend(values: Any, positions: Any, raster: RasterOutput, crossings: Crossing
     if not dr.is_diff_v(positions):
         return Mixer(values, raster.width, crossings).values
     wanted = dr.grad_enabled(values), dr.grad_enabled(positions)
-    return dr.custom(_Blend, values, positions, raster.width, crossings, wanted)
+    return dr.custom(_Blend, values, positions, raster.width, crossings, wanted, surroundings)
 
 
 class _Blend(dr.CustomOp):
     """Blending as one differentiable operation: the derivatives, too, do work only where pixels were blended."""
 
-    def eval(self, values: Any, positions: Any, width: int, crossings: Crossings, wanted: tuple[bool, bool]) -> Any:
-        self.mixer = Mixer(values, width, crossings)
+    def eval(
+        self,
+        values: Any,
+        positions: Any,
+        width: int,
+        crossings: Crossings,
+        wanted: tuple[bool, bool],
+        surroundings: Surroundings | None,
+    ) -> Any:
+        self.mixer = Mixer(values, width, crossings, surroundings)
         self.wanted, self.vertices = wanted, dr.width(positions)
         return self.mixer.values
 
@@ -63,9 +75,9 @@ class Mixer:
     more than all of it they cannot have: ``scale = 1 / max(1, sum of weights)``.
     """
 
-    def __init__(self, values: Any, width: int, crossings: Crossings) -> None:
+    def __init__(self, values: Any, width: int, crossings: Crossings, surroundings: Surroundings | None = None) -> None:
         self.module = backend(crossings.right)
-        self.crossings, self.width = crossings, width
+        self.crossings, self.width, self.surroundings = crossings, width, surroundings
         self.pixels = dr.width(crossings.right)
         self.planar = isinstance(values, list)
         self.channels = len(values) if self.planar else dr.width(values) // self.pixels
@@ -251,12 +263,27 @@ class Mixer:
         claims = dr.gather(self.module.Float, self.claims, taker)
         scale = _scale(claims)
         g, own = self.read(adjoint, taker), self.read(self.original, taker)
-        other = self.read(self.original, giver)
+        other = self._beyond(taker, giver, down, 0.5 - dr.abs(weight), True)
         shared = claims >= 1  # shares itself out: more for one neighbour is less for all of them
         mixed = self.read(self.values, taker, shared)
         mean = [dr.select(shared, m, o) for m, o in zip(mixed, own, strict=True)]
         gain = sum(a * (v - m) for a, v, m in zip(g, other, mean, strict=True))
         return gain * dr.select(weight > 0, scale, -scale)
+
+    def _beyond(self, taker: Any, giver: Any, down: Any, place: Any, active: Any) -> list[Any]:
+        """What pixels gain by a larger share of their neighbours, from whom edges at some place separate them, plus their own."""
+        if self.surroundings is None:
+            return self.read(self.original, giver, active)
+
+        def read(pixel: Any, active: Any) -> list[Any]:
+            return self.read(self.original, pixel, active)
+
+        def crossed(pixel: Any, down: Any, active: Any) -> Any:
+            weights = ((self.crossings.right, active & ~down), (self.crossings.down, active & down))
+            right, below = (dr.gather(self.module.Float, weight, pixel, wanted) for weight, wanted in weights)
+            return (right != 0) | (below != 0)
+
+        return self.surroundings.beyond(read, crossed, taker, giver, down, place, active)
 
     def tangent(self, values: Any, positions: Any) -> Any:
         """Change of the result with that of the values and positions (each or None)."""
@@ -282,7 +309,7 @@ class Mixer:
                 factor = weight * scale
                 total = [dr.fma(factor, v - c, t) for v, c, t in zip(other, change, total, strict=True)]
             if positions is not None:
-                other = self.read(self.original, neighbour, active)
+                other = self._beyond(pixel, neighbour, self.module.Bool(k % 2 == 1), 0.5 - weight, active)
                 factor = dr.select(active, rates[k] * scale, 0)
                 total = [dr.fma(factor, v - m, t) for v, m, t in zip(other, mean, total, strict=True)]
         return self.written(total)

@@ -129,6 +129,17 @@ def test_resume_keeps_finished_runs_and_adds_new_ones(tmp_path: Path) -> None:
     assert [record["iterations"] for record in json.loads((tmp_path / "pose.json").read_text())] == [3]
 
 
+@pytest.mark.parametrize("lost", ["final", "rotation_error_curve"])
+def test_records_that_are_cut_short_are_made_again(tmp_path: Path, lost: str) -> None:
+    (whole,) = run_pose(options(tmp_path, methods=("shadows",), runs=1, iterations=3), build=build)
+    stored = tmp_path / "pose.json"
+    records = json.loads(stored.read_text())
+    del records[0][lost]
+    stored.write_text(json.dumps(records))
+    (again,) = run_pose(options(tmp_path, methods=("shadows",), runs=1, iterations=3, resume=True), build=build)
+    assert again["final"] == pytest.approx(whole["final"]) and json.loads(stored.read_text()) == [again]
+
+
 def test_runs_with_other_samples_are_others(tmp_path: Path) -> None:
     def sampled(samples: int) -> Any:
         def build_sampled(name: str, problem: Any, reference: Any) -> Method:

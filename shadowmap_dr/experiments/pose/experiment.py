@@ -26,7 +26,7 @@ from ...errors import ShadowmapError
 from ...inverse import Method, run_sweep
 from ...inverse.schedulers import check_scheduler, check_threads
 from .methods import METHODS, Builder, Image, build_method, fairness
-from .record import identity, is_of, make_record
+from .record import identity, is_complete, is_of, make_record
 from .scene import NormalKind, PoseProblem, ReferenceKind, make_problem, start_pose
 from .sweep import PoseRuns, make_reference
 
@@ -98,6 +98,7 @@ def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Co
             for record in stored
         ):
             raise ShadowmapError(f"{out / 'pose.json'} is no list of records: choose another folder.")
+        stored = [record for record in stored if is_complete(record)]
 
     problems = {
         problem.folder: (name, problem)

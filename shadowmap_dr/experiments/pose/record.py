@@ -52,6 +52,13 @@ def is_of(record: dict[str, Any], wanted: dict[str, Any]) -> bool:
     return all(found.get(key) == value for key, value in essence(wanted).items())
 
 
+def is_complete(record: dict[str, Any]) -> bool:
+    """Whether a record says what came out of its run: all that is shown of runs, and all that says where they went."""
+    curves = ("loss_curve", "rotation_error_curve", "translation_error_curve")
+    results = ("final", "rotation_error_deg", "translation_error_x100", "recovered", "seconds_per_iteration", "seconds_to_pose")
+    return all(key in record for key in results) and all(isinstance(record.get(key), list) for key in ("final", *curves))
+
+
 def essence(value: Any) -> Any:
     """Settings without what was measured of them, whose last digits depend on the number of threads, and without verdicts."""
     if isinstance(value, dict):

@@ -31,8 +31,8 @@ from shadowmap_dr.lights import DirectionalLight
 
 ALL = [(case.name, parameter) for case in CASES for parameter in case.parameters]
 
-# What needs more samples than the case has: ridges that bend (c = 0.997, s = 1.041 with 16), whose place follows from triangles at
-# some distance.
+# What needs more samples than the case has: ridges that bend (c = 0.997, s = 1.041 with 16), whose place follows from triangles
+# at some distance.
 SAMPLES = {("fine_box", "caster_deformation"): 64}
 # What one sample per pixel is enough for.
 AT_ONE_SAMPLE = {

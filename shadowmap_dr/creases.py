@@ -19,8 +19,9 @@ from .raster import Folds, Topology
 from .raster._memory import device_array
 from .traversal import Watch, attributes, is_attribute, is_plain
 
-# Numbers that differ by less (in any component) are the same for the eye.
-_NORMAL_JUMP, _COLOUR_JUMP = 0.02, 1e-3
+# Numbers that differ by less (in any component) are the same: colours for the eye, normals but for rounding, since small bends
+# add up over a surface.
+_NORMAL_JUMP, _COLOUR_JUMP = 1e-4, 1e-3
 # Where along an edge the colours of both sides are compared.
 _LOOKED_AT = (0.02, 0.5, 0.98)
 

@@ -67,9 +67,8 @@ def antialias(
         crossings = find_crossings(positions, topology, raster, vertex_count, creases, crease_weights, meetings, gap, folds)
     elif dr.width(crossings.right) != raster.batch * raster.height * raster.width:
         raise ValueError(f"crossings are those of {dr.width(crossings.right)} pixels, but {_size_of(raster)} are given")
-    sharpness = None if crease_weights is None else dr.detach(crease_weights)
-    seen = (raster.triangle, topology.parts, creases, raster.height, raster.width, sharpness)
-    blended = blend(flat, positions, raster, crossings, Surroundings(*seen) if continued else None)
+    surroundings = Surroundings.of(raster, positions, topology, creases, folds, crease_weights) if continued else None
+    blended = blend(flat, positions, raster, crossings, surroundings)
     return type(values)(blended, shape=values.shape) if is_tensor else blended
 
 

@@ -12,8 +12,8 @@ from .topology import NO_VERTEX, Topology
 
 # Planes that cross so far (relative) beyond two edges still cross at the nearer one, in spite of rounding.
 _SLACK = 0.05
-# Sine of the angle up to which two faces lie in one plane: rounding of small triangles, and no bend that anybody sees.
-_FLAT = 1e-3
+# Sine of the angle up to which two faces lie in one plane: rounding of small triangles. Small bends add up over a surface.
+_FLAT = 1e-4
 
 
 @dataclass(frozen=True)
@@ -31,11 +31,12 @@ class Folds:
     normals: Any
 
     def flat(self, here: Any, neighbour: Any) -> Any:
-        """Whether two faces lie in one plane, if they have a point in common."""
+        """Whether two faces lie in one plane and are turned to the same side, if they have a point in common."""
         Array3f, Array4f = (getattr(backend(here), name) for name in ("Array3f", "Array4f"))
         n, m = (dr.gather(Array4f, self.normals, face) for face in (here, neighbour))
         n, m = Array3f(n.x, n.y, n.z), Array3f(m.x, m.y, m.z)
-        return dr.squared_norm(dr.cross(n, m)) <= _FLAT**2 * dr.squared_norm(n) * dr.squared_norm(m)
+        across = dr.squared_norm(dr.cross(n, m))
+        return (across <= _FLAT**2 * dr.squared_norm(n) * dr.squared_norm(m)) & (dr.dot(n, m) >= 0)
 
 
 def find_creases(
@@ -67,7 +68,7 @@ def find_creases(
     """
     module = backend(here)
     UInt32, Bool = module.UInt32, module.Bool
-    near = _touch(topology, here, neighbour)
+    near = touching(topology, here, neighbour)
 
     def search(image: Any, pixel: Any, here: Any, neighbour: Any, down: Any) -> tuple[Any, Any, Any, Any, Any, Any]:
         row = pixel // raster.width
@@ -105,7 +106,7 @@ def find_creases(
     return dr.if_stmt(arguments, near, search, nothing, mode="symbolic", label="creases")
 
 
-def _touch(topology: Topology, first: Any, second: Any) -> Any:
+def touching(topology: Topology, first: Any, second: Any) -> Any:
     """Whether two faces (or none) have a corner in common."""
     module = backend(first)
     active = (first != NO_TRIANGLE) & (second != NO_TRIANGLE)

@@ -13,7 +13,10 @@ from typing import Any
 
 import drjit as dr
 
-from ._types import NO_TRIANGLE, backend
+from ._types import NO_TRIANGLE, RasterOutput, backend, by_image
+from .creases import Folds, touching
+from .setup import edge_lines, gather_triangle
+from .topology import Topology
 
 
 @dataclass(frozen=True)
@@ -22,19 +25,36 @@ class Surroundings:
 
     Attributes:
         triangle: ``UInt32``, what each pixel sees.
-        parts: ``UInt32`` (F,), see :class:`Topology`.
+        positions: flat clip-space vertices (4 V B), as rasterized.
+        topology: of the mesh.
         creases: ``Bool`` (3 F,), edges of faces at which colours jump, or None.
-        height, width: of an image.
-        sharpness: ``Float`` for each pixel, 1 where a flat face is large enough for its own colour to be seen, or None for 1.
-            Between small ones, whose colours are at random where pixels see them, there is nothing to continue.
+        folds: which of them are none within a plane, or None.
+        sharpness: ``Float`` for each pixel, or None for 1. 1 where a flat face is large enough for its own colour to be seen, 0
+            where faces are so small that it is that of a smooth surface. In between colours are in part at random: there is
+            nothing to continue.
+        batch: number of images.
+        height, width, vertex_count: of an image.
     """
 
     triangle: Any
-    parts: Any
+    positions: Any
+    topology: Topology
     creases: Any
+    folds: Folds | None
+    sharpness: Any
+    batch: int
     height: int
     width: int
-    sharpness: Any
+    vertex_count: int
+
+    @classmethod
+    def of(
+        cls, raster: RasterOutput, positions: Any, topology: Topology, creases: Any, folds: Folds | None, sharpness: Any
+    ) -> Surroundings:
+        """For flat positions; sharpness as ``crease_weights`` of :func:`find_crossings`."""
+        positions, sharpness = dr.detach(positions), None if sharpness is None else dr.detach(sharpness)
+        size = raster.batch, raster.height, raster.width, dr.width(positions) // (4 * raster.batch)
+        return cls(raster.triangle, positions, topology, creases, folds, sharpness, *size)
 
     def beyond(
         self,
@@ -66,7 +86,7 @@ class Surroundings:
         for near, values, sign in ((taker, own, -1), (giver, other, 1)):
             ahead = forward if sign > 0 else ~forward
             far = dr.select(ahead, near + step, near - step)
-            steady, smooth = self._steady(near, far, self._inside(near, down, ahead, active))
+            steady, smooth = self._steady(near, far, down, ahead, self._inside(near, down, ahead, active))
             steady |= smooth & ~crossed(dr.select(ahead, near, far), down, smooth)
             slopes.append([dr.select(steady, sign * (f - v), 0) for f, v in zip(read(far, steady), values, strict=True)])
         result = []
@@ -84,7 +104,7 @@ class Surroundings:
         last = dr.select(down, UInt32(self.height), self.width) - 1
         return dr.select(ahead, at < last, at > 0) & active
 
-    def _steady(self, near: Any, far: Any, inside: Any) -> tuple[Any, Any]:
+    def _steady(self, near: Any, far: Any, down: Any, ahead: Any, inside: Any) -> tuple[Any, Any]:
         """Whether pixels and their neighbours see the same triangle, and whether they see others of a smooth surface.
 
         These may still have an edge in between. That no edge crosses the way to the neighbour would not be enough by itself:
@@ -93,12 +113,47 @@ class Surroundings:
         module = backend(near)
         here, there = (dr.gather(module.UInt32, self.triangle, pixel, inside) for pixel in (near, far))
         inside = inside & (here != NO_TRIANGLE) & (there != NO_TRIANGLE)
-        same, smooth = inside & (here == there), inside & (here != there)
+        same, smooth, soft = inside & (here == there), inside & (here != there), module.Bool(False)
         if self.sharpness is not None:
-            same &= dr.gather(module.Float, self.sharpness, near, same) == 1
-        if self.creases is not None:
-            for k in range(3):
-                smooth &= ~dr.gather(module.Bool, self.creases, 3 * here + k, smooth)
-        part, other = (dr.gather(module.UInt32, self.parts, triangle, smooth) for triangle in (here, there))
+            sharp, far_sharp = (dr.gather(module.Float, self.sharpness, pixel, inside) for pixel in (near, far))
+            soft = (sharp == 0) & (far_sharp == 0)
+            same &= (sharp == 1) | soft
+        part, other = (dr.gather(module.UInt32, self.topology.parts, triangle, smooth) for triangle in (here, there))
         smooth &= part == other
-        return same, smooth
+        if self.creases is None:
+            return same, smooth
+
+        def unbroken(near: Any, far: Any, down: Any, ahead: Any, here: Any, there: Any, soft: Any) -> Any:
+            if self.folds is not None:
+                soft |= touching(self.topology, here, there) & self.folds.flat(here, there)
+            return ~self._leaves(near, here, down, ahead, soft) & ~self._leaves(far, there, down, ~ahead, soft)
+
+        lanes = near, far, down, ahead, here, there, soft
+        return same, dr.if_stmt(lanes, smooth, unbroken, lambda *_: module.Bool(False), mode="symbolic", label="smooth")
+
+    def _leaves(self, pixel: Any, triangle: Any, down: Any, ahead: Any, soft: Any) -> Any:
+        """Whether the edge at which one leaves a triangle, from a pixel's centre towards a neighbour, is a crease.
+
+        Folds are none between coplanar triangles, nor where triangles are seen as a smooth surface (``soft``).
+        """
+        module = backend(pixel)
+        Float64, Bool = module.Float64, module.Bool
+        row_flat = pixel // self.width
+        image, row = by_image(row_flat, self.height, self.batch)
+        corners = gather_triangle(self.positions, self.topology.faces, triangle, image * self.vertex_count, True)
+        lines, det = edge_lines(corners)
+        size_x, size_y = self.width, self.height
+        x = (2 * Float64(pixel - row_flat * size_x) + (1 - size_x)) / size_x
+        y = (2 * Float64(row) + (1 - size_y)) / size_y
+        sign = dr.select((det < 0) == ahead, 1, -1)
+        nearest, edge = Float64(dr.inf), module.UInt32(0)
+        for k, (a, b, c) in enumerate(lines):
+            # Distances from the edge opposite to a corner, of any unit, and by how much they shrink on the way.
+            value, rate = dr.abs(dr.fma(a, x, dr.fma(b, y, c))), sign * dr.select(down, b / size_y, a / size_x)
+            distance = dr.select(rate > 0, value / rate, dr.inf)
+            edge = dr.select(distance < nearest, (k + 1) % 3, edge)
+            nearest = dr.minimum(nearest, distance)
+        found = dr.gather(Bool, self.creases, 3 * triangle + edge)
+        if self.folds is not None:
+            found &= ~(soft & dr.gather(Bool, self.folds.edges, 3 * triangle + edge))
+        return found

@@ -9,6 +9,7 @@ only if it is flat up to there; planes of a curved one cross where it is not.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -27,6 +28,8 @@ _LEAST_FOLD = 0.02
 # Faces beside two triangles may leave both their planes by this part of the bend between them; at twice that there is no crease.
 # On curved surfaces they leave them by more: with one facet in between, by about a half.
 _BENT = 0.05
+# Least barycentric coordinate of a point inside a triangle and not, but for rounding, on an edge that it shares.
+_INSIDE = 1e-4
 # Weight of a pair whose edge lies on the border between its pixels, which mixes nothing: what is 0 has no edge, nor derivatives.
 LEAST_WEIGHT = 1e-12
 # So many lanes take turns at the pairs that are listed; few, so that threads get equal parts of a short list, too.
@@ -176,13 +179,16 @@ class Meetings:
         upwards = (b * step_y) ** 2
         bent = dr.maximum(*(self._bent(*one, planes, along) for one in seen))
         flat = Float(dr.clip(2 - bent / (_BENT * dr.select(meet, dr.abs(change), 1)), 0, 1))
+        # Where both triangles have the point of the line inside, one passes through the other, whatever is beside them.
+        x, y = dr.select(down, x, x + t * step_x), dr.select(down, y + t * step_y, y)
+        at = [[Float(dr.fma(m, x, dr.fma(n, y, o))) for m, n, o in lines] for _, lines, _ in found]
+        inside = start < 0
+        for places in at:
+            inside &= functools.reduce(dr.minimum, places) > _INSIDE * sum(places)
+        flat = dr.select(inside, 1, flat)
         share = dr.clip(0.5 + (across - upwards) / dr.select(meet, across + upwards, 1), 0, 1)
         share = dr.select(meet, dr.select(down, 1 - share, share) * dr.select(folded, soft * flat, 1), 0)
-        x, y = dr.select(down, x, x + t * step_x), dr.select(down, y + t * step_y, y)
-        triangles = [
-            (vertices, [Float(v) for v in plane], [Float(dr.fma(m, x, dr.fma(n, y, o))) for m, n, o in lines])
-            for vertices, lines, plane in found
-        ]
+        triangles = [(vertices, [Float(v) for v in plane], at[k]) for k, (vertices, _, plane) in enumerate(found)]
         return Float(share) * beyond_middle(Float(t)), Float(-share * slope), triangles
 
     def _bent(self, triangle: Any, first: Any, corners: Any, planes: list[Any], along: Callable[[Any], Any]) -> Any:

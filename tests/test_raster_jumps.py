@@ -71,7 +71,11 @@ def test_colours_are_those_at_the_edge(variant: str, degrees: float) -> None:
 
 
 def test_noise_is_not_continued_far(variant: str) -> None:
-    """What colours do beyond the pixels changes no sign, and at most doubles a derivative; between facets of middle size nothing."""
+    """What colours do beyond the pixels changes no sign, and at most doubles a derivative; between facets of middle size
+    nothing.
+
+    Small ones (0) are shaded as a smooth surface, large ones (1) as they are.
+    """
     random = np.random.default_rng(0)
     values = [random.uniform(size=(SIZE, SIZE)) for _ in range(2)]
 
@@ -85,7 +89,6 @@ def test_noise_is_not_continued_far(variant: str) -> None:
     assert (continued != plain).sum() > 20
     pixels = SIZE * SIZE
     assert (change(True, dr.full(mi.Float, 0.99, pixels)) == change(False, dr.full(mi.Float, 0.99, pixels))).all()
-    # Small ones (0) are shaded as a smooth surface, large ones (1) as they are.
     for sharpness in (0, 1):
         alike = dr.full(mi.Float, sharpness, pixels)
         assert (change(True, alike) != change(False, alike)).sum() > 20

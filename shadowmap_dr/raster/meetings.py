@@ -4,7 +4,7 @@ Surfaces do so along lines where one passes through another, or stands on it: no
 what they see changes at once. So do flat faces of one surface between which there are others, too narrow for a pixel to see: the
 faces of a box are, seen from the side, if they consist of many triangles. The depths of both triangles are affine on the screen,
 so that the place between the pixels' centres where they are equal follows from six vertices. Within one surface that is true
-only if it is flat up to there; planes of a curved one cross where it is not.
+only if it is flat up to there, or cuts itself in both triangles; planes of a curved one cross where it is not.
 """
 
 from __future__ import annotations

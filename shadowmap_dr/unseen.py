@@ -9,7 +9,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from .traversal import fingerprint, is_attribute
+from .traversal import children, fingerprint, is_attribute
 
 
 class Unseen:
@@ -17,16 +17,17 @@ class Unseen:
 
     They are shapes of tensors (an ``envmap`` knows its own), Python's numbers and Mitsuba's scalar transformations (``to_uv`` of
     a bitmap, ``eta`` of a plastic, ``scale`` of a bump map), and arrays that Mitsuba 3.9 does not show to Dr.Jit: textures inside
-    of bump maps, attributes of meshes, and what a ``sunsky`` makes tables from.
+    of bump maps, attributes of meshes, and what a ``sunsky`` makes tables from. And that lobes of ``principled`` materials have
+    been switched on: Mitsuba leaves out those that are 0 when they are loaded until they are given another value.
 
     Args:
         nodes: Mitsuba's BSDFs, emitters, and shapes whose attributes are read. They are kept alive.
     """
 
     def __init__(self, nodes: Iterable[Any]) -> None:
-        self._held, self._sized = [], []
+        self._held, self._sized, self._off = [], [], []
         for node in {id(node): node for node in nodes}.values():
-            table = mi.traverse(node)
+            table, switched = mi.traverse(node), _has_switches(node)
             for key in table.keys():
                 with suppress(TypeError):  # raised for parameters without a value
                     value = table[key]
@@ -34,11 +35,35 @@ class Unseen:
                         self._held.append((table, key))
                     if dr.is_tensor_v(value):
                         self._sized.append((table, key))
+                    if switched and isinstance(value, mi.Float):
+                        self._off.append(_Off(table, key))
 
     def now(self) -> tuple[Any, ...]:
         """The values as they are: those of two calls are equal if nothing has changed in between."""
         shapes = (tuple(table[key].shape) for table, key in self._sized)
-        return (*(fingerprint(table[key]) for table, key in self._held), *shapes)
+        return (*(fingerprint(table[key]) for table, key in self._held), *shapes, *(value.still() for value in self._off))
+
+
+class _Off:
+    """Whether a parameter has been 0 all the time. Its value is read when there is a new one."""
+
+    def __init__(self, table: Any, key: str) -> None:
+        self._table, self._key, self._known, self._still = table, key, None, True
+
+    def still(self) -> bool:
+        if self._still:
+            value = self._table[self._key]
+            now = fingerprint(value)
+            if now != self._known:
+                self._known, self._still = now, bool(dr.all(dr.detach(value) == 0))
+        return self._still
+
+
+def _has_switches(node: Any) -> bool:
+    """Whether a BSDF is, or holds, one with lobes that Mitsuba switches on when their parameters are changed."""
+    if not isinstance(node, mi.BSDF):
+        return False
+    return node.class_name().startswith("Principled") or any(_has_switches(child) for _, child in children(node))
 
 
 def _is_seen(node: Any, key: str, value: Any) -> bool:

@@ -170,6 +170,38 @@ def test_materials_may_change_and_have_gradients(variant: str) -> None:
     assert_same(*(step(scene, integrator, texture, new) for integrator in (plain, recorded)))
 
 
+@pytest.mark.parametrize("case", ["principled metallic", "principled clearcoat", "principledthin diff_trans"])
+def test_lobes_that_are_switched_on(variant: str, case: str) -> None:
+    """Mitsuba leaves out lobes of materials whose parameters are 0, which Dr.Jit does not see, until these are changed."""
+    kind, lobe = case.split()
+    scene = small_scene()
+    ball = next(shape for shape in scene.shapes() if shape.id() == "ball")
+    ball.set_bsdf(mi.load_dict({"type": "twosided", "bsdf": {"type": kind}} if kind == "principled" else {"type": kind}))
+    params = mi.traverse(scene)
+    value = next(key for key in params.keys() if key.endswith(f"{lobe}.value"))
+    plain, recorded = both()
+    vertices = mi.Float(dr.detach(params[VERTICES]))
+
+    def compare() -> np.ndarray:
+        expected, found = (step(scene, integrator, VERTICES, vertices) for integrator in (plain, recorded))
+        assert_same(expected, found)
+        return found[0]
+
+    for height in (0.0, 0.1, 0.2):
+        vertices = vertices + mi.Float(height * np.tile([0, 0, 1], dr.width(vertices) // 3))
+        before = compare()
+    count = recordings(recorded)
+    params[value] = 0.8
+    params.update()
+    assert np.abs(compare() - before).max() > 0.01
+    # And no more often than that.
+    made = recordings(recorded)
+    params[value] = 0.6
+    params.update()
+    compare()
+    assert made <= count + 2 and recordings(recorded) <= made
+
+
 def test_other_sizes_are_recorded_anew(variant: str) -> None:
     plain, recorded = both()
     scene = small_scene()

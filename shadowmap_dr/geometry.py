@@ -188,6 +188,10 @@ class Geometry:
         TensorXf or NumPy array (Vs, 3), or Point3f/Vector3f (Vs,). Gradients flow through. Normals of shapes that have them
         are computed anew with Mitsuba's angle weighting (``vertex_normals``), attached. Sizes must be those of the scene.
         """
+        if not isinstance(positions, Mapping):
+            raise ShadowmapError(f"vertex_positions is a {type(positions).__name__}: give a dictionary of the shapes' names.")
+        if not positions:
+            return self
         changed = self.changed
         if changed is None and not dr.grad_enabled(self.positions, self.normals):
             changed = ()

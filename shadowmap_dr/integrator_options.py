@@ -28,7 +28,7 @@ class Options:
     shadow_filter_size     odd number of texels
     shadow_antialias       anti-alias shadow maps; without it casters get no gradient from the outlines of their shadows
     shadow_bleeding        visibilities below this count as 0, against light that bleeds through (``vsm``, ``evsm``, ``msm``)
-    shadow_order           terms of the Fourier series of ``csm``, 2 to 16
+    shadow_order           terms of the Fourier series of ``csm``, an even number from 2 to 16
     shadow_supersampling   texels along each side that are averaged into one of the map, 1 to 8 (pre-filtered methods)
     shadow_receiver_range  tell depths apart only from the first receiver on, against light that bleeds through
     shadow_cull_backfaces  leave the backs of closed shapes out of the maps of directional lights: faster, and the same as long as

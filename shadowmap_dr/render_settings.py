@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from numbers import Integral
 
 from .aovs import AOVS
 from .errors import ShadowmapError
@@ -49,6 +50,9 @@ class RenderSettings:
         for name in self.aovs:
             if name not in AOVS:
                 raise ShadowmapError(f"There is no AOV '{name}': choose from {', '.join(AOVS)}.")
+        for name in ("shadow_samples", "emitter_samples", "environment_samples"):
+            if not isinstance(getattr(self, name), Integral):
+                raise ShadowmapError(f"{name} is {getattr(self, name)!r}: give an integer.")
         if not 0 <= self.shadow_samples <= 8:
             raise ShadowmapError(f"shadow_samples is {self.shadow_samples}: choose 0 (automatic) to 8.")
         for name in ("emitter_samples", "environment_samples"):

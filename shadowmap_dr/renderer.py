@@ -199,13 +199,12 @@ class Renderer:
             Colour and alpha have passed through the film's reconstruction filter.
             Attached to vertices, lights, cameras, and the BSDFs and textures of the scene.
         """
-        geometry = self.data.geometry
-        if vertex_positions:
+        cameras, geometry = self.data.cameras(sensor), self.data.geometry
+        if vertex_positions is not None:
             geometry = geometry.with_positions(vertex_positions)
         geometry = geometry.in_packets()
         # Before all else that is attached: derivatives are taken in the reverse order, and pixels should need one pass only.
         facets = self._facets(geometry)
-        cameras = self._sensors(sensor)
         windows = sample_windows(cameras)
         factor = sample_grid(spp, windows)
         margin = Margin.of(cameras, factor) if self.settings.antialias else Margin()
@@ -241,15 +240,6 @@ class Renderer:
             if type(old) is not type(new):
                 raise ShadowmapError(f"Light '{name}' is a {type(old).__name__}, not a {type(new).__name__}.")
         return tuple((replacements or {}).get(light.name, light) for light in lights)
-
-    def _sensors(self, sensor: int | Sensor) -> tuple[Sensor, ...]:
-        if isinstance(sensor, Sensor):
-            return (sensor,)
-        if not isinstance(sensor, int):
-            raise ShadowmapError(f"the sensor is a {type(sensor).__name__}: give its number in the scene, or a Sensor record.")
-        if not 0 <= sensor < len(self.data.sensors):
-            raise ShadowmapError(f"There is no sensor {sensor}: the scene has {len(self.data.sensors)}, counted from 0.")
-        return self.data.sensors[sensor]
 
     def _lighting(
         self, views: list[_View], geometry: Geometry, topology: Topology, replacements: Mapping[str, Any] | None
@@ -329,7 +319,7 @@ class Renderer:
             ShadowmapError: there is no such sensor, or it has several cameras, or a reconstruction filter that is not a box.
         """
         with dr.suspend_grad():
-            windows = sample_windows(self._sensors(sensor))
+            windows = sample_windows(self.data.cameras(sensor))
             if len(windows) != 1 or not windows[0].filter.is_box:
                 raise ShadowmapError(f"sensor {sensor} is no single camera whose film has a box filter: use another one.")
             geometry = self.data.geometry.in_packets()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from numbers import Integral
 from typing import Any
 
 import drjit as dr
@@ -37,6 +38,7 @@ class SceneData:
     areas         area lights
     environments  constant, envmap and sunsky emitters (at most one)
     shape_ptr, bsdf_ptr   mi.ShapePtr, mi.BSDFPtr (S,), by the index that ``geometry.face_shape`` holds
+    variant       of Mitsuba, to which all of them belong
     needs_frames  whether any BSDF asks for more than the cosines of directions: tangents, texture coordinates
     """
 
@@ -49,7 +51,24 @@ class SceneData:
     shape_ptr: Any
     bsdf_ptr: Any
     sources: tuple[ShapeSource, ...]
+    variant: str
     needs_frames: bool = True
+
+    def cameras(self, sensor: int | Sensor) -> tuple[Sensor, ...]:
+        """Those of the scene's sensor of that number, or the one that is given.
+
+        Raises:
+            ShadowmapError: there is no such sensor; the variant is not the scene's.
+        """
+        if mi.variant() != self.variant:
+            raise ShadowmapError(f"The variant is {mi.variant()}, but this renderer was made for {self.variant}: set that one.")
+        if isinstance(sensor, Sensor):
+            return (sensor,)
+        if not isinstance(sensor, Integral):
+            raise ShadowmapError(f"the sensor is a {type(sensor).__name__}: give its number in the scene, or a Sensor record.")
+        if not 0 <= sensor < len(self.sensors):
+            raise ShadowmapError(f"There is no sensor {sensor}: the scene has {len(self.sensors)}, counted from 0.")
+        return self.sensors[sensor]
 
     def light(self, name: str) -> Light | AreaLight:
         """The light called ``name``; raises ``ShadowmapError`` listing the known names otherwise."""
@@ -94,7 +113,7 @@ def load(scene: Any, *, tessellation: int = 64, warn: bool = True) -> SceneData:
     if not isinstance(scene, mi.Scene):
         given = repr(scene) if isinstance(scene, str) else f"a {type(scene).__name__}"
         raise ShadowmapError(f"{given} is no mi.Scene of the variant {mi.variant()}: load it with mi.load_file or mi.load_dict.")
-    if not isinstance(tessellation, int) or tessellation < 3:
+    if not isinstance(tessellation, Integral) or tessellation < 3:
         raise ShadowmapError(f"tessellation is {tessellation!r}, but must be an integer of at least 3.")
     infos, sources, faces, unsupported = [], [], [], []
     for name, shape, instance in _shapes_of(scene):
@@ -138,6 +157,7 @@ def load(scene: Any, *, tessellation: int = 64, warn: bool = True) -> SceneData:
         shape_ptr=dr.concat([mi.ShapePtr(source.shape) for source in sources]),
         bsdf_ptr=dr.concat([mi.BSDFPtr(source.shape.bsdf()) for source in sources]),
         sources=tuple(sources),
+        variant=mi.variant(),
         needs_frames=not all(is_plain(source.shape.bsdf()) for source in sources),
     )
     data = refresh(data)

@@ -410,6 +410,25 @@ def test_unknown_names(renderer: Renderer) -> None:
         renderer.render(sensor=-1)
 
 
+def test_numbers_of_numpy_are_numbers(renderer: Renderer) -> None:
+    assert np.array_equal(renderer.render(sensor=np.int64(0)).numpy(), renderer.render().numpy())
+    assert Renderer.from_scene(renderer.data.scene, tessellation=np.int64(16)).data.geometry.face_count
+
+
+def test_inputs_of_the_wrong_kind(renderer: Renderer) -> None:
+    with pytest.raises(ShadowmapError, match="vertex_positions is a Point3f: give a dictionary"):
+        renderer.render(rest(renderer))
+    with pytest.raises(ShadowmapError, match="There is no sensor -1"):
+        renderer.render(sensor=np.int64(-1))
+    before = mi.variant()
+    mi.set_variant(before.replace("rgb", "mono"))
+    try:
+        with pytest.raises(ShadowmapError, match="The variant is .*_ad_mono, but this renderer was made for .*_ad_rgb: set that"):
+            renderer.render()
+    finally:
+        mi.set_variant(before)
+
+
 def test_scenes_and_settings_that_are_none(variant: str) -> None:
     with pytest.raises(ShadowmapError, match="'scene.xml' is no mi.Scene of the variant .*: load it"):
         Renderer.from_scene("scene.xml")
@@ -463,6 +482,8 @@ def test_wrong_kinds_and_sizes(renderer: Renderer) -> None:
         ({"shadow_filter_size": 8}, "8"),
         ({"shadow_filter_size": 9, "shadow_map_resolution": 8}, "too large for maps of 8 texels"),
         ({"shadow_samples": 9}, "shadow_samples is 9"),
+        ({"shadow_samples": 1.5}, "shadow_samples is 1.5: give an integer"),
+        ({"emitter_samples": "4"}, "emitter_samples is '4': give an integer"),
         ({"ambient": float("nan")}, "ambient is nan"),
         ({"aovs": ("albedo",)}, "no AOV 'albedo'"),
         ({"tessellation": 1}, "tessellation is 1"),

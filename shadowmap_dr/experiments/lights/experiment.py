@@ -47,7 +47,7 @@ class LightOptions(LightSetting):
             if not values:
                 raise ShadowmapError(f"no {name} given: name at least one.")
             if len(set(values)) != len(values):
-                raise ShadowmapError(f"a {name} is given twice in {', '.join(map(str, values))}: name each once.")
+                raise ShadowmapError(f"one {name} is given twice in {', '.join(map(str, values))}: name each once.")
         if self.memory < 1:
             raise ShadowmapError(f"{self.memory} bytes of memory: give at least 1.")
         check_threads(self.threads)

@@ -73,7 +73,7 @@ class MapsOptions:
                 raise ShadowmapError(f"no {kind} given: name at least one.")
             for name in names:
                 if name not in known:
-                    raise ShadowmapError(f"no {kind} {name!r}: choose from {', '.join(known)}.")
+                    raise ShadowmapError(f"no {kind} {name!r}: choose from {', '.join(map(repr, known))}.")
         if self.resolution < 8 or self.reference_spp < 1 or self.rounds < 1 or self.pose_runs < 0:
             raise ShadowmapError("resolution, samples, rounds and runs must be at least 8, 1, 1 and 0.")
         try:

@@ -55,7 +55,7 @@ class PoseOptions:
             if not values:
                 raise ShadowmapError(f"no {name} given: name at least one.")
             if len(set(values)) != len(values):
-                raise ShadowmapError(f"a {name} is given twice in {', '.join(map(str, values))}: name each once.")
+                raise ShadowmapError(f"one {name} is given twice in {', '.join(map(str, values))}: name each once.")
         for method in self.methods:
             if method not in METHODS:
                 raise ShadowmapError(f"no method {method!r}: choose from {', '.join(METHODS)}.")

@@ -85,7 +85,7 @@ def test_unusable_outputs(tmp_path: Path) -> None:
         with pytest.raises(OutputError):
             io.check_output(path)
     (tmp_path / "file").touch()
-    with pytest.raises(OutputError):
+    with pytest.raises(OutputError, match=f"{tmp_path / 'file'} is a file"):
         io.check_output(tmp_path / "file" / "a.exr")
     with pytest.raises(OutputError):
         io.write_image(tmp_path / "a.tiff", np.zeros((2, 2, 3)))

@@ -13,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+import trimesh
 from integrator_scenes import camera, shadowmap
 
 SIZE = 64
@@ -182,3 +183,24 @@ def test_triangles_of_a_plane_do_not_matter(variant: str) -> None:
         found.append(derivative(mi.load_dict({"type": "scene", **parts}), change=grown))
     cosine, scale = agreement(found[1], found[0])
     assert cosine > 0.999 and abs(scale - 1) < 0.005, (cosine, scale)
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_a_curved_sheet_that_cuts_itself(variant: str, smooth: bool) -> None:
+    """A loop. Its last third moves, and with it the line of the cut, beside which no pixel may see neighbouring triangles."""
+    columns, rows = 60, 8
+    t, y = np.meshgrid(np.linspace(-1, 1, columns + 1), np.linspace(-0.5, 0.5, rows + 1))
+    vertices = np.stack([1.9 * (t**3 - 0.6 * t), y, 1.2 * t**2 - 0.5], -1).reshape(-1, 3)
+    corner = np.add.outer((columns + 1) * np.arange(rows), np.arange(columns)).ravel()[:, None]
+    faces = np.r_[corner + [0, 1, columns + 2], corner + [0, columns + 2, columns + 1]]
+    normals = trimesh.Trimesh(vertices, faces, process=False).vertex_normals if smooth else None
+    surface = mesh(vertices, faces, normals, twosided=True)
+    scene = scene_of(surface, (0.6, 0.5, -1), looking(0.3, -2.6, 2.2))
+    end = mi.Float(np.clip(3 * t - 1, 0, 1).astype(np.float32).ravel())
+
+    def slide(points: Any, x: Any) -> Any:
+        return sideways(points, x * end)
+
+    wanted, found = derivative(scene, change=slide, difference=True), derivative(scene, 16, change=slide)
+    cosine, scale = agreement(found, wanted)
+    assert cosine > 0.99 and abs(scale - 1) < 0.03, (cosine, scale)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 
 from ._types import NO_TRIANGLE, RasterOutput, backend, by_image, zeros
-from .creases import Folds, find_creases
+from .creases import Folds, find_creases, touching
 from .meetings import LEAST_WEIGHT, Meetings, beyond_middle
 from .pairs import PairList, differing_pairs, empty_list
 from .silhouette import BEFORE, register_silhouettes
@@ -162,7 +163,8 @@ def _measure(
         if meetings is not None:
             bare = (a == NO_VERTEX) | (silhouette & (key < BEFORE))
             here, there = (dr.gather(UInt32, raster.triangle, p, bare) for p in (pixel, pixel + step))
-            meetings.add(slot, dr.select(bare, here, NO_TRIANGLE), there, soft)
+            cross = functools.partial(_cut, topology, raster, image, pixel, here, there, down)
+            meetings.add(slot, dr.select(bare, here, NO_TRIANGLE), there, soft, cross)
         first = image * vertex_count
         a, b, c, d = (dr.select(end == NO_VERTEX, NO_VERTEX, end + first) for end in (a, b, c, d))
         value, slopes = _weight(positions, a, b, raster, row, column, down, weight)
@@ -194,6 +196,24 @@ def _measure(
     return found
 
 
+def _cut(
+    topology: Topology, raster: RasterOutput, image: Any, pixel: Any, here: Any, there: Any, down: Any, active: Any
+) -> Any:
+    """Whether triangles without a common corner, seen by pixels and their neighbours, may cut each other between these.
+
+    Their planes cross there, and each triangle is seen where it is the nearer one.
+    """
+    Float = backend(raster.depth).Float
+    active &= ~touching(topology, here, there)
+    planes = (raster.depth_plane(image, triangle, active) for triangle in (here, there))
+    a, b, c = (u - v for u, v in zip(*planes, strict=True))
+    row_flat = pixel // raster.width
+    x = Float(pixel - row_flat * raster.width) + (0.5 - 0.5 * raster.width)
+    y = Float(row_flat - image * raster.height) + (0.5 - 0.5 * raster.height)
+    start = dr.fma(a, x, dr.fma(b, y, c))
+    return active & (start < 0) & (start + dr.select(down, b, a) > 0)
+
+
 def _meet(found: Crossings, meetings: Meetings, raster: RasterOutput) -> None:
     """Write the weights of pairs whose triangles meet other than in an edge, which then takes the place of one that touches."""
     UInt32, Array4u = (getattr(backend(found.ends), name) for name in ("UInt32", "Array4u"))
@@ -202,7 +222,7 @@ def _meet(found: Crossings, meetings: Meetings, raster: RasterOutput) -> None:
         pair = found.pairs.at(slot)
         down, pixel = (pair & 1) != 0, pair >> 1
         value = meetings.weight(pixel, down)
-        met = meetings.possible(pixel, dr.select(down, UInt32(raster.width), 1)) & (value != 0)
+        met = value != 0
         dr.scatter(found.ends, Array4u(NO_VERTEX), slot, met)
         dr.scatter(found.right, value, pixel, met & ~down)
         dr.scatter(found.down, value, pixel, met & down)

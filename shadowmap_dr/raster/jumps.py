@@ -7,6 +7,8 @@ of pixels that are mixed do not depend on it, but the derivatives of what is mix
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -86,8 +88,7 @@ class Surroundings:
         for near, values, sign in ((taker, own, -1), (giver, other, 1)):
             ahead = forward if sign > 0 else ~forward
             far = dr.select(ahead, near + step, near - step)
-            steady, smooth = self._steady(near, far, down, ahead, self._inside(near, down, ahead, active))
-            steady |= smooth & ~crossed(dr.select(ahead, near, far), down, smooth)
+            steady = self._steady(crossed, near, far, down, ahead, self._inside(near, down, ahead, active))
             slopes.append([dr.select(steady, sign * (f - v), 0) for f, v in zip(read(far, steady), values, strict=True)])
         result = []
         for o, v, slope, other_slope in zip(own, other, *slopes, strict=True):
@@ -104,11 +105,12 @@ class Surroundings:
         last = dr.select(down, UInt32(self.height), self.width) - 1
         return dr.select(ahead, at < last, at > 0) & active
 
-    def _steady(self, near: Any, far: Any, down: Any, ahead: Any, inside: Any) -> tuple[Any, Any]:
-        """Whether pixels and their neighbours see the same triangle, and whether they see others of a smooth surface.
+    def _steady(
+        self, crossed: Callable[[Any, Any, Any], Any], near: Any, far: Any, down: Any, ahead: Any, inside: Any
+    ) -> Any:
+        """Whether pixels and their neighbours see the same triangle, or others of a smooth surface.
 
-        These may still have an edge in between. That no edge crosses the way to the neighbour would not be enough by itself:
-        edges along it do not count there.
+        That no edge crosses the way to the neighbour would not be enough by itself: edges along it do not count there.
         """
         module = backend(near)
         here, there = (dr.gather(module.UInt32, self.triangle, pixel, inside) for pixel in (near, far))
@@ -120,24 +122,40 @@ class Surroundings:
             same &= (sharp == 1) | soft
         part, other = (dr.gather(module.UInt32, self.topology.parts, triangle, smooth) for triangle in (here, there))
         smooth &= part == other
+        smooth &= ~crossed(dr.select(ahead, near, far), down, smooth)
         if self.creases is None:
-            return same, smooth
+            return same | smooth
 
         def unbroken(near: Any, far: Any, down: Any, ahead: Any, here: Any, there: Any, soft: Any) -> Any:
             if self.folds is not None:
                 soft |= touching(self.topology, here, there) & self.folds.flat(here, there)
-            return ~self._leaves(near, here, down, ahead, soft) & ~self._leaves(far, there, down, ~ahead, soft)
+            jumps = [[self._jump(3 * triangle + k, soft) for k in range(3)] for triangle in (here, there)]
+            none = ~functools.reduce(operator.or_, jumps[0] + jumps[1])
+            open_ = ~(jumps[0][0] & jumps[0][1] & jumps[0][2]) & ~(jumps[1][0] & jumps[1][1] & jumps[1][2])
+
+            def on_the_way(near: Any, far: Any, down: Any, ahead: Any, here: Any, there: Any, soft: Any, none: Any) -> Any:
+                return ~self._leaves(near, here, down, ahead, soft) & ~self._leaves(far, there, down, ~ahead, soft)
+
+            # Few triangles have creases at some of their edges and not at others.
+            lanes = near, far, down, ahead, here, there, soft, none
+            return dr.if_stmt(lanes, open_ & ~none, on_the_way, lambda *lanes: lanes[-1], mode="symbolic", label="rims")
 
         lanes = near, far, down, ahead, here, there, soft
-        return same, dr.if_stmt(lanes, smooth, unbroken, lambda *_: module.Bool(False), mode="symbolic", label="smooth")
+        return same | dr.if_stmt(lanes, smooth, unbroken, lambda *_: module.Bool(False), mode="symbolic", label="smooth")
+
+    def _jump(self, edge: Any, soft: Any) -> Any:
+        """Whether an edge is a crease. Folds are none where they are ``soft``."""
+        Bool = backend(edge).Bool
+        found = dr.gather(Bool, self.creases, edge)
+        return found if self.folds is None else found & ~(soft & dr.gather(Bool, self.folds.edges, edge))
 
     def _leaves(self, pixel: Any, triangle: Any, down: Any, ahead: Any, soft: Any) -> Any:
         """Whether the edge at which one leaves a triangle, from a pixel's centre towards a neighbour, is a crease.
 
-        Folds are none between coplanar triangles, nor where triangles are seen as a smooth surface (``soft``).
+        Folds are none (``soft``) between coplanar triangles, and where triangles are seen as a smooth surface.
         """
         module = backend(pixel)
-        Float64, Bool = module.Float64, module.Bool
+        Float64 = module.Float64
         row_flat = pixel // self.width
         image, row = by_image(row_flat, self.height, self.batch)
         corners = gather_triangle(self.positions, self.topology.faces, triangle, image * self.vertex_count, True)
@@ -153,7 +171,4 @@ class Surroundings:
             distance = dr.select(rate > 0, value / rate, dr.inf)
             edge = dr.select(distance < nearest, (k + 1) % 3, edge)
             nearest = dr.minimum(nearest, distance)
-        found = dr.gather(Bool, self.creases, 3 * triangle + edge)
-        if self.folds is not None:
-            found &= ~(soft & dr.gather(Bool, self.folds.edges, 3 * triangle + edge))
-        return found
+        return self._jump(3 * triangle + edge, soft)

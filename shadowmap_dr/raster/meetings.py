@@ -4,12 +4,13 @@ Surfaces do so along lines where one passes through another, or stands on it: no
 what they see changes at once. So do flat faces of one surface between which there are others, too narrow for a pixel to see: the
 faces of a box are, seen from the side, if they consist of many triangles. The depths of both triangles are affine on the screen,
 so that the place between the pixels' centres where they are equal follows from six vertices. Within one surface that is true
-only if it is flat up to there, or cuts itself in both triangles; planes of a curved one cross where it is not.
+only if it is flat up to there, or cuts itself in both triangles; planes of a curved one cross where it is not, too.
 """
 
 from __future__ import annotations
 
 import functools
+import operator
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -84,40 +85,27 @@ class Meetings:
         found = dr.empty(UInt32, 2 * dr.width(raster.triangle)), dr.zeros(UInt32, 1)
         return cls(dr.detach(positions), *surfaces, *size, unconnected, creases, crease_weights, *found)
 
-    def add(self, slot: Any, here: Any, there: Any, soft: Any) -> None:
+    def add(self, slot: Any, here: Any, there: Any, soft: Any, cross: Callable[[Any], Any]) -> None:
         """List a pair if what it sees may meet. To be traced only once.
 
         Args:
             slot: of the pair.
             here, there: triangles that it sees, or none, also if the pair has an edge.
             soft: how much creases count there (``Float``).
+            cross: ``cross(active)``, whether their planes do in between, as those of a surface that cuts itself there.
         """
         UInt32 = backend(slot).UInt32
         both = (here != NO_TRIANGLE) & (there != NO_TRIANGLE)
         apart = dr.gather(UInt32, self.parts, here, both) != dr.gather(UInt32, self.parts, there, both)
         folded = (soft > 0) & (self.creases is not None)
         listed = both & dr.select(apart, self.unconnected, folded)
+        if self.unconnected:
+            listed |= cross(both & ~listed)
         dr.scatter(self.slots, slot, dr.scatter_inc(self.count, UInt32(0), listed), listed)
 
     def for_each(self, visit: Callable[[Any], None]) -> None:
         """Call ``visit(slot)``, which writes somewhere, for all pairs that were listed: few, and dear to visit."""
         each_number(self.count, _LANES, lambda k: visit(dr.gather(type(k), self.slots, k)))
-
-    def possible(self, pixel: Any, step: Any) -> Any:
-        """Whether the triangles that pixels and those ``step`` further on see belong to different surfaces, or are flat.
-
-        Smooth surfaces are spared: they have no ridges, and one seldom passes through itself.
-        """
-        UInt32, Bool = type(pixel), backend(pixel).Bool
-        here, there = (dr.gather(UInt32, self.triangle, p) for p in (pixel, pixel + step))
-        apart = dr.gather(UInt32, self.parts, here) != dr.gather(UInt32, self.parts, there)
-        if self.creases is None:
-            return apart
-        flat = ~apart
-        for triangle in (here, there):
-            for k in range(3):
-                flat &= dr.gather(Bool, self.creases, 3 * triangle + k, flat)
-        return apart | flat
 
     def weight(self, pixel: Any, down: Any) -> Any:
         """Signed weight (see :class:`Crossings`) of pairs of pixels that see triangles, 0 where these do not meet in between."""
@@ -146,12 +134,16 @@ class Meetings:
         x, y = (2 * Float64(column) + (1 - self.width)) / self.width, (2 * Float64(row) + (1 - self.height)) / self.height
         step_x, step_y = 2 / self.width, 2 / self.height
         step = dr.select(down, UInt32(self.width), 1)
-        found, seen, parts, soft = [], [], [], Float(1)
+        found, seen, parts = [], [], []
+        # How much ridges and valleys count: smooth surfaces have none.
+        soft = Float(0 if self.creases is None else 1)
         for p in (pixel, pixel + step):
             triangle = dr.gather(UInt32, self.triangle, p)
             parts.append(dr.gather(UInt32, self.parts, triangle))
-            if self.crease_weights is not None:
-                soft = dr.minimum(soft, dr.gather(Float, self.crease_weights, p))
+            if self.creases is not None:
+                weight = 1 if self.crease_weights is None else dr.gather(Float, self.crease_weights, p)
+                flat = functools.reduce(operator.and_, (dr.gather(module.Bool, self.creases, 3 * triangle + k) for k in range(3)))
+                soft = dr.minimum(soft, dr.select(flat, weight, 0))
             corners = gather_triangle(self.positions, self.faces, triangle, first, True)
             lines, plane = _plane(corners)
             i = dr.gather(module.Array3u, self.faces, triangle)
@@ -178,16 +170,16 @@ class Meetings:
         across = (a * step_x) ** 2
         upwards = (b * step_y) ** 2
         bent = dr.maximum(*(self._bent(*one, planes, along) for one in seen))
-        flat = Float(dr.clip(2 - bent / (_BENT * dr.select(meet, dr.abs(change), 1)), 0, 1))
+        soft *= Float(dr.clip(2 - bent / (_BENT * dr.select(meet, dr.abs(change), 1)), 0, 1))
         # Where both triangles have the point of the line inside, one passes through the other, whatever is beside them.
         x, y = dr.select(down, x, x + t * step_x), dr.select(down, y + t * step_y, y)
         at = [[Float(dr.fma(m, x, dr.fma(n, y, o))) for m, n, o in lines] for _, lines, _ in found]
         inside = start < 0
         for places in at:
             inside &= functools.reduce(dr.minimum, places) > _INSIDE * sum(places)
-        flat = dr.select(inside, 1, flat)
+        soft = dr.select(inside, 1, soft)
         share = dr.clip(0.5 + (across - upwards) / dr.select(meet, across + upwards, 1), 0, 1)
-        share = dr.select(meet, dr.select(down, 1 - share, share) * dr.select(folded, soft * flat, 1), 0)
+        share = dr.select(meet, dr.select(down, 1 - share, share) * dr.select(folded, soft, 1), 0)
         triangles = [(vertices, [Float(v) for v in plane], at[k]) for k, (vertices, _, plane) in enumerate(found)]
         return Float(share) * beyond_middle(Float(t)), Float(-share * slope), triangles
 

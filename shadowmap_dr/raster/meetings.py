@@ -48,7 +48,7 @@ class Meetings:
         triangle: what each pixel sees.
         batch: number of images.
         height, width, vertex_count: of an image.
-        unconnected: whether faces of different parts may meet.
+        unconnected: whether faces of different parts may meet, and those of one cut each other.
         creases, crease_weights: see :func:`shadowmap_dr.raster.crossings.find_crossings`. Without, faces of one part do not meet.
         slots, count: ``UInt32``, pairs without an edge that may meet, as slots in the list of all pairs, and how many there are.
     """

@@ -138,7 +138,10 @@ def calibrate(
         if residual <= uniformity:
             return replace(proxy, irradiance_residual=residual, image_residual=_image_residual(scene, proxy, light))
         distance *= 2
-    raise ShadowmapError(f"the light on {receiver!r} is uniform only to {residual:.2%}: it may not face {light!r}.")
+    raise ShadowmapError(
+        f"the light on {receiver!r} is uniform only to {residual:.2%}: it may not face {light!r}, or pixels ({pixel_size:.2g} "
+        "wide) are so large that the light that may blur shadows by half of one is too large: choose a larger image."
+    )
 
 
 def with_proxy(scene: mi.Scene, proxy: Proxy, light: str = "light", *, only: tuple[str, ...] | None = None) -> mi.Scene:

@@ -16,6 +16,7 @@ import mitsuba as mi
 
 from .beams import Beam, Outlined, Projector, beam_of, picture, projector_of, share_inside, towards
 from .environments import ENVIRONMENTS, SUNSKY, Environment, SunSky, environment_of
+from .errors import ShadowmapError
 from .shadow.camera import unit
 from .traversal import children, parameters, varies
 
@@ -24,11 +25,18 @@ _DEGREE = math.pi / 180.0
 
 @dataclass(frozen=True)
 class DirectionalLight:
-    """Parallel light. ``direction``: Vector3f, in which light travels, world space, any length; ``irradiance``: colour."""
+    """Parallel light. ``direction``: Vector3f, in which light travels, world space, any length but 0; ``irradiance``: colour."""
 
     name: str
     direction: Any
     irradiance: Any
+
+    def __post_init__(self) -> None:
+        nowhere = dr.all(mi.Vector3f(self.direction) == 0)
+        # A direction that is the result of a computation is not waited for.
+        given = not dr.is_jit_v(self.direction) or nowhere.state == dr.VarState.Literal
+        if given and nowhere[0]:
+            raise ShadowmapError(f"light '{self.name}' has the direction (0, 0, 0): give one in which its light travels.")
 
     def illuminate(self, p_world: Any, active: Any = True) -> tuple[Any, Any]:
         """(wo, weight): unit direction to the light (Vector3f) and its irradiance on a surface that faces it."""

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from shadowmap_dr.beams import Projector
-from shadowmap_dr.lights import area_lights_of, environments_of, lights_of, objection
+from shadowmap_dr.errors import ShadowmapError
+from shadowmap_dr.lights import DirectionalLight, area_lights_of, environments_of, lights_of, objection
 from shadowmap_dr.scene import load
 from shadowmap_dr.traversal import children
 
@@ -219,3 +220,10 @@ def test_attributes_of_meshes_do_not_shine(variant: str) -> None:
     assert area_lights_of(scene, scene.shapes()) == ()
     with pytest.warns(UserWarning, match="AreaLight. has a mesh_attribute for its radiance"):
         load(scene)
+
+
+@pytest.mark.parametrize("kind", [list, np.array, lambda v: mi.ScalarVector3f(v), lambda v: mi.Vector3f(v)])
+def test_parallel_light_needs_a_direction(kind: Any) -> None:
+    with pytest.raises(ShadowmapError, match=r"'sun' has the direction \(0, 0, 0\)"):
+        DirectionalLight("sun", kind([0.0, 0.0, 0.0]), mi.Color3f(1))
+    DirectionalLight("sun", kind([0.0, 0.0, -1.0]), mi.Color3f(1))

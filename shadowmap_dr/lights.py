@@ -32,10 +32,13 @@ class DirectionalLight:
     irradiance: Any
 
     def __post_init__(self) -> None:
-        nowhere = dr.all(mi.Vector3f(self.direction) == 0)
-        # A direction that is the result of a computation is not waited for.
-        given = not dr.is_jit_v(self.direction) or nowhere.state == dr.VarState.Literal
-        if given and nowhere[0]:
+        # Numbers are looked at on the spot; an array is not waited for, unless it is a constant.
+        if dr.is_jit_v(self.direction):
+            nowhere = dr.all(self.direction == 0)
+            zero = nowhere.state == dr.VarState.Literal and nowhere[0]
+        else:
+            zero = not any(self.direction)
+        if zero:
             raise ShadowmapError(f"light '{self.name}' has the direction (0, 0, 0): give one in which its light travels.")
 
     def illuminate(self, p_world: Any, active: Any = True) -> tuple[Any, Any]:

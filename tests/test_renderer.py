@@ -11,56 +11,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-import trimesh
+from renderer_scenes import OPTIONS, SIZE, ball, build, camera, renderer_of, rest
 
-from shadowmap_dr import Renderer, RenderSettings, ShadowmapError
-
-SIZE = 48
-# No hidden dependence of the number of look-ups on the size of the image.
-OPTIONS = {"shadow_map_resolution": 64, "shadow_filter_size": 5, "shadow_samples": 1}
-
-
-def ball(name: str, center: list[float], radius: float = 0.5, smooth: bool = True) -> Any:
-    """A ``mi.Mesh`` of a sphere."""
-    sphere = trimesh.creation.icosphere(subdivisions=2, radius=radius)
-    mesh = mi.Mesh(name, len(sphere.vertices), len(sphere.faces), has_vertex_normals=smooth)
-    params = mi.traverse(mesh)
-    params["vertex_positions"] = (np.asarray(sphere.vertices) + center).astype(np.float32).ravel()
-    params["faces"] = np.asarray(sphere.faces).astype(np.uint32).ravel()
-    params.update()
-    # Mitsuba sums face normals in any order: those of two equal balls may differ in the last bit, and so would their pictures.
-    if smooth:
-        params["vertex_normals"] = np.asarray(sphere.vertices / radius).astype(np.float32).ravel()
-        params.update()
-    return mesh
-
-
-def camera(width: int = SIZE, height: int = SIZE, **changes: Any) -> dict[str, Any]:
-    film = {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
-    to_world = mi.ScalarTransform4f().look_at([2, -3, 4], [0, 0, 0], [0, 0, 1])
-    return {"type": "perspective", "fov": 45, "to_world": to_world, "film": film, **changes}
-
-
-def build(**changes: Any) -> Any:
-    """A ball over a floor in the light of the sun and a lamp."""
-    parts = {
-        "type": "scene",
-        "ball": ball("ball", [0, 0, 0.9]),
-        "floor": {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(3)},
-        "camera": camera(),
-        "sun": {"type": "directional", "direction": [0.4, 0.3, -1], "irradiance": {"type": "rgb", "value": 2.0}},
-        "lamp": {"type": "point", "position": [1.5, 0, 2.5], "intensity": {"type": "rgb", "value": [4.0, 3.0, 2.0]}},
-        **changes,
-    }
-    return mi.load_dict({k: v for k, v in parts.items() if v is not None}, optimize=False)
-
-
-def renderer_of(**changes: Any) -> Renderer:
-    return Renderer.from_scene(build(**changes), **OPTIONS)
-
-
-def rest(renderer: Renderer, name: str = "ball") -> Any:
-    return renderer.data.geometry.shape_positions(name)
+from shadowmap_dr import Renderer, RenderSettings
 
 
 @pytest.fixture
@@ -390,109 +343,6 @@ def test_further_channels(variant: str) -> None:
     dr.forward_to(image)
     derivative = dr.grad(image).numpy()[..., 3]
     assert derivative.min() < -0.5 and derivative.max() > 0.5
-
-
-# ------------------------------------------------------------------------------------------------------------------ errors
-
-
-def test_unknown_names(renderer: Renderer) -> None:
-    with pytest.raises(ShadowmapError, match="no shape 'bal' in the scene; its shapes are 'ball', 'floor'"):
-        renderer.render(vertex_positions={"bal": rest(renderer)})
-    with pytest.raises(ShadowmapError, match="no light 'moon' in the scene; its lights: 'sun', 'lamp'"):
-        renderer.render(lights={"moon": renderer.light("sun")})
-    with pytest.raises(ShadowmapError, match="There is no sensor 1: the scene has 1, counted from 0"):
-        renderer.render(sensor=1)
-    with pytest.raises(ShadowmapError, match="give its number in the scene"):
-        renderer.render(sensor=mi.load_dict({"type": "perspective"}))
-    with pytest.raises(ShadowmapError, match=r"give names in a tuple, as in \('depth',\)"):
-        Renderer.from_scene(renderer.data.scene, aovs="depth")
-    with pytest.raises(ShadowmapError, match="There is no sensor -1"):
-        renderer.render(sensor=-1)
-
-
-def test_numbers_of_numpy_are_numbers(renderer: Renderer) -> None:
-    assert np.array_equal(renderer.render(sensor=np.int64(0)).numpy(), renderer.render().numpy())
-    assert Renderer.from_scene(renderer.data.scene, tessellation=np.int64(16)).data.geometry.face_count
-
-
-def test_inputs_of_the_wrong_kind(renderer: Renderer) -> None:
-    with pytest.raises(ShadowmapError, match="vertex_positions is a Point3f: give a dictionary"):
-        renderer.render(rest(renderer))
-    with pytest.raises(ShadowmapError, match="There is no sensor -1"):
-        renderer.render(sensor=np.int64(-1))
-    before = mi.variant()
-    mi.set_variant(before.replace("rgb", "mono"))
-    try:
-        with pytest.raises(ShadowmapError, match="The variant is .*_ad_mono, but this renderer was made for .*_ad_rgb: set that"):
-            renderer.render()
-    finally:
-        mi.set_variant(before)
-
-
-def test_scenes_and_settings_that_are_none(variant: str) -> None:
-    with pytest.raises(ShadowmapError, match="'scene.xml' is no mi.Scene of the variant .*: load it"):
-        Renderer.from_scene("scene.xml")
-    with pytest.raises(ShadowmapError, match="a NoneType is no mi.Scene"):
-        Renderer.from_scene(None)
-    with pytest.raises(ShadowmapError, match="There is no setting 'shadow_bias'; beside those of shadow maps"):
-        Renderer.from_scene(build(), shadow_bias=1)
-
-
-@pytest.mark.parametrize("length", [1e-25, 1e-3, 1e25, 3e38])
-def test_directions_of_any_length(renderer: Renderer, length: float) -> None:
-    """Squares of their components may be out of range."""
-    sun = renderer.light("sun")
-    image = renderer.render().numpy()
-    direction = mi.Vector3f(sun.direction) * length
-    dr.enable_grad(direction)
-    scaled = renderer.render(lights={"sun": replace(sun, direction=direction)})
-    np.testing.assert_allclose(scaled.numpy(), image, atol=1e-3)
-    dr.backward(dr.mean(scaled))
-    assert all(np.isfinite(np.array(dr.grad(direction))))
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("axis", range(3))
-def test_a_vertex_that_is_not_finite_takes_its_triangles_only(renderer: Renderer, axis: int, value: float) -> None:
-    """And not the shadow of the whole mesh, whose bounds it is in."""
-    points = rest(renderer).numpy().reshape(-1, 3).copy()
-    # On the lower side, where neither the camera nor a light sees its triangles.
-    lowest = int(points[:, 2].argmin())
-    expected = renderer.render(vertex_positions={"ball": mi.Float(points.ravel())}).numpy()
-    points[lowest, axis] = value
-    found = renderer.render(vertex_positions={"ball": mi.Float(points.ravel())}).numpy()
-    assert (np.abs(found - expected).max(2) > 0.05).sum() <= 2
-
-
-def test_wrong_kinds_and_sizes(renderer: Renderer) -> None:
-    with pytest.raises(ShadowmapError, match="Light 'sun' is a DirectionalLight, not a PointLight"):
-        renderer.render(lights={"sun": renderer.light("lamp")})
-    with pytest.raises(ShadowmapError, match="shape 'ball' are an array of 9 numbers, but 162 vertices need 486"):
-        renderer.render(vertex_positions={"ball": mi.Float([0.0] * 9)})
-    with pytest.raises(ShadowmapError, match=r"tensor shape \(3, 162\), but it has 162 vertices"):
-        renderer.render(vertex_positions={"ball": np.zeros((3, 162), np.float32)})
-
-
-@pytest.mark.parametrize(
-    "options, message",
-    [
-        ({"shadow_method": "esm2"}, "shadow method 'esm2' is unknown"),
-        ({"shadow_map_resolution": 5000}, "resolution is 5000"),
-        ({"shadow_filter": "tent"}, "shadow filter 'tent' is unknown"),
-        ({"shadow_filter_size": 8}, "8"),
-        ({"shadow_filter_size": 9, "shadow_map_resolution": 8}, "too large for maps of 8 texels"),
-        ({"shadow_samples": 9}, "shadow_samples is 9"),
-        ({"shadow_samples": 1.5}, "shadow_samples is 1.5: give an integer"),
-        ({"emitter_samples": "4"}, "emitter_samples is '4': give an integer"),
-        ({"ambient": float("nan")}, "ambient is nan"),
-        ({"aovs": ("albedo",)}, "no AOV 'albedo'"),
-        ({"tessellation": 1}, "tessellation is 1"),
-    ],
-)
-def test_bad_settings(variant: str, options: dict[str, Any], message: str) -> None:
-    with pytest.raises(ShadowmapError) as error:
-        Renderer.from_scene(build(), **options)
-    assert message in str(error.value) and "\n" not in str(error.value)
 
 
 def test_settings_are_the_same_for_both_ways_to_build(renderer: Renderer) -> None:

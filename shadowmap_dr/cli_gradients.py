@@ -14,6 +14,7 @@ from .experiments.gradients import jacobian as jacobian_experiment
 from .experiments.gradients import plane as plane_experiment
 from .experiments.gradients import report as gradients_report
 from .experiments.gradients import scenes as gradients_scenes
+from .experiments.gradients.images import CANDIDATES
 
 app = typer.Typer(help="Measure the derivatives of shadows, and what can be found with them.", no_args_is_help=True)
 
@@ -24,6 +25,10 @@ _FULL_FILTERS = (1, 3, 5, 9, 15)
 Out = Annotated[Path, typer.Option(help="Folder for the results.")]
 Full = Annotated[bool, typer.Option("--full", help="The whole grid: many minutes instead of two.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Keep what a killed run with the same settings has measured.")]
+Candidates = Annotated[
+    list[str] | None,
+    typer.Option("--candidate", metavar="|".join(CANDIDATES), help="Kind of shadow map; repeatable [default: default]."),
+]
 FilterSizes = Annotated[
     list[int] | None, typer.Option("--filter-size", help="Texels along each side of the filter, 1 for none; repeatable.")
 ]
@@ -35,10 +40,7 @@ def jacobian(
         list[str] | None,
         typer.Option(metavar="|".join(gradients_scenes.MOTIONS), help="Motion of the occluder; repeatable [default: all]."),
     ] = None,
-    candidate: Annotated[
-        list[str] | None,
-        typer.Option(metavar="|".join(jacobian_experiment.CANDIDATES), help="Kind of shadow map; repeatable [default: default]."),
-    ] = None,
+    candidate: Candidates = None,
     map_resolution: Annotated[
         list[int] | None, typer.Option(help="Texels along each side of the map; repeatable [default: 256 and 1024].")
     ] = None,
@@ -59,7 +61,7 @@ def jacobian(
     defaults = jacobian_experiment.JacobianOptions()
     options = jacobian_experiment.JacobianOptions(
         motions=tuple(motion or defaults.motions),
-        candidates=tuple(candidate or (jacobian_experiment.CANDIDATES if full else defaults.candidates)),
+        candidates=tuple(candidate or (CANDIDATES if full else defaults.candidates)),
         map_resolutions=tuple(map_resolution or (_FULL_MAPS if full else defaults.map_resolutions)),
         filter_sizes=tuple(filter_size or defaults.filter_sizes),
         resolution=resolution,
@@ -82,6 +84,7 @@ def convergence(
     camera: Annotated[
         list[str] | None, typer.Option(metavar="orthographic|perspective", help="Camera; repeatable [default: both].")
     ] = None,
+    candidate: Candidates = None,
     filter_size: FilterSizes = None,
     displacement: Annotated[list[float] | None, typer.Option(help="Start of a run, along x; repeatable.")] = None,
     map_resolution: Annotated[int, typer.Option(help="Texels along each side of the map.")] = 256,
@@ -100,6 +103,7 @@ def convergence(
     options = convergence_experiment.ConvergenceOptions(
         occluders=tuple(occluder or defaults.occluders),
         cameras=tuple(camera or defaults.cameras),
+        candidates=tuple(candidate or defaults.candidates),
         filter_sizes=tuple(filter_size or (_FULL_FILTERS if full else defaults.filter_sizes)),
         displacements=tuple(displacement or (_FULL_DISPLACEMENTS if full else defaults.displacements)),
         map_resolution=map_resolution,

@@ -276,7 +276,7 @@ def test_gradients(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     for arguments in (
         ("jacobian", "--motion", "x", "--filter-size", "5", "--out", "here", "--resume"),
         ("jacobian", "--full", "--map-resolution", "64"),
-        ("convergence", "--displacement", "0.2", "--camera", "perspective"),
+        ("convergence", "--displacement", "0.2", "--camera", "perspective", "--candidate", "msm"),
         ("minimal-plane", "--iterations", "7"),
     ):
         result = run("gradients", *arguments)
@@ -285,6 +285,7 @@ def test_gradients(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     assert first.motions == ("x",) and first.filter_sizes == (5,) and first.out == Path("here") and first.resume
     assert len(full.candidates) > 3 and full.map_resolutions == (64,) and full.spp > first.spp
     assert convergence.displacements == (0.2,) and convergence.cameras == ("perspective",)
+    assert convergence.candidates == ("msm",)
     assert plane.iterations == 7
     result = run("gradients", "convergence", "--occluder", "moon")
     assert result.status == 1 and "moon" in result.err

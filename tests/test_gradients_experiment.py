@@ -247,6 +247,24 @@ def test_small_convergence(variant: str, tmp_path: Path, monkeypatch: pytest.Mon
         run_convergence(ConvergenceOptions(**{**options, "spp": 8}, displacements=(0.1,), resume=True))
 
 
+def test_outlines_that_are_not_parallel_to_texels_are_placed_exactly(variant: str, tmp_path: Path) -> None:
+    """All of a parallel one lies at the same place within its texels, and is displaced by up to a seventh of one."""
+    options = {"cameras": ("orthographic",), "filter_sizes": (3,), "displacements": (0.1, 0.3), "map_resolution": 64,
+               "resolution": 128, "spp": 128}
+    occluders, candidates = ("plane", "turned plane"), ("default", "no anti-aliasing")
+    runs = run_convergence(ConvergenceOptions(**options, occluders=occluders, candidates=candidates, out=tmp_path))["runs"]
+    turned = [runs[f"turned plane | orthographic | 3 | {d}"]["error_texels"] for d in (0.1, 0.3)]
+    assert max(turned) < 0.02
+    for d in (0.1, 0.3):
+        assert runs[f"plane | orthographic | 3 | {d}"]["error_texels"] < 0.15
+        for name in occluders:
+            stays = runs[f"no anti-aliasing | {name} | orthographic | 3 | {d}"]
+            assert stays["candidate"] == "no anti-aliasing" and not stays["recovered"]
+    text = (tmp_path / "convergence.md").read_text()
+    assert "| turned plane, orthographic, 3 | 2/2 | 0.3 |" in text
+    assert "| plane, orthographic, 3, no anti-aliasing | 0/2 | - | - |" in text
+
+
 def test_largest_recovered() -> None:
     runs = [{"displacement": d, "recovered": found} for d, found in ((0.3, False), (0.1, True), (0.2, True), (0.4, True))]
     assert gradients_convergence.largest_recovered(runs) == 0.2

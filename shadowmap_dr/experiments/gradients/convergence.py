@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,26 +20,30 @@ from ...timing import machine
 from ..bench.meshes import Mesh
 from . import scenes as gradients_scenes
 from .fit import ShadowFit
-from .images import Image, check_maps
+from .images import CANDIDATES, Image, check_maps
 from .report import markdown
 
 #: Error in texels below which an occluder counts as recovered, and largest error that is hoped for.
 RECOVERED, HOPED_FOR = 1.0, 0.1
-OCCLUDERS = ("plane", "ring")
+OCCLUDERS = ("plane", "turned plane", "ring")
 # Above the perspective camera, which must not see the occluder.
 _Z = 1.0
-_SIZES = {"plane": 0.25, "ring": 0.3}
+_PLANE, _RING = 0.25, 0.3
+# About the light, so that its outlines are not parallel to the texels.
+_TURN_DEG = 10.0
 MAX_DISPLACEMENT = 0.7
 STEP_SIZE, _DECAY = 0.02, 0.005
 
 
 @dataclass(frozen=True)
 class ConvergenceOptions:
-    """What to run. Everything is run for each occluder, camera, filter size and displacement.
+    """What to run. Everything is run for each candidate, occluder, camera, filter size and displacement.
 
     Attributes:
-        occluders: names in `OCCLUDERS`: a square of side 0.5, a ring 0.57 wide.
+        occluders: names in `OCCLUDERS`: a square of side 0.5, its outlines parallel to the texels; the same, turned by 10 degrees
+            about the light; a ring 0.59 wide.
         cameras: names in `gradients.scenes.CAMERAS`.
+        candidates: kinds of shadow map, names in `images.CANDIDATES`.
         filter_sizes: texels along each side of the Gaussian; 1 for none.
         displacements: along x, world units.
         map_resolution: texels along each side of the map.
@@ -51,6 +56,7 @@ class ConvergenceOptions:
 
     occluders: tuple[str, ...] = OCCLUDERS
     cameras: tuple[str, ...] = ("orthographic", "perspective")
+    candidates: tuple[str, ...] = ("default",)
     filter_sizes: tuple[int, ...] = (1, 3, 15)
     displacements: tuple[float, ...] = (0.1, 0.3, 0.5, 0.65)
     map_resolution: int = 256
@@ -61,12 +67,13 @@ class ConvergenceOptions:
     resume: bool = False
 
     def __post_init__(self) -> None:
-        for kind, names, known in (("occluder", self.occluders, OCCLUDERS), ("camera", self.cameras, gradients_scenes.CAMERAS)):
+        for kind, names, known in (("occluder", self.occluders, OCCLUDERS), ("camera", self.cameras, gradients_scenes.CAMERAS),
+                                   ("candidate", self.candidates, CANDIDATES)):
             for name in names:
                 if name not in known:
                     raise ShadowmapError(f"no {kind} {name!r}: choose from {', '.join(known)}.")
-        for kind, values in (("occluder", self.occluders), ("camera", self.cameras), ("filter size", self.filter_sizes),
-                             ("displacement", self.displacements)):
+        for kind, values in (("occluder", self.occluders), ("camera", self.cameras), ("candidate", self.candidates),
+                             ("filter size", self.filter_sizes), ("displacement", self.displacements)):
             if not values:
                 raise ShadowmapError(f"no {kind} given: name at least one.")
         for value in self.displacements:
@@ -82,18 +89,18 @@ def run_convergence(options: ConvergenceOptions, *, console: Console | None = No
     console = console or Console(stderr=True)
     path = io.check_output(options.out / "convergence.json", (".json",))
     record = _started(path, options)
-    groups = [(name, camera, taps) for name in options.occluders for camera in options.cameras for taps in options.filter_sizes]
+    groups = list(itertools.product(options.candidates, options.occluders, options.cameras, options.filter_sizes))
     sheet: dict[str, dict[str, Image]] = {}
     with report.progress(console) as progress:
         task = progress.add_task("runs", total=len(groups) * len(options.displacements), note="")
-        for name, camera, taps in groups:
+        for label, name, camera, taps in groups:
             progress.update(task, note=f"{name}, {camera}, filter {taps}")
-            todo = [d for d in options.displacements if _key(name, camera, taps, d) not in record["runs"]]
+            todo = [d for d in options.displacements if _key(label, name, camera, taps, d) not in record["runs"]]
             pictured = f"{name}, {camera}"
             if not todo and pictured in sheet:
                 progress.advance(task, len(options.displacements))
                 continue
-            fit, texel = _fit(name, camera, taps, options)
+            fit, texel = _fit(label, name, camera, taps, options)
             if pictured not in sheet:
                 start = max(options.displacements)
                 sheet[pictured] = {"reference": fit.reference, f"displaced by {start}": fit.method.render((start,)),
@@ -102,8 +109,9 @@ def run_convergence(options: ConvergenceOptions, *, console: Console | None = No
             for displacement in todo:
                 history = optimize(fit.method, (displacement,), options.iterations)
                 errors = np.abs(history.parameters[:, 0]) / texel
-                record["runs"][_key(name, camera, taps, displacement)] = {
-                    "occluder": name, "camera": camera, "filter": taps, "displacement": displacement, "texel": texel,
+                record["runs"][_key(label, name, camera, taps, displacement)] = {
+                    "candidate": label, "occluder": name, "camera": camera, "filter": taps, "displacement": displacement,
+                    "texel": texel,
                     "error_texels": float(errors[-1]), "recovered": bool(errors[-1] < RECOVERED),
                     "seconds_per_iteration": history.seconds_per_iteration, "error_curve_texels": errors,
                     "loss_curve": history.loss,
@@ -123,12 +131,19 @@ def _started(path: Path, options: ConvergenceOptions) -> dict[str, Any]:
     identity = {"map_resolution": options.map_resolution, "resolution": options.resolution, "iterations": options.iterations,
                 "spp": options.spp, "step_size": STEP_SIZE, "decay": _DECAY}
     if options.resume and path.exists():
-        return report.read_record(path, identity, "runs")
+        record = report.read_record(path, identity, "runs")
+        for run in record["runs"].values():
+            run.setdefault("candidate", "default")  # for records from before there were others
+        return record
     return {"settings": identity, "machine": machine(), "runs": {}}
 
 
-def _key(name: str, camera: str, taps: int, displacement: float) -> str:
-    return f"{name} | {camera} | {taps} | {displacement:g}"
+def _key(label: str, name: str, camera: str, taps: int, displacement: float) -> str:
+    return " | ".join([*_unless_default(label), name, camera, str(taps), f"{displacement:g}"])
+
+
+def _unless_default(label: str) -> list[str]:
+    return [label] if label != "default" else []
 
 
 @dataclass(frozen=True)
@@ -137,7 +152,7 @@ class _Fit:
     reference: Image
 
 
-def _fit(name: str, camera: str, taps: int, options: ConvergenceOptions) -> tuple[_Fit, float]:
+def _fit(label: str, name: str, camera: str, taps: int, options: ConvergenceOptions) -> tuple[_Fit, float]:
     """Method for an occluder that moves along x, its path-traced target, and the width of a texel in world units."""
     from mitsuba_baselines.reference import path_traced
 
@@ -145,7 +160,7 @@ def _fit(name: str, camera: str, taps: int, options: ConvergenceOptions) -> tupl
     scene = gradients_scenes.build(mesh, options.resolution, camera)
     reference = path_traced(scene, spp=options.spp).image
     filters = {"shadow_filter": "gaussian" if taps > 1 else "none", "shadow_filter_size": taps}
-    renderer = Renderer.from_scene(scene, shadow_map_resolution=options.map_resolution, **filters)
+    renderer = Renderer.from_scene(scene, shadow_map_resolution=options.map_resolution, **filters, **CANDIDATES[label])
     basis = np.zeros((1, *mesh.vertices.shape))
     basis[0, :, 0] = 1
     method = ShadowFit(renderer, mesh.vertices, basis, reference, step_size=STEP_SIZE, decay=(_DECAY, options.iterations))
@@ -156,33 +171,33 @@ def _fit(name: str, camera: str, taps: int, options: ConvergenceOptions) -> tupl
 
 def occluder(name: str) -> Mesh:
     """One of `OCCLUDERS`, in its target position."""
-    if name == "plane":
-        return gradients_scenes.plane(_SIZES[name], _Z)
-    return gradients_scenes.ring(8000, _Z, _SIZES[name])
+    if name == "ring":
+        return gradients_scenes.ring(8000, _Z, _RING)
+    return gradients_scenes.plane(_PLANE, _Z, 0.0 if name == "plane" else _TURN_DEG)
 
 
 def _curves(record: Mapping[str, Any]) -> dict[str, dict[str, list[list[float]]]]:
     """Error over iterations, a panel for each occluder and camera, a colour for each filter."""
     panels: dict[str, dict[str, list[list[float]]]] = {}
     for run in record["runs"].values():
-        label = f"filter {run['filter']}" if run["filter"] > 1 else "no filter"
+        label = ", ".join([f"filter {run['filter']}" if run["filter"] > 1 else "no filter", *_unless_default(run["candidate"])])
         panel = panels.setdefault(f"error [texels]: {run['occluder']}, {run['camera']}", {})
         panel.setdefault(label, []).append(run["error_curve_texels"])
     return panels
 
 
 def convergence_rows(record: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
-    """A row for each occluder, camera and filter: how far it is recovered from, and how well."""
+    """A row for each occluder, camera, filter and kind of map: how far it is recovered from, and how well."""
     groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
     for run in record["runs"].values():
-        groups.setdefault((run["occluder"], run["camera"], run["filter"]), []).append(run)
+        groups.setdefault((run["occluder"], run["camera"], run["filter"], run["candidate"]), []).append(run)
     rows = []
-    for (name, camera, taps), runs in groups.items():
+    for (name, camera, taps, label), runs in groups.items():
         runs = sorted(runs, key=lambda run: run["displacement"])
         far = largest_recovered(runs)
         found = [run["error_texels"] for run in runs if run["recovered"]]
-        rows.append([f"{name}, {camera}, {taps if taps > 1 else 'none'}", f"{len(found)}/{len(runs)}",
-                     f"{far:g}" if far else "-", f"{max(found):.3f}" if found else "-"])
+        kind = ", ".join([name, camera, str(taps) if taps > 1 else "none", *_unless_default(label)])
+        rows.append([kind, f"{len(found)}/{len(runs)}", f"{far:g}" if far else "-", f"{max(found):.3f}" if found else "-"])
     return ["occluder, camera, filter", "recovered", "from up to", "largest error"], rows
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterable
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -20,6 +21,18 @@ from .scenes import RECEIVER_HALF, Motion
 Image = npt.NDArray[np.float32]
 
 SHAPE = "occluder"
+
+#: What may be compared: a label, and options of the `Renderer`.
+CANDIDATES: dict[str, dict[str, Any]] = {
+    "default": {},
+    "no anti-aliasing": {"shadow_antialias": False},
+    "2 x 2 texels": {"shadow_supersampling": 2},
+    "4 x 4 texels": {"shadow_supersampling": 4},
+    "4 x 4 look-ups": {"shadow_samples": 4},
+    "plain vsm": {"shadow_method": "vsm", "shadow_receiver_range": False},
+    "plain vsm, 2 x 2": {"shadow_method": "vsm", "shadow_receiver_range": False, "shadow_supersampling": 2},
+    "msm": {"shadow_method": "msm"},
+}
 
 
 def check_maps(resolutions: Iterable[int], filter_sizes: Iterable[int]) -> None:

@@ -19,6 +19,7 @@ from ..bench.meshes import Mesh
 from . import report as gradients_report
 from . import scenes as gradients_scenes
 from .images import (
+    CANDIDATES,
     Image,
     blurred_by_map,
     central_derivative,
@@ -31,17 +32,6 @@ from .images import (
 from .references import Sampling, path_traced_derivative, projective_image
 from .scenes import MOTIONS
 
-#: What may be compared: a label, and options of the `Renderer`.
-CANDIDATES: dict[str, dict[str, Any]] = {
-    "default": {},
-    "no anti-aliasing": {"shadow_antialias": False},
-    "2 x 2 texels": {"shadow_supersampling": 2},
-    "4 x 4 texels": {"shadow_supersampling": 4},
-    "4 x 4 look-ups": {"shadow_samples": 4},
-    "plain vsm": {"shadow_method": "vsm", "shadow_receiver_range": False},
-    "plain vsm, 2 x 2": {"shadow_method": "vsm", "shadow_receiver_range": False, "shadow_supersampling": 2},
-    "msm": {"shadow_method": "msm"},
-}
 # Faces of the coarse occluder in the test of tessellation, and how often each is divided in four: 64-fold.
 _COARSE_FACES, _DIVISIONS, _TARGET_PIXELS = 2000, 3, 8.0
 

@@ -77,14 +77,14 @@ def ring(faces: int = 130_000, z: float = 0.0, radius: float = 0.6) -> Mesh:
     across -= across % 2
     around = max(3, round(faces / (2 * across)))
     mesh = torus(around, across)
-    turned = radius * mesh.vertices.astype(np.float64) @ _rotation(np.radians([7.0, -5.0, 4.0])).T
-    return Mesh((turned + [0.0, 0.0, z]).astype(np.float32), mesh.faces)
+    rotated = radius * _turned(mesh.vertices, (7.0, -5.0, 4.0))
+    return Mesh((rotated + [0.0, 0.0, z]).astype(np.float32), mesh.faces)
 
 
-def plane(half: float, z: float) -> Mesh:
-    """A square parallel to the receiver, two triangles."""
-    corners = np.array([[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]], np.float32)
-    return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]], np.uint32))
+def plane(half: float, z: float, turn_deg: float = 0.0) -> Mesh:
+    """A square parallel to the receiver, two triangles, turned about the z axis."""
+    corners = np.array([[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]])
+    return Mesh(_turned(corners, (0.0, 0.0, turn_deg)).astype(np.float32), np.array([[0, 1, 2], [0, 2, 3]], np.uint32))
 
 
 def tessellated(mesh: Mesh, times: int) -> Mesh:
@@ -148,6 +148,11 @@ MOTIONS: Mapping[str, Motion] = {
     "rotation": Motion(spin=(1 / 3, 2 / 3, 2 / 3)),
     "scale": Motion(growth=1.0),
 }
+
+
+def _turned(points: npt.NDArray[Any], vector_deg: tuple[float, float, float]) -> npt.NDArray[np.float64]:
+    """Points (V, 3) turned by a rotation vector in degrees."""
+    return points.astype(np.float64) @ _rotation(np.radians(vector_deg)).T
 
 
 def _rotation(vector: npt.ArrayLike) -> npt.NDArray[np.float64]:

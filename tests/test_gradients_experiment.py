@@ -248,15 +248,15 @@ def test_small_convergence(variant: str, tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_outlines_that_are_not_parallel_to_texels_are_placed_exactly(variant: str, tmp_path: Path) -> None:
-    """All of a parallel one lies at the same place within its texels, and is displaced by up to a seventh of one."""
-    options = {"cameras": ("orthographic",), "filter_sizes": (3,), "displacements": (0.1, 0.3), "map_resolution": 64,
-               "resolution": 128, "spp": 128}
+    """All of a parallel one lies at the same place within its texels, and ends a tenth to a fifth of one away."""
+    options = {"cameras": ("orthographic",), "filter_sizes": (3,), "displacements": (0.1, 0.3), "map_resolution": 96,
+               "resolution": 256, "spp": 128}
     occluders, candidates = ("plane", "turned plane"), ("default", "no anti-aliasing")
     runs = run_convergence(ConvergenceOptions(**options, occluders=occluders, candidates=candidates, out=tmp_path))["runs"]
     turned = [runs[f"turned plane | orthographic | 3 | {d}"]["error_texels"] for d in (0.1, 0.3)]
     assert max(turned) < 0.02
     for d in (0.1, 0.3):
-        assert runs[f"plane | orthographic | 3 | {d}"]["error_texels"] < 0.15
+        assert runs[f"plane | orthographic | 3 | {d}"]["error_texels"] < 0.25
         for name in occluders:
             stays = runs[f"no anti-aliasing | {name} | orthographic | 3 | {d}"]
             assert stays["candidate"] == "no anti-aliasing" and not stays["recovered"]

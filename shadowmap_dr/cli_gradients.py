@@ -23,7 +23,7 @@ _FULL_DISPLACEMENTS = (0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.45, 0.5, 0.55, 0.6, 0.6
 _FULL_FILTERS = (1, 3, 5, 9, 15)
 
 Out = Annotated[Path, typer.Option(help="Folder for the results.")]
-Full = Annotated[bool, typer.Option("--full", help="The whole grid: many minutes instead of two.")]
+Full = Annotated[bool, typer.Option("--full", help="The whole grid: many minutes instead of two or three.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Keep what a killed run with the same settings has measured.")]
 Candidates = Annotated[
     list[str] | None,

@@ -85,6 +85,7 @@ def plot_curves(
     path: str | os.PathLike[str],
     panels: Mapping[str, Mapping[str, Sequence[Sequence[float]]]],
     x_label: str = "iteration",
+    columns: int | None = None,
 ) -> None:
     """Plot curves over their index, one panel beside the other, with logarithmic vertical axes.
 
@@ -92,12 +93,15 @@ def plot_curves(
         path: file to write (.png, .pdf, .svg).
         panels: vertical axis label -> legend entry -> curves (several curves of one entry, e.g. runs, share a colour).
         x_label: label of the horizontal axes.
+        columns: panels in a row, or None for all.
     """
     from matplotlib.figure import Figure  # without pyplot there is no global state and no display is needed
 
-    figure = Figure(figsize=(5 * len(panels), 4), layout="constrained")
+    across = max(1, min(columns or len(panels), len(panels)))
+    down = math.ceil(len(panels) / across)
+    figure = Figure(figsize=(5 * across, 4 * down), layout="constrained")
     for i, (y_label, entries) in enumerate(panels.items()):
-        axes = figure.add_subplot(1, len(panels), i + 1)
+        axes = figure.add_subplot(down, across, i + 1)
         for colour, (label, curves) in enumerate(entries.items()):
             for k, curve in enumerate(curves):
                 axes.plot(curve, color=f"C{colour}", alpha=0.8, linewidth=1.2, label=label if k == 0 else None)

@@ -121,7 +121,7 @@ def run_convergence(options: ConvergenceOptions, *, console: Console | None = No
     record = report.plain(record)
     report.write_json(path, record)
     report.image_sheet(options.out / "convergence-images.png", sheet)
-    report.plot_curves(options.out / "convergence.png", _curves(record))
+    report.plot_curves(options.out / "convergence.png", _curves(record), columns=2)
     with io.atomic(options.out / "convergence.md") as temporary:
         temporary.write_text(read_convergence(record), encoding="utf-8")
     return record

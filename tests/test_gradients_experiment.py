@@ -246,6 +246,13 @@ def test_small_convergence(variant: str, tmp_path: Path, monkeypatch: pytest.Mon
     with pytest.raises(ShadowmapError, match="leave out --resume"):
         run_convergence(ConvergenceOptions(**{**options, "spp": 8}, displacements=(0.1,), resume=True))
 
+    # A record from before there were candidates.
+    old = json.loads((tmp_path / "convergence.json").read_text())
+    for run in old["runs"].values():
+        del run["candidate"]
+    (tmp_path / "convergence.json").write_text(json.dumps(old))
+    assert run_convergence(ConvergenceOptions(**options, displacements=(0.1, 0.2), resume=True))["runs"] == second["runs"]
+
 
 def test_outlines_that_are_not_parallel_to_texels_are_placed_exactly(variant: str, tmp_path: Path) -> None:
     """All of a parallel one lies at the same place within its texels, and ends a tenth to a fifth of one away."""

@@ -20,7 +20,7 @@ from ...timing import machine
 from ..bench.meshes import Mesh
 from . import scenes as gradients_scenes
 from .fit import ShadowFit
-from .images import CANDIDATES, Image, check_maps
+from .images import CANDIDATES, Image, check_chosen, check_maps
 from .report import markdown
 
 #: Error in texels below which an occluder counts as recovered, and largest error that is hoped for.
@@ -67,15 +67,11 @@ class ConvergenceOptions:
     resume: bool = False
 
     def __post_init__(self) -> None:
-        for kind, names, known in (("occluder", self.occluders, OCCLUDERS), ("camera", self.cameras, gradients_scenes.CAMERAS),
-                                   ("candidate", self.candidates, CANDIDATES)):
-            for name in names:
-                if name not in known:
-                    raise ShadowmapError(f"no {kind} {name!r}: choose from {', '.join(known)}.")
-        for kind, values in (("occluder", self.occluders), ("camera", self.cameras), ("candidate", self.candidates),
-                             ("filter size", self.filter_sizes), ("displacement", self.displacements)):
-            if not values:
-                raise ShadowmapError(f"no {kind} given: name at least one.")
+        check_chosen({
+            "occluder": (self.occluders, OCCLUDERS), "camera": (self.cameras, gradients_scenes.CAMERAS),
+            "candidate": (self.candidates, CANDIDATES), "filter size": (self.filter_sizes, None),
+            "displacement": (self.displacements, None),
+        })
         for value in self.displacements:
             if not 0 < value <= MAX_DISPLACEMENT:
                 raise ShadowmapError(f"a displacement of {value}: give more than 0 and at most {MAX_DISPLACEMENT}.")

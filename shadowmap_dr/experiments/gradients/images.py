@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 import drjit as dr
@@ -33,6 +33,20 @@ CANDIDATES: dict[str, dict[str, Any]] = {
     "plain vsm, 2 x 2": {"shadow_method": "vsm", "shadow_receiver_range": False, "shadow_supersampling": 2},
     "msm": {"shadow_method": "msm"},
 }
+
+
+def check_chosen(chosen: Mapping[str, tuple[Collection[Any], Collection[str] | None]]) -> None:
+    """ShadowmapError for a kind of which nothing was chosen, or something that is not among the known names (None: any).
+
+    Args:
+        chosen: what is chosen (a word for the message) -> what was, and the known names.
+    """
+    for kind, (values, known) in chosen.items():
+        if not values:
+            raise ShadowmapError(f"no {kind} given: name at least one.")
+        for value in values:
+            if known is not None and value not in known:
+                raise ShadowmapError(f"no {kind} {value!r}: choose from {', '.join(map(repr, known))}.")
 
 
 def check_maps(resolutions: Iterable[int], filter_sizes: Iterable[int]) -> None:

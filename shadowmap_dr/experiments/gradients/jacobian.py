@@ -23,6 +23,7 @@ from .images import (
     Image,
     blurred_by_map,
     central_derivative,
+    check_chosen,
     check_maps,
     forward_derivative,
     image_of,
@@ -65,14 +66,10 @@ class JacobianOptions:
     resume: bool = False
 
     def __post_init__(self) -> None:
-        for kind, names, known in (("motion", self.motions, MOTIONS), ("candidate", self.candidates, CANDIDATES)):
-            for name in names:
-                if name not in known:
-                    raise ShadowmapError(f"no {kind} {name!r}: choose from {', '.join(known)}.")
-        for kind, values in (("motion", self.motions), ("candidate", self.candidates), ("map size", self.map_resolutions),
-                             ("filter size", self.filter_sizes)):
-            if not values:
-                raise ShadowmapError(f"no {kind} given: name at least one.")
+        check_chosen({
+            "motion": (self.motions, MOTIONS), "candidate": (self.candidates, CANDIDATES),
+            "map size": (self.map_resolutions, None), "filter size": (self.filter_sizes, None),
+        })
         check_maps(self.map_resolutions, self.filter_sizes)
         if self.resolution < 16 or self.faces < 20 or self.spp < 2:
             raise ShadowmapError("resolution, faces and samples must be at least 16, 20 and 2.")

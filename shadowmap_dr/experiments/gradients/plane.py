@@ -18,7 +18,7 @@ from ...renderer import Renderer
 from ...timing import machine
 from . import scenes as gradients_scenes
 from .fit import ShadowFit
-from .images import Image, check_maps
+from .images import Image, check_chosen, check_maps
 from .report import markdown
 
 #: Largest error of a recovered vertex, world units.
@@ -50,11 +50,7 @@ class PlaneOptions:
     out: Path = Path("gradients")
 
     def __post_init__(self) -> None:
-        if not self.cameras:
-            raise ShadowmapError("no camera given: name at least one.")
-        for name in self.cameras:
-            if name not in gradients_scenes.CAMERAS:
-                raise ShadowmapError(f"no camera {name!r}: choose from {', '.join(gradients_scenes.CAMERAS)}.")
+        check_chosen({"camera": (self.cameras, gradients_scenes.CAMERAS)})
         check_maps((self.map_resolution,), (self.filter_size,))
         if self.resolution < 16 or self.iterations < 1 or self.spp < 1:
             raise ShadowmapError("resolution, iterations and samples must be at least 16, 1 and 1.")

@@ -11,6 +11,7 @@ import mitsuba as mi
 
 from .geometry import normalize_or
 from .spread import spread
+from .sums import evaluate
 
 # Width of the rim in which light fades, half of it on either side of the outline: through it a moving outline has derivatives.
 # In units of the picture, and of the narrower half of a beam's cross-section. In images it is at least as wide as a pixel.
@@ -263,7 +264,7 @@ def picture(texture: Any, uv: Any, active: Any) -> Any:
     """Colour of a texture at texture coordinates (Point2f). Attached to both."""
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(uv))
     si.uv = uv
-    return mi.UnpolarizedSpectrum(texture.eval(si, active))
+    return evaluate(lambda at: mi.UnpolarizedSpectrum(texture.eval(*at)), (si, mi.Bool(active)), [texture], dr.width(uv))
 
 
 def translation(to_world: Any) -> Any:

@@ -31,6 +31,11 @@ class Environment:
     emitter: Any
 
     @property
+    def nodes(self) -> list[Any]:
+        """Objects of Mitsuba's that its radiance comes from."""
+        return [self.emitter]
+
+    @property
     def rows(self) -> int:
         """Rows of its image, 0 if it has none."""
         data = parameters(self.emitter).get("data")

@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .sensors import Sensor
+from .tables import Copies, copied
 
 #: Up to this many by this many spots are arrays of their own; so are more, if one array of all would be longer than that.
 _WRITTEN_OUT = 2
@@ -56,54 +57,22 @@ class Spots:
         if count <= _WRITTEN_OUT or copies * dr.width(p_world) > _MOST_LANES:
             return cls(footprint_points(sensor, size, depth, p_world, n_world, count), active, 1)
         dr.eval(p_world, n_world, depth, active)
-        points = dr.custom(_Copies, p_world, copies, False)
+        (points,) = dr.custom(Copies, [p_world], copies, False)
         with dr.suspend_grad():
             number = dr.arange(mi.UInt32, copies * dr.width(p_world)) // dr.width(p_world)
             row = number // count
-            depth = None if depth is None else _copied(dr.detach(depth), copies)
-            axes = _Axes.of(sensor, size, depth, points, _copied(dr.detach(n_world), copies))
+            depth = None if depth is None else copied(dr.detach(depth), copies)
+            axes = _Axes.of(sensor, size, depth, points, copied(dr.detach(n_world), copies))
             across, down = ((mi.Float(k) + 0.5) / count - 0.5 for k in (number - row * count, row))
             offset = axes.offset(across, down)
-        return cls([points + offset], _copied(active, copies), copies)
+        return cls([points + offset], copied(active, copies), copies)
 
     def mean(self, look_up: Callable[[Any, Any], Any]) -> Any:
         """Mean (Float, N) of what ``look_up`` finds at points (Point3f, Bool). Attached."""
         total = sum(look_up(points, self.active) for points in self.points)
         if self.copies > 1:
-            total = dr.custom(_Copies, total, self.copies, True)
+            (total,) = dr.custom(Copies, [total], self.copies, True)
         return total * (1 / (self.copies * len(self.points)))
-
-
-class _Copies(dr.CustomOp):
-    """Copies of an array one after the other, or (``transpose``) the sum of such copies: each is the adjoint of the other.
-
-    Dr.Jit's own adjoint of a repeated gather would add up with atomics.
-    """
-
-    def eval(self, array: Any, copies: int, transpose: bool) -> Any:
-        self._arguments = copies, transpose
-        return self._apply(array, transpose)
-
-    def forward(self) -> None:
-        self.set_grad_out(self._apply(self.grad_in("array"), self._arguments[1]))
-
-    def backward(self) -> None:
-        self.set_grad_in("array", self._apply(self.grad_out(), not self._arguments[1]))
-
-    def _apply(self, array: Any, transpose: bool) -> Any:
-        return (_sum_of_copies if transpose else _copied)(array, self._arguments[0])
-
-
-def _copied(array: Any, copies: int) -> Any:
-    width = dr.width(array)
-    lane = dr.arange(mi.UInt32, copies * width)
-    return dr.gather(type(array), array, lane - lane // width * width)
-
-
-def _sum_of_copies(array: Any, copies: int) -> Any:
-    width = dr.width(array) // copies
-    lane = dr.arange(mi.UInt32, width)
-    return sum(dr.gather(type(array), array, lane + k * width) for k in range(copies))
 
 
 @dataclass(frozen=True)

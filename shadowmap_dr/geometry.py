@@ -16,6 +16,8 @@ import mitsuba as mi
 import numpy as np
 
 from .errors import ShadowmapError
+from .raster._types import backend
+from .tables import copy_of_lane, in_copies
 
 NO_TRIANGLE = 0xFFFFFFFF
 """Triangle index that means "nothing was hit"."""
@@ -95,6 +97,7 @@ class Geometry:
     stand_ins      UInt32 (V,) which vertex each one's place is taken from, None if all have faces: those without, which nobody
                    sees, lie where another one of their shape does, so that they stretch no bounds (``settled``)
     packets        Float (4V,), positions with a fourth number, through which derivatives take the way back (``in_packets``)
+    copies         of packets, normals and texture coordinates, one after the other, one for each block of lanes
     """
 
     positions: Any
@@ -111,6 +114,7 @@ class Geometry:
     as_loaded: bool = False
     stand_ins: Any = None
     packets: Any = None
+    copies: int = 1
 
     @property
     def vertex_count(self) -> int:
@@ -160,25 +164,38 @@ class Geometry:
         """Whether a shape is known (on the host) to be as it was when the scene was loaded."""
         return self.as_loaded and self.changed is not None and info.name not in self.changed
 
-    def in_packets(self) -> Geometry:
-        """The same geometry, prepared for many look-ups of attached positions.
+    def in_packets(self, lanes: int) -> Geometry:
+        """The same geometry, prepared for look-ups of attached positions, normals and texture coordinates by so many lanes.
 
         Sums over packets of four numbers run several times faster than those of three.
         """
-        if not dr.grad_enabled(self.positions):
-            return self
-        p = dr.gather(mi.Point3f, self.positions, dr.arange(mi.UInt32, self.vertex_count))
-        return replace(self, packets=dr.ravel(mi.Point4f(p.x, p.y, p.z, 0)))
+        packets = self.packets
+        if dr.grad_enabled(self.positions):
+            p = dr.gather(mi.Point3f, self.positions, dr.arange(mi.UInt32, self.vertex_count))
+            packets = dr.ravel(mi.Point4f(p.x, p.y, p.z, 0))
+        buffers = [array for array in (packets, self.normals, self.texcoords) if array is not None]
+        made, copies = in_copies(buffers, lanes)
+        if copies == 1:
+            return replace(self, packets=packets)
+        *first, normals, texcoords = made
+        return replace(self, packets=first[0] if first else None, normals=normals, texcoords=texcoords, copies=copies)
 
-    def vertices(self, index: Any, active: Any = True, changed: Any = None) -> Any:
-        """Positions (Point3f) of vertices (UInt32); gradients flow only where they may have ``changed`` (None: anywhere)."""
+    def row_of_copy(self, lanes: int) -> Any:
+        """First row (UInt32) of the copy of vertices that each of so many lanes reads; a constant if there is but one copy."""
+        return copy_of_lane(backend(self.faces), lanes, self.copies) * self.vertex_count
+
+    def vertices(self, index: Any, active: Any = True, changed: Any = None, row: Any = 0) -> Any:
+        """Positions (Point3f) of vertices (UInt32); gradients flow only where they may have ``changed`` (None: anywhere).
+
+        ``row``: :meth:`row_of_copy` of the lanes, if they are those that the copies were made for.
+        """
         p = dr.gather(mi.Point3f, self.positions, index, active)
         if not dr.grad_enabled(self.positions):
             return p
         changed = active if changed is None else changed
         if self.packets is None:
             return dr.replace_grad(p, dr.gather(mi.Point3f, self.positions, index, changed))
-        q = dr.gather(mi.Point4f, self.packets, index, changed)
+        q = dr.gather(mi.Point4f, self.packets, index + row, changed)
         return dr.replace_grad(p, mi.Point3f(q.x, q.y, q.z))
 
     def with_positions(self, positions: Mapping[str, Any]) -> Geometry:

@@ -26,6 +26,7 @@ class Hits:
     active       Bool (N,), false where nothing was hit; there all other fields are finite and meaningless
     changed      Bool (N,), where vertices may have been replaced, or carry gradients
     face         Vector3u (N,), the triangle's vertices
+    row          UInt32 (N,), or a constant: ``Geometry.row_of_copy``
     shape, flags UInt32 (N,), index of the shape and its ``ShapeInfo.flags``
     e1, e2       Vector3f (N,), vertices 1 and 2 minus vertex 0, attached
     n_face       Normal3f (N,), unit normal (p1 - p0) x (p2 - p0), attached
@@ -40,6 +41,7 @@ class Hits:
     active: Any
     changed: Any
     face: Any
+    row: Any
     shape: Any
     flags: Any
     e1: Any
@@ -53,8 +55,15 @@ class Hits:
     pixel: Any = None
 
     def corners(self, kind: Any, buffer: Any) -> tuple[Any, Any, Any]:
-        """A vertex attribute at vertex 0 and the differences of vertices 1 and 2 to it. Attached where vertices move."""
+        """A vertex attribute at vertex 0 and the differences of vertices 1 and 2 to it. Attached where vertices move.
+
+        ``buffer`` has no copies (``Geometry.copies``).
+        """
         return corner_values(kind, buffer, self.face, self.active, self.changed)
+
+    def corners_of_copy(self, kind: Any, buffer: Any) -> tuple[Any, Any, Any]:
+        """The same from a buffer that has copies: normals, texture coordinates."""
+        return corner_values(kind, buffer, self.face + self.row, self.active, self.changed)
 
 
 def hits_at(geometry: Geometry, triangle: Any, u: Any, v: Any, active: Any = True) -> Hits:
@@ -63,9 +72,10 @@ def hits_at(geometry: Geometry, triangle: Any, u: Any, v: Any, active: Any = Tru
     face = dr.gather(mi.Vector3u, geometry.faces, triangle, active)
     shape, flags = geometry.shape_and_flags(triangle, active)
     u, v = dr.select(active, u, 0.0), dr.select(active, v, 0.0)
-    origin, e1, e2 = _triangle(geometry, face, active, active)
+    row = geometry.row_of_copy(dr.width(triangle))
+    origin, e1, e2 = _triangle(geometry, face, active, row)
     p_world = origin + e1 * u + e2 * v
-    return Hits(triangle, active, active, face, shape, flags, e1, e2, _normal(e1, e2), u, v, p_world)
+    return Hits(triangle, active, active, face, row, shape, flags, e1, e2, _normal(e1, e2), u, v, p_world)
 
 
 def pixel_hits(geometry: Geometry, sensor: Sensor, triangle: Any, size: tuple[int, int]) -> Hits:
@@ -79,24 +89,25 @@ def pixel_hits(geometry: Geometry, sensor: Sensor, triangle: Any, size: tuple[in
     changed = active & geometry.has_changed(shape)
     ray_o, ray_d, pixel = sensor.pixel_rays(*size)
     moving = dr.grad_enabled(ray_o, ray_d)
+    row = geometry.row_of_copy(dr.width(triangle))
 
-    def intersect(face: Any, active: Any, ray_o: Any, ray_d: Any) -> tuple[Any, ...]:
-        return _intersect(_triangle(geometry, face, active, active), active, ray_o, ray_d)
+    def intersect(face: Any, active: Any, ray_o: Any, ray_d: Any, row: Any) -> tuple[Any, ...]:
+        return _intersect(_triangle(geometry, face, active, row), active, ray_o, ray_d)
 
     if moving or not dr.grad_enabled(geometry.positions):
-        found = intersect(face, active, ray_o, ray_d)
+        found = intersect(face, active, ray_o, ray_d, row)
     else:
         with dr.suspend_grad():
-            found = intersect(face, active, ray_o, ray_d)
+            found = intersect(face, active, ray_o, ray_d, row)
 
         # Of the types only: functions that held what they lead to would keep the whole graph alive, if nothing ever traverses it.
         kinds = [type(value) for value in found]
 
-        def none(face: Any, active: Any, ray_o: Any, ray_d: Any) -> tuple[Any, ...]:
+        def none(face: Any, active: Any, ray_o: Any, ray_d: Any, row: Any) -> tuple[Any, ...]:
             return tuple(dr.zeros(kind) for kind in kinds)
 
         # Derivatives on their own, in a branch: most pixels of many images see nothing that moves.
-        attached = dr.if_stmt((face, changed, ray_o, ray_d), changed, intersect, none, mode="symbolic", label="attached hits")
+        attached = dr.if_stmt((face, changed, ray_o, ray_d, row), changed, intersect, none, mode="symbolic", label="attached hits")
         found = tuple(dr.replace_grad(value, other) for value, other in zip(found, attached, strict=True))
     e1, e2, normal, u, v, p_world = found
     wi_world = -dr.normalize(ray_d)
@@ -106,7 +117,7 @@ def pixel_hits(geometry: Geometry, sensor: Sensor, triangle: Any, size: tuple[in
         d = dr.detach(ray_d)
         depth = dr.dot(dr.detach(p_world) - dr.detach(ray_o), d) * dr.rcp(dr.squared_norm(d))
         pixel *= depth
-    return Hits(triangle, active, changed, face, shape, flags, e1, e2, normal, u, v, p_world, wi_world, depth, pixel)
+    return Hits(triangle, active, changed, face, row, shape, flags, e1, e2, normal, u, v, p_world, wi_world, depth, pixel)
 
 
 def _intersect(triangle: tuple[Any, Any, Any], active: Any, ray_o: Any, ray_d: Any) -> tuple[Any, Any, Any, Any, Any, Any]:
@@ -149,8 +160,8 @@ def _normal(e1: Any, e2: Any) -> Any:
     return normalize_or(mi.Normal3f(dr.cross(e1, e2)), mi.Normal3f(0.0, 0.0, 1.0))
 
 
-def _triangle(geometry: Geometry, face: Any, active: Any, changed: Any) -> tuple[Any, Any, Any]:
-    first, second, third = (geometry.vertices(face[k], active, changed) for k in range(3))
+def _triangle(geometry: Geometry, face: Any, active: Any, row: Any) -> tuple[Any, Any, Any]:
+    first, second, third = (geometry.vertices(face[k], active, row=row) for k in range(3))
     return first, second - first, third - first
 
 

@@ -76,5 +76,11 @@ def with_arrays(record: Any, arrays: list[Any]) -> Any:
     return map_arrays(record, lambda array: next(position) if _attached(array) else array)
 
 
+def with_places(record: Any, places: tuple[int, ...], arrays: list[Any]) -> Any:
+    """The same tree with others in the place of arrays of :func:`attached_places`, which need not be attached."""
+    wanted, place = dict(zip(places, arrays, strict=True)), count()
+    return map_arrays(record, lambda array: wanted.get(next(place), array))
+
+
 def _attached(array: Any) -> bool:
     return dr.is_float_v(array) and dr.grad_enabled(array)

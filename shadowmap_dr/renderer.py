@@ -202,15 +202,16 @@ class Renderer:
         cameras, geometry = self.data.cameras(sensor), self.data.geometry
         if vertex_positions is not None:
             geometry = geometry.with_positions(vertex_positions)
-        geometry = geometry.in_packets()
-        # Before all else that is attached: derivatives are taken in the reverse order, and pixels should need one pass only.
-        facets = self._facets(geometry)
         windows = sample_windows(cameras)
         factor = sample_grid(spp, windows)
+        samples = max(window.width * window.height for window in windows) * factor**2
+        # Before all else that is attached: derivatives are taken in the reverse order, and pixels should need one pass only.
+        geometry = geometry.in_packets(samples)
+        facets = self._facets(geometry)
         margin = Margin.of(cameras, factor) if self.settings.antialias else Margin()
         seen, casting = self._topologies(geometry)
         views = [self._view(margin.around(window), geometry, seen, factor) for window in windows]
-        lighting = self._lighting(views, geometry, casting, lights)
+        lighting = self._lighting(views, geometry, casting, lights).for_points(samples)
         shapes = (geometry, facets, self._creases(geometry, facets))
         pictures = [margin.cut(self._camera_image(view, lighting, *shapes), factor) for view in views]
         return develop(pictures, windows[0], factor)
@@ -322,7 +323,7 @@ class Renderer:
             windows = sample_windows(self.data.cameras(sensor))
             if len(windows) != 1 or not windows[0].filter.is_box:
                 raise ShadowmapError(f"sensor {sensor} is no single camera whose film has a box filter: use another one.")
-            geometry = self.data.geometry.in_packets()
+            geometry = self.data.geometry.in_packets(windows[0].width * windows[0].height)
             facets = self._facets(geometry)
             view = self._view(windows[0], geometry, self._topologies(geometry)[0], 1)
             seen, depth, sharpness = self._surface(view, geometry, facets, self.data.needs_frames)
@@ -403,13 +404,13 @@ class Renderer:
     def _radiance(self, seen: Surface, lighting: _Lighting, visible: list[Any], sensor: Sensor, raster: RasterOutput) -> Any:
         compat = self.settings.shadow.compat
         color = dr.zeros(mi.UnpolarizedSpectrum, dr.width(seen.shape))
+        nodes = self.data.materials()
         for light, fraction in zip(lighting.lights, visible, strict=True):
-            color += direct_light(seen, light, fraction, gate=not compat)
-        nodes = [*(source.shape.bsdf() for source in self.data.sources), *self.data.with_attributes()]
+            color += direct_light(seen, light, fraction, nodes, gate=not compat)
         for plan, samples in zip(self.soft, lighting.samples, strict=True):
             color += soft_light(seen, plan, samples, lighting.soft_maps, nodes, gate=not compat)
         for uniform in self._uniform_ambient():
-            color += ambient_light(seen, uniform, _AMBIENT_DIRECTIONS)
+            color += ambient_light(seen, uniform, _AMBIENT_DIRECTIONS, nodes)
         if not self.settings.hide_emitters:
             color += emission(seen, lighting.areas)
             for environment in self.data.environments:
@@ -449,6 +450,10 @@ class _Lighting:
     areas: tuple[AreaLight, ...]
     samples: tuple[LightSamples, ...]
     soft_maps: SoftMaps | None
+
+    def for_points(self, count: int) -> _Lighting:
+        """The same for look-ups by so many points at once (:meth:`~shadowmap_dr.shadow.ShadowMaps.for_points`)."""
+        return self if self.maps is None else replace(self, maps=self.maps.for_points(count))
 
 
 @dataclass(frozen=True)

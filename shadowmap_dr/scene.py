@@ -23,7 +23,7 @@ from .omissions import omissions_of, warn_of
 from .raster._memory import device_array
 from .sensors import Sensor, sensors_of
 from .sources import CurveSource, ShapeSource, source_of
-from .traversal import children, is_plain
+from .traversal import children, is_cosine, is_plain
 
 # Unit directions of rays that ask instances for their shapes. A cylinder does not answer one that lies in its axis.
 _PROBING = ((0.48, 0.36, 0.8), (-0.6, 0.64, 0.48))
@@ -40,6 +40,7 @@ class SceneData:
     shape_ptr, bsdf_ptr   mi.ShapePtr, mi.BSDFPtr (S,), by the index that ``geometry.face_shape`` holds
     variant       of Mitsuba, to which all of them belong
     needs_frames  whether any BSDF asks for more than the cosines of directions: tangents, texture coordinates
+    only_cosines  whether all BSDFs are proportional to the cosine of the light's direction, and know no more of directions
     """
 
     scene: Any
@@ -53,6 +54,7 @@ class SceneData:
     sources: tuple[ShapeSource, ...]
     variant: str
     needs_frames: bool = True
+    only_cosines: bool = False
 
     def cameras(self, sensor: int | Sensor) -> tuple[Sensor, ...]:
         """Those of the scene's sensor of that number, or the one that is given.
@@ -69,6 +71,10 @@ class SceneData:
         if not 0 <= sensor < len(self.sensors):
             raise ShadowmapError(f"There is no sensor {sensor}: the scene has {len(self.sensors)}, counted from 0.")
         return self.sensors[sensor]
+
+    def materials(self) -> list[Any]:
+        """BSDFs, and meshes whose attributes they read: all that Mitsuba shades with."""
+        return [*(source.shape.bsdf() for source in self.sources), *self.with_attributes()]
 
     def light(self, name: str) -> Light | AreaLight:
         """The light called ``name``; raises ``ShadowmapError`` listing the known names otherwise."""
@@ -159,6 +165,7 @@ def load(scene: Any, *, tessellation: int = 64, warn: bool = True) -> SceneData:
         sources=tuple(sources),
         variant=mi.variant(),
         needs_frames=not all(is_plain(source.shape.bsdf()) for source in sources),
+        only_cosines=all(is_cosine(source.shape.bsdf()) for source in sources),
     )
     data = refresh(data)
     if warn:

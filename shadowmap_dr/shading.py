@@ -20,9 +20,12 @@ from .environments import Environment
 from .geometry import FACETED, FLIP_GEOMETRIC, FLIP_SHADING, HAS_NORMALS, HAS_TEXCOORDS, READS_ATTRIBUTES, Geometry, normalize_or
 from .hits import Hits, corner_values, hits_at
 from .lights import AreaLight, Light
+from .raster._types import backend
 from .scene import SceneData
 from .sensors import Sensor
 from .spread import spread
+from .sums import evaluate
+from .tables import LIKE_LANES, copy_of_lane, in_copies
 
 
 @dataclass(frozen=True)
@@ -36,7 +39,7 @@ class Surface:
     active   Bool (N,), false where nothing was hit; there all records are finite and meaningless
     si       mi.SurfaceInteraction3f, for BSDF evaluation. ``si.p`` is the *rest-pose* position for shapes with mesh attributes
     bsdf     mi.BSDFPtr (N,)
-    plain    Float (8 S,), colours of shapes that are plain diffuse on both sides (:func:`plain_colours`), or None
+    colour   colour (N,), the BSDF on the viewer's side over the cosine, where no BSDF knows more of directions than that; else None
     """
 
     p_world: Any
@@ -46,17 +49,13 @@ class Surface:
     active: Any
     si: Any
     bsdf: Any
-    plain: Any = None
+    colour: Any = None
 
     def evaluate(self, wo: Any, active: Any) -> Any:
         """BSDF times cosine (colour, N) for directions to the light in the local frame (Vector3f). Attached to all."""
-        if self.plain is None:
+        if self.colour is None:
             return mi.UnpolarizedSpectrum(self.bsdf.eval(mi.BSDFContext(), self.si, wo, active))
-        side = self.si.wi.z
-        active = active & (side * wo.z > 0)
-        colour = dr.gather(mi.Vector4f, self.plain, 2 * self.shape + dr.select(side < 0, mi.UInt32(1), 0), active)
-        channels = dr.size_v(mi.UnpolarizedSpectrum)
-        return mi.UnpolarizedSpectrum(*(colour[c] for c in range(channels))) * dr.abs(wo.z)
+        return dr.select(active & (self.si.wi.z * wo.z > 0), self.colour * dr.abs(wo.z), 0)
 
 
 def plain_colours(data: SceneData) -> Any:
@@ -112,7 +111,7 @@ def normals_at(geometry: Geometry, hits: Hits) -> tuple[Any, Any]:
         normal = normalize_or(first + d1 * u + d2 * v, mi.Vector3f(0.0))
         return mi.Normal3f(dr.select(dr.squared_norm(normal) > 0, dr.select(negative, -normal, normal), n_world))
 
-    arguments = (hits.face, hits.changed, hits.u, hits.v, n_world, flags.test(FLIP_SHADING))
+    arguments = (hits.face + hits.row, hits.changed, hits.u, hits.v, n_world, flags.test(FLIP_SHADING))
     needed = hits.active & flags.test(HAS_NORMALS)
     if any(info.faceted and geometry.known_unchanged(info) for info in infos):
         needed &= ~flags.test(FACETED) | hits.changed
@@ -148,8 +147,31 @@ def surface_at(
     si.shape = dr.gather(mi.ShapePtr, data.shape_ptr, shape, active)
     si.prim_index = hits.triangle - dr.gather(mi.UInt32, geometry.shape_face_start, shape, active)
     bsdf = dr.gather(mi.BSDFPtr, data.bsdf_ptr, shape, active)
-    plain = None if frames else plain_colours(data)
-    return Surface(hits.p_world, n_world, hits.wi_world, shape, active, si, bsdf, plain)
+    seen = Surface(hits.p_world, n_world, hits.wi_world, shape, active, si, bsdf)
+    if not frames:
+        return replace(seen, colour=_plain_colour(data, seen))
+    return replace(seen, colour=_cosine_colour(data, seen)) if data.only_cosines else seen
+
+
+def _plain_colour(data: SceneData, seen: Surface) -> Any:
+    """``Surface.colour`` of materials that are the same everywhere on a shape."""
+    width, sides, channels = dr.width(seen.shape), plain_colours(data), dr.size_v(mi.UnpolarizedSpectrum)
+    rows = dr.width(sides) // 4
+    (sides,), copies = in_copies([sides], width, LIKE_LANES)
+    row = copy_of_lane(backend(sides), width, copies, LIKE_LANES) * rows
+    row += 2 * seen.shape + dr.select(seen.si.wi.z < 0, mi.UInt32(1), 0)
+    colour = dr.gather(mi.Vector4f, sides, row, seen.active, mode=dr.ReduceMode.Local)
+    return mi.UnpolarizedSpectrum(*(colour[c] for c in range(channels)))
+
+
+def _cosine_colour(data: SceneData, seen: Surface) -> Any:
+    """``Surface.colour`` of materials with textures: what they return for light along the normal."""
+
+    def colour(seen: Surface) -> Any:
+        side = dr.select(seen.si.wi.z < 0, mi.Float(-1), 1)
+        return seen.evaluate(mi.Vector3f(0, 0, side), seen.active)
+
+    return evaluate(colour, seen, data.materials(), dr.width(seen.shape))
 
 
 def _parametrisation(geometry: Geometry, flags: _Flags, hits: Hits) -> tuple[Any, Any, Any]:
@@ -158,7 +180,7 @@ def _parametrisation(geometry: Geometry, flags: _Flags, hits: Hits) -> tuple[Any
     if not any(info.has_texcoords for info in geometry.shapes):
         return uv, dp_du, dp_dv
     has = flags.test(HAS_TEXCOORDS)
-    first, d1, d2 = hits.corners(mi.Point2f, geometry.texcoords)
+    first, d1, d2 = hits.corners_of_copy(mi.Point2f, geometry.texcoords)
     uv = dr.select(has, first + d1 * hits.u + d2 * hits.v, uv)
     det = d1.x * d2.y - d1.y * d2.x
     regular = has & (det != 0)
@@ -169,10 +191,10 @@ def _parametrisation(geometry: Geometry, flags: _Flags, hits: Hits) -> tuple[Any
     return uv, dp_du, dp_dv
 
 
-def direct_light(surface: Surface, light: Light, visibility: Any = 1.0, *, gate: bool = True) -> Any:
+def direct_light(surface: Surface, light: Light, visibility: Any = 1.0, nodes: Sequence[Any] = (), *, gate: bool = True) -> Any:
     """Radiance (colour, N) towards the camera of one light: BSDF * light * visibility.
 
-    ``visibility`` Float (N,), 0 dark to 1 lit. ``gate`` removes light that reaches the shading normal from the wrong side of the
+    ``visibility`` Float (N,), 0 dark to 1 lit. ``nodes``: :meth:`SceneData.materials`. ``gate`` removes light that reaches the shading normal from the wrong side of the
     triangle, as a shadow ray would. Gradients flow to all of surface, light and visibility, not through the gate.
     """
     wo_world, weight = spread(light, dr.width(surface.shape)).illuminate(surface.p_world, surface.active)
@@ -180,7 +202,14 @@ def direct_light(surface: Surface, light: Light, visibility: Any = 1.0, *, gate:
     active = mi.Bool(surface.active)
     if gate:
         active &= passes_gate(surface, wo_world, wo)
-    return dr.select(active, surface.evaluate(wo, active) * weight * visibility, 0.0)
+    return dr.select(active, _reflected(surface, wo, active, nodes) * weight * visibility, 0.0)
+
+
+def _reflected(surface: Surface, wo: Any, active: Any, nodes: Sequence[Any]) -> Any:
+    """:meth:`Surface.evaluate` with derivatives by parameters of ``nodes`` that add up without loss."""
+    if surface.colour is not None:
+        return surface.evaluate(wo, active)
+    return evaluate(lambda own: own[0].evaluate(*own[1:]), (surface, wo, mi.Bool(active)), nodes, dr.width(surface.shape))
 
 
 def passes_gate(surface: Surface, wo_world: Any, wo: Any) -> Any:
@@ -197,15 +226,17 @@ def emission(surface: Surface, lights: Sequence[AreaLight]) -> Any:
     total = dr.zeros(mi.UnpolarizedSpectrum, dr.width(surface.shape))
     for light in lights:
         own = surface.active & (surface.shape == light.shape) & (dr.detach(surface.si.wi.z) > 0)
-        total += dr.select(own, light.seen(surface.si, own), 0)
+        radiance = evaluate(lambda at, light=light: light.seen(*at), (surface.si, own), [light.emitter], dr.width(surface.shape))
+        total += dr.select(own, radiance, 0)
     return total
 
 
-def ambient_light(surface: Surface, environment: Environment, n_directions: int = 16) -> Any:
+def ambient_light(surface: Surface, environment: Environment, n_directions: int = 16, nodes: Sequence[Any] = ()) -> Any:
     """Radiance (colour, N) towards the camera of an environment that nothing shadows.
 
     A fixed set of ``n_directions`` cosine-distributed directions in the hemisphere of the shading normal on the viewer's side
     (Fibonacci spiral): exact for diffuse surfaces under constant light, coarse for gloss. Gradients flow to surface and emitter.
+    ``nodes``: :meth:`SceneData.materials`.
     """
     total = dr.zeros(mi.UnpolarizedSpectrum, dr.width(surface.shape))
     side = dr.select(surface.si.wi.z < 0, -1.0, mi.Float(1.0))
@@ -215,13 +246,14 @@ def ambient_light(surface: Surface, environment: Environment, n_directions: int 
         cosine = math.sqrt(1.0 - radius * radius)
         wo = mi.Vector3f(radius * math.cos(angle), radius * math.sin(angle), cosine * side)
         radiance = environment.radiance(surface.si.to_world(wo), surface.active)
-        total += surface.evaluate(wo, surface.active) * radiance * (math.pi / (cosine * n_directions))
+        total += _reflected(surface, wo, surface.active, nodes) * radiance * (math.pi / (cosine * n_directions))
     return dr.select(surface.active, total, 0.0)
 
 
 def background(environment: Environment, sensor: Sensor, width: int | None = None, height: int | None = None) -> Any:
     """Radiance (colour, H * W) of an environment at every pixel centre, as seen where nothing is in front of it."""
-    return environment.radiance(sensor.ray_direction(width, height))
+    towards = sensor.ray_direction(width, height)
+    return evaluate(environment.radiance, towards, environment.nodes, dr.width(towards))
 
 
 def opacity(surface: Surface) -> Any:

@@ -7,8 +7,9 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from .raster._types import backend
 from .records import map_arrays
-from .tables import look_up, one_buffer
+from .tables import LIKE_LANES, copy_of_lane, in_copies, look_up, one_buffer
 
 
 def spread(record: Any, width: int) -> Any:
@@ -29,10 +30,13 @@ def spread(record: Any, width: int) -> Any:
     if not leaves or width == 1:
         return record
     flat = one_buffer(leaves)
+    numbers = dr.width(flat)
+    (flat,), copies = in_copies([flat], width, LIKE_LANES)
+    first = copy_of_lane(backend(flat), width, copies, LIKE_LANES) * numbers
     position = iter(range(len(leaves)))
 
     def wide(number: Any) -> Any:
-        return look_up(flat, dr.full(mi.UInt32, next(position), width))
+        return look_up(flat, dr.full(mi.UInt32, next(position), width) + first)
 
     return map_arrays(record, lambda array: _map_numbers(array, wide))
 

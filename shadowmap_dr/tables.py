@@ -1,20 +1,31 @@
 """Small tables that many lanes look numbers up in, differentiable without loss.
 
+Two things lose a part of the derivatives otherwise.
+
 On the LLVM backend ``dr.gather`` has an adjoint of its own for small arrays (``ReduceMode.Expand``, its default there): each
 thread sums up in memory of its own. Dr.Jit 1.5 loses a part of that sum, depending on the thread that comes to run it, where two
 things meet: the array has been read before, and the incoming gradient is a sum of any such kind that is not evaluated yet, which
 it is when what was looked up has itself served as a table. So tables are read in another mode here (:func:`look_up`), and what
 the caller gave never receives such a sum (:func:`from_one_buffer`), since the caller may have looked it up in the default mode.
+
+And a sum in single precision that grows term by term rounds each of them to its own last digit: with millions of like terms, all
+in the same direction. So blocks of lanes add to a copy of the table each (:func:`in_copies`), and the copies are added afterwards.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from types import ModuleType
 from typing import Any
 
 import drjit as dr
 
 from .raster._types import backend
+
+#: Lanes that add to one copy of a table of vertices, cameras or texels: their terms differ from lane to lane.
+LANES = 1 << 20
+#: The same where all terms may be equal, such as those by the strength of a light. A power of two, like the other.
+LIKE_LANES = 1 << 18
 
 
 def look_up(column: Any, index: Any) -> Any:
@@ -33,3 +44,67 @@ def from_one_buffer(columns: Sequence[Any]) -> list[Any]:
     buffer, rows = one_buffer(columns), dr.width(columns[0])
     row = dr.arange(backend(buffer).UInt32, rows)
     return [dr.gather(type(c), buffer, row + k * rows, mode=dr.ReduceMode.NoConflicts) for k, c in enumerate(columns)]
+
+
+def in_copies(arrays: Sequence[Any], lanes: int, block: int = LANES) -> tuple[list[Any], int]:
+    """Copies of flat ``Float`` arrays, one for each block of lanes that look numbers up in them (:func:`copy_of_lane`).
+
+    Make them before all that hangs on the lanes: derivatives are taken in the reverse order, and the lanes are worked out once more
+    for each place where copies are added.
+
+    Args:
+        arrays: tables.
+        lanes: number of the lanes that will look numbers up.
+        block: of lanes that share a copy, a power of two.
+
+    Returns:
+        The copies of each array, one after the other in one buffer, and their number, which is 1 if no array is attached. Attached.
+    """
+    count = -(-lanes // block)
+    if count == 1 or not dr.grad_enabled(list(arrays)):
+        return list(arrays), 1
+    return dr.custom(Copies, list(arrays), count, False), count
+
+
+def copy_of_lane(module: ModuleType, lanes: int, copies: int, block: int = LANES) -> Any:
+    """The copy (``UInt32``) that each lane is to read; a constant if there is but one."""
+    if copies == 1:
+        return module.UInt32(0)
+    return dr.minimum(dr.arange(module.UInt32, lanes) >> (block.bit_length() - 1), copies - 1)
+
+
+class Copies(dr.CustomOp):
+    """Copies of arrays, one after the other, or (``transpose``) the sums of such copies: each is the adjoint of the other.
+
+    Dr.Jit's own adjoint of a repeated gather would add up with atomics.
+    """
+
+    def eval(self, arrays: list[Any], count: int, transpose: bool) -> list[Any]:
+        self._arguments = count, transpose
+        return self._apply(arrays, transpose)
+
+    def forward(self) -> None:
+        self.set_grad_out(self._apply(self.grad_in("arrays"), self._arguments[1]))
+
+    def backward(self) -> None:
+        self.set_grad_in("arrays", self._apply(self.grad_out(), not self._arguments[1]))
+
+    def name(self) -> str:
+        return "copies"
+
+    def _apply(self, arrays: list[Any], transpose: bool) -> list[Any]:
+        return [(sum_of_copies if transpose else copied)(array, self._arguments[0]) for array in arrays]
+
+
+def copied(array: Any, count: int) -> Any:
+    """``count`` copies of an array (N) of any Dr.Jit type, one after the other (N * count)."""
+    width = dr.width(array)
+    lane = dr.arange(backend(array).UInt32, count * width)
+    return dr.gather(type(array), array, lane - lane // width * width)
+
+
+def sum_of_copies(array: Any, count: int) -> Any:
+    """The sum (N) of ``count`` arrays that lie one after the other (N * count)."""
+    width = dr.width(array) // count
+    lane = dr.arange(backend(array).UInt32, width)
+    return sum(dr.gather(type(array), array, lane + k * width) for k in range(count))

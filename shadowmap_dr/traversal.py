@@ -57,6 +57,18 @@ def is_plain(bsdf: Any) -> bool:
     )
 
 
+def is_cosine(bsdf: Any) -> bool:
+    """Whether a BSDF is known to be the cosine of the light's direction times a number that no direction changes: diffuse."""
+    kind = bsdf.class_name()
+    if kind == "SmoothDiffuse":
+        textures = [part for _, part in children(bsdf)]
+        # Those written in Python may look at directions.
+        return all(type(part) is mi.Texture for part in textures)
+    if kind not in ("TwoSidedBRDF", "MaskBSDF"):
+        return False
+    return all(is_cosine(part) if isinstance(part, mi.BSDF) else type(part) is mi.Texture for _, part in children(bsdf))
+
+
 def fingerprint(value: Any) -> Any:
     """Something that is equal to that of another value only if a parameter has not been given another one in between.
 

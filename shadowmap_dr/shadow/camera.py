@@ -55,6 +55,16 @@ class Views:
     def count(self) -> int:
         return dr.width(self.spread)
 
+    def columns(self) -> list[Any]:
+        """All numbers (``Float`` (M,) each) in a fixed order."""
+        return [*self.right, *self.up, *self.forward, *self.origin, self.spread, self.limit]
+
+    @classmethod
+    def of(cls, columns: Sequence[Any]) -> Views:
+        """Put together what :meth:`columns` has taken apart."""
+        Array3f = backend(columns[0]).Array3f
+        return cls(*(Array3f(*columns[k : k + 3]) for k in (0, 3, 6, 9)), *columns[12:])
+
 
 @dataclass(frozen=True)
 class Frusta:
@@ -158,7 +168,7 @@ def stack_views(views: Sequence[LightView]) -> Views:
 
 
 def of_map(table: Any, index: Any, count: int) -> Any:
-    """Rows of :class:`Views` or :class:`Frusta` for the map that each lane works on."""
+    """Rows of :class:`Views` or :class:`Frusta` (``count`` of them) for the map that each lane works on."""
     module = backend(index)
 
     def pick(value: Any) -> Any:

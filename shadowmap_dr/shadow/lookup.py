@@ -9,6 +9,7 @@ import drjit as dr
 import numpy as np
 
 from ..raster._types import backend
+from ..tables import copy_of_lane
 from .camera import of_map, project, to_light_space
 from .filters import filter_kernel, separable_terms
 from .methods import PREFILTERED
@@ -32,9 +33,11 @@ def visibility(maps: ShadowMaps, map_index: Any, p_world: Any, active: Any = Tru
         ``Float`` in 0..1; 1 outside the map (0 with ``compat``). Gradients flow to the points, the casters and the light.
     """
     module = backend(maps.values)
-    count = maps.views.count
     map_index = module.UInt32(map_index)
-    view, frustum = of_map(maps.views, map_index, count), of_map(maps.frusta, map_index, count)
+    frustum = of_map(maps.frusta, map_index, maps.count)
+    if maps.copies > 1:
+        map_index = map_index + copy_of_lane(module, dr.width(p_world), maps.copies) * maps.count
+    view = of_map(maps.views, map_index, maps.views.count)
     u, v, depth, inside = project(view, frustum, p_world)
     if maps.settings.compat:
         p = to_light_space(view, p_world)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import index
 from typing import Any
 
@@ -13,6 +13,7 @@ import drjit as dr
 from ..raster import MAX_RESOLUTION, RasterOutput, Topology, antialias, visible_triangles
 from ..raster._types import backend, pixel_coordinates
 from ..raster.planes import pixel_depth
+from ..tables import in_copies
 from .camera import Frusta, Views, linear_depth, of_map, to_clip
 from .filters import FILTERS, filter_kernel, filter_map, reach_of
 from .methods import DEFAULT, METHODS, PREFILTERED
@@ -120,6 +121,7 @@ class ShadowMaps:
         views, frusta: cameras of the maps.
         settings: how they were made.
         channels: C.
+        copies: of values and views, one after the other, one for each block of points (:meth:`for_points`).
     """
 
     values: Any
@@ -127,6 +129,17 @@ class ShadowMaps:
     frusta: Frusta
     settings: ShadowSettings
     channels: int
+    copies: int = 1
+
+    @property
+    def count(self) -> int:
+        """M."""
+        return self.views.count // self.copies
+
+    def for_points(self, count: int) -> ShadowMaps:
+        """The same maps for look-ups by so many points at once, whose derivatives shall add up without loss. Attached."""
+        (values, *columns), copies = in_copies([self.values, *self.views.columns()], count)
+        return replace(self, values=values, views=Views.of(columns), copies=copies) if copies > 1 else self
 
 
 def render_maps(

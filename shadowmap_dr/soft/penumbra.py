@@ -13,11 +13,10 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..records import attached_arrays, with_arrays
 from ..shadow import Frusta, ShadowMaps, Views, chebyshev_visibility
 from ..shadow.camera import of_map, to_light_space
 from ..shadow.shadow_map import FAR, block_means
-from .sums import sum_over
+from ..sums import sum_over
 
 # Places that are looked at for occluders, and again for visibility.
 _TAPS = 16
@@ -79,31 +78,29 @@ def penumbra_visibility(pyramid: Pyramid, which: Any, radius: Any, p_world: Any,
     a point does not hide it. In 0..1; 1 for points that are not ``active``. Attached to points, casters, light and radius, but
     not to the tangent plane, nor through the level of the pyramid.
     """
-    lanes = (radius, mi.Point3f(p_world))
-    inputs, start = (lanes, pyramid), dr.zeros(mi.Vector2f, dr.width(p_world))
+    lanes = (radius, mi.Point3f(p_world), which, dr.detach(n_world), mi.Bool(active))
+    start = dr.zeros(mi.Vector2f, dr.width(p_world))
 
-    def occluders(index: Any, arrays: list[Any]) -> Any:
-        (radius, p_world), pyramid = with_arrays(inputs, arrays)
+    def occluders(index: Any, lanes: Any, pyramid: Any) -> Any:
+        radius, p_world, which, n_world, active = lanes
         at = _Place.of(pyramid, which, p_world, n_world, active)
         moments, depth = at.look_up(pyramid, which, index, at.footprint(radius, at.nearest), attached=False)
         lit = chebyshev_visibility(moments, depth)
         return dr.select(moments.x < depth, mi.Vector2f(1 - lit, moments.x - lit * depth), 0)
 
-    blocked, depths = sum_over(occluders, _TAPS, start, attached_arrays(inputs), [], len(attached_arrays(lanes)), active)
+    blocked, depths = sum_over(occluders, _TAPS, start, lanes, pyramid, active=active)
     some = blocked > 1e-4
     mean = dr.select(some, depths / dr.select(some, blocked, 1), -0.5)
     dr.eval(mean, some)
-    lanes = (*lanes, mean)
-    found = (lanes, pyramid)
 
-    def passing(index: Any, arrays: list[Any]) -> Any:
-        (radius, p_world, mean), pyramid = with_arrays(found, arrays)
+    def passing(index: Any, lanes: Any, pyramid: Any) -> Any:
+        (radius, p_world, which, n_world, active), mean = lanes
         at = _Place.of(pyramid, which, p_world, n_world, active)
         nearer = at.frustum.first + (mean + 0.5) * (at.frustum.far - at.frustum.first)
         moments, depth = at.look_up(pyramid, which, index, at.footprint(radius, dr.maximum(nearer, at.nearest)))
         return mi.Vector2f(chebyshev_visibility(moments, depth), 0)
 
-    total, _ = sum_over(passing, _TAPS, start, attached_arrays(found), [], len(attached_arrays(lanes)), active)
+    total, _ = sum_over(passing, _TAPS, start, (lanes, mean), pyramid, active=active)
     return dr.select(mi.Bool(active) & some, total * (1 / _TAPS), 1)
 
 

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from ..records import attached_arrays, with_arrays
 from ..shading import Surface, passes_gate
 from ..shadow import visibility
-from ..traversal import parameters
+from ..sums import attached_parameters, sum_over
 from .maps import SoftMaps, SoftPlan, map_of
 from .penumbra import penumbra_visibility
 from .samples import LightSamples
-from .sums import sum_over
 
 
 def soft_light(
@@ -35,13 +32,9 @@ def soft_light(
     Gradients flow to all of surface, samples, maps and BSDFs.
     """
     sampled = None if maps is None or plan.kind == "single" else maps.sampled
-    # The colours of plain shapes are no lane's own: all gather from them.
-    own = replace(seen, plain=None)
-    inputs = (own, seen.plain, samples.table(), sampled)
 
-    def one_sample(index: Any, arrays: list[Any]) -> Any:
-        seen, plain, table, maps = with_arrays(inputs, arrays)
-        seen = replace(seen, plain=plain)
+    def one_sample(index: Any, seen: Surface, shared: Any) -> Any:
+        table, maps = shared
         wo_world, weight, reached = table.illuminate(index, seen.p_world)
         wo = seen.si.to_local(wo_world)
         active = seen.active & reached
@@ -53,17 +46,10 @@ def soft_light(
         return dr.select(active, value, 0)
 
     start = dr.zeros(mi.UnpolarizedSpectrum, dr.width(seen.shape))
-    lanes = len(attached_arrays(own))
-    light = sum_over(one_sample, samples.count, start, attached_arrays(inputs), _attached_parameters(nodes), lanes, seen.active)
+    implicit = [] if seen.colour is not None else attached_parameters(nodes)
+    light = sum_over(one_sample, samples.count, start, seen, (samples.table(), sampled), implicit, seen.active)
     if maps is None or plan.kind != "single":
         return light
     radius = samples.radius_towards(seen.p_world)
     return light * penumbra_visibility(maps.single, mi.UInt32(plan.first), radius, seen.p_world, seen.n_world, seen.active)
 
-
-def _attached_parameters(nodes: Sequence[Any]) -> list[Any]:
-    """What objects of Mitsuba's hold that gradients may flow to."""
-    found = []
-    for node in dict.fromkeys(nodes):
-        found += [v for v in parameters(node).values() if dr.is_array_v(v) and dr.is_float_v(v) and dr.grad_enabled(v)]
-    return found

@@ -14,6 +14,7 @@ from .errors import ShadowmapError
 from .raster import MAX_RESOLUTION
 from .reconstruction import reconstruct
 from .sensors import Sensor
+from .warning import warn
 
 
 @dataclass(frozen=True)
@@ -79,11 +80,22 @@ def _checked(windows: tuple[Sensor, ...]) -> tuple[Sensor, ...]:
 
 
 def sample_grid(spp: int, windows: Sequence[Sensor]) -> int:
-    """Samples along each side of a pixel: at most 16, and as many as the rasterizer's largest image has room for."""
+    """Samples along each side of a pixel: at most 16, and as many as the rasterizer's largest image has room for.
+
+    A warning names both counts where that is less than was asked for.
+    """
     if spp < 1:
         raise ShadowmapError(f"spp is {spp}: give at least 1 sample per pixel.")
-    longest = max(max(window.width, window.height) for window in windows)
-    return max(1, min(math.isqrt(math.ceil(spp) - 1) + 1, 16, MAX_RESOLUTION // longest))
+    widest = max(windows, key=lambda window: max(window.width, window.height))
+    wanted = min(math.isqrt(math.ceil(spp) - 1) + 1, 16)
+    factor = max(1, min(wanted, MAX_RESOLUTION // max(widest.width, widest.height)))
+    if factor < wanted:
+        size = f"{widest.width} x {widest.height} pixels"
+        warn(
+            f"Of {wanted**2} samples per pixel {factor**2} are taken: {size} would be more than {MAX_RESOLUTION} samples "
+            "along a side. Render parts of the image with crop windows, or lower spp."
+        )
+    return factor
 
 
 def develop(pictures: Sequence[Any], camera: Sensor, factor: int) -> Any:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
-import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,11 +9,10 @@ import mitsuba as mi
 
 from .lights import named_emitters, objection
 from .sensors import lenses_of
+from .warning import warn
 
 # Names that a warning lists.
 _LISTED = 4
-# Packages whose own code a warning does not point to.
-_CALLED = ("shadowmap_dr", "mitsuba", "drjit")
 
 
 def omissions_of(scene: Any, shapes: Sequence[tuple[str, Any]], unsupported: Sequence[str]) -> tuple[str, ...]:
@@ -42,12 +39,9 @@ def omissions_of(scene: Any, shapes: Sequence[tuple[str, Any]], unsupported: Seq
 
 
 def warn_of(omissions: Sequence[str]) -> None:
-    """One ``UserWarning`` that names all omissions, and points to who called this package or Mitsuba; nothing without any."""
+    """One ``UserWarning`` that names all omissions; nothing without any."""
     if omissions:
-        level, frame = 1, inspect.currentframe()
-        while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] in _CALLED:
-            level, frame = level + 1, frame.f_back
-        warnings.warn(f"Not all in the scene is supported: {'; '.join(omissions)}.", stacklevel=level)
+        warn(f"Not all in the scene is supported: {'; '.join(omissions)}.")
 
 
 def _has_extended_lights(scene: Any) -> bool:

@@ -16,7 +16,7 @@ import mitsuba as mi
 
 from ...errors import ShadowmapError
 
-SECTIONS = ("steps", "raster", "scaling", "breakdown")
+SECTIONS = ("steps", "raster", "scaling", "breakdown", "sums")
 
 
 @dataclass(frozen=True)
@@ -37,6 +37,7 @@ class Sizes:
         light_resolutions: sizes of images, beside that of the series, for which the numbers of lights are compared.
         large: mesh and resolution of the largest step.
         batch, batch_resolution: number and size of small images.
+        sums: (pixels along each side, samples a pixel) whose derivatives are added up; see `bench.sums`.
     """
 
     resolutions: tuple[int, ...] = (128, 512, 1024)
@@ -65,6 +66,7 @@ class Sizes:
     large: tuple[str, int] | None = ("spot-1.5M", 1024)
     batch: tuple[int, ...] = (1, 4, 8, 16, 32)
     batch_resolution: int = 64
+    sums: tuple[tuple[int, int], ...] = ((1024, 4), (1024, 16), (4096, 1))
 
 
 FULL = Sizes()
@@ -91,6 +93,7 @@ QUICK = Sizes(
     passes=1,
     large=None,
     batch=(1, 8),
+    sums=((512, 4),),
 )
 
 

@@ -24,6 +24,7 @@ from . import raster as bench_raster
 from . import report as bench_report
 from . import scaling as bench_scaling
 from . import steps as bench_steps
+from . import sums as bench_sums
 from .common import BenchOptions, Unit
 
 FORMAT = "shadowmap-dr bench 1"
@@ -33,6 +34,7 @@ UNITS: dict[str, Callable[[BenchOptions], list[Unit]]] = {
     "raster": bench_raster.units,
     "scaling": bench_scaling.units,
     "breakdown": bench_breakdown.units,
+    "sums": bench_sums.units,
 }
 
 

@@ -16,6 +16,7 @@ from rich.table import Table
 from ... import report
 from ...errors import ShadowmapError
 from . import plot as bench_plot
+from . import sums as bench_sums
 
 plot = bench_plot.plot
 
@@ -59,7 +60,7 @@ COLUMNS = ["", "size", "ours", "other", "ratio", "aim"]
 
 def rows(record: dict[str, Any]) -> list[Row]:
     """All that a record can tell, in the order of the sections."""
-    makers = {"steps": _step_rows, "raster": _raster_rows, "scaling": _scaling_rows, "breakdown": _breakdown_rows}
+    makers = {"steps": _step_rows, "raster": _raster_rows, "scaling": _scaling_rows, "breakdown": _breakdown_rows, "sums": _sum_rows}
     result: list[Row] = []
     for name, make in makers.items():
         units = record["sections"].get(name, {}).get("units", {})
@@ -259,6 +260,13 @@ def _breakdown_rows(key: str, unit: dict[str, Any]) -> Iterator[Row]:
         both = entry["forward_seconds"] + entry["backward_seconds"]
         other = f"there {_time(entry['forward_seconds'])}, back {_time(entry['backward_seconds'])}"
         yield Row(f"{what}: {entry['pass']}", size, _time(both), other, f"{100 * both / total:.0f} %")
+
+
+def _sum_rows(key: str, unit: dict[str, Any]) -> Iterator[Row]:
+    for entry in unit["sums"]:
+        size, off = f"{entry['size']}, {entry['spp']} spp", abs(entry["ratio"] - 1)
+        aims = _aim(100 * off, 100 * bench_sums.TOLERANCE, "<= {:g} %", least=False)
+        yield Row(f"sum: {key}", size, f"{100 * off:.3f} % off", entry["mode"], f"{entry['ratio']:.4f}x", *aims)
 
 
 def _aim(value: float, aim: float | None, form: str, *, least: bool) -> tuple[str, bool | None]:

@@ -18,6 +18,7 @@ from .aovs import aov_names
 from .errors import ShadowmapError
 from .film import put_into_film
 from .integrator_options import PLUGIN, Options
+from .nesting import Nesting
 from .pending import Inputs, Waiting, backward
 from .render_settings import RenderSettings
 from .scene_renderer import SceneRenderer, same_objects
@@ -138,13 +139,20 @@ def make_class() -> type:
         """
 
         def __init__(self, props: Any) -> None:
-            self.shell = Shell.from_properties(props)
+            self.shell, self.nesting = Shell.from_properties(props), Nesting()
             super().__init__(props)
 
-        def render(
+        def render(self, *arguments: Any, **named: Any) -> Any:
+            """Image (H, W, C) without gradients. It is put into the sensor's film too, but not while a function is frozen.
+
+            Takes Mitsuba's arguments: scene, sensor = 0, seed = 0, spp = 0, develop = True, evaluate = True.
+            """
+            self.nesting.note(arguments, named)
+            return self._render(*arguments, **named)
+
+        def _render(
             self, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, develop: bool = True, evaluate: bool = True
         ) -> Any:
-            """Image (H, W, C) without gradients. It is put into the sensor's film too, but not while a function is frozen."""
             sensor = sensor_of(scene, sensor)
             if develop and not evaluate:  # through mi.render
                 image = self.shell.primal(scene, sensor, spp)
@@ -173,9 +181,19 @@ def make_class() -> type:
             self.shell.backward(scene, sensor_of(scene, sensor), spp, grad_in)
             dr.eval()
 
-        def sample(self, *_: Any, **__: Any) -> Any:
-            """Refuses what integrators that hold others ask of these."""
-            raise ShadowmapError(f"'{PLUGIN}' cannot be nested in an integrator: for further channels, use its parameter aovs.")
+        def sample(self, *_: Any, **arguments: Any) -> Any:
+            """Nothing along rays: ``aov`` asks for that beside its nested images, and throws it away. Refused to all others."""
+            if not self.nesting.allows():
+                raise ShadowmapError(
+                    f"'{PLUGIN}' cannot be nested in an integrator that samples single rays, such as moment: render it by itself, "
+                    "or in aov."
+                )
+            if self.shell.options.aovs:
+                raise ShadowmapError(
+                    f"'{PLUGIN}' has channels of its own (aovs is {self.shell.options.aovs!r}), which aov cannot pass on: "
+                    "leave them out, or render it by itself."
+                )
+            return mi.Spectrum(0), mi.Bool(False), [], None
 
         def aov_names(self) -> list[str]:
             """Names of the channels after colour and alpha."""

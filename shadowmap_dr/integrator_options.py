@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from difflib import get_close_matches
+from fnmatch import fnmatchcase
 from typing import Any
 
 from .errors import ShadowmapError
-from .render_settings import RenderSettings
+from .render_settings import DIRECT, RenderSettings
 from .shadow import ShadowSettings
+from .warning import warn
 
 PLUGIN = "shadowmap"
 
@@ -15,6 +18,13 @@ PLUGIN = "shadowmap"
 _SYNONYMS = {"sh_normal": "normal"}
 # Channels of the image itself.
 COLOURS = ("R", "G", "B", "A", "Y")
+
+# Parameters of Mitsuba's integrators that have no meaning here: scenes keep them when they change to this one. Those that end with *
+# stand for all that begin so.
+_FOREIGN = (
+    "rr_depth", "shading_samples", "emitter_samples", "bsdf_samples", "sppc", "sppp", "sppi", "guiding*", "project_seed",
+    "proj_seed*", "samples_per_pass", "timeout", "block_size",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -41,6 +51,7 @@ class Options:
     antialias              anti-alias the image; without it outlines have no gradient
     ambient                radiance of unshadowed light from all directions, beside that of the scene's environment
     hide_emitters          the camera looks through area lights, and sees black instead of environments; both light the scene
+    max_depth              as in Mitsuba: 0 is black, 1 shows emitters only, 2 is direct light; more, or -1, is rendered as 2
     aovs                   further channels, separated by commas: names of ``shadowmap_dr.aovs.AOVS``, or ``label:name`` to call
                            the channel ``label``
     tessellation           triangles around spheres, disks and cylinders, at least 3; curves have half as many around them, and
@@ -69,6 +80,7 @@ class Options:
     antialias: bool = True
     ambient: float = 0.0
     hide_emitters: bool = False
+    max_depth: int = DIRECT
     aovs: str = ""
     tessellation: int = 64
     recorded: bool = False
@@ -78,12 +90,22 @@ class Options:
     def from_properties(cls, props: Any) -> Options:
         """Read ``mi.Properties``. Raises ShadowmapError for an unknown parameter or a value of another type."""
         defaults = {f.name: f.default for f in fields(cls)}
-        values = {}
+        values, foreign = {}, []
         for name in props.keys():  # noqa: SIM118  (Properties is no dictionary)
-            if name not in defaults:
-                raise ShadowmapError(f"'{PLUGIN}' has no parameter '{name}': it has {', '.join(sorted(defaults))}.")
-            values[name] = _typed(name, props[name], type(defaults[name]))
-        return cls(**values)
+            if name in defaults:
+                values[name] = _typed(name, props[name], type(defaults[name]))
+            elif any(fnmatchcase(name, pattern) for pattern in _FOREIGN):
+                _ = props[name]  # or Mitsuba would say that nobody has asked for it
+                foreign.append(name)
+            else:
+                raise ShadowmapError(f"'{PLUGIN}' has no parameter '{name}': {_near(name, sorted(defaults))}.")
+        if foreign:
+            names = ", ".join(sorted(foreign))
+            warn(f"'{PLUGIN}' ignores {names}: {'parameters' if len(foreign) > 1 else 'a parameter'} of Mitsuba's integrators.")
+        options = cls(**values)
+        if options.max_depth == -1 or options.max_depth > DIRECT:
+            warn(f"'{PLUGIN}' renders max_depth {options.max_depth} as {DIRECT}: light that is reflected more than once is left out.")
+        return options
 
     @property
     def labelled_aovs(self) -> tuple[tuple[str, str], ...]:
@@ -126,6 +148,7 @@ class Options:
             antialias=self.antialias,
             ambient=self.ambient,
             hide_emitters=self.hide_emitters,
+            max_depth=self.max_depth,
             shadow_samples=self.shadow_samples,
             emitter_samples=self.emitter_samples,
             environment_samples=self.environment_samples,
@@ -133,6 +156,12 @@ class Options:
             emitter_shadows=self.emitter_shadows,
             aovs=tuple(name for _, name in self.labelled_aovs),
         )
+
+
+def _near(name: str, known: list[str]) -> str:
+    """What is known, and what is meant, perhaps."""
+    nearest = get_close_matches(name, known, 1)
+    return f"it has {', '.join(known)}" + (f"; the nearest is '{nearest[0]}'" if nearest else "")
 
 
 def _typed(name: str, value: Any, kind: type) -> Any:

@@ -11,6 +11,8 @@ from .shadow import ShadowSettings
 
 #: Most samples of one extended light.
 MOST_SAMPLES = 4096
+#: ``max_depth`` of light that is reflected once on its way to the camera.
+DIRECT = 2
 
 
 @dataclass(frozen=True)
@@ -23,6 +25,7 @@ class RenderSettings:
         ambient: radiance of unshadowed light that arrives from everywhere, beside that of the scene's environment.
         hide_emitters: the camera looks through area lights, and sees black instead of environments, which light the scene all
             the same.
+        max_depth: 0 is black, 1 shows emitters only, 2 is direct light, as in Mitsuba; more, or -1, is the same as 2.
         emitter_samples: points on each area light, each with a shadow map.
         environment_samples: directions of an environment, each with a shadow map.
         soft_map_resolution: texels along each side of these maps.
@@ -37,6 +40,7 @@ class RenderSettings:
     antialias: bool = True
     ambient: float = 0.0
     hide_emitters: bool = False
+    max_depth: int = DIRECT
     shadow_samples: int = 0
     emitter_samples: int = 32
     environment_samples: int = 64
@@ -50,9 +54,11 @@ class RenderSettings:
         for name in self.aovs:
             if name not in AOVS:
                 raise ShadowmapError(f"There is no AOV '{name}': choose from {', '.join(AOVS)}.")
-        for name in ("shadow_samples", "emitter_samples", "environment_samples"):
+        for name in ("shadow_samples", "emitter_samples", "environment_samples", "max_depth"):
             if not isinstance(getattr(self, name), Integral):
                 raise ShadowmapError(f"{name} is {getattr(self, name)!r}: give an integer.")
+        if self.max_depth < -1:
+            raise ShadowmapError(f"max_depth is {self.max_depth}: choose -1 (no limit), or 0 and more.")
         if not 0 <= self.shadow_samples <= 8:
             raise ShadowmapError(f"shadow_samples is {self.shadow_samples}: choose 0 (automatic) to 8.")
         for name in ("emitter_samples", "environment_samples"):
@@ -67,6 +73,11 @@ class RenderSettings:
             _ = self.soft_shadow  # whether such maps can be
         if not (self.ambient >= 0 and self.ambient < float("inf")):
             raise ShadowmapError(f"ambient is {self.ambient}: give a finite radiance of at least 0.")
+
+    @property
+    def lit(self) -> bool:
+        """Whether surfaces reflect light."""
+        return not 0 <= self.max_depth < DIRECT
 
     def look_ups(self, width: int) -> int:
         """Look-ups along each side of a pixel's footprint in images of this many columns of samples."""

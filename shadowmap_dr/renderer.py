@@ -247,6 +247,8 @@ class Renderer:
     ) -> _Lighting:
         """All lights and their shadow maps."""
         data, settings = self.data, self.settings
+        if not settings.lit:
+            return _Lighting((), None, data.areas, (), None)
         lights, areas = self._replaced(data.lights, replacements), self._replaced(data.areas, replacements)
         extended = (*areas, *data.environments)
         samples = tuple(samples_of(light, plan, geometry) for light, plan in zip(extended, self.soft, strict=True))
@@ -370,7 +372,7 @@ class Renderer:
         shining = [SquareSpot(light) if compat and isinstance(light, SpotLight) else light for light in lights]
         lighting = replace(lighting, lights=softened(shining, seen.p_world, around))
         color = self._radiance(seen, lighting, visible, sensor, raster)
-        channels = film_channels(color, seen.active, sensor)
+        channels = film_channels(color, seen.active & (self.settings.max_depth != 0), sensor)
         named = collect_aovs(self.settings.aovs, seen, raster, lights, visible)
         if self.settings.antialias:
             # In one pass over the pixels, since both need much of the same.
@@ -407,11 +409,12 @@ class Renderer:
         nodes = self.data.materials()
         for light, fraction in zip(lighting.lights, visible, strict=True):
             color += direct_light(seen, light, fraction, nodes, gate=not compat)
-        for plan, samples in zip(self.soft, lighting.samples, strict=True):
+        soft = self.soft if self.settings.lit else ()
+        for plan, samples in zip(soft, lighting.samples, strict=True):
             color += soft_light(seen, plan, samples, lighting.soft_maps, nodes, gate=not compat)
         for uniform in self._uniform_ambient():
             color += ambient_light(seen, uniform, _AMBIENT_DIRECTIONS, nodes)
-        if not self.settings.hide_emitters:
+        if not self.settings.hide_emitters and self.settings.max_depth != 0:
             color += emission(seen, lighting.areas)
             for environment in self.data.environments:
                 sky = background(environment, sensor, raster.width, raster.height)
@@ -419,7 +422,7 @@ class Renderer:
         return color
 
     def _uniform_ambient(self) -> tuple[Any, ...]:
-        return (_Uniform(self.settings.ambient),) if self.settings.ambient > 0 else ()
+        return (_Uniform(self.settings.ambient),) if self.settings.ambient > 0 and self.settings.lit else ()
 
 
 @dataclass(frozen=True)

@@ -76,7 +76,7 @@ class SceneRenderer:
             data = replace(load(scene, tessellation=tessellation, warn=warn), sensors=(sensors_of(sensor),))
             renderer = Renderer.from_data(data, settings)
             sky, unseen = SkyWatch(data.environments), Unseen((*scene.emitters(), *_bsdfs(data), *data.with_attributes()))
-        lights = tuple(light.name for light in data.lights)
+        lights = tuple(light.name for light in data.lights) if settings.lit else ()
         record = cls(_parts(scene, data), _statics(scene, data), _sizes(data), lights, renderer.with_data(_without_scene(data)))
         mirrors = MirrorWatch([shape for source in data.sources for shape in source.transformed()])
         return replace(record, sky=sky, mirrors=mirrors, unseen=unseen, colours=renderer.creases.watch(data.sources))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import traceback
 
 import drjit as dr
 import mitsuba as mi
@@ -131,11 +130,3 @@ def test_film_holds_the_image_of_mi_render(variant: str, recorded: bool) -> None
         params.update()
         image = mi.render(scene, params, integrator=integrator).numpy()
         assert np.allclose(film.develop().numpy(), image, atol=1e-6)
-
-
-@pytest.mark.parametrize("kind", ["aov", "moment"])
-def test_nested_in_another_integrator(variant: str, kind: str) -> None:
-    outer = {"type": kind, "inner": {"type": "shadowmap"}} | ({"aovs": "d:depth"} if kind == "aov" else {})
-    with pytest.raises(RuntimeError) as error:
-        mi.render(small_scene(camera=camera(8)), integrator=mi.load_dict(outer), spp=1)
-    assert "use its parameter aovs" in "".join(traceback.format_exception(error.value))

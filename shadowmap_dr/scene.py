@@ -207,12 +207,12 @@ def refresh(data: SceneData, sensors: tuple[Any, ...] | None = None) -> SceneDat
 
 def _shapes_of(scene: Any) -> Iterator[tuple[str, Any, Any]]:
     """(unique name, shape, instance or None) of all shapes, shape groups resolved."""
-    groups = [children(node) for _, node in children(scene) if node.class_name().startswith("ShapeGroup")]
+    groups = _Groups(scene)
     taken: set[str] = set()
     for index, shape in enumerate(scene.shapes()):
         name = shape.id() or f"shape_{index}"
         if shape.class_name() == "Instance":
-            for child_index, child in enumerate(_group_of(shape, name, groups)):
+            for child_index, child in enumerate(groups.shapes_of(shape, name)):
                 yield _unique(f"{name}.{child.id() or child_index}", taken), child, shape
         else:
             yield _unique(name, taken), shape, None
@@ -226,15 +226,35 @@ def _unique(name: str, taken: set[str]) -> str:
     return candidate
 
 
-def _group_of(instance: Any, name: str, groups: list[list[tuple[str, Any]]]) -> list[Any]:
-    """Shapes of the group that an instance shows.
+class _Groups:
+    """The shape groups of a scene.
 
-    An instance does not tell its group; but if there are several, an intersection record made by hand shows which shape would
-    have been hit.
+    An instance has no reference to its group that can be read, but says what it shows, with the group's name. Groups that say the
+    same of themselves are told apart by an intersection record made by hand, which shows the shape that would have been hit.
+    That takes a kernel for each instance.
     """
-    shown = [[child for _, child in group if isinstance(child, mi.Shape)] for group in groups]
-    if len(shown) == 1:
-        return shown[0]
+
+    def __init__(self, scene: Any) -> None:
+        nodes = [node for _, node in children(scene) if node.class_name().startswith("ShapeGroup")]
+        self._shapes = [[child for _, child in children(node) if isinstance(child, mi.Shape)] for node in nodes]
+        self._texts = [_in_one_line(node) for node in nodes]
+
+    def shapes_of(self, instance: Any, name: str) -> list[Any]:
+        """Shapes of the group that an instance shows. ``name`` of the instance, for messages."""
+        shown = self._shapes
+        if len(shown) > 1:
+            text = _in_one_line(instance)
+            said = [k for k, group in enumerate(self._texts) if text.startswith(f"Instance[ shapegroup = {group} to_world")]
+            shown = [shown[k] for k in said] or shown
+        return shown[0] if len(shown) == 1 else _hit_by(instance, name, shown)
+
+
+def _in_one_line(node: Any) -> str:
+    return " ".join(str(node).split())
+
+
+def _hit_by(instance: Any, name: str, shown: list[list[Any]]) -> list[Any]:
+    """The group, of several, whose first shape a ray would hit."""
     hit = dr.zeros(mi.PreliminaryIntersection3f)
     hit.t, hit.valid, hit.instance = mi.Float(1.0), mi.Bool(True), mi.ShapePtr(instance)
     # Without FollowShape no shape is found where the instance's to_world is attached.

@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 
 from shadowmap_dr import ShadowmapError, assets
+from shadowmap_dr import scene as scene_module
 from shadowmap_dr.scene import describe, load, refresh
 from shadowmap_dr.shading import surface
 from shadowmap_dr.sources import MeshSource
+from shadowmap_dr.traversal import children
 
 EXAMPLES = ["pose", "gallery", "still_life", "pavilion", "meadow"]
 
@@ -165,6 +167,28 @@ def test_all_instances_of_a_mesh_pass_gradients_on(variant: str) -> None:
     params.update()
     dr.backward(dr.sum(refresh(data).geometry.positions))
     np.testing.assert_allclose(dr.grad(params[key]).numpy(), sum(factors), rtol=1e-5)
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_instances_of_several_groups(variant: str, named: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Groups of other names cost no kernel for each instance; those that say the same of themselves are told apart by one."""
+    kinds, probed = ("cube", "sphere", "cylinder"), []
+    hit_by = scene_module._hit_by
+    monkeypatch.setattr(scene_module, "_hit_by", lambda *arguments: probed.append(arguments[1]) or hit_by(*arguments))
+    scene = {"type": "scene"}
+    for k, kind in enumerate(kinds):
+        scene[f"group{k}"] = {"type": "shapegroup", "shape": {"type": kind}}
+    for k in range(6):
+        scene[f"copy{k}"] = {"type": "instance", "group": {"type": "ref", "id": f"group{k % 3}"}}
+    scene = mi.load_dict(scene, optimize=False)
+    if not named:
+        for _, node in children(scene):
+            if node.class_name().startswith("ShapeGroup"):
+                node.set_id("")
+    infos = load(scene).geometry.shapes
+    assert [info.plugin.lower() for info in infos] == [*kinds, *kinds]
+    # A cube's group has another number of triangles than the others have shapes.
+    assert len(probed) == (0 if named else 4)
 
 
 def test_topology_change_is_refused(variant: str) -> None:

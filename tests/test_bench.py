@@ -24,6 +24,7 @@ from shadowmap_dr.experiments.bench import experiment as bench
 from shadowmap_dr.experiments.bench import meshes as bench_meshes
 from shadowmap_dr.experiments.bench import raster as bench_raster
 from shadowmap_dr.experiments.bench import report as bench_report
+from shadowmap_dr.experiments.bench import sums as bench_sums
 from shadowmap_dr.experiments.bench.common import BenchOptions, Sizes, Unit, run_child
 from shadowmap_dr.scene import load
 
@@ -45,6 +46,7 @@ TINY = Sizes(
     large=("teapot-1k", 16),
     batch=(1, 2),
     batch_resolution=8,
+    sums=((16, 1),),
 )
 
 
@@ -106,6 +108,21 @@ def test_growth(tmp_path: Path) -> None:
     for kind in ("raster", "sensors"):
         assert units["batch"][kind]["throughput_over_single_steps"]["1"] == 1
         assert units["batch"][kind]["throughput_over_single_steps"]["2"] > 0
+
+
+def test_sums(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    cases = (bench_sums.Sum("sun", "texture", "floor.bsdf.reflectance.data"), bench_sums.Sum("point", "diffuse", "light.position"))
+    monkeypatch.setattr(bench_sums, "SUMS", cases)
+    record = run(options(tmp_path, "sums"))
+    units = record["sections"]["sums"]["units"]
+    assert [[entry["mode"] for entry in units[str(case)]["sums"]] for case in cases] == [
+        ["plug-in", "recorded"],
+        ["plug-in", "recorded", "renderer", "frozen"],
+    ]
+    entries = [entry for unit in units.values() for entry in unit["sums"]]
+    assert all(entry["ratio"] == pytest.approx(1, rel=bench_sums.TOLERANCE) for entry in entries)
+    rows = [row for row in bench_report.rows(record) if row.what.startswith("sum")]
+    assert len(rows) == 6 and all(row.met for row in rows)
 
 
 def test_passes(tmp_path: Path) -> None:

@@ -66,7 +66,7 @@ class Sizes:
     large: tuple[str, int] | None = ("spot-1.5M", 1024)
     batch: tuple[int, ...] = (1, 4, 8, 16, 32)
     batch_resolution: int = 64
-    sums: tuple[tuple[int, int], ...] = ((1024, 4), (1024, 16), (4096, 1))
+    sums: tuple[tuple[int, int], ...] = ((1024, 16), (4096, 1))
 
 
 FULL = Sizes()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import signal
@@ -21,6 +22,7 @@ from shadowmap_dr.errors import ShadowmapError
 from shadowmap_dr.experiments.bench import breakdown as bench_breakdown
 from shadowmap_dr.experiments.bench import common as bench_common
 from shadowmap_dr.experiments.bench import experiment as bench
+from shadowmap_dr.experiments.bench import loops as bench_loops
 from shadowmap_dr.experiments.bench import meshes as bench_meshes
 from shadowmap_dr.experiments.bench import raster as bench_raster
 from shadowmap_dr.experiments.bench import report as bench_report
@@ -47,6 +49,8 @@ TINY = Sizes(
     batch=(1, 2),
     batch_resolution=8,
     sums=((16, 1),),
+    loop_size=8,
+    loop_steps=0,
 )
 
 
@@ -123,6 +127,21 @@ def test_sums(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert all(entry["ratio"] == pytest.approx(1, rel=bench_sums.TOLERANCE) for entry in entries)
     rows = [row for row in bench_report.rows(record) if row.what.startswith("sum")]
     assert len(rows) == 6 and all(row.met for row in rows)
+
+
+def test_loops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    loop = dataclasses.replace(bench_loops.LOOPS["clipped colours"], count=5)
+    monkeypatch.setattr(bench_loops, "LOOPS", {"clipped colours": loop})
+    record = run(options(tmp_path, "loops"))
+    unit = record["sections"]["loops"]["units"]["clipped colours"]
+    assert unit["seconds"].keys() == unit["errors"].keys() == {"ours", "original"}
+    assert unit["original"] == {"type": "prb", "max_depth": 2} and unit["ratio_of_medians"]["original / ours"] > 0
+    assert all(entry["last"] < entry["first"] for entry in unit["errors"].values())
+
+
+def test_memory_of_loops() -> None:
+    found = bench_loops.measure_memory("kept parameters", 8, 103, lambda result: None)
+    assert found["steps"] == 103 and found["settled"] > 0 and found["later"] > 0
 
 
 def test_passes(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ import mitsuba as mi
 
 from ...errors import ShadowmapError
 
-SECTIONS = ("steps", "raster", "scaling", "breakdown", "sums")
+SECTIONS = ("steps", "raster", "scaling", "breakdown", "sums", "loops")
 
 
 @dataclass(frozen=True)
@@ -38,6 +38,8 @@ class Sizes:
         large: mesh and resolution of the largest step.
         batch, batch_resolution: number and size of small images.
         sums: (pixels along each side, samples a pixel) whose derivatives are added up; see `bench.sums`.
+        loop_size: pixels along each side of images in the loops of `bench.loops`.
+        loop_steps: steps over which their memory is watched, 0 for not at all.
     """
 
     resolutions: tuple[int, ...] = (128, 512, 1024)
@@ -67,6 +69,8 @@ class Sizes:
     batch: tuple[int, ...] = (1, 4, 8, 16, 32)
     batch_resolution: int = 64
     sums: tuple[tuple[int, int], ...] = ((1024, 16), (4096, 1))
+    loop_size: int = 128
+    loop_steps: int = 1000
 
 
 FULL = Sizes()
@@ -94,6 +98,8 @@ QUICK = Sizes(
     large=None,
     batch=(1, 8),
     sums=((512, 4),),
+    loop_size=64,
+    loop_steps=0,
 )
 
 

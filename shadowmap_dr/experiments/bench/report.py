@@ -60,7 +60,7 @@ COLUMNS = ["", "size", "ours", "other", "ratio", "aim"]
 
 def rows(record: dict[str, Any]) -> list[Row]:
     """All that a record can tell, in the order of the sections."""
-    makers = {"steps": _step_rows, "raster": _raster_rows, "scaling": _scaling_rows, "breakdown": _breakdown_rows, "sums": _sum_rows}
+    makers = {"steps": _step_rows, "raster": _raster_rows, "scaling": _scaling_rows, "breakdown": _breakdown_rows, "sums": _sum_rows, "loops": _loop_rows}
     result: list[Row] = []
     for name, make in makers.items():
         units = record["sections"].get(name, {}).get("units", {})
@@ -267,6 +267,21 @@ def _sum_rows(key: str, unit: dict[str, Any]) -> Iterator[Row]:
         size, off = f"{entry['size']}, {entry['spp']} spp", abs(entry["ratio"] - 1)
         aims = _aim(100 * off, 100 * bench_sums.TOLERANCE, "<= {:g} %", least=False)
         yield Row(f"sum: {key}", size, f"{100 * off:.3f} % off", entry["mode"], f"{entry['ratio']:.4f}x", *aims)
+
+
+def _loop_rows(key: str, unit: dict[str, Any]) -> Iterator[Row]:
+    size, seconds, errors = f"{unit['size']}", unit["seconds"], unit["errors"]
+    ours, original = seconds["ours"]["median"], seconds["original"]["median"]
+    value = unit["ratio_of_medians"]["original / ours"]
+    other = f"{unit['original']['type']} {_time(original)}"
+    yield Row(f"loop: {key}", size, _time(ours), other, f"{value:.2f}x", *_aim(value, 1.0, ">= {:g}x", least=True))
+    left = {name: entry["last"] / entry["first"] for name, entry in errors.items()}
+    other = f"{unit['original']['type']} {100 * left['original']:.0f} %"
+    yield Row(f"loop: {key}, error left", size, f"{100 * left['ours']:.0f} %", other)
+    if "later" in unit.get("memory", {}):
+        memory = unit["memory"]
+        grown = (memory["later"] - memory["settled"]) / 2**20
+        yield Row(f"loop: {key}, {memory['steps']} steps", size, f"{grown:.0f} MiB more")
 
 
 def _aim(value: float, aim: float | None, form: str, *, least: bool) -> tuple[str, bool | None]:

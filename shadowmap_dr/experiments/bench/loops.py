@@ -1,0 +1,415 @@
+"""Loops as Mitsuba's users write them, in which nothing but the integrator's dictionary is exchanged.
+
+Rebuilt from Mitsuba's and Dr.Jit's public documentation. Each loop is a generator: it takes one step at a time and yields how far
+the parameters are from the true ones, so that loops with different integrators can take turns.
+"""
+
+from __future__ import annotations
+
+import functools
+import pickle
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ... import assets
+from ...timing import compare, forget_peak_memory, peak_memory, quiet_garbage, timed
+from .common import BenchOptions, Unit, Update, run_child
+
+#: The integrator that takes the place of the originals.
+OURS: dict[str, Any] = {"type": "shadowmap"}
+# Originals: for materials and lights, and for what moves. Their sample counts are the defaults.
+_MATERIALS: dict[str, Any] = {"type": "prb", "max_depth": 2}
+_MOVES: dict[str, Any] = {"type": "direct_projective", "guiding": "none"}
+
+_FLOOR, _BALL = "floor.bsdf.reflectance.value", "ball.bsdf.reflectance.value"
+_TRUE_FLOOR, _TRUE_BALL, _TRUE_LAMP = (0.5, 0.5, 0.5), (0.6, 0.3, 0.2), (12.0, 12.0, 12.0)
+# Samples of reference images and of steps.
+_MANY, _SPP = 64, 4
+# Steps that are not timed, and those of a long run after which its memory counts.
+_WARM_UP, _SETTLED = 3, 100
+# A loop that takes longer than this hangs.
+_SECONDS = 1800.0
+
+
+@dataclass(frozen=True)
+class Loop:
+    """``steps(integrator, size)`` makes the generator; ``original``: dictionary of Mitsuba's integrator; ``bar``: share of the
+    first error that is left after ``count`` steps."""
+
+    steps: Callable[[dict[str, Any], int], Iterator[float]]
+    original: dict[str, Any]
+    count: int = 40
+    bar: float = 0.5
+
+
+def _scene_dict(integrator: dict[str, Any], size: int, **changes: Any) -> dict[str, Any]:
+    """A head over a floor under a lamp; ``changes``: other parts, None for those that are left out."""
+    t = mi.ScalarTransform4f()
+    head = {"type": "ply", "filename": str(assets.mesh("suzanne")), "to_world": t.translate([0, 0, 0.5]).rotate([1, 0, 0], 90).scale(0.4)}
+    parts = {
+        "type": "scene",
+        "integrator": integrator,
+        "sensor": {**_camera(-np.pi / 2), "film": _film(size, size)},
+        "floor": {"type": "rectangle", "to_world": t.scale(2), "bsdf": _diffuse(_TRUE_FLOOR)},
+        "lamp": {
+            "type": "rectangle",
+            "to_world": t.look_at([1, -1, 3], [0, 0, 0], [0, 1, 0]).scale(0.4),
+            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": list(_TRUE_LAMP)}},
+        },
+        "ball": {**head, "bsdf": _diffuse(_TRUE_BALL)},
+        **changes,
+    }
+    return {name: part for name, part in parts.items() if part is not None}
+
+
+def _camera(angle: float) -> dict[str, Any]:
+    origin = [4 * np.cos(angle), 4 * np.sin(angle), 3]
+    return {"type": "perspective", "fov": 40, "to_world": mi.ScalarTransform4f().look_at(origin, [0, 0, 0.2], [0, 0, 1])}
+
+
+def _film(width: int, height: int) -> dict[str, Any]:
+    filtered = {"rfilter": {"type": "box"}, "sample_border": True}
+    return {"type": "hdrfilm", "width": width, "height": height, "pixel_format": "rgb", **filtered}
+
+
+def _diffuse(colour: Sequence[float]) -> dict[str, Any]:
+    return {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(colour)}}
+
+
+def _error(value: Any, true: Any) -> float:
+    return float(np.abs(np.ravel(dr.detach(value)) - np.ravel(true)).mean())
+
+
+def _descend(
+    scene: Any, names: Sequence[str], starts: Sequence[Any], true: Sequence[Any], rate: float, bounds: tuple[float, float] | None
+) -> Iterator[float]:
+    """The loop of Mitsuba's tutorials: Adam, clipping, `params.update(opt)`."""
+    reference = mi.render(scene, spp=_MANY)
+    params = mi.traverse(scene)
+    opt = mi.ad.Adam(lr=rate)
+    for name, start in zip(names, starts, strict=True):
+        opt[name] = start
+    params.update(opt)
+    step = 0
+    while True:
+        image = mi.render(scene, params, spp=_SPP, seed=step)
+        dr.backward(dr.mean(dr.square(image - reference), axis=None))
+        opt.step()
+        for name in names if bounds else ():
+            opt[name] = dr.clip(opt[name], *bounds)
+        params.update(opt)
+        step += 1
+        yield sum(_error(opt[name], value) for name, value in zip(names, true, strict=True))
+
+
+def clipped_colours(integrator: dict[str, Any], size: int) -> Iterator[float]:
+    """Reflectances, clipped to 0..1 after each step."""
+    scene = mi.load_dict(_scene_dict(integrator, size))
+    return _descend(scene, [_FLOOR, _BALL], [mi.Color3f(0.1, 0.9, 0.3), mi.Color3f(0.5)], [_TRUE_FLOOR, _TRUE_BALL], 0.04, (0, 1))
+
+
+def kept_parameters(integrator: dict[str, Any], size: int) -> Iterator[float]:
+    """`params.keep`, and a lamp's radiance."""
+    scene = mi.load_dict(_scene_dict(integrator, size))
+    reference, name = mi.render(scene, spp=_MANY), "lamp.emitter.radiance.value"
+    params = mi.traverse(scene)
+    params.keep([name])
+    opt = mi.ad.Adam(lr=0.4, params={name: mi.Color3f(5, 7, 9)})
+    params.update(opt)
+    step = 0
+    while True:
+        dr.backward(dr.mean(dr.square(mi.render(scene, params, spp=_SPP, seed=step) - reference), axis=None))
+        opt.step()
+        params.update(opt)
+        step += 1
+        yield _error(opt[name], _TRUE_LAMP)
+
+
+def sensors_in_turns(integrator: dict[str, Any], size: int) -> Iterator[float]:
+    """Three cameras, one backward pass for each before a step."""
+    cameras = {f"camera{k}": {**_camera(2 * k), "film": _film(size, size)} for k in range(3)}
+    scene = mi.load_dict(_scene_dict(integrator, size, sensor=None, **cameras))
+    references = [mi.render(scene, sensor=k, spp=_MANY) for k in range(3)]
+    params = mi.traverse(scene)
+    opt = mi.ad.Adam(lr=0.04)
+    opt[_BALL] = mi.Color3f(0.2, 0.6, 0.7)
+    params.update(opt)
+    step = 0
+    while True:
+        for k, reference in enumerate(references):
+            image = mi.render(scene, params, sensor=k, spp=_SPP, seed=step)
+            dr.backward(dr.mean(dr.square(image - reference), axis=None))
+        opt.step()
+        opt[_BALL] = dr.clip(opt[_BALL], 0, 1)
+        params.update(opt)
+        step += 1
+        yield _error(opt[_BALL], _TRUE_BALL)
+
+
+def batch_sensor(integrator: dict[str, Any], size: int) -> Iterator[float]:
+    """The same three cameras in one film."""
+    cameras = {f"camera{k}": _camera(2 * k) for k in range(3)}
+    sensor = {"type": "batch", **cameras, "film": _film(3 * size, size)}
+    scene = mi.load_dict(_scene_dict(integrator, size, sensor=sensor))
+    return _descend(scene, [_BALL], [mi.Color3f(0.2, 0.6, 0.7)], [_TRUE_BALL], 0.04, (0, 1))
+
+
+def pytorch(integrator: dict[str, Any], size: int) -> Iterator[float]:
+    """`dr.wrap`, with PyTorch's optimiser."""
+    import torch
+
+    scene = mi.load_dict(_scene_dict(integrator, size))
+    reference, params = mi.render(scene, spp=_MANY).torch(), mi.traverse(scene)
+
+    @dr.wrap(source="torch", target="drjit")
+    def render(colour: Any, seed: int = 0) -> Any:
+        params[_FLOOR] = dr.unravel(mi.Color3f, colour.array)
+        params.update()
+        return mi.render(scene, params, spp=_SPP, seed=seed)
+
+    colour = torch.tensor([0.1, 0.9, 0.3], device=reference.device, requires_grad=True)
+    opt = torch.optim.Adam([colour], lr=0.04)
+    step = 0
+    while True:
+        opt.zero_grad()
+        (render(colour, seed=step) - reference).square().mean().backward()
+        opt.step()
+        with torch.no_grad():
+            colour.clamp_(0, 1)
+        step += 1
+        yield _error(mi.Float(colour.detach().cpu().numpy()), _TRUE_FLOOR)
+
+
+def moved_light(integrator: dict[str, Any], size: int) -> Iterator[float]:
+    """Forward-mode derivatives by the place of the lamp, and a step of Gauss and Newton."""
+    scene = mi.load_dict(_scene_dict(integrator, size))
+    reference, params = np.array(mi.render(scene, spp=_MANY)), mi.traverse(scene)
+    pose, offset, step = mi.Transform4f(params["lamp.to_world"]), 0.4, 0
+    while True:
+        x = mi.Float(offset)
+        dr.enable_grad(x)
+        params["lamp.to_world"] = mi.Transform4f().translate([x, 0, 0]) @ pose
+        params.update()
+        dr.forward(x, dr.ADFlag.ClearEdges)
+        image = mi.render(scene, params, spp=4 * _SPP, seed=step)
+        slope = np.array(dr.forward_to(image))
+        offset -= 0.5 * float(((np.array(image) - reference) * slope).sum() / (slope**2).sum())
+        step += 1
+        yield abs(offset)
+
+
+def large_steps(integrator: dict[str, Any], size: int) -> Iterator[float]:
+    """Vertices through `mi.ad.LargeSteps`. Yields the image's RMSE."""
+    scene = mi.load_dict(_scene_dict(integrator, size))
+    reference, params, name = mi.render(scene, spp=_MANY), mi.traverse(scene), "ball.vertex_positions"
+    smooth = mi.ad.LargeSteps(params[name], params["ball.faces"], 10)
+    opt = mi.ad.Adam(lr=0.01, uniform=True)
+    moved = dr.unravel(mi.Point3f, params[name]) * 0.8 + mi.Vector3f(0.2, 0.1, 0.1)
+    opt["u"] = smooth.to_differential(dr.ravel(moved))
+    step = 0
+    while True:
+        params[name] = smooth.from_differential(opt["u"])
+        params.update()
+        loss = dr.mean(dr.square(mi.render(scene, params, spp=_SPP, seed=step) - reference), axis=None)
+        dr.backward(loss)
+        opt.step()
+        step += 1
+        yield float(loss.array[0]) ** 0.5
+
+
+def remeshing(integrator: dict[str, Any], size: int) -> Iterator[float]:
+    """A sphere that is subdivided, and the scene loaded again, every ten steps. Yields the image's RMSE."""
+    import trimesh
+
+    reference = mi.render(mi.load_dict(_scene_dict(integrator, size)), spp=_MANY)
+    mesh = trimesh.creation.icosphere(subdivisions=1, radius=0.3)
+    vertices, faces, step = np.array(mesh.vertices) + [0, 0, 0.5], np.array(mesh.faces), 0
+    while True:
+        scene = mi.load_dict(_scene_dict(integrator, size, ball=_mesh(vertices, faces, _diffuse(_TRUE_BALL))))
+        params, name = mi.traverse(scene), "ball.vertex_positions"
+        smooth = mi.ad.LargeSteps(params[name], params["ball.faces"], 10)
+        opt = mi.ad.Adam(lr=0.02, uniform=True)
+        opt["u"] = smooth.to_differential(params[name])
+        for _ in range(10):
+            params[name] = smooth.from_differential(opt["u"])
+            params.update()
+            loss = dr.mean(dr.square(mi.render(scene, params, spp=_SPP, seed=step) - reference), axis=None)
+            dr.backward(loss)
+            opt.step()
+            step += 1
+            yield float(loss.array[0]) ** 0.5
+        vertices = np.array(params[name]).reshape(-1, 3)
+        if len(faces) < 2000:
+            vertices, faces = trimesh.remesh.subdivide(vertices, faces)
+
+
+def _mesh(vertices: np.ndarray, faces: np.ndarray, bsdf: dict[str, Any]) -> mi.Mesh:
+    properties = mi.Properties()
+    properties["bsdf"] = mi.load_dict(bsdf)
+    mesh = mi.Mesh("ball", len(vertices), len(faces), props=properties)
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = np.ravel(vertices).astype(np.float32)
+    params["faces"] = np.ravel(faces).astype(np.uint32)
+    params.update()
+    return mesh
+
+
+def texture(integrator: dict[str, Any], size: int) -> Iterator[float]:
+    """Texels of the floor."""
+    true = np.random.default_rng(0).uniform(0.2, 0.8, (8, 8, 3)).astype(np.float32)
+    bsdf = {"type": "diffuse", "reflectance": {"type": "bitmap", "bitmap": mi.Bitmap(true), "raw": True}}
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(2), "bsdf": bsdf}
+    scene = mi.load_dict(_scene_dict(integrator, size, floor=floor))
+    start = dr.full(mi.TensorXf, 0.5, true.shape)
+    return _descend(scene, ["floor.bsdf.reflectance.data"], [start], [true], 0.03, (0, 1))
+
+
+def vertex_colours(integrator: dict[str, Any], size: int) -> Iterator[float]:
+    """An attribute of a mesh."""
+    import trimesh
+
+    mesh = trimesh.creation.icosphere(subdivisions=2, radius=0.5)
+    bsdf = {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_color"}}
+    ball = _mesh(np.array(mesh.vertices) + [0, 0, 0.5], np.array(mesh.faces), bsdf)
+    true = np.repeat([_TRUE_BALL], len(mesh.vertices), 0).astype(np.float32)
+    ball.add_attribute("vertex_color", 3, true.ravel())
+    scene = mi.load_dict(_scene_dict(integrator, size, ball=ball))
+    return _descend(scene, ["ball.vertex_color"], [dr.full(mi.Float, 0.5, true.size)], [true], 0.02, (0, 1))
+
+
+def more_and_more_lights(integrator: dict[str, Any], size: int) -> Iterator[float]:
+    """A scene that is loaded again with one more light, up to three, every ten steps."""
+
+    def lights(count: int) -> dict[str, Any]:
+        places = [[float(np.cos(2 * k)), float(np.sin(2 * k)), 2.5] for k in range(count)]
+        colour = {"type": "rgb", "value": [3.0] * 3}
+        return {f"light{k}": {"type": "point", "position": place, "intensity": colour} for k, place in enumerate(places)}
+
+    reference = mi.render(mi.load_dict(_scene_dict(integrator, size, lamp=None, **lights(3))), spp=_MANY)
+    known: dict[str, Any] = {}
+    count, step = 0, 0
+    while True:
+        count = min(count + 1, 3)
+        scene = mi.load_dict(_scene_dict(integrator, size, lamp=None, **lights(count)))
+        params, names = mi.traverse(scene), [f"light{k}.intensity.value" for k in range(count)]
+        opt = mi.ad.Adam(lr=0.2)
+        for name in names:
+            opt[name] = known.get(name, mi.Color3f(0.5))
+        params.update(opt)
+        for _ in range(10):
+            dr.backward(dr.mean(dr.square(mi.render(scene, params, spp=_SPP, seed=step) - reference), axis=None))
+            opt.step()
+            params.update(opt)
+            step += 1
+            yield sum(_error(opt[name], [3.0] * 3) for name in names) + 2.5 * (3 - count)
+        known = {name: dr.detach(opt[name]) for name in names}
+
+
+def saved_and_loaded(integrator: dict[str, Any], size: int) -> Iterator[float]:
+    """A run that is stored every ten steps, and goes on from the file in a scene that is loaded again."""
+    stored = pickle.dumps([0.1, 0.9, 0.3])
+    while True:
+        scene = mi.load_dict(_scene_dict(integrator, size))
+        start = mi.Color3f(*pickle.loads(stored))
+        reference, params = mi.render(scene, spp=_MANY), mi.traverse(scene)
+        opt = mi.ad.Adam(lr=0.04)
+        opt[_FLOOR] = start
+        params.update(opt)
+        for step in range(10):
+            dr.backward(dr.mean(dr.square(mi.render(scene, params, spp=_SPP, seed=step) - reference), axis=None))
+            opt.step()
+            opt[_FLOOR] = dr.clip(opt[_FLOOR], 0, 1)
+            params.update(opt)
+            yield _error(opt[_FLOOR], _TRUE_FLOOR)
+        stored = pickle.dumps([float(c[0]) for c in opt[_FLOOR]])
+
+
+def two_scenes(integrator: dict[str, Any], size: int) -> Iterator[float]:
+    """One colour of two scenes, one of which has a glossy material."""
+    glossy = {"type": "roughplastic", "diffuse_reflectance": {"type": "rgb", "value": [0.1, 0.2, 0.6]}}
+    box = {"type": "cube", "to_world": mi.ScalarTransform4f().translate([0, 0, 0.4]).scale(0.3), "bsdf": glossy}
+    scenes = [mi.load_dict(_scene_dict(integrator, size)), mi.load_dict(_scene_dict(integrator, size, ball=box))]
+    references = [mi.render(scene, spp=_MANY) for scene in scenes]
+    tables = [mi.traverse(scene) for scene in scenes]
+    opt = mi.ad.Adam(lr=0.04)
+    opt["colour"] = mi.Color3f(0.1, 0.9, 0.3)
+    step = 0
+    while True:
+        for scene, params, reference in zip(scenes, tables, references, strict=True):
+            params[_FLOOR] = opt["colour"]
+            params.update()
+            dr.backward(dr.mean(dr.square(mi.render(scene, params, spp=_SPP, seed=step) - reference), axis=None))
+        opt.step()
+        opt["colour"] = dr.clip(opt["colour"], 0, 1)
+        step += 1
+        yield _error(opt["colour"], _TRUE_FLOOR)
+
+
+def cells_run_again(integrator: dict[str, Any], size: int) -> Iterator[float]:
+    """A notebook's cell: all made anew every ten steps, while what it made before is still known."""
+    while True:
+        loop = clipped_colours(integrator, size)
+        for _ in range(10):
+            yield next(loop)
+
+
+LOOPS: dict[str, Loop] = {
+    "clipped colours": Loop(clipped_colours, _MATERIALS),
+    "kept parameters": Loop(kept_parameters, _MATERIALS),
+    "sensors in turns": Loop(sensors_in_turns, _MATERIALS),
+    "batch sensor": Loop(batch_sensor, _MATERIALS),
+    "PyTorch": Loop(pytorch, _MATERIALS),
+    "moved light": Loop(moved_light, _MOVES, count=20),
+    "large steps": Loop(large_steps, _MOVES, bar=0.7),
+    "remeshing": Loop(remeshing, _MOVES, count=30, bar=0.8),
+    "texture": Loop(texture, _MATERIALS),
+    "vertex colours": Loop(vertex_colours, _MATERIALS, bar=0.8),
+    "more and more lights": Loop(more_and_more_lights, _MATERIALS, count=30),
+    "saved and loaded": Loop(saved_and_loaded, _MATERIALS, count=30),
+    "two scenes": Loop(two_scenes, _MATERIALS),
+    "cells run again": Loop(cells_run_again, _MATERIALS, count=20, bar=0.8),
+}
+
+
+def units(options: BenchOptions) -> list[Unit]:
+    """A unit for each loop."""
+    return [Unit(name, functools.partial(_measure, options, name)) for name in LOOPS]
+
+
+def _measure(options: BenchOptions, name: str, done: Mapping[str, Any], update: Update) -> dict[str, Any]:
+    """Steps in turns with the original's, the errors at the end, and how memory grows over many steps."""
+    loop, size = LOOPS[name], options.what.loop_size
+    both = {"ours": loop.steps(OURS, size), "original": loop.steps(loop.original, size)}
+    seconds: dict[str, list[float]] = {key: [] for key in both}
+    errors: dict[str, list[float]] = {key: [] for key in both}
+    with quiet_garbage():
+        for step in range(loop.count):
+            update(step, loop.count, name)
+            for key, steps in both.items():
+                spent = timed(lambda key=key, steps=steps: errors[key].append(next(steps)))
+                if step >= _WARM_UP:
+                    seconds[key].append(spent)
+    result = {"size": size, "original": loop.original, **compare(seconds, [("original", "ours")])}
+    result["errors"] = {key: {"first": values[0], "last": values[-1]} for key, values in errors.items()}
+    if options.what.loop_steps:
+        update(0, 1, f"{options.what.loop_steps} steps")
+        arguments = {"name": name, "size": size, "count": options.what.loop_steps}
+        result["memory"] = run_child("bench.loops:measure_memory", arguments, _SECONDS)
+    return result
+
+
+def measure_memory(name: str, size: int, count: int, emit: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
+    """Most memory (bytes) of this process up to a number of steps, and in all those after."""
+    steps = LOOPS[name].steps(OURS, size)
+    for step in range(count):
+        next(steps)
+        if step == _SETTLED:
+            dr.sync_thread()
+            settled = peak_memory()
+            forget_peak_memory()
+    return {"steps": count, "settled": settled, "later": peak_memory()}

@@ -1,0 +1,24 @@
+"""Loops as Mitsuba's users write them, in which only the integrator is exchanged. Beside the originals: `bench --only loops`."""
+
+from __future__ import annotations
+
+import warnings
+
+import pytest
+
+from shadowmap_dr.experiments.bench.loops import LOOPS, OURS
+
+SIZE = 24
+_NEEDS = {"PyTorch": "torch", "large steps": "cholespy", "remeshing": "cholespy"}
+
+
+@pytest.mark.parametrize("name", LOOPS)
+def test_loop(variant: str, name: str) -> None:
+    if name in _NEEDS:
+        pytest.importorskip(_NEEDS[name])
+    loop = LOOPS[name]
+    steps = loop.steps(OURS, SIZE)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        errors = [next(steps) for _ in range(loop.count)]
+    assert errors[-1] < loop.bar * errors[0]

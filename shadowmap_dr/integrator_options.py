@@ -19,8 +19,8 @@ _SYNONYMS = {"sh_normal": "normal"}
 # Channels of the image itself.
 COLOURS = ("R", "G", "B", "A", "Y")
 
-# Parameters of Mitsuba's integrators that have no meaning here: scenes keep them when they change to this one. Those that end with *
-# stand for all that begin so.
+# Parameters of Mitsuba's integrators that have no meaning here: scenes keep them when they change to this one. A name that ends
+# with * stands for all that begin so.
 _FOREIGN = (
     "rr_depth", "shading_samples", "emitter_samples", "bsdf_samples", "sppc", "sppp", "sppi", "guiding*", "project_seed",
     "proj_seed*", "samples_per_pass", "timeout", "block_size",
@@ -43,8 +43,8 @@ class Options:
     shadow_receiver_range  tell depths apart only from the first receiver on, against light that bleeds through
     shadow_cull_backfaces  leave the backs of closed shapes out of the maps of directional lights: faster, and the same as long as
                            no shape turns inside out, not even in a fold
-    emitter_samples        points on each area light that cast shadows
-    environment_samples    directions of an environment that cast shadows
+    area_light_samples     points on each area light that cast shadows (Mitsuba's ``emitter_samples`` is another number)
+    environment_light_samples  directions of an environment that cast shadows
     soft_map_resolution    texels along each side of their shadow maps
     emitter_shadows        ``samples``, or ``single``: one map for each area light, penumbrae estimated from it
     shadow_samples         look-ups along each side of a pixel, 1 to 8; 0 chooses
@@ -73,8 +73,8 @@ class Options:
     shadow_receiver_range: bool = True
     shadow_cull_backfaces: bool = False
     shadow_samples: int = 0
-    emitter_samples: int = 32
-    environment_samples: int = 64
+    area_light_samples: int = 32
+    environment_light_samples: int = 64
     soft_map_resolution: int = 128
     emitter_shadows: str = "samples"
     antialias: bool = True
@@ -100,11 +100,13 @@ class Options:
             else:
                 raise ShadowmapError(f"'{PLUGIN}' has no parameter '{name}': {_near(name, sorted(defaults))}.")
         if foreign:
-            names = ", ".join(sorted(foreign))
-            warn(f"'{PLUGIN}' ignores {names}: {'parameters' if len(foreign) > 1 else 'a parameter'} of Mitsuba's integrators.")
+            names, kind = ", ".join(sorted(foreign)), "parameters" if len(foreign) > 1 else "a parameter"
+            own = " Points on area lights are area_light_samples here." if "emitter_samples" in foreign else ""
+            warn(f"'{PLUGIN}' ignores {names}: {kind} of Mitsuba's integrators.{own}")
         options = cls(**values)
         if options.max_depth == -1 or options.max_depth > DIRECT:
-            warn(f"'{PLUGIN}' renders max_depth {options.max_depth} as {DIRECT}: light that is reflected more than once is left out.")
+            left_out = "light that is reflected more than once is left out"
+            warn(f"'{PLUGIN}' renders max_depth {options.max_depth} as {DIRECT}: {left_out}.")
         return options
 
     @property
@@ -150,8 +152,8 @@ class Options:
             hide_emitters=self.hide_emitters,
             max_depth=self.max_depth,
             shadow_samples=self.shadow_samples,
-            emitter_samples=self.emitter_samples,
-            environment_samples=self.environment_samples,
+            area_light_samples=self.area_light_samples,
+            environment_light_samples=self.environment_light_samples,
             soft_map_resolution=self.soft_map_resolution,
             emitter_shadows=self.emitter_shadows,
             aovs=tuple(name for _, name in self.labelled_aovs),

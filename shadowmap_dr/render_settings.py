@@ -26,8 +26,8 @@ class RenderSettings:
         hide_emitters: the camera looks through area lights, and sees black instead of environments, which light the scene all
             the same.
         max_depth: 0 is black, 1 shows emitters only, 2 is direct light, as in Mitsuba; more, or -1, is the same as 2.
-        emitter_samples: points on each area light, each with a shadow map.
-        environment_samples: directions of an environment, each with a shadow map.
+        area_light_samples: points on each area light, each with a shadow map.
+        environment_light_samples: directions of an environment, each with a shadow map.
         soft_map_resolution: texels along each side of these maps.
         emitter_shadows: ``samples``, or ``single``: one map of ``shadow.resolution`` texels (a power of two) for each area light,
             from which penumbrae are estimated; fast, and right for simple occluders only.
@@ -42,8 +42,8 @@ class RenderSettings:
     hide_emitters: bool = False
     max_depth: int = DIRECT
     shadow_samples: int = 0
-    emitter_samples: int = 32
-    environment_samples: int = 64
+    area_light_samples: int = 32
+    environment_light_samples: int = 64
     soft_map_resolution: int = 128
     emitter_shadows: str = "samples"
     aovs: tuple[str, ...] = ()
@@ -54,14 +54,14 @@ class RenderSettings:
         for name in self.aovs:
             if name not in AOVS:
                 raise ShadowmapError(f"There is no AOV '{name}': choose from {', '.join(AOVS)}.")
-        for name in ("shadow_samples", "emitter_samples", "environment_samples", "max_depth"):
+        for name in ("shadow_samples", "area_light_samples", "environment_light_samples", "max_depth"):
             if not isinstance(getattr(self, name), Integral):
                 raise ShadowmapError(f"{name} is {getattr(self, name)!r}: give an integer.")
         if self.max_depth < -1:
             raise ShadowmapError(f"max_depth is {self.max_depth}: choose -1 (no limit), or 0 and more.")
         if not 0 <= self.shadow_samples <= 8:
             raise ShadowmapError(f"shadow_samples is {self.shadow_samples}: choose 0 (automatic) to 8.")
-        for name in ("emitter_samples", "environment_samples"):
+        for name in ("area_light_samples", "environment_light_samples"):
             if not 1 <= getattr(self, name) <= MOST_SAMPLES:
                 raise ShadowmapError(f"{name} is {getattr(self, name)}: choose 1 to {MOST_SAMPLES}.")
         if self.emitter_shadows not in ("samples", "single"):

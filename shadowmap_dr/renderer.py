@@ -490,7 +490,7 @@ class _Uniform:
 
 def _plan_soft(data: SceneData, settings: RenderSettings) -> tuple[SoftPlan, ...]:
     lights, single = (*data.areas, *data.environments), settings.emitter_shadows == "single"
-    soft = plan_soft(lights, data.geometry, settings.emitter_samples, settings.environment_samples, single)
+    soft = plan_soft(lights, data.geometry, settings.area_light_samples, settings.environment_light_samples, single)
     if settings.shadow.method != "none":
         check_soft_sizes(soft, data.geometry, settings.soft_map_resolution)
     return soft

@@ -267,7 +267,7 @@ def result_of(name: str) -> str:
     except Exception as error:
         return f"{NOT_LOADED}: {str(error).splitlines()[-1]}"
     made, change = made if isinstance(made, tuple) else (made, None)
-    options = {"soft_map_resolution": 32, "emitter_samples": 4, "environment_samples": 8, "shadow_map_resolution": 64}
+    options = {"soft_map_resolution": 32, "area_light_samples": 4, "environment_light_samples": 8, "shadow_map_resolution": 64}
     integrator = mi.load_dict({"type": "shadowmap", **options})
     try:
         if change is not None:

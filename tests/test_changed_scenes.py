@@ -13,7 +13,7 @@ from integrator_scenes import camera, floor, shadowmap, small_scene, sun
 
 from shadowmap_dr.traversal import fingerprint
 
-FEW = {"emitter_samples": 4, "environment_samples": 16}
+FEW = {"area_light_samples": 4, "environment_light_samples": 16}
 
 
 def image(scene: Any, integrator: Any) -> np.ndarray:

@@ -54,7 +54,7 @@ def test_more_maps_than_arrays_can_hold_are_refused(variant: str) -> None:
     with pytest.raises(ShadowmapError, match="37 shadow maps of lights, 4096 x 4096"):
         Renderer.from_scene(scene, shadow_map_resolution=512, shadow_supersampling=8)
     Renderer.from_scene(scene, shadow_map_resolution=4096, shadow_method="none")
-    with pytest.raises(ShadowmapError, match="maps of extended lights, 4096 x 4096 .*emitter_samples"):
+    with pytest.raises(ShadowmapError, match="maps of extended lights, 4096 x 4096 .*area_light_samples"):
         Renderer.from_scene(scene_with(sheet(2), sky={"type": "constant"}), soft_map_resolution=4096)
 
 

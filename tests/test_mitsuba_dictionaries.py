@@ -27,6 +27,7 @@ SKY = {"type": "constant", "radiance": {"type": "rgb", "value": [0.1, 0.2, 0.3]}
         ({"sppc": 8, "sppp": 8, "sppi": 32, "guiding": "grid"}, "ignores guiding, sppc, sppi, sppp"),
         ({"guiding_proj": False, "guiding_rounds": 2, "project_seed": "both"}, "ignores guiding_proj, guiding_rounds, project_seed"),
         ({"proj_seed_spp": 64}, "ignores proj_seed_spp"),
+        ({"emitter_samples": 1}, "ignores emitter_samples: a parameter of Mitsuba's integrators. Points on area lights are"),
     ],
 )
 def test_parameters_of_other_integrators(variant: str, entries: dict[str, Any], named: str) -> None:

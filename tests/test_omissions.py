@@ -14,7 +14,7 @@ from broken_scenes import SIZE, lamp, scene
 from shadowmap_dr import Renderer
 from shadowmap_dr.scene import load
 
-OPTIONS = {"type": "shadowmap", "emitter_samples": 4, "environment_samples": 8, "soft_map_resolution": 32}
+OPTIONS = {"type": "shadowmap", "area_light_samples": 4, "environment_light_samples": 8, "soft_map_resolution": 32}
 
 
 def blob() -> dict[str, Any]:

@@ -100,7 +100,7 @@ def test_maps_count_as_memory(variant: str) -> None:
     """Images of a scene with many maps hold much more than their pixels."""
     above = mi.ScalarTransform4f().translate([0, 0, 3])
     lamp = {"type": "rectangle", "to_world": above, "emitter": {"type": "area", "radiance": 1.0}}
-    scene, integrator = small_scene(lamp=lamp), shadowmap(emitter_samples=32, soft_map_resolution=256)
+    scene, integrator = small_scene(lamp=lamp), shadowmap(area_light_samples=32, soft_map_resolution=256)
     params = mi.traverse(scene)
     moved(params, 0.0)
     views = [mi.load_dict(camera()) for _ in range(6)]
@@ -152,7 +152,7 @@ def test_forward_agrees_with_backward_that_has_waited(variant: str, kind: str, k
     derivatives = []
     for forward in (True, False):
         scene = lit_scene(kind)
-        integrator = shadowmap(emitter_samples=4, environment_samples=8)
+        integrator = shadowmap(area_light_samples=4, environment_light_samples=8)
         params = mi.traverse(scene)
         shift = dr.opaque(mi.Float, 0)
         dr.enable_grad(shift)

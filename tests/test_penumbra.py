@@ -45,7 +45,7 @@ def test_penumbra_is_as_wide_as_that_of_samples(variant: str, lamp: float) -> No
     single, unshadowed = error(emitter_shadows="single"), error(shadow_method="none")
     assert single < 0.06 and single < 0.3 * unshadowed
     if lamp > 0.3:
-        assert single < 0.7 * error(emitter_samples=1)
+        assert single < 0.7 * error(area_light_samples=1)
 
 
 def test_forward_and_backward_agree(variant: str) -> None:
@@ -59,7 +59,7 @@ def test_forward_and_backward_agree(variant: str) -> None:
         for key in ("ball.to_world", "lamp.to_world"):
             params[key] = mi.Transform4f().translate(mi.Vector3f(shift, 0, 0)) @ params[key]
         params.update()
-        integrator = mi.load_dict({"type": "shadowmap", "emitter_shadows": "single", "emitter_samples": 4})
+        integrator = mi.load_dict({"type": "shadowmap", "emitter_shadows": "single", "area_light_samples": 4})
         rendered = mi.render(tested, params, integrator=integrator)
         if forward:
             dr.forward(shift)
@@ -86,5 +86,5 @@ def test_resolution_must_be_a_power_of_two(variant: str) -> None:
 
 
 def test_too_many_maps_are_refused(variant: str) -> None:
-    with pytest.raises(shadowmap_dr.ShadowmapError, match="4096 shadow maps.*emitter_samples"):
-        shadowmap_dr.Renderer.from_scene(scene(), emitter_samples=4096, soft_map_resolution=1024)
+    with pytest.raises(shadowmap_dr.ShadowmapError, match="4096 shadow maps.*area_light_samples"):
+        shadowmap_dr.Renderer.from_scene(scene(), area_light_samples=4096, soft_map_resolution=1024)

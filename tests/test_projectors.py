@@ -102,7 +102,7 @@ def test_all_kinds_of_lights_at_once(variant: str) -> None:
         shapes = {key: {k: v for k, v in parts[key].items() if k != "emitter"} for key in ("panel", "lamp")}
         return {key: part if key == name else shapes[key] for key, part in parts.items() if key == name or key in shapes}
 
-    options = {"emitter_samples": 8, "environment_samples": 16, "shadow_map_resolution": 128}
+    options = {"area_light_samples": 8, "environment_light_samples": 16, "shadow_map_resolution": 128}
     together = np.array(mi.render(lit_by(32, **parts), integrator=shadowmap(**options)))
     alone = [mi.render(lit_by(32, **only(name)), integrator=shadowmap(**options)) for name in parts]
     assert all(np.array(image).max() > 0.05 for image in alone)
@@ -204,7 +204,7 @@ def test_light_that_was_dark_at_first(variant: str) -> None:
         "lamp": lamp,
         "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.0}},
     }
-    options = {"emitter_samples": 8, "environment_samples": 16, "shadow_map_resolution": 128}
+    options = {"area_light_samples": 8, "environment_light_samples": 16, "shadow_map_resolution": 128}
     made, integrator = lit_by(32, **lights), shadowmap(**options)
     assert not np.array(mi.render(made, integrator=integrator)).any()
     params = mi.traverse(made)

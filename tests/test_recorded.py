@@ -19,7 +19,7 @@ from shadowmap_dr.renderer import Renderer
 from shadowmap_dr.timing import quiet_garbage
 
 VERTICES = "ball.vertex_positions"
-FEW = {"emitter_samples": 4, "environment_samples": 8}
+FEW = {"area_light_samples": 4, "environment_light_samples": 8}
 
 
 def both(**options: Any) -> tuple[Any, Any]:
@@ -81,11 +81,11 @@ def test_views_in_one_call(variant: str) -> None:
     sky = {"type": "constant", "radiance": {"type": "rgb", "value": 0.5}}
     scene = small_scene(aside=aside, views=views, sky=sky)
     vertices = mi.Float(dr.detach(mi.traverse(scene)[VERTICES]))
-    together = shadowmap(recorded=True, environment_samples=8)
+    together = shadowmap(recorded=True, environment_light_samples=8)
     weight = np.random.default_rng(1).uniform(0, 1, (64, 128, 3)).astype(np.float32)
     for by in (0.0, 0.02, 0.05):
         found = []
-        for integrator, sensors in ((shadowmap(environment_samples=8), (0, 1)), (together, (2,))):
+        for integrator, sensors in ((shadowmap(environment_light_samples=8), (0, 1)), (together, (2,))):
             params = mi.traverse(scene)
             moved = mi.Float(vertices + by)
             dr.enable_grad(moved)

@@ -107,7 +107,7 @@ def test_wrong_kinds_and_sizes(renderer: Renderer) -> None:
         ({"shadow_filter_size": 9, "shadow_map_resolution": 8}, "too large for maps of 8 texels"),
         ({"shadow_samples": 9}, "shadow_samples is 9"),
         ({"shadow_samples": 1.5}, "shadow_samples is 1.5: give an integer"),
-        ({"emitter_samples": "4"}, "emitter_samples is '4': give an integer"),
+        ({"area_light_samples": "4"}, "area_light_samples is '4': give an integer"),
         ({"ambient": float("nan")}, "ambient is nan"),
         ({"aovs": ("albedo",)}, "no AOV 'albedo'"),
         ({"tessellation": 1}, "tessellation is 1"),

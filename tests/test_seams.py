@@ -76,7 +76,7 @@ def test_shapes_that_part_in_the_plug_in(variant: str, recorded: bool) -> None:
 @pytest.mark.parametrize("x", [0.11, -0.11])
 def test_shapes_beside_hidden_lamps_end_there(variant: str, x: float) -> None:
     lamp = {"glow": {"type": "area", "radiance": {"type": "rgb", "value": 1.0}}}
-    options = {"hide_emitters": True, "emitter_samples": 1}
+    options = {"hide_emitters": True, "area_light_samples": 1}
     expected, derivative = moved_right(scene(5, x), "left", 0, **options)
     found, other = moved_right(scene(0, x, **lamp), "left", 0, **options)
     middle = slice(SIZE // 4, -SIZE // 4), slice(SIZE // 4, -SIZE // 4)

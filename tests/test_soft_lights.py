@@ -68,7 +68,7 @@ def traced(scene: Any, spp: int = 1024, **options: Any) -> np.ndarray:
 @pytest.mark.parametrize("height", [0.5, 1.0, 3.0])
 def test_disk_above_a_floor(variant: str, height: float) -> None:
     """Irradiance below the centre of a disk: pi L r^2 / (r^2 + h^2)."""
-    image = render(scene_of(lamp=panel(height, 0.4, "disk")), emitter_samples=64)
+    image = render(scene_of(lamp=panel(height, 0.4, "disk")), area_light_samples=64)
     expected = ALBEDO * 2.0 * 0.4**2 / (0.4**2 + height**2)
     assert image.mean() == pytest.approx(expected, rel=0.015)
 
@@ -77,13 +77,13 @@ def test_disk_above_a_floor(variant: str, height: float) -> None:
 def test_sphere_above_a_floor(variant: str, height: float) -> None:
     """Irradiance below a sphere: pi L r^2 / h^2. It does not shadow itself, though half of it lies behind the other."""
     ball = {"type": "sphere", "center": [0, height, 0], "radius": 0.15, "emitter": area(2.0)}
-    image = render(scene_of(camera=camera(height=0.3), lamp=ball), emitter_samples=64)
+    image = render(scene_of(camera=camera(height=0.3), lamp=ball), area_light_samples=64)
     assert image.mean() == pytest.approx(ALBEDO * 2.0 * 0.15**2 / height**2, rel=0.02)
 
 
 def test_constant_sky_over_a_floor(variant: str) -> None:
     """Radiance: albedo times that of the sky."""
-    image = render(scene_of(sky={"type": "constant", "radiance": 0.8}), environment_samples=128)
+    image = render(scene_of(sky={"type": "constant", "radiance": 0.8}), environment_light_samples=128)
     assert image.mean() == pytest.approx(ALBEDO * 0.8, rel=0.015)
 
 
@@ -162,7 +162,7 @@ def test_opaque_lid_makes_it_dark(variant: str) -> None:
     lit, dark = (render(scene_of(lamp=panel(), **parts)) for parts in ({}, {"lid": lid}))
     assert dark.max() < 0.01 * lit.mean()
     lit, dark = (
-        render(scene_of(sky={"type": "constant"}, **parts), environment_samples=32) for parts in ({}, {"lid": lid})
+        render(scene_of(sky={"type": "constant"}, **parts), environment_light_samples=32) for parts in ({}, {"lid": lid})
     )
     assert dark.max() < 0.6 * lit.mean()
 
@@ -186,10 +186,10 @@ def around(lamp: Any) -> dict[str, Any]:
 def test_lamp_in_the_middle_looks_around_itself(variant: str) -> None:
     lamp = {"type": "sphere", "center": [0, 0.6, 0], "radius": 0.12, "emitter": area(6.0)}
     scene = scene_of(**around(lamp))
-    (plan,) = Renderer.from_scene(scene, emitter_samples=4, soft_map_resolution=16).soft
+    (plan,) = Renderer.from_scene(scene, area_light_samples=4, soft_map_resolution=16).soft
     assert plan.kind == "cube" and plan.maps == 24
     # The lamp itself is so bright that it would hide all else.
-    options = {"emitter_samples": 32, "hide_emitters": True}
+    options = {"area_light_samples": 32, "hide_emitters": True}
     image, reference = render(scene, spp=4, **options), traced(scene, hide_emitters=True)
     assert difference(image, reference) < 0.05
     unshadowed = render(scene, spp=4, shadow_method="none", **options)
@@ -203,7 +203,7 @@ def test_emitter_that_is_not_convex_shadows_itself(variant: str, monkeypatch: py
     holes = {"type": "mask", "opacity": {"type": "checkerboard", "color0": 0.0, "color1": 1.0}, "b": {"type": "diffuse"}}
     above = {"type": "rectangle", "to_world": T().translate([0, 2, 0]) @ T().rotate([1, 0, 0], -90), "bsdf": holes}
     scene = scene_of(camera=camera(height=0.4, half=1.2), lamp=shaded_lamp((0, 0.8, 0)), veil=above if veil else None)
-    options = {"spp": 4, "emitter_samples": 256, "soft_map_resolution": 64}
+    options = {"spp": 4, "area_light_samples": 256, "soft_map_resolution": 64}
     image, reference = render(scene, **options), traced(scene, 4096)
     assert difference(image, reference) < 0.02
     monkeypatch.setattr(emitters, "_dented", lambda *arguments: False)
@@ -277,7 +277,7 @@ def scenery(**changes: Any) -> Any:
     return scene_of(**{**parts, **changes})
 
 
-OPTIONS = {"emitter_samples": 8, "environment_samples": 8, "soft_map_resolution": 32}
+OPTIONS = {"area_light_samples": 8, "environment_light_samples": 8, "soft_map_resolution": 32}
 
 
 def test_frozen_step_equals_unfrozen(variant: str) -> None:
@@ -320,9 +320,9 @@ def test_lights_are_replaced_by_name(variant: str) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"emitter_samples": 0}, "emitter_samples is 0"),
-        ({"environment_samples": -3}, "environment_samples is -3"),
-        ({"emitter_samples": 100_000}, "choose 1 to"),
+        ({"area_light_samples": 0}, "area_light_samples is 0"),
+        ({"environment_light_samples": -3}, "environment_light_samples is -3"),
+        ({"area_light_samples": 100_000}, "choose 1 to"),
         ({"soft_map_resolution": 0}, "soft_map_resolution"),
     ],
 )
@@ -366,7 +366,7 @@ def test_light_that_is_off_has_a_derivative(variant: str, light: str) -> None:
         dr.enable_grad(radiance)
         params[key] = radiance
         params.update()
-        integrator = mi.load_dict({"type": "shadowmap", "emitter_samples": 4, "environment_samples": 16})
+        integrator = mi.load_dict({"type": "shadowmap", "area_light_samples": 4, "environment_light_samples": 16})
         dr.backward(dr.sum(mi.render(scene, params, integrator=integrator)))
         found.append(np.array(dr.grad(radiance), np.float64).sum())
     assert found[0] > 10
@@ -377,8 +377,8 @@ def test_light_that_is_off_has_a_derivative(variant: str, light: str) -> None:
 def test_more_samples_than_triangles(variant: str) -> None:
     """A lamp of two triangles and 200 samples, and one of 320 triangles and one sample."""
     lamp = scenery(sky=None)
-    many, few = (render(lamp, emitter_samples=count, soft_map_resolution=32) for count in (200, 32))
+    many, few = (render(lamp, area_light_samples=count, soft_map_resolution=32) for count in (200, 32))
     assert difference(few, many) < 0.05
     ball = {"type": "sphere", "center": [0, 1.2, 0], "radius": 0.2, "emitter": area(2.0)}
-    single = render(scenery(sky=None, lamp=ball), emitter_samples=1, soft_map_resolution=32)
+    single = render(scenery(sky=None, lamp=ball), area_light_samples=1, soft_map_resolution=32)
     assert np.isfinite(single).all() and single.mean() > 0.01

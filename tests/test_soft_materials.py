@@ -14,7 +14,7 @@ from gradients.model import Case, Model, Parameter
 
 from mitsuba_baselines import derivatives
 
-OPTIONS = {"emitter_samples": 24, "environment_samples": 32, "soft_map_resolution": 64}
+OPTIONS = {"area_light_samples": 24, "environment_light_samples": 32, "soft_map_resolution": 64}
 CASTER = {"caster": Parameter("object.vertex_positions", translated(1, 0.5, 0), 0.02)}
 FLOOR = {"floor": Parameter("floor.to_world", moved(0, 1, 0), 0.02)}
 LAMP = {"lamp": Parameter("light.to_world", moved(1, 0, 0.3), 0.04)}

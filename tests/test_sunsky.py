@@ -38,7 +38,7 @@ def _scene(direction: tuple[float, ...] = _DIRECTION, **sky: Any) -> Any:
 
 
 def _ours(**parameters: Any) -> Any:
-    return mi.load_dict({"type": "shadowmap", "environment_samples": 128, "shadow_map_resolution": 512, **parameters})
+    return mi.load_dict({"type": "shadowmap", "environment_light_samples": 128, "shadow_map_resolution": 512, **parameters})
 
 
 def _path_traced(scene: Any, spp: int, seed: int = 0) -> np.ndarray:

@@ -309,7 +309,7 @@ def test_skies_may_change(renderer: sdr.Renderer) -> None:
             "sky": {"type": "envmap", "bitmap": mi.Bitmap(pixels.numpy()), "to_world": up},
         })  # fmt: skip
 
-    options = {"environment_samples": 32, "shadow_map_resolution": 64, "soft_map_resolution": 64}
+    options = {"environment_light_samples": 32, "shadow_map_resolution": 64, "soft_map_resolution": 64}
     used = sdr.Renderer.from_scene(with_sky(sky(2)), frozen=renderer._frozen is not None, **options)
     data = torch.from_numpy(np.array(mi.traverse(with_sky(sky(20)))["sky.data"])).requires_grad_()
     first = used.render()

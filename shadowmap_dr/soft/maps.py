@@ -108,7 +108,7 @@ def still_aimed(plans: Sequence[SoftPlan], geometry: Callable[[], Geometry]) -> 
 
 def check_soft_sizes(plans: Sequence[SoftPlan], geometry: Geometry, texels: int) -> None:
     """Refuse (ShadowmapError) what would not fit into arrays."""
-    remedy = "lower emitter_samples, environment_samples or soft_map_resolution"
+    remedy = "lower area_light_samples, environment_light_samples or soft_map_resolution"
     check_sizes(sum(plan.maps for plan in plans), texels, geometry, "extended lights", remedy)
 
 

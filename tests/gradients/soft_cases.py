@@ -13,7 +13,7 @@ from .changes import brighter, lightened, moved, one_corner, swung, translated, 
 from .model import Case, Parameter
 
 SIZE = 64
-OPTIONS = {"emitter_samples": 64, "environment_samples": 128}
+OPTIONS = {"area_light_samples": 64, "environment_light_samples": 128}
 # Twice the steps of the larger images: boundaries move by as many pixels.
 CASTER = {
     "caster_translation": Parameter("object.vertex_positions", translated(1, 0, 0), 0.02),
@@ -93,17 +93,17 @@ SOFT_CASES = (
     # Out of view: parts of it shadow others, which only its light tells.
     Case("shaded_lamp", lambda: scenes.scene(SIZE, light=scenes.shaded_lamp((0.2, 2.6, -1.6), 20.0)), {
         "plate_shift": Parameter("light.vertex_positions", translated(0.3, -1, 0, first=8), 0.04)},
-        {"emitter_samples": 256, "soft_map_resolution": 64}, 4),
+        {"area_light_samples": 256, "soft_map_resolution": 64}, 4),
     Case("constant_box", lambda: under(None, sky={"type": "constant", "radiance": 0.8}), {
         **CASTER, **RECEIVER,
         # Of which there are enough that their hard shadows overlap on the floor, far below the box.
-        "radiance": Parameter("sky.radiance.value", brighter, 0.05)}, {"environment_samples": 512}, 4),
+        "radiance": Parameter("sky.radiance.value", brighter, 0.05)}, {"environment_light_samples": 512}, 4),
     Case("sky_box", lambda: under(None, sky=sky_map()), {
         **CASTER, **RECEIVER, **CAMERA,
         "sky_turn": Parameter("sky.to_world", swung((0, 1, 0)), 0.03),
         "sky_pixels": Parameter("sky.data", lightened(2, 6, 8, 13), 0.3)}, OPTIONS),
     # Against all directions at once, each of whose shadows has an edge, a floor moves: enough directions for edges to overlap.
-    Case("sky_floor", lambda: under(None, sky=sky_map()), RECEIVER, {"environment_samples": 512}, 4),
+    Case("sky_floor", lambda: under(None, sky=sky_map()), RECEIVER, {"environment_light_samples": 512}, 4),
 )  # fmt: skip
 
 # Compared with stored path-traced differences.

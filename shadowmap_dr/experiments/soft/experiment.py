@@ -182,7 +182,7 @@ def measure(name: str, options: SoftOptions, step: Callable[..., None]) -> tuple
 def one_map(scene: Any, traced: Traced, options: SoftOptions) -> dict[str, float] | None:
     """Error of the fast mode, with the most samples for shading; None where no light of the scene is fit for it."""
     area, sky = options.samples[-1]
-    renderer = Renderer.from_scene(scene, emitter_samples=area, environment_samples=sky, emitter_shadows="single")
+    renderer = Renderer.from_scene(scene, area_light_samples=area, environment_light_samples=sky, emitter_shadows="single")
     if not any(plan.kind == "single" for plan in renderer.soft):
         return None
     image = np.array(renderer.render(spp=options.spp))[..., :3]
@@ -192,7 +192,7 @@ def one_map(scene: Any, traced: Traced, options: SoftOptions) -> dict[str, float
 def make_renderer(scene: Any, samples: tuple[int, int], map_resolution: int) -> Renderer:
     """A renderer with so many samples of (each area light, the environment)."""
     area, sky = samples
-    return Renderer.from_scene(scene, emitter_samples=area, environment_samples=sky, soft_map_resolution=map_resolution)
+    return Renderer.from_scene(scene, area_light_samples=area, environment_light_samples=sky, soft_map_resolution=map_resolution)
 
 
 def path_traced_twice(scene: Any, spp: int) -> Traced:

@@ -222,11 +222,20 @@ def passes_gate(surface: Surface, wo_world: Any, wo: Any) -> Any:
 
 
 def emission(surface: Surface, lights: Sequence[AreaLight]) -> Any:
-    """Radiance (colour, N) that surfaces give off themselves, seen from the camera. Attached to surface and lights."""
+    """Radiance (colour, N) that surfaces give off themselves, seen from the camera. Attached to surface and lights.
+
+    Faces shine on the side on which their vertex normals are. Mitsuba asks the interpolated normal itself, which turns away
+    before the outline of a smooth shape is reached: the dark rim hides the outline, and with it what a moving lamp changes.
+    """
     total = dr.zeros(mi.UnpolarizedSpectrum, dr.width(surface.shape))
+    with dr.suspend_grad():
+        towards = dr.dot(surface.n_world, surface.wi_world) * dr.dot(surface.n_world, surface.si.sh_frame.n)
+        front = surface.active & (towards > 0)
+    si = mi.SurfaceInteraction3f(surface.si)
+    si.wi = mi.Vector3f(0, 0, 1)
     for light in lights:
-        own = surface.active & (surface.shape == light.shape) & (dr.detach(surface.si.wi.z) > 0)
-        radiance = evaluate(lambda at, light=light: light.seen(*at), (surface.si, own), [light.emitter], dr.width(surface.shape))
+        own = front & (surface.shape == light.shape)
+        radiance = evaluate(lambda at, light=light: light.seen(*at), (si, own), [light.emitter], dr.width(surface.shape))
         total += dr.select(own, radiance, 0)
     return total
 

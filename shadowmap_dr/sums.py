@@ -107,7 +107,9 @@ class _Sum(dr.CustomOp):
         self._trees, self._owned, self._call, self._lanes = trees, owned, call, lanes
         self.add_input(implicit)
         own, shared = trees[0]
-        return _loop(lambda index: call.term(index, own, shared), call.count, call.zero, call.active)
+        found = _loop(lambda index: call.term(index, own, shared), call.count, call.zero, call.active)
+        self._shared_value = dr.width(found) == 1
+        return found
 
     def forward(self) -> None:
         call, (tree, places) = self._call, self._trees
@@ -131,7 +133,8 @@ class _Sum(dr.CustomOp):
         call, tree, gradient = self._call, self._trees[0], self.grad_out()
         size = LIKE_LANES if call.implicit or len(self._trees[1]) > self._owned else self._lanes
         with _local_sums(bool(call.implicit)):
-            if size >= self._lanes:
+            # A value that all lanes share, such as the radiance of a constant sky, has one gradient, which is their sum already.
+            if size >= self._lanes or self._shared_value:
                 self.set_grad_in("arrays", self._backward(tree, call.zero, gradient, call.active, self._lanes))
                 return
             dr.eval(tree[0], gradient, call.active)

@@ -87,6 +87,25 @@ def test_constant_sky_over_a_floor(variant: str) -> None:
     assert image.mean() == pytest.approx(ALBEDO * 0.8, rel=0.015)
 
 
+@pytest.mark.parametrize(("count", "worst"), [(16, 0.025), (64, 0.005)])
+def test_constant_sky_is_as_bright_on_all_sides(variant: str, count: int, worst: float) -> None:
+    """A ball shows all normals. Parts of the sky lie across each one's horizon, and are wide."""
+    ball = {"type": "sphere", "center": [0, 0.4, 0], "radius": 0.8}
+    parts = {"camera": view(rfilter={"type": "box"}), "floor": None, "ball": ball, "sky": {"type": "constant", "radiance": 0.8}}
+    image = render(scene_of(**parts), environment_samples=count, antialias=False)
+    on_ball = image[image < 0.79]
+    assert on_ball.size > 300
+    np.testing.assert_allclose(on_ball, ALBEDO * 0.8, rtol=worst)
+
+
+@pytest.mark.parametrize("turn", [0.0, 20.0, 45.0])
+def test_turned_floor_receives_all_of_a_constant_sky(variant: str, turn: float) -> None:
+    T = mi.ScalarTransform4f
+    floor = {"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90 + turn) @ T().scale(3)}
+    image = render(scene_of(floor=floor, sky={"type": "constant", "radiance": 0.8}))
+    np.testing.assert_allclose(image, ALBEDO * 0.8, rtol=5e-3)
+
+
 def test_one_sided(variant: str) -> None:
     assert np.all(render(scene_of(lamp=panel(down=False))) == 0)
     assert np.all(render(scene_of(lamp=panel())) > 0.1)

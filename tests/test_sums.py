@@ -135,6 +135,21 @@ def test_slices_of_lanes_add_up(variant: str) -> None:
     np.testing.assert_allclose(dr.ravel(dr.grad(params["value"])).numpy(), [3 * products.sum(), 0, 0], rtol=1e-5)
 
 
+def test_value_that_all_lanes_share(variant: str) -> None:
+    """The radiance of a constant sky is one number, whatever the direction. Its gradient is no lane's own."""
+    lanes = LIKE_LANES + 1
+    texture = mi.load_dict({"type": "rgb", "value": [0.2, 0.4, 0.6]})
+    value = mi.traverse(texture)["value"]
+    dr.enable_grad(value)
+
+    def term(own: mi.Float) -> mi.UnpolarizedSpectrum:
+        return texture.eval(dr.zeros(mi.SurfaceInteraction3f))
+
+    result = evaluate(term, dr.arange(mi.Float, lanes), [texture], lanes)
+    dr.backward(result.x * dr.full(mi.Float, 0.5, lanes))
+    assert dr.ravel(dr.grad(value))[0] == pytest.approx(0.5 * lanes, rel=1e-4)
+
+
 def test_gradients_that_a_parameter_has_already_stay(variant: str) -> None:
     lanes = LIKE_LANES + 1
     texture = mi.load_dict({"type": "rgb", "value": [0.2, 0.4, 0.6]})

@@ -14,6 +14,7 @@ from ..sums import attached_parameters, sum_over
 from .maps import SoftMaps, SoftPlan, map_of
 from .penumbra import penumbra_visibility
 from .samples import LightSamples
+from .sky_light import reflects_only, sky_light
 
 
 def soft_light(
@@ -31,6 +32,8 @@ def soft_light(
     attributes these read. ``gate``: see :func:`shadowmap_dr.shading.direct_light`.
     Gradients flow to all of surface, samples, maps and BSDFs.
     """
+    if samples.distant and reflects_only(nodes):
+        return sky_light(seen, plan, samples, maps, nodes, gate=gate)
     sampled = None if maps is None or plan.kind == "single" else maps.sampled
 
     def one_sample(index: Any, seen: Surface, shared: Any) -> Any:

@@ -34,11 +34,15 @@ class SkyPlan:
     rows       of the latitude-longitude grid, with twice as many columns
     cluster    UInt32 (P,), the part that each of its cells belongs to
     direction  Vector3f (N,), unit, towards the centre of each part, in the environment's own space
+    length     Float (N,), length of the mean of a part's directions: the wider it is, the shorter
+    axes       three Vector3f (N,), principal axes of a part's directions, as long as these deviate along them
     """
 
     rows: int
     cluster: Any
     direction: Any
+    length: Any
+    axes: tuple[Any, Any, Any]
 
 
 def plan_sky(light: Environment, count: int, geometry: Geometry) -> SkyPlan:
@@ -64,7 +68,30 @@ def plan_sky(light: Environment, count: int, geometry: Geometry) -> SkyPlan:
     heaviest = directions[order[np.searchsorted(cluster[order], np.arange(count))]]
     cancelled = length < 1e-3 * np.bincount(cluster, energy, count)
     centre = np.where(cancelled[:, None], heaviest, centre / np.maximum(length, 1e-300)[:, None])
-    return SkyPlan(rows, device_array(mi.UInt32, cluster), mi.Vector3f(*(device_array(mi.Float, column) for column in centre.T)))
+    length, axes = _extent(directions, energy, cluster, centre)
+    vectors = [mi.Vector3f(*(device_array(mi.Float, column) for column in v.T)) for v in (centre, *axes)]
+    return SkyPlan(rows, device_array(mi.UInt32, cluster), vectors[0], device_array(mi.Float, length), tuple(vectors[1:]))
+
+
+def _extent(
+    directions: np.ndarray, energy: np.ndarray, cluster: np.ndarray, centre: np.ndarray
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """(lengths of the mean directions of parts (N,), their three principal axes (N, 3)); ``centre``: their unit directions.
+
+    Parts larger than half the sky count as a point: most of them lies behind any surface.
+    """
+    count = len(centre)
+    total = np.maximum(np.bincount(cluster, energy, count), 1e-300)
+    moments = np.empty((count, 3, 3))
+    for i in range(3):
+        for j in range(3):
+            moments[:, i, j] = np.bincount(cluster, energy * directions[:, i] * directions[:, j], count) / total
+    mean = np.stack([np.bincount(cluster, energy * directions[:, c], count) for c in range(3)], -1) / total[:, None]
+    length = (mean * centre).sum(-1)
+    variances, axes = np.linalg.eigh(moments - mean[:, :, None] * mean[:, None, :])
+    point = length < 0.5
+    scaled = axes * np.sqrt(np.maximum(variances, 0))[:, None, :] * ~point[:, None, None]
+    return np.where(point, 1, np.minimum(length, 1)), [scaled[:, :, k] for k in range(3)]
 
 
 def _divided(energy: np.ndarray, hidden: np.ndarray, count: int) -> np.ndarray:
@@ -154,14 +181,57 @@ def _floors(geometry: Geometry) -> list[tuple[np.ndarray, float]]:
     return found
 
 
-def sky_samples(light: Environment, plan: SkyPlan) -> LightSamples:
-    """The samples of an environment as it is now. Attached to its radiance, all of it, and to its rotation."""
+@dataclass(frozen=True)
+class SkySamples(LightSamples):
+    """Directions of an environment, and how wide the parts are that they stand for.
+
+    length, axes  as of :class:`SkyPlan`, axes in world space, attached to the environment's rotation
+    """
+
+    length: Any = None
+    axes: tuple[Any, Any, Any] | None = None
+
+    def widths(self) -> SkyWidths:
+        """The widths in packets, for look-ups by many lanes."""
+        first, second, third = self.axes
+        rows = (
+            mi.Vector4f(first.x, first.y, first.z, self.length),
+            mi.Vector4f(second.x, second.y, second.z, third.x),
+            mi.Vector2f(third.y, third.z),
+        )
+        packets = tuple(dr.ravel(row) for row in rows)
+        dr.eval(packets)
+        return SkyWidths(packets)
+
+
+@dataclass(frozen=True)
+class SkyWidths:
+    """Widths of the parts of a sky as flat buffers."""
+
+    packets: tuple[Any, Any, Any]
+
+    def of(self, index: Any, normal: Any) -> tuple[Any, Any]:
+        """(length, half): length of the mean of the directions of part ``index`` (UInt32, P), and how far their cosines to a unit
+        ``normal`` (Vector3f, P) lie on either side of the mean cosine, if they are spread evenly (Float). Attached to both.
+        """
+        kinds = (mi.Vector4f, mi.Vector4f, mi.Vector2f)
+        a, b, c = (
+            dr.gather(kind, packet, index, mode=dr.ReduceMode.Local) for kind, packet in zip(kinds, self.packets, strict=True)
+        )
+        axes = (mi.Vector3f(a.x, a.y, a.z), mi.Vector3f(b.x, b.y, b.z), mi.Vector3f(b.w, c.x, c.y))
+        variance = sum(dr.square(dr.dot(axis, normal)) for axis in axes)
+        # The least keeps the derivative of the root finite.
+        return a.w, dr.sqrt(dr.maximum(3 * variance, 1e-8))
+
+
+def sky_samples(light: Environment, plan: SkyPlan) -> SkySamples:
+    """Samples of an environment as it is now. Attached to its radiance, all of it, and to its rotation."""
     local, solid_angle = _grid(plan.rows)
     radiance = mi.UnpolarizedSpectrum(light.diffuse_radiance(light.to_world(local)))
     count = dr.width(plan.direction)
     power = cluster_sums(radiance * solid_angle, plan.cluster, count)
-    towards = light.to_world(plan.direction)
-    return LightSamples(True, -towards, mi.Vector3f(0), power, mi.Float(0))
+    axes = tuple(light.to_world(axis) for axis in plan.axes)
+    return SkySamples(True, -light.to_world(plan.direction), mi.Vector3f(0), power, mi.Float(0), length=plan.length, axes=axes)
 
 
 def _grid(rows: int) -> tuple[Any, Any]:

@@ -13,6 +13,7 @@ import numpy as np
 
 from .aovs import collect_aovs
 from .beams import softened
+from .call_data import rewrite_scalars
 from .camera_pass import camera_clip, least_gap, seen_points, within_far_plane, without_shapes
 from .creases import Creases
 from .errors import ShadowmapError
@@ -200,6 +201,7 @@ class Renderer:
             Attached to vertices, lights, cameras, and the BSDFs and textures of the scene.
         """
         cameras, geometry = self.data.cameras(sensor), self.data.geometry
+        rewrite_scalars(self._nodes())
         if vertex_positions is not None:
             geometry = geometry.with_positions(vertex_positions)
         geometry = geometry.in_packets()
@@ -405,9 +407,8 @@ class Renderer:
         color = dr.zeros(mi.UnpolarizedSpectrum, dr.width(seen.shape))
         for light, fraction in zip(lighting.lights, visible, strict=True):
             color += direct_light(seen, light, fraction, gate=not compat)
-        nodes = [*(source.shape.bsdf() for source in self.data.sources), *self.data.with_attributes()]
         for plan, samples in zip(self.soft, lighting.samples, strict=True):
-            color += soft_light(seen, plan, samples, lighting.soft_maps, nodes, gate=not compat)
+            color += soft_light(seen, plan, samples, lighting.soft_maps, self._nodes(), gate=not compat)
         for uniform in self._uniform_ambient():
             color += ambient_light(seen, uniform, _AMBIENT_DIRECTIONS)
         if not self.settings.hide_emitters:
@@ -416,6 +417,10 @@ class Renderer:
                 sky = background(environment, sensor, raster.width, raster.height)
                 color = dr.select(seen.active, color, sky)
         return color
+
+    def _nodes(self) -> list[Any]:
+        """All objects of Mitsuba's that shading calls: BSDFs, and meshes whose attributes these read."""
+        return [*(source.shape.bsdf() for source in self.data.sources), *self.data.with_attributes()]
 
     def _uniform_ambient(self) -> tuple[Any, ...]:
         return (_Uniform(self.settings.ambient),) if self.settings.ambient > 0 else ()

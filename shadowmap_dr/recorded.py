@@ -9,7 +9,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from .garbage import uncollected
+from .frozen import Frozen
 from .pending import backward, pass_on
 from .raster._memory import own_memory
 from .records import attached_places, map_arrays
@@ -17,18 +17,18 @@ from .renderer import Renderer
 
 
 class Recorded:
-    """The image of a renderer and the gradients of its data, each recorded with ``dr.freeze``.
+    """The image of a renderer and the gradients of its data, each recorded.
 
     Dr.Jit records anew where more than numbers has changed: sizes, types, settings, and how many objects there are in Mitsuba.
     The backward pass renders again, since nothing that is computed in one recording can wait for the other.
     """
 
     def __init__(self) -> None:
-        self._image, self._gradients = dr.freeze(_image), dr.freeze(_gradients)
+        self._image, self._gradients = Frozen(_image), Frozen(_gradients)
 
     def image(self, spp: int, renderer: Renderer) -> tuple[Any, Any, Any]:
         """(detached image, fit of the shadow maps, of those of extended lights)."""
-        with dr.suspend_grad(), uncollected():
+        with dr.suspend_grad():
             return self._image(spp, plain(renderer))
 
     def backward(self, spp: int, gradient: Any, renderer: Renderer) -> None:
@@ -36,9 +36,7 @@ class Recorded:
         places, outer = attached_places(renderer.data)
         if not outer:
             return
-        with uncollected():
-            found = self._gradients(spp, places, _owned(gradient), plain(renderer))
-        pass_on(outer, found)
+        pass_on(outer, self._gradients(spp, places, _owned(gradient), plain(renderer)))
 
     @property
     def recordings(self) -> int:
@@ -51,7 +49,6 @@ def _owned(gradient: Any) -> Any:
     return own_memory(gradient) if gradient.array.state == dr.VarState.Evaluated else dr.detach(gradient)
 
 
-# The renderer comes last: Dr.Jit 1.5 does not tell recordings apart by Python's numbers and strings that follow it.
 def _image(spp: int, renderer: Renderer) -> tuple[Any, Any, Any]:
     image = renderer.render(spp=spp)
     return image, renderer.frusta, renderer.soft_frusta

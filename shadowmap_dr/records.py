@@ -27,7 +27,7 @@ def map_arrays(value: Any, function: Callable[[Any], Any]) -> Any:
         return type(value)([map_arrays(item, function) for item in value])
     if isinstance(value, dict):
         return {key: map_arrays(item, function) for key, item in value.items()}
-    fields = _fields(type(value))
+    fields = fields_of(type(value))
     if fields is not None:
         old = [getattr(value, name) for name in fields]
         new = [map_arrays(item, function) for item in old]
@@ -45,7 +45,7 @@ def map_arrays(value: Any, function: Callable[[Any], Any]) -> Any:
 
 
 @functools.cache
-def _fields(kind: type) -> tuple[str, ...] | None:
+def fields_of(kind: type) -> tuple[str, ...] | None:
     """Names of the fields of a dataclass, None for other classes. Asked for again and again, at every step of an optimisation."""
     return tuple(field.name for field in dataclasses.fields(kind)) if dataclasses.is_dataclass(kind) else None
 

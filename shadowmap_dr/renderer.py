@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -13,12 +13,14 @@ import numpy as np
 
 from .aovs import collect_aovs
 from .beams import softened
+from .call_data import rewrite_scalars
 from .camera_pass import camera_clip, least_gap, seen_points, within_far_plane, without_shapes
 from .creases import Creases
 from .errors import ShadowmapError
 from .facets import facet_normals, flat_faces, mean_normals, soften_facets
 from .film import Margin, develop, film_channels, interleave, sample_grid, sample_windows
 from .footprint import Spots, footprint_points
+from .frozen import take_apart
 from .geometry import Geometry
 from .hits import pixel_hits
 from .light_maps import MapPlan, check_sizes, light_visibility, make_maps, plan_maps
@@ -41,6 +43,7 @@ from .soft import (
     samples_of,
     soft_light,
 )
+from .unseen import UnseenState
 
 # Directions over which the light of environments is summed.
 _AMBIENT_DIRECTIONS = 16
@@ -65,6 +68,7 @@ class Renderer:
         outward: ``Bool`` (F,), faces that shadow maps show from the front only, or None.
         soft: how extended lights (area lights, environments) are sampled, and which maps these samples have.
         frusta: fit of the shadow maps in the last rendering, None before the first. ``soft_frusta``: of those of extended lights.
+        unseen: what recordings do not see of the scene, or None if whoever records takes care of it.
     """
 
     data: SceneData
@@ -77,6 +81,15 @@ class Renderer:
     soft: tuple[SoftPlan, ...] = ()
     frusta: Frusta | None = None
     soft_frusta: SoftFrusta = (None, None)
+    unseen: UnseenState | None = None
+
+    # All that Dr.Jit is to know of, instead of the fields: see ``frozen``.
+    DRJIT_STRUCT: ClassVar[dict[str, type]] = {"recording_parts": tuple}
+
+    @property
+    def recording_parts(self) -> tuple[str, list[Any]]:
+        """Text for what a recording holds, arrays and objects of Mitsuba's. Read by ``dr.freeze``."""
+        return take_apart([getattr(self, part.name) for part in fields(self)])
 
     @classmethod
     def from_scene(
@@ -145,6 +158,7 @@ class Renderer:
             check_sizes(plan.maps, texels, geometry, "lights", "lower shadow_map_resolution, or leave out lights")
         outward = mi.Bool(outward_faces(topology, positions.reshape(-1, 3))) if settings.shadow.cull_backfaces else None
         renderer = cls(data, topology, plan, settings, flat_faces(geometry, topology), creases, outward, soft)
+        renderer.unseen = UnseenState((*data.scene.emitters(), *renderer._nodes()))
         # The first fit is made here, so that a step which is recorded later always starts from one.
         if data.sensors:
             with dr.suspend_grad():
@@ -200,6 +214,7 @@ class Renderer:
             Attached to vertices, lights, cameras, and the BSDFs and textures of the scene.
         """
         cameras, geometry = self.data.cameras(sensor), self.data.geometry
+        rewrite_scalars(self.data.materials())
         if vertex_positions is not None:
             geometry = geometry.with_positions(vertex_positions)
         windows = sample_windows(cameras)

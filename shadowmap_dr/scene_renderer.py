@@ -74,7 +74,7 @@ class SceneRenderer:
             raise ShadowmapError("A scene cannot be read while a function is frozen: render it once with this integrator before.")
         with dr.suspend_grad():
             data = replace(load(scene, tessellation=tessellation, warn=warn), sensors=(sensors_of(sensor),))
-            renderer = Renderer.from_data(data, settings)
+            renderer = replace(Renderer.from_data(data, settings), unseen=None)
             sky, unseen = SkyWatch(data.environments), Unseen((*scene.emitters(), *_bsdfs(data), *data.with_attributes()))
         lights = tuple(light.name for light in data.lights) if settings.lit else ()
         record = cls(_parts(scene, data), _statics(scene, data), _sizes(data), lights, renderer.with_data(_without_scene(data)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from contextlib import suppress
+from itertools import count
 from typing import Any
 
 import drjit as dr
@@ -22,16 +23,18 @@ class Unseen:
 
     Args:
         nodes: Mitsuba's BSDFs, emitters, and shapes whose attributes are read. They are kept alive.
+        arrays: whether arrays that Dr.Jit is not shown count. It refuses to record functions that read them, unless these have
+            set them before.
     """
 
-    def __init__(self, nodes: Iterable[Any]) -> None:
+    def __init__(self, nodes: Iterable[Any], *, arrays: bool = True) -> None:
         self._held, self._sized, self._off = [], [], []
         for node in {id(node): node for node in nodes}.values():
             table, switched = mi.traverse(node), _has_switches(node)
             for key in table.keys():
                 with suppress(TypeError):  # raised for parameters without a value
                     value = table[key]
-                    if not _is_seen(node, key, value):
+                    if not _is_seen(node, key, value) and (arrays or not _is_hidden_array(node, key, value)):
                         self._held.append((table, key))
                     if dr.is_tensor_v(value):
                         self._sized.append((table, key))
@@ -42,6 +45,33 @@ class Unseen:
         """The values as they are: those of two calls are equal if nothing has changed in between."""
         shapes = (tuple(table[key].shape) for table, key in self._sized)
         return (*(fingerprint(table[key]) for table, key in self._held), *shapes, *(value.still() for value in self._off))
+
+
+class UnseenState:
+    """Describes the unseen values of objects for recordings of functions: see :func:`shadowmap_dr.frozen.take_apart`.
+
+    Args:
+        nodes: as for :class:`Unseen`.
+    """
+
+    def __init__(self, nodes: Iterable[Any]) -> None:
+        self._nodes = tuple(nodes)
+        self._unseen: Unseen | None = None
+        self._states: list[tuple[tuple[Any, ...], int]] = []
+
+    def recording_text(self) -> str:
+        """A number for the values as they are, that no other object has."""
+        if not dr.flag(dr.JitFlag.FreezingScope):  # where values cannot be read
+            if self._unseen is None:
+                self._unseen = Unseen(self._nodes, arrays=False)
+            now = self._unseen.now()
+            found = next((state for state in self._states if state[0] == now), None) or (now, next(_NUMBERS))
+            self._states = [found, *(state for state in self._states if state is not found)][:_REMEMBERED]
+        return f"unseen {self._states[0][1] if self._states else 0}"
+
+
+# Of states of objects, and how many of them one object remembers.
+_NUMBERS, _REMEMBERED = count(1), 64
 
 
 class _Off:
@@ -74,3 +104,7 @@ def _is_seen(node: Any, key: str, value: Any) -> bool:
     if "nested_texture." in key or is_attribute(node, key):
         return False
     return dr.is_array_v(value) or isinstance(value, mi.Transform4f)
+
+
+def _is_hidden_array(node: Any, key: str, value: Any) -> bool:
+    return dr.is_array_v(value) and ("nested_texture." in key or is_attribute(node, key))

@@ -92,7 +92,7 @@ def test_constant_sky_is_as_bright_on_all_sides(variant: str, count: int, worst:
     """A ball shows all normals. Parts of the sky lie across each one's horizon, and are wide."""
     ball = {"type": "sphere", "center": [0, 0.4, 0], "radius": 0.8}
     parts = {"camera": view(rfilter={"type": "box"}), "floor": None, "ball": ball, "sky": {"type": "constant", "radiance": 0.8}}
-    image = render(scene_of(**parts), environment_samples=count, antialias=False)
+    image = render(scene_of(**parts), environment_light_samples=count, antialias=False)
     on_ball = image[image < 0.79]
     assert on_ball.size > 300
     np.testing.assert_allclose(on_ball, ALBEDO * 0.8, rtol=worst)

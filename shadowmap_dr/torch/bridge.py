@@ -112,15 +112,17 @@ def _gathered(kind: Any, flat: Any, index: Any) -> Any:
     return dr.gather(kind, flat, backend(flat).UInt32(index), mode=dr.ReduceMode.NoConflicts)
 
 
-def to_torch(array: Any, *, copy: bool) -> torch.Tensor:
-    """A PyTorch tensor with the values of a Dr.Jit tensor; shares the memory unless it is to be a copy."""
-    tensor = dr.detach(array).torch()
-    return tensor.clone() if copy else tensor
+def to_torch(array: Any) -> torch.Tensor:
+    """A PyTorch tensor with the values of a Dr.Jit tensor, in memory of its own. Only where it is the thread's turn: it waits."""
+    return dr.detach(array).torch().clone()
 
 
 @contextmanager
 def drjit_turn(device: torch.device) -> Iterator[ModuleType]:
     """Let Dr.Jit work: on what PyTorch has finished, and finishing before PyTorch goes on. Yields the module of its types.
+
+    Whatever may wait for Dr.Jit belongs inside, reading an array back included. Threads help Dr.Jit while they wait, and sums
+    lose terms where two of them do (Dr.Jit 1.5, ``docs/dr-jit-faults/shared_sums.py``).
 
     Also keeps alive what is made inside until it is no longer read: arrays that share memory with PyTorch must not be dropped
     before the end of this context.
@@ -147,10 +149,10 @@ class _Crossing(torch.autograd.Function):
             arrays = [to_drjit(tensor) for tensor in tensors]
             results = operation.forward(arrays, wanted)
             dr.eval(results)
+            found = tuple(to_torch(result) for result in results)
         ctx.operation, ctx.wanted, ctx.device = operation, wanted, tensors[0].device
         ctx.set_materialize_grads(False)
-        # A result may be memory of an array that is kept for the derivatives, and that nobody else may write to.
-        return tuple(to_torch(result, copy=any(wanted)) for result in results)
+        return found
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -159,6 +161,6 @@ class _Crossing(torch.autograd.Function):
             arrays = [None if adjoint is None else to_drjit(adjoint) for adjoint in adjoints]
             found = ctx.operation.backward(arrays)
             dr.eval(found)
-        # PyTorch may add to them in place.
-        wanted = zip(found, ctx.wanted, strict=True)
-        return None, None, *(to_torch(gradient, copy=True) if want else None for gradient, want in wanted)
+            wanted = zip(found, ctx.wanted, strict=True)
+            given = [to_torch(gradient) if want else None for gradient, want in wanted]
+        return None, None, *given

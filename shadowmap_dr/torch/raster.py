@@ -86,7 +86,7 @@ def rasterize(positions: torch.Tensor, faces: torch.Tensor, resolution: tuple[in
     with drjit_turn(device) as module:
         # What the pixels see by itself: the rest is in the tensors.
         found = dr.detach(replace(kept[0], u=None, v=None, depth=None, w=None))
-        triangle = to_torch(module.TensorXi(module.Int32(found.triangle), u.shape), copy=True)
+        triangle = to_torch(module.TensorXi(module.Int32(found.triangle), u.shape))
     return Raster(triangle, u, v, depth, found)
 
 

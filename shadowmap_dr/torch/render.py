@@ -13,6 +13,7 @@ import mitsuba as mi
 import torch
 
 from ..errors import ShadowmapError
+from ..frozen import Frozen
 from ..records import map_arrays
 from ..renderer import Renderer as _Renderer
 from ..soft import SkyWatch, still_aimed
@@ -42,27 +43,33 @@ class Renderer:
         self._renderer = replace(renderer)
         # What calls with parameters take over from each other: extended lights as they have been divided, and where skies shone.
         self._planned: dict[str, Any] = {}
-        self._sky = SkyWatch(renderer.data.environments)
         self._variant = mi.variant()
-        self._frozen = (dr.freeze(_forward), dr.freeze(_backward)) if frozen else None
+        self._device = _device_of(self._variant)
+        with drjit_turn(self._device):
+            self._sky = SkyWatch(renderer.data.environments)
+        self._frozen = (Frozen(_forward), Frozen(_backward)) if frozen else None
 
     @classmethod
     def from_scene(cls, scene: Any, *, frozen: bool = False, **settings: Any) -> Renderer:
         """Build a renderer for a ``mi.Scene``. ``settings`` are those of :meth:`shadowmap_dr.Renderer.from_scene`."""
-        return cls(_Renderer.from_scene(scene, **settings), frozen=frozen)
+        with drjit_turn(_device_of(mi.variant() or "")):
+            renderer = _Renderer.from_scene(scene, **settings)
+        return cls(renderer, frozen=frozen)
 
     def vertices(self, name: str) -> torch.Tensor:
         """Positions of a shape when the scene was loaded: float32 (V, 3), world space, without gradients."""
         count = self._renderer.data.geometry.shape(name).vertex_count
-        flat = dr.ravel(dr.detach(self._renderer.data.geometry.shape_positions(name)))
-        return to_torch(mi.TensorXf(flat, (count, 3)), copy=True)
+        with drjit_turn(self._device):
+            flat = dr.ravel(dr.detach(self._renderer.data.geometry.shape_positions(name)))
+            return to_torch(mi.TensorXf(flat, (count, 3)))
 
     def faces(self, name: str) -> torch.Tensor:
         """Triangles of a shape: int32 (F, 3), indices into its vertices."""
         info = self._renderer.data.geometry.shape(name)
-        faces = self._renderer.data.geometry.faces.numpy().reshape(-1, 3).astype("int32")
+        with drjit_turn(self._device):
+            faces = self._renderer.data.geometry.faces.numpy().reshape(-1, 3).astype("int32")
         own = torch.from_numpy(faces[info.face_start : info.face_start + info.face_count] - info.vertex_start)
-        return own.to("cuda" if self._variant.startswith("cuda") else "cpu")
+        return own.to(self._device)
 
     def render(
         self,
@@ -103,9 +110,9 @@ class Renderer:
         operation = _Rendering(self, tuple(given), sensor, spp)
         if given:
             return cross(operation, *given.values())[0]
-        with drjit_turn(torch.device("cpu" if self._variant.startswith("llvm") else "cuda")):
+        with drjit_turn(self._device):
             (image,) = operation.forward([], [])
-            return to_torch(image, copy=False)
+            return to_torch(image)
 
     def _inputs(
         self,
@@ -228,13 +235,16 @@ class _Rendering:
             return renderer.planned_anew()
 
 
+def _device_of(variant: str) -> torch.device:
+    return torch.device("cuda" if variant.startswith("cuda") else "cpu")
+
+
 def _set(table: Any, values: Mapping[str, Any]) -> None:
     for name, value in values.items():
         table[name] = value
     table.update()
 
 
-# The renderer comes last: Dr.Jit 1.5 does not tell recordings apart by Python's numbers and strings that follow it.
 def _forward(places: tuple[_Place, ...], sensor: int, spp: int, arrays: list[Any], renderer: _Renderer) -> tuple[Any, Any]:
     """Image and the fits of the shadow maps and of those of extended lights."""
     given = list(zip(places, arrays, strict=True))

@@ -158,7 +158,7 @@ class Renderer:
             check_sizes(plan.maps, texels, geometry, "lights", "lower shadow_map_resolution, or leave out lights")
         outward = mi.Bool(outward_faces(topology, positions.reshape(-1, 3))) if settings.shadow.cull_backfaces else None
         renderer = cls(data, topology, plan, settings, flat_faces(geometry, topology), creases, outward, soft)
-        renderer.unseen = UnseenState((*data.scene.emitters(), *renderer._nodes()))
+        renderer.unseen = UnseenState((*data.scene.emitters(), *data.materials()))
         # The first fit is made here, so that a step which is recorded later always starts from one.
         if data.sensors:
             with dr.suspend_grad():

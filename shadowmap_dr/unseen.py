@@ -23,18 +23,16 @@ class Unseen:
 
     Args:
         nodes: Mitsuba's BSDFs, emitters, and shapes whose attributes are read. They are kept alive.
-        arrays: whether arrays that Dr.Jit is not shown count. It refuses to record functions that read them, unless these have
-            set them before.
     """
 
-    def __init__(self, nodes: Iterable[Any], *, arrays: bool = True) -> None:
+    def __init__(self, nodes: Iterable[Any]) -> None:
         self._held, self._sized, self._off = [], [], []
         for node in {id(node): node for node in nodes}.values():
             table, switched = mi.traverse(node), _has_switches(node)
             for key in table.keys():
                 with suppress(TypeError):  # raised for parameters without a value
                     value = table[key]
-                    if not _is_seen(node, key, value) and (arrays or not _is_hidden_array(node, key, value)):
+                    if not _is_seen(node, key, value):
                         self._held.append((table, key))
                     if dr.is_tensor_v(value):
                         self._sized.append((table, key))
@@ -61,13 +59,16 @@ class UnseenState:
 
     def recording_text(self) -> str:
         """A number for the values as they are, that no other object has."""
-        if not dr.flag(dr.JitFlag.FreezingScope):  # where values cannot be read
-            if self._unseen is None:
-                self._unseen = Unseen(self._nodes, arrays=False)
-            now = self._unseen.now()
+        if self._unseen is None:
+            self._unseen = Unseen(self._nodes)
+        now = self._unseen.now()
+        if dr.flag(dr.JitFlag.FreezingScope) and self._states:
+            # What the recorded function has set itself, it sets again.
+            self._states[0] = (now, self._states[0][1])
+        else:
             found = next((state for state in self._states if state[0] == now), None) or (now, next(_NUMBERS))
             self._states = [found, *(state for state in self._states if state is not found)][:_REMEMBERED]
-        return f"unseen {self._states[0][1] if self._states else 0}"
+        return f"unseen {self._states[0][1]}"
 
 
 # Of states of objects, and how many of them one object remembers.
@@ -84,7 +85,7 @@ class _Off:
         if self._still:
             value = self._table[self._key]
             now = fingerprint(value)
-            if now != self._known:
+            if now != self._known and not dr.flag(dr.JitFlag.FreezingScope):  # where nothing can be read
                 self._known, self._still = now, bool(dr.all(dr.detach(value) == 0))
         return self._still
 
@@ -104,7 +105,3 @@ def _is_seen(node: Any, key: str, value: Any) -> bool:
     if "nested_texture." in key or is_attribute(node, key):
         return False
     return dr.is_array_v(value) or isinstance(value, mi.Transform4f)
-
-
-def _is_hidden_array(node: Any, key: str, value: Any) -> bool:
-    return dr.is_array_v(value) and ("nested_texture." in key or is_attribute(node, key))

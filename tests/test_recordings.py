@@ -16,6 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+import recording_stress
 from renderer_scenes import renderer_of
 
 from shadowmap_dr import Renderer
@@ -145,6 +146,18 @@ def test_values_that_recordings_do_not_see(variant: str, key: str, values: list[
         images.append(image(replace(renderer)).numpy())
         np.testing.assert_allclose(images[-1], replace(renderer).render().numpy(), atol=1e-5)
     assert np.abs(images[1] - images[0]).max() > 1e-2
+
+
+def test_colours_of_vertices_are_recorded_anew(variant: str) -> None:
+    """Mitsuba does not show them to Dr.Jit, whether they lie in memory or are one constant."""
+    scene = recording_stress.scene(few=True)
+    params, renderer = mi.traverse(scene), Renderer.from_scene(scene, shadow_map_resolution=32)
+    count = len(params["ball.vertex_positions"])
+    image = dr.freeze(lambda renderer: renderer.render())
+    for value in (0.2, 0.5, 0.8, 0.4):
+        params["ball.vertex_color"] = dr.full(mi.Float, value, count)
+        params.update()
+        np.testing.assert_allclose(image(replace(renderer)).numpy(), replace(renderer).render().numpy(), atol=1e-5)
 
 
 def test_only_one_thread_waits_for_drjit(variant: str, monkeypatch: pytest.MonkeyPatch) -> None:

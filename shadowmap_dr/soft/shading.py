@@ -37,20 +37,29 @@ def soft_light(
     sampled = None if maps is None or plan.kind == "single" else maps.sampled
     # The colours of plain shapes are no lane's own: all gather from them.
     own = replace(seen, plain=None)
+    transmits = not samples.distant and any(_transmits(node) for node in nodes)
     inputs = (own, seen.plain, samples.table(), sampled)
 
     def one_sample(index: Any, arrays: list[Any]) -> Any:
         seen, plain, table, maps = with_arrays(inputs, arrays)
         seen = replace(seen, plain=plain)
-        wo_world, weight, reached = table.illuminate(index, seen.p_world)
-        wo = seen.si.to_local(wo_world)
-        active = seen.active & reached
-        if gate:
-            active &= passes_gate(seen, wo_world, wo)
-        value = seen.evaluate(wo, active) * weight
+        value, active = mi.UnpolarizedSpectrum(0), mi.Bool(False)
+        for wo_world, weight, reached in table.illuminate(index, seen.p_world, sides(seen)):
+            wo = seen.si.to_local(wo_world)
+            passes = seen.active & reached
+            if gate:
+                passes &= passes_gate(seen, wo_world, wo)
+            value += dr.select(passes, seen.evaluate(wo, passes) * weight, 0)
+            active |= passes
         if maps is not None:
             value *= visibility(maps, map_of(plan, table, index, seen.p_world), seen.p_world, active)
         return dr.select(active, value, 0)
+
+    def sides(seen: Surface) -> list[Any]:
+        """Normals on the sides of the surface that light may come from."""
+        n = seen.si.sh_frame.n
+        above = mi.Vector3f(dr.select(dr.detach(seen.si.wi.z) < 0, -n, n))
+        return [above, -above] if transmits else [above]
 
     start = dr.zeros(mi.UnpolarizedSpectrum, dr.width(seen.shape))
     lanes = len(attached_arrays(own))
@@ -59,6 +68,11 @@ def soft_light(
         return light
     radius = samples.radius_towards(seen.p_world)
     return light * penumbra_visibility(maps.single, mi.UInt32(plan.first), radius, seen.p_world, seen.n_world, seen.active)
+
+
+def _transmits(node: Any) -> bool:
+    flags = node.flags() if isinstance(node, mi.BSDF) else 0
+    return mi.has_flag(flags, mi.BSDFFlags.DiffuseTransmission) or mi.has_flag(flags, mi.BSDFFlags.GlossyTransmission)
 
 
 def _attached_parameters(nodes: Sequence[Any]) -> list[Any]:

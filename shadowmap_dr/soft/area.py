@@ -16,10 +16,9 @@ from ..raster._memory import device_array
 from .clusters import facet_clusters, surface_clusters
 from .samples import Facets, LightSamples, brightness, cluster_sums
 
-# Pieces of the emitter for each sample, at least, and if it is not flat; and how many more of them a texture needs, up to so many
-# in all.
-_PIECES, _BENT_PIECES = 16, 64
-_TEXTURED, _MOST = 64, 1 << 17
+# Pieces of the emitter for each sample, at least; and how many more of them a texture needs, up to so many in all.
+_PIECES = 64
+_TEXTURED, _MOST = 16, 1 << 17
 # Disks that stand for a sample's part of an emitter that is not flat.
 _FACETS = 4
 # Weight of what is dark in the middle of a facet, in units of the emitter's mean brightness.
@@ -75,7 +74,7 @@ def plan_area(light: AreaLight, geometry: Geometry, count: int) -> AreaPlan:
     normals, areas = _normals(corners)
     sign = _shining_side(geometry, info, normals, faces[own])
     normals *= sign[:, None]
-    pieces = (_PIECES if info.planar else _BENT_PIECES) * count
+    pieces = _PIECES * count
     face, (u, v), fraction = _pieces(areas, max(pieces, min(_TEXTURED * pieces, _MOST)) if light.textured else pieces)
     a, b, c = (corners[face, k] for k in range(3))
     centres = a + u[:, None] * (b - a) + v[:, None] * (c - a)
@@ -123,7 +122,7 @@ def area_samples(light: AreaLight, plan: AreaPlan, geometry: Geometry) -> LightS
 
 
 def _facets(light: AreaLight, plan: AreaPlan, planar: bool, pieces: tuple[Any, Any, Any, Any], place: Any) -> Facets:
-    """The disks that shine like an emitter. ``pieces``: their positions, area vectors, areas, radiances; ``place``: of samples."""
+    """The disks that shine like an emitter. ``pieces``: their positions, area vectors, areas and radiances."""
     position, vector, area, radiance = pieces
     # Relative to the samples, which keeps digits.
     offset = position - _at(place, plan.cluster)

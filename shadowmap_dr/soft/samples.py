@@ -84,7 +84,7 @@ class LightSamples:
 
     def table(self) -> SampleTable:
         """The same numbers in packets, for look-ups by many lanes."""
-        p, n, c = self.place, self.normal, self.power
+        p, c = self.place, self.power
         colour = [c[k] for k in range(dr.size_v(type(c)))]
         rows = [mi.Vector4f(p.x, p.y, p.z, 0), mi.Vector4f(*colour, *[mi.Float(0)] * (4 - len(colour)))]
         if self.facets:
@@ -141,8 +141,8 @@ class SampleTable:
             along, across = disk_irradiance(squared, height, squared_radius)
             vector = offset * along - normal * across
             for i, side in enumerate(sides):
-                # The disk's points reach so far above and below its centre, if spread evenly.
-                reach = 0.75 * squared_radius * (1 - dr.square(dr.dot(normal, side)))
+                # Evenly spread this far above and below the centre, points have as much light above it as those of the disk.
+                reach = 0.72 * squared_radius * (1 - dr.square(dr.dot(normal, side)))
                 vectors[i] += _above(vector, along, side, dr.dot(offset, side), reach, squared) * size
         found = []
         for vector in vectors:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,12 +13,16 @@ import numpy as np
 from ..geometry import Geometry, ShapeInfo
 from ..lights import AreaLight
 from ..raster._memory import device_array
-from .clusters import surface_clusters
-from .samples import BEND, LightSamples, brightness, cluster_sums
+from .clusters import facet_clusters, surface_clusters
+from .samples import Facets, LightSamples, brightness, cluster_sums
 
 # Pieces of the emitter for each sample, at least; and how many more of them a texture needs, up to so many in all.
-_PIECES = 16
-_TEXTURED, _MOST = 64, 1 << 17
+_PIECES = 64
+_TEXTURED, _MOST = 16, 1 << 17
+# Disks that stand for a sample's part of an emitter that is not flat.
+_FACETS = 4
+# Weight of what is dark in the middle of a facet, in units of the emitter's mean brightness.
+_DIM = 1e-3
 # Importance of what faces away from everything, in units of the mean.
 _AWAY = 0.1
 # A part of an emitter that faces opposite ways is as bad as one that is twice as long, in units of the distance to what is near.
@@ -38,6 +43,8 @@ class AreaPlan:
     cluster   UInt32 (P,), which of the N clusters it belongs to
     chosen    UInt32 (N,), the piece in whose centre a cluster's sample lies
     shape     index of the emitter's shape
+    facet     UInt32 (P,), which facet it belongs to, ``facets`` for each cluster
+    facets    number of disks that stand for the part of a sample
     dented    whether parts of the emitter look at the shining side of others. False if it shines on the side from which its
               triangles wind the other way: maps show the other sides only
     """
@@ -50,6 +57,8 @@ class AreaPlan:
     chosen: Any
     shape: int
     dented: bool
+    facet: Any
+    facets: int
 
 
 def plan_area(light: AreaLight, geometry: Geometry, count: int) -> AreaPlan:
@@ -76,6 +85,8 @@ def plan_area(light: AreaLight, geometry: Geometry, count: int) -> AreaPlan:
     weights = fraction * areas[face] * importance * (shine + _AWAY * max(shine.mean(), 1e-30))
     weights = np.maximum(weights, 1e-12 * max(weights.max(), 1e-300))
     cluster, chosen = surface_clusters(centres, weights, count, normals[face], _OPPOSITE * nearest)
+    facets = 1 if info.planar else _FACETS
+    bright = fraction * areas[face] * (shine + _DIM * shine.mean())
     return AreaPlan(
         face=device_array(mi.UInt32, face + info.face_start),
         u=device_array(mi.Float, u),
@@ -85,41 +96,79 @@ def plan_area(light: AreaLight, geometry: Geometry, count: int) -> AreaPlan:
         chosen=device_array(mi.UInt32, chosen),
         shape=light.shape,
         dented=not info.planar and bool((sign > 0).all()) and _dented(centres[chosen], corners, normals),
+        facet=device_array(mi.UInt32, facet_clusters(centres, normals[face], bright, cluster, facets, nearest)),
+        facets=facets,
     )
 
 
 def area_samples(light: AreaLight, plan: AreaPlan, geometry: Geometry) -> LightSamples:
     """The samples of an emitter where it is now. Attached to its vertices and its radiance."""
     info, count = geometry.shapes[plan.shape], dr.width(plan.chosen)
-    _, e1, e2 = _triangles(geometry, plan.face)
+    first, e1, e2 = _triangles(geometry, plan.face)
     vector = dr.cross(e1, e2) * (0.5 * plan.fraction)
     area = dr.norm(vector)
     radiance = light.radiance(_uv(geometry, plan.face, plan.u, plan.v, info))
-    face = dr.gather(mi.UInt32, plan.face, plan.chosen)
-    first, e1, e2 = _triangles(geometry, face)
-    u, v = dr.gather(mi.Float, plan.u, plan.chosen), dr.gather(mi.Float, plan.v, plan.chosen)
+    position = mi.Vector3f(first + e1 * plan.u + e2 * plan.v)
+    place = _at(position, plan.chosen)
     total = cluster_sums(area, plan.cluster, count)
-    share = dr.rcp(dr.maximum(total, 1e-30))
-    normal = cluster_sums(vector, plan.cluster, count) * share
     return LightSamples(
         distant=False,
-        place=mi.Vector3f(first + e1 * u + e2 * v),
-        normal=normal,
+        place=place,
+        normal=cluster_sums(vector, plan.cluster, count) * dr.rcp(dr.maximum(total, 1e-30)),
         power=cluster_sums(radiance * area, plan.cluster, count),
         area=total,
-        bend=None if info.planar else _bend(vector, area, normal, share, plan.cluster),
+        facets=_facets(light, plan, info.planar, (position, vector, area, radiance), dr.detach(place)),
     )
 
 
-def _bend(vector: Any, area: Any, normal: Any, share: Any, cluster: Any) -> Any:
-    """Covariance of the normals of each part, see :class:`LightSamples`. ``vector``: normals of pieces times their areas."""
+def _facets(light: AreaLight, plan: AreaPlan, planar: bool, pieces: tuple[Any, Any, Any, Any], place: Any) -> Facets:
+    """The disks that shine like an emitter. ``pieces``: their positions, area vectors, areas and radiances."""
+    position, vector, area, radiance = pieces
+    # Relative to the samples, which keeps digits.
+    offset = position - _at(place, plan.cluster)
+    count = dr.width(place) * plan.facets
+    # Where a facet shines, and which way, is the mean over its light.
+    weight = area * _relative(radiance) if light.textured else area
+    sums = cluster_sums(weight, plan.facet, count)
+    share = dr.rcp(dr.maximum(sums, 1e-30))
+
+    def mean(values: Any) -> Any:
+        return cluster_sums(values * weight, plan.facet, count) * share
+
     n = vector * dr.rcp(dr.maximum(area, 1e-30))
-    count = dr.width(share)
+    normal, middle, bend = mean(n), mean(offset), dr.zeros(mi.Float, count)
+    if not planar:
+        # What bends shines like a flat disk with the same outline, as far below its middle as the middle is below its top.
+        sag = mean(dr.dot(offset, n)) - dr.dot(middle, normal)
+        squared = dr.squared_norm(normal)
+        middle -= normal * (0.5 * sag * dr.rcp(dr.maximum(squared, 0.1)))
+        bend = dr.mulsign(dr.sqrt(dr.maximum(1 - squared, 1e-8)), dr.detach(sag))
+    part = dr.arange(mi.UInt32, count) // plan.facets
+    in_all = dr.gather(mi.Float, cluster_sums(weight, plan.cluster, dr.width(place)), part)
+    shown = cluster_sums(area, plan.facet, count) * _length(normal)
+    return Facets(
+        count=plan.facets,
+        flat=planar,
+        middle=_at(place, part) + middle,
+        normal=normal * (sums * dr.rcp(dr.maximum(in_all, 1e-30))),
+        radius=dr.sqrt(dr.maximum(shown * (1 / math.pi), 1e-30)),
+        bend=bend,
+    )
 
-    def entry(i: int, j: int) -> Any:
-        return cluster_sums(vector[i] * n[j], cluster, count) * share - normal[i] * normal[j]
 
-    return tuple(entry(i, j) for i, j in BEND)
+def _at(values: Any, index: Any) -> Any:
+    """Vectors of some numbers (Vector3f)."""
+    return mi.Vector3f(*(dr.gather(mi.Float, values[c], index) for c in range(3)))
+
+
+def _length(vector: Any) -> Any:
+    return dr.sqrt(dr.maximum(dr.squared_norm(vector), 1e-20))
+
+
+def _relative(radiance: Any) -> Any:
+    """Brightness of pieces (Float, P) in units of their mean, with a little more so that dark parts have a middle, too."""
+    bright = dr.maximum(dr.mean(mi.UnpolarizedSpectrum(radiance)), 0)
+    return bright * dr.rcp(dr.maximum(dr.detach(dr.mean(bright)), 1e-30)) + _DIM
 
 
 def _triangles(geometry: Geometry, face: Any) -> tuple[Any, Any, Any]:

@@ -57,6 +57,51 @@ def surface_clusters(
     return cluster, best
 
 
+def facet_clusters(
+    positions: np.ndarray, normals: np.ndarray, weights: np.ndarray, cluster: np.ndarray, count: int, reach: np.ndarray
+) -> np.ndarray:
+    """Divide each cluster of pieces into ``count`` facets that differ little in position and normal, whatever they weigh.
+
+    Args:
+        positions, normals, weights: (P, 3), (P, 3), unit, and (P,) >= 0.
+        cluster: (P,) uint32.
+        reach: (P,), distances at which opposite normals are as bad as being so far apart; at least the size of the cluster.
+
+    Returns:
+        Facet of each piece, (P,) uint32. Those of cluster c are ``c * count`` and the following; some are empty where a cluster
+        has fewer pieces.
+    """
+    facet = cluster.astype(np.uint32) * np.uint32(count)
+    if count == 1:
+        return facet
+    order = np.argsort(cluster, kind="stable")
+    for members in np.split(order, np.flatnonzero(np.diff(cluster[order])) + 1):
+        share = weights[members] + 1e-12 * max(weights[members].max(), 1e-300)
+        size = np.ptp(positions[members], axis=0).max()
+        scale = max(float(np.average(reach[members], weights=share)), float(size))
+        features = np.concatenate([positions[members], scale * normals[members]], axis=1)
+        parts = [np.arange(len(members))]
+        while len(parts) < count:
+            moments = [_moment(features[part], share[part]) for part in parts]
+            worst = int(np.argmax([moment for moment, _ in moments]))
+            moment, before = moments[worst]
+            if moment <= 0:
+                break
+            part = parts.pop(worst)
+            parts += [part[before], part[~before]]
+        for k, part in enumerate(parts):
+            facet[members[part]] += np.uint32(k)
+    return facet
+
+
+def _moment(points: np.ndarray, weights: np.ndarray) -> tuple[float, np.ndarray]:
+    """(second moment of points (P, D) along their longest axis, Bool (P,): which lie before the mean on it)."""
+    centred = points - np.average(points, axis=0, weights=weights)
+    moments, axes = np.linalg.eigh(centred.T @ (centred * weights[:, None]))
+    before = centred @ axes[:, -1] < 0
+    return (float(moments[-1]) if before.any() and not before.all() else 0.0), before
+
+
 def sky_clusters(weights: np.ndarray, count: int) -> np.ndarray:
     """Divide a latitude-longitude image into ``count`` rectangles that weigh about the same, by repeated halving.
 

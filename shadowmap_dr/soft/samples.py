@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,8 +13,32 @@ import numpy as np
 
 from ..errors import ShadowmapError
 
-# Which entries of a covariance of unit vectors are kept: the last one follows from the mean vector's length.
-BEND = ((0, 0), (1, 1), (0, 1), (0, 2), (1, 2))
+
+@dataclass(frozen=True)
+class Facets:
+    """Disks that shine like the N parts of an emitter: ``count`` for each part, one after the other, F in all.
+
+    count   static
+    flat    whether none of them stands for something that bends (static)
+    middle  Vector3f (F,), centres, world space
+    normal  Vector3f (F,), mean normals of what they stand for, times their share of the part
+    radius  Float (F,)
+    bend    Float (F,), standard deviation of normals, negative where they are bent inwards
+
+    All may carry gradients.
+    """
+
+    count: int
+    flat: bool
+    middle: Any
+    normal: Any
+    radius: Any
+    bend: Any
+
+    def packets(self) -> list[Any]:
+        """Two rows of four numbers."""
+        m, n = self.middle, self.normal
+        return [mi.Vector4f(m.x, m.y, m.z, self.radius), mi.Vector4f(n.x, n.y, n.z, self.bend)]
 
 
 @dataclass(frozen=True)
@@ -25,7 +50,7 @@ class LightSamples:
     normal   Vector3f (N,), mean normals of the parts, shorter than 1 where these are curved (unused if distant)
     power    colour (N,), radiance times area, or irradiance on a surface that faces the light
     area     Float (N,), share of the emitter's area (unused if distant)
-    bend     Float (N,) for each of :data:`BEND`, covariance of the normals of each part, or None where the emitter is flat
+    facets   what the parts shine like, near points; None if distant
 
     All may carry gradients.
     """
@@ -35,7 +60,7 @@ class LightSamples:
     normal: Any
     power: Any
     area: Any
-    bend: tuple[Any, ...] | None = None
+    facets: Facets | None = None
 
     @property
     def count(self) -> int:
@@ -59,71 +84,126 @@ class LightSamples:
 
     def table(self) -> SampleTable:
         """The same numbers in packets, for look-ups by many lanes."""
-        p, n, c = self.place, self.normal, self.power
+        p, c = self.place, self.power
         colour = [c[k] for k in range(dr.size_v(type(c)))]
-        rows = [mi.Vector4f(p.x, p.y, p.z, self.area), mi.Vector4f(*colour, *[mi.Float(0)] * (4 - len(colour)))]
-        if not self.distant:
-            rows.append(mi.Vector4f(n.x, n.y, n.z, self.bend[0] if self.bend else 0))
-            if self.bend:
-                rows.append(mi.Vector4f(*self.bend[1:]))
+        rows = [mi.Vector4f(p.x, p.y, p.z, 0), mi.Vector4f(*colour, *[mi.Float(0)] * (4 - len(colour)))]
+        if self.facets:
+            rows += self.facets.packets()
         packets = tuple(dr.ravel(row) for row in rows)
         dr.eval(packets)
-        return SampleTable(self.distant, self.count, packets)
+        count, flat = (self.facets.count, self.facets.flat) if self.facets else (1, True)
+        return SampleTable(self.distant, self.count, packets, count, flat)
 
 
 @dataclass(frozen=True)
 class SampleTable:
-    """:class:`LightSamples` as flat buffers of four numbers for each sample."""
+    """:class:`LightSamples` as flat buffers of four numbers for each sample, and :class:`Facets` likewise."""
 
     distant: bool
     count: int
     packets: tuple[Any, ...]
+    facets: int
+    flat: bool
 
     def place(self, index: Any) -> Any:
         """Vector3f, where sample ``index`` (UInt32) is, detached."""
         packet = dr.gather(mi.Vector4f, dr.detach(self.packets[0]), index)
         return mi.Vector3f(packet.x, packet.y, packet.z)
 
-    def illuminate(self, index: Any, p_world: Any) -> tuple[Any, Any, Any]:
-        """(wo, weight, reached): unit direction from points to sample ``index`` (UInt32), its irradiance on a surface that faces
-        it, and where (Bool) its light arrives. That does not ask for its radiance, whose derivative is there even if it is zero.
+    def illuminate(self, index: Any, p_world: Any, sides: Sequence[Any]) -> list[tuple[Any, Any, Any]]:
+        """(wo, weight, reached) of sample ``index`` (UInt32) at points, for the light on each of some sides of them.
 
-        ``p_world`` Point3f (P,), world space. Attached to points and samples. One-sided, as Mitsuba's area lights are.
+        wo is a unit direction (Vector3f) to the light in the mean, weight its irradiance on a surface that faces it (colour), and
+        reached (Bool) tells where it arrives. That does not ask for its radiance, whose derivative is there even if it is zero.
+
+        ``p_world`` Point3f (P,), world space; ``sides``: normals (unit Vector3f (P,)) that point to these sides. Weight times
+        cosine is right also where the horizon cuts the light in two. Light from infinitely far away is on one side. Attached to
+        points, normals and samples. One-sided, as Mitsuba's area lights are.
         """
-        place, colour, *rest = (_packet(packet, index) for packet in self.packets)
-        channels = dr.size_v(mi.UnpolarizedSpectrum)
-        power = mi.UnpolarizedSpectrum(*(colour[k] for k in range(channels)))
-        where = mi.Vector3f(place.x, place.y, place.z)
+        colour = _packet(self.packets[1], index)
+        power = mi.UnpolarizedSpectrum(*(colour[k] for k in range(dr.size_v(mi.UnpolarizedSpectrum))))
         if self.distant:
-            return -where, power, mi.Bool(True)
-        offset = where - mi.Vector3f(p_world)
-        squared = dr.squared_norm(offset)
-        # A point on the light's own surface may be the sample itself.
-        valid = squared > 0
-        wo = offset * dr.rsqrt(dr.select(valid, squared, 1))
-        n = rest[0]
-        normal = mi.Vector3f(n.x, n.y, n.z)
-        cosine = -dr.dot(normal, wo)
-        cosine = _mean_cosine(cosine, _spread(normal, n.w, rest[1], wo)) if len(rest) > 1 else dr.maximum(cosine, 0)
-        # The share of a disk of this area in the view of a point on its axis: exact at any distance, and never infinite.
-        form = cosine * dr.rcp(dr.maximum(squared + place.w * (1 / math.pi), 1e-20))
-        return wo, power * form, dr.detach(form) > 0
+            place = _packet(self.packets[0], index)
+            return [(mi.Vector3f(-place.x, -place.y, -place.z), power, mi.Bool(True))]
+        vectors = [mi.Vector3f(0) for _ in sides]
+        for k in range(self.facets):
+            middle, n = (_packet(packet, index * self.facets + k) for packet in self.packets[2:])
+            offset, normal = mi.Vector3f(middle.x, middle.y, middle.z) - mi.Vector3f(p_world), mi.Vector3f(n.x, n.y, n.z)
+            size = mi.Float(1)
+            if self.facets > 1:
+                size = dr.squared_norm(normal)
+                inverse = dr.rsqrt(dr.maximum(size, 1e-20))
+                normal, size = normal * inverse, size * inverse
+            squared, height = dr.squared_norm(offset), -dr.dot(normal, offset)
+            if not self.flat:
+                height = _shown(height, 1.06 * middle.w * n.w, 1.5 * dr.square(n.w) * (squared - dr.square(height)), squared)
+            squared_radius = dr.square(middle.w)
+            along, across = disk_irradiance(squared, height, squared_radius)
+            vector = offset * along - normal * across
+            for i, side in enumerate(sides):
+                # Evenly spread this far above and below the centre, points have as much light above it as those of the disk.
+                reach = 0.72 * squared_radius * (1 - dr.square(dr.dot(normal, side)))
+                vectors[i] += _above(vector, along, side, dr.dot(offset, side), reach, squared) * size
+        found = []
+        for vector in vectors:
+            squared = dr.squared_norm(vector)
+            reached = dr.detach(squared) > 0
+            inverse = dr.rsqrt(dr.select(reached, squared, 1))
+            found.append((vector * inverse, power * (squared * inverse), reached))
+        return found
 
 
-def _spread(normal: Any, xx: Any, others: Any, wo: Any) -> Any:
-    """How far the cosines of a part's own normals lie on either side of their mean (Float), if they are spread evenly."""
-    yy, xy, xz, yz = others
-    zz = 1 - dr.squared_norm(normal) - xx - yy
-    variance = xx * wo.x * wo.x + yy * wo.y * wo.y + zz * wo.z * wo.z
-    variance += 2 * (xy * wo.x * wo.y + xz * wo.x * wo.z + yz * wo.y * wo.z)
-    # The least keeps the derivative of the root finite.
-    return dr.sqrt(dr.maximum(3 * variance, 1e-8))
+def _above(vector: Any, along: Any, side: Any, level: Any, variance: Any, squared: Any) -> Any:
+    """Irradiance (Vector3f) of what is on one side of planes, of a disk that gives ``vector`` in all.
+
+    ``level``: of the disk's centre above the plane, around which its points are spread evenly, with a ``variance`` of a third.
+    """
+    variance = dr.maximum(variance, dr.maximum(1e-8 * squared, 1e-20))
+    inverse = dr.rsqrt(variance)
+    reach = variance * inverse
+    share = dr.clip(dr.fma(0.5 * level, inverse, 0.5), 0, 1)
+    upright = dr.dot(vector, side)
+    higher = dr.maximum(upright + along * dr.square(1 - share) * reach, 0)
+    return dr.select(share > 0, vector * share + side * (higher - upright * share), 0)
 
 
-def _mean_cosine(cosine: Any, spread: Any) -> Any:
-    """Mean of what is positive of cosines spread evenly around ``cosine``: parts that turn away do so little by little."""
-    partly = dr.square(cosine + spread) * dr.rcp(4 * spread)
-    return dr.select(dr.abs(cosine) < spread, partly, dr.maximum(cosine, 0))
+def disk_irradiance(squared_distance: Any, height: Any, squared_radius: Any) -> tuple[Any, Any]:
+    """(along, across): along * offset - across * normal is the vector whose product with a unit normal is the irradiance of a
+    disk of radiance 1, divided by the disk's area.
+
+    That is if all of it is in front of the surface. Exact at any distance; 0 behind the disk. Bounded, as are its derivatives:
+    those next to the rim are smaller. Attached to all.
+
+    Args:
+        squared_distance: Float, from the point to the disk's centre.
+        height: Float, of the point above the disk's plane, on the side that shines.
+        squared_radius: Float.
+
+    Source: elements parallel to a disk and perpendicular to it in Howell, "A Catalog of Radiation Heat Transfer Configuration
+    Factors"; here without differences of numbers that are nearly the same.
+    """
+    rise = dr.square(height)
+    inner, outer = squared_distance - squared_radius, squared_distance + squared_radius
+    square = dr.maximum(dr.square(inner) + squared_radius * dr.fma(4, rise, 1e-4 * squared_radius), 1e-22)
+    inverse = dr.rsqrt(square)
+    root = square * inverse
+    scale = dr.select(height > 0, 2 * inverse, 0)
+    along = scale * dr.rcp(root + outer)
+    near = inner < 0
+    axial = dr.select(near, root - inner, rise) * dr.rcp(dr.select(near, dr.maximum(4 * squared_radius, 1e-18), root + inner))
+    return along * height, scale * axial - along * rise
+
+
+def _shown(height: Any, rise: Any, variance: Any, squared: Any) -> Any:
+    """Mean height (Float) above what is seen of a facet: what bends turns away little by little.
+
+    ``height``: above its disk; ``rise``: of the planes through its pieces above that, in the mean, around which they are spread
+    evenly, with a ``variance`` of a third.
+    """
+    variance = dr.maximum(variance, dr.maximum(1e-8 * squared, 1e-20))
+    inverse = dr.rsqrt(variance)
+    share = dr.clip(dr.fma(0.5 * (height - rise), inverse, 0.5), 0, 1)
+    return dr.select(share < 1, share * dr.fma(share, variance * inverse, rise), height)
 
 
 def _packet(flat: Any, index: Any) -> Any:

@@ -35,18 +35,27 @@ def soft_light(
     if samples.distant and reflects_only(nodes):
         return sky_light(seen, plan, samples, maps, nodes, gate=gate)
     sampled = None if maps is None or plan.kind == "single" else maps.sampled
+    transmits = not samples.distant and any(_transmits(node) for node in nodes)
 
     def one_sample(index: Any, seen: Surface, shared: Any) -> Any:
         table, maps = shared
-        wo_world, weight, reached = table.illuminate(index, seen.p_world)
-        wo = seen.si.to_local(wo_world)
-        active = seen.active & reached
-        if gate:
-            active &= passes_gate(seen, wo_world, wo)
-        value = seen.evaluate(wo, active) * weight
+        value, active = mi.UnpolarizedSpectrum(0), mi.Bool(False)
+        for wo_world, weight, reached in table.illuminate(index, seen.p_world, sides(seen)):
+            wo = seen.si.to_local(wo_world)
+            passes = seen.active & reached
+            if gate:
+                passes &= passes_gate(seen, wo_world, wo)
+            value += dr.select(passes, seen.evaluate(wo, passes) * weight, 0)
+            active |= passes
         if maps is not None:
             value *= visibility(maps, map_of(plan, table, index, seen.p_world), seen.p_world, active)
         return dr.select(active, value, 0)
+
+    def sides(seen: Surface) -> list[Any]:
+        """Normals on the sides of the surface that light may come from."""
+        n = seen.si.sh_frame.n
+        above = mi.Vector3f(dr.select(dr.detach(seen.si.wi.z) < 0, -n, n))
+        return [above, -above] if transmits else [above]
 
     start = dr.zeros(mi.UnpolarizedSpectrum, dr.width(seen.shape))
     implicit = [] if seen.colour is not None else attached_parameters(nodes)
@@ -56,3 +65,7 @@ def soft_light(
     radius = samples.radius_towards(seen.p_world)
     return light * penumbra_visibility(maps.single, mi.UInt32(plan.first), radius, seen.p_world, seen.n_world, seen.active)
 
+
+def _transmits(node: Any) -> bool:
+    flags = node.flags() if isinstance(node, mi.BSDF) else 0
+    return mi.has_flag(flags, mi.BSDFFlags.DiffuseTransmission) or mi.has_flag(flags, mi.BSDFFlags.GlossyTransmission)

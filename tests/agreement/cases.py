@@ -18,7 +18,7 @@ from .shapes import ball, camera, gray, lamp, rough_picture, square
 Change = Callable[[Any, Any], Any]
 
 #: Options of the plug-in, the same for all cases: shadow maps as by default, but more points on lamps and directions of skies.
-OPTIONS = {"emitter_samples": 128, "environment_samples": 256}
+OPTIONS = {"area_light_samples": 128, "environment_light_samples": 256}
 
 
 @dataclass(frozen=True)

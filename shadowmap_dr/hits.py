@@ -107,7 +107,9 @@ def pixel_hits(geometry: Geometry, sensor: Sensor, triangle: Any, size: tuple[in
             return tuple(dr.zeros(kind) for kind in kinds)
 
         # Derivatives on their own, in a branch: most pixels of many images see nothing that moves.
-        attached = dr.if_stmt((face, changed, ray_o, ray_d, row), changed, intersect, none, mode="symbolic", label="attached hits")
+        attached = dr.if_stmt(
+            (face, changed, ray_o, ray_d, row), changed, intersect, none, mode="symbolic", label="attached hits"
+        )
         found = tuple(dr.replace_grad(value, other) for value, other in zip(found, attached, strict=True))
     e1, e2, normal, u, v, p_world = found
     wi_world = -dr.normalize(ray_d)

@@ -185,7 +185,7 @@ def make_class() -> type:
             """Nothing along rays: ``aov`` asks for that beside its nested images, and throws it away. Refused to all others."""
             if not self.nesting.allows():
                 raise ShadowmapError(
-                    f"'{PLUGIN}' cannot be nested in an integrator that samples single rays, such as moment: render it by itself, "
+                    f"'{PLUGIN}' cannot be nested in integrators that sample single rays, such as moment: render it by itself, "
                     "or in aov."
                 )
             if self.shell.options.aovs:

@@ -39,7 +39,7 @@ class Surface:
     active   Bool (N,), false where nothing was hit; there all records are finite and meaningless
     si       mi.SurfaceInteraction3f, for BSDF evaluation. ``si.p`` is the *rest-pose* position for shapes with mesh attributes
     bsdf     mi.BSDFPtr (N,)
-    colour   colour (N,), the BSDF on the viewer's side over the cosine, where no BSDF knows more of directions than that; else None
+    colour   colour (N,), the BSDF on the viewer's side over the cosine, if no BSDF depends on directions otherwise; else None
     """
 
     p_world: Any
@@ -194,8 +194,9 @@ def _parametrisation(geometry: Geometry, flags: _Flags, hits: Hits) -> tuple[Any
 def direct_light(surface: Surface, light: Light, visibility: Any = 1.0, nodes: Sequence[Any] = (), *, gate: bool = True) -> Any:
     """Radiance (colour, N) towards the camera of one light: BSDF * light * visibility.
 
-    ``visibility`` Float (N,), 0 dark to 1 lit. ``nodes``: :meth:`SceneData.materials`. ``gate`` removes light that reaches the shading normal from the wrong side of the
-    triangle, as a shadow ray would. Gradients flow to all of surface, light and visibility, not through the gate.
+    ``visibility`` Float (N,), 0 dark to 1 lit. ``nodes``: :meth:`SceneData.materials`. ``gate`` removes
+    light that reaches the shading normal from the wrong side of the triangle, as a shadow ray would. Gradients flow to all of
+    surface, light and visibility, not through the gate.
     """
     wo_world, weight = spread(light, dr.width(surface.shape)).illuminate(surface.p_world, surface.active)
     wo = surface.si.to_local(wo_world)

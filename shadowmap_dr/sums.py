@@ -32,7 +32,7 @@ def attached_parameters(nodes: Sequence[Any]) -> list[Any]:
 
 
 def evaluate(term: Callable[[Any], Any], own: Any, nodes: Sequence[Any], lanes: int) -> Any:
-    """``term(own)``, which calls objects of Mitsuba's (``nodes``). Attached to the arrays of ``own`` and to the nodes' parameters.
+    """``term(own)``, which calls objects of Mitsuba's (``nodes``). Attached to the arrays of ``own`` and the nodes' parameters.
 
     ``own`` is a tree of arrays as long as there are ``lanes``, or of width 1. ``term`` may look at no other wide array.
     """

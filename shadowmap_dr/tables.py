@@ -9,7 +9,7 @@ it is when what was looked up has itself served as a table. So tables are read i
 the caller gave never receives such a sum (:func:`from_one_buffer`), since the caller may have looked it up in the default mode.
 
 And a sum in single precision that grows term by term rounds each of them to its own last digit: with millions of like terms, all
-in the same direction. So blocks of lanes add to a copy of the table each (:func:`in_copies`), and the copies are added afterwards.
+in the same direction. So blocks of lanes add to a copy of the table each (:func:`in_copies`), and the copies are added up later.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def from_one_buffer(columns: Sequence[Any]) -> list[Any]:
 def in_copies(arrays: Sequence[Any], lanes: int, block: int = LANES) -> tuple[list[Any], int]:
     """Copies of flat ``Float`` arrays, one for each block of lanes that look numbers up in them (:func:`copy_of_lane`).
 
-    Make them before all that hangs on the lanes: derivatives are taken in the reverse order, and the lanes are worked out once more
+    Make them before what hangs on the lanes: derivatives are taken in the reverse order, and the lanes are worked out once more
     for each place where copies are added.
 
     Args:
@@ -58,7 +58,7 @@ def in_copies(arrays: Sequence[Any], lanes: int, block: int = LANES) -> tuple[li
         block: of lanes that share a copy, a power of two.
 
     Returns:
-        The copies of each array, one after the other in one buffer, and their number, which is 1 if no array is attached. Attached.
+        The copies of each array, one after the other in one buffer, and their number: 1 if no array is attached. Attached.
     """
     count = -(-lanes // block)
     if count == 1 or not dr.grad_enabled(list(arrays)):

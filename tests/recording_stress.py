@@ -62,7 +62,12 @@ class Walk:
     def __init__(self, seed: int, few: bool) -> None:
         self.rng, self.scene, self.few = np.random.default_rng(seed), scene(few), few
         self.params = mi.traverse(self.scene)
-        settings = {"shadow_map_resolution": 32, "area_light_samples": 4, "environment_light_samples": 4, "soft_map_resolution": 32}
+        settings = {
+            "shadow_map_resolution": 32,
+            "area_light_samples": 4,
+            "environment_light_samples": 4,
+            "soft_map_resolution": 32,
+        }
         self.renderers = [Renderer.from_scene(self.scene, antialias=antialias, **settings) for antialias in (True, False)]
         self.start = {key: type(value)(value) for key, value in self.params if dr.is_array_v(value)}
         self.cameras = {key: self.params[key] for key in ("one.to_world", "two.to_world", "lamp.to_world") if key in self.params}
@@ -115,9 +120,7 @@ def _step(renderer: Renderer, sensor: int, spp: int, inside: dict[str, Any], par
     return dr.detach(image), [dr.grad(leaf) for leaf in leaves]
 
 
-def stress(
-    steps: int, seed: int = 0, seconds: float = 1e9, report: Any = None, few: bool = False
-) -> tuple[int, int, list[str]]:
+def stress(steps: int, seed: int = 0, seconds: float = 1e9, report: Any = None, few: bool = False) -> tuple[int, int, list[str]]:
     """(steps taken, recordings among them, what was wrong in which). ``few``: a simpler scene, and fewer kinds of steps."""
     walk, rng, frozen, wrong = Walk(seed, few), np.random.default_rng(seed), dr.freeze(_step), []
     start = time.monotonic()

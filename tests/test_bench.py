@@ -115,7 +115,10 @@ def test_growth(tmp_path: Path) -> None:
 
 
 def test_sums(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    cases = (bench_sums.Sum("sun", "texture", "floor.bsdf.reflectance.data"), bench_sums.Sum("point", "diffuse", "light.position"))
+    cases = (
+        bench_sums.Sum("sun", "texture", "floor.bsdf.reflectance.data"),
+        bench_sums.Sum("point", "diffuse", "light.position"),
+    )
     monkeypatch.setattr(bench_sums, "SUMS", cases)
     record = run(options(tmp_path, "sums"))
     units = record["sections"]["sums"]["units"]

@@ -15,7 +15,12 @@ from integrator_scenes import camera, render, shadowmap, small_scene
 import shadowmap_dr
 from shadowmap_dr import ShadowmapError
 
-LAMP = {"type": "sphere", "center": [1, 0, 2.5], "radius": 0.4, "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 4.0}}}
+LAMP = {
+    "type": "sphere",
+    "center": [1, 0, 2.5],
+    "radius": 0.4,
+    "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 4.0}},
+}
 SKY = {"type": "constant", "radiance": {"type": "rgb", "value": [0.1, 0.2, 0.3]}}
 
 
@@ -25,7 +30,10 @@ SKY = {"type": "constant", "radiance": {"type": "rgb", "value": [0.1, 0.2, 0.3]}
         ({"rr_depth": 5}, "ignores rr_depth: a parameter"),
         ({"shading_samples": 4, "bsdf_samples": 1}, "ignores bsdf_samples, shading_samples: parameters"),
         ({"sppc": 8, "sppp": 8, "sppi": 32, "guiding": "grid"}, "ignores guiding, sppc, sppi, sppp"),
-        ({"guiding_proj": False, "guiding_rounds": 2, "project_seed": "both"}, "ignores guiding_proj, guiding_rounds, project_seed"),
+        (
+            {"guiding_proj": False, "guiding_rounds": 2, "project_seed": "both"},
+            "ignores guiding_proj, guiding_rounds, project_seed",
+        ),
         ({"proj_seed_spp": 64}, "ignores proj_seed_spp"),
         ({"emitter_samples": 1}, "ignores emitter_samples: a parameter of Mitsuba's integrators. Points on area lights are"),
     ],
@@ -39,7 +47,8 @@ def test_parameters_of_other_integrators(variant: str, entries: dict[str, Any], 
 
 @pytest.mark.parametrize("optimize", [False, True])
 def test_xml(variant: str, optimize: bool) -> None:
-    xml = """<scene version="3.0.0"><integrator type="shadowmap"><integer name="max_depth" value="3"/><integer name="sppc" value="4"/>
+    xml = """<scene version="3.0.0"><integrator type="shadowmap">
+        <integer name="max_depth" value="3"/><integer name="sppc" value="4"/>
         <string name="guiding" value="none"/><boolean name="hide_emitters" value="true"/></integrator>
         <shape type="rectangle"/><emitter type="point"/></scene>"""
     with pytest.warns(UserWarning) as found:

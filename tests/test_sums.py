@@ -17,7 +17,7 @@ from shadowmap_dr.sums import evaluate
 from shadowmap_dr.tables import LANES, LIKE_LANES, copy_of_lane, in_copies
 
 FLOOR = "floor.bsdf.reflectance"
-# (what, pixels along each side, samples a pixel). The rest of the kinds, and 16 million samples: `shadowmap-dr bench --only sums`.
+# (what, pixels along each side, samples a pixel). All kinds, and 16 million samples: `shadowmap-dr bench --only sums`.
 CASES = [
     (Sum("sun", "diffuse", f"{FLOOR}.value"), 1024, 4),
     (Sum("sun", "texture", f"{FLOOR}.data"), 1024, 4),

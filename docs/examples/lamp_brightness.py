@@ -142,7 +142,9 @@ def main() -> None:
         lamp = lamps()[name]
         low = float(mi.load_dict({key: part for key, part in lamp.items() if key != "emitter"}).bbox().min.z)
         found[name] = {
-            f"{receiver}, {distance:g}": compare(scene_of(lamp, receiver, low - distance, 0.5), area_light_samples=options.samples)
+            f"{receiver}, {distance:g}": compare(
+                scene_of(lamp, receiver, low - distance, 0.5), area_light_samples=options.samples
+            )
             for receiver in RECEIVERS
             for distance in DISTANCES
         }

@@ -50,7 +50,11 @@ class Loop:
 def _scene_dict(integrator: dict[str, Any], size: int, **changes: Any) -> dict[str, Any]:
     """A head over a floor under a lamp; ``changes``: other parts, None for those that are left out."""
     t = mi.ScalarTransform4f()
-    head = {"type": "ply", "filename": str(assets.mesh("suzanne")), "to_world": t.translate([0, 0, 0.5]).rotate([1, 0, 0], 90).scale(0.4)}
+    head = {
+        "type": "ply",
+        "filename": str(assets.mesh("suzanne")),
+        "to_world": t.translate([0, 0, 0.5]).rotate([1, 0, 0], 90).scale(0.4),
+    }
     parts = {
         "type": "scene",
         "integrator": integrator,

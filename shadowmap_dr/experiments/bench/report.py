@@ -60,7 +60,14 @@ COLUMNS = ["", "size", "ours", "other", "ratio", "aim"]
 
 def rows(record: dict[str, Any]) -> list[Row]:
     """All that a record can tell, in the order of the sections."""
-    makers = {"steps": _step_rows, "raster": _raster_rows, "scaling": _scaling_rows, "breakdown": _breakdown_rows, "sums": _sum_rows, "loops": _loop_rows}
+    makers = {
+        "steps": _step_rows,
+        "raster": _raster_rows,
+        "scaling": _scaling_rows,
+        "breakdown": _breakdown_rows,
+        "sums": _sum_rows,
+        "loops": _loop_rows,
+    }
     result: list[Row] = []
     for name, make in makers.items():
         units = record["sections"].get(name, {}).get("units", {})

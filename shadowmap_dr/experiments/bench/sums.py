@@ -1,8 +1,8 @@
 """Benchmark: whether derivatives of millions of samples add up, in reverse mode as in forward mode.
 
-For a parameter p and an image I the derivative of <I, w> by p is worked out twice: backwards, where the device adds up the terms of
-all samples in single precision, and as the sum of the derivative image, added up in double precision on the host. ``w`` is constant
-where p is a colour: then all terms are alike, which is the worst case for such sums.
+For a parameter p and an image I the derivative of <I, w> by p is worked out twice: backwards, where the device adds up the terms
+of all samples in single precision, and as the sum of the derivative image, added up in double precision on the host. ``w`` is
+constant where p is a colour: then all terms are alike, which is the worst case for such sums.
 """
 
 from __future__ import annotations
@@ -142,7 +142,9 @@ def _of_renderer(case: Sum, size: int, spp: int, frozen: bool) -> float:
             image = renderer.render(vertex_positions={name: _moved(case, points, change)}, spp=spp)
         else:
             light = renderer.light(name)
-            image = renderer.render(lights={name: replace(light, **{field: _moved(case, getattr(light, field), change)})}, spp=spp)
+            image = renderer.render(
+                lights={name: replace(light, **{field: _moved(case, getattr(light, field), change)})}, spp=spp
+            )
         dr.backward(dr.sum((image * weights).array))
         return dr.grad(change)
 

@@ -124,7 +124,9 @@ class _Sum(dr.CustomOp):
         def change(index: Any) -> Any:
             with dr.resume_grad():
                 value = call.term(index, own, shared)
-                dr.forward_to(value, flags=dr.ADFlag.ClearInterior | dr.ADFlag.ClearEdges)
+                # Terms may call objects that hold attached numbers and depend on none of them.
+                flags = dr.ADFlag.ClearInterior | dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad
+                dr.forward_to(value, flags=flags)
             return dr.grad(value)
 
         self.set_grad_out(_loop(change, call.count, call.zero, call.active, "soft light, forward"))

@@ -55,7 +55,8 @@ class Surface:
         """BSDF times cosine (colour, N) for directions to the light in the local frame (Vector3f). Attached to all."""
         if self.colour is None:
             return mi.UnpolarizedSpectrum(self.bsdf.eval(mi.BSDFContext(), self.si, wo, active))
-        return dr.select(active & (self.si.wi.z * wo.z > 0), self.colour * dr.abs(wo.z), 0)
+        # Directions that are NaN give NaN, as BSDFs do: a broken light is not just dark.
+        return dr.select(active & ~(self.si.wi.z * wo.z <= 0), self.colour * dr.abs(wo.z), 0)
 
 
 def plain_colours(data: SceneData) -> Any:

@@ -110,6 +110,15 @@ class SampleTable:
         packet = dr.gather(mi.Vector4f, dr.detach(self.packets[0]), index)
         return mi.Vector3f(packet.x, packet.y, packet.z)
 
+    def from_sky(self, index: Any) -> tuple[Any, Any]:
+        """(wo, weight) of direction ``index`` (UInt32) of a light infinitely far away, the same at all points. Attached."""
+        place = _packet(self.packets[0], index)
+        return mi.Vector3f(-place.x, -place.y, -place.z), self._power(index)
+
+    def _power(self, index: Any) -> Any:
+        colour = _packet(self.packets[1], index)
+        return mi.UnpolarizedSpectrum(*(colour[k] for k in range(dr.size_v(mi.UnpolarizedSpectrum))))
+
     def illuminate(self, index: Any, p_world: Any, sides: Sequence[Any]) -> list[tuple[Any, Any, Any]]:
         """(wo, weight, reached) of sample ``index`` (UInt32) at points, for the light on each of some sides of them.
 
@@ -120,11 +129,9 @@ class SampleTable:
         cosine is right also where the horizon cuts the light in two. Light from infinitely far away is on one side. Attached to
         points, normals and samples. One-sided, as Mitsuba's area lights are.
         """
-        colour = _packet(self.packets[1], index)
-        power = mi.UnpolarizedSpectrum(*(colour[k] for k in range(dr.size_v(mi.UnpolarizedSpectrum))))
         if self.distant:
-            place = _packet(self.packets[0], index)
-            return [(mi.Vector3f(-place.x, -place.y, -place.z), power, mi.Bool(True))]
+            return [(*self.from_sky(index), mi.Bool(True))]
+        power = self._power(index)
         vectors = [mi.Vector3f(0) for _ in sides]
         for k in range(self.facets):
             middle, n = (_packet(packet, index * self.facets + k) for packet in self.packets[2:])

@@ -39,7 +39,7 @@ def sky_light(
 
     def one_part(index: Any, seen: Surface, shared: Any) -> Any:
         table, widths, maps = shared
-        towards, power, _ = table.illuminate(index, seen.p_world)
+        towards, power = table.from_sky(index)
         side = dr.select(seen.si.wi.z < 0, mi.Float(-1), 1)
         length, half = widths.of(index, mi.Vector3f(seen.si.sh_frame.n))
         wo = seen.si.to_local(towards)

@@ -124,8 +124,9 @@ class _Sum(dr.CustomOp):
         def change(index: Any) -> Any:
             with dr.resume_grad():
                 value = call.term(index, own, shared)
-                # Terms may call objects that hold attached numbers and depend on none of them.
-                flags = dr.ADFlag.ClearInterior | dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad
+                # What parameters hang on keeps its gradients, which other terms have yet to read. Terms may call objects that
+                # hold attached numbers and depend on none of them.
+                flags = dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad
                 dr.forward_to(value, flags=flags)
             return dr.grad(value)
 

@@ -150,7 +150,7 @@ def test_derivatives_in_aov(variant: str, name: str) -> None:
 def test_what_samples_single_rays_is_refused(variant: str) -> None:
     inner = shadowmap()
     scene, outer = small_scene(camera=camera(8)), mi.load_dict({"type": "moment", "inner": inner})
-    with pytest.raises(ShadowmapError, match="cannot be nested in an integrator that samples single rays"):
+    with pytest.raises(ShadowmapError, match="cannot be nested in integrators that sample single rays"):
         outer.render(scene, spp=1)
     # The same object in both: only one of them may ask.
     around = mi.load_dict({"type": "aov", "aovs": "far:depth", "inner": inner})

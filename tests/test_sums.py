@@ -164,6 +164,44 @@ def test_gradients_that_a_parameter_has_already_stay(variant: str) -> None:
     assert dr.ravel(dr.grad(value))[0] == pytest.approx(4 * lanes, rel=1e-4)
 
 
+@pytest.mark.parametrize("mode", ["forward", "reverse"])
+def test_what_parameters_hang_on_is_passed_on_to_all_terms(variant: str, mode: str) -> None:
+    """A sky's pixels and a reflectance, themselves computed, are read by the light, the background and two materials."""
+    pixels = np.random.default_rng(0).uniform(0, 1, (4, 8, 3)).astype(np.float32)
+    paint = {"type": "diffuse", "reflectance": {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True}}
+    film = {"type": "hdrfilm", "rfilter": {"type": "box"}, "width": 256, "height": 256, "pixel_format": "rgb"}
+    place = mi.ScalarTransform4f().look_at([0, -5, 4], [0, 0, 0], [0, 0, 1])
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sky": {"type": "envmap", "bitmap": mi.Bitmap(pixels)},
+            "floor": {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(2), "bsdf": paint},
+            "sensor": {"type": "perspective", "to_world": place, "film": film},
+        }
+    )
+    integrator = mi.load_dict({"type": "shadowmap", "shadow_method": "none", "environment_light_samples": 8})
+    params = mi.traverse(scene)
+    rest = {key: mi.TensorXf(params[key]) for key in ("sky.data", "floor.bsdf.reflectance.data")}
+
+    def image_at(x: mi.Float) -> mi.TensorXf:
+        for key, value in rest.items():
+            params[key] = value * (1 + x)
+        params.update()
+        return mi.render(scene, params, integrator=integrator, spp=4)
+
+    up, down = (float(image_at(dr.opaque(mi.Float, step)).numpy().mean(dtype=np.float64)) for step in (0.1, -0.1))
+    x = dr.opaque(mi.Float, 0)
+    dr.enable_grad(x)
+    image = image_at(x)
+    if mode == "forward":
+        dr.forward(x)
+        found = dr.grad(image).numpy().mean(dtype=np.float64)
+    else:
+        dr.backward(dr.mean(image, axis=None))
+        found = dr.grad(x)[0]
+    assert found == pytest.approx((up - down) / 0.2, rel=TOLERANCE)
+
+
 def test_fewer_samples_than_asked_for_are_named(variant: str) -> None:
     film = {"type": "hdrfilm", "rfilter": {"type": "box"}, "width": 1500, "height": 4, "sample_border": False}
     floor, sun = {"type": "rectangle"}, {"type": "directional", "direction": [0, 0, -1]}

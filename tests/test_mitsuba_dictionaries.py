@@ -157,4 +157,4 @@ def test_what_samples_single_rays_is_refused(variant: str) -> None:
     assert render(scene, around).shape == (8, 8, 4)
     with pytest.raises(RuntimeError) as error:
         mi.render(scene, integrator=outer, spp=1)
-    assert "samples single rays" in "".join(traceback.format_exception(error.value))
+    assert "sample single rays" in "".join(traceback.format_exception(error.value))

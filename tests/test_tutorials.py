@@ -20,9 +20,9 @@ from shadowmap_dr.report import read_json
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "tutorials"
 NAMES = ("pose", "shape", "curve")
 PARAMETERS = {
-    "pose": {"resolution": 64, "steps": 60, "reference_samples": 256},
-    "shape": {"resolution": 48, "steps": 40, "reference_samples": 64, "subdivisions": 3},
-    "curve": {"resolution": 48, "steps": 60, "reference_samples": 128, "check_samples": 32},
+    "pose": {"resolution": 64, "steps": 40, "reference_samples": 256},
+    "shape": {"resolution": 48, "steps": 24, "reference_samples": 64, "subdivisions": 3},
+    "curve": {"resolution": 48, "steps": 30, "reference_samples": 128, "check_samples": 32},
 }
 # Share of the start's errors that may be left.
 LEFT = {"pose": (0.1, 0.15), "shape": (0.75, 0.95), "curve": (0.6,)}

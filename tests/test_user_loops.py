@@ -9,6 +9,9 @@ import pytest
 from shadowmap_dr.experiments.bench.loops import LOOPS, OURS
 
 SIZE = 24
+# Loops that need all their steps to come below their bar; of the others these are enough.
+_SLOW = {"large steps", "more and more lights", "vertex colours", "remeshing", "cells run again"}
+_STEPS = 16
 _NEEDS = {"PyTorch": "torch", "large steps": "cholespy", "remeshing": "cholespy"}
 
 
@@ -20,5 +23,5 @@ def test_loop(variant: str, name: str) -> None:
     steps = loop.steps(OURS, SIZE)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        errors = [next(steps) for _ in range(loop.count)]
+        errors = [next(steps) for _ in range(loop.count if name in _SLOW else _STEPS)]
     assert errors[-1] < loop.bar * errors[0]

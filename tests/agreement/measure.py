@@ -31,9 +31,9 @@ class Error:
 
 
 def error(case: Case, mode: str, options: Any = None) -> Error:
-    """Error of the plug-in for a case in one of ``MODES``; ``options`` (a dictionary) replace ``cases.OPTIONS``."""
+    """Error of the plug-in for a case in one of ``MODES``; ``options`` (a dictionary) replace all that the case has."""
     reference = _reference(case)
-    options = OPTIONS if options is None else options
+    options = {**OPTIONS, **(case.options or {})} if options is None else options
     if mode == "reverse":
         found = abs(reverse(case, references.weights(reference.image.shape), options) / reference.slope - 1)
         return Error(found, found)

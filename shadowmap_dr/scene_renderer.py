@@ -23,6 +23,7 @@ from .shadow import Frusta
 from .soft import SkyWatch, SoftFrusta, still_aimed
 from .traversal import Watch, parameters
 from .unseen import Unseen
+from .warning import warn
 
 # Sensors whose fit of the shadow maps is remembered, and how many of these may not be the scene's own: some make a new one for
 # each image, and all that are remembered are kept alive. How many objects there are is also a part of what recordings hold for.
@@ -47,6 +48,7 @@ class SceneRenderer:
     sky       where its environments shone
     mirrors   which shapes were mirrored
     checked   vertices that were found to be finite
+    warned    whether it was said what frozen functions of users do not see
     unseen    what recordings do not see, and ``unseen_then`` its values when they were made
     colours   of meshes, for which the renderer's creases were found
     """
@@ -66,6 +68,7 @@ class SceneRenderer:
     sky: SkyWatch = field(default_factory=lambda: SkyWatch(()))
     mirrors: MirrorWatch = field(default_factory=lambda: MirrorWatch(()))
     checked: Any = None
+    warned: bool = False
 
     @classmethod
     def build(cls, scene: Any, sensor: Any, settings: RenderSettings, tessellation: int, warn: bool = True) -> SceneRenderer:
@@ -109,6 +112,7 @@ class SceneRenderer:
 
         If ``inputs`` is given, the image is attached to these instead of the vertices, lights and cameras.
         """
+        self._name_constants_of_recordings()
         current = self._current(scene, sensor)
         self._check_vertices(current)
         if inputs is not None:
@@ -140,6 +144,19 @@ class SceneRenderer:
             self._forget_stale_recordings()
             self.recorded.backward(spp, gradient, current)
         return self.recordable[attached]
+
+    def _name_constants_of_recordings(self) -> None:
+        """Warn, once, of parameters that a frozen function of the user's takes for constants: Dr.Jit does not ask for them."""
+        if self.warned or not self.unseen.names or not dr.flag(dr.JitFlag.FreezingScope):
+            return
+        self.warned = True
+        shapes = {source.shape.bsdf(): f"{source.shape.id()}." for source in self.renderer.data.sources}
+        names = [f"{shapes.get(node, '')}{node.id()}.{key}" for node, key in self.unseen.names]
+        listed = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+        warn(
+            f"dr.freeze does not see changes of {listed}: call clear() of the frozen function after one, "
+            f"or leave the recording to the integrator's parameter 'recorded'."
+        )
 
     def _forget_stale_recordings(self) -> None:
         """Recordings hold for the values of materials and lights that they do not see."""

@@ -23,10 +23,14 @@ class Unseen:
 
     Args:
         nodes: Mitsuba's BSDFs, emitters, and shapes whose attributes are read. They are kept alive.
+
+    Attributes:
+        names: the parameters among the values, each an object and its name there.
     """
 
     def __init__(self, nodes: Iterable[Any]) -> None:
         self._held, self._sized, self._off = [], [], []
+        self.names: list[tuple[Any, str]] = []
         for node in {id(node): node for node in nodes}.values():
             table, switched = mi.traverse(node), _has_switches(node)
             for key in table.keys():
@@ -34,6 +38,7 @@ class Unseen:
                     value = table[key]
                     if not _is_seen(node, key, value):
                         self._held.append((table, key))
+                        self.names.append((node, key))
                     if dr.is_tensor_v(value):
                         self._sized.append((table, key))
                     if switched and isinstance(value, mi.Float):

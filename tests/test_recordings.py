@@ -214,3 +214,27 @@ threads = [threading.Thread(target=work, args=(number,)) for number in range(4)]
 [thread.start() for thread in threads], [thread.join() for thread in threads]
 assert not wrong, wrong
 """)
+
+
+def test_what_frozen_functions_of_users_take_for_constant_is_named(variant: str) -> None:
+    pixels = mi.Bitmap(np.random.default_rng(0).uniform(0.2, 0.8, (4, 4, 3)).astype(np.float32))
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "pixel_format": "rgb", "rfilter": {"type": "box"}}
+    floor = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": {"type": "bitmap", "bitmap": pixels, "raw": True}}}
+    sun = {"type": "directional", "direction": [0, 0, -1]}
+    view = {"type": "orthographic", "film": film, "to_world": mi.ScalarTransform4f().look_at([0, 0, 2], [0, 0, 0], [0, 1, 0])}
+    scene = mi.load_dict({"type": "scene", "floor": floor, "sun": sun, "view": view})
+    integrator, params = mi.load_dict({"type": "shadowmap", "shadow_map_resolution": 16}), mi.traverse(scene)
+
+    @dr.freeze
+    def frozen(scene: Any, light: Any) -> Any:
+        return mi.render(scene, integrator=integrator, spp=1) * light
+
+    mi.render(scene, integrator=integrator, spp=1)
+    with pytest.warns(UserWarning, match=r"dr.freeze does not see changes of floor.*to_uv: call clear\(\)"):
+        before = frozen(scene, mi.Float(1)).numpy()
+    params["floor.bsdf.reflectance.to_uv"] = mi.ScalarTransform3f().translate([0.3, 0.1])
+    params.update()
+    frozen.clear()
+    after = frozen(scene, mi.Float(1)).numpy()
+    np.testing.assert_allclose(after, mi.render(scene, integrator=integrator, spp=1).numpy(), rtol=1e-5, atol=1e-6)
+    assert np.abs(after - before).max() > 0.05

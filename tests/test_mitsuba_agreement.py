@@ -19,7 +19,6 @@ class Known:
 
 
 KNOWN = {
-    ("painted_plane_moves", "reverse"): Known(0.018, "a grid of samples misses where the texture's derivative jumps: 1.54 %"),
     ("corner_moves", "forward"): Known(0.065, "shadows that rows of directions throw alike, and the contact: 5.93 %"),
     ("corner_moves", "reverse"): Known(0.035, "the same: 3.0 %"),
     ("occluder_in_sky", "reverse"): Known(0.025, "a penumbra of 256 sharper shadows, of which each is sampled: 2.14 %"),

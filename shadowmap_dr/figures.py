@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import gzip
 import io
 import os
+import re
+import zlib
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +21,10 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".gif", ".bmp", ".svg", ".svgz")
 
 # Pixels along the longer side of drawings and letters, and the most that an image may have.
 _SIDE, _MOST_PIXELS = 1024, 64_000_000
+# How much longer one side of a drawing may be than the other. Lengths in it, and units in pixels.
+_MOST_SIDES_DIFFER = 64
+_LENGTH = re.compile(r"\+?([0-9.]+(?:[eE][-+]?[0-9]+)?)(|%|px|pt|pc|mm|cm|in|em|ex)")
+_UNITS = {"": 1, "px": 1, "pt": 4 / 3, "pc": 16, "mm": 96 / 25.4, "cm": 960 / 25.4, "in": 96, "em": 12, "ex": 6}
 # Coverage above this counts as figure; the least share of an image that a figure may cover.
 _INSIDE, _LEAST_SHARE = 0.5, 1e-4
 
@@ -186,6 +194,41 @@ def _rasterized(path: Path) -> bytes:
     except ModuleNotFoundError as error:
         raise ShadowmapError(f"{path}: drawings need the package resvg-py: pip install 'shadowmap-dr[art]'.") from error
     try:
-        return bytes(resvg_py.svg_to_bytes(svg_path=str(path), width=_SIDE))
-    except ValueError as error:
+        width, height = _drawn_size(path)
+        # The longer side is bounded: in a narrow drawing the other one would have millions of pixels.
+        if max(width, height) > _MOST_SIDES_DIFFER * min(width, height):
+            raise ShadowmapError(
+                f"cannot read {path}: a drawing of {width:g} x {height:g} is too narrow; its sides may differ by "
+                f"{_MOST_SIDES_DIFFER} times."
+            )
+        side = {"width": _SIDE} if width >= height else {"height": _SIDE}
+        return bytes(resvg_py.svg_to_bytes(svg_path=str(path), dpi=96, **side))
+    except (ValueError, ElementTree.ParseError, OSError, EOFError, zlib.error) as error:
         raise ShadowmapError(f"cannot read {path}: it is no drawing, or it is damaged.") from error
+
+
+def _drawn_size(path: Path) -> tuple[float, float]:
+    """(width, height) of a drawing in pixels, at least 1. ValueError for what is none."""
+    with gzip.open(path) if path.suffix.lower() == ".svgz" else path.open("rb") as file:
+        root = next((element for _, element in ElementTree.iterparse(file, ("start",))), None)
+    if root is None or root.tag.rpartition("}")[2] != "svg":
+        raise ValueError("no element svg")
+    box = [float(number) for number in re.split(r"[\s,]+", root.get("viewBox", "").strip()) if number]
+    box = box[2:] if len(box) == 4 else []
+    sides = [_length(root.get(name, ""), whole) for name, whole in zip(("width", "height"), box or (100.0, 100.0), strict=True)]
+    if box:
+        # One length alone keeps the proportions.
+        scales = [side / whole for side, whole in zip(sides, box, strict=True) if side is not None] or [1.0]
+        sides = [scales[0] * whole if side is None else side for side, whole in zip(sides, box, strict=True)]
+    sides = [100.0 if side is None else side for side in sides]
+    if not (np.isfinite(sides).all() and min(sides) > 0):
+        raise ValueError("no extent")
+    return max(sides[0], 1.0), max(sides[1], 1.0)
+
+
+def _length(text: str, whole: float) -> float | None:
+    """A length of a drawing in pixels, at 96 to the inch; None if it is not given. ``whole``: what shares of it refer to."""
+    found = _LENGTH.fullmatch(text.strip())
+    if found is None:
+        return None
+    return float(found[1]) * (whole / 100 if found[2] == "%" else _UNITS[found[2]])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -139,3 +140,32 @@ def test_heights_can_be_given():
     seen = np.ones((128, 128), bool)
     for figure in (drawing(), figures.text_figure("I")):
         assert np.count_nonzero((figures.fit(figure, seen, high=60) < 0.5).any(1)) == pytest.approx(60, abs=1)
+
+
+@pytest.mark.parametrize(
+    ("size", "shape"),
+    [
+        ('width="1" height="40"', (1024, 26)),
+        ('width="30mm" height="1cm"', (341, 1024)),
+        ('width="50%" viewBox="0 0 100 200"', (1024, 512)),
+        ('viewBox="0,0,20,10" height="50"', (512, 1024)),
+    ],
+)
+def test_longer_side_of_drawings_is_bounded(tmp_path: Path, size: str, shape: tuple[int, int]) -> None:
+    pytest.importorskip("resvg_py")
+    path = tmp_path / "a.svg"
+    path.write_text(f'<svg xmlns="http://www.w3.org/2000/svg" {size}><rect width="100%" height="50%"/></svg>')
+    figure = figures.read_figure(path)
+    assert np.abs(np.subtract(figure.shape, shape)).max() <= 4  # from a size in whole pixels
+
+
+@pytest.mark.parametrize(
+    "size", ['width="1" height="100000"', 'width="1e9" height="1e3"', 'width="0" height="10"', 'width="1e999" height="1"']
+)
+def test_narrow_drawings_are_refused(tmp_path: Path, size: str) -> None:
+    """They ended the process, or took gigabytes."""
+    pytest.importorskip("resvg_py")
+    path = tmp_path / "a.svg"
+    path.write_text(f'<svg xmlns="http://www.w3.org/2000/svg" {size}><rect width="1" height="1"/></svg>')
+    with pytest.raises(ShadowmapError, match="cannot read .*a.svg"):
+        figures.read_figure(path)

@@ -26,8 +26,14 @@ class Unseen:
     """
 
     def __init__(self, nodes: Iterable[Any]) -> None:
+        self._nodes = list(dict.fromkeys(nodes))
+        self._known = False
         self._held, self._sized, self._off = [], [], []
-        for node in {id(node): node for node in nodes}.values():
+
+    def _look(self) -> None:
+        """Find out what there is to read. Most scenes are never recorded, and do without."""
+        self._known = True
+        for node in self._nodes:
             table, switched = mi.traverse(node), _has_switches(node)
             for key in table.keys():
                 with suppress(TypeError):  # raised for parameters without a value
@@ -41,6 +47,8 @@ class Unseen:
 
     def now(self) -> tuple[Any, ...]:
         """The values as they are: those of two calls are equal if nothing has changed in between."""
+        if not self._known:
+            self._look()
         shapes = (tuple(table[key].shape) for table, key in self._sized)
         return (*(fingerprint(table[key]) for table, key in self._held), *shapes, *(value.still() for value in self._off))
 

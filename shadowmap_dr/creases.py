@@ -81,7 +81,9 @@ class Creases:
         """Find all edges that may matter (on the host, once)."""
         shapes = geometry.face_shape.numpy()
         smooth = np.array([info.has_normals for info in geometry.shapes])
-        one, other, ends = _edges(geometry, topology)
+        # Faces with attributes of their own may differ at any edge, others only where there is more than one vertex at a place.
+        of_faces = np.array([info.reads_attributes for info in geometry.shapes])
+        one, other, ends = _edges(geometry, topology, of_faces[shapes])
         shape, next_shape = shapes[one // 3], shapes[other // 3]
         within = shape == next_shape
         always = np.repeat(~smooth[shapes], 3)
@@ -96,15 +98,16 @@ class Creases:
             return Pairs(*edges, tuple(map(tuple, ids)))
 
         attributed, textured = [], []
+        plain: dict[Any, bool] = {}
+        doubled = set(np.unique(shape[within & own_vertices]).tolist())
         for index, (info, source) in enumerate(zip(geometry.shapes, sources, strict=True)):
-            own = within & (shape == index)
             if info.reads_attributes:
                 of_faces = any(name.startswith("face_") for name in attributes(source.shape))
-                chosen = own & (own_vertices | of_faces)
+                chosen = within & (shape == index) & (own_vertices | of_faces)
                 if chosen.any():
                     attributed.append((index, pairs(chosen)))
-            if info.has_texcoords and _may_vary(source.shape) and (own & own_vertices).any():
-                textured.append((index, pairs(own & own_vertices)))
+            if info.has_texcoords and index in doubled and _may_vary(source.shape, plain):
+                textured.append((index, pairs(within & (shape == index) & own_vertices)))
         seams, fixed = within & smooth[shape] & own_vertices, device_array(mi.Bool, always)
         flat = device_array(mi.Bool, bendable) if bendable.any() else None
         found = cls(fixed, flat, fixed, flat, pairs(seams) if seams.any() else None, tuple(attributed), tuple(textured))
@@ -175,9 +178,12 @@ class Creases:
         return None if self.folds is None else Folds(self.folds, normals)
 
 
-def _may_vary(shape: Any) -> bool:
-    """Whether texture coordinates may decide on what a shape looks like."""
-    return not is_plain(shape.bsdf()) or shape.is_emitter()
+def _may_vary(shape: Any, plain: dict[Any, bool]) -> bool:
+    """Whether texture coordinates may decide on what a shape looks like. ``plain``: what is known of materials, kept here."""
+    bsdf = shape.bsdf()
+    if bsdf not in plain:
+        plain[bsdf] = is_plain(bsdf)
+    return not plain[bsdf] or shape.is_emitter()
 
 
 def _other_colours(shape: Any, texcoords: Any, pairs: Pairs, first: int) -> Any:
@@ -204,19 +210,29 @@ def _other_colours(shape: Any, texcoords: Any, pairs: Pairs, first: int) -> Any:
     return found
 
 
-def _edges(geometry: Geometry, topology: Topology) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Edges at which two faces meet: half-edges (E,) of one and of the other, vertices (E, ends, sides) at both ends."""
-    faces, welded = (np.asarray(a.numpy(), np.int64).reshape(-1, 3) for a in (geometry.faces, topology.welded))
-    start, end = welded.ravel(), np.roll(welded, -1, 1).ravel()
+def _edges(geometry: Geometry, topology: Topology, everywhere: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Edges at which two faces meet: half-edges (E,) of one and of the other, vertices (E, ends, sides) at both ends.
+
+    Of faces that are not meant by ``everywhere`` (F,) only those from or to a place where there is more than one vertex.
+    """
+    faces, welded = (a.numpy() for a in (geometry.faces, topology.welded))
+    several = np.zeros(geometry.vertex_count, bool)
+    several[welded[faces != welded]] = True
+    chosen = several[welded]
+    chosen |= chosen.reshape(-1, 3)[:, [1, 2, 0]].ravel()
+    chosen |= np.repeat(everywhere, 3)
+    half = np.flatnonzero(chosen)
+    after = half + np.where(half % 3 == 2, -2, 1)
+    start, end = welded[half].astype(np.int64), welded[after].astype(np.int64)
     key = np.minimum(start, end) * geometry.vertex_count + np.maximum(start, end)
     order = np.argsort(key, kind="stable")
     same = key[order][1:] == key[order][:-1]
     one, other = order[:-1][same], order[1:][same]
-    first, second = faces.ravel(), np.roll(faces, -1, 1).ravel()
+    first, second = faces[half].astype(np.int64), faces[after].astype(np.int64)
     # The other's half-edge may run either way.
     reverse = start[one] != start[other]
     ends = np.stack([
         np.stack([first[one], np.where(reverse, second[other], first[other])], 1),
         np.stack([second[one], np.where(reverse, first[other], second[other])], 1),
     ], 1)
-    return one, other, ends
+    return half[one], half[other], ends

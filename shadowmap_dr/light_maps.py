@@ -16,6 +16,7 @@ from .errors import ShadowmapError
 from .geometry import Geometry
 from .lights import DirectionalLight, Light, PointLight, SpotLight
 from .raster import RasterOutput, Topology
+from .raster._memory import device_array
 from .shadow import (
     Boxes,
     Frusta,
@@ -50,8 +51,8 @@ class MapPlan:
     """The maps of each light. Static, made once for a scene.
 
     ``kinds``: ``directional``, ``beam``, ``spot`` (one map each) or ``cube`` (six). ``first``: number of each light's first map.
-    ``planes``: the largest face (index) of each shape. ``planar``: Bool (S,). ``center``, ``radius``: a sphere around the
-    scene at rest, world space, for the fixed frusta of ``compat``.
+    ``planes``: the largest face (index) of each planar shape, any of others. ``planar``: Bool (S,).
+    ``center``, ``radius``: a sphere around the scene at rest, world space, for the fixed frusta of ``compat``.
     """
 
     kinds: tuple[str, ...]
@@ -71,22 +72,24 @@ def plan_maps(lights: Sequence[Light], geometry: Geometry) -> MapPlan:
     """Decide (on the host, once) which maps the lights need and what is known about the shapes."""
     kinds = tuple(_kind_of(light) for light in lights)
     sizes = [6 if kind == "cube" else 1 for kind in kinds]
-    positions = dr.detach(geometry.positions).numpy().reshape(-1, 3).astype(np.float64)
+    positions = dr.detach(geometry.positions).numpy().reshape(-1, 3)
     faces = geometry.faces.numpy().reshape(-1, 3)
     planes = []
     for info in geometry.shapes:
-        own = positions[faces[info.face_start : info.face_start + info.face_count]]
-        area = np.linalg.norm(np.cross(own[:, 1] - own[:, 0], own[:, 2] - own[:, 0]), axis=1)
-        planes.append(info.face_start + int(np.argmax(area)))
-    low, high = positions.min(0), positions.max(0)
-    center = 0.5 * (low + high)
+        largest = 0
+        if info.planar:
+            own = positions[faces[info.face_start : info.face_start + info.face_count]].astype(np.float64)
+            largest = int(np.argmax(np.linalg.norm(np.cross(own[:, 1] - own[:, 0], own[:, 2] - own[:, 0]), axis=1)))
+        planes.append(info.face_start + largest)
+    columns = [column.astype(np.float64) for column in positions.T]
+    center = [0.5 * (column.min() + column.max()) for column in columns]
     return MapPlan(
         kinds,
         tuple(int(n) for n in np.cumsum([0, *sizes])[:-1]),
-        mi.UInt32(planes),
-        mi.Bool([info.planar for info in geometry.shapes]),
+        device_array(mi.UInt32, planes),
+        device_array(mi.Bool, [info.planar for info in geometry.shapes]),
         tuple(float(c) for c in center),
-        float(np.linalg.norm(positions - center, axis=1).max()) or 1.0,
+        float(np.sqrt(sum((column - middle) ** 2 for column, middle in zip(columns, center, strict=True)).max())) or 1.0,
     )
 
 

@@ -215,10 +215,13 @@ def area_lights_of(scene: Any, shapes: Sequence[Any]) -> tuple[AreaLight, ...]:
     their shapes: emitters inside of shapes are all called the same. What is not supported (:func:`objection`) is left out.
     """
     found = []
+    numbers: dict[Any, int] = {}
     for name, emitter in named_emitters(scene):
         if emitter.class_name() == "AreaLight" and objection(emitter) is None:
             shape = emitter.get_shape()
-            index = next((k for k, other in enumerate(shapes) if other is shape or other == shape), None)
+            if not numbers:
+                numbers = {other: len(shapes) - 1 - k for k, other in enumerate(reversed(shapes))}  # the first of equal ones
+            index = numbers.get(shape)
             textures = [part for _, part in children(emitter) if isinstance(part, mi.Texture)]
             if index is not None:
                 textured = any(varies(texture) for texture in textures)

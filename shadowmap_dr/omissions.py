@@ -25,13 +25,13 @@ def omissions_of(scene: Any, shapes: Sequence[tuple[str, Any]], unsupported: Seq
     if media:
         found.append(f"{_named('shape', media)} {_bounds(media)}, which is ignored: light passes through it unchanged")
     found += _delta_materials(shapes, _has_extended_lights(scene))
-    rendered = [shape for _, shape in shapes]
+    rendered = {shape for _, shape in shapes}
     for name, emitter in named_emitters(scene):
         shape, reason = emitter.get_shape(), objection(emitter)
         place = f" of shape '{shape.id()}'" if shape is not None else ""
         if reason is not None:
             found.append(f"emitter '{name}'{place} ({emitter.class_name()}) {reason}")
-        elif emitter.class_name() == "AreaLight" and not any(other == shape for other in rendered):
+        elif emitter.class_name() == "AreaLight" and shape not in rendered:
             found.append(f"emitter '{name}'{place} is left out with its shape")
     for sensor in scene.sensors():
         found += lenses_of(sensor)
@@ -50,16 +50,11 @@ def _has_extended_lights(scene: Any) -> bool:
 
 def _delta_materials(shapes: Sequence[tuple[str, Any]], mirrored: bool) -> list[str]:
     """About BSDFs that reflect or refract into single directions. ``mirrored``: whether there is direct light in mirrors."""
-    groups: list[tuple[Any, list[str]]] = []
+    groups: dict[Any, list[str]] = {}
     for name, shape in shapes:
-        bsdf = shape.bsdf()
-        users = next((users for other, users in groups if other == bsdf), None)
-        if users is None:
-            groups.append((bsdf, [name]))
-        else:
-            users.append(name)
+        groups.setdefault(shape.bsdf(), []).append(name)
     found = []
-    for bsdf, users in groups:
+    for bsdf, users in groups.items():
         flags, what = bsdf.flags(), f"BSDF '{bsdf.id()}' ({bsdf.class_name()}) of {_named('shape', users)}"
         delta = mi.has_flag(flags, mi.BSDFFlags.DeltaReflection) or mi.has_flag(flags, mi.BSDFFlags.DeltaTransmission)
         if not mi.has_flag(flags, mi.BSDFFlags.Smooth):

@@ -15,16 +15,20 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .descriptions import Parts, describe_all
 from .environments import Environment
 from .errors import ShadowmapError, UnsupportedShape
-from .geometry import Geometry, ShapeInfo, pack_face_info, stand_ins, with_faces
+from .geometry import Geometry, ShapeInfo, pack_face_info, stand_ins
 from .lights import AreaLight, Light, area_lights_of, environments_of, lights_of
 from .omissions import omissions_of, warn_of
 from .raster._memory import device_array
 from .sensors import Sensor, sensors_of
+from .soup import Soup, Vertices
 from .sources import CurveSource, ShapeSource, source_of
 from .traversal import children, is_cosine, is_plain
 
+# Vertices of fewer shapes are put together anew for each image.
+_MANY_SHAPES = 16
 # Unit directions of rays that ask instances for their shapes. A cylinder does not answer one that lies in its axis.
 _PROBING = ((0.48, 0.36, 0.8), (-0.6, 0.64, 0.48))
 
@@ -39,6 +43,7 @@ class SceneData:
     environments  constant, envmap and sunsky emitters (at most one)
     shape_ptr, bsdf_ptr   mi.ShapePtr, mi.BSDFPtr (S,), by the index that ``geometry.face_shape`` holds
     variant       of Mitsuba, to which all of them belong
+    soup          the shapes' vertices, None if there are few
     needs_frames  whether any BSDF asks for more than the cosines of directions: tangents, texture coordinates
     only_cosines  whether all BSDFs are proportional to the cosine of the light's direction, and know no more of directions
     """
@@ -55,6 +60,7 @@ class SceneData:
     variant: str
     needs_frames: bool = True
     only_cosines: bool = False
+    soup: Soup | None = None
 
     def cameras(self, sensor: int | Sensor) -> tuple[Sensor, ...]:
         """Those of the scene's sensor of that number, or the one that is given.
@@ -121,25 +127,26 @@ def load(scene: Any, *, tessellation: int = 64, warn: bool = True) -> SceneData:
         raise ShadowmapError(f"{given} is no mi.Scene of the variant {mi.variant()}: load it with mi.load_file or mi.load_dict.")
     if not isinstance(tessellation, Integral) or tessellation < 3:
         raise ShadowmapError(f"tessellation is {tessellation!r}, but must be an integer of at least 3.")
-    infos, sources, faces, unsupported = [], [], [], []
+    names, sources, faces, unsupported = [], [], [], []
+    known: dict[Any, Any] = {}
     for name, shape, instance in _shapes_of(scene):
         try:
-            source, own_faces = source_of(name, shape, instance, tessellation)
+            source, own_faces = source_of(name, shape, instance, tessellation, known)
         except UnsupportedShape as error:
             unsupported.append(str(error).rstrip("."))
             continue
-        vertex_start = infos[-1].vertex_start + infos[-1].vertex_count if infos else 0
-        face_start = infos[-1].face_start + infos[-1].face_count if infos else 0
-        infos.append(describe(name, source, own_faces, vertex_start, face_start))
+        names.append(name)
         sources.append(source)
-        faces.append(own_faces + np.uint32(vertex_start))
-    if not infos:
+        faces.append(own_faces)
+    if not sources:
         why = "; ".join(unsupported) or "it has no shapes"
         raise ShadowmapError(f"There is nothing to render in the scene: {why}.")
+    soup, infos = _described(names, sources, faces)
     face_counts, vertex_counts = [i.face_count for i in infos], [i.vertex_count for i in infos]
     shape_index = np.arange(len(infos), dtype=np.uint32)
-    merged, vertex_shape = np.concatenate(faces), np.repeat(shape_index, vertex_counts)
-    settled = stand_ins(merged, vertex_shape, tuple(infos), np.array([isinstance(s.shape, mi.Mesh) for s in sources]))
+    starts = np.array([i.vertex_start for i in infos], np.uint32)
+    merged, vertex_shape = np.concatenate(faces) + np.repeat(starts, face_counts)[:, None], np.repeat(shape_index, vertex_counts)
+    settled = stand_ins(merged, vertex_shape, infos, np.array([isinstance(s.shape, mi.Mesh) for s in sources]))
     geometry = Geometry(
         positions=None,  # the four buffers that may change are read by ``refresh``
         normals=None,
@@ -147,12 +154,14 @@ def load(scene: Any, *, tessellation: int = 64, warn: bool = True) -> SceneData:
         rest_positions=None,
         faces=device_array(mi.UInt32, merged),
         face_shape=device_array(mi.UInt32, np.repeat(shape_index, face_counts)),
-        face_info=device_array(mi.UInt32, pack_face_info(tuple(infos))),
+        face_info=device_array(mi.UInt32, pack_face_info(infos)),
         vertex_shape=device_array(mi.UInt32, vertex_shape),
         shape_face_start=device_array(mi.UInt32, [i.face_start for i in infos]),
-        shapes=tuple(infos),
+        shapes=infos,
         stand_ins=None if settled is None else device_array(mi.UInt32, settled),
     )
+    bsdfs = [source.shape.bsdf() for source in sources]
+    different = list(dict.fromkeys(bsdfs))
     data = SceneData(
         scene=scene,
         geometry=geometry,
@@ -160,12 +169,13 @@ def load(scene: Any, *, tessellation: int = 64, warn: bool = True) -> SceneData:
         lights=(),
         areas=(),
         environments=(),
-        shape_ptr=dr.concat([mi.ShapePtr(source.shape) for source in sources]),
-        bsdf_ptr=dr.concat([mi.BSDFPtr(source.shape.bsdf()) for source in sources]),
+        shape_ptr=_pointers(mi.ShapePtr, [source.shape for source in sources]),
+        bsdf_ptr=_pointers(mi.BSDFPtr, bsdfs),
         sources=tuple(sources),
         variant=mi.variant(),
-        needs_frames=not all(is_plain(source.shape.bsdf()) for source in sources),
-        only_cosines=all(is_cosine(source.shape.bsdf()) for source in sources),
+        needs_frames=not all(is_plain(bsdf) for bsdf in different),
+        only_cosines=all(is_cosine(bsdf) for bsdf in different),
+        soup=soup if len(sources) >= _MANY_SHAPES else None,
     )
     data = refresh(data)
     if warn:
@@ -181,15 +191,14 @@ def refresh(data: SceneData, sensors: tuple[Any, ...] | None = None) -> SceneDat
     Values are attached where the scene's parameters are. Topology must be that of ``load``; BSDFs need no refresh, since they
     are always evaluated by Mitsuba itself. Nothing is read back to the host.
     """
-    buffers = [_vertex_buffers(source, info) for source, info in zip(data.sources, data.geometry.shapes, strict=True)]
-    positions, normals, texcoords, rest = (dr.concat(list(parts)) for parts in zip(*buffers, strict=True))
+    vertices = _vertices(data)
     # Not an empty array: one among the arguments of a frozen function ends the process (Dr.Jit 1.5).
-    rest = rest if any(info.reads_attributes for info in data.geometry.shapes) else None
+    rest = vertices.rest if any(info.reads_attributes for info in data.geometry.shapes) else None
     geometry = replace(
         data.geometry,
-        positions=data.geometry.settled(positions),
-        normals=normals,
-        texcoords=texcoords,
+        positions=data.geometry.settled(vertices.positions),
+        normals=vertices.normals,
+        texcoords=vertices.texcoords,
         rest_positions=rest,
         changed=None,
         as_loaded=False,
@@ -278,70 +287,34 @@ def _hit_by(instance: Any, name: str, shown: list[list[Any]]) -> list[Any]:
     raise ShadowmapError(f"The shape group of instance '{name}' was not found in the scene.")
 
 
-def describe(name: str, source: ShapeSource, faces: np.ndarray, vertex_start: int, face_start: int) -> ShapeInfo:
-    """Validate the buffers of a shape, with ``faces`` (F, 3), and describe it; it will start at the given vertex and face."""
-    shape, own = source.shape, source.own()
-    points = own.positions.numpy().reshape(-1, 3)
-    if not len(points) or not len(faces):
-        raise ShadowmapError(f"Shape '{name}' is an empty mesh ({len(points)} vertices, {len(faces)} faces): remove it.")
-    bad = np.flatnonzero(~np.isfinite(points).all(-1))
-    if len(bad):
-        raise ShadowmapError(f"Vertex {bad[0]} of shape '{name}' is {points[bad[0]].tolist()}: positions must be finite.")
-    if int(faces.max()) >= len(points):
-        where = int(np.argmax(faces.max(-1)))
-        raise ShadowmapError(
-            f"Face {where} of shape '{name}' refers to vertex {faces[where].max()}, but there are only {len(points)} vertices."
-        )
-    mirrored = source.mirrored != source.instance_mirrored
-    flipped = shape.has_flipped_normals() != source.inverted
-    has_normals = own.normals is not None
-    faceted = isinstance(shape, mi.Mesh) and has_normals and not mirrored
-    # Mitsuba takes normals from the winding once vertices change, but a rectangle's never do.
-    turned = shape.class_name() == "Rectangle" and has_normals and _is_turned(points, faces, own.normals.numpy().reshape(-1, 3))
-    return ShapeInfo(
-        name=name,
-        plugin=shape.class_name(),
-        vertex_start=vertex_start,
-        vertex_count=len(points),
-        face_start=face_start,
-        face_count=len(faces),
-        has_normals=has_normals,
-        has_texcoords=own.texcoords is not None,
-        flip_geometric=flipped != mirrored,
-        flip_shading=flipped,
-        reads_attributes=isinstance(shape, mi.Mesh) and shape.has_mesh_attributes(),
-        planar=_is_planar(points, faces),
-        against_winding=mirrored != turned,
-        see_through=mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null),
-        faceted=faceted and _is_faceted(points, faces, own.normals.numpy().reshape(-1, 3)),
-    )
-
-
-def _is_faceted(points: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> bool:
-    """Whether the vertex normals are those of the faces."""
-    corners = points[faces].astype(np.float64)
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    length = np.linalg.norm(normal, axis=1, keepdims=True)
-    return bool((length > 0).all() and np.abs(normals[faces] - (normal / length)[:, None]).max() < 1e-6)
-
-
-def _is_turned(points: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> bool:
-    """Whether the vertex normals are on the other side than the winding of the faces says."""
-    a, b, c = (points[faces[:, k]].astype(np.float64) for k in range(3))
-    return bool((np.cross(b - a, c - a) * normals[faces].sum(1)).sum() < 0)
-
-
-def _is_planar(points: np.ndarray, faces: np.ndarray) -> bool:
-    points = points[with_faces(faces, len(points))]
-    centred = points.astype(np.float64) - points.mean(0, dtype=np.float64)
-    spread = np.linalg.eigvalsh(centred.T @ centred)
-    return bool(spread[0] <= 1e-10 * spread[2])
-
-
 def with_positions(data: SceneData) -> Geometry:
     """The geometry with the vertices as they are now, attached, and nothing else that :func:`refresh` reads."""
-    buffers = (_vertex_buffers(source, info) for source, info in zip(data.sources, data.geometry.shapes, strict=True))
-    return replace(data.geometry, positions=data.geometry.settled(dr.concat([positions for positions, *_ in buffers])))
+    return replace(data.geometry, positions=data.geometry.settled(_vertices(data).positions))
+
+
+def _described(names: list[str], sources: list[ShapeSource], faces: list[np.ndarray]) -> tuple[Soup, tuple[ShapeInfo, ...]]:
+    """The soup of shapes, with the faces of each, and what they are like."""
+    with dr.suspend_grad():
+        soup = Soup(names, sources)
+        points, normals = (buffer.numpy().reshape(-1, 3) for buffer in soup.own())
+    parts = Parts(points, normals, np.concatenate(faces), soup.counts, np.array([len(own) for own in faces]))
+    return soup, describe_all(names, sources, soup.held, parts)
+
+
+def _pointers(kind: type, objects: list[Any]) -> Any:
+    """Pointers to Mitsuba's objects, evaluated."""
+    # Joined as numbers: a kernel that joins pointers would be another one for each number of shapes.
+    numbers = [dr.reinterpret_array(mi.UInt32, kind(one))[0] for one in objects]
+    return dr.reinterpret_array(kind, device_array(mi.UInt32, numbers))
+
+
+def _vertices(data: SceneData) -> Vertices:
+    """The vertices of all shapes as they are now, attached."""
+    sources, infos = data.sources, data.geometry.shapes
+    if data.soup is None or dr.flag(dr.JitFlag.FreezingScope):  # what is kept would not be read again by a replay
+        buffers = (_vertex_buffers(source, info) for source, info in zip(sources, infos, strict=True))
+        return Vertices(*(dr.concat(list(parts)) for parts in zip(*buffers, strict=True)))
+    return data.soup.vertices(lambda k: _vertex_buffers(sources[k], infos[k]))
 
 
 def _vertex_buffers(source: ShapeSource, info: ShapeInfo) -> tuple[Any, Any, Any, Any]:

@@ -147,11 +147,11 @@ class SceneRenderer:
 
     def _name_constants_of_recordings(self) -> None:
         """Warn, once, of parameters that a frozen function of the user's takes for constants: Dr.Jit does not ask for them."""
-        if self.warned or not self.unseen.names or not dr.flag(dr.JitFlag.FreezingScope):
+        if self.warned or not dr.flag(dr.JitFlag.FreezingScope) or not self.unseen.names():
             return
         self.warned = True
         shapes = {source.shape.bsdf(): f"{source.shape.id()}." for source in self.renderer.data.sources}
-        names = [f"{shapes.get(node, '')}{node.id()}.{key}" for node, key in self.unseen.names]
+        names = [f"{shapes.get(node, '')}{node.id()}.{key}" for node, key in self.unseen.names()]
         listed = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
         warn(
             f"dr.freeze does not see changes of {listed}: call clear() of the frozen function after one, "

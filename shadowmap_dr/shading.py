@@ -27,6 +27,9 @@ from .spread import spread
 from .sums import evaluate
 from .tables import LIKE_LANES, copy_of_lane, in_copies
 
+# The BSDFs of fewer shapes are called one by one.
+_MANY_SHAPES = 16
+
 
 @dataclass(frozen=True)
 class Surface:
@@ -72,15 +75,17 @@ def plain_colours(data: SceneData) -> Any:
     si.n = mi.Normal3f(0, 0, 1)
     si.sh_frame = mi.Frame3f(mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), mi.Vector3f(0, 0, 1))
     si.wi = normal
-    # One by one and not through pointers to them: such calls in small kernels come out wrong when a frozen function is replayed.
-    colour = dr.zeros(mi.UnpolarizedSpectrum, dr.width(lane))
-    known: list[tuple[Any, Any]] = []
-    for shape, bsdf in enumerate(bsdfs):
-        value = next((value for other, value in known if other == bsdf), None)
-        if value is None:
-            value = mi.UnpolarizedSpectrum(bsdf.eval(mi.BSDFContext(), si, normal))
-            known.append((bsdf, value))
-        colour = dr.select(lane >> 1 == shape, value, colour)
+    if len(bsdfs) > _MANY_SHAPES and not dr.flag(dr.JitFlag.FreezingScope):
+        pointer = dr.gather(mi.BSDFPtr, data.bsdf_ptr, lane >> 1)
+        colour = mi.UnpolarizedSpectrum(pointer.eval(mi.BSDFContext(), si, normal))
+    else:
+        # One by one: calls through pointers in small kernels come out wrong when a frozen function is replayed.
+        colour = dr.zeros(mi.UnpolarizedSpectrum, dr.width(lane))
+        known: dict[Any, Any] = {}
+        for shape, bsdf in enumerate(bsdfs):
+            if bsdf not in known:
+                known[bsdf] = mi.UnpolarizedSpectrum(bsdf.eval(mi.BSDFContext(), si, normal))
+            colour = dr.select(lane >> 1 == shape, known[bsdf], colour)
     result = dr.ravel(mi.Vector4f(*colour, *(mi.Float(0) for _ in range(4 - len(colour)))))
     dr.eval(result)
     return result

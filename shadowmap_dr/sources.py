@@ -6,7 +6,7 @@ of a mesh, ``to_world`` of an analytic shape, control points of a curve. Gradien
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -15,9 +15,8 @@ import numpy as np
 
 from . import curves, tessellate, tubes
 from .errors import ShadowmapError, UnsupportedShape
-from .mirroring import mirrors
 from .raster._memory import device_array
-from .traversal import mesh_buffers, parameters
+from .traversal import Parameter, mesh_buffers, parameters
 
 _ANALYTIC = {"Sphere": tessellate.sphere, "Disk": tessellate.disk, "Cylinder": tessellate.cylinder}
 _CURVES = {"BSplineCurve": curves.BSplines, "LinearCurve": curves.Polylines}
@@ -44,7 +43,20 @@ class ShapeSource:
 
     def own(self) -> Buffers:
         """Vertices where Mitsuba holds them: before the instance's transformation."""
+        return self.rest()
+
+    def rest(self) -> Buffers:
+        """Vertices before any transformation."""
         raise NotImplementedError
+
+    def read(self) -> tuple[Any, ...]:
+        """Arrays of Mitsuba's that :meth:`rest` depends on."""
+        return ()
+
+    @property
+    def own_placement(self) -> Any:
+        """The ``mi.Shape`` whose ``to_world`` leads from :meth:`rest` to :meth:`own`, or None."""
+        return None
 
     def statics(self) -> tuple[Any, ...]:
         """Arrays that decided on the topology. Where they change, the scene has to be loaded again."""
@@ -54,21 +66,6 @@ class ShapeSource:
         """Lengths of arrays and flags that decided on the topology and on what is read, likewise."""
         return ()
 
-    @property
-    def mirrored(self) -> bool:
-        """Whether the triangles' winding is reversed before the instance's transformation. Read back to the host."""
-        return False
-
-    @property
-    def inverted(self) -> bool:
-        """Whether Mitsuba's normals are on the inside, apart from ``flip_normals``. Read back to the host."""
-        return False
-
-    @property
-    def instance_mirrored(self) -> bool:
-        """Whether the instance's transformation reverses the triangles' winding. Read back to the host."""
-        return self.instance is not None and mirrors(self.instance)
-
     def transformed(self) -> tuple[Any, ...]:
         """Objects of Mitsuba's whose ``to_world`` places the shape. Where one comes to mirror it, or no longer does, the scene
         has to be loaded again."""
@@ -76,16 +73,19 @@ class ShapeSource:
 
     def placed(self, own: Buffers) -> Buffers:
         """The same vertices in world space: after the instance's transformation."""
-        return own if self.instance is None else _placed(own, parameters(self.instance)["to_world"])
+        return own if self.instance is None else _placed(own, Parameter(self.instance, "to_world").now())
 
 
 @dataclass(frozen=True)
 class MeshSource(ShapeSource):
     """The buffers of a ``mi.Mesh``."""
 
-    def own(self) -> Buffers:
+    def rest(self) -> Buffers:
         _, positions, normals, texcoords = mesh_buffers(self.shape)
         return Buffers(positions, normals if len(normals) else None, texcoords if len(texcoords) else None)
+
+    def read(self) -> tuple[Any, ...]:
+        return mesh_buffers(self.shape)[1:]
 
     def statics(self) -> tuple[Any, ...]:
         return (mesh_buffers(self.shape)[0],)
@@ -106,7 +106,14 @@ class PlacedSource(ShapeSource):
     local: Buffers
 
     def own(self) -> Buffers:
-        return _placed(self.local, parameters(self.shape)["to_world"])
+        return _placed(self.local, Parameter(self.shape, "to_world").now())
+
+    def rest(self) -> Buffers:
+        return self.local
+
+    @property
+    def own_placement(self) -> Any:
+        return self.shape
 
     def transformed(self) -> tuple[Any, ...]:
         return (self.shape, *super().transformed())
@@ -119,16 +126,6 @@ class AnalyticSource(PlacedSource):
     def sizes(self) -> tuple[int, ...]:
         # Mitsuba turns a sphere's normals over where ``to_world`` comes to mirror it.
         return (self.shape.has_flipped_normals(),)
-
-    @property
-    def mirrored(self) -> bool:
-        return mirrors(self.shape)
-
-    @property
-    def inverted(self) -> bool:
-        # Mitsuba's normals stay on their side where a shape is mirrored, except for a cylinder's, which are computed from its
-        # parametrisation and change sides too.
-        return self.shape.class_name() == "Cylinder" and self.mirrored
 
 
 @dataclass(frozen=True)
@@ -143,13 +140,16 @@ class CurveSource(ShapeSource):
     layout: tubes.Layout
     count: int
 
-    def own(self) -> Buffers:
-        points = mi.Float(parameters(self.shape)["control_points"])
+    def rest(self) -> Buffers:
+        (points,) = self.read()
         now = len(points) / 4
         if now != self.count:
             changed = f"now has {now:g} control points instead of {self.count}"
             raise ShadowmapError(f"Curve '{self.name}' {changed}: load the scene again.")
         return self.with_control_points(points)
+
+    def read(self) -> tuple[Any, ...]:
+        return (mi.Float(parameters(self.shape)["control_points"]),)
 
     def with_control_points(self, points: Any) -> Buffers:
         """Vertices for control points (x, y, z, radius), flat Float (4P,), attached to them; before the instance's placement."""
@@ -162,25 +162,42 @@ class CurveSource(ShapeSource):
         return (len(parameters(self.shape)["control_points"]),)
 
 
-def source_of(name: str, shape: Any, instance: Any, tessellation: int) -> tuple[ShapeSource, np.ndarray]:
+Found = tuple[ShapeSource, np.ndarray]
+
+
+def source_of(name: str, shape: Any, instance: Any, tessellation: int, known: dict[Any, Any] | None = None) -> Found:
     """The source of a shape's vertices and its faces, uint32 (F, 3).
 
     ``tessellation``: triangles around spheres, disks and cylinders. Curves have half as many around them and, if they are
-    B-splines, an eighth of it along each segment. Raises ``ShadowmapError`` for other shapes and for curves that are broken.
+    B-splines, an eighth of it along each segment. ``known``: what other shapes of the scene share, kept here from one call to the
+    next. Raises ``ShadowmapError`` for other shapes and for curves that are broken.
     """
-    kind = shape.class_name()
+    known = {} if known is None else known
+    if shape not in known:
+        known[shape] = _new_source(name, shape, tessellation, known)
+    source, faces = known[shape]
+    return replace(source, instance=instance), faces
+
+
+def _new_source(name: str, shape: Any, tessellation: int, known: dict[Any, Any]) -> Found:
+    kind, instance = shape.class_name(), None
     if kind == "Rectangle":
         faces, _, _, texcoords = (buffer.numpy() for buffer in mesh_buffers(shape))
         # In its own space a rectangle's corners are those of its texture's, from -1 to 1.
         uv = texcoords.reshape(-1, 2)
-        mesh = (np.insert(2 * uv - 1, 2, 0, 1), np.tile(np.float32([0, 0, 1]), (len(uv), 1)), uv)
-        return PlacedSource(shape, instance, Buffers(*(device_array(mi.Float, a) for a in mesh))), faces.reshape(-1, 3)
+        if uv.tobytes() not in known:
+            mesh = (np.insert(2 * uv - 1, 2, 0, 1), np.tile(np.float32([0, 0, 1]), (len(uv), 1)), uv)
+            known[uv.tobytes()] = Buffers(*(device_array(mi.Float, a) for a in mesh))
+        return PlacedSource(shape, instance, known[uv.tobytes()]), faces.reshape(-1, 3)
     if isinstance(shape, mi.Mesh):
         return MeshSource(shape, instance), mesh_buffers(shape)[0].numpy().reshape(-1, 3)
     if kind in _ANALYTIC:
-        mesh = _ANALYTIC[kind](tessellation)
-        local = Buffers(*(device_array(mi.Float, a) for a in (mesh.positions, mesh.normals, mesh.texcoords)))
-        return AnalyticSource(shape, instance, local), mesh.faces
+        if kind not in known:
+            mesh = _ANALYTIC[kind](tessellation)
+            local = Buffers(*(device_array(mi.Float, a) for a in (mesh.positions, mesh.normals, mesh.texcoords)))
+            known[kind] = local, mesh.faces
+        local, faces = known[kind]
+        return AnalyticSource(shape, instance, local), faces
     if kind in _CURVES:
         held = parameters(shape)
         points, segments = np.array(held["control_points"]), np.array(held["segment_indices"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
@@ -25,16 +26,51 @@ def parameters(node: Any) -> dict[str, Any]:
 
 def children(node: Any) -> list[tuple[str, Any]]:
     """(name, object) of the direct children of a Mitsuba object, in its own order."""
-    found: list[tuple[str, Any]] = []
+    return [(name, value) for name, value, _ in _parts_of(node) if isinstance(value, mi.Object)]
 
-    # Defined here and not at module level: the base class belongs to the variant that is current.
-    class Callback(mi.TraversalCallback):
+
+class Parameter:
+    """One parameter of a Mitsuba object itself, read again and again. The object is kept alive.
+
+    Raises:
+        KeyError: it has no parameter of that name.
+    """
+
+    def __init__(self, node: Any, name: str) -> None:
+        self._node, self._name = node, name
+        self._place, self._kind = self._found()
+
+    def now(self) -> Any:
+        """Its current, possibly attached, value."""
+        return self._found()[0] if self._kind is None else mi.get_property(self._place, self._kind, self._node)
+
+    def _found(self) -> tuple[Any, Any]:
+        for name, value, kind in _parts_of(self._node):
+            if name == self._name and not isinstance(value, mi.Object):
+                return value, kind
+        raise KeyError(self._name)
+
+
+def _parts_of(node: Any) -> list[tuple[str, Any, Any]]:
+    """(name, child or where a parameter's value is, type of the parameter) of all that a Mitsuba object itself has."""
+    callback = _collector(mi.variant())()
+    node.traverse(callback)
+    return callback.found
+
+
+@functools.cache
+def _collector(variant: str) -> type:
+    """Mitsuba's base class belongs to the variant that is current."""
+
+    class Collector(mi.TraversalCallback):
+        def __init__(self) -> None:
+            super().__init__()
+            self.found: list[tuple[str, Any, Any]] = []
+
         def put(self, name: str, value: Any, flags: int = 0, cpptype: Any = None) -> None:
-            if isinstance(value, mi.Object):
-                found.append((name, value))
+            self.found.append((name, value, cpptype))
 
-    node.traverse(Callback())
-    return found
+    return Collector
 
 
 def varies(texture: Any) -> bool:

@@ -23,29 +23,40 @@ class Unseen:
 
     Args:
         nodes: Mitsuba's BSDFs, emitters, and shapes whose attributes are read. They are kept alive.
-
-    Attributes:
-        names: the parameters among the values, each an object and its name there.
     """
 
     def __init__(self, nodes: Iterable[Any]) -> None:
+        self._nodes = list(dict.fromkeys(nodes))
+        self._known = False
         self._held, self._sized, self._off = [], [], []
-        self.names: list[tuple[Any, str]] = []
-        for node in {id(node): node for node in nodes}.values():
+        self._names: list[tuple[Any, str]] = []
+
+    def _look(self) -> None:
+        """Find out what there is to read. Most scenes are never recorded, and do without."""
+        self._known = True
+        for node in self._nodes:
             table, switched = mi.traverse(node), _has_switches(node)
             for key in table.keys():
                 with suppress(TypeError):  # raised for parameters without a value
                     value = table[key]
                     if not _is_seen(node, key, value):
                         self._held.append((table, key))
-                        self.names.append((node, key))
+                        self._names.append((node, key))
                     if dr.is_tensor_v(value):
                         self._sized.append((table, key))
                     if switched and isinstance(value, mi.Float):
                         self._off.append(_Off(table, key))
 
+    def names(self) -> list[tuple[Any, str]]:
+        """The parameters among the values, each an object and its name there."""
+        if not self._known:
+            self._look()
+        return self._names
+
     def now(self) -> tuple[Any, ...]:
         """The values as they are: those of two calls are equal if nothing has changed in between."""
+        if not self._known:
+            self._look()
         shapes = (tuple(table[key].shape) for table, key in self._sized)
         return (*(fingerprint(table[key]) for table, key in self._held), *shapes, *(value.still() for value in self._off))
 

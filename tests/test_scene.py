@@ -12,7 +12,8 @@ import pytest
 
 from shadowmap_dr import ShadowmapError, assets
 from shadowmap_dr import scene as scene_module
-from shadowmap_dr.scene import describe, load, refresh
+from shadowmap_dr.descriptions import describe
+from shadowmap_dr.scene import load, refresh
 from shadowmap_dr.shading import surface
 from shadowmap_dr.sources import MeshSource
 from shadowmap_dr.traversal import children

@@ -9,7 +9,12 @@ import drjit as dr
 import numpy as np
 
 from ._memory import device_array
+from .adjacency import EdgeOrder, InnerEdges, after, edge_keys, pairs_of, parts_of, third
 from .seams import NO_VERTEX, Seams
+from .welding import copies_of, weld
+
+# Up to so many edges are sorted by their places. Where some lie on one another in an image, the first of them counts.
+_MOST_SORTED = 1 << 18
 
 
 @dataclass(frozen=True)
@@ -21,7 +26,7 @@ class Topology:
         opposite: ``UInt32`` (2 E,) third vertices of the one or two faces at each edge, ``NO_VERTEX`` at a boundary. An edge of
             three or more faces stands once for each of them, as a boundary.
         count: number of edges E.
-        faces, welded: ``UInt32`` (3 F,) vertices of the faces, as they are and with one number for each place.
+        faces, welded: ``UInt32`` (3 F,) vertices of the faces, as they are and each the first one at its place.
         parts: ``UInt32`` (F,) a number for each face, the same for faces that are connected through common vertices.
         part_count: how many different numbers there are.
         beyond: ``UInt32`` (3 F,) for the edge from corner k to k + 1 of each face the third vertex of the face on its other side,
@@ -69,55 +74,70 @@ def build_topology(
     Raises:
         ValueError: arrays of other shapes, no faces, an index out of range.
     """
-    faces = _in_threes("faces", "F", np.asarray(faces)).astype(np.int64)
+    faces = _in_threes("faces", "F", np.asarray(faces))
     positions = np.ascontiguousarray(_in_threes("positions", "V", np.asarray(positions, np.float32))) + np.float32(0)  # -0 -> 0
     if faces.size == 0:
         raise ValueError("faces are empty; a topology needs at least one triangle")
-    if faces.min() < 0 or faces.max() >= len(positions):
-        raise ValueError(f"faces refer to vertices {faces.min()}..{faces.max()}, but there are {len(positions)}")
-    _, weld = np.unique(positions.view([("", np.float32)] * 3).ravel(), return_inverse=True)
-    welded = weld[faces]
-    owners = np.zeros(len(positions), np.int64) if shapes is None else np.asarray(shapes, np.int64)
-    places = welded if shapes is None else welded * (owners.max() + 1) + owners[faces]
-    parts, part_count = _parts(np.unique(places, return_inverse=True)[1].reshape(-1, 3))
-    flat = [device_array(dtype, t) for t in (faces, welded, parts)]
-    proper = (welded != np.roll(welded, 1, 1)).all(1)
-    where = np.flatnonzero(proper)
-    beyond = np.full(3 * len(proper), NO_VERTEX)
-    vertex_count = int(faces.max()) + 1
-    faces, welded = faces[proper], welded[proper]
-
-    a, b, opposite = (np.concatenate([faces[:, (k + s) % 3] for k in range(3)]) for s in (0, 1, 2))
-    wa, wb = (np.concatenate([welded[:, (k + s) % 3] for k in range(3)]) for s in (0, 1))
-    key = np.minimum(wa, wb) * len(positions) + np.maximum(wa, wb)
-    # Two faces of one shape, or else the only ones of two.
-    pair, partner, alone = _pairs(np.arange(len(key)), key * (owners.max() + 1) + owners[a])
-    one, two, alone = _pairs(alone, key)
-    slot = np.concatenate([3 * where + k for k in range(3)])
-    for mine, other in ((pair, partner), (one, two)):
-        beyond[slot[mine]], beyond[slot[other]] = opposite[other], opposite[mine]
+    low, high = int(faces.min()), int(faces.max())
+    if low < 0 or high >= len(positions):
+        raise ValueError(f"faces refer to vertices {low}..{high}, but there are {len(positions)}")
+    faces = np.ascontiguousarray(faces, np.uint32)
+    owners = None if shapes is None else np.asarray(shapes, np.int64)
+    vertices = weld(positions, owners)
+    copies = copies_of(faces, vertices.own, owners)
+    corners, places = faces.ravel(), vertices.place.astype(np.uint32)[faces.ravel()]
+    inner = [InnerEdges.of(group, corners, vertices.own) for group in copies]
+    alone = np.concatenate([group.repeated(edges.alone, 3) for group, edges in zip(copies, inner, strict=True)])
+    one, two, alone = pairs_of(alone, edge_keys(vertices.place, corners, alone))
+    firsts, seconds = (
+        [group.repeated(half, 3) for group, half in zip(copies, halves, strict=True)]
+        for halves in ([edges.pair for edges in inner], [edges.partner for edges in inner])
+    )
+    paired = np.concatenate(firsts)
+    order = None
+    if len(paired) + len(alone) + len(one) <= _MOST_SORTED:
+        sort = EdgeOrder.of(positions, corners, owners)
+        order, chosen = sort(paired), sort(one)
+        alone, one, two = alone[sort(alone)], one[chosen], two[chosen]
+    beyond = np.full(len(corners), NO_VERTEX, np.uint32)
+    for group, edges in zip(copies, inner, strict=True):
+        beyond[edges.pair], beyond[edges.partner] = edges.thirds[:, 1], edges.thirds[:, 0]
+        group.fill(beyond)
+    beyond[one], beyond[two] = third(corners, two), third(corners, one)
     # Those between shapes come last, and each of them again, without extent, as an edge of its other face.
-    edges = np.concatenate([pair, alone, one])
-    second = np.concatenate([opposite[partner], np.full(len(alone), NO_VERTEX), opposite[two]])
-    ends, thirds = np.stack([a[edges], b[edges]], 1), np.stack([opposite[edges], second], 1)
-    seams, owner = None, np.stack([slot[edges], np.concatenate([slot[pair], slot[alone], slot[two]])], 1) // 3
+    count = [len(edges.pair) * len(group.faces) for group, edges in zip(copies, inner, strict=True)]
+    start, rest = np.cumsum([0, *count]), np.concatenate([alone, one])
+    ends, thirds = np.empty((start[-1] + len(rest), 2), np.uint32), np.empty((start[-1] + len(rest), 2), np.uint32)
+    for group, edges, first, last in zip(copies, inner, start[:-1], start[1:], strict=True):
+        group.copy_vertices(edges.ends, ends[first:last])
+        group.copy_vertices(edges.thirds, thirds[first:last])
+    if order is not None:
+        ends[: start[-1]], thirds[: start[-1]] = ends[order], thirds[order]
+    ends[start[-1] :, 0], ends[start[-1] :, 1] = corners[rest], corners[after(rest)]
+    thirds[start[-1] :, 0], thirds[start[-1] :, 1] = third(corners, rest), beyond[rest]
+    seams = None
     if len(one):
-        other = np.stack([a[two], b[two]], 1)
-        other = np.where((wa[one] == wa[two])[:, None], other, other[:, ::-1])
-        seams = Seams.of(dtype, ends[-len(one) :], other, thirds[-len(one) :], np.stack([slot[one], slot[two]], 1))
+        other = np.stack([corners[two], corners[after(two)]], 1)
+        other = np.where((places[one] == vertices.place[other[:, 0]])[:, None], other, other[:, ::-1])
+        seams = Seams.of(dtype, ends[-len(one) :], other, thirds[-len(one) :], np.stack([one, two], 1))
         ends = np.concatenate([ends, np.zeros_like(other)])
         thirds = np.concatenate([thirds, np.full_like(other, NO_VERTEX)])
-        owner = np.concatenate([owner, np.stack([slot[two], slot[two]], 1) // 3])
+    veiled = (None, None)
+    if veils is not None:
+        first, second = (values if order is None else values[order] for values in (paired, np.concatenate(seconds)))
+        owner = np.stack([np.concatenate([first, alone, one, two]), np.concatenate([second, alone, two, two])], 1) // 3
+        veiled = device_array(dr.mask_t(dtype), veils), device_array(dtype, owner)
+    parts, part_count = parts_of(copies, corners, vertices.own)
     return Topology(
         device_array(dtype, ends),
         device_array(dtype, thirds),
         len(ends),
-        *flat,
+        *(device_array(dtype, values) for values in (corners, places, parts)),
         part_count,
         device_array(dtype, beyond),
-        vertex_count,
+        high + 1,
         seams,
-        *(None, None) if veils is None else (device_array(dr.mask_t(dtype), veils), device_array(dtype, owner)),
+        *veiled,
     )
 
 
@@ -125,29 +145,3 @@ def _in_threes(name: str, count: str, values: np.ndarray) -> np.ndarray:
     if (values.ndim == 2 and values.shape[1] == 3) or (values.ndim == 1 and values.size % 3 == 0):
         return values.reshape(-1, 3)
     raise ValueError(f"{name} have shape {values.shape}; expected ({count}, 3)")
-
-
-def _pairs(index: np.ndarray, key: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Those of ``index`` whose key exactly one other has, too (the first and the second of each two), and the rest."""
-    order = index[np.argsort(key[index], kind="stable")]
-    _, first, size = np.unique(key[order], return_index=True, return_counts=True)
-    return order[first[size == 2]], order[first[size == 2] + 1], order[np.repeat(size != 2, size)]
-
-
-def _parts(welded: np.ndarray) -> tuple[np.ndarray, int]:
-    """Number of the connected part of each face, from 0 on, and how many there are.
-
-    All vertices point to themselves at first. Those that the corners of a face point to are redirected to the lowest of them and
-    chains are cut short, until nothing changes: as many rounds as the logarithm of a part's size, about.
-    """
-    target = np.arange(welded.max() + 1)
-    while True:
-        corners = target[welded]
-        lowest = corners.min(1)
-        if (corners == lowest[:, None]).all():
-            break
-        np.minimum.at(target, corners.ravel(), np.repeat(lowest, 3))
-        while (target != target[target]).any():
-            target = target[target]
-    _, parts = np.unique(lowest, return_inverse=True)
-    return parts, int(parts.max()) + 1

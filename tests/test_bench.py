@@ -22,6 +22,7 @@ from shadowmap_dr.errors import ShadowmapError
 from shadowmap_dr.experiments.bench import breakdown as bench_breakdown
 from shadowmap_dr.experiments.bench import common as bench_common
 from shadowmap_dr.experiments.bench import experiment as bench
+from shadowmap_dr.experiments.bench import first as bench_first
 from shadowmap_dr.experiments.bench import loops as bench_loops
 from shadowmap_dr.experiments.bench import meshes as bench_meshes
 from shadowmap_dr.experiments.bench import raster as bench_raster
@@ -49,6 +50,7 @@ TINY = Sizes(
     batch=(1, 2),
     batch_resolution=8,
     sums=((16, 1),),
+    crowds=({"instances": 4, "groups": 2, "shapes": 4, "lights": 3},),
     loop_size=8,
     loop_steps=0,
 )
@@ -145,6 +147,17 @@ def test_loops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_memory_of_loops() -> None:
     found = bench_loops.measure_memory("kept parameters", 8, 103, lambda result: None)
     assert found["steps"] == 103 and found["settled"] > 0 and found["later"] > 0
+
+
+def test_first_pictures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = {"bench.first:measure_first": bench_first.measure_first}
+    monkeypatch.setattr(bench_first, "run_child", lambda name, arguments, seconds: calls[name](**arguments, emit=None))
+    record = run(options(tmp_path, "first"))
+    (name, unit), *others = record["sections"]["first"]["units"].items()
+    assert name == "4 instances of 2 groups, 4 shapes, 3 lights" and not others
+    assert unit["seconds"].keys() == unit["uncompiled"].keys() == {"ours", "direct", "backward"}
+    rows = [row for row in bench_report.rows(record) if row.what.startswith("first")]
+    assert [row.what for row in rows] == ["first picture", "first derivative"] and all(row.aim for row in rows)
 
 
 def test_passes(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ import mitsuba as mi
 
 from ...errors import ShadowmapError
 
-SECTIONS = ("steps", "raster", "scaling", "breakdown", "sums", "loops")
+SECTIONS = ("steps", "raster", "scaling", "breakdown", "sums", "loops", "first")
 
 
 @dataclass(frozen=True)
@@ -40,6 +40,7 @@ class Sizes:
         sums: (pixels along each side, samples a pixel) whose derivatives are added up; see `bench.sums`.
         loop_size: pixels along each side of images in the loops of `bench.loops`.
         loop_steps: steps over which their memory is watched, 0 for not at all.
+        crowds: scenes of many shapes; see `bench.first.Crowd`.
     """
 
     resolutions: tuple[int, ...] = (128, 512, 1024)
@@ -71,6 +72,15 @@ class Sizes:
     sums: tuple[tuple[int, int], ...] = ((1024, 16), (4096, 1))
     loop_size: int = 128
     loop_steps: int = 1000
+    crowds: tuple[Mapping[str, Any], ...] = (
+        {"instances": 30, "groups": 6},
+        {"instances": 60, "groups": 12},
+        {"instances": 1000, "groups": 50},
+        {"shapes": 200, "kinds": ("sphere",)},
+        {"shapes": 400, "kinds": ("sphere",)},
+        {"shapes": 5000},
+        {"shapes": 200, "lights": 40},
+    )
 
 
 FULL = Sizes()
@@ -100,6 +110,7 @@ QUICK = Sizes(
     sums=((512, 4),),
     loop_size=64,
     loop_steps=0,
+    crowds=({"instances": 30, "groups": 6}, {"shapes": 50, "lights": 6}),
 )
 
 

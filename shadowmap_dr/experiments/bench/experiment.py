@@ -20,6 +20,7 @@ from ... import __version__, io, report
 from ...errors import ShadowmapError
 from ...timing import OtherWork, load, machine
 from . import breakdown as bench_breakdown
+from . import first as bench_first
 from . import loops as bench_loops
 from . import raster as bench_raster
 from . import report as bench_report
@@ -37,6 +38,7 @@ UNITS: dict[str, Callable[[BenchOptions], list[Unit]]] = {
     "breakdown": bench_breakdown.units,
     "sums": bench_sums.units,
     "loops": bench_loops.units,
+    "first": bench_first.units,
 }
 
 

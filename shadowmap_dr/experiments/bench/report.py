@@ -32,6 +32,8 @@ EXPONENT = 1.05
 LARGE_MS, LARGE_GIB = 250.0, 3.0
 #: Cores that other work may use before times are called doubtful.
 BUSY = 0.3
+#: First pictures: over the time of Mitsuba's `direct`, and seconds more.
+FIRST_OVER_DIRECT, FIRST_SECONDS, BACKWARD_SECONDS = 2.0, 0.5, 5.0
 EIGHT_LIGHTS, BATCH, OUTSIDE_KERNELS = 4.5, 1.2, 0.10
 
 
@@ -67,6 +69,7 @@ def rows(record: dict[str, Any]) -> list[Row]:
         "breakdown": _breakdown_rows,
         "sums": _sum_rows,
         "loops": _loop_rows,
+        "first": _first_rows,
     }
     result: list[Row] = []
     for name, make in makers.items():
@@ -289,6 +292,17 @@ def _loop_rows(key: str, unit: dict[str, Any]) -> Iterator[Row]:
         memory = unit["memory"]
         grown = (memory["later"] - memory["settled"]) / 2**20
         yield Row(f"loop: {key}, {memory['steps']} steps", size, f"{grown:.0f} MiB more")
+
+
+def _first_rows(key: str, unit: dict[str, Any]) -> Iterator[Row]:
+    seconds = {name: entry["median"] for name, entry in unit["seconds"].items()}
+    ours, most = seconds["ours"], FIRST_OVER_DIRECT * seconds["direct"] + FIRST_SECONDS
+    ratio = f"{unit['ratio_of_medians']['ours / direct']:.2f}x"
+    aims = _aim(ours, most, f"<= {most:.2f} s", least=False)
+    yield Row("first picture", key, _time(ours), f"direct {_time(seconds['direct'])}", ratio, *aims)
+    aims = _aim(seconds["backward"], BACKWARD_SECONDS, "<= {:g} s", least=False)
+    other = f"uncompiled {_time(unit['uncompiled']['backward'])}"
+    yield Row("first derivative", key, _time(seconds["backward"]), other, "", *aims)
 
 
 def _aim(value: float, aim: float | None, form: str, *, least: bool) -> tuple[str, bool | None]:

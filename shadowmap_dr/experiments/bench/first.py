@@ -1,0 +1,124 @@
+"""Benchmark: seconds from a loaded scene to its first picture, where scenes have many shapes.
+
+Each scene is loaded anew for each picture, after others of its kind have been rendered: kernels are compiled then, as they are in
+the second process that works on a scene. Mitsuba's `direct` renders the same scenes in turns.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ...timing import compare, timed
+from .common import BenchOptions, Unit, Update, run_child
+
+# Pictures of each scene, and the time after which a scene is given up.
+_ROUNDS, _SECONDS = 3, 900.0
+_KINDS = ("cube", "rectangle", "sphere", "cylinder", "disk")
+_GROUPED = ("cube", "sphere", "cylinder")
+
+
+@dataclass(frozen=True)
+class Crowd:
+    """A scene of many shapes.
+
+    Attributes:
+        instances: of groups of shapes, in turns.
+        groups: how many of these there are, 0 for none.
+        shapes: single ones.
+        kinds: of these, in turns.
+        lights: points, spots and directional lights, in turns.
+    """
+
+    instances: int = 0
+    groups: int = 0
+    shapes: int = 0
+    kinds: tuple[str, ...] = _KINDS
+    lights: int = 1
+
+    def __str__(self) -> str:
+        parts = []
+        if self.instances:
+            parts.append(f"{self.instances} instances of {self.groups} groups")
+        if self.shapes:
+            parts.append(f"{self.shapes} {self.kinds[0]}s" if len(self.kinds) == 1 else f"{self.shapes} shapes")
+        if self.lights > 1:
+            parts.append(f"{self.lights} lights")
+        return ", ".join(parts)
+
+    def scene(self, seed: int) -> Any:
+        """A new scene (64 x 64 pixels) with shapes and lights in other places for each ``seed``."""
+        place = functools.partial(_place, np.random.default_rng(seed))
+        film = {"type": "hdrfilm", "width": 64, "height": 64, "pixel_format": "rgb", "rfilter": {"type": "box"}}
+        to_world = mi.ScalarTransform4f().look_at([0, -5, 4], [0, 0, 0], [0, 0, 1])
+        parts: dict[str, Any] = {
+            "type": "scene",
+            "floor": {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(3)},
+            "sensor": {"type": "perspective", "fov": 45, "to_world": to_world, "film": film},
+        }
+        for k in range(self.lights):
+            x, y = np.random.default_rng((seed, k)).uniform(-1, 1, 2).tolist()
+            parts[f"light{k}"] = (
+                {"type": "directional", "direction": [0.3 + x, y, -2]},
+                {"type": "point", "position": [x, y, 3]},
+                {"type": "spot", "to_world": mi.ScalarTransform4f().look_at([x, y, 3], [y, x, 0], [0, 1, 0])},
+            )[k % 3]
+        for k in range(self.groups):
+            parts[f"group{k}"] = {"type": "shapegroup", "shape": {"type": _GROUPED[k % len(_GROUPED)]}}
+        for k in range(self.instances):
+            parts[f"instance{k}"] = {
+                "type": "instance",
+                "to_world": place(),
+                "of": {"type": "ref", "id": f"group{k % self.groups}"},
+            }
+        for k in range(self.shapes):
+            parts[f"shape{k}"] = {"type": self.kinds[k % len(self.kinds)], "to_world": place()}
+        return mi.load_dict(parts)
+
+
+def _place(random: np.random.Generator) -> Any:
+    x, y = random.uniform(-2, 2, 2).tolist()
+    return mi.ScalarTransform4f().translate([x, y, 0.2]).scale(0.2)
+
+
+def units(options: BenchOptions) -> list[Unit]:
+    """A unit for each scene."""
+    crowds = [Crowd(**crowd) for crowd in options.what.crowds]
+    return [Unit(str(crowd), functools.partial(_measure, crowd)) for crowd in crowds]
+
+
+def _measure(crowd: Crowd, done: Mapping[str, Any], update: Update) -> dict[str, Any]:
+    update(0, 1, str(crowd))
+    return run_child("bench.first:measure_first", {"crowd": asdict(crowd)}, _SECONDS)
+
+
+def measure_first(crowd: Mapping[str, Any], emit: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
+    """Seconds of first pictures, and of a first backward pass."""
+    made = Crowd(**{**crowd, "kinds": tuple(crowd["kinds"])})
+    methods = {"ours": "shadowmap", "direct": "direct"}
+    seconds: dict[str, list[float]] = {name: [] for name in (*methods, "backward")}
+    for seed in range(1 + _ROUNDS):
+        for name, plugin in methods.items():
+            scene, integrator = made.scene(seed), mi.load_dict({"type": plugin})
+            dr.sync_thread()
+            seconds[name].append(timed(lambda scene=scene, integrator=integrator: mi.render(scene, integrator=integrator, spp=1)))
+            if name == "ours":
+                seconds["backward"].append(timed(lambda scene=scene, integrator=integrator: _derivative(scene, integrator)))
+    # What was not compiled before this process began was in the first of these.
+    return {"uncompiled": {name: values.pop(0) for name, values in seconds.items()}, **compare(seconds, [("ours", "direct")])}
+
+
+def _derivative(scene: Any, integrator: Any) -> Any:
+    """Gradient of the image's sum by the place of the floor."""
+    params, change = mi.traverse(scene), mi.Point3f(0)
+    dr.enable_grad(change)
+    params["floor.to_world"] = mi.Transform4f().translate(change) @ mi.Transform4f(params["floor.to_world"])
+    params.update()
+    dr.backward(dr.sum(mi.render(scene, params, integrator=integrator, spp=1), axis=None))
+    return dr.grad(change)

@@ -52,6 +52,12 @@ def integrator(**options: Any) -> Any:
     return mi.load_dict({"type": "shadowmap", "tessellation": 8, "shadow_map_resolution": 32, **options})
 
 
+@pytest.fixture(autouse=True)
+def calls_through_pointers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As of more shapes than make quick tests."""
+    monkeypatch.setattr(shading_module, "_MANY_SHAPES", 16)
+
+
 def one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in (scene_module, shading_module):
         monkeypatch.setattr(module, "_MANY_SHAPES", 1000)

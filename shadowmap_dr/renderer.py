@@ -23,6 +23,7 @@ from .footprint import Spots, footprint_points
 from .frozen import take_apart
 from .geometry import Geometry
 from .hits import pixel_hits
+from .light_loops import MANY_LIGHTS, Places, in_tables, light_of_table
 from .light_maps import MapPlan, check_sizes, light_visibility, make_maps, plan_maps
 from .lights import AreaLight, Light, SpotLight, SquareSpot
 from .raster import RasterOutput, Topology, antialias, build_topology, outward_faces, parted, visible_triangles
@@ -380,13 +381,15 @@ class Renderer:
         textured = any(light.textured for light in lighting.areas)
         frames = self.data.needs_frames or self.settings.ambient > 0 or textured
         seen, depth, sharpness = self._surface(view, geometry, facets, frames)
-        lights = lighting.lights
-        visible = self._visibilities(lighting, seen, view, depth)
         around = lambda: footprint_points(sensor, (width, height), depth, seen.p_world, seen.n_world, 2)  # noqa: E731
         compat = self.settings.shadow.compat
+        looped, written = self._in_tables(lighting, seen, view, depth, around)
+        lighting = replace(lighting, lights=tuple(lighting.lights[k] for k in written))
+        lights = lighting.lights
+        visible = self._visibilities(lighting, written, seen, view, depth)
         shining = [SquareSpot(light) if compat and isinstance(light, SpotLight) else light for light in lights]
         lighting = replace(lighting, lights=softened(shining, seen.p_world, around))
-        color = self._radiance(seen, lighting, visible, sensor, raster)
+        color = looped + self._radiance(seen, lighting, visible, sensor, raster)
         channels = film_channels(color, seen.active & (self.settings.max_depth != 0), sensor)
         named = collect_aovs(self.settings.aovs, seen, raster, lights, visible)
         if self.settings.antialias:
@@ -407,16 +410,33 @@ class Renderer:
             image = dr.concat([image, mi.TensorXf(interleave(named), shape=(height, width, len(named)))], axis=2)
         return image
 
-    def _visibilities(self, lighting: _Lighting, seen: Surface, view: _View, depth: Any) -> list[Any]:
-        """Of each light, from all pixels."""
-        maps = lighting.maps
-        if maps is None:
-            return [mi.Float(1) for _ in lighting.lights]
+    def _in_tables(
+        self, lighting: _Lighting, seen: Surface, view: _View, depth: Any, around: Callable[[], list[Any]]
+    ) -> tuple[Any, list[int]]:
+        """(radiance of lights of kinds of which there are many, numbers of the other lights)."""
+        every = list(range(len(lighting.lights)))
+        if len(every) < MANY_LIGHTS or self.settings.shadow.compat or self.settings.aovs:
+            return 0, every
+        spots = Spots([seen.p_world], seen.active, 1) if lighting.maps is None else self._spots(seen, view, depth)
+        if spots.copies > 1:  # they are lanes of their own
+            return 0, every
+        tables, written = in_tables(lighting.lights, self.plan)
+        if not tables:
+            return 0, every
+        places, nodes = Places.of(seen.p_world, spots.points, around()), self.data.materials()
+        return sum(light_of_table(seen, places, table, lighting.maps, nodes) for table in tables), written
+
+    def _spots(self, seen: Surface, view: _View, depth: Any) -> Spots:
         size, count = (view.raster.width, view.raster.height), self.settings.look_ups(view.columns)
-        spots = Spots.of(view.sensor, size, depth, seen.p_world, seen.n_world, seen.active, count)
-        return [
-            spots.mean(partial(light_visibility, maps, self.plan, light, index)) for index, light in enumerate(lighting.lights)
-        ]
+        return Spots.of(view.sensor, size, depth, seen.p_world, seen.n_world, seen.active, count)
+
+    def _visibilities(self, lighting: _Lighting, numbers: list[int], seen: Surface, view: _View, depth: Any) -> list[Any]:
+        """Of each light, from all pixels. ``numbers``: of the lights in the plan."""
+        maps = lighting.maps
+        if maps is None or not numbers:
+            return [mi.Float(1) for _ in lighting.lights]
+        spots, lights = self._spots(seen, view, depth), zip(numbers, lighting.lights, strict=True)
+        return [spots.mean(partial(light_visibility, maps, self.plan, light, index)) for index, light in lights]
 
     def _radiance(self, seen: Surface, lighting: _Lighting, visible: list[Any], sensor: Sensor, raster: RasterOutput) -> Any:
         compat = self.settings.shadow.compat

@@ -27,8 +27,8 @@ from .spread import spread
 from .sums import evaluate
 from .tables import LIKE_LANES, copy_of_lane, in_copies
 
-# The BSDFs of fewer shapes are called one by one.
-_MANY_SHAPES = 16
+# The BSDFs of fewer shapes are called one by one: quicker again and again, but their program grows with their number.
+_MANY_SHAPES = 128
 
 
 @dataclass(frozen=True)

@@ -41,6 +41,8 @@ class Frozen:
         call.arguments = arguments
         try:
             key, leaves = take_apart(arguments)
+            # An array that is yet to be worked out would be another input than the same one later.
+            dr.eval([leaf for leaf in leaves if dr.is_array_v(leaf)])
             with uncollected():
                 number, arrays = self._recorded(key, leaves)
         finally:

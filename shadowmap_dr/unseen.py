@@ -13,6 +13,11 @@ import mitsuba as mi
 from .traversal import children, fingerprint, is_attribute
 
 
+# Of so many objects, what there is to read is found out at once. Mitsuba's textures make arrays when they are asked what they have,
+# and recordings of other scenes, too, are made anew when a scene comes to hold others.
+_FEW = 32
+
+
 class Unseen:
     """Values that are parts of recordings like constants, so that these hold for no others.
 
@@ -30,6 +35,8 @@ class Unseen:
         self._known = False
         self._held, self._sized, self._off = [], [], []
         self._names: list[tuple[Any, str]] = []
+        if len(self._nodes) <= _FEW:
+            self._look()
 
     def _look(self) -> None:
         """Find out what there is to read. Most scenes are never recorded, and do without."""
@@ -70,7 +77,7 @@ class UnseenState:
 
     def __init__(self, nodes: Iterable[Any]) -> None:
         self._nodes = tuple(nodes)
-        self._unseen: Unseen | None = None
+        self._unseen = Unseen(self._nodes) if len(self._nodes) <= _FEW else None
         self._states: list[tuple[tuple[Any, ...], int]] = []
 
     def recording_text(self) -> str:

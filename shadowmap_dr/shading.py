@@ -171,13 +171,23 @@ def _plain_colour(data: SceneData, seen: Surface) -> Any:
 
 
 def _cosine_colour(data: SceneData, seen: Surface) -> Any:
-    """``Surface.colour`` of materials with textures: what they return for light along the normal."""
+    """``Surface.colour`` of materials with textures: what they return for light along the normal.
 
-    def colour(seen: Surface) -> Any:
-        side = dr.select(seen.si.wi.z < 0, mi.Float(-1), 1)
-        return seen.evaluate(mi.Vector3f(0, 0, side), seen.active)
+    They are given what textures read, and no more: derivatives keep all of it in memory.
+    """
+    si, width = seen.si, dr.width(seen.shape)
 
-    return evaluate(colour, seen, data.materials(), dr.width(seen.shape))
+    def colour(own: tuple[Any, ...]) -> Any:
+        p, uv, primitive, shape, bsdf, behind, active = own
+        at = dr.zeros(mi.SurfaceInteraction3f, dr.width(active))
+        at.p, at.uv, at.prim_index, at.shape = p, uv, primitive, shape
+        at.n = mi.Normal3f(0, 0, 1)
+        at.sh_frame = mi.Frame3f(mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), mi.Vector3f(0, 0, 1))
+        at.wi = mi.Vector3f(0, 0, dr.select(behind, mi.Float(-1), 1))
+        return mi.UnpolarizedSpectrum(bsdf.eval(mi.BSDFContext(), at, at.wi, active))
+
+    own = (si.p, si.uv, si.prim_index, si.shape, seen.bsdf, si.wi.z < 0, seen.active)
+    return evaluate(colour, own, data.materials(), width)
 
 
 def _parametrisation(geometry: Geometry, flags: _Flags, hits: Hits) -> tuple[Any, Any, Any]:

@@ -21,6 +21,9 @@ from .traversal import parameters
 
 # Up to so many lanes Dr.Jit's own sums are exact enough for single terms.
 _FEW = 1 << 15
+# Threads that sum up in memory of their own are quicker than atomic additions, if there are at most so many numbers, and exact
+# enough for so many lanes with a term each.
+_EXPANDED, _ONE_BY_ONE = 1 << 16, 1 << 16
 
 
 def attached_parameters(nodes: Sequence[Any]) -> list[Any]:
@@ -135,7 +138,10 @@ class _Sum(dr.CustomOp):
     def backward(self) -> None:
         call, tree, gradient = self._call, self._trees[0], self.grad_out()
         size = LIKE_LANES if call.implicit or len(self._trees[1]) > self._owned else self._lanes
-        with _local_sums(bool(call.implicit)):
+        one_by_one = call.count is None and sum(_size(array) for array in call.implicit) <= _EXPANDED
+        if one_by_one:
+            size = min(size, _ONE_BY_ONE)
+        with _local_sums(bool(call.implicit) and not one_by_one):
             # A value that all lanes share, such as the radiance of a constant sky, has one gradient, which is their sum already.
             if size >= self._lanes or self._shared_value:
                 self.set_grad_in("arrays", self._backward(tree, call.zero, gradient, call.active, self._lanes))
@@ -226,6 +232,10 @@ def attached_of(tree: Any, places: tuple[int, ...]) -> list[Any]:
 
 def _total(parts: Sequence[Any]) -> Any:
     return sum(parts[1:], parts[0])
+
+
+def _size(array: Any) -> int:
+    return dr.width(array) * (1 if dr.depth_v(array) <= 1 or dr.is_tensor_v(array) else dr.size_v(type(array)))
 
 
 def _taken(arrays: Sequence[Any]) -> list[Any]:

@@ -12,9 +12,8 @@ import mitsuba as mi
 
 from .traversal import children, fingerprint, is_attribute
 
-
-# Of so many objects, what there is to read is found out at once. Mitsuba's textures make arrays when they are asked what they have,
-# and recordings of other scenes, too, are made anew when a scene comes to hold others.
+# Of so many objects, what there is to read is found out at once. Mitsuba's textures make arrays when they are asked what they
+# have, and recordings of other scenes, too, are made anew when a scene comes to hold others.
 _FEW = 32
 
 

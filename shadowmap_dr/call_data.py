@@ -25,7 +25,7 @@ def rewrite_scalars(nodes: Iterable[Any]) -> None:
     Dr.Jit 1.5 forgets the type of a scalar that was filled with a constant during the recording. Calls through pointers
     (``mi.BSDFPtr``) copy such members of their instances, and a replay copies none of their bytes: it reads whatever was in the
     memory before. A texture that is given new data holds its resolution in such scalars. ``docs/dr-jit-faults`` has the proof.
-    Values and gradients stay as they are.
+    Values stay as they are, and so do numbers through which gradients flow: users have given them before the recording.
 
     Args:
         nodes: objects whose methods are called through pointers, with all that they hold.
@@ -44,14 +44,14 @@ def rewrite_scalars(nodes: Iterable[Any]) -> None:
 
 
 def _copies(indices: Iterable[int]) -> Mapping[int, Any]:
-    """Copies of those variables that are evaluated scalars. The number of a variable has that of its AD variable in front."""
+    """Copies of evaluated scalars without gradients. The number of a variable has that of its AD variable in front."""
     module, types, copies = sys.modules[mi.Float.__module__], _types_now(), {}
-    for index in set(indices):
+    # Not by `dr.grad_enabled`, which is false wherever gradients are suspended.
+    for index in {index for index in indices if index >> 32 == 0}:
         kind = _kind(module, types.get(index & 0xFFFFFFFF))
         array = None if kind is None else dr.detail.update_indices(kind(0), [index])
         if array is not None and len(array) == 1 and array.state == dr.VarState.Evaluated:
-            copy = own_memory(array)
-            copies[index] = dr.replace_grad(copy, array) if dr.grad_enabled(array) else copy
+            copies[index] = own_memory(array)
     return copies
 
 

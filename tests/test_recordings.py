@@ -238,3 +238,31 @@ def test_what_frozen_functions_of_users_take_for_constant_is_named(variant: str)
     after = frozen(scene, mi.Float(1)).numpy()
     np.testing.assert_allclose(after, mi.render(scene, integrator=integrator, spp=1).numpy(), rtol=1e-5, atol=1e-6)
     assert np.abs(after - before).max() > 0.05
+
+
+def test_numbers_of_materials_that_are_set_in_a_recorded_step(variant: str) -> None:
+    """Values and gradients of replays, beside those of the same steps unrecorded."""
+    scene = recording_stress.scene(few=False)
+    params, renderer = mi.traverse(scene), Renderer.from_scene(scene, shadow_map_resolution=32, soft_map_resolution=32)
+    keys = ("box.bsdf.roughness.value", "box.bsdf.base_color.value")
+
+    def step(renderer: Renderer, roughness: Any, colour: Any) -> Any:
+        values = [roughness, colour]
+        dr.enable_grad(values)
+        for key, value in zip(keys, values, strict=True):
+            params[key] = value
+        params.update()
+        image = renderer.render()
+        dr.backward(dr.sum(dr.square(image), axis=None))
+        return dr.detach(image), [dr.grad(value) for value in values]
+
+    frozen = dr.freeze(step)
+    for roughness in (0.3, 0.5, 0.4):
+        found = []
+        for function in (step, frozen):
+            values = dr.opaque(mi.Float, roughness), mi.Color3f(*(dr.opaque(mi.Float, roughness * k) for k in (1, 0.5, 1.5)))
+            image, gradients = function(replace(renderer), *values)
+            found.append([image.numpy(), *(np.array(gradient) for gradient in gradients)])
+        for right, value in zip(*found, strict=True):
+            np.testing.assert_allclose(value, right, rtol=1e-3, atol=1e-4 * np.abs(right).max())
+        assert np.abs(found[0][1]).min() > 0

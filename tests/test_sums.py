@@ -44,6 +44,23 @@ def test_recordings_and_renderers_agree(variant: str, mode: str) -> None:
     assert reverse == pytest.approx(forward, rel=TOLERANCE)
 
 
+@pytest.mark.parametrize(
+    "case",
+    [
+        Sum("sun", "diffuse", f"{FLOOR}.value"),
+        Sum("lamp", "plastic", "floor.bsdf.diffuse_reflectance.value"),
+        Sum("lamp", "plastic", "floor.bsdf.alpha"),
+        Sum("sky", "diffuse", "light.radiance.value"),
+    ],
+    ids=str,
+)
+def test_recordings_leave_single_numbers_attached(variant: str, case: Sum) -> None:
+    """The image is recorded without gradients, before they are asked for: materials must not lose them there."""
+    reverse, forward = both(case, 32, 1, "recorded")
+    assert abs(forward) > 1e-3
+    assert reverse == pytest.approx(forward, rel=TOLERANCE)
+
+
 def test_pytorch(variant: str) -> None:
     torch = pytest.importorskip("torch")
     sdr = pytest.importorskip("shadowmap_dr.torch")

@@ -11,7 +11,7 @@ from shadowmap_dr.experiments.bench.loops import LOOPS, OURS
 SIZE = 24
 # Loops that need all their steps to come below their bar; of the others these are enough.
 _SLOW = {"large steps", "more and more lights", "vertex colours", "remeshing", "cells run again"}
-_STEPS = 16
+_STEPS = 12
 _NEEDS = {"PyTorch": "torch", "large steps": "cholespy", "remeshing": "cholespy"}
 
 

@@ -1,20 +1,19 @@
 """Breaks the renderer on purpose, one way at a time, and checks that a named test notices: ``python tests/mutations.py``.
 
-Each mutation replaces one function of the package while the tests run in a process of their own. A mutation counts as noticed
+Each mutation replaces one function of the package while the tests run, in a process of their own. A mutation counts as noticed
 only if its named tests fail by an assertion, its code was reached, and the same tests pass without it.
-
-This file is also the pytest plug-in that applies a mutation in that process (named by ``SHADOWMAP_MUTATION``).
 """
 
 from __future__ import annotations
 
 import argparse
+import gc
 import json
 import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
@@ -188,91 +187,123 @@ def check_all(
 ) -> list[Verdict]:
     """Run the named tests without any mutation (they must pass), then each mutation's with it (they must fail)."""
     healthy = tuple(dict.fromkeys(test for mutation in mutations for test in mutation.tests))
-    _, outcomes = _run(healthy, None)
-    broken = [test for test in healthy if outcomes.get(test) != "passed"]
-    verdicts = [Verdict("none", healthy, not broken, "all pass" if not broken else f"do not pass: {', '.join(broken)}")]
-    report(verdicts[0])
-    for mutation in mutations:
-        reached, outcomes = _run(mutation.tests, mutation)
-        seen = [outcomes.get(test, "did not run") for test in mutation.tests]
-        noticed = reached > 0 and all(outcome.startswith("AssertionError") for outcome in seen)
-        detail = "; ".join(seen) + ("" if reached else "; the broken function was never called")
-        verdicts.append(Verdict(mutation.name, mutation.tests, noticed, detail))
-        report(verdicts[-1])
+    plan = [("", healthy), *((mutation.name, mutation.tests) for mutation in mutations)]
+    verdicts = []
+    for (_, tests), mutation, (reached, outcomes) in zip(plan, (None, *mutations), _runs(plan), strict=True):
+        seen = [outcomes.get(test, "did not run") for test in tests]
+        if mutation is None:
+            broken = [test for test, outcome in zip(tests, seen, strict=True) if outcome != "passed"]
+            verdict = Verdict("none", tests, not broken, "all pass" if not broken else f"do not pass: {', '.join(broken)}")
+        else:
+            noticed = reached > 0 and all(outcome.startswith("AssertionError") for outcome in seen)
+            detail = "; ".join(seen) + ("" if reached else "; the broken function was never called")
+            verdict = Verdict(mutation.name, tests, noticed, detail)
+        verdicts.append(verdict)
+        report(verdict)
     return verdicts
 
 
-def _run(tests: tuple[str, ...], mutation: Mutation | None) -> tuple[int, dict[str, str]]:
-    """(calls of the broken function, outcome by test: ``passed``, ``skipped`` or the exception in one line)."""
-    with tempfile.TemporaryDirectory() as folder:
-        record = Path(folder) / "record.json"
-        environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTEST_")}
-        environment.update(SHADOWMAP_MUTATION=mutation.name if mutation else "", SHADOWMAP_MUTATION_RECORD=str(record))
-        environment["PYTHONPATH"] = os.pathsep.join([str(TESTS), str(TESTS.parent), environment.get("PYTHONPATH", "")])
-        command = [sys.executable, "-m", "pytest", "-q", "-p", "mutations", "-p", "no:cacheprovider", f"--rootdir={TESTS.parent}"]
-        command += [str(TESTS / test) for test in tests]
-        done = subprocess.run(command, env=environment, cwd=TESTS.parent, capture_output=True, text=True, timeout=600)
-        if not record.exists():
-            raise RuntimeError(f"pytest did not run:\n{done.stdout[-2000:]}{done.stderr[-2000:]}")
-        content = json.loads(record.read_text())
-        return content["calls"], content["outcomes"]
+def _runs(plan: list[tuple[str, tuple[str, ...]]]) -> Iterator[tuple[int, dict[str, str]]]:
+    """For each mutation (its name, or none) and tests: (calls of the broken function, outcome by test).
+
+    An outcome is ``passed``, ``skipped`` or the exception in one line. All run in one process, which loads its libraries once.
+    """
+    environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTEST_")}
+    environment["PYTHONPATH"] = os.pathsep.join([str(TESTS), str(TESTS.parent), environment.get("PYTHONPATH", "")])
+    with tempfile.TemporaryFile("w+") as errors, subprocess.Popen(
+        [sys.executable, __file__, "--worker"],
+        env=environment, cwd=TESTS.parent, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, text=True,
+    ) as worker:  # fmt: skip
+        worker.stdin.write(json.dumps(plan))
+        worker.stdin.close()
+        for name, _ in plan:
+            line = next((line for line in worker.stdout if line.startswith(_MARK)), None)
+            if line is None:
+                errors.seek(0)
+                raise RuntimeError(f"pytest did not run with '{name or 'none'}':\n{errors.read()[-2000:]}")
+            yield tuple(json.loads(line.removeprefix(_MARK)))
 
 
-# The plug-in, in the process that runs the tests.
+# In the process that runs the tests. Its output has other lines, too.
 
-_calls = 0
-_outcomes: dict[str, str] = {}
-
-
-def pytest_configure() -> None:
-    name = os.environ.get("SHADOWMAP_MUTATION")
-    if name:
-        _apply(next(mutation for mutation in MUTATIONS if mutation.name == name))
+_MARK = "@mutation "
 
 
-def _apply(mutation: Mutation) -> None:
-    import shadowmap_dr.renderer  # noqa: F401  (everything a rendering calls is loaded now)
+class _Recorder:
+    """A plug-in of pytest: what became of the tests, and how often a broken function was called."""
 
-    owner: Any = sys.modules[f"shadowmap_dr.{mutation.module}"]
-    *classes, attribute = mutation.function.split(".")
-    for name in classes:
-        owner = getattr(owner, name)
-    good = getattr(owner, attribute)
-    bad = mutation.breaks(good)
+    def __init__(self) -> None:
+        self.calls = 0
+        self.outcomes: dict[str, str] = {}
 
-    def counted(*arguments: Any, **options: Any) -> Any:
-        global _calls
-        _calls += 1
-        return bad(*arguments, **options)
+    def apply(self, mutation: Mutation) -> Callable[[], None]:
+        """Break the package. Returns what mends it."""
+        import shadowmap_dr.renderer  # noqa: F401  (everything a rendering calls is loaded now)
 
-    setattr(owner, attribute, counted)
-    if mutation.only_there:
-        return
-    # Functions are imported by name: replace them wherever they are known.
-    for module in [m for key, m in sys.modules.items() if key.startswith("shadowmap_dr") and isinstance(m, ModuleType)]:
-        for key in [key for key, value in vars(module).items() if value is good]:
-            setattr(module, key, counted)
+        owner: Any = sys.modules[f"shadowmap_dr.{mutation.module}"]
+        *classes, attribute = mutation.function.split(".")
+        for name in classes:
+            owner = getattr(owner, name)
+        good = getattr(owner, attribute)
+        bad = mutation.breaks(good)
+
+        def counted(*arguments: Any, **options: Any) -> Any:
+            self.calls += 1
+            return bad(*arguments, **options)
+
+        places = [(owner, attribute)]
+        if not mutation.only_there:
+            # Functions are imported by name: replace them wherever they are known.
+            for module in [m for key, m in sys.modules.items() if key.startswith("shadowmap_dr") and isinstance(m, ModuleType)]:
+                places += [(module, key) for key, value in vars(module).items() if value is good]
+        for place, key in places:
+            setattr(place, key, counted)
+
+        def mend() -> None:
+            for place, key in places:
+                setattr(place, key, good)
+
+        return mend
+
+    @pytest.hookimpl(hookwrapper=True)
+    def pytest_runtest_makereport(self, item: pytest.Item, call: pytest.CallInfo) -> Any:
+        outcome = (yield).get_result()
+        name = item.nodeid.removeprefix("tests/")
+        if call.excinfo is not None:
+            reason = " ".join(str(call.excinfo.value).split("\n")[:1])
+            self.outcomes[name] = "skipped" if outcome.skipped else f"{call.excinfo.type.__name__}: {reason}"
+        elif call.when == "call":
+            self.outcomes[name] = outcome.outcome
 
 
-@pytest.hookimpl(hookwrapper=True)
-def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo) -> Any:
-    outcome = (yield).get_result()
-    name = item.nodeid.removeprefix("tests/")
-    if call.excinfo is not None:
-        reason = " ".join(str(call.excinfo.value).split("\n")[:1])
-        _outcomes[name] = "skipped" if outcome.skipped else f"{call.excinfo.type.__name__}: {reason}"
-    elif call.when == "call":
-        _outcomes[name] = outcome.outcome
+def _work() -> None:
+    """Run all tests of a plan (standard input) and print a line for each mutation."""
+    known = {mutation.name: mutation for mutation in MUTATIONS}
+    for name, tests in json.load(sys.stdin):
+        recorder = _Recorder()
+        mend = recorder.apply(known[name]) if name else lambda: None
+        options = ["-q", "-p", "no:cacheprovider", f"--rootdir={TESTS.parent}"]
+        pytest.main([*options, *(str(TESTS / test) for test in tests)], plugins=[recorder])
+        mend()
+        _forget_tests()
+        print(f"\n{_MARK}{json.dumps([recorder.calls, recorder.outcomes])}", flush=True)
 
 
-def pytest_sessionfinish() -> None:
-    record = os.environ.get("SHADOWMAP_MUTATION_RECORD")
-    if record:
-        Path(record).write_text(json.dumps({"calls": _calls, "outcomes": _outcomes}))
+def _forget_tests() -> None:
+    """Import test modules anew: they keep images that they have rendered."""
+    for name, module in list(sys.modules.items()):
+        file = getattr(module, "__file__", None)
+        if file and Path(file).is_relative_to(TESTS) and name not in ("__main__", "quick_kernels"):
+            del sys.modules[name]
+    gc.collect()
 
 
 def main() -> None:
-    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
+    if parser.parse_args().worker:
+        _work()
+        return
 
     def report(verdict: Verdict) -> None:
         mark = "ok    " if verdict.noticed else "MISSED"

@@ -21,9 +21,9 @@ from .traversal import parameters
 
 # Up to so many lanes Dr.Jit's own sums are exact enough for single terms.
 _FEW = 1 << 15
-# Threads that sum up in memory of their own are quicker than atomic additions, if there are at most so many numbers, and exact
-# enough for so many lanes with a term each.
-_EXPANDED, _ONE_BY_ONE = 1 << 16, 1 << 16
+# Threads that sum up in memory of their own are quicker than atomic additions, if there are at most so many numbers. So many
+# lanes with a term each lose less than 1e-5 there, whether they share one texel or many.
+_EXPANDED, _ONE_BY_ONE = 1 << 16, 1 << 20
 
 
 def attached_parameters(nodes: Sequence[Any]) -> list[Any]:
@@ -137,10 +137,9 @@ class _Sum(dr.CustomOp):
 
     def backward(self) -> None:
         call, tree, gradient = self._call, self._trees[0], self.grad_out()
-        size = LIKE_LANES if call.implicit or len(self._trees[1]) > self._owned else self._lanes
         one_by_one = call.count is None and sum(_size(array) for array in call.implicit) <= _EXPANDED
-        if one_by_one:
-            size = min(size, _ONE_BY_ONE)
+        sliced = call.implicit or len(self._trees[1]) > self._owned
+        size = self._lanes if not sliced else _ONE_BY_ONE if one_by_one else LIKE_LANES
         with _local_sums(bool(call.implicit) and not one_by_one):
             # A value that all lanes share, such as the radiance of a constant sky, has one gradient, which is their sum already.
             if size >= self._lanes or self._shared_value:

@@ -181,7 +181,7 @@ def run_child(function: str, arguments: Mapping[str, Any], seconds: float) -> di
     Returns:
         The result. If the process failed, the last preliminary one with the entry `failed`, a line that says why.
     """
-    package = str(Path(__file__).resolve().parent.parent.parent)
+    package = str(Path(__file__).resolve().parents[3])
     paths = filter(None, (package, os.environ.get("PYTHONPATH")))
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
     task = {"function": function, "arguments": arguments, "variant": mi.variant(), "threads": dr.thread_count()}

@@ -55,27 +55,15 @@ class Parts:
         return np.cumsum(self.face_counts) - self.face_counts
 
 
-def describe(name: str, source: ShapeSource, faces: np.ndarray, vertex_start: int, face_start: int) -> ShapeInfo:
-    """Validate the buffers of a shape, with ``faces`` (F, 3), and describe it; it will start at the given vertex and face."""
-    own = source.own()
-    points = own.positions.numpy().reshape(-1, 3)
-    normals = np.zeros_like(points) if own.normals is None else own.normals.numpy().reshape(-1, 3)
-    parts = Parts(points, normals, faces, np.array([len(points)]), np.array([len(faces)]))
-    held = own.normals is not None, own.texcoords is not None
-    return describe_all([name], [source], [held], parts, vertex_start, face_start)[0]
-
-
 def describe_all(
     names: Sequence[str],
     sources: Sequence[ShapeSource],
     held: Sequence[tuple[bool, bool]],
     parts: Parts,
-    vertex_start: int = 0,
-    face_start: int = 0,
 ) -> tuple[ShapeInfo, ...]:
     """Validate the buffers of all shapes and describe them.
 
-    ``held``: which of them have (normals, texture coordinates); ``vertex_start``, ``face_start``: where the first one will start.
+    ``held``: which of them have (normals, texture coordinates).
 
     Raises:
         ShadowmapError: a mesh is broken.
@@ -107,9 +95,9 @@ def describe_all(
             ShapeInfo(
                 name=name,
                 plugin=kind,
-                vertex_start=vertex_start + first_vertex,
+                vertex_start=first_vertex,
                 vertex_count=vertices,
-                face_start=face_start + first_face,
+                face_start=first_face,
                 face_count=faces,
                 has_normals=normals,
                 has_texcoords=texcoords,

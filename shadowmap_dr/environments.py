@@ -99,6 +99,16 @@ class SunSky(Environment):
         return dr.normalize(mi.Vector3f(parameters(self.emitter)["sun_direction"]))
 
 
+@dataclass(frozen=True)
+class UniformRadiance:
+    """Constant radiance from all directions, beside the scene's own environment."""
+
+    value: float
+
+    def radiance(self, direction: Any, active: Any = True) -> Any:
+        return dr.select(active, mi.UnpolarizedSpectrum(self.value), 0)
+
+
 def environment_of(emitter: Any, name: str) -> Environment:
     """Record of a ``mi.Emitter`` that is one of ``ENVIRONMENTS``."""
     return (SunSky if emitter.class_name() == SUNSKY else Environment)(name, emitter)

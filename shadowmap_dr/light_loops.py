@@ -5,7 +5,7 @@ Written out one after the other, forty lights and their derivatives make a progr
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
 from typing import Any
@@ -102,6 +102,27 @@ def in_tables(lights: Sequence[Light], plan: MapPlan) -> tuple[list[LightTable],
     ]
     taken = {k for members in many.values() for k in members}
     return tables, [k for k in range(len(lights)) if k not in taken]
+
+
+def many_lights(
+    seen: Surface,
+    lights: Sequence[Light],
+    plan: MapPlan,
+    maps: ShadowMaps | None,
+    spots: Sequence[Any],
+    around: Callable[[], Sequence[Any]],
+    nodes: Sequence[Any],
+) -> tuple[Any, list[int]]:
+    """(radiance towards the camera of lights of kinds of which there are many, the numbers of the other lights).
+
+    ``spots``: points (Point3f (N,) each) where visibility is looked up; ``around``: makes those half way to the pixel's corners.
+    For the other arguments see :func:`light_of_table`. Attached likewise.
+    """
+    tables, others = in_tables(lights, plan)
+    if not tables:
+        return 0, others
+    places = Places.of(seen.p_world, spots, around())
+    return sum(light_of_table(seen, places, table, maps, nodes) for table in tables), others
 
 
 def light_of_table(seen: Surface, places: Places, table: LightTable, maps: ShadowMaps | None, nodes: Sequence[Any]) -> Any:

@@ -15,7 +15,9 @@ from .aovs import collect_aovs
 from .beams import softened
 from .call_data import rewrite_scalars
 from .camera_pass import camera_clip, least_gap, seen_points, within_far_plane, without_shapes
+from .camera_view import CameraView, GBuffer
 from .creases import Creases
+from .environments import UniformRadiance
 from .errors import ShadowmapError
 from .facets import facet_normals, flat_faces, mean_normals, soften_facets
 from .film import Margin, develop, film_channels, interleave, sample_grid, sample_windows
@@ -23,11 +25,11 @@ from .footprint import Spots, footprint_points
 from .frozen import take_apart
 from .geometry import Geometry
 from .hits import pixel_hits
-from .light_loops import MANY_LIGHTS, Places, in_tables, light_of_table
+from .light_loops import MANY_LIGHTS, many_lights
 from .light_maps import MapPlan, check_sizes, light_visibility, make_maps, plan_maps
 from .lights import AreaLight, Light, SpotLight, SquareSpot
 from .raster import RasterOutput, Topology, antialias, build_topology, outward_faces, parted, visible_triangles
-from .raster.crossings import Crossings, find_crossings
+from .raster.crossings import find_crossings
 from .render_settings import RenderSettings
 from .scene import SceneData, load, refresh
 from .sensors import Sensor
@@ -259,7 +261,7 @@ class Renderer:
         return tuple((replacements or {}).get(light.name, light) for light in lights)
 
     def _lighting(
-        self, views: list[_View], geometry: Geometry, topology: Topology, replacements: Mapping[str, Any] | None
+        self, views: list[CameraView], geometry: Geometry, topology: Topology, replacements: Mapping[str, Any] | None
     ) -> _Lighting:
         """All lights and their shadow maps."""
         data, settings = self.data, self.settings
@@ -281,7 +283,7 @@ class Renderer:
                 self.soft_frusta = soft_maps.frusta
         return _Lighting(lights, maps, areas, samples, soft_maps)
 
-    def _seen(self, views: list[_View], geometry: Geometry) -> tuple[Any, Any]:
+    def _seen(self, views: list[CameraView], geometry: Geometry) -> tuple[Any, Any]:
         """Points on what the cameras see, and which of them there are."""
         found = [seen_points(view.sensor, view.raster, geometry) for view in views]
         if len(found) == 1:
@@ -299,7 +301,7 @@ class Renderer:
 
         return transparent
 
-    def _view(self, sensor: Sensor, geometry: Geometry, topology: Topology, factor: int) -> _View:
+    def _view(self, sensor: Sensor, geometry: Geometry, topology: Topology, factor: int) -> CameraView:
         clip = camera_clip(sensor, geometry)
         if self._hidden():
             clip = without_shapes(clip, geometry, self._hidden())
@@ -307,7 +309,7 @@ class Renderer:
         size = (sensor.height * factor, sensor.width * factor)
         transparent = self._transparent(geometry, sensor)
         raster = visible_triangles(clip, geometry.faces, size, transparent=transparent)
-        return _View(sensor, factor, clip, raster, topology)
+        return CameraView(sensor, factor, clip, raster, topology)
 
     def _hidden(self) -> list[int]:
         """Shapes that cameras do not see."""
@@ -321,7 +323,7 @@ class Renderer:
             casting = parted(casting, points, shape)
         return parted(self.topology, points, shape, hidden) if hidden else casting, casting
 
-    def _surface(self, view: _View, geometry: Geometry, facets: Any, frames: bool) -> tuple[Surface, Any, Any]:
+    def _surface(self, view: CameraView, geometry: Geometry, facets: Any, frames: bool) -> tuple[Surface, Any, Any]:
         """(what a camera sees, its depth as ``Hits.depth``, how much edges between facets still show or None for all)."""
         sensor, raster = view.sensor, view.raster
         hits = pixel_hits(geometry, sensor, raster.triangle, (raster.width, raster.height))
@@ -375,7 +377,7 @@ class Renderer:
             return {}
         return {"creases": self.creases.now(geometry), "folds": self.creases.folds_of(facets and facets[0])}
 
-    def _camera_image(self, view: _View, lighting: _Lighting, geometry: Geometry, facets: Any, creases: Any) -> Any:
+    def _camera_image(self, view: CameraView, lighting: _Lighting, geometry: Geometry, facets: Any, creases: Any) -> Any:
         sensor, raster = view.sensor, view.raster
         height, width = raster.height, raster.width
         textured = any(light.textured for light in lighting.areas)
@@ -411,7 +413,7 @@ class Renderer:
         return image
 
     def _in_tables(
-        self, lighting: _Lighting, seen: Surface, view: _View, depth: Any, around: Callable[[], list[Any]]
+        self, lighting: _Lighting, seen: Surface, view: CameraView, depth: Any, around: Callable[[], list[Any]]
     ) -> tuple[Any, list[int]]:
         """(radiance of lights of kinds of which there are many, numbers of the other lights)."""
         every = list(range(len(lighting.lights)))
@@ -420,17 +422,13 @@ class Renderer:
         spots = Spots([seen.p_world], seen.active, 1) if lighting.maps is None else self._spots(seen, view, depth)
         if spots.copies > 1:  # they are lanes of their own
             return 0, every
-        tables, written = in_tables(lighting.lights, self.plan)
-        if not tables:
-            return 0, every
-        places, nodes = Places.of(seen.p_world, spots.points, around()), self.data.materials()
-        return sum(light_of_table(seen, places, table, lighting.maps, nodes) for table in tables), written
+        return many_lights(seen, lighting.lights, self.plan, lighting.maps, spots.points, around, self.data.materials())
 
-    def _spots(self, seen: Surface, view: _View, depth: Any) -> Spots:
+    def _spots(self, seen: Surface, view: CameraView, depth: Any) -> Spots:
         size, count = (view.raster.width, view.raster.height), self.settings.look_ups(view.columns)
         return Spots.of(view.sensor, size, depth, seen.p_world, seen.n_world, seen.active, count)
 
-    def _visibilities(self, lighting: _Lighting, numbers: list[int], seen: Surface, view: _View, depth: Any) -> list[Any]:
+    def _visibilities(self, lighting: _Lighting, numbers: list[int], seen: Surface, view: CameraView, depth: Any) -> list[Any]:
         """Of each light, from all pixels. ``numbers``: of the lights in the plan."""
         maps = lighting.maps
         if maps is None or not numbers:
@@ -457,26 +455,7 @@ class Renderer:
         return color
 
     def _uniform_ambient(self) -> tuple[Any, ...]:
-        return (_Uniform(self.settings.ambient),) if self.settings.ambient > 0 and self.settings.lit else ()
-
-
-@dataclass(frozen=True)
-class GBuffer:
-    """What a camera sees, H * W pixels, row-major.
-
-    Attributes:
-        sensor: the camera.
-        surface: what each pixel sees.
-        points: where visibility is looked up, all over the pixel (list of Point3f, H * W each); a pixel's is their mean.
-        crossings: how pixels mix, None without anti-aliasing.
-        seen: points all over what is seen (Point3f, world space) and a mask of those that there are.
-    """
-
-    sensor: Sensor
-    surface: Surface
-    points: list[Any]
-    crossings: Crossings | None
-    seen: tuple[Any, Any]
+        return (UniformRadiance(self.settings.ambient),) if self.settings.ambient > 0 and self.settings.lit else ()
 
 
 @dataclass(frozen=True)
@@ -492,35 +471,6 @@ class _Lighting:
     def for_points(self, count: int) -> _Lighting:
         """The same for look-ups by so many points at once (:meth:`~shadowmap_dr.shadow.ShadowMaps.for_points`)."""
         return self if self.maps is None else replace(self, maps=self.maps.for_points(count))
-
-
-@dataclass(frozen=True)
-class _View:
-    """One camera's visibility: clip-space vertices and what each sample sees, ``factor`` x ``factor`` samples a pixel.
-
-    ``topology``: edges of the shapes that it sees, where they are now.
-    """
-
-    sensor: Sensor
-    factor: int
-    clip: Any
-    raster: RasterOutput
-    topology: Topology
-
-    @property
-    def columns(self) -> int:
-        """Samples across the camera's whole picture, whatever part of it is rendered."""
-        return self.sensor.film_size[0] * self.factor
-
-
-@dataclass(frozen=True)
-class _Uniform:
-    """Constant radiance from all directions, beside the scene's own environment."""
-
-    value: float
-
-    def radiance(self, direction: Any, active: Any = True) -> Any:
-        return dr.select(active, mi.UnpolarizedSpectrum(self.value), 0)
 
 
 def _plan_soft(data: SceneData, settings: RenderSettings) -> tuple[SoftPlan, ...]:

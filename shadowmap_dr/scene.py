@@ -189,7 +189,8 @@ def refresh(data: SceneData, sensors: tuple[Any, ...] | None = None) -> SceneDat
 
     ``sensors``: of Mitsuba, in place of all of the scene's, for whoever needs but one of many.
     Values are attached where the scene's parameters are. Topology must be that of ``load``; BSDFs need no refresh, since they
-    are always evaluated by Mitsuba itself. Nothing is read back to the host.
+    are always evaluated by Mitsuba itself. With few shapes nothing is read back to the host. With many, vertices and
+    transformations without gradients are read back when they have been given other values.
     """
     vertices = _vertices(data)
     # Not an empty array: one among the arguments of a frozen function ends the process (Dr.Jit 1.5).

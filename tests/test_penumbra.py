@@ -33,12 +33,12 @@ def image(of: Any, **options: Any) -> np.ndarray:
     return np.array(mi.render(of, integrator=mi.load_dict({"type": "shadowmap", "shadow_map_resolution": 256, **options}), spp=4))
 
 
-@pytest.mark.parametrize("lamp", [0.1, 0.5, 0.8])
+@pytest.mark.parametrize("lamp", [0.1, 0.4, 0.8])
 def test_penumbra_is_as_wide_as_that_of_samples(variant: str, lamp: float) -> None:
     """The larger the light, the wider: one shadow map agrees with Mitsuba much better than no shadows or hard ones."""
     tested = scene(lamp)
-    # At 256 samples noise was half of the error of hard shadows.
-    expected = np.array(mi.render(tested, integrator=mi.load_dict({"type": "direct"}), spp=4096))
+    # With 256 samples noise was half of the error of hard shadows.
+    expected = np.array(mi.render(tested, integrator=mi.load_dict({"type": "direct"}), spp=16384))
 
     def error(**options: Any) -> float:
         return float(np.sqrt(((image(tested, **options) - expected) ** 2).mean()) / expected.mean())

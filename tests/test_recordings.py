@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -168,8 +169,13 @@ def test_only_one_thread_waits_for_drjit(variant: str, monkeypatch: pytest.Monke
 
     original, turns = bridge.to_torch, []
 
+    def free() -> bool:
+        """Whether another thread could have its turn now."""
+        with ThreadPoolExecutor(1) as other:
+            return other.submit(lambda: bridge._TURN.acquire(blocking=False) and bridge._TURN.release() is None).result()
+
     def to_torch(array: Any) -> Any:
-        turns.append(bridge._TURN._is_owned())  # type: ignore[attr-defined]
+        turns.append(not free())
         return original(array)
 
     for module in (bridge, render):

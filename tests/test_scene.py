@@ -12,7 +12,7 @@ import pytest
 
 from shadowmap_dr import ShadowmapError, assets
 from shadowmap_dr import scene as scene_module
-from shadowmap_dr.descriptions import describe
+from shadowmap_dr.descriptions import Parts, describe_all
 from shadowmap_dr.scene import load, refresh
 from shadowmap_dr.shading import surface
 from shadowmap_dr.sources import MeshSource
@@ -223,10 +223,16 @@ def test_broken_meshes_are_named(variant: str) -> None:
 def test_faces_out_of_range_and_empty_meshes_are_named(variant: str) -> None:
     """On the buffers themselves: Mitsuba would read beyond the end of its own before one could load such a mesh."""
     source = MeshSource(triangle_mesh([0, 0, 0, 1, 0, 0, 0, 1, 0], [0, 1, 2]), None)
+    points = source.own().positions.numpy().reshape(-1, 3)
+
+    def describe(faces: np.ndarray) -> None:
+        parts = Parts(points, np.zeros_like(points), faces, np.array([len(points)]), np.array([len(faces)]))
+        describe_all(["broken"], [source], [(False, False)], parts)
+
     with pytest.raises(ShadowmapError, match="Face 1 of shape 'broken' refers to vertex 3.* 3 vertices"):
-        describe("broken", source, np.array([[0, 1, 2], [0, 1, 3]], np.uint32), 0, 0)
+        describe(np.array([[0, 1, 2], [0, 1, 3]], np.uint32))
     with pytest.raises(ShadowmapError, match="'broken' is an empty mesh"):
-        describe("broken", source, np.zeros((0, 3), np.uint32), 0, 0)
+        describe(np.zeros((0, 3), np.uint32))
 
 
 def test_nothing_to_render_is_refused(variant: str) -> None:

@@ -105,3 +105,11 @@ def test_small_run(variant: str, tmp_path: Path) -> None:
 def test_bad_options_are_named(change: dict[str, object], word: str) -> None:
     with pytest.raises(ShadowmapError, match=word):
         SoftOptions(**change)
+
+
+def test_samples_of_equal_error() -> None:
+    """An error of zero asked for more samples than Mitsuba takes, and ended the command."""
+    assert soft.equal_error_samples(0.02, 0.5, 96 * 96) == 625
+    assert soft.equal_error_samples(0.0, 0.5, 96 * 96) == soft.equal_error_samples(0.005, 0.5, 96 * 96) == 10_000
+    assert soft.equal_error_samples(0.5, 0.1, 96 * 96) == 1
+    assert soft.equal_error_samples(0.0, 1e6, 512 * 512) * 512 * 512 < 2**32

@@ -217,13 +217,18 @@ def large_steps(integrator: dict[str, Any], size: int) -> Iterator[float]:
     opt["u"] = smooth.to_differential(dr.ravel(moved))
     step = 0
     while True:
-        params[name] = smooth.from_differential(opt["u"])
-        params.update()
-        loss = dr.mean(dr.square(mi.render(scene, params, spp=_SPP, seed=step) - reference), axis=None)
-        dr.backward(loss)
-        opt.step()
+        yield _smooth_step(scene, params, name, smooth, opt, reference, step)
         step += 1
-        yield float(loss.array[0]) ** 0.5
+
+
+def _smooth_step(scene: Any, params: Any, name: str, smooth: Any, opt: Any, reference: Any, step: int) -> float:
+    """A step of the variable ``u`` of vertices (`mi.ad.LargeSteps`). The image's RMSE before it."""
+    params[name] = smooth.from_differential(opt["u"])
+    params.update()
+    loss = dr.mean(dr.square(mi.render(scene, params, spp=_SPP, seed=step) - reference), axis=None)
+    dr.backward(loss)
+    opt.step()
+    return float(loss.array[0]) ** 0.5
 
 
 def remeshing(integrator: dict[str, Any], size: int) -> Iterator[float]:
@@ -240,13 +245,8 @@ def remeshing(integrator: dict[str, Any], size: int) -> Iterator[float]:
         opt = mi.ad.Adam(lr=0.02, uniform=True)
         opt["u"] = smooth.to_differential(params[name])
         for _ in range(10):
-            params[name] = smooth.from_differential(opt["u"])
-            params.update()
-            loss = dr.mean(dr.square(mi.render(scene, params, spp=_SPP, seed=step) - reference), axis=None)
-            dr.backward(loss)
-            opt.step()
+            yield _smooth_step(scene, params, name, smooth, opt, reference, step)
             step += 1
-            yield float(loss.array[0]) ** 0.5
         vertices = np.array(params[name]).reshape(-1, 3)
         if len(faces) < 2000:
             vertices, faces = trimesh.remesh.subdivide(vertices, faces)

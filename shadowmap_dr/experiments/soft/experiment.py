@@ -26,6 +26,8 @@ from . import scenes as soft_scenes
 BAR, BAR_SAMPLES = 0.02, (64, 128)
 # Distances from the camera whose second difference, relative to themselves, is larger lie on either side of an outline.
 _JUMP = 0.01
+# Errors below this are not told from none (relative to the mean of the image); samples of one image that Mitsuba takes at once.
+_RESOLVED, _MOST_SAMPLES = 5e-3, (1 << 32) - 1
 # Seconds and renderings at most that a time is measured for.
 _TIMED_SECONDS, _TIMED_ROUNDS = 10.0, 9
 
@@ -231,11 +233,21 @@ def counted_pixels(scene: Any) -> Mask:
     return surface & ~grown
 
 
+def equal_error_samples(error: float, noise: float, pixels: int) -> int:
+    """Samples per pixel with which path tracing has an error, if it is ``noise`` with one.
+
+    In favour of path tracing an error that the references cannot tell from none counts as `_RESOLVED`, and images of more samples
+    than Mitsuba takes at once count as ones of so many.
+    """
+    wanted = math.ceil((noise / max(error, _RESOLVED)) ** 2)
+    return min(max(1, wanted), _MOST_SAMPLES // pixels)
+
+
 def _times(scene: Any, errors: list[dict[str, Any]], noise: float, options: SoftOptions) -> dict[str, Any]:
     """Seconds of our image with the most samples, and of a path-traced one with the same error."""
     best = errors[-1]
-    # An error below the references' own noise counts as a tenth of a percent, in favour of the path tracer.
-    spp = max(1, math.ceil((noise / max(best["error"], 1e-3)) ** 2))
+    width, height = (int(side) for side in scene.sensors()[0].film().crop_size())
+    spp = equal_error_samples(best["error"], noise, width * height)
     renderer = make_renderer(scene, tuple(best["samples"]), options.map_resolution)
     render = dr.freeze(lambda spp, renderer: renderer.render(spp=spp).array)
     plugin = mi.load_dict({"type": "direct"})

@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .geometry import normalize_or
+from .gpu import looked_up
 from .spread import spread
 from .sums import evaluate
 
@@ -264,7 +265,11 @@ def picture(texture: Any, uv: Any, active: Any) -> Any:
     """Colour of a texture at texture coordinates (Point2f). Attached to both."""
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(uv))
     si.uv = uv
-    return evaluate(lambda at: mi.UnpolarizedSpectrum(texture.eval(*at)), (si, mi.Bool(active)), [texture], dr.width(uv))
+
+    def colour(at: tuple[Any, Any]) -> Any:
+        return looked_up(lambda *where: mi.UnpolarizedSpectrum(texture.eval(*where)), *at)
+
+    return evaluate(colour, (si, mi.Bool(active)), [texture], dr.width(uv))
 
 
 def translation(to_world: Any) -> Any:

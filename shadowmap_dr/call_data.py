@@ -12,9 +12,10 @@ import mitsuba as mi
 
 from .raster._memory import own_memory
 
-# Types in the table of Dr.Jit's variables, by the name that is printed, and in a module such as ``drjit.llvm.ad``.
+# Types in the table of Dr.Jit's variables, by the name that is printed, and in a module such as ``drjit.llvm.ad``. Unsigned
+# 64-bit integers are not among them: they are handles of a GPU's textures, which may not be replaced.
 _TYPES = {
-    "bool": "Bool", "i8": "Int8", "u8": "UInt8", "i32": "Int", "u32": "UInt", "i64": "Int64", "u64": "UInt64",
+    "bool": "Bool", "i8": "Int8", "u8": "UInt8", "i32": "Int", "u32": "UInt", "i64": "Int64",
     "f16": "Float16", "f32": "Float", "f64": "Float64",
 }  # fmt: skip
 

@@ -17,6 +17,7 @@ import mitsuba as mi
 from .aovs import aov_names
 from .errors import ShadowmapError
 from .film import put_into_film
+from .gpu import keep_registers
 from .integrator_options import PLUGIN, Options
 from .nesting import Nesting
 from .pending import Inputs, Waiting, backward
@@ -167,6 +168,7 @@ def make_class() -> type:
         def render_forward(self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> Any:
             """Derivative of the image (H, W, C) in the direction of the gradients that the parameters hold."""
             Waiting.forget_all()
+            keep_registers()
             with dr.resume_grad():
                 image = self.shell.image(scene, sensor_of(scene, sensor), spp)
                 if not dr.grad_enabled(image):

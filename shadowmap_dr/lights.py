@@ -17,6 +17,7 @@ import mitsuba as mi
 from .beams import Beam, Outlined, Projector, beam_of, picture, projector_of, share_inside, towards
 from .environments import ENVIRONMENTS, SUNSKY, Environment, SunSky, environment_of
 from .errors import ShadowmapError
+from .gpu import looked_up
 from .shadow.camera import unit
 from .traversal import children, parameters, varies
 
@@ -168,7 +169,7 @@ class AreaLight:
 
     def seen(self, si: Any, active: Any) -> Any:
         """Radiance (colour) of surface points towards ``si.wi``."""
-        return mi.UnpolarizedSpectrum(self.emitter.eval(si, active)) * self.scale
+        return looked_up(lambda *where: mi.UnpolarizedSpectrum(self.emitter.eval(*where)), si, active) * self.scale
 
 
 Light = DirectionalLight | PointLight | SpotLight | Projector | Beam

@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 
 import drjit as dr
 
+from .gpu import keep_registers
 from .records import attached_arrays, map_arrays, with_arrays
 from .scene import SceneData
 from .traversal import parameters
@@ -154,6 +155,7 @@ def backward(image: Any, gradient: Any) -> None:
 def _traverse(end: Any) -> None:
     """Backwards from what has gradients. The graph stays: another image may hang on the same parts of it, such as those that
     Mitsuba's shapes hold of what their vertices were computed from."""
+    keep_registers()
     dr.enqueue(dr.ADMode.Backward, end)
     dr.traverse(dr.ADMode.Backward, flags=dr.ADFlag.ClearVertices)
 

@@ -24,6 +24,7 @@ from .film import Margin, develop, film_channels, interleave, sample_grid, sampl
 from .footprint import Spots, footprint_points
 from .frozen import take_apart
 from .geometry import Geometry
+from .gpu import keep_registers
 from .hits import pixel_hits
 from .light_loops import MANY_LIGHTS, many_lights
 from .light_maps import MapPlan, check_sizes, light_visibility, make_maps, plan_maps
@@ -216,6 +217,7 @@ class Renderer:
             Colour and alpha have passed through the film's reconstruction filter.
             Attached to vertices, lights, cameras, and the BSDFs and textures of the scene.
         """
+        keep_registers()
         cameras, geometry = self.data.cameras(sensor), self.data.geometry
         rewrite_scalars(self.data.materials())
         if vertex_positions is not None:

@@ -25,12 +25,10 @@ from .raster._memory import device_array
 from .sensors import Sensor, sensors_of
 from .soup import Soup, Vertices
 from .sources import CurveSource, ShapeSource, source_of
-from .traversal import children, is_cosine, is_plain
+from .traversal import children, held_arrays, is_cosine, is_plain
 
 # Vertices of fewer shapes are put together anew for each image.
 _MANY_SHAPES = 16
-# Unit directions of rays that ask instances for their shapes. A cylinder does not answer one that lies in its axis.
-_PROBING = ((0.48, 0.36, 0.8), (-0.6, 0.64, 0.48))
 
 
 @dataclass(frozen=True)
@@ -239,53 +237,26 @@ def _unique(name: str, taken: set[str]) -> str:
 class _Groups:
     """The shape groups of a scene.
 
-    An instance has no reference to its group that can be read, but says what it shows, with the group's name. Groups that say the
-    same of themselves are told apart by an intersection record made by hand, which shows the shape that would have been hit.
-    That takes a kernel for each instance.
+    An instance has no reference to its group that can be read. But it hands out the arrays that it holds, and so does a group:
+    those of an instance's own group are among them.
     """
 
     def __init__(self, scene: Any) -> None:
         nodes = [node for _, node in children(scene) if node.class_name().startswith("ShapeGroup")]
-        self._shapes = [[child for _, child in children(node) if isinstance(child, mi.Shape)] for node in nodes]
-        self._texts = [_in_one_line(node) for node in nodes]
+        self._groups = [
+            (held_arrays(node), [child for _, child in children(node) if isinstance(child, mi.Shape)]) for node in nodes
+        ]
 
     def shapes_of(self, instance: Any, name: str) -> list[Any]:
         """Shapes of the group that an instance shows. ``name`` of the instance, for messages."""
-        shown = self._shapes
-        if len(shown) > 1:
-            text = _in_one_line(instance)
-            said = [k for k, group in enumerate(self._texts) if text.startswith(f"Instance[ shapegroup = {group} to_world")]
-            shown = [shown[k] for k in said] or shown
-        return shown[0] if len(shown) == 1 else _hit_by(instance, name, shown)
-
-
-def _in_one_line(node: Any) -> str:
-    return " ".join(str(node).split())
-
-
-def _hit_by(instance: Any, name: str, shown: list[list[Any]]) -> list[Any]:
-    """The group, of several, whose first shape a ray would hit."""
-    hit = dr.zeros(mi.PreliminaryIntersection3f)
-    hit.t, hit.valid, hit.instance = mi.Float(1.0), mi.Bool(True), mi.ShapePtr(instance)
-    # Without FollowShape no shape is found where the instance's to_world is attached.
-    flags = mi.RayFlags.Minimal | mi.RayFlags.FollowShape
-    for direction in _PROBING:
-        # From afar: curves are not hit from behind, and so they face the ray wherever they are.
-        ray = mi.Ray3f(mi.Point3f(direction) * -1e6, mi.Vector3f(direction))
-        try:
-            si = hit.compute_surface_interaction(ray, flags)
-        except RuntimeError as error:
-            if "Cannot differentiate instance" not in str(error):
-                raise
-            what = "an instance and what it shows both carry gradients, here or in another scene that is still there"
-            raise ShadowmapError(
-                f"The shapes of instance '{name}' cannot be read, since Mitsuba refuses where {what}: render once before that."
-            ) from error
-        first = dr.reinterpret_array(mi.UInt32, si.shape)[0]
-        for shapes in shown:
-            if shapes and dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shapes[0]))[0] == first:
-                return shapes
-    raise ShadowmapError(f"The shape group of instance '{name}' was not found in the scene.")
+        if len(self._groups) == 1:
+            return self._groups[0][1]
+        held = held_arrays(instance)
+        shown = [(len(arrays), shapes) for arrays, shapes in self._groups if arrays and arrays <= held]
+        if not shown:
+            raise ShadowmapError(f"The shape group of instance '{name}' was not found in the scene.")
+        # A group that shares all its shapes with another one may be part of that.
+        return max(shown, key=lambda group: group[0])[1]
 
 
 def with_positions(data: SceneData) -> Geometry:

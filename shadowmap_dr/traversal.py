@@ -29,6 +29,14 @@ def children(node: Any) -> list[tuple[str, Any]]:
     return [(name, value) for name, value, _ in _parts_of(node) if isinstance(value, mi.Object)]
 
 
+def held_arrays(node: Any) -> frozenset[int]:
+    """Numbers of the Dr.Jit variables that a Mitsuba object holds, with all that it refers to."""
+    found: list[int] = []
+    with dr.scoped_set_flag(dr.JitFlag.EnableObjectTraversal, True):
+        node._traverse_1_cb_ro(lambda index, variant, domain: found.append(index))
+    return frozenset(found) - {0}
+
+
 class Parameter:
     """One parameter of a Mitsuba object itself, read again and again. The object is kept alive.
 

@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .errors import ShadowmapError
+from .gpu import looked_up
 from .traversal import parameters
 
 SUNSKY = "SunskyEmitter"
@@ -53,7 +54,7 @@ class Environment:
         """Radiance (colour) that arrives *from* the unit world-space ``direction`` (Vector3f). Attached to the emitter."""
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(direction))
         si.wi = -direction
-        return self.emitter.eval(si, mi.Bool(active))
+        return looked_up(self.emitter.eval, si, mi.Bool(active))
 
     def diffuse_radiance(self, direction: Any) -> Any:
         """The same without what is a light of its own: what samples of the environment stand for."""

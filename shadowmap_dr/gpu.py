@@ -19,18 +19,16 @@ def keep_registers() -> None:
 
 
 def looked_up(look_up: Callable[[Any, Any], Any], si: Any, active: Any) -> Any:
-    """``look_up(si, active)``, which reads textures at ``si.uv``; zero where not ``active`` (Bool).
+    """``look_up(si, active)``, which reads textures; zero where not ``active`` (Bool).
 
     A GPU reads textures without a mask here: masked reads, other than those within calls, end the process while a function is
     recorded.
 
     Args:
         look_up: given ``mi.SurfaceInteraction3f`` and Bool, returns colours. Attached as it is.
-        si: surface interactions (N). Texture coordinates that are not active may be anything.
+        si: surface interactions (N). Texels are found for whatever is not active, too: all numbers do.
         active: Bool (N).
     """
     if dr.backend_v(mi.Float) != dr.JitBackend.CUDA:
         return look_up(si, active)
-    read = mi.SurfaceInteraction3f(si)
-    read.uv = dr.select(active, si.uv, 0)
-    return dr.select(active, look_up(read, mi.Bool(True)), 0)
+    return dr.select(active, look_up(si, mi.Bool(True)), 0)

@@ -81,6 +81,12 @@ class RasterOutput:
         return self.triangle != NO_TRIANGLE
 
 
+def precise_rcp(x: Any) -> Any:
+    """``1 / x`` to full precision. ``dr.rcp`` of a double is good for some 20 bits only on a GPU."""
+    with dr.scoped_set_flag(dr.JitFlag.FastMath, False):
+        return dr.rcp(x)
+
+
 def check_range(faces: Any, count: int, what: str) -> None:
     """Raise ValueError if faces refer to a ``what`` (vertex, row) of number ``count`` or more. Reads back one number."""
     largest = int(np.max(dr.max(faces).numpy()))

@@ -17,7 +17,7 @@ from typing import Any
 
 import drjit as dr
 
-from ._types import NO_TRIANGLE, RasterOutput, backend, by_image
+from ._types import NO_TRIANGLE, RasterOutput, backend, by_image, precise_rcp
 from .pairs import each_number
 from .setup import edge_lines, gather_triangle
 from .topology import NO_VERTEX, Topology
@@ -165,7 +165,7 @@ class Meetings:
         steepness = sum(dr.abs(along(plane)) for plane in planes)
         least = dr.maximum(_LEAST_CHANGE * dr.abs(depth), dr.select(folded, _LEAST_FOLD * steepness, 0))
         meet = (((start < 0) & (end > 0)) | (folded & (start > 0) & (end < 0))) & (dr.abs(change) > least)
-        slope = dr.select(meet, dr.rcp(dr.select(meet, change, 1)), 0)
+        slope = dr.select(meet, precise_rcp(dr.select(meet, change, 1)), 0)
         t = -start * slope
         across = (a * step_x) ** 2
         upwards = (b * step_y) ** 2
@@ -211,6 +211,6 @@ def beyond_middle(t: Any) -> Any:
 def _plane(corners: tuple[Any, Any, Any]) -> tuple[list[list[Any]], list[Any]]:
     """Barycentrics / w of a triangle as affine functions (a, b, c: a x + b y + c) in NDC, and its depth as such a one."""
     lines, det = edge_lines(corners)
-    inverse = dr.select(det != 0, dr.rcp(dr.select(det != 0, det, 1)), 0)
+    inverse = dr.select(det != 0, precise_rcp(dr.select(det != 0, det, 1)), 0)
     lines = [[c * inverse for c in line] for line in lines]
     return lines, [sum(line[c] * type(det)(p.z) for line, p in zip(lines, corners, strict=True)) for c in range(3)]

@@ -10,7 +10,7 @@ from typing import Any
 
 import drjit as dr
 
-from ._types import MAX_RESOLUTION, RasterOutput, backend, by_image, pixel_coordinates
+from ._types import MAX_RESOLUTION, RasterOutput, backend, by_image, pixel_coordinates, precise_rcp
 from .setup import edge_lines, gather_triangle
 
 # Smallest determinant (twice the area in NDC times all w) of a triangle that a pixel may see.
@@ -91,7 +91,7 @@ def planes(
         lines, det = edge_lines(own)
         # Slivers that hardly are triangles would have infinite weights, and NaN derivatives where no pixel sees them.
         regular = dr.isfinite(det) & (dr.abs(det) > _LEAST)
-        inverse = dr.select(regular, dr.rcp(dr.select(regular, det, 1)), 0)
+        inverse = dr.select(regular, precise_rcp(dr.select(regular, det, 1)), 0)
         near = [_pixel_near(own, axis, size) for axis, size in ((0, width), (1, height))]
         # Pixel p has the NDC coordinate (2 p + 1 - size) / size.
         x, y = ((2 * Float64(p) + (1 - size)) / size for p, size in zip(near, (width, height), strict=True))

@@ -8,7 +8,7 @@ from typing import Any
 
 import drjit as dr
 
-from ._types import backend
+from ._types import backend, precise_rcp
 
 # Boxes are widened by this many pixels so that rounding in the single-precision edge functions cannot lose a pixel.
 _BOX_MARGIN = 1.0 / 512.0
@@ -60,7 +60,7 @@ def set_up(corners: tuple[Any, Any, Any], height: int, width: int) -> Triangles:
     zs = [Float64(p.z) for p in corners]
     active = dr.isfinite(det) & (det != 0)
     sign = dr.select(det < 0, Float64(-1), Float64(1))
-    inv_det = dr.rcp(dr.select(active, det, 1))
+    inv_det = precise_rcp(dr.select(active, det, 1))
 
     # NDC -> pixels counted from the image centre, where single precision loses least.
     sx, sy = 2.0 / width, 2.0 / height

@@ -15,6 +15,8 @@ _KEEP_FILL = 0.6
 _MARGIN = 0.10
 # Least depth range of a frustum in units of its lateral extent.
 _FLATTEST = 1e-2
+# And of its distance: rounding changes depths by some 1e-7 of that.
+_THINNEST = 1e-3
 # Part of the depth range between the last depth at which there may be casters and the far plane (see `texel_depths`).
 _BEHIND_LAST = 0.04
 # Depths are told apart from this far before the first receiver on, in units of the range from there on.
@@ -166,7 +168,7 @@ def _fit(
     # A flat caster that faces the light has no depth of its own. In a range of next to nothing all that tilts it would be a huge
     # change, of which the derivative of visibility is the small difference.
     lateral = dr.maximum(x1 - x0, y1 - y0) * dr.select(perspective, dr.abs(z1), 1)
-    least = dr.maximum(_FLATTEST * lateral, 1e-3 * dr.maximum(dr.abs(z1), 1e-3))
+    least = dr.maximum(_FLATTEST * lateral, _THINNEST * dr.maximum(dr.abs(z1), 1e-3))
     # What is seen is known from samples: a little may lie before them.
     spread = dr.select(dr.isfinite(window[5]), window[5] - receivers, 0)
     depth = dr.maximum(dr.maximum(z1 - receivers, least), 0.1 * spread)

@@ -17,7 +17,7 @@ def art(
         list[str] | None,
         typer.Option(metavar="NAME|IMAGE", help="Image (PNG, JPEG, SVG, ...) of a shadow; twice for two views."),
     ] = None,
-    text: Annotated[list[str] | None, typer.Option(metavar="TEXT", help="Letters instead of an image; repeatable.")] = None,
+    text: Annotated[list[str] | None, typer.Option(metavar="LETTERS", help="Letters instead of an image; repeatable.")] = None,
     mesh: Annotated[
         str | None, typer.Option(metavar="NAME|FILE", help="What is deformed [default: a sphere of 12,800 triangles].")
     ] = None,

@@ -19,7 +19,7 @@ def keep_registers() -> None:
 
 
 def looked_up(look_up: Callable[[Any, Any], Any], si: Any, active: Any) -> Any:
-    """``look_up(si, active)``, which reads textures; zero where not ``active`` (Bool).
+    """``look_up(si, active)``, which reads textures. Without meaning where not ``active`` (Bool).
 
     A GPU reads textures without a mask here: masked reads, other than those within calls, end the process while a function is
     recorded.

@@ -26,6 +26,7 @@ from .frozen import take_apart
 from .geometry import Geometry
 from .gpu import keep_registers
 from .hits import pixel_hits
+from .kernel_cache import note_size
 from .light_loops import MANY_LIGHTS, many_lights
 from .light_maps import MapPlan, check_sizes, light_visibility, make_maps, plan_maps
 from .lights import AreaLight, Light, SpotLight, SquareSpot
@@ -218,6 +219,7 @@ class Renderer:
             Attached to vertices, lights, cameras, and the BSDFs and textures of the scene.
         """
         keep_registers()
+        self.note_kernels(spp, sensor)
         cameras, geometry = self.data.cameras(sensor), self.data.geometry
         rewrite_scalars(self.data.materials())
         if vertex_positions is not None:
@@ -235,6 +237,12 @@ class Renderer:
         shapes = (geometry, facets, self._creases(geometry, facets))
         pictures = [margin.cut(self._camera_image(view, lighting, *shapes), factor) for view in views]
         return develop(pictures, windows[0], factor)
+
+    def note_kernels(self, spp: int, sensor: int | Sensor = 0) -> None:
+        """Before an image is taken: let kernels of others go, if there have been many sizes."""
+        cameras = self.data.cameras(sensor)
+        sizes = [(camera.film_size, camera.crop_size, camera.crop_offset) for camera in cameras]
+        note_size((*sizes, spp, self.settings.shadow.resolution))
 
     def light(self, name: str) -> Light | AreaLight:
         """Record of a light of the scene."""

@@ -126,6 +126,7 @@ class SceneRenderer:
         self._forget_stale_recordings()
         current = self._current(scene, sensor)
         self._check_vertices(current)
+        current.note_kernels(spp)
         image, frusta, soft_frusta = self.recorded.image(spp, current)
         self._remember(scene, sensor, frusta, soft_frusta)
         return image

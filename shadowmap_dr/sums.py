@@ -170,7 +170,8 @@ class _Sum(dr.CustomOp):
         # A lane's part of these is added up from term to term; the others receive theirs where the terms gather from them.
         own = leaves[: self._owned]
         wide = [dr.repeat(leaf, width // dr.width(leaf)) for leaf in own]
-        dr.eval(wide, gradient)
+        if count is not None:
+            dr.eval(wide, gradient)
 
         def slopes(index: Any) -> list[Any]:
             with dr.resume_grad():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -32,6 +33,19 @@ def soft_light(
     attributes these read. ``gate``: see :func:`shadowmap_dr.shading.direct_light`.
     Gradients flow to all of surface, samples, maps and BSDFs.
     """
+    if seen.colour is not None:
+        # Of materials that know cosines only, the colour stays outside of the loop: its derivative needs no second one.
+        white = replace(seen, colour=mi.UnpolarizedSpectrum(1))
+        light = _loop_light(white, plan, samples, maps, nodes, gate)
+        if dr.grad_enabled(seen.colour):
+            dr.eval(light)
+        return seen.colour * light
+    return _loop_light(seen, plan, samples, maps, nodes, gate)
+
+
+def _loop_light(
+    seen: Surface, plan: SoftPlan, samples: LightSamples, maps: SoftMaps | None, nodes: Sequence[Any], gate: bool
+) -> Any:
     if samples.distant and reflects_only(nodes):
         return sky_light(seen, plan, samples, maps, nodes, gate=gate)
     sampled = None if maps is None or plan.kind == "single" else maps.sampled

@@ -71,6 +71,8 @@ def sky_light(
     shared = (samples.table(), samples.widths(), None if maps is None else maps.sampled)
     start = dr.zeros(mi.ArrayXf, (2 * channels + 2, dr.width(seen.shape)))
     sums = sum_over(one_part, samples.count, start, seen, shared, implicit, seen.active)
+    if dr.grad_enabled(sums):
+        dr.eval(sums)  # derivatives of what follows need them, and would run the loop once more
     own, further = (mi.UnpolarizedSpectrum(*(sums[first + c] for c in range(channels))) for first in (0, channels))
     lit, low = sums[2 * channels], sums[2 * channels + 1]
     some = dr.detach(low) > 0

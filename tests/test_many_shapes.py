@@ -13,7 +13,7 @@ import shadowmap_dr  # noqa: F401  registers the plug-in
 from shadowmap_dr import ShadowmapError
 from shadowmap_dr import scene as scene_module
 from shadowmap_dr import shading as shading_module
-from shadowmap_dr.raster import build_topology, topology, welding
+from shadowmap_dr.raster import adjacency, build_topology, topology, welding
 from shadowmap_dr.scene import load, refresh
 
 KINDS = ("cube", "rectangle", "disk", "sphere")
@@ -201,3 +201,16 @@ def test_vertices_are_welded_where_they_are_equal(monkeypatch: pytest.MonkeyPatc
         found = welding.weld(points, shapes)
         assert (found.place == place).all() and (found.own == own).all()
         monkeypatch.setattr(welding, "_mixed", lambda bits: bits[:, 0] & np.uint64(0))
+
+
+def test_edges_are_ordered_by_their_places_and_what_else_tells_them_apart() -> None:
+    """Shape, then corner, then face, where edges of several faces and shapes lie on one another."""
+    random = np.random.default_rng(1)
+    points = random.integers(0, 3, (40, 3)).astype(np.float32)
+    corners, shapes = random.integers(0, 40, 300).astype(np.uint32), np.repeat([0, 1, 2, 3], 10)
+    halves = random.permutation(300)[:200]
+    order = adjacency.EdgeOrder.of(points, corners, shapes)(halves)
+    following = np.arange(300) // 3 * 3 + (np.arange(300) + 1) % 3
+    places = [sorted((tuple(points[corners[h]]), tuple(points[corners[following[h]]]))) for h in halves[order]]
+    keys = [(*place, shapes[corners[h]], h % 3, h // 3) for place, h in zip(places, halves[order], strict=True)]
+    assert keys == sorted(keys) and len(set(map(str, places))) < 150

@@ -13,9 +13,6 @@ from .adjacency import EdgeOrder, InnerEdges, after, edge_keys, pairs_of, parts_
 from .seams import NO_VERTEX, Seams
 from .welding import copies_of, weld
 
-# Up to so many edges are sorted by their places. Where some lie on one another in an image, the first of them counts.
-_MOST_SORTED = 1 << 18
-
 
 @dataclass(frozen=True)
 class Topology:
@@ -94,11 +91,10 @@ def build_topology(
         for halves in ([edges.pair for edges in inner], [edges.partner for edges in inner])
     )
     paired = np.concatenate(firsts)
-    order = None
-    if len(paired) + len(alone) + len(one) <= _MOST_SORTED:
-        sort = EdgeOrder.of(positions, corners, owners)
-        order, chosen = sort(paired), sort(one)
-        alone, one, two = alone[sort(alone)], one[chosen], two[chosen]
+    # Where edges lie on one another in an image, the first of them counts.
+    sort = EdgeOrder.of(positions, corners, owners)
+    order, chosen = sort(paired), sort(one)
+    alone, one, two = alone[sort(alone)], one[chosen], two[chosen]
     beyond = np.full(len(corners), NO_VERTEX, np.uint32)
     for group, edges in zip(copies, inner, strict=True):
         beyond[edges.pair], beyond[edges.partner] = edges.thirds[:, 1], edges.thirds[:, 0]
@@ -111,8 +107,7 @@ def build_topology(
     for group, edges, first, last in zip(copies, inner, start[:-1], start[1:], strict=True):
         group.copy_vertices(edges.ends, ends[first:last])
         group.copy_vertices(edges.thirds, thirds[first:last])
-    if order is not None:
-        ends[: start[-1]], thirds[: start[-1]] = ends[order], thirds[order]
+    ends[: start[-1]], thirds[: start[-1]] = ends[order], thirds[order]
     ends[start[-1] :, 0], ends[start[-1] :, 1] = corners[rest], corners[after(rest)]
     thirds[start[-1] :, 0], thirds[start[-1] :, 1] = third(corners, rest), beyond[rest]
     seams = None

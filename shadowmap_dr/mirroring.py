@@ -29,7 +29,8 @@ class MirrorWatch:
     def __init__(self, shapes: Sequence[Any]) -> None:
         self._transformations = [Parameter(shape, "to_world") for shape in dict.fromkeys(shapes)]
         self._matrices, self._numbers = self._read()
-        self._mirrored = _negative(self._matrices)
+        # Read back when it is first asked for: most scenes never change, and the matrices that are held do not.
+        self._mirrored: np.ndarray | None = None
 
     def same(self) -> bool:
         """Whether the same ones are mirrored as at the start."""
@@ -37,6 +38,8 @@ class MirrorWatch:
         # Those that are held cannot be taken for others: their variables' numbers are not used again.
         if numbers == self._numbers:
             return True
+        if self._mirrored is None:
+            self._mirrored = _negative(self._matrices)
         other = [k for k, pair in enumerate(zip(numbers, self._numbers, strict=True)) if pair[0] != pair[1]]
         same = bool((_negative([matrices[k] for k in other]) == self._mirrored[other]).all())
         if same:

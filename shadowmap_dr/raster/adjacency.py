@@ -103,17 +103,10 @@ class EdgeOrder:
 
     def __call__(self, halves: Index) -> Index:
         """The order of edges, given a half-edge of each."""
-        keys = edge_keys(self.rank, self.corners, halves)
-        order = np.argsort(keys)
-        same = np.diff(keys[order]) == 0
-        places = np.flatnonzero(np.append(same, False) | np.append(False, same))
-        # Few lie on one another; sorting all of them by all that they have would take several times as long.
-        tied = halves[order[places]]
-        columns = [tied // 3, tied % 3, keys[order[places]]]
+        columns = [halves // 3, halves % 3, edge_keys(self.rank, self.corners, halves)]
         if self.shapes is not None:
-            columns.insert(2, self.shapes[self.corners[tied]])
-        order[places] = order[places][np.lexsort(columns)]
-        return order
+            columns.insert(2, self.shapes[self.corners[halves]])
+        return np.lexsort(columns)
 
 
 def parts_of(copies: Sequence[Copies], corners: Vertices, own: Index) -> tuple[Index, int]:

@@ -22,10 +22,10 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from shadowmap_dr import assets
 from shadowmap_dr.errors import ShadowmapError
 from shadowmap_dr.inverse.pose import apply_pose
-from shadowmap_dr.io import atomic
+from shadowmap_dr.io import assets
+from shadowmap_dr.io.files import atomic
 
 from .proxy import Proxy, calibrate, with_proxy
 from .reference import path_traced

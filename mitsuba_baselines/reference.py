@@ -12,8 +12,8 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from shadowmap_dr import io
 from shadowmap_dr.errors import ShadowmapError
+from shadowmap_dr.io import images
 
 SETTINGS_KEY = "shadowmap_settings"
 SAMPLES_PER_LAUNCH = 1 << 24
@@ -152,8 +152,8 @@ def save(path: str | Path, reference: Reference, *, half: bool = False) -> None:
     """
     # Not with mi.Bitmap, which waits forever where Dr.Jit has a single thread.
     pixels = reference.image.astype(np.float16 if half else np.float32)
-    names = io.colour_channels(pixels.shape[2])
-    io.write_exr(path, {name: pixels[..., i] for i, name in enumerate(names)}, {SETTINGS_KEY: json.dumps(reference.settings)})
+    names = images.colour_channels(pixels.shape[2])
+    images.write_exr(path, {name: pixels[..., i] for i, name in enumerate(names)}, {SETTINGS_KEY: json.dumps(reference.settings)})
 
 
 def load(path: str | Path) -> Reference:
@@ -163,11 +163,11 @@ def load(path: str | Path) -> Reference:
         ShadowmapError: No such file, or a damaged one.
     """
     if not Path(path).is_file():
-        raise ShadowmapError(f"no file {str(path)!r}: make references with tests/references/make.py.")
-    channels, metadata = io.read_exr(path)
+        raise ShadowmapError(f"no file {str(path)!r}: make references with tests/support/references/make.py.")
+    channels, metadata = images.read_exr(path)
     try:
         settings = json.loads(metadata.get(SETTINGS_KEY, "{}"))
-        image = np.stack([channels[name] for name in io.colour_channels(len(channels))], -1).astype(np.float32)
+        image = np.stack([channels[name] for name in images.colour_channels(len(channels))], -1).astype(np.float32)
     except (KeyError, ValueError) as error:
         raise ShadowmapError(f"cannot read {path}: its channels or settings are not those of a reference.") from error
     return Reference(image, settings)

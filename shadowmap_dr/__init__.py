@@ -6,8 +6,7 @@ _llvm.ensure()  # before anything imports mitsuba or drjit
 
 from . import integrator  # noqa: E402
 from .errors import ShadowmapError  # noqa: E402
-from .render_settings import RenderSettings  # noqa: E402
-from .renderer import Renderer  # noqa: E402
+from .rendering import Renderer, RenderSettings  # noqa: E402
 from .shadow import ShadowSettings  # noqa: E402
 
 __version__ = "0.1.0"

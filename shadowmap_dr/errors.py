@@ -1,9 +1,12 @@
-"""Errors that the library raises on purpose.
+"""Errors and warnings of the library.
 
 Every message is one line: what is wrong, the offending value, and what to do about it.
 """
 
 from __future__ import annotations
+
+import inspect
+import warnings
 
 
 class ShadowmapError(ValueError):
@@ -29,3 +32,15 @@ def is_interrupt(error: BaseException | None) -> bool:
             return True
         error = error.__cause__ or error.__context__
     return False
+
+
+# Packages whose own code a warning does not point to.
+_CALLED = ("shadowmap_dr", "mitsuba", "drjit")
+
+
+def warn(message: str) -> None:
+    """A ``UserWarning`` that points to who called this package or Mitsuba."""
+    level, frame = 1, inspect.currentframe()
+    while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] in _CALLED:
+        level, frame = level + 1, frame.f_back
+    warnings.warn(message, stacklevel=level)

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 import shadowmap_dr
-from shadowmap_dr import assets
+from shadowmap_dr.io import assets
 
 # isort: split
 import drjit as dr  # after shadowmap_dr, which chooses the LLVM library

@@ -21,12 +21,12 @@ from typing import Any
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "support"))
 
 from browsers import browser, paint  # noqa: E402
 
-from shadowmap_dr import report  # noqa: E402
-from shadowmap_dr.timing import machine  # noqa: E402
+from shadowmap_dr.experiments.common.timing import machine  # noqa: E402
+from shadowmap_dr.io import records  # noqa: E402
 
 SIZE, HALF, RADIUS_WORLD = 256, 2.0, 1.0
 
@@ -59,7 +59,7 @@ def main() -> None:
     parser.add_argument("--picture", type=Path, help="picture of the page to write (.png)")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        code = "from shadowmap_dr.cli import main; main()"
+        code = "from shadowmap_dr.cli.main import main; main()"
         server = subprocess.Popen(
             [sys.executable, "-c", code, "model", "sphere", "--serve", "--port", "0", "-o", f"{folder}/mesh.ply"],
             stdout=subprocess.PIPE, text=True,
@@ -76,7 +76,7 @@ def main() -> None:
         times = record["delay_seconds"][name]
         print(f"{1000 * np.median(times):.0f} ms (median of {len(times)}), {1000 * max(times):.0f} ms at most until {text}")
     if options.json:
-        report.write_json(options.json, record)
+        records.write_json(options.json, record)
 
 
 def measure(instance: Any, url: str, options: argparse.Namespace) -> dict[str, Any]:

@@ -13,8 +13,8 @@ from typing import Any
 import drjit as dr
 
 import shadowmap_dr
-from shadowmap_dr import assets
-from shadowmap_dr.timing import Contender, OtherWork, alternate, compare
+from shadowmap_dr.experiments.common.timing import Contender, OtherWork, alternate, compare
+from shadowmap_dr.io import assets
 
 # isort: split
 import mitsuba as mi  # after shadowmap_dr, which chooses the LLVM library

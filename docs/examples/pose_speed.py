@@ -10,9 +10,9 @@ import tempfile
 from pathlib import Path
 
 from mitsuba_baselines.pose import ProjectiveSetting
+from shadowmap_dr.experiments.common.timing import Contender, OtherWork, alternate, compare
 from shadowmap_dr.experiments.pose.methods import METHODS, build_method, usual_methods
 from shadowmap_dr.experiments.pose.scene import make_problem, path_traced_reference, start_pose
-from shadowmap_dr.timing import Contender, OtherWork, alternate, compare
 
 # isort: split
 import mitsuba as mi  # after shadowmap_dr, which chooses the LLVM library

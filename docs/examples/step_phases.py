@@ -14,9 +14,9 @@ from statistics import median
 
 import numpy as np
 
+from shadowmap_dr.experiments.common.timing import timed
 from shadowmap_dr.experiments.pose.methods import build_method
 from shadowmap_dr.experiments.pose.scene import make_problem, start_pose
-from shadowmap_dr.timing import timed
 
 # isort: split
 import drjit as dr  # after shadowmap_dr, which chooses the LLVM library

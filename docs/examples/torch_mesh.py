@@ -20,8 +20,8 @@ import torch
 from rich.progress import track
 
 import shadowmap_dr.torch as sdr
-from shadowmap_dr import assets
-from shadowmap_dr.io import write_png
+from shadowmap_dr.io import assets
+from shadowmap_dr.io.images import write_png
 
 # isort: split
 import mitsuba as mi  # after shadowmap_dr, which chooses the LLVM library

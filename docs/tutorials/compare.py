@@ -23,10 +23,12 @@ import numpy as np
 from notebooks import HERE, run
 from rich.console import Console
 
-from shadowmap_dr import timing
 from shadowmap_dr.errors import ShadowmapError
-from shadowmap_dr.io import atomic
-from shadowmap_dr.report import progress, read_json, table, write_json
+from shadowmap_dr.experiments.common import timing
+from shadowmap_dr.io.console import progress, table
+from shadowmap_dr.io.files import atomic
+from shadowmap_dr.io.records import read_json, write_json
+from shadowmap_dr.jit import gc
 
 OUT = HERE.parent / "results" / "tutorials.json"
 # Steps in a row whose mean error decides.
@@ -197,7 +199,7 @@ def race(
 
     traces = {method: Trace() for method in methods}
     other = timing.OtherWork()
-    with timing.quiet_garbage():
+    with gc.gc_quiet():
         for method in methods:  # compiles kernels
             for _ in islice(start(method, WARM_UP), WARM_UP):
                 on_step(f"{method}: warm-up")

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from shadowmap_dr.errors import ShadowmapError
-from shadowmap_dr.io import atomic
+from shadowmap_dr.io.files import atomic
 
 HERE = Path(__file__).resolve().parent
 # Of stored figures: small files matter more than sharp lettering.

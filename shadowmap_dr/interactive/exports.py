@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .. import figures
 from ..errors import ShadowmapError
-from ..io import atomic
-from ..mesh_files import trimesh_package, vertex_colours
+from ..inverse.shadow_art import target_images
+from ..inverse.shadow_art.exports import vertex_colours
+from ..io.files import atomic
+from ..io.meshes import trimesh_package
 
 #: Formats of meshes, with their media types.
 FORMATS = {"ply": "application/octet-stream", "obj": "text/plain; charset=utf-8", "glb": "model/gltf-binary"}
@@ -88,8 +89,8 @@ def read_target(data: bytes, seen: npt.NDArray[np.bool_]) -> Array:
     if image.size == (width, height) and not _transparent(image):
         return read_shadow(data, (height, width))
     image.thumbnail((4 * width, 4 * height))
-    figure = figures.figure_of(np.asarray(image.convert("RGBA"), np.float32) / 255)
-    return figures.fit(figure, seen)
+    figure = target_images.figure_of(np.asarray(image.convert("RGBA"), np.float32) / 255)
+    return target_images.fit(figure, seen)
 
 
 def _open(data: bytes) -> Any:
@@ -103,7 +104,7 @@ def _open(data: bytes) -> Any:
         if image.width * image.height > MOST_PIXELS:  # before anything is decoded
             raise ShadowmapError(f"an image of {image.width} x {image.height} pixels: {MOST_PIXELS} are allowed.")
         image.load()
-        return figures.scaled_to_bytes(image)
+        return target_images.scaled_to_bytes(image)
     except ShadowmapError:
         raise
     except Exception as error:  # damaged files make decoders raise whatever they like

@@ -18,8 +18,8 @@ from starlette.routing import Route, WebSocketRoute
 
 from ..errors import ShadowmapError
 from . import exports, messages
-from .guards import Guard
-from .studio import Studio
+from .connections import Connections
+from .request_guard import Guard
 
 ADDRESS = "127.0.0.1"
 #: The page's files: name -> media type. Nothing else is ever read for a browser.
@@ -37,7 +37,7 @@ PAGE = {
 _MOST_CONNECTIONS = 64
 
 
-def create_app(studio: Studio) -> Starlette:
+def create_app(connections: Connections) -> Starlette:
     """The ASGI application: the page, its live connection (``/live``), an upload for images, and downloads."""
     decoding = asyncio.Semaphore(1)
 
@@ -45,13 +45,13 @@ def create_app(studio: Studio) -> Starlette:
         try:
             data = await _body(request)
             async with decoding:
-                target = await run_in_threadpool(exports.read_target, data, studio.view.seen)
+                target = await run_in_threadpool(exports.read_target, data, connections.view.seen)
         except ShadowmapError as error:
             return PlainTextResponse(str(error), 422)
         except ClientDisconnect:
             return Response(status_code=400)
-        studio.canvas.replace(target)
-        studio.paint()
+        connections.canvas.replace(target)
+        connections.paint()
         return Response(status_code=204)
 
     async def mesh(request: Request) -> Response:
@@ -59,16 +59,18 @@ def create_app(studio: Studio) -> Starlette:
         if kind not in exports.FORMATS:
             return PlainTextResponse("There is no such format.", 404)
         async with decoding:
-            content = await run_in_threadpool(exports.mesh_bytes, kind, studio.session.snapshot.vertices, studio.session.faces)
+            content = await run_in_threadpool(
+                exports.mesh_bytes, kind, connections.session.snapshot.vertices, connections.session.faces
+            )
         return _download(content, exports.FORMATS[kind], f"mesh.{kind}")
 
     async def shadow(request: Request) -> Response:
-        content = await run_in_threadpool(exports.shadow_bytes, studio.session.snapshot.shadow)
+        content = await run_in_threadpool(exports.shadow_bytes, connections.session.snapshot.shadow)
         return _download(content, "image/png", "shadow.png")
 
     @asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
-        studio.attach()
+        connections.attach()
         yield
 
     page = [Route("/" if name == "index.html" else f"/{name}", _file(name, kind)) for name, kind in PAGE.items()]
@@ -77,7 +79,7 @@ def create_app(studio: Studio) -> Starlette:
         Route("/image", upload, methods=["POST"]),
         Route("/mesh.{kind}", mesh),
         Route("/shadow.png", shadow),
-        WebSocketRoute("/live", studio.serve),
+        WebSocketRoute("/live", connections.serve),
     ]
     return Starlette(routes=routes, middleware=[Middleware(Guard)], lifespan=lifespan)
 
@@ -96,18 +98,21 @@ def listen(port: int = 0) -> socket.socket:
 
 
 def serve(
-    studio: Studio, listener: socket.socket, stop: Callable[[], bool], on_start: Callable[[str], None] = lambda url: None
+    connections: Connections,
+    listener: socket.socket,
+    stop: Callable[[], bool],
+    on_start: Callable[[str], None] = lambda url: None,
 ) -> None:
     """Serve until told to stop. Signals are left to the caller.
 
     Args:
-        studio: its session is started, and stays open afterwards.
+        connections: its session is started, and stays open afterwards.
         listener: from :func:`listen`; stays open, too.
         stop: asked ten times a second.
         on_start: called with the page's address once it can be opened.
     """
     on_start(f"http://{ADDRESS}:{listener.getsockname()[1]}/")
-    _Server(config(studio), stop).run(sockets=[listener])
+    _Server(config(connections), stop).run(sockets=[listener])
 
 
 class _Server(uvicorn.Server):
@@ -124,10 +129,10 @@ class _Server(uvicorn.Server):
         return await super().on_tick(counter) or self._stop()
 
 
-def config(studio: Studio) -> uvicorn.Config:
+def config(connections: Connections) -> uvicorn.Config:
     """Uvicorn's settings: small messages, few connections, nothing said about itself."""
     return uvicorn.Config(
-        create_app(studio), log_level="warning", access_log=False, server_header=False, proxy_headers=False,
+        create_app(connections), log_level="warning", access_log=False, server_header=False, proxy_headers=False,
         ws_max_size=messages.MOST_BYTES, ws_per_message_deflate=False, limit_concurrency=_MOST_CONNECTIONS,
         timeout_graceful_shutdown=2,
     )  # fmt: skip

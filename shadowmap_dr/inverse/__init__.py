@@ -1,19 +1,19 @@
 """Inverse problems: what is optimised (parametrisations), how (loops that survive being killed), and sweeps over many runs."""
 
-from .art.collection import Collection
-from .art.remeshing import RemeshingSculptor
-from .art.sculpt import Sculptor
-from .art.shadow_views import ShadowView, shadow_view
-from .art.start_meshes import even_sphere
+from ..rendering.receivers.shadow_views import ShadowView, shadow_view
 from .faces.blend_shapes import blend
 from .faces.morph_fit import MorphFit
 from .faces.morphable import MorphableModel, load_model, save_model
-from .lights.batch import LightBatch, LightHistory, Stage
-from .lights.pixels import StillScene
-from .loop import History, Method, optimize
+from .light_directions.batch import LightBatch, LightHistory, Stage
+from .light_directions.pixels import StillScene
 from .pose import PoseFit, apply_pose
-from .problems import LossProblem, MethodProblem, Problem
-from .sweep import run_sweep
+from .runs.loop import History, Method, optimize
+from .runs.problems import LossProblem, MethodProblem, Problem
+from .runs.sweep import run_sweep
+from .shadow_art.collection import Collection
+from .shadow_art.remeshing import RemeshingSculptor
+from .shadow_art.sculpt import Sculptor
+from .shadow_art.start_meshes import even_sphere
 
 __all__ = [
     "Collection",

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import ShadowmapError
-from ..raster._memory import device_array
+from ..jit.arrays import device_array
 
 
 def apply_pose(p_rest: Any, pose: Any, shift_z: float = 0.0) -> Any:

@@ -1,14 +1,14 @@
 """Screen-space primitives on Dr.Jit arrays: rasterize, interpolate, antialias. No lights, no scenes."""
 
-from ._types import MAX_RESOLUTION, NO_TRIANGLE, RasterOutput
-from .antialias import antialias
-from .closed import drawing_order, outward_faces
-from .creases import Folds
-from .crossings import DEPTH_GAP, Crossings, find_crossings
+from .antialiasing.antialias import antialias
+from .antialiasing.creases import CoplanarCreases
+from .antialiasing.edge_crossings import DEPTH_GAP, Crossings, find_crossings
+from .closed_parts import drawing_order, outward_faces
 from .interpolate import interpolate
 from .rasterize import rasterize, visible_triangles
-from .seams import parted
+from .shape_seams import detach_moved_seams
 from .topology import NO_VERTEX, Topology, build_topology
+from .types import MAX_RESOLUTION, NO_TRIANGLE, RasterOutput
 
 __all__ = [
     "DEPTH_GAP",
@@ -16,7 +16,7 @@ __all__ = [
     "NO_TRIANGLE",
     "NO_VERTEX",
     "Crossings",
-    "Folds",
+    "CoplanarCreases",
     "RasterOutput",
     "Topology",
     "antialias",
@@ -25,7 +25,7 @@ __all__ = [
     "find_crossings",
     "interpolate",
     "outward_faces",
-    "parted",
+    "detach_moved_seams",
     "rasterize",
     "visible_triangles",
 ]

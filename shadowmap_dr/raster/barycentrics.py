@@ -6,8 +6,9 @@ from typing import Any
 
 import drjit as dr
 
-from ._types import NO_TRIANGLE, RasterOutput, backend, by_image
-from .planes import offset, pixels, planes
+from ..jit.arrays import backend
+from .screen_planes import offset, pixels, planes
+from .types import NO_TRIANGLE, RasterOutput, by_image
 
 # Pixels of a lane, as many as a packet holds.
 _STRIP = 4

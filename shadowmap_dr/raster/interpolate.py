@@ -6,7 +6,8 @@ from typing import Any
 
 import drjit as dr
 
-from ._types import RasterOutput, backend, check_range, pixel_coordinates
+from ..jit.arrays import backend
+from .types import RasterOutput, check_range, pixel_coordinates
 
 
 def interpolate(attributes: Any, raster: RasterOutput, faces: Any, *, check_indices: bool = True) -> Any:

@@ -10,11 +10,12 @@ from typing import Any
 
 import drjit as dr
 
-from ._types import MAX_RESOLUTION, NO_TRIANGLE, RasterOutput, backend, by_image, check_range, pixel_coordinates
+from ..jit.arrays import backend
 from .barycentrics import pixel_barycentrics
-from .fragments import EMPTY, draw
-from .setup import centred, covers, edge_lines, fragment_key, gather_triangle, set_up
-from .tiles import STRIP, Strips, TileGrid, TileLists, build_tile_lists, nearest_covers, strips
+from .small_triangles import EMPTY, draw
+from .tile_lists import STRIP, Strips, TileGrid, TileLists, build_tile_lists, nearest_covers, strips
+from .triangle_setup import centred, covers, edge_lines, fragment_key, gather_triangle, set_up
+from .types import MAX_RESOLUTION, NO_TRIANGLE, RasterOutput, by_image, check_range, pixel_coordinates
 
 #: A triangle that covers more pixels than this, and is not thin, goes through the lists of tiles.
 _LARGE = 512
@@ -58,8 +59,8 @@ def rasterize(
         ValueError: on wrong shapes, an empty mesh, a resolution outside the limits, or an index out of range.
 
     The method: homogeneous edge functions (Olano and Greer, "Triangle scan conversion using 2D homogeneous coordinates", 1997);
-    small and thin triangles draw their fragments themselves (:mod:`shadowmap_dr.raster.fragments`), pixels look for the large
-    ones in the list of their tile (:mod:`shadowmap_dr.raster.tiles`).
+    small and thin triangles draw their fragments themselves (:mod:`shadowmap_dr.raster.small_triangles`), pixels look for the
+    large ones in the list of their tile (:mod:`shadowmap_dr.raster.tile_lists`).
     """
     flat, face_indices, batch, _ = check_mesh(positions, faces, batch, check_indices)
     located = visible_triangles(flat, face_indices, resolution, batch=batch, transparent=transparent, layers=layers)

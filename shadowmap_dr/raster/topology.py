@@ -8,10 +8,33 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from ._memory import device_array
+from ..jit.arrays import device_array
 from .adjacency import EdgeOrder, InnerEdges, after, edge_keys, pairs_of, parts_of, third
-from .seams import NO_VERTEX, Seams
+from .types import NO_VERTEX
 from .welding import copies_of, weld
+
+
+@dataclass(frozen=True)
+class Seams:
+    """The last edges of a :class:`Topology`: those of S seams, and for each an edge of the other shape, without any extent.
+
+    Attributes:
+        mine, other: ``UInt32`` (2 S,) ends of each seam, as vertices of its one and its other face, in the same order.
+        opposite: ``UInt32`` (2 S,) third vertices of both faces.
+        slots: ``UInt32`` (2 S,) where in :attr:`Topology.beyond` both faces have the edge.
+        count: S.
+    """
+
+    mine: Any
+    other: Any
+    opposite: Any
+    slots: Any
+    count: int
+
+    @classmethod
+    def of(cls, dtype: type, mine: np.ndarray, other: np.ndarray, opposite: np.ndarray, slots: np.ndarray) -> Seams:
+        """From NumPy arrays (S, 2) each."""
+        return cls(*(device_array(dtype, array) for array in (mine, other, opposite, slots)), len(mine))
 
 
 @dataclass(frozen=True)
@@ -30,8 +53,10 @@ class Topology:
             ``NO_VERTEX`` where there is none or more than one.
         vertex_count: how many vertices there are at least: one more than the largest index.
         seams: where shapes border on each other, or None if they do nowhere.
-        veils: ``Bool`` (F,), faces that one may see through, or None if there are none. Where one does, their edges hide nothing.
-        owners: ``UInt32`` (2 E,) faces of each edge, twice the same where they are of one shape; None without ``veils``.
+        see_through_faces: ``Bool`` (F,), faces that one may see through, or None if there are none. Where one does, their edges
+            hide nothing.
+        owners: ``UInt32`` (2 E,) faces of each edge, twice the same where they are of one shape; None without
+            ``see_through_faces``.
     """
 
     edges: Any
@@ -44,7 +69,7 @@ class Topology:
     beyond: Any
     vertex_count: int
     seams: Seams | None = None
-    veils: Any = None
+    see_through_faces: Any = None
     owners: Any = None
 
 
@@ -53,7 +78,7 @@ def build_topology(
     positions: np.ndarray,
     dtype: type,
     shapes: np.ndarray | None = None,
-    veils: np.ndarray | None = None,
+    see_through_faces: np.ndarray | None = None,
 ) -> Topology:
     """Find the edges of a mesh (on the host, once).
 
@@ -63,8 +88,9 @@ def build_topology(
             duplicate vertices, but are no boundaries of the surface.
         dtype: the ``UInt32`` type of the Dr.Jit backend in use.
         shapes: (V,) number of the shape that each vertex belongs to. Shapes may move apart: where they border on each other, and
-            nowhere else, their faces have common edges, but they are parts of their own. :func:`parted` tells which still do.
-        veils: (F,) which faces one may see through.
+            nowhere else, their faces have common edges, but they are parts of their own. :func:`detach_moved_seams` tells which
+            still do.
+        see_through_faces: (F,) which faces one may see through.
 
     Degenerate faces (with two corners at the same place) are left out.
 
@@ -118,10 +144,10 @@ def build_topology(
         ends = np.concatenate([ends, np.zeros_like(other)])
         thirds = np.concatenate([thirds, np.full_like(other, NO_VERTEX)])
     veiled = (None, None)
-    if veils is not None:
+    if see_through_faces is not None:
         first, second = (values if order is None else values[order] for values in (paired, np.concatenate(seconds)))
         owner = np.stack([np.concatenate([first, alone, one, two]), np.concatenate([second, alone, two, two])], 1) // 3
-        veiled = device_array(dr.mask_t(dtype), veils), device_array(dtype, owner)
+        veiled = device_array(dr.mask_t(dtype), see_through_faces), device_array(dtype, owner)
     parts, part_count = parts_of(copies, corners, vertices.own)
     return Topology(
         device_array(dtype, ends),

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from .seams import NO_VERTEX
+from .types import NO_VERTEX
 
 Index = npt.NDArray[np.int64]
 

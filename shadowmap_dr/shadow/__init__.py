@@ -1,6 +1,9 @@
 """Shadow maps for directional, spot and point lights: cameras, moments, filters, visibility. No Mitsuba."""
 
-from .camera import (
+from .caster_bounds import Boxes, casting_shapes, shape_boxes
+from .filters import FILTERS, filter_kernel, filter_map
+from .frustum_fit import fit_frusta, shape_bounds
+from .light_camera import (
     Frusta,
     LightView,
     Views,
@@ -12,13 +15,12 @@ from .camera import (
     to_light_space,
     vertices_in_maps,
 )
-from .casters import Boxes, casting_shapes, shape_boxes
-from .filters import FILTERS, filter_kernel, filter_map
-from .fit import fit_frusta, shape_bounds
 from .lookup import visibility
-from .methods import METHODS, PREFILTERED
-from .moments import chebyshev_visibility, standard_visibility, variance_moments
-from .shadow_map import ShadowMaps, ShadowSettings, filter_maps, render_maps
+from .methods.comparison import standard_visibility
+from .methods.registry import METHODS, PREFILTERED
+from .methods.variance import chebyshev_visibility, variance_moments
+from .settings import ShadowSettings
+from .shadow_map import ShadowMaps, filter_maps, render_maps
 
 __all__ = [
     "FILTERS",

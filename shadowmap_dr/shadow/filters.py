@@ -8,7 +8,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from ..raster._types import backend
+from ..jit.arrays import backend
 
 FILTERS = ("box", "gaussian", "wendland", "none")
 

@@ -8,12 +8,13 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from ..raster._types import backend
-from ..tables import copy_of_lane
-from .camera import of_map, project, to_light_space
+from ..jit.arrays import backend
+from ..jit.broadcast import copy_of_lane
 from .filters import filter_kernel, separable_terms
-from .methods import PREFILTERED
-from .moments import MINIMUM_VARIANCE_COMPAT, chebyshev_visibility, reduced_bleeding, soft_comparison, standard_visibility
+from .light_camera import of_map, project, to_light_space
+from .methods.comparison import soft_comparison, standard_visibility
+from .methods.registry import PREFILTERED
+from .methods.variance import MINIMUM_VARIANCE_COMPAT, chebyshev_visibility, reduced_bleeding
 from .shadow_map import FAR, ShadowMaps
 
 # Depth over which the comparison of percentage-closer filtering is spread: without it there would be no derivative by depth.

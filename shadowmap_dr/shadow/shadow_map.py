@@ -2,114 +2,28 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from operator import index
 from typing import Any
 
 import drjit as dr
 
-from ..raster import MAX_RESOLUTION, RasterOutput, Topology, antialias, visible_triangles
-from ..raster._types import backend, pixel_coordinates
-from ..raster.planes import pixel_depth
-from ..tables import in_copies
-from .camera import Frusta, Views, linear_depth, of_map, to_clip
-from .filters import FILTERS, filter_kernel, filter_map, reach_of
-from .methods import DEFAULT, METHODS, PREFILTERED
-from .moments import other_depth, variance_moments
+from ..jit.arrays import backend
+from ..jit.broadcast import in_copies
+from ..raster import RasterOutput, Topology, antialias, visible_triangles
+from ..raster.screen_planes import pixel_depth
+from ..raster.types import pixel_coordinates
+from .filters import filter_kernel, filter_map, reach_of
+from .light_camera import Frusta, Views, linear_depth, of_map, to_clip
+from .methods.comparison import other_depth
+from .methods.registry import PREFILTERED
+from .methods.variance import variance_moments
+from .settings import ShadowSettings
 
 #: Depth that a texel without geometry holds, and beyond which receivers are moved to it: an unoccluded receiver lies at its mean.
 FAR = 0.5
 # A plane's slope counts as variance up to this many texels of depth per texel; silhouettes seen edge-on would have any amount.
 _MAX_SLOPE = 2.0
-
-
-@dataclass(frozen=True)
-class ShadowSettings:
-    """How shadows are computed.
-
-    Attributes:
-        method: ``auto`` (``evsm4``, or ``vsm`` with ``compat``), ``vsm`` (variance), ``esm`` (exponential), ``evsm2``, ``evsm4``
-            (exponential variance, two or four moments), ``msm`` (four power moments), ``csm`` (convolution: Fourier series),
-            ``pcf`` (percentage-closer: depths are compared, and the filter applied, in the look-up; of a texel that an
-            outline crosses both depths, by the share that each covers), ``standard`` (one comparison, no gradients) or ``none``.
-        resolution: texels along each side of a map.
-        filter: ``box``, ``gaussian``, ``wendland`` or ``none``.
-        filter_size: odd number of texels.
-        antialias: anti-alias the maps; without it shadows have no gradient to the outlines of their casters.
-        bias: depth offset of ``standard`` and ``pcf``, in units of the depth range of the map.
-        bleeding: visibilities below this are cut off and the rest is stretched to 0..1; for ``vsm``, ``evsm`` and ``msm``.
-        order: terms of the series of ``csm``, an even number.
-        supersampling: each texel is the mean of so many along both sides, anti-aliased first: coverage and derivatives are more
-            exact, and so many times as many texels are rasterized. For pre-filtered methods.
-        receiver_range: maps tell depths apart only from a little before the first receiver in view on: how far before it casters
-            lie does not matter, and does not bleed.
-        cull_backfaces: leave faces that turn away from the light out of the maps of directional lights, if they belong to parts
-            that were closed and turned outwards when the scene was loaded. Saves a third of drawing. Shadows are the same as long
-            as these parts do not turn inside out, not even in a fold. Not with ``compat``; without effect in scenes with alpha
-            tested materials.
-        compat: the conventions of Worchel and Alexa's code: unnormalised radial depth, fixed frusta, dark outside of them, their
-            kernels, minimum variance 1e-4.
-    """
-
-    method: str = "auto"
-    resolution: int = 256
-    filter: str = "gaussian"
-    filter_size: int = 3
-    antialias: bool = True
-    bias: float = 5e-3
-    compat: bool = False
-    bleeding: float = 0.0
-    order: int = 4
-    supersampling: int = 1
-    receiver_range: bool = True
-    cull_backfaces: bool = False
-
-    def __post_init__(self) -> None:
-        for name in ("resolution", "filter_size", "order", "supersampling"):
-            try:
-                object.__setattr__(self, name, index(getattr(self, name)))
-            except TypeError:
-                raise ValueError(f"shadow map {name} is {getattr(self, name)!r}; give a whole number") from None
-        for name in ("bias", "bleeding"):
-            value = getattr(self, name)
-            if not isinstance(value, int | float) or not math.isfinite(value):
-                raise ValueError(f"shadow map {name} is {value!r}; give a finite number")
-        if self.method == "auto":
-            object.__setattr__(self, "method", "vsm" if self.compat else DEFAULT)
-        if self.method not in METHODS:
-            raise ValueError(f"shadow method {self.method!r} is unknown; choose one of auto, {', '.join(METHODS)}")
-        if self.filter not in FILTERS:
-            raise ValueError(f"shadow filter {self.filter!r} is unknown; choose one of {', '.join(FILTERS)}")
-        if self.compat and self.method not in ("vsm", "standard", "none"):
-            raise ValueError(f"shadow method {self.method!r} has no compatible variant; use vsm with compat")
-        if not 0 <= self.bleeding < 1:
-            raise ValueError(f"light bleeding is to be cut off below {self.bleeding}; give a number from 0 to below 1")
-        if not 2 <= self.order <= 16 or self.order % 2:
-            raise ValueError(f"the order of the Fourier series is {self.order}; it must be an even number from 2 to 16")
-        if not 1 <= self.resolution <= 4096:
-            raise ValueError(f"shadow map resolution is {self.resolution}; it must lie between 1 and 4096")
-        if self.compat and self.cull_backfaces:
-            raise ValueError("compat has fixed frusta, which may begin inside of a caster: do not combine it with cull_backfaces")
-        if not 1 <= self.supersampling <= 8 or self.supersampling * self.resolution > MAX_RESOLUTION:
-            raise ValueError(
-                f"shadow map supersampling is {self.supersampling}; it must lie between 1 and 8, "
-                f"and maps may have {MAX_RESOLUTION} texels along a side in all"
-            )
-        if self.supersampling > 1 and self.method != "none" and (self.compat or not self.filterable):
-            raise ValueError(f"shadow method {self.method!r} cannot be supersampled; use a pre-filtered one without compat")
-        filter_kernel(self.filter, self.filter_size)
-        if self.filter_size + 6 > self.resolution and self.method != "none":
-            raise ValueError(
-                f"shadow filter size {self.filter_size} is too large for maps of {self.resolution} texels; "
-                f"use at least {self.filter_size + 6} texels"
-            )
-
-    @property
-    def filterable(self) -> bool:
-        """Whether what a map stores may be mixed, and so anti-aliased and filtered."""
-        return self.method in PREFILTERED
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from typing import Any, Protocol
 import drjit as dr
 import torch
 
-from ..raster._types import backend
+from ..jit.arrays import backend
 from .checks import backend_of
 
 # Held by the thread in which Dr.Jit works.

@@ -13,10 +13,10 @@ import mitsuba as mi
 import torch
 
 from ..errors import ShadowmapError
-from ..frozen import Frozen
-from ..records import map_arrays
-from ..renderer import Renderer as _Renderer
-from ..soft import SkyWatch, still_aimed
+from ..jit.frozen import Frozen
+from ..jit.pytree import tree_map
+from ..rendering.extended_lights import SkyWatch, still_aimed
+from ..rendering.renderer import Renderer as _Renderer
 from .bridge import attached, cross, drjit_turn, gradients, number, to_torch
 from .checks import check_devices, check_floats, check_kind, number_of
 
@@ -83,9 +83,9 @@ class Renderer:
 
         Args:
             vertex_positions: new world-space vertices, float32 (V, 3), by the name of their shape.
-            lights: by the name of the light, new values of fields of its record (:mod:`shadowmap_dr.lights`): ``direction``,
-                ``position`` (3,), ``irradiance``, ``intensity`` (3,) or (1,) as the variant has colours, ``to_world`` (4, 4),
-                ``cutoff_angle``, ``beam_width`` (1,), in degrees.
+            lights: by the name of the light, new values of fields of its record (:mod:`shadowmap_dr.scene.lights`):
+                ``direction``, ``position`` (3,), ``irradiance``, ``intensity`` (3,) or (1,) as the variant has colours,
+                ``to_world`` (4, 4), ``cutoff_angle``, ``beam_width`` (1,), in degrees.
             parameters: by Mitsuba's names (``mi.traverse(scene)``), new values of anything else: textures (H, W, C) in linear
                 colour, colours, ``to_world`` (4, 4) of cameras. Set in the scene for the time of the call only. All else is
                 read from the scene as it is now, too; and each call loads textures anew.
@@ -206,7 +206,7 @@ class _Rendering:
         renderer = replace(self.owner._renderer, **(self.fixed or (self.owner._planned if self.changes_scene else {})))
         # Copies, since a replayed function writes into the records that it is given: another image's backward pass may need them.
         fits = (renderer.frusta, renderer.soft_frusta)
-        renderer.frusta, renderer.soft_frusta = map_arrays(fits, lambda array: type(array)(array))
+        renderer.frusta, renderer.soft_frusta = tree_map(fits, lambda array: type(array)(array))
         values = {place.name: array for place, array in zip(self.places, arrays, strict=True) if place.kind == "parameter"}
         if not values:
             yield renderer
@@ -232,7 +232,7 @@ class _Rendering:
             if self.sky.same(data.environments) and still_aimed(renderer.soft, lambda: data.geometry):
                 return renderer
             self.sky = SkyWatch(data.environments)
-            return renderer.planned_anew()
+            return renderer.with_replanned_lights()
 
 
 def _device_of(variant: str) -> torch.device:

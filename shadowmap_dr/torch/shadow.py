@@ -12,7 +12,7 @@ import torch
 
 from .. import shadow as _shadow
 from ..errors import ShadowmapError
-from ..raster._types import backend
+from ..jit.arrays import backend
 from ..shadow import Frusta, LightView, ShadowSettings, Views
 from .bridge import Repeated, cross, drjit_turn, index_array, vector
 from .checks import check_devices, check_floats, check_kind, check_same, number_of

@@ -16,11 +16,15 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from ... import __version__, assets, figures, io, mesh_files, report
+from ... import __version__
 from ...errors import ShadowmapError
 from ...inverse import Collection, RemeshingSculptor, Sculptor, even_sphere, shadow_view
-from ...inverse.art.shadow_views import CAMERAS, RECEIVERS, ShadowView
-from ...timing import machine
+from ...inverse.shadow_art import exports, target_images
+from ...io import assets, files, meshes, records
+from ...io import console as io_console
+from ...io import images as io_images
+from ...rendering.receivers.shadow_views import CAMERAS, RECEIVERS, ShadowView
+from ..common.timing import machine
 from . import pictures as art_pictures
 from .run import Frame, Maker, Trace, intersection_over_union, make
 
@@ -102,8 +106,8 @@ class ArtOptions:
 def read_target(target: str) -> Any:
     """The figure (H, W) of a target of `ArtOptions`."""
     if target.startswith("text:"):
-        return figures.text_figure(target.removeprefix("text:"))
-    return figures.read_figure(assets.target(target))
+        return target_images.text_figure(target.removeprefix("text:"))
+    return target_images.read_figure(assets.target(target))
 
 
 def views_of(options: ArtOptions) -> tuple[ShadowView, ...]:
@@ -118,24 +122,24 @@ def place(figure_list: list[Any], views: tuple[ShadowView, ...]) -> list[Any]:
     """Target images: as large as they can be, but of equal height in all views, which share the vertical axis."""
     fill = _FILL[views[0].camera]
     if len(views) == 1:
-        return [figures.fit(figure_list[0], views[0].seen, fill)]
-    heights = [figures.figure_height(figure, view.seen, fill) for figure, view in zip(figure_list, views, strict=True)]
-    return [figures.fit(figure, view.seen, high=min(heights)) for figure, view in zip(figure_list, views, strict=True)]
+        return [target_images.fit(figure_list[0], views[0].seen, fill)]
+    heights = [target_images.figure_height(figure, view.seen, fill) for figure, view in zip(figure_list, views, strict=True)]
+    return [target_images.fit(figure, view.seen, high=min(heights)) for figure, view in zip(figure_list, views, strict=True)]
 
 
 def build(options: ArtOptions) -> Maker:
     """What `run_art` lets make its steps."""
     views = views_of(options)
     read = [read_target(target) for target in options.targets]
-    targets = place([figures.filled(figure) for figure in read] if options.fill_holes else read, views)
+    targets = place([target_images.filled(figure) for figure in read] if options.fill_holes else read, views)
     texels = options.resolution if options.map_resolution is None else options.map_resolution
     if options.collection is not None:
-        mesh = mesh_files.read_mesh(assets.mesh(options.collection))
+        mesh = meshes.read_mesh(assets.mesh(options.collection))
         return Collection(
             *mesh, views, targets, interval=options.interval, most=options.most, seed=options.seed, map_resolution=texels,
             settings={"collection": _name(options.collection)},
         )  # fmt: skip
-    mesh = even_sphere() if options.mesh is None else mesh_files.read_mesh(assets.mesh(options.mesh))
+    mesh = even_sphere() if options.mesh is None else meshes.read_mesh(assets.mesh(options.mesh))
     arguments: dict[str, Any] = {
         "step_size": options.step_size, "smoothness": options.smoothness, "consistency": options.consistency,
         "map_resolution": texels, "settings": {"mesh": "sphere" if options.mesh is None else _name(options.mesh)},
@@ -148,23 +152,25 @@ def build(options: ArtOptions) -> Maker:
 def run_art(options: ArtOptions, *, console: Console | None = None) -> dict[str, Any]:
     """Make one piece; writes all files into ``options.out`` and returns the record of `art.json`."""
     console = console or Console(stderr=True)
-    path = io.check_output(options.out / "art.json", (".json",))
-    mesh_files.trimesh_package()
+    path = files.check_output(options.out / "art.json", (".json",))
+    meshes.trimesh_package()
     checkpoint = options.out / "checkpoint.npz"
     if not options.resume:
         checkpoint.unlink(missing_ok=True)
     maker = build(options)
     settings = {"targets": [_name(target) for target in options.targets], "iterations": options.iterations, **maker.describe()}
-    with report.progress(console) as progress:
+    with io_console.progress(console) as progress:
         task = progress.add_task("steps", total=options.iterations, note="")
         trace = make(
             maker, options.iterations, checkpoint=checkpoint, fingerprint=_fingerprint(settings, maker),
             on_step=lambda done, note: progress.update(task, completed=done, note=note),
         )  # fmt: skip
-        record = report.plain({"settings": settings, "machine": machine(), "shadowmap_dr": __version__, **_results(maker, trace)})
+        record = records.plain(
+            {"settings": settings, "machine": machine(), "shadowmap_dr": __version__, **_results(maker, trace)}
+        )
         written = _write(options, maker, trace, progress)
     record["files"] = written
-    report.write_json(path, record)
+    records.write_json(path, record)
     checkpoint.unlink(missing_ok=True)
     return record
 
@@ -175,14 +181,14 @@ def _name(target: str) -> str:
 
 def _fingerprint(settings: dict[str, Any], maker: Maker) -> str:
     images = [float(np.square(maker.target(k) - 0.3).sum(dtype=np.float64)) for k in range(len(maker.views))]
-    return json.dumps([report.plain(settings), images], sort_keys=True)
+    return json.dumps([records.plain(settings), images], sort_keys=True)
 
 
 def _results(maker: Maker, trace: Trace) -> dict[str, Any]:
     views = []
     for k, (view, image) in enumerate(zip(maker.views, maker.visibility(), strict=True)):
         target = maker.target(k)
-        whole = 1 - figures.filled(1 - target)
+        whole = 1 - target_images.filled(1 - target)
         holes = np.count_nonzero((whole < 0.5) & (target > 0.5)) / max(np.count_nonzero(whole < 0.5), 1)
         views.append({
             "iou": intersection_over_union(image, target, view.seen),
@@ -192,7 +198,7 @@ def _results(maker: Maker, trace: Trace) -> dict[str, Any]:
         })  # fmt: skip
     return {
         "views": views,
-        "mesh": mesh_files.mesh_report(maker.vertices(), maker.faces),
+        "mesh": exports.mesh_report(maker.vertices(), maker.faces),
         "seconds_per_iteration": trace.seconds_per_iteration,
         "seconds": float(sum(trace.seconds)),
         "iou_curve": {"step": [step for step, _ in trace.looks], "iou": [values for _, values in trace.looks]},
@@ -204,15 +210,15 @@ def _write(options: ArtOptions, maker: Maker, trace: Trace, progress: Any) -> li
     """All files but the record; returns their names."""
     out, last = options.out, Frame(trace.iterations, maker.vertices(), maker.faces)
     images = maker.visibility()
-    mesh_files.write_meshes(out, last.vertices, last.faces, maker.views, images)
+    exports.write_meshes(out, last.vertices, last.faces, maker.views, images)
     names = ["mesh.ply", "mesh.obj", "mesh.glb"]
     for k, image in enumerate(images):
         target = maker.target(k)
-        for kind, picture in (("shadow", image), ("target", target), ("error", mesh_files.error_picture(image, target))):
+        for kind, picture in (("shadow", image), ("target", target), ("error", exports.error_picture(image, target))):
             names.append(f"{kind}-{k + 1}.png")
-            io.write_png(out / names[-1], picture)
+            io_images.write_png(out / names[-1], picture)
     if options.printable:
-        mesh_files.write_printable(out / "mesh.stl", last.vertices, last.faces)
+        exports.write_printable(out / "mesh.stl", last.vertices, last.faces)
         names.append("mesh.stl")
     size = options.picture_size
     names.append("picture.png")
@@ -234,7 +240,9 @@ def table(record: dict[str, Any]) -> Table:
     for name, view in zip(record["settings"]["targets"], record["views"], strict=True):
         whole = f"{view['iou_filled']:.4f}" if view["holes"] > 0 else "the same"
         rows.append([name, f"{view['iou']:.4f}", whole, f"{100 * view['holes']:.1f} %"])
-    return report.table("Shadows and targets: intersection over union", ["target", "IoU", "target without holes", "holes"], rows)
+    return io_console.table(
+        "Shadows and targets: intersection over union", ["target", "IoU", "target without holes", "holes"], rows
+    )
 
 
 def summary(record: dict[str, Any]) -> str:

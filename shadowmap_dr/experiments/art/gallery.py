@@ -20,11 +20,12 @@ import mitsuba as mi
 import numpy as np
 from rich.console import Console
 
-from ... import io, report
-from ...cli_options import DEFAULT_VARIANT
 from ...errors import ShadowmapError
-from ...timing import machine
-from ..gradients.report import markdown
+from ...io import files
+from ...io import records as io_records
+from ...io.console import markdown
+from ...variants import DEFAULT_VARIANT
+from ..common.timing import machine
 from .experiment import ArtOptions, run_art
 
 #: Targets without holes, the thin-legged horse apart, and those with holes.
@@ -96,7 +97,7 @@ def run_gallery(
         resume: keep pieces that are finished.
     """
     console = console or Console(stderr=True)
-    io.check_output(results, (".json",))
+    files.check_output(results, (".json",))
     chosen = [piece for piece in PIECES if piece.name in set(names)]
     records: dict[str, Any] = {}
     for number, piece in enumerate(chosen):
@@ -108,19 +109,19 @@ def run_gallery(
                            out=work / piece.name, resume=resume),
                 console=console,
             )  # fmt: skip
-        kept = {name: value for name, value in report.read_json(path).items() if name not in _LEFT_OUT}
+        kept = {name: value for name, value in io_records.read_json(path).items() if name not in _LEFT_OUT}
         records[piece.name] = {"group": piece.group, **kept}
         if piece.shown:
             for name in (*_SHOWN, *_shadow_images(piece)):
-                with io.atomic(out / f"{piece.name}-{name}") as temporary:
+                with files.atomic(out / f"{piece.name}-{name}") as temporary:
                     shutil.copyfile(work / piece.name / name, temporary)
-    record = {"machine": report.plain(machine()), "pieces": records, "summary": summary(records)}
-    report.write_json(results, record)
-    with io.atomic(results.with_suffix(".md")) as temporary:
+    record = {"machine": io_records.plain(machine()), "pieces": records, "summary": summary(records)}
+    io_records.write_json(results, record)
+    with files.atomic(results.with_suffix(".md")) as temporary:
         temporary.write_text("\n".join(document(record)) + "\n", encoding="utf-8")
     shown = [piece for piece in chosen if piece.shown]
     if shown:
-        with io.atomic(out / "gallery.md") as temporary:
+        with files.atomic(out / "gallery.md") as temporary:
             temporary.write_text("\n".join(gallery(shown, records)) + "\n", encoding="utf-8")
         _sheet(out / "gallery.png", [work / piece.name / "picture.png" for piece in shown])
     return record
@@ -201,7 +202,7 @@ def _sheet(path: Path, pictures: Sequence[Path], columns: int = 5, size: int = 2
         with Image.open(picture) as image:
             sheet.paste(image.convert("RGB").resize((size, size), Image.Resampling.LANCZOS),
                         (size * (k % columns), size * (k // columns)))  # fmt: skip
-    with io.atomic(path) as temporary:
+    with files.atomic(path) as temporary:
         sheet.save(temporary)
 
 

@@ -11,11 +11,12 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from ... import io
 from ...errors import ShadowmapError
-from ...inverse.art.shadow_views import DISTANCE, HALF, ShadowView, height
-from ...renderer import Renderer
-from ..maps.scenes import occluder
+from ...io import files
+from ...io import images as io_images
+from ...rendering.receivers.shadow_views import DISTANCE, HALF, ShadowView, height
+from ...rendering.renderer import Renderer
+from ..common.objects import occluder
 from .run import Frame
 
 ANIMATIONS = (".webp", ".gif")
@@ -68,7 +69,7 @@ class Stage:
         points = self._points if vertices is None else np.asarray(vertices, np.float32)
         with dr.suspend_grad():
             image = self._renderer.render({"object": mi.Float(np.ascontiguousarray(points).ravel())}, spp=4)
-        return np.round(255 * io.to_srgb(np.array(image)[..., :3])).astype(np.uint8)
+        return np.round(255 * io_images.to_srgb(np.array(image)[..., :3])).astype(np.uint8)
 
 
 def turntable(frame: Frame, views: Sequence[ShadowView], size: int, count: int = 40,
@@ -107,7 +108,7 @@ def write_animation(path: Path, pictures: Sequence[Pixels], last_ms: int = FRAME
     if path.suffix.lower() == ".gif":
         images = [image.quantize(128, dither=Image.Dither.NONE) for image in images]
     duration = [FRAME_MS] * (len(images) - 1) + [last_ms]
-    with io.atomic(path) as temporary:
+    with files.atomic(path) as temporary:
         images[0].save(temporary, save_all=True, append_images=images[1:], duration=duration, loop=0, **options)
 
 
@@ -115,7 +116,7 @@ def write_picture(path: Path, picture: Pixels) -> None:
     """An 8-bit sRGB image."""
     from PIL import Image
 
-    with io.atomic(path) as temporary:
+    with files.atomic(path) as temporary:
         Image.fromarray(picture).save(temporary)
 
 

@@ -13,9 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ...errors import ShadowmapError
-from ...inverse.art.shadow_views import ShadowView
-from ...inverse.loop import WARM_UP_STEPS
-from ...io import atomic, read_arrays
+from ...inverse.runs.loop import WARM_UP_STEPS
+from ...io.files import atomic, read_arrays
+from ...rendering.receivers.shadow_views import ShadowView
 
 #: Steps between two looks at the shadows, and between two checkpoints.
 LOOK_INTERVAL, CHECKPOINT_INTERVAL = 10, 50

@@ -16,26 +16,27 @@ import numpy as np
 
 from ...inverse import PoseFit
 from ...inverse.pose import _pose_step
-from ...timing import Contender, alternate, quiet_garbage, summary, timed
+from ...jit.gc import gc_quiet
+from ..common.timing import Contender, alternate, summary, timed
 from .common import BenchOptions, Unit, Update
 from .scaling import Case
 
 #: The passes of a step in their order: label, and the function (module:name below `shadowmap_dr`) that makes them up.
 PASSES = (
-    ("vertices", "geometry:Geometry.with_positions"),
-    ("facets: mean normals", "renderer:mean_normals"),
-    ("camera: projection", "renderer:camera_clip"),
-    ("camera: rasterization", "renderer:visible_triangles"),
-    ("shadow map: frustum", "light_maps:fit_frusta"),
-    ("shadow map: rendering", "light_maps:render_maps"),
-    ("shadow map: filter", "light_maps:filter_maps"),
-    ("hits", "renderer:pixel_hits"),
-    ("normals", "renderer:normals_at"),
-    ("facets: blend", "renderer:soften_facets"),
-    ("surface", "renderer:surface_at"),
-    ("shadow look-up", "renderer:Renderer._visibilities"),
-    ("shading", "renderer:Renderer._radiance"),
-    ("anti-aliasing", "renderer:antialias"),
+    ("vertices", "scene.geometry:Geometry.with_positions"),
+    ("facets: mean normals", "rendering.renderer:mean_normals"),
+    ("camera: projection", "rendering.renderer:camera_clip"),
+    ("camera: rasterization", "rendering.renderer:visible_triangles"),
+    ("shadow map: frustum", "rendering.shadow_pass:fit_frusta"),
+    ("shadow map: rendering", "rendering.shadow_pass:render_maps"),
+    ("shadow map: filter", "rendering.shadow_pass:filter_maps"),
+    ("hits", "rendering.renderer:pixel_hits"),
+    ("normals", "rendering.renderer:normals_at"),
+    ("facets: blend", "rendering.renderer:prefilter_normals"),
+    ("surface", "rendering.renderer:surface_at"),
+    ("shadow look-up", "rendering.renderer:Renderer._visibilities"),
+    ("shading", "rendering.renderer:Renderer._radiance"),
+    ("anti-aliasing", "rendering.renderer:antialias"),
 )
 REST = "loss, Adam, the rest"
 
@@ -92,7 +93,7 @@ def _history() -> Iterator[None]:
 def _kernels(call: Callable[[], Any], rounds: int) -> tuple[list[float], list[list[float]]]:
     """Seconds of some calls, and of each kernel of theirs."""
     walls, kernels = [], []
-    with quiet_garbage(), _history():
+    with gc_quiet(), _history():
         for _ in range(min(rounds, 20) + 1):
             walls.append(timed(call))
             kernels.append([entry["execution_time"] / 1e3 for entry in dr.kernel_history()])
@@ -185,7 +186,7 @@ def _passes(fit: PoseFit, rounds: int, update: Update) -> list[dict[str, Any]]:
     """Median seconds of the kernels of each pass in both directions."""
     count = max(3, rounds // 4)
     records: list[Recorder] = []
-    with quiet_garbage(), ExitStack() as stack:
+    with gc_quiet(), ExitStack() as stack:
         for name, place in PASSES:
             owner, attribute = find(place)
             original = owner.__dict__[attribute]

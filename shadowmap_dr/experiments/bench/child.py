@@ -11,7 +11,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ... import report
+from ...io import records
 
 
 def main() -> None:
@@ -24,7 +24,7 @@ def main() -> None:
     function = getattr(importlib.import_module(f"shadowmap_dr.experiments.{module}"), name)
 
     def emit(result: dict[str, Any]) -> None:
-        print(json.dumps(report.plain(result), allow_nan=False), flush=True)
+        print(json.dumps(records.plain(result), allow_nan=False), flush=True)
 
     emit(function(**task["arguments"], emit=emit))
 

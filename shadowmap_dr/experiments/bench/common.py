@@ -29,8 +29,8 @@ class Sizes:
         default_steps: steps of Mitsuba's default setting for each resolution.
         starts, iterations: of the times to pose.
         path_traced: whether the reference images are path-traced or, faster, our own.
-        meshes, raster_resolutions: of rasterization alone, see `bench.meshes.make`.
-        worst: worst cases, with the well-behaved mesh that each is compared with; see `bench.meshes`.
+        meshes, raster_resolutions: of rasterization alone, see `common.meshes.make`.
+        worst: worst cases, with the well-behaved mesh that each is compared with; see `common.meshes`.
         full_raster: mesh and resolutions for the forward and backward pass through the raster functions.
         call_seconds: a rasterization that is predicted to take longer than this is left out.
         series: quantity -> values; see `bench.scaling`.

@@ -16,9 +16,11 @@ import drjit as dr
 import mitsuba as mi
 from rich.console import Console
 
-from ... import __version__, io, report
+from ... import __version__
 from ...errors import ShadowmapError
-from ...timing import OtherWork, load, machine
+from ...io import console as io_console
+from ...io import files, records
+from ..common.timing import OtherWork, load, machine
 from . import breakdown as bench_breakdown
 from . import first as bench_first
 from . import loops as bench_loops
@@ -52,7 +54,7 @@ def run_bench(options: BenchOptions, *, console: Console | None = None) -> dict[
         `machine`, `load_before` and `load_after`, and `figures`, the rows of the table.
     """
     console = console or Console(stderr=True)
-    io.check_output(options.out, (".json",))
+    files.check_output(options.out, (".json",))
     record = _stored(options)
     command = shlex.join(["shadowmap-dr", *sys.argv[1:]])
     record |= {"format": FORMAT, "machine": machine(), "load_before": load()}
@@ -65,7 +67,7 @@ def run_bench(options: BenchOptions, *, console: Console | None = None) -> dict[
         record["sections"][name] = {"command": command, "settings": settings, "machine": machine(), "units": units}
     _write(options, record)
 
-    with report.progress(console) as progress:
+    with io_console.progress(console) as progress:
         for name, units in plan.items():
             task = progress.add_task(name, total=len(units), note="")
             done = record["sections"][name]["units"]
@@ -116,12 +118,12 @@ def _measured(unit: Unit, done: dict[str, Any], update: Callable[[int, int, str]
         "cores_used_by_others": others.cores(),
         "wall_seconds": time.perf_counter() - began,
     }
-    return report.plain({**result, **surroundings})
+    return records.plain({**result, **surroundings})
 
 
 def _settings(options: BenchOptions) -> dict[str, Any]:
     """What results must have been measured with to be kept."""
-    return report.plain(
+    return records.plain(
         {
             "quick": options.quick,
             "mitsuba_seconds": options.mitsuba_seconds,
@@ -139,11 +141,11 @@ def _stored(options: BenchOptions) -> dict[str, Any]:
     """The record in the file, or an empty one."""
     if not options.out.exists():
         return {"sections": {}}
-    record = report.read_json(options.out)
+    record = records.read_json(options.out)
     if not isinstance(record, dict) or record.get("format") != FORMAT or not isinstance(record.get("sections"), dict):
         raise ShadowmapError(f"{options.out} is no record of a benchmark: choose another file.")
     return record
 
 
 def _write(options: BenchOptions, record: dict[str, Any]) -> None:
-    report.write_json(options.out, record)
+    records.write_json(options.out, record)

@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...timing import compare, timed
+from ..common.timing import compare, timed
 from .common import BenchOptions, Unit, Update, run_child
 
 # Pictures of each scene, and the time after which a scene is given up.

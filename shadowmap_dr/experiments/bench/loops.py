@@ -16,8 +16,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ... import assets
-from ...timing import compare, forget_peak_memory, peak_memory, quiet_garbage, timed
+from ...io import assets
+from ...jit.gc import gc_quiet
+from ..common.timing import compare, forget_peak_memory, peak_memory, timed
 from .common import BenchOptions, Unit, Update, run_child
 
 #: The integrator that takes the place of the originals.
@@ -391,7 +392,7 @@ def _measure(options: BenchOptions, name: str, done: Mapping[str, Any], update: 
     both = {"ours": loop.steps(OURS, size), "original": loop.steps(loop.original, size)}
     seconds: dict[str, list[float]] = {key: [] for key in both}
     errors: dict[str, list[float]] = {key: [] for key in both}
-    with quiet_garbage():
+    with gc_quiet():
         for step in range(loop.count):
             update(step, loop.count, name)
             for key, steps in both.items():

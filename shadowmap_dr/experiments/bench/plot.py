@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from typing import Any
 
-from ...io import atomic
+from ...io.files import atomic
 
 _LABELS = {
     "triangles": "triangles",

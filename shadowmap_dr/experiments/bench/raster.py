@@ -13,9 +13,9 @@ import mitsuba as mi
 import numpy as np
 
 from ...raster import Topology, antialias, build_topology, interpolate, rasterize
-from ...scene import load
-from ...timing import Contender, alternate, compare
-from . import meshes as bench_meshes
+from ...scene.load import load
+from ..common import meshes as bench_meshes
+from ..common.timing import Contender, alternate, compare
 from .common import BenchOptions, Unit, Update
 
 #: Milliseconds that others measured with Meta's DRTK (C++ kernels for the CPU), Spot over the wall.
@@ -71,7 +71,7 @@ class RasterScene:
 
 
 def raster_scene(options: BenchOptions, kind: str, resolution: int) -> RasterScene:
-    """The wall and a mesh of `bench.meshes`, seen from the camera of `scenes/pose.xml`."""
+    """The wall and a mesh of `common.meshes`, seen from the camera of `scenes/pose.xml`."""
     scene = bench_meshes.scene(bench_meshes.stored(kind, options.work), resolution)
     data = load(scene)
     geometry = data.geometry

@@ -13,8 +13,8 @@ from typing import Any
 
 from rich.table import Table
 
-from ... import report
 from ...errors import ShadowmapError
+from ...io import console, records
 from . import plot as bench_plot
 from . import sums as bench_sums
 
@@ -84,7 +84,7 @@ def rows(record: dict[str, Any]) -> list[Row]:
 
 def table(record: dict[str, Any]) -> Table:
     """For the terminal."""
-    result = report.table("Medians; ratios are those of medians", COLUMNS, [])
+    result = console.table("Medians; ratios are those of medians", COLUMNS, [])
     kind = None
     for row in rows(record):
         if kind is not None and row.what.split()[0] != kind:
@@ -323,7 +323,7 @@ def main() -> None:
     if len(sys.argv) != 2:
         sys.exit("usage: python -m shadowmap_dr.experiments.bench.report FILE.json")
     try:
-        print(markdown(report.read_json(sys.argv[1])))
+        print(markdown(records.read_json(sys.argv[1])))
     except ShadowmapError as error:
         sys.exit(f"error: {error}")
     except (KeyError, TypeError, AttributeError):

@@ -13,9 +13,9 @@ import mitsuba as mi
 import numpy as np
 
 from ...inverse import PoseFit
-from ...renderer import Renderer
-from ...timing import Contender, alternate, compare, exponent, forget_peak_memory, peak_memory, summary
-from . import meshes as bench_meshes
+from ...rendering.renderer import Renderer
+from ..common import meshes as bench_meshes
+from ..common.timing import Contender, alternate, compare, exponent, forget_peak_memory, peak_memory, summary
 from .common import BenchOptions, Unit, Update, run_child
 from .raster import _forward_backward, offsets, raster_scene
 
@@ -25,7 +25,7 @@ CHILD_SECONDS = 900.0
 
 @dataclass(frozen=True)
 class Case:
-    """An optimisation step: its scene and its settings. `mesh` as in `bench.meshes.make`; `views` cameras side by side."""
+    """An optimisation step: its scene and its settings. `mesh` as in `common.meshes.make`; `views` cameras side by side."""
 
     mesh: str = "spot-6k"
     resolution: int = 256

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ... import assets, io
 from ...errors import ShadowmapError
 from ...inverse import Method
-from ...timing import Contender, alternate, compare, timed
+from ...io import assets, images
+from ..common.timing import Contender, alternate, compare, timed
 from ..pose.methods import BETAS, METHODS, STEP_SIZE, build_method
 from ..pose.record import seconds_to_pose
 from ..pose.scene import PoseProblem, make_problem, path_traced_reference, pose_errors, start_pose
@@ -86,7 +86,7 @@ def default_steps(resolution: int, reference: str, steps: int, emit: Callable[[d
 
     setting = ProjectiveSetting(16, 16, 16, "octree", 16)
     scene, mesh = assets.scene("pose"), assets.mesh(OBJECT)
-    method = MitsubaPose(scene, mesh, resolution, setting, io.read_image(reference), step_size=STEP_SIZE, betas=BETAS)
+    method = MitsubaPose(scene, mesh, resolution, setting, images.read_image(reference), step_size=STEP_SIZE, betas=BETAS)
     method.reset(start_pose(SEED, 0))
     seconds: list[float] = []
     result = {"setting": asdict(setting), "seconds": seconds}
@@ -210,5 +210,5 @@ def _problem(options: BenchOptions, resolution: int, update: Update) -> tuple[Po
     image = method.render(np.zeros(3))
     if not np.isfinite(image).all():
         raise ShadowmapError(f"the reference image of {OBJECT} at {resolution} pixels is not finite.")
-    io.write_image(path, image)
+    images.write_image(path, image)
     return problem, image, path

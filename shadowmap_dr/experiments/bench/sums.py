@@ -18,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...errors import ShadowmapError
-from ...renderer import Renderer
+from ...rendering.renderer import Renderer
 from .common import BenchOptions, Unit, Update, run_child
 
 MODES = ("plug-in", "recorded", "renderer", "frozen")

@@ -11,11 +11,12 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
-from ... import io, report
 from ...errors import ShadowmapError
 from ...inverse import History, optimize
 from ...inverse.faces.morphable import MorphableModel
-from ...timing import machine
+from ...io import console as io_console
+from ...io import files, records
+from ..common.timing import machine
 from . import pictures as faces_pictures
 from . import report as faces_report
 from .information import image_derivatives, posterior_covariance, recovery
@@ -128,14 +129,14 @@ def run_faces(options: FaceOptions, *, console: Console | None = None) -> dict[s
     """
     check_libraries()
     console = console or Console(stderr=True)
-    path = io.check_output(options.out / "faces.json", (".json",))
+    path = files.check_output(options.out / "faces.json", (".json",))
     model = default_model(options.model)
     scenes = {
         lights: FaceScene.build(model, lights, options.height, options.map_resolution, options.filter_size)
         for lights in options.lights
     }
     record = _started(path, options, model)
-    with report.progress(console) as progress:
+    with io_console.progress(console) as progress:
         task = progress.add_task("heads", total=len(options.modes) * len(options.lights) * len(options.seeds), note="")
         for mode in options.modes:
             sheets = faces_pictures.Sheets(model, mode)
@@ -175,7 +176,7 @@ def _one(
         history = optimize(fit, start, options.iterations, checkpoint=checkpoint, settings=settings, on_step=show)
         progress.remove_task(steps)
         record["runs"][key] = _measured(scene, head, mode, options, fit, history)
-        report.write_json(path, record)
+        records.write_json(path, record)
         checkpoint.unlink(missing_ok=True)
     final = np.array(record["runs"][key]["final"], np.float64)
     found = fit.vertices(final)
@@ -203,12 +204,12 @@ def _measured(scene: FaceScene, head: Head, mode: Mode, options: FaceOptions, fi
     if mode == "expression" and options.prior > 0:
         left = posterior_covariance(image_derivatives(fit, np.zeros(len(history.final))), options.prior)
         result["recovery"] = recovery(scene.model.expression_names, left, true, weights)
-    return report.plain(result)
+    return records.plain(result)
 
 
 def _started(path: Path, options: FaceOptions, model: MorphableModel) -> dict[str, Any]:
     """The record of an earlier call with the same settings, or an empty one."""
-    settings = report.plain({
+    settings = records.plain({
         "model": faces_report.digest(model), "iterations": options.iterations, "prior": options.prior,
         "translate": options.translate, "reference": options.reference,
         "spp": options.spp if options.reference != "own" else None,
@@ -216,7 +217,7 @@ def _started(path: Path, options: FaceOptions, model: MorphableModel) -> dict[st
         "samples": options.samples, "step_size": STEP_SIZE, "translation_step": TRANSLATION_STEP,
     })
     if options.resume and path.exists():
-        return report.read_record(path, settings, "runs")
+        return records.read_record(path, settings, "runs")
     return {"settings": settings, "machine": machine(), "runs": {}}
 
 

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from ... import io, report
 from ...inverse import optimize
-from ...timing import machine
+from ...io import console as io_console
+from ...io import files, plots, records
+from ..common.timing import machine
 from . import pictures as faces_pictures
 from . import report as faces_report
 from .experiment import STEP_SIZE, TRANSLATION_STEP, check_numbers
@@ -55,7 +56,7 @@ def run_image(options: ImageOptions, *, console: Console | None = None) -> dict[
     """
     console = console or Console(stderr=True)
     name = options.image.stem
-    path = io.check_output(options.out / f"{name}-face.json", (".json",))
+    path = files.check_output(options.out / f"{name}-face.json", (".json",))
     silhouette = read_silhouette(options.image)
     model = default_model(options.model)
     scene = FaceScene.build(model, 1, options.height, options.map_resolution, options.filter_size)
@@ -64,7 +65,7 @@ def run_image(options: ImageOptions, *, console: Console | None = None) -> dict[
     fit = scene.fit(
         options.mode, target, translate=True, prior=options.prior, step_size=STEP_SIZE, translation_step=TRANSLATION_STEP
     )
-    settings = report.plain({
+    settings = records.plain({
         "image": options.image.name, "mode": options.mode, "model": faces_report.digest(model), "iterations": options.iterations,
         "height": options.height, "map_resolution": options.map_resolution, "filter_size": options.filter_size,
         "placement": vars(placement), **fit.describe(),
@@ -73,25 +74,25 @@ def run_image(options: ImageOptions, *, console: Console | None = None) -> dict[
     if not options.resume:
         checkpoint.unlink(missing_ok=True)
     start = np.zeros(fit.count + 2)
-    with report.progress(console) as progress:
+    with io_console.progress(console) as progress:
         task = progress.add_task("steps", total=options.iterations, note="")
         show = functools.partial(_show, progress, task)
         history = optimize(fit, start, options.iterations, checkpoint=checkpoint, settings=settings, on_step=show)
     images = {"target": target[..., None], "mean head": fit.render(start), "result": fit.render(history.final)}
     images["difference"] = np.abs(images["result"] - images["target"])
-    record = report.plain({
+    record = records.plain({
         "settings": settings, "machine": machine(),
         "image_error": float(np.sqrt(np.mean(images["difference"] ** 2))),
         "image_error_start": float(np.sqrt(np.mean(np.square(images["mean head"] - images["target"])))),
         "weights": history.final[: fit.count], "translation": history.final[fit.count :],
         "seconds_per_iteration": history.seconds_per_iteration, "loss_curve": history.loss,
     })
-    report.write_json(path, record)
+    records.write_json(path, record)
     found = fit.vertices(history.final)
     heads = {"mean head": model.mean, "result": found}
     drawn = {title: faces_pictures.picture(vertices, model.faces, model.mask) for title, vertices in heads.items()}
-    report.image_sheet(options.out / f"{name}-shadows.png", {"shadow": images})
-    report.image_sheet(options.out / f"{name}-heads.png", {"head": drawn})
+    plots.image_sheet(options.out / f"{name}-shadows.png", {"shadow": images})
+    plots.image_sheet(options.out / f"{name}-heads.png", {"head": drawn})
     faces_pictures.write_ply(options.out / f"{name}-face.ply", found, model.faces)
     checkpoint.unlink(missing_ok=True)
     return record

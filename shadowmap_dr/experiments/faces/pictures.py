@@ -10,9 +10,10 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from ... import io, report
 from ...inverse.faces.morphable import MorphableModel
-from ...io import atomic, to_srgb
+from ...io import meshes, plots
+from ...io.files import atomic
+from ...io.images import to_srgb
 from .metrics import distances
 
 #: Distance that has the last colour of the map (head within [-1, 1]^3).
@@ -44,7 +45,7 @@ class Sheets:
     def write(self, out: Path) -> None:
         """`MODE-profiles-N.png` for each number N of shadows, and `MODE-errors.png`."""
         for lights, rows in self._profiles.items():
-            report.image_sheet(out / f"{self._mode}-profiles-{lights}.png", rows)
+            plots.image_sheet(out / f"{self._mode}-profiles-{lights}.png", rows)
         rows = {}
         for seed, heads in self._heads.items():
             faces = self._model.faces
@@ -119,7 +120,7 @@ def error_sheet(path: str | os.PathLike[str], rows: dict[str, dict[str, npt.NDAr
 def write_ply(path: str | os.PathLike[str], vertices: npt.ArrayLike, faces: npt.ArrayLike) -> None:
     """Write a mesh as a binary PLY file."""
     mesh = _mesh(np.asarray(vertices, np.float32), np.asarray(faces))
-    io.write_ply(path, mesh)
+    meshes.write_ply(path, mesh)
 
 
 def _mesh(vertices: npt.NDArray[np.float32], faces: npt.NDArray[Any]) -> Any:

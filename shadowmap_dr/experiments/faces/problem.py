@@ -11,11 +11,11 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from ... import assets
 from ...errors import ShadowmapError
 from ...inverse.faces.morph_fit import MorphFit
 from ...inverse.faces.morphable import MorphableModel, load_model
-from ...receiver import ReceiverShadows, Window
+from ...io import assets
+from ...rendering.receivers.planar_receiver import ReceiverShadows, Window
 from ...shadow import ShadowSettings
 
 Mode = Literal["identity", "both", "expression"]

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from ... import report
 from ...inverse.faces.morphable import MorphableModel
-from ...io import atomic
-from ..gradients.report import markdown
+from ...io import console, plots
+from ...io.console import markdown
+from ...io.files import atomic
 from .information import SEEN
 
 #: Mean errors over the four heads of the paper's Table 2, (mean distance, Hausdorff distance, seconds per iteration).
@@ -87,7 +87,7 @@ def rows(record: Mapping[str, Any], mode: str) -> tuple[list[str], list[list[str
 def tables(record: Mapping[str, Any]) -> list[Table]:
     """For the terminal: one for each mode."""
     modes = [mode for mode in _TITLES if runs_of(record, mode)]
-    return [report.table(f"{_TITLES[mode]}: distances, ms a step", *rows(record, mode)) for mode in modes]
+    return [console.table(f"{_TITLES[mode]}: distances, ms a step", *rows(record, mode)) for mode in modes]
 
 
 def seen_expressions(record: Mapping[str, Any], lights: int) -> list[dict[str, Any]]:
@@ -143,4 +143,4 @@ def write(out: Path, record: Mapping[str, Any]) -> None:
     curves: dict[str, list[Any]] = {}
     for run in record["runs"].values():
         curves.setdefault(f"{run['mode']}, {run['lights']}", []).append(run["loss_curve"])
-    report.plot_curves(out / "convergence.png", {"loss": curves})
+    plots.plot_curves(out / "convergence.png", {"loss": curves})

@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ...errors import ShadowmapError
-from ...figures import scaled_to_bytes
-from ...io import read_image, to_srgb
+from ...inverse.shadow_art.target_images import scaled_to_bytes
+from ...io.images import read_image, to_srgb
 
 FloatArray = npt.NDArray[np.float32]
 

@@ -12,16 +12,17 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from ... import io, report
 from ...errors import ShadowmapError
 from ...inverse import optimize
-from ...renderer import Renderer
-from ...timing import machine
-from ..bench.meshes import Mesh
+from ...io import console as io_console
+from ...io import files, plots, records
+from ...io.console import markdown
+from ...rendering.renderer import Renderer
+from ..common.meshes import Mesh
+from ..common.timing import machine
 from . import scenes as gradients_scenes
 from .fit import ShadowFit
 from .images import CANDIDATES, Image, check_chosen, check_maps
-from .report import markdown
 
 #: Error in texels below which an occluder counts as recovered, and largest error that is hoped for.
 RECOVERED, HOPED_FOR = 1.0, 0.1
@@ -83,11 +84,11 @@ class ConvergenceOptions:
 def run_convergence(options: ConvergenceOptions, *, console: Console | None = None) -> dict[str, Any]:
     """Run all; writes `convergence.json`, `convergence.md`, a plot and pictures into `options.out`, and returns the record."""
     console = console or Console(stderr=True)
-    path = io.check_output(options.out / "convergence.json", (".json",))
+    path = files.check_output(options.out / "convergence.json", (".json",))
     record = _started(path, options)
     groups = list(itertools.product(options.candidates, options.occluders, options.cameras, options.filter_sizes))
     sheet: dict[str, dict[str, Image]] = {}
-    with report.progress(console) as progress:
+    with io_console.progress(console) as progress:
         task = progress.add_task("runs", total=len(groups) * len(options.displacements), note="")
         for label, name, camera, taps in groups:
             progress.update(task, note=f"{name}, {camera}, filter {taps}")
@@ -112,13 +113,13 @@ def run_convergence(options: ConvergenceOptions, *, console: Console | None = No
                     "seconds_per_iteration": history.seconds_per_iteration, "error_curve_texels": errors,
                     "loss_curve": history.loss,
                 }
-                report.write_json(path, record)
+                records.write_json(path, record)
                 progress.advance(task)
-    record = report.plain(record)
-    report.write_json(path, record)
-    report.image_sheet(options.out / "convergence-images.png", sheet)
-    report.plot_curves(options.out / "convergence.png", _curves(record), columns=2)
-    with io.atomic(options.out / "convergence.md") as temporary:
+    record = records.plain(record)
+    records.write_json(path, record)
+    plots.image_sheet(options.out / "convergence-images.png", sheet)
+    plots.plot_curves(options.out / "convergence.png", _curves(record), columns=2)
+    with files.atomic(options.out / "convergence.md") as temporary:
         temporary.write_text(read_convergence(record), encoding="utf-8")
     return record
 
@@ -127,7 +128,7 @@ def _started(path: Path, options: ConvergenceOptions) -> dict[str, Any]:
     identity = {"map_resolution": options.map_resolution, "resolution": options.resolution, "iterations": options.iterations,
                 "spp": options.spp, "step_size": STEP_SIZE, "decay": _DECAY}
     if options.resume and path.exists():
-        record = report.read_record(path, identity, "runs")
+        record = records.read_record(path, identity, "runs")
         for run in record["runs"].values():
             run.setdefault("candidate", "default")  # for records from before there were others
         return record
@@ -209,7 +210,7 @@ def largest_recovered(runs: list[Mapping[str, Any]]) -> float:
 
 def convergence_table(record: Mapping[str, Any]) -> Table:
     """For the terminal."""
-    return report.table("Displaced occluders (error of the recovered ones in texels)", *convergence_rows(record))
+    return io_console.table("Displaced occluders (error of the recovered ones in texels)", *convergence_rows(record))
 
 
 def read_convergence(record: Mapping[str, Any]) -> str:

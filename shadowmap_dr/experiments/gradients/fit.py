@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ...errors import ShadowmapError
-from ...raster._memory import device_array
-from ...renderer import Renderer
+from ...jit.arrays import device_array
+from ...rendering.renderer import Renderer
 from .images import SHAPE
 
 

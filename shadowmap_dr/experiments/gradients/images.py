@@ -12,10 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from ...errors import ShadowmapError
-from ...renderer import Renderer
+from ...rendering.renderer import Renderer
 from ...shadow import ShadowSettings, directional_view
 from ...shadow.filters import filter_kernel
-from ..bench.meshes import Mesh
+from ..common.meshes import Mesh
 from .scenes import RECEIVER_HALF, Motion
 
 Image = npt.NDArray[np.float32]

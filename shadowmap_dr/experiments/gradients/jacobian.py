@@ -11,11 +11,12 @@ import numpy as np
 import numpy.typing as npt
 from rich.console import Console
 
-from ... import io, report
 from ...errors import ShadowmapError
-from ...renderer import Renderer
-from ...timing import machine
-from ..bench.meshes import Mesh
+from ...io import console as io_console
+from ...io import files, records
+from ...rendering.renderer import Renderer
+from ..common.meshes import Mesh
+from ..common.timing import machine
 from . import report as gradients_report
 from . import scenes as gradients_scenes
 from .images import (
@@ -80,7 +81,7 @@ class JacobianOptions:
 def run_jacobian(options: JacobianOptions, *, console: Console | None = None) -> dict[str, Any]:
     """Measure all; writes `jacobian.json`, `jacobian.md`, pictures and a plot into `options.out` and returns the record."""
     console = console or Console(stderr=True)
-    path = io.check_output(options.out / "jacobian.json", (".json",))
+    path = files.check_output(options.out / "jacobian.json", (".json",))
     record = _started(path, options)
     mesh = gradients_scenes.ring(options.faces)
     record["settings"]["faces"] = len(mesh.faces)
@@ -94,7 +95,7 @@ def run_jacobian(options: JacobianOptions, *, console: Console | None = None) ->
         for taps in options.filter_sizes
         if _key(label, name, size, taps) not in record["entries"]
     ]
-    with report.progress(console) as progress:
+    with io_console.progress(console) as progress:
         def track(title: str, items: list[Any]) -> Iterable[Any]:
             task = progress.add_task(title, total=len(items), note="")
             for item in items:
@@ -108,18 +109,18 @@ def run_jacobian(options: JacobianOptions, *, console: Console | None = None) ->
         mitsuba = {}
         for name in track("Mitsuba, projective", moving if options.mitsuba_passes else []):
             mitsuba[name], record["mitsuba"][name] = projective_image(mesh, name, sampling, options.mitsuba_passes)
-            report.write_json(path, record)
+            records.write_json(path, record)
         for label, name, size, taps in track("derivative images", work):
             entry = _measure(mesh, label, name, size, taps, traced[name], options)
             record["entries"][_key(label, name, size, taps)] = entry
-            report.write_json(path, record)
+            records.write_json(path, record)
         for name in track("64-fold tessellation", [name for name in moving if name not in record["tessellation"]]):
             record["tessellation"][name] = _tessellation(name, options)
-        report.write_json(path, record)
+        records.write_json(path, record)
         pictures = {name: _pictures(mesh, name, traced, mitsuba, options) for name in track("pictures", list(options.motions))}
     gradients_report.signed_sheet(options.out / "jacobian.png", pictures)
     gradients_report.plot_agreement(options.out / "jacobian-agreement.png", record)
-    with io.atomic(options.out / "jacobian.md") as temporary:
+    with files.atomic(options.out / "jacobian.md") as temporary:
         temporary.write_text(gradients_report.read_jacobian(record), encoding="utf-8")
     return record
 
@@ -128,7 +129,7 @@ def _started(path: Path, options: JacobianOptions) -> dict[str, Any]:
     """A new record, or the stored one to go on with."""
     identity = {"resolution": options.resolution, "requested_faces": options.faces, "spp": options.spp}
     if options.resume and path.exists():
-        return report.read_record(path, identity, "references", "mitsuba", "entries", "tessellation")
+        return records.read_record(path, identity, "references", "mitsuba", "entries", "tessellation")
     empty: dict[str, Any] = {"settings": identity, "machine": machine(), "candidates": CANDIDATES}
     return empty | {"references": {}, "mitsuba": {}, "entries": {}, "tessellation": {}}
 

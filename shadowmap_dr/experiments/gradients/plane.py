@@ -11,15 +11,16 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from ... import io, report
 from ...errors import ShadowmapError
 from ...inverse import optimize
-from ...renderer import Renderer
-from ...timing import machine
+from ...io import console as io_console
+from ...io import files, plots, records
+from ...io.console import markdown
+from ...rendering.renderer import Renderer
+from ..common.timing import machine
 from . import scenes as gradients_scenes
 from .fit import ShadowFit
 from .images import Image, check_chosen, check_maps
-from .report import markdown
 
 #: Largest error of a recovered vertex, world units.
 RECOVERED = 0.002
@@ -61,7 +62,7 @@ def run_plane(options: PlaneOptions, *, console: Console | None = None) -> dict[
     from mitsuba_baselines.reference import path_traced
 
     console = console or Console(stderr=True)
-    path = io.check_output(options.out / "minimal-plane.json", (".json",))
+    path = files.check_output(options.out / "minimal-plane.json", (".json",))
     mesh = gradients_scenes.plane(HALF, Z)
     basis = np.zeros((2, *mesh.vertices.shape))
     basis[0, VERTEX, 0] = basis[1, VERTEX, 1] = 1
@@ -70,7 +71,7 @@ def run_plane(options: PlaneOptions, *, console: Console | None = None) -> dict[
                 "iterations": options.iterations, "spp": options.spp, "step_size": STEP_SIZE, "start": start}
     record: dict[str, Any] = {"settings": settings, "machine": machine(), "runs": []}
     sheet: dict[str, dict[str, Image]] = {}
-    with report.progress(console) as progress:
+    with io_console.progress(console) as progress:
         task = progress.add_task("steps", total=len(options.cameras) * len(CASES) * options.iterations, note="")
         for camera in options.cameras:
             scene = gradients_scenes.build(mesh, options.resolution, camera)
@@ -92,14 +93,14 @@ def run_plane(options: PlaneOptions, *, console: Console | None = None) -> dict[
                 result = fit.render(history.final)
                 sheet[f"{camera}, {label}"] = {"reference": reference, "start": fit.render(start), "result": result,
                                                "difference": np.abs(result - reference)}
-    record = report.plain(record)
-    report.write_json(path, record)
-    report.image_sheet(options.out / "minimal-plane-images.png", sheet)
+    record = records.plain(record)
+    records.write_json(path, record)
+    plots.image_sheet(options.out / "minimal-plane-images.png", sheet)
     curves = {
         key: {f"{run['camera']}, {_label(run)}": [run[f"{key}_curve"]] for run in record["runs"]} for key in ("error", "loss")
     }
-    report.plot_curves(options.out / "minimal-plane.png", curves)
-    with io.atomic(options.out / "minimal-plane.md") as temporary:
+    plots.plot_curves(options.out / "minimal-plane.png", curves)
+    with files.atomic(options.out / "minimal-plane.md") as temporary:
         temporary.write_text(read_plane(record), encoding="utf-8")
     return record
 
@@ -117,7 +118,7 @@ def plane_rows(record: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
 
 def plane_table(record: Mapping[str, Any]) -> Table:
     """For the terminal."""
-    return report.table("A vertex recovered from the shadow (distance from its place, world units)", *plane_rows(record))
+    return io_console.table("A vertex recovered from the shadow (distance from its place, world units)", *plane_rows(record))
 
 
 def read_plane(record: Mapping[str, Any]) -> str:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import ShadowmapError
-from ..bench.meshes import Mesh
+from ..common.meshes import Mesh
 from . import scenes as gradients_scenes
 from .images import Image
 from .scenes import MOTIONS, Motion

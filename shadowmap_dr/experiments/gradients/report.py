@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from rich.table import Table
 
-from ... import report
-from ...io import atomic
+from ...io import console
+from ...io.console import markdown
+from ...io.files import atomic
 
 #: What a derivative is expected to reach: least cosine, and bounds of the scale.
 OWN, TRACED = (0.98, 0.97, 1.03), (0.95, 0.95, 1.05)
@@ -102,7 +103,7 @@ def jacobian_rows(record: Mapping[str, Any]) -> tuple[list[str], list[list[str]]
 
 def jacobian_table(record: Mapping[str, Any]) -> Table:
     """For the terminal."""
-    return report.table("Derivative images: worst cosine c and scale s over all motions", *jacobian_rows(record))
+    return console.table("Derivative images: worst cosine c and scale s over all motions", *jacobian_rows(record))
 
 
 def read_jacobian(record: Mapping[str, Any]) -> str:
@@ -198,10 +199,3 @@ def _tessellation(record: Mapping[str, Any]) -> list[str]:
 
 def _verdict(reached: bool, limit: str) -> str:
     return f"limit {limit}: {'reached' if reached else 'not reached'}"
-
-
-def markdown(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    """Lines of a table."""
-    return [f"| {' | '.join(columns)} |", "|" + "---|" * len(columns), *(f"| {' | '.join(row)} |" for row in rows)]
-
-

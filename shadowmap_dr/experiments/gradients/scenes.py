@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ...errors import ShadowmapError
-from ..bench.meshes import Mesh, subdivided, torus
-from ..maps.scenes import occluder
+from ..common.meshes import Mesh, subdivided, torus
+from ..common.objects import occluder
 
 #: z of the receiver, and half of its side.
 RECEIVER_Z, RECEIVER_HALF = -2.0, 1.0

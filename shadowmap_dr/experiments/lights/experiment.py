@@ -15,11 +15,13 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from ... import assets, io, report, timing
 from ...errors import ShadowmapError
 from ...inverse import run_sweep
-from ...inverse.schedulers import check_threads
-from ...inverse.sweep import MEMORY, stored_records
+from ...inverse.runs.schedulers import check_threads
+from ...inverse.runs.sweep import MEMORY, stored_records
+from ...io import assets, files
+from ...io import records as io_records
+from ..common import timing
 from .problem import LightProblem, LightSetting, check_problem, curve_iterations
 from .report import pictures, plot
 from .scene import OBJECTS
@@ -76,7 +78,7 @@ def run_lights(options: LightOptions, *, variant: str = "llvm_ad_rgb", console: 
     with the same folder have left in `lights.json` stay if `options.resume` is set, and summaries of the same settings go on to
     count the objects and runs of which batches are in the folder. Returns the summaries.
     """
-    path = io.check_output(options.out / "lights.json", (".json",))
+    path = files.check_output(options.out / "lights.json", (".json",))
     problems = options.problems()
     stored = _stored(path) if options.resume else []
     found = run_sweep(
@@ -99,7 +101,7 @@ def run_lights(options: LightOptions, *, variant: str = "llvm_ad_rgb", console: 
         summaries.append(summary(*(wider or (group, [found[problem.name] for problem in group]))))
     new = [entry["setting"] for entry in summaries]
     summaries = [entry for entry in stored if entry["setting"] not in new] + summaries
-    report.write_json(path, {"summaries": summaries, "machine": timing.machine()})
+    io_records.write_json(path, {"summaries": summaries, "machine": timing.machine()})
     plot(options.out / "lights.png", summaries)
     shown = next(iter(groups.values()))
     pictures(options.out / "pictures.png", shown, [found[problem.name] for problem in shown])
@@ -112,7 +114,7 @@ def summary(problems: Sequence[LightProblem], records: Sequence[Sequence[dict[st
     curves = np.array([record["alignment_curve"] for own in records for record in own])
     settings = {"filter": "gaussian", **problems[0].settings()}
     settings = {key: value for key, value in settings.items() if key not in ("object", "object_digest", "steps")}
-    return report.plain(
+    return io_records.plain(
         {
             "setting": problems[0].setting,
             **settings,
@@ -135,7 +137,7 @@ def summary(problems: Sequence[LightProblem], records: Sequence[Sequence[dict[st
 def _stored(path: Path) -> list[dict[str, Any]]:
     if not path.exists():
         return []
-    value = report.read_json(path)
+    value = io_records.read_json(path)
     summaries = value.get("summaries") if isinstance(value, dict) else None
     needed = {"setting", "lights", "filter", "filter_size", "cone_deg", "strategy", "starts", "reference", "objects", "runs"}
     needed |= {"alignment_mean", "alignment_std", "alignment_least", "share_from_0.995"}

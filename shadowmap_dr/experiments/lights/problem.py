@@ -14,11 +14,11 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from ... import assets
 from ...errors import ShadowmapError
 from ...inverse import LightBatch, Problem, Stage, StillScene
-from ...inverse.lights.batch import batch_bytes
-from ...renderer import Renderer
+from ...inverse.light_directions.batch import batch_bytes
+from ...io import assets
+from ...rendering.renderer import Renderer
 from ...shadow import ShadowSettings
 from .scene import CONE_DEG, alignment, check_scene, make_scene, target_and_starts
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from ... import report
-from ...io import atomic
+from ...io import console, plots
+from ...io.files import atomic
 from .problem import LightProblem
 
 
@@ -29,7 +29,7 @@ def table(summaries: Sequence[dict[str, Any]]) -> Table:
         for entry in summaries
     ]
     columns = ["lights", "shadows", "runs", "alignment", "deviation", "least", "% >= 0.995"]
-    return report.table("Alignment of estimated with true light directions", columns, rows)
+    return console.table("Alignment of estimated with true light directions", columns, rows)
 
 
 def label_of(entry: dict[str, Any]) -> str:
@@ -98,7 +98,7 @@ def pictures(path: Path, problems: Sequence[LightProblem], records: Sequence[Seq
         target = problem.target_images(batch, np.array([record["target"]]), [record["run"]])[0]
         start, final = batch.render([record["start"]])[0], batch.render([record["final"]])[0]
         rows[problem.object] = {"target": target, "start": start, "result": final, "difference": np.abs(final - target)}
-    report.image_sheet(path, rows)
+    plots.image_sheet(path, rows)
 
 
 def _is_plain(entry: dict[str, Any]) -> bool:

@@ -10,9 +10,9 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from ... import assets
 from ...errors import ShadowmapError
-from ..objects import check_suffix, load_mesh, placement
+from ...io import assets
+from ..common.objects import check_suffix, load_mesh, placement
 
 OBJECTS = ("bunny", "dragon", "hand", "spot", "teapot", "suzanne")
 #: Opening angle (degrees) of the cone about the vertical in which the directions to the lights lie.

@@ -13,13 +13,13 @@ import mitsuba as mi
 import numpy as np
 from rich.console import Console
 
-from ... import timing
 from ...inverse import LightBatch, StillScene, run_sweep
-from ...inverse.lights.batch import batch_bytes
-from ...inverse.lights.pixels import mixed_pixels
-from ...light_maps import light_visibility, make_maps
-from ...raster._memory import device_array
-from ...renderer import Renderer
+from ...inverse.light_directions.batch import batch_bytes
+from ...inverse.light_directions.pixels import mixed_pixels
+from ...jit.arrays import device_array
+from ...rendering.renderer import Renderer
+from ...rendering.shadow_pass import light_visibility, make_maps
+from ..common import timing
 from .problem import LightProblem
 from .scene import make_scene
 

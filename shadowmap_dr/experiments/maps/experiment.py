@@ -16,11 +16,12 @@ import numpy.typing as npt
 from rich.console import Console
 from rich.table import Table
 
-from ... import io, report
 from ...errors import ShadowmapError
-from ...renderer import Renderer
+from ...io import console as io_console
+from ...io import files, plots, records
+from ...rendering.renderer import Renderer
 from ...shadow import ShadowSettings, directional_view
-from ...timing import Contender, alternate, machine
+from ..common.timing import Contender, alternate, machine
 from . import pose as maps_pose
 from . import scenes as maps_scenes
 from .metrics import Image, Texel, metrics, texel_in_pixels
@@ -85,10 +86,10 @@ class MapsOptions:
 def run_maps(options: MapsOptions, *, console: Console | None = None) -> dict[str, Any]:
     """Measure all candidates on all scenes; writes `maps.json` and `maps.png` into `options.out` and returns the record."""
     console = console or Console(stderr=True)
-    io.check_output(options.out / "maps.json", (".json",))
+    files.check_output(options.out / "maps.json", (".json",))
     record: dict[str, Any] = {"settings": asdict(options), "machine": machine(), "candidates": CANDIDATES, "scenes": {}}
     sheet: dict[str, dict[str, Image]] = {}
-    with report.progress(console) as progress:
+    with io_console.progress(console) as progress:
         for name in options.scenes:
             task = progress.add_task(name, total=len(options.candidates) + 1, note="reference")
             scene = maps_scenes.build(name, options.resolution)
@@ -108,11 +109,11 @@ def run_maps(options: MapsOptions, *, console: Console | None = None) -> dict[st
                 sheet[name][label] = image[..., None]
                 progress.update(task, advance=1)
             _add_times(record["scenes"][name], scene, options)
-            report.write_json(options.out / "maps.json", record)
+            records.write_json(options.out / "maps.json", record)
         if options.pose_runs:
             record["poses"] = _poses(options, progress)
-            report.write_json(options.out / "maps.json", record)
-    report.image_sheet(options.out / "maps.png", sheet, size=1.8)
+            records.write_json(options.out / "maps.json", record)
+    plots.image_sheet(options.out / "maps.png", sheet, size=1.8)
     return record
 
 
@@ -244,4 +245,4 @@ def table(record: dict[str, Any]) -> Table:
     for label, e in record.get("poses", {}).items():
         errors = f"{e['median_rotation_deg']:.3f} deg, {e['median_offset_x100']:.3f}"
         rows.append([f"poses, {label}", f"{e['found']} of {e['runs']}", errors, *[""] * (len(columns) - 3)])
-    return report.table("Shadow maps against path tracing (shift in texels, time over plain vsm)", columns, rows)
+    return io_console.table("Shadow maps against path tracing (shift in texels, time over plain vsm)", columns, rows)

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...inverse import PoseFit
-from ...renderer import Renderer
+from ...rendering.renderer import Renderer
 from ..pose.methods import BETAS, STEP_SIZE
 from ..pose.record import RECOVERED_DEG, RECOVERED_X100
 from ..pose.scene import PoseProblem, make_problem, path_traced_reference, pose_errors, start_pose

@@ -9,6 +9,8 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
+from ..common.objects import occluder
+
 Mesh = tuple[npt.NDArray[np.float32], npt.NDArray[np.uint32]]
 
 #: Half-size of the square that the camera sees, world units.
@@ -117,21 +119,3 @@ def build(name: str, resolution: int, offset: float = 0.0) -> Any:
     for key, (points, faces) in meshes(offset).items():
         scene[key] = occluder(key, points, faces)
     return mi.load_dict(scene, optimize=False)  # else Mitsuba would merge meshes, and they lose their names
-
-
-def occluder(
-    name: str,
-    points: npt.NDArray[np.float32],
-    faces: npt.NDArray[np.uint32],
-    colour: tuple[float, ...] = (0.5, 0.5, 0.5),
-) -> Any:
-    """A ``mi.Mesh`` of (V, 3) vertices and (F, 3) faces, diffuse on both sides."""
-    props = mi.Properties()
-    diffuse = {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(colour)}}
-    props["bsdf"] = mi.load_dict({"type": "twosided", "bsdf": diffuse})
-    mesh = mi.Mesh(name, len(points), len(faces), props=props)
-    params = mi.traverse(mesh)
-    params["vertex_positions"] = np.ascontiguousarray(points, np.float32).ravel()
-    params["faces"] = np.ascontiguousarray(faces, np.uint32).ravel()
-    params.update()
-    return mesh

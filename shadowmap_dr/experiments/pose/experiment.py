@@ -21,10 +21,13 @@ from rich.console import Console
 from rich.progress import Progress, TaskID
 from rich.table import Table
 
-from ... import io, report
 from ...errors import ShadowmapError
 from ...inverse import Method, run_sweep
-from ...inverse.schedulers import check_scheduler, check_threads
+from ...inverse.runs.schedulers import check_scheduler, check_threads
+from ...io import console as io_console
+from ...io import files, plots
+from ...io import images as io_images
+from ...io import records as io_records
 from .methods import METHODS, Builder, Image, build_method, fairness
 from .record import identity, is_complete, is_of, make_record
 from .scene import NormalKind, PoseProblem, ReferenceKind, make_problem, start_pose
@@ -89,10 +92,10 @@ def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Co
     if build is build_method:
         build = functools.partial(build_method, samples=options.samples)
     out = options.out
-    io.check_output(out / "pose.json", (".json",))
+    files.check_output(out / "pose.json", (".json",))
     stored: list[dict[str, Any]] = []
     if options.resume and (out / "pose.json").exists():
-        stored = report.read_json(out / "pose.json")
+        stored = io_records.read_json(out / "pose.json")
         if not isinstance(stored, list) or not all(
             isinstance(record, dict) and isinstance(record.get("settings"), dict) and isinstance(record.get("environment"), dict)
             for record in stored
@@ -117,7 +120,7 @@ def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Co
         stored += _sweep(problems, options, stored, console)
 
     result: list[dict[str, Any]] = []
-    with report.progress(console) as progress:
+    with io_console.progress(console) as progress:
         for _, problem in problems.values():
             task = progress.add_task(f"{problem.folder} reference and methods", total=None, note="")
             reference = _reference(problem, options, build)
@@ -138,12 +141,12 @@ def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Co
                     final = record["final"] if None not in record["final"] else start_pose(options.seed, run)
                     pictures = _pictures(methods[name], record["start"], final, reference)
                     for picture, image in pictures.items():
-                        io.write_png(out / problem.folder / f"{name}-run{run}-{picture}.png", image)
+                        io_images.write_png(out / problem.folder / f"{name}-run{run}-{picture}.png", image)
                     if run == 0:
                         images[name] = pictures
                     records.append(record)
                     stored = [*(other for other in stored if _key(other) != _key(record)), record]
-                    report.write_json(out / "pose.json", stored)
+                    io_records.write_json(out / "pose.json", stored)
                     _checkpoint(problem, name, run, options).unlink(missing_ok=True)
                     progress.remove_task(task)
                     progress.console.print(f"{title}: {_outcome(record)}", highlight=False)
@@ -172,7 +175,7 @@ def table(records: Sequence[dict[str, Any]]) -> Table:
             ]
         )
     columns = ["object", "pixels", "method", "found", "degrees", "offset", "s/step", "s total"]
-    return report.table("Poses found, mean rotation error in degrees, mean offset error x 100, times", columns, rows)
+    return io_console.table("Poses found, mean rotation error in degrees, mean offset error x 100, times", columns, rows)
 
 
 def _identity(problem: PoseProblem, name: str, run: int, options: PoseOptions, method: Method) -> dict[str, Any]:
@@ -248,7 +251,7 @@ def _show(progress: Progress, task: TaskID, done: int) -> None:
 def _reference(problem: PoseProblem, options: PoseOptions, build: Builder) -> Image:
     folder = options.out / problem.folder
     image = make_reference(problem, options.reference, folder, build)
-    io.write_png(folder / "reference.png", image)
+    io_images.write_png(folder / "reference.png", image)
     return image
 
 
@@ -273,9 +276,9 @@ def _plots(
         label: {name: [record[key] for record in records if record["method"] == name] for name in options.methods}
         for label, key in panels.items()
     }
-    report.plot_curves(options.out / problem.folder / "convergence.png", curves)
+    plots.plot_curves(options.out / problem.folder / "convergence.png", curves)
     rows = {name: {"reference": reference, **pictures} for name, pictures in images.items()}
-    report.image_sheet(options.out / problem.folder / "images.png", rows)
+    plots.image_sheet(options.out / problem.folder / "images.png", rows)
 
 
 def _checkpoint(problem: PoseProblem, name: str, run: int, options: PoseOptions) -> Path:

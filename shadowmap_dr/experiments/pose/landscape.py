@@ -17,10 +17,11 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from ... import io, report
-from ...cli_options import DEFAULT_VARIANT
 from ...errors import ShadowmapError
-from ...io import atomic
+from ...io import images
+from ...io import records as io_records
+from ...io.files import atomic
+from ...variants import DEFAULT_VARIANT
 from .methods import METHODS, build_method
 from .scene import make_problem
 
@@ -124,7 +125,7 @@ def landscape(
     The images are those of the run's own method unless another one is named as `renderer`: Mitsuba's are slow and noisy.
     Returns angles in degrees and the slices. Raises ShadowmapError if there is no such record or no reference image.
     """
-    records = report.read_json(folder / "pose.json")
+    records = io_records.read_json(folder / "pose.json")
     if not isinstance(records, list) or not all(isinstance(entry, dict) for entry in records):
         raise ShadowmapError(f"{folder / 'pose.json'} is no list of records: give a folder of the pose experiment.")
     record = next((entry for entry in records if all(entry.get(key) == value for key, value in wanted.items())), None)
@@ -136,7 +137,7 @@ def landscape(
     if problem.digest != record["settings"].get("object_digest", problem.digest):
         raise ShadowmapError(f"the object {record['object']} is not the one of the run any more: run it again.")
     name = "reference.exr" if record["reference"] == "mitsuba" else "reference-own.exr"
-    reference = io.read_image(folder / problem.folder / name)
+    reference = images.read_image(folder / problem.folder / name)
     renderer = renderer or record["method"]
     method = build_method(renderer, problem, reference, record["settings"].get("samples_per_pixel", 1))
     angles = np.radians(np.linspace(-width_deg, width_deg, count))

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from ... import assets
 from ...inverse import Method, PoseFit
+from ...io import assets
 from .scene import PoseProblem
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def build_method(
             normals=problem.normals,
             proxy=baseline.calibrate(problem.scene),
         )
-    from ...renderer import Renderer
+    from ...rendering.renderer import Renderer
 
     settings = shadow_settings(name)
     renderer = Renderer.from_scene(problem.scene, **settings)

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ...io import atomic
+from ...io.files import atomic
 
 COLOURS = {"shadows": "C0", "rasterizer": "C1", "mitsuba": "C2"}
 _LIMIT_DEG = 0.2

@@ -12,8 +12,9 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from ... import __version__, report
+from ... import __version__
 from ...inverse import History, Method, optimize
+from ...io import records
 from .methods import fairness
 from .scene import PoseProblem, ReferenceKind, pose_errors, start_pose
 
@@ -25,7 +26,7 @@ def identity(
     problem: PoseProblem, name: str, run: int, method: Method, *, seed: int, iterations: int, reference: ReferenceKind
 ) -> dict[str, Any]:
     """What a run's record says before the run is made: two records that agree in this are of the same run."""
-    return report.plain(
+    return records.plain(
         {
             "object": problem.name,
             "resolution": problem.resolution,
@@ -78,7 +79,7 @@ def make_record(
 
 def _results(history: History) -> dict[str, Any]:
     rotation, translation = pose_errors(history.parameters)
-    return report.plain(
+    return records.plain(
         {
             "final": history.final,
             "rotation_error_deg": rotation[-1],

@@ -13,9 +13,9 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from ... import assets, io
 from ...errors import ShadowmapError
-from ..objects import load_mesh, placement, positions
+from ...io import assets, images, meshes
+from ..common.objects import load_mesh, placement, positions
 
 ReferenceKind = Literal["mitsuba", "own"]
 NormalKind = Literal["face", "vertex"]
@@ -138,15 +138,15 @@ def path_traced_reference(problem: PoseProblem, path: Path) -> npt.NDArray[np.fl
     }
     if path.exists():
         try:
-            _, metadata = io.read_exr(path)
-            image = io.read_image(path)
+            _, metadata = images.read_exr(path)
+            image = images.read_image(path)
             colours = 1 if "mono" in mi.variant() else 3
             if json.loads(metadata.get(_REFERENCE_KEY, "{}")) == settings and image.shape[2] == colours:
                 return image
         except (ShadowmapError, json.JSONDecodeError):
             pass  # a file that cannot be read is made again
     image = np.asarray(path_traced(problem.scene, spp=REFERENCE_SPP).image, np.float32)
-    io.write_image(path, image, {_REFERENCE_KEY: json.dumps(settings)})
+    images.write_image(path, image, {_REFERENCE_KEY: json.dumps(settings)})
     return image
 
 
@@ -163,4 +163,4 @@ def _write_mesh(mesh: Any, positions: npt.NDArray[Any], path: Path) -> None:
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = mi.Float(positions.astype(np.float32).ravel())
     parameters.update()
-    io.write_ply(path, mesh)
+    meshes.write_ply(path, mesh)

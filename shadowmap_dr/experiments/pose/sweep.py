@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ... import io
 from ...inverse import Method, Problem
+from ...io import images
 from .methods import Builder, Image, build_method
 from .record import identity, make_record
 from .scene import NormalKind, PoseProblem, ReferenceKind, make_problem, path_traced_reference
@@ -91,5 +91,5 @@ def make_reference(problem: PoseProblem, kind: ReferenceKind, folder: Path, buil
         return path_traced_reference(problem, folder / "reference.exr")
     blank = np.zeros((problem.resolution, problem.resolution, 3), np.float32)
     image = build("shadows", problem, blank).render(np.zeros(3))
-    io.write_image(folder / "reference-own.exr", image)
+    images.write_image(folder / "reference-own.exr", image)
     return image

@@ -16,9 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from ... import io, report
 from ...errors import ShadowmapError
-from ..gradients.report import markdown
+from ...io import files
+from ...io import records as io_records
+from ...io.console import markdown
 from .plot import plot_convergence
 from .record import essence
 
@@ -244,7 +245,7 @@ def read(folders: Iterable[str | Path]) -> list[dict[str, Any]]:
     result: list[dict[str, Any]] = []
     for folder in map(Path, folders):
         path = folder / "pose.json" if folder.is_dir() else folder
-        records = report.read_json(path)
+        records = io_records.read_json(path)
         if isinstance(records, dict) and "rows" in records:
             try:
                 result += [record for row in records["rows"] for record in _records(row)]
@@ -264,9 +265,9 @@ def write(out: Path, records: Sequence[Mapping[str, Any]], timed: Sequence[Mappi
     Cases in which the curve of a run is not known (tables from before curves were kept) get no plot: the one in `out` stays.
     """
     table = rows(records, timed)
-    io.check_output(out / "pose.json", (".json",))
-    report.write_json(out / "pose.json", {"rows": [row.plain() for row in table], "comparison": comparison(table)})
-    with io.atomic(out / "pose-table.md") as temporary:
+    files.check_output(out / "pose.json", (".json",))
+    io_records.write_json(out / "pose.json", {"rows": [row.plain() for row in table], "comparison": comparison(table)})
+    with files.atomic(out / "pose-table.md") as temporary:
         temporary.write_text(document(table), encoding="utf-8")
     for case in dict.fromkeys(row.case for row in table):
         if not all(record.get(_CURVE) for row in table if row.case == case for record in row.runs.values()):

@@ -15,10 +15,11 @@ import numpy as np
 import numpy.typing as npt
 from rich.console import Console
 
-from ... import io, report
 from ...errors import ShadowmapError
-from ...renderer import Renderer
-from ...timing import Contender, alternate, machine
+from ...io import console as io_console
+from ...io import files, records
+from ...rendering.renderer import Renderer
+from ..common.timing import Contender, alternate, machine
 from . import report as soft_report
 from . import scenes as soft_scenes
 
@@ -76,7 +77,7 @@ class SoftOptions:
         kept = asdict(self)
         for name in ("scenes", "out", "resume"):
             kept.pop(name)
-        return report.plain(kept)
+        return records.plain(kept)
 
 
 @dataclass(frozen=True)
@@ -125,9 +126,9 @@ class Traced:
 def run_soft(options: SoftOptions, *, console: Console | None = None) -> dict[str, Any]:
     """Measure all scenes; writes `soft.json`, `soft.md` and `soft.png` into `options.out` and returns the record."""
     path = options.out / "soft.json"
-    io.check_output(path, (".json",))
+    files.check_output(path, (".json",))
     record: dict[str, Any] = {"settings": options.settings, "machine": machine(), "scenes": _kept(path, options)}
-    with report.progress(console or Console(stderr=True)) as progress:
+    with io_console.progress(console or Console(stderr=True)) as progress:
         task = progress.add_task("scenes", total=len(options.scenes) * (2 + len(options.samples)), note="")
         for name in options.scenes:
             if name in record["scenes"]:
@@ -139,10 +140,10 @@ def run_soft(options: SoftOptions, *, console: Console | None = None) -> dict[st
 
             entry, pictures = measure(name, options, step)
             record["scenes"][name] = entry
-            report.write_json(path, record)
+            records.write_json(path, record)
             soft_report.save_pictures(options.out / "pictures" / f"{name}.exr", pictures)
     record["scenes"] = {name: record["scenes"][name] for name in soft_scenes.SCENES if name in record["scenes"]}
-    report.write_json(path, record)
+    records.write_json(path, record)
     soft_report.write(record, options.out)
     return record
 
@@ -150,7 +151,7 @@ def run_soft(options: SoftOptions, *, console: Console | None = None) -> dict[st
 def _kept(path: Path, options: SoftOptions) -> dict[str, Any]:
     if not options.resume or not path.exists():
         return {}
-    scenes = report.read_record(path, options.settings, "scenes")["scenes"]
+    scenes = records.read_record(path, options.settings, "scenes")["scenes"]
     return {name: entry for name, entry in scenes.items() if isinstance(entry, dict) and "errors" in entry}
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from rich.table import Table
 
-from ... import io, report
+from ...io import console, files, images, plots
 
 Image = npt.NDArray[np.floating[Any]]
 
@@ -45,7 +45,7 @@ def table(record: Mapping[str, Any]) -> Table:
     columns, lines = rows(record)
     keep = [k for k in range(len(columns)) if k != 1]
     title = "Relative error by samples (area light / sky), and time at equal error (samples per pixel)"
-    return report.table(title, [columns[k] for k in keep], [[line[k] for k in keep] for line in lines])
+    return console.table(title, [columns[k] for k in keep], [[line[k] for k in keep] for line in lines])
 
 
 def reading(record: Mapping[str, Any], bar: float = 0.02) -> list[str]:
@@ -73,7 +73,7 @@ def write(record: Mapping[str, Any], out: Path) -> None:
     columns, lines = rows(record)
     text = ["# Extended lights", "", *reading(record), "", _markdown(columns), _markdown(["---"] * len(columns))]
     text += [_markdown(line) for line in lines]
-    with io.atomic(out / "soft.md") as temporary:
+    with files.atomic(out / "soft.md") as temporary:
         temporary.write_text("\n".join(text) + "\n", encoding="utf-8")
     sheet = {}
     for name in record["scenes"]:
@@ -83,21 +83,21 @@ def write(record: Mapping[str, Any], out: Path) -> None:
             shown = {title: image * _exposure(pictures["path traced"]) for title, image in pictures.items()}
             sheet[name] = {**shown, f"difference x {_ENLARGED:g}": difference}
     if sheet:
-        report.image_sheet(out / "soft.png", _paired(sheet))
+        plots.image_sheet(out / "soft.png", _paired(sheet))
 
 
 def save_pictures(path: Path, pictures: Mapping[str, Image]) -> None:
     """Write images (H, W, 3) of the same size as channels of one EXR file."""
     channels = {f"{title}.{'RGB'[k]}": image[..., k].astype(np.float32) for title, image in pictures.items() for k in range(3)}
     path.parent.mkdir(parents=True, exist_ok=True)
-    io.write_exr(path, channels)
+    images.write_exr(path, channels)
 
 
 def load_pictures(path: Path) -> dict[str, Image]:
     """What :func:`save_pictures` wrote; nothing if there is no such file."""
     if not path.exists():
         return {}
-    channels, _ = io.read_exr(path)
+    channels, _ = images.read_exr(path)
     titles = dict.fromkeys(key.rpartition(".")[0] for key in channels)
     order = sorted(titles, key=lambda title: title != "path traced")
     return {title: np.stack([channels[f"{title}.{c}"] for c in "RGB"], -1) for title in order}

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from ... import assets
+from ...io import assets
 
 Parts = dict[str, Any]
 

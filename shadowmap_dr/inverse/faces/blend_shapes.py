@@ -6,7 +6,7 @@ from typing import Any
 
 import drjit as dr
 
-from ...raster._types import backend
+from ...jit.arrays import backend
 
 # Lanes that share the adjoint's sum over all coordinates for one weight: enough to keep a vector machine busy.
 _LANES = 64

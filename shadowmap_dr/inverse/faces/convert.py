@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...errors import ShadowmapError
-from ...io import read_arrays
+from ...io.files import read_arrays
 from .morphable import MorphableModel, from_arrays
 
 FACING = ("+x", "-x", "+z", "-z")

@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ...errors import ShadowmapError
-from ...raster._memory import device_array
-from ...receiver import ReceiverShadows
+from ...jit.arrays import device_array
+from ...rendering.receivers.planar_receiver import ReceiverShadows
 from .blend_shapes import blend
 
 BETAS = (0.9, 0.999)

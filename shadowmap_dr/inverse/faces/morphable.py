@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...errors import ShadowmapError
-from ...io import atomic, read_arrays
+from ...io.files import atomic, read_arrays
 
 #: Arrays that every model file holds, and what may be left out.
 REQUIRED, OPTIONAL = ("mean", "faces", "identity"), ("expression", "identity_names", "expression_names", "mask")

@@ -1,0 +1,1 @@
+"""The command line program `shadowmap-dr`: one module for each command; `main` has them all."""

@@ -1,0 +1,169 @@
+"""The command `shadowmap-dr render`: an image of a scene file."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Annotated, Any
+
+import mitsuba as mi
+import numpy as np
+import typer
+
+from .. import __version__
+from ..errors import ShadowmapError
+from ..io import assets, files, images
+from ..variants import ANY, DEFAULT_VARIANT, set_variant
+from .options import Variant
+
+
+def render(
+    scene: Annotated[str, typer.Argument(help="Mitsuba XML file, or the name of a scene of this package.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Image to write: .exr (all channels) or .png (sRGB).")],
+    define: Annotated[
+        list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="Value of a $NAME in the scene; repeatable.")
+    ] = None,
+    integrator: Annotated[str, typer.Option(help="Integrator plug-in, or 'scene' for the scene's own.")] = "shadowmap",
+    size: Annotated[str | None, typer.Option(metavar="WxH", help="Image size in pixels.")] = None,
+    spp: Annotated[int | None, typer.Option(min=1, max=1 << 24, help="Samples per pixel [default: the integrator's].")] = None,
+    seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Seed of the sampler.")] = 0,
+    aovs: Annotated[
+        str | None,
+        typer.Option(help="Further channels, separated by commas, as the integrator (or Mitsuba's aov) names them."),
+    ] = None,
+    variant: Variant = DEFAULT_VARIANT,
+) -> None:
+    """Render a Mitsuba scene."""
+    files.check_output(output)
+    if aovs is not None and output.suffix.lower() != ".exr":
+        raise ShadowmapError(f"--aovs {aovs}: {output.suffix} files hold colours only, choose an .exr file.")
+    values = _definitions(define or [])
+    set_variant(variant, ANY)
+    loaded = _load(assets.scene(scene), values)
+    if size is not None:
+        loaded = _resized(loaded, *_size(size))
+    width, height = loaded.sensors()[0].film().crop_size()
+    if width * height == 0:
+        raise ShadowmapError(f"the film of {scene} has {width} x {height} pixels: it needs at least one.")
+
+    method = _integrator(loaded, integrator, aovs)
+    try:
+        image = np.array(mi.render(loaded, integrator=method, spp=spp or 0, seed=seed))
+    except RuntimeError as error:
+        raise ShadowmapError(f"cannot render {scene}: {_one_line(_root(error))}") from error
+    names = _channel_names(method, image.shape[2])
+    bad = int(np.count_nonzero(~np.isfinite(image[..., : _colours(names)]).all(axis=-1)))
+    if bad:
+        raise ShadowmapError(f"{scene} renders to {bad} pixels that are not finite: check its parameters for NaN or inf.")
+
+    if output.suffix.lower() == ".png":
+        images.write_png(output, image[..., : _colours(names)])
+    else:
+        metadata = {
+            "shadowmap_dr:version": __version__,
+            "shadowmap_dr:mitsuba": mi.__version__,
+            "shadowmap_dr:scene": scene,
+            "shadowmap_dr:definitions": ", ".join(f"{k}={v}" for k, v in values.items()),
+            "shadowmap_dr:integrator": integrator,
+            "shadowmap_dr:spp": "default" if spp is None else str(spp),
+            "shadowmap_dr:seed": str(seed),
+        }
+        pixels = np.asarray(image, dtype=np.float32)
+        images.write_exr(output, {name: pixels[..., i] for i, name in enumerate(names)}, metadata)
+    typer.echo(f"{output}: {width} x {height}, {', '.join(names)}")
+
+
+def _definitions(entries: list[str]) -> dict[str, str]:
+    values = {}
+    for entry in entries:
+        match = re.fullmatch(r"([A-Za-z_]\w*)=(.*)", entry)
+        if match is None:
+            raise ShadowmapError(f"-D {entry}: write it as NAME=VALUE, for instance -D resolution=256.")
+        name, value = match.groups()
+        if name in values:
+            raise ShadowmapError(f"-D {entry}: {name} has a value already, {values[name]!r}.")
+        if value.strip().lower() in ("nan", "-nan", "inf", "-inf", "+inf", "infinity", "-infinity"):
+            raise ShadowmapError(f"-D {entry}: {value} is no finite number.")
+        values[name] = value
+    return values
+
+
+def _size(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"(\d+)[xX](\d+)", text)
+    if match is None:
+        raise ShadowmapError(f"--size {text}: write it as WxH, for instance 512x256.")
+    width, height = int(match[1]), int(match[2])
+    if not (1 <= width <= 16384 and 1 <= height <= 16384):
+        raise ShadowmapError(f"--size {text}: both sides must lie between 1 and 16384 pixels.")
+    return width, height
+
+
+def _load(path: Path, values: dict[str, str]) -> Any:
+    try:
+        loaded = mi.load_file(str(path), **values)
+    except RuntimeError as error:
+        raise ShadowmapError(f"cannot load {path}: {_one_line(error)}") from error
+    if not isinstance(loaded, mi.Scene):
+        raise ShadowmapError(f"cannot load {path}: its root is a {type(loaded).__name__}, not a scene.")
+    if not loaded.sensors():
+        raise ShadowmapError(f"cannot render {path}: the scene has no sensor.")
+    return loaded
+
+
+def _resized(scene: Any, width: int, height: int) -> Any:
+    parameters = mi.traverse(scene)
+    names = [name for name in parameters.keys() if re.search(r"(^|\.)film\.size$", name)]  # noqa: SIM118
+    if not names:
+        raise ShadowmapError("--size: no film of this scene has a size that can be changed.")
+    for name in names:
+        parameters[name] = [width, height]
+        parameters[name.replace("film.size", "film.crop_size")] = [width, height]
+        parameters[name.replace("film.size", "film.crop_offset")] = [0, 0]
+    parameters.update()
+    return scene
+
+
+def _integrator(scene: Any, name: str, aovs: str | None) -> Any:
+    if aovs is not None and name != "shadowmap" and not re.fullmatch(r"[\w.]+:\w+(,[\w.]+:\w+)*", aovs):
+        # Mitsuba ends the process on some of these instead of raising an error.
+        raise ShadowmapError(f"--aovs {aovs}: the integrator {name} takes NAME:TYPE pairs, for instance d:depth,n:sh_normal.")
+    try:
+        if name == "scene":
+            method = scene.integrator()
+            if method is None:
+                raise ShadowmapError("--integrator scene: the scene has no integrator of its own.")
+            return method if aovs is None else mi.load_dict({"type": "aov", "aovs": aovs, "img": method})
+        if aovs is None:
+            return mi.load_dict({"type": name})
+        if name == "shadowmap":
+            return mi.load_dict({"type": name, "aovs": aovs})
+        return mi.load_dict({"type": "aov", "aovs": aovs, "img": {"type": name}})
+    except RuntimeError as error:
+        raise ShadowmapError(f"--integrator {name}: {_one_line(error)}") from error
+
+
+def _channel_names(integrator: Any, count: int) -> list[str]:
+    """OpenEXR names of the channels of an image, colours first."""
+    # Mitsuba's `aov` lists the nested image's channels as img.R, img.G, ... although it returns them as colours.
+    further = [name for name in integrator.aov_names() if not name.startswith("img.")]
+    colours = images.colour_channels(count - len(further))
+    return [*colours, *further]
+
+
+def _colours(names: list[str]) -> int:
+    return sum(name in ("R", "G", "B", "Y", "A") for name in names)
+
+
+def _root(error: BaseException) -> BaseException:
+    """The exception that started a chain: Dr.Jit wraps what an integrator raises."""
+    while (cause := error.__cause__ or error.__context__) is not None:
+        error = cause
+    return error
+
+
+def _one_line(error: BaseException) -> str:
+    """Message of a Mitsuba exception without line breaks and without the position in Mitsuba's own source."""
+    text = str(error)
+    if "Traceback (most recent call last)" in text:  # raised by a plug-in written in Python: its own message comes last
+        return re.sub(r"^[\w.]*(?:Error|Exception): ", "", text.strip().splitlines()[-1])
+    return re.sub(r"\[\w+\.(?:cpp|h):\d+\] ?", "", " ".join(text.split()))

@@ -1,0 +1,1 @@
+"""Timing, meshes and objects that several experiments share."""

@@ -1,0 +1,176 @@
+"""Parameters of the plug-in ``shadowmap``: their names, types and defaults in XML, and what the renderer makes of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from difflib import get_close_matches
+from fnmatch import fnmatchcase
+from typing import Any
+
+from ..errors import ShadowmapError, warn
+from ..rendering.settings import DIRECT, RenderSettings
+from ..shadow import ShadowSettings
+
+PLUGIN = "shadowmap"
+
+# Names that Mitsuba's own `aov` integrator has for channels of ours.
+_SYNONYMS = {"sh_normal": "normal"}
+# Channels of the image itself.
+COLOURS = ("R", "G", "B", "A", "Y")
+
+# Parameters of Mitsuba's integrators that have no meaning here: scenes keep them when they change to this one. A name that ends
+# with * stands for all that begin so.
+_FOREIGN = (
+    "rr_depth", "shading_samples", "emitter_samples", "bsdf_samples", "sppc", "sppp", "sppi", "guiding*", "project_seed",
+    "proj_seed*", "samples_per_pass", "timeout", "block_size",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Options:
+    """Parameters of the plug-in, as in XML or a dictionary.
+
+    shadow_map_resolution  texels along each side of a shadow map, six more than the filter has at least, 4096 at most
+    shadow_method          ``auto`` (``evsm4``), ``vsm``, ``esm``, ``evsm2``, ``evsm4``, ``msm``, ``csm``, ``pcf``, ``standard``
+                           (no shadow gradients) or ``none`` (no shadows); see ``shadowmap_dr.shadow.ShadowSettings``
+    shadow_filter          ``box``, ``gaussian``, ``wendland`` or ``none``
+    shadow_filter_size     odd number of texels
+    shadow_antialias       anti-alias shadow maps; without it casters get no gradient from the outlines of their shadows
+    shadow_bleeding        visibilities below this count as 0, against light that bleeds through (``vsm``, ``evsm``, ``msm``)
+    shadow_order           terms of the Fourier series of ``csm``, an even number from 2 to 16
+    shadow_supersampling   texels along each side that are averaged into one of the map, 1 to 8 (pre-filtered methods)
+    shadow_receiver_range  tell depths apart only from the first receiver on, against light that bleeds through
+    shadow_cull_backfaces  leave the backs of closed shapes out of the maps of directional lights: faster, and the same as long as
+                           no shape turns inside out, not even in a fold
+    area_light_samples     points on each area light that cast shadows (Mitsuba's ``emitter_samples`` is another number)
+    environment_light_samples  directions of an environment that cast shadows
+    soft_map_resolution    texels along each side of their shadow maps
+    emitter_shadows        ``samples``, or ``single``: one map for each area light, penumbrae estimated from it
+    shadow_samples         look-ups along each side of a pixel, 1 to 8; 0 chooses
+    antialias              anti-alias the image; without it outlines have no gradient
+    ambient                radiance of unshadowed light from all directions, beside that of the scene's environment
+    hide_emitters          the camera looks through area lights, and sees black instead of environments; both light the scene
+    max_depth              as in Mitsuba: 0 is black, 1 shows emitters only, 2 is direct light; more, or -1, is rendered as 2
+    aovs                   further channels, separated by commas: names of ``shadowmap_dr.rendering.film.aovs.AOVS``, or
+                           ``label:name`` to call the channel ``label``
+    tessellation           triangles around spheres, disks and cylinders, at least 3; curves have half as many around them, and
+                           B-splines an eighth of it along each segment
+    recorded               ``mi.render`` and its backward pass are recorded with ``dr.freeze`` and replayed while only numbers
+                           change: up to twice as fast where passes are short, slower where they are long, since the backward
+                           pass renders again. Backward passes to materials and textures are not recorded
+    compat                 conventions of Worchel and Alexa's code
+    """
+
+    shadow_map_resolution: int = 256
+    shadow_method: str = "auto"
+    shadow_filter: str = "gaussian"
+    shadow_filter_size: int = 3
+    shadow_antialias: bool = True
+    shadow_bleeding: float = 0.0
+    shadow_order: int = 4
+    shadow_supersampling: int = 1
+    shadow_receiver_range: bool = True
+    shadow_cull_backfaces: bool = False
+    shadow_samples: int = 0
+    area_light_samples: int = 32
+    environment_light_samples: int = 64
+    soft_map_resolution: int = 128
+    emitter_shadows: str = "samples"
+    antialias: bool = True
+    ambient: float = 0.0
+    hide_emitters: bool = False
+    max_depth: int = DIRECT
+    aovs: str = ""
+    tessellation: int = 64
+    recorded: bool = False
+    compat: bool = False
+
+    @classmethod
+    def from_properties(cls, props: Any) -> Options:
+        """Read ``mi.Properties``. Raises ShadowmapError for an unknown parameter or a value of another type."""
+        defaults = {f.name: f.default for f in fields(cls)}
+        values, foreign = {}, []
+        for name in props.keys():  # noqa: SIM118  (Properties is no dictionary)
+            if name in defaults:
+                values[name] = _typed(name, props[name], type(defaults[name]))
+            elif any(fnmatchcase(name, pattern) for pattern in _FOREIGN):
+                _ = props[name]  # or Mitsuba would say that nobody has asked for it
+                foreign.append(name)
+            else:
+                raise ShadowmapError(f"'{PLUGIN}' has no parameter '{name}': {_near(name, sorted(defaults))}.")
+        if foreign:
+            names, kind = ", ".join(sorted(foreign)), "parameters" if len(foreign) > 1 else "a parameter"
+            own = " Points on area lights are area_light_samples here." if "emitter_samples" in foreign else ""
+            warn(f"'{PLUGIN}' ignores {names}: {kind} of Mitsuba's integrators.{own}")
+        options = cls(**values)
+        if options.max_depth == -1 or options.max_depth > DIRECT:
+            left_out = "light that is reflected more than once is left out"
+            warn(f"'{PLUGIN}' renders max_depth {options.max_depth} as {DIRECT}: {left_out}.")
+        return options
+
+    @property
+    def labelled_aovs(self) -> tuple[tuple[str, str], ...]:
+        """(label, name) of each further channel."""
+        pairs = []
+        for entry in filter(None, (part.strip() for part in self.aovs.split(","))):
+            label, _, name = entry.rpartition(":")
+            name = name.strip()
+            pairs.append((label.strip() or name, _SYNONYMS.get(name, name)))
+        labels = [label for label, _ in pairs]
+        for label in labels:
+            if label in COLOURS:
+                raise ShadowmapError(f"aovs is {self.aovs!r}: '{label}' is a channel of the image itself, label it otherwise.")
+            if labels.count(label) > 1:
+                raise ShadowmapError(f"aovs is {self.aovs!r}: '{label}' is there twice; label one of them, as in a:depth.")
+        return tuple(pairs)
+
+    def render_settings(self) -> RenderSettings:
+        """The same as the renderer wants it. Raises ShadowmapError for values out of range."""
+        if self.tessellation < 3:
+            raise ShadowmapError(f"tessellation is {self.tessellation}: spheres need at least 3 triangles around them.")
+        try:
+            shadow = ShadowSettings(
+                method=self.shadow_method,
+                resolution=self.shadow_map_resolution,
+                filter=self.shadow_filter,
+                filter_size=self.shadow_filter_size,
+                antialias=self.shadow_antialias,
+                compat=self.compat,
+                bleeding=self.shadow_bleeding,
+                order=self.shadow_order,
+                supersampling=self.shadow_supersampling,
+                receiver_range=self.shadow_receiver_range,
+                cull_backfaces=self.shadow_cull_backfaces,
+            )
+        except ValueError as error:
+            raise ShadowmapError(str(error)) from None
+        return RenderSettings(
+            shadow=shadow,
+            antialias=self.antialias,
+            ambient=self.ambient,
+            hide_emitters=self.hide_emitters,
+            max_depth=self.max_depth,
+            shadow_samples=self.shadow_samples,
+            area_light_samples=self.area_light_samples,
+            environment_light_samples=self.environment_light_samples,
+            soft_map_resolution=self.soft_map_resolution,
+            emitter_shadows=self.emitter_shadows,
+            aovs=tuple(name for _, name in self.labelled_aovs),
+        )
+
+
+def _near(name: str, known: list[str]) -> str:
+    """What is known, and what is meant, perhaps."""
+    nearest = get_close_matches(name, known, 1)
+    return f"it has {', '.join(known)}" + (f"; the nearest is '{nearest[0]}'" if nearest else "")
+
+
+def _typed(name: str, value: Any, kind: type) -> Any:
+    # A bool is an int to Python, not to us; and numbers may be written without a decimal point.
+    if type(value) is kind:
+        return value
+    if kind is float and type(value) is int:
+        return float(value)
+    words = {int: "an integer", float: "a number", bool: "a boolean", str: "a string"}
+    shown = repr(value) if isinstance(value, bool | int | float | str) else type(value).__name__
+    raise ShadowmapError(f"'{name}' of '{PLUGIN}' is {shown}, but must be {words[kind]}.")

@@ -1,0 +1,246 @@
+"""What the plug-in keeps of a scene from one rendering to the next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..errors import ShadowmapError, warn
+from ..rendering.extended_lights import SkyWatch, SoftFrusta, still_aimed
+from ..rendering.renderer import Renderer
+from ..rendering.settings import RenderSettings
+from ..scene.changes import MirrorWatch, ParameterWatch
+from ..scene.lights.read import environments_of
+from ..scene.load import SceneData, load, refresh, with_positions
+from ..scene.mitsuba_objects import parameters
+from ..scene.sensor import lenses_of, sensors_of
+from ..scene.unsupported import warn_of
+from ..scene.untracked import UntrackedValues
+from ..shadow import Frusta
+from .deferred import DeferredImages, DetachedInputs, attached_names
+from .recording import FrozenPasses, plain
+
+# Sensors whose fit of the shadow maps is remembered, and how many of these may not be the scene's own: some make a new one for
+# each image, and all that are remembered are kept alive. How many objects there are is also a part of what recordings hold for.
+_REMEMBERED_SENSORS, _OTHERS = 64, 8
+
+
+@dataclass
+class SceneCache:
+    """What stays the same between renderings of a scene.
+
+    The scene itself is not kept: it may own the integrator that owns this record.
+
+    parts     shapes, BSDFs and emitters of the scene; kept alive here, so that comparing them by identity is safe
+    statics   arrays that decided on the topology and on the shadow maps: faces, segments of curves, cutoff angles of spot lights
+    sizes     numbers of vertices and faces, of control points of each curve, and which buffers there are: ``ShapeSource.sizes``
+    lights    names of the lights
+    renderer  without what is re-read for each rendering
+    fits      (sensor, frusta of the shadow maps, of those of extended lights) of the last image that it took, latest first
+    waiting   images that wait for their backward passes
+    recorded  both passes, replayed if the plug-in's user wants it; ``recordable``: for names of attached parameters, whether
+              gradients flow through nothing but what is read from the scene
+    sky       where its environments shone
+    mirrors   which shapes were mirrored
+    checked   vertices that were found to be finite
+    warned    whether it was said what frozen functions of users do not see
+    untracked  what recordings do not see, and ``untracked_then`` its values when they were made
+    colours   of meshes, for which the renderer's creases were found
+    """
+
+    parts: tuple[Any, ...]
+    statics: tuple[Any, ...]
+    sizes: tuple[int, ...]
+    lights: tuple[str, ...]
+    renderer: Renderer
+    fits: list[tuple[Any, Frusta | None, SoftFrusta]] = field(default_factory=list)
+    waiting: DeferredImages = field(default_factory=DeferredImages)
+    recorded: FrozenPasses = field(default_factory=FrozenPasses)
+    recordable: dict[tuple[str, ...], bool] = field(default_factory=dict)
+    untracked: UntrackedValues = field(default_factory=lambda: UntrackedValues(()))
+    untracked_then: tuple[Any, ...] = ()
+    colours: ParameterWatch | None = None
+    sky: SkyWatch = field(default_factory=lambda: SkyWatch(()))
+    mirrors: MirrorWatch = field(default_factory=lambda: MirrorWatch(()))
+    checked: Any = None
+    warned: bool = False
+
+    @classmethod
+    def build(cls, scene: Any, sensor: Any, settings: RenderSettings, tessellation: int, warn: bool = True) -> SceneCache:
+        """Read a scene. Raises ShadowmapError for what is broken; ``warn``: of what is left out."""
+        if dr.flag(dr.JitFlag.FreezingScope):
+            raise ShadowmapError("A scene cannot be read while a function is frozen: render it once with this integrator before.")
+        with dr.suspend_grad():
+            data = replace(load(scene, tessellation=tessellation, warn=warn), sensors=(sensors_of(sensor),))
+            renderer = replace(Renderer.from_data(data, settings), untracked=None)
+            sky, untracked = (
+                SkyWatch(data.environments),
+                UntrackedValues((*scene.emitters(), *_bsdfs(data), *data.with_attributes())),
+            )
+        lights = tuple(light.name for light in data.lights) if settings.lit else ()
+        record = cls(_parts(scene, data), _statics(scene, data), _sizes(data), lights, renderer.with_data(_without_scene(data)))
+        mirrors = MirrorWatch([shape for source in data.sources for shape in source.transformed()])
+        return replace(record, sky=sky, mirrors=mirrors, untracked=untracked, colours=renderer.creases.watch(data.sources))
+
+    def matches(self, scene: Any) -> bool:
+        """Whether this record was made for the scene; it is none the worse for moved vertices or other parameter values.
+
+        Where a lamp, or what is around it, has moved so far that its shadow maps miss some of it, or where the sky shines from
+        elsewhere, it is.
+        """
+        data = self.renderer.data
+        if not same_objects(self.parts, _parts(scene, data)) or self.sizes != _sizes(data):
+            return False
+        statics = _statics(scene, data)
+        if not _same_arrays(self.statics, statics):
+            return False
+        self.statics = statics
+        if dr.flag(dr.JitFlag.FreezingScope):
+            return True  # nothing can be read back
+        with dr.suspend_grad():
+            still = self.mirrors.same() and self.sky.same(environments_of(scene))
+            return still and still_aimed(self.renderer.soft, lambda: with_positions(data))
+
+    def data(self, scene: Any, sensor: Any) -> SceneData:
+        """What is read from the scene as it is now, with one sensor, attached to the scene's parameters."""
+        return refresh(replace(self.renderer.data, scene=scene), sensors=(sensor,))
+
+    def render(self, scene: Any, sensor: Any, spp: int, inputs: DetachedInputs | None = None) -> Any:
+        """Image (mi.TensorXf), attached to the scene's parameters unless gradients are suspended.
+
+        If ``inputs`` is given, the image is attached to these instead of the vertices, lights and cameras.
+        """
+        self._name_constants_of_recordings()
+        current = self._current(scene, sensor)
+        self._check_vertices(current)
+        if inputs is not None:
+            current = current.with_data(inputs.instead_of(current.data))
+        image = current.render(spp=spp)
+        self._remember(scene, sensor, current.frusta, current.soft_frusta)
+        return image
+
+    def replay(self, scene: Any, sensor: Any, spp: int) -> Any:
+        """The same image, detached, recorded when it is first taken."""
+        self._forget_stale_recordings()
+        current = self._current(scene, sensor)
+        self._check_vertices(current)
+        current.note_kernels(spp)
+        image, frusta, soft_frusta = self.recorded.image(spp, current)
+        self._remember(scene, sensor, frusta, soft_frusta)
+        return image
+
+    def replay_backward(self, scene: Any, sensor: Any, spp: int, gradient: Any) -> bool:
+        """Add the gradients of <image, gradient> to the scene's parameters, recorded, too.
+
+        False, and nothing done, if they flow through more than what is read from the scene: materials, textures and the radiance
+        of extended lights are evaluated by Mitsuba itself.
+        """
+        current = self._current(scene, sensor)
+        attached = attached_names(scene, sensor)
+        if attached not in self.recordable:
+            self.recordable[attached] = not dr.grad_enabled(plain(current).render(spp=spp))
+        if self.recordable[attached]:
+            self._forget_stale_recordings()
+            self.recorded.backward(spp, gradient, current)
+        return self.recordable[attached]
+
+    def _name_constants_of_recordings(self) -> None:
+        """Warn, once, of parameters that a frozen function of the user's takes for constants: Dr.Jit does not ask for them."""
+        if self.warned or not dr.flag(dr.JitFlag.FreezingScope) or not self.untracked.names():
+            return
+        self.warned = True
+        shapes = {source.shape.bsdf(): f"{source.shape.id()}." for source in self.renderer.data.sources}
+        names = [f"{shapes.get(node, '')}{node.id()}.{key}" for node, key in self.untracked.names()]
+        listed = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+        warn(
+            f"dr.freeze does not see changes of {listed}: call clear() of the frozen function after one, "
+            f"or leave the recording to the integrator's parameter 'recorded'."
+        )
+
+    def _forget_stale_recordings(self) -> None:
+        """Recordings hold for the values of materials and lights that they do not see."""
+        now = self.untracked.now()
+        if now != self.untracked_then:
+            self.recorded, self.untracked_then = FrozenPasses(), now
+
+    def _current(self, scene: Any, sensor: Any) -> Renderer:
+        """The renderer for the scene as it is now.
+
+        Each sensor goes on from its own fit. Fitting it again to the same vertices and lights keeps it bit by bit, so the
+        derivatives of a step see the frusta of its image, whatever other sensors have taken in between.
+        """
+        if not (dr.flag(dr.JitFlag.FreezingScope) or self.colours is None or self.colours.same()):
+            self.renderer = self.renderer.with_updated_shading_edges()
+        kept = self.renderer
+        fits = ((frusta, soft_frusta) for known, frusta, soft_frusta in self.fits if known is sensor)
+        frusta, soft_frusta = next(fits, (kept.frusta, kept.soft_frusta))
+        return replace(kept, data=self.data(scene, sensor), frusta=frusta, soft_frusta=soft_frusta)
+
+    def _check_vertices(self, current: Renderer) -> None:
+        """Raise ShadowmapError for vertices that are not finite: triangles would be gone, and their derivatives with them."""
+        geometry = current.data.geometry
+        positions = dr.detach(geometry.positions)
+        if dr.flag(dr.JitFlag.FreezingScope) or (self.checked is not None and positions.index == self.checked.index):
+            return
+        if not dr.all(dr.isfinite(positions)):
+            points = positions.numpy().reshape(-1, 3)
+            vertex = int(np.flatnonzero(~np.isfinite(points).all(1))[0])
+            info = geometry.shapes[int(geometry.vertex_shape[vertex])]
+            where = f"Vertex {vertex - info.vertex_start} of shape '{info.name}' is {points[vertex].tolist()}"
+            raise ShadowmapError(f"{where}: positions must be finite.")
+        self.checked = positions
+
+    def _remember(self, scene: Any, sensor: Any, frusta: Frusta | None, soft_frusta: SoftFrusta) -> None:
+        """Keep the fit of an image for the next one of this sensor, and warn of lenses when it is seen first."""
+        others = [fit for fit in self.fits if fit[0] is not sensor]
+        if len(others) == len(self.fits) and not any(sensor is known for known in scene.sensors()):
+            warn_of(lenses_of(sensor))
+        own, room, kept = scene.sensors(), _OTHERS, []
+        for fit in [(sensor, frusta, soft_frusta), *others]:
+            strange = not any(fit[0] is known for known in own)
+            room -= strange
+            if not strange or room >= 0:
+                kept.append(fit)
+        self.fits = kept[:_REMEMBERED_SENSORS]
+
+
+def _parts(scene: Any, data: SceneData) -> tuple[Any, ...]:
+    return (*scene.shapes(), *scene.emitters(), *_bsdfs(data))
+
+
+def _bsdfs(data: SceneData) -> list[Any]:
+    return [source.shape.bsdf() for source in data.sources]
+
+
+def _statics(scene: Any, data: SceneData) -> tuple[Any, ...]:
+    topology = [array for source in data.sources for array in source.statics()]
+    cones = [e for e in scene.emitters() if e.class_name() == "SpotLight"]
+    return (*topology, *(dr.detach(mi.Float(parameters(cone)["cutoff_angle"])) for cone in cones))
+
+
+def _sizes(data: SceneData) -> tuple[int, ...]:
+    return tuple(size for source in data.sources for size in source.sizes())
+
+
+def _without_scene(data: SceneData) -> SceneData:
+    """Drop what ``refresh`` reads again."""
+    geometry = replace(data.geometry, positions=None, normals=None, texcoords=None, rest_positions=None)
+    return replace(data, scene=None, geometry=geometry, sensors=(), lights=(), areas=(), environments=())
+
+
+def same_objects(first: tuple[Any, ...], second: tuple[Any, ...]) -> bool:
+    return len(first) == len(second) and all(a is b for a, b in zip(first, second, strict=True))
+
+
+def _same_arrays(first: tuple[Any, ...], second: tuple[Any, ...]) -> bool:
+    """Equality of arrays that are read back only if they are not the very same."""
+    if len(first) != len(second):
+        return False
+    for a, b in zip(first, second, strict=True):
+        if a.index != b.index and (len(a) != len(b) or not dr.all(a == b)):
+            return False
+    return True

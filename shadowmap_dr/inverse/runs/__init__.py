@@ -1,0 +1,1 @@
+"""Loops that survive being killed, and sweeps over many runs."""

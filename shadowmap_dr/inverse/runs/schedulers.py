@@ -1,0 +1,147 @@
+"""Who does the batches of a sweep: this process, processes on this machine, or the workers of a Dask cluster."""
+
+from __future__ import annotations
+
+import threading
+import uuid
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from ...errors import OutputError, ShadowmapError, is_interrupt
+from .worker import Batch, Worker
+
+#: How a scheduler is named.
+SCHEDULERS = "local, processes:N or tcp://HOST:PORT"
+
+MOST_THREADS = 1024
+
+Report = Callable[[Batch, dict[str, Any]], None]
+
+
+def check_scheduler(name: str) -> None:
+    """Raise ShadowmapError for a name of no scheduler, or if what it needs is not installed."""
+    kind, _, count = name.partition(":")
+    if name == "local":
+        return
+    if kind == "processes":
+        if not (count.isdecimal() and int(count)):
+            raise ShadowmapError(f"scheduler {name!r}: give the number of processes, as in processes:2.")
+    elif kind not in ("tcp", "tls") or not count.startswith("//"):
+        raise ShadowmapError(f"no scheduler {name!r}: choose {SCHEDULERS}.")
+    try:
+        import distributed  # noqa: F401
+    except ImportError as error:
+        raise ShadowmapError(f"scheduler {name!r} needs Dask: pip install 'shadowmap-dr[distributed]'.") from error
+
+
+def check_threads(threads: int) -> None:
+    """Raise ShadowmapError for a number of Dr.Jit threads that cannot be."""
+    if not 0 <= threads <= MOST_THREADS:
+        raise ShadowmapError(f"{threads} threads: give 1 to {MOST_THREADS}, or 0 for all.")
+
+
+def do_batches(
+    batches: Sequence[Batch],
+    scheduler: str,
+    *,
+    threads: int,
+    folder: Path,
+    on_done: Report,
+    on_step: Callable[[Batch, int], None] = lambda batch, done: None,
+) -> None:
+    """Do all units; ``on_done`` gets each one's result as soon as it is there, in the order in which they end.
+
+    A unit whose worker died is done again by another one. ``on_step`` is called by the scheduler ``local`` only.
+    Raises what a unit raised, after all others are done.
+    """
+    failed = (_do_here if scheduler == "local" else _do_elsewhere)(batches, scheduler, threads, folder, on_done, on_step)
+    if failed:
+        error = failed[0]
+        if scheduler == "local":
+            raise error
+        if isinstance(error, ShadowmapError):
+            raise error
+        lines = " ".join(str(error).split())
+        raise ShadowmapError(f"{len(failed)} batches failed, the first one with {type(error).__name__}: {lines}") from error
+
+
+def _do_here(
+    batches: Sequence[Batch], _: str, threads: int, folder: Path, on_done: Report, on_step: Callable[[Batch, int], None]
+) -> list[Exception]:
+    worker, failed = Worker(threads), []
+    for batch in batches:
+        try:
+            result = worker.do(batch, folder, lambda done, batch=batch: on_step(batch, done))
+        except OutputError:
+            raise  # where a checkpoint cannot be written, no other could be
+        except Exception as error:
+            if is_interrupt(error):
+                raise KeyboardInterrupt from error
+            failed.append(error)
+            continue
+        on_done(batch, result)
+    return failed
+
+
+def _do_elsewhere(
+    batches: Sequence[Batch], scheduler: str, threads: int, folder: Path, on_done: Report, _: Callable[[Batch, int], None]
+) -> list[Exception]:
+    from distributed import as_completed
+
+    failed: list[Exception] = []
+    with _client(scheduler) as client:
+        # Other sweeps on the same cluster may have units of the same name, whose results are not ours.
+        sweep = uuid.uuid4().hex
+        futures = {
+            client.submit(_do, batch, str(folder), threads, pure=False, key=f"{batch.file}-{sweep}", retries=0): batch
+            for batch in batches
+        }
+        for future in as_completed(list(futures)):
+            batch = futures.pop(future)
+            if future.cancelled():
+                raise ShadowmapError(f"the Dask scheduler at {scheduler} is gone: start it and go on from complete batches.")
+            error = future.exception()
+            if error is None:
+                on_done(batch, future.result())
+            else:
+                failed.append(error)
+            future.release()
+    return failed
+
+
+@contextmanager
+def _client(scheduler: str) -> Iterator[Any]:
+    from distributed import Client, LocalCluster
+
+    if scheduler.startswith("processes:"):
+        count = int(scheduler.partition(":")[2])
+        # One thread for Python; those of Dr.Jit are its own affair. Workers start anew when they die.
+        with (
+            LocalCluster(
+                n_workers=count, threads_per_worker=1, processes=True, dashboard_address=None, memory_limit=0
+            ) as cluster,
+            Client(cluster) as client,
+        ):
+            yield client
+        return
+    try:
+        client = Client(scheduler, timeout=20)
+    except (OSError, ValueError, TypeError) as error:  # the last two for ports that are none, and missing certificates
+        raise ShadowmapError(f"no Dask scheduler answers at {scheduler}: start one, or give its address.") from error
+    with client:
+        yield client
+
+
+#: The worker of this process, if it is a worker, for as long as nobody asks for another number of threads.
+_WORKER: list[Worker] = []
+_LOCK = threading.Lock()
+
+
+def _do(batch: Batch, folder: str, threads: int) -> dict[str, Any]:
+    with _LOCK:
+        if not _WORKER or _WORKER[0].threads != threads:
+            _WORKER[:] = [Worker(threads)]
+        worker = _WORKER[0]
+    return worker.do(batch, Path(folder))

@@ -1,0 +1,129 @@
+"""Sweeps: all runs of some problems, in batches, each with a file of its own, so that whatever is killed goes on from there."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+from rich.console import Console
+
+from ...errors import OutputError, ShadowmapError
+from ...io import console as io_console
+from ...io import records
+from .problems import Problem
+from .schedulers import check_scheduler, check_threads, do_batches
+from .worker import Batch, stem
+
+#: Bytes that a batch may need if nobody says otherwise.
+MEMORY = 1 << 31
+#: How the names of checkpoints end: those of batches, and of single runs of a batch.
+_CHECKPOINT = r"\.checkpoint(-[0-9a-f]{8})?(-run\d+)?\.npz"
+
+
+def run_sweep(
+    problems: Sequence[Problem],
+    out: Path,
+    *,
+    scheduler: str = "local",
+    variant: str = "llvm_ad_rgb",
+    threads: int = 0,
+    memory: int = MEMORY,
+    resume: bool = False,
+    console: Console | None = None,
+) -> dict[str, list[dict[str, Any]]]:
+    """Do all runs of some problems.
+
+    Each batch leaves a file ``out/batches/NAME-DIGEST-FIRST-LAST.json`` with the records of its runs, which appears when it is
+    complete. DIGEST is one of the settings and the variant: files of the same problem with other settings are left alone.
+
+    Args:
+        problems: with different names.
+        out: folder for results.
+        scheduler: ``local`` (this process), ``processes:N`` (on this machine) or the address of a Dask scheduler
+            (``tcp://host:port``). Scheduler and workers must have this package, and the module of the problems, installed.
+        variant: Mitsuba variant, here and in workers.
+        threads: Dr.Jit threads of each process, 0 for as many as there are cores.
+        memory: bytes that a batch may need, about.
+        resume: keep records on disk whose settings are those of their problem. They may come from batches of another size, or
+            from another scheduler. Otherwise files of these problems with these settings are deleted first.
+
+    Returns:
+        For each problem's name its records, in the order of the runs.
+
+    Raises:
+        ShadowmapError: names that are no file names, or not different; an unknown scheduler; what a batch raised (results of the
+            others are on disk by then).
+    """
+    check_scheduler(scheduler)
+    check_threads(threads)
+    if variant not in mi.variants():
+        raise ShadowmapError(f"no Mitsuba variant {variant!r}: choose one of {', '.join(mi.variants())}.")
+    names = [problem.name for problem in problems]
+    if len(set(names)) != len(names):
+        raise ShadowmapError(f"two problems of the sweep have the same name in {', '.join(names)}: rename one.")
+    for name in names:
+        if not re.fullmatch(r"[\w.-]+", name):
+            raise ShadowmapError(f"a problem is called {name!r}: use letters, digits, '.', '_' and '-'.")
+    folder = out / "batches"
+    done = {problem.name: stored_records(problem, out, variant) if resume else {} for problem in problems}
+    if not resume:
+        for problem in problems:
+            for path in [*_files(problem, folder, variant), *_files(problem, folder, variant, _CHECKPOINT)]:
+                path.unlink()
+    batches = [batch for problem in problems for batch in _batches(problem, variant, done[problem.name], memory)]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"cannot write {folder}: {error.strerror or error}.") from error
+    with io_console.progress(console or Console(stderr=True)) as progress:
+        total = progress.add_task("batches", total=len(batches), note="")
+        task = progress.add_task("", total=None, note="", visible=False)
+
+        def on_step(batch: Batch, steps: int) -> None:
+            progress.update(task, description=batch.title, total=batch.problem.steps, completed=steps, visible=True)
+
+        def on_done(batch: Batch, result: dict[str, Any]) -> None:
+            records.write_json(folder / batch.file, result)
+            for path in folder.glob(f"{Path(batch.file).stem}.checkpoint*"):
+                path.unlink(missing_ok=True)
+            done[batch.problem.name] |= dict(zip(result["runs"], result["records"], strict=True))
+            progress.update(total, advance=1)
+
+        do_batches(batches, scheduler, threads=threads, folder=folder.resolve(), on_done=on_done, on_step=on_step)
+    for problem in problems:  # those of batches of another size, which were killed
+        for path in _files(problem, folder, variant, _CHECKPOINT):
+            path.unlink(missing_ok=True)
+    return {problem.name: [done[problem.name][run] for run in problem.run_numbers()] for problem in problems}
+
+
+def _batches(problem: Problem, variant: str, done: dict[int, Any], memory: int) -> list[Batch]:
+    """Batches, as equal in size as can be, of the runs that are still to be done."""
+    left = [run for run in problem.run_numbers() if run not in done]
+    if not left:
+        return []
+    count = -(-len(left) // max(1, problem.batch_size(memory)))
+    ends = [len(left) * k // count for k in range(count + 1)]
+    return [Batch(problem, tuple(left[a:b]), variant) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+
+
+def _files(problem: Problem, folder: Path, variant: str, ending: str = r"\.json") -> list[Path]:
+    """Files of a problem's batches: not those of problems whose names begin with its own."""
+    pattern = re.compile(re.escape(stem(problem, variant)) + r"-\d+-\d+" + ending)
+    return [path for path in sorted(folder.glob("*")) if pattern.fullmatch(path.name)]
+
+
+def stored_records(problem: Problem, out: Path, variant: str) -> dict[int, Any]:
+    """Records by run from complete batches below ``out`` that were made with the problem's settings in a variant."""
+    wanted, found = records.plain(problem.settings()), {}
+    for path in _files(problem, out / "batches", variant):
+        try:
+            result = records.read_json(path)
+            if result["settings"] == wanted and result["variant"] == variant:
+                pairs = zip(result["runs"], result["records"], strict=True)
+                found |= {run: record for run, record in pairs if run in problem.run_numbers()}
+        except (ShadowmapError, KeyError, TypeError, ValueError):
+            continue  # whatever cannot be read is done again
+    return found

@@ -1,0 +1,21 @@
+"""Files: images, meshes, records, plots, tables for the terminal, and what comes with the package. No rendering."""
+
+from .files import atomic, check_output, read_arrays
+from .images import colour_channels, read_exr, read_image, to_srgb, write_exr, write_image, write_png
+from .records import read_json, read_record, write_json
+
+__all__ = [
+    "atomic",
+    "check_output",
+    "colour_channels",
+    "read_arrays",
+    "read_exr",
+    "read_image",
+    "read_json",
+    "read_record",
+    "to_srgb",
+    "write_exr",
+    "write_image",
+    "write_json",
+    "write_png",
+]

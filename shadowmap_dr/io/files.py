@@ -1,0 +1,91 @@
+"""Files that appear under their name only when they are complete, and archives of arrays."""
+
+from __future__ import annotations
+
+import errno
+import os
+import tempfile
+import zipfile
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import OutputError, ShadowmapError
+
+SUFFIXES = (".exr", ".png")
+
+
+@contextmanager
+def atomic(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """A temporary file beside `path` that takes its place when the block succeeds, and vanishes when it does not.
+
+    Raises OutputError where the file cannot be written (no such directory, no permission, full disk). Parent directories
+    are created.
+    """
+    path = Path(path)
+    temporary: Path | None = None
+    try:
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, "Is a directory")
+        make_folder(path.parent)
+        handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
+        os.close(handle)
+        temporary = Path(name)
+        yield temporary
+        temporary.chmod(0o666 & ~_umask())  # mkstemp makes files that nobody else may read
+        os.replace(temporary, path)
+        temporary = None
+    except OutputError:
+        raise
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror or error}.") from error
+    finally:
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)
+
+
+def make_folder(folder: Path) -> None:
+    for path in (folder, *folder.parents):
+        if path.exists() and not path.is_dir():
+            raise NotADirectoryError(errno.ENOTDIR, f"{path} is a file")
+    folder.mkdir(parents=True, exist_ok=True)
+
+
+def check_output(path: str | os.PathLike[str], suffixes: tuple[str, ...] = SUFFIXES) -> Path:
+    """Fail early, before any work is done, if `path` cannot be written later. Returns it as a Path."""
+    path = Path(path)
+    if path.suffix.lower() not in suffixes:
+        raise OutputError(f"cannot write {path}: the suffix {path.suffix!r} is not one of {', '.join(suffixes)}.")
+    try:
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, "Is a directory")
+        if path.exists() and not os.access(path, os.W_OK):
+            raise PermissionError(errno.EACCES, "Permission denied")
+        make_folder(path.parent)
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror or error}.") from error
+    return path
+
+
+def read_arrays(path: str | os.PathLike[str], only: Collection[str] | None = None) -> dict[str, npt.NDArray[Any]]:
+    """The arrays of an .npz file by name (those of the names in ``only``). ShadowmapError where it cannot be read."""
+    try:
+        if not zipfile.is_zipfile(path):  # NumPy would call other files pickled objects
+            raise ValueError("no archive")
+        with np.load(path, allow_pickle=False) as file:
+            return {name: file[name] for name in file.files if only is None or name in only}
+    except Exception as error:  # whatever NumPy and the decompressor come across in a damaged file
+        reason = "objects are not read" if "pickle" in str(error) else "it is no .npz file, or it is damaged"
+        raise ShadowmapError(f"cannot read {path}: {reason}; give an .npz file of plain arrays.") from error
+
+
+def _umask() -> int:
+    mask = os.umask(0o022)
+    os.umask(mask)
+    return mask

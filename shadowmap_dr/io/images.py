@@ -1,0 +1,112 @@
+"""Reading and writing of images."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import OutputError, ShadowmapError
+from .files import SUFFIXES, atomic
+
+Array = npt.NDArray[np.generic]
+
+
+def write_exr(path: str | os.PathLike[str], channels: Mapping[str, Array], metadata: Mapping[str, str] | None = None) -> None:
+    """Write a multi-channel OpenEXR file.
+
+    Args:
+        path: where to; parent directories are created.
+        channels: name -> array (H, W) of float16, float32 or uint32, top row first. Usual names: R, G, B, A, Y, depth.Z.
+        metadata: strings that are stored in the header.
+
+    Raises OutputError if the file cannot be written.
+    """
+    import OpenEXR
+
+    header: dict[str, object] = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    header.update(metadata or {})
+    arrays = {name: np.ascontiguousarray(array) for name, array in channels.items()}
+    with atomic(path) as temporary:
+        try:
+            with OpenEXR.File(header, arrays) as file:
+                file.write(str(temporary))
+        except RuntimeError as error:
+            reason = str(error).replace("\n", " ").rstrip(".").rsplit(". ", 1)[-1]
+            raise OutputError(f"cannot write {path}: {reason}.") from error
+
+
+def read_exr(path: str | os.PathLike[str]) -> tuple[dict[str, Array], dict[str, str]]:
+    """Channels (name -> (H, W) array) and the header's strings of an OpenEXR file."""
+    import OpenEXR
+
+    if not Path(path).is_file():
+        raise ShadowmapError(f"no image {str(path)!r}: the file does not exist.")
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+            metadata = {name: value for name, value in file.header().items() if isinstance(value, str)}
+    except Exception as error:  # whatever the library comes across in a damaged header
+        raise ShadowmapError(f"cannot read {path}: it is no OpenEXR file, or it is damaged.") from error
+    return channels, metadata
+
+
+def write_png(path: str | os.PathLike[str], image: Array) -> None:
+    """Write an image as an 8-bit sRGB PNG. Values outside [0, 1] are clipped.
+
+    Args:
+        path: where to; parent directories are created.
+        image: linear (H, W), (H, W, 1), (H, W, 3) or, with alpha, (H, W, 4), top row first.
+    """
+    from PIL import Image
+
+    pixels = np.asarray(image, dtype=np.float32)
+    if pixels.ndim == 3 and pixels.shape[2] == 1:
+        pixels = pixels[..., 0]
+    if pixels.ndim not in (2, 3) or (pixels.ndim == 3 and pixels.shape[2] not in (3, 4)):
+        raise ShadowmapError(f"an image of shape {np.shape(image)} is no PNG: give (H, W), (H, W, 1), (H, W, 3 or 4).")
+    encoded = to_srgb(pixels)
+    if pixels.ndim == 3 and pixels.shape[2] == 4:
+        encoded[..., 3] = np.clip(pixels[..., 3], 0, 1)
+    with atomic(path) as temporary:
+        Image.fromarray(np.round(np.nan_to_num(encoded) * 255).astype(np.uint8)).save(temporary, format="PNG")
+
+
+def write_image(path: str | os.PathLike[str], image: Array, metadata: Mapping[str, str] | None = None) -> None:
+    """Write a linear (H, W, C) image with 1, 3 or 4 channels as .exr or .png, whichever the suffix says."""
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix == ".png":
+        write_png(path, image)
+    elif suffix == ".exr":
+        pixels = np.asarray(image, dtype=np.float32)
+        pixels = pixels[..., None] if pixels.ndim == 2 else pixels
+        write_exr(path, {name: pixels[..., i] for i, name in enumerate(colour_channels(pixels.shape[2]))}, metadata)
+    else:
+        raise OutputError(f"cannot write {path}: the suffix {suffix!r} is not one of {', '.join(SUFFIXES)}.")
+
+
+def read_image(path: str | os.PathLike[str]) -> npt.NDArray[np.float32]:
+    """Colour channels of an OpenEXR file as a linear float32 (H, W, 1) or (H, W, 3) image."""
+    channels, _ = read_exr(path)
+    names = ("R", "G", "B") if "R" in channels else ("Y",)
+    if not all(name in channels for name in names):
+        raise ShadowmapError(f"cannot read {path}: it has no colour channels, only {', '.join(channels)}.")
+    return np.stack([channels[name] for name in names], axis=-1).astype(np.float32)
+
+
+def colour_channels(count: int) -> tuple[str, ...]:
+    """OpenEXR channel names of an image with that many colour channels."""
+    names = {1: ("Y",), 2: ("Y", "A"), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}.get(count)
+    if names is None:
+        raise ShadowmapError(f"an image with {count} colour channels has no OpenEXR channel names: give 1 to 4.")
+    return names
+
+
+def to_srgb(linear: Array) -> npt.NDArray[np.float32]:
+    """sRGB transfer curve (IEC 61966-2-1) of linear values, clipped to [0, 1]."""
+    x = np.clip(np.asarray(linear, dtype=np.float32), 0, 1)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(x, 1 / 2.4) - 0.055).astype(np.float32)

@@ -1,0 +1,1 @@
+"""Arrays and trees of arrays on Dr.Jit: memory, broadcasting, vectors, recordings. Knows no scenes."""

@@ -1,0 +1,407 @@
+"""Mixing of pixels with the neighbours that reach into them, and its derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import drjit as dr
+
+from ...jit.arrays import backend
+from ..topology import NO_VERTEX
+from ..types import RasterOutput
+from .colour_jumps import Surroundings
+from .edge_crossings import Crossings
+from .neighbour_weights import around
+from .pixel_pairs import each_number
+
+
+def blend(
+    values: Any, positions: Any, raster: RasterOutput, crossings: Crossings, surroundings: Surroundings | None = None
+) -> Any:
+    """Apply the weights of all pairs of pixels.
+
+    Args:
+        values: flat, interleaved channels of all pixels, or a list with one array for each channel. Attached.
+        positions: flat clip-space vertices of all images. Attached.
+        raster: what the pixels see.
+        crossings: for the same positions.
+        surroundings: if colours are to be continued up to the edges, see :mod:`shadowmap_dr.raster.antialiasing.colour_jumps`.
+
+    Returns blended values, flat and interleaved.
+    """
+    with dr.suspend_grad():
+        dr.eval(values)
+    if not dr.is_diff_v(positions):
+        return Mixer(values, raster.width, crossings).values
+    wanted = dr.grad_enabled(values), dr.grad_enabled(positions)
+    return dr.custom(_Blend, values, positions, raster.width, crossings, wanted, surroundings)
+
+
+class _Blend(dr.CustomOp):
+    """Blending as one differentiable operation: the derivatives, too, do work only where pixels were blended."""
+
+    def eval(
+        self,
+        values: Any,
+        positions: Any,
+        width: int,
+        crossings: Crossings,
+        wanted: tuple[bool, bool],
+        surroundings: Surroundings | None,
+    ) -> Any:
+        self.mixer = Mixer(values, width, crossings, surroundings)
+        self.wanted, self.vertices = wanted, dr.width(positions)
+        return self.mixer.values
+
+    def forward(self) -> None:
+        values = self.grad_in("values") if self.wanted[0] else None
+        positions = self.grad_in("positions") if self.wanted[1] else None
+        dr.eval(values, positions)
+        self.set_grad_out(self.mixer.tangent(values, positions))
+
+    def backward(self) -> None:
+        adjoint = self.grad_out()
+        dr.eval(adjoint)
+        if self.wanted[0]:
+            self.set_grad_in("values", self.mixer.adjoint_of_values(adjoint))
+        if self.wanted[1]:
+            self.set_grad_in("positions", self.mixer.adjoint_of_positions(adjoint, self.vertices))
+
+
+class Mixer:
+    """Blended ``values``, and what their derivatives need. Detached.
+
+    A pixel mixes ``scale * weight`` of each neighbour that reaches into it. Up to four may each claim half of an isolated pixel;
+    more than all of it they cannot have: ``scale = 1 / max(1, sum of weights)``.
+    """
+
+    def __init__(self, values: Any, width: int, crossings: Crossings, surroundings: Surroundings | None = None) -> None:
+        self.module = backend(crossings.right)
+        self.crossings, self.width, self.surroundings = crossings, width, surroundings
+        self.pixels = dr.width(crossings.right)
+        self.planar = isinstance(values, list)
+        self.channels = len(values) if self.planar else dr.width(values) // self.pixels
+        self.original = values
+        # Sums of weights, defined only where neighbours reach into a pixel.
+        self.claims = dr.empty(self.module.Float, self.pixels)
+        self.values = self._mix()
+        dr.eval(self.values, self.claims)
+
+    def _mix(self) -> Any:
+        if not self.planar:
+            return self._mix_few()
+        pixel = dr.arange(self.module.UInt32, self.pixels)
+        incoming = self.around(self.crossings.right, self.crossings.down, 1)
+        own = self.read(self.original, pixel)
+
+        def mix(pixel: Any, *lanes: Any) -> tuple[Any, ...]:
+            incoming, own = lanes[:4], lanes[4:]
+            claims = sum(incoming)
+            dr.scatter(self.claims, claims, pixel)
+            return tuple(self._mixed(pixel, incoming, claims, own))
+
+        return self.written(self._where(sum(incoming) > 0, mix, pixel, (*incoming, *own), own))
+
+    def _mix_few(self) -> Any:
+        # Of interleaved values all are copied, and those of the few blended pixels overwritten.
+        result = self.copied(self.original)
+        dr.eval(result)
+
+        def visit(slot: Any, pair: Any) -> None:
+            down, pixel, weight = self._pair(pair)
+
+            def mix(pixel: Any, down: Any, weight: Any) -> Any:
+                taker = dr.select(weight > 0, self._neighbour(pixel, down), pixel)
+                incoming = self.around(self.crossings.right, self.crossings.down, 1, at=taker)
+                claims = sum(incoming)
+                # Of the pairs of which a pixel takes, one does the work.
+                first = self._is_first(incoming, taker != pixel, down)
+                dr.scatter(self.claims, claims, taker, first)
+                mixed = self._mixed(taker, incoming, claims, self.read(self.original, taker))
+                dr.scatter(result, self.packet(mixed), taker, first)
+                return weight
+
+            dr.if_stmt((pixel, down, weight), weight != 0, mix, lambda pixel, down, weight: weight, mode="symbolic")
+
+        self.crossings.pairs.for_each(visit)
+        return result
+
+    def _mixed(self, pixel: Any, incoming: Sequence[Any], claims: Any, own: Sequence[Any]) -> list[Any]:
+        scale = _scale(claims)
+        total = list(own)
+        for weight, neighbour in zip(incoming, self.neighbours(pixel), strict=True):
+            other = self.read(self.original, neighbour, weight > 0)
+            factor = weight * scale
+            total = [dr.fma(factor, dr.select(weight > 0, v - o, 0), t) for v, o, t in zip(other, own, total, strict=True)]
+        return total
+
+    def adjoint_of_values(self, adjoint: Any) -> Any:
+        """Gradient to the values from that of the result."""
+        if not self.planar:
+            return self._adjoint_of_few(adjoint)
+        pixel = dr.arange(self.module.UInt32, self.pixels)
+        right, down = self.crossings.right, self.crossings.down
+        incoming, outgoing = self.around(right, down, 1), self.around(right, down, -1)
+        own = self.read(adjoint, pixel)
+
+        def spread(pixel: Any, *lanes: Any) -> tuple[Any, ...]:
+            return tuple(self._spread(adjoint, pixel, lanes[:4], lanes[4:8], lanes[8:]))
+
+        touched = sum(incoming) + sum(outgoing) > 0
+        result = self._where(touched, spread, pixel, (*incoming, *outgoing, *own), own)
+        dr.eval(result)  # more than one kernel may want it
+        return result
+
+    def _adjoint_of_few(self, adjoint: Any) -> Any:
+        result = self.copied(adjoint)
+        dr.eval(result)
+
+        def visit(slot: Any, end: Any) -> None:
+            down, pixel, weight = self._pair(self.crossings.pairs.at(slot))
+
+            def spread(pixel: Any, down: Any, weight: Any, end: Any) -> Any:
+                second = end != 0
+                pixel = dr.select(second, self._neighbour(pixel, down), pixel)
+                signed = self.around(self.crossings.right, self.crossings.down, 1, True, pixel)
+                incoming, outgoing = [dr.maximum(w, 0) for w in signed], [dr.maximum(-w, 0) for w in signed]
+                first = self._is_first([dr.abs(w) for w in signed], second, down)
+                total = self._spread(adjoint, pixel, incoming, outgoing, self.read(adjoint, pixel))
+                dr.scatter(result, self.packet(total), pixel, first)
+                return weight
+
+            lanes = (pixel, down, weight, end)
+            dr.if_stmt(lanes, weight != 0, spread, lambda pixel, down, weight, end: weight, mode="symbolic")
+
+        # Both pixels of each pair.
+        pairs = self.crossings.pairs
+        each_number(2 * (pairs.front + pairs.back), pairs.lanes, lambda number: visit(number >> 1, number & 1))
+        dr.eval(result)
+        return result
+
+    def _spread(
+        self, adjoint: Any, pixel: Any, incoming: Sequence[Any], outgoing: Sequence[Any], own: Sequence[Any]
+    ) -> list[Any]:
+        claims = sum(incoming)
+        kept = 1 - claims * _scale(claims)
+        total = [kept * o for o in own]
+        for weight, neighbour in zip(outgoing, self.neighbours(pixel), strict=True):
+            factor = weight * _scale(dr.gather(self.module.Float, self.claims, neighbour, weight > 0))
+            other = self.read(adjoint, neighbour, weight > 0)
+            total = [dr.fma(factor, v, t) for v, t in zip(other, total, strict=True)]
+        return total
+
+    def adjoint_of_positions(self, adjoint: Any, size: int) -> Any:
+        """Gradient to the flat positions from that of the result."""
+        module = self.module
+        Float, Array4f = module.Float, module.Array4f
+        result = dr.zeros(Float, size)
+        crossings = self.crossings
+
+        def visit(slot: Any, pair: Any) -> None:
+            down, pixel, weight = self._pair(pair)
+
+            def add(slot: Any, pixel: Any, down: Any, weight: Any) -> Any:
+                gain, ends = self._gain(adjoint, pixel, down, weight), dr.gather(module.Array4u, crossings.ends, slot)
+                _add(result, gain, dr.gather(Array4f, crossings.slopes, slot), ends.x, ends.y, ends.x != NO_VERTEX)
+                two = ends.z != NO_VERTEX
+
+                def second(slot: Any, gain: Any, c: Any, d: Any) -> Any:
+                    _add(result, gain, dr.gather(Array4f, crossings.second_slopes, slot), c, d, True)
+                    return gain
+
+                return dr.if_stmt((slot, gain, ends.z, ends.w), two, second, lambda slot, gain, c, d: gain, mode="symbolic")
+
+            dr.if_stmt((slot, pixel, down, weight), weight != 0, add, lambda slot, pixel, down, weight: weight, mode="symbolic")
+
+        def meet(slot: Any) -> None:
+            down, pixel, weight = self._pair(crossings.pairs.at(slot))
+            active = (weight != 0) & self._bare(slot)
+
+            def add(pixel: Any, down: Any, weight: Any) -> Any:
+                gain = self._gain(adjoint, pixel, down, weight)
+                for vertex, slope in crossings.meetings.slopes(pixel, down):
+                    dr.scatter_add(result, slope * gain, vertex)
+                return weight
+
+            dr.if_stmt((pixel, down, weight), active, add, lambda pixel, down, weight: weight, mode="symbolic")
+
+        crossings.pairs.for_each(visit)
+        if crossings.meetings is not None:
+            crossings.meetings.for_each(meet)
+        return result
+
+    def _pair(self, pair: Any) -> tuple[Any, Any, Any]:
+        """Whether it is a pair with the lower neighbour, its pixel, and its weight."""
+        down, pixel = (pair & 1) != 0, pair >> 1
+        below = dr.gather(self.module.Float, self.crossings.down, pixel, down)
+        return down, pixel, dr.select(down, below, dr.gather(self.module.Float, self.crossings.right, pixel, ~down))
+
+    def _neighbour(self, pixel: Any, down: Any) -> Any:
+        """The second pixel of a pair."""
+        return pixel + dr.select(down, self.module.UInt32(self.width), 1)
+
+    def _is_first(self, shares: list[Any], second: Any, down: Any) -> Any:
+        """Whether a pair is the first with a share among those around one of its pixels (``second``: its second pixel).
+
+        ``shares`` are those of the right, lower, left and upper neighbour.
+        """
+        before = [shares[0] > 0]
+        for share in shares[1:3]:
+            before.append(before[-1] | (share > 0))
+        # The other pixel of the pair: right, lower; left, upper.
+        return ~dr.select(second, dr.select(down, before[2], before[1]), down & before[0])
+
+    def _bare(self, slot: Any) -> Any:
+        """Whether a pair has no edge."""
+        return dr.gather(self.module.UInt32, self.crossings.ends, 4 * slot) == NO_VERTEX
+
+    def _gain(self, adjoint: Any, pixel: Any, down: Any, weight: Any) -> Any:
+        """Gradient to the weight of a pair."""
+        # The neighbour takes from the pixel where the weight is positive, else the other way round.
+        neighbour = self._neighbour(pixel, down)
+        taker, giver = dr.select(weight > 0, neighbour, pixel), dr.select(weight > 0, pixel, neighbour)
+        claims = dr.gather(self.module.Float, self.claims, taker)
+        scale = _scale(claims)
+        g, own = self.read(adjoint, taker), self.read(self.original, taker)
+        other = self._beyond(taker, giver, down, 0.5 - dr.abs(weight), True)
+        shared = claims >= 1  # shares itself out: more for one neighbour is less for all of them
+        mixed = self.read(self.values, taker, shared)
+        mean = [dr.select(shared, m, o) for m, o in zip(mixed, own, strict=True)]
+        gain = sum(a * (v - m) for a, v, m in zip(g, other, mean, strict=True))
+        return gain * dr.select(weight > 0, scale, -scale)
+
+    def _beyond(self, taker: Any, giver: Any, down: Any, place: Any, active: Any) -> list[Any]:
+        """What pixels gain by a larger share of their neighbours, from whom edges at some place separate them, plus their own."""
+        if self.surroundings is None:
+            return self.read(self.original, giver, active)
+
+        def read(pixel: Any, active: Any) -> list[Any]:
+            return self.read(self.original, pixel, active)
+
+        def crossed(pixel: Any, down: Any, active: Any) -> Any:
+            weights = ((self.crossings.right, active & ~down), (self.crossings.down, active & down))
+            right, below = (dr.gather(self.module.Float, weight, pixel, wanted) for weight, wanted in weights)
+            return (right != 0) | (below != 0)
+
+        return self.surroundings.beyond(read, crossed, taker, giver, down, place, active)
+
+    def tangent(self, values: Any, positions: Any) -> Any:
+        """Change of the result with that of the values and positions (each or None)."""
+        module = self.module
+        pixel = dr.arange(module.UInt32, self.pixels)
+        crossings = self.crossings
+        incoming = self.around(crossings.right, crossings.down, 1)
+        claims = sum(incoming)
+        scale = _scale(claims)
+        own = self.read(self.original, pixel)
+        change = self.read(values, pixel) if values is not None else [module.Float(0)] * self.channels
+        total = list(change)
+        if positions is not None:
+            right, down = self._tangent_of_weights(positions)
+            # A weight's sign tells who takes; its change has the sign of the (right, lower) pair's.
+            rates = self.around(right, down, 1, signed=True)
+            mixed = self.read(self.values, pixel, claims >= 1)
+            mean = [dr.select(claims >= 1, m, o) for m, o in zip(mixed, own, strict=True)]
+        for k, (weight, neighbour) in enumerate(zip(incoming, self.neighbours(pixel), strict=True)):
+            active = weight > 0
+            if values is not None:
+                other = self.read(values, neighbour, active)
+                factor = weight * scale
+                total = [dr.fma(factor, v - c, t) for v, c, t in zip(other, change, total, strict=True)]
+            if positions is not None:
+                other = self._beyond(pixel, neighbour, self.module.Bool(k % 2 == 1), 0.5 - weight, active)
+                factor = dr.select(active, rates[k] * scale, 0)
+                total = [dr.fma(factor, v - m, t) for v, m, t in zip(other, mean, total, strict=True)]
+        return self.written(total)
+
+    def _tangent_of_weights(self, positions: Any) -> tuple[Any, Any]:
+        module = self.module
+        Float, Array4f = module.Float, module.Array4f
+        crossings = self.crossings
+        right, down = dr.zeros(Float, self.pixels), dr.zeros(Float, self.pixels)
+
+        def visit(slot: Any, pair: Any) -> None:
+            ends = dr.gather(module.Array4u, crossings.ends, slot)
+            change = Float(0)
+            for slopes, a, b in ((crossings.slopes, ends.x, ends.y), (crossings.second_slopes, ends.z, ends.w)):
+                has = a != NO_VERTEX
+                slope = dr.gather(Array4f, slopes, slot, has)
+                p, q = (dr.gather(Array4f, positions, v, has) for v in (a, b))
+                at = dr.fma(q - p, slope.x, p)
+                change += dr.select(has, slope.y * at.x + slope.z * at.y + slope.w * at.w, 0)
+            is_down = (pair & 1) != 0
+            dr.scatter(right, change, pair >> 1, ~is_down)
+            dr.scatter(down, change, pair >> 1, is_down)
+
+        def meet(slot: Any) -> None:
+            is_down, pixel, weight = self._pair(crossings.pairs.at(slot))
+            slopes = crossings.meetings.slopes(pixel, is_down)
+            change = sum(dr.dot(slope, dr.gather(Array4f, positions, vertex)) for vertex, slope in slopes)
+            active = (weight != 0) & self._bare(slot)
+            dr.scatter(right, change, pixel, active & ~is_down)
+            dr.scatter(down, change, pixel, active & is_down)
+
+        crossings.pairs.for_each(visit)
+        if crossings.meetings is not None:
+            dr.eval(right, down)
+            crossings.meetings.for_each(meet)
+        dr.eval(right, down)
+        return right, down
+
+    def neighbours(self, pixel: Any) -> tuple[Any, Any, Any, Any]:
+        """Right, lower, left, upper."""
+        return pixel + 1, pixel + self.width, pixel - 1, pixel - self.width
+
+    def around(self, right: Any, down: Any, sign: int, signed: bool = False, at: Any = None) -> tuple[Any, Any, Any, Any]:
+        """See :func:`around`."""
+        return around(right, down, self.width, sign, signed, at)
+
+    def _where(self, active: Any, function: Any, pixel: Any, lanes: tuple[Any, ...], otherwise: list[Any]) -> list[Any]:
+        """``function(pixel, *lanes)``, one number for each channel, in packets with active lanes; the last lanes elsewhere."""
+        count = len(otherwise)
+        result = dr.if_stmt(
+            (pixel, *lanes), active, function, lambda pixel, *lanes: tuple(lanes[-count:]), mode="symbolic", label="blend"
+        )
+        return list(result)
+
+    def read(self, flat: Any, pixel: Any, active: Any = True) -> list[Any]:
+        """All channels of pixels."""
+        module = self.module
+        if isinstance(flat, list):
+            return [dr.gather(module.Float, channel, pixel, active) for channel in flat]
+        if self.channels in (2, 4):
+            packet = module.Array2f if self.channels == 2 else module.Array4f
+            return list(dr.gather(packet, flat, pixel, active))
+        return [dr.gather(module.Float, flat, pixel * self.channels + c, active) for c in range(self.channels)]
+
+    def packet(self, channels: list[Any]) -> Any:
+        """Channels as what is scattered at once."""
+        return channels[0] if self.channels == 1 else self.module.ArrayXf(channels)
+
+    def written(self, channels: list[Any]) -> Any:
+        """Interleave the channels."""
+        if self.channels == 1:
+            return channels[0]
+        result = dr.empty(self.module.Float, self.channels * self.pixels)
+        dr.scatter(result, self.packet(channels), dr.arange(self.module.UInt32, self.pixels))
+        return result
+
+    def copied(self, flat: Any) -> Any:
+        """A copy that may be written to. Not Dr.Jit's, which one thread would make."""
+        UInt32 = self.module.UInt32
+        # Nothing that Dr.Jit could see to be the same array.
+        bits = dr.reinterpret_array(UInt32, flat) ^ (dr.arange(UInt32, dr.width(flat)) >> 31)
+        return dr.reinterpret_array(self.module.Float, bits)
+
+
+def _scale(claims: Any) -> Any:
+    return dr.rcp(dr.maximum(1, claims))
+
+
+def _add(result: Any, gain: Any, slopes: Any, a: Any, b: Any, active: Any) -> None:
+    """Pass a weight's gradient on to the ends of its edge."""
+    Array4f = type(slopes)
+    g = Array4f(gain * slopes.y, gain * slopes.z, 0, gain * slopes.w)
+    dr.scatter_add(result, g * (1 - slopes.x), a, active)
+    dr.scatter_add(result, g * slopes.x, b, active)

@@ -1,0 +1,175 @@
+"""How much colours jump at an edge between two pixels, from what is seen on both sides of it.
+
+The colours at the pixels' centres differ by more than that: what shading falls by on the way to a rim, say, is no jump, and would
+count twice where the rim moves. So both sides are continued to the edge, as steeply as they change beyond the pixels. The weights
+of pixels that are mixed do not depend on it, but the derivatives of what is mixed do.
+"""
+
+from __future__ import annotations
+
+import functools
+import operator
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from ...jit.arrays import backend
+from ..topology import Topology
+from ..triangle_setup import edge_lines, gather_triangle
+from ..types import NO_TRIANGLE, RasterOutput, by_image
+from .creases import CoplanarCreases, touching
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What it takes to tell whether colours change steadily from a pixel to its neighbour. Detached.
+
+    Attributes:
+        triangle: ``UInt32``, what each pixel sees.
+        positions: flat clip-space vertices (4 V B), as rasterized.
+        topology: of the mesh.
+        creases: ``Bool`` (3 F,), edges of faces at which colours jump, or None.
+        folds: which of them are none within a plane, or None.
+        sharpness: ``Float`` for each pixel, or None for 1. 1 where a flat face is large enough for its own colour to be seen, 0
+            where faces are so small that it is that of a smooth surface. In between colours are in part at random: there is
+            nothing to continue.
+        batch: number of images.
+        height, width, vertex_count: of an image.
+    """
+
+    triangle: Any
+    positions: Any
+    topology: Topology
+    creases: Any
+    folds: CoplanarCreases | None
+    sharpness: Any
+    batch: int
+    height: int
+    width: int
+    vertex_count: int
+
+    @classmethod
+    def of(
+        cls, raster: RasterOutput, positions: Any, topology: Topology, creases: Any, folds: CoplanarCreases | None, sharpness: Any
+    ) -> Surroundings:
+        """For flat positions; sharpness as ``crease_weights`` of :func:`find_crossings`."""
+        positions, sharpness = dr.detach(positions), None if sharpness is None else dr.detach(sharpness)
+        size = raster.batch, raster.height, raster.width, dr.width(positions) // (4 * raster.batch)
+        return cls(raster.triangle, positions, topology, creases, folds, sharpness, *size)
+
+    def beyond(
+        self,
+        read: Callable[[Any, Any], list[Any]],
+        crossed: Callable[[Any, Any, Any], Any],
+        taker: Any,
+        giver: Any,
+        down: Any,
+        place: Any,
+        active: Any = True,
+    ) -> list[Any]:
+        """Colours of pixels, plus how much those of their neighbours differ from them at an edge in between.
+
+        Both are continued up to the edge, if the next pixel on their other side sees the same surface. The difference has the
+        sign of that between the pixels, and is at most twice as large, in each channel.
+
+        Args:
+            read: ``read(pixel, active)``, the channels of pixels.
+            crossed: ``crossed(pixel, down, active)``, whether an edge lies between a pixel and its right (lower) neighbour.
+            taker, giver: pixels, and neighbours that reach into them.
+            down: whether these are above or below.
+            place: of the edge, from 0 at the taker's centre to 1 at the giver's.
+        """
+        module = backend(place)
+        own, other = read(taker, active), read(giver, active)
+        step = dr.select(down, module.UInt32(self.width), 1)
+        forward = giver > taker
+        slopes = []
+        for near, values, sign in ((taker, own, -1), (giver, other, 1)):
+            ahead = forward if sign > 0 else ~forward
+            far = dr.select(ahead, near + step, near - step)
+            steady = self._steady(crossed, near, far, down, ahead, self._inside(near, down, ahead, active))
+            slopes.append([dr.select(steady, sign * (f - v), 0) for f, v in zip(read(far, steady), values, strict=True)])
+        result = []
+        for o, v, slope, other_slope in zip(own, other, *slopes, strict=True):
+            jump = v - o
+            continued = dr.fma(other_slope, place - 1, dr.fma(-slope, place, jump))
+            result.append(o + dr.clip(continued, dr.minimum(2 * jump, 0), dr.maximum(2 * jump, 0)))
+        return result
+
+    def _inside(self, pixel: Any, down: Any, ahead: Any, active: Any) -> Any:
+        """Whether the next pixel to the right (left, if not ``ahead``) or below (above) belongs to the same image."""
+        UInt32 = backend(pixel).UInt32
+        row_flat = pixel // self.width
+        at = dr.select(down, row_flat % self.height, pixel - row_flat * self.width)
+        last = dr.select(down, UInt32(self.height), self.width) - 1
+        return dr.select(ahead, at < last, at > 0) & active
+
+    def _steady(
+        self, crossed: Callable[[Any, Any, Any], Any], near: Any, far: Any, down: Any, ahead: Any, inside: Any
+    ) -> Any:
+        """Whether pixels and their neighbours see the same triangle, or others of a smooth surface.
+
+        That no edge crosses the way to the neighbour would not be enough by itself: edges along it do not count there.
+        """
+        module = backend(near)
+        here, there = (dr.gather(module.UInt32, self.triangle, pixel, inside) for pixel in (near, far))
+        inside = inside & (here != NO_TRIANGLE) & (there != NO_TRIANGLE)
+        same, smooth, soft = inside & (here == there), inside & (here != there), module.Bool(False)
+        if self.sharpness is not None:
+            sharp, far_sharp = (dr.gather(module.Float, self.sharpness, pixel, inside) for pixel in (near, far))
+            soft = (sharp == 0) & (far_sharp == 0)
+            same &= (sharp == 1) | soft
+        part, other = (dr.gather(module.UInt32, self.topology.parts, triangle, smooth) for triangle in (here, there))
+        smooth &= part == other
+        smooth &= ~crossed(dr.select(ahead, near, far), down, smooth)
+        if self.creases is None:
+            return same | smooth
+
+        def unbroken(near: Any, far: Any, down: Any, ahead: Any, here: Any, there: Any, soft: Any) -> Any:
+            if self.folds is not None:
+                soft |= touching(self.topology, here, there) & self.folds.flat(here, there)
+            jumps = [[self._jump(3 * triangle + k, soft) for k in range(3)] for triangle in (here, there)]
+            none = ~functools.reduce(operator.or_, jumps[0] + jumps[1])
+            open_ = ~(jumps[0][0] & jumps[0][1] & jumps[0][2]) & ~(jumps[1][0] & jumps[1][1] & jumps[1][2])
+
+            def on_the_way(near: Any, far: Any, down: Any, ahead: Any, here: Any, there: Any, soft: Any, none: Any) -> Any:
+                return ~self._leaves(near, here, down, ahead, soft) & ~self._leaves(far, there, down, ~ahead, soft)
+
+            # Few triangles have creases at some of their edges and not at others.
+            lanes = near, far, down, ahead, here, there, soft, none
+            return dr.if_stmt(lanes, open_ & ~none, on_the_way, lambda *lanes: lanes[-1], mode="symbolic", label="rims")
+
+        lanes = near, far, down, ahead, here, there, soft
+        return same | dr.if_stmt(lanes, smooth, unbroken, lambda *_: module.Bool(False), mode="symbolic", label="smooth")
+
+    def _jump(self, edge: Any, soft: Any) -> Any:
+        """Whether an edge is a crease. Folds are none where they are ``soft``."""
+        Bool = backend(edge).Bool
+        found = dr.gather(Bool, self.creases, edge)
+        return found if self.folds is None else found & ~(soft & dr.gather(Bool, self.folds.edges, edge))
+
+    def _leaves(self, pixel: Any, triangle: Any, down: Any, ahead: Any, soft: Any) -> Any:
+        """Whether the edge at which one leaves a triangle, from a pixel's centre towards a neighbour, is a crease.
+
+        Folds are none (``soft``) between coplanar triangles, and where triangles are seen as a smooth surface.
+        """
+        module = backend(pixel)
+        Float64 = module.Float64
+        row_flat = pixel // self.width
+        image, row = by_image(row_flat, self.height, self.batch)
+        corners = gather_triangle(self.positions, self.topology.faces, triangle, image * self.vertex_count, True)
+        lines, det = edge_lines(corners)
+        size_x, size_y = self.width, self.height
+        x = (2 * Float64(pixel - row_flat * size_x) + (1 - size_x)) / size_x
+        y = (2 * Float64(row) + (1 - size_y)) / size_y
+        sign = dr.select((det < 0) == ahead, 1, -1)
+        nearest, edge = Float64(dr.inf), module.UInt32(0)
+        for k, (a, b, c) in enumerate(lines):
+            # Distances from the edge opposite to a corner, of any unit, and by how much they shrink on the way.
+            value, rate = dr.abs(dr.fma(a, x, dr.fma(b, y, c))), sign * dr.select(down, b / size_y, a / size_x)
+            distance = dr.select(rate > 0, value / rate, dr.inf)
+            edge = dr.select(distance < nearest, (k + 1) % 3, edge)
+            nearest = dr.minimum(nearest, distance)
+        return self._jump(3 * triangle + edge, soft)

@@ -1,0 +1,149 @@
+"""Creases between neighbouring pixels: edges at which no surface ends, but its colour jumps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from ...jit.arrays import backend
+from ..topology import NO_VERTEX, Topology
+from ..types import NO_TRIANGLE, RasterOutput
+
+# Planes that cross so far (relative) beyond two edges still cross at the nearer one, in spite of rounding.
+_SLACK = 0.05
+# Sine of the angle up to which two faces lie in one plane: rounding of small triangles. Small bends add up over a surface.
+_FLAT = 1e-4
+
+
+@dataclass(frozen=True)
+class CoplanarCreases:
+    """Creases that are none where the surface is not bent: within a flat face of many triangles, colours do not jump.
+
+    What they change by from one pixel to the next, because of a texture, say, would count twice if its triangles had edges.
+
+    Attributes:
+        edges: ``Bool`` (3 F,), which of the creases from corner k to k + 1 of a face these are.
+        normals: ``Float`` (4 F,), normals of the faces, of any length, and a number that is not read. Detached.
+    """
+
+    edges: Any
+    normals: Any
+
+    def flat(self, here: Any, neighbour: Any) -> Any:
+        """Whether two faces lie in one plane and are turned to the same side, if they have a point in common."""
+        Array3f, Array4f = (getattr(backend(here), name) for name in ("Array3f", "Array4f"))
+        n, m = (dr.gather(Array4f, self.normals, face) for face in (here, neighbour))
+        n, m = Array3f(n.x, n.y, n.z), Array3f(m.x, m.y, m.z)
+        across = dr.squared_norm(dr.cross(n, m))
+        return (across <= _FLAT**2 * dr.squared_norm(n) * dr.squared_norm(m)) & (dr.dot(n, m) >= 0)
+
+
+def find_creases(
+    creases: Any,
+    folds: CoplanarCreases | None,
+    topology: Topology,
+    raster: RasterOutput,
+    image: Any,
+    pixel: Any,
+    here: Any,
+    neighbour: Any,
+    down: Any,
+) -> tuple[Any, Any, Any, Any, Any, Any]:
+    """Creases between pixels and their right or (where ``down``) lower neighbours.
+
+    Two triangles of one surface have a corner in common, if they are not much smaller than a pixel. Through one edge one
+    leaves the first on the way to the neighbour, through one (the same, as a rule) one enters the other. If they are two, other
+    faces of unknown colour lie in between. Each edge then counts as much as the surface bends there: not at all where it lies
+    within a flat face of many triangles. That follows from where the planes of both triangles cross: at the first edge if all of
+    the bend is there, at the second, or in between. If they do not cross there, each edge counts half.
+
+    Args:
+        creases, folds: see :func:`find_crossings`.
+        topology, raster: the mesh and what the pixels see.
+        image, pixel: which pixels, and in which images of the batch.
+        here, neighbour: triangles that the pixels and their neighbours see.
+
+    Returns ends (a, b) of the first edge, ``NO_VERTEX`` where there is none, those of the second, and the weights of both.
+    """
+    module = backend(here)
+    UInt32, Bool = module.UInt32, module.Bool
+    near = touching(topology, here, neighbour)
+
+    def search(image: Any, pixel: Any, here: Any, neighbour: Any, down: Any) -> tuple[Any, Any, Any, Any, Any, Any]:
+        row = pixel // raster.width
+        x = module.Float(pixel - row * raster.width) + (0.5 - 0.5 * raster.width)
+        y = module.Float(row - image * raster.height) + (0.5 - 0.5 * raster.height)
+        corner_out, way_out, depth, slope = _way_out(raster, image, here, x, y, down, 1)
+        x, y = dr.select(down, x, x + 1), dr.select(down, y + 1, y)
+        corner_in, way_in, other_depth, other_slope = _way_out(raster, image, neighbour, x, y, down, -1)
+        hard_out = dr.gather(Bool, creases, 3 * here + corner_out)
+        hard_in = dr.gather(Bool, creases, 3 * neighbour + corner_in)
+        if folds is not None:
+            bent = ~folds.flat(here, neighbour)
+            hard_out &= bent | ~dr.gather(Bool, folds.edges, 3 * here + corner_out)
+            hard_in &= bent | ~dr.gather(Bool, folds.edges, 3 * neighbour + corner_in)
+        a, b = _ends(topology, here, corner_out, hard_out)
+        c, d = _ends(topology, neighbour, corner_in, hard_in)
+        # Twice the same edge, or only the second: one edge is what is left.
+        same = hard_out & hard_in & (((a == c) & (b == d)) | ((a == d) & (b == c)))
+        a, b = dr.select(hard_out, a, c), dr.select(hard_out, b, d)
+        two = hard_out & hard_in & ~same
+        # Where the planes cross, from 0 at the first edge to 1 at the second.
+        bend = other_slope - slope
+        crossing = (depth - (other_depth - other_slope)) / dr.select(bend == 0, 1, bend)
+        between = 1 - way_in - way_out
+        second = (crossing - way_out) / dr.select(between == 0, 1, between)
+        second = dr.select((bend != 0) & (between > 0) & (second >= -_SLACK) & (second <= 1 + _SLACK), dr.clip(second, 0, 1), 0.5)
+        second = dr.select(two, second, 0)
+        return a, b, dr.select(two, c, NO_VERTEX), dr.select(two, d, NO_VERTEX), 1 - second, second
+
+    def nothing(image: Any, pixel: Any, *_: Any) -> tuple[Any, Any, Any, Any, Any, Any]:
+        none, zero = dr.full(UInt32, NO_VERTEX, dr.width(pixel)), dr.zeros(module.Float, dr.width(pixel))
+        return none, none, none, none, zero, zero
+
+    arguments = (image, pixel, here, neighbour, down)
+    return dr.if_stmt(arguments, near, search, nothing, mode="symbolic", label="creases")
+
+
+def touching(topology: Topology, first: Any, second: Any) -> Any:
+    """Whether two faces (or none) have a corner in common."""
+    module = backend(first)
+    active = (first != NO_TRIANGLE) & (second != NO_TRIANGLE)
+    mine = dr.gather(module.Array3u, topology.welded, first, active)
+    other = dr.gather(module.Array3u, topology.welded, second, active)
+    common = module.Bool(False)
+    for k in range(3):
+        common |= (mine[k] == other.x) | (mine[k] == other.y) | (mine[k] == other.z)
+    return active & common
+
+
+def _way_out(raster: RasterOutput, image: Any, triangle: Any, x: Any, y: Any, down: Any, sign: int) -> tuple[Any, Any, Any, Any]:
+    """The edge through which one leaves a triangle from a point inside, along an axis of the image.
+
+    Returns the corner at which it starts, the way there in pixels, the depth at the point, and its change with each pixel (along
+    the axis, whichever way one goes).
+    """
+    module = backend(x)
+    lines = raster.edge_functions(image, triangle)
+    value = dr.fma(lines[0], x, dr.fma(lines[1], y, lines[2]))
+    nearest, opposite = module.Float(dr.inf), module.UInt32(0)
+    for k in range(3):
+        slope = dr.select(down, lines[1][k], lines[0][k]) * -sign
+        distance = dr.select(slope > 0, dr.maximum(value[k], 0) / slope, dr.inf)
+        opposite = dr.select(distance < nearest, k, opposite)
+        nearest = dr.minimum(nearest, distance)
+    return _next(opposite), nearest, value.w, dr.select(down, lines[1].w, lines[0].w)
+
+
+def _next(corner: Any) -> Any:
+    return dr.select(corner == 2, 0, corner + 1)
+
+
+def _ends(topology: Topology, face: Any, corner: Any, found: Any) -> tuple[Any, Any]:
+    """Vertices of the edge that starts at a corner of a face, ``NO_VERTEX`` if not ``found``."""
+    UInt32 = backend(face).UInt32
+    ends = (dr.gather(UInt32, topology.faces, 3 * face + k, found) for k in (corner, _next(corner)))
+    a, b = (dr.select(found, v, NO_VERTEX) for v in ends)
+    return a, b

@@ -1,0 +1,281 @@
+"""Which edges separate neighbouring pixels, where they cross the segments between the pixels' centres, and how that changes."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from ...jit.arrays import backend
+from ..topology import NO_VERTEX, Topology
+from ..types import NO_TRIANGLE, RasterOutput, by_image, zeros
+from .creases import CoplanarCreases, find_creases, touching
+from .pixel_pairs import PairList, differing_pairs, empty_list
+from .silhouettes import BEFORE, register_silhouettes
+from .surface_intersections import LEAST_WEIGHT, Meetings, beyond_middle
+
+#: How far (NDC depth) an edge must lie before the surface that it borders, with depths as those of the usual matrices.
+DEPTH_GAP = 2e-7
+
+
+@dataclass(frozen=True)
+class Crossings:
+    """Edges that separate pixels from their right and lower neighbours, for one set of vertex positions. No gradients.
+
+    Attributes:
+        right, down: ``Float`` for each pixel, the signed weight of its pair with the right (lower) neighbour. Positive: so much
+            of the pixel reaches into its neighbour; negative: so much of the neighbour into the pixel.
+        pairs: the pairs that may have a weight. What follows is indexed by their slots in this list.
+        ends: ``UInt32``, four for each slot: ends of the edge and of a second one, as vertices of the whole batch; ``NO_VERTEX``
+            where there is none.
+        slopes, second_slopes: ``Float``, four for each slot: the weight changes by the sum over x, y, w (numbers 2 to 4) of
+            slope * (change of the clip-space edge at the crossing), whose ends count by 1 - s and s (number 1).
+        meetings: if surfaces that meet without an edge were looked for: what the weights of pairs without ends depend on.
+    """
+
+    right: Any
+    down: Any
+    pairs: PairList
+    ends: Any
+    slopes: Any
+    second_slopes: Any
+    meetings: Meetings | None = None
+
+
+def find_crossings(
+    positions: Any,
+    topology: Topology,
+    raster: RasterOutput,
+    vertex_count: int,
+    creases: Any = None,
+    crease_weights: Any = None,
+    meetings: bool = False,
+    gap: float = DEPTH_GAP,
+    folds: CoplanarCreases | None = None,
+) -> Crossings:
+    """Find the edges between neighbouring pixels.
+
+    Args:
+        positions: flat clip-space vertices (4 V B), as rasterized.
+        topology: edges of the mesh.
+        raster: output of the rasterizer for the same vertices.
+        vertex_count: vertices per image, V.
+        creases: ``Bool`` (3 F,), whether the edge from corner k to k + 1 of a face separates pixels that see its two faces, too
+            (between flat-shaded ones, whose colours jump there).
+        crease_weights: ``Float`` for each pixel, between 0 and 1: how much creases count there; 1 if not given.
+        meetings: also look for the lines along which surfaces that are not connected pass through each other or touch. Depths,
+            and what follows from them alone, do not jump there.
+        folds: which of the creases are none between faces in one plane. None: no one.
+        gap: how far (NDC depth) a silhouette must at least lie before what it borders, besides 1e-5 of the depth there. 0 suits
+            depths of which all digits count, such as -near / distance; more those that are close to 1 far away.
+
+    A silhouette is an edge whose faces all lie on one side of it in the image. It separates two pixels that see different
+    triangles when it crosses the segment between their centres and lies before the surface that the uncovered one sees
+    (extended to the crossing). Among several the outermost is taken: up to it the uncovered pixel's surface is hidden.
+    With ``meetings`` the edge may also lie on that surface, if this is of another part and the two do not meet in a valley.
+
+    Between two pixels whose triangles touch, the edges through which one leaves the first triangle and enters the other are
+    creases. If these are two edges, with something unseen in between, each counts as much as the surface bends there. Between
+    flat triangles that do not touch, the crease is where their planes cross, if that is in between and the faces beside the
+    triangles lie in these planes, too.
+
+    An edge steeper than 60 degrees counts for horizontal pairs only, one flatter than 30 degrees for vertical pairs only, so that
+    the two directions together blend each piece of outline once.
+    """
+    if topology.count == 0:
+        raise ValueError("the topology has no edges: all faces of the mesh have two corners at the same place")
+    with dr.suspend_grad():
+        positions = dr.detach(positions)
+        meetings = meetings and topology.part_count > 1
+        meet = None
+        if creases is None and not meetings:
+            pairs, keys = empty_list(raster)
+            register_silhouettes(positions, topology, raster, vertex_count, keys, pairs, gap)
+        else:
+            pairs, keys = differing_pairs(raster)
+            register_silhouettes(positions, topology, raster, vertex_count, keys, None, gap, meetings)
+            crease_weights = None if crease_weights is None else dr.detach(crease_weights)
+            dr.eval(crease_weights)
+        dr.eval(keys, pairs)
+        if creases is not None or meetings:
+            meet = Meetings.of(positions, topology, raster, vertex_count, meetings, creases, crease_weights)
+        return _measure(positions, topology, raster, vertex_count, keys, pairs, creases, folds, crease_weights, meet)
+
+
+def _measure(
+    positions: Any,
+    topology: Topology,
+    raster: RasterOutput,
+    vertex_count: int,
+    keys: Any,
+    pairs: PairList,
+    creases: Any,
+    folds: CoplanarCreases | None,
+    crease_weights: Any,
+    meetings: Meetings | None,
+) -> Crossings:
+    module = backend(positions)
+    Float, UInt32, Array4f = module.Float, module.UInt32, module.Array4f
+    pixels = dr.width(raster.triangle)
+    right, down = zeros(module, pixels, 2)
+    found = Crossings(
+        right,
+        down,
+        pairs,
+        dr.empty(UInt32, 8 * pixels),
+        dr.empty(Float, 8 * pixels),
+        dr.empty(Float, 8 * pixels),
+        meetings,
+    )
+
+    def visit(slot: Any, pair: Any) -> None:
+        down, pixel = (pair & 1) != 0, pair >> 1
+        step = dr.select(down, UInt32(raster.width), 1)
+        row_flat = pixel // raster.width
+        image, row = by_image(row_flat, raster.height, raster.batch)
+        column = pixel - row_flat * raster.width
+        key = dr.gather(module.UInt64, keys, pair)
+        silhouette = key != 0
+        ends = dr.gather(module.Array2u, topology.edges, ~UInt32(key & 0xFFFFFFFF), silhouette)
+        a, b = (dr.select(silhouette, end, NO_VERTEX) for end in (ends.x, ends.y))
+        c, d, weight, weight_2, soft = UInt32(NO_VERTEX), UInt32(NO_VERTEX), Float(1), Float(0), Float(1)
+        if creases is not None:
+            if crease_weights is not None:
+                soft = dr.minimum(*(dr.gather(Float, crease_weights, p, ~silhouette) for p in (pixel, pixel + step)))
+
+            def crease(image, pixel, step, down, a, b, soft):  # noqa: ANN001, ANN202
+                here, neighbour = (dr.gather(UInt32, raster.triangle, p) for p in (pixel, pixel + step))
+                a, b, c, d, weight, weight_2 = find_creases(
+                    creases, folds, topology, raster, image, pixel, here, neighbour, down
+                )
+                return a, b, c, d, soft * weight, soft * weight_2
+
+            none = dr.full(UInt32, NO_VERTEX, dr.width(pair))
+            a, b, c, d, weight, weight_2 = dr.if_stmt(
+                (image, pixel, step, down, a, b, soft),
+                ~silhouette & (soft > 0),
+                crease,
+                lambda image, pixel, step, down, a, b, soft: (a, b, none, none, Float(1), Float(0)),
+                mode="symbolic",
+                label="no silhouette",
+            )
+        if meetings is not None:
+            bare = (a == NO_VERTEX) | (silhouette & (key < BEFORE))
+            here, there = (dr.gather(UInt32, raster.triangle, p, bare) for p in (pixel, pixel + step))
+            cross = functools.partial(_cut, topology, raster, image, pixel, here, there, down)
+            meetings.add(slot, dr.select(bare, here, NO_TRIANGLE), there, soft, cross)
+        first = image * vertex_count
+        a, b, c, d = (dr.select(end == NO_VERTEX, NO_VERTEX, end + first) for end in (a, b, c, d))
+        value, slopes = _weight(positions, a, b, raster, row, column, down, weight)
+
+        def second(slot, c, d, row, column, down, weight_2, value):  # noqa: ANN001, ANN202
+            more, slopes = _weight(positions, c, d, raster, row, column, down, weight_2)
+            dr.scatter(found.second_slopes, slopes, slot)
+            return dr.select((value != 0) & (value + more == 0), value * LEAST_WEIGHT, value + more)
+
+        if creases is not None:
+            value = dr.if_stmt(
+                (slot, c, d, row, column, down, weight_2, value),
+                c != NO_VERTEX,
+                second,
+                lambda slot, c, d, row, column, down, weight_2, value: value,
+                mode="symbolic",
+                label="second crease",
+            )
+        dr.scatter(found.ends, module.Array4u(a, b, c, d), slot)
+        dr.scatter(found.slopes, Array4f(slopes), slot)
+        dr.scatter(found.right, value, pixel, ~down)
+        dr.scatter(found.down, value, pixel, down)
+
+    pairs.for_each(visit)
+    dr.eval(found)
+    if meetings is not None:
+        _meet(found, meetings, raster)
+        dr.eval(found)
+    return found
+
+
+def _cut(
+    topology: Topology, raster: RasterOutput, image: Any, pixel: Any, here: Any, there: Any, down: Any, active: Any
+) -> Any:
+    """Whether triangles without a common corner, seen by pixels and their neighbours, may cut each other between these.
+
+    Their planes cross there, and each triangle is seen where it is the nearer one.
+    """
+    Float = backend(raster.depth).Float
+    active &= ~touching(topology, here, there)
+    planes = (raster.depth_plane(image, triangle, active) for triangle in (here, there))
+    a, b, c = (u - v for u, v in zip(*planes, strict=True))
+    row_flat = pixel // raster.width
+    x = Float(pixel - row_flat * raster.width) + (0.5 - 0.5 * raster.width)
+    y = Float(row_flat - image * raster.height) + (0.5 - 0.5 * raster.height)
+    start = dr.fma(a, x, dr.fma(b, y, c))
+    return active & (start < 0) & (start + dr.select(down, b, a) > 0)
+
+
+def _meet(found: Crossings, meetings: Meetings, raster: RasterOutput) -> None:
+    """Write the weights of pairs whose triangles meet other than in an edge, which then takes the place of one that touches."""
+    UInt32, Array4u = (getattr(backend(found.ends), name) for name in ("UInt32", "Array4u"))
+
+    def visit(slot: Any) -> None:
+        pair = found.pairs.at(slot)
+        down, pixel = (pair & 1) != 0, pair >> 1
+        value = meetings.weight(pixel, down)
+        met = value != 0
+        dr.scatter(found.ends, Array4u(NO_VERTEX), slot, met)
+        dr.scatter(found.right, value, pixel, met & ~down)
+        dr.scatter(found.down, value, pixel, met & down)
+
+    meetings.for_each(visit)
+
+
+def _weight(
+    positions: Any, a: Any, b: Any, raster: RasterOutput, row: Any, column: Any, down: Any, weight: Any
+) -> tuple[Any, Any]:
+    """Signed weight of a pair of pixels between which an edge crosses, 0 where there is none, and its derivatives ("slopes").
+
+    The homogeneous form is valid, in value and derivative, for edges that reach behind the camera.
+    """
+    module = backend(positions)
+    Float, Array4f = module.Float, module.Array4f
+    has = a != NO_VERTEX
+    p, q = (dr.gather(Array4f, positions, v, has) for v in (a, b))
+    width, height = raster.width, raster.height
+    # The pixel line is y = const (x = const for the lower neighbour) in NDC.
+    ndc = dr.select(
+        down,
+        dr.fma(Float(column), 2.0 / width, 1.0 / width - 1.0),
+        dr.fma(Float(row), 2.0 / height, 1.0 / height - 1.0),
+    )
+    p_along, q_along = dr.select(down, p.y, p.x), dr.select(down, q.y, q.x)
+    size = dr.select(down, Float(height), Float(width))
+    dp = dr.fma(-p.w, ndc, dr.select(down, p.x, p.y))
+    dq = dr.fma(-q.w, ndc, dr.select(down, q.x, q.y))
+    span = dp - dq
+    span = dr.select(has & (span != 0), span, 1)
+    s = dp / span
+    w = dr.fma(s, q.w - p.w, p.w)
+    w = dr.select(has & (w != 0), w, 1)
+    value = dr.fma(s, q_along - p_along, p_along) / w
+    t = dr.fma(value, 0.5 * size, 0.5 * size - 0.5) - Float(dr.select(down, row, column))
+    weight = dr.select(has, weight * _share(p, q, down, raster), 0)
+
+    # d value = sum over both ends of (1 - s, s) / w * (d along - tilt * d across - (value - tilt * ndc) * d w)
+    # An edge on a pixel's centre may belong to two pairs (t = 0 and 1): half of the pixel is what the one neighbour sees, half
+    # what the other does, and as it moves the one half grows by as much as the other shrinks.
+    slope = dr.select((t >= 0) & (t <= 1), weight * 0.5 * size / w, 0)
+    tilt = ((p_along - q_along) - value * (p.w - q.w)) / span
+    across = -slope * tilt
+    slopes = Array4f(s, dr.select(down, across, slope), dr.select(down, slope, across), -dr.fma(value, slope, ndc * across))
+    return weight * beyond_middle(dr.clip(t, 0, 1)), slopes
+
+
+def _share(p: Any, q: Any, down: Any, raster: RasterOutput) -> Any:
+    """How much an edge counts for pairs of this kind, from its direction in the image (or its line's, behind the camera)."""
+    # The line a x + b y + c = 0 in ndc is a (2 / width) x + ... in pixels.
+    nx, ny = (p.y * q.w - q.y * p.w) / raster.width, (q.x * p.w - p.x * q.w) / raster.height
+    square = nx * nx + ny * ny
+    share = dr.clip(0.5 + (nx * nx - ny * ny) / dr.select(square > 0, square, 1), 0, 1)
+    return dr.select(down, 1 - share, share)

@@ -1,0 +1,33 @@
+"""How much the neighbours of a pixel reach into it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+
+from ...jit.arrays import backend
+from .edge_crossings import Crossings
+
+
+def incoming_weights(crossings: Crossings, width: int) -> tuple[Any, Any, Any, Any]:
+    """How much the right, lower, left and upper neighbour each reach into a pixel of images ``width`` pixels wide."""
+    return around(crossings.right, crossings.down, width, 1)
+
+
+def around(
+    right: Any, down: Any, width: int, sign: int, signed: bool = False, at: Any = None
+) -> tuple[Any, Any, Any, Any]:
+    """How much each neighbour reaches into a pixel, or (``sign`` -1) a pixel into each neighbour; all pixels, or those ``at``.
+
+    Neighbours are the right, lower, left and upper one. Pairs that reach beyond the image have weight 0, which is also what the
+    last pixels of the line above and the image before have for the first ones.
+    """
+    module = backend(right)
+    pixel = dr.arange(module.UInt32, dr.width(right)) if at is None else at
+    left = dr.gather(module.Float, right, pixel - 1, pixel >= 1)
+    up = dr.gather(module.Float, down, pixel - width, pixel >= width)
+    if at is not None:
+        right, down = (dr.gather(module.Float, weights, at) for weights in (right, down))
+    values = (-sign * right, -sign * down, sign * left, sign * up)
+    return values if signed else tuple(dr.maximum(v, 0) for v in values)

@@ -1,0 +1,265 @@
+"""Where silhouettes cross the image: for each pair of neighbouring pixels, the mesh edge that separates them.
+
+The usual scheme looks for the separating edge among the three of the triangle that a pixel sampled, which fails once
+triangles are smaller than pixels. Here each silhouette edge of the whole mesh walks along the lines through pixel centres
+that it crosses, and registers with the pairs of pixels that it separates; the outermost edge of a pair wins.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+
+from ...jit.arrays import backend
+from ..topology import NO_VERTEX, Topology
+from ..types import NO_TRIANGLE, RasterOutput, by_image
+from .pixel_pairs import PairList
+
+# An edge must lie this far (relative) before the surface that it borders: it is a discontinuity, not a crease.
+_RELATIVE_GAP = 1e-5
+#: Part of the keys of edges that do. Others may be those of a surface that lies on another one.
+BEFORE = 1 << 62
+# Lines through pixel centres that lie this far (in pixels) beyond an edge's ends are tested, too, in spite of rounding.
+_MARGIN = 1.0 / 512.0
+# So many lanes walk along the silhouettes of an image; few, so that threads get equal parts of a short list, too.
+_LANES, _LANES_PER_EDGE = 512, 4
+_MOST_LANES = 32768
+
+
+def register_silhouettes(
+    positions: Any,
+    topology: Topology,
+    raster: RasterOutput,
+    vertex_count: int,
+    keys: Any,
+    found: PairList | None,
+    gap: float,
+    touching: bool = False,
+) -> None:
+    """Let all silhouette edges write to the pairs of pixels that they separate.
+
+    Args:
+        positions: flat clip-space vertices, as rasterized. Detached.
+        topology, raster, vertex_count: the mesh and what the pixels see.
+        keys: ``UInt64``, one number for each pair (see :mod:`shadowmap_dr.raster.antialiasing.pixel_pairs`), 0 at first. Gets the
+            largest of the edges' keys: how much of the uncovered pixel the edge's surface hides as the upper half (a float's
+            bits, and ``BEFORE``), the complement of the edge's index as the lower. The outermost edge wins: the result does not
+            depend on the order.
+        found: list to which pairs are added when the first edge registers.
+        gap: NDC depth by which edges lie before what they border, at least.
+        touching: whether edges also register that do not lie before, but on a surface of another part.
+    """
+    module = backend(positions)
+    UInt32 = module.UInt32
+    count, records, edges = _collect(positions, topology, raster, vertex_count)
+    # Lanes that share an edge take turns: edges differ in length, and few are silhouettes.
+    lanes, stride = min(_LANES * raster.batch, _MOST_LANES), _LANES_PER_EDGE
+
+    def walk(lane: Any) -> tuple[Any]:
+        slot, turn = lane // stride, lane % stride
+        a, b = (dr.gather(module.Array4f, records, 2 * slot + k) for k in range(2))
+        index = dr.gather(UInt32, edges, slot)
+        _walk(a, b, index, turn, stride, topology, raster, keys, found, gap, touching)
+        return (lane + lanes,)
+
+    dr.while_loop((dr.arange(UInt32, lanes),), lambda lane: lane < count * stride, walk, mode="symbolic", label="silhouettes")
+
+
+def _collect(positions: Any, topology: Topology, raster: RasterOutput, vertex_count: int) -> tuple[Any, Any, Any]:
+    """List the silhouettes that cross lines through pixel centres.
+
+    Returns their number (width 1), records and indices ``image * E + edge``. A record holds both ends, x and y in pixels from the
+    image's centre and the NDC depth, with the side on which the surface lies (as a sign) and the share of horizontal pairs.
+    """
+    module = backend(positions)
+    Float, UInt32 = module.Float, module.UInt32
+    width, height = raster.width, raster.height
+    total = raster.batch * topology.count
+    index = dr.arange(UInt32, total)
+    image, edge = by_image(index, topology.count, raster.batch)
+    a, b, side, active = _silhouettes(positions, topology, image, edge, vertex_count)
+    a, b, active = _project(a, b, active, width, height)
+    share = _horizontal_share(b.x - a.x, b.y - a.y, active)
+    _, rows = _lines(a.y, b.y, active & (share > 0), height)
+    _, columns = _lines(a.x, b.x, active & (share < 1), width)
+    active &= rows + columns > 0
+    count, edges, records = dr.zeros(UInt32, 1), dr.empty(UInt32, total), dr.empty(Float, 8 * total)
+
+    def add(index: Any, a: Any, b: Any, side: Any, share: Any) -> Any:
+        slot = dr.scatter_inc(count, UInt32(0))
+        dr.scatter(edges, index, slot)
+        dr.scatter(records, module.ArrayXf(*a, side, *b, share), slot)
+        return slot
+
+    dr.if_stmt((index, a, b, side, share), active, add, lambda index, *_: index, mode="symbolic", label="silhouette")
+    dr.eval(count, edges, records)
+    return count, records, edges
+
+
+def _walk(
+    a: Any,
+    b: Any,
+    index: Any,
+    line: Any,
+    stride: int,
+    topology: Topology,
+    raster: RasterOutput,
+    keys: Any,
+    found: PairList | None,
+    gap: float,
+    touching: bool,
+) -> None:
+    """Visit every ``stride``-th of the lines through pixel centres that edges cross, beginning with ``line``."""
+    module = backend(a)
+    Float, UInt32, UInt64 = module.Float, module.UInt32, module.UInt64
+    width, height = raster.width, raster.height
+    side, share = a.w, b.w
+    image, edge = by_image(index, topology.count, raster.batch)
+    first_row, rows = _lines(a.y, b.y, share > 0, height)
+    first_column, columns = _lines(a.x, b.x, share < 1, width)
+
+    def step(line: Any, again: Any) -> tuple[Any, Any]:
+        """One line through pixel centres: a row, where the edge separates pixels of two columns, or the other way round."""
+        across_rows = line < rows
+        down = ~across_rows
+        at = dr.select(across_rows, first_row + line, first_column + (line - rows))
+        fixed = Float(at) + dr.select(across_rows, 0.5 - 0.5 * height, 0.5 - 0.5 * width)
+        a_along, a_across = dr.select(down, a.y, a.x), dr.select(down, a.x, a.y)
+        b_along, b_across = dr.select(down, b.y, b.x), dr.select(down, b.x, b.y)
+        extent = b_across - a_across
+        s = (fixed - a_across) / dr.select(extent == 0, 1, extent)
+        crossing = dr.fma(s, b_along - a_along, a_along)
+        z = dr.fma(s, b.z - a.z, a.z)
+
+        # Pair (i, i + 1) contains the crossing; one on a pixel's centre belongs to (i - 1, i) as well, which comes next.
+        size = dr.select(down, Float(height), Float(width))
+        middle = 0.5 * size - 0.5
+        near = dr.floor(dr.clip(crossing + middle, -2, size + 1))
+        near = dr.select(crossing < near - middle, near - 1, near)
+        on_center = ~again & (crossing == near - middle)
+        near = dr.select(again, near - 1, near)
+        t = crossing - (near - middle)
+        ok = (extent != 0) & (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1) & (near >= 0) & (near + 1 < size)
+
+        row, column = dr.select(down, UInt32(near), at), dr.select(down, at, UInt32(near))
+        pixel = (image * height + row) * width + column
+        here = dr.gather(UInt32, raster.triangle, pixel, ok)
+        neighbour = dr.gather(UInt32, raster.triangle, pixel + dr.select(down, UInt32(width), 1), ok)
+        ok &= here != neighbour
+        covers_here = dr.select(down, -side, side) * extent > 0
+        hidden = dr.select(covers_here, neighbour, here)
+        x, y = dr.select(down, fixed, crossing), dr.select(down, crossing, fixed)
+        depth = _depth_on_plane(raster, image, hidden, x, y, ok)
+        least = dr.fma(dr.abs(depth), _RELATIVE_GAP, gap)
+        before = z < depth - least
+        on = module.Bool(False)
+        if touching:
+            on = ok & ~before & (z < depth + least) & (here != NO_TRIANGLE) & (neighbour != NO_TRIANGLE)
+            on &= dr.gather(UInt32, topology.parts, here, on) != dr.gather(UInt32, topology.parts, neighbour, on)
+        ok &= before | on
+
+        if topology.see_through_faces is not None:
+            # What is seen through hides nothing: an edge of it counts where its own surface is seen beside it.
+            seen = dr.select(covers_here, here, neighbour)
+            hit, counts = ok & (seen != NO_TRIANGLE), module.Bool(False)
+            part = dr.gather(UInt32, topology.parts, seen, hit)
+            for owner in dr.gather(module.Array2u, topology.owners, edge, ok):
+                counts |= hit & (part == dr.gather(UInt32, topology.parts, owner, hit))
+                counts |= ~dr.gather(module.Bool, topology.see_through_faces, owner, ok)
+            ok &= counts
+
+        reach = dr.select(covers_here, t, 1 - t)
+        key = (UInt64(dr.reinterpret_array(UInt32, reach)) << 32) | UInt64(~edge)
+        if touching:
+            key |= dr.select(before, UInt64(BEFORE), 0)
+        pair = 2 * pixel + dr.select(down, UInt32(1), 0)
+        # Not "Auto", which would give each thread a copy of a small buffer.
+        dr.scatter_reduce(dr.ReduceOp.Max, keys, key, pair, ok, mode=dr.ReduceMode.Direct)
+        if found is not None:
+            found.add_once(pair, ok)
+        return dr.select(on_center, line, line + stride), on_center
+
+    count = rows + columns
+    dr.while_loop(
+        (line, module.Bool(False)),
+        lambda line, again: line < count,
+        step,
+        mode="symbolic",
+        label="lines that edges cross",
+    )
+
+
+def _silhouettes(positions: Any, topology: Topology, image: Any, edge: Any, vertex_count: int) -> tuple[Any, Any, Any, Any]:
+    """Clip-space end points of edges, on which side of them their surface is, and whether it is on one side only."""
+    module = backend(positions)
+    Array4f, Array2u = module.Array4f, module.Array2u
+    ends, opposite = dr.gather(Array2u, topology.edges, edge), dr.gather(Array2u, topology.opposite, edge)
+    first = image * vertex_count
+    a, b = (dr.gather(Array4f, positions, first + ends[k]) for k in range(2))
+    # Orientation is compared, not measured: the cross product is taken around one end point to keep small triangles exact.
+    sides = []
+    for k in range(2):
+        exists = opposite[k] != NO_VERTEX
+        o = dr.gather(Array4f, positions, first + opposite[k], exists)
+        sides.append(dr.select(exists, _orientation(a, b, o), 0))
+    side = dr.select(sides[0] != 0, sides[0], sides[1])
+    return a, b, side, (sides[0] * sides[1] >= 0) & (side != 0)
+
+
+def _orientation(a: Any, b: Any, o: Any) -> Any:
+    """Sign of the determinant of three homogeneous (x, y, w) points, in double precision."""
+    Float64 = backend(a).Float64
+    ax, ay, aw = Float64(a.x), Float64(a.y), Float64(a.w)
+    bx, by, bw = Float64(b.x), Float64(b.y), Float64(b.w)
+    det = (ay * bw - by * aw) * Float64(o.x) + (bx * aw - ax * bw) * Float64(o.y) + (ax * by - bx * ay) * Float64(o.w)
+    return backend(a).Float(dr.select(det == 0, 0, dr.sign(det)))
+
+
+def _project(a: Any, b: Any, active: Any, width: int, height: int) -> tuple[Any, Any, Any]:
+    """Clip edges at the near plane and project them: (x, y in pixels from the image's centre, NDC depth), and which are left."""
+    module = backend(a)
+    near_a, near_b = a.z + a.w, b.z + b.w
+    # Infinite ones would be projected to the middle of the image.
+    active = active & dr.isfinite(near_a + a.x + a.y + near_b + b.x + b.y) & ((near_a > 0) | (near_b > 0))
+
+    def clip(p: Any, q: Any, near_p: Any, near_q: Any) -> Any:
+        # From the end in front, as rasterization does.
+        s = near_q / dr.select(near_p < 0, near_q - near_p, 1)
+        return dr.select(near_p < 0, dr.fma(p - q, s, q), p)
+
+    a, b = clip(a, b, near_a, near_b), clip(b, a, near_b, near_a)
+    active &= (a.w > 0) & (b.w > 0)
+
+    def project(p: Any) -> Any:
+        inv = dr.rcp(dr.select(active, p.w, 1))
+        return module.Array3f(p.x * inv * (0.5 * width), p.y * inv * (0.5 * height), p.z * inv)
+
+    a, b = project(a), project(b)
+    active &= dr.isfinite(a.x + a.y + b.x + b.y)
+    return a, b, active
+
+
+def _horizontal_share(dx: Any, dy: Any, active: Any) -> Any:
+    """How much an edge of this direction counts for horizontal pairs of pixels; for vertical ones it is the rest."""
+    dx, dy = dr.select(active, dx, 0), dr.select(active, dy, 0)
+    square = dx * dx + dy * dy
+    return dr.clip(0.5 + (dy * dy - dx * dx) / dr.select(square > 0, square, 1), 0, 1)
+
+
+def _lines(p: Any, q: Any, active: Any, size: int) -> tuple[Any, Any]:
+    """First of the lines through pixel centres within [p, q] (pixels from the image's centre), and their number."""
+    module = backend(p)
+    p, q = dr.select(active, p, 0), dr.select(active, q, 0)
+    low = dr.clip(dr.minimum(p, q) + (0.5 * size - 0.5 - _MARGIN), -1, size)
+    high = dr.clip(dr.maximum(p, q) + (0.5 * size - 0.5 + _MARGIN), -1, size)
+    first = dr.maximum(module.Int32(dr.floor(low)) + 1, 0)
+    last = dr.minimum(module.Int32(dr.floor(high)), size - 1)
+    return module.UInt32(first), module.UInt32(dr.select(active, dr.maximum(last - first + 1, 0), 0))
+
+
+def _depth_on_plane(raster: RasterOutput, image: Any, triangle: Any, x: Any, y: Any, active: Any) -> Any:
+    """NDC depth of a triangle's plane at centred pixel coordinates; the far plane where there is no triangle."""
+    hit = active & (triangle != NO_TRIANGLE)
+    dx, dy, d = raster.depth_plane(image, triangle, hit)
+    return dr.fma(dx, x, dr.fma(dy, y, dr.select(hit, d, 1)))

@@ -1,0 +1,218 @@
+"""Where what two neighbouring pixels see meets, other than in an edge that both have.
+
+Surfaces do so along lines where one passes through another, or stands on it: no silhouette lies between the pixels there, but
+what they see changes at once. So do flat faces of one surface between which there are others, too narrow for a pixel to see: the
+faces of a box are, seen from the side, if they consist of many triangles. The depths of both triangles are affine on the screen,
+so that the place between the pixels' centres where they are equal follows from six vertices. Within one surface that is true
+only if it is flat up to there, or cuts itself in both triangles; planes of a curved one cross where it is not, too.
+"""
+
+from __future__ import annotations
+
+import functools
+import operator
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from ...jit.arrays import backend
+from ..topology import NO_VERTEX, Topology
+from ..triangle_setup import edge_lines, gather_triangle
+from ..types import NO_TRIANGLE, RasterOutput, by_image, precise_rcp
+from .pixel_pairs import each_number
+
+# Depths whose difference changes by less (relative) from one pixel to the next are the same: the surfaces lie on each other.
+_LEAST_CHANGE = 1e-6
+# Faces of one surface whose depths change so much alike (relative) from one pixel to the next lie in one plane.
+_LEAST_FOLD = 0.02
+# Faces beside two triangles may leave both their planes by this part of the bend between them; at twice that there is no crease.
+# On curved surfaces they leave them by more: with one facet in between, by about a half.
+_BENT = 0.05
+# Least barycentric coordinate of a point inside a triangle and not, but for rounding, on an edge that it shares.
+_INSIDE = 1e-4
+# Weight of a pair whose edge lies on the border between its pixels, which mixes nothing: what is 0 has no edge, nor derivatives.
+LEAST_WEIGHT = 1e-12
+# So many lanes take turns at the pairs that are listed; few, so that threads get equal parts of a short list, too.
+_LANES = 1024
+
+
+@dataclass(frozen=True)
+class Meetings:
+    """What it takes to find out where the triangles that two neighbouring pixels see meet. Detached.
+
+    Attributes:
+        positions: flat clip-space vertices (4 V B), as rasterized.
+        faces: ``UInt32`` (3 F,).
+        parts, beyond: ``UInt32`` (F,) and (3 F,), see :class:`Topology`.
+        triangle: what each pixel sees.
+        batch: number of images.
+        height, width, vertex_count: of an image.
+        unconnected: whether faces of different parts may meet, and those of one cut each other.
+        creases, crease_weights: see :func:`shadowmap_dr.raster.antialiasing.edge_crossings.find_crossings`. Without, faces of one
+            part do not meet.
+        slots, count: ``UInt32``, pairs without an edge that may meet, as slots in the list of all pairs, and how many there are.
+    """
+
+    positions: Any
+    faces: Any
+    parts: Any
+    beyond: Any
+    triangle: Any
+    batch: int
+    height: int
+    width: int
+    vertex_count: int
+    unconnected: bool
+    creases: Any
+    crease_weights: Any
+    slots: Any
+    count: Any
+
+    @classmethod
+    def of(
+        cls,
+        positions: Any,
+        topology: Topology,
+        raster: RasterOutput,
+        vertex_count: int,
+        unconnected: bool = True,
+        creases: Any = None,
+        crease_weights: Any = None,
+    ) -> Meetings:
+        size = raster.batch, raster.height, raster.width, vertex_count
+        surfaces = topology.faces, topology.parts, topology.beyond, raster.triangle
+        UInt32 = backend(raster.triangle).UInt32
+        found = dr.empty(UInt32, 2 * dr.width(raster.triangle)), dr.zeros(UInt32, 1)
+        return cls(dr.detach(positions), *surfaces, *size, unconnected, creases, crease_weights, *found)
+
+    def add(self, slot: Any, here: Any, there: Any, soft: Any, cross: Callable[[Any], Any]) -> None:
+        """List a pair if what it sees may meet. To be traced only once.
+
+        Args:
+            slot: of the pair.
+            here, there: triangles that it sees, or none, also if the pair has an edge.
+            soft: how much creases count there (``Float``).
+            cross: ``cross(active)``, whether their planes do in between, as those of a surface that cuts itself there.
+        """
+        UInt32 = backend(slot).UInt32
+        both = (here != NO_TRIANGLE) & (there != NO_TRIANGLE)
+        apart = dr.gather(UInt32, self.parts, here, both) != dr.gather(UInt32, self.parts, there, both)
+        folded = (soft > 0) & (self.creases is not None)
+        listed = both & dr.select(apart, self.unconnected, folded)
+        if self.unconnected:
+            listed |= cross(both & ~listed)
+        dr.scatter(self.slots, slot, dr.scatter_inc(self.count, UInt32(0), listed), listed)
+
+    def for_each(self, visit: Callable[[Any], None]) -> None:
+        """Call ``visit(slot)``, which writes somewhere, for all pairs that were listed: few, and dear to visit."""
+        each_number(self.count, _LANES, lambda k: visit(dr.gather(type(k), self.slots, k)))
+
+    def weight(self, pixel: Any, down: Any) -> Any:
+        """Signed weight (see :class:`Crossings`) of pairs of pixels that see triangles, 0 where these do not meet in between."""
+        return self._between(pixel, down)[0]
+
+    def slopes(self, pixel: Any, down: Any) -> list[tuple[Any, Any]]:
+        """(vertex, change of the weight with its clip-space position, ``Array4f``) for all six vertices."""
+        _, rate, triangles = self._between(pixel, down)
+        Array4f = backend(rate).Array4f
+        result = []
+        for sign, (vertices, plane, weights) in zip((1, -1), triangles, strict=True):
+            # The depth A x + B y + C w = z of a corner: what its change violates, the plane makes up for.
+            direction = Array4f(-plane[0], -plane[1], 1, -plane[2])
+            result += [(vertices[k], direction * (sign * rate * weights[k])) for k in range(3)]
+        return result
+
+    def _between(self, pixel: Any, down: Any) -> tuple[Any, Any, list[Any]]:
+        """Weight, its change with the first depth minus the second, and (vertices, depth plane, barycentrics / w) of both."""
+        module = backend(self.positions)
+        Float, Float64, UInt32 = module.Float, module.Float64, module.UInt32
+        row_flat = pixel // self.width
+        image, row = by_image(row_flat, self.height, self.batch)
+        column = pixel - row_flat * self.width
+        first = image * self.vertex_count
+        # Centre of the pixel, and the way to its neighbour, in NDC.
+        x, y = (2 * Float64(column) + (1 - self.width)) / self.width, (2 * Float64(row) + (1 - self.height)) / self.height
+        step_x, step_y = 2 / self.width, 2 / self.height
+        step = dr.select(down, UInt32(self.width), 1)
+        found, seen, parts = [], [], []
+        # How much ridges and valleys count: smooth surfaces have none.
+        soft = Float(0 if self.creases is None else 1)
+        for p in (pixel, pixel + step):
+            triangle = dr.gather(UInt32, self.triangle, p)
+            parts.append(dr.gather(UInt32, self.parts, triangle))
+            if self.creases is not None:
+                weight = 1 if self.crease_weights is None else dr.gather(Float, self.crease_weights, p)
+                flat = functools.reduce(operator.and_, (dr.gather(module.Bool, self.creases, 3 * triangle + k) for k in range(3)))
+                soft = dr.minimum(soft, dr.select(flat, weight, 0))
+            corners = gather_triangle(self.positions, self.faces, triangle, first, True)
+            lines, plane = _plane(corners)
+            i = dr.gather(module.Array3u, self.faces, triangle)
+            found.append(([first + i[k] for k in range(3)], lines, plane))
+            seen.append((triangle, first, corners))
+        planes = [plane for _, _, plane in found]
+
+        def along(plane: Any) -> Any:
+            """Its change on the way to the neighbour."""
+            return dr.select(down, plane[1] * step_y, plane[0] * step_x)
+
+        a, b, c = (u - v for u, v in zip(*planes, strict=True))
+        # First depth minus second here, and its change on the way to the neighbour.
+        start, change = dr.fma(a, x, dr.fma(b, y, c)), dr.select(down, b * step_y, a * step_x)
+        end = start + change
+        depth = found[0][2][0] * x + found[0][2][1] * y + found[0][2][2]
+        # Of two surfaces one sees the nearer one. Faces of one surface form a ridge or a valley.
+        folded = parts[0] == parts[1]
+        steepness = sum(dr.abs(along(plane)) for plane in planes)
+        least = dr.maximum(_LEAST_CHANGE * dr.abs(depth), dr.select(folded, _LEAST_FOLD * steepness, 0))
+        meet = (((start < 0) & (end > 0)) | (folded & (start > 0) & (end < 0))) & (dr.abs(change) > least)
+        slope = dr.select(meet, precise_rcp(dr.select(meet, change, 1)), 0)
+        t = -start * slope
+        across = (a * step_x) ** 2
+        upwards = (b * step_y) ** 2
+        bent = dr.maximum(*(self._bent(*one, planes, along) for one in seen))
+        soft *= Float(dr.clip(2 - bent / (_BENT * dr.select(meet, dr.abs(change), 1)), 0, 1))
+        # Where both triangles have the point of the line inside, one passes through the other, whatever is beside them.
+        x, y = dr.select(down, x, x + t * step_x), dr.select(down, y + t * step_y, y)
+        at = [[Float(dr.fma(m, x, dr.fma(n, y, o))) for m, n, o in lines] for _, lines, _ in found]
+        inside = start < 0
+        for places in at:
+            inside &= functools.reduce(dr.minimum, places) > _INSIDE * sum(places)
+        soft = dr.select(inside, 1, soft)
+        share = dr.clip(0.5 + (across - upwards) / dr.select(meet, across + upwards, 1), 0, 1)
+        share = dr.select(meet, dr.select(down, 1 - share, share) * dr.select(folded, soft, 1), 0)
+        triangles = [(vertices, [Float(v) for v in plane], at[k]) for k, (vertices, _, plane) in enumerate(found)]
+        return Float(share) * beyond_middle(Float(t)), Float(-share * slope), triangles
+
+    def _bent(self, triangle: Any, first: Any, corners: Any, planes: list[Any], along: Callable[[Any], Any]) -> Any:
+        """How far from both planes the faces beside a triangle turn, as changes of depth on the way to the neighbour: the most.
+
+        The ridge itself lies between a face of the one plane and a face of the other.
+        """
+        module = backend(self.positions)
+        most = module.Float64(0)
+        for k in range(3):
+            vertex = dr.gather(module.UInt32, self.beyond, 3 * triangle + k)
+            has = vertex != NO_VERTEX
+            beside = corners[k], corners[(k + 1) % 3], dr.gather(module.Array4f, self.positions, first + vertex, has)
+            slope = along(_plane(beside)[1])
+            apart = dr.minimum(*(dr.abs(slope - along(plane)) for plane in planes))
+            most = dr.maximum(most, dr.select(has, apart, 0))
+        return most
+
+
+def beyond_middle(t: Any) -> Any:
+    """How far (pixels) something lies beyond the border between two pixels, from where it is (0 to 1) between their centres.
+
+    Never 0: see ``LEAST_WEIGHT``.
+    """
+    return dr.select(t == 0.5, LEAST_WEIGHT, t - 0.5)
+
+
+def _plane(corners: tuple[Any, Any, Any]) -> tuple[list[list[Any]], list[Any]]:
+    """Barycentrics / w of a triangle as affine functions (a, b, c: a x + b y + c) in NDC, and its depth as such a one."""
+    lines, det = edge_lines(corners)
+    inverse = dr.select(det != 0, precise_rcp(dr.select(det != 0, det, 1)), 0)
+    lines = [[c * inverse for c in line] for line in lines]
+    return lines, [sum(line[c] * type(det)(p.z) for line, p in zip(lines, corners, strict=True)) for c in range(3)]

@@ -1,0 +1,81 @@
+"""Drawing triangles row by row, one lane a triangle: the way for the small and the thin ones, that is, nearly all.
+
+Each lane walks the rows of its triangle and, in each, the few columns between its edges, and merges fragments into the image
+with an atomic minimum over ``(depth, triangle)`` keys. Nothing is sorted and no list is kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+
+from ..jit.arrays import backend
+from .triangle_setup import Triangles, centred, covers, fragment_key, rounding_error
+
+#: Key of a pixel that nothing covers.
+EMPTY = 0xFFFFFFFFFFFFFFFF
+
+
+def draw(
+    triangles: Triangles,
+    keys: Any,
+    behind: Any,
+    pixel_index: Callable[[Any, Any], Any],
+    triangle: Any,
+    box: tuple[Any, Any, Any, Any],
+    active: Any,
+) -> None:
+    """Merge the fragments of triangles within a box each into an image of keys.
+
+    Args:
+        keys: ``UInt64`` for each pixel of the batch, written.
+        behind: None or ``UInt64`` for each pixel, in the order of ``keys``: only fragments with a larger key count.
+        pixel_index: where the keys of a (row, column) of the triangle's image are.
+        triangle: index that goes into the keys.
+        box: inclusive bounds (first column, first row, last column, last row), inside the image.
+        active: triangles to draw.
+    """
+    t = triangles
+    module = backend(t.a)
+    Float, Int32, UInt32 = module.Float, module.Int32, module.UInt32
+    x0, y0, x1, y1 = (Int32(b) for b in box)
+    rounding = rounding_error(t.height, t.width)
+    tiny = 1e-12
+    slope = [dr.select(dr.abs(t.a[k]) < tiny, dr.select(t.a[k] < 0, Float(-tiny), Float(tiny)), t.a[k]) for k in range(3)]
+    inverse = [dr.rcp(s) for s in slope]
+
+    def span(row: Any) -> tuple[Any, Any, Any]:
+        """Edge functions and depth in the middle of a row, and the columns between the edges, or a few more."""
+        _, y = centred(module, row, 0, t.height, t.width)
+        at_middle = dr.fma(t.b, y, t.c)
+        # What rounding might hide is left to the coverage test.
+        low, high = Float(x0), Float(x1)
+        for k in range(3):
+            crossing = dr.fma(-at_middle[k], inverse[k], 0.5 * t.width - 0.5)
+            error = dr.fma(dr.abs(inverse[k]), rounding, 1e-3)
+            low = dr.select(slope[k] > 0, dr.maximum(low, crossing - error), low)
+            high = dr.select(slope[k] < 0, dr.minimum(high, crossing + error), high)
+        return at_middle, Int32(dr.ceil(dr.minimum(low, t.width))), Int32(dr.floor(dr.maximum(high, -1.0)))
+
+    def draw_pixel(row, column, end, at_middle):  # noqa: ANN001, ANN202
+        x, _ = centred(module, 0, column, t.height, t.width)
+        values = dr.fma(t.a, x, at_middle)
+        covered = (column <= end) & covers(values, row, column, t.height, t.width, t.exact)
+        key = fragment_key(values.w, triangle)
+        pixel = pixel_index(UInt32(row), UInt32(column))
+        if behind is not None:
+            covered &= key > dr.gather(module.UInt64, behind, pixel, covered)
+        # A copy of the image for each thread, Dr.Jit's usual way, would cost far more than a few atomic operations.
+        dr.scatter_reduce(dr.ReduceOp.Min, keys, key, pixel, covered, mode=dr.ReduceMode.Direct)
+        wrap = column >= end
+        row = dr.select(wrap, row + 1, row)
+        next_middle, start, next_end = span(row)
+        return row, dr.select(wrap, start, column + 1), dr.select(wrap, next_end, end), dr.select(wrap, next_middle, at_middle)
+
+    # One loop and not one in another: each lane goes on to its next row when it is done with one, without waiting for others.
+    first, last = dr.select(active, y0, 0), dr.select(active, y1, -1)
+    at_middle, start, end = span(first)
+    state = (first, start, end, at_middle)
+    dr.while_loop(state, lambda row, *_: row <= last, draw_pixel, mode="symbolic", label="fragments")

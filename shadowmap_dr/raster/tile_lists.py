@@ -1,0 +1,279 @@
+"""Large triangles: short lists for tiles of 16 x 16 pixels, which the pixels then walk.
+
+A triangle is kept out of a tile when it misses it, or lies behind one that covers it; if possible, of a block of 4 x 4 tiles
+at once. What a list has no room for is drawn fragment by fragment, so that no array size depends on the data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+import drjit as dr
+
+from ..jit.arrays import backend
+from .small_triangles import draw
+from .triangle_setup import Triangles, centred, depth_key, rounding_error
+from .types import by_image
+
+#: log2 of the side of a tile in pixels.
+TILE = 4
+#: Side of a block in tiles, a power of two.
+BLOCK = 4
+#: Pixels of a strip.
+STRIP = 4
+#: Triangles that a tile's list has room for.
+CAPACITY = 32
+
+
+@dataclass(frozen=True)
+class TileGrid:
+    """The tiles of a batch of ``height`` x ``width`` images."""
+
+    batch: int
+    height: int
+    width: int
+
+    @property
+    def columns(self) -> int:
+        return -(-self.width >> TILE)
+
+    @property
+    def rows(self) -> int:
+        return -(-self.height >> TILE)
+
+    @property
+    def count(self) -> int:
+        return self.batch * self.rows * self.columns
+
+    @property
+    def block_count(self) -> int:
+        return self.batch * self._block_rows * self._block_columns
+
+    @property
+    def _block_rows(self) -> int:
+        return -(-self.rows // BLOCK)
+
+    @property
+    def _block_columns(self) -> int:
+        return -(-self.columns // BLOCK)
+
+    @property
+    def pixel_count(self) -> int:
+        """Of all tiles, what lies beyond the image included."""
+        return self.count << (2 * TILE)
+
+    def pixel(self, image: Any, row: Any, column: Any) -> Any:
+        """Number of a pixel where those of a tile follow each other, row by row."""
+        within = ((row & ((1 << TILE) - 1)) << TILE) + (column & ((1 << TILE) - 1))
+        return (self.tile(image, row >> TILE, column >> TILE) << (2 * TILE)) + within
+
+    def tile(self, image: Any, row: Any, column: Any) -> Any:
+        """Number of the tile in a row and column of tiles."""
+        return (image * self.rows + row) * self.columns + column
+
+    def block(self, image: Any, row: Any, column: Any) -> Any:
+        """Number of the block that holds that tile."""
+        return (image * self._block_rows + row // BLOCK) * self._block_columns + column // BLOCK
+
+
+@dataclass(frozen=True)
+class TileLists:
+    """``items[c * capacity:][:count[c]]`` are the triangles (numbered through the batch) that tile ``c`` may see.
+
+    ``count`` may exceed the capacity: triangles beyond it are not in the list, but drawn.
+    """
+
+    grid: TileGrid
+    capacity: int
+    count: Any
+    items: Any
+
+
+@dataclass(frozen=True)
+class Strips:
+    """All pixels of a batch of images in horizontal strips of four, one lane each; some may reach beyond the image.
+
+    16 consecutive lanes make up 16 x 4 pixels of one tile, so that the control flow of a SIMD packet hardly ever diverges.
+    ``column`` is that of the first pixel, ``index`` its position in a flat row-major batch.
+    """
+
+    image: Any
+    row: Any
+    column: Any
+    tile: Any
+    index: Any
+    images: int
+    height: int
+    width: int
+
+    def gather(self, flat: Any, tiled: bool = False) -> list[Any]:
+        """What a batch of images (``UInt64``) holds for the pixels of each strip; undefined beyond the image. The images are
+        row-major or, if ``tiled``, in the order of `TileGrid.pixel`."""
+        if tiled:  # the order of the strips themselves
+            return list(dr.gather(backend(flat).Array4u64, flat, dr.arange(type(self.tile), dr.width(flat) // STRIP)))
+        inside = self.row < self.height
+        if self.width % STRIP == 0:
+            return list(dr.gather(backend(flat).Array4u64, flat, self.index // STRIP, inside & (self.column < self.width)))
+        return [dr.gather(type(flat), flat, self.index + k, inside & (self.column + k < self.width)) for k in range(STRIP)]
+
+    def written(self, values: list[Any]) -> Any:
+        """A row-major batch of images with a value for each pixel of the strips, evaluated."""
+        kind = type(values[0])
+        module = backend(values[0])
+        across = -(-self.width // STRIP)
+        rows = self.images * self.height
+        # One packet for each strip: several scatters would be kernels of their own.
+        padded = dr.empty(kind, rows * across * STRIP)
+        inside = (self.row < self.height) & (self.column < self.width)
+        packet = {module.UInt32: module.Array4u, module.UInt64: module.Array4u64}[kind]
+        at = (self.image * self.height + self.row) * across + self.column // STRIP
+        dr.scatter(padded, packet(*values), at, inside)
+        dr.eval(padded)
+        if self.width % STRIP == 0:
+            return padded
+        pixel = dr.arange(module.UInt32, rows * self.width)
+        row = pixel // self.width
+        result = dr.gather(kind, padded, row * (across * STRIP) + (pixel - row * self.width))
+        dr.eval(result)
+        return result
+
+
+def strips(grid: TileGrid, module: ModuleType) -> Strips:
+    """Enumerate the strips of a batch of images."""
+    lane = dr.arange(module.UInt32, grid.count << (2 * TILE - 2))
+    within = lane & ((1 << (2 * TILE - 2)) - 1)
+    tile = lane >> (2 * TILE - 2)
+    row_of_tiles = tile // grid.columns
+    image, row_within = by_image(row_of_tiles, grid.rows, grid.batch)
+    row = (row_within << TILE) + (within >> (TILE - 2))
+    column = ((tile - row_of_tiles * grid.columns) << TILE) + ((within & ((1 << (TILE - 2)) - 1)) * STRIP)
+    index = (image * grid.height + row) * grid.width + column
+    return Strips(image, row, column, tile, index, grid.batch, grid.height, grid.width)
+
+
+def nearest_covers(grid: TileGrid, triangles: Triangles, image: Any, active: Any) -> Any:
+    """``UInt32`` for each tile, then for each block: key of the smallest depth beyond which some triangle that covers all of it
+    reaches nowhere. What is noted for a block is not repeated for its tiles."""
+    module = backend(triangles.a)
+    nearest = dr.full(module.UInt32, 0xFFFFFFFF, grid.count + grid.block_count)
+    dr.eval(nearest)
+
+    def visit(row: Any, column: Any, is_tile: Any) -> Any:
+        span = _Span(triangles, row, column, is_tile)
+        node = dr.select(is_tile, grid.tile(image, row, column), grid.count + grid.block(image, row, column))
+        dr.scatter_reduce(dr.ReduceOp.Min, nearest, depth_key(span.farthest), node, span.covered, mode=dr.ReduceMode.Direct)
+        return ~span.missed & ~span.covered
+
+    _for_each_tile(triangles.box, active, visit)
+    return nearest
+
+
+def build_tile_lists(
+    grid: TileGrid,
+    triangles: Triangles,
+    index: Any,
+    image: Any,
+    triangle: Any,
+    active: Any,
+    nearest: Any,
+    keys: Any,
+    behind: Any,
+    pixel_index: Callable[[Any, Any], Any],
+) -> TileLists:
+    """Enter large triangles into the lists of the tiles where they may be seen.
+
+    Args:
+        grid: the tiles.
+        triangles: with ``box`` set; ``a``, ``b``, ``c`` of all of them.
+        index, triangle: number of each triangle through the batch, and in its image.
+        image: image of each triangle.
+        active: the large ones.
+        nearest: from :func:`nearest_covers`, or None to keep hidden triangles too.
+        keys, behind, pixel_index: see :func:`shadowmap_dr.raster.small_triangles.draw`, for triangles that find a list full.
+    """
+    module = backend(triangles.a)
+    Int32 = module.Int32
+    count = dr.zeros(module.UInt32, grid.count)
+    items = dr.empty(module.UInt32, grid.count * CAPACITY)
+    dr.eval(count, items)
+
+    def visit(row: Any, column: Any, is_tile: Any) -> Any:
+        span = _Span(triangles, row, column, is_tile)
+        tile = grid.tile(image, row, column)
+        seen = ~span.missed
+        if nearest is not None:
+            depth = depth_key(span.nearest)
+            seen &= depth <= dr.gather(module.UInt32, nearest, grid.count + grid.block(image, row, column), seen)
+            seen &= ~is_tile | (depth <= dr.gather(module.UInt32, nearest, tile, seen & is_tile))
+        wanted = seen & is_tile
+        slot = dr.scatter_inc(count, tile, wanted)
+        fits = wanted & (slot < CAPACITY)
+        dr.scatter(items, index, tile * CAPACITY + slot, fits)
+        x0, y0, x1, y1 = triangles.box
+        left, top = Int32(column << TILE), Int32(row << TILE)
+        size = (1 << TILE) - 1
+        box = (dr.maximum(x0, left), dr.maximum(y0, top), dr.minimum(x1, left + size), dr.minimum(y1, top + size))
+        draw(triangles, keys, behind, pixel_index, triangle, box, wanted & ~fits)
+        return seen
+
+    _for_each_tile(triangles.box, active, visit)
+    dr.eval(count, items, keys)
+    return TileLists(grid, CAPACITY, count, items)
+
+
+def _for_each_tile(box: tuple[Any, Any, Any, Any], active: Any, visit: Any) -> None:
+    """Call ``visit(row, column, is_tile)`` in a symbolic loop over the tiles that a box touches.
+
+    A box of many tiles is walked block by block: a block is visited first (``is_tile`` is false, row and column are those of its
+    first tile), and its tiles only if that returns true.
+    """
+    UInt32 = backend(box[0]).UInt32
+    x0, y0, x1, y1 = (UInt32(dr.select(active, b, 0)) >> TILE for b in box)
+    few = (x1 - x0 + 1) * (y1 - y0 + 1) <= BLOCK * BLOCK
+
+    def first(top: Any, left: Any) -> tuple[Any, Any]:
+        """Where to begin in the block with this first tile."""
+        return dr.select(few, dr.maximum(top, y0), top), dr.select(few, dr.maximum(left, x0), left)
+
+    def body(row, column, is_tile):  # noqa: ANN001, ANN202
+        descend = visit(row, column, is_tile)
+        top, left = row & ~UInt32(BLOCK - 1), column & ~UInt32(BLOCK - 1)
+        right, bottom = dr.minimum(left + BLOCK - 1, x1), dr.minimum(top + BLOCK - 1, y1)
+        next_row = is_tile & (column == right)
+        leave = dr.select(is_tile, next_row & (row == bottom), ~descend)
+        last = left + BLOCK > x1
+        block_row, block_column = first(dr.select(last, top + BLOCK, top), dr.select(last, x0 & ~UInt32(BLOCK - 1), left + BLOCK))
+        tile_row = dr.select(is_tile, dr.select(next_row, row + 1, row), dr.maximum(top, y0))
+        tile_column = dr.select(is_tile & ~next_row, column + 1, dr.maximum(left, x0))
+        row, column = dr.select(leave, block_row, tile_row), dr.select(leave, block_column, tile_column)
+        return row, column, ~leave | few
+
+    row, column = first(y0 & ~UInt32(BLOCK - 1), x0 & ~UInt32(BLOCK - 1))
+    state = (dr.select(active, row, y1 + 1), column, few)
+    dr.while_loop(state, lambda row, *_: row <= y1, body, mode="symbolic", label="tiles")
+
+
+class _Span:
+    """What a triangle does over the pixel centres of a tile or block.
+
+    ``missed``: it contains none of them; ``covered``: it contains all; ``nearest``, ``farthest``: bounds of its depth there.
+    """
+
+    def __init__(self, t: Triangles, row: Any, column: Any, is_tile: Any) -> None:
+        module = backend(t.a)
+        half = dr.select(is_tile, module.Float(0.5 * ((1 << TILE) - 1)), 0.5 * ((BLOCK << TILE) - 1))
+        x, y = centred(module, row << TILE, column << TILE, t.height, t.width)
+        middle = dr.fma(t.a, x + half, dr.fma(t.b, y + half, t.c))
+        reach = (dr.abs(t.a) + dr.abs(t.b)) * half
+        error = rounding_error(t.height, t.width)
+        # The depth is evaluated elsewhere, with rounding errors relative to its largest term.
+        error_depth = 1e-6 * dr.fma(dr.abs(t.a.w), 0.5 * t.width, dr.fma(dr.abs(t.b.w), 0.5 * t.height, dr.abs(t.c.w)))
+        self.nearest = middle.w - reach.w - error_depth
+        self.farthest = middle.w + reach.w + error_depth
+        outside = [middle[k] + reach[k] < -error for k in range(3)]
+        inside = [middle[k] - reach[k] > error for k in range(3)]
+        self.missed = outside[0] | outside[1] | outside[2] | (self.nearest > 1) | (self.farthest < -1)
+        self.covered = inside[0] & inside[1] & inside[2] & (self.nearest >= -1) & (self.farthest <= 1)

@@ -1,0 +1,218 @@
+"""Triangles made ready for the screen: edge functions, depth plane, bounds, and the coverage test."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from ..jit.arrays import backend
+from .types import precise_rcp
+
+# Boxes are widened by this many pixels so that rounding in the single-precision edge functions cannot lose a pixel.
+_BOX_MARGIN = 1.0 / 512.0
+# Distance, in pixels, of an edge that is infinitely far away.
+_DISTANT = 1e9
+
+
+@dataclass(frozen=True)
+class Triangles:
+    """One lane a triangle, of every image of a batch; not evaluated, so that what follows can join the same kernel.
+
+    Attributes:
+        a, b, c: ``Array4f``: three edge functions ``a x + b y + c`` (x, y in pixels from the image centre, distance in pixels,
+            positive inside) and, in the fourth component, NDC depth.
+        exact: the same edges as :func:`edge_lines` returns them, for the branch of :func:`covers` that needs them.
+        box: inclusive pixel bounds (first column, first row, last column, last row), inside the image where ``active``.
+        active: triangles that may cover a pixel centre.
+        fragments: about how many pixel centres it covers (``Float``), never more than the box holds.
+        height, width: of an image.
+    """
+
+    a: Any
+    b: Any
+    c: Any
+    exact: Callable[[], tuple[list[tuple[Any, Any, Any]], Any]]
+    box: tuple[Any, Any, Any, Any]
+    active: Any
+    fragments: Any
+    height: int
+    width: int
+
+
+def gather_triangle(positions: Any, faces: Any, triangle: Any, first_vertex: Any, active: Any) -> tuple[Any, Any, Any]:
+    """Clip-space corners (``Array4f``) of triangles of one image of the batch."""
+    module = backend(positions)
+    i = dr.gather(module.Array3u, faces, triangle, active)
+    return tuple(dr.gather(module.Array4f, positions, first_vertex + i[k], active) for k in range(3))
+
+
+def set_up(corners: tuple[Any, Any, Any], height: int, width: int) -> Triangles:
+    """Edge functions, depth plane and bounds of triangles with the given clip-space corners.
+
+    Edge functions are cross products of float32 (x, y, w) evaluated in float64: every product is then exact, so the two
+    triangles that share an edge get coefficients that are exact negatives, whatever their vertex order or indices.
+    """
+    module = backend(corners[0])
+    Float, Float64, Int32 = module.Float, module.Float64, module.Int32
+    lines, det = edge_lines(corners)
+    zs = [Float64(p.z) for p in corners]
+    active = dr.isfinite(det) & (det != 0)
+    sign = dr.select(det < 0, Float64(-1), Float64(1))
+    inv_det = precise_rcp(dr.select(active, det, 1))
+
+    # NDC -> pixels counted from the image centre, where single precision loses least.
+    sx, sy = 2.0 / width, 2.0 / height
+    coefficients: list[list[Any]] = [[], [], []]
+    for a, b, c in lines:
+        norm = dr.sqrt(a * a * (sx * sx) + b * b * (sy * sy))
+        # Between two corners with w = 0 the edge is infinitely far away: all of the image is on one side of it.
+        distant = norm == 0
+        scale = sign / dr.select(distant, 1, norm)
+        c = dr.select(distant, dr.sign(c) * _DISTANT, c)
+        for store, value in zip(coefficients, (a * sx * scale, b * sy * scale, c * scale), strict=True):
+            store.append(Float(value))
+    plane = [sum(zs[k] * lines[k][c] for k in range(3)) * inv_det for c in range(3)]
+    for store, value in zip(coefficients, (plane[0] * sx, plane[1] * sy, plane[2]), strict=True):
+        store.append(Float(value))
+
+    x_min, y_min, x_max, y_max, seen = _screen_bounds(corners, height, width)
+    active &= seen
+    m = _BOX_MARGIN
+    box = (
+        dr.maximum(Int32(dr.ceil(x_min - (0.5 + m))), 0),
+        dr.maximum(Int32(dr.ceil(y_min - (0.5 + m))), 0),
+        dr.minimum(Int32(dr.floor(x_max - (0.5 - m))), width - 1),
+        dr.minimum(Int32(dr.floor(y_max - (0.5 - m))), height - 1),
+    )
+    active &= (box[0] <= box[2]) & (box[1] <= box[3])
+
+    columns, rows = Float(box[2] - box[0] + 1), Float(box[3] - box[1] + 1)
+    # det is twice the area in NDC times the product of the w, where all of them are positive.
+    w3 = corners[0].w * corners[1].w * corners[2].w
+    before = (corners[0].w > 0) & (corners[1].w > 0) & (corners[2].w > 0)
+    area = dr.abs(Float(det)) * (width * height / 8) / dr.select(before, w3, 1)
+    fragments = dr.select(before, dr.minimum(area + (columns + rows), columns * rows), columns * rows)
+    a, b, c = (module.Array4f(*values) for values in coefficients)
+    return Triangles(a, b, c, lambda: (lines, det), box, active, fragments, height, width)
+
+
+def edge_lines(corners: tuple[Any, Any, Any]) -> tuple[list[tuple[Any, Any, Any]], Any]:
+    """Homogeneous lines (opposite to vertices 0, 1, 2), not oriented, and the determinant whose sign orients them."""
+    module = backend(corners[0])
+    xs, ys, ws = ([module.Float64(p[c]) for p in corners] for c in (0, 1, 3))
+
+    def line(a: int, b: int) -> tuple[Any, Any, Any]:
+        return ys[a] * ws[b] - ys[b] * ws[a], xs[b] * ws[a] - xs[a] * ws[b], xs[a] * ys[b] - xs[b] * ys[a]
+
+    lines = [line(1, 2), line(2, 0), line(0, 1)]
+    return lines, lines[0][0] * xs[0] + lines[0][1] * ys[0] + lines[0][2] * ws[0]
+
+
+def rounding_error(height: int, width: int) -> float:
+    """Bound of the error (pixels) of a single-precision edge function anywhere in the image."""
+    return max(width, height) * 3e-7
+
+
+def centred(module: Any, row: Any, column: Any, height: int, width: int) -> tuple[Any, Any]:
+    """Pixel centres counted from the image centre."""
+    return module.Float(column) + (0.5 - 0.5 * width), module.Float(row) + (0.5 - 0.5 * height)
+
+
+def covers(values: Any, row: Any, column: Any, height: int, width: int, exact_lines: Callable[[], Any]) -> Any:
+    """Does a triangle contain a pixel's centre, between the near and the far plane?
+
+    Single precision decides unless the centre lies within its rounding error of an edge. There (rarely) double precision
+    does, for otherwise the rounded edges that meet in a vertex would leave pinholes or doubly owned pixels around it.
+
+    Args:
+        values: ``Array4f``, the edge functions and the depth at the centre.
+        row, column: of the pixel.
+        exact_lines: returns (lines, det) of the triangle; called within a branch.
+    """
+    module = backend(values)
+    Float64 = module.Float64
+    least = dr.minimum(dr.minimum(values.x, values.y), values.z)
+    in_range = (values.w >= -1) & (values.w <= 1)
+
+    def exact(row, column):  # noqa: ANN001, ANN202
+        lines, det = exact_lines()
+        x = (2 * Float64(column) + (1 - width)) / width
+        y = (2 * Float64(row) + (1 - height)) / height
+        covered = module.Bool(True)
+        for la, lb, lc in lines:
+            la, lb, lc = (dr.select(det < 0, -q, q) for q in (la, lb, lc))
+            value = dr.fma(la, x, dr.fma(lb, y, lc))
+            # Top-left rule: of the two triangles at an edge exactly one owns the points on it.
+            covered &= (value > 0) | ((value == 0) & ((la > 0) | ((la == 0) & (lb > 0))))
+        return covered
+
+    undecided = in_range & (dr.abs(least) <= rounding_error(height, width))
+    covered = dr.if_stmt(
+        (row, column), undecided, exact, lambda row, column: least > 0, mode="symbolic", label="exact edge test"
+    )
+    return covered & in_range
+
+
+def depth_key(depth: Any) -> Any:
+    """``UInt32`` in the order of the (finite) depths."""
+    module = backend(depth)
+    bits = dr.reinterpret_array(module.UInt32, depth + 0.0)  # -0 becomes +0
+    return bits ^ dr.select(bits >> 31 != 0, module.UInt32(0xFFFFFFFF), module.UInt32(0x80000000))
+
+
+def fragment_key(depth: Any, triangle: Any) -> Any:
+    """``UInt64`` whose minimum is the nearest fragment; equal depths go to the lower triangle index."""
+    UInt64 = backend(depth).UInt64
+    return (UInt64(depth_key(depth)) << 32) | UInt64(triangle)
+
+
+def _screen_bounds(corners: tuple[Any, Any, Any], height: int, width: int) -> tuple[Any, Any, Any, Any, Any]:
+    """Pixel bounds of the part of a triangle in front of the near plane, and whether there is any within the depth range.
+
+    Where a visible point has ``w <= 0`` (no camera does that, but a caller's matrix may), the whole image is the bound.
+    """
+    module = backend(corners[0])
+    Float, Bool = module.Float, module.Bool
+    x_min, y_min, x_max, y_max = Float(dr.inf), Float(dr.inf), Float(-dr.inf), Float(-dr.inf)
+    unbounded, beyond_far = Bool(False), Bool(True)
+    near = [p.z + p.w for p in corners]
+    for p in corners:
+        beyond_far &= p.z > p.w
+
+    def include(x: Any, y: Any, w: Any, use: Any) -> None:
+        nonlocal x_min, y_min, x_max, y_max, unbounded
+        ok = use & (w > 0)
+        unbounded |= use & ~(w > 0)
+        inv = dr.rcp(dr.select(ok, w, 1))
+        px, py = x * inv, y * inv
+        x_min, x_max = dr.select(ok, dr.minimum(x_min, px), x_min), dr.select(ok, dr.maximum(x_max, px), x_max)
+        y_min, y_max = dr.select(ok, dr.minimum(y_min, py), y_min), dr.select(ok, dr.maximum(y_max, py), y_max)
+
+    for p, d in zip(corners, near, strict=True):
+        include(p.x, p.y, p.w, d >= 0)
+    for a, b in ((0, 1), (1, 2), (2, 0)):
+        crosses = (near[a] >= 0) != (near[b] >= 0)
+        # From the end in front: the other one may be so far behind that where the edge crosses would be lost in rounding.
+        front = near[a] >= 0
+        d = dr.select(front, near[a], near[b])
+        p, back = dr.select(front, corners[a], corners[b]), dr.select(front, corners[b], corners[a])
+        s = d / dr.select(crosses, d - dr.select(front, near[b], near[a]), 1)
+        q = dr.fma(back - p, s, p)
+        include(q.x, q.y, q.w, crosses)
+
+    # Clamp before the conversion to integers: a vertex near the camera plane projects beyond their range.
+    def to_pixel(ndc: Any, size: int) -> Any:
+        return dr.clip(dr.fma(ndc, 0.5 * size, 0.5 * size), -2.0, size + 2.0)
+
+    seen = ~beyond_far & (unbounded | (x_max >= x_min))
+    wide = unbounded | ~seen
+    return (
+        dr.select(wide, 0, to_pixel(dr.select(wide, 0, x_min), width)),
+        dr.select(wide, 0, to_pixel(dr.select(wide, 0, y_min), height)),
+        dr.select(wide, width, to_pixel(dr.select(wide, 0, x_max), width)),
+        dr.select(wide, height, to_pixel(dr.select(wide, 0, y_max), height)),
+        seen,
+    )

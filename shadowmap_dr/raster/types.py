@@ -1,0 +1,119 @@
+"""Dr.Jit types and the records that all screen-space primitives share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from ..jit.arrays import backend
+
+#: Triangle index of a pixel that no triangle covers.
+NO_TRIANGLE = 0xFFFFFFFF
+
+#: Largest image side for which the single-precision edge functions keep their accuracy (1/256 pixel).
+MAX_RESOLUTION = 4096
+
+
+@dataclass(frozen=True)
+class RasterOutput:
+    """What each pixel of a batch of images sees.
+
+    All arrays have ``batch * height * width`` entries, row-major (``(b * height + row) * width + column``).
+
+    Attributes:
+        triangle: index of the visible triangle, ``NO_TRIANGLE`` where there is none.
+        u, v: perspective-correct barycentric weights of the triangle's vertices 1 and 2 (vertex 0 has ``1 - u - v``).
+        depth: ``z / w`` in clip space, 1 (the far plane) where nothing is seen.
+        w: interpolated clip-space ``w`` (distance along the viewing axis of a perspective camera), 1 where nothing is seen.
+        records: per-triangle set-up of the rasterizer (three arrays of 4 floats a triangle), for later passes.
+        face_count, batch, height, width: sizes.
+
+    ``u``, ``v``, ``depth`` and ``w`` carry gradients to the clip-space positions (for a fixed visible triangle; the change
+    of *which* triangle is visible is the business of :func:`shadowmap_dr.raster.antialias`).
+    """
+
+    triangle: Any
+    u: Any
+    v: Any
+    depth: Any
+    w: Any
+    records: Any
+    face_count: int
+    batch: int
+    height: int
+    width: int
+
+    def edge_functions(self, image: Any, triangle: Any, active: Any = True) -> tuple[Any, Any, Any]:
+        """``a x + b y + c``, x and y in pixels from the image centre, as three ``Array4f``. Detached.
+
+        Components 0, 1, 2: distance (pixels) from the edges opposite to vertices 0, 1, 2, positive inside; 3: NDC depth.
+        For triangles (valid indices where ``active``) of images of the batch.
+        """
+        Array4f = backend(self.records[0]).Array4f
+        index = image * self.face_count + triangle
+        a, b, c = (dr.gather(Array4f, record, index, active) for record in self.records)
+        return a, b, c
+
+    def depth_plane(self, image: Any, triangle: Any, active: Any = True) -> tuple[Any, Any, Any]:
+        """The last component of :func:`edge_functions` alone: (dx, dy, d), each ``Float``."""
+        Float = backend(self.records[0]).Float
+        index = 4 * (image * self.face_count + triangle) + 3
+        dx, dy, d = (dr.gather(Float, record, index, active) for record in self.records)
+        return dx, dy, d
+
+    @property
+    def valid(self) -> Any:
+        """Mask of the pixels that see a triangle."""
+        return self.triangle != NO_TRIANGLE
+
+
+def precise_rcp(x: Any) -> Any:
+    """``1 / x`` to full precision. ``dr.rcp`` of a double is good for some 20 bits only on a GPU."""
+    with dr.scoped_set_flag(dr.JitFlag.FastMath, False):
+        return dr.rcp(x)
+
+
+def check_range(faces: Any, count: int, what: str) -> None:
+    """Raise ValueError if faces refer to a ``what`` (vertex, row) of number ``count`` or more. Reads back one number."""
+    largest = int(np.max(dr.max(faces).numpy()))
+    if largest >= count:
+        raise ValueError(f"faces refer to {what} {largest}, but there are only {count}")
+
+
+def by_image(index: Any, size: int, batch: int) -> tuple[Any, Any]:
+    """Which image of a batch an index (``UInt32``) below ``batch * size`` belongs to, and the index within that image.
+
+    The only image of a batch is a constant: no divisions, and no sizes of meshes in kernels, which then serve other meshes, too.
+    """
+    if batch == 1:
+        return type(index)(0), index
+    image = index // size
+    return image, index - image * size
+
+
+def pixel_coordinates(module: ModuleType, batch: int, height: int, width: int) -> tuple[Any, Any, Any]:
+    """Image index, row and column (``UInt32``) of every entry of a flat row-major batch of images."""
+    index = dr.arange(module.UInt32, batch * height * width)
+    row_flat = index // width
+    image, row = by_image(row_flat, height, batch)
+    return image, row, index - row_flat * width
+
+
+def zeros(module: ModuleType, size: int, count: int) -> list[Any]:
+    """``count`` evaluated ``Float`` arrays of zeros, to be written to.
+
+    One kernel of all threads writes them: one thread would fill an array with a constant. ``size`` is at most 2^28.
+    """
+    lane = dr.arange(module.UInt32, size)
+    # Different, for Dr.Jit must not see that they are the same.
+    arrays = [module.Float(lane >> (31 - k)) for k in range(count)]
+    dr.eval(arrays)
+    return arrays
+
+
+#: Stands for "no second face" in :attr:`Topology.opposite`.
+NO_VERTEX = 0xFFFFFFFF

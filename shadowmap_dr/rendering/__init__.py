@@ -1,0 +1,9 @@
+"""The passes that make an image: shadow maps, G-buffer, light, film."""
+
+from .renderer import Renderer
+from .settings import RenderSettings
+
+__all__ = [
+    "RenderSettings",
+    "Renderer",
+]

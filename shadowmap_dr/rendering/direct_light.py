@@ -1,0 +1,93 @@
+"""Light that surfaces reflect once, emit, or that environments send to the camera."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ..jit.broadcast import broadcast_differentiable
+from ..scene.lights.area import AreaLight
+from ..scene.lights.environment import Environment
+from ..scene.lights.read import Light
+from ..scene.sensor import Sensor
+from ..scene.sums import evaluate
+from .gbuffer.surface import Surface
+
+
+def direct_light(surface: Surface, light: Light, visibility: Any = 1.0, nodes: Sequence[Any] = (), *, gate: bool = True) -> Any:
+    """Radiance (colour, N) towards the camera of one light: BSDF * light * visibility.
+
+    ``visibility`` Float (N,), 0 dark to 1 lit. ``nodes``: :meth:`SceneData.materials`. ``gate`` removes
+    light that reaches the shading normal from the wrong side of the triangle, as a shadow ray would. Gradients flow to all of
+    surface, light and visibility, not through the gate.
+    """
+    wo_world, weight = broadcast_differentiable(light, dr.width(surface.shape)).illuminate(surface.p_world, surface.active)
+    wo = surface.si.to_local(wo_world)
+    active = mi.Bool(surface.active)
+    if gate:
+        active &= passes_gate(surface, wo_world, wo)
+    return dr.select(active, _reflected(surface, wo, active, nodes) * weight * visibility, 0.0)
+
+
+def _reflected(surface: Surface, wo: Any, active: Any, nodes: Sequence[Any]) -> Any:
+    """:meth:`Surface.evaluate` with derivatives by parameters of ``nodes`` that add up without loss."""
+    if surface.colour is not None:
+        return surface.evaluate(wo, active)
+    return evaluate(lambda own: own[0].evaluate(*own[1:]), (surface, wo, mi.Bool(active)), nodes, dr.width(surface.shape))
+
+
+def passes_gate(surface: Surface, wo_world: Any, wo: Any) -> Any:
+    """Bool (N,): where no light comes through the triangle's wrong side; ``wo``: the same direction in the shading frame."""
+    # Light and viewer lie on the same side of the triangle exactly where they lie on the same side by the shading normal.
+    # Holds for reflection and transmission, and for triangles whose vertex normals point the other way.
+    with dr.suspend_grad():
+        sides = dr.dot(surface.n_world, wo_world) * dr.dot(surface.n_world, surface.wi_world)
+        return (sides > 0) == (wo.z * surface.si.wi.z > 0)
+
+
+def emission(surface: Surface, lights: Sequence[AreaLight]) -> Any:
+    """Radiance (colour, N) that surfaces give off themselves, seen from the camera. Attached to surface and lights.
+
+    Faces shine on the side on which their vertex normals are. Mitsuba asks the interpolated normal itself, which turns away
+    before the outline of a smooth shape is reached: the dark rim hides the outline, and with it what a moving lamp changes.
+    """
+    total = dr.zeros(mi.UnpolarizedSpectrum, dr.width(surface.shape))
+    with dr.suspend_grad():
+        towards = dr.dot(surface.n_world, surface.wi_world) * dr.dot(surface.n_world, surface.si.sh_frame.n)
+        front = surface.active & (towards > 0)
+    si = mi.SurfaceInteraction3f(surface.si)
+    si.wi = mi.Vector3f(0, 0, 1)
+    for light in lights:
+        own = front & (surface.shape == light.shape)
+        radiance = evaluate(lambda at, light=light: light.seen(*at), (si, own), [light.emitter], dr.width(surface.shape))
+        total += dr.select(own, radiance, 0)
+    return total
+
+
+def ambient_light(surface: Surface, environment: Environment, n_directions: int = 16, nodes: Sequence[Any] = ()) -> Any:
+    """Radiance (colour, N) towards the camera of an environment that nothing shadows.
+
+    A fixed set of ``n_directions`` cosine-distributed directions in the hemisphere of the shading normal on the viewer's side
+    (Fibonacci spiral): exact for diffuse surfaces under constant light, coarse for gloss. Gradients flow to surface and emitter.
+    ``nodes``: :meth:`SceneData.materials`.
+    """
+    total = dr.zeros(mi.UnpolarizedSpectrum, dr.width(surface.shape))
+    side = dr.select(surface.si.wi.z < 0, -1.0, mi.Float(1.0))
+    for i in range(n_directions):
+        radius = math.sqrt((i + 0.5) / n_directions)
+        angle = i * math.pi * (3.0 - math.sqrt(5.0))
+        cosine = math.sqrt(1.0 - radius * radius)
+        wo = mi.Vector3f(radius * math.cos(angle), radius * math.sin(angle), cosine * side)
+        radiance = environment.radiance(surface.si.to_world(wo), surface.active)
+        total += _reflected(surface, wo, surface.active, nodes) * radiance * (math.pi / (cosine * n_directions))
+    return dr.select(surface.active, total, 0.0)
+
+
+def background(environment: Environment, sensor: Sensor, width: int | None = None, height: int | None = None) -> Any:
+    """Radiance (colour, H * W) of an environment at every pixel centre, as seen where nothing is in front of it."""
+    towards = sensor.ray_direction(width, height)
+    return evaluate(environment.radiance, towards, environment.nodes, dr.width(towards))

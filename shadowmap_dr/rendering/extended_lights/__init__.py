@@ -1,0 +1,31 @@
+"""Extended lights: area lights and environments as many samples, each with a shadow map."""
+
+from .sample_maps import (
+    SoftFrusta,
+    SoftLight,
+    SoftMaps,
+    SoftPlan,
+    check_soft_sizes,
+    make_soft_maps,
+    plan_soft,
+    samples_of,
+    still_aimed,
+)
+from .samples import LightSamples
+from .shading import soft_light
+from .sky_samples import SkyWatch
+
+__all__ = [
+    "LightSamples",
+    "SkyWatch",
+    "SoftFrusta",
+    "SoftLight",
+    "SoftMaps",
+    "SoftPlan",
+    "check_soft_sizes",
+    "make_soft_maps",
+    "plan_soft",
+    "samples_of",
+    "soft_light",
+    "still_aimed",
+]

@@ -1,0 +1,282 @@
+"""Shadow maps of light samples: one each, all of a scene in one batch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ...raster import RasterOutput, Topology
+from ...scene.geometry import Geometry
+from ...scene.lights.area import AreaLight
+from ...scene.lights.environment import Environment
+from ...shadow import (
+    Frusta,
+    ShadowMaps,
+    ShadowSettings,
+    Views,
+    casting_shapes,
+    cube_face,
+    cube_views,
+    directional_view,
+    filter_maps,
+    fit_frusta,
+    render_maps,
+    shape_bounds,
+    to_light_space,
+    vertices_in_maps,
+)
+from ...shadow.light_camera import of_map
+from ..shadow_pass import MapPlan, boxes_of, check_sizes, shape_planes
+from .area_samples import AreaPlan, area_samples, plan_area
+from .map_aim import WIDEST, aim, sees_all, shape_vertices
+from .penumbra import Pyramid
+from .samples import LightSamples, SampleTable
+from .sky_samples import SkyPlan, plan_sky, sky_samples
+
+SoftLight = AreaLight | Environment
+SoftFrusta = tuple[Frusta | None, Frusta | None]
+
+#: No shape is left out of a map.
+NO_SHAPE = 0xFFFFFFFF
+# Seen points that the fit of a map looks at.
+_SEEN = 1024
+
+
+@dataclass(frozen=True)
+class SoftPlan:
+    """How one extended light is sampled, and which maps it has. Static.
+
+    ``kind``: ``distant`` or ``near`` (one map for each sample), ``cube`` (six), or ``single`` (one in all, see
+    :mod:`shadowmap_dr.rendering.extended_lights.penumbra`). ``first``: number of the first map, single ones and others counted
+    apart. ``target``: point that the maps of a ``near`` or ``single`` light face, in the middle of the shapes ``casters``.
+    ``hides``: shape that casts no shadow of this light: its own, unless parts of it see others of it, ``facing``; then these cast
+    shadows with the sides that shine.
+    """
+
+    parts: AreaPlan | SkyPlan
+    kind: str
+    count: int
+    first: int
+    target: tuple[float, float, float]
+    hides: int
+    facing: tuple[int, int] = (0, 0)
+    casters: tuple[int, ...] = ()
+
+    @property
+    def maps(self) -> int:
+        """Number of its maps."""
+        return 1 if self.kind == "single" else self.count * (6 if self.kind == "cube" else 1)
+
+
+def plan_soft(
+    lights: Sequence[SoftLight], geometry: Geometry, area_count: int, sky_count: int, single: bool = False
+) -> tuple[SoftPlan, ...]:
+    """Sample the lights and decide on their maps (on the host, once). ``single``: area lights get one map where one is enough."""
+    plans: list[SoftPlan] = []
+    first = {True: 0, False: 0}
+    for light in lights:
+        if isinstance(light, Environment):
+            plan = SoftPlan(plan_sky(light, sky_count, geometry), "distant", sky_count, 0, (0.0, 0.0, 0.0), NO_SHAPE)
+        else:
+            parts = plan_area(light, geometry, area_count)
+            aimed = aim(shape_vertices(geometry), geometry.shapes, light.shape)
+            kind = "cube" if aimed.surrounded else "single" if single else "near"
+            plan = SoftPlan(parts, kind, area_count, 0, aimed.target, light.shape, casters=aimed.casters)
+            if kind != "single" and parts.dented:
+                info = geometry.shapes[light.shape]
+                plan = replace(plan, kind="cube", hides=NO_SHAPE, facing=(info.face_start, info.face_start + info.face_count))
+        alone = plan.kind == "single"
+        plans.append(replace(plan, first=first[alone]))
+        first[alone] += plan.maps
+    return tuple(plans)
+
+
+def still_aimed(plans: Sequence[SoftPlan], geometry: Callable[[], Geometry]) -> bool:
+    """Whether the maps of lights that have one for each sample, or one in all, still cover what they are meant to.
+
+    If there are such lights, the geometry is asked for, and its vertices are read back to the host.
+    """
+    aimed = [plan for plan in plans if plan.kind in ("near", "single")]
+    vertices = shape_vertices(geometry()) if aimed else []
+    return all(sees_all(vertices[plan.hides], [vertices[k] for k in plan.casters], plan.target) for plan in aimed)
+
+
+def check_soft_sizes(plans: Sequence[SoftPlan], geometry: Geometry, texels: int) -> None:
+    """Refuse (ShadowmapError) what would not fit into arrays."""
+    remedy = "lower area_light_samples, environment_light_samples or soft_map_resolution"
+    check_sizes(sum(plan.maps for plan in plans), texels, geometry, "extended lights", remedy)
+
+
+def samples_of(light: SoftLight, plan: SoftPlan, geometry: Geometry) -> LightSamples:
+    """The light's samples as it is now. Attached."""
+    if isinstance(light, Environment):
+        return sky_samples(light, plan.parts)
+    return area_samples(light, plan.parts, geometry)
+
+
+@dataclass(frozen=True)
+class SoftMaps:
+    """The maps of all extended lights: ``sampled``, one for each sample, and ``single``, one for each light; or None."""
+
+    sampled: ShadowMaps | None
+    single: Pyramid | None
+
+    @property
+    def frusta(self) -> SoftFrusta:
+        """Their fit."""
+        return (
+            None if self.sampled is None else self.sampled.frusta,
+            None if self.single is None else self.single.maps.frusta,
+        )
+
+
+def make_soft_maps(
+    plans: Sequence[SoftPlan],
+    samples: Sequence[LightSamples],
+    scene: MapPlan,
+    geometry: Geometry,
+    topology: Topology,
+    settings: tuple[ShadowSettings, ShadowSettings],
+    previous: SoftFrusta,
+    transparent: Callable[[RasterOutput], Any] | None = None,
+    seen: Any = None,
+) -> SoftMaps:
+    """Render and filter the maps of all samples as one batch, and those of single ones as another. Attached to samples, vertices.
+
+    ``scene`` tells the shapes' planes, ``settings`` are those of either kind, ``previous`` is the fit of an earlier call; the
+    rest is as in :func:`shadowmap_dr.rendering.shadow_pass.make_maps`.
+    """
+    made: list[ShadowMaps | None] = []
+    for single, setting, fit in zip((False, True), settings, previous, strict=True):
+        own = [(p, s) for p, s in zip(plans, samples, strict=True) if (p.kind == "single") == single]
+        made.append(_make(own, scene, geometry, topology, setting, fit, transparent, seen) if own else None)
+    sampled, single = made
+    return SoftMaps(None if sampled is None else filter_maps(sampled), None if single is None else Pyramid.of(single))
+
+
+def _make(
+    lights: Sequence[tuple[SoftPlan, LightSamples]],
+    scene: MapPlan,
+    geometry: Geometry,
+    topology: Topology,
+    settings: ShadowSettings,
+    previous: Frusta | None,
+    transparent: Callable[[RasterOutput], Any] | None,
+    seen: Any,
+) -> ShadowMaps:
+    plans = [plan for plan, _ in lights]
+    views = _stack([_views(plan, s, settings) for plan, s in lights])
+    hidden = dr.concat([dr.full(mi.UInt32, plan.hides, plan.maps) for plan in plans])
+    dr.eval(views, hidden)
+    frusta = _fit(views, hidden, scene, geometry, settings, previous, seen)
+    p_light, which, vertex = vertices_in_maps(views, geometry.positions)
+    if any(plan.hides != NO_SHAPE for plan in plans):
+        own = dr.gather(mi.UInt32, hidden, which) == dr.gather(mi.UInt32, geometry.vertex_shape, vertex)
+        # Behind the light's camera, where no triangle is drawn.
+        p_light = dr.select(own, type(p_light)(0, 0, -1), p_light)
+    return render_maps(p_light, which, geometry.faces, topology, views, frusta, settings, transparent, _facing(plans, geometry))
+
+
+def _facing(plans: Sequence[SoftPlan], geometry: Geometry) -> Any:
+    """Faces (Bool, for all faces of each map) that cast shadows only where they face the light, or None."""
+    if not any(plan.facing[1] for plan in plans):
+        return None
+    first, last = (dr.concat([dr.full(mi.UInt32, plan.facing[k], plan.maps) for plan in plans]) for k in range(2))
+    lane = dr.arange(mi.UInt32, dr.width(first) * geometry.face_count)
+    which = lane // geometry.face_count
+    face = lane - which * geometry.face_count
+    return (face >= dr.gather(mi.UInt32, first, which)) & (face < dr.gather(mi.UInt32, last, which))
+
+
+def map_of(plan: SoftPlan, table: SampleTable, sample: Any, p_world: Any) -> Any:
+    """Number of the map (UInt32) that tells whether points see a sample (UInt32)."""
+    if plan.kind == "cube":
+        return plan.first + sample * 6 + cube_face(dr.detach(mi.Vector3f(p_world) - table.place(sample)))
+    return plan.first + sample
+
+
+def _views(plan: SoftPlan, samples: LightSamples, settings: ShadowSettings) -> Views:
+    """Cameras of a light's samples, attached to their places and directions."""
+    count = plan.maps
+    zero = dr.zeros(mi.Float, count)
+    if plan.kind == "distant":
+        view = directional_view(samples.place)
+        return Views(view.right, view.up, view.forward, mi.Vector3f(zero), zero, zero + dr.inf)
+    if plan.kind in ("near", "single"):
+        place = samples.centre() if plan.kind == "single" else samples.place
+        # Which way a camera faces has no influence on what it sees, so it need not be differentiated.
+        with dr.suspend_grad():
+            view = directional_view(mi.Vector3f(*plan.target) - dr.detach(place))
+        spread = dr.full(mi.Float, math.tan(math.radians(WIDEST)), count)
+        return Views(view.right, view.up, view.forward, place, spread, zero + dr.inf)
+    lane = dr.arange(mi.UInt32, count)
+    sample, face = lane // 6, lane % 6
+    faces = cube_views(mi.Point3f(0), settings.resolution, settings.filter_size)
+
+    def pick(name: str) -> Any:
+        total = mi.Vector3f(0)
+        for k, view in enumerate(faces):
+            total = dr.select(face == k, mi.Vector3f(getattr(view, name)), total)
+        return total
+
+    origin = mi.Vector3f(*(dr.gather(mi.Float, samples.place[c], sample) for c in range(3)))
+    spread = dr.full(mi.Float, 0, count) + faces[0].spread
+    return Views(pick("right"), pick("up"), pick("forward"), origin, spread, spread)
+
+
+def _stack(parts: list[Views]) -> Views:
+    """One batch of all cameras."""
+    if len(parts) == 1:
+        return parts[0]
+
+    def join(name: str) -> Any:
+        values = [getattr(part, name) for part in parts]
+        if dr.depth_v(values[0]) == 1:
+            return dr.concat(values)
+        return mi.Vector3f(*(dr.concat([mi.Float(v[c]) for v in values]) for c in range(3)))
+
+    return Views(*(join(name) for name in Views.__dataclass_fields__))
+
+
+def _fit(
+    views: Views, hidden: Any, scene: MapPlan, geometry: Geometry, settings: ShadowSettings, previous: Frusta | None, seen: Any
+) -> Frusta:
+    """Frusta around the boxes of shapes: with so many maps, asking each vertex would cost more than drawing it."""
+    with dr.suspend_grad():
+        shapes, count = len(geometry.shapes), views.count
+        boxes = boxes_of(geometry)
+        lane = dr.arange(mi.UInt32, count * shapes * 8)
+        entry = lane >> 3
+        which = entry // shapes
+        shape = entry - which * shapes
+        corner = boxes.corners(shape, lane & 7)
+        bounds = shape_bounds(views, to_light_space(of_map(dr.detach(views), which, count), corner), which, shape, shapes)
+        casts = casting_shapes(views, *shape_planes(scene, geometry), boxes, hidden)
+        return fit_frusta(
+            views,
+            bounds,
+            casts,
+            shapes,
+            settings.resolution,
+            settings.filter_size,
+            previous,
+            _few(seen),
+            settings.receiver_range,
+        )
+
+
+def _few(seen: Any) -> Any:
+    """About 1,000 of the seen points."""
+    if seen is None:
+        return None
+    points, active = seen
+    stride = max(1, dr.width(points) // _SEEN)
+    # Odd steps do not run down the columns of an image.
+    stride += stride > 1 and stride % 2 == 0
+    index = dr.arange(mi.UInt32, dr.width(points) // stride) * stride
+    return mi.Point3f(*(dr.gather(mi.Float, points[c], index) for c in range(3))), dr.gather(mi.Bool, mi.Bool(active), index)

@@ -1,0 +1,259 @@
+"""What an extended light is to the shading: a fixed number of points, or of directions, each with a shadow map of its own."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ...errors import ShadowmapError
+
+
+@dataclass(frozen=True)
+class Facets:
+    """Disks that shine like the N parts of an emitter: ``count`` for each part, one after the other, F in all.
+
+    count   static
+    flat    whether none of them stands for something that bends (static)
+    middle  Vector3f (F,), centres, world space
+    normal  Vector3f (F,), mean normals of what they stand for, times their share of the part
+    radius  Float (F,)
+    bend    Float (F,), standard deviation of normals, negative where they are bent inwards
+
+    All may carry gradients.
+    """
+
+    count: int
+    flat: bool
+    middle: Any
+    normal: Any
+    radius: Any
+    bend: Any
+
+    def packets(self) -> list[Any]:
+        """Two rows of four numbers."""
+        m, n = self.middle, self.normal
+        return [mi.Vector4f(m.x, m.y, m.z, self.radius), mi.Vector4f(n.x, n.y, n.z, self.bend)]
+
+
+@dataclass(frozen=True)
+class LightSamples:
+    """N points of a light that is near (an area light), or N directions of one that is infinitely far away.
+
+    distant  which of the two (static)
+    place    Vector3f (N,), positions, or unit directions in which light travels, world space
+    normal   Vector3f (N,), mean normals of the parts, shorter than 1 where these are curved (unused if distant)
+    power    colour (N,), radiance times area, or irradiance on a surface that faces the light
+    area     Float (N,), share of the emitter's area (unused if distant)
+    facets   what the parts shine like, near points; None if distant
+
+    All may carry gradients.
+    """
+
+    distant: bool
+    place: Any
+    normal: Any
+    power: Any
+    area: Any
+    facets: Facets | None = None
+
+    @property
+    def count(self) -> int:
+        """N."""
+        return dr.width(self.place)
+
+    def centre(self) -> Any:
+        """Vector3f of width 1, the mean position by area. Attached."""
+        total = dr.sum(self.area)
+        return mi.Vector3f(*(dr.sum(self.place[c] * self.area) / total for c in range(3)))
+
+    def radius_towards(self, p_world: Any) -> Any:
+        """Float, radius of a disk of the area that points see of the light, if nothing hides it. Attached."""
+        direction = dr.normalize(mi.Vector3f(p_world) - self.centre())
+        # The mean normal times the whole area is the area vector of what faces one way; closed surfaces show a quarter of theirs.
+        total = dr.sum(self.area)
+        facing = mi.Vector3f(*(dr.sum(self.normal[c] * self.area) for c in range(3)))
+        flat = dr.maximum(dr.dot(facing, direction), 0)
+        closed = 0.25 * (total - dr.norm(facing))
+        return dr.sqrt(dr.maximum(flat + closed, 1e-12 * total) * (1 / math.pi))
+
+    def table(self) -> SampleTable:
+        """The same numbers in packets, for look-ups by many lanes."""
+        p, c = self.place, self.power
+        colour = [c[k] for k in range(dr.size_v(type(c)))]
+        rows = [mi.Vector4f(p.x, p.y, p.z, 0), mi.Vector4f(*colour, *[mi.Float(0)] * (4 - len(colour)))]
+        if self.facets:
+            rows += self.facets.packets()
+        packets = tuple(dr.ravel(row) for row in rows)
+        dr.eval(packets)
+        count, flat = (self.facets.count, self.facets.flat) if self.facets else (1, True)
+        return SampleTable(self.distant, self.count, packets, count, flat)
+
+
+@dataclass(frozen=True)
+class SampleTable:
+    """:class:`LightSamples` as flat buffers of four numbers for each sample, and :class:`Facets` likewise."""
+
+    distant: bool
+    count: int
+    packets: tuple[Any, ...]
+    facets: int
+    flat: bool
+
+    def place(self, index: Any) -> Any:
+        """Vector3f, where sample ``index`` (UInt32) is, detached."""
+        packet = dr.gather(mi.Vector4f, dr.detach(self.packets[0]), index)
+        return mi.Vector3f(packet.x, packet.y, packet.z)
+
+    def from_sky(self, index: Any) -> tuple[Any, Any]:
+        """(wo, weight) of direction ``index`` (UInt32) of a light infinitely far away, the same at all points. Attached."""
+        place = _packet(self.packets[0], index)
+        return mi.Vector3f(-place.x, -place.y, -place.z), self._power(index)
+
+    def _power(self, index: Any) -> Any:
+        colour = _packet(self.packets[1], index)
+        return mi.UnpolarizedSpectrum(*(colour[k] for k in range(dr.size_v(mi.UnpolarizedSpectrum))))
+
+    def illuminate(self, index: Any, p_world: Any, sides: Sequence[Any]) -> list[tuple[Any, Any, Any]]:
+        """(wo, weight, reached) of sample ``index`` (UInt32) at points, for the light on each of some sides of them.
+
+        wo is a unit direction (Vector3f) to the light in the mean, weight its irradiance on a surface that faces it (colour), and
+        reached (Bool) tells where it arrives. That does not ask for its radiance, whose derivative is there even if it is zero.
+
+        ``p_world`` Point3f (P,), world space; ``sides``: normals (unit Vector3f (P,)) that point to these sides. Weight times
+        cosine is right also where the horizon cuts the light in two. Light from infinitely far away is on one side. Attached to
+        points, normals and samples. One-sided, as Mitsuba's area lights are.
+        """
+        if self.distant:
+            return [(*self.from_sky(index), mi.Bool(True))]
+        power = self._power(index)
+        vectors = [mi.Vector3f(0) for _ in sides]
+        for k in range(self.facets):
+            middle, n = (_packet(packet, index * self.facets + k) for packet in self.packets[2:])
+            offset, normal = mi.Vector3f(middle.x, middle.y, middle.z) - mi.Vector3f(p_world), mi.Vector3f(n.x, n.y, n.z)
+            size = mi.Float(1)
+            if self.facets > 1:
+                size = dr.squared_norm(normal)
+                inverse = dr.rsqrt(dr.maximum(size, 1e-20))
+                normal, size = normal * inverse, size * inverse
+            squared, height = dr.squared_norm(offset), -dr.dot(normal, offset)
+            if not self.flat:
+                height = _shown(height, 1.06 * middle.w * n.w, 1.5 * dr.square(n.w) * (squared - dr.square(height)), squared)
+            squared_radius = dr.square(middle.w)
+            along, across = disk_irradiance(squared, height, squared_radius)
+            vector = offset * along - normal * across
+            for i, side in enumerate(sides):
+                # Evenly spread this far above and below the centre, points have as much light above it as those of the disk.
+                reach = 0.72 * squared_radius * (1 - dr.square(dr.dot(normal, side)))
+                vectors[i] += _above(vector, along, side, dr.dot(offset, side), reach, squared) * size
+        found = []
+        for vector in vectors:
+            squared = dr.squared_norm(vector)
+            reached = dr.detach(squared) > 0
+            inverse = dr.rsqrt(dr.select(reached, squared, 1))
+            found.append((vector * inverse, power * (squared * inverse), reached))
+        return found
+
+
+def _above(vector: Any, along: Any, side: Any, level: Any, variance: Any, squared: Any) -> Any:
+    """Irradiance (Vector3f) of what is on one side of planes, of a disk that gives ``vector`` in all.
+
+    ``level``: of the disk's centre above the plane, around which its points are spread evenly, with a ``variance`` of a third.
+    """
+    variance = dr.maximum(variance, dr.maximum(1e-8 * squared, 1e-20))
+    inverse = dr.rsqrt(variance)
+    reach = variance * inverse
+    share = dr.clip(dr.fma(0.5 * level, inverse, 0.5), 0, 1)
+    upright = dr.dot(vector, side)
+    higher = dr.maximum(upright + along * dr.square(1 - share) * reach, 0)
+    return dr.select(share > 0, vector * share + side * (higher - upright * share), 0)
+
+
+def disk_irradiance(squared_distance: Any, height: Any, squared_radius: Any) -> tuple[Any, Any]:
+    """(along, across): along * offset - across * normal is the vector whose product with a unit normal is the irradiance of a
+    disk of radiance 1, divided by the disk's area.
+
+    That is if all of it is in front of the surface. Exact at any distance; 0 behind the disk. Bounded, as are its derivatives:
+    those next to the rim are smaller. Attached to all.
+
+    Args:
+        squared_distance: Float, from the point to the disk's centre.
+        height: Float, of the point above the disk's plane, on the side that shines.
+        squared_radius: Float.
+
+    Source: elements parallel to a disk and perpendicular to it in Howell, "A Catalog of Radiation Heat Transfer Configuration
+    Factors"; here without differences of numbers that are nearly the same.
+    """
+    rise = dr.square(height)
+    inner, outer = squared_distance - squared_radius, squared_distance + squared_radius
+    square = dr.maximum(dr.square(inner) + squared_radius * dr.fma(4, rise, 1e-4 * squared_radius), 1e-22)
+    inverse = dr.rsqrt(square)
+    root = square * inverse
+    scale = dr.select(height > 0, 2 * inverse, 0)
+    along = scale * dr.rcp(root + outer)
+    near = inner < 0
+    axial = dr.select(near, root - inner, rise) * dr.rcp(dr.select(near, dr.maximum(4 * squared_radius, 1e-18), root + inner))
+    return along * height, scale * axial - along * rise
+
+
+def _shown(height: Any, rise: Any, variance: Any, squared: Any) -> Any:
+    """Mean height (Float) above what is seen of a facet: what bends turns away little by little.
+
+    ``height``: above its disk; ``rise``: of the planes through its pieces above that, in the mean, around which they are spread
+    evenly, with a ``variance`` of a third.
+    """
+    variance = dr.maximum(variance, dr.maximum(1e-8 * squared, 1e-20))
+    inverse = dr.rsqrt(variance)
+    share = dr.clip(dr.fma(0.5 * (height - rise), inverse, 0.5), 0, 1)
+    return dr.select(share < 1, share * dr.fma(share, variance * inverse, rise), height)
+
+
+def _packet(flat: Any, index: Any) -> Any:
+    return dr.gather(mi.Vector4f, flat, index, mode=dr.ReduceMode.Local)
+
+
+def brightness(name: str, radiance: Any, count: int) -> np.ndarray:
+    """Mean over the channels of radiances (colour, ``count``), on the host, at least 0.
+
+    Raises ``ShadowmapError`` if one is not finite: sums over parts would lose it, and the light would just be dark.
+    """
+    mean = dr.mean(mi.UnpolarizedSpectrum(radiance)) + dr.zeros(mi.Float, count)
+    values = mean.numpy().astype(np.float64)
+    if not np.isfinite(values).all():
+        raise ShadowmapError(f"The radiance of light '{name}' is not finite everywhere: check its values for NaN or inf.")
+    return np.maximum(values, 0)
+
+
+def cluster_sums(values: Any, cluster: Any, count: int) -> Any:
+    """Sums of ``values`` (Float or vector, P) over the pieces that belong to each of ``count`` clusters (UInt32, P). Attached."""
+    if dr.depth_v(values) == 1:
+        return dr.custom(_Sums, mi.Float(values), cluster, count)
+    return type(values)(*(cluster_sums(values[k], cluster, count) for k in range(len(values))))
+
+
+class _Sums(dr.CustomOp):
+    """Scatter-add whose derivatives are evaluated at once: pending ones end the process where a loop comes to read them."""
+
+    def eval(self, values: Any, cluster: Any, count: int) -> Any:
+        self._cluster, self._count = cluster, count
+        total = dr.zeros(mi.Float, count)
+        dr.scatter_add(total, values, cluster)
+        dr.eval(total)
+        return total
+
+    def forward(self) -> None:
+        total = dr.zeros(mi.Float, self._count)
+        dr.scatter_add(total, self.grad_in("values"), self._cluster)
+        dr.eval(total)
+        self.set_grad_out(total)
+
+    def backward(self) -> None:
+        self.set_grad_in("values", dr.gather(mi.Float, self.grad_out(), self._cluster))
+
+    def name(self) -> str:
+        return "cluster sums"

@@ -1,0 +1,86 @@
+"""Light of extended lights on what is seen: a sum over their samples, in one loop on the device."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ...scene.sums import attached_parameters, sum_over
+from ...shadow import visibility
+from ..direct_light import passes_gate
+from ..gbuffer.surface import Surface
+from .penumbra import penumbra_visibility
+from .sample_maps import SoftMaps, SoftPlan, map_of
+from .samples import LightSamples
+from .sky_light import reflects_only, sky_light
+
+
+def soft_light(
+    seen: Surface,
+    plan: SoftPlan,
+    samples: LightSamples,
+    maps: SoftMaps | None,
+    nodes: Sequence[Any],
+    *,
+    gate: bool = True,
+) -> Any:
+    """Radiance (colour, P) towards the camera of one extended light.
+
+    ``maps`` None: unshadowed. ``nodes``: all BSDFs that ``seen`` may call, and shapes whose
+    attributes these read. ``gate``: see :func:`shadowmap_dr.rendering.direct_light.direct_light`.
+    Gradients flow to all of surface, samples, maps and BSDFs.
+    """
+    if seen.colour is not None:
+        # Of materials that know cosines only, the colour stays outside of the loop: its derivative needs no second one.
+        white = replace(seen, colour=mi.UnpolarizedSpectrum(1))
+        light = _loop_light(white, plan, samples, maps, nodes, gate)
+        if dr.grad_enabled(seen.colour):
+            dr.eval(light)
+        return seen.colour * light
+    return _loop_light(seen, plan, samples, maps, nodes, gate)
+
+
+def _loop_light(
+    seen: Surface, plan: SoftPlan, samples: LightSamples, maps: SoftMaps | None, nodes: Sequence[Any], gate: bool
+) -> Any:
+    if samples.distant and reflects_only(nodes):
+        return sky_light(seen, plan, samples, maps, nodes, gate=gate)
+    sampled = None if maps is None or plan.kind == "single" else maps.sampled
+    transmits = not samples.distant and any(_transmits(node) for node in nodes)
+
+    def one_sample(index: Any, seen: Surface, shared: Any) -> Any:
+        table, maps = shared
+        value, active = mi.UnpolarizedSpectrum(0), mi.Bool(False)
+        for wo_world, weight, reached in table.illuminate(index, seen.p_world, sides(seen)):
+            wo = seen.si.to_local(wo_world)
+            passes = seen.active & reached
+            if gate:
+                passes &= passes_gate(seen, wo_world, wo)
+            value += dr.select(passes, seen.evaluate(wo, passes) * weight, 0)
+            active |= passes
+        if maps is not None:
+            value *= visibility(maps, map_of(plan, table, index, seen.p_world), seen.p_world, active)
+        return dr.select(active, value, 0)
+
+    def sides(seen: Surface) -> list[Any]:
+        """Normals on the sides of the surface that light may come from."""
+        n = seen.si.sh_frame.n
+        above = mi.Vector3f(dr.select(dr.detach(seen.si.wi.z) < 0, -n, n))
+        return [above, -above] if transmits else [above]
+
+    start = dr.zeros(mi.UnpolarizedSpectrum, dr.width(seen.shape))
+    implicit = [] if seen.colour is not None else attached_parameters(nodes)
+    light = sum_over(one_sample, samples.count, start, seen, (samples.table(), sampled), implicit, seen.active)
+    if maps is None or plan.kind != "single":
+        return light
+    radius = samples.radius_towards(seen.p_world)
+    return light * penumbra_visibility(maps.single, mi.UInt32(plan.first), radius, seen.p_world, seen.n_world, seen.active)
+
+
+def _transmits(node: Any) -> bool:
+    flags = node.flags() if isinstance(node, mi.BSDF) else 0
+    return mi.has_flag(flags, mi.BSDFFlags.DiffuseTransmission) or mi.has_flag(flags, mi.BSDFFlags.GlossyTransmission)

@@ -1,0 +1,1 @@
+"""From samples to the images of films: windows, reconstruction filters, further channels."""

@@ -1,0 +1,65 @@
+"""Further image channels that the passes produce anyway."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ...raster import RasterOutput
+from ...scene.lights.read import Light
+from ..gbuffer.surface import Surface
+
+#: Name -> channel suffixes. ``visibility`` has one channel for each light, named after it.
+AOVS: dict[str, tuple[str, ...]] = {
+    "depth": ("",),
+    "position": (".X", ".Y", ".Z"),
+    "normal": (".X", ".Y", ".Z"),
+    "shape_index": ("",),
+    "prim_index": ("",),
+    "visibility": (),
+}
+
+
+def aov_names(aovs: tuple[str, ...], light_names: list[str]) -> list[str]:
+    """Channel names in the order of :func:`collect_aovs`."""
+    names = []
+    for name in aovs:
+        if name == "visibility":
+            names += [f"visibility.{light}" for light in light_names]
+        else:
+            names += [name + suffix for suffix in AOVS[name]]
+    return names
+
+
+def collect_aovs(
+    aovs: tuple[str, ...], seen: Surface, raster: RasterOutput, lights: tuple[Light, ...], visible: list[Any]
+) -> list[Any]:
+    """Channels (Float, one entry a pixel), 0 where nothing is seen; visibility is 1 there.
+
+    ``depth``: distance from the camera, world units (as Mitsuba's). ``position``, ``normal``: world space, the normal is the
+    shading normal. ``shape_index``, ``prim_index``: counted from 0, -1 where nothing is seen. Not anti-aliased, and not passed
+    through the film's reconstruction filter.
+    """
+    width = dr.width(raster.triangle)
+
+    def masked(value: Any, empty: float = 0.0) -> Any:
+        full = dr.select(seen.active, mi.Float(value), empty)
+        return full if dr.width(full) == width else full + dr.zeros(mi.Float, width)
+
+    channels: list[Any] = []
+    for name in aovs:
+        if name == "depth":
+            channels.append(masked(seen.si.t))
+        elif name == "position":
+            channels += [masked(seen.p_world[k]) for k in range(3)]
+        elif name == "normal":
+            channels += [masked(seen.si.sh_frame.n[k]) for k in range(3)]
+        elif name == "shape_index":
+            channels.append(masked(seen.shape, -1.0))
+        elif name == "prim_index":
+            channels.append(masked(seen.si.prim_index, -1.0))
+        elif name == "visibility":
+            channels += [masked(fraction, 1.0) for fraction in visible]
+    return channels

@@ -1,0 +1,182 @@
+"""Films: the window of samples that a picture needs, the picture made of them, and Mitsuba's film that is to hold it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ...errors import ShadowmapError, warn
+from ...raster import MAX_RESOLUTION
+from ...scene.sensor import Sensor
+from .reconstruction import reconstruct
+
+
+@dataclass(frozen=True)
+class Margin:
+    """Pixels of the film around a crop window, with which its outermost ones are blended where edges pass between them."""
+
+    left: int = 0
+    top: int = 0
+    right: int = 0
+    bottom: int = 0
+
+    @classmethod
+    def of(cls, cameras: Sequence[Sensor], factor: int) -> Margin:
+        """One pixel on each side that is not the film's own, so that a picture is the same whether it is cut before or after.
+
+        ``factor`` x ``factor`` samples a pixel; none where the rasterizer has no room for more.
+        """
+        (camera, *others), room = cameras, MAX_RESOLUTION // factor - 2
+        if others or camera.border > 0 or max(camera.crop_size) > room:
+            return cls()
+        (width, height), (w, h), (x, y) = camera.film_size, camera.crop_size, camera.crop_offset
+        return cls(int(x > 0), int(y > 0), int(x + w < width), int(y + h < height))
+
+    def around(self, camera: Sensor) -> Sensor:
+        """A camera whose window has the margin, too."""
+        (width, height), (x, y) = camera.crop_size, camera.crop_offset
+        size = width + self.left + self.right, height + self.top + self.bottom
+        return replace(camera, crop_size=size, crop_offset=(x - self.left, y - self.top))
+
+    def cut(self, picture: Any, factor: int) -> Any:
+        """A picture (rows, columns, C) of ``factor`` x ``factor`` samples a pixel without the margin."""
+        if self == Margin():
+            return picture
+        rows, columns = picture.shape[:2]
+        first, last = (self.top * factor, self.left * factor), (rows - self.bottom * factor, columns - self.right * factor)
+        return picture[first[0] : last[0], first[1] : last[1]]
+
+
+def sample_windows(cameras: Sequence[Sensor]) -> tuple[Sensor, ...]:
+    """Cameras whose windows include what a film samples beyond its border (``sample_border``).
+
+    Cameras of one film lie side by side: the first one gets a border on its left, the last one on its right.
+    """
+    border = cameras[0].border
+    if border == 0:
+        return _checked(tuple(cameras))
+    windows = []
+    for k, camera in enumerate(cameras):
+        left, right = border * (k == 0), border * (k == len(cameras) - 1)
+        width, height = camera.crop_size
+        x, y = camera.crop_offset
+        size = (width + left + right, height + 2 * border)
+        windows.append(replace(camera, crop_size=size, crop_offset=(x - left, y - border)))
+    return _checked(tuple(windows))
+
+
+def _checked(windows: tuple[Sensor, ...]) -> tuple[Sensor, ...]:
+    for window in windows:
+        if max(window.width, window.height) > MAX_RESOLUTION:
+            size = f"A picture of {window.width} x {window.height} pixels"
+            raise ShadowmapError(f"{size} is too large: render it in crop windows of {MAX_RESOLUTION} pixels a side at most.")
+    return windows
+
+
+def sample_grid(spp: int, windows: Sequence[Sensor]) -> int:
+    """Samples along each side of a pixel: at most 16, and as many as the rasterizer's largest image has room for.
+
+    A warning names both counts where that is less than was asked for.
+    """
+    if spp < 1:
+        raise ShadowmapError(f"spp is {spp}: give at least 1 sample per pixel.")
+    widest = max(windows, key=lambda window: max(window.width, window.height))
+    wanted = min(math.isqrt(math.ceil(spp) - 1) + 1, 16)
+    factor = max(1, min(wanted, MAX_RESOLUTION // max(widest.width, widest.height)))
+    if factor < wanted:
+        size = f"{widest.width} x {widest.height} pixels"
+        warn(
+            f"Of {wanted**2} samples per pixel {factor**2} are taken: {size} would be more than {MAX_RESOLUTION} samples "
+            "along a side. Render parts of the image with crop windows, or lower spp."
+        )
+    return factor
+
+
+def develop(pictures: Sequence[Any], camera: Sensor, factor: int) -> Any:
+    """Picture (``mi.TensorXf``, H, W, C) of the samples that the cameras of one film took.
+
+    Args:
+        pictures: for each camera's window (:func:`sample_windows`) a tensor (rows, columns, C) of ``factor`` x ``factor`` samples
+            for each pixel; side by side they are the film.
+        camera: any of these cameras.
+
+    The film's colours and alpha pass through its reconstruction filter, further channels are means over the samples in a pixel.
+    Gradients flow to ``pictures``.
+    """
+    if camera.filter.is_box:
+        return _side_by_side([_means(picture, factor) for picture in pictures])
+    samples = _side_by_side(pictures)
+    filtered = camera.channels + camera.alpha
+    if samples.shape[2] == filtered:
+        return reconstruct(samples, camera.filter, factor, camera.border)
+    edge = camera.border * factor
+    inner = samples[edge : samples.shape[0] - edge, edge : samples.shape[1] - edge, filtered:]
+    image = reconstruct(samples[:, :, :filtered], camera.filter, factor, camera.border)
+    return dr.concat([image, _means(inner, factor)], axis=2)
+
+
+def _side_by_side(images: Sequence[Any]) -> Any:
+    return images[0] if len(images) == 1 else dr.concat(list(images), axis=1)
+
+
+def _means(image: Any, factor: int) -> Any:
+    """Average factor x factor blocks."""
+    if factor == 1:
+        return image
+    height, width, channels = image.shape[0] // factor, image.shape[1] // factor, image.shape[2]
+    index = dr.arange(mi.UInt32, height * width * channels)
+    pixel, channel = index // channels, index % channels
+    row, column = pixel // width, pixel % width
+    total = dr.zeros(mi.Float, height * width * channels)
+    for j in range(factor):
+        for i in range(factor):
+            source = ((row * factor + j) * (width * factor) + column * factor + i) * channels + channel
+            total += dr.gather(mi.Float, image.array, source)
+    return mi.TensorXf(total * (1 / factor**2), shape=(height, width, channels))
+
+
+def put_into_film(film: Any, image: Any, aovs: list[str]) -> None:
+    """Make ``film.develop()``, ``film.bitmap()`` and ``film.write()`` give this image (detached)."""
+    film.prepare(aovs)
+    base = film.base_channels_count()
+    alpha = base in (2, 4)
+    colour = [image[..., k : k + 1] for k in range(base - alpha)]
+    # A film stores three colours, even if it is to give luminance, then alpha, then the weight that it divides by.
+    planes = colour * 3 if len(colour) == 1 else colour
+    planes += [image[..., base - 1 : base]] if alpha else []
+    planes += [dr.ones(mi.TensorXf, (*image.shape[:2], 1))]
+    planes += [image[..., base:]] if image.shape[2] > base else []
+    block = mi.ImageBlock(dr.concat(planes, axis=2), offset=film.crop_offset(), rfilter=None, border=False)
+    film.put_block(block)
+
+
+def film_channels(color: Any, active: Any, sensor: Sensor) -> list[Any]:
+    """Channels (Float) of what a sensor's film holds of a colour: one or three, and where something was hit, if it has alpha."""
+    channels = [color[k] for k in range(len(color))]
+    if sensor.channels == 1 and len(channels) == 3:
+        channels = [mi.luminance(color)]
+    elif sensor.channels == 3 and len(channels) == 1:
+        channels = channels * 3
+    if sensor.alpha:
+        channels.append(dr.select(active, mi.Float(1), 0))
+    return channels
+
+
+def interleave(channels: list[Any]) -> Any:
+    """Flat pixel-interleaved buffer of some channels, all of the same width."""
+    if len(channels) == 1:
+        return channels[0]
+    if len(channels) == 3:
+        return dr.ravel(mi.Vector3f(*channels))
+    count = len(channels)
+    width = max(dr.width(c) for c in channels)
+    index = dr.arange(mi.UInt32, width) * count
+    result = dr.zeros(mi.Float, count * width)
+    for k, channel in enumerate(channels):
+        dr.scatter(result, channel, index + k)
+    return result

@@ -1,0 +1,127 @@
+"""Reconstruction filters of films: their weights on a grid of samples, and the weighted sums that make pixels of samples.
+
+Mitsuba adds each sample to the pixels around it, weighted by the film's filter at the distance from the sample to the pixel's
+centre, and divides a pixel by its sum of weights. With ever more samples that is the integral of the filter times the image. Here
+a sample is an anti-aliased value, which stands for a cell: the pixel, or one of a grid of cells in it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ...scene.pixel_filter import Filter
+
+
+def reconstruct(samples: Any, filter: Filter, factor: int, border: int) -> Any:
+    """Pixels (``mi.TensorXf``, H, W, C) from samples ((H + 2 border) * factor, (W + 2 border) * factor, C).
+
+    Args:
+        samples: a grid of ``factor`` x ``factor`` for each pixel.
+        border: pixels on each side that were sampled beyond the film; without any (or with fewer than the filter reaches) weights
+            of samples that do not exist are shared out to those that do.
+
+    Gradients flow to ``samples``, by gathering, without atomics. Nothing is read back; sizes and weights are static.
+    """
+    weights = filter.weights(factor)
+    rows, columns, channels = samples.shape
+    height, width = rows // factor - 2 * border, columns // factor - 2 * border
+    first = border * factor - (len(weights) - factor) // 2
+    values = dr.custom(_Gathered, samples.array, weights, _Axis(rows, columns, width, channels, factor, first))
+    values = dr.custom(_Gathered, values, weights, _Axis(1, rows, height, width * channels, factor, first))
+    if first < 0:
+        pixel = dr.arange(mi.UInt32, height * width * channels) // channels
+        row = pixel // width
+        values *= _share(row, height, weights, factor, first) * _share(pixel - row * width, width, weights, factor, first)
+    return mi.TensorXf(values, shape=(height, width, channels))
+
+
+def _share(at: Any, size: int, weights: tuple[float, ...], factor: int, first: int) -> Any:
+    """1 / (sum of the weights of the samples that exist) for pixels ``at`` along an axis of ``size``."""
+    total = mi.Float(1.0)
+    for k in range(min(size, -(first // factor))):
+        missing = sum(weights[: -first - k * factor])
+        total -= dr.select(at == k, missing, 0.0) + dr.select(at == size - 1 - k, missing, 0.0)
+    return dr.rcp(total)
+
+
+@dataclass(frozen=True)
+class _Axis:
+    """Layout (before, samples or pixels, after) of an array that is filtered along its middle axis.
+
+    Pixel p's first weight belongs to sample ``p * factor + first``.
+    """
+
+    before: int
+    samples: int
+    pixels: int
+    after: int
+    factor: int
+    first: int
+
+
+class _Gathered(dr.CustomOp):
+    """Weighted sums of samples along an axis, and their transpose."""
+
+    def eval(self, values: Any, weights: tuple[float, ...], axis: _Axis) -> Any:
+        self.arguments = (weights, axis)
+        return _to_pixels(values, *self.arguments)
+
+    def forward(self) -> None:
+        self.set_grad_out(_to_pixels(self.grad_in("values"), *self.arguments))
+
+    def backward(self) -> None:
+        self.set_grad_in("values", _to_samples(self.grad_out(), *self.arguments))
+
+
+def _packets(axis: _Axis) -> tuple[Any, int]:
+    """Type of what is moved at once, and how many of them lie after an entry of the axis."""
+    if axis.after % 4 == 0:
+        return mi.Vector4f, axis.after // 4
+    return (mi.Vector3f, axis.after // 3) if axis.after % 3 == 0 else (mi.Float, axis.after)
+
+
+def _to_pixels(values: Any, weights: tuple[float, ...], axis: _Axis) -> Any:
+    packet, after = _packets(axis)
+    lane = dr.arange(mi.UInt32, axis.before * axis.pixels * after)
+    entry = lane // after
+    before = entry // axis.pixels
+    start = mi.Int32((entry - before * axis.pixels) * axis.factor) + axis.first
+    base = mi.Int32(before * axis.samples)
+    offset = mi.Int32(lane - entry * after)
+    dr.eval(values)
+    total = dr.zeros(packet)
+    for k, weight in enumerate(weights):
+        at = start + k
+        inside = True if axis.first >= 0 else (at >= 0) & (at < axis.samples)
+        total += dr.gather(packet, values, mi.UInt32((base + at) * after + offset), inside) * weight
+    return total if packet is mi.Float else dr.ravel(total)
+
+
+def _to_samples(values: Any, weights: tuple[float, ...], axis: _Axis) -> Any:
+    packet, after = _packets(axis)
+    lane = dr.arange(mi.UInt32, axis.before * axis.samples * after)
+    entry = lane // after
+    before = entry // axis.samples
+    base = mi.Int32(before * axis.pixels)
+    offset = mi.Int32(lane - entry * after)
+    # The last pixel whose weights reach this sample, and which of its weights does. Shifted, since division rounds to zero.
+    pixels = -(-len(weights) // axis.factor)
+    shift = max(0, axis.first) // axis.factor + 1
+    place = (entry - before * axis.samples) + (shift * axis.factor - axis.first)
+    last = place // axis.factor
+    which = place - last * axis.factor
+    last = mi.Int32(last) - shift
+    dr.eval(values)
+    total = dr.zeros(packet)
+    for k in range(pixels):
+        at = last - k
+        inside = (at >= 0) & (at < axis.pixels)
+        weight = mi.Float(0.0)
+        for j, value in enumerate(weights[k * axis.factor : (k + 1) * axis.factor]):
+            weight = mi.Float(value) if axis.factor == 1 else dr.select(which == j, value, weight)
+        total += dr.gather(packet, values, mi.UInt32((base + at) * after + offset), inside) * weight
+    return total if packet is mi.Float else dr.ravel(total)

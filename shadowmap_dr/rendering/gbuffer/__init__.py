@@ -1,0 +1,1 @@
+"""What cameras see: visibility, points on surfaces, normals, shading edges, footprints of pixels."""

@@ -1,0 +1,140 @@
+"""Flat-shaded surfaces whose facets are smaller than a pixel.
+
+The colour of a flat-shaded mesh jumps from facet to facet. Facets larger than pixels are dealt with by anti-aliasing the edges
+between them. Smaller ones cannot be sampled: a pixel's centre sees one facet of many at random, and the derivative of what it
+sees says nothing about that of the pixel's average. What a pixel shows there is, up to the size of a facet, the shading of the
+facets' mean normal, so that is what is shaded.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ...jit.arrays import device_array
+from ...jit.vectors import normalize_or
+from ...raster import Topology
+from ...scene.geometry import HAS_NORMALS, Geometry
+from .surface_points import SurfacePoints
+
+# Facets below the first size (in pixels) are shaded with mean normals, those above the second with their own.
+_SMALL, _LARGE = 1.5, 3.0
+
+
+@dataclass(frozen=True)
+class FlatFaces:
+    """Which flat faces meet at each place of a mesh: those of place v are ``faces[start[v]:start[v + 1]]``, ``UInt32`` each.
+
+    ``flat``: ``Bool`` (F,), whether a face is one of them.
+    """
+
+    start: Any
+    faces: Any
+    flat: Any
+
+
+def flat_faces(geometry: Geometry, topology: Topology) -> FlatFaces | None:
+    """Faces of shapes without vertex normals, by welded vertex; None if there are none (on the host, once)."""
+    flat = np.array([not info.has_normals for info in geometry.shapes])
+    if not flat.any():
+        return None
+    chosen = flat[geometry.face_shape.numpy()]
+    faces = np.flatnonzero(chosen).astype(np.uint32)
+    places = topology.welded.numpy().reshape(-1, 3)[faces].ravel()
+    order = np.argsort(places, kind="stable")
+    start = np.searchsorted(places[order], np.arange(geometry.vertex_count + 1))
+    return FlatFaces(device_array(mi.UInt32, start), device_array(mi.UInt32, faces[order // 3]), device_array(mi.Bool, chosen))
+
+
+def facet_normals(geometry: Geometry, flat: FlatFaces) -> Any:
+    """Normals of the flat faces, as long as (twice) the faces are large, 0 for others (Float, 4 F). Attached.
+
+    Four numbers and not three (the last is 0), since packets of four are read faster.
+    """
+    face = dr.arange(mi.UInt32, geometry.face_count)
+    corner = dr.gather(mi.Vector3u, geometry.faces, face, flat.flat)
+    p = [geometry.vertices(corner[k], flat.flat) for k in range(3)]
+    n = dr.cross(p[1] - p[0], p[2] - p[0])
+    normals = dr.ravel(mi.Vector4f(n.x, n.y, n.z, 0))
+    dr.eval(normals)
+    return normals
+
+
+def mean_normals(normals: Any, topology: Topology, flat: FlatFaces) -> Any:
+    """Sums of the flat faces' normals (:func:`facet_normals`) at each place (Float, 4 V, by welded vertex). Attached."""
+    return dr.custom(_Sums, normals, topology, flat)
+
+
+class _Sums(dr.CustomOp):
+    """Sums over the faces at each place. Both ways look up what they add: atomic operations would cost several times as much."""
+
+    def eval(self, normals: Any, topology: Topology, flat: FlatFaces) -> Any:
+        self.topology, self.flat, self.faces = topology, flat, dr.width(normals) // 4
+        return self._at_places(normals)
+
+    def forward(self) -> None:
+        self.set_grad_out(self._at_places(self.grad_in("normals")))
+
+    def backward(self) -> None:
+        adjoint = self.grad_out()
+        dr.eval(adjoint)
+        places = dr.gather(mi.Vector3u, self.topology.welded, dr.arange(mi.UInt32, self.faces), self.flat.flat)
+        total = sum(dr.gather(mi.Vector4f, adjoint, places[k], self.flat.flat) for k in range(3))
+        self.set_grad_in("normals", dr.ravel(mi.Vector4f(total)))
+
+    def _at_places(self, normals: Any) -> Any:
+        dr.eval(normals)
+        place = dr.arange(mi.UInt32, dr.width(self.flat.start) - 1)
+        at, end = dr.gather(mi.UInt32, self.flat.start, place), dr.gather(mi.UInt32, self.flat.start, place + 1)
+
+        def add(at: Any, end: Any, total: Any) -> tuple[Any, Any, Any]:
+            face = dr.gather(mi.UInt32, self.flat.faces, at)
+            return at + 1, end, total + dr.gather(mi.Vector4f, normals, face)
+
+        state = (at, end, dr.zeros(mi.Vector4f, dr.width(place)))
+        total = dr.while_loop(state, lambda at, end, total: at < end, add, mode="symbolic", label="faces at a place")[2]
+        result = dr.ravel(total)
+        dr.eval(result)
+        return result
+
+
+def prefilter_normals(
+    hits: SurfacePoints, normals: tuple[Any, Any], topology: Topology, mean: Any
+) -> tuple[tuple[Any, Any], Any]:
+    """Replace the normals of flat-shaded facets smaller than pixels by the mean over their neighbourhood.
+
+    ``normals`` (geometric, shading) and the result are as :func:`shadowmap_dr.rendering.gbuffer.surface.normals_at`, ``mean`` is
+    the sum that :func:`mean_normals` returns. Also returns how much of their own normal is left (Float, 0 to 1), by which the
+    edges between them still show. Gradients flow to the vertices through the new normals, not through the size of the facets.
+    """
+    with dr.suspend_grad():
+        # Sizes are square roots of (twice the) areas, and compared without taking any.
+        square = dr.squared_norm(dr.cross(dr.detach(hits.e1), dr.detach(hits.e2)))
+        pixel = mi.Float(hits.pixel)
+        soft = hits.active & ((hits.flags & HAS_NORMALS) == 0) & (square < dr.square(dr.square(_LARGE * pixel)))
+
+    def mixed(triangle: Any, u: Any, v: Any, n_world: Any, n_shading: Any, square: Any, pixel: Any) -> tuple[Any, Any, Any]:
+        size = dr.sqrt(dr.sqrt(square))
+        mix = dr.detach(dr.clip((_LARGE - size / pixel) / (_LARGE - _SMALL), 0, 1))
+        slot = dr.gather(mi.Vector3u, topology.welded, triangle)
+        sums = [dr.gather(mi.Vector4f, mean, slot[k]) for k in range(3)]
+        n = [normalize_or(mi.Normal3f(s.x, s.y, s.z), mi.Normal3f(0)) for s in sums]
+        normal = n[0] + (n[1] - n[0]) * u + (n[2] - n[0]) * v
+        normal = dr.select(dr.dot(normal, n_world) < 0, -normal, normal)
+        normal = mi.Normal3f(normalize_or(n_shading + (normal - n_shading) * mix, n_shading))
+        return normal, normal, 1 - mix
+
+    # Most pixels of a large image see large facets: a branch spares them the look-ups.
+    n_world, n_shading, own = dr.if_stmt(
+        (hits.triangle, hits.u, hits.v, *normals, square, pixel),
+        soft,
+        mixed,
+        lambda triangle, u, v, n_world, n_shading, square, pixel: (n_world, n_shading, mi.Float(1)),
+        mode="symbolic",
+        label="soften facets",
+    )
+    return (n_world, n_shading), dr.detach(own)

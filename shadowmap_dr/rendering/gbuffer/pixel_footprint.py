@@ -1,0 +1,120 @@
+"""The spots on a surface that a pixel looks at, and the mean of what is found there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ...jit.broadcast import Copies, copied
+from ...scene.sensor import Sensor
+
+#: Up to this many by this many spots are arrays of their own; so are more, if one array of all would be longer than that.
+_WRITTEN_OUT = 2
+_MOST_LANES = 1 << 22
+
+
+def footprint_points(sensor: Sensor, size: tuple[int, int], depth: Any, p_world: Any, n_world: Any, count: int) -> list[Any]:
+    """``count`` x ``count`` points spread over a pixel's footprint on the tangent plane of what it sees (Point3f each).
+
+    Attached to ``p_world`` only: the spread itself is detached. ``depth`` is that of
+    :class:`~shadowmap_dr.rendering.gbuffer.surface_points.SurfacePoints`, or None.
+    """
+    if count == 1:
+        return [p_world]
+    with dr.suspend_grad():
+        axes = _Axes.of(sensor, size, depth, p_world, n_world)
+        offsets = [axes.offset((i + 0.5) / count - 0.5, (j + 0.5) / count - 0.5) for j in range(count) for i in range(count)]
+    return [p_world + offset for offset in offsets]
+
+
+@dataclass(frozen=True)
+class FootprintSamples:
+    """The points of :func:`footprint_points` for all pixels, for means over what is found there.
+
+    Many spots of few pixels are one array: the first of all pixels, the second of all, and so on. Written out one by one, they
+    would all be compiled, which takes time that grows faster than their number. Few spots are an array each, and so are those
+    of large images, which have no use for more lanes, and none of the memory for them.
+
+    Attributes:
+        points: Point3f (C N,) each, attached to the pixels' own points.
+        active: Bool (C N,).
+        copies: C, the number of spots in one array.
+    """
+
+    points: list[Any]
+    active: Any
+    copies: int
+
+    @classmethod
+    def of(
+        cls, sensor: Sensor, size: tuple[int, int], depth: Any, p_world: Any, n_world: Any, active: Any, count: int
+    ) -> FootprintSamples:
+        """``count`` x ``count`` spots of each of N pixels; arguments as of :func:`footprint_points`, and Bool (N,)."""
+        copies = count * count
+        if count <= _WRITTEN_OUT or copies * dr.width(p_world) > _MOST_LANES:
+            return cls(footprint_points(sensor, size, depth, p_world, n_world, count), active, 1)
+        dr.eval(p_world, n_world, depth, active)
+        (points,) = dr.custom(Copies, [p_world], copies, False)
+        with dr.suspend_grad():
+            number = dr.arange(mi.UInt32, copies * dr.width(p_world)) // dr.width(p_world)
+            row = number // count
+            depth = None if depth is None else copied(dr.detach(depth), copies)
+            axes = _Axes.of(sensor, size, depth, points, copied(dr.detach(n_world), copies))
+            across, down = ((mi.Float(k) + 0.5) / count - 0.5 for k in (number - row * count, row))
+            offset = axes.offset(across, down)
+        return cls([points + offset], copied(active, copies), copies)
+
+    def mean(self, look_up: Callable[[Any, Any], Any]) -> Any:
+        """Mean (Float, N) of what ``look_up`` finds at points (Point3f, Bool). Attached."""
+        total = sum(look_up(points, self.active) for points in self.points)
+        if self.copies > 1:
+            (total,) = dr.custom(Copies, [total], self.copies, True)
+        return total * (1 / (self.copies * len(self.points)))
+
+
+@dataclass(frozen=True)
+class _Axes:
+    """Where a pixel's right and upper side lie in the world, seen at the depth of its surface (Vector3f each), and how it slants.
+
+    ``view`` is the direction in which it is seen, ``normal`` its own, ``slope`` their cosine, kept away from 0.
+    """
+
+    right: Any
+    up: Any
+    view: Any
+    normal: Any
+    slope: Any
+
+    @classmethod
+    def of(cls, sensor: Sensor, size: tuple[int, int], depth: Any, p_world: Any, n_world: Any) -> _Axes:
+        width, height = size
+        matrix = dr.detach(sensor.to_world.matrix)
+        right, up, forward = (dr.normalize(mi.Vector3f(matrix[0, k], matrix[1, k], matrix[2, k])) for k in range(3))
+        projection = dr.detach(sensor.projection)
+        if sensor.kind == "perspective":
+            scale = dr.detach(depth)
+            view = dr.normalize(dr.detach(p_world) - dr.detach(sensor.origin))
+        else:
+            # An orthographic camera's scale lies in its transformation, whose columns were normalised above.
+            scale = mi.Float(1)
+            right *= dr.norm(mi.Vector3f(matrix[0, 0], matrix[1, 0], matrix[2, 0]))
+            up *= dr.norm(mi.Vector3f(matrix[0, 1], matrix[1, 1], matrix[2, 1]))
+            view = forward
+        right *= 2 / (width * dr.abs(projection[0, 0])) * scale
+        up *= 2 / (height * dr.abs(projection[1, 1])) * scale
+        n = dr.detach(n_world)
+        slope = dr.dot(n, view)
+        # Seen at a grazing angle the footprint grows without bound; four pixels long is as much as makes sense.
+        slope = dr.select(slope < 0, dr.minimum(slope, -0.25), dr.maximum(slope, 0.25))
+        return cls(right, up, view, n, slope)
+
+    def offset(self, across: Any, down: Any) -> Any:
+        """From the pixel's centre to a place in its footprint (Vector3f), in shares of its width and height."""
+        lateral = self.right * across + self.up * down
+        offset = lateral - self.view * (dr.dot(self.normal, lateral) / self.slope)
+        # On the surface also where the footprint has been cut short: beside it there is shadow.
+        return offset - self.normal * dr.dot(self.normal, offset)

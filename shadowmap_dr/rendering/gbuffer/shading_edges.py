@@ -1,0 +1,239 @@
+"""Edges of faces at which the colour of a surface jumps, so that they have to be anti-aliased like outlines.
+
+Which these are follows from the faces where they are flat. Between smooth ones it depends on numbers that may change: what a mesh
+holds twice, for each side of a line on it, may be equal now and different in the next step of an optimisation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ...jit.arrays import device_array
+from ...raster import CoplanarCreases, Topology
+from ...scene.changes import ParameterWatch
+from ...scene.geometry import Geometry
+from ...scene.mitsuba_objects import attributes, is_attribute, is_plain
+
+# Numbers that differ by less (in any component) are the same: colours for the eye, normals but for rounding, since small bends
+# add up over a surface.
+_NORMAL_JUMP, _COLOUR_JUMP = 1e-4, 1e-3
+# Where along an edge the colours of both sides are compared.
+_LOOKED_AT = (0.02, 0.5, 0.98)
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Edges between smooth faces, K of them, by the half-edges (3 * face + corner) of both faces.
+
+    one, other    UInt32 (K,), half-edges
+    ends          ((UInt32 (K,), UInt32 (K,)), likewise): vertices of one and of the other at the edge's first end; at its second
+    """
+
+    one: Any
+    other: Any
+    ends: tuple[tuple[Any, Any], tuple[Any, Any]]
+
+    def mark(self, edges: Any, jump: Any, value: bool = True) -> None:
+        """Set the flags (Bool, 3 F) of the edges for which ``jump`` (Bool, K) holds, on both sides."""
+        dr.scatter(edges, mi.Bool(value), self.one, jump)
+        dr.scatter(edges, mi.Bool(value), self.other, jump)
+
+    def jump(self, values: Any, size: int, least: float, first: int = 0) -> Any:
+        """Bool (K,): whether values of vertices (Float, ``size`` each, from that of ``first`` on) differ by more than that."""
+        found = dr.full(mi.Bool, False, dr.width(self.one))
+        for one, other in self.ends:
+            for k in range(size):
+                a, b = (dr.gather(mi.Float, values, (vertex - first) * size + k) for vertex in (one, other))
+                found |= dr.abs(a - b) > least
+        return found
+
+
+@dataclass(frozen=True)
+class ShadingEdges:
+    """Where shading jumps. A PyTree that may cross ``dr.freeze``.
+
+    always      Bool (3 F,), edges from corner k to k + 1 of a face at which it does whatever moves: at flat faces, between shapes
+    bendable    Bool (3 F,), those of them between flat faces of one shape, at which it only does if the surface is bent there, or
+                None if there are none
+    coloured    as ``always``, and where colours of meshes (attributes, textures, emission) differ: :meth:`with_colours`. None if
+                there is no edge at all at which shading may ever jump
+    folds       as ``bendable``, but for where colours of meshes differ
+    seams       edges of smooth shapes whose faces have vertices of their own there, None if there are none
+    attributed  (number of the shape, the edges of it at which its attributes may differ)
+    textured    (number of the shape, the edges of it at which its texture coordinates may differ)
+    """
+
+    always: Any
+    bendable: Any
+    coloured: Any
+    folds: Any
+    seams: Pairs | None
+    attributed: tuple[tuple[int, Pairs], ...]
+    textured: tuple[tuple[int, Pairs], ...]
+
+    @classmethod
+    def of(cls, geometry: Geometry, topology: Topology, sources: Sequence[Any]) -> ShadingEdges:
+        """Find all edges that may matter (on the host, once)."""
+        shapes = geometry.face_shape.numpy()
+        smooth = np.array([info.has_normals for info in geometry.shapes])
+        # Faces with attributes of their own may differ at any edge, others only where there is more than one vertex at a place.
+        of_faces = np.array([info.reads_attributes for info in geometry.shapes])
+        one, other, ends = _edges(geometry, topology, of_faces[shapes])
+        shape, next_shape = shapes[one // 3], shapes[other // 3]
+        within = shape == next_shape
+        always = np.repeat(~smooth[shapes], 3)
+        bendable = always.copy()
+        always[one[~within]] = always[other[~within]] = True
+        bendable[one[~within]] = bendable[other[~within]] = False
+        own_vertices = (ends[:, :, 0] != ends[:, :, 1]).any(1)
+
+        def pairs(chosen: np.ndarray) -> Pairs:
+            ids = [[device_array(mi.UInt32, ends[chosen, end, side]) for side in range(2)] for end in range(2)]
+            edges = [device_array(mi.UInt32, half[chosen]) for half in (one, other)]
+            return Pairs(*edges, tuple(map(tuple, ids)))
+
+        attributed, textured = [], []
+        plain: dict[Any, bool] = {}
+        doubled = set(np.unique(shape[within & own_vertices]).tolist())
+        for index, (info, source) in enumerate(zip(geometry.shapes, sources, strict=True)):
+            if info.reads_attributes:
+                of_faces = any(name.startswith("face_") for name in attributes(source.shape))
+                chosen = within & (shape == index) & (own_vertices | of_faces)
+                if chosen.any():
+                    attributed.append((index, pairs(chosen)))
+            if info.has_texcoords and index in doubled and _may_vary(source.shape, plain):
+                textured.append((index, pairs(within & (shape == index) & own_vertices)))
+        seams, fixed = within & smooth[shape] & own_vertices, device_array(mi.Bool, always)
+        flat = device_array(mi.Bool, bendable) if bendable.any() else None
+        found = cls(fixed, flat, fixed, flat, pairs(seams) if seams.any() else None, tuple(attributed), tuple(textured))
+        if not attributed and not seams.any() and not always.any():
+            return replace(found, coloured=None)
+        return found.with_colours(geometry, sources)
+
+    def watch(self, sources: Sequence[Any]) -> ParameterWatch:
+        """All on which :meth:`with_colours` depends: attributes, texture coordinates, materials and emission of shapes."""
+        nodes = [sources[index].shape for index, _ in self.attributed]
+        for index, _ in self.textured:
+            shape = sources[index].shape
+            nodes += [shape, shape.bsdf(), *([shape.emitter()] if shape.is_emitter() else [])]
+
+        def counts(node: Any, key: str) -> bool:
+            return not isinstance(node, mi.Shape) or key == "vertex_texcoords" or is_attribute(node, key)
+
+        return ParameterWatch(nodes, counts)
+
+    def with_colours(self, geometry: Geometry, sources: Sequence[Any]) -> ShadingEdges:
+        """The same for the attributes, texture coordinates and textures that meshes have now.
+
+        Texture coordinates that jump are not enough: on both sides of most seams of a texture, there is the same colour.
+        """
+        if not self.attributed and not self.textured:
+            return self
+        edges, folds = mi.Bool(self.always), self.bendable
+        jumps = []
+        with dr.suspend_grad():
+            for index, pairs in self.attributed:
+                info = geometry.shapes[index]
+                for name, values in attributes(sources[index].shape).items():
+                    values = dr.detach(mi.Float(values))
+                    if name.startswith("vertex_"):
+                        size = dr.width(values) // info.vertex_count
+                        jump = pairs.jump(values, size, _COLOUR_JUMP, info.vertex_start)
+                    else:
+                        size = dr.width(values) // info.face_count
+                        faces = (half // 3 - info.face_start for half in (pairs.one, pairs.other))
+                        jump = replace(pairs, ends=(tuple(faces),)).jump(values, size, _COLOUR_JUMP)
+                    jumps.append((pairs, jump))
+            for index, pairs in self.textured:
+                texcoords = mi.Float(sources[index].own().texcoords)
+                first = geometry.shapes[index].vertex_start
+                jumps.append((pairs, _other_colours(sources[index].shape, texcoords, pairs, first)))
+            for pairs, jump in jumps:
+                pairs.mark(edges, jump)
+            if folds is not None:
+                folds = mi.Bool(folds)
+                for pairs, jump in jumps:
+                    pairs.mark(folds, jump, False)
+            dr.eval(edges, folds)
+        return replace(self, coloured=edges, folds=folds)
+
+    def now(self, geometry: Geometry) -> Any:
+        """``Bool`` (3 F,): whether shading jumps at the edge from corner k to k + 1 of a face, with these normals. None if there
+        are no such edges whatever moves. Detached."""
+        if self.seams is None:
+            return self.coloured
+        with dr.suspend_grad():
+            edges, seams = mi.Bool(self.coloured), self.seams
+            seams.mark(edges, seams.jump(dr.detach(geometry.normals), 3, _NORMAL_JUMP))
+            dr.eval(edges)
+        return edges
+
+    def folds_of(self, normals: Any) -> CoplanarCreases | None:
+        """Which of these edges shading jumps at only if the surface is bent there, for normals of flat faces (Float, 4 F)."""
+        return None if self.folds is None else CoplanarCreases(self.folds, normals)
+
+
+def _may_vary(shape: Any, plain: dict[Any, bool]) -> bool:
+    """Whether texture coordinates may decide on what a shape looks like. ``plain``: what is known of materials, kept here."""
+    bsdf = shape.bsdf()
+    if bsdf not in plain:
+        plain[bsdf] = is_plain(bsdf)
+    return not plain[bsdf] or shape.is_emitter()
+
+
+def _other_colours(shape: Any, texcoords: Any, pairs: Pairs, first: int) -> Any:
+    """Bool (K,): whether a shape has different colours on both sides of edges, seen and lit from right above. Detached.
+
+    ``texcoords``: of its own vertices (Float, 2 each), whose first one is vertex ``first``.
+    """
+    ends = [[dr.gather(mi.Point2f, dr.detach(texcoords), v - first) for v in sides] for sides in pairs.ends]
+    places = [dr.lerp(ends[0][side], ends[1][side], t) for t in _LOOKED_AT for side in range(2)]
+    si = dr.zeros(mi.SurfaceInteraction3f, len(places) * dr.width(pairs.one))
+    si.uv = mi.Point2f(*(dr.concat([place[c] for place in places]) for c in range(2)))
+    si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
+    si.sh_frame, si.n, si.wi = mi.Frame3f(mi.Vector3f(0, 0, 1)), mi.Normal3f(0, 0, 1), mi.Vector3f(0, 0, 1)
+    colours = [shape.bsdf().eval(mi.BSDFContext(), si, si.wi)]
+    if shape.is_emitter():
+        colours.append(shape.emitter().eval(si))
+    lane, found = dr.arange(mi.UInt32, dr.width(pairs.one)), dr.full(mi.Bool, False, dr.width(pairs.one))
+    channels = [channel + dr.zeros(mi.Float, dr.width(si.uv)) for colour in colours for channel in mi.UnpolarizedSpectrum(colour)]
+    dr.eval(channels)
+    for channel in channels:
+        for k in range(len(_LOOKED_AT)):
+            one, other = (dr.gather(mi.Float, channel, lane + (2 * k + side) * dr.width(lane)) for side in range(2))
+            found |= dr.abs(one - other) > _COLOUR_JUMP * (1 + dr.abs(one))
+    return found
+
+
+def _edges(geometry: Geometry, topology: Topology, everywhere: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Edges at which two faces meet: half-edges (E,) of one and of the other, vertices (E, ends, sides) at both ends.
+
+    Of faces that are not meant by ``everywhere`` (F,) only those from or to a place where there is more than one vertex.
+    """
+    faces, welded = (a.numpy() for a in (geometry.faces, topology.welded))
+    several = np.zeros(geometry.vertex_count, bool)
+    several[welded[faces != welded]] = True
+    chosen = several[welded]
+    chosen |= chosen.reshape(-1, 3)[:, [1, 2, 0]].ravel()
+    chosen |= np.repeat(everywhere, 3)
+    half = np.flatnonzero(chosen)
+    after = half + np.where(half % 3 == 2, -2, 1)
+    start, end = welded[half].astype(np.int64), welded[after].astype(np.int64)
+    key = np.minimum(start, end) * geometry.vertex_count + np.maximum(start, end)
+    order = np.argsort(key, kind="stable")
+    same = key[order][1:] == key[order][:-1]
+    one, other = order[:-1][same], order[1:][same]
+    first, second = faces[half].astype(np.int64), faces[after].astype(np.int64)
+    # The other's half-edge may run either way.
+    reverse = start[one] != start[other]
+    ends = np.stack([
+        np.stack([first[one], np.where(reverse, second[other], first[other])], 1),
+        np.stack([second[one], np.where(reverse, first[other], second[other])], 1),
+    ], 1)
+    return half[one], half[other], ends

@@ -1,0 +1,194 @@
+"""Many lights of one kind, summed up in a loop on the device.
+
+Written out one after the other, forty lights and their derivatives make a program that takes minutes to compile.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import count
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ..jit.arrays import device_array
+from ..jit.pytree import tree_map
+from ..scene.lights.punctual import DirectionalLight, PointLight, SpotLight
+from ..scene.lights.read import Light, colour_of
+from ..scene.lights.soft_outline import Softened, share_inside
+from ..scene.mitsuba_objects import varies
+from ..scene.sums import attached_parameters, sum_over
+from ..shadow import ShadowMaps, cube_face, visibility
+from .direct_light import passes_gate
+from .gbuffer.surface import Surface
+from .shadow_pass import MapPlan
+
+#: As many lights of a kind, at least, are summed up in a loop.
+MANY_LIGHTS = 8
+
+
+@dataclass(frozen=True)
+class LightTable:
+    """Lights of one kind, K of them.
+
+    Attributes:
+        light: the first one, for its type.
+        numbers: ``Float`` (N K,): N numbers of each, one light after the other. Attached.
+        first: ``UInt32`` (K,), number of each one's first map.
+        cube: whether each has the six maps of a cube.
+    """
+
+    light: Light
+    numbers: Any
+    first: Any
+    cube: bool
+
+    @classmethod
+    def of(cls, lights: Sequence[Light], first: Sequence[int], cube: bool) -> LightTable:
+        """Put them together."""
+        numbers = [number for light in lights for number in _numbers(light)]
+        chosen = [k for k, number in enumerate(numbers) if dr.grad_enabled(number)]
+        if dr.flag(dr.JitFlag.FreezingScope):
+            table = dr.concat([mi.Float(number) for number in numbers])
+        else:
+            dr.eval(numbers)
+            table = device_array(mi.Float, [number[0] for number in numbers])
+            if chosen:
+                attached = dr.concat([numbers[k] for k in chosen]) if len(chosen) > 1 else numbers[chosen[0]]
+                dr.scatter(table, attached, device_array(mi.UInt32, chosen), mode=dr.ReduceMode.NoConflicts)
+        return cls(tree_map(lights[0], dr.detach), table, _indices(first), cube)
+
+    @property
+    def size(self) -> int:
+        """K."""
+        return dr.width(self.first)
+
+    def at(self, index: Any) -> Light:
+        """The light of that number (UInt32, for each lane). Attached."""
+        each, place = dr.width(self.numbers) // self.size, count()
+        row = index * each
+        return tree_map(self.light, lambda array: _filled(array, lambda: dr.gather(mi.Float, self.numbers, row + next(place))))
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where each pixel looks at the lights, N pixels: offsets from what it sees (Vector3f each), detached.
+
+    ``spots``: to the points where visibility is looked up; ``around``: half way to the pixel's corners.
+    """
+
+    spots: list[Any]
+    around: list[Any]
+
+    @classmethod
+    def of(cls, p_world: Any, spots: Sequence[Any], around: Sequence[Any]) -> Places:
+        """From such points (Point3f each)."""
+        middle = dr.detach(p_world)
+        offsets = [[mi.Vector3f(dr.detach(point) - middle) for point in points] for points in (spots, around)]
+        return cls(*offsets)
+
+
+def in_tables(lights: Sequence[Light], plan: MapPlan) -> tuple[list[LightTable], list[int]]:
+    """(tables of the lights of kinds of which there are many, the numbers of the others)."""
+    plain = [_untextured(light) for light in lights]
+    kinds: dict[Any, list[int]] = {}
+    for k, (light, kind) in enumerate(zip(plain, plan.kinds, strict=True)):
+        if light is not None:
+            kinds.setdefault((type(light), kind), []).append(k)
+    many = {kind: members for kind, members in kinds.items() if len(members) >= MANY_LIGHTS}
+    tables = [
+        LightTable.of([plain[k] for k in members], [plan.first[k] for k in members], kind == "cube")
+        for (_, kind), members in many.items()
+    ]
+    taken = {k for members in many.values() for k in members}
+    return tables, [k for k in range(len(lights)) if k not in taken]
+
+
+def many_lights(
+    seen: Surface,
+    lights: Sequence[Light],
+    plan: MapPlan,
+    maps: ShadowMaps | None,
+    spots: Sequence[Any],
+    around: Callable[[], Sequence[Any]],
+    nodes: Sequence[Any],
+) -> tuple[Any, list[int]]:
+    """(radiance towards the camera of lights of kinds of which there are many, the numbers of the other lights).
+
+    ``spots``: points (Point3f (N,) each) where visibility is looked up; ``around``: makes those half way to the pixel's corners.
+    For the other arguments see :func:`light_of_table`. Attached likewise.
+    """
+    tables, others = in_tables(lights, plan)
+    if not tables:
+        return 0, others
+    places = Places.of(seen.p_world, spots, around())
+    return sum(light_of_table(seen, places, table, maps, nodes) for table in tables), others
+
+
+def light_of_table(seen: Surface, places: Places, table: LightTable, maps: ShadowMaps | None, nodes: Sequence[Any]) -> Any:
+    """Radiance (colour, N) towards the camera of all lights of a table. Attached to the surface, lights and maps.
+
+    ``maps`` None: unshadowed. ``nodes``: :meth:`~shadowmap_dr.scene.load.SceneData.materials`.
+    """
+
+    def one_light(index: Any, own: Any, shared: Any) -> Any:
+        (seen, places), (table, maps) = own, shared
+        light: Any = table.at(index)
+        if isinstance(light, SpotLight):
+            inside = share_inside(light, seen.p_world, [seen.p_world + offset for offset in places.around])
+            light = Softened(light, inside)
+        wo_world, weight = light.illuminate(seen.p_world, seen.active)
+        wo = seen.si.to_local(wo_world)
+        active = seen.active & passes_gate(seen, wo_world, wo)
+        value = seen.evaluate(wo, active) * weight
+        if maps is not None:
+            lit = [_visibility(table, maps, index, light, seen.p_world + offset, seen.active) for offset in places.spots]
+            value *= sum(lit) * (1 / len(lit))
+        return dr.select(active, value, 0)
+
+    start = dr.zeros(mi.UnpolarizedSpectrum, dr.width(seen.shape))
+    implicit = [] if seen.colour is not None else attached_parameters(nodes)
+    return sum_over(one_light, table.size, start, (seen, places), (table, maps), implicit, seen.active)
+
+
+def _untextured(light: Light) -> Light | None:
+    """The same light without a texture, of the same colour all over, or None. A spot light always has one in Mitsuba."""
+    if not isinstance(light, SpotLight):
+        return light if isinstance(light, DirectionalLight | PointLight) else None
+    if light.texture is None or varies(light.texture):
+        return light if light.texture is None else None
+    return replace(light, intensity=light.intensity * colour_of(light.texture), texture=None)
+
+
+def _visibility(table: LightTable, maps: ShadowMaps, index: Any, light: Any, p_world: Any, active: Any) -> Any:
+    which = dr.gather(mi.UInt32, table.first, index)
+    if table.cube:
+        position = light.light.position if isinstance(light, Softened) else light.position
+        which += cube_face(dr.detach(mi.Vector3f(p_world - position)))
+    return visibility(maps, which, p_world, active)
+
+
+def _numbers(light: Light) -> list[Any]:
+    """All numbers of a light, in a fixed order."""
+    found: list[Any] = []
+    tree_map(light, lambda array: _filled(array, lambda: None, found))
+    return found
+
+
+def _filled(array: Any, number: Any, found: list[Any] | None = None) -> Any:
+    """An array with other numbers in the place of its own, which are put into ``found`` instead if that is given."""
+    if dr.depth_v(array) > 1:
+        parts = [_filled(part, number, found) for part in array]
+        return array if found is not None else type(array)(*parts)
+    if found is not None:
+        found.append(array)
+        return array
+    return number()
+
+
+def _indices(values: Sequence[int]) -> Any:
+    if dr.flag(dr.JitFlag.FreezingScope):
+        return dr.concat([mi.UInt32(value) for value in values])
+    return device_array(mi.UInt32, values)

@@ -1,0 +1,1 @@
+"""Shadows on a receiver alone, without a camera pass."""

@@ -1,0 +1,95 @@
+"""How a scene is rendered."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from numbers import Integral
+
+from ..errors import ShadowmapError
+from ..shadow import ShadowSettings
+from .film.aovs import AOVS
+
+#: Most samples of one extended light.
+MOST_SAMPLES = 4096
+#: ``max_depth`` of light that is reflected once on its way to the camera.
+DIRECT = 2
+
+
+@dataclass(frozen=True)
+class RenderSettings:
+    """How a scene is rendered.
+
+    Attributes:
+        shadow: see :class:`ShadowSettings`.
+        antialias: anti-alias silhouettes in the image; without it they have no gradient.
+        ambient: radiance of unshadowed light that arrives from everywhere, beside that of the scene's environment.
+        hide_emitters: the camera looks through area lights, and sees black instead of environments, which light the scene all
+            the same.
+        max_depth: 0 is black, 1 shows emitters only, 2 is direct light, as in Mitsuba; more, or -1, is the same as 2.
+        area_light_samples: points on each area light, each with a shadow map.
+        environment_light_samples: directions of an environment, each with a shadow map.
+        soft_map_resolution: texels along each side of these maps.
+        emitter_shadows: ``samples``, or ``single``: one map of ``shadow.resolution`` texels (a power of two) for each area light,
+            from which penumbrae are estimated; fast, and right for simple occluders only.
+        shadow_samples: look-ups along each side of a pixel's footprint (``samples ** 2`` in all), or 0 for 1 where the image is
+            larger than the shadow map, else 2 to 4, one for every two texels of the map that a pixel of the image has.
+        aovs: names of further channels, see :data:`shadowmap_dr.rendering.film.aovs.AOVS`.
+    """
+
+    shadow: ShadowSettings = field(default_factory=ShadowSettings)
+    antialias: bool = True
+    ambient: float = 0.0
+    hide_emitters: bool = False
+    max_depth: int = DIRECT
+    shadow_samples: int = 0
+    area_light_samples: int = 32
+    environment_light_samples: int = 64
+    soft_map_resolution: int = 128
+    emitter_shadows: str = "samples"
+    aovs: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if isinstance(self.aovs, str):
+            raise ShadowmapError(f"aovs is {self.aovs!r}: give names in a tuple, as in ('{self.aovs}',).")
+        for name in self.aovs:
+            if name not in AOVS:
+                raise ShadowmapError(f"There is no AOV '{name}': choose from {', '.join(AOVS)}.")
+        for name in ("shadow_samples", "area_light_samples", "environment_light_samples", "max_depth"):
+            if not isinstance(getattr(self, name), Integral):
+                raise ShadowmapError(f"{name} is {getattr(self, name)!r}: give an integer.")
+        if self.max_depth < -1:
+            raise ShadowmapError(f"max_depth is {self.max_depth}: choose -1 (no limit), or 0 and more.")
+        if not 0 <= self.shadow_samples <= 8:
+            raise ShadowmapError(f"shadow_samples is {self.shadow_samples}: choose 0 (automatic) to 8.")
+        for name in ("area_light_samples", "environment_light_samples"):
+            if not 1 <= getattr(self, name) <= MOST_SAMPLES:
+                raise ShadowmapError(f"{name} is {getattr(self, name)}: choose 1 to {MOST_SAMPLES}.")
+        if self.emitter_shadows not in ("samples", "single"):
+            raise ShadowmapError(f"emitter_shadows is {self.emitter_shadows!r}: choose samples or single.")
+        size = self.shadow.resolution
+        if self.emitter_shadows == "single" and (size < 8 or size & (size - 1)):
+            raise ShadowmapError(f"shadow map resolution is {size}; with emitter_shadows 'single' choose a power of two from 8")
+        if self.shadow.method != "none":
+            _ = self.soft_shadow  # whether such maps can be
+        if not (self.ambient >= 0 and self.ambient < float("inf")):
+            raise ShadowmapError(f"ambient is {self.ambient}: give a finite radiance of at least 0.")
+
+    @property
+    def lit(self) -> bool:
+        """Whether surfaces reflect light."""
+        return not 0 <= self.max_depth < DIRECT
+
+    def look_ups(self, width: int) -> int:
+        """Look-ups along each side of a pixel's footprint in images of this many columns of samples."""
+        if self.shadow_samples:
+            return self.shadow_samples
+        return 1 if width > self.shadow.resolution else min(max(2, self.shadow.resolution // (2 * width)), 4)
+
+    @property
+    def soft_shadow(self) -> tuple[ShadowSettings, ShadowSettings]:
+        """Settings of the maps of extended lights: those of samples, and single ones."""
+        try:
+            sampled = replace(self.shadow, resolution=self.soft_map_resolution)
+        except ValueError as error:
+            raise ShadowmapError(f"{error} (soft_map_resolution)") from None
+        return sampled, replace(self.shadow, method="vsm", filter="none", filter_size=1, supersampling=1, compat=False)

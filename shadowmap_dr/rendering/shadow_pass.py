@@ -1,0 +1,304 @@
+"""Which shadow maps a scene's lights need, where their cameras are, and what each pixel asks of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..errors import ShadowmapError
+from ..jit.arrays import device_array
+from ..raster import RasterOutput, Topology
+from ..scene.geometry import Geometry
+from ..scene.lights.projected import Beam, Projector
+from ..scene.lights.punctual import DirectionalLight, PointLight, SpotLight
+from ..scene.lights.read import Light
+from ..shadow import (
+    Boxes,
+    Frusta,
+    LightView,
+    ShadowMaps,
+    ShadowSettings,
+    casting_shapes,
+    cube_face,
+    cube_views,
+    directional_view,
+    filter_maps,
+    fit_frusta,
+    render_maps,
+    shape_bounds,
+    shape_boxes,
+    spot_view,
+    stack_views,
+    vertices_in_maps,
+    visibility,
+)
+
+#: Spot lights and projectors with a wider cone (half-angle in degrees) use the faces of a cube.
+WIDEST_SPOT = 60.0
+# Half-angle in degrees that one map covers, whatever becomes of its light.
+_WIDEST_MAP = 80.0
+# Casters of a beam's shadows are as far from its shape, at least, in units of its reach: it must not shadow itself.
+_BEAM_START = 1e-3
+
+
+@dataclass(frozen=True)
+class MapPlan:
+    """The maps of each light. Static, made once for a scene.
+
+    ``kinds``: ``directional``, ``beam``, ``spot`` (one map each) or ``cube`` (six). ``first``: number of each light's first map.
+    ``planes``: the largest face (index) of each planar shape, any of others. ``planar``: Bool (S,).
+    ``center``, ``radius``: a sphere around the scene at rest, world space, for the fixed frusta of ``compat``.
+    """
+
+    kinds: tuple[str, ...]
+    first: tuple[int, ...]
+    planes: Any
+    planar: Any
+    center: tuple[float, float, float]
+    radius: float
+
+    @property
+    def maps(self) -> int:
+        """How many maps there are."""
+        return sum(6 if kind == "cube" else 1 for kind in self.kinds)
+
+
+def plan_maps(lights: Sequence[Light], geometry: Geometry) -> MapPlan:
+    """Decide (on the host, once) which maps the lights need and what is known about the shapes."""
+    kinds = tuple(_kind_of(light) for light in lights)
+    sizes = [6 if kind == "cube" else 1 for kind in kinds]
+    positions = dr.detach(geometry.positions).numpy().reshape(-1, 3)
+    faces = geometry.faces.numpy().reshape(-1, 3)
+    planes = []
+    for info in geometry.shapes:
+        largest = 0
+        if info.planar:
+            own = positions[faces[info.face_start : info.face_start + info.face_count]].astype(np.float64)
+            largest = int(np.argmax(np.linalg.norm(np.cross(own[:, 1] - own[:, 0], own[:, 2] - own[:, 0]), axis=1)))
+        planes.append(info.face_start + largest)
+    columns = [column.astype(np.float64) for column in positions.T]
+    center = [0.5 * (column.min() + column.max()) for column in columns]
+    return MapPlan(
+        kinds,
+        tuple(int(n) for n in np.cumsum([0, *sizes])[:-1]),
+        device_array(mi.UInt32, planes),
+        device_array(mi.Bool, [info.planar for info in geometry.shapes]),
+        tuple(float(c) for c in center),
+        float(np.sqrt(sum((column - middle) ** 2 for column, middle in zip(columns, center, strict=True)).max())) or 1.0,
+    )
+
+
+def check_sizes(maps: int, texels: int, geometry: Geometry, lights: str, remedy: str) -> None:
+    """Refuse (ShadowmapError) maps that would not fit into arrays: lanes are counted with 32 bits.
+
+    Args:
+        maps: how many there are.
+        texels: along each side of one of them.
+        geometry: the scene's.
+        lights: whose maps they are, for the message.
+        remedy: what to do about it, for the message.
+    """
+    if maps * max(geometry.vertex_count, geometry.face_count, 4 * texels * texels) >= 2**31:
+        raise ShadowmapError(
+            f"{maps} shadow maps of {lights}, {texels} x {texels} texels, {geometry.face_count} triangles, are too many: "
+            f"{remedy}."
+        )
+
+
+def _kind_of(light: Light) -> str:
+    if isinstance(light, DirectionalLight):
+        return "directional"
+    if isinstance(light, Beam):
+        return "beam"
+    if isinstance(light, PointLight):
+        return "cube"
+    half_angle = dr.atan(light.spread) * (180 / math.pi) if isinstance(light, Projector) else light.cutoff_angle
+    return "spot" if float(dr.max(dr.detach(half_angle))[0]) <= WIDEST_SPOT else "cube"
+
+
+def _spread(light: SpotLight | Projector) -> Any:
+    """Tangent of the half-angle that its map has to cover (Float), detached."""
+    if isinstance(light, Projector):
+        return dr.detach(light.spread)
+    # A light of one map that has become wider since is lit beyond it.
+    return dr.tan(dr.minimum(dr.detach(light.cutoff_angle), _WIDEST_MAP) * (math.pi / 180))
+
+
+def make_maps(
+    plan: MapPlan,
+    lights: Sequence[Light],
+    geometry: Geometry,
+    topology: Topology,
+    settings: ShadowSettings,
+    previous: Frusta | None,
+    transparent: Callable[[RasterOutput], Any] | None = None,
+    seen: Any = None,
+    outward: Any = None,
+) -> ShadowMaps:
+    """Render and filter the maps of all lights as one batch. Attached to lights and vertices.
+
+    ``transparent`` is the alpha test of :func:`shadowmap_dr.raster.rasterize`, ``previous`` the fit of an earlier call,
+    ``seen`` points on what the cameras see (Point3f, world space) and a mask of those that count, ``outward`` faces (Bool, F) of
+    which the maps of directional lights show the fronts only (:func:`shadowmap_dr.raster.outward_faces`).
+    """
+    views = [view for light, kind in zip(lights, plan.kinds, strict=True) for view in _views(plan, light, kind, settings)]
+    stacked = stack_views(views)
+    p_light, lanes, vertex = vertices_in_maps(stacked, geometry.positions)
+    if settings.compat:
+        frusta = _compat_frusta(plan, stacked)
+    else:
+        shapes = len(geometry.shapes)
+        shape = dr.gather(mi.UInt32, geometry.vertex_shape, vertex)
+        planes, planar = shape_planes(plan, geometry)
+        bounds = shape_bounds(stacked, _within_beams(plan, lights, p_light, lanes), lanes, shape, shapes)
+        frusta = fit_frusta(
+            stacked,
+            bounds,
+            casting_shapes(stacked, planes, planar, boxes_of(geometry)),
+            shapes,
+            settings.resolution,
+            settings.filter_size,
+            previous,
+            seen,
+            settings.receiver_range,
+        )
+        frusta = _from_beams_on(plan, lights, frusta)
+    culled = None if transparent is not None else _culled(plan, stacked.count, outward)
+    maps = render_maps(p_light, lanes, geometry.faces, topology, stacked, frusta, settings, transparent, culled)
+    return filter_maps(maps)
+
+
+def _culled(plan: MapPlan, count: int, outward: Any) -> Any:
+    """Faces of each map (Bool, for all maps or for all faces of each) of which only fronts are drawn, or None.
+
+    Only the maps of directional lights begin before all casters: others may begin inside of one, and see its backs.
+    """
+    directional = [first for kind, first in zip(plan.kinds, plan.first, strict=True) if kind == "directional"]
+    if outward is None or not directional:
+        return None
+    if len(directional) == count:
+        return outward
+    faces = dr.width(outward)
+    lane = dr.arange(mi.UInt32, count * faces)
+    which = lane // faces
+    chosen = mi.Bool(False)
+    for first in directional:
+        chosen |= which == first
+    return chosen & dr.gather(mi.Bool, outward, lane - which * faces)
+
+
+def _views(plan: MapPlan, light: Light, kind: str, settings: ShadowSettings) -> tuple[LightView, ...]:
+    if kind == "cube":
+        return cube_views(mi.Point3f(light.position), settings.resolution, settings.filter_size)
+    if kind == "directional":
+        view = directional_view(mi.Vector3f(light.direction))
+        if not settings.compat:
+            return (view,)
+        # The authors' camera stands outside of the scene, facing its centre.
+        origin = mi.Point3f(*plan.center) - view.forward * (2 * plan.radius)
+        return (LightView(view.right, view.up, view.forward, origin, view.spread),)
+    if isinstance(light, Beam):
+        view = directional_view(light.direction)
+        return (LightView(view.right, view.up, view.forward, mi.Vector3f(light.position), view.spread),)
+    assert isinstance(light, SpotLight | Projector)
+    matrix = light.to_world.matrix
+    right, up, forward = (dr.normalize(mi.Vector3f(matrix[0, k], matrix[1, k], matrix[2, k])) for k in range(3))
+    return (spot_view(light.position, right, up, forward, _spread(light)),)
+
+
+def _within_beams(plan: MapPlan, lights: Sequence[Light], p_light: Any, map_index: Any) -> Any:
+    """Light-space points, moved to the nearest that a beam can reach in the maps of beams."""
+    result = p_light
+    for k, light in enumerate(lights):
+        if isinstance(light, Beam):
+            reach, start = dr.detach(light.reach), _start_of(light)
+            x, y = dr.clip(p_light.x, -reach, reach), dr.clip(p_light.y, -reach, reach)
+            moved = type(p_light)(x, y, dr.maximum(p_light.z, start))
+            result = dr.select(map_index == plan.first[k], moved, result)
+    return result
+
+
+def _start_of(light: Beam) -> Any:
+    """How far from a beam's shape (Float, detached) its casters begin: beyond what rounding may do to the shape itself."""
+    place = dr.detach(light.position)
+    far = dr.maximum(dr.maximum(dr.abs(place.x), dr.abs(place.y)), dr.abs(place.z))
+    return dr.fma(_BEAM_START, dr.detach(light.reach), 1e-5 * far)
+
+
+def _from_beams_on(plan: MapPlan, lights: Sequence[Light], frusta: Frusta) -> Frusta:
+    """Frusta that begin in front of a beam's shape, so that what lies behind it casts no shadow, nor the shape itself."""
+    if "beam" not in plan.kinds:
+        return frusta
+    index = dr.arange(mi.UInt32, dr.width(frusta.near))
+    start = mi.Float(-dr.inf)
+    for light, first in zip(lights, plan.first, strict=True):
+        if isinstance(light, Beam):
+            start = dr.select(index == first, _start_of(light), start)
+    near = dr.maximum(frusta.near, start)
+    first = dr.maximum(frusta.first, near)
+    least = first + 0.1 * dr.maximum(start, 0)
+    frusta = replace(frusta, near=near, first=first, far=dr.maximum(frusta.far, least), last=dr.maximum(frusta.last, least))
+    dr.eval(frusta)
+    return frusta
+
+
+def _compat_frusta(plan: MapPlan, views: Any) -> Frusta:
+    """Fixed frusta that hold the whole scene, whatever moves in it."""
+    spread = dr.detach(views.spread)
+    zero = dr.zeros(mi.Float, views.count)
+    half = dr.select(spread > 0, spread, 1.2 * plan.radius)
+    near, far = zero + 0.01 * plan.radius, zero + 4 * plan.radius
+    return Frusta(zero, zero, half, half, near, far, near, far)
+
+
+def boxes_of(geometry: Geometry) -> Boxes:
+    """Boxes of the shapes where they are now."""
+    vertex = dr.arange(mi.UInt32, geometry.vertex_count)
+    p_world = dr.gather(mi.Point3f, dr.detach(geometry.positions), vertex)
+    return shape_boxes(p_world, geometry.vertex_shape, len(geometry.shapes))
+
+
+def shape_planes(plan: MapPlan, geometry: Geometry) -> tuple[tuple[Any, Any], Any]:
+    """((unit normal, point), whether it is one (Bool)) of the plane of each shape where it is now, detached, world space."""
+    planes = _planes(plan, geometry)
+    return planes, _still_planar(plan, geometry, planes)
+
+
+def _planes(plan: MapPlan, geometry: Geometry) -> tuple[Any, Any]:
+    """(unit normal, point) of each planar shape where it is now, detached, world space."""
+    with dr.suspend_grad():
+        corners = dr.gather(mi.Vector3u, geometry.faces, plan.planes)
+        a, b, c = (dr.gather(mi.Point3f, dr.detach(geometry.positions), corners[k]) for k in range(3))
+        normal = dr.cross(b - a, c - a)
+        length = dr.norm(normal)
+        return normal / dr.select(length > 0, length, 1), a
+
+
+def _still_planar(plan: MapPlan, geometry: Geometry, planes: tuple[Any, Any]) -> Any:
+    """Which of the shapes that were planar at rest still are (Bool, S): vertices may have moved out of the plane since."""
+    if all(not info.planar or geometry.known_unchanged(info) for info in geometry.shapes):
+        return plan.planar
+    with dr.suspend_grad():
+        vertex = dr.arange(mi.UInt32, geometry.vertex_count)
+        shape = geometry.vertex_shape
+        p = dr.gather(mi.Point3f, dr.detach(geometry.positions), vertex)
+        normal, point = (mi.Vector3f(*(dr.gather(mi.Float, v[c], shape) for c in range(3))) for v in planes)
+        farthest = dr.zeros(mi.Float, len(geometry.shapes))
+        dr.scatter_reduce(dr.ReduceOp.Max, farthest, dr.abs(dr.dot(normal, mi.Vector3f(p) - point)), shape)
+        return plan.planar & (farthest <= 1e-4 * plan.radius)
+
+
+def light_visibility(maps: ShadowMaps, plan: MapPlan, light: Light, index: int, p_world: Any, active: Any) -> Any:
+    """Visibility (Float) of light number ``index`` from world-space points. Attached to points, casters and light."""
+    # Wide, although it is one number: adjoints of look-ups with it then run in one kernel, others in one for each number.
+    which: Any = dr.full(mi.UInt32, plan.first[index], dr.width(p_world))
+    if plan.kinds[index] == "cube":
+        offset = dr.detach(mi.Vector3f(p_world - light.position))
+        which = plan.first[index] + cube_face(offset)
+    return visibility(maps, which, p_world, active)

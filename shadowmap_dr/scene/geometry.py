@@ -1,0 +1,336 @@
+"""One merged triangle soup of a scene, in world space, and its vertex normals.
+
+The soup is what the rasterizer draws, from the camera and from the lights alike. Its static part (faces, texture coordinates,
+which shape a triangle belongs to) is separate from the two buffers that move (positions and normals), so that a step of an
+optimisation replaces the latter only and never touches Mitsuba's meshes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..errors import ShadowmapError
+from ..jit.arrays import backend
+from ..jit.broadcast import copy_of_lane, in_copies
+from ..jit.vectors import normalize_or
+
+NO_TRIANGLE = 0xFFFFFFFF
+"""Triangle index that means "nothing was hit"."""
+
+# Shapes are told apart by comparing with each of a list, as long as that is cheaper than what it saves.
+_MANY_SHAPES = 8
+
+HAS_NORMALS = 1
+HAS_TEXCOORDS = 2
+FLIP_GEOMETRIC = 4
+FLIP_SHADING = 8
+READS_ATTRIBUTES = 16
+FACETED = 32
+# Bits of ``Geometry.face_info`` that hold flags; the shape's index lies above them.
+_FLAG_BITS = 8
+
+
+@dataclass(frozen=True)
+class ShapeInfo:
+    """What is known about a shape without looking at its buffers. All fields are static.
+
+    ``name`` is the Mitsuba id (``instance.child`` for an instanced shape). The shape owns vertices
+    ``vertex_start .. vertex_start + vertex_count`` and faces ``face_start .. face_start + face_count`` of the soup.
+    ``flip_geometric`` says that its geometric normal is *minus* (p1 - p0) x (p2 - p0), ``flip_shading`` that vertex normals
+    are negated before use. ``reads_attributes``: it has mesh attributes, which Mitsuba finds through rest-pose positions.
+    ``planar``: all its vertices lay in one plane when the scene was loaded. ``see_through``: its BSDF (``mask``, ``null``) lets
+    some light pass straight on, as ``shading.opacity`` tells for each point. ``faceted``: its vertex normals were those of its
+    faces, as on a cube or rectangle, when the scene was loaded. ``against_winding``: its vertex normals, before ``flip_shading``,
+    are on the other side of (p1 - p0) x (p2 - p0), and stay there when its vertices are replaced.
+    """
+
+    name: str
+    plugin: str
+    vertex_start: int
+    vertex_count: int
+    face_start: int
+    face_count: int
+    has_normals: bool
+    has_texcoords: bool
+    flip_geometric: bool = False
+    flip_shading: bool = False
+    reads_attributes: bool = False
+    planar: bool = False
+    see_through: bool = False
+    faceted: bool = False
+    against_winding: bool = False
+
+    @property
+    def flags(self) -> int:
+        """The booleans as bits, for ``Geometry.face_info``."""
+        return (
+            HAS_NORMALS * self.has_normals
+            + HAS_TEXCOORDS * self.has_texcoords
+            + FLIP_GEOMETRIC * self.flip_geometric
+            + FLIP_SHADING * self.flip_shading
+            + READS_ATTRIBUTES * self.reads_attributes
+            + FACETED * self.faceted
+        )
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """All triangles of a scene: V vertices, F faces, S shapes. A PyTree that may cross ``dr.freeze``.
+
+    positions      Float  (3V,)  world space, may carry gradients
+    normals        Float  (3V,)  unit vertex normals, world space, may carry gradients; zero for shapes without
+    texcoords      Float  (2V,)  zero for shapes without
+    rest_positions Float  (3V,)  positions as Mitsuba holds them, in the shape's own space, attached to Mitsuba's buffers (so that
+                                 these cancel where barycentrics are recovered); None when no shape has mesh attributes
+    faces          UInt32 (3F,)  indices into the vertices of the whole soup
+    face_shape     UInt32 (F,)   index of the shape
+    face_info      UInt32 (F,)   index and flags of the shape, see ``shape_and_flags``
+    vertex_shape   UInt32 (V,)
+    shape_face_start  UInt32 (S,)  ``ShapeInfo.face_start`` as an array
+    changed        names of the shapes that ``with_positions`` replaced, if only their vertices may carry gradients; else None
+    as_loaded      whether the other shapes are as they were when the scene was loaded
+    stand_ins      UInt32 (V,) which vertex each one's place is taken from, None if all have faces: those without, which nobody
+                   sees, lie where another one of their shape does, so that they stretch no bounds (``settled``)
+    packets        Float (4V,), positions with a fourth number, through which derivatives take the way back (``in_packets``)
+    copies         of packets, normals and texture coordinates, one after the other, one for each block of lanes
+    """
+
+    positions: Any
+    normals: Any
+    texcoords: Any
+    rest_positions: Any
+    faces: Any
+    face_shape: Any
+    face_info: Any
+    vertex_shape: Any
+    shape_face_start: Any
+    shapes: tuple[ShapeInfo, ...]
+    changed: tuple[str, ...] | None = None
+    as_loaded: bool = False
+    stand_ins: Any = None
+    packets: Any = None
+    copies: int = 1
+
+    @property
+    def vertex_count(self) -> int:
+        """Number of vertices of all shapes."""
+        last = self.shapes[-1]
+        return last.vertex_start + last.vertex_count
+
+    @property
+    def face_count(self) -> int:
+        """Number of triangles of all shapes."""
+        last = self.shapes[-1]
+        return last.face_start + last.face_count
+
+    def shape(self, name: str) -> ShapeInfo:
+        """The shape called ``name``; raises ``ShadowmapError`` listing the known names otherwise."""
+        for info in self.shapes:
+            if info.name == name:
+                return info
+        known = ", ".join(repr(info.name) for info in self.shapes)
+        raise ShadowmapError(f"There is no shape '{name}' in the scene; its shapes are {known}.")
+
+    def shape_positions(self, name: str) -> Any:
+        """Positions of one shape as Point3f (Vs,), world space, attached."""
+        info = self.shape(name)
+        return dr.gather(mi.Point3f, self.positions, dr.arange(mi.UInt32, info.vertex_count) + info.vertex_start)
+
+    def shape_and_flags(self, triangle: Any, active: Any) -> tuple[Any, Any]:
+        """(index of the shape, its ``ShapeInfo.flags``), UInt32 each, for each triangle."""
+        info = dr.gather(mi.UInt32, self.face_info, triangle, active)
+        return info >> _FLAG_BITS, info & (2**_FLAG_BITS - 1)
+
+    def has_changed(self, shape: Any) -> Any:
+        """Bool: which of these shapes (UInt32, index) may have been replaced. The others' vertices carry no gradients."""
+        if self.changed is None:
+            return mi.Bool(True)
+        chosen = [info.name in self.changed for info in self.shapes]
+        wanted = sum(chosen) <= len(chosen) // 2
+        listed = [k for k, value in enumerate(chosen) if value == wanted]
+        if len(listed) > _MANY_SHAPES:
+            return mi.Bool(True)
+        found = mi.Bool(False)
+        for k in listed:
+            found |= shape == k
+        return found if wanted else ~found
+
+    def known_unchanged(self, info: ShapeInfo) -> bool:
+        """Whether a shape is known (on the host) to be as it was when the scene was loaded."""
+        return self.as_loaded and self.changed is not None and info.name not in self.changed
+
+    def in_packets(self, lanes: int) -> Geometry:
+        """The same geometry, prepared for look-ups of attached positions, normals and texture coordinates by so many lanes.
+
+        Sums over packets of four numbers run several times faster than those of three.
+        """
+        packets = self.packets
+        if dr.grad_enabled(self.positions):
+            p = dr.gather(mi.Point3f, self.positions, dr.arange(mi.UInt32, self.vertex_count))
+            packets = dr.ravel(mi.Point4f(p.x, p.y, p.z, 0))
+        buffers = [array for array in (packets, self.normals, self.texcoords) if array is not None]
+        made, copies = in_copies(buffers, lanes)
+        if copies == 1:
+            return replace(self, packets=packets)
+        *first, normals, texcoords = made
+        return replace(self, packets=first[0] if first else None, normals=normals, texcoords=texcoords, copies=copies)
+
+    def row_of_copy(self, lanes: int) -> Any:
+        """First row (UInt32) of the copy of vertices that each of so many lanes reads; a constant if there is but one copy."""
+        return copy_of_lane(backend(self.faces), lanes, self.copies) * self.vertex_count
+
+    def vertices(self, index: Any, active: Any = True, changed: Any = None, row: Any = 0) -> Any:
+        """Positions (Point3f) of vertices (UInt32); gradients flow only where they may have ``changed`` (None: anywhere).
+
+        ``row``: :meth:`row_of_copy` of the lanes, if they are those that the copies were made for.
+        """
+        p = dr.gather(mi.Point3f, self.positions, index, active)
+        if not dr.grad_enabled(self.positions):
+            return p
+        changed = active if changed is None else changed
+        if self.packets is None:
+            return dr.replace_grad(p, dr.gather(mi.Point3f, self.positions, index, changed))
+        q = dr.gather(mi.Point4f, self.packets, index + row, changed)
+        return dr.replace_grad(p, mi.Point3f(q.x, q.y, q.z))
+
+    def with_positions(self, positions: Mapping[str, Any]) -> Geometry:
+        """Replace the positions of some shapes; returns a new Geometry, this one is left as it was.
+
+        Each value is the world-space positions of all Vs vertices of the shape: Float (3Vs,) interleaved as xyzxyz...,
+        TensorXf or NumPy array (Vs, 3), or Point3f/Vector3f (Vs,). Gradients flow through. Normals of shapes that have them
+        are computed anew with Mitsuba's angle weighting (``vertex_normals``), attached. Sizes must be those of the scene.
+        """
+        if not isinstance(positions, Mapping):
+            raise ShadowmapError(f"vertex_positions is a {type(positions).__name__}: give a dictionary of the shapes' names.")
+        if not positions:
+            return self
+        changed = self.changed
+        if changed is None and not dr.grad_enabled(self.positions, self.normals):
+            changed = ()
+        if changed is not None:
+            changed = tuple(sorted({*changed, *positions}))
+        merged = self.positions
+        for name, value in positions.items():
+            info = self.shape(name)
+            value = _checked_positions(name, value, info.vertex_count)
+            merged = _write_vertices(merged, value, info.vertex_start, info.vertex_count, self.vertex_count)
+        normals = self.normals
+        for name in positions:
+            info = self.shape(name)
+            if info.has_normals:
+                smooth = vertex_normals(merged, _faces_of(self.faces, info), self.vertex_count)
+                own = dr.arange(mi.UInt32, info.vertex_count) + info.vertex_start
+                smooth = dr.gather(mi.Normal3f, smooth, own) * (-1 if info.against_winding else 1)
+                normals = _write_vertices(normals, smooth, info.vertex_start, info.vertex_count, self.vertex_count)
+        return replace(self, positions=self.settled(merged), normals=normals, changed=changed, packets=None)
+
+    def settled(self, positions: Any) -> Any:
+        """Positions (Float, 3V) of which those of vertices without faces are another vertex's."""
+        return positions if self.stand_ins is None else dr.ravel(dr.gather(mi.Point3f, positions, self.stand_ins))
+
+
+def vertex_normals(positions: Any, faces: Any, vertex_count: int) -> Any:
+    """Smooth unit vertex normals: face normals weighted by the angle at the vertex, as Mitsuba does.
+
+    positions Float (3V,), any space; faces Vector3u (F,). Returns Float (3V,). Where the face normals of a vertex cancel, or it
+    has no faces, the result is (1, 0, 0), as Mitsuba's. Gradients flow to positions.
+    Source: Thuermer and Wuethrich, "Computing Vertex Normals from Polygonal Facets", 1998.
+    """
+    p0, p1, p2 = (dr.gather(mi.Point3f, positions, faces[i]) for i in range(3))
+    e01, e02, e12 = p1 - p0, p2 - p0, p2 - p1
+    n = dr.cross(e01, e02)
+    n_squared = dr.squared_norm(n)
+    valid = n_squared > 0
+    # |e_i x e_j| is the same (twice the area) at all three corners, so the angles need one square root only.
+    area2 = dr.sqrt(dr.select(valid, n_squared, 1.0))
+    n = dr.select(valid, n / area2, 0.0)
+    angles = (dr.atan2(area2, dr.dot(e01, e02)), dr.atan2(area2, -dr.dot(e01, e12)), dr.atan2(area2, dr.dot(e02, e12)))
+    total = dr.zeros(mi.Float, 3 * vertex_count)
+    for corner, angle in enumerate(angles):
+        dr.scatter_add(total, n * angle, faces[corner], active=valid)
+    total = dr.unravel(mi.Vector3f, total)
+    # The weights are angles: a sum of this size is the rounding error of faces that lie back to back.
+    total = dr.select(dr.squared_norm(total) > 1e-10, total, 0.0)
+    return dr.ravel(normalize_or(total, mi.Vector3f(1.0, 0.0, 0.0)))
+
+
+def with_faces(faces: np.ndarray, count: int) -> np.ndarray:
+    """Which of ``count`` vertices belong to any of the faces (F, 3), bool."""
+    found = np.zeros(count, np.bool_)
+    found[faces] = True
+    return found
+
+
+def stand_ins(
+    faces: np.ndarray, vertex_shape: np.ndarray, shapes: tuple[ShapeInfo, ...], meshes: np.ndarray
+) -> np.ndarray | None:
+    """``Geometry.stand_ins``, uint32 (V,), for faces (F, 3) and each vertex's shape (V,).
+
+    ``meshes`` (S,) tells which shapes come from elsewhere: all vertices of what is tessellated here lie on their surfaces.
+    """
+    used = with_faces(faces, len(vertex_shape)) | ~meshes[vertex_shape]
+    if used.all():
+        return None
+    some = faces[[info.face_start for info in shapes], 0]
+    return np.where(used, np.arange(len(used)), some[vertex_shape]).astype(np.uint32)
+
+
+def pack_face_info(shapes: tuple[ShapeInfo, ...]) -> np.ndarray:
+    """``Geometry.face_info``, uint32 (F,), for shapes in the order of the soup."""
+    packed = [(index << _FLAG_BITS) + info.flags for index, info in enumerate(shapes)]
+    return np.repeat(np.array(packed, np.uint32), [info.face_count for info in shapes])
+
+
+def _faces_of(faces: Any, info: ShapeInfo) -> Any:
+    return dr.gather(mi.Vector3u, faces, dr.arange(mi.UInt32, info.face_count) + info.face_start)
+
+
+def _checked_positions(name: str, value: Any, count: int) -> Any:
+    """Bring positions to Float (3Vs,) or an array of three components; sizes are known without evaluating anything."""
+    if not dr.is_array_v(value):
+        try:
+            value = mi.TensorXf(np.asarray(value, np.float32))  # Dr.Jit never comes back from a string
+        except (TypeError, ValueError) as error:
+            raise ShadowmapError(f"Positions of shape '{name}' are {value!r:.60}: give an array of {count} points.") from error
+    if dr.is_tensor_v(value):
+        if tuple(value.shape) not in ((count, 3), (3 * count,)):
+            raise ShadowmapError(
+                f"Positions of shape '{name}' have the tensor shape {tuple(value.shape)}, but it has {count} vertices: "
+                f"give a tensor of shape ({count}, 3)."
+            )
+        value = value.array
+    if dr.depth_v(value) == 2 and dr.size_v(value) == 3:
+        if dr.width(value) not in (1, count):
+            raise ShadowmapError(
+                f"Positions of shape '{name}' are an array of {dr.width(value)} points, but it has {count} vertices."
+            )
+        return mi.Point3f(value)
+    if dr.depth_v(value) != 1 or dr.width(value) != 3 * count:
+        raise ShadowmapError(
+            f"Positions of shape '{name}' are an array of {dr.width(value)} numbers, but {count} vertices need {3 * count}."
+        )
+    return mi.Float(value)
+
+
+def _write_vertices(target: Any, value: Any, start: int, count: int, total: int) -> Any:
+    """A copy of the flat buffer ``target`` with ``count`` vertices from ``start`` on replaced, differentiable in both."""
+    points = dr.size_v(value) == 3
+    if start == 0 and count == total:
+        return dr.ravel(value) if points and dr.width(value) == count else _fill(value, count)
+    result = type(target)(target)
+    index = dr.arange(mi.UInt32, count if points else 3 * count) + (start if points else 3 * start)
+    # Not ``Permute``: that promises that all of the target is written, and its gradient would be dropped.
+    dr.scatter(result, value, index, mode=dr.ReduceMode.NoConflicts)
+    return result
+
+
+def _fill(value: Any, count: int) -> Any:
+    if dr.size_v(value) == 3:
+        return dr.ravel(dr.gather(mi.Point3f, dr.ravel(value), dr.zeros(mi.UInt32, count)))
+    return value

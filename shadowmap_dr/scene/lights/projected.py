@@ -1,0 +1,186 @@
+"""Projectors, and flat shapes that shine straight."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ...jit.vectors import normalize_or
+from .light import axis, picture, towards, translation
+from .soft_outline import BoundedLight, share_inside
+
+# Width of the rim in which light fades, half of it on either side of the outline: through it a moving outline has derivatives.
+# In units of the picture, and of the narrower half of a beam's cross-section. In images it is at least as wide as a pixel.
+_PICTURE_RIM = 1 / 1024
+_BEAM_RIM = 0.005
+
+
+@dataclass(frozen=True)
+class Projector(BoundedLight):
+    """A picture thrown along the local +z axis: Mitsuba's ``projector``.
+
+    to_world    Transform4f
+    irradiance  ``mi.Texture``: the picture, as irradiance on a plane at local z = 1 (times pi, as Mitsuba has it)
+    scale       Float, factor of the irradiance
+    tangents    Vector2f, of the half-angles that the picture covers, in local x and y
+    falloff_width  width of the rim in which the light fades, half of it on either side of the outline, in units of the picture's
+                width and height. Through it a moving outline has derivatives. Elsewhere all is as in Mitsuba.
+    """
+
+    name: str
+    to_world: Any
+    irradiance: Any
+    scale: Any
+    tangents: Any
+    falloff_width: float = _PICTURE_RIM
+    widest: float = 0.5
+
+    @property
+    def position(self) -> Any:
+        """Point3f, world space."""
+        return translation(self.to_world)
+
+    @property
+    def direction(self) -> Any:
+        """Vector3f, unit axis, the direction in which light travels, world space."""
+        return dr.normalize(axis(self.to_world, 2))
+
+    @property
+    def spread(self) -> Any:
+        """Float, tangent of the half-angle of the smallest cone about the axis with a square base that holds the picture."""
+        x, y, z = (dr.norm(axis(self.to_world, k)) for k in range(3))
+        return dr.maximum(self.tangents.x * x, self.tangents.y * y) * (1 + self.falloff_width) / z
+
+    def illuminate(self, p_world: Any, active: Any = True, inside: Any = None) -> tuple[Any, Any]:
+        """(wo, weight): unit direction to the projector (Vector3f), and its irradiance (colour) on a surface that faces it.
+
+        ``p_world`` Point3f (N,), world space. ``inside``: share of the light at the outline (:func:`share_inside`), Float (N,).
+        Attached to points, to_world, picture, scale and tangents.
+        """
+        wo, _ = towards(p_world, self.position)
+        local, uv = self._local(p_world)
+        inside = share_inside(self, p_world) if inside is None else inside
+        lit = mi.Bool(active) & (local.z > 0) & (inside > 0)
+        z = dr.select(lit, local.z, 1.0)
+        cosine = dr.select(lit, -dr.dot(axis(self.to_world, 2), wo), 1.0)
+        weight = picture(self.irradiance, dr.clip(uv, 0, 1), lit) * inside * (dr.pi * self.scale / (dr.square(z) * cosine))
+        return wo, dr.select(lit, weight, 0)
+
+    def distances(self, p_world: Any) -> list[Any]:
+        """Distances from the edges that bound the light (Float), positive inside, in units of ``falloff_width``. Attached."""
+        _, uv = self._local(p_world)
+        return [0.5 - dr.abs(uv[k] - 0.5) for k in range(2)]
+
+    def _local(self, p_world: Any) -> tuple[Any, Any]:
+        """Place in the projector's own space, and in the picture."""
+        local = dr.rcp(mi.Matrix3f(self.to_world.matrix)) @ mi.Vector3f(p_world - self.position)
+        z = dr.select(local.z > 0, local.z, 1.0)
+        # As in Mitsuba's cameras, local x points to the left of the picture.
+        return local, mi.Point2f(*(0.5 - 0.5 * local[k] / (z * self.tangents[k]) for k in range(2)))
+
+
+@dataclass(frozen=True)
+class Beam(BoundedLight):
+    """Parallel light from a rectangle or a disk: Mitsuba's ``directionalarea``.
+
+    Mitsuba's particle tracer shows the beam; its other integrators cannot find it.
+
+    shape      ``rectangle`` (local -1..1 in x and y) or ``disk`` (local radius 1)
+    to_world   Transform4f, of the shape
+    radiance   ``mi.Texture`` over the shape; what Mitsuba calls radiance is irradiance on a surface across the beam
+    flipped    whether it shines along local -z instead of +z
+    falloff_width  Float, world units: width of the rim in which the beam fades, as a projector's picture
+    """
+
+    name: str
+    shape: str
+    to_world: Any
+    radiance: Any
+    flipped: bool
+    falloff_width: Any
+
+    @property
+    def position(self) -> Any:
+        """Point3f, centre of the shape, world space."""
+        return translation(self.to_world)
+
+    @property
+    def direction(self) -> Any:
+        """Vector3f, unit normal of the shape, the direction in which light travels, world space."""
+        # A shape without area has no normal; nor does it light anything.
+        normal = normalize_or(dr.cross(axis(self.to_world, 0), axis(self.to_world, 1)), mi.Vector3f(0, 0, 1))
+        matrix = mi.Matrix3f(self.to_world.matrix)
+        # Mitsuba's normals stay on the side of local z where a transform mirrors.
+        inwards = dr.detach(dr.det(matrix)) < 0
+        return dr.select(inwards ^ self.flipped, -normal, normal)
+
+    @property
+    def widest(self) -> Any:
+        """Float, world units: the rim is never made wider than this."""
+        return dr.detach(self.reach)
+
+    @property
+    def reach(self) -> Any:
+        """Float, world units: nothing of the beam is farther from its axis."""
+        return dr.norm(axis(self.to_world, 0)) + dr.norm(axis(self.to_world, 1)) + self.falloff_width
+
+    def illuminate(self, p_world: Any, active: Any = True, inside: Any = None) -> tuple[Any, Any]:
+        """(wo, weight): unit direction against the beam (Vector3f), and its irradiance (colour) on a surface across it.
+
+        ``p_world`` Point3f (N,), world space. ``inside``: share of the light at the outline (:func:`share_inside`), Float (N,).
+        Attached to points, to_world, radiance and rim.
+        """
+        along, local, _ = self._local(p_world)
+        inside = share_inside(self, p_world) if inside is None else inside
+        lit = mi.Bool(active) & (along > 0) & (inside > 0)
+        if self.shape == "disk":
+            angle = dr.atan2(local.y, local.x) * (0.5 / dr.pi)
+            uv = mi.Point2f(dr.minimum(dr.norm(local), 1), dr.select(angle < 0, angle + 1, angle))
+        else:
+            uv = mi.Point2f(*(dr.clip(0.5 + 0.5 * local[k], 0, 1) for k in range(2)))
+        return -self.direction, dr.select(lit, picture(self.radiance, uv, lit) * inside, 0)
+
+    def distances(self, p_world: Any) -> list[Any]:
+        """Distances from the edges that bound the light (Float), positive inside, in units of ``falloff_width``. Attached."""
+        _, local, rows = self._local(p_world)
+        if self.shape == "disk":
+            radius = dr.norm(local)
+            return [(1 - radius) * radius / dr.norm(rows[0] * local.x + rows[1] * local.y)]
+        return [(1 - dr.abs(local[k])) / dr.norm(rows[k]) for k in range(2)]
+
+    def _local(self, p_world: Any) -> tuple[Any, Any, list[Any]]:
+        """(distance along the beam, place on the shape (Vector2f), derivatives of its two coordinates)."""
+        offset = mi.Vector3f(p_world - self.position)
+        along = dr.dot(offset, self.direction)
+        inverse = dr.rcp(mi.Matrix3f(self.to_world.matrix))
+        rows = [mi.Vector3f(inverse[k, 0], inverse[k, 1], inverse[k, 2]) for k in range(2)]
+        across = offset - self.direction * along
+        local = mi.Vector2f(dr.dot(rows[0], across), dr.dot(rows[1], across))
+        if self.shape == "disk":
+            # The centre has neither angle nor derivatives: any other point inside will do.
+            local = mi.Vector2f(dr.select(dr.squared_norm(local) == 0, 1e-6, local.x), local.y)
+        return along, local, rows
+
+
+def projector_of(emitter: Any, name: str, values: dict[str, Any], picture: Any) -> Projector:
+    """Record of a ``mi.Emitter`` called ``projector``. ``values``: its parameters, ``picture``: its texture."""
+    to_world = values["to_world"]
+    with dr.suspend_grad():
+        # Mitsuba tells the angles of view by where it projects points only. How far away they are has no influence.
+        place = dr.detach(to_world)
+        far = 1 + dr.norm(mi.Vector3f(translation(place)))
+        si = dr.zeros(mi.SurfaceInteraction3f)
+        si.p = place @ mi.Point3f(0.5 * far, 0.5 * far, far)
+        uv = emitter.sample_direction(si, mi.Point2f(0.5))[0].uv
+        tangents = mi.Vector2f(0.25 / (0.5 - uv.x), 0.25 / (0.5 - uv.y))
+    return Projector(name, to_world, picture, mi.Float(values["scale"]), tangents)
+
+
+def beam_of(emitter: Any, name: str, to_world: Any, radiance: Any) -> Beam:
+    """Record of a ``mi.Emitter`` called ``directionalarea``, which belongs to a rectangle or a disk placed by ``to_world``."""
+    shape = emitter.get_shape()
+    sides = dr.minimum(*(dr.norm(axis(dr.detach(to_world), k)) for k in range(2)))
+    return Beam(name, shape.class_name().lower(), to_world, radiance, shape.has_flipped_normals(), _BEAM_RIM * sides)

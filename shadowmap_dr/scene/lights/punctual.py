@@ -1,0 +1,139 @@
+"""Lights without extent: directional, point and spot lights."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ...errors import ShadowmapError
+from ...jit.vectors import unit
+from .light import picture, towards
+from .soft_outline import BoundedLight, share_inside
+
+_DEGREE = math.pi / 180.0
+
+
+@dataclass(frozen=True)
+class DirectionalLight:
+    """Parallel light. ``direction``: Vector3f, in which light travels, world space, any length but 0; ``irradiance``: colour."""
+
+    name: str
+    direction: Any
+    irradiance: Any
+
+    def __post_init__(self) -> None:
+        # Numbers are looked at on the spot; an array is not waited for, unless it is a constant.
+        if dr.is_jit_v(self.direction):
+            nowhere = dr.all(self.direction == 0)
+            zero = nowhere.state == dr.VarState.Literal and nowhere[0]
+        else:
+            zero = not any(self.direction)
+        if zero:
+            raise ShadowmapError(f"light '{self.name}' has the direction (0, 0, 0): give one in which its light travels.")
+
+    def illuminate(self, p_world: Any, active: Any = True) -> tuple[Any, Any]:
+        """(wo, weight): unit direction to the light (Vector3f) and its irradiance on a surface that faces it."""
+        return -unit(mi.Vector3f(self.direction)), self.irradiance & mi.Bool(active)
+
+
+@dataclass(frozen=True)
+class PointLight:
+    """Light from a point. ``position``: Point3f, world space; ``intensity``: colour, W/sr."""
+
+    name: str
+    position: Any
+    intensity: Any
+
+    def illuminate(self, p_world: Any, active: Any = True) -> tuple[Any, Any]:
+        """(wo, weight) with weight = intensity / distance^2."""
+        wo, inverse_squared = towards(p_world, self.position)
+        return wo, (self.intensity * inverse_squared) & mi.Bool(active)
+
+
+@dataclass(frozen=True)
+class SpotLight(BoundedLight):
+    """Cone of light along the local +z axis.
+
+    to_world      Transform4f
+    intensity     colour on the axis, W/sr
+    cutoff_angle  Float, degrees, half-angle of the cone beyond which there is no light
+    beam_width    Float, degrees, half-angle up to which intensity is full; in between it falls off linearly in the angle
+    texture       ``mi.Texture`` over the square that circumscribes the cone, or None
+    """
+
+    name: str
+    to_world: Any
+    intensity: Any
+    cutoff_angle: Any
+    beam_width: Any
+    texture: Any = None
+
+    @property
+    def position(self) -> Any:
+        """Point3f, world space."""
+        matrix = self.to_world.matrix
+        return mi.Point3f(matrix[0, 3], matrix[1, 3], matrix[2, 3])
+
+    @property
+    def direction(self) -> Any:
+        """Vector3f, unit axis of the cone, the direction in which light travels, world space."""
+        matrix = self.to_world.matrix
+        return dr.normalize(mi.Vector3f(matrix[0, 2], matrix[1, 2], matrix[2, 2]))
+
+    @property
+    def falloff_width(self) -> Any:
+        """Float, radians: width of the rim in which light falls off from full to none. Attached to both angles."""
+        return (self.cutoff_angle - self._full) * _DEGREE
+
+    @property
+    def widest(self) -> Any:
+        """Float, radians: the rim is never made wider than this."""
+        return dr.detach(self.cutoff_angle) * _DEGREE
+
+    def illuminate(self, p_world: Any, active: Any = True, inside: Any = None) -> tuple[Any, Any]:
+        """(wo, weight) with weight = intensity * falloff * texture / distance^2.
+
+        ``p_world`` Point3f (N,), world space. ``inside``: the falloff, if known
+        (:func:`~shadowmap_dr.scene.lights.soft_outline.share_inside`), Float (N,). Attached to points and all fields.
+        """
+        wo, inverse_squared = towards(p_world, self.position)
+        local = self._local(wo)
+        inside = share_inside(self, p_world) if inside is None else inside
+        lit = (inside > 0) & mi.Bool(active)
+        weight = self.intensity * (inside * inverse_squared)
+        if self.texture is not None:
+            # Lanes outside the cone may have z = 0, and those within a pixel of it lie off the texture: it may not begin anew.
+            scale = 0.5 * dr.rcp(dr.select(lit, local.z, 1.0) * dr.tan(self.cutoff_angle * _DEGREE))
+            uv = mi.Point2f(0.5 + local.x * scale, 0.5 + local.y * scale)
+            weight = weight * picture(self.texture, dr.clip(uv, 0, 1), lit)
+        return wo, weight & lit
+
+    def distances(self, p_world: Any) -> list[Any]:
+        """Angle between the middle of the rim and points (Float), positive inside, in radians. Attached."""
+        angle = dr.safe_acos(self._local(towards(p_world, self.position)[0]).z)
+        return [0.5 * (self.cutoff_angle + self._full) * _DEGREE - angle]
+
+    @property
+    def _full(self) -> Any:
+        """Angle up to which intensity is full, in degrees: a beam wider than the cone ends where that does."""
+        return dr.minimum(self.beam_width, self.cutoff_angle)
+
+    def _local(self, wo: Any) -> Any:
+        """Unit direction in the light's own space in which light travels that arrives from ``wo``."""
+        return dr.normalize(mi.Vector3f(dr.rcp(mi.Matrix3f(self.to_world.matrix)) @ mi.Vector3f(-wo)))
+
+
+@dataclass(frozen=True)
+class SquareSpot:
+    """A spot light as in Worchel and Alexa's code: full intensity, at any distance, in the square that its shadow map covers."""
+
+    light: SpotLight
+
+    def illuminate(self, p_world: Any, active: Any = True) -> tuple[Any, Any]:
+        """(wo, weight) with weight = intensity. What lies outside of the square is dark by its visibility."""
+        wo, _ = towards(p_world, self.light.position)
+        return wo, self.light.intensity & mi.Bool(active)

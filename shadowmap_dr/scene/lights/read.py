@@ -1,0 +1,118 @@
+"""Light records, read from Mitsuba's emitters.
+
+``illuminate`` returns what ``emitter.sample_direction`` returns for the same point, without any visibility. All fields that
+are not names may carry gradients; replace them with ``dataclasses.replace``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ..mitsuba_objects import children, parameters, varies
+from .area import AreaLight
+from .environment import ENVIRONMENTS, SUNSKY, Environment, SunSky, environment_of
+from .projected import Beam, Projector, beam_of, projector_of
+from .punctual import DirectionalLight, PointLight, SpotLight
+
+Light = DirectionalLight | PointLight | SpotLight | Projector | Beam
+
+_LIGHTS = ("DirectionalEmitter", "PointLight", "SpotLight", "Projector")
+_BEAMS = ("Rectangle", "Disk")
+
+
+def unsupported_reason(emitter: Any) -> str | None:
+    """Why a ``mi.Emitter`` is not supported, as the end of a sentence about it; None if it is."""
+    kind = emitter.class_name()
+    if kind == "AreaLight":
+        # Mitsuba's own direct light from one is far too dark: it has no way to sample such a texture.
+        attributes = any(part.class_name() == "MeshAttribute" for _, part in children(emitter))
+        return "has a mesh_attribute for its radiance, which does not shine: use a bitmap" if attributes else None
+    if kind in _LIGHTS or kind in ENVIRONMENTS:
+        return None
+    if kind == "DirectionalArea":
+        shape = emitter.get_shape().class_name()
+        return None if shape in _BEAMS else f"shines along the normals of a {shape}: only rectangles and disks may"
+    around = emitter.is_environment()
+    wanted = "constant, envmap or sunsky" if around else "area, directional, spot or point lights, or projectors"
+    return f"is not supported: use {wanted}"
+
+
+def lights_of(scene: Any) -> tuple[Light, ...]:
+    """Records of the lights of a ``mi.Scene`` without extent, of its projectors and beams, in the scene's order.
+
+    Area lights and environments have functions of their own; what is not supported (:func:`unsupported_reason`) is left out.
+    Names are Mitsuba ids; lights without one are called ``light_0``, ... The sun of a sky called ``sky`` is the light
+    ``sky.sun``. Fields are attached where the emitters' parameters are.
+    """
+    return tuple(
+        _light_of(emitter, name)
+        for name, emitter in named_emitters(scene)
+        if emitter.class_name() in (*_LIGHTS, "DirectionalArea", SUNSKY) and unsupported_reason(emitter) is None
+    )
+
+
+def area_lights_of(scene: Any, shapes: Sequence[Any]) -> tuple[AreaLight, ...]:
+    """Records of the area lights of a ``mi.Scene``.
+
+    ``shapes``: its ``mi.Shape`` objects in the order of the soup; the lights of others are left out. Lights have the names of
+    their shapes: emitters inside of shapes are all called the same. What is not supported (:func:`unsupported_reason`) is left
+    out.
+    """
+    found = []
+    numbers: dict[Any, int] = {}
+    for name, emitter in named_emitters(scene):
+        if emitter.class_name() == "AreaLight" and unsupported_reason(emitter) is None:
+            shape = emitter.get_shape()
+            if not numbers:
+                numbers = {other: len(shapes) - 1 - k for k, other in enumerate(reversed(shapes))}  # the first of equal ones
+            index = numbers.get(shape)
+            textures = [part for _, part in children(emitter) if isinstance(part, mi.Texture)]
+            if index is not None:
+                textured = any(varies(texture) for texture in textures)
+                found.append(AreaLight(shape.id() or name, index, emitter, textured))
+    return tuple(found)
+
+
+def environments_of(scene: Any) -> tuple[Environment, ...]:
+    """Records of the ``constant``, ``envmap`` and ``sunsky`` emitters of a ``mi.Scene`` (at most one)."""
+    found = ((name, emitter) for name, emitter in named_emitters(scene) if emitter.class_name() in ENVIRONMENTS)
+    return tuple(environment_of(emitter, name) for name, emitter in found)
+
+
+def named_emitters(scene: Any) -> list[tuple[str, Any]]:
+    """(name, ``mi.Emitter``) of all emitters of a ``mi.Scene``."""
+    return [(emitter.id() or f"light_{i}", emitter) for i, emitter in enumerate(scene.emitters())]
+
+
+def _light_of(emitter: Any, name: str) -> Light:
+    if emitter.class_name() == SUNSKY:
+        return DirectionalLight(f"{name}.sun", *SunSky(name, emitter).sun())
+    kind, values, parts = emitter.class_name(), parameters(emitter), dict(children(emitter))
+    if kind == "DirectionalEmitter":
+        matrix = values["to_world"].matrix
+        direction = mi.Vector3f(matrix[0, 2], matrix[1, 2], matrix[2, 2])
+        length = dr.norm(direction)  # Mitsuba's becomes brighter with a transformation that scales
+        return DirectionalLight(name, direction / length, colour_of(parts["irradiance"]) * length)
+    if kind == "PointLight":
+        return PointLight(name, mi.Point3f(values["position"]), colour_of(parts["intensity"]))
+    if kind == "Projector":
+        return projector_of(emitter, name, values, parts["irradiance"])
+    if kind == "DirectionalArea":
+        return beam_of(emitter, name, parameters(emitter.get_shape())["to_world"], parts["radiance"])
+    return SpotLight(
+        name=name,
+        to_world=values["to_world"],
+        intensity=colour_of(parts["intensity"]),
+        cutoff_angle=mi.Float(values["cutoff_angle"]),
+        beam_width=mi.Float(values["beam_width"]),
+        texture=parts.get("texture"),
+    )
+
+
+def colour_of(texture: Any) -> Any:
+    """The colour of a spectrum that does not vary over space, as ``mi.UnpolarizedSpectrum``."""
+    return texture.eval(dr.zeros(mi.SurfaceInteraction3f))

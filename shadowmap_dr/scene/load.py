@@ -1,0 +1,302 @@
+"""From a Mitsuba scene to the records that the renderer works on.
+
+``load`` does the expensive part once (topology, tessellation, tables, validation); ``refresh`` re-reads what parameters may
+change, attached where they carry gradients.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from numbers import Integral
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..errors import ShadowmapError, UnsupportedShape
+from ..jit.arrays import device_array
+from .descriptions import Parts, describe_all
+from .geometry import Geometry, ShapeInfo, pack_face_info, stand_ins
+from .lights.area import AreaLight
+from .lights.environment import Environment
+from .lights.read import Light, area_lights_of, environments_of, lights_of
+from .mitsuba_objects import children, held_arrays, is_cosine, is_plain
+from .sensor import Sensor, sensors_of
+from .shapes.sources import CurveSource, ShapeSource, source_of
+from .soup import Soup, Vertices
+from .unsupported import omissions_of, warn_of
+
+# Vertices of fewer shapes are put together anew for each image.
+_MANY_SHAPES = 16
+
+
+@dataclass(frozen=True)
+class SceneData:
+    """A scene as records. A PyTree that may cross ``dr.freeze``.
+
+    sensors       one tuple for each sensor of the scene; a batch sensor's holds several cameras, all others one
+    lights        directional, spot and point lights, projectors and beams
+    areas         area lights
+    environments  constant, envmap and sunsky emitters (at most one)
+    shape_ptr, bsdf_ptr   mi.ShapePtr, mi.BSDFPtr (S,), by the index that ``geometry.face_shape`` holds
+    variant       of Mitsuba, to which all of them belong
+    soup          the shapes' vertices, None if there are few
+    needs_frames  whether any BSDF asks for more than the cosines of directions: tangents, texture coordinates
+    only_cosines  whether all BSDFs are proportional to the cosine of the light's direction, and know no more of directions
+    """
+
+    scene: Any
+    geometry: Geometry
+    sensors: tuple[tuple[Sensor, ...], ...]
+    lights: tuple[Light, ...]
+    areas: tuple[AreaLight, ...]
+    environments: tuple[Environment, ...]
+    shape_ptr: Any
+    bsdf_ptr: Any
+    sources: tuple[ShapeSource, ...]
+    variant: str
+    needs_frames: bool = True
+    only_cosines: bool = False
+    soup: Soup | None = None
+
+    def cameras(self, sensor: int | Sensor) -> tuple[Sensor, ...]:
+        """Those of the scene's sensor of that number, or the one that is given.
+
+        Raises:
+            ShadowmapError: there is no such sensor; the variant is not the scene's.
+        """
+        if mi.variant() != self.variant:
+            raise ShadowmapError(f"The variant is {mi.variant()}, but this renderer was made for {self.variant}: set that one.")
+        if isinstance(sensor, Sensor):
+            return (sensor,)
+        if not isinstance(sensor, Integral):
+            raise ShadowmapError(f"the sensor is a {type(sensor).__name__}: give its number in the scene, or a Sensor record.")
+        if not 0 <= sensor < len(self.sensors):
+            raise ShadowmapError(f"There is no sensor {sensor}: the scene has {len(self.sensors)}, counted from 0.")
+        return self.sensors[sensor]
+
+    def materials(self) -> list[Any]:
+        """BSDFs, and meshes whose attributes they read: all that Mitsuba shades with."""
+        return [*(source.shape.bsdf() for source in self.sources), *self.with_attributes()]
+
+    def light(self, name: str) -> Light | AreaLight:
+        """The light called ``name``; raises ``ShadowmapError`` listing the known names otherwise."""
+        lights = (*self.lights, *self.areas)
+        for light in lights:
+            if light.name == name:
+                return light
+        known = ", ".join(repr(light.name) for light in lights) or "none"
+        raise ShadowmapError(f"There is no light '{name}' in the scene; its lights: {known}.")
+
+    def with_attributes(self) -> list[Any]:
+        """Mitsuba's meshes that have attributes, such as colours of vertices, which materials may read."""
+        return [source.shape for source, info in zip(self.sources, self.geometry.shapes, strict=True) if info.reads_attributes]
+
+    def curve_vertices(self, name: str, control_points: Any) -> Any:
+        """See :meth:`shadowmap_dr.Renderer.curve_vertices`."""
+        index = [info.name for info in self.geometry.shapes].index(self.geometry.shape(name).name)
+        source = self.sources[index]
+        if not isinstance(source, CurveSource):
+            raise ShadowmapError(f"Shape '{name}' is no curve: give its vertices instead of control points.")
+        points = mi.Float(control_points)
+        if dr.width(points) != 4 * source.count:
+            raise ShadowmapError(
+                f"{dr.width(points)} numbers for curve '{name}': give x, y, z and radius of {source.count} control points."
+            )
+        return source.placed(source.with_control_points(points)).positions
+
+
+def load(scene: Any, *, tessellation: int = 64, warn: bool = True) -> SceneData:
+    """Read a ``mi.Scene``.
+
+    ``tessellation``: triangles around the circumference of spheres, disks and cylinders; curves have fewer in proportion
+    (``sources.source_of``). ``warn``: name all that is left out, since it is not supported, in one ``UserWarning``. Raises
+    ``ShadowmapError`` for what is broken, naming the plug-in and its id, and where nothing is left.
+    Needs a variant ``*_ad_rgb`` or ``*_ad_mono``.
+    """
+    if not ("_ad_" in mi.variant() and mi.variant().endswith(("_rgb", "_mono"))):
+        raise ShadowmapError(
+            f"Mitsuba variant '{mi.variant()}' is not supported: set one whose name ends in _ad_rgb or _ad_mono, "
+            "for instance llvm_ad_rgb."
+        )
+    if not isinstance(scene, mi.Scene):
+        given = repr(scene) if isinstance(scene, str) else f"a {type(scene).__name__}"
+        raise ShadowmapError(f"{given} is no mi.Scene of the variant {mi.variant()}: load it with mi.load_file or mi.load_dict.")
+    if not isinstance(tessellation, Integral) or tessellation < 3:
+        raise ShadowmapError(f"tessellation is {tessellation!r}, but must be an integer of at least 3.")
+    names, sources, faces, unsupported = [], [], [], []
+    known: dict[Any, Any] = {}
+    for name, shape, instance in _shapes_of(scene):
+        try:
+            source, own_faces = source_of(name, shape, instance, tessellation, known)
+        except UnsupportedShape as error:
+            unsupported.append(str(error).rstrip("."))
+            continue
+        names.append(name)
+        sources.append(source)
+        faces.append(own_faces)
+    if not sources:
+        why = "; ".join(unsupported) or "it has no shapes"
+        raise ShadowmapError(f"There is nothing to render in the scene: {why}.")
+    soup, infos = _described(names, sources, faces)
+    face_counts, vertex_counts = [i.face_count for i in infos], [i.vertex_count for i in infos]
+    shape_index = np.arange(len(infos), dtype=np.uint32)
+    starts = np.array([i.vertex_start for i in infos], np.uint32)
+    merged, vertex_shape = np.concatenate(faces) + np.repeat(starts, face_counts)[:, None], np.repeat(shape_index, vertex_counts)
+    settled = stand_ins(merged, vertex_shape, infos, np.array([isinstance(s.shape, mi.Mesh) for s in sources]))
+    geometry = Geometry(
+        positions=None,  # the four buffers that may change are read by ``refresh``
+        normals=None,
+        texcoords=None,
+        rest_positions=None,
+        faces=device_array(mi.UInt32, merged),
+        face_shape=device_array(mi.UInt32, np.repeat(shape_index, face_counts)),
+        face_info=device_array(mi.UInt32, pack_face_info(infos)),
+        vertex_shape=device_array(mi.UInt32, vertex_shape),
+        shape_face_start=device_array(mi.UInt32, [i.face_start for i in infos]),
+        shapes=infos,
+        stand_ins=None if settled is None else device_array(mi.UInt32, settled),
+    )
+    bsdfs = [source.shape.bsdf() for source in sources]
+    different = list(dict.fromkeys(bsdfs))
+    data = SceneData(
+        scene=scene,
+        geometry=geometry,
+        sensors=(),
+        lights=(),
+        areas=(),
+        environments=(),
+        shape_ptr=_pointers(mi.ShapePtr, [source.shape for source in sources]),
+        bsdf_ptr=_pointers(mi.BSDFPtr, bsdfs),
+        sources=tuple(sources),
+        variant=mi.variant(),
+        needs_frames=not all(is_plain(bsdf) for bsdf in different),
+        only_cosines=all(is_cosine(bsdf) for bsdf in different),
+        soup=soup if len(sources) >= _MANY_SHAPES else None,
+    )
+    data = refresh(data)
+    if warn:
+        shapes = [(info.name, source.shape) for info, source in zip(infos, sources, strict=True)]
+        warn_of(omissions_of(scene, shapes, unsupported))
+    return replace(data, geometry=replace(data.geometry, as_loaded=True))
+
+
+def refresh(data: SceneData, sensors: tuple[Any, ...] | None = None) -> SceneData:
+    """Read again what scene parameters may have changed: vertices, normals, texture coordinates, lights and sensors.
+
+    ``sensors``: of Mitsuba, in place of all of the scene's, for whoever needs but one of many.
+    Values are attached where the scene's parameters are. Topology must be that of ``load``; BSDFs need no refresh, since they
+    are always evaluated by Mitsuba itself. With few shapes nothing is read back to the host. With many, vertices and
+    transformations without gradients are read back when they have been given other values.
+    """
+    vertices = _vertices(data)
+    # Not an empty array: one among the arguments of a frozen function ends the process (Dr.Jit 1.5).
+    rest = vertices.rest if any(info.reads_attributes for info in data.geometry.shapes) else None
+    geometry = replace(
+        data.geometry,
+        positions=data.geometry.settled(vertices.positions),
+        normals=vertices.normals,
+        texcoords=vertices.texcoords,
+        rest_positions=rest,
+        changed=None,
+        as_loaded=False,
+        packets=None,
+    )
+    return replace(
+        data,
+        geometry=geometry,
+        sensors=tuple(sensors_of(sensor) for sensor in (data.scene.sensors() if sensors is None else sensors)),
+        lights=lights_of(data.scene),
+        areas=area_lights_of(data.scene, [source.shape for source in data.sources]),
+        environments=environments_of(data.scene),
+    )
+
+
+def _shapes_of(scene: Any) -> Iterator[tuple[str, Any, Any]]:
+    """(unique name, shape, instance or None) of all shapes, shape groups resolved."""
+    groups = _Groups(scene)
+    taken: set[str] = set()
+    for index, shape in enumerate(scene.shapes()):
+        name = shape.id() or f"shape_{index}"
+        if shape.class_name() == "Instance":
+            for child_index, child in enumerate(groups.shapes_of(shape, name)):
+                yield _unique(f"{name}.{child.id() or child_index}", taken), child, shape
+        else:
+            yield _unique(name, taken), shape, None
+
+
+def _unique(name: str, taken: set[str]) -> str:
+    candidate, count = name, 1
+    while candidate in taken:
+        candidate, count = f"{name}_{count}", count + 1
+    taken.add(candidate)
+    return candidate
+
+
+class _Groups:
+    """The shape groups of a scene.
+
+    An instance has no reference to its group that can be read. But it hands out the arrays that it holds, and so does a group:
+    those of an instance's own group are among them.
+    """
+
+    def __init__(self, scene: Any) -> None:
+        nodes = [node for _, node in children(scene) if node.class_name().startswith("ShapeGroup")]
+        self._groups = [
+            (held_arrays(node), [child for _, child in children(node) if isinstance(child, mi.Shape)]) for node in nodes
+        ]
+
+    def shapes_of(self, instance: Any, name: str) -> list[Any]:
+        """Shapes of the group that an instance shows. ``name`` of the instance, for messages."""
+        if len(self._groups) == 1:
+            return self._groups[0][1]
+        held = held_arrays(instance)
+        shown = [(len(arrays), shapes) for arrays, shapes in self._groups if arrays and arrays <= held]
+        if not shown:
+            raise ShadowmapError(f"The shape group of instance '{name}' was not found in the scene.")
+        # A group that shares all its shapes with another one may be part of that.
+        return max(shown, key=lambda group: group[0])[1]
+
+
+def with_positions(data: SceneData) -> Geometry:
+    """The geometry with the vertices as they are now, attached, and nothing else that :func:`refresh` reads."""
+    return replace(data.geometry, positions=data.geometry.settled(_vertices(data).positions))
+
+
+def _described(names: list[str], sources: list[ShapeSource], faces: list[np.ndarray]) -> tuple[Soup, tuple[ShapeInfo, ...]]:
+    """The soup of shapes, with the faces of each, and what they are like."""
+    with dr.suspend_grad():
+        soup = Soup(names, sources)
+        points, normals = (buffer.numpy().reshape(-1, 3) for buffer in soup.own())
+    parts = Parts(points, normals, np.concatenate(faces), soup.counts, np.array([len(own) for own in faces]))
+    return soup, describe_all(names, sources, soup.held, parts)
+
+
+def _pointers(kind: type, objects: list[Any]) -> Any:
+    """Pointers to Mitsuba's objects, evaluated."""
+    # Joined as numbers: a kernel that joins pointers would be another one for each number of shapes.
+    numbers = [dr.reinterpret_array(mi.UInt32, kind(one))[0] for one in objects]
+    return dr.reinterpret_array(kind, device_array(mi.UInt32, numbers))
+
+
+def _vertices(data: SceneData) -> Vertices:
+    """The vertices of all shapes as they are now, attached."""
+    sources, infos = data.sources, data.geometry.shapes
+    if data.soup is None or dr.flag(dr.JitFlag.FreezingScope):  # what is kept would not be read again by a replay
+        buffers = (_vertex_buffers(source, info) for source, info in zip(sources, infos, strict=True))
+        return Vertices(*(dr.concat(list(parts)) for parts in zip(*buffers, strict=True)))
+    return data.soup.vertices(lambda k: _vertex_buffers(sources[k], infos[k]))
+
+
+def _vertex_buffers(source: ShapeSource, info: ShapeInfo) -> tuple[Any, Any, Any, Any]:
+    """(positions, normals, texcoords, rest positions) of one shape: flat, world space (rest: own space), attached."""
+    own = source.own()
+    if len(own.positions) != 3 * info.vertex_count:
+        now = len(own.positions) // 3
+        raise ShadowmapError(f"Shape '{info.name}' now has {now} vertices instead of {info.vertex_count}: load the scene again.")
+    world = source.placed(own)
+    normals = world.normals if info.has_normals else dr.zeros(mi.Float, 3 * info.vertex_count)
+    texcoords = world.texcoords if info.has_texcoords else dr.zeros(mi.Float, 2 * info.vertex_count)
+    return world.positions, normals, texcoords, own.positions

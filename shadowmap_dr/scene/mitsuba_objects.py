@@ -1,0 +1,134 @@
+"""Reading one Mitsuba object: parameters, children, mesh buffers. Nothing here walks the whole scene."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+_BUFFERS = ("vertex_count", "face_count", "vertex_positions", "vertex_normals", "vertex_texcoords")
+
+
+def parameters(node: Any) -> dict[str, Any]:
+    """Current (possibly AD-attached) parameters of a Mitsuba object and its children, by their relative names.
+
+    Those without a value are left out: a ``hair`` material has some.
+    """
+    # Without the indexing of `mi.SceneParameters`, which takes as long again to remember what was asked for.
+    properties = mi.traverse(node).properties.items()
+    found = {name: value if kind is None else mi.get_property(value, kind, owner) for name, (value, kind, owner, _) in properties}
+    return {name: value for name, value in found.items() if value is not None}
+
+
+def children(node: Any) -> list[tuple[str, Any]]:
+    """(name, object) of the direct children of a Mitsuba object, in its own order."""
+    return [(name, value) for name, value, _ in _parts_of(node) if isinstance(value, mi.Object)]
+
+
+def held_arrays(node: Any) -> frozenset[int]:
+    """Numbers of the Dr.Jit variables that a Mitsuba object holds, with all that it refers to."""
+    found: list[int] = []
+    with dr.scoped_set_flag(dr.JitFlag.EnableObjectTraversal, True):
+        node._traverse_1_cb_ro(lambda index, variant, domain: found.append(index))
+    return frozenset(found) - {0}
+
+
+class Parameter:
+    """One parameter of a Mitsuba object itself, read again and again. The object is kept alive.
+
+    Raises:
+        KeyError: it has no parameter of that name.
+    """
+
+    def __init__(self, node: Any, name: str) -> None:
+        self._node, self._name = node, name
+        self._place, self._kind = self._found()
+
+    def now(self) -> Any:
+        """Its current, possibly attached, value."""
+        return self._found()[0] if self._kind is None else mi.get_property(self._place, self._kind, self._node)
+
+    def _found(self) -> tuple[Any, Any]:
+        for name, value, kind in _parts_of(self._node):
+            if name == self._name and not isinstance(value, mi.Object):
+                return value, kind
+        raise KeyError(self._name)
+
+
+def _parts_of(node: Any) -> list[tuple[str, Any, Any]]:
+    """(name, child or where a parameter's value is, type of the parameter) of all that a Mitsuba object itself has."""
+    callback = _collector(mi.variant())()
+    node.traverse(callback)
+    return callback.found
+
+
+@functools.cache
+def _collector(variant: str) -> type:
+    """Mitsuba's base class belongs to the variant that is current."""
+
+    class Collector(mi.TraversalCallback):
+        def __init__(self) -> None:
+            super().__init__()
+            self.found: list[tuple[str, Any, Any]] = []
+
+        def put(self, name: str, value: Any, flags: int = 0, cpptype: Any = None) -> None:
+            self.found.append((name, value, cpptype))
+
+    return Collector
+
+
+def varies(texture: Any) -> bool:
+    """Whether a ``mi.Texture`` may differ from place to place, attributes of meshes aside. Those written in Python may say what
+    they like: the base class says no for them."""
+    return texture.is_spatially_varying() or type(texture) is not mi.Texture
+
+
+def is_plain(bsdf: Any) -> bool:
+    """Whether a BSDF is known to depend on nothing but the cosines of directions: diffuse, of the same colour everywhere."""
+    parts = [part for _, part in children(bsdf)]
+    if bsdf.class_name() == "TwoSidedBRDF":
+        return all(is_plain(part) for part in parts)
+    if bsdf.class_name() != "SmoothDiffuse":
+        return False
+    # Mitsuba does not count vertex colours as varying.
+    return all(
+        isinstance(part, mi.Texture) and not varies(part) and part.class_name() != "MeshAttribute"
+        for part in parts
+    )
+
+
+def is_cosine(bsdf: Any) -> bool:
+    """Whether a BSDF is known to be the cosine of the light's direction times a number that no direction changes: diffuse."""
+    kind = bsdf.class_name()
+    if kind == "SmoothDiffuse":
+        textures = [part for _, part in children(bsdf)]
+        # Those written in Python may look at directions.
+        return all(type(part) is mi.Texture for part in textures)
+    if kind not in ("TwoSidedBRDF", "MaskBSDF"):
+        return False
+    return all(is_cosine(part) if isinstance(part, mi.BSDF) else type(part) is mi.Texture for _, part in children(bsdf))
+
+
+def is_attribute(node: Any, key: str) -> bool:
+    """Whether a parameter is an attribute of a mesh: colours of vertices or faces, for instance."""
+    return isinstance(node, mi.Mesh) and key.startswith(("vertex_", "face_")) and key not in _BUFFERS
+
+
+def attributes(mesh: Any) -> dict[str, Any]:
+    """Attributes of a ``mi.Mesh`` by name: flat Float, of all vertices (``vertex_...``) or of all faces (``face_...``)."""
+    return {name: value for name, value in parameters(mesh).items() if is_attribute(mesh, name)}
+
+
+def mesh_buffers(mesh: Any) -> tuple[Any, Any, Any, Any]:
+    """(faces UInt32 (3F,), positions Float (3V,), normals Float (3V,) or (0,), texcoords Float (2V,) or (0,)) of a ``mi.Mesh``.
+
+    World space; attached where the mesh's buffers are.
+    """
+    return (
+        mi.UInt32(mesh.faces_buffer()),
+        mi.Float(mesh.vertex_positions_buffer()),
+        mi.Float(mesh.vertex_normals_buffer()),
+        mi.Float(mesh.vertex_texcoords_buffer()),
+    )

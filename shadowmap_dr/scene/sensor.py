@@ -1,0 +1,281 @@
+"""Cameras: a record with everything the rasterizer and the shading need, read from a Mitsuba sensor.
+
+``Sensor.view_projection`` takes world space to OpenGL clip space (visible where -w <= x, y, z <= w) with row 0 of the image, the
+topmost row of Mitsuba's film, at y = -w.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ..errors import ShadowmapError
+from ..jit.broadcast import broadcast_differentiable
+from .mitsuba_objects import children, parameters
+from .pixel_filter import Filter
+
+_KINDS = {
+    "PerspectiveCamera": "perspective",
+    "ThinLensCamera": "perspective",
+    "OrthographicCamera": "orthographic",
+}
+
+
+# Mitsuba makes something of about this size of an aperture of zero.
+_PINHOLE = 1e-6
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A pinhole (``kind='perspective'``) or orthographic camera. Replace fields with ``dataclasses.replace``.
+
+    to_world         Transform4f; the camera looks along +z, x points to the *left* (Mitsuba's convention), y up
+    x_fov            Float, degrees, horizontal angle of the whole film (perspective only)
+    principal_point  Point2f, Mitsuba's principal_point_offset_x/y, as a fraction of the film's width and height
+    near, far        Float, clip distances along the viewing direction
+    film_size, crop_size, crop_offset   pixels
+    channels         colour channels that the film holds: 1 (luminance) or 3; ``alpha`` says whether one more holds coverage
+    filter           the film's reconstruction filter
+    sample_border    whether samples beyond the window contribute to its outermost pixels, as the film's parameter says
+    film_column      leftmost column of this camera's picture in its film (batch sensors put several side by side)
+    pixel_aspect     width of a pixel for a height of 1; other than 1 where a batch sensor has a crop window, into which Mitsuba
+                     squeezes all that its cameras see
+
+    Gradients flow from ``view_projection``, ``origin``, ``direction`` and ``wi_world`` to to_world, x_fov and principal_point.
+    """
+
+    name: str
+    kind: str
+    to_world: Any
+    x_fov: Any
+    principal_point: Any
+    near: Any
+    far: Any
+    film_size: tuple[int, int]
+    crop_size: tuple[int, int]
+    crop_offset: tuple[int, int]
+    channels: int
+    alpha: bool
+    filter: Filter
+    sample_border: bool = False
+    film_column: int = 0
+    pixel_aspect: float = 1.0
+
+    @property
+    def width(self) -> int:
+        """Columns of the picture (the crop window)."""
+        return self.crop_size[0]
+
+    @property
+    def height(self) -> int:
+        """Rows of the picture (the crop window)."""
+        return self.crop_size[1]
+
+    @property
+    def border(self) -> int:
+        """Pixels on each side of the picture that are sampled for the filter's sake."""
+        return self.filter.border if self.sample_border else 0
+
+    @property
+    def origin(self) -> Any:
+        """Point3f, centre of projection (perspective) or a point on the optical axis (orthographic), world space."""
+        matrix = self.to_world.matrix
+        return mi.Point3f(matrix[0, 3], matrix[1, 3], matrix[2, 3])
+
+    @property
+    def direction(self) -> Any:
+        """Vector3f, unit viewing direction, world space."""
+        matrix = self.to_world.matrix
+        return dr.normalize(mi.Vector3f(matrix[0, 2], matrix[1, 2], matrix[2, 2]))
+
+    @property
+    def view(self) -> Any:
+        """Matrix4f, world to camera space."""
+        return dr.rcp(mi.Matrix4f(self.to_world.matrix))
+
+    @property
+    def reach(self) -> Any:
+        """Float, camera space: how far behind the near plane the far plane is.
+
+        An orthographic camera of Mitsuba's, whose transformation scales along its axis, begins at ``near`` in its own units,
+        and its rays are as long as ``far - near`` in those of the world.
+        """
+        between = mi.Float(self.far) - mi.Float(self.near)
+        if self.kind == "perspective":
+            return between
+        matrix = dr.detach(mi.Matrix4f(self.to_world.matrix))
+        return between / dr.norm(mi.Vector3f(matrix[0, 2], matrix[1, 2], matrix[2, 2]))
+
+    @property
+    def projection(self) -> Any:
+        """Matrix4f, camera space to clip space, crop window and principal point included."""
+        (film_w, film_h), (crop_w, crop_h), (crop_x, crop_y) = self.film_size, self.crop_size, self.crop_offset
+        # Position in the crop window in [0, 1] = (position in the film - crop offset) * film size / crop size.
+        zoom = (film_w / crop_w, film_h / crop_h)
+        aspect = self.pixel_aspect * film_w / film_h
+        if self.kind == "perspective":
+            scale = dr.rcp(dr.tan(mi.Float(self.x_fov) * (0.5 * math.pi / 180.0)))
+        else:
+            scale = mi.Float(1.0)
+        sx, sy = -scale * zoom[0], -scale * (zoom[1] * aspect)
+        # Film position 0.5 + 0.5 * ndc - principal point, then the crop, then back to [-1, 1].
+        cx = zoom[0] * (1.0 - 2.0 * self.principal_point.x - 2.0 * crop_x / film_w) - 1.0
+        cy = zoom[1] * (1.0 - 2.0 * self.principal_point.y - 2.0 * crop_y / film_h) - 1.0
+        near = mi.Float(self.near)
+        far = mi.Float(self.far) if self.kind == "perspective" else near + self.reach
+        inverse_depth = dr.rcp(self.reach)
+        if self.kind == "perspective":
+            return mi.Matrix4f(
+                [sx, 0, cx, 0],
+                [0, sy, cy, 0],
+                [0, 0, (far + near) * inverse_depth, -2.0 * far * near * inverse_depth],
+                [0, 0, 1, 0],
+            )
+        return mi.Matrix4f(
+            [sx, 0, 0, cx],
+            [0, sy, 0, cy],
+            [0, 0, 2.0 * inverse_depth, -(far + near) * inverse_depth],
+            [0, 0, 0, 1],
+        )
+
+    @property
+    def view_projection(self) -> Any:
+        """Matrix4f, world space to clip space: pos_clip = view_projection @ (p_world, 1)."""
+        return self.projection @ self.view
+
+    def wi_world(self, p_world: Any) -> Any:
+        """Unit vector from p_world (Point3f) to the camera, world space."""
+        if self.kind == "perspective":
+            return dr.normalize(self.origin - p_world)
+        return -self.direction
+
+    def ray_direction(self, width: int | None = None, height: int | None = None) -> Any:
+        """Vector3f (H * W,), unit world-space directions through the pixel centres, row-major. Attached.
+
+        ``width`` and ``height`` ask for another grid over the same window (supersampling).
+        """
+        width, height = width or self.width, height or self.height
+        index = dr.arange(mi.UInt32, width * height)
+        ndc_x = (mi.Float(index % width) + 0.5) * (2.0 / width) - 1.0
+        ndc_y = (mi.Float(index // width) + 0.5) * (2.0 / height) - 1.0
+        if self.kind == "orthographic":
+            return dr.select(mi.Bool(True), self.direction, dr.zeros(mi.Vector3f, width * height))
+        projection = self.projection
+        x = (ndc_x - projection[0, 2]) / projection[0, 0]
+        y = (ndc_y - projection[1, 2]) / projection[1, 1]
+        linear = mi.Matrix3f(self.to_world.matrix)
+        return dr.normalize(mi.Vector3f(linear @ mi.Vector3f(x, y, 1.0)))
+
+    def pixel_rays(self, width: int, height: int) -> tuple[Any, Any, Any]:
+        """(origin Point3f, direction Vector3f) of the rays through the pixel centres of a ``width`` x ``height`` picture.
+
+        Row-major, world space, attached. Directions have unit length along the viewing axis (perspective) or in all
+        (orthographic); the one of the two that all rays share may be of width 1. Also returns the height of a pixel (Float,
+        width 1, detached), world units, at unit distance along a perspective camera's axis.
+        """
+        index = dr.arange(mi.UInt32, width * height)
+        row = index // width
+        ndc_x = (mi.Float(index - row * width) + 0.5) * (2.0 / width) - 1.0
+        ndc_y = (mi.Float(row) + 0.5) * (2.0 / height) - 1.0
+        projection, linear = self.projection, mi.Matrix3f(self.to_world.matrix)
+        column = 2 if self.kind == "perspective" else 3
+        across, down = linear @ mi.Vector3f(dr.rcp(projection[0, 0]), 0, 0), linear @ mi.Vector3f(0, dr.rcp(projection[1, 1]), 0)
+        centre = -(across * projection[0, column] + down * projection[1, column])
+        if self.kind == "perspective":
+            centre += mi.Vector3f(linear @ mi.Vector3f(0, 0, 1))
+            fixed = mi.Vector3f(self.origin)
+        else:
+            centre += self.origin
+            fixed = self.direction
+        # Nine numbers for all pixels: worked out once, and for each pixel their derivatives are summed up in one kernel.
+        parts = (fixed, mi.Vector3f(centre), mi.Vector3f(across), mi.Vector3f(down))
+        pixel = dr.norm(dr.detach(parts[3])) * (2.0 / height)
+        dr.eval(parts, pixel)
+        fixed, centre, across, down = broadcast_differentiable(parts, width * height)
+        varying = dr.fma(across, ndc_x, dr.fma(down, ndc_y, centre))
+        if self.kind == "perspective":
+            return mi.Point3f(fixed), varying, pixel
+        return mi.Point3f(varying), fixed, pixel
+
+
+def lenses_of(sensor: Any) -> list[str]:
+    """Sentences (without full stops) about a ``mi.Sensor``, or cameras in a batch sensor, whose aperture is ignored."""
+    if dr.flag(dr.JitFlag.FreezingScope):
+        return []  # the aperture cannot be read now
+    found = []
+    for camera in (sensor, *_cameras_of(sensor)):
+        if camera.class_name() != "ThinLensCamera":
+            continue
+        aperture = float(dr.detach(mi.Float(parameters(camera)["aperture_radius"]))[0])
+        if aperture > _PINHOLE:
+            found.append(
+                f"sensor '{camera.id()}' is a thin lens with an aperture_radius of {aperture:g} and treated as a pinhole, "
+                "so that everything is in focus"
+            )
+    return found
+
+
+def _cameras_of(batch: Any) -> list[Any]:
+    return [child for _, child in children(batch) if isinstance(child, mi.Sensor)]
+
+
+def sensors_of(sensor: Any) -> tuple[Sensor, ...]:
+    """Records of a ``mi.Sensor``: one, or for a batch sensor one for each camera in it, left to right."""
+    kind = sensor.class_name()
+    if kind == "BatchSensor":
+        cameras, film = _cameras_of(sensor), sensor.film()
+        columns = int(film.crop_size()[0])
+        if columns % len(cameras):
+            raise ShadowmapError(
+                f"The crop window of batch sensor '{sensor.id()}' has {columns} columns for {len(cameras)} cameras: "
+                "choose a multiple of them."
+            )
+        share = (columns // len(cameras), int(film.crop_size()[1]))
+        return tuple(_squeezed(_sensor_of(camera, film, i * share[0]), share) for i, camera in enumerate(cameras))
+    return (_sensor_of(sensor, sensor.film(), 0),)
+
+
+def _squeezed(camera: Sensor, size: tuple[int, int]) -> Sensor:
+    """A camera that shows all it sees on other pixels: what a batch sensor's crop window does to its cameras in Mitsuba."""
+    (width, height) = camera.film_size
+    aspect = (width * size[1]) / (height * size[0])
+    return replace(camera, film_size=size, crop_size=size, crop_offset=(0, 0), pixel_aspect=aspect)
+
+
+def _sensor_of(sensor: Any, film: Any, film_column: int) -> Sensor:
+    kind = _KINDS.get(sensor.class_name())
+    if kind is None:
+        raise ShadowmapError(
+            f"Sensor '{sensor.id()}' ({sensor.class_name()}) is not supported: use perspective, orthographic or batch."
+        )
+    if film.base_channels_count() not in (1, 2, 3, 4):
+        raise ShadowmapError(
+            f"The film of sensor '{sensor.id()}' has {film.base_channels_count()} channels: use pixel_format luminance or rgb."
+        )
+    if "pixel_format = xyz" in str(film):
+        raise ShadowmapError(f"The film of sensor '{sensor.id()}' stores XYZ, which is not supported: use pixel_format rgb.")
+    values = parameters(sensor)
+    window = sensor.film()  # a batch sensor's cameras have their share of the common film's size
+    alpha = film.base_channels_count() in (2, 4)
+    zero = mi.Float(0.0)
+    return Sensor(
+        name=sensor.id(),
+        kind=kind,
+        to_world=values["to_world"],
+        x_fov=values.get("x_fov", mi.Float(90.0)),
+        principal_point=mi.Point2f(values.get("principal_point_offset_x", zero), values.get("principal_point_offset_y", zero)),
+        near=mi.Float(values["near_clip"]),
+        far=mi.Float(values["far_clip"]),
+        film_size=tuple(int(n) for n in window.size()),
+        crop_size=tuple(int(n) for n in window.crop_size()),
+        crop_offset=tuple(int(n) for n in window.crop_offset()),
+        channels=int(film.base_channels_count()) - alpha,
+        alpha=alpha,
+        filter=Filter.read(film, sensor.id()),
+        sample_border=bool(film.sample_border()),
+        film_column=film_column,
+    )

@@ -1,0 +1,1 @@
+"""Vertices of shapes: meshes, and tessellated spheres, disks, cylinders and curves."""

@@ -1,0 +1,114 @@
+"""Which shapes can cast a shadow at all: a wall or a floor with nothing behind it only takes up room in a map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from ..jit.arrays import backend
+from .light_camera import Views, of_map
+
+#: Share of a shape's extent that may lie behind a floor on which it stands without the floor casting a shadow on it.
+SUNK = 0.1
+#: What stands on a floor keeps this far from its border, as a share of the floor's own size.
+BORDER = 0.01
+#: Shapes touch if they are this close: as a share of the smaller one's size, and, for rounding, of their coordinates.
+TOUCH, ROUNDING = 1e-4, 1e-6
+
+
+@dataclass(frozen=True)
+class Boxes:
+    """Axis-aligned boxes of S shapes in world space: ``low``, ``high``, ``Array3f`` of width S, evaluated, detached."""
+
+    low: Any
+    high: Any
+
+    @property
+    def count(self) -> int:
+        """S."""
+        return dr.width(self.low)
+
+    def corners(self, shape: Any, corner: Any) -> Any:
+        """``Array3f``: corner number 0 to 7 of the boxes of shapes (``UInt32`` each)."""
+        scalar, vector = backend(self.low).Float, backend(self.low).Array3f
+        ends = [(dr.gather(scalar, self.high[c], shape), dr.gather(scalar, self.low[c], shape)) for c in range(3)]
+        return vector(*(dr.select((corner & (1 << c)) != 0, *end) for c, end in enumerate(ends)))
+
+
+def shape_boxes(p_world: Any, shape: Any, count: int) -> Boxes:
+    """Boxes around the vertices (``Array3f``, V) of each of ``count`` shapes (``UInt32``, V)."""
+    module = backend(shape)
+    with dr.suspend_grad():
+        p = dr.detach(p_world)
+        # All maxima, and all in one buffer, since a reduction costs more to start than to run.
+        extremes = dr.full(module.Float, -dr.inf, 6 * count)
+        drawn = dr.isfinite(p.x + p.y + p.z)
+        for k, value in enumerate((p.x, p.y, p.z, -p.x, -p.y, -p.z)):
+            dr.scatter_reduce(dr.ReduceOp.Max, extremes, value, shape * 6 + k, drawn)
+        row = dr.arange(module.UInt32, count) * 6
+        values = [dr.gather(module.Float, extremes, row + k) for k in range(6)]
+        boxes = Boxes(module.Array3f(*(-v for v in values[3:])), module.Array3f(*values[:3]))
+        dr.eval(boxes.low, boxes.high)
+        return boxes
+
+
+def casting_shapes(views: Views, planes: tuple[Any, Any], planar: Any, boxes: Boxes, hidden: Any = None) -> Any:
+    """Which shapes can cast a shadow in which map: not planar ones with nothing behind them, as seen from the light.
+
+    Args:
+        views: cameras of the M maps.
+        planes: (normal, point) in world space, ``Array3f`` of width S: the plane of each shape that is ``planar`` (``Bool``).
+        boxes: of the S shapes.
+        hidden: shape (``UInt32``, for each map) that casts no shadow in it. None: all may.
+
+    Returns:
+        ``Bool`` of width M * S (entry ``map * S + shape``), detached.
+    """
+    module = backend(views.spread)
+    with dr.suspend_grad():
+        views, shapes = dr.detach(views), boxes.count
+        (normal, point) = planes
+        dr.eval(normal, point, planar)
+        reach = _reach(normal, point, boxes)
+        index = dr.arange(module.UInt32, views.count * shapes)
+        which = index // shapes
+        shape = index - which * shapes
+        view = of_map(views, which, views.count)
+        n, p = (module.Array3f(*(dr.gather(module.Float, v[c], shape) for c in range(3))) for v in (normal, point))
+        above = dr.dot(n, dr.select(view.spread > 0, view.origin - p, -view.forward)) > 0
+        behind = dr.gather(module.Float, reach, shape * 2 + dr.select(above, module.UInt32(1), 0)) > 0
+        casts = ~dr.gather(module.Bool, planar, shape) | behind
+        return casts if hidden is None else casts & (shape != dr.gather(module.UInt32, hidden, which))
+
+
+def _reach(normal: Any, point: Any, boxes: Boxes) -> Any:
+    """How far the boxes of the other shapes reach on either side of each shape's plane (``Float``, 2 S); at most 0 if they touch.
+
+    The first tenth of what stands on the plane does not count: it may sink in a little, which shall not change the maps.
+    """
+    module, shapes = backend(boxes.low), boxes.count
+    Float = module.Float
+    pair = dr.arange(module.UInt32, shapes * shapes)
+    own = pair // shapes
+    other = pair - own * shapes
+    sizes = [dr.max(dr.gather(module.Array3f, dr.ravel(boxes.high - boxes.low), which)) for which in (own, other)]
+    before, behind, extent, far, stands = Float(0), Float(0), Float(0), Float(0), module.Bool(True)
+    for c in range(3):
+        n, p = dr.gather(Float, normal[c], own), dr.gather(Float, point[c], own)
+        low, high = dr.gather(Float, boxes.low[c], other), dr.gather(Float, boxes.high[c], other)
+        before += n * (dr.select(n > 0, high, low) - p)
+        behind -= n * (dr.select(n > 0, low, high) - p)
+        extent += dr.abs(n) * (high - low)
+        far = dr.maximum(far, dr.maximum(dr.abs(low), dr.abs(high)))
+        # Within the plane's own outline, along its normal as far as it likes.
+        left, right = dr.gather(Float, boxes.low[c], own), dr.gather(Float, boxes.high[c], own)
+        border, room = BORDER * (right - left), dr.abs(n) * sizes[1]
+        stands &= (low >= left + border - room) & (high <= right - border + room)
+    touch = dr.fma(TOUCH, dr.minimum(*sizes), ROUNDING * far)
+    sunk = dr.select(stands, SUNK * extent, 0)
+    reach = dr.full(Float, -dr.inf, 2 * shapes)
+    for k, value in enumerate((before, behind)):
+        dr.scatter_reduce(dr.ReduceOp.Max, reach, value - sunk - touch, own * 2 + k, own != other)
+    return reach

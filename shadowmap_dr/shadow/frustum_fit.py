@@ -1,0 +1,216 @@
+"""The frusta of the light cameras: fitted to what can cast shadows on what is seen, and stable under small changes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from ..jit.arrays import backend
+from .light_camera import Frusta, Views, of_map, to_light_space
+
+# A frustum is kept while the scene fits and fills at least this fraction of it.
+_KEEP_FILL = 0.6
+_MARGIN = 0.10
+# Least depth range of a frustum in units of its lateral extent.
+_FLATTEST = 1e-2
+# And of its distance: rounding changes depths by some 1e-7 of that.
+_THINNEST = 1e-3
+# Part of the depth range between the last depth at which there may be casters and the far plane (see `texel_depths`).
+_BEHIND_LAST = 0.04
+# Depths are told apart from this far before the first receiver on, in units of the range from there on.
+_BEFORE = 1.0
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Light-space bounds of each shape in each map: image coordinates and depths.
+
+    ``negated`` holds -x0, -y0, -z0, x1, y1, z1 (``Float``, 6 for each shape in each map): all maxima, and all in one buffer,
+    since a reduction costs more to start than to run.
+    """
+
+    negated: Any
+
+    def of(self, index: Any) -> tuple[Any, Any, Any, Any, Any, Any]:
+        """(x0, y0, x1, y1, z0, z1) of entry ``map * shapes + shape``."""
+        x0, y0, z0, x1, y1, z1 = _rows(self.negated, index, 6)
+        return -x0, -y0, x1, y1, -z0, z1
+
+
+def _maxima(values: list[Any], index: Any, count: int, active: Any = True) -> Any:
+    """Maxima of several values over the lanes with the same ``index`` (below ``count``), interleaved in one buffer."""
+    target = dr.full(backend(index).Float, -dr.inf, len(values) * count)
+    for k, value in enumerate(values):
+        dr.scatter_reduce(dr.ReduceOp.Max, target, value, index * len(values) + k, active)
+    return target
+
+
+def _rows(flat: Any, index: Any, count: int) -> list[Any]:
+    return [dr.gather(backend(index).Float, flat, index * count + k) for k in range(count)]
+
+
+def shape_bounds(view: Views, p_light: Any, map_index: Any, shape_index: Any, shape_count: int) -> Bounds:
+    """Reduce light-space vertices (one lane for each vertex in each map) to bounds for each shape. Detached."""
+    with dr.suspend_grad():
+        view, p = dr.detach(view), dr.detach(p_light)
+        perspective = of_map(view, map_index, view.count).spread > 0
+        behind = perspective & (p.z <= 0)
+        w = dr.select(perspective & ~behind, p.z, 1.0)
+        x, y = p.x / w, p.y / w
+        # A vertex behind a spot light bounds nothing: its shape may reach anywhere in the image.
+        sides = [dr.select(behind, dr.inf, value) for value in (-x, -y, x, y)]
+        values = [*sides[:2], -p.z, *sides[2:], p.z]
+        # What is not finite is not drawn, and bounds nothing.
+        drawn = dr.isfinite(p.x + p.y + p.z)
+        return Bounds(_maxima(values, map_index * shape_count + shape_index, view.count * shape_count, drawn))
+
+
+def fit_frusta(
+    views: Views,
+    bounds: Bounds,
+    casts: Any,
+    shape_count: int,
+    resolution: int,
+    filter_size: int,
+    previous: Frusta | None,
+    seen: Any = None,
+    receiver_range: bool = True,
+) -> Frusta:
+    """Frusta that cover everything that can cast a shadow on what is seen, or the previous ones as long as they still do.
+
+    Args:
+        bounds: from :func:`shape_bounds`.
+        casts: which shapes can cast a shadow in which map (:func:`casting_shapes`; ``Bool``). What is behind a light does not.
+        previous: frusta of an earlier call. Kept bit by bit while the casters lie inside them with room for the filter
+            and fill most of them.
+        seen: points (``Array3f``, world space) all over the receivers in view, and a mask of those that count. None: anywhere.
+        receiver_range: tell depths apart only from a little before the first receiver on, not from the first caster on.
+
+    All arithmetic stays on the device: nothing is read back.
+    """
+    with dr.suspend_grad():
+        views = dr.detach(views)
+        module = backend(views.spread)
+        index = dr.arange(module.UInt32, views.count * shape_count)
+        map_index = index // shape_count
+        extent = bounds.of(index)
+        casts &= ~(of_map(views, map_index, views.count).spread > 0) | (extent[5] > 0)
+        window = _window(views, seen)
+        if not receiver_range:
+            window = (*window[:4], module.Float(-dr.inf), window[5])
+        fitted = _fit(views, extent, casts, map_index, window, resolution, filter_size)
+        if previous is None:
+            dr.eval(fitted[0])
+            return fitted[0]
+        keep = _still_fits(views, previous, *fitted, resolution, filter_size)
+        result = Frusta(
+            *(dr.select(keep, getattr(previous, name), getattr(fitted[0], name)) for name in Frusta.__dataclass_fields__)
+        )
+        dr.eval(result)
+        return result
+
+
+def _window(views: Views, seen: Any) -> tuple[Any, ...]:
+    """(x0, y0, x1, y1) in each map's image plane around what is seen, within the light's own cone, and bounds of its depth."""
+    module = backend(views.spread)
+    perspective = views.spread > 0
+    limit = dr.select(perspective, views.spread, dr.inf)
+    if seen is None:
+        return -limit, -limit, limit, limit, module.Float(-dr.inf), module.Float(dr.inf)
+    points, active = seen
+    count = dr.width(points)
+    lane = dr.arange(module.UInt32, views.count * count)
+    map_index = lane // count
+    view = of_map(views, map_index, views.count)
+    if views.count > 1:
+        source = lane - map_index * count
+        points = module.Array3f(*(dr.gather(module.Float, points[c], source) for c in range(3)))
+        active = dr.gather(module.Bool, module.Bool(active), source)
+    point = module.Array3f(points)
+    p = to_light_space(view, point)
+    in_perspective = view.spread > 0
+    behind = in_perspective & (p.z <= 0)
+    w = dr.select(in_perspective & ~behind, p.z, 1)
+    values = [*(dr.select(behind, dr.inf, v / w) for v in (-p.x, -p.y, p.x, p.y)), -p.z, p.z]
+    *sides, nearest, farthest = _rows(_maxima(values, map_index, views.count, active), dr.arange(module.UInt32, views.count), 6)
+    x0, y0, x1, y1 = (dr.minimum(side, limit) for side in sides)
+    return -x0, -y0, x1, y1, -nearest, farthest
+
+
+def _fit(
+    views: Views,
+    extent: tuple[Any, ...],
+    casts: Any,
+    map_index: Any,
+    window: tuple[Any, ...],
+    resolution: int,
+    filter_size: int,
+) -> tuple[Frusta, tuple[Any, ...]]:
+    module = backend(views.spread)
+    x0, y0, x1, y1, z0, z1 = extent
+    needed = _maxima([-x0, -y0, -z0, x1, y1, z1], map_index, views.count, casts)
+    x0, y0, x1, y1, z0, z1 = Bounds(needed).of(dr.arange(module.UInt32, views.count))
+    nothing = ~(x1 >= x0)
+    x0, y0, x1, y1 = (dr.select(nothing, s, v) for s, v in ((-1.0, x0), (-1.0, y0), (1.0, x1), (1.0, y1)))
+    z0, z1 = dr.select(nothing, 0.0, z0), dr.select(nothing, 1.0, z1)
+
+    perspective = views.spread > 0
+    x0, y0 = dr.maximum(x0, window[0]), dr.maximum(y0, window[1])
+    x1, y1 = dr.minimum(x1, window[2]), dr.minimum(y1, window[3])
+    # Behind all that is seen, casters are of no account; but seen receivers may end before the first of them.
+    z1 = dr.maximum(dr.minimum(z1, window[5]), z0)
+    # How far casters lie before all that is seen does not matter. All of them may.
+    receivers = dr.select(dr.isfinite(window[4]), dr.maximum(window[4], z0), z0)
+    # Casters outside of the window leave an empty rectangle; any small one will do.
+    x1, y1 = dr.maximum(x1, x0 + 1e-4 * (1 + dr.abs(x0))), dr.maximum(y1, y0 + 1e-4 * (1 + dr.abs(y0)))
+    # A flat caster that faces the light has no depth of its own. In a range of next to nothing all that tilts it would be a huge
+    # change, of which the derivative of visibility is the small difference.
+    lateral = dr.maximum(x1 - x0, y1 - y0) * dr.select(perspective, dr.abs(z1), 1)
+    least = dr.maximum(_FLATTEST * lateral, _THINNEST * dr.maximum(dr.abs(z1), 1e-3))
+    # What is seen is known from samples: a little may lie before them.
+    spread = dr.select(dr.isfinite(window[5]), window[5] - receivers, 0)
+    depth = dr.maximum(dr.maximum(z1 - receivers, least), 0.1 * spread)
+    near = z0 - 0.05 * dr.maximum(z1 - z0, least)
+    # Where all casters end before what is seen, so does the far plane. If a floor lay right on it, rounding would decide whether
+    # it is drawn: its depth in the map would have a derivative, which that of a point on it, moved to the plane, has not.
+    last = dr.maximum(z1, receivers - 0.1 * depth) + 0.05 * depth
+    last = dr.select(perspective, dr.maximum(last, 1e-6), last)
+    first = dr.maximum(near, receivers - _BEFORE * depth)
+    far = last + _BEHIND_LAST * (last - first)
+    near = dr.select(perspective, dr.maximum(near, 1e-3 * far), near)
+    first = dr.maximum(near, receivers - _BEFORE * depth)
+
+    def widen(lo: Any, hi: Any) -> tuple[Any, Any]:
+        half = 0.5 * (hi - lo)
+        grown = half * max(1 + 2 * _MARGIN, 1 / (1 - 2 * (filter_size / 2 + 2) / resolution))
+        middle = 0.5 * (lo + hi)
+        lo, hi = dr.maximum(middle - grown, -views.limit), dr.minimum(middle + grown, views.limit)
+        limited = dr.isfinite(views.limit)
+        return dr.select(limited, 0.5 * (lo + hi), middle), dr.select(limited, 0.5 * (hi - lo), grown)
+
+    (cx, hx), (cy, hy) = widen(x0, x1), widen(y0, y1)
+    return Frusta(cx, cy, hx, hy, near, far, first, last), (x0, y0, x1, y1, z0, z1, receivers)
+
+
+def _still_fits(views: Views, old: Frusta, new: Frusta, needed: tuple[Any, ...], resolution: int, filter_size: int) -> Any:
+    x0, y0, x1, y1, z0, z1, receivers = needed
+    room = 2 * (filter_size / 2 + 1) / resolution
+
+    def holds(lo: Any, hi: Any, center: Any, half: Any) -> Any:
+        # A map that reaches its limit needs no room there.
+        limit = views.limit * (1 - 1e-5)
+        below = (lo >= center - half * (1 - room)) | (center - half <= -limit)
+        return below & ((hi <= center + half * (1 - room)) | (center + half >= limit))
+
+    keep = holds(x0, x1, old.center_x, old.half_x) & holds(y0, y1, old.center_y, old.half_y)
+    keep &= (new.half_x >= _KEEP_FILL * old.half_x) & (new.half_y >= _KEEP_FILL * old.half_y)
+    # Where casters surround a light, its near plane follows from the far one alone, and need not follow it closely.
+    around = (views.spread > 0) & (z0 < new.near)
+    keep &= dr.maximum(z0, new.near) >= dr.select(around, 0.5 * old.near, old.near)
+    # Receivers before the range in which depths are told apart would lose their shadows.
+    keep &= dr.maximum(receivers, new.first) >= dr.select(around & (old.first <= old.near), 0.5 * old.first, old.first)
+    keep &= z1 <= old.last
+    keep &= new.far - new.first >= _KEEP_FILL * (old.far - old.first)
+    return keep

@@ -1,0 +1,246 @@
+"""Cameras at the lights: their axes, their frusta, and the projections in between.
+
+A light sees the scene through one map (directional: orthographic; spot: perspective) or six (point: the faces of a cube). The
+maps of all lights form one batch of M images. Axes and origins are attached to the lights' parameters; the frustum (which part
+of the light's image plane the map covers) is detached and stable, so that an optimisation does not see the fit move.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from ..jit.arrays import backend
+from ..jit.broadcast import from_one_buffer, look_up
+from ..jit.vectors import unit
+
+#: Half-angle (tangent) of one cube face, before the margin for the filter.
+CUBE_FACE = 1.0
+
+
+@dataclass(frozen=True)
+class LightView:
+    """One map's camera.
+
+    Attributes:
+        right, up, forward: ``Array3f`` of width 1, orthonormal, world space; light travels along ``forward``.
+        origin: ``Array3f``, world space: the light's position, or any point for a directional light.
+        spread: tangent of the half-angle that the map may cover, or 0 for an orthographic map.
+        limit: image coordinates beyond which the map need not reach in any case, not even for a margin: those of a cube's face.
+    """
+
+    right: Any
+    up: Any
+    forward: Any
+    origin: Any
+    spread: Any
+    limit: Any = math.inf
+
+
+@dataclass(frozen=True)
+class Views:
+    """The cameras of all M maps: ``Array3f``/``Float`` of width M. Gradients flow to the lights."""
+
+    right: Any
+    up: Any
+    forward: Any
+    origin: Any
+    spread: Any
+    limit: Any
+
+    @property
+    def count(self) -> int:
+        return dr.width(self.spread)
+
+    def columns(self) -> list[Any]:
+        """All numbers (``Float`` (M,) each) in a fixed order."""
+        return [*self.right, *self.up, *self.forward, *self.origin, self.spread, self.limit]
+
+    @classmethod
+    def of(cls, columns: Sequence[Any]) -> Views:
+        """Put together what :meth:`columns` has taken apart."""
+        Array3f = backend(columns[0]).Array3f
+        return cls(*(Array3f(*columns[k : k + 3]) for k in (0, 3, 6, 9)), *columns[12:])
+
+
+@dataclass(frozen=True)
+class Frusta:
+    """Part of the image plane and of the depth range that each map covers; ``Float`` of width M, detached.
+
+    A point with light-space coordinates (x, y, z) has image coordinates (x, y) in an orthographic and (x, y) / z in a perspective
+    view; the map covers ``center +- half`` in them and depths from ``near`` to ``far``. It tells depths apart from ``first`` on:
+    what lies before that lies before all receivers, and it does not matter how far. Behind ``last`` nothing casts
+    a shadow.
+    """
+
+    center_x: Any
+    center_y: Any
+    half_x: Any
+    half_y: Any
+    near: Any
+    far: Any
+    first: Any
+    last: Any
+
+
+def directional_view(direction: Any) -> LightView:
+    """View along a light direction (``Array3f``, any length). The other axes follow from it without a twist of their own."""
+    forward = unit(direction)
+    # The world axis least aligned with the (detached) direction starts the frame.
+    d = dr.abs(dr.detach(forward))
+    use_x = (d.x <= d.y) & (d.x <= d.z)
+    use_y = ~use_x & (d.y <= d.z)
+    vector = type(direction)
+    axis = vector(dr.select(use_x, 1.0, 0.0), dr.select(use_y, 1.0, 0.0), dr.select(use_x | use_y, 0.0, 1.0))
+    right = dr.normalize(dr.cross(axis, forward))
+    zero = type(direction[0])(0)
+    return LightView(right, dr.cross(forward, right), forward, vector(zero, zero, zero), zero)
+
+
+def spot_view(position: Any, right: Any, up: Any, forward: Any, tan_cutoff: Any) -> LightView:
+    """View along the axis of a cone of light. Up to a half-angle of 60 degrees (tangent 1.73); wider ones use a cube."""
+    return LightView(right, up, forward, position, tan_cutoff)
+
+
+def cube_views(position: Any, resolution: int, filter_size: int) -> tuple[LightView, ...]:
+    """Six views along the world axes, each slightly wider than 90 degrees so that filters find neighbours, not a border."""
+    vector, scalar = type(position), type(position[0])
+    spread = scalar(CUBE_FACE / (1.0 - 2.0 * (filter_size // 2 + 1) / resolution))
+
+    def axis(k: int, sign: float) -> Any:
+        return vector(*(scalar(sign if c == k else 0.0) for c in range(3)))
+
+    views = []
+    for k in range(3):
+        for sign in (1.0, -1.0):
+            forward, right = axis(k, sign), axis((k + 1) % 3, 1.0)
+            views.append(LightView(right, dr.cross(forward, right), forward, position, spread, spread))
+    return tuple(views)
+
+
+def cube_face(offset: Any) -> Any:
+    """Which of the six :func:`cube_views` sees a point at ``offset`` from the light (``UInt32``)."""
+    a = dr.abs(offset)
+    k = dr.select((a.x >= a.y) & (a.x >= a.z), 0, dr.select(a.y >= a.z, 1, 2))
+    component = dr.select(k == 0, offset.x, dr.select(k == 1, offset.y, offset.z))
+    return backend(offset).UInt32(2 * k + dr.select(component < 0, 1, 0))
+
+
+def stack_views(views: Sequence[LightView]) -> Views:
+    """Collect single views into arrays of width M, keeping their gradients."""
+    module = backend(views[0].spread)
+    index = dr.arange(module.UInt32, len(views))
+
+    def stack(values: list[Any]) -> Any:
+        if len(values) == 1:
+            return module.Float(values[0])
+        total = module.Float(0)
+        for k, value in enumerate(values):
+            total = dr.select(index == k, value, total)
+        return total
+
+    def stack3(name: str) -> Any:
+        parts = [stack([getattr(v, name)[c] for v in views]) for c in range(3)]
+        # A single view's are the caller's own numbers.
+        return module.Array3f(*(from_one_buffer(parts) if dr.grad_enabled(parts) else parts))
+
+    return Views(
+        stack3("right"),
+        stack3("up"),
+        stack3("forward"),
+        stack3("origin"),
+        stack([v.spread for v in views]),
+        stack([module.Float(v.limit) for v in views]),
+    )
+
+
+def of_map(table: Any, index: Any, count: int) -> Any:
+    """Rows of :class:`Views` or :class:`Frusta` (``count`` of them) for the map that each lane works on."""
+    module = backend(index)
+
+    def pick(value: Any) -> Any:
+        # A single row broadcasts by itself; but the adjoint of that is a reduction of its own for each number, while
+        # gathers share one kernel.
+        if count == 1 and not dr.grad_enabled(value):
+            return value
+        if dr.depth_v(value) > 1:
+            return module.Array3f(*(look_up(value[c], index) for c in range(3)))
+        return look_up(value, index)
+
+    return type(table)(*(pick(getattr(table, name)) for name in table.__dataclass_fields__))
+
+
+def to_light_space(view: Views, p_world: Any) -> Any:
+    """(x, y, z) in a light's axes; z is the distance along its axis. Attached to points and light."""
+    d = backend(p_world).Array3f(p_world) - view.origin
+    return backend(p_world).Array3f(dr.dot(d, view.right), dr.dot(d, view.up), dr.dot(d, view.forward))
+
+
+def vertices_in_maps(views: Views, positions: Any) -> tuple[Any, Any, Any]:
+    """All vertices in the light space of each map, map after map.
+
+    Args:
+        views: of the M maps.
+        positions: flat ``Float`` (3V,), world space.
+
+    Returns:
+        ``Array3f`` of width M * V (:func:`to_light_space`), attached to positions and lights, and the map and the vertex of each
+        of these lanes (``UInt32``).
+    """
+    module, count = backend(positions), views.count
+    number = dr.width(positions) // 3
+    lane = dr.arange(module.UInt32, count * number)
+    map_index = lane // number if count > 1 else dr.zeros(module.UInt32, number)
+    vertex = lane - map_index * number
+    p_world = dr.gather(module.Array3f, positions, vertex)
+    return to_light_space(of_map(views, map_index, count), p_world), map_index, vertex
+
+
+def to_clip(view: Views, frustum: Frusta, p_light: Any) -> Any:
+    """Clip-space position (``Array4f``) in a map: its ndc square is the frustum's rectangle, depths near..far are -1..1."""
+    perspective = view.spread > 0
+    n, f = frustum.near, frustum.far
+    w = dr.select(perspective, p_light.z, 1.0)
+    x = dr.fma(-frustum.center_x, w, p_light.x) / frustum.half_x
+    y = dr.fma(-frustum.center_y, w, p_light.y) / frustum.half_y
+    a = dr.select(perspective, (f + n) / (f - n), 2 / (f - n))
+    b = dr.select(perspective, -2 * f * n / (f - n), -(f + n) / (f - n))
+    return backend(p_light).Array4f(x, y, dr.fma(a, p_light.z, b), w)
+
+
+def linear_depth(view: Views, frustum: Frusta, depth: Any) -> tuple[Any, Any]:
+    """Depth along the light's axis, mapped linearly from first..far to -1/2..1/2, and its derivative by ``depth``.
+
+    ``depth``: NDC depth in parallel projections, 1 / w in perspective. Depths before ``first`` are moved to it: -1/2, without
+    derivative.
+    """
+    perspective = view.spread > 0
+    n, f, first = frustum.near, frustum.far, frustum.first
+    # Where nothing is seen, whatever stands for it is no reason to divide by zero.
+    z = dr.rcp(dr.select(perspective & (depth > 0), depth, 1))
+    scale = 1 / (f - first)
+    z = dr.select(perspective, z, 0.5 * dr.fma(depth, f - n, f + n))
+    linear = (z - first) * scale - 0.5
+    slope = dr.select(perspective, -z * z, 0.5 * (f - n)) * scale
+    told_apart = linear > -0.5
+    return dr.select(told_apart, linear, -0.5), dr.select(told_apart, slope, 0)
+
+
+def project(view: Views, frustum: Frusta, p_world: Any) -> tuple[Any, Any, Any, Any]:
+    """Where world-space points lie in a map: (u, v) in -1..1, linear depth, and whether (u, v) are inside.
+
+    Attached to points and light.
+    """
+    p = to_light_space(view, p_world)
+    perspective = view.spread > 0
+    in_front = ~perspective | (p.z > 1e-6 * frustum.far)
+    w = dr.select(perspective & in_front, p.z, 1.0)
+    u = (p.x / w - frustum.center_x) / frustum.half_x
+    v = (p.y / w - frustum.center_y) / frustum.half_y
+    depth = (p.z - frustum.first) / (frustum.far - frustum.first) - 0.5
+    inside = in_front & (dr.abs(u) <= 1) & (dr.abs(v) <= 1)
+    return u, v, depth, inside

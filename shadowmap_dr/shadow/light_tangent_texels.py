@@ -1,0 +1,207 @@
+"""What the texels of directional lights' maps store, and how that changes when the lights turn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+
+from ..jit.arrays import backend
+from ..raster import NO_TRIANGLE, NO_VERTEX, Crossings, RasterOutput
+from ..raster.antialiasing.neighbour_weights import incoming_weights
+from ..raster.screen_planes import depth_at, planes
+from ..raster.types import pixel_coordinates
+from .light_camera import Frusta, Views, of_map
+from .methods.registry import PREFILTERED
+from .settings import ShadowSettings
+from .shadow_map import FAR, interleaved, texel_depths
+
+
+def twist_of(views: Views) -> Any:
+    """How much each view turns about its axis while its axis moves along ``right`` (``Float``, M)."""
+    module = backend(views.spread)
+    d = [dr.abs(views.forward[c]) for c in range(3)]
+    # The world axis that `directional_view` starts from.
+    use_x = (d[0] <= d[1]) & (d[0] <= d[2])
+    use_y = ~use_x & (d[1] <= d[2])
+
+    def component(vector: Any) -> Any:
+        return dr.select(use_x, vector[0], dr.select(use_y, vector[1], vector[2]))
+
+    return module.Float(component(views.forward) / component(views.up))
+
+
+def turned(twist: Any, p: Any) -> tuple[tuple[Any, Any, Any], tuple[Any, Any, Any]]:
+    """Changes of light-space coordinates (x, y, z) with a, and with b."""
+    zero = type(p[0])(0)
+    return (dr.fma(twist, p[1], -p[2]), -twist * p[0], p[0]), (zero, -p[2], p[1])
+
+
+class TangentTexels:
+    """What the texels of a batch of maps store, and its tangents: anti-aliased in the same kernel.
+
+    Texels hold simple functions of their triangles' planes. Those that are mixed compute their neighbours' numbers once more,
+    which costs less than to write and read those of all texels.
+    """
+
+    def __init__(
+        self,
+        raster: RasterOutput,
+        clip: Any,
+        faces: Any,
+        views: Views,
+        frusta: Frusta,
+        twist: Any,
+        settings: ShadowSettings,
+        size: int,
+    ) -> None:
+        self.module, self.raster, self.size, self.settings = backend(clip), raster, size, settings
+        self.views, self.frusta, self.twist = views, frusta, twist
+        self.method = PREFILTERED[settings.method]
+        self.planes, _ = planes(clip, faces, raster, False)
+        dr.eval(self.planes)
+
+    def mixed(self, crossings: Crossings | None, rates: tuple[Any, Any] | None) -> tuple[Any, Any]:
+        """Flat numbers, and flat tangents: a texel's changes with a, then with b."""
+        module, size = self.module, self.size
+        image, row, column = pixel_coordinates(module, self.raster.batch, size, size)
+        texel = dr.arange(module.UInt32, self.raster.batch * size * size)
+        free = self.method.encode(module.Float(FAR), module.Float(0), self.settings.order)
+
+        def plain(*lanes: Any) -> tuple[Any, ...]:
+            own, changes = self._own(*lanes)
+            return (*own, *changes)
+
+        # Half of a map may see nothing.
+        result = dr.if_stmt(
+            (image, row, column, self.raster.triangle),
+            self.raster.triangle != NO_TRIANGLE,
+            plain,
+            lambda *lanes: (*free, *(module.Float(0) for _ in range(2 * len(free)))),
+            mode="symbolic",
+            label="texels",
+        )
+        own, changes = list(result[: len(free)]), list(result[len(free) :])
+        if crossings is None:
+            return interleaved(own), interleaved(changes)
+        incoming = incoming_weights(crossings, size)
+        channels = len(own)
+
+        def mix(texel: Any, image: Any, row: Any, column: Any, *lanes: Any) -> tuple[Any, ...]:
+            incoming, own, changes = lanes[:4], lanes[4 : 4 + channels], lanes[4 + channels :]
+            claims = sum(incoming)
+            scale = dr.rcp(dr.maximum(1, claims))
+            # Right, lower, left, upper; who holds the weight, and the sign by which it says that the neighbour reaches into here.
+            steps = ((0, 1, texel, 0, -1), (1, 0, texel, 1, -1), (0, -1, texel - 1, 0, 1), (-1, 0, texel - size, 1, 1))
+            others = []
+            for weight, (down, right, *_) in zip(incoming, steps, strict=True):
+                there = weight > 0
+                triangle = dr.gather(module.UInt32, self.raster.triangle, _moved(texel, down * size + right), there)
+                triangle = dr.select(there, triangle, NO_TRIANGLE)
+                others.append(self._own(image, _moved(row, down), _moved(column, right), triangle))
+            mixed = [
+                v + sum(dr.select(w > 0, w * scale * (other[0][c] - v), 0) for w, other in zip(incoming, others, strict=True))
+                for c, v in enumerate(own)
+            ]
+            # A texel that is wholly claimed shares itself out: more for one neighbour is less for all of them.
+            mean = [dr.select(claims >= 1, m, v) for m, v in zip(mixed, own, strict=True)]
+            total = list(changes)
+            for weight, (numbers, tangents), (_, _, holder, axis, sign) in zip(incoming, others, steps, strict=True):
+                there = weight > 0
+                factor = weight * scale
+                rate = dr.gather(module.Array2f, rates[axis], holder, there) * (sign * scale)
+                for k in range(2 * channels):
+                    c = k % channels
+                    change = factor * (tangents[k] - changes[k]) + rate[k // channels] * (numbers[c] - mean[c])
+                    # Not in place, which would change what is the texel's own, too.
+                    total[k] = total[k] + dr.select(there, change, 0)
+            return (*mixed, *total)
+
+        result = dr.if_stmt(
+            (texel, image, row, column, *incoming, *own, *changes),
+            sum(incoming) > 0,
+            mix,
+            lambda texel, image, row, column, *lanes: lanes[4:],
+            mode="symbolic",
+            label="mixed texels",
+        )
+        return interleaved(list(result[:channels])), interleaved(list(result[channels:]))
+
+    def _own(self, image: Any, row: Any, column: Any, triangle: Any) -> tuple[list[Any], list[Any]]:
+        """Numbers that texels store by themselves, and their changes with a, then with b."""
+        module, size = self.module, self.size
+        view, frustum = of_map(self.views, image, self.views.count), of_map(self.frusta, image, self.views.count)
+        twist = dr.gather(module.Float, self.twist, image)
+        hit = triangle != NO_TRIANGLE
+        seen = depth_at(self.planes, image * self.raster.face_count + triangle, row, column, hit)
+        texels = texel_depths(seen, hit, view, frustum, self.settings)
+        n, f = frustum.near, frustum.far
+        ndc_x = dr.fma(module.Float(column), 2.0 / size, 1.0 / size - 1.0)
+        ndc_y = dr.fma(module.Float(row), 2.0 / size, 1.0 / size - 1.0)
+        # The light-space point that the texel sees, and the slopes of its triangle there.
+        half_range = 0.5 * (f - n)
+        p = (
+            dr.fma(ndc_x, frustum.half_x, frustum.center_x),
+            dr.fma(ndc_y, frustum.half_y, frustum.center_y),
+            dr.fma(texels.seen, half_range, 0.5 * (f + n)),
+        )
+        slope_x = texels.dx * half_range * (0.5 * size) / frustum.half_x
+        slope_y = texels.dy * half_range * (0.5 * size) / frustum.half_y
+        # What lies before the depths that are told apart does not move.
+        scale = dr.select(texels.shown & (texels.depth > -0.5), dr.rcp(f - frustum.first), 0)
+        # A texel stays where it is while the triangle moves through it.
+        rates = [(dz - slope_x * dx - slope_y * dy) * scale for dx, dy, dz in turned(twist, p)]
+        values, slopes = _with_slopes(lambda z: self.method.encode(z, texels.slope_square, self.settings.order), texels.depth)
+        return values, [slope * rate for rate in rates for slope in slopes]
+
+
+def _moved(number: Any, by: int) -> Any:
+    """``UInt32`` plus a whole number of either sign."""
+    return number + by if by >= 0 else number - -by
+
+
+def _with_slopes(function: Callable[[Any], list[Any]], x: Any) -> tuple[list[Any], list[Any]]:
+    """Several numbers and their derivatives by the one that they are functions of."""
+    with dr.resume_grad():
+        x = dr.detach(x, preserve_type=True) + 0
+        dr.enable_grad(x)
+        values = function(x)
+        dr.set_grad(x, 1)
+        dr.enqueue(dr.ADMode.Forward, x)
+        # A number may be x itself, whose gradient would be cleared on the way.
+        dr.traverse(dr.ADMode.Forward, flags=dr.ADFlag.ClearEdges)
+        slopes = [dr.grad(v) for v in values]
+    return [dr.detach(v) for v in values], slopes
+
+
+def weight_rates(clip: Any, crossings: Crossings, frusta: Frusta, twist: Any, size: int) -> tuple[Any, Any]:
+    """Changes with a and b (interleaved, 2 for each pixel) of the weights of right and of lower pairs; undefined for weight 0."""
+    module = backend(clip)
+    Array2f, Array4f = module.Array2f, module.Array4f
+    count, pixels = dr.width(twist), dr.width(crossings.right)
+    right, down = dr.empty(module.Float, 2 * pixels), dr.empty(module.Float, 2 * pixels)
+
+    def visit(slot: Any, pair: Any) -> None:
+        ends = dr.gather(module.Array4u, crossings.ends, slot)
+        has = ends.x != NO_VERTEX
+        slope = dr.gather(Array4f, crossings.slopes, slot, has)
+        a, b = (dr.gather(Array4f, clip, v, has) for v in (ends.x, ends.y))
+        at = dr.fma(b - a, slope.x, a)
+        pixel = pair >> 1
+        frustum, own = of_map(frusta, pixel // (size * size), count), dr.gather(module.Float, twist, pixel // (size * size))
+        n, f = frustum.near, frustum.far
+        p = (
+            dr.fma(at.x, frustum.half_x, frustum.center_x),
+            dr.fma(at.y, frustum.half_y, frustum.center_y),
+            0.5 * dr.fma(at.z, f - n, f + n),
+        )
+        per_x, per_y = slope.y / frustum.half_x, slope.z / frustum.half_y
+        rate = Array2f(*(dr.select(has, per_x * dx + per_y * dy, 0) for dx, dy, _ in turned(own, p)))
+        is_down = (pair & 1) != 0
+        dr.scatter(right, rate, pixel, ~is_down)
+        dr.scatter(down, rate, pixel, is_down)
+
+    crossings.pairs.for_each(visit)
+    dr.eval(right, down)
+    return right, down

@@ -1,0 +1,45 @@
+"""Depth comparison: `standard` and `pcf` shadow maps."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+
+from ...jit.arrays import backend
+
+# Means that differ by less from the depth at the centre of a texel are equal to it: a few units in the last place.
+_LEAST_DIFFERENCE = 1e-6
+
+
+def standard_visibility(map_depth: Any, depth: Any, bias: float) -> Any:
+    """1 where a receiver lies at most ``bias`` behind the depth in the map, else 0 (Williams 1978). No gradients."""
+    return dr.select(dr.detach(depth) <= dr.detach(map_depth) + bias, backend(depth).Float(1), 0)
+
+
+def soft_comparison(map_depth: Any, depth: Any, bias: float, softness: float) -> Any:
+    """1 where a receiver lies at most ``bias`` behind the depth in the map, falling to 0 over the next ``softness``. Attached."""
+    return 1 - dr.clip((depth - map_depth - bias) / softness, 0, 1)
+
+
+def other_depth(depth: Any, moments: Any) -> tuple[Any, Any]:
+    """What a texel with two surfaces sees beside the nearer or farther one at its centre. Attached to both arguments.
+
+    Args:
+        depth: linear depth at the centre of the texel, in -1/2..1/2.
+        moments: ``Array2f``, mean and mean square of the depth over the texel.
+
+    Returns:
+        (the other surface's depth in -1/2..1/2, the share of the texel that it covers in 0..1), such that both surfaces together
+        have these moments; (``depth``, 0) where there is no other surface. Finite, also in derivatives, for any arguments.
+    """
+    mean = moments.x - depth
+    square = dr.fma(-2 * moments.x + depth, depth, moments.y)
+    # No distribution has a mean square below the squared mean: what is left of it is rounding.
+    least = mean * mean
+    square = dr.select(square > least, square, least)
+    there = dr.abs(mean) > _LEAST_DIFFERENCE
+    mean, square = dr.select(there, mean, 1), dr.select(there, square, 1)
+    other = depth + dr.select(there, square / mean, 0)
+    other = dr.select(other < -0.5, -0.5, dr.select(other > 0.5, 0.5, other))
+    return other, dr.select(there, mean * mean / square, 0)

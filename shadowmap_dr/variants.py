@@ -1,0 +1,27 @@
+"""The Mitsuba variants that commands accept."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from .errors import ShadowmapError
+
+DEFAULT_VARIANT = "llvm_ad_rgb"
+#: Endings of variants: those that renderings with shadow maps work in, those with colours, and all.
+SUPPORTED, COLOURED, ANY = ("_ad_rgb", "_ad_mono"), ("_ad_rgb",), ("",)
+
+
+def set_variant(name: str, endings: tuple[str, ...] = SUPPORTED) -> None:
+    """Set the Mitsuba variant.
+
+    ShadowmapError if it does not exist, has no device, or is none that the command works in: only those with the ``endings`` are.
+    """
+    fitting = [variant for variant in mi.variants() if variant.endswith(endings)]
+    if name not in mi.variants():
+        raise ShadowmapError(f"no variant {name!r} in this Mitsuba: choose one of {', '.join(fitting)}.")
+    if name not in fitting:
+        raise ShadowmapError(f"this command does not work in the variant {name}: choose one of {', '.join(fitting)}.")
+    if name.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
+        raise ShadowmapError(f"the variant {name} needs an NVIDIA GPU, and Dr.Jit found none: use {DEFAULT_VARIANT}.")
+    mi.set_variant(name)

@@ -1,0 +1,76 @@
+"""The scripts in ``docs/examples``, shortened."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_a_mesh_takes_the_shape_of_its_shadow(tmp_path: Path) -> None:
+    pytest.importorskip("torch", reason="PyTorch is not installed: pip install '.[torch]'")
+    script = ROOT / "docs" / "examples" / "torch_mesh.py"
+    command = [sys.executable, script, "--steps", "40", "--size", "96", "--out", tmp_path / "out"]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=ROOT)
+    assert result.returncode == 0, result.stderr
+    before, after = map(float, re.search(r"loss ([0-9.]+) -> ([0-9.]+)", result.stdout).groups())
+    assert after < 0.2 * before
+    shadows = np.asarray(Image.open(tmp_path / "out" / "shadows.png"), np.float32).mean(2)
+    start, end, wanted = (shadows[:, k * 96 : (k + 1) * 96] < 170 for k in range(3))
+    assert 0.05 < wanted.mean() < 0.6
+    assert (end != wanted).mean() < 0.3 * (start != wanted).mean()
+    views = [np.asarray(Image.open(tmp_path / "out" / f"{name}.png"), np.float32) for name in ("before", "after")]
+    assert views[0].shape == (384, 384, 3) and np.abs(views[0] - views[1]).mean() > 2
+
+
+def test_ways_to_render_are_timed_in_turns() -> None:
+    script = ROOT / "docs" / "examples" / "plugin_speed.py"
+    command = [sys.executable, script, "--resolution", "16", "--rounds", "2"]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=ROOT)
+    assert result.returncode == 0, result.stderr
+    steps = dict(re.findall(r"^(.+): ([0-9.]+) ms a step", result.stdout, re.MULTILINE))
+    assert list(steps) == ["plug-in", "plug-in, recorded", "renderer, recorded"] and min(map(float, steps.values())) > 0
+
+
+@pytest.mark.parametrize("setting", [[], ["--setting", "2/2/8/none/4"]])  # the fair one: ratios above a thousand
+def test_steps_are_timed_in_turns(setting: list[str]) -> None:
+    script = ROOT / "docs" / "examples" / "pose_speed.py"
+    command = [sys.executable, script, "--resolution", "16", "--rounds", "1", *setting]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=ROOT)
+    assert result.returncode == 0, result.stderr
+    assert ("2/2/8 none, 4" in result.stdout) == bool(setting)
+    steps = {name: float(value) for name, value in re.findall(r"^(\w+): ([0-9.]+) ms a step", result.stdout, re.MULTILINE)}
+    assert steps.keys() == {"shadows", "rasterizer", "mitsuba"} and min(steps.values()) > 0
+    ratios = {pair: float(value) for pair, value in re.findall(r"^(\w+ / \w+): ([0-9.]+)x$", result.stdout, re.MULTILINE)}
+    assert ratios.keys() == {"mitsuba / shadows", "mitsuba / rasterizer", "shadows / rasterizer"}
+    for pair, ratio in ratios.items():  # plain numbers, also above a thousand
+        above, below = pair.split(" / ")
+        assert ratio == pytest.approx(steps[above] / steps[below], rel=0.02, abs=0.06 if ratio < 10 else 0.6)
+
+
+def test_steps_are_timed_again_and_again() -> None:
+    script = ROOT / "docs" / "examples" / "step_phases.py"
+    command = [sys.executable, script, "--resolution", "16", "24", "--seconds", "0.1"]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=ROOT)
+    assert result.returncode == 0, result.stderr
+    times = re.findall(r"(\d+) threads: ([0-9.]+) ([0-9.]+)", result.stdout)
+    assert times and times[-1][0] == "1" and all(float(value) > 0 for row in times for value in row)
+
+
+def test_limits_are_measured() -> None:
+    script = ROOT / "docs" / "examples" / "limits.py"
+    command = [sys.executable, script, "--size", "24", "--samples", "1"]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=ROOT)
+    assert result.returncode == 0, result.stderr
+    lines = re.findall(r"^(.+), 1 samples: cosine (-?[0-9.]+), scale (-?[0-9.]+)$", result.stdout, re.MULTILINE)
+    assert len(lines) == 8
+    found = {name: (float(cosine), float(scale)) for name, cosine, scale in lines}
+    # The right direction, and not the right size.
+    assert found["ball lit from the camera, grows"] == (pytest.approx(1, abs=0.01), pytest.approx(1.2, abs=0.1))

@@ -14,3 +14,7 @@ __version__ = "0.1.0"
 integrator.install()  # the plug-in `shadowmap`, in this variant and all that will be set
 
 __all__ = ["RenderSettings", "Renderer", "ShadowSettings", "ShadowmapError", "__version__"]
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__all__", "__doc__", "__file__", "__name__", "__path__"]

@@ -193,3 +193,9 @@ def test_the_program_imports_no_command() -> None:
 def test_nothing_lies_flat() -> None:
     flat = {path.stem for path in (ROOT / "shadowmap_dr").glob("*.py")}
     assert flat == {"__init__", "_llvm", "errors", "variants"}
+
+
+def test_the_package_shows_its_public_names_only() -> None:
+    import shadowmap_dr
+
+    assert [name for name in dir(shadowmap_dr) if not name.startswith("__")] == sorted(set(shadowmap_dr.__all__) - {"__version__"})

@@ -113,8 +113,9 @@ class MitsubaPose:
     ) -> None:
         image = np.asarray(reference, np.float32)
         if image.ndim != 3 or image.shape[:2] != (resolution, resolution) or not np.isfinite(image).all():
-            raise ShadowmapError(f"a reference of shape {image.shape}: give finite values of shape "
-                                 f"({resolution}, {resolution}, C).")
+            raise ShadowmapError(
+                f"a reference of shape {image.shape}: give finite values of shape ({resolution}, {resolution}, C)."
+            )
         self.setting, self.step_size, self.betas, self.seed, self.shift_z = setting, step_size, betas, seed, shift_z
         scene = _load(scene_path, mesh_path, resolution, normals)
         params = mi.traverse(scene)
@@ -126,16 +127,22 @@ class MitsubaPose:
         self._params = mi.traverse(self._scene)
         self._sensor = self._scene.sensors()[0]
         self._reference = mi.TensorXf(image)
-        self._integrator = mi.load_dict({
-            "type": "direct_projective", "sppc": setting.sppc, "sppp": setting.sppp, "sppi": setting.sppi,
-            "guiding": setting.guiding,
-        })
+        self._integrator = mi.load_dict(
+            {
+                "type": "direct_projective",
+                "sppc": setting.sppc,
+                "sppp": setting.sppp,
+                "sppi": setting.sppi,
+                "guiding": setting.guiding,
+            }
+        )
         self.reset((0.0, 0.0, 0.0))
 
     def reset(self, start: npt.ArrayLike) -> None:
         """Starts anew at (rotation in radians, x, y) with empty moments."""
-        self.load_state({"parameters": np.asarray(start, np.float64), "m": np.zeros(3), "v": np.zeros(3),
-                         "t": np.zeros(1, np.int64)})
+        self.load_state(
+            {"parameters": np.asarray(start, np.float64), "m": np.zeros(3), "v": np.zeros(3), "t": np.zeros(1, np.int64)}
+        )
 
     def step(self) -> float:
         """One step of Adam. Returns the loss before it: the mean squared difference of linear colours."""
@@ -163,7 +170,8 @@ class MitsubaPose:
             count = difference.array.shape[0]
             loss = dr.sum(dr.square(difference.array)) / count
         self._integrator.render_backward(
-            self._scene, self._params, difference * (2 / count), sensor=self._sensor, seed=int(seeds[1]), spp=0)
+            self._scene, self._params, difference * (2 / count), sensor=self._sensor, seed=int(seeds[1]), spp=0
+        )
         return float(loss[0]), np.array(dr.grad(pose), dtype=np.float64)
 
     def parameters(self) -> np.ndarray:
@@ -191,8 +199,13 @@ class MitsubaPose:
     def describe(self) -> dict[str, Any]:
         """Settings for the record: integrator, samples, proxy, optimiser."""
         return {
-            "integrator": "direct_projective", **asdict(self.setting), "optimizer": "Adam", "step_size": self.step_size,
-            "betas": list(self.betas), "seed": self.seed, "proxy": self.proxy.record(),
+            "integrator": "direct_projective",
+            **asdict(self.setting),
+            "optimizer": "Adam",
+            "step_size": self.step_size,
+            "betas": list(self.betas),
+            "seed": self.seed,
+            "proxy": self.proxy.record(),
         }
 
     def _place(self, pose: Any) -> None:
@@ -200,13 +213,35 @@ class MitsubaPose:
         self._params.update()
 
 
-CANDIDATES = tuple(ProjectiveSetting(*counts) for counts in (
-    # Counts that the stratified sampler takes without rounding. What limits convergence is the noise of the shadow
-    # boundaries' derivative (sppi): nearly no sample meets the small light, so the others are not searched alone.
-    (1, 1, 1), (1, 1, 4), (1, 1, 16), (1, 1, 64), (2, 2, 2), (2, 2, 8), (2, 2, 36), (4, 4, 4), (4, 4, 16), (4, 4, 64),
-    (4, 4, 144), (4, 4, 256), (8, 8, 36), (8, 8, 64), (16, 16, 16), (16, 16, 64), (16, 16, 144), (64, 64, 64), (16, 16, 256),
-    (4, 4, 4, "grid"), (4, 4, 4, "octree"), (16, 16, 16, "octree"),
-))
+CANDIDATES = tuple(
+    ProjectiveSetting(*counts)
+    for counts in (
+        # Counts that the stratified sampler takes without rounding. What limits convergence is the noise of the shadow
+        # boundaries' derivative (sppi): nearly no sample meets the small light, so the others are not searched alone.
+        (1, 1, 1),
+        (1, 1, 4),
+        (1, 1, 16),
+        (1, 1, 64),
+        (2, 2, 2),
+        (2, 2, 8),
+        (2, 2, 36),
+        (4, 4, 4),
+        (4, 4, 16),
+        (4, 4, 64),
+        (4, 4, 144),
+        (4, 4, 256),
+        (8, 8, 36),
+        (8, 8, 64),
+        (16, 16, 16),
+        (16, 16, 64),
+        (16, 16, 144),
+        (64, 64, 64),
+        (16, 16, 256),
+        (4, 4, 4, "grid"),
+        (4, 4, 4, "octree"),
+        (16, 16, 16, "octree"),
+    )
+)
 
 
 def pose_start(run: int, seed: int = 0) -> np.ndarray:
@@ -237,7 +272,9 @@ def fair_setting(resolution: int, normals: str = "face") -> ProjectiveSetting:
 def is_fair(setting: ProjectiveSetting, resolution: int, normals: str = "face", mesh: str = "spot") -> bool:
     """True if a stored search with this very mesh and resolution found the setting to be the cheapest one that converges."""
     return any(
-        entry["setting"] == asdict(setting) and entry["resolution"] == resolution and entry.get("mesh", "spot") == mesh
+        entry["setting"] == asdict(setting)
+        and entry["resolution"] == resolution
+        and entry.get("mesh", "spot") == mesh
         and entry.get("normals", "face") == normals
         for entry in _stored().values()
     )
@@ -281,8 +318,14 @@ def find_fair_setting(
         degrees, the final offsets and the median seconds per iteration of each candidate, the seconds per iteration of
         those not tried, the proxy and the machine.
     """
-    protocol = {"resolution": resolution, "mesh": mesh, "normals": normals, "starts": starts, "iterations": iterations,
-                "threshold_deg": threshold_deg}
+    protocol = {
+        "resolution": resolution,
+        "mesh": mesh,
+        "normals": normals,
+        "starts": starts,
+        "iterations": iterations,
+        "threshold_deg": threshold_deg,
+    }
     earlier = earlier or protocol
     for name, value in protocol.items():
         # Searches from before there was a choice are with flat shading.
@@ -293,8 +336,13 @@ def find_fair_setting(
     scene = _load(scene_path, mesh_path, resolution, normals)
     reference, proxy = path_traced(scene, spp=512).image, calibrate(scene)
     record: dict[str, Any] = {
-        **protocol, "measurements": list(earlier.get("measurements", [])), "untried": dict(earlier.get("untried", {})),
-        "proxy": proxy.record(), "mitsuba": mi.__version__, "variant": mi.variant(), "threads": dr.thread_count(),
+        **protocol,
+        "measurements": list(earlier.get("measurements", [])),
+        "untried": dict(earlier.get("untried", {})),
+        "proxy": proxy.record(),
+        "mitsuba": mi.__version__,
+        "variant": mi.variant(),
+        "threads": dr.thread_count(),
     }
     record["setting"] = _cheapest(record["measurements"], starts, threshold_deg)
     begun = [entry for entry in record["measurements"] if not _complete(entry, starts, threshold_deg)]
@@ -324,14 +372,20 @@ def find_fair_setting(
         pose = method(setting)
         entry = next((entry for entry in begun if entry["setting"] == asdict(setting)), None)
         if entry is None:
-            entry = {"setting": asdict(setting), "timed_seconds_per_iteration": cost[setting], "load_average": os.getloadavg()[0],
-                     "runs": []}
+            entry = {
+                "setting": asdict(setting),
+                "timed_seconds_per_iteration": cost[setting],
+                "load_average": os.getloadavg()[0],
+                "runs": [],
+            }
             record["measurements"].append(entry)
         runs = entry["runs"]
         while not _complete(entry, starts, threshold_deg):
             runs.append(_measure(pose, len(runs), iterations))
-            report("{} run {run}: {mean_error_deg_last_20:.3f} degrees, {offset_x100:.2f}, "
-                   "{seconds_per_iteration:.2f} s per step".format(setting, **runs[-1]))
+            report(
+                "{} run {run}: {mean_error_deg_last_20:.3f} degrees, {offset_x100:.2f}, "
+                "{seconds_per_iteration:.2f} s per step".format(setting, **runs[-1])
+            )
             save(record)
         del record["untried"][str(setting)]
         record["setting"] = _cheapest(record["measurements"], starts, threshold_deg)
@@ -350,7 +404,8 @@ def _complete(entry: Mapping[str, Any], starts: int, threshold_deg: float) -> bo
 def _cheapest(measurements: list[dict[str, Any]], starts: int, threshold_deg: float) -> dict[str, Any] | None:
     """The setting with the fastest steps among those that converged from all starts; None if none did."""
     passed = [
-        entry for entry in measurements
+        entry
+        for entry in measurements
         if len(entry["runs"]) == starts and all(run["mean_error_deg_last_20"] <= threshold_deg for run in entry["runs"])
     ]
     cost = lambda entry: float(np.median([run["seconds_per_iteration"] for run in entry["runs"]]))  # noqa: E731
@@ -365,7 +420,9 @@ def _measure(pose: MitsubaPose, run: int, iterations: int) -> dict[str, Any]:
         seconds.append(_timed(pose.step))
         trace.append(pose.parameters())
     return {
-        "run": run, "start": pose_start(run).tolist(), "final": trace[-1].tolist(),
+        "run": run,
+        "start": pose_start(run).tolist(),
+        "final": trace[-1].tolist(),
         "mean_error_deg_last_20": float(np.degrees(np.abs(np.array(trace)[-20:, 0])).mean()),
         "offset_x100": float(100 * np.hypot(*trace[-1][1:])),
         "seconds_per_iteration": float(np.median(seconds[5:] or seconds)),
@@ -399,12 +456,15 @@ def _stored(path: Path | None = None) -> dict[str, dict[str, Any]]:
 def _nearest(resolution: int, normals: str) -> tuple[int, ProjectiveSetting]:
     """The resolution nearest to the given one at which a stored search found a setting, and the setting."""
     found = {
-        entry["resolution"]: ProjectiveSetting(**entry["setting"]) for entry in _stored().values()
+        entry["resolution"]: ProjectiveSetting(**entry["setting"])
+        for entry in _stored().values()
         if entry["setting"] and entry.get("normals", "face") == normals
     }
     if not found:
-        raise ShadowmapError(f"no setting is known to converge with {normals} normals: "
-                             f"run python -m mitsuba_baselines.pose --search {resolution} --normals {normals}.")
+        raise ShadowmapError(
+            f"no setting is known to converge with {normals} normals: "
+            f"run python -m mitsuba_baselines.pose --search {resolution} --normals {normals}."
+        )
     nearest = min(found, key=lambda size: abs(np.log2(size / resolution)))
     return nearest, found[nearest]
 
@@ -437,8 +497,15 @@ def _search(options: argparse.Namespace) -> None:
         with atomic(options.output) as temporary:
             temporary.write_text(json.dumps(table, indent=1) + "\n")
 
-    record = find_fair_setting(options.search, mesh=options.mesh, normals=options.normals, candidates=candidates,
-                               earlier=_stored(options.output).get(key), save=save, report=lambda line: print(line, flush=True))
+    record = find_fair_setting(
+        options.search,
+        mesh=options.mesh,
+        normals=options.normals,
+        candidates=candidates,
+        earlier=_stored(options.output).get(key),
+        save=save,
+        report=lambda line: print(line, flush=True),
+    )
     print(f"fair setting at {key}: {record['setting']}")
 
 

@@ -68,6 +68,13 @@ def projective_derivative(
     counts = (passes - passes // 2, passes // 2)
     even, odd = (half / count for half, count in zip(halves, counts, strict=True))
     noise = agreement(even, odd).cosine if np.any(odd) else 0.0
-    settings = {"kind": "projective", "sppi": sppi, "passes": passes, "guiding": guiding, "seed": seed,
-                "mitsuba": mi.__version__, "halves_cosine": noise}
+    settings = {
+        "kind": "projective",
+        "sppi": sppi,
+        "passes": passes,
+        "guiding": guiding,
+        "seed": seed,
+        "mitsuba": mi.__version__,
+        "halves_cosine": noise,
+    }
     return Reference(((halves[0] + halves[1]) / passes).astype(np.float32), settings)

@@ -61,12 +61,14 @@ class Proxy:
         centre, direction = np.array(self.centre), np.array(self.direction)
         up = [0.0, 1.0, 0.0] if abs(direction[1]) < 0.9 else [1.0, 0.0, 0.0]
         place = mi.ScalarTransform4f().look_at(centre.tolist(), (centre + direction).tolist(), up)
-        return mi.load_dict({
-            "type": "disk",
-            "to_world": place @ mi.ScalarTransform4f().scale(self.diameter / 2),
-            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": list(self.radiance)}},
-            "bsdf": {"type": "diffuse", "reflectance": 0.0},
-        })
+        return mi.load_dict(
+            {
+                "type": "disk",
+                "to_world": place @ mi.ScalarTransform4f().scale(self.diameter / 2),
+                "emitter": {"type": "area", "radiance": {"type": "rgb", "value": list(self.radiance)}},
+                "bsdf": {"type": "diffuse", "reflectance": 0.0},
+            }
+        )
 
     def record(self) -> dict[str, object]:
         """All attributes as JSON values."""
@@ -129,9 +131,15 @@ def calibrate(
         diameter = max_penumbra_px / height_px * distance
         area = np.pi * diameter**2 / 4
         proxy = Proxy(
-            direction=_triple(direction), irradiance=_triple(irradiance), centre=_triple(middle - distance * direction),
-            distance=float(distance), diameter=float(diameter), radiance=_triple(irradiance * distance**2 / area),
-            pixel_size=pixel_size, caster_height=height, penumbra_px=diameter / distance * height_px,
+            direction=_triple(direction),
+            irradiance=_triple(irradiance),
+            centre=_triple(middle - distance * direction),
+            distance=float(distance),
+            diameter=float(diameter),
+            radiance=_triple(irradiance * distance**2 / area),
+            pixel_size=pixel_size,
+            caster_height=height,
+            penumbra_px=diameter / distance * height_px,
             parallax_px=reach * height / distance / pixel_size,
         )
         residual = _irradiance_residual(scene, proxy, light, receiver)
@@ -228,16 +236,21 @@ def _irradiance_residual(scene: mi.Scene, proxy: Proxy, light: str, receiver: st
     extent = np.linalg.norm(box - box.mean(0), axis=1).max()
     eye = box.mean(0) - 4 * extent * np.array(proxy.direction)
     up = [0, 1, 0] if abs(proxy.direction[1]) < 0.9 else [1, 0, 0]
-    sensor = mi.load_dict({
-        "type": "orthographic",
-        "to_world": mi.ScalarTransform4f().look_at(eye.tolist(), box.mean(0).tolist(), up)
-        @ mi.ScalarTransform4f().scale([float(extent), float(extent), 1.0]),
-        "film": {"type": "hdrfilm", "width": 64, "height": 64, "rfilter": {"type": "box"}, "pixel_format": "rgb"},
-        "sampler": {"type": "independent"},
-    })
+    sensor = mi.load_dict(
+        {
+            "type": "orthographic",
+            "to_world": mi.ScalarTransform4f().look_at(eye.tolist(), box.mean(0).tolist(), up)
+            @ mi.ScalarTransform4f().scale([float(extent), float(extent), 1.0]),
+            "film": {"type": "hdrfilm", "width": 64, "height": 64, "rfilter": {"type": "box"}, "pixel_format": "rgb"},
+            "sampler": {"type": "independent"},
+        }
+    )
     integrator = mi.load_dict({"type": "direct", "bsdf_samples": 0, "emitter_samples": 1})
-    parallel = {"type": "directional", "direction": list(proxy.direction),
-                "irradiance": {"type": "rgb", "value": list(proxy.irradiance)}}
+    parallel = {
+        "type": "directional",
+        "direction": list(proxy.direction),
+        "irradiance": {"type": "rgb", "value": list(proxy.irradiance)},
+    }
     images = []
     for substitute in (proxy.emitter(), mi.load_dict(parallel)):
         alone = _rebuilt(scene, light, substitute, (receiver,))

@@ -86,8 +86,13 @@ def path_traced(
                 total = total + render(samples, _mix(pass_seed, index))
         return total
 
-    settings = {"kind": "path_traced", "integrator": name, "hide_emitters": hide_emitters, "sensor": sensor,
-                "lights": "summed" if weights is not None and len(weights) > 1 else "sampled"}
+    settings = {
+        "kind": "path_traced",
+        "integrator": name,
+        "hide_emitters": hide_emitters,
+        "sensor": sensor,
+        "lights": "summed" if weights is not None and len(weights) > 1 else "sampled",
+    }
     return accumulate(scene, render_all, settings, spp=spp, seed=seed, sensor=sensor, passes=passes)
 
 
@@ -112,7 +117,7 @@ def accumulate(
     """
     film = scene.sensors()[sensor].film()
     if type(film.rfilter()).__name__ != "BoxFilter" and "box" not in str(film.rfilter()).lower():
-        raise ShadowmapError(f"the film's filter is {film.rfilter()}: references need <rfilter type=\"box\"/>.")
+        raise ShadowmapError(f'the film\'s filter is {film.rfilter()}: references need <rfilter type="box"/>.')
     if spp < 1:
         raise ShadowmapError(f"spp is {spp}: give at least 1.")
     width, height = film.crop_size()
@@ -125,8 +130,15 @@ def accumulate(
         mean = mean + step / (index + 1)
         square = square + step * (image - mean)
     record = dict(settings)
-    record.update(spp=per_pass * count, passes=count, seed=seed, variant=mi.variant(), mitsuba=mi.__version__,
-                  filter="box", size=[int(width), int(height)])
+    record.update(
+        spp=per_pass * count,
+        passes=count,
+        seed=seed,
+        variant=mi.variant(),
+        mitsuba=mi.__version__,
+        filter="box",
+        size=[int(width), int(height)],
+    )
     if count > 1:
         error = np.sqrt(np.mean(square) / (count - 1) / count)
         record["relative_standard_error"] = float(error / max(float(np.mean(mean)), 1e-12))
@@ -180,8 +192,11 @@ def _mix(*numbers: int) -> int:
 
 def _selection_weights(scene: mi.Scene) -> dict[str, float] | None:
     """Parameters with which the lights are chosen and their values, or None if not all are delta lights."""
-    if not all(mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaPosition)
-               or mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaDirection) for emitter in scene.emitters()):
+    if not all(
+        mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaPosition)
+        or mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaDirection)
+        for emitter in scene.emitters()
+    ):
         return None  # an emitter with an extent also counts in passes that do not choose it: rays of the BSDF hit it
     params = mi.traverse(scene)
     keys = [key for key in params.keys() if key.rpartition(".")[2] == "sampling_weight"]

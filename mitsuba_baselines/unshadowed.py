@@ -60,8 +60,13 @@ def unshadowed(
     def render(samples: int, pass_seed: int) -> np.ndarray:
         return np.array(mi.render(scene, sensor=sensor, integrator=integrator, spp=samples, seed=pass_seed))
 
-    settings: dict[str, object] = {"kind": "unshadowed", "integrator": NAME, "geometric_gate": geometric_gate,
-                                   "hide_emitters": hide_emitters, "sensor": sensor}
+    settings: dict[str, object] = {
+        "kind": "unshadowed",
+        "integrator": NAME,
+        "geometric_gate": geometric_gate,
+        "hide_emitters": hide_emitters,
+        "sensor": sensor,
+    }
     return accumulate(scene, render, settings, spp=spp, seed=seed, sensor=sensor)
 
 
@@ -89,9 +94,12 @@ def _integrator_class() -> type:
             radiance, throughput = mi.Spectrum(0), mi.Spectrum(1)
             ray, active = mi.RayDifferential3f(ray), mi.Bool(active)
             hit = mi.Bool(False)
-            lights = [emitter for emitter in scene.emitters()
-                      if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite)
-                      or mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaDirection)]
+            lights = [
+                emitter
+                for emitter in scene.emitters()
+                if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite)
+                or mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaDirection)
+            ]
             layers = MAX_LAYERS if has_masks(scene) else 1
             for layer in range(layers):
                 si = scene.ray_intersect(ray, active)

@@ -91,14 +91,21 @@ def leaf() -> tuple[np.ndarray, np.ndarray]:
 def slide() -> np.ndarray:
     """The picture that a spot light projects: soft coloured window panes."""
     x, y = grid()
-    pane = (smooth_step(0.06, 0.14, np.abs(((x * 3) % 1) - 0.5) * -1 + 0.5)
-            * smooth_step(0.06, 0.14, np.abs(((y * 3) % 1) - 0.5) * -1 + 0.5))
+    pane = smooth_step(0.06, 0.14, np.abs(((x * 3) % 1) - 0.5) * -1 + 0.5) * smooth_step(
+        0.06, 0.14, np.abs(((y * 3) % 1) - 0.5) * -1 + 0.5
+    )
     hue = np.stack([0.6 + 0.4 * np.cos(2 * np.pi * (x + y + k / 3)) for k in range(3)], axis=-1)
     return 0.15 + 0.85 * pane[..., None] * hue
 
 
-def write_mesh(name: str, vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, texcoords: np.ndarray,
-               colors: np.ndarray | None = None) -> None:
+def write_mesh(
+    name: str,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    normals: np.ndarray,
+    texcoords: np.ndarray,
+    colors: np.ndarray | None = None,
+) -> None:
     mesh = mi.Mesh(name, len(vertices), len(faces), has_vertex_normals=True, has_vertex_texcoords=True)
     if colors is not None:
         mesh.add_attribute("vertex_color", 3, colors.astype(np.float32).ravel())
@@ -152,7 +159,7 @@ def drape() -> None:
     slope_z = (height(x, z + step) - height(x, z - step)) / (2 * step)
     normals = normalised(np.stack([-slope_x, np.ones_like(x), -slope_z], 1))
     ripple = 0.5 + 0.5 * np.sin(2 * np.pi * 2.5 * np.hypot(x, z))
-    colors = (np.array([0.75, 0.18, 0.15]) * ripple[:, None] + np.array([0.85, 0.75, 0.35]) * (1 - ripple[:, None]))
+    colors = np.array([0.75, 0.18, 0.15]) * ripple[:, None] + np.array([0.85, 0.75, 0.35]) * (1 - ripple[:, None])
     write_mesh("drape.ply", np.stack([x, height(x, z), z], 1), faces, normals, np.stack([u, v], 1), colors)
 
 

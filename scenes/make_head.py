@@ -28,8 +28,18 @@ NECK, STUB = 6.15, 1.5
 
 ORIGINS = ("african", "asian", "caucasian")
 OPPOSITE = {
-    "incr": 1, "decr": -1, "up": 1, "down": -1, "in": 1, "out": -1, "forward": 1, "backward": -1, "convex": 1, "concave": -1,
-    "uncompress": 1, "compress": -1,
+    "incr": 1,
+    "decr": -1,
+    "up": 1,
+    "down": -1,
+    "in": 1,
+    "out": -1,
+    "forward": 1,
+    "backward": -1,
+    "convex": 1,
+    "concave": -1,
+    "uncompress": 1,
+    "compress": -1,
 }
 
 

@@ -54,7 +54,9 @@ def run_tests(report: Path, processes: int) -> dict[str, Any]:
     if not report.is_file():
         return {"run": 0, "failed": ["pytest itself: see above"]}
     cases = list(ElementTree.parse(report).getroot().iter("testcase"))
-    failed = [f"{case.get('classname')}::{case.get('name')}" for case in cases if {part.tag for part in case} & {"failure", "error"}]
+    failed = [
+        f"{case.get('classname')}::{case.get('name')}" for case in cases if {part.tag for part in case} & {"failure", "error"}
+    ]
     skipped = sum(any(part.tag == "skipped" for part in case) for case in cases)
     return {"run": len(cases) - skipped, "skipped": skipped, "failed": failed}
 

@@ -198,4 +198,6 @@ def test_nothing_lies_flat() -> None:
 def test_the_package_shows_its_public_names_only() -> None:
     import shadowmap_dr
 
-    assert [name for name in dir(shadowmap_dr) if not name.startswith("__")] == sorted(set(shadowmap_dr.__all__) - {"__version__"})
+    assert [name for name in dir(shadowmap_dr) if not name.startswith("__")] == sorted(
+        set(shadowmap_dr.__all__) - {"__version__"}
+    )

@@ -117,9 +117,7 @@ def test_read_only_environment_without_the_wheels_links(tmp_path: Path) -> None:
             (copy / path.name).write_bytes(path.read_bytes())
     assert not (copy / "libc++.so.1").exists()
     # The loader resolves the symbolic link's own folder, so that only the preloaded copies can serve.
-    code = (
-        f"import os; os.environ['DRJIT_LIBLLVM_PATH'] = {str(copy.parent / library.name)!r}\nimport shadowmap_dr" + USE
-    )
+    code = f"import os; os.environ['DRJIT_LIBLLVM_PATH'] = {str(copy.parent / library.name)!r}\nimport shadowmap_dr" + USE
     result = run(code + f"\nassert {str(copy)!r} in open('/proc/self/maps').read()")
     assert result.returncode == 0, result.stderr
 

@@ -1,6 +1,6 @@
 """Time of an optimisation step with shadows, without, and with Mitsuba's projective integrator at its fair setting, in turns.
 
-    python docs/examples/pose_speed.py --normals vertex [--resolution 128] [--rounds 10] [--setting 1/1/64/none/64]
+python docs/examples/pose_speed.py --normals vertex [--resolution 128] [--rounds 10] [--setting 1/1/64/none/64]
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Time of an optimisation step with all threads and with one, again and again: does the machine always run at one speed?
 
-    python docs/examples/step_phases.py [--resolution 128 512 1024] [--seconds 30]
+python docs/examples/step_phases.py [--resolution 128 512 1024] [--seconds 30]
 """
 
 from __future__ import annotations

@@ -75,22 +75,40 @@ def face(
         if len(modes) > 1 or modes[0] not in faces_problem.MODES or modes[0] == "expression":
             raise ShadowmapError(f"--mode {' '.join(modes)}: with --image, choose identity or both.")
         options = faces_image.ImageOptions(
-            image=image, mode=modes[0], model=model, iterations=iterations, height=height,
+            image=image,
+            mode=modes[0],
+            model=model,
+            iterations=iterations,
+            height=height,
             prior=faces_image.PRIOR if prior is None else prior,
-            map_resolution=map_resolution, filter_size=filter_size, out=out, resume=resume,
+            map_resolution=map_resolution,
+            filter_size=filter_size,
+            out=out,
+            resume=resume,
         )
         set_variant(variant, COLOURED)
         record = faces_image.run_image(options)
-        typer.echo(f"root mean square difference of the shadows: {record['image_error_start']:.4f} at the start, "
-                   f"{record['image_error']:.4f} at the end")
+        typer.echo(
+            f"root mean square difference of the shadows: {record['image_error_start']:.4f} at the start, "
+            f"{record['image_error']:.4f} at the end"
+        )
         typer.echo(f"Record, pictures and head: {out}")
         return
     defaults = faces_experiment.FaceOptions()
     artificial = faces_experiment.FaceOptions(
-        seeds=tuple(head or defaults.seeds), lights=tuple(shadows or defaults.lights), modes=tuple(mode or defaults.modes),
-        model=model, iterations=iterations, prior=defaults.prior if prior is None else prior, translate=translate,
-        reference=reference, height=height,
-        map_resolution=map_resolution, filter_size=filter_size, out=out, resume=resume,
+        seeds=tuple(head or defaults.seeds),
+        lights=tuple(shadows or defaults.lights),
+        modes=tuple(mode or defaults.modes),
+        model=model,
+        iterations=iterations,
+        prior=defaults.prior if prior is None else prior,
+        translate=translate,
+        reference=reference,
+        height=height,
+        map_resolution=map_resolution,
+        filter_size=filter_size,
+        out=out,
+        resume=resume,
     )
     set_variant(variant, COLOURED)
     record = faces_experiment.run_faces(artificial)

@@ -32,9 +32,9 @@ def model(
     serve: Annotated[bool, typer.Option("--serve", help="Paint in the browser instead of in an image file.")] = False,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page on 127.0.0.1; 0 for any free one.")] = 8711,
     image: Annotated[Path, typer.Option(help="The shadow's file, .png, to edit in a paint program.")] = Path("shadow.png"),
-    output: Annotated[
-        Path, typer.Option("-o", "--output", help=f"Mesh to write: .{', .'.join(exports.FORMATS)}.")
-    ] = Path("model.ply"),
+    output: Annotated[Path, typer.Option("-o", "--output", help=f"Mesh to write: .{', .'.join(exports.FORMATS)}.")] = Path(
+        "model.ply"
+    ),
     view: Annotated[str, typer.Option(metavar="|".join(VIEWS), help="Where the light comes from.")] = "front",
     resolution: Annotated[int, typer.Option(min=32, max=512, help="Pixels along each side of the shadow.")] = 256,
     smoothness: Annotated[float, typer.Option(help="How stiff the mesh is; finer meshes need more.")] = 20.0,

@@ -109,9 +109,7 @@ def planes(
         value = [Float(v) for v in (dx, dy, d)]
     if dr.grad_enabled(positions):
         # z = A x + B y + C w holds for all corners: what a corner's change violates, the plane's change makes up for.
-        excess = [
-            z - slopes[0] * p.x - slopes[1] * p.y - slopes[2] * p.w for p, z in zip(corners, heights, strict=True)
-        ]
+        excess = [z - slopes[0] * p.x - slopes[1] * p.y - slopes[2] * p.w for p, z in zip(corners, heights, strict=True)]
         value = [
             dr.replace_grad(v, sum(w * e for w, e in zip(row, excess, strict=True)))
             for v, row in zip(value, weights, strict=True)

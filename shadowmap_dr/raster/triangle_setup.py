@@ -150,9 +150,7 @@ def covers(values: Any, row: Any, column: Any, height: int, width: int, exact_li
         return covered
 
     undecided = in_range & (dr.abs(least) <= rounding_error(height, width))
-    covered = dr.if_stmt(
-        (row, column), undecided, exact, lambda row, column: least > 0, mode="symbolic", label="exact edge test"
-    )
+    covered = dr.if_stmt((row, column), undecided, exact, lambda row, column: least > 0, mode="symbolic", label="exact edge test")
     return covered & in_range
 
 

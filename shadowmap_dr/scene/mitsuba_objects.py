@@ -93,10 +93,7 @@ def is_plain(bsdf: Any) -> bool:
     if bsdf.class_name() != "SmoothDiffuse":
         return False
     # Mitsuba does not count vertex colours as varying.
-    return all(
-        isinstance(part, mi.Texture) and not varies(part) and part.class_name() != "MeshAttribute"
-        for part in parts
-    )
+    return all(isinstance(part, mi.Texture) and not varies(part) and part.class_name() != "MeshAttribute" for part in parts)
 
 
 def is_cosine(bsdf: Any) -> bool:

@@ -184,4 +184,3 @@ def _with_gradient(function: Any, values: list[Any], depth: Any) -> tuple[Any, l
         dr.traverse(dr.ADMode.Backward)
         slopes = [dr.grad(v) for v in inputs]
     return dr.detach(result), slopes[:-1], slopes[-1]
-

@@ -166,5 +166,3 @@ def antialias(image: torch.Tensor, raster: Raster, positions: torch.Tensor, topo
         return (_raster.antialias(image, found, positions, topology._edges),)
 
     return cross(Repeated(run), image, positions)[0]
-
-

@@ -217,9 +217,7 @@ def _light_views(light: Light, number: int, given: dict[str, Any], settings: Sha
     return (_shadow.spot_view(own("position"), view.right, view.up, view.forward, spread),)
 
 
-def _fit(
-    views: Views, p_light: Any, map_index: Any, settings: ShadowSettings, previous: ShadowMaps | None, seen: Any
-) -> Frusta:
+def _fit(views: Views, p_light: Any, map_index: Any, settings: ShadowSettings, previous: ShadowMaps | None, seen: Any) -> Frusta:
     """The casters as one shape that is not flat."""
     module = backend(map_index)
     bounds = _shadow.shape_bounds(views, p_light, map_index, module.UInt32(0), 1)

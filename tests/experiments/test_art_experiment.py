@@ -161,8 +161,9 @@ def test_recorded_collections_are_pieces_too(variant, tmp_path):
 
 def test_errors_are_red_where_the_shadow_is_missing_and_blue_where_it_is_too_much():
     shadow, lit = np.zeros((1, 1)), np.ones((1, 1))
-    both, missing, much, none = (exports.error_picture(*pair)[0, 0] for pair in (
-        (shadow, shadow), (lit, shadow), (shadow, lit), (lit, lit)))
+    both, missing, much, none = (
+        exports.error_picture(*pair)[0, 0] for pair in ((shadow, shadow), (lit, shadow), (shadow, lit), (lit, lit))
+    )
     assert missing[0] > missing[1] + 0.5 and missing[0] > missing[2] + 0.5
     assert much[2] > much[0] + 0.5 and (none == 1).all() and np.ptp(both) == 0 and both[0] < 0.6
 

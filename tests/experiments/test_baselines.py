@@ -25,16 +25,21 @@ def load(name: str, resolution: int = 48) -> mi.Scene:
 def one_object(shape: dict, bsdf: dict | None = None, filter_type: str = "box") -> mi.Scene:
     """A convex object, so that nothing but its own horizon casts shadows, under three kinds of light."""
     T = mi.ScalarTransform4f
-    return mi.load_dict({
-        "type": "scene",
-        "sensor": {"type": "perspective", "fov": 35, "to_world": T().look_at([0, 1, 5], [0, 0, 0], [0, 1, 0]),
-                   "film": {"type": "hdrfilm", "width": 48, "height": 48, "rfilter": {"type": filter_type},
-                            "pixel_format": "rgb"}},
-        "object": {**shape, "bsdf": bsdf or {"type": "diffuse"}},
-        "sun": {"type": "directional", "direction": [1, -1, -1], "irradiance": 2.0},
-        "bulb": {"type": "point", "position": [-3, 2, 0.4], "intensity": 6.0},
-        "spot": {"type": "spot", "to_world": T().look_at([2, 3, 3], [0, 0, 0], [0, 1, 0]), "intensity": 9.0},
-    })
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": {
+                "type": "perspective",
+                "fov": 35,
+                "to_world": T().look_at([0, 1, 5], [0, 0, 0], [0, 1, 0]),
+                "film": {"type": "hdrfilm", "width": 48, "height": 48, "rfilter": {"type": filter_type}, "pixel_format": "rgb"},
+            },
+            "object": {**shape, "bsdf": bsdf or {"type": "diffuse"}},
+            "sun": {"type": "directional", "direction": [1, -1, -1], "irradiance": 2.0},
+            "bulb": {"type": "point", "position": [-3, 2, 0.4], "intensity": 6.0},
+            "spot": {"type": "spot", "to_world": T().look_at([2, 3, 3], [0, 0, 0], [0, 1, 0]), "intensity": 9.0},
+        }
+    )
 
 
 def relative_rms(image: np.ndarray, target: np.ndarray) -> float:
@@ -80,11 +85,15 @@ def test_geometric_gate_does_what_the_own_surface_does_to_a_shadow_ray(variant: 
     assert ungated > 5 * gated
 
 
-@pytest.mark.parametrize("bsdf", [
-    {"type": "twosided", "bsdf": {"type": "roughplastic"}},
-    {"type": "roughconductor", "alpha": 0.4},
-    {"type": "principled", "roughness": 0.4, "base_color": {"type": "rgb", "value": [0.5, 0.3, 0.2]}},
-], ids=lambda bsdf: bsdf["type"])
+@pytest.mark.parametrize(
+    "bsdf",
+    [
+        {"type": "twosided", "bsdf": {"type": "roughplastic"}},
+        {"type": "roughconductor", "alpha": 0.4},
+        {"type": "principled", "roughness": 0.4, "base_color": {"type": "rgb", "value": [0.5, 0.3, 0.2]}},
+    ],
+    ids=lambda bsdf: bsdf["type"],
+)
 def test_materials(variant: str, bsdf: dict) -> None:
     scene = one_object({"type": "sphere"}, bsdf)
     error = relative_rms(unshadowed.unshadowed(scene, spp=256).image, reference.path_traced(scene, spp=256).image)
@@ -163,8 +172,7 @@ def test_integrator_follows_the_variant() -> None:
 
 def test_stored_scene_references_can_be_made_again(variant: str) -> None:
     scene = load("pose", cases.RESOLUTION)
-    for kind, made in (("direct", reference.path_traced(scene, spp=512)),
-                       ("unshadowed", unshadowed.unshadowed(scene, spp=256))):
+    for kind, made in (("direct", reference.path_traced(scene, spp=512)), ("unshadowed", unshadowed.unshadowed(scene, spp=256))):
         stored = reference.load(cases.FOLDER / f"pose_{kind}.exr")
         assert relative_rms(made.image, stored.image) < 0.01
         assert abs(made.image.mean() / stored.image.mean() - 1) < 5e-4

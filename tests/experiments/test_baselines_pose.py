@@ -187,9 +187,7 @@ def test_searches_keep_what_others_write_meanwhile(monkeypatch: pytest.MonkeyPat
         (["--search", "16", "--output", "list.json"], "list.json holds no searches"),
     ],
 )
-def test_searches_name_bad_input(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, arguments: list[str], message: str
-) -> None:
+def test_searches_name_bad_input(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, arguments: list[str], message: str) -> None:
     (tmp_path / "damaged.ply").write_text("ply\nnothing")
     (tmp_path / "list.json").write_text("[]")
     monkeypatch.chdir(tmp_path)

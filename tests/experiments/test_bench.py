@@ -464,8 +464,15 @@ def test_sections_of_the_options_and_of_the_benchmark_agree() -> None:
 
 @pytest.mark.parametrize(
     ("seconds", "text"),
-    [(0.00397, "3.97 ms"), (0.9992, "999 ms"), (0.9997, "1 s"), (218.4, "218 s"), (999.4, "999 s"), (999.7, "1000 s"),
-     (2345.6, "2346 s")],
+    [
+        (0.00397, "3.97 ms"),
+        (0.9992, "999 ms"),
+        (0.9997, "1 s"),
+        (218.4, "218 s"),
+        (999.4, "999 s"),
+        (999.7, "1000 s"),
+        (2345.6, "2346 s"),
+    ],
 )
 def test_times_are_plain_numbers(seconds: float, text: str) -> None:
     assert bench_report._time(seconds) == text

@@ -267,8 +267,25 @@ def test_commands_from_a_folder_to_a_head(run: Any, tmp_path: Path) -> None:
         trimesh.Trimesh(vertices, model.faces, process=False).export(folder / f"{name}.obj")
     converted, out = str(tmp_path / "egg.npz"), tmp_path / "out"
     assert run("face", "convert", str(folder), converted, "--facing", "+x", "--neck", "-0.8")[0] == 0
-    arguments = ["face", "--model", converted, "--head", "5", "--iterations", "40", "--height", "48", "--map-resolution", "64",
-                 "--mode", "identity", "--mode", "expression", "--out", str(out)]
+    arguments = [
+        "face",
+        "--model",
+        converted,
+        "--head",
+        "5",
+        "--iterations",
+        "40",
+        "--height",
+        "48",
+        "--map-resolution",
+        "64",
+        "--mode",
+        "identity",
+        "--mode",
+        "expression",
+        "--out",
+        str(out),
+    ]
     status, text = run(*arguments)
     assert status == 0 and "Identity: distances" in text
     record = json.loads((out / "faces.json").read_text())

@@ -165,8 +165,11 @@ def test_shadow_fit_frozen_goes_on_from_its_state(variant: str) -> None:
 
 @pytest.mark.parametrize(
     ("basis", "reference", "word"),
-    [(np.zeros((2, 3, 3)), np.zeros((4, 4, 1)), "basis"), (np.zeros((1, 4, 3)), np.zeros((4, 4)), "reference"),
-     (np.zeros((1, 4, 3)), np.full((4, 4, 1), np.nan), "reference")],
+    [
+        (np.zeros((2, 3, 3)), np.zeros((4, 4, 1)), "basis"),
+        (np.zeros((1, 4, 3)), np.zeros((4, 4)), "reference"),
+        (np.zeros((1, 4, 3)), np.full((4, 4, 1), np.nan), "reference"),
+    ],
 )
 def test_shadow_fit_names_bad_input(variant: str, basis: np.ndarray, reference: np.ndarray, word: str) -> None:
     renderer = Renderer.from_scene(gradients_scenes.build(turned_square(0), 16))
@@ -211,11 +214,24 @@ def test_small_jacobian(variant: str, tmp_path: Path, monkeypatch: pytest.Monkey
 
 def test_reading_tells_what_is_not_reached() -> None:
     good = {"cosine": 0.999, "scale": 1.0}
-    entry = {"candidate": "default", "motion": "x", "map": 64, "filter": 3, "reverse_error": 1e-6,
-             "own": good, "traced": good, "traced_blurred": good}
+    entry = {
+        "candidate": "default",
+        "motion": "x",
+        "map": 64,
+        "filter": 3,
+        "reverse_error": 1e-6,
+        "own": good,
+        "traced": good,
+        "traced_blurred": good,
+    }
     bad = {**entry, "motion": "scale", "filter": 9, "traced": {"cosine": 0.99, "scale": 0.8}, "reverse_error": 1e-3}
-    record = {"settings": {"faces": 1, "resolution": 2, "spp": 3}, "entries": {"a": entry, "b": bad}, "references": {},
-              "mitsuba": {}, "tessellation": {"x": {"gradient_change": 0.03, "image_change": 0.1}}}
+    record = {
+        "settings": {"faces": 1, "resolution": 2, "spp": 3},
+        "entries": {"a": entry, "b": bad},
+        "references": {},
+        "mitsuba": {},
+        "tessellation": {"x": {"gradient_change": 0.03, "image_change": 0.1}},
+    }
     text = gradients_report.read_jacobian(record)
     assert "against path-traced differences 1 of 2 reach" in text and "worst scale at 64 texels, filter 9: 0.990, 0.800" in text
     assert "against own differences 2 of 2 reach" in text and "with the map's blur" not in text
@@ -230,8 +246,16 @@ def test_reading_tells_what_is_not_reached() -> None:
 
 
 def test_small_convergence(variant: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    options = {"occluders": ("ring",), "cameras": ("perspective",), "filter_sizes": (3,), "map_resolution": 64, "resolution": 96,
-               "iterations": 120, "spp": 32, "out": tmp_path}
+    options = {
+        "occluders": ("ring",),
+        "cameras": ("perspective",),
+        "filter_sizes": (3,),
+        "map_resolution": 64,
+        "resolution": 96,
+        "iterations": 120,
+        "spp": 32,
+        "out": tmp_path,
+    }
     first = run_convergence(ConvergenceOptions(**options, displacements=(0.1,)))
     run = first["runs"]["ring | perspective | 3 | 0.1"]
     assert run["recovered"] and run["error_texels"] < 0.3
@@ -256,8 +280,14 @@ def test_small_convergence(variant: str, tmp_path: Path, monkeypatch: pytest.Mon
 
 def test_outlines_that_are_not_parallel_to_texels_are_placed_exactly(variant: str, tmp_path: Path) -> None:
     """All of a parallel one lies at the same place within its texels, and ends a tenth to a fifth of one away."""
-    options = {"cameras": ("orthographic",), "filter_sizes": (3,), "displacements": (0.1, 0.3), "map_resolution": 96,
-               "resolution": 256, "spp": 128}
+    options = {
+        "cameras": ("orthographic",),
+        "filter_sizes": (3,),
+        "displacements": (0.1, 0.3),
+        "map_resolution": 96,
+        "resolution": 256,
+        "spp": 128,
+    }
     occluders, candidates = ("plane", "turned plane"), ("default", "no anti-aliasing")
     runs = run_convergence(ConvergenceOptions(**options, occluders=occluders, candidates=candidates, out=tmp_path))["runs"]
     turned = [runs[f"turned plane | orthographic | 3 | {d}"]["error_texels"] for d in (0.1, 0.3)]

@@ -100,8 +100,14 @@ def test_scenes_have_light_and_shadow(variant: str, name: str) -> None:
 
 def test_small_run(variant: str, tmp_path: Path) -> None:
     options = MapsOptions(
-        scenes=("overlap",), candidates=("plain vsm", "evsm4"), resolution=64, map_resolution=64, reference_spp=16, rounds=3,
-        pose_runs=1, out=tmp_path / "m",
+        scenes=("overlap",),
+        candidates=("plain vsm", "evsm4"),
+        resolution=64,
+        map_resolution=64,
+        reference_spp=16,
+        rounds=3,
+        pose_runs=1,
+        out=tmp_path / "m",
     )
     record = run_maps(options)
     stored = json.loads((tmp_path / "m" / "maps.json").read_text())

@@ -74,9 +74,7 @@ def test_program_draws_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 def test_meshes_of_users_are_those_of_their_runs(tmp_path: Path) -> None:
     path = tmp_path / "brick.ply"
     trimesh.creation.box((1, 2, 3)).export(path)
-    options = PoseOptions(
-        (str(path),), (16,), ("shadows",), iterations=2, reference="own", out=tmp_path / "runs"
-    )
+    options = PoseOptions((str(path),), (16,), ("shadows",), iterations=2, reference="own", out=tmp_path / "runs")
     run_pose(options)
     wanted = {"object": "brick", "resolution": 16, "method": "shadows", "run": 0}
     lines = pose_landscape.landscape(options.out, wanted, tmp_path / "a.png", count=3)

@@ -30,7 +30,7 @@ def record(method: str, run: int, degrees: float | None, **changes: Any) -> dict
 
 def test_rows_have_means_medians_and_shares() -> None:
     records = [record("shadows", run, degrees) for run, degrees in enumerate((0.1, 0.2, 0.6))]
-    row, = (row.plain() for row in pose_table.rows(records))
+    (row,) = (row.plain() for row in pose_table.rows(records))
     assert row["mean"] == pytest.approx({"rotation_error_deg": 0.3, "translation_error_x100": 0.6})
     assert row["median"] == pytest.approx({"rotation_error_deg": 0.2, "translation_error_x100": 0.4})
     assert row["recovered"] == 1 and row["share_recovered"] == pytest.approx(1 / 3)
@@ -40,7 +40,7 @@ def test_rows_have_means_medians_and_shares() -> None:
 
 def test_times_come_from_runs_that_were_timed_alone() -> None:
     timed = [record("shadows", 0, 0.1, seconds_per_iteration=0.125, iterations=40), record("mitsuba", 0, 0.1)]
-    row, = pose_table.rows([record("shadows", 0, 0.1, seconds_per_iteration=9.0)], timed)
+    (row,) = pose_table.rows([record("shadows", 0, 0.1, seconds_per_iteration=9.0)], timed)
     assert row.seconds == 0.125
 
 
@@ -91,7 +91,7 @@ def test_times_may_come_from_an_earlier_table(tmp_path: Path) -> None:
 def test_mitsuba_is_compared_on_the_starts_that_both_have() -> None:
     ours = [record("shadows", run, degrees) for run, degrees in enumerate((0.10, 0.11, 0.14, 5.0, 6.0))]
     theirs = [record("mitsuba", run, 0.10) for run in range(3)] + [record("mitsuba", 4, 9.0, start=[1, 1, 1])]
-    entry, = pose_table.comparison(pose_table.rows(ours + theirs))
+    (entry,) = pose_table.comparison(pose_table.rows(ours + theirs))
     assert entry["starts"] == [0, 1, 2] and entry["recovered_ours_and_mitsuba"] == [3, 3]
     assert entry["ours_less_mitsuba"] == pytest.approx({"rotation_error_deg": 0.01, "translation_error_x100": 0.02})
     assert entry["met"]
@@ -146,7 +146,7 @@ def test_a_table_goes_on_from_what_an_earlier_one_has(tmp_path: Path) -> None:
     assert by_method["shadows"]["runs"]["rotation_error_curve"] == [[10, 1.23, 0.1], [10, 1, 0.2]]
     assert by_method["rasterizer"]["runs"]["rotation_error_curve"] == [[10, None, None]]
     assert by_method["shadows"]["seconds_per_step"] == 0.25  # somebody took the time for the earlier table
-    mitsuba, = (row for row in old if row.method == "mitsuba")
+    (mitsuba,) = (row for row in old if row.method == "mitsuba")
     assert by_method["mitsuba"] == mitsuba.plain()
 
 

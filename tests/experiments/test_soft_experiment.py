@@ -47,7 +47,9 @@ def test_outlines_emitters_and_the_background_are_not_counted(variant: str) -> N
             "camera": {"type": "orthographic", "to_world": T().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]), "film": film},
             "square": {"type": "rectangle", "to_world": T().scale(0.5)},
             "lamp": {
-                "type": "rectangle", "to_world": T().translate([0.75, 0, 0.5]) @ T().scale(0.1), "emitter": {"type": "area"},
+                "type": "rectangle",
+                "to_world": T().translate([0.75, 0, 0.5]) @ T().scale(0.1),
+                "emitter": {"type": "area"},
             },
         }
     )
@@ -76,7 +78,12 @@ def test_scenes_have_something_to_count(variant: str, name: str) -> None:
 
 def test_small_run(variant: str, tmp_path: Path) -> None:
     options = SoftOptions(
-        scenes=("desk",), samples=((4, 4), (32, 4)), resolution=24, map_resolution=64, reference_spp=256, timed=False,
+        scenes=("desk",),
+        samples=((4, 4), (32, 4)),
+        resolution=24,
+        map_resolution=64,
+        reference_spp=256,
+        timed=False,
         out=tmp_path / "s",
     )
     record = run_soft(options)

@@ -83,8 +83,15 @@ def test_perspective_pixels_see_the_first_point_of_the_receiver(receiver):
 
 
 def test_views_refuse_what_makes_no_sense():
-    for arguments in ({"receiver": "ball"}, {"camera": "fisheye"}, {"size": 4}, {"half": -1}, {"direction": (0, 2, 0)},
-                      {"direction": (0, 0, 0)}, {"up": (np.nan, 0, 0)}):
+    for arguments in (
+        {"receiver": "ball"},
+        {"camera": "fisheye"},
+        {"size": 4},
+        {"half": -1},
+        {"direction": (0, 2, 0)},
+        {"direction": (0, 0, 0)},
+        {"up": (np.nan, 0, 0)},
+    ):
         with pytest.raises(ShadowmapError):
             shadow_view(**arguments)
 

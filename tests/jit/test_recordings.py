@@ -31,7 +31,7 @@ UNSEEN = [
     ("sky.data", [np.random.default_rng(n).uniform(0.2, 2, (n, 2 * n + 1, 3)).astype(np.float32) for n in (4, 8)]),
 ]
 
-TEXTURES = '''
+TEXTURES = """
 import sys
 import drjit as dr, numpy as np
 import quick_kernels, shadowmap_dr
@@ -74,7 +74,7 @@ def losses(frozen):
 plain, frozen = losses(False), losses(True)
 assert plain[-1] < 0.9 * plain[0]
 np.testing.assert_allclose(frozen, plain, rtol=1e-4)
-'''
+"""
 
 
 def run(code: str, *arguments: str) -> None:

@@ -205,9 +205,7 @@ def test_emitters_of_all_kinds_at_once(variant: str) -> None:
     together = render(scene_of(**common, **lights), hide_emitters=True)
     # A lamp that does not shine is still there and casts shadows; it lies above the picture.
     dark = {**lights["lamp"], "emitter": area(0.0)}
-    total = sum(
-        render(scene_of(**common, **{"lamp": dark, name: light}), hide_emitters=True) for name, light in lights.items()
-    )
+    total = sum(render(scene_of(**common, **{"lamp": dark, name: light}), hide_emitters=True) for name, light in lights.items())
     np.testing.assert_allclose(together, total, rtol=0.05, atol=0.01 * together.max())
     assert difference(together, total) < 0.01
 

@@ -70,7 +70,9 @@ class FaceOptions:
 
     def __post_init__(self) -> None:
         for name, values, known in (
-            ("head", self.seeds, None), ("number of shadows", self.lights, LIGHTS), ("mode", self.modes, MODES)
+            ("head", self.seeds, None),
+            ("number of shadows", self.lights, LIGHTS),
+            ("mode", self.modes, MODES),
         ):
             if not values:
                 raise ShadowmapError(f"no {name} given: name at least one.")
@@ -152,7 +154,13 @@ def run_faces(options: FaceOptions, *, console: Console | None = None) -> dict[s
 
 
 def _one(
-    scene: FaceScene, head: Head, mode: Mode, options: FaceOptions, record: dict[str, Any], path: Path, progress: Progress,
+    scene: FaceScene,
+    head: Head,
+    mode: Mode,
+    options: FaceOptions,
+    record: dict[str, Any],
+    path: Path,
+    progress: Progress,
     sheets: faces_pictures.Sheets,
 ) -> None:
     """Run one fit, unless it has been run; note its record, and its pictures."""
@@ -162,7 +170,12 @@ def _one(
     else:
         target = path_traced_shadow(scene, head.vertices, options.spp)
     fit = scene.fit(
-        mode, target, identity=head.identity, prior=options.prior, translate=options.translate, step_size=STEP_SIZE,
+        mode,
+        target,
+        identity=head.identity,
+        prior=options.prior,
+        translate=options.translate,
+        step_size=STEP_SIZE,
         translation_step=TRANSLATION_STEP,
     )
     if key not in record["runs"]:
@@ -182,7 +195,13 @@ def _one(
     found = fit.vertices(final)
     faces_pictures.write_ply(options.out / "heads" / f"{mode}-{head.seed}-{scene.lights}.ply", found, scene.model.faces)
     sheets.add(
-        head.seed, scene.lights, head.vertices, head.start, found, target[..., None], fit.render(np.zeros_like(final)),
+        head.seed,
+        scene.lights,
+        head.vertices,
+        head.start,
+        found,
+        target[..., None],
+        fit.render(np.zeros_like(final)),
         fit.render(final),
     )
 
@@ -193,13 +212,18 @@ def _measured(scene: FaceScene, head: Head, mode: Mode, options: FaceOptions, fi
     weights = history.final[: fit.count]
     difference = fit.render(history.final)[..., 0] - np.array(fit.reference)
     result = {
-        "mode": mode, "lights": scene.lights, "seed": head.seed,
+        "mode": mode,
+        "lights": scene.lights,
+        "seed": head.seed,
         "distance": vars(surface_distance(found, head.vertices, faces, mask, samples=options.samples)),
         "start_distance": vars(surface_distance(head.start, head.vertices, faces, mask, samples=options.samples)),
         "image_error": float(np.sqrt(np.mean(np.square(difference)))),
         "weight_error": float(np.sqrt(np.mean(np.square(weights - true)))),
-        "seconds_per_iteration": history.seconds_per_iteration, "seconds_total": history.seconds_total,
-        "final": history.final, "true": true, "loss_curve": history.loss,
+        "seconds_per_iteration": history.seconds_per_iteration,
+        "seconds_total": history.seconds_total,
+        "final": history.final,
+        "true": true,
+        "loss_curve": history.loss,
     }
     if mode == "expression" and options.prior > 0:
         left = posterior_covariance(image_derivatives(fit, np.zeros(len(history.final))), options.prior)
@@ -209,13 +233,22 @@ def _measured(scene: FaceScene, head: Head, mode: Mode, options: FaceOptions, fi
 
 def _started(path: Path, options: FaceOptions, model: MorphableModel) -> dict[str, Any]:
     """The record of an earlier call with the same settings, or an empty one."""
-    settings = records.plain({
-        "model": faces_report.digest(model), "iterations": options.iterations, "prior": options.prior,
-        "translate": options.translate, "reference": options.reference,
-        "spp": options.spp if options.reference != "own" else None,
-        "height": options.height, "map_resolution": options.map_resolution, "filter_size": options.filter_size,
-        "samples": options.samples, "step_size": STEP_SIZE, "translation_step": TRANSLATION_STEP,
-    })
+    settings = records.plain(
+        {
+            "model": faces_report.digest(model),
+            "iterations": options.iterations,
+            "prior": options.prior,
+            "translate": options.translate,
+            "reference": options.reference,
+            "spp": options.spp if options.reference != "own" else None,
+            "height": options.height,
+            "map_resolution": options.map_resolution,
+            "filter_size": options.filter_size,
+            "samples": options.samples,
+            "step_size": STEP_SIZE,
+            "translation_step": TRANSLATION_STEP,
+        }
+    )
     if options.resume and path.exists():
         return records.read_record(path, settings, "runs")
     return {"settings": settings, "machine": machine(), "runs": {}}

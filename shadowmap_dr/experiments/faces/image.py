@@ -65,11 +65,19 @@ def run_image(options: ImageOptions, *, console: Console | None = None) -> dict[
     fit = scene.fit(
         options.mode, target, translate=True, prior=options.prior, step_size=STEP_SIZE, translation_step=TRANSLATION_STEP
     )
-    settings = records.plain({
-        "image": options.image.name, "mode": options.mode, "model": faces_report.digest(model), "iterations": options.iterations,
-        "height": options.height, "map_resolution": options.map_resolution, "filter_size": options.filter_size,
-        "placement": vars(placement), **fit.describe(),
-    })
+    settings = records.plain(
+        {
+            "image": options.image.name,
+            "mode": options.mode,
+            "model": faces_report.digest(model),
+            "iterations": options.iterations,
+            "height": options.height,
+            "map_resolution": options.map_resolution,
+            "filter_size": options.filter_size,
+            "placement": vars(placement),
+            **fit.describe(),
+        }
+    )
     checkpoint = options.out / "checkpoints" / f"{name}.npz"
     if not options.resume:
         checkpoint.unlink(missing_ok=True)
@@ -80,13 +88,18 @@ def run_image(options: ImageOptions, *, console: Console | None = None) -> dict[
         history = optimize(fit, start, options.iterations, checkpoint=checkpoint, settings=settings, on_step=show)
     images = {"target": target[..., None], "mean head": fit.render(start), "result": fit.render(history.final)}
     images["difference"] = np.abs(images["result"] - images["target"])
-    record = records.plain({
-        "settings": settings, "machine": machine(),
-        "image_error": float(np.sqrt(np.mean(images["difference"] ** 2))),
-        "image_error_start": float(np.sqrt(np.mean(np.square(images["mean head"] - images["target"])))),
-        "weights": history.final[: fit.count], "translation": history.final[fit.count :],
-        "seconds_per_iteration": history.seconds_per_iteration, "loss_curve": history.loss,
-    })
+    record = records.plain(
+        {
+            "settings": settings,
+            "machine": machine(),
+            "image_error": float(np.sqrt(np.mean(images["difference"] ** 2))),
+            "image_error_start": float(np.sqrt(np.mean(np.square(images["mean head"] - images["target"])))),
+            "weights": history.final[: fit.count],
+            "translation": history.final[fit.count :],
+            "seconds_per_iteration": history.seconds_per_iteration,
+            "loss_curve": history.loss,
+        }
+    )
     records.write_json(path, record)
     found = fit.vertices(history.final)
     heads = {"mean head": model.mean, "result": found}

@@ -85,8 +85,13 @@ def recovery(
     rows = []
     for contrast in contrasts(names):
         v = contrast.vector
-        rows.append({
-            "name": contrast.name, "deviation": float(np.sqrt(v @ c @ v)), "true": float(v @ np.asarray(true)),
-            "found": float(v @ np.asarray(found)), "error": float(v @ error),
-        })
+        rows.append(
+            {
+                "name": contrast.name,
+                "deviation": float(np.sqrt(v @ c @ v)),
+                "true": float(v @ np.asarray(true)),
+                "found": float(v @ np.asarray(found)),
+                "error": float(v @ error),
+            }
+        )
     return sorted(rows, key=lambda row: row["deviation"])

@@ -37,7 +37,10 @@ class Sheets:
     ) -> None:
         """Vertices (V, 3) of the true head, the start and the result; (H, W, 1) shadows of the three."""
         self._profiles.setdefault(lights, {})[f"head {seed}"] = {
-            "target": target, "start": shadow_start, "result": shadow_found, "difference": np.abs(shadow_found - target)
+            "target": target,
+            "start": shadow_start,
+            "result": shadow_found,
+            "difference": np.abs(shadow_found - target),
         }
         heads = self._heads.setdefault(seed, {"true": true, "start": start})
         heads[lights] = found
@@ -73,22 +76,31 @@ def picture(
         colours = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
     mesh = _mesh(p, f)
     mesh.add_attribute("vertex_paint", 3, np.ascontiguousarray(colours, np.float32).ravel())
-    mesh.set_bsdf(mi.load_dict({
-        "type": "twosided",
-        "material": {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_paint"}},
-    }))
+    mesh.set_bsdf(
+        mi.load_dict(
+            {
+                "type": "twosided",
+                "material": {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_paint"}},
+            }
+        )
+    )
     middle = [float(x) for x in 0.5 * (p[m].min(0) + p[m].max(0))]
     eye = [a + b for a, b in zip(_EYE, middle, strict=True)]
-    scene = mi.load_dict({
-        "type": "scene",
-        "camera": {
-            "type": "perspective", "fov": _FOV_DEG, "to_world": mi.ScalarTransform4f().look_at(eye, middle, [0, 1, 0]),
-            "film": {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}, "pixel_format": "rgba"},
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "camera": {
+                "type": "perspective",
+                "fov": _FOV_DEG,
+                "to_world": mi.ScalarTransform4f().look_at(eye, middle, [0, 1, 0]),
+                "film": {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}, "pixel_format": "rgba"},
+            },
+            "head": mesh,
+            "key": {"type": "directional", "direction": [-1.0, -0.9, -0.5], "irradiance": {"type": "rgb", "value": 1.6}},
+            "fill": {"type": "directional", "direction": [-0.3, -0.2, -1.0], "irradiance": {"type": "rgb", "value": 1.4}},
         },
-        "head": mesh,
-        "key": {"type": "directional", "direction": [-1.0, -0.9, -0.5], "irradiance": {"type": "rgb", "value": 1.6}},
-        "fill": {"type": "directional", "direction": [-0.3, -0.2, -1.0], "irradiance": {"type": "rgb", "value": 1.4}},
-    }, optimize=False)
+        optimize=False,
+    )
     image = np.array(mi.render(scene, integrator=mi.load_dict({"type": "shadowmap"}), spp=9))
     return image[..., :3] + (1 - image[..., 3:4])  # before white
 

@@ -149,8 +149,14 @@ def path_traced_shadow(scene: FaceScene, vertices: npt.ArrayLike, spp: int) -> F
             @ transform().scale([0.5 * window.size[0]] * 2 + [1]),
             "near_clip": 1e-3,
             "far_clip": 1.0,
-            "film": {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"},
-                     "pixel_format": "luminance", "component_format": "float32"},
+            "film": {
+                "type": "hdrfilm",
+                "width": width,
+                "height": height,
+                "rfilter": {"type": "box"},
+                "pixel_format": "luminance",
+                "component_format": "float32",
+            },
             "sampler": {"type": "multijitter", "sample_count": 64},
         },
         "receiver": {
@@ -164,6 +170,8 @@ def path_traced_shadow(scene: FaceScene, vertices: npt.ArrayLike, spp: int) -> F
     for k, direction in enumerate(directions):
         irradiance = np.pi / len(directions) / -direction[2]  # as much light on the receiver from each of them
         description[f"light{k}"] = {
-            "type": "directional", "direction": list(direction), "irradiance": {"type": "rgb", "value": float(irradiance)},
+            "type": "directional",
+            "direction": list(direction),
+            "irradiance": {"type": "rgb", "value": float(irradiance)},
         }
     return path_traced(mi.load_dict(description, optimize=False), spp=spp).image[..., 0]

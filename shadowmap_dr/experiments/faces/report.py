@@ -67,8 +67,15 @@ def rows(record: Mapping[str, Any], mode: str) -> tuple[list[str], list[list[str
         row = [str(seed), f"{start['mean']:.4f}", f"{start['hausdorff']:.3f}"]
         for lights in means:
             run = runs.get(lights)
-            row += [f"{run['distance']['mean']:.4f}", f"{run['distance']['hausdorff']:.3f}",
-                    f"{1000 * run['seconds_per_iteration']:.1f}"] if run else ["", "", ""]
+            row += (
+                [
+                    f"{run['distance']['mean']:.4f}",
+                    f"{run['distance']['hausdorff']:.3f}",
+                    f"{1000 * run['seconds_per_iteration']:.1f}",
+                ]
+                if run
+                else ["", "", ""]
+            )
         body.append(row)
     first = next(iter(means.values()))
     row = ["mean", f"{first['start_mean']:.4f}", f"{first['start_hausdorff']:.3f}"]
@@ -132,7 +139,9 @@ def _expressions(record: Mapping[str, Any], lights: int) -> list[str]:
     return [
         f"{lights} shadow{'s' * (lights > 1)}: of {len(entries)} expressions {len(seen)} can be seen (the image leaves a "
         f"standard deviation of at most {SEEN}, of 1). Error of these: {rms(seen)}, of the others: {rms(rest)}.",
-        "", *markdown(["expression", "predicted deviation", "error", "size"], table), "",
+        "",
+        *markdown(["expression", "predicted deviation", "error", "size"], table),
+        "",
     ]
 
 

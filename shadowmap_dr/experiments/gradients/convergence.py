@@ -68,11 +68,15 @@ class ConvergenceOptions:
     resume: bool = False
 
     def __post_init__(self) -> None:
-        check_chosen({
-            "occluder": (self.occluders, OCCLUDERS), "camera": (self.cameras, gradients_scenes.CAMERAS),
-            "candidate": (self.candidates, CANDIDATES), "filter size": (self.filter_sizes, None),
-            "displacement": (self.displacements, None),
-        })
+        check_chosen(
+            {
+                "occluder": (self.occluders, OCCLUDERS),
+                "camera": (self.cameras, gradients_scenes.CAMERAS),
+                "candidate": (self.candidates, CANDIDATES),
+                "filter size": (self.filter_sizes, None),
+                "displacement": (self.displacements, None),
+            }
+        )
         for value in self.displacements:
             if not 0 < value <= MAX_DISPLACEMENT:
                 raise ShadowmapError(f"a displacement of {value}: give more than 0 and at most {MAX_DISPLACEMENT}.")
@@ -100,17 +104,26 @@ def run_convergence(options: ConvergenceOptions, *, console: Console | None = No
             fit, texel = _fit(label, name, camera, taps, options)
             if pictured not in sheet:
                 start = max(options.displacements)
-                sheet[pictured] = {"reference": fit.reference, f"displaced by {start}": fit.method.render((start,)),
-                                   "own, in place": fit.method.render((0.0,))}
+                sheet[pictured] = {
+                    "reference": fit.reference,
+                    f"displaced by {start}": fit.method.render((start,)),
+                    "own, in place": fit.method.render((0.0,)),
+                }
             progress.advance(task, len(options.displacements) - len(todo))
             for displacement in todo:
                 history = optimize(fit.method, (displacement,), options.iterations)
                 errors = np.abs(history.parameters[:, 0]) / texel
                 record["runs"][_key(label, name, camera, taps, displacement)] = {
-                    "candidate": label, "occluder": name, "camera": camera, "filter": taps, "displacement": displacement,
+                    "candidate": label,
+                    "occluder": name,
+                    "camera": camera,
+                    "filter": taps,
+                    "displacement": displacement,
                     "texel": texel,
-                    "error_texels": float(errors[-1]), "recovered": bool(errors[-1] < RECOVERED),
-                    "seconds_per_iteration": history.seconds_per_iteration, "error_curve_texels": errors,
+                    "error_texels": float(errors[-1]),
+                    "recovered": bool(errors[-1] < RECOVERED),
+                    "seconds_per_iteration": history.seconds_per_iteration,
+                    "error_curve_texels": errors,
                     "loss_curve": history.loss,
                 }
                 records.write_json(path, record)
@@ -125,8 +138,14 @@ def run_convergence(options: ConvergenceOptions, *, console: Console | None = No
 
 
 def _started(path: Path, options: ConvergenceOptions) -> dict[str, Any]:
-    identity = {"map_resolution": options.map_resolution, "resolution": options.resolution, "iterations": options.iterations,
-                "spp": options.spp, "step_size": STEP_SIZE, "decay": _DECAY}
+    identity = {
+        "map_resolution": options.map_resolution,
+        "resolution": options.resolution,
+        "iterations": options.iterations,
+        "spp": options.spp,
+        "step_size": STEP_SIZE,
+        "decay": _DECAY,
+    }
     if options.resume and path.exists():
         record = records.read_record(path, identity, "runs")
         for run in record["runs"].values():
@@ -218,19 +237,27 @@ def read_convergence(record: Mapping[str, Any]) -> str:
     s, runs = record["settings"], list(record["runs"].values())
     found = [run for run in runs if run["recovered"]]
     near = [run for run in found if run["error_texels"] <= HOPED_FOR]
-    lines = ["# An occluder recovered from its shadow", "",
-             f"Displaced along x, path-traced reference ({s['spp']} samples, {s['resolution']} x {s['resolution']} pixels), "
-             f"map of {s['map_resolution']} texels, {s['iterations']} steps of Adam. Recovered: within a texel.", ""]
+    lines = [
+        "# An occluder recovered from its shadow",
+        "",
+        f"Displaced along x, path-traced reference ({s['spp']} samples, {s['resolution']} x {s['resolution']} pixels), "
+        f"map of {s['map_resolution']} texels, {s['iterations']} steps of Adam. Recovered: within a texel.",
+        "",
+    ]
     lines += markdown(*convergence_rows(record)) + [""]
     lines.append(f"{len(found)} of {len(runs)} runs recover the occluder, {len(near)} of these to {HOPED_FOR} texel.")
     worst = max(found, key=lambda run: run["error_texels"], default=None)
     if worst is not None and worst["error_texels"] > HOPED_FOR:
-        lines.append(f"The worst of them: {worst['occluder']}, {worst['camera']}, filter {worst['filter']}, "
-                     f"{worst['error_texels']:.3f} texels.")
+        lines.append(
+            f"The worst of them: {worst['occluder']}, {worst['camera']}, filter {worst['filter']}, "
+            f"{worst['error_texels']:.3f} texels."
+        )
     for name in dict.fromkeys(run["occluder"] for run in runs):
         width = float(np.ptp(occluder(name).vertices[:, 0]))
         lost = [run["displacement"] for run in runs if run["occluder"] == name and not run["recovered"]]
         kept = [run["displacement"] for run in runs if run["occluder"] == name and run["recovered"]]
-        lines.append(f"The {name} is {width:.2f} wide; it was recovered from up to {max(kept, default=0):g}, "
-                     + (f"and lost, in some case, from {min(lost):g}." if lost else "and never lost."))
+        lines.append(
+            f"The {name} is {width:.2f} wide; it was recovered from up to {max(kept, default=0):g}, "
+            + (f"and lost, in some case, from {min(lost):g}." if lost else "and never lost.")
+        )
     return "\n".join(lines) + "\n"

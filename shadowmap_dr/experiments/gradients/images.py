@@ -132,4 +132,3 @@ def _response(frequency: npt.NDArray[np.float64], texel: float, taps: npt.NDArra
     offsets = np.arange(len(taps)) - len(taps) // 2
     filtered = (taps * np.cos(2 * np.pi * np.outer(frequency * texel, offsets))).sum(1)
     return np.sinc(frequency * texel) ** 3 * filtered
-

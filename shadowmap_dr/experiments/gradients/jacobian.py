@@ -67,10 +67,14 @@ class JacobianOptions:
     resume: bool = False
 
     def __post_init__(self) -> None:
-        check_chosen({
-            "motion": (self.motions, MOTIONS), "candidate": (self.candidates, CANDIDATES),
-            "map size": (self.map_resolutions, None), "filter size": (self.filter_sizes, None),
-        })
+        check_chosen(
+            {
+                "motion": (self.motions, MOTIONS),
+                "candidate": (self.candidates, CANDIDATES),
+                "map size": (self.map_resolutions, None),
+                "filter size": (self.filter_sizes, None),
+            }
+        )
         check_maps(self.map_resolutions, self.filter_sizes)
         if self.resolution < 16 or self.faces < 20 or self.spp < 2:
             raise ShadowmapError("resolution, faces and samples must be at least 16, 20 and 2.")
@@ -96,6 +100,7 @@ def run_jacobian(options: JacobianOptions, *, console: Console | None = None) ->
         if _key(label, name, size, taps) not in record["entries"]
     ]
     with io_console.progress(console) as progress:
+
         def track(title: str, items: list[Any]) -> Iterable[Any]:
             task = progress.add_task(title, total=len(items), note="")
             for item in items:
@@ -144,9 +149,7 @@ def make_renderer(scene: Any, label: str, size: int, taps: int) -> Renderer:
     return Renderer.from_scene(scene, shadow_map_resolution=size, **filters, **CANDIDATES[label])
 
 
-def _measure(
-    mesh: Mesh, label: str, name: str, size: int, taps: int, traced: Image, options: JacobianOptions
-) -> dict[str, Any]:
+def _measure(mesh: Mesh, label: str, name: str, size: int, taps: int, traced: Image, options: JacobianOptions) -> dict[str, Any]:
     """Agreement of one derivative image with all that it can be compared with."""
     motion, resolution = MOTIONS[name], options.resolution
     renderer = make_renderer(gradients_scenes.build(mesh, resolution), label, size, taps)
@@ -154,8 +157,12 @@ def _measure(
     _, derivative = forward_derivative(renderer, rate)
     texel = texel_in_pixels(renderer, resolution)
     entry: dict[str, Any] = {
-        "candidate": label, "motion": name, "map": size, "filter": taps,
-        "texel_pixels": list(texel), "norm": float(np.linalg.norm(derivative)),
+        "candidate": label,
+        "motion": name,
+        "map": size,
+        "filter": taps,
+        "texel_pixels": list(texel),
+        "norm": float(np.linalg.norm(derivative)),
         "reverse_error": reverse_error(renderer, rate, derivative),
     }
     if motion.along_light:
@@ -198,7 +205,8 @@ def _tessellation(name: str, options: JacobianOptions) -> dict[str, float]:
         gradients.append(float(((value - target).astype(np.float64) * derivative).sum()))
     a, b = images
     return {
-        "faces": faces[0], "divided_faces": faces[1],
+        "faces": faces[0],
+        "divided_faces": faces[1],
         "image_change": float(np.linalg.norm(a - b) / np.linalg.norm(a)),
         "gradient_change": abs(gradients[1] / gradients[0] - 1),
     }

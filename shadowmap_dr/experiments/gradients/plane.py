@@ -67,8 +67,15 @@ def run_plane(options: PlaneOptions, *, console: Console | None = None) -> dict[
     basis = np.zeros((2, *mesh.vertices.shape))
     basis[0, VERTEX, 0] = basis[1, VERTEX, 1] = 1
     start = -0.5 * mesh.vertices[VERTEX, :2].astype(np.float64)
-    settings = {"map_resolution": options.map_resolution, "filter_size": options.filter_size, "resolution": options.resolution,
-                "iterations": options.iterations, "spp": options.spp, "step_size": STEP_SIZE, "start": start}
+    settings = {
+        "map_resolution": options.map_resolution,
+        "filter_size": options.filter_size,
+        "resolution": options.resolution,
+        "iterations": options.iterations,
+        "spp": options.spp,
+        "step_size": STEP_SIZE,
+        "start": start,
+    }
     record: dict[str, Any] = {"settings": settings, "machine": machine(), "runs": []}
     sheet: dict[str, dict[str, Image]] = {}
     with io_console.progress(console) as progress:
@@ -79,20 +86,33 @@ def run_plane(options: PlaneOptions, *, console: Console | None = None) -> dict[
             for label, antialiased in CASES.items():
                 progress.update(task, note=f"{camera}, {label}")
                 renderer = Renderer.from_scene(
-                    scene, shadow_map_resolution=options.map_resolution, shadow_filter_size=options.filter_size,
+                    scene,
+                    shadow_map_resolution=options.map_resolution,
+                    shadow_filter_size=options.filter_size,
                     shadow_antialias=antialiased,
                 )
                 fit = ShadowFit(renderer, mesh.vertices, basis, reference, step_size=STEP_SIZE)
                 history = optimize(fit, start, options.iterations, on_step=lambda _: progress.advance(task))
                 errors = np.linalg.norm(history.parameters, axis=1)
-                record["runs"].append({
-                    "camera": camera, "antialiased": antialiased, "error": errors[-1],
-                    "recovered": bool(errors[-1] <= RECOVERED), "final": history.final,
-                    "seconds_per_iteration": history.seconds_per_iteration, "error_curve": errors, "loss_curve": history.loss,
-                })
+                record["runs"].append(
+                    {
+                        "camera": camera,
+                        "antialiased": antialiased,
+                        "error": errors[-1],
+                        "recovered": bool(errors[-1] <= RECOVERED),
+                        "final": history.final,
+                        "seconds_per_iteration": history.seconds_per_iteration,
+                        "error_curve": errors,
+                        "loss_curve": history.loss,
+                    }
+                )
                 result = fit.render(history.final)
-                sheet[f"{camera}, {label}"] = {"reference": reference, "start": fit.render(start), "result": result,
-                                               "difference": np.abs(result - reference)}
+                sheet[f"{camera}, {label}"] = {
+                    "reference": reference,
+                    "start": fit.render(start),
+                    "result": result,
+                    "difference": np.abs(result - reference),
+                }
     record = records.plain(record)
     records.write_json(path, record)
     plots.image_sheet(options.out / "minimal-plane-images.png", sheet)
@@ -111,8 +131,15 @@ def _label(run: Mapping[str, Any]) -> str:
 
 def plane_rows(record: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
     """A row for each run."""
-    rows = [[f"{run['camera']}, {_label(run)}", f"{run['error_curve'][0]:.4f}", f"{run['error']:.4f}",
-             "yes" if run["recovered"] else "no"] for run in record["runs"]]
+    rows = [
+        [
+            f"{run['camera']}, {_label(run)}",
+            f"{run['error_curve'][0]:.4f}",
+            f"{run['error']:.4f}",
+            "yes" if run["recovered"] else "no",
+        ]
+        for run in record["runs"]
+    ]
     return ["camera, moments", "error at start", "error", "recovered"], rows
 
 
@@ -124,16 +151,21 @@ def plane_table(record: Mapping[str, Any]) -> Table:
 def read_plane(record: Mapping[str, Any]) -> str:
     """Markdown: the table, and what it says."""
     s = record["settings"]
-    lines = ["# A square with one vertex out of place", "",
-             f"Path-traced reference ({s['spp']} samples, {s['resolution']} x {s['resolution']} pixels), map of "
-             f"{s['map_resolution']} texels, {s['iterations']} steps of Adam of {s['step_size']}.", ""]
+    lines = [
+        "# A square with one vertex out of place",
+        "",
+        f"Path-traced reference ({s['spp']} samples, {s['resolution']} x {s['resolution']} pixels), map of "
+        f"{s['map_resolution']} texels, {s['iterations']} steps of Adam of {s['step_size']}.",
+        "",
+    ]
     lines += markdown(*plane_rows(record)) + [""]
     for antialiased in (True, False):
         runs = [run for run in record["runs"] if run["antialiased"] == antialiased]
         if runs:
             found, moved = sum(run["recovered"] for run in runs), max(abs(run["error_curve"][0] - run["error"]) for run in runs)
             errors = ", ".join(format(run["error"], ".4f") for run in runs)
-            lines.append(f"With{'' if antialiased else 'out'} anti-aliased moments {found} of {len(runs)} are recovered to "
-                         f"{RECOVERED} (errors {errors}"
-                         + (")." if moved > 0 else "; the vertex never moves: there is no gradient)."))
+            lines.append(
+                f"With{'' if antialiased else 'out'} anti-aliased moments {found} of {len(runs)} are recovered to "
+                f"{RECOVERED} (errors {errors}" + (")." if moved > 0 else "; the vertex never moves: there is no gradient).")
+            )
     return "\n".join(lines) + "\n"

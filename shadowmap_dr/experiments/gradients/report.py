@@ -17,8 +17,11 @@ from ...io.files import atomic
 #: What a derivative is expected to reach: least cosine, and bounds of the scale.
 OWN, TRACED = (0.98, 0.97, 1.03), (0.95, 0.95, 1.05)
 REVERSE, TESSELLATION = 1e-4, 0.02
-_KINDS = {"own": ("own differences", OWN), "traced": ("path-traced differences", TRACED),
-          "traced_blurred": ("path-traced, blurred like the map", TRACED)}
+_KINDS = {
+    "own": ("own differences", OWN),
+    "traced": ("path-traced differences", TRACED),
+    "traced_blurred": ("path-traced, blurred like the map", TRACED),
+}
 
 
 def signed_sheet(
@@ -111,8 +114,11 @@ def read_jacobian(record: Mapping[str, Any]) -> str:
     lines = ["# Derivative images of a shadow", ""]
     s = record["settings"]
     motions = ", ".join(sorted({e["motion"] for e in record["entries"].values()}))
-    lines += [f"Occluder of {s['faces']} faces, image of {s['resolution']} x {s['resolution']} pixels, "
-              f"path-traced with {s['spp']} samples. Motions: {motions}.", ""]
+    lines += [
+        f"Occluder of {s['faces']} faces, image of {s['resolution']} x {s['resolution']} pixels, "
+        f"path-traced with {s['spp']} samples. Motions: {motions}.",
+        "",
+    ]
     lines += markdown(*jacobian_rows(record)) + [""]
     entries = _compared(record)
     for label in dict.fromkeys(e["candidate"] for e in entries):
@@ -130,14 +136,18 @@ def _reading_of(entries: Sequence[Mapping[str, Any]], kind: str) -> str:
     least, low, high = bounds
     good = [e for e in entries if _reaches(e[kind], bounds)]
     cosines, scales = ([e[kind][q] for e in entries] for q in ("cosine", "scale"))
-    text = (f"against {title} {len(good)} of {len(entries)} reach c >= {least} and s in [{low}, {high}] "
-            f"(c from {min(cosines):.3f}, s {min(scales):.3f} to {max(scales):.3f})")
+    text = (
+        f"against {title} {len(good)} of {len(entries)} reach c >= {least} and s in [{low}, {high}] "
+        f"(c from {min(cosines):.3f}, s {min(scales):.3f} to {max(scales):.3f})"
+    )
     bad = [e for e in entries if e not in good]
     if not bad:
         return text
     worst = min(bad, key=lambda e: e[kind]["cosine"] - abs(1 - e[kind]["scale"]))
-    return text + (f", worst {worst['motion']} at {worst['map']} texels, filter {worst['filter']}: "
-                   f"{worst[kind]['cosine']:.3f}, {worst[kind]['scale']:.3f}")
+    return text + (
+        f", worst {worst['motion']} at {worst['map']} texels, filter {worst['filter']}: "
+        f"{worst[kind]['cosine']:.3f}, {worst[kind]['scale']:.3f}"
+    )
 
 
 def _reaches(found: Mapping[str, float], bounds: tuple[float, float, float]) -> bool:
@@ -152,9 +162,11 @@ def _blur(entries: Sequence[Mapping[str, Any]]) -> str:
         return ""
     alike = sum(not _reaches(e["blur"], TRACED) for e in missed)
     gains = [abs(e["blur"]["scale"] - 1) - abs(e["traced"]["scale"] - 1) for e in missed]
-    return (f" Of the {len(missed)} that miss path-traced differences, path-traced images with the map's blur miss them in "
-            f"{alike}, too; scales are nearer to 1 than theirs by up to {max(0.0, *gains):.3f}, "
-            f"farther from it by up to {max(0.0, *(-gain for gain in gains)):.3f}.")
+    return (
+        f" Of the {len(missed)} that miss path-traced differences, path-traced images with the map's blur miss them in "
+        f"{alike}, too; scales are nearer to 1 than theirs by up to {max(0.0, *gains):.3f}, "
+        f"farther from it by up to {max(0.0, *(-gain for gain in gains)):.3f}."
+    )
 
 
 def _along_light(record: Mapping[str, Any]) -> list[str]:
@@ -164,9 +176,12 @@ def _along_light(record: Mapping[str, Any]) -> list[str]:
     names = sorted({e["motion"] for e in entries})
     norms = [record["references"][name].get("norm") for name in names if name in record["references"]]
     low, high = min(e["relative_norm"] for e in entries), max(e["relative_norm"] for e in entries)
-    return [f"Motion along the light ({', '.join(names)}) moves no shadow: path-traced differences have the norm "
-            f"{max(norms or [0.0]):.3g}, so that there is nothing to compare with. Ours have {low:.1e} to {high:.1e} of the norm "
-            "for the same motion across the light.", ""]
+    return [
+        f"Motion along the light ({', '.join(names)}) moves no shadow: path-traced differences have the norm "
+        f"{max(norms or [0.0]):.3g}, so that there is nothing to compare with. Ours have {low:.1e} to {high:.1e} of the norm "
+        "for the same motion across the light.",
+        "",
+    ]
 
 
 def _noise(record: Mapping[str, Any]) -> list[str]:
@@ -178,11 +193,17 @@ def _mitsuba(record: Mapping[str, Any]) -> list[str]:
     if not record["mitsuba"]:
         return []
     first = next(iter(record["mitsuba"].values()))
-    lines = [f"Mitsuba's projective integrator, area light with a penumbra of {first['penumbra_px']:.0f} pixels, "
-             f"{first['resolution']} x {first['resolution']} pixels, {first['passes']} x {first['sppi']} samples:", ""]
+    lines = [
+        f"Mitsuba's projective integrator, area light with a penumbra of {first['penumbra_px']:.0f} pixels, "
+        f"{first['resolution']} x {first['resolution']} pixels, {first['passes']} x {first['sppi']} samples:",
+        "",
+    ]
     rows = [
-        [name, *(f"{r[key][q]:.3f}" for key in ("agreement_directional", "agreement_area") for q in ("cosine", "scale")),
-         f"{r['halves_cosine']:.3f}"]
+        [
+            name,
+            *(f"{r[key][q]:.3f}" for key in ("agreement_directional", "agreement_area") for q in ("cosine", "scale")),
+            f"{r['halves_cosine']:.3f}",
+        ]
         for name, r in record["mitsuba"].items()
     ]
     return lines + markdown(["motion", "c, parallel light", "s", "c, same area light", "s", "c of its halves"], rows) + [""]
@@ -192,9 +213,12 @@ def _tessellation(record: Mapping[str, Any]) -> list[str]:
     if not record["tessellation"]:
         return []
     worst = {key: max(r[key] for r in record["tessellation"].values()) for key in ("image_change", "gradient_change")}
-    return ["Dividing each triangle into 64 changes the gradient of a squared difference by at most "
-            f"{worst['gradient_change']:.1e} ({_verdict(worst['gradient_change'] < TESSELLATION, f'{TESSELLATION:.0%}')}), "
-            f"the derivative image by {worst['image_change']:.1e} of its norm.", ""]
+    return [
+        "Dividing each triangle into 64 changes the gradient of a squared difference by at most "
+        f"{worst['gradient_change']:.1e} ({_verdict(worst['gradient_change'] < TESSELLATION, f'{TESSELLATION:.0%}')}), "
+        f"the derivative image by {worst['image_change']:.1e} of its norm.",
+        "",
+    ]
 
 
 def _verdict(reached: bool, limit: str) -> str:

@@ -41,8 +41,13 @@ def build(mesh: Mesh, resolution: int, camera: str = "orthographic") -> Any:
         raise ShadowmapError(f"no camera {camera!r}: choose from {', '.join(CAMERAS)}.")
     t = mi.ScalarTransform4f
     film: dict[str, Any] = {
-        "type": "hdrfilm", "width": resolution, "height": resolution, "rfilter": {"type": "box"}, "pixel_format": "luminance",
-        "component_format": "float32", "sample_border": camera == "pinhole",  # which Mitsuba wants for derivatives of shapes
+        "type": "hdrfilm",
+        "width": resolution,
+        "height": resolution,
+        "rfilter": {"type": "box"},
+        "pixel_format": "luminance",
+        "component_format": "float32",
+        "sample_border": camera == "pinhole",  # which Mitsuba wants for derivatives of shapes
     }
     if camera == "orthographic":
         place = t().look_at([0, 0, _BETWEEN_Z], [0, 0, RECEIVER_Z], [0, 1, 0]) @ t().scale([RECEIVER_HALF, RECEIVER_HALF, 1])
@@ -57,8 +62,13 @@ def build(mesh: Mesh, resolution: int, camera: str = "orthographic") -> Any:
     return mi.load_dict(
         {
             "type": "scene",
-            "camera": {**sensor, "near_clip": 0.01, "far_clip": 10.0, "film": film,
-                       "sampler": {"type": "multijitter", "sample_count": 64}},
+            "camera": {
+                **sensor,
+                "near_clip": 0.01,
+                "far_clip": 10.0,
+                "film": film,
+                "sampler": {"type": "multijitter", "sample_count": 64},
+            },
             "light": {"type": "directional", "direction": [0, 0, -1], "irradiance": {"type": "rgb", "value": float(np.pi)}},
             "receiver": {
                 "type": "rectangle",

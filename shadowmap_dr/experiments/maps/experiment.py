@@ -179,9 +179,7 @@ def _texel(name: str, p_world: Image, renderer: Renderer, mask: npt.NDArray[np.b
     return texel_in_pixels(p_world, view, renderer.frusta, renderer.settings.shadow.resolution, mask)
 
 
-def _derivative_agreement(
-    name: str, label: str, reference: Image, footprint: float, options: MapsOptions
-) -> dict[str, float]:
+def _derivative_agreement(name: str, label: str, reference: Image, footprint: float, options: MapsOptions) -> dict[str, float]:
     """Forward derivative of the image by the offset of what casts the shadow, against path-traced central differences.
 
     ``footprint``: width of the filter in pixels.

@@ -58,9 +58,7 @@ def texel_in_pixels(
     return Texel(float(np.median(area)) ** -0.5, float(np.median(sides.max(-1))))
 
 
-def metrics(
-    image: Image, reference: Image, mask: npt.NDArray[np.bool_], texel: Texel, filter_size: int
-) -> dict[str, float]:
+def metrics(image: Image, reference: Image, mask: npt.NDArray[np.bool_], texel: Texel, filter_size: int) -> dict[str, float]:
     """Errors of a visibility image (H, W): root mean squares, bleeding, acne, shift of the contour in texels."""
     error = np.where(mask, image - reference, 0)
 

@@ -36,9 +36,7 @@ def poses_found(
     Returns the number of runs, how many found the pose, and the median errors of all: degrees, 100 x offset.
     """
     renderer = Renderer.from_scene(problem.scene, **settings)
-    fit = PoseFit(
-        renderer, "object", problem.p_rest, reference, step_size=STEP_SIZE, betas=BETAS, shift_z=problem.shift_z
-    )
+    fit = PoseFit(renderer, "object", problem.p_rest, reference, step_size=STEP_SIZE, betas=BETAS, shift_z=problem.shift_z)
     final = []
     for run in range(runs):
         fit.reset(start_pose(0, run))

@@ -52,8 +52,10 @@ def slices(
         return float(np.mean((render(pose) - reference) ** 2))
 
     lines = {"target": np.zeros((len(angles), 2)), "end": np.tile(end[1:], (len(angles), 1))}
-    result = {name: np.array([loss(np.array([angle, *offset])) for angle, offset in zip(angles, offsets, strict=True)])
-              for name, offsets in lines.items()}
+    result = {
+        name: np.array([loss(np.array([angle, *offset])) for angle, offset in zip(angles, offsets, strict=True)])
+        for name, offsets in lines.items()
+    }
     best = np.minimum(result["target"], result["end"])
     where = np.where((result["target"] <= result["end"])[:, None], lines["target"], lines["end"])
     for order in (range(len(angles)), range(len(angles) - 1, -1, -1)):
@@ -67,7 +69,11 @@ def slices(
 
 
 def _best_offset(
-    render: Render, reference: npt.NDArray[np.float64], angle: float, offset: npt.NDArray[np.float64], steps: int,
+    render: Render,
+    reference: npt.NDArray[np.float64],
+    angle: float,
+    offset: npt.NDArray[np.float64],
+    steps: int,
     loss: Callable[[npt.NDArray[np.float64]], float],
 ) -> tuple[npt.NDArray[np.float64], float]:
     """Offset and loss after some steps of Gauss and Newton's method at a fixed angle."""
@@ -75,8 +81,9 @@ def _best_offset(
     for _ in range(steps):
         pose = np.array([angle, *offset])
         residual = (render(pose) - reference).ravel()
-        columns = [(render(pose + move) - render(pose - move)).ravel() / (2 * _DIFFERENCE)
-                   for move in _DIFFERENCE * np.eye(3)[1:]]
+        columns = [
+            (render(pose + move) - render(pose - move)).ravel() / (2 * _DIFFERENCE) for move in _DIFFERENCE * np.eye(3)[1:]
+        ]
         change = np.linalg.lstsq(np.stack(columns, axis=1), -residual, rcond=None)[0]
         offset = offset + change * min(1.0, _LONGEST / max(float(np.hypot(*change)), 1e-12))
         value = loss(np.array([angle, *offset]))
@@ -132,8 +139,14 @@ def landscape(
     if record is None:
         raise ShadowmapError(f"{folder / 'pose.json'} has no run with " + ", ".join(f"{k} {v}" for k, v in wanted.items()) + ".")
     copy = folder / "objects" / f"{record['object']}.ply"  # of a mesh file of the user's
-    problem = make_problem(record["object"], record["resolution"], shadow_only=record["shadow_only"],
-                           normals=record.get("normals", "face"), work=folder / "objects", scaled=copy if copy.exists() else None)
+    problem = make_problem(
+        record["object"],
+        record["resolution"],
+        shadow_only=record["shadow_only"],
+        normals=record.get("normals", "face"),
+        work=folder / "objects",
+        scaled=copy if copy.exists() else None,
+    )
     if problem.digest != record["settings"].get("object_digest", problem.digest):
         raise ShadowmapError(f"the object {record['object']} is not the one of the run any more: run it again.")
     name = "reference.exr" if record["reference"] == "mitsuba" else "reference-own.exr"

@@ -37,7 +37,7 @@ def plot_convergence(
                 with warnings.catch_warnings():  # no run may have come as far as a step: a gap in the plot
                     warnings.simplefilter("ignore", RuntimeWarning)
                     low, middle, high = np.nanpercentile(errors, (25, 50, 75), axis=0)
-                line, = axes.plot(middle, COLOURS.get(method, "0.3"), linewidth=1.4, label=method)
+                (line,) = axes.plot(middle, COLOURS.get(method, "0.3"), linewidth=1.4, label=method)
                 axes.fill_between(np.arange(len(middle)), low, high, color=line.get_color(), alpha=0.25, linewidth=0)
                 handles[method] = line
             axes.axhline(_LIMIT_DEG, color="0.5", linestyle=":", linewidth=1)

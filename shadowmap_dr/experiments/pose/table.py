@@ -140,8 +140,12 @@ def rows(records: Iterable[Mapping[str, Any]], timed: Iterable[Mapping[str, Any]
                 raise ShadowmapError(f"{which} were made with different settings: run one of them again.")
         row.seconds = float(np.median(seconds[key])) if key in seconds else first.get("seconds_per_step")
     order = (list(CASES).index, str, int, METHODS.index)
-    return sorted(result.values(), key=lambda row: tuple(
-        rank(value) for rank, value in zip(order, (row.case, row.object, row.resolution, row.method), strict=True)))
+    return sorted(
+        result.values(),
+        key=lambda row: tuple(
+            rank(value) for rank, value in zip(order, (row.case, row.object, row.resolution, row.method), strict=True)
+        ),
+    )
 
 
 def _made_with(record: Mapping[str, Any]) -> list[Any]:
@@ -186,8 +190,14 @@ def comparison(table: Sequence[Row]) -> list[dict[str, Any]]:
 
 def document(table: Sequence[Row]) -> str:
     """Markdown: a summary, the comparison with Mitsuba, then a table for each case."""
-    lines = ["# Poses found", "", "## Runs recovered: median rotation error [degrees], median 100 x offset error", "",
-             *_summary(table), ""]
+    lines = [
+        "# Poses found",
+        "",
+        "## Runs recovered: median rotation error [degrees], median 100 x offset error",
+        "",
+        *_summary(table),
+        "",
+    ]
     compared = comparison(table)
     if compared:
         lines += ["## With shadows and by Mitsuba, from the same starts", "", *_compared(compared), ""]
@@ -209,31 +219,70 @@ def _summary(table: Sequence[Row]) -> list[str]:
         return f"{row.recovered()}/{len(row.runs)}: {medians}"
 
     problems = sorted({key[:2] for key in by_key})
-    return markdown(["object", "pixels", *_SUMMARY], (
-        [name, str(resolution), *(cell((name, resolution, *column)) for column in _SUMMARY.values())]
-        for name, resolution in problems))
+    return markdown(
+        ["object", "pixels", *_SUMMARY],
+        (
+            [name, str(resolution), *(cell((name, resolution, *column)) for column in _SUMMARY.values())]
+            for name, resolution in problems
+        ),
+    )
 
 
 def _compared(entries: Sequence[Mapping[str, Any]]) -> list[str]:
-    columns = ["normals", "our samples", "object", "pixels", "starts", "recovered: ours, Mitsuba",
-               "median rotation [deg]: ours, Mitsuba", "median 100 x offset: ours, Mitsuba", "aim"]
-    return markdown(columns, ([
-        *(str(CASES[entry["case"]][key]) for key in ("normals", "samples_per_pixel")),
-        entry["object"], str(entry["resolution"]), str(len(entry["starts"])),
-        ", ".join(map(str, entry["recovered_ours_and_mitsuba"])),
-        *(", ".join(f"{value:.3f}" for value in entry["medians_ours_and_mitsuba"][key]) for key in _ERRORS),
-        "yes" if entry["met"] else "NO",
-    ] for entry in entries))
+    columns = [
+        "normals",
+        "our samples",
+        "object",
+        "pixels",
+        "starts",
+        "recovered: ours, Mitsuba",
+        "median rotation [deg]: ours, Mitsuba",
+        "median 100 x offset: ours, Mitsuba",
+        "aim",
+    ]
+    return markdown(
+        columns,
+        (
+            [
+                *(str(CASES[entry["case"]][key]) for key in ("normals", "samples_per_pixel")),
+                entry["object"],
+                str(entry["resolution"]),
+                str(len(entry["starts"])),
+                ", ".join(map(str, entry["recovered_ours_and_mitsuba"])),
+                *(", ".join(f"{value:.3f}" for value in entry["medians_ours_and_mitsuba"][key]) for key in _ERRORS),
+                "yes" if entry["met"] else "NO",
+            ]
+            for entry in entries
+        ),
+    )
 
 
 def _cells(table: Sequence[Row]) -> list[str]:
-    columns = ["object", "pixels", "method", "recovered", "rotation [deg]: mean", "median", "100 x offset: mean", "median",
-               "s a step"]
-    return markdown(columns, ([
-        row.object, str(row.resolution), row.method, f"{row.recovered()} of {len(row.runs)}",
-        *(f"{value:.3f}" for key in _ERRORS for value in (np.mean(row.errors(key)), np.median(row.errors(key)))),
-        "" if row.seconds is None else f"{row.seconds:.2g}",
-    ] for row in table))
+    columns = [
+        "object",
+        "pixels",
+        "method",
+        "recovered",
+        "rotation [deg]: mean",
+        "median",
+        "100 x offset: mean",
+        "median",
+        "s a step",
+    ]
+    return markdown(
+        columns,
+        (
+            [
+                row.object,
+                str(row.resolution),
+                row.method,
+                f"{row.recovered()} of {len(row.runs)}",
+                *(f"{value:.3f}" for key in _ERRORS for value in (np.mean(row.errors(key)), np.median(row.errors(key)))),
+                "" if row.seconds is None else f"{row.seconds:.2g}",
+            ]
+            for row in table
+        ),
+    )
 
 
 def read(folders: Iterable[str | Path]) -> list[dict[str, Any]]:

@@ -259,4 +259,3 @@ def _times(scene: Any, errors: list[dict[str, Any]], noise: float, options: Soft
     }
     seconds = {name: statistics.median(values) for name, values in alternate(contenders).items()}
     return {"seconds": seconds, "path_traced_spp": spp, "ratio": seconds["path traced"] / seconds["ours"]}
-

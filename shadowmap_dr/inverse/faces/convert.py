@@ -179,8 +179,13 @@ def _triangles(path: Path, triangles: Array, vertices: int) -> Array:
 
 
 def _placed(
-    mean: Array, faces: Array, identity: Array, expression: Array, identity_names: tuple[str, ...],
-    expression_names: tuple[str, ...], options: ConvertOptions,
+    mean: Array,
+    faces: Array,
+    identity: Array,
+    expression: Array,
+    identity_names: tuple[str, ...],
+    expression_names: tuple[str, ...],
+    options: ConvertOptions,
 ) -> MorphableModel:
     mask = np.ones(len(mean), bool) if options.neck is None else mean[:, 1] > options.neck
     if not mask.any():

@@ -38,9 +38,7 @@ def fit_maps(scene: StillScene, views: Views, previous: Frusta | None) -> Frusta
     bounds = shape_bounds(views, p_light, index, dr.gather(mi.UInt32, scene.vertex_shape, vertex), scene.shapes)
     casts = casting_shapes(views, scene.planes, scene.planar, scene.boxes)
     s = scene.shadow
-    return fit_frusta(
-        views, bounds, casts, scene.shapes, s.resolution, s.filter_size, previous, scene.seen, s.receiver_range
-    )
+    return fit_frusta(views, bounds, casts, scene.shapes, s.resolution, s.filter_size, previous, scene.seen, s.receiver_range)
 
 
 def lit(scene: StillScene, views: Views, maps: TangentMaps | None) -> Any:

@@ -148,9 +148,7 @@ class MethodProblem(Problem):
         for run in runs:
             own = None if checkpoint is None else checkpoint.with_name(f"{checkpoint.stem}-run{run}{checkpoint.suffix}")
             settings = {"settings": self.settings(), "run": run}
-            history = optimize(
-                built, self.start(run), self.steps, checkpoint=own, settings=settings, on_step=on_step
-            )
+            history = optimize(built, self.start(run), self.steps, checkpoint=own, settings=settings, on_step=on_step)
             records.append(self.record(run, history))
         return records
 

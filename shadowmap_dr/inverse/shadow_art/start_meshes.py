@@ -8,9 +8,7 @@ import numpy.typing as npt
 from ...errors import ShadowmapError
 
 
-def even_sphere(
-    rings: int = 40, radius: float = 1.0
-) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint32]]:
+def even_sphere(rings: int = 40, radius: float = 1.0) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint32]]:
     """A closed sphere of 8 rings^2 triangles of the same area, without poles where they would crowd: (V, 3) and (F, 3).
 
     From each pole to the equator there are so many rings, ring i with 4 i vertices at a height of 1 - (i / rings)^2. 40 rings

@@ -106,9 +106,7 @@ class Surroundings:
         last = dr.select(down, UInt32(self.height), self.width) - 1
         return dr.select(ahead, at < last, at > 0) & active
 
-    def _steady(
-        self, crossed: Callable[[Any, Any, Any], Any], near: Any, far: Any, down: Any, ahead: Any, inside: Any
-    ) -> Any:
+    def _steady(self, crossed: Callable[[Any, Any, Any], Any], near: Any, far: Any, down: Any, ahead: Any, inside: Any) -> Any:
         """Whether pixels and their neighbours see the same triangle, or others of a smooth surface.
 
         That no edge crosses the way to the neighbour would not be enough by itself: edges along it do not count there.

@@ -147,9 +147,7 @@ def _measure(
 
             def crease(image, pixel, step, down, a, b, soft):  # noqa: ANN001, ANN202
                 here, neighbour = (dr.gather(UInt32, raster.triangle, p) for p in (pixel, pixel + step))
-                a, b, c, d, weight, weight_2 = find_creases(
-                    creases, folds, topology, raster, image, pixel, here, neighbour, down
-                )
+                a, b, c, d, weight, weight_2 = find_creases(creases, folds, topology, raster, image, pixel, here, neighbour, down)
                 return a, b, c, d, soft * weight, soft * weight_2
 
             none = dr.full(UInt32, NO_VERTEX, dr.width(pair))
@@ -197,9 +195,7 @@ def _measure(
     return found
 
 
-def _cut(
-    topology: Topology, raster: RasterOutput, image: Any, pixel: Any, here: Any, there: Any, down: Any, active: Any
-) -> Any:
+def _cut(topology: Topology, raster: RasterOutput, image: Any, pixel: Any, here: Any, there: Any, down: Any, active: Any) -> Any:
     """Whether triangles without a common corner, seen by pixels and their neighbours, may cut each other between these.
 
     Their planes cross there, and each triangle is seen where it is the nearer one.

@@ -15,9 +15,7 @@ def incoming_weights(crossings: Crossings, width: int) -> tuple[Any, Any, Any, A
     return around(crossings.right, crossings.down, width, 1)
 
 
-def around(
-    right: Any, down: Any, width: int, sign: int, signed: bool = False, at: Any = None
-) -> tuple[Any, Any, Any, Any]:
+def around(right: Any, down: Any, width: int, sign: int, signed: bool = False, at: Any = None) -> tuple[Any, Any, Any, Any]:
     """How much each neighbour reaches into a pixel, or (``sign`` -1) a pixel into each neighbour; all pixels, or those ``at``.
 
     Neighbours are the right, lower, left and upper one. Pairs that reach beyond the image have weight 0, which is also what the

@@ -24,6 +24,7 @@ def surface_clusters(
         Cluster of each piece, (P,) uint32, and the representative piece of each cluster, (count,) int64: the one nearest to the
         weighted mean of positions.
     """
+
     def urgency(members: np.ndarray) -> float:
         """Which cluster is halved next: the heaviest, and sooner where normals differ."""
         total = float(weights[members].sum())

@@ -142,9 +142,7 @@ class _Place:
         slope = radius * dr.maximum(self.z - z_occluder, 0) / (self.z * z_occluder)
         return tuple(dr.minimum(0.5 * slope / half, _WIDEST) for half in (self.frustum.half_x, self.frustum.half_y))
 
-    def look_up(
-        self, pyramid: Pyramid, which: Any, tap: Any, radii: tuple[Any, Any], attached: bool = True
-    ) -> tuple[Any, Any]:
+    def look_up(self, pyramid: Pyramid, which: Any, tap: Any, radii: tuple[Any, Any], attached: bool = True) -> tuple[Any, Any]:
         """(moments at one of the places all over an ellipse around the point, depth of the point's tangent plane there)."""
         rx, ry = radii if attached else (dr.detach(r) for r in radii)
         # Each place stands for its share of the ellipse.

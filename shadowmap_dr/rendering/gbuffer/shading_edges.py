@@ -232,8 +232,11 @@ def _edges(geometry: Geometry, topology: Topology, everywhere: np.ndarray) -> tu
     first, second = faces[half].astype(np.int64), faces[after].astype(np.int64)
     # The other's half-edge may run either way.
     reverse = start[one] != start[other]
-    ends = np.stack([
-        np.stack([first[one], np.where(reverse, second[other], first[other])], 1),
-        np.stack([second[one], np.where(reverse, first[other], second[other])], 1),
-    ], 1)
+    ends = np.stack(
+        [
+            np.stack([first[one], np.where(reverse, second[other], first[other])], 1),
+            np.stack([second[one], np.where(reverse, first[other], second[other])], 1),
+        ],
+        1,
+    )
     return half[one], half[other], ends

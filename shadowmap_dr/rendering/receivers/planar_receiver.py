@@ -117,8 +117,13 @@ class ReceiverShadows:
         frusta = _frusta(directions, window, reach)
         dr.eval(points, views, frusta)
         return cls(
-            points, device_array(mi.UInt32, triangles), build_topology(triangles, np.asarray(positions), mi.UInt32),
-            views, frusta, settings, (rows, columns),
+            points,
+            device_array(mi.UInt32, triangles),
+            build_topology(triangles, np.asarray(positions), mi.UInt32),
+            views,
+            frusta,
+            settings,
+            (rows, columns),
         )
 
     def render(self, positions: Any) -> Any:

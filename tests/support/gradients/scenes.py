@@ -80,9 +80,7 @@ def cow(bsdf: Any = None, face_normals: bool = True) -> dict[str, Any]:
             "bsdf": bsdf or diffuse(0.6)}  # fmt: skip
 
 
-def mesh(
-    name: str, vertices: np.ndarray, faces: np.ndarray, bsdf: Any = None, normals: bool = False, emitter: Any = None
-) -> Any:
+def mesh(name: str, vertices: np.ndarray, faces: np.ndarray, bsdf: Any = None, normals: bool = False, emitter: Any = None) -> Any:
     """A ``mi.Mesh``, smooth if ``normals``, which Mitsuba then works out from its faces."""
     props = mi.Properties()
     if emitter is not None:

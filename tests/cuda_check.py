@@ -2,8 +2,8 @@
 
     python -m tests.cuda_check [--out FOLDER] [--processes N]
 
-Writes ``cuda.json`` and the records of tests (``junit.xml``) and steps (``steps.json``) into FOLDER, and prints a table. Where there
-is no NVIDIA GPU it says so in one line. Exit status 1 if a test fails.
+Writes ``cuda.json`` and the records of tests (``junit.xml``) and steps (``steps.json``) into FOLDER, and prints a table. Where
+there is no NVIDIA GPU it says so in one line. Exit status 1 if a test fails.
 """
 
 from __future__ import annotations

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import threading
 import uuid
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -126,10 +127,13 @@ def _client(scheduler: str) -> Iterator[Any]:
         ):
             yield client
         return
-    try:
+    client = None
+    with suppress(OSError, ValueError, TypeError):  # the last two for ports that are none, and missing certificates
         client = Client(scheduler, timeout=20)
-    except (OSError, ValueError, TypeError) as error:  # the last two for ports that are none, and missing certificates
-        raise ShadowmapError(f"no Dask scheduler answers at {scheduler}: start one, or give its address.") from error
+    if client is None:
+        # What is left of it waits for a lock when it is collected: forever, if that is in the thread that starts the next one.
+        gc.collect()
+        raise ShadowmapError(f"no Dask scheduler answers at {scheduler}: start one, or give its address.")
     with client:
         yield client
 

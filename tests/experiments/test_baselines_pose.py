@@ -12,8 +12,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_baselines import pose, proxy, reference
-from mitsuba_baselines.pose import MitsubaPose, ProjectiveSetting, fair_setting, is_fair, pose_start
+from mitsuba_baselines import fair_settings, pose, proxy, reference
+from mitsuba_baselines.fair_settings import fair_setting, is_fair
+from mitsuba_baselines.pose import MitsubaPose, ProjectiveSetting, pose_start
 from shadowmap_dr.errors import ShadowmapError
 from shadowmap_dr.experiments.pose.methods import METHODS, usual_methods
 from shadowmap_dr.io import assets
@@ -170,9 +171,9 @@ def test_searches_keep_what_others_write_meanwhile(monkeypatch: pytest.MonkeyPat
         save({"resolution": resolution, "setting": None})
         return {"setting": None}
 
-    monkeypatch.setattr(pose, "find_fair_setting", search)
+    monkeypatch.setattr(fair_settings, "find_fair_setting", search)
     monkeypatch.setattr(sys, "argv", ["pose", "--search", "32", "--output", str(store), "--candidates", "1/1/1", "1/1/1"])
-    pose.main()
+    fair_settings.main()
     assert set(json.loads(store.read_text())) == {"16", "32"}
 
 
@@ -193,13 +194,13 @@ def test_searches_name_bad_input(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["pose", "--output", "new.json", *arguments])
     with pytest.raises(SystemExit) as ended:
-        pose.main()
+        fair_settings.main()
     assert str(ended.value).startswith("error: ") and message in str(ended.value) and "\n" not in str(ended.value)
 
 
 def test_fair_settings_are_kept_by_kind_of_normals(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     store = tmp_path / "fair.json"
-    monkeypatch.setattr(pose, "STORE", store)
+    monkeypatch.setattr(fair_settings, "STORE", store)
     flat, smooth = ProjectiveSetting(4, 4, 64), ProjectiveSetting(4, 4, 16)
     entries = {"128": {"resolution": 128, "setting": asdict(flat)}}
     store.write_text(json.dumps(entries))
@@ -230,13 +231,13 @@ def test_search_goes_on_within_a_candidate(monkeypatch: pytest.MonkeyPatch) -> N
                 raise KeyboardInterrupt
 
         try:
-            return pose.find_fair_setting(16, candidates=(bad, good), earlier=earlier, save=save), saved
+            return fair_settings.find_fair_setting(16, candidates=(bad, good), earlier=earlier, save=save), saved
         except KeyboardInterrupt:
             return {}, saved
 
     bad, good = ProjectiveSetting(1, 1, 1, spp=1), ProjectiveSetting(1, 1, 4, spp=1)
-    monkeypatch.setattr(pose, "_measure", measure)
-    monkeypatch.setattr(pose, "_timed", lambda step: 0.1)
+    monkeypatch.setattr(fair_settings, "_measure", measure)
+    monkeypatch.setattr(fair_settings, "_timed", lambda step: 0.1)
     whole, _ = search()
     assert measured == [(str(bad), 0), (str(bad), 1), (str(good), 0), (str(good), 1), (str(good), 2)]
     assert whole["setting"]["sppi"] == 4 and not whole["untried"]
@@ -257,14 +258,14 @@ def test_search_goes_on_within_a_candidate(monkeypatch: pytest.MonkeyPatch) -> N
 def test_searches_of_something_else_are_not_continued(changes: dict) -> None:
     earlier = {"resolution": 16, "mesh": "spot", "starts": 3, "iterations": 150, "threshold_deg": 0.1, "measurements": []}
     with pytest.raises(ShadowmapError, match=next(iter(changes))):
-        pose.find_fair_setting(**{"resolution": 16, "candidates": (), "earlier": earlier, **changes})
+        fair_settings.find_fair_setting(**{"resolution": 16, "candidates": (), "earlier": earlier, **changes})
 
 
 @pytest.mark.parametrize("normals", ["face", "vertex"])
 def test_searches_begin_without_an_earlier_one(normals: str) -> None:
-    found = pose.find_fair_setting(16, normals=normals, candidates=())
+    found = fair_settings.find_fair_setting(16, normals=normals, candidates=())
     assert found["normals"] == normals and found["setting"] is None and found["measurements"] == []
-    again = pose.find_fair_setting(16, normals=normals, candidates=(), earlier=json.loads(json.dumps(found)))
+    again = fair_settings.find_fair_setting(16, normals=normals, candidates=(), earlier=json.loads(json.dumps(found)))
     assert again.keys() == found.keys()
 
 
@@ -275,12 +276,12 @@ def test_search_skips_what_costs_more_than_a_known_setting(monkeypatch: pytest.M
         measured.append(str(method.setting))
         return {"run": run, "mean_error_deg_last_20": 0.01, "offset_x100": 0.1, "seconds_per_iteration": method.setting.sppi}
 
-    monkeypatch.setattr(pose, "_measure", measure)
-    monkeypatch.setattr(pose, "_timed", lambda step: 0.1 * step.__self__.setting.sppi)
+    monkeypatch.setattr(fair_settings, "_measure", measure)
+    monkeypatch.setattr(fair_settings, "_timed", lambda step: 0.1 * step.__self__.setting.sppi)
     known, cheap, dear = (ProjectiveSetting(1, 1, count, spp=1) for count in (4, 2, 9))
-    earlier = pose.find_fair_setting(16, candidates=(known,))
+    earlier = fair_settings.find_fair_setting(16, candidates=(known,))
     measured.clear()
-    found = pose.find_fair_setting(16, candidates=(dear,), earlier=earlier)
+    found = fair_settings.find_fair_setting(16, candidates=(dear,), earlier=earlier)
     assert not measured and found["setting"] == asdict(known) and found["untried"] == {str(dear): pytest.approx(0.9)}
-    found = pose.find_fair_setting(16, candidates=(dear, cheap), earlier=earlier)
+    found = fair_settings.find_fair_setting(16, candidates=(dear, cheap), earlier=earlier)
     assert set(measured) == {str(cheap)} and found["setting"] == asdict(cheap)

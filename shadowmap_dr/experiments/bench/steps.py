@@ -177,7 +177,7 @@ def _times(entries: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _setting(method: Any, resolution: int, left_out: str | None) -> dict[str, Any]:
-    from mitsuba_baselines.pose import fair_setting, is_fair
+    from mitsuba_baselines.fair_settings import fair_setting, is_fair
 
     setting = fair_setting(resolution)
     result = {"setting": asdict(setting), "fair": is_fair(setting, resolution)}
@@ -186,7 +186,7 @@ def _setting(method: Any, resolution: int, left_out: str | None) -> dict[str, An
 
 def _methods(problem: PoseProblem, reference: Image) -> tuple[dict[str, Any], str | None]:
     """All methods, but for Mitsuba's if its samples do not fit into the memory; and why it was left out."""
-    from mitsuba_baselines.pose import fair_setting
+    from mitsuba_baselines.fair_settings import fair_setting
 
     setting = fair_setting(problem.resolution)
     samples = max(setting.spp, setting.sppc, setting.sppp, setting.sppi) * problem.resolution**2

@@ -28,7 +28,7 @@ def usual_methods(shadow_only: bool = False, normals: str = "face") -> tuple[str
     if shadow_only:
         # Its integrator hardly ever samples silhouettes of shadows this sharp; it needs to see the object.
         return METHODS[:2]
-    from mitsuba_baselines.pose import is_searched
+    from mitsuba_baselines.fair_settings import is_searched
 
     return METHODS if is_searched(normals) else METHODS[:2]
 
@@ -43,10 +43,12 @@ def build_method(
         setting: Sample counts of Mitsuba's; default: the fair ones, or what stands in for them.
     """
     if name == "mitsuba":
-        from mitsuba_baselines import pose as baseline
+        from mitsuba_baselines.fair_settings import fair_setting
+        from mitsuba_baselines.pose import MitsubaPose
+        from mitsuba_baselines.proxy import calibrate
 
-        setting = setting or baseline.fair_setting(problem.resolution, problem.normals)
-        return baseline.MitsubaPose(
+        setting = setting or fair_setting(problem.resolution, problem.normals)
+        return MitsubaPose(
             assets.scene("pose"),
             problem.mesh,
             problem.resolution,
@@ -56,7 +58,7 @@ def build_method(
             betas=BETAS,
             shift_z=problem.shift_z,
             normals=problem.normals,
-            proxy=baseline.calibrate(problem.scene),
+            proxy=calibrate(problem.scene),
         )
     from ...rendering.renderer import Renderer
 
@@ -89,7 +91,7 @@ def fairness(method: Method, problem: PoseProblem) -> dict[str, bool]:
     setting = getattr(method, "setting", None)
     if setting is None:
         return {}
-    from mitsuba_baselines.pose import is_fair
+    from mitsuba_baselines.fair_settings import is_fair
 
     searched = is_fair(setting, problem.resolution, problem.normals, problem.name)
     return {"fair": searched and not problem.shadow_only}

@@ -1,4 +1,4 @@
-"""What matters most on a GPU, in ten minutes: tests in ``cuda_ad_rgb``, and times of steps beside the paper's.
+"""The checks that matter most on a GPU: tests in ``cuda_ad_rgb``, and times of steps beside the paper's.
 
     python -m tests.cuda_check [--out FOLDER] [--processes N]
 

@@ -57,7 +57,7 @@ INSIDE = {
     ),
     "shadow.methods": (),
     "scene.shapes": ("scene.mitsuba_objects", "scene.changes"),
-    "scene.lights": ("scene.geometry", "scene.mitsuba_objects", "scene.changes", "scene.sums"),
+    "scene.lights": ("scene.geometry", "scene.mitsuba_objects", "scene.changes", "scene.sums", "scene.transforms"),
     "rendering.gbuffer": (),
     "rendering.receivers": (),
     "rendering.film": ("rendering.gbuffer",),

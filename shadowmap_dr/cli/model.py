@@ -16,7 +16,7 @@ from ..interactive.file_session import follow, kept
 from ..interactive.modeller import Modeller
 from ..inverse import Sculptor, even_sphere, shadow_view
 from ..io import assets, files
-from ..io.meshes import read_placed_mesh, trimesh_package
+from ..io.meshes import read_placed_mesh
 from ..variants import DEFAULT_VARIANT, set_variant
 from .options import Variant
 
@@ -51,7 +51,6 @@ def model(
     files.check_output(output, tuple(f".{kind}" for kind in exports.FORMATS))
     if not serve:
         files.check_output(image, (".png",))
-    trimesh_package()
     path = None if mesh == _SPHERE else assets.mesh(mesh)
     set_variant(variant)
     vertices, faces, (middle, scale) = (*even_sphere(), ((0, 0, 0), 1.0)) if path is None else read_placed_mesh(path)

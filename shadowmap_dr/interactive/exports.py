@@ -13,7 +13,6 @@ from ..errors import ShadowmapError
 from ..inverse.shadow_art import target_images
 from ..inverse.shadow_art.exports import vertex_colours
 from ..io.files import atomic
-from ..io.meshes import trimesh_package
 
 #: Formats of meshes, with their media types.
 FORMATS = {"ply": "application/octet-stream", "obj": "text/plain; charset=utf-8", "glb": "model/gltf-binary"}
@@ -29,7 +28,8 @@ def mesh_bytes(kind: str, vertices: Array, faces: npt.NDArray[np.uint32]) -> byt
     """A mesh of (V, 3) vertices and (F, 3) faces as a file of one of `FORMATS`; GLB has colours."""
     if kind not in FORMATS:
         raise ShadowmapError(f"no mesh format {kind!r}: choose from {', '.join(FORMATS)}.")
-    trimesh = trimesh_package()
+    import trimesh
+
     colours = vertex_colours(vertices) if kind == "glb" else None
     content = trimesh.Trimesh(vertices, faces, process=False, vertex_colors=colours).export(file_type=kind)
     return content.encode() if isinstance(content, str) else content

@@ -27,7 +27,8 @@ def read_mesh(path: Path) -> tuple[Array, Faces]:
 
 def read_placed_mesh(path: Path) -> tuple[Array, Faces, tuple[npt.NDArray[np.float64], float]]:
     """As `read_mesh`, and where the mesh was: its middle (3,) and a scale; vertices * scale + middle are the file's."""
-    trimesh = trimesh_package()
+    import trimesh
+
     try:
         mesh = trimesh.load_mesh(path, process=False)
         if isinstance(mesh, trimesh.Scene):
@@ -51,15 +52,6 @@ def read_placed_mesh(path: Path) -> tuple[Array, Faces, tuple[npt.NDArray[np.flo
     if not proper.any():
         raise ShadowmapError(f"all triangles of {path} have two corners at the same place.")
     return unique.astype(np.float32), faces[proper].astype(np.uint32), (middle.astype(np.float64), 0.5 * scale)
-
-
-def trimesh_package() -> Any:
-    """The module `trimesh`; ShadowmapError where it is not installed. To be asked before hours of work end in a mesh file."""
-    try:
-        import trimesh
-    except ModuleNotFoundError as error:
-        raise ShadowmapError("mesh files need the package trimesh: pip install 'shadowmap-dr[art]'.") from error
-    return trimesh
 
 
 def write_ply(path: str | os.PathLike[str], mesh: Any) -> None:

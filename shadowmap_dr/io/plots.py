@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,10 @@ import numpy.typing as npt
 
 from .files import atomic
 from .images import to_srgb
+
+Image = npt.NDArray[np.floating[Any]]
+#: Title of a row -> title of a column -> image.
+Rows = Mapping[str, Mapping[str, Image]]
 
 
 def plot_curves(
@@ -49,11 +53,30 @@ def plot_curves(
         figure.savefig(temporary, dpi=150)
 
 
-def image_sheet(
-    path: str | os.PathLike[str], rows: Mapping[str, Mapping[str, npt.NDArray[np.floating[Any]]]], size: float = 2.2
-) -> None:
+def image_sheet(path: str | os.PathLike[str], rows: Rows, size: float = 2.2) -> None:
     """Draw images in a grid: row title -> column title -> linear (H, W, 3) or (H, W, 1) image."""
-    from matplotlib.figure import Figure
+
+    def draw(axes: Any, image: Image, _: Mapping[str, Image]) -> None:
+        pixels = to_srgb(np.nan_to_num(image))
+        pixels = np.repeat(pixels, 3, axis=2) if pixels.shape[2] == 1 else pixels[..., :3]
+        axes.imshow(pixels, interpolation="nearest")
+
+    _grid(path, rows, size, draw)
+
+
+def signed_sheet(path: str | os.PathLike[str], rows: Rows, size: float = 2.0) -> None:
+    """Draw signed images (H, W) in a grid, blue below zero and red above, with one scale for each row."""
+
+    def draw(axes: Any, image: Image, row: Mapping[str, Image]) -> None:
+        limit = max(float(np.percentile(np.abs(other), 99.7)) for other in row.values()) or 1.0
+        axes.imshow(np.nan_to_num(image), cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="antialiased")
+
+    _grid(path, rows, size, draw)
+
+
+def _grid(path: str | os.PathLike[str], rows: Rows, size: float, draw: Callable[[Any, Image, Mapping[str, Image]], None]) -> None:
+    """A grid of images with titles; ``draw`` is given the axes, the image, and its row."""
+    from matplotlib.figure import Figure  # without pyplot there is no global state and no display is needed
 
     columns = max(len(row) for row in rows.values())
     aspect = max(image.shape[0] / image.shape[1] for row in rows.values() for image in row.values())
@@ -61,9 +84,7 @@ def image_sheet(
     for i, (row_title, row) in enumerate(rows.items()):
         for j, (column_title, image) in enumerate(row.items()):
             axes = figure.add_subplot(len(rows), columns, i * columns + j + 1)
-            pixels = to_srgb(np.nan_to_num(image))
-            pixels = np.repeat(pixels, 3, axis=2) if pixels.shape[2] == 1 else pixels[..., :3]
-            axes.imshow(pixels, interpolation="nearest")
+            draw(axes, image, row)
             axes.set_xticks([])
             axes.set_yticks([])
             if i == 0:

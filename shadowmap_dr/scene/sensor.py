@@ -17,6 +17,7 @@ from ..errors import ShadowmapError
 from ..jit.broadcast import broadcast_differentiable
 from .mitsuba_objects import children, parameters
 from .pixel_filter import Filter
+from .transforms import axis, translation
 
 _KINDS = {
     "PerspectiveCamera": "perspective",
@@ -83,14 +84,12 @@ class Sensor:
     @property
     def origin(self) -> Any:
         """Point3f, centre of projection (perspective) or a point on the optical axis (orthographic), world space."""
-        matrix = self.to_world.matrix
-        return mi.Point3f(matrix[0, 3], matrix[1, 3], matrix[2, 3])
+        return translation(self.to_world)
 
     @property
     def direction(self) -> Any:
         """Vector3f, unit viewing direction, world space."""
-        matrix = self.to_world.matrix
-        return dr.normalize(mi.Vector3f(matrix[0, 2], matrix[1, 2], matrix[2, 2]))
+        return dr.normalize(axis(self.to_world, 2))
 
     @property
     def view(self) -> Any:

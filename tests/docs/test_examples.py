@@ -39,6 +39,15 @@ def test_ways_to_render_are_timed_in_turns() -> None:
     assert list(steps) == ["plug-in", "plug-in, recorded", "renderer, recorded"] and min(map(float, steps.values())) > 0
 
 
+def test_steps_of_all_kinds_are_timed() -> None:
+    script = ROOT / "docs" / "examples" / "step_kinds.py"
+    command = [sys.executable, script, "--resolution", "16", "--seconds", "0"]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=ROOT)
+    assert result.returncode == 0, result.stderr
+    steps = dict(re.findall(r"^(.+): ([0-9.]+) ms a step", result.stdout, re.MULTILINE))
+    assert len(steps) == 10 and "frozen" in steps and min(map(float, steps.values())) > 0
+
+
 @pytest.mark.parametrize("setting", [[], ["--setting", "2/2/8/none/4"]])  # the fair one: ratios above a thousand
 def test_steps_are_timed_in_turns(setting: list[str]) -> None:
     script = ROOT / "docs" / "examples" / "pose_speed.py"

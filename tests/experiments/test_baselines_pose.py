@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_baselines import fair_settings, pose, proxy, reference
+from mitsuba_baselines import fair_settings, proxy, reference
 from mitsuba_baselines.fair_settings import fair_setting, is_fair
 from mitsuba_baselines.pose import MitsubaPose, ProjectiveSetting, pose_start
 from shadowmap_dr.errors import ShadowmapError

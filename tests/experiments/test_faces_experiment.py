@@ -188,9 +188,9 @@ def test_exr_files_are_silhouettes_too(tmp_path: Path) -> None:
     assert values.shape == (40, 30) and values[0, 0] == 1 and values[30, 12] == 0
 
 
-def test_missing_libraries_are_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(ShadowmapError, match=r"needs scipy and trimesh: pip install 'shadowmap-dr\[faces\]'"):
+    with pytest.raises(ShadowmapError, match=r"needs scipy: pip install 'shadowmap-dr\[faces\]'"):
         run_faces(FaceOptions(out=tmp_path))
 
 

@@ -153,7 +153,6 @@ def run_art(options: ArtOptions, *, console: Console | None = None) -> dict[str,
     """Make one piece; writes all files into ``options.out`` and returns the record of `art.json`."""
     console = console or Console(stderr=True)
     path = files.check_output(options.out / "art.json", (".json",))
-    meshes.trimesh_package()
     checkpoint = options.out / "checkpoint.npz"
     if not options.resume:
         checkpoint.unlink(missing_ok=True)

@@ -38,10 +38,9 @@ class SurfaceDistance:
 
 
 def check_libraries() -> None:
-    """ShadowmapError if the libraries that measure distances are not installed."""
-    missing = [name for name in ("scipy", "trimesh") if importlib.util.find_spec(name) is None]
-    if missing:
-        raise ShadowmapError(f"measuring faces needs {' and '.join(missing)}: pip install 'shadowmap-dr[faces]'.")
+    """ShadowmapError if SciPy, with which distances are measured, is not installed."""
+    if importlib.util.find_spec("scipy") is None:
+        raise ShadowmapError("measuring faces needs scipy: pip install 'shadowmap-dr[faces]'.")
 
 
 def surface_distance(

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from ...errors import ShadowmapError
 from ...io import console as io_console
-from ...io import files, records
+from ...io import files, plots, records
 from ...rendering.renderer import Renderer
 from ..common.meshes import Mesh
 from ..common.timing import machine
@@ -123,7 +123,7 @@ def run_jacobian(options: JacobianOptions, *, console: Console | None = None) ->
             record["tessellation"][name] = _tessellation(name, options)
         records.write_json(path, record)
         pictures = {name: _pictures(mesh, name, traced, mitsuba, options) for name in track("pictures", list(options.motions))}
-    gradients_report.signed_sheet(options.out / "jacobian.png", pictures)
+    plots.signed_sheet(options.out / "jacobian.png", pictures)
     gradients_report.plot_agreement(options.out / "jacobian-agreement.png", record)
     with files.atomic(options.out / "jacobian.md") as temporary:
         temporary.write_text(gradients_report.read_jacobian(record), encoding="utf-8")

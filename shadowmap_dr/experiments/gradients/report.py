@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from rich.table import Table
 
 from ...io import console
@@ -22,29 +21,6 @@ _KINDS = {
     "traced": ("path-traced differences", TRACED),
     "traced_blurred": ("path-traced, blurred like the map", TRACED),
 }
-
-
-def signed_sheet(
-    path: str | os.PathLike[str], rows: Mapping[str, Mapping[str, npt.NDArray[np.floating[Any]]]], size: float = 2.0
-) -> None:
-    """Draw signed images (H, W) in a grid, blue below zero and red above, with one scale for each row."""
-    from matplotlib.figure import Figure  # without pyplot there is no global state and no display is needed
-
-    columns = max(len(row) for row in rows.values())
-    figure = Figure(figsize=(size * columns, size * len(rows) + 0.3), layout="constrained")
-    for i, (row_title, row) in enumerate(rows.items()):
-        limit = max(float(np.percentile(np.abs(image), 99.7)) for image in row.values()) or 1.0
-        for j, (column_title, image) in enumerate(row.items()):
-            axes = figure.add_subplot(len(rows), columns, i * columns + j + 1)
-            axes.imshow(np.nan_to_num(image), cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="antialiased")
-            axes.set_xticks([])
-            axes.set_yticks([])
-            if i == 0:
-                axes.set_title(column_title, fontsize=8)
-            if j == 0:
-                axes.set_ylabel(row_title, fontsize=9)
-    with atomic(path) as temporary:
-        figure.savefig(temporary, dpi=120)
 
 
 def plot_agreement(path: str | os.PathLike[str], record: Mapping[str, Any]) -> None:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from ...io import files
 from ...io import images as io_images
-from ...io.meshes import Array, Faces, trimesh_package
+from ...io.meshes import Array, Faces
 from ...rendering.receivers.shadow_views import ShadowView, height
 from .smoothness import inverted_share
 
@@ -33,7 +33,8 @@ def vertex_colours(vertices: Array) -> npt.NDArray[np.uint8]:
 
 def write_meshes(folder: Path, vertices: Array, faces: Faces, views: Sequence[ShadowView], images: Sequence[Array]) -> None:
     """`mesh.ply`, `mesh.obj`, and `mesh.glb`: the object with colours, and the receivers with the shadows (H, W) on them."""
-    trimesh = trimesh_package()
+    import trimesh
+
     plain = trimesh.Trimesh(vertices, faces, process=False)
     coloured = trimesh.Trimesh(vertices, faces, process=False, vertex_colors=vertex_colours(vertices))
     scene = trimesh.Scene({"object": coloured})
@@ -47,7 +48,8 @@ def write_meshes(folder: Path, vertices: Array, faces: Faces, views: Sequence[Sh
 
 def write_printable(path: Path, vertices: Array, faces: Faces) -> None:
     """A binary STL in millimetres, z up, standing on z = 0, outside out."""
-    trimesh = trimesh_package()
+    import trimesh
+
     scale = PRINT_SIZE_MM / float(np.ptp(vertices, axis=0).max())
     upright = np.stack([vertices[:, 0], -vertices[:, 2], vertices[:, 1]], 1) * scale
     mesh = trimesh.Trimesh(upright - [0, 0, upright[:, 2].min()], faces, process=False)
@@ -59,7 +61,9 @@ def write_printable(path: Path, vertices: Array, faces: Faces) -> None:
 
 def mesh_report(vertices: Array, faces: Faces) -> dict[str, Any]:
     """Whether a mesh can be printed: closed, oriented, volume (cubic scene units), share of inverted triangles."""
-    mesh = trimesh_package().Trimesh(vertices, faces, process=False)
+    import trimesh
+
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
     return {
         "vertices": len(vertices),
         "faces": len(faces),
@@ -79,9 +83,9 @@ def error_picture(image: Array, target: Array) -> npt.NDArray[np.float32]:
 
 
 def _wall(view: ShadowView, image: Array) -> Any:
+    import trimesh
     from PIL import Image
 
-    trimesh = trimesh_package()
     line = np.linspace(-1, 1, _WALL_CELLS + 1)
     x, y = (a.ravel() for a in np.meshgrid(line, line))
     z = height(view.receiver, view.half * x, view.half)

@@ -27,15 +27,3 @@ def picture(texture: Any, uv: Any, active: Any) -> Any:
         return looked_up(lambda *where: mi.UnpolarizedSpectrum(texture.eval(*where)), *at)
 
     return evaluate(colour, (si, mi.Bool(active)), [texture], dr.width(uv))
-
-
-def translation(to_world: Any) -> Any:
-    """Where a Transform4f puts the origin (Point3f)."""
-    matrix = to_world.matrix
-    return mi.Point3f(matrix[0, 3], matrix[1, 3], matrix[2, 3])
-
-
-def axis(to_world: Any, k: int) -> Any:
-    """Where a Transform4f points the k-th axis (Vector3f, with its scale)."""
-    matrix = to_world.matrix
-    return mi.Vector3f(matrix[0, k], matrix[1, k], matrix[2, k])

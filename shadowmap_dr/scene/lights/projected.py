@@ -9,7 +9,8 @@ import drjit as dr
 import mitsuba as mi
 
 from ...jit.vectors import normalize_or
-from .light import axis, picture, towards, translation
+from ..transforms import axis, translation
+from .light import picture, towards
 from .soft_outline import BoundedLight, share_inside
 
 # Width of the rim in which light fades, half of it on either side of the outline: through it a moving outline has derivatives.

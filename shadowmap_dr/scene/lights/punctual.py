@@ -11,6 +11,7 @@ import mitsuba as mi
 
 from ...errors import ShadowmapError
 from ...jit.vectors import unit
+from ..transforms import axis, translation
 from .light import picture, towards
 from .soft_outline import BoundedLight, share_inside
 
@@ -75,14 +76,12 @@ class SpotLight(BoundedLight):
     @property
     def position(self) -> Any:
         """Point3f, world space."""
-        matrix = self.to_world.matrix
-        return mi.Point3f(matrix[0, 3], matrix[1, 3], matrix[2, 3])
+        return translation(self.to_world)
 
     @property
     def direction(self) -> Any:
         """Vector3f, unit axis of the cone, the direction in which light travels, world space."""
-        matrix = self.to_world.matrix
-        return dr.normalize(mi.Vector3f(matrix[0, 2], matrix[1, 2], matrix[2, 2]))
+        return dr.normalize(axis(self.to_world, 2))
 
     @property
     def falloff_width(self) -> Any:

@@ -13,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..mitsuba_objects import children, parameters, varies
+from ..transforms import axis
 from .area import AreaLight
 from .environment import ENVIRONMENTS, SUNSKY, Environment, SunSky, environment_of
 from .projected import Beam, Projector, beam_of, projector_of
@@ -93,8 +94,7 @@ def _light_of(emitter: Any, name: str) -> Light:
         return DirectionalLight(f"{name}.sun", *SunSky(name, emitter).sun())
     kind, values, parts = emitter.class_name(), parameters(emitter), dict(children(emitter))
     if kind == "DirectionalEmitter":
-        matrix = values["to_world"].matrix
-        direction = mi.Vector3f(matrix[0, 2], matrix[1, 2], matrix[2, 2])
+        direction = axis(values["to_world"], 2)
         length = dr.norm(direction)  # Mitsuba's becomes brighter with a transformation that scales
         return DirectionalLight(name, direction / length, colour_of(parts["irradiance"]) * length)
     if kind == "PointLight":

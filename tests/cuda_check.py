@@ -24,7 +24,7 @@ import drjit as dr
 
 VARIANT = "cuda_ad_rgb"
 TESTS = ("raster", "shadow", "scene", "rendering", "integrator", "torch", "jit")
-#: Milliseconds of a step with shadows, by pixels a side: Worchel and Alexa 2023, table 1.
+#: Milliseconds of a step with shadows that Worchel and Alexa (2023) give, by pixels a side.
 PAPER = {128: 14.0, 512: 23.0, 1024: 46.0}
 _STEPS = "import sys; from shadowmap_dr.cli.main import main; main()"
 

@@ -33,7 +33,7 @@ def test_bad_input_is_one_line(variant, tmp_path, monkeypatch, arguments, reason
     assert not Path("shadow.png").exists() and not Path("model.ply").exists()
 
 
-@pytest.mark.parametrize(("package", "extra"), [("uvicorn", "interactive"), ("trimesh", "art")])
+@pytest.mark.parametrize(("package", "extra"), [("uvicorn", "interactive"), ("cholespy", "art")])
 def test_missing_packages_are_named(variant, tmp_path, monkeypatch, package, extra):
     monkeypatch.chdir(tmp_path)
     load = builtins.__import__

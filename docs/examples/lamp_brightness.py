@@ -4,7 +4,8 @@
 
 A ball and a floor below lamps whose longest side is 1, at 0.5 to 10 from their lowest point, and a ball inside lamps that shine
 inwards. `bias`: sum of the image over that of the reference, minus 1. `error`: mean absolute difference of pixels over the
-reference's mean. The reference sums 4,096 of Mitsuba's own samples of the emitter for each pixel, on a lattice.
+reference's mean. The reference sums 4,096 of Mitsuba's own samples of the emitter for each pixel, on a lattice. Fine
+meshes, which a lattice meets unevenly (65,536 samples are still 0.2 % off), it sums triangle by triangle.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from shadowmap_dr.io import assets
 import drjit as dr  # after shadowmap_dr, which chooses the LLVM library
 import mitsuba as mi
 
-SIZE, LATTICE, BLOCK = 32, 4096, 512
+SIZE, LATTICE, BLOCK, MANY_TRIANGLES = 32, 4096, 512, 1000
 DISTANCES = (0.5, 1.0, 2.0, 5.0, 10.0)
 RECEIVERS = ("floor", "ball")
 Parts = dict[str, Any]
@@ -98,6 +99,14 @@ def reference(scene: Any) -> tuple[Any, Any]:
     while dr.any((hit := scene.ray_intersect(ray)).shape == emitter.get_shape()):
         ray = dr.select(hit.shape == emitter.get_shape(), hit.spawn_ray(ray.d), ray)
     valid = hit.is_valid()
+    counted = np.array(valid).reshape(SIZE, SIZE)
+    inner = counted.copy()
+    for axis in (0, 1):
+        for shift in (-1, 1):
+            inner &= np.roll(counted, shift, axis)
+    lamp = emitter.get_shape()
+    if lamp.is_mesh() and lamp.face_count() >= MANY_TRIANGLES:
+        return _sum_over_triangles(lamp, hit).reshape(SIZE, SIZE), inner
     total = dr.zeros(mi.Float, SIZE * SIZE)
     for block in range(LATTICE // BLOCK):
         lane = dr.arange(mi.UInt32, SIZE * SIZE * BLOCK)
@@ -110,12 +119,32 @@ def reference(scene: Any) -> tuple[Any, Any]:
         value = dr.select(sample.pdf > 0, value[0], 0)
         total += dr.block_sum(value, BLOCK)
         dr.eval(total)
-    counted = np.array(valid).reshape(SIZE, SIZE)
-    inner = counted.copy()
-    for axis in (0, 1):
-        for shift in (-1, 1):
-            inner &= np.roll(counted, shift, axis)
     return np.array(total).reshape(SIZE, SIZE) / LATTICE, inner
+
+
+def _sum_over_triangles(lamp: Any, hit: Any) -> np.ndarray:
+    """Radiance (P,) at points of a diffuse surface of reflectance 0.5 under a mesh of radiance 1, in double precision.
+
+    The middles of the quarters of each triangle stand for it.
+    """
+    parameters = mi.traverse(lamp)
+    corners = np.array(parameters["vertex_positions"], np.float64).reshape(-1, 3)[np.array(parameters["faces"]).reshape(-1, 3)]
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+    middles = np.concatenate([(x + y + z) / 3 for x, y, z in ((a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca))])
+    # Half the product of edges is a triangle's area; a quarter of that is a piece's.
+    vectors = np.tile(np.cross(b - a, c - a) / 8, (4, 1))
+    if lamp.has_flipped_normals():
+        vectors = -vectors
+    points, normals = (np.array(values, np.float64).T for values in (hit.p, hit.n))
+    found = np.zeros(len(points))
+    for block in np.array_split(np.arange(len(points)), 64):
+        to = middles[None] - points[block, None]
+        squared = (to**2).sum(-1)
+        received = np.maximum((to * normals[block, None]).sum(-1), 0)
+        sent = np.maximum(-(to * vectors[None]).sum(-1), 0)
+        found[block] = (received * sent / squared**2).sum(-1)
+    return found * (0.5 / np.pi)
 
 
 def compare(scene: Any, **options: Any) -> dict[str, float]:

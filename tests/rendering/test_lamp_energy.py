@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+import trimesh
 
 from mitsuba_baselines.unshadowed import unshadowed
 from shadowmap_dr import Renderer
@@ -110,6 +112,24 @@ def test_ball_below_lamps_of_all_shapes(variant: str, kind: str, distance: float
     scene = scene_of(lamps[kind], {"type": "sphere", "radius": 0.3}, camera(0.2, (2, 0.3, 0.5)))
     ours, right = render(scene), unshadowed(scene, spp=1024, hide_emitters=True).image[..., 0]
     assert ours.mean() == pytest.approx(right.mean(), rel=0.01)
+
+
+@pytest.mark.parametrize("distance", [0.5, 1.0, 5.0])
+def test_floor_below_an_uneven_mesh(variant: str, tmp_path: Path, distance: float) -> None:
+    """A ball with waves on it, 5,120 triangles, each of which shines from the middle of its quarters in NumPy."""
+    ball = trimesh.creation.icosphere(subdivisions=4)
+    waves = 1 + 0.04 * np.sin(14 * ball.vertices).sum(1)
+    ball.vertices *= 0.45 * waves[:, None]
+    ball.vertices[:, 2] += distance - ball.vertices[:, 2].min()
+    a, b, c = np.moveaxis(ball.vertices[ball.faces], 1, 0)
+    places = np.concatenate([(4 * a + b + c) / 6, (a + 4 * b + c) / 6, (a + b + 4 * c) / 6, (a + b + c) / 3])
+    areas = np.tile(np.cross(b - a, c - a) / 8, (4, 1))
+    squared = (places**2).sum(1)
+    sent = np.maximum(-(places * areas).sum(1), 0) * np.maximum(places[:, 2], 0) / squared**2
+    ball.export(tmp_path / "lamp.ply")
+    lamp = {"type": "ply", "filename": str(tmp_path / "lamp.ply"), "face_normals": True}
+    image = render(scene_of(lamp, view=camera(0.005)))
+    assert image.mean() == pytest.approx(ALBEDO / math.pi * RADIANCE * sent.sum(), rel=0.006)
 
 
 def test_rough_glass_gets_light_from_both_sides(variant: str) -> None:

@@ -13,14 +13,15 @@ import numpy as np
 from ...jit.arrays import device_array
 from ...scene.geometry import Geometry, ShapeInfo
 from ...scene.lights.area import AreaLight
-from .clusters import facet_clusters, surface_clusters
+from .clusters import facet_clusters, surface_clusters, unevenness
 from .samples import Facets, LightSamples, brightness, cluster_sums
 
 # Pieces of the emitter for each sample, at least; and how many more of them a texture needs, up to so many in all.
 _PIECES = 64
 _TEXTURED, _MOST = 16, 1 << 17
-# Disks that stand for a sample's part of an emitter that is not flat.
-_FACETS = 4
+# Disks that stand for a sample's part of an emitter that is not flat; and of one whose normals differ within a disk by more than
+# this from those of an evenly bent sheet, such as an animal's.
+_FACETS, _MORE_FACETS, _UNEVEN = 4, 8, 0.15
 # Weight of what is dark in the middle of a facet, in units of the emitter's mean brightness.
 _DIM = 1e-3
 # Importance of what faces away from everything, in units of the mean.
@@ -85,8 +86,8 @@ def plan_area(light: AreaLight, geometry: Geometry, count: int) -> AreaPlan:
     weights = fraction * areas[face] * importance * (shine + _AWAY * max(shine.mean(), 1e-30))
     weights = np.maximum(weights, 1e-12 * max(weights.max(), 1e-300))
     cluster, chosen = surface_clusters(centres, weights, count, normals[face], _OPPOSITE * nearest)
-    facets = 1 if info.planar else _FACETS
     bright = fraction * areas[face] * (shine + _DIM * shine.mean())
+    facet, facets = _divided(info.planar, (centres, normals[face], bright, cluster), nearest)
     return AreaPlan(
         face=device_array(mi.UInt32, face + info.face_start),
         u=device_array(mi.Float, u),
@@ -96,9 +97,20 @@ def plan_area(light: AreaLight, geometry: Geometry, count: int) -> AreaPlan:
         chosen=device_array(mi.UInt32, chosen),
         shape=light.shape,
         dented=not info.planar and bool((sign > 0).all()) and _dented(centres[chosen], corners, normals),
-        facet=device_array(mi.UInt32, facet_clusters(centres, normals[face], bright, cluster, facets, nearest)),
+        facet=device_array(mi.UInt32, facet),
         facets=facets,
     )
+
+
+def _divided(planar: bool, pieces: tuple[np.ndarray, ...], nearest: np.ndarray) -> tuple[np.ndarray, int]:
+    """(facet of each piece, facets of each cluster). ``pieces``: their positions, normals, weights and clusters."""
+    positions, normals, weights, cluster = pieces
+    if planar:
+        return facet_clusters(positions, normals, weights, cluster, 1, nearest), 1
+    facet = facet_clusters(positions, normals, weights, cluster, _FACETS, nearest)
+    if unevenness(positions, normals, weights, facet) <= _UNEVEN:
+        return facet, _FACETS
+    return facet_clusters(positions, normals, weights, cluster, _MORE_FACETS, nearest), _MORE_FACETS
 
 
 def area_samples(light: AreaLight, plan: AreaPlan, geometry: Geometry) -> LightSamples:

@@ -95,6 +95,22 @@ def facet_clusters(
     return facet
 
 
+def unevenness(positions: np.ndarray, normals: np.ndarray, weights: np.ndarray, facet: np.ndarray) -> float:
+    """Standard deviation of normals from those of evenly bent sheets, the best of which is fitted to each facet.
+
+    Arguments as in `facet_clusters`. Next to 0 for flat facets and pieces of spheres and cylinders.
+    """
+    deviation = 0.0
+    order = np.argsort(facet, kind="stable")
+    for members in np.split(order, np.flatnonzero(np.diff(facet[order])) + 1):
+        root = np.sqrt(weights[members])[:, None]
+        places = np.concatenate([positions[members] - positions[members[0]], np.ones((len(members), 1))], axis=1) * root
+        wanted = normals[members] * root
+        fitted, *_ = np.linalg.lstsq(places, wanted, rcond=None)
+        deviation += float(((wanted - places @ fitted) ** 2).sum())
+    return float(np.sqrt(deviation / max(weights.sum(), 1e-300)))
+
+
 def _moment(points: np.ndarray, weights: np.ndarray) -> tuple[float, np.ndarray]:
     """(second moment of points (P, D) along their longest axis, Bool (P,): which lie before the mean on it)."""
     centred = points - np.average(points, axis=0, weights=weights)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from .welding import Copies, Index, runs
+from .welding import Copies, Index, Places, runs
 
 Vertices = npt.NDArray[np.uint32]
 
@@ -86,27 +86,27 @@ def pairs_of(halves: Index, keys: Index) -> tuple[Index, Index, Index]:
 class EdgeOrder:
     """An order of edges that depends on where they are, before all else.
 
-    ``rank`` (V,): of the vertices' places, by x, y and z; ``corners``, ``shapes``: as for :meth:`InnerEdges.of` and ``weld``.
+    ``places``: of the vertices; ``corners``, ``shapes``: as for :meth:`InnerEdges.of` and ``weld``.
     """
 
-    rank: Index
+    places: Places
     corners: Vertices
     shapes: Index | None
 
-    @classmethod
-    def of(cls, positions: npt.NDArray[np.float32], corners: Vertices, shapes: Index | None) -> EdgeOrder:
-        """For vertices (V, 3)."""
-        order = np.lexsort(positions.T[::-1])
-        rank = np.empty(len(positions), np.int64)
-        rank[order] = np.concatenate([[0], np.cumsum((np.diff(positions[order], axis=0) != 0).any(1))])
-        return cls(rank, corners, shapes)
-
     def __call__(self, halves: Index) -> Index:
-        """The order of edges, given a half-edge of each."""
-        columns = [halves // 3, halves % 3, edge_keys(self.rank, self.corners, halves)]
-        if self.shapes is not None:
-            columns.insert(2, self.shapes[self.corners[halves]])
-        return np.lexsort(columns)
+        """The order of edges, given a half-edge of each: by their ends' places, then by shape, corner and face."""
+        keys = edge_keys(self.places.rank, self.corners, halves)
+        order = np.argsort(keys)
+        starts, sizes = runs(keys[order])
+        # Few edges lie on one another: only they are sorted by more than their places.
+        several = np.repeat(sizes > 1, sizes)
+        tied = order[several]
+        if len(tied):
+            columns = [halves[tied] // 3, halves[tied] % 3, keys[tied]]
+            if self.shapes is not None:
+                columns.insert(2, self.shapes[self.corners[halves[tied]]])
+            order[several] = tied[np.lexsort(columns)]
+        return order
 
 
 def parts_of(copies: Sequence[Copies], corners: Vertices, own: Index) -> tuple[Index, int]:

@@ -11,7 +11,7 @@ import numpy as np
 from ..jit.arrays import device_array
 from .adjacency import EdgeOrder, InnerEdges, after, edge_keys, pairs_of, parts_of, third
 from .types import NO_VERTEX
-from .welding import copies_of, weld
+from .welding import Places, copies_of, weld
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,8 @@ def build_topology(
         raise ValueError(f"faces refer to vertices {low}..{high}, but there are {len(positions)}")
     faces = np.ascontiguousarray(faces, np.uint32)
     owners = None if shapes is None else np.asarray(shapes, np.int64)
-    vertices = weld(positions, owners)
+    located = Places.of(positions)
+    vertices = weld(located, owners)
     copies = copies_of(faces, vertices.own, owners)
     corners, places = faces.ravel(), vertices.place.astype(np.uint32)[faces.ravel()]
     inner = [InnerEdges.of(group, corners, vertices.own) for group in copies]
@@ -118,7 +119,7 @@ def build_topology(
     )
     paired = np.concatenate(firsts)
     # Where edges lie on one another in an image, the first of them counts.
-    sort = EdgeOrder.of(positions, corners, owners)
+    sort = EdgeOrder(located, corners, owners)
     order, chosen = sort(paired), sort(one)
     alone, one, two = alone[sort(alone)], one[chosen], two[chosen]
     beyond = np.full(len(corners), NO_VERTEX, np.uint32)

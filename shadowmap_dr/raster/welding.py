@@ -24,10 +24,41 @@ class Welded:
     own: Index
 
 
-def weld(positions: npt.NDArray[np.float32], shapes: Index | None) -> Welded:
-    """Find the vertices (V, 3) at the same place, to the last bit. ``shapes`` (V,): whose they are, None if all are of one."""
-    place, shared = _first_of_equal(positions)
-    if shapes is None or not len(shared):
+@dataclass(frozen=True)
+class Places:
+    """Where vertices are, in the order of x, then y, then z.
+
+    rank   (V,) of each vertex's place, from 0 on: the same for vertices at the same place, to the last bit
+    order  (V,) the vertices, ascending by rank
+    """
+
+    rank: Index
+    order: Index
+
+    @classmethod
+    def of(cls, positions: npt.NDArray[np.float32]) -> Places:
+        """For vertices (V, 3). Sorts whole numbers, which is several times as fast as `numpy.lexsort`."""
+        bits = np.ascontiguousarray(positions).view(np.uint32)
+        # Ordered as the numbers are.
+        x, y, z = np.where(bits >> np.uint32(31), ~bits, bits | np.uint32(1 << 31)).astype(np.uint64).T
+        shift = np.uint64(32)
+        order, before = _sorted(x << shift | y)
+        again, rank = _sorted(before.astype(np.uint64) << shift | z[order])
+        order = order[again]
+        ranks = np.empty(len(order), np.int64)
+        ranks[order] = rank
+        return cls(ranks, order)
+
+
+def weld(places: Places, shapes: Index | None) -> Welded:
+    """Find the vertices at the same place. ``shapes`` (V,): whose they are, None if all are of one."""
+    starts, sizes = runs(places.rank[places.order])
+    place = np.arange(len(places.order))
+    shared = places.order[np.repeat(sizes > 1, sizes)]
+    if not len(shared):
+        return Welded(place, place)
+    place[places.order] = np.repeat(np.minimum.reduceat(places.order, starts), sizes)
+    if shapes is None:
         return Welded(place, place)
     own = np.arange(len(place))
     key = place[shared] * (int(shapes.max()) + 1) + shapes[shared]
@@ -43,32 +74,11 @@ def runs(values: npt.NDArray[np.generic]) -> tuple[Index, Index]:
     return starts, np.diff(np.append(starts, len(values)))
 
 
-def _first_of_equal(positions: npt.NDArray[np.float32]) -> tuple[Index, Index]:
-    """(the first of the equal rows for each one, those that have an equal one)."""
-    bits = np.ascontiguousarray(positions).view(np.uint32).astype(np.uint64)
-    mixed = _mixed(bits)
-    order = np.argsort(mixed)
-    starts, sizes = runs(mixed[order])
-    many = np.repeat(sizes > 1, sizes)
-    shared = order[many]
-    first = np.repeat(order[starts], sizes)[many]
-    if (bits[shared] != bits[first]).any():
-        order = np.lexsort(bits.T)
-        rows = bits[order]
-        starts = np.flatnonzero(np.concatenate([[True], (rows[1:] != rows[:-1]).any(1)]))
-        sizes = np.diff(np.append(starts, len(rows)))
-        many = np.repeat(sizes > 1, sizes)
-        shared = order[many]
-    place = np.arange(len(positions))
-    if len(shared):
-        place[shared] = np.repeat(np.minimum.reduceat(order, starts), sizes)[many]
-    return place, shared
-
-
-def _mixed(bits: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
-    """Numbers that differ for different rows (N, 3), but by accident: they sort several times faster than rows."""
-    mixed = (bits[:, 0] << np.uint64(32) | bits[:, 1]) * np.uint64(0x9E3779B97F4A7C15)
-    return ((mixed ^ (mixed >> np.uint64(32))) + bits[:, 2]) * np.uint64(0xBF58476D1CE4E5B9)
+def _sorted(keys: npt.NDArray[np.uint64]) -> tuple[Index, Index]:
+    """(order of keys, the rank of each in this order: the same for equal ones)."""
+    order = np.argsort(keys)
+    keys = keys[order]
+    return order, np.concatenate([[0], np.cumsum(keys[1:] != keys[:-1])])
 
 
 @dataclass(frozen=True)

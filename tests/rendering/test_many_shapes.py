@@ -171,7 +171,7 @@ def test_copies_have_the_edges_of_single_shapes(variant: str, monkeypatch: pytes
     points = np.concatenate(parts).astype(np.float32)
     merged = np.concatenate([own + len(roof) * k for k, own in enumerate(faces)])
     shapes = np.repeat(np.arange(6), len(roof))
-    sizes = [len(group.faces) for group in welding.copies_of(merged, welding.weld(points, shapes).own, shapes)]
+    sizes = [len(group.faces) for group in welding.copies_of(merged, welding.weld(welding.Places.of(points), shapes).own, shapes)]
     assert sorted(sizes) == [1, 4]  # what has no copy is one group
     copied = build_topology(merged, points, mi.UInt32, shapes)
     whole = [welding.Copies(np.zeros(1, int), np.zeros(1, int), np.arange(len(merged)))]
@@ -190,26 +190,27 @@ def test_copies_have_the_edges_of_single_shapes(variant: str, monkeypatch: pytes
     assert copied.seams.count == single.seams.count > 0
 
 
-def test_vertices_are_welded_where_they_are_equal(monkeypatch: pytest.MonkeyPatch) -> None:
-    """By brute force, and also where the numbers that stand for places are the same for different ones."""
+def test_vertices_are_welded_where_they_are_equal() -> None:
+    """By brute force."""
     random = np.random.default_rng(0)
-    points, shapes = random.integers(0, 3, (60, 3)).astype(np.float32), np.repeat([0, 1, 2], 20)
+    points, shapes = random.integers(-1, 2, (60, 3)).astype(np.float32), np.repeat([0, 1, 2], 20)
     equal = (points[:, None] == points).all(-1)
     place = equal.argmax(1)
     own = (equal & (shapes[:, None] == shapes)).argmax(1)
-    for _ in range(2):
-        found = welding.weld(points, shapes)
-        assert (found.place == place).all() and (found.own == own).all()
-        monkeypatch.setattr(welding, "_mixed", lambda bits: bits[:, 0] & np.uint64(0))
+    located = welding.Places.of(points)
+    assert (located.rank == np.unique(points, axis=0, return_inverse=True)[1].ravel()).all()
+    found = welding.weld(located, shapes)
+    assert (found.place == place).all() and (found.own == own).all()
+    assert (welding.weld(located, None).own == place).all()
 
 
 def test_edges_are_ordered_by_their_places_and_what_else_tells_them_apart() -> None:
     """Shape, then corner, then face, where edges of several faces and shapes lie on one another."""
     random = np.random.default_rng(1)
-    points = random.integers(0, 3, (40, 3)).astype(np.float32)
+    points = random.integers(-1, 2, (40, 3)).astype(np.float32)
     corners, shapes = random.integers(0, 40, 300).astype(np.uint32), np.repeat([0, 1, 2, 3], 10)
     halves = random.permutation(300)[:200]
-    order = adjacency.EdgeOrder.of(points, corners, shapes)(halves)
+    order = adjacency.EdgeOrder(welding.Places.of(points), corners, shapes)(halves)
     following = np.arange(300) // 3 * 3 + (np.arange(300) + 1) % 3
     places = [sorted((tuple(points[corners[h]]), tuple(points[corners[following[h]]]))) for h in halves[order]]
     keys = [(*place, shapes[corners[h]], h % 3, h // 3) for place, h in zip(places, halves[order], strict=True)]

@@ -96,10 +96,8 @@ class EdgeOrder:
     def __call__(self, halves: Index) -> Index:
         """The order of edges, given a half-edge of each: by their ends' places, then by shape, corner and face."""
         keys = edge_keys(self.places.rank, self.corners, halves)
-        order = np.argsort(keys)
-        starts, sizes = runs(keys[order])
+        order, several = _nearly_ordered(keys)
         # Few edges lie on one another: only they are sorted by more than their places.
-        several = np.repeat(sizes > 1, sizes)
         tied = order[several]
         if len(tied):
             columns = [halves[tied] // 3, halves[tied] % 3, keys[tied]]
@@ -107,6 +105,27 @@ class EdgeOrder:
                 columns.insert(2, self.shapes[self.corners[halves[tied]]])
             order[several] = tied[np.lexsort(columns)]
         return order
+
+
+def _nearly_ordered(keys: Index) -> tuple[Index, npt.NDArray[np.bool_]]:
+    """(an order of keys (K,) >= 0, places in it whose keys are equal to a neighbour's but for their last bits).
+
+    Keys and their numbers are sorted as one number of 64 bits each, which is several times as fast as `numpy.argsort`. It has the
+    first bits of keys only where there is no room for all.
+    """
+    if not len(keys):
+        return keys, np.zeros(0, bool)
+    bits = len(keys).bit_length()
+    lost = max(0, int(keys.max()).bit_length() + bits - 64)
+    both = keys.astype(np.uint64) >> np.uint64(lost) << np.uint64(bits) | np.arange(len(keys), dtype=np.uint64)
+    both.sort()
+    order = (both & np.uint64((1 << bits) - 1)).astype(np.int64)
+    both >>= np.uint64(bits)
+    equal = both[1:] == both[:-1]
+    several = np.zeros(len(keys), bool)
+    several[1:] = equal
+    several[:-1] |= equal
+    return order, several
 
 
 def parts_of(copies: Sequence[Copies], corners: Vertices, own: Index) -> tuple[Index, int]:

@@ -215,3 +215,16 @@ def test_edges_are_ordered_by_their_places_and_what_else_tells_them_apart() -> N
     places = [sorted((tuple(points[corners[h]]), tuple(points[corners[following[h]]]))) for h in halves[order]]
     keys = [(*place, shapes[corners[h]], h % 3, h // 3) for place, h in zip(places, halves[order], strict=True)]
     assert keys == sorted(keys) and len(set(map(str, places))) < 150
+
+
+@pytest.mark.parametrize("largest", [50, 1 << 40, 1 << 62])
+def test_orders_by_numbers_too_large_for_one_word(largest: int) -> None:
+    """Their first bits are sorted, and the places of neighbours that only the last ones may tell apart are named."""
+    keys = np.random.default_rng(2).integers(0, largest, 3000)
+    keys[::3] = keys[0] - keys[::3] % 64 % (keys[0] + 1)
+    order, several = adjacency._nearly_ordered(keys)
+    assert sorted(order) == list(range(3000))
+    tied = order[several]
+    order[several] = tied[np.argsort(keys[tied], kind="stable")]
+    assert (np.diff(keys[order]) >= 0).all()
+    assert several.sum() < 3000 or largest == 50

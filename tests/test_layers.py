@@ -1,4 +1,7 @@
-"""Layers of the package: which packages may import which others. Read from the sources; nothing is imported."""
+"""Layers of the package: which packages may import which others. Read from the sources; nothing is imported.
+
+``python tests/test_layers.py`` prints the picture in docs/architecture.md.
+"""
 
 from __future__ import annotations
 
@@ -72,6 +75,9 @@ INSIDE = {
 #: The most layers.
 LAYERS = 9
 
+# Modules that all packages may import; the picture leaves them out.
+_EVERYWHERE = ("_llvm", "errors", "variants")
+
 
 @functools.cache
 def modules() -> dict[str, Path]:
@@ -119,6 +125,31 @@ def within(module: str, places: tuple[str, ...]) -> bool:
     """True if a module is one of some places, or lies in one."""
     name = short(module)
     return any(name == place or (place and name.startswith(place + ".")) for place in places)
+
+
+def picture() -> str:
+    """A Mermaid diagram: packages, with arrows to those that they import. What an imported package imports has no arrow."""
+    below: dict[str, set[str]] = {}
+    for module in modules():
+        package = package_of(module)
+        others = {package_of(other) for other in imports(module)} - {package, "", *_EVERYWHERE}
+        if package not in ("", *_EVERYWHERE):
+            below.setdefault(package, set()).update(others)
+
+    @functools.cache
+    def reached(package: str) -> frozenset[str]:
+        return frozenset().union(*({other} | reached(other) for other in below[package]))
+
+    lines = ["```mermaid", "flowchart TD"]
+    for package in sorted(below):
+        direct = sorted(other for other in below[package] if not any(other in reached(between) for between in below[package]))
+        lines += [f"    {package} --> {other}" for other in direct] or [f"    {package}"]
+    return "\n".join([*lines, "```"])
+
+
+def test_the_picture_shows_the_imports() -> None:
+    page = (ROOT / "docs" / "architecture.md").read_text()
+    assert picture() in page, f"docs/architecture.md: its picture should be\n{picture()}"
 
 
 def test_packages_import_what_they_may() -> None:
@@ -201,3 +232,7 @@ def test_the_package_shows_its_public_names_only() -> None:
     assert [name for name in dir(shadowmap_dr) if not name.startswith("__")] == sorted(
         set(shadowmap_dr.__all__) - {"__version__"}
     )
+
+
+if __name__ == "__main__":
+    print(picture())

@@ -7,6 +7,7 @@ the second process that works on a scene. Mitsuba's `direct` renders the same sc
 from __future__ import annotations
 
 import functools
+import gc
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -105,6 +106,9 @@ def measure_first(crowd: Mapping[str, Any], emit: Callable[[dict[str, Any]], Non
     seconds: dict[str, list[float]] = {name: [] for name in (*methods, "backward")}
     for seed in range(1 + _ROUNDS):
         for name, plugin in methods.items():
+            # Earlier scenes are in reference cycles (`mi.traverse` makes some). While they live, Mitsuba compiles calls of them.
+            scene = integrator = None
+            gc.collect()
             scene, integrator = made.scene(seed), mi.load_dict({"type": plugin})
             dr.sync_thread()
             seconds[name].append(timed(lambda scene=scene, integrator=integrator: mi.render(scene, integrator=integrator, spp=1)))

@@ -191,6 +191,7 @@ def test_only_one_thread_waits_for_drjit(variant: str, monkeypatch: pytest.Monke
 
 def test_threads_with_recordings() -> None:
     """Gradients of all threads are those of one, and none waits forever."""
+    pytest.importorskip("torch")
     run("""
 import threading, time, quick_kernels
 import shadowmap_dr.torch as sdr

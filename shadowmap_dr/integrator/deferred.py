@@ -7,21 +7,20 @@ what the image was computed from.
 from __future__ import annotations
 
 import weakref
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import drjit as dr
 
 from ..jit.gpu import keep_registers
-from ..jit.pytree import attached_arrays, tree_map, with_arrays
+from ..jit.pytree import attached_arrays, with_arrays
 from ..scene.load import SceneData
-from ..scene.mitsuba_objects import parameters
+from .parameter_state import ParameterState
 
 #: Samples of pixels of all images that wait; each may hold half a kilobyte.
 MOST_SAMPLES = 1 << 20
 #: So many texels of shadow maps hold as much as one of these samples.
-_TEXELS = 6
+TEXELS = 6
 
 # Parameters that an image is attached to through what is read from the scene, and in no other way. Materials and textures are
 # evaluated by Mitsuba itself.
@@ -61,7 +60,7 @@ class DeferredImage:
     texels: int
     image: Any
     inputs: DetachedInputs
-    camera: dict[str, Any]
+    camera: ParameterState
 
     @property
     def samples(self) -> int:
@@ -72,11 +71,11 @@ class DeferredImage:
     @property
     def weight(self) -> int:
         """What the memory for the image grows with, in samples."""
-        return self.samples + self.texels // _TEXELS
+        return self.samples + self.texels // TEXELS
 
     def is_of(self, sensor: Any, spp: int) -> bool:
         """Whether it shows what a sensor sees now."""
-        return sensor is self.sensor and spp == self.spp and _numbers(_held(sensor)) == _numbers(self.camera)
+        return sensor is self.sensor and spp == self.spp and ParameterState.of(sensor).same(self.camera)
 
     def backward(self, gradient: Any, data: SceneData) -> None:
         """Add the gradients of <image, gradient> to the scene's parameters. ``data``: as read for the image."""
@@ -91,7 +90,7 @@ class DeferredImages:
     _everywhere: ClassVar[weakref.WeakSet[DeferredImages]] = weakref.WeakSet()
 
     def __init__(self) -> None:
-        self._parameters: dict[str, Any] = {}
+        self._state: ParameterState | None = None
         self._images: list[DeferredImage] = []
         self._everywhere.add(self)
 
@@ -102,41 +101,31 @@ class DeferredImages:
         for waiting in cls._everywhere:
             waiting._images = []
 
-    def forget_older(self, scene: Any) -> None:
-        """Drop images of the scene before its parameters changed."""
-        now = _held(scene)
-        if _numbers(now) != _numbers(self._parameters):
-            self._parameters, self._images = now, []
+    def forget_older(self, now: ParameterState) -> None:
+        """Drop images of the scene before its parameters changed. ``now``: those of the scene."""
+        if self._state is None or not now.same(self._state):
+            self._state, self._images = now, []
 
-    def welcomes(self, sensor: Any) -> bool:
+    def welcomes(self, now: ParameterState, sensor: Any) -> bool:
         """Whether an image of the scene as it is now would be attached to :class:`DetachedInputs` alone."""
-        attached = _attached({**self._parameters, **_held(sensor)})
+        attached = (*now.attached, *ParameterState.of(sensor).attached)
         return bool(attached) and all(name.endswith(_READ) for name in attached)
 
     def add(self, sensor: Any, spp: int, texels: int, image: Any, inputs: DetachedInputs) -> None:
         """Let an attached image wait. Those that have waited longest make room for it."""
-        new = DeferredImage(sensor, spp, texels, image, inputs, _held(sensor))
+        new = DeferredImage(sensor, spp, texels, image, inputs, ParameterState.of(sensor))
         others = [other for other in self._images if other.sensor is not sensor]
         self._images = [*others, new] if new.samples <= MOST_SAMPLES else others
         # Whatever its maps are, the latest one waits: with a single view, nothing would be saved by rendering it again.
         while len(self._images) > 1 and sum(one.weight for one in self._images) > MOST_SAMPLES:
             self._images.pop(0)
 
-    def take(self, scene: Any, sensor: Any, spp: int) -> DeferredImage | None:
+    def take(self, now: ParameterState, sensor: Any, spp: int) -> DeferredImage | None:
         """The image of a scene as a sensor sees it now, if it waits. It does so no longer."""
-        self.forget_older(scene)
+        self.forget_older(now)
         found = next((one for one in self._images if one.is_of(sensor, spp)), None)
         self._images = [one for one in self._images if one is not found]
         return found
-
-
-def attached_names(scene: Any, sensor: Any) -> tuple[str, ...]:
-    """Names of the parameters through which gradients flow."""
-    return _attached({**parameters(scene), **parameters(sensor)})
-
-
-def _attached(held: Mapping[str, Any]) -> tuple[str, ...]:
-    return tuple(name for name, value in held.items() if dr.grad_enabled(value))
 
 
 def pass_on(arrays: list[Any], gradients: list[Any]) -> None:
@@ -158,25 +147,3 @@ def _traverse(end: Any) -> None:
     keep_registers()
     dr.enqueue(dr.ADMode.Backward, end)
     dr.traverse(dr.ADMode.Backward, flags=dr.ADFlag.ClearVertices)
-
-
-def _held(node: Any) -> dict[str, Any]:
-    """Parameters, copied: Mitsuba's change with the object. What is held keeps its variables' numbers from being used again."""
-    return tree_map(parameters(node), lambda array: type(array)(array))
-
-
-def _numbers(held: dict[str, Any]) -> list[Any]:
-    """What tells variables apart, and what holds them, in a fixed order."""
-    found: list[Any] = []
-
-    def collect(array: Any) -> Any:
-        if dr.depth_v(array) > 1 and not dr.is_tensor_v(array):
-            for part in array:
-                collect(part)
-        else:
-            part = array.array if dr.is_tensor_v(array) else array
-            found.append((part.index, getattr(part, "index_ad", 0)))
-        return array
-
-    tree_map(held, collect)
-    return [*found, *(value for value in held.values() if isinstance(value, bool | int | float | str))]

@@ -22,6 +22,7 @@ from ..rendering.settings import RenderSettings
 from .deferred import DeferredImages, DetachedInputs, backward
 from .nesting import Nesting
 from .options import PLUGIN, Options
+from .parameter_state import ParameterState
 from .scene_cache import SceneCache, same_objects
 
 # Scenes that one integrator remembers; each holds the scene's shapes in memory.
@@ -53,19 +54,19 @@ class Shell:
                 return record.replay(scene, sensor, spp or 1)
         with dr.resume_grad():
             record = self._record(scene, sensor)
-            waiting = record.waiting
-            waiting.forget_older(scene)
+            waiting, now = record.waiting, ParameterState.of(scene)
+            waiting.forget_older(now)
             # Where attributes of meshes are read, Mitsuba finds out with its own vertices where on a triangle they are wanted:
             # the image would hang on these.
-            alone = not record.renderer.data.with_attributes() and waiting.welcomes(sensor)
+            alone = not record.renderer.data.with_attributes() and waiting.welcomes(now, sensor)
             if alone and not dr.flag(dr.JitFlag.FreezingScope):
                 inputs = DetachedInputs()
-                image = self.image(scene, sensor, spp, inputs)
+                image = self.image(scene, sensor, spp, now, inputs)
                 if dr.grad_enabled(image):
                     waiting.add(sensor, spp or 1, record.renderer.texels, image, inputs)
                 return dr.detach(image)
         with dr.suspend_grad():
-            return self.image(scene, sensor, spp)
+            return self.image(scene, sensor, spp, now)
 
     def backward(self, scene: Any, sensor: Any, spp: int, gradient: Any) -> None:
         """Add the gradients of <image, gradient> to the scene's parameters."""
@@ -73,20 +74,23 @@ class Shell:
             record = self._record(scene, sensor)
             if self._replays and record.replay_backward(scene, sensor, spp or 1, gradient):
                 return
-            pending = record.waiting.take(scene, sensor, spp or 1)
+            now = ParameterState.of(scene)
+            pending = record.waiting.take(now, sensor, spp or 1)
             if pending is not None:
                 pending.backward(gradient, record.data(scene, sensor))
                 return
-            image = self.image(scene, sensor, spp)
+            image = self.image(scene, sensor, spp, now)
             if dr.grad_enabled(image):
                 backward(image, gradient)
 
-    def image(self, scene: Any, sensor: Any, spp: int, inputs: DetachedInputs | None = None) -> Any:
-        """Attached image. ``spp`` 0 means not given: one sample, anti-aliased."""
+    def image(
+        self, scene: Any, sensor: Any, spp: int, now: ParameterState | None = None, inputs: DetachedInputs | None = None
+    ) -> Any:
+        """Attached image. ``spp`` 0 means not given: one sample, anti-aliased. For the rest see :meth:`SceneCache.render`."""
         _check_samples(spp)
         record = self._record(scene, sensor)
         self.light_names = record.lights
-        return record.render(scene, sensor, spp or 1, inputs)
+        return record.render(scene, sensor, spp or 1, now, inputs)
 
     @property
     def _replays(self) -> bool:

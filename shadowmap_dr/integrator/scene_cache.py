@@ -11,6 +11,7 @@ import numpy as np
 
 from ..errors import ShadowmapError, warn
 from ..rendering.extended_lights import SkyWatch, SoftFrusta, still_aimed
+from ..rendering.pass_cache import PassCache
 from ..rendering.renderer import Renderer
 from ..rendering.settings import RenderSettings
 from ..scene.changes import MirrorWatch, ParameterWatch
@@ -21,8 +22,10 @@ from ..scene.sensor import lenses_of, sensors_of
 from ..scene.unsupported import warn_of
 from ..scene.untracked import UntrackedValues
 from ..shadow import Frusta
-from .deferred import DeferredImages, DetachedInputs, attached_names
+from .deferred import TEXELS, DeferredImages, DetachedInputs
+from .parameter_state import ParameterState
 from .recording import FrozenPasses, plain
+from .still_passes import StillPasses
 
 # Sensors whose fit of the shadow maps is remembered, and how many of these may not be the scene's own: some make a new one for
 # each image, and all that are remembered are kept alive. How many objects there are is also a part of what recordings hold for.
@@ -50,6 +53,7 @@ class SceneCache:
     warned    whether it was said what frozen functions of users do not see
     untracked  what recordings do not see, and ``untracked_then`` its values when they were made
     colours   of meshes, for which the renderer's creases were found
+    still     passes whose results hold from one image to the next; None before the second image
     """
 
     parts: tuple[Any, ...]
@@ -68,6 +72,7 @@ class SceneCache:
     mirrors: MirrorWatch = field(default_factory=lambda: MirrorWatch(()))
     checked: Any = None
     warned: bool = False
+    still: StillPasses | None = None
 
     @classmethod
     def build(cls, scene: Any, sensor: Any, settings: RenderSettings, tessellation: int, warn: bool = True) -> SceneCache:
@@ -109,19 +114,32 @@ class SceneCache:
         """What is read from the scene as it is now, with one sensor, attached to the scene's parameters."""
         return refresh(replace(self.renderer.data, scene=scene), sensors=(sensor,))
 
-    def render(self, scene: Any, sensor: Any, spp: int, inputs: DetachedInputs | None = None) -> Any:
+    def render(
+        self, scene: Any, sensor: Any, spp: int, now: ParameterState | None = None, inputs: DetachedInputs | None = None
+    ) -> Any:
         """Image (mi.TensorXf), attached to the scene's parameters unless gradients are suspended.
 
-        If ``inputs`` is given, the image is attached to these instead of the vertices, lights and cameras.
+        ``now``: these parameters, if they have been read. If ``inputs`` is given, the image is attached to these instead of the
+        vertices, lights and cameras.
         """
         self._name_constants_of_recordings()
         current = self._current(scene, sensor)
         self._check_vertices(current)
         if inputs is not None:
             current = current.with_data(inputs.instead_of(current.data))
-        image = current.render(spp=spp)
+        frozen = dr.flag(dr.JitFlag.FreezingScope)
+        image = current.render(spp=spp, cache=None if frozen else self._passes(scene, sensor, spp, now))
         self._remember(scene, sensor, current.frusta, current.soft_frusta)
         return image
+
+    def _passes(self, scene: Any, sensor: Any, spp: int, now: ParameterState | None) -> PassCache:
+        """Results of passes that hold for the next image."""
+        if self.still is None:
+            self.still = StillPasses(scene, self.renderer.data)
+        samples = int(np.prod(sensor.film().crop_size())) * spp
+        with dr.resume_grad():  # which parameters are attached
+            states = now or ParameterState.of(scene), ParameterState.of(sensor)
+        return self.still.cache_for(*states, sensor, spp, samples + self.renderer.texels // TEXELS)
 
     def replay(self, scene: Any, sensor: Any, spp: int) -> Any:
         """The same image, detached, recorded when it is first taken."""
@@ -140,7 +158,7 @@ class SceneCache:
         of extended lights are evaluated by Mitsuba itself.
         """
         current = self._current(scene, sensor)
-        attached = attached_names(scene, sensor)
+        attached = (*ParameterState.of(scene).attached, *ParameterState.of(sensor).attached)
         if attached not in self.recordable:
             self.recordable[attached] = not dr.grad_enabled(plain(current).render(spp=spp))
         if self.recordable[attached]:
@@ -175,6 +193,8 @@ class SceneCache:
         """
         if not (dr.flag(dr.JitFlag.FreezingScope) or self.colours is None or self.colours.same()):
             self.renderer = self.renderer.with_updated_shading_edges()
+            if self.still is not None:
+                self.still.forget_edges()
         kept = self.renderer
         fits = ((frusta, soft_frusta) for known, frusta, soft_frusta in self.fits if known is sensor)
         frusta, soft_frusta = next(fits, (kept.frusta, kept.soft_frusta))

@@ -56,9 +56,7 @@ def emission(surface: Surface, lights: Sequence[AreaLight]) -> Any:
     before the outline of a smooth shape is reached: the dark rim hides the outline, and with it what a moving lamp changes.
     """
     total = dr.zeros(mi.UnpolarizedSpectrum, dr.width(surface.shape))
-    with dr.suspend_grad():
-        towards = dr.dot(surface.n_world, surface.wi_world) * dr.dot(surface.n_world, surface.si.sh_frame.n)
-        front = surface.active & (towards > 0)
+    front = shining_side(surface)
     si = mi.SurfaceInteraction3f(surface.si)
     si.wi = mi.Vector3f(0, 0, 1)
     for light in lights:
@@ -66,6 +64,13 @@ def emission(surface: Surface, lights: Sequence[AreaLight]) -> Any:
         radiance = evaluate(lambda at, light=light: light.seen(*at), (si, own), [light.emitter], dr.width(surface.shape))
         total += dr.select(own, radiance, 0)
     return total
+
+
+def shining_side(surface: Surface) -> Any:
+    """Bool (N,): where the camera sees the side of a surface on which its vertex normals are."""
+    with dr.suspend_grad():
+        towards = dr.dot(surface.n_world, surface.wi_world) * dr.dot(surface.n_world, surface.si.sh_frame.n)
+        return surface.active & (towards > 0)
 
 
 def ambient_light(surface: Surface, environment: Environment, n_directions: int = 16, nodes: Sequence[Any] = ()) -> Any:

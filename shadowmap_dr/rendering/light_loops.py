@@ -6,7 +6,7 @@ Written out one after the other, forty lights and their derivatives make a progr
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import count
 from typing import Any
 
@@ -15,14 +15,14 @@ import mitsuba as mi
 
 from ..jit.arrays import device_array
 from ..jit.pytree import tree_map
-from ..scene.lights.punctual import DirectionalLight, PointLight, SpotLight
-from ..scene.lights.read import Light, colour_of
+from ..scene.lights.punctual import SpotLight
+from ..scene.lights.read import Light
 from ..scene.lights.soft_outline import Softened, share_inside
-from ..scene.mitsuba_objects import varies
 from ..scene.sums import attached_parameters, sum_over
 from ..shadow import ShadowMaps, cube_face, visibility
 from .direct_light import passes_gate
 from .gbuffer.surface import Surface
+from .light_colours import untextured
 from .shadow_pass import MapPlan
 
 #: As many lights of a kind, at least, are summed up in a loop.
@@ -92,7 +92,7 @@ class Places:
 
 def in_tables(lights: Sequence[Light], plan: MapPlan) -> tuple[list[LightTable], list[int]]:
     """(tables of the lights of kinds of which there are many, the numbers of the others)."""
-    plain = [_untextured(light) for light in lights]
+    plain = [untextured(light) for light in lights]
     kinds: dict[Any, list[int]] = {}
     for k, (light, kind) in enumerate(zip(plain, plan.kinds, strict=True)):
         if light is not None:
@@ -151,15 +151,6 @@ def light_of_table(seen: Surface, places: Places, table: LightTable, maps: Shado
     start = dr.zeros(mi.UnpolarizedSpectrum, dr.width(seen.shape))
     implicit = [] if seen.colour is not None else attached_parameters(nodes)
     return sum_over(one_light, table.size, start, (seen, places), (table, maps), implicit, seen.active)
-
-
-def _untextured(light: Light) -> Light | None:
-    """The same light without a texture, of the same colour all over, or None. A spot light always has one in Mitsuba."""
-    if not isinstance(light, SpotLight):
-        return light if isinstance(light, DirectionalLight | PointLight) else None
-    if light.texture is None or varies(light.texture):
-        return light if light.texture is None else None
-    return replace(light, intensity=light.intensity * colour_of(light.texture), texture=None)
 
 
 def _visibility(table: LightTable, maps: ShadowMaps, index: Any, light: Any, p_world: Any, active: Any) -> Any:

@@ -1,15 +1,49 @@
-"""The lights of one rendering with their shadow maps."""
+"""The light pass: shadow maps of all lights of a scene, and the light that surfaces send towards a camera."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
+import drjit as dr
+import mitsuba as mi
+
+from ..errors import ShadowmapError
+from ..raster import RasterOutput
+from ..scene.geometry import Geometry
 from ..scene.lights.area import AreaLight
+from ..scene.lights.environment import UniformRadiance
+from ..scene.lights.punctual import SpotLight, SquareSpot
 from ..scene.lights.read import Light
+from ..scene.lights.soft_outline import softened
 from ..scene.load import SceneData
-from ..shadow import ShadowMaps
-from .extended_lights import LightSamples, SoftMaps, SoftPlan, check_soft_sizes, plan_soft
+from ..scene.sensor import Sensor
+from ..shadow import Frusta, ShadowMaps
+from .direct_light import ambient_light, background, direct_light, emission
+from .extended_lights import (
+    LightSamples,
+    SoftFrusta,
+    SoftMaps,
+    SoftPlan,
+    check_soft_sizes,
+    make_soft_maps,
+    plan_soft,
+    samples_of,
+    soft_light,
+    visible_parts,
+)
+from .gbuffer.camera_view import Frame, PlacedShapes
+from .gbuffer.pixel_footprint import FootprintSamples, footprint_points
+from .gbuffer.surface import Surface
+from .light_colours import white_light
+from .light_loops import MANY_LIGHTS, many_lights
 from .settings import RenderSettings
+from .shadow_pass import MapPlan, light_visibility, make_maps
+
+# Directions over which the light of environments is summed.
+_AMBIENT_DIRECTIONS = 16
 
 
 @dataclass(frozen=True)
@@ -27,7 +61,211 @@ class Lighting:
         return self if self.maps is None else replace(self, maps=self.maps.for_points(count))
 
 
+@dataclass(frozen=True)
+class Visible:
+    """Visibility of lights from the samples of a camera, N of them. Detached.
+
+    Attributes:
+        lights: ``Float`` (N,) of each light without extent.
+        parts: ``Float`` (K N,) of each extended light, of its K samples one after the other, or None.
+    """
+
+    lights: list[Any]
+    parts: tuple[Any, ...]
+
+
+@dataclass(frozen=True)
+class Shone:
+    """The light that reaches the samples of a frame, N of them.
+
+    Attributes:
+        lights: lights that are summed up one by one, with their soft outlines.
+        visible: ``Float`` (N,) each, the visibility of these lights.
+        looped: radiance towards the camera (colour, N) of all others that have no extent.
+        parts: as :attr:`Visible.parts`, None where visibility has to be looked up.
+    """
+
+    lights: tuple[Any, ...]
+    visible: list[Any]
+    looped: Any
+    parts: tuple[Any, ...]
+
+
+@dataclass(frozen=True)
+class LightPass:
+    """Renders shadow maps, and adds up the light that they let through.
+
+    Attributes:
+        data: records of the scene.
+        settings: how to render.
+        plan: which shadow maps there are.
+        soft: how extended lights are sampled, and which maps these samples have.
+        outward: ``Bool`` (F,), faces that shadow maps show from the front only, or None.
+    """
+
+    data: SceneData
+    settings: RenderSettings
+    plan: MapPlan
+    soft: tuple[SoftPlan, ...]
+    outward: Any
+
+    @property
+    def needs_frames(self) -> bool:
+        """Whether light has to know tangents and texture coordinates of surfaces."""
+        textured = any(light.textured for light in self.data.areas)
+        return self.data.needs_frames or self.settings.ambient > 0 or textured
+
+    def lighting(
+        self,
+        shapes: PlacedShapes,
+        replacements: Mapping[str, Any] | None,
+        fits: tuple[Frusta | None, SoftFrusta],
+        transparent: Callable[[RasterOutput], Any] | None,
+        seen: Callable[[], tuple[Any, Any]],
+    ) -> Lighting:
+        """All lights and their shadow maps.
+
+        Args:
+            shapes: where they are now.
+            replacements: records of lights by name, in the place of the scene's.
+            fits: of the shadow maps, and of those of extended lights, in an earlier rendering.
+            transparent: alpha test, see :meth:`CameraPass.transparent`.
+            seen: makes points on what cameras see, see :meth:`CameraPass.seen`.
+        """
+        data, settings = self.data, self.settings
+        if not settings.lit:
+            return Lighting((), None, data.areas, (), None)
+        lights, areas = self._replaced(data.lights, replacements), self._replaced(data.areas, replacements)
+        samples = self._samples(areas, shapes.geometry)
+        maps = soft_maps = None
+        if settings.shadow.method != "none" and (lights or samples):
+            points, common = seen(), (shapes.geometry, shapes.casting)
+            if lights:
+                maps = make_maps(self.plan, lights, *common, settings.shadow, fits[0], transparent, points, self.outward)
+            if samples:
+                shadow = settings.soft_shadow
+                soft_maps = make_soft_maps(self.soft, samples, self.plan, *common, shadow, fits[1], transparent, points)
+        return Lighting(lights, maps, areas, samples, soft_maps)
+
+    def relit(self, maps: tuple[ShadowMaps | None, SoftMaps | None], geometry: Geometry) -> Lighting:
+        """The scene's lights as they are now, with the shadow maps of an image of the same places of shapes and lights."""
+        data = self.data
+        if not self.settings.lit:
+            return Lighting((), None, data.areas, (), None)
+        return Lighting(data.lights, maps[0], data.areas, self._samples(data.areas, geometry), maps[1])
+
+    def shone(self, frame: Frame, lighting: Lighting, known: Visible | None = None) -> Shone:
+        """The light of all lights on what a camera sees. ``known``: visibilities, where they still hold. Attached."""
+        if known is not None:
+            return Shone(self._outlined(frame, lighting.lights), known.lights, 0, known.parts)
+        looped, written = self._in_tables(frame, lighting)
+        lights = [lighting.lights[k] for k in written]
+        visible = self.visibilities(frame, lighting, written, lights)
+        return Shone(self._outlined(frame, lights), visible, looped, (None,) * len(lighting.samples))
+
+    def visible(self, frame: Frame, lighting: Lighting) -> Visible:
+        """Visibility of all lights from what a camera sees. Detached."""
+        with dr.suspend_grad():
+            numbers = list(range(len(lighting.lights)))
+            lights = self.visibilities(frame, lighting, numbers, list(lighting.lights))
+            pairs = zip(self.soft, lighting.samples, strict=True) if self.settings.lit else ()
+            return Visible(lights, tuple(visible_parts(frame.surface, *pair, lighting.soft_maps) for pair in pairs))
+
+    def white_terms(self, frame: Frame, lighting: Lighting, geometry: Geometry) -> tuple[Any, ...]:
+        """Radiance towards the camera (Float, N) of each of the lights on white surfaces, if it were white. Detached.
+
+        For lights that have a colour (:mod:`shadowmap_dr.rendering.light_colours`), and surfaces whose colour is white.
+        """
+        with dr.suspend_grad():
+            lights, seen = [white_light(light) for light in lighting.lights], frame.surface
+            samples = self._samples(tuple(white_light(area) for area in lighting.areas), geometry)
+            visible = self.visibilities(frame, lighting, list(range(len(lights))), lights)
+            reach = zip(self._outlined(frame, lights), visible, strict=True)
+            extended, maps, nodes = zip(self.soft, samples, strict=True), lighting.soft_maps, self.data.materials()
+            terms = [direct_light(seen, light, fraction) for light, fraction in reach]
+            terms += [soft_light(seen, plan, own, maps, nodes) for plan, own in extended]
+            return tuple(term[0] for term in terms)
+
+    def radiance(self, seen: Surface, lighting: Lighting, shone: Shone) -> Any:
+        """Reflected radiance (colour, N) towards the camera. ``shone``: on the same surfaces. Attached to all of these."""
+        gate = not self.settings.shadow.compat
+        color = dr.zeros(mi.UnpolarizedSpectrum, dr.width(seen.shape))
+        nodes = self.data.materials()
+        for light, fraction in zip(shone.lights, shone.visible, strict=True):
+            color += direct_light(seen, light, fraction, nodes, gate=gate)
+        soft = self.soft if self.settings.lit else ()
+        for plan, samples, parts in zip(soft, lighting.samples, shone.parts, strict=True):
+            color += soft_light(seen, plan, samples, lighting.soft_maps, nodes, gate=gate, visible=parts)
+        return shone.looped + self.with_ambient(color, seen)
+
+    def with_ambient(self, color: Any, seen: Surface) -> Any:
+        """The same radiance with reflected light that nothing shadows."""
+        if self.settings.ambient > 0 and self.settings.lit:
+            nodes, uniform = self.data.materials(), UniformRadiance(self.settings.ambient)
+            color += ambient_light(seen, uniform, _AMBIENT_DIRECTIONS, nodes)
+        return color
+
+    def with_emission(self, color: Any, seen: Surface, lighting: Lighting, sensor: Sensor, size: tuple[int, int]) -> Any:
+        """The same radiance with that of emitters that the camera sees. ``size``: (columns, rows) of samples."""
+        if self.settings.hide_emitters or self.settings.max_depth == 0:
+            return color
+        color += emission(seen, lighting.areas)
+        for environment in self.data.environments:
+            color = dr.select(seen.active, color, background(environment, sensor, *size))
+        return color
+
+    def visibilities(self, frame: Frame, lighting: Lighting, numbers: list[int], lights: list[Light]) -> list[Any]:
+        """Visibility (Float, N) of lights from all pixels. ``numbers``: of the lights in the plan."""
+        maps = lighting.maps
+        if maps is None or not numbers:
+            return [mi.Float(1) for _ in lights]
+        spots = self._spots(frame)
+        return [
+            spots.mean(partial(light_visibility, maps, self.plan, light, index))
+            for index, light in zip(numbers, lights, strict=True)
+        ]
+
+    def _samples(self, areas: tuple[AreaLight, ...], geometry: Geometry) -> tuple[LightSamples, ...]:
+        extended = (*areas, *self.data.environments)
+        return tuple(samples_of(light, plan, geometry) for light, plan in zip(extended, self.soft, strict=True))
+
+    def _replaced(self, lights: tuple[Any, ...], replacements: Mapping[str, Any] | None) -> tuple[Any, ...]:
+        for name in replacements or ():
+            old, new = self.data.light(name), replacements[name]
+            if type(old) is not type(new):
+                raise ShadowmapError(f"Light '{name}' is a {type(old).__name__}, not a {type(new).__name__}.")
+        return tuple((replacements or {}).get(light.name, light) for light in lights)
+
+    def _around(self, frame: Frame) -> list[Any]:
+        view, seen = frame.view, frame.surface
+        size = view.raster.width, view.raster.height
+        return footprint_points(view.sensor, size, frame.depth, seen.p_world, seen.n_world, 2)
+
+    def _outlined(self, frame: Frame, lights: Sequence[Light]) -> tuple[Any, ...]:
+        """Lights with outlines as soft as pixels are wide."""
+        compat = self.settings.shadow.compat
+        shining = [SquareSpot(light) if compat and isinstance(light, SpotLight) else light for light in lights]
+        return softened(shining, frame.surface.p_world, lambda: self._around(frame))
+
+    def _in_tables(self, frame: Frame, lighting: Lighting) -> tuple[Any, list[int]]:
+        """(radiance of lights of kinds of which there are many, numbers of the other lights)."""
+        every, seen = list(range(len(lighting.lights))), frame.surface
+        if len(every) < MANY_LIGHTS or self.settings.shadow.compat or self.settings.aovs:
+            return 0, every
+        spots = FootprintSamples([seen.p_world], seen.active, 1) if lighting.maps is None else self._spots(frame)
+        if spots.copies > 1:  # they are lanes of their own
+            return 0, every
+        around = partial(self._around, frame)
+        return many_lights(seen, lighting.lights, self.plan, lighting.maps, spots.points, around, self.data.materials())
+
+    def _spots(self, frame: Frame) -> FootprintSamples:
+        view, seen = frame.view, frame.surface
+        size, count = (view.raster.width, view.raster.height), self.settings.look_ups(view.columns)
+        return FootprintSamples.of(view.sensor, size, frame.depth, seen.p_world, seen.n_world, seen.active, count)
+
+
 def plan_extended_lights(data: SceneData, settings: RenderSettings) -> tuple[SoftPlan, ...]:
+    """How the area lights and environments of a scene are sampled (on the host, once). Refuses what would not fit into arrays."""
     lights, single = (*data.areas, *data.environments), settings.emitter_shadows == "single"
     soft = plan_soft(lights, data.geometry, settings.area_light_samples, settings.environment_light_samples, single)
     if settings.shadow.method != "none":

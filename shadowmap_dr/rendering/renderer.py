@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Any, ClassVar
@@ -16,36 +16,24 @@ from ..jit.call_data import rewrite_scalars
 from ..jit.frozen import take_apart
 from ..jit.gpu import keep_registers
 from ..jit.kernel_cache import note_size
-from ..raster import RasterOutput, Topology, antialias, build_topology, detach_moved_seams, outward_faces, visible_triangles
-from ..raster.antialiasing.edge_crossings import find_crossings
-from ..scene.geometry import Geometry
+from ..raster import Topology, build_topology, outward_faces
 from ..scene.lights.area import AreaLight
-from ..scene.lights.environment import UniformRadiance
-from ..scene.lights.punctual import SpotLight, SquareSpot
 from ..scene.lights.read import Light
-from ..scene.lights.soft_outline import softened
 from ..scene.load import SceneData, load, refresh
 from ..scene.sensor import Sensor
 from ..scene.untracked import UntrackedState
 from ..shadow import Frusta, ShadowSettings
-from .direct_light import ambient_light, background, direct_light, emission
-from .extended_lights import SoftFrusta, SoftPlan, make_soft_maps, samples_of, soft_light
-from .film.aovs import collect_aovs
-from .film.film import Margin, develop, film_channels, interleave, sample_grid, sample_windows
-from .gbuffer.camera_pass import camera_clip, least_gap, seen_points, within_far_plane, without_shapes
-from .gbuffer.camera_view import CameraView, GBuffer
-from .gbuffer.facet_normals import facet_normals, flat_faces, mean_normals, prefilter_normals
-from .gbuffer.pixel_footprint import FootprintSamples, footprint_points
+from .extended_lights import SoftFrusta, SoftPlan
+from .film.film import Margin, develop, sample_grid, sample_windows
+from .gbuffer.camera_view import CameraPass, CameraView, GBuffer, PlacedShapes
+from .gbuffer.facet_normals import flat_faces
+from .gbuffer.pixel_footprint import footprint_points
 from .gbuffer.shading_edges import ShadingEdges
-from .gbuffer.surface import Surface, normals_at, opacity, surface, surface_at
-from .gbuffer.surface_points import pixel_hits
-from .light_loops import MANY_LIGHTS, many_lights
-from .light_pass import Lighting, plan_extended_lights
+from .image_pass import ImagePass
+from .light_pass import Lighting, LightPass, plan_extended_lights
+from .pass_cache import PassCache
 from .settings import RenderSettings
-from .shadow_pass import MapPlan, check_sizes, light_visibility, make_maps, plan_maps
-
-# Directions over which the light of environments is summed.
-_AMBIENT_DIRECTIONS = 16
+from .shadow_pass import MapPlan, check_sizes, plan_maps
 
 
 @dataclass
@@ -165,9 +153,9 @@ class Renderer:
         # The first fit is made here, so that a step which is recorded later always starts from one.
         if data.sensors:
             with dr.suspend_grad():
-                seen, casting = renderer._topologies(geometry)
-                views = [renderer._view(camera, geometry, seen, 1) for camera in sample_windows(data.sensors[0])]
-                renderer._lighting(views, geometry, casting, None)
+                shapes = renderer.camera_pass.placed(geometry)
+                views = [renderer.camera_pass.view(camera, shapes, 1) for camera in sample_windows(data.sensors[0])]
+                renderer._lighting(views, shapes, None)
         return renderer
 
     def with_data(self, data: SceneData) -> Renderer:
@@ -201,6 +189,7 @@ class Renderer:
         lights: Mapping[str, Light] | None = None,
         sensor: int | Sensor = 0,
         spp: int = 1,
+        cache: PassCache | None = None,
     ) -> Any:
         """Render an image.
 
@@ -210,6 +199,8 @@ class Renderer:
             sensor: number of the scene's sensor, or a camera record.
             spp: samples per pixel, a grid of ``ceil(sqrt(spp)) ** 2``, at most 16 x 16 and
                 4096 along the longer side of the image. Each is anti-aliased.
+            cache: results of earlier passes that still hold, with the same ``spp``, for the scene as it is. The image leaves its
+                own there. Only without ``vertex_positions`` and ``lights``, and not in recordings.
 
         Returns:
             ``mi.TensorXf`` (H, W, C): linear colour (1 or 3 channels, as the film), then alpha if the film has it, then the AOVs.
@@ -224,17 +215,30 @@ class Renderer:
             geometry = geometry.with_positions(vertex_positions)
         windows = sample_windows(cameras)
         factor = sample_grid(spp, windows)
-        samples = max(window.width * window.height for window in windows) * factor**2
-        # Before all else that is attached: derivatives are taken in the reverse order, and pixels should need one pass only.
-        geometry = geometry.in_packets(samples)
-        facets = self._facets(geometry)
         margin = Margin.of(cameras, factor) if self.settings.antialias else Margin()
-        seen, casting = self._topologies(geometry)
-        views = [self._view(margin.around(window), geometry, seen, factor) for window in windows]
-        lighting = self._lighting(views, geometry, casting, lights).for_points(samples)
-        shapes = (geometry, facets, self._creases(geometry, facets))
-        pictures = [margin.cut(self._camera_image(view, lighting, *shapes), factor) for view in views]
-        return develop(pictures, windows[0], factor)
+        cache = cache or PassCache()
+        images = ImagePass(self.camera_pass, self.light_pass)
+        samples = max(window.width * window.height for window in windows) * factor**2
+        views, lighting, shapes = cache.views, None, cache.shapes
+        if shapes is None:
+            # Before all else that is attached: derivatives are taken in the reverse order, and pixels should need one pass only.
+            shapes = images.cameras.placed(geometry.in_packets(samples))
+        if cache.lit:
+            images.fill_crossings(cache, shapes, cache.lit)
+        else:
+            views = views or [images.cameras.view(margin.around(window), shapes, factor) for window in windows]
+            if cache.maps is None:
+                lighting = self._lighting(views, shapes, lights).for_points(samples)
+            else:
+                lighting = images.light.relit(cache.maps, shapes.geometry)
+            images.fill(cache, shapes, views, lighting)
+        crossings = cache.crossings or (None,) * len(windows)
+        if cache.lit:
+            pictures = [images.coloured_image(*each) for each in zip(cache.lit, crossings, strict=True)]
+        else:
+            visible = cache.visible or (None,) * len(views)
+            pictures = [images.image(*each, lighting, shapes) for each in zip(views, crossings, visible, strict=True)]
+        return develop([margin.cut(picture, factor) for picture in pictures], windows[0], factor)
 
     def note_kernels(self, spp: int, sensor: int | Sensor = 0) -> None:
         """Before an image is taken: let kernels of others go, if there have been many sizes."""
@@ -261,85 +265,28 @@ class Renderer:
         """
         return self.data.curve_vertices(name, control_points)
 
-    def _replaced(self, lights: tuple[Any, ...], replacements: Mapping[str, Any] | None) -> tuple[Any, ...]:
-        for name in replacements or ():
-            old, new = self.data.light(name), replacements[name]
-            if type(old) is not type(new):
-                raise ShadowmapError(f"Light '{name}' is a {type(old).__name__}, not a {type(new).__name__}.")
-        return tuple((replacements or {}).get(light.name, light) for light in lights)
+    @property
+    def camera_pass(self) -> CameraPass:
+        """The pass that finds out what cameras see."""
+        hidden = tuple(light.shape for light in self.data.areas) if self.settings.hide_emitters else ()
+        return CameraPass(self.data, self.topology, self.flat, self.creases if self.settings.antialias else None, hidden)
 
-    def _lighting(
-        self, views: list[CameraView], geometry: Geometry, topology: Topology, replacements: Mapping[str, Any] | None
-    ) -> Lighting:
+    @property
+    def light_pass(self) -> LightPass:
+        """The pass that finds out what light reaches it."""
+        return LightPass(self.data, self.settings, self.plan, self.soft, self.outward)
+
+    def _lighting(self, views: Sequence[CameraView], shapes: PlacedShapes, replacements: Mapping[str, Any] | None) -> Lighting:
         """All lights and their shadow maps."""
-        data, settings = self.data, self.settings
-        if not settings.lit:
-            return Lighting((), None, data.areas, (), None)
-        lights, areas = self._replaced(data.lights, replacements), self._replaced(data.areas, replacements)
-        extended = (*areas, *data.environments)
-        samples = tuple(samples_of(light, plan, geometry) for light, plan in zip(extended, self.soft, strict=True))
-        maps = soft_maps = None
-        if settings.shadow.method != "none" and (lights or samples):
-            transparent, seen = self._transparent(geometry, views[0].sensor), self._seen(views, geometry)
-            common = (geometry, topology)
-            if lights:
-                maps = make_maps(self.plan, lights, *common, settings.shadow, self.frusta, transparent, seen, self.outward)
-                self.frusta = maps.frusta
-            if samples:
-                shadow = settings.soft_shadow
-                soft_maps = make_soft_maps(self.soft, samples, self.plan, *common, shadow, self.soft_frusta, transparent, seen)
-                self.soft_frusta = soft_maps.frusta
-        return Lighting(lights, maps, areas, samples, soft_maps)
-
-    def _seen(self, views: list[CameraView], geometry: Geometry) -> tuple[Any, Any]:
-        """Points on what the cameras see, and which of them there are."""
-        found = [seen_points(view.sensor, view.raster, geometry) for view in views]
-        if len(found) == 1:
-            return found[0]
-        points = mi.Point3f(*(dr.concat([p[c] for p, _ in found]) for c in range(3)))
-        return points, dr.concat([mi.Bool(hit) for _, hit in found])
-
-    def _transparent(self, geometry: Geometry, camera: Sensor) -> Callable[[RasterOutput], Any] | None:
-        """Alpha test for cameras and shadow maps (from whichever side); None where no material lets one look through."""
-        if not any(info.see_through for info in geometry.shapes):
-            return None
-
-        def transparent(raster: RasterOutput) -> Any:
-            return opacity(surface(self.data, geometry, camera, raster.triangle, raster.u, raster.v)) < 0.5
-
-        return transparent
-
-    def _view(self, sensor: Sensor, geometry: Geometry, topology: Topology, factor: int) -> CameraView:
-        clip = camera_clip(sensor, geometry)
-        if self._hidden():
-            clip = without_shapes(clip, geometry, self._hidden())
-        dr.eval(clip)
-        size = (sensor.height * factor, sensor.width * factor)
-        transparent = self._transparent(geometry, sensor)
-        raster = visible_triangles(clip, geometry.faces, size, transparent=transparent)
-        return CameraView(sensor, factor, clip, raster, topology)
-
-    def _hidden(self) -> list[int]:
-        """Shapes that cameras do not see."""
-        return [light.shape for light in self.data.areas] if self.settings.hide_emitters else []
-
-    def _topologies(self, geometry: Geometry) -> tuple[Topology, Topology]:
-        """The topology of shapes where they are now: of those that cameras see, and of those that cast shadows."""
-        casting, hidden, shape = self.topology, self._hidden(), geometry.vertex_shape
-        points = dr.gather(mi.Point3f, dr.detach(geometry.positions), dr.arange(mi.UInt32, geometry.vertex_count))
-        if not (geometry.as_loaded and geometry.positions is self.data.geometry.positions):
-            casting = detach_moved_seams(casting, points, shape)
-        return detach_moved_seams(self.topology, points, shape, hidden) if hidden else casting, casting
-
-    def _surface(self, view: CameraView, geometry: Geometry, facets: Any, frames: bool) -> tuple[Surface, Any, Any]:
-        """(what a camera sees, its depth as ``Hits.depth``, how much edges between facets still show or None for all)."""
-        sensor, raster = view.sensor, view.raster
-        hits = pixel_hits(geometry, sensor, raster.triangle, (raster.width, raster.height))
-        hits = replace(hits, active=hits.active & within_far_plane(sensor, hits.depth))
-        normals, sharpness = normals_at(geometry, hits), None
-        if self.flat is not None:
-            normals, sharpness = prefilter_normals(hits, normals, self.topology, facets[1])
-        return surface_at(self.data, geometry, sensor, hits, *normals, frames=frames), hits.depth, sharpness
+        cameras, fits = self.camera_pass, (self.frusta, self.soft_frusta)
+        transparent = cameras.transparent(shapes.geometry, views[0].sensor)
+        seen = partial(cameras.seen, views, shapes.geometry)
+        lighting = self.light_pass.lighting(shapes, replacements, fits, transparent, seen)
+        if lighting.maps is not None:
+            self.frusta = lighting.maps.frusta
+        if lighting.soft_maps is not None:
+            self.soft_frusta = lighting.soft_maps.frusta
+        return lighting
 
     def g_buffer(self, sensor: int = 0) -> GBuffer:
         """What a camera sees of the scene as it is, for those who shade it themselves again and again. Detached.
@@ -352,115 +299,11 @@ class Renderer:
             if len(windows) != 1 or not windows[0].filter.is_box:
                 raise ShadowmapError(f"sensor {sensor} is no single camera whose film has a box filter: use another one.")
             geometry = self.data.geometry.in_packets(windows[0].width * windows[0].height)
-            facets = self._facets(geometry)
-            view = self._view(windows[0], geometry, self._topologies(geometry)[0], 1)
-            seen, depth, sharpness = self._surface(view, geometry, facets, self.data.needs_frames)
-            size, samples = (view.raster.width, view.raster.height), self.settings.look_ups(view.columns)
-            points = footprint_points(windows[0], size, depth, seen.p_world, seen.n_world, samples)
-            crossings = None
-            if self.settings.antialias:
-                dr.eval(sharpness)
-                crossings = find_crossings(
-                    view.clip,
-                    view.topology,
-                    view.raster,
-                    geometry.vertex_count,
-                    crease_weights=sharpness,
-                    meetings=True,
-                    gap=least_gap(windows[0]),
-                    **self._creases(geometry, facets),
-                )
-            return GBuffer(windows[0], seen, points, crossings, self._seen([view], geometry))
-
-    def _facets(self, geometry: Geometry) -> Any:
-        """(normals of flat faces, their sums at each place), None if there are none."""
-        if self.flat is None:
-            return None
-        normals = facet_normals(geometry, self.flat)
-        return dr.detach(normals), mean_normals(normals, self.topology, self.flat)
-
-    def _creases(self, geometry: Geometry, facets: Any) -> dict[str, Any]:
-        """Edges at which shading jumps, if images are anti-aliased and there are any, as arguments of ``find_crossings``."""
-        if self.creases is None or not self.settings.antialias:
-            return {}
-        return {"creases": self.creases.now(geometry), "folds": self.creases.folds_of(facets and facets[0])}
-
-    def _camera_image(self, view: CameraView, lighting: Lighting, geometry: Geometry, facets: Any, creases: Any) -> Any:
-        sensor, raster = view.sensor, view.raster
-        height, width = raster.height, raster.width
-        textured = any(light.textured for light in lighting.areas)
-        frames = self.data.needs_frames or self.settings.ambient > 0 or textured
-        seen, depth, sharpness = self._surface(view, geometry, facets, frames)
-        around = lambda: footprint_points(sensor, (width, height), depth, seen.p_world, seen.n_world, 2)  # noqa: E731
-        compat = self.settings.shadow.compat
-        looped, written = self._in_tables(lighting, seen, view, depth, around)
-        lighting = replace(lighting, lights=tuple(lighting.lights[k] for k in written))
-        lights = lighting.lights
-        visible = self._visibilities(lighting, written, seen, view, depth)
-        shining = [SquareSpot(light) if compat and isinstance(light, SpotLight) else light for light in lights]
-        lighting = replace(lighting, lights=softened(shining, seen.p_world, around))
-        color = looped + self._radiance(seen, lighting, visible, sensor, raster)
-        channels = film_channels(color, seen.active & (self.settings.max_depth != 0), sensor)
-        named = collect_aovs(self.settings.aovs, seen, raster, lights, visible)
-        if self.settings.antialias:
-            # In one pass over the pixels, since both need much of the same.
-            dr.eval(channels, sharpness)
-            flat = antialias(
-                *(channels, raster, view.clip, view.topology),
-                **creases,
-                crease_weights=sharpness,
-                meetings=True,
-                gap=least_gap(sensor),
-                continued=True,
-            )
-            image = mi.TensorXf(flat, shape=(height, width, len(channels)))
-        else:
-            image = mi.TensorXf(interleave(channels), shape=(height, width, len(channels)))
-        if named:
-            image = dr.concat([image, mi.TensorXf(interleave(named), shape=(height, width, len(named)))], axis=2)
-        return image
-
-    def _in_tables(
-        self, lighting: Lighting, seen: Surface, view: CameraView, depth: Any, around: Callable[[], list[Any]]
-    ) -> tuple[Any, list[int]]:
-        """(radiance of lights of kinds of which there are many, numbers of the other lights)."""
-        every = list(range(len(lighting.lights)))
-        if len(every) < MANY_LIGHTS or self.settings.shadow.compat or self.settings.aovs:
-            return 0, every
-        spots = FootprintSamples([seen.p_world], seen.active, 1) if lighting.maps is None else self._spots(seen, view, depth)
-        if spots.copies > 1:  # they are lanes of their own
-            return 0, every
-        return many_lights(seen, lighting.lights, self.plan, lighting.maps, spots.points, around, self.data.materials())
-
-    def _spots(self, seen: Surface, view: CameraView, depth: Any) -> FootprintSamples:
-        size, count = (view.raster.width, view.raster.height), self.settings.look_ups(view.columns)
-        return FootprintSamples.of(view.sensor, size, depth, seen.p_world, seen.n_world, seen.active, count)
-
-    def _visibilities(self, lighting: Lighting, numbers: list[int], seen: Surface, view: CameraView, depth: Any) -> list[Any]:
-        """Of each light, from all pixels. ``numbers``: of the lights in the plan."""
-        maps = lighting.maps
-        if maps is None or not numbers:
-            return [mi.Float(1) for _ in lighting.lights]
-        spots, lights = self._spots(seen, view, depth), zip(numbers, lighting.lights, strict=True)
-        return [spots.mean(partial(light_visibility, maps, self.plan, light, index)) for index, light in lights]
-
-    def _radiance(self, seen: Surface, lighting: Lighting, visible: list[Any], sensor: Sensor, raster: RasterOutput) -> Any:
-        compat = self.settings.shadow.compat
-        color = dr.zeros(mi.UnpolarizedSpectrum, dr.width(seen.shape))
-        nodes = self.data.materials()
-        for light, fraction in zip(lighting.lights, visible, strict=True):
-            color += direct_light(seen, light, fraction, nodes, gate=not compat)
-        soft = self.soft if self.settings.lit else ()
-        for plan, samples in zip(soft, lighting.samples, strict=True):
-            color += soft_light(seen, plan, samples, lighting.soft_maps, nodes, gate=not compat)
-        for uniform in self._uniform_ambient():
-            color += ambient_light(seen, uniform, _AMBIENT_DIRECTIONS, nodes)
-        if not self.settings.hide_emitters and self.settings.max_depth != 0:
-            color += emission(seen, lighting.areas)
-            for environment in self.data.environments:
-                sky = background(environment, sensor, raster.width, raster.height)
-                color = dr.select(seen.active, color, sky)
-        return color
-
-    def _uniform_ambient(self) -> tuple[Any, ...]:
-        return (UniformRadiance(self.settings.ambient),) if self.settings.ambient > 0 and self.settings.lit else ()
+            cameras = self.camera_pass
+            shapes = cameras.placed(geometry)
+            view = cameras.view(windows[0], shapes, 1)
+            frame = cameras.frame(view, shapes, self.data.needs_frames)
+            seen, size, samples = frame.surface, (view.raster.width, view.raster.height), self.settings.look_ups(view.columns)
+            points = footprint_points(windows[0], size, frame.depth, seen.p_world, seen.n_world, samples)
+            crossings = cameras.crossings(view, frame.sharpness, shapes) if self.settings.antialias else None
+            return GBuffer(windows[0], seen, points, crossings, cameras.seen([view], geometry))

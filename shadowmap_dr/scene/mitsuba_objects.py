@@ -22,6 +22,11 @@ def parameters(node: Any) -> dict[str, Any]:
     return {name: value for name, value in found.items() if value is not None}
 
 
+def owners(node: Any) -> list[tuple[str, Any]]:
+    """(relative name, object that has it) of all parameters of a Mitsuba object and its children."""
+    return [(name, owner) for name, (_, _, owner, _) in mi.traverse(node).properties.items()]
+
+
 def children(node: Any) -> list[tuple[str, Any]]:
     """(name, object) of the direct children of a Mitsuba object, in its own order."""
     return [(name, value) for name, value, _ in _parts_of(node) if isinstance(value, mi.Object)]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import shadowmap_dr  # noqa: F401  registers the plug-in
-from shadowmap_dr.rendering import light_loops, renderer
+from shadowmap_dr.rendering import light_loops, light_pass
 
 SIZE = 32
 
@@ -47,7 +47,7 @@ def integrator(**options: Any) -> Any:
 
 
 def in_loops_from(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
-    for module in (light_loops, renderer):
+    for module in (light_loops, light_pass):
         monkeypatch.setattr(module, "MANY_LIGHTS", count)
 
 

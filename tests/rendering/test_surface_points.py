@@ -49,7 +49,8 @@ def test_derivatives_are_those_of_the_barycentrics(variant: str, kind: str) -> N
         dr.enable_grad(p, rows)
         sensor = replace(camera, to_world=mi.Transform4f(rows))
         moved = replace(geometry, positions=p)
-        raster = renderer._view(sensor, moved, renderer.topology, 1).raster
+        cameras = renderer.camera_pass
+        raster = cameras.view(sensor, cameras.placed(moved), 1).raster
         hits: SurfacePoints = of(moved, sensor, raster)
         _, normal = normals_at(moved, hits)
         values = [*hits.p_world, hits.u, hits.v, *normal]

@@ -24,19 +24,19 @@ from .scaling import Case
 #: The passes of a step in their order: label, and the function (module:name below `shadowmap_dr`) that makes them up.
 PASSES = (
     ("vertices", "scene.geometry:Geometry.with_positions"),
-    ("facets: mean normals", "rendering.renderer:mean_normals"),
-    ("camera: projection", "rendering.renderer:camera_clip"),
-    ("camera: rasterization", "rendering.renderer:visible_triangles"),
+    ("facets: mean normals", "rendering.gbuffer.camera_view:mean_normals"),
+    ("camera: projection", "rendering.gbuffer.camera_view:camera_clip"),
+    ("camera: rasterization", "rendering.gbuffer.camera_view:visible_triangles"),
     ("shadow map: frustum", "rendering.shadow_pass:fit_frusta"),
     ("shadow map: rendering", "rendering.shadow_pass:render_maps"),
     ("shadow map: filter", "rendering.shadow_pass:filter_maps"),
-    ("hits", "rendering.renderer:pixel_hits"),
-    ("normals", "rendering.renderer:normals_at"),
-    ("facets: blend", "rendering.renderer:prefilter_normals"),
-    ("surface", "rendering.renderer:surface_at"),
-    ("shadow look-up", "rendering.renderer:Renderer._visibilities"),
-    ("shading", "rendering.renderer:Renderer._radiance"),
-    ("anti-aliasing", "rendering.renderer:antialias"),
+    ("hits", "rendering.gbuffer.camera_view:pixel_hits"),
+    ("normals", "rendering.gbuffer.camera_view:normals_at"),
+    ("facets: blend", "rendering.gbuffer.camera_view:prefilter_normals"),
+    ("surface", "rendering.gbuffer.camera_view:surface_at"),
+    ("shadow look-up", "rendering.light_pass:LightPass.visibilities"),
+    ("shading", "rendering.light_pass:LightPass.radiance"),
+    ("anti-aliasing", "rendering.image_pass:antialias"),
 )
 REST = "loss, Adam, the rest"
 

@@ -12,7 +12,7 @@ from .sample_maps import (
     still_aimed,
 )
 from .samples import LightSamples
-from .shading import soft_light
+from .shading import soft_light, visible_parts
 from .sky_samples import SkyWatch
 
 __all__ = [
@@ -28,4 +28,5 @@ __all__ = [
     "samples_of",
     "soft_light",
     "still_aimed",
+    "visible_parts",
 ]

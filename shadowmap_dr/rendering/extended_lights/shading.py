@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -27,33 +26,22 @@ def soft_light(
     nodes: Sequence[Any],
     *,
     gate: bool = True,
+    visible: Any = None,
 ) -> Any:
     """Radiance (colour, P) towards the camera of one extended light.
 
     ``maps`` None: unshadowed. ``nodes``: all BSDFs that ``seen`` may call, and shapes whose
-    attributes these read. ``gate``: see :func:`shadowmap_dr.rendering.direct_light.direct_light`.
+    attributes these read. ``gate``: see :func:`shadowmap_dr.rendering.direct_light.direct_light`. ``visible``: from
+    :func:`visible_parts`, to be looked up instead of the maps.
     Gradients flow to all of surface, samples, maps and BSDFs.
     """
-    if seen.colour is not None:
-        # Of materials that know cosines only, the colour stays outside of the loop: its derivative needs no second one.
-        white = replace(seen, colour=mi.UnpolarizedSpectrum(1))
-        light = _loop_light(white, plan, samples, maps, nodes, gate)
-        if dr.grad_enabled(seen.colour):
-            dr.eval(light)
-        return seen.colour * light
-    return _loop_light(seen, plan, samples, maps, nodes, gate)
-
-
-def _loop_light(
-    seen: Surface, plan: SoftPlan, samples: LightSamples, maps: SoftMaps | None, nodes: Sequence[Any], gate: bool
-) -> Any:
     if samples.distant and reflects_only(nodes):
-        return sky_light(seen, plan, samples, maps, nodes, gate=gate)
+        return sky_light(seen, plan, samples, maps, nodes, gate=gate, visible=visible)
     sampled = None if maps is None or plan.kind == "single" else maps.sampled
     transmits = not samples.distant and any(_transmits(node) for node in nodes)
 
-    def one_sample(index: Any, seen: Surface, shared: Any) -> Any:
-        table, maps = shared
+    def one_sample(index: Any, own: Any, shared: Any) -> Any:
+        (seen, lane), (table, maps, visible) = own, shared
         value, active = mi.UnpolarizedSpectrum(0), mi.Bool(False)
         for wo_world, weight, reached in table.illuminate(index, seen.p_world, sides(seen)):
             wo = seen.si.to_local(wo_world)
@@ -62,7 +50,9 @@ def _loop_light(
                 passes &= passes_gate(seen, wo_world, wo)
             value += dr.select(passes, seen.evaluate(wo, passes) * weight, 0)
             active |= passes
-        if maps is not None:
+        if visible is not None:
+            value *= dr.gather(mi.Float, visible, index * lanes + lane, active)
+        elif maps is not None:
             value *= visibility(maps, map_of(plan, table, index, seen.p_world), seen.p_world, active)
         return dr.select(active, value, 0)
 
@@ -72,13 +62,35 @@ def _loop_light(
         above = mi.Vector3f(dr.select(dr.detach(seen.si.wi.z) < 0, -n, n))
         return [above, -above] if transmits else [above]
 
-    start = dr.zeros(mi.UnpolarizedSpectrum, dr.width(seen.shape))
+    lanes = dr.width(seen.shape)
+    start = dr.zeros(mi.UnpolarizedSpectrum, lanes)
     implicit = [] if seen.colour is not None else attached_parameters(nodes)
-    light = sum_over(one_sample, samples.count, start, seen, (samples.table(), sampled), implicit, seen.active)
+    own = seen, None if visible is None else dr.arange(mi.UInt32, lanes)
+    shared = samples.table(), sampled, visible
+    light = sum_over(one_sample, samples.count, start, own, shared, implicit, seen.active)
     if maps is None or plan.kind != "single":
         return light
     radius = samples.radius_towards(seen.p_world)
     return light * penumbra_visibility(maps.single, mi.UInt32(plan.first), radius, seen.p_world, seen.n_world, seen.active)
+
+
+def visible_parts(seen: Surface, plan: SoftPlan, samples: LightSamples, maps: SoftMaps | None) -> Any:
+    """Visibility (Float, K P) of the K samples of an extended light, one after the other, or None where there are no such maps.
+
+    Detached. For images that differ in nothing but materials and the colours of lights.
+    """
+    if maps is None or plan.kind == "single":
+        return None
+    with dr.suspend_grad():
+        count, table = dr.width(seen.shape), samples.table()
+        lane = dr.arange(mi.UInt32, samples.count * count)
+        sample = lane // count
+        dr.eval(seen.p_world, seen.active)
+        pixel = lane - sample * count
+        p_world, active = dr.gather(mi.Point3f, seen.p_world, pixel), dr.gather(mi.Bool, seen.active, pixel)
+        found = visibility(maps.sampled, map_of(plan, table, sample, p_world), p_world, active)
+        dr.eval(found)
+        return found
 
 
 def _transmits(node: Any) -> bool:

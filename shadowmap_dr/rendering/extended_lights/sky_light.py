@@ -25,7 +25,14 @@ def reflects_only(nodes: Sequence[Any]) -> bool:
 
 
 def sky_light(
-    seen: Surface, plan: SoftPlan, samples: SkySamples, maps: SoftMaps | None, nodes: Sequence[Any], *, gate: bool = True
+    seen: Surface,
+    plan: SoftPlan,
+    samples: SkySamples,
+    maps: SoftMaps | None,
+    nodes: Sequence[Any],
+    *,
+    gate: bool = True,
+    visible: Any = None,
 ) -> Any:
     """Radiance (colour, P) towards the camera of an environment, on surfaces that reflect only.
 
@@ -36,10 +43,10 @@ def sky_light(
     light where that gives none. The shadow map of such a part looks along the surface, or comes from behind it, and says little:
     this additional light is as visible as what comes from other parts low above the horizon.
     """
-    channels = dr.size_v(mi.UnpolarizedSpectrum)
+    channels, lanes = dr.size_v(mi.UnpolarizedSpectrum), dr.width(seen.shape)
 
-    def one_part(index: Any, seen: Surface, shared: Any) -> Any:
-        table, widths, maps = shared
+    def one_part(index: Any, own: Any, shared: Any) -> Any:
+        (seen, lane), (table, widths, maps, known) = own, shared
         towards, power = table.from_sky(index)
         side = dr.select(seen.si.wi.z < 0, mi.Float(-1), 1)
         length, half = widths.of(index, mi.Vector3f(seen.si.sh_frame.n))
@@ -57,21 +64,24 @@ def sky_light(
         value = dr.select(active, seen.evaluate(wo, active) * power * length, 0)
         # Shares of the value that the middle's own cosine makes, and that come in addition.
         upper = dr.maximum(place, 0)
-        own = value * (2 * upper * dr.rcp(1 + upper))
+        inner = value * (2 * upper * dr.rcp(1 + upper))
         further = value * dr.select(dr.detach(place) > 0, dr.square(1 - place) * dr.rcp(2 * (1 + upper)), 0.5 * (1 + place))
         above = dr.detach(height) > 0
         low = dr.maximum(height * (1 - height * dr.rcp(_LOW * half)), 0)
         visible = mi.Float(1)
-        if maps is not None:
-            lit = active & above
+        lit = active & above
+        if known is not None:
+            visible = dr.gather(mi.Float, known, index * lanes + lane, lit)
+        elif maps is not None:
             visible = dr.select(lit, visibility(maps, map_of(plan, table, index, seen.p_world), seen.p_world, lit), 0)
-        sums = [*(own * visible), *further, low * visible, low]
+        sums = [*(inner * visible), *further, low * visible, low]
         return mi.ArrayXf([mi.Float(dr.select(seen.active, x, 0)) for x in sums])
 
     implicit = [] if seen.colour is not None else attached_parameters(nodes)
-    shared = (samples.table(), samples.widths(), None if maps is None else maps.sampled)
-    start = dr.zeros(mi.ArrayXf, (2 * channels + 2, dr.width(seen.shape)))
-    sums = sum_over(one_part, samples.count, start, seen, shared, implicit, seen.active)
+    shared = (samples.table(), samples.widths(), None if maps is None else maps.sampled, visible)
+    own = seen, None if visible is None else dr.arange(mi.UInt32, lanes)
+    start = dr.zeros(mi.ArrayXf, (2 * channels + 2, lanes))
+    sums = sum_over(one_part, samples.count, start, own, shared, implicit, seen.active)
     if dr.grad_enabled(sums):
         dr.eval(sums)  # derivatives of what follows need them, and would run the loop once more
     own, further = (mi.UnpolarizedSpectrum(*(sums[first + c] for c in range(channels))) for first in (0, channels))

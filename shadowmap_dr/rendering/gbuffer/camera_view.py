@@ -1,13 +1,24 @@
-"""What one camera sees: which triangles its samples hit, and the records of its pixels."""
+"""The camera pass: which triangles the samples of a camera hit, the surfaces there, and how neighbouring samples mix."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
-from ...raster import Crossings, RasterOutput, Topology
+import drjit as dr
+import mitsuba as mi
+
+from ...raster import Crossings, RasterOutput, Topology, detach_moved_seams, visible_triangles
+from ...raster.antialiasing.edge_crossings import find_crossings
+from ...scene.geometry import Geometry
+from ...scene.load import SceneData
 from ...scene.sensor import Sensor
-from .surface import Surface
+from .camera_pass import camera_clip, least_gap, seen_points, within_far_plane, without_shapes
+from .facet_normals import facet_normals, mean_normals, prefilter_normals
+from .shading_edges import ShadingEdges
+from .surface import Surface, normals_at, opacity, surface, surface_at
+from .surface_points import pixel_hits
 
 
 @dataclass(frozen=True)
@@ -30,6 +41,41 @@ class CameraView:
 
 
 @dataclass(frozen=True)
+class PlacedShapes:
+    """The shapes of a scene where they are now, and all that follows from their places alone.
+
+    Attributes:
+        geometry: the triangles.
+        facets: (normals of flat faces, their sums at each place), None if there are none.
+        creases: edges at which shading jumps, as arguments of :func:`~shadowmap_dr.raster.find_crossings`.
+        seen, casting: edges of the shapes that cameras see, and of those that cast shadows.
+    """
+
+    geometry: Geometry
+    facets: Any
+    creases: dict[str, Any]
+    seen: Topology
+    casting: Topology
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The samples of one camera, N of them.
+
+    Attributes:
+        view: the camera and the triangles that it sees.
+        surface: the surfaces there.
+        depth: ``SurfacePoints.depth``, or None.
+        sharpness: ``Float`` (N,), how much edges between facets still show, or None for all of it.
+    """
+
+    view: CameraView
+    surface: Surface
+    depth: Any
+    sharpness: Any
+
+
+@dataclass(frozen=True)
 class GBuffer:
     """What a camera sees, H * W pixels, row-major.
 
@@ -46,3 +92,97 @@ class GBuffer:
     points: list[Any]
     crossings: Crossings | None
     seen: tuple[Any, Any]
+
+
+@dataclass(frozen=True)
+class CameraPass:
+    """Renders what cameras see of a scene.
+
+    Attributes:
+        data: records of the scene.
+        topology: edges of the merged mesh.
+        flat: faces that are shaded flat, or None.
+        creases: edges of faces at which shading jumps, None if images are not anti-aliased.
+        hidden: shapes that cameras do not see.
+    """
+
+    data: SceneData
+    topology: Topology
+    flat: Any
+    creases: ShadingEdges | None
+    hidden: tuple[int, ...] = ()
+
+    def placed(self, geometry: Geometry) -> PlacedShapes:
+        """The shapes at places of theirs. Attached to the geometry."""
+        facets = self._facets(geometry)
+        creases = {}
+        if self.creases is not None:
+            creases = {"creases": self.creases.now(geometry), "folds": self.creases.folds_of(facets and facets[0])}
+        return PlacedShapes(geometry, facets, creases, *self._topologies(geometry))
+
+    def view(self, sensor: Sensor, shapes: PlacedShapes, factor: int) -> CameraView:
+        """Rasterize the scene. Clip-space vertices are attached to vertices and camera."""
+        geometry = shapes.geometry
+        clip = camera_clip(sensor, geometry)
+        if self.hidden:
+            clip = without_shapes(clip, geometry, self.hidden)
+        dr.eval(clip)
+        size = (sensor.height * factor, sensor.width * factor)
+        raster = visible_triangles(clip, geometry.faces, size, transparent=self.transparent(geometry, sensor))
+        return CameraView(sensor, factor, clip, raster, shapes.seen)
+
+    def transparent(self, geometry: Geometry, camera: Sensor) -> Callable[[RasterOutput], Any] | None:
+        """Alpha test for cameras and shadow maps (from whichever side); None where no material lets one look through."""
+        if not any(info.see_through for info in geometry.shapes):
+            return None
+
+        def transparent(raster: RasterOutput) -> Any:
+            return opacity(surface(self.data, geometry, camera, raster.triangle, raster.u, raster.v)) < 0.5
+
+        return transparent
+
+    def seen(self, views: list[CameraView], geometry: Geometry) -> tuple[Any, Any]:
+        """Points on what cameras see (Point3f, world space), and which of them there are (Bool). Detached."""
+        found = [seen_points(view.sensor, view.raster, geometry) for view in views]
+        if len(found) == 1:
+            return found[0]
+        points = mi.Point3f(*(dr.concat([p[c] for p, _ in found]) for c in range(3)))
+        return points, dr.concat([mi.Bool(hit) for _, hit in found])
+
+    def frame(self, view: CameraView, shapes: PlacedShapes, frames: bool) -> Frame:
+        """The surfaces that a camera sees, attached. ``frames``: as for :func:`surface_at`."""
+        sensor, raster, geometry = view.sensor, view.raster, shapes.geometry
+        hits = pixel_hits(geometry, sensor, raster.triangle, (raster.width, raster.height))
+        hits = replace(hits, active=hits.active & within_far_plane(sensor, hits.depth))
+        normals, sharpness = normals_at(geometry, hits), None
+        if self.flat is not None:
+            normals, sharpness = prefilter_normals(hits, normals, self.topology, shapes.facets[1])
+        return Frame(view, surface_at(self.data, geometry, sensor, hits, *normals, frames=frames), hits.depth, sharpness)
+
+    def crossings(self, view: CameraView, sharpness: Any, shapes: PlacedShapes) -> Crossings:
+        """How the samples of a camera mix. ``sharpness``: that of its :class:`Frame`. Detached."""
+        dr.eval(sharpness)
+        return find_crossings(
+            view.clip,
+            view.topology,
+            view.raster,
+            shapes.geometry.vertex_count,
+            crease_weights=sharpness,
+            meetings=True,
+            gap=least_gap(view.sensor),
+            **shapes.creases,
+        )
+
+    def _facets(self, geometry: Geometry) -> Any:
+        if self.flat is None:
+            return None
+        normals = facet_normals(geometry, self.flat)
+        return dr.detach(normals), mean_normals(normals, self.topology, self.flat)
+
+    def _topologies(self, geometry: Geometry) -> tuple[Topology, Topology]:
+        """The topology of the shapes that cameras see, and of those that cast shadows."""
+        casting, shape = self.topology, geometry.vertex_shape
+        points = dr.gather(mi.Point3f, dr.detach(geometry.positions), dr.arange(mi.UInt32, geometry.vertex_count))
+        if not (geometry.as_loaded and geometry.positions is self.data.geometry.positions):
+            casting = detach_moved_seams(casting, points, shape)
+        return detach_moved_seams(self.topology, points, shape, self.hidden) if self.hidden else casting, casting

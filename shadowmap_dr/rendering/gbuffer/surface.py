@@ -143,7 +143,15 @@ def surface_at(
     si.shape = dr.gather(mi.ShapePtr, data.shape_ptr, shape, active)
     si.prim_index = hits.triangle - dr.gather(mi.UInt32, geometry.shape_face_start, shape, active)
     bsdf = dr.gather(mi.BSDFPtr, data.bsdf_ptr, shape, active)
-    seen = Surface(hits.p_world, n_world, hits.wi_world, shape, active, si, bsdf)
+    return coloured(data, Surface(hits.p_world, n_world, hits.wi_world, shape, active, si, bsdf), frames)
+
+
+def coloured(data: SceneData, seen: Surface, frames: bool) -> Surface:
+    """The same surfaces with the colours of the materials as they are now, if these know cosines only. Attached to both.
+
+    Of ``seen`` it takes the shape, the BSDF, whether it is active, the side seen (``si.wi.z``), and (``frames``: as for
+    :func:`surface_at`) with textures the rest that these read: place, texture coordinates, number of the triangle, ``si.shape``.
+    """
     if not frames:
         return replace(seen, colour=_plain_colour(data, seen))
     return replace(seen, colour=_cosine_colour(data, seen)) if data.only_cosines else seen

@@ -1,0 +1,65 @@
+"""Parameters of a Mitsuba object at one moment: whether they are still the same, and which carry gradients."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from ..scene.mitsuba_objects import parameters
+
+
+@dataclass(frozen=True)
+class ParameterState:
+    """Parameters of a Mitsuba object and its children, by their relative names.
+
+    Attributes:
+        numbers: of each parameter something that is equal to that of another value only if it has not been given another one:
+            of arrays which they are, and whether they are attached.
+        attached: names of those through which gradients flow.
+        held: the arrays, detached. That keeps their variables' numbers from being used again. No AD variable is held: Mitsuba's
+            integrators, which clear the AD graph in forward mode, would fail on it.
+    """
+
+    numbers: dict[str, tuple[Any, ...]]
+    attached: tuple[str, ...]
+    held: list[Any]
+
+    @classmethod
+    def of(cls, node: Any) -> ParameterState:
+        """The parameters as they are now."""
+        numbers, attached, held = {}, [], []
+        for name, value in parameters(node).items():
+            value = getattr(value, "matrix", value)
+            if not dr.is_array_v(value):
+                numbers[name] = (value,)
+                continue
+            if dr.grad_enabled(value):
+                attached.append(name)
+            found: list[tuple[int, bool]] = []
+            _collect(value, found, held)
+            numbers[name] = tuple(found)
+        return cls(numbers, tuple(attached), held)
+
+    def same(self, other: ParameterState, names: Iterable[str] | None = None) -> bool:
+        """Whether parameters (all, or those of these names) are the same in both."""
+        if names is None:
+            return self.numbers == other.numbers
+        return all(self.numbers.get(name) == other.numbers.get(name) for name in names)
+
+
+def _collect(array: Any, numbers: list[tuple[int, bool]], held: list[Any]) -> None:
+    if dr.is_tensor_v(array):
+        array = array.array
+    if dr.depth_v(array) > 1:
+        for k in range(len(array)):
+            _collect(array[k], numbers, held)
+        return
+    if not dr.is_jit_v(array):
+        numbers.append((hash(tuple(array)), False))
+        return
+    alone = dr.detach(array)
+    numbers.append((alone.index, bool(getattr(array, "index_ad", 0))))
+    held.append(type(alone)(alone))

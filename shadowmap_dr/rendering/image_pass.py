@@ -1,0 +1,180 @@
+"""The image pass: light of the surfaces that a camera sees, emitters, further channels, and how neighbouring samples mix."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ..jit.broadcast import broadcast_differentiable
+from ..raster import Crossings, antialias
+from .direct_light import shining_side
+from .film.aovs import collect_aovs
+from .film.film import film_channels, interleave
+from .gbuffer.camera_pass import least_gap
+from .gbuffer.camera_view import CameraPass, CameraView, Frame, PlacedShapes
+from .gbuffer.surface import coloured
+from .light_colours import colours_of
+from .light_loops import MANY_LIGHTS
+from .light_pass import Lighting, LightPass, Shone, Visible
+from .pass_cache import LitFrame, PassCache, Still, colouring_inputs, weights_only
+
+# Most numbers of visibility that are kept from one image to the next.
+_MOST_VISIBLE = 1 << 23
+
+
+@dataclass(frozen=True)
+class ImagePass:
+    """Makes images of what cameras see, as tensors (rows, columns, C) of samples.
+
+    Attributes:
+        cameras, light: the passes before.
+    """
+
+    cameras: CameraPass
+    light: LightPass
+
+    def image(
+        self, view: CameraView, crossings: Crossings | None, visible: Visible | None, lighting: Lighting, shapes: PlacedShapes
+    ) -> Any:
+        """The image of one camera. Attached to all, but not through edges if ``crossings`` are given, nor through visibilities
+        if ``visible`` is."""
+        light, settings = self.light, self.light.settings
+        frame = self.cameras.frame(view, shapes, light.needs_frames)
+        seen, shone, color = frame.surface, *self._reflected(frame, lighting, visible)
+        color = light.with_emission(color, seen, lighting, view.sensor, (view.raster.width, view.raster.height))
+        named = collect_aovs(settings.aovs, seen, view.raster, lighting.lights, shone.visible)
+        if crossings is None and settings.antialias:
+            channels = self._channels(color, seen.active, view)
+            # In one pass over the pixels, since both need much of the same.
+            dr.eval(channels, frame.sharpness)
+            flat = antialias(
+                *(channels, view.raster, view.clip, view.topology),
+                **shapes.creases,
+                crease_weights=frame.sharpness,
+                meetings=True,
+                gap=least_gap(view.sensor),
+                continued=True,
+            )
+            return _picture(flat, view, len(channels), named)
+        return self._mixed(color, seen.active, view, crossings, named)
+
+    def coloured_image(self, lit: LitFrame, crossings: Crossings | None) -> Any:
+        """The image of one camera, of which light and edges are known already. Attached to materials and the lights' colours."""
+        surface, width = coloured(self.light.data, lit.surface, self.light.needs_frames), dr.width(lit.surface.shape)
+        irradiance, emitted = lit.irradiance, lit.emitted
+        if lit.terms:
+            lights, areas = self.light.data.lights, self.light.data.areas
+            colours = broadcast_differentiable(colours_of((*lights, *areas)), width)
+            irradiance = irradiance + sum(term * colour for term, colour in zip(lit.terms, colours, strict=True))
+            for light, colour in zip(areas, colours[len(lights) :], strict=True):
+                emitted = emitted + dr.select(lit.front & (lit.surface.shape == light.shape), colour, 0)
+        return self._mixed(surface.colour * irradiance + emitted, lit.surface.active, lit.view, crossings, [])
+
+    def fill(self, cache: PassCache, shapes: PlacedShapes, views: Sequence[CameraView], lighting: Lighting) -> None:
+        """Leave the results of passes to later images, and what follows from them."""
+        if cache.still == Still.NOTHING:
+            return
+        settings = self.light.settings
+        plain = self.light.data.only_cosines and not settings.aovs and not settings.shadow.compat
+        lit = plain and (cache.still >= Still.RADIANCE or (cache.still == Still.LIGHTS and self._uniform()))
+        cache.shapes, cache.views = shapes, tuple(views)
+        if cache.still >= Still.LIGHTS:
+            cache.maps = lighting.maps, lighting.soft_maps
+        seen = cache.still >= Still.LIGHTS and not lit and not cache.visible and self._room_for_visible(shapes, views)
+        if not (lit or seen) and (cache.crossings or not settings.antialias):
+            return
+        with dr.suspend_grad():
+            frames = [self.cameras.frame(view, shapes, self.light.needs_frames) for view in views]
+            self.fill_crossings(cache, shapes, frames)
+            if lit:
+                one = self._uniformly_lit if cache.still == Still.LIGHTS else self._lit
+                cache.lit = tuple(one(frame, lighting, shapes) for frame in frames)
+            elif seen:
+                cache.visible = tuple(self.light.visible(frame, lighting) for frame in frames)
+            dr.eval(shapes, cache.views, cache.maps, cache.visible, cache.lit)
+
+    def fill_crossings(self, cache: PassCache, shapes: PlacedShapes, frames: Sequence[Frame | LitFrame]) -> None:
+        """Leave to later images how samples mix. ``frames``: of all cameras."""
+        if self.light.settings.antialias and not cache.crossings:
+            found = (self.cameras.crossings(frame.view, frame.sharpness, shapes) for frame in frames)
+            cache.crossings = tuple(weights_only(crossings) for crossings in found)
+
+    def _uniform(self) -> bool:
+        """Whether an image is a sum over few lights, each times its colour."""
+        data, settings = self.light.data, self.light.settings
+        lights = (*data.lights, *data.areas)
+        if data.environments or not settings.lit or not 0 < len(lights) < MANY_LIGHTS:
+            return False
+        return colours_of(lights) is not None
+
+    def _room_for_visible(self, shapes: PlacedShapes, views: Sequence[CameraView]) -> bool:
+        """Whether visibilities of all lights may be kept."""
+        light = self.light
+        if len(light.data.lights) >= MANY_LIGHTS or light.settings.shadow.method == "none":
+            return False
+        each = len(light.data.lights) + sum(plan.count for plan in light.soft)
+        return each * sum(view.raster.width * view.raster.height for view in views) <= _MOST_VISIBLE
+
+    def _reflected(self, frame: Frame, lighting: Lighting, visible: Visible | None) -> tuple[Shone, Any]:
+        """(the light on a frame, reflected radiance (colour, N) towards the camera)."""
+        light, colour = self.light, frame.surface.colour
+        if colour is None:
+            shone = light.shone(frame, lighting, visible)
+            return shone, light.radiance(frame.surface, lighting, shone)
+        # In the same order as where the light is known already, so that images of a scene that stays are the same bit by bit.
+        white = _white(frame)
+        shone = light.shone(white, lighting, visible)
+        irradiance = light.radiance(white.surface, lighting, shone)
+        if dr.grad_enabled(colour) and lighting.samples:
+            dr.eval(irradiance)  # its loops would run again for the derivative
+        return shone, colour * irradiance
+
+    def _lit(self, frame: Frame, lighting: Lighting, shapes: PlacedShapes) -> LitFrame:
+        view, light = frame.view, self.light
+        size = view.raster.width, view.raster.height
+        white = _white(frame)
+        irradiance = light.radiance(white.surface, lighting, light.shone(white, lighting))
+        none = dr.zeros(mi.UnpolarizedSpectrum, dr.width(frame.surface.shape))
+        emitted = light.with_emission(none, frame.surface, lighting, view.sensor, size)
+        return LitFrame(view, colouring_inputs(frame.surface), frame.sharpness, irradiance, emitted)
+
+    def _uniformly_lit(self, frame: Frame, lighting: Lighting, shapes: PlacedShapes) -> LitFrame:
+        light = self.light
+        settings, surface = light.settings, frame.surface
+        none, white = dr.zeros(mi.UnpolarizedSpectrum, dr.width(surface.shape)), _white(frame)
+        terms = light.white_terms(white, lighting, shapes.geometry)
+        front = shining_side(surface)
+        if settings.hide_emitters or settings.max_depth == 0:
+            front &= mi.Bool(False)
+        ambient = light.with_ambient(mi.UnpolarizedSpectrum(none), white.surface)
+        return LitFrame(frame.view, colouring_inputs(surface), frame.sharpness, ambient, none, terms, front)
+
+    def _channels(self, color: Any, active: Any, view: CameraView) -> list[Any]:
+        return film_channels(color, active & (self.light.settings.max_depth != 0), view.sensor)
+
+    def _mixed(self, color: Any, active: Any, view: CameraView, crossings: Crossings | None, named: list[Any]) -> Any:
+        """A picture of samples that mix as is known already, or not at all."""
+        channels = self._channels(color, active, view)
+        if crossings is None:
+            return _picture(interleave(channels), view, len(channels), named)
+        dr.eval(channels)
+        flat = antialias(channels, view.raster, dr.detach(view.clip), view.topology, crossings=crossings)
+        return _picture(flat, view, len(channels), named)
+
+
+def _white(frame: Frame) -> Frame:
+    """The same frame with white surfaces."""
+    return replace(frame, surface=replace(frame.surface, colour=mi.UnpolarizedSpectrum(1)))
+
+
+def _picture(flat: Any, view: CameraView, channels: int, named: list[Any]) -> Any:
+    """A tensor of interleaved channels, and further ones (Float each)."""
+    height, width = view.raster.height, view.raster.width
+    image = mi.TensorXf(flat, shape=(height, width, channels))
+    if named:
+        image = dr.concat([image, mi.TensorXf(interleave(named), shape=(height, width, len(named)))], axis=2)
+    return image

@@ -1,0 +1,103 @@
+"""Results of passes that stay from one image of a camera to the next, where nothing that they depend on changes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import IntEnum
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ..raster import Crossings
+from ..shadow import ShadowMaps
+from .extended_lights import SoftMaps
+from .gbuffer.camera_view import CameraView, PlacedShapes
+from .gbuffer.surface import Surface
+from .light_pass import Visible
+
+
+class Still(IntEnum):
+    """What stays as it is from one image to the next; each includes those before."""
+
+    NOTHING = 0
+    #: Shapes and the camera.
+    VIEW = 1
+    #: Places and directions of lights.
+    LIGHTS = 2
+    #: The radiance of lights: all but materials.
+    RADIANCE = 3
+
+
+@dataclass(frozen=True)
+class LitFrame:
+    """The samples of one camera, N of them, on materials that know cosines only. Detached.
+
+    Attributes:
+        view: the camera.
+        surface: the surfaces, with what their colours are found by and no more.
+        sharpness: as :attr:`~shadowmap_dr.rendering.gbuffer.camera_view.Frame.sharpness`.
+        irradiance: radiance towards the camera (colour, N) if all materials were white, of lights whose radiance is known.
+        emitted: radiance (colour, N) of such emitters that the camera sees.
+        terms: of each light of the scene, if their radiance is not known: ``irradiance`` (Float, N) if its colour were white.
+        front: ``Bool`` (N,), where the camera sees the shining side of a surface, if emitters' radiance is not known.
+    """
+
+    view: CameraView
+    surface: Surface
+    sharpness: Any
+    irradiance: Any
+    emitted: Any
+    terms: tuple[Any, ...] = ()
+    front: Any = None
+
+
+@dataclass
+class PassCache:
+    """Results of the passes of one image, detached.
+
+    Attributes:
+        still: what has not changed since the image before, and carries no gradients. Images leave results here that depend on
+            nothing else.
+        shapes, views, crossings: with ``VIEW``; the latter two for each camera of a film.
+        maps: shadow maps of lights, and of extended lights; with ``LIGHTS``.
+        visible: what they let through, if there is room for it; with ``LIGHTS``.
+        lit: only colours are left to do; with ``RADIANCE``, or with ``LIGHTS`` where radiance is the same all over each light.
+    """
+
+    still: Still = Still.NOTHING
+    shapes: PlacedShapes | None = None
+    views: tuple[CameraView, ...] = ()
+    crossings: tuple[Crossings, ...] = ()
+    maps: tuple[ShadowMaps | None, SoftMaps | None] | None = None
+    visible: tuple[Visible, ...] = ()
+    lit: tuple[LitFrame, ...] = ()
+
+    def keep(self, still: Still) -> None:
+        """Drop results that depend on more than what is still."""
+        self.still = still
+        if still < Still.VIEW:
+            self.shapes, self.views, self.crossings = None, (), ()
+        if still < Still.LIGHTS:
+            self.maps, self.visible, self.lit = None, (), ()
+        if still < Still.RADIANCE and not all(frame.terms for frame in self.lit):
+            self.lit = ()
+
+    def forget_edges(self) -> None:
+        """Drop results that depend on the edges at which shading jumps."""
+        self.shapes, self.crossings = None, ()
+
+
+def colouring_inputs(surface: Surface) -> Surface:
+    """The same surfaces with nothing but the fields that :func:`~shadowmap_dr.rendering.gbuffer.surface.coloured` looks at."""
+    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(surface.shape))
+    for name in ("p", "uv", "prim_index", "shape"):
+        setattr(si, name, getattr(surface.si, name))
+    si.wi = mi.Vector3f(0, 0, dr.select(surface.si.wi.z < 0, mi.Float(-1), 1))
+    return Surface(mi.Point3f(0), mi.Normal3f(0), mi.Vector3f(0), surface.shape, surface.active, si, surface.bsdf)
+
+
+def weights_only(crossings: Crossings) -> Crossings:
+    """The same without what derivatives by the edges' places need, which is most of it."""
+    none = type(crossings.slopes)()
+    return replace(crossings, ends=type(crossings.ends)(), slopes=none, second_slopes=none, meetings=None)

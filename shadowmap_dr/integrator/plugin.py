@@ -46,51 +46,48 @@ class Shell:
 
     def primal(self, scene: Any, sensor: Any, spp: int) -> Any:
         """Detached image of ``mi.render``, which will ask for its derivatives later if parameters are attached."""
-        if self._replays:
-            _check_samples(spp)
-            with dr.resume_grad():
-                record = self._record(scene, sensor)
-                self.light_names = record.lights
-                return record.replay(scene, sensor, spp or 1)
+        _check_samples(spp)
         with dr.resume_grad():
-            record = self._record(scene, sensor)
-            waiting, now = record.waiting, ParameterState.of(scene)
+            now = ParameterState.of(scene)
+            record = self._record(scene, sensor, now)
+            if self._replays:
+                return record.replay(scene, sensor, spp or 1)
+            waiting = record.waiting
             waiting.forget_older(now)
             # Where attributes of meshes are read, Mitsuba finds out with its own vertices where on a triangle they are wanted:
             # the image would hang on these.
             alone = not record.renderer.data.with_attributes() and waiting.welcomes(now, sensor)
             if alone and not dr.flag(dr.JitFlag.FreezingScope):
                 inputs = DetachedInputs()
-                image = self.image(scene, sensor, spp, now, inputs)
+                image = record.render(scene, sensor, spp or 1, now, inputs)
                 if dr.grad_enabled(image):
                     waiting.add(sensor, spp or 1, record.renderer.texels, image, inputs)
                 return dr.detach(image)
         with dr.suspend_grad():
-            return self.image(scene, sensor, spp, now)
+            return record.render(scene, sensor, spp or 1, now)
 
     def backward(self, scene: Any, sensor: Any, spp: int, gradient: Any) -> None:
         """Add the gradients of <image, gradient> to the scene's parameters."""
+        _check_samples(spp)
         with dr.resume_grad():
-            record = self._record(scene, sensor)
+            now = ParameterState.of(scene)
+            record = self._record(scene, sensor, now)
             if self._replays and record.replay_backward(scene, sensor, spp or 1, gradient):
                 return
-            now = ParameterState.of(scene)
             pending = record.waiting.take(now, sensor, spp or 1)
             if pending is not None:
                 pending.backward(gradient, record.data(scene, sensor))
                 return
-            image = self.image(scene, sensor, spp, now)
+            image = record.render(scene, sensor, spp or 1, now)
             if dr.grad_enabled(image):
                 backward(image, gradient)
 
-    def image(
-        self, scene: Any, sensor: Any, spp: int, now: ParameterState | None = None, inputs: DetachedInputs | None = None
-    ) -> Any:
-        """Attached image. ``spp`` 0 means not given: one sample, anti-aliased. For the rest see :meth:`SceneCache.render`."""
+    def image(self, scene: Any, sensor: Any, spp: int) -> Any:
+        """Attached image. ``spp`` 0 means not given: one sample, anti-aliased."""
         _check_samples(spp)
-        record = self._record(scene, sensor)
-        self.light_names = record.lights
-        return record.render(scene, sensor, spp or 1, now, inputs)
+        with dr.resume_grad():
+            now = ParameterState.of(scene)
+        return self._record(scene, sensor, now).render(scene, sensor, spp or 1, now)
 
     @property
     def _replays(self) -> bool:
@@ -103,9 +100,9 @@ class Shell:
             names += [label + channel[len(name) :] for channel in aov_names((name,), list(self.light_names))]
         return names
 
-    def _record(self, scene: Any, sensor: Any) -> SceneCache:
+    def _record(self, scene: Any, sensor: Any, now: ParameterState) -> SceneCache:
         for record in self.scenes:
-            if record.matches(scene):
+            if record.matches(scene, now):
                 break
         else:
             # The scene is told from others by its shapes: it may be here again with another topology.
@@ -113,6 +110,7 @@ class Shell:
             known = any(same_objects(other.parts[: len(shapes)], shapes) for other in self.scenes)
             record = SceneCache.build(scene, sensor, self.settings, self.options.tessellation, warn=not known)
         self.scenes = [record, *(other for other in self.scenes if other is not record)][:_REMEMBERED_SCENES]
+        self.light_names = record.lights
         return record
 
 

@@ -53,7 +53,8 @@ class SceneCache:
     warned    whether it was said what frozen functions of users do not see
     untracked  what recordings do not see, and ``untracked_then`` its values when they were made
     colours   of meshes, for which the renderer's creases were found
-    still     passes whose results hold from one image to the next; None before the second image
+    still     passes whose results hold from one image to the next; None before the first image
+    matched   parameters with which the record was last found to be the scene's
     """
 
     parts: tuple[Any, ...]
@@ -73,6 +74,7 @@ class SceneCache:
     checked: Any = None
     warned: bool = False
     still: StillPasses | None = None
+    matched: ParameterState | None = None
 
     @classmethod
     def build(cls, scene: Any, sensor: Any, settings: RenderSettings, tessellation: int, warn: bool = True) -> SceneCache:
@@ -91,14 +93,25 @@ class SceneCache:
         mirrors = MirrorWatch([shape for source in data.sources for shape in source.transformed()])
         return replace(record, sky=sky, mirrors=mirrors, untracked=untracked, colours=renderer.creases.watch(data.sources))
 
-    def matches(self, scene: Any) -> bool:
-        """Whether this record was made for the scene; it is none the worse for moved vertices or other parameter values.
+    def matches(self, scene: Any, now: ParameterState) -> bool:
+        """True if the cached state still fits the scene, with its parameters as they are ``now``.
 
-        Where a lamp, or what is around it, has moved so far that its shadow maps miss some of it, or where the sky shines from
-        elsewhere, it is.
+        Moved vertices and changed parameters do not invalidate it; a lamp that left the range of its maps does, and a sky that
+        shines from elsewhere.
         """
         data = self.renderer.data
-        if not same_objects(self.parts, _parts(scene, data)) or self.sizes != _sizes(data):
+        if not same_objects(self.parts, _parts(scene, data)):
+            return False
+        if self.matched is not None and now.same(self.matched):
+            return True
+        fits = self._fits(scene, data)
+        if fits and not dr.flag(dr.JitFlag.FreezingScope):
+            self.matched = now
+        return fits
+
+    def _fits(self, scene: Any, data: SceneData) -> bool:
+        """Whether the cached state fits a scene of the same objects."""
+        if self.sizes != _sizes(data):
             return False
         statics = _statics(scene, data)
         if not _same_arrays(self.statics, statics):
@@ -114,12 +127,10 @@ class SceneCache:
         """What is read from the scene as it is now, with one sensor, attached to the scene's parameters."""
         return refresh(replace(self.renderer.data, scene=scene), sensors=(sensor,))
 
-    def render(
-        self, scene: Any, sensor: Any, spp: int, now: ParameterState | None = None, inputs: DetachedInputs | None = None
-    ) -> Any:
+    def render(self, scene: Any, sensor: Any, spp: int, now: ParameterState, inputs: DetachedInputs | None = None) -> Any:
         """Image (mi.TensorXf), attached to the scene's parameters unless gradients are suspended.
 
-        ``now``: these parameters, if they have been read. If ``inputs`` is given, the image is attached to these instead of the
+        ``now``: these parameters. If ``inputs`` is given, the image is attached to these instead of the
         vertices, lights and cameras.
         """
         self._name_constants_of_recordings()
@@ -132,14 +143,14 @@ class SceneCache:
         self._remember(scene, sensor, current.frusta, current.soft_frusta)
         return image
 
-    def _passes(self, scene: Any, sensor: Any, spp: int, now: ParameterState | None) -> PassCache:
+    def _passes(self, scene: Any, sensor: Any, spp: int, now: ParameterState) -> PassCache:
         """Results of passes that hold for the next image."""
         if self.still is None:
             self.still = StillPasses(scene, self.renderer.data)
         samples = int(np.prod(sensor.film().crop_size())) * spp
         with dr.resume_grad():  # which parameters are attached
-            states = now or ParameterState.of(scene), ParameterState.of(sensor)
-        return self.still.cache_for(*states, sensor, spp, samples + self.renderer.texels // TEXELS)
+            camera = ParameterState.of(sensor)
+        return self.still.cache_for(now, camera, sensor, spp, samples + self.renderer.texels // TEXELS)
 
     def replay(self, scene: Any, sensor: Any, spp: int) -> Any:
         """The same image, detached, recorded when it is first taken."""

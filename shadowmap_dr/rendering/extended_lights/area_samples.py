@@ -278,11 +278,15 @@ def _importance(centres: np.ndarray, normals: np.ndarray, probes: np.ndarray) ->
     """
     if not len(probes):
         return np.ones(len(centres)), np.zeros(len(centres))
+    # Around a point between them, where products of coordinates lose least.
+    middle = probes.mean(0)
+    centres, probes = centres - middle, probes - middle
     seen, nearest = np.zeros(len(centres)), np.zeros(len(centres))
     for block in np.array_split(np.arange(len(centres)), max(1, len(centres) // 4096)):
-        to = probes[None] - centres[block, None]
-        distance = np.maximum(np.linalg.norm(to, axis=-1), 1e-12)
-        seen[block] = np.maximum((to * normals[block, None]).sum(-1) / distance, 0).mean(-1)
-        nearest[block] = distance.min(-1)
+        own, n = centres[block], normals[block]
+        squared = (own**2).sum(1)[:, None] + (probes**2).sum(1) - 2 * own @ probes.T
+        distance = np.sqrt(np.maximum(squared, 1e-24))
+        seen[block] = (np.maximum(n @ probes.T - (n * own).sum(1)[:, None], 0) / distance).mean(1)
+        nearest[block] = distance.min(1)
     mean = seen.mean()
     return seen / mean + _AWAY if mean > 0 else np.ones(len(centres)), nearest

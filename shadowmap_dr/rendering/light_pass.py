@@ -28,6 +28,7 @@ from .extended_lights import (
     SoftMaps,
     SoftPlan,
     check_soft_sizes,
+    fit_soft_maps,
     make_soft_maps,
     plan_soft,
     samples_of,
@@ -40,7 +41,7 @@ from .gbuffer.surface import Surface
 from .light_colours import white_light
 from .light_loops import MANY_LIGHTS, many_lights
 from .settings import RenderSettings
-from .shadow_pass import MapPlan, light_visibility, make_maps
+from .shadow_pass import MapPlan, fit_maps, light_visibility, make_maps
 
 # Directions over which the light of environments is summed.
 _AMBIENT_DIRECTIONS = 16
@@ -146,6 +147,20 @@ class LightPass:
                 shadow = settings.soft_shadow
                 soft_maps = make_soft_maps(self.soft, samples, self.plan, *common, shadow, fits[1], transparent, points)
         return Lighting(lights, maps, areas, samples, soft_maps)
+
+    def fit(self, shapes: PlacedShapes, seen: tuple[Any, Any]) -> tuple[Frusta | None, SoftFrusta]:
+        """The first fit of the shadow maps, and of those of extended lights. Arguments as of :meth:`lighting`. Detached."""
+        data, settings, geometry = self.data, self.settings, shapes.geometry
+        if not settings.lit or settings.shadow.method == "none":
+            return None, (None, None)
+        with dr.suspend_grad():
+            samples = self._samples(data.areas, geometry)
+            frusta, soft = None, (None, None)
+            if data.lights:
+                frusta = fit_maps(self.plan, data.lights, geometry, settings.shadow, None, seen)
+            if samples:
+                soft = fit_soft_maps(self.soft, samples, self.plan, geometry, settings.soft_shadow, soft, seen)
+            return frusta, soft
 
     def relit(self, maps: tuple[ShadowMaps | None, SoftMaps | None], geometry: Geometry) -> Lighting:
         """The scene's lights as they are now, with the shadow maps of an image of the same places of shapes and lights."""

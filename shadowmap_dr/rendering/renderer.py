@@ -153,9 +153,10 @@ class Renderer:
         # The first fit is made here, so that a step which is recorded later always starts from one.
         if data.sensors:
             with dr.suspend_grad():
-                shapes = renderer.camera_pass.placed(geometry)
-                views = [renderer.camera_pass.view(camera, shapes, 1) for camera in sample_windows(data.sensors[0])]
-                renderer._lighting(views, shapes, None)
+                cameras = renderer.camera_pass
+                shapes = cameras.placed(geometry)
+                views = [cameras.view(camera, shapes, 1) for camera in sample_windows(data.sensors[0])]
+                renderer.frusta, renderer.soft_frusta = renderer.light_pass.fit(shapes, cameras.seen(views, geometry))
         return renderer
 
     def with_data(self, data: SceneData) -> Renderer:

@@ -24,6 +24,7 @@ from ..shadow import (
     LightView,
     ShadowMaps,
     ShadowSettings,
+    Views,
     casting_shapes,
     cube_face,
     cube_views,
@@ -147,6 +148,27 @@ def make_maps(
     ``seen`` points on what the cameras see (Point3f, world space) and a mask of those that count, ``outward`` faces (Bool, F) of
     which the maps of directional lights show the fronts only (:func:`shadowmap_dr.raster.outward_faces`).
     """
+    views, p_light, lanes, frusta = _fitted(plan, lights, geometry, settings, previous, seen)
+    culled = None if transparent is not None else _culled(plan, views.count, outward)
+    return filter_maps(render_maps(p_light, lanes, geometry.faces, topology, views, frusta, settings, transparent, culled))
+
+
+def fit_maps(
+    plan: MapPlan,
+    lights: Sequence[Light],
+    geometry: Geometry,
+    settings: ShadowSettings,
+    previous: Frusta | None,
+    seen: Any = None,
+) -> Frusta:
+    """The fit of the maps of :func:`make_maps`, without rendering them. Arguments as there."""
+    return _fitted(plan, lights, geometry, settings, previous, seen)[3]
+
+
+def _fitted(
+    plan: MapPlan, lights: Sequence[Light], geometry: Geometry, settings: ShadowSettings, previous: Frusta | None, seen: Any
+) -> tuple[Views, Any, Any, Frusta]:
+    """(cameras of all maps, light-space vertices, the map of each of these, the fit)."""
     views = [view for light, kind in zip(lights, plan.kinds, strict=True) for view in _views(plan, light, kind, settings)]
     stacked = stack_views(views)
     p_light, lanes, vertex = vertices_in_maps(stacked, geometry.positions)
@@ -169,9 +191,7 @@ def make_maps(
             settings.receiver_range,
         )
         frusta = _from_beams_on(plan, lights, frusta)
-    culled = None if transparent is not None else _culled(plan, stacked.count, outward)
-    maps = render_maps(p_light, lanes, geometry.faces, topology, stacked, frusta, settings, transparent, culled)
-    return filter_maps(maps)
+    return stacked, p_light, lanes, frusta
 
 
 def _culled(plan: MapPlan, count: int, outward: Any) -> Any:

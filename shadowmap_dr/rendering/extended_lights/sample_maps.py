@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -152,15 +152,54 @@ def make_soft_maps(
     rest is as in :func:`shadowmap_dr.rendering.shadow_pass.make_maps`.
     """
     made: list[ShadowMaps | None] = []
-    for single, setting, fit in zip((False, True), settings, previous, strict=True):
-        own = [(p, s) for p, s in zip(plans, samples, strict=True) if (p.kind == "single") == single]
+    for own, setting, fit in _kinds(plans, samples, settings, previous):
         made.append(_make(own, scene, geometry, topology, setting, fit, transparent, seen) if own else None)
     sampled, single = made
     return SoftMaps(None if sampled is None else filter_maps(sampled), None if single is None else Pyramid.of(single))
 
 
+def fit_soft_maps(
+    plans: Sequence[SoftPlan],
+    samples: Sequence[LightSamples],
+    scene: MapPlan,
+    geometry: Geometry,
+    settings: tuple[ShadowSettings, ShadowSettings],
+    previous: SoftFrusta,
+    seen: Any = None,
+) -> SoftFrusta:
+    """The fit of the maps of :func:`make_soft_maps`, without rendering them. Arguments as there."""
+    kinds = _kinds(plans, samples, settings, previous)
+    sampled, single = (_fitted(own, scene, geometry, setting, fit, seen)[2] if own else None for own, setting, fit in kinds)
+    return sampled, single
+
+
+_Parts = Sequence[tuple[SoftPlan, LightSamples]]
+
+
+def _kinds(
+    plans: Sequence[SoftPlan],
+    samples: Sequence[LightSamples],
+    settings: tuple[ShadowSettings, ShadowSettings],
+    previous: SoftFrusta,
+) -> Iterator[tuple[_Parts, ShadowSettings, Frusta | None]]:
+    """(lights, settings of their maps, fit of an earlier call): of maps for each sample, and of single ones."""
+    for single, setting, fit in zip((False, True), settings, previous, strict=True):
+        yield [(p, s) for p, s in zip(plans, samples, strict=True) if (p.kind == "single") == single], setting, fit
+
+
+def _fitted(
+    lights: _Parts, scene: MapPlan, geometry: Geometry, settings: ShadowSettings, previous: Frusta | None, seen: Any
+) -> tuple[Views, Any, Frusta]:
+    """(cameras of all maps, the shape that each of these does not see, the fit)."""
+    plans = [plan for plan, _ in lights]
+    views = _stack([_views(plan, s, settings) for plan, s in lights])
+    hidden = dr.concat([dr.full(mi.UInt32, plan.hides, plan.maps) for plan in plans])
+    dr.eval(views, hidden)
+    return views, hidden, _fit(views, hidden, scene, geometry, settings, previous, seen)
+
+
 def _make(
-    lights: Sequence[tuple[SoftPlan, LightSamples]],
+    lights: _Parts,
     scene: MapPlan,
     geometry: Geometry,
     topology: Topology,
@@ -170,10 +209,7 @@ def _make(
     seen: Any,
 ) -> ShadowMaps:
     plans = [plan for plan, _ in lights]
-    views = _stack([_views(plan, s, settings) for plan, s in lights])
-    hidden = dr.concat([dr.full(mi.UInt32, plan.hides, plan.maps) for plan in plans])
-    dr.eval(views, hidden)
-    frusta = _fit(views, hidden, scene, geometry, settings, previous, seen)
+    views, hidden, frusta = _fitted(lights, scene, geometry, settings, previous, seen)
     p_light, which, vertex = vertices_in_maps(views, geometry.positions)
     if any(plan.hides != NO_SHAPE for plan in plans):
         own = dr.gather(mi.UInt32, hidden, which) == dr.gather(mi.UInt32, geometry.vertex_shape, vertex)

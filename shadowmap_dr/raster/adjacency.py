@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from .welding import Copies, Index, Places, runs
+from .welding import Copies, Index, runs
 
 Vertices = npt.NDArray[np.uint32]
 
@@ -83,49 +84,52 @@ def pairs_of(halves: Index, keys: Index) -> tuple[Index, Index, Index]:
 
 
 @dataclass(frozen=True)
-class EdgeOrder:
-    """An order of edges that depends on where they are, before all else.
+class EdgeBlocks:
+    """An order of the edges of copies: by the lower half-edge of each, as if no shape were a copy.
 
-    ``places``: of the vertices; ``corners``, ``shapes``: as for :meth:`InnerEdges.of` and ``weld``.
+    Attributes:
+        copies: as for :func:`parts_of`.
+        places: for each group of copies where the edges of each copy begin (copies,); for shapes without a copy where each edge
+            lies.
+        count: of all edges.
     """
 
-    places: Places
-    corners: Vertices
-    shapes: Index | None
+    copies: Sequence[Copies]
+    places: list[Index]
+    count: int
 
-    def __call__(self, halves: Index) -> Index:
-        """The order of edges, given a half-edge of each: by their ends' places, then by shape, corner and face."""
-        keys = edge_keys(self.places.rank, self.corners, halves)
-        order, several = _nearly_ordered(keys)
-        # Few edges lie on one another: only they are sorted by more than their places.
-        tied = order[several]
-        if len(tied):
-            columns = [halves[tied] // 3, halves[tied] % 3, keys[tied]]
-            if self.shapes is not None:
-                columns.insert(2, self.shapes[self.corners[halves[tied]]])
-            order[several] = tied[np.lexsort(columns)]
-        return order
+    @classmethod
+    def of(cls, copies: Sequence[Copies], inner: Sequence[InnerEdges]) -> EdgeBlocks:
+        """``inner``: edges of each group."""
+        groups = list(zip(copies, inner, strict=True))
+        starts = np.concatenate([group.faces for group in copies if len(group.faces) > 1] or [np.zeros(0, np.int64)])
+        sizes = [np.full(len(group.faces), len(edges.pair)) for group, edges in groups if len(group.faces) > 1]
+        order = np.argsort(starts)
+        before = np.concatenate([[0], np.cumsum(np.concatenate(sizes or [np.zeros(0, np.int64)])[order])])
+        lower = [np.minimum(edges.pair, edges.partner) for group, edges in groups if len(group.faces) == 1]
+        single = np.concatenate(lower or [np.zeros(0, np.int64)])
+        places = []
+        for group, edges in groups:
+            if len(group.faces) == 1:
+                places.append(np.arange(len(edges.pair)) + before[np.searchsorted(3 * starts[order], single, "right")])
+            else:
+                places.append(before[np.searchsorted(starts[order], group.faces)] + np.searchsorted(single, 3 * group.faces))
+        return cls(copies, places, len(single) + int(before[-1]))
 
+    def fill(self, values: Sequence[npt.NDArray[np.integer[Any]]], target: npt.NDArray[np.uint32], kind: str) -> None:
+        """Write numbers of edges (E, 2), given for the first copy of each group, for all copies to ``target`` (count.., 2).
 
-def _nearly_ordered(keys: Index) -> tuple[Index, npt.NDArray[np.bool_]]:
-    """(an order of keys (K,) >= 0, places in it whose keys are equal to a neighbour's but for their last bits).
-
-    Keys and their numbers are sorted as one number of 64 bits each, which is several times as fast as `numpy.argsort`. It has the
-    first bits of keys only where there is no room for all.
-    """
-    if not len(keys):
-        return keys, np.zeros(0, bool)
-    bits = len(keys).bit_length()
-    lost = max(0, int(keys.max()).bit_length() + bits - 64)
-    both = keys.astype(np.uint64) >> np.uint64(lost) << np.uint64(bits) | np.arange(len(keys), dtype=np.uint64)
-    both.sort()
-    order = (both & np.uint64((1 << bits) - 1)).astype(np.int64)
-    both >>= np.uint64(bits)
-    equal = both[1:] == both[:-1]
-    several = np.zeros(len(keys), bool)
-    several[1:] = equal
-    several[:-1] |= equal
-    return order, several
+        ``kind``: ``vertices`` or ``faces``, of which the numbers of copies differ.
+        """
+        for group, places, own in zip(self.copies, self.places, values, strict=True):
+            if len(group.faces) == 1:
+                target[places] = own
+                continue
+            first = group.vertices if kind == "vertices" else group.faces
+            shifts = (first - first[0]).astype(np.uint32)
+            own = own.astype(np.uint32)
+            for place, shift in zip(places.tolist(), shifts, strict=True):
+                np.add(own, shift, out=target[place : place + len(own)])
 
 
 def parts_of(copies: Sequence[Copies], corners: Vertices, own: Index) -> tuple[Index, int]:

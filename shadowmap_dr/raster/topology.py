@@ -9,7 +9,7 @@ import drjit as dr
 import numpy as np
 
 from ..jit.arrays import device_array
-from .adjacency import EdgeOrder, InnerEdges, after, edge_keys, pairs_of, parts_of, third
+from .adjacency import EdgeBlocks, InnerEdges, after, edge_keys, pairs_of, parts_of, third
 from .types import NO_VERTEX
 from .welding import Places, copies_of, weld
 
@@ -113,30 +113,23 @@ def build_topology(
     inner = [InnerEdges.of(group, corners, vertices.own) for group in copies]
     alone = np.concatenate([group.repeated(edges.alone, 3) for group, edges in zip(copies, inner, strict=True)])
     one, two, alone = pairs_of(alone, edge_keys(vertices.place, corners, alone))
-    firsts, seconds = (
-        [group.repeated(half, 3) for group, half in zip(copies, halves, strict=True)]
-        for halves in ([edges.pair for edges in inner], [edges.partner for edges in inner])
-    )
-    paired = np.concatenate(firsts)
-    # Where edges lie on one another in an image, the first of them counts.
-    sort = EdgeOrder(located, corners, owners)
-    order, chosen = sort(paired), sort(one)
-    alone, one, two = alone[sort(alone)], one[chosen], two[chosen]
+    # Where outlines of sheets lie on one another in an image, the first of them counts. Their places decide, not the order of
+    # vertices in a file.
+    alone, chosen = (halves[np.argsort(edge_keys(located.rank, corners, halves), kind="stable")] for halves in (alone, one))
+    one, two = chosen, two[np.searchsorted(one, chosen)]
     beyond = np.full(len(corners), NO_VERTEX, np.uint32)
     for group, edges in zip(copies, inner, strict=True):
         beyond[edges.pair], beyond[edges.partner] = edges.thirds[:, 1], edges.thirds[:, 0]
         group.fill(beyond)
     beyond[one], beyond[two] = third(corners, two), third(corners, one)
+    blocks = EdgeBlocks.of(copies, inner)
     # Those between shapes come last, and each of them again, without extent, as an edge of its other face.
-    count = [len(edges.pair) * len(group.faces) for group, edges in zip(copies, inner, strict=True)]
-    start, rest = np.cumsum([0, *count]), np.concatenate([alone, one])
-    ends, thirds = np.empty((start[-1] + len(rest), 2), np.uint32), np.empty((start[-1] + len(rest), 2), np.uint32)
-    for group, edges, first, last in zip(copies, inner, start[:-1], start[1:], strict=True):
-        group.copy_vertices(edges.ends, ends[first:last])
-        group.copy_vertices(edges.thirds, thirds[first:last])
-    ends[: start[-1]], thirds[: start[-1]] = ends[order], thirds[order]
-    ends[start[-1] :, 0], ends[start[-1] :, 1] = corners[rest], corners[after(rest)]
-    thirds[start[-1] :, 0], thirds[start[-1] :, 1] = third(corners, rest), beyond[rest]
+    count, rest = blocks.count, np.concatenate([alone, one])
+    ends, thirds = np.empty((count + len(rest), 2), np.uint32), np.empty((count + len(rest), 2), np.uint32)
+    blocks.fill([edges.ends for edges in inner], ends, "vertices")
+    blocks.fill([edges.thirds for edges in inner], thirds, "vertices")
+    ends[count:, 0], ends[count:, 1] = corners[rest], corners[after(rest)]
+    thirds[count:, 0], thirds[count:, 1] = third(corners, rest), beyond[rest]
     seams = None
     if len(one):
         other = np.stack([corners[two], corners[after(two)]], 1)
@@ -146,8 +139,9 @@ def build_topology(
         thirds = np.concatenate([thirds, np.full_like(other, NO_VERTEX)])
     veiled = (None, None)
     if see_through_faces is not None:
-        first, second = (values if order is None else values[order] for values in (paired, np.concatenate(seconds)))
-        owner = np.stack([np.concatenate([first, alone, one, two]), np.concatenate([second, alone, two, two])], 1) // 3
+        owner = np.empty((len(ends), 2), np.uint32)
+        blocks.fill([np.stack([edges.pair, edges.partner], 1) // 3 for edges in inner], owner, "faces")
+        owner[count:, 0], owner[count:, 1] = np.concatenate([rest, two]) // 3, np.concatenate([alone, two, two]) // 3
         veiled = device_array(dr.mask_t(dtype), see_through_faces), device_array(dtype, owner)
     parts, part_count = parts_of(copies, corners, vertices.own)
     return Topology(

@@ -101,11 +101,6 @@ class Copies:
         """Numbers that belong to the first copy (N,), for all of them (copies * N,): greater by ``step`` for each face."""
         return (values + step * (self.faces - self.faces[0])[:, None]).ravel()
 
-    def copy_vertices(self, values: npt.NDArray[np.uint32], target: npt.NDArray[np.uint32]) -> None:
-        """Write vertices of the first copy (N, 2) for all of them, one after the other, to ``target`` (copies * N, 2)."""
-        shift = (self.vertices - self.vertices[0]).astype(np.uint32)
-        np.add(values, shift[:, None, None], out=target.reshape(len(shift), *values.shape))
-
     def fill(self, target: npt.NDArray[np.uint32], shift: Index | None = None) -> None:
         """Copy numbers of the faces of the first copy to the places of the others in ``target``, (F,) or (3 F,).
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +11,9 @@ from ..scene.load import SceneData
 from ..scene.mitsuba_objects import children, is_attribute, owners
 from .deferred import MOST_SAMPLES
 from .parameter_state import ParameterState
+
+#: Names of the parameters of a scene that must stay for each level to hold.
+NamesByLevel = dict[Still, list[str]]
 
 
 @dataclass
@@ -26,30 +29,36 @@ class _Known:
 
 
 class StillPasses:
-    """Results of passes for each sensor of a scene.
+    """Results of passes for each sensor of a scene."""
 
-    Args:
-        scene: the ``mi.Scene``.
-        data: its records.
-    """
-
-    def __init__(self, scene: Any, data: SceneData) -> None:
-        self._names = _names_by_level(scene, data)
+    def __init__(self) -> None:
+        self._names: NamesByLevel | None = None
         self._known: list[_Known] = []
 
-    def cache_for(self, scene: ParameterState, camera: ParameterState, sensor: Any, spp: int, weight: int) -> PassCache:
+    def cache_for(
+        self,
+        scene: ParameterState,
+        camera: ParameterState,
+        sensor: Any,
+        spp: int,
+        weight: int,
+        names: Callable[[], NamesByLevel],
+    ) -> PassCache:
         """What the next image of a sensor may use, and leave to later ones.
 
         Args:
             scene, camera: parameters as they are now.
             sensor, spp: of the image.
             weight: what the memory for the image's passes grows with, in samples.
+            names: makes :func:`names_by_level` of the scene. Called at the second image.
         """
+        if self._names is None and self._known:
+            self._names = names()
         known = next((one for one in self._known if one.sensor is sensor and one.spp == spp), None)
         if known is None or known.weight != weight:
             known = _Known(sensor, spp, weight, scene, camera, PassCache())
         else:
-            known.cache.keep(self._still(known, scene, camera))
+            known.cache.keep(_still(known, scene, camera, self._names or names()))
             known.scene, known.camera = scene, camera
         others = [one for one in self._known if one.sensor is not sensor or one.spp != spp]
         room = MOST_SAMPLES
@@ -65,26 +74,27 @@ class StillPasses:
         for known in self._known:
             known.cache.forget_edges()
 
-    def _still(self, known: _Known, scene: ParameterState, camera: ParameterState) -> Still:
-        # Parameters that have come since may mean anything.
-        if camera.attached or not camera.same(known.camera) or len(scene.numbers) != len(known.scene.numbers):
-            return Still.NOTHING
-        attached, still = set(scene.attached), Still.NOTHING
-        for level in (Still.VIEW, Still.LIGHTS, Still.RADIANCE):
-            names = self._names[level]
-            if attached.intersection(names) or not scene.same(known.scene, names):
-                return still
-            still = level
-        return still
+
+def _still(known: _Known, scene: ParameterState, camera: ParameterState, names: NamesByLevel) -> Still:
+    """What has stayed since the last image, and is not attached."""
+    # Parameters that have come since may mean anything.
+    if camera.attached or not camera.same(known.camera) or len(scene.numbers) != len(known.scene.numbers):
+        return Still.NOTHING
+    attached, still = set(scene.attached), Still.NOTHING
+    for level in (Still.VIEW, Still.LIGHTS, Still.RADIANCE):
+        if attached.intersection(names[level]) or not scene.same(known.scene, names[level]):
+            return still
+        still = level
+    return still
 
 
-def _names_by_level(scene: Any, data: SceneData) -> dict[Still, list[str]]:
+def names_by_level(scene: Any, data: SceneData) -> NamesByLevel:
     """Names of the parameters of a scene that must stay for each level to hold. Those of materials and sensors are left out."""
     emitters, cameras = set(scene.emitters()), set(_below(scene.sensors()))
     materials, lights = set(_below({source.shape.bsdf() for source in data.sources})), set(_below(emitters))
     # Alpha tests decide on what is seen.
     solid = not any(info.see_through for info in data.geometry.shapes)
-    names: dict[Still, list[str]] = {level: [] for level in Still}
+    names: NamesByLevel = {level: [] for level in Still}
     for name, node in owners(scene):
         shared = node in materials and node in lights
         if node in cameras:

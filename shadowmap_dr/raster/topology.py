@@ -11,7 +11,7 @@ import numpy as np
 from ..jit.arrays import device_array
 from .adjacency import EdgeBlocks, InnerEdges, after, edge_keys, pairs_of, parts_of, third
 from .types import NO_VERTEX
-from .welding import Places, copies_of, weld
+from .welding import Index, Places, copies_of, weld
 
 
 @dataclass(frozen=True)
@@ -106,8 +106,7 @@ def build_topology(
         raise ValueError(f"faces refer to vertices {low}..{high}, but there are {len(positions)}")
     faces = np.ascontiguousarray(faces, np.uint32)
     owners = None if shapes is None else np.asarray(shapes, np.int64)
-    located = Places.of(positions)
-    vertices = weld(located, owners)
+    vertices = weld(positions, owners)
     copies = copies_of(faces, vertices.own, owners)
     corners, places = faces.ravel(), vertices.place.astype(np.uint32)[faces.ravel()]
     inner = [InnerEdges.of(group, corners, vertices.own) for group in copies]
@@ -115,7 +114,7 @@ def build_topology(
     one, two, alone = pairs_of(alone, edge_keys(vertices.place, corners, alone))
     # Where outlines of sheets lie on one another in an image, the first of them counts. Their places decide, not the order of
     # vertices in a file.
-    alone, chosen = (halves[np.argsort(edge_keys(located.rank, corners, halves), kind="stable")] for halves in (alone, one))
+    alone, chosen = (_by_place(halves, corners, positions) for halves in (alone, one))
     one, two = chosen, two[np.searchsorted(one, chosen)]
     beyond = np.full(len(corners), NO_VERTEX, np.uint32)
     for group, edges in zip(copies, inner, strict=True):
@@ -155,6 +154,18 @@ def build_topology(
         seams,
         *veiled,
     )
+
+
+def _by_place(halves: Index, corners: np.ndarray, positions: np.ndarray) -> Index:
+    """Half-edges (ascending) in the order of the places of their ends, and those at the same place as they are."""
+    if not len(halves):
+        return halves
+    marked = np.zeros(len(positions), bool)
+    marked[corners[halves]] = marked[corners[after(halves)]] = True
+    used = np.flatnonzero(marked)
+    rank = np.zeros(len(positions), np.int64)
+    rank[used] = Places.of(positions[used]).rank
+    return halves[np.argsort(edge_keys(rank, corners, halves), kind="stable")]
 
 
 def _in_threes(name: str, count: str, values: np.ndarray) -> np.ndarray:

@@ -76,13 +76,12 @@ def plan_maps(lights: Sequence[Light], geometry: Geometry) -> MapPlan:
     sizes = [6 if kind == "cube" else 1 for kind in kinds]
     positions = dr.detach(geometry.positions).numpy().reshape(-1, 3)
     faces = geometry.faces.numpy().reshape(-1, 3)
-    planes = []
-    for info in geometry.shapes:
-        largest = 0
-        if info.planar:
+    planes = [info.face_start for info in geometry.shapes]
+    for k, info in enumerate(geometry.shapes):
+        if info.planar and info.face_count > 1:
             own = positions[faces[info.face_start : info.face_start + info.face_count]].astype(np.float64)
-            largest = int(np.argmax(np.linalg.norm(np.cross(own[:, 1] - own[:, 0], own[:, 2] - own[:, 0]), axis=1)))
-        planes.append(info.face_start + largest)
+            n = np.cross(own[:, 1] - own[:, 0], own[:, 2] - own[:, 0])
+            planes[k] += int(np.argmax((n**2).sum(1)))
     columns = [column.astype(np.float64) for column in positions.T]
     center = [0.5 * (column.min() + column.max()) for column in columns]
     return MapPlan(

@@ -171,7 +171,7 @@ def test_copies_have_the_edges_of_single_shapes(variant: str, monkeypatch: pytes
     points = np.concatenate(parts).astype(np.float32)
     merged = np.concatenate([own + len(roof) * k for k, own in enumerate(faces)])
     shapes = np.repeat(np.arange(6), len(roof))
-    sizes = [len(group.faces) for group in welding.copies_of(merged, welding.weld(welding.Places.of(points), shapes).own, shapes)]
+    sizes = [len(group.faces) for group in welding.copies_of(merged, welding.weld(points, shapes).own, shapes)]
     assert sorted(sizes) == [1, 4]  # what has no copy is one group
     see_through = np.arange(len(merged)) % 2 == 0
     copied = build_topology(merged, points, mi.UInt32, shapes, see_through)
@@ -194,8 +194,8 @@ def test_vertices_are_welded_where_they_are_equal() -> None:
     equal = (points[:, None] == points).all(-1)
     place = equal.argmax(1)
     own = (equal & (shapes[:, None] == shapes)).argmax(1)
-    located = welding.Places.of(points)
-    assert (located.rank == np.unique(points, axis=0, return_inverse=True)[1].ravel()).all()
-    found = welding.weld(located, shapes)
+    assert (welding.Places.of(points).rank == np.unique(points, axis=0, return_inverse=True)[1].ravel()).all()
+    found = welding.weld(points, shapes)
     assert (found.place == place).all() and (found.own == own).all()
-    assert (welding.weld(located, None).own == place).all()
+    assert (welding.weld(points, None).own == place).all()
+    assert (welding.weld(points[:1], shapes[:1]).place == [0]).all()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -12,6 +13,19 @@ import pytest
 from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[2]
+SUPPORT = ROOT / "tests" / "support"
+# As a script, but for how kernels are compiled.
+QUICKLY = "import quick_kernels, runpy, sys; del sys.argv[0]; runpy.run_path(sys.argv[0], run_name='__main__')"
+
+
+def output_of(script: str, *options: object) -> str:
+    """What an example prints that runs for a moment. Its kernels are compiled as those of tests."""
+    command = [sys.executable, "-c", QUICKLY, ROOT / "docs" / "examples" / script, *options]
+    paths = os.pathsep.join([str(SUPPORT), os.environ.get("PYTHONPATH", "")]).strip(os.pathsep)
+    environment = {**os.environ, "PYTHONPATH": paths}
+    result = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=300, cwd=ROOT, env=environment)
+    assert result.returncode == 0, result.stderr
+    return result.stdout
 
 
 def test_a_mesh_takes_the_shape_of_its_shadow(tmp_path: Path) -> None:
@@ -31,33 +45,24 @@ def test_a_mesh_takes_the_shape_of_its_shadow(tmp_path: Path) -> None:
 
 
 def test_ways_to_render_are_timed_in_turns() -> None:
-    script = ROOT / "docs" / "examples" / "plugin_speed.py"
-    command = [sys.executable, script, "--resolution", "16", "--rounds", "2"]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=ROOT)
-    assert result.returncode == 0, result.stderr
-    steps = dict(re.findall(r"^(.+): ([0-9.]+) ms a step", result.stdout, re.MULTILINE))
+    output = output_of("plugin_speed.py", "--resolution", "16", "--rounds", "2")
+    steps = dict(re.findall(r"^(.+): ([0-9.]+) ms a step", output, re.MULTILINE))
     assert list(steps) == ["plug-in", "plug-in, recorded", "renderer, recorded"] and min(map(float, steps.values())) > 0
 
 
 def test_steps_of_all_kinds_are_timed() -> None:
-    script = ROOT / "docs" / "examples" / "step_kinds.py"
-    command = [sys.executable, script, "--resolution", "16", "--seconds", "0"]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=ROOT)
-    assert result.returncode == 0, result.stderr
-    steps = dict(re.findall(r"^(.+): ([0-9.]+) ms a step", result.stdout, re.MULTILINE))
+    output = output_of("step_kinds.py", "--resolution", "16", "--seconds", "0")
+    steps = dict(re.findall(r"^(.+): ([0-9.]+) ms a step", output, re.MULTILINE))
     assert len(steps) == 10 and "frozen" in steps and min(map(float, steps.values())) > 0
 
 
 @pytest.mark.parametrize("setting", [[], ["--setting", "2/2/8/none/4"]])  # the fair one: ratios above a thousand
 def test_steps_are_timed_in_turns(setting: list[str]) -> None:
-    script = ROOT / "docs" / "examples" / "pose_speed.py"
-    command = [sys.executable, script, "--resolution", "16", "--rounds", "1", *setting]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=ROOT)
-    assert result.returncode == 0, result.stderr
-    assert ("2/2/8 none, 4" in result.stdout) == bool(setting)
-    steps = {name: float(value) for name, value in re.findall(r"^(\w+): ([0-9.]+) ms a step", result.stdout, re.MULTILINE)}
+    output = output_of("pose_speed.py", "--resolution", "16", "--rounds", "1", *setting)
+    assert ("2/2/8 none, 4" in output) == bool(setting)
+    steps = {name: float(value) for name, value in re.findall(r"^(\w+): ([0-9.]+) ms a step", output, re.MULTILINE)}
     assert steps.keys() == {"shadows", "rasterizer", "mitsuba"} and min(steps.values()) > 0
-    ratios = {pair: float(value) for pair, value in re.findall(r"^(\w+ / \w+): ([0-9.]+)x$", result.stdout, re.MULTILINE)}
+    ratios = {pair: float(value) for pair, value in re.findall(r"^(\w+ / \w+): ([0-9.]+)x$", output, re.MULTILINE)}
     assert ratios.keys() == {"mitsuba / shadows", "mitsuba / rasterizer", "shadows / rasterizer"}
     for pair, ratio in ratios.items():  # plain numbers, also above a thousand
         above, below = pair.split(" / ")
@@ -65,20 +70,14 @@ def test_steps_are_timed_in_turns(setting: list[str]) -> None:
 
 
 def test_steps_are_timed_again_and_again() -> None:
-    script = ROOT / "docs" / "examples" / "step_phases.py"
-    command = [sys.executable, script, "--resolution", "16", "24", "--seconds", "0.1"]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=ROOT)
-    assert result.returncode == 0, result.stderr
-    times = re.findall(r"(\d+) threads: ([0-9.]+) ([0-9.]+)", result.stdout)
+    output = output_of("step_phases.py", "--resolution", "16", "24", "--seconds", "0.1")
+    times = re.findall(r"(\d+) threads: ([0-9.]+) ([0-9.]+)", output)
     assert times and times[-1][0] == "1" and all(float(value) > 0 for row in times for value in row)
 
 
 def test_limits_are_measured() -> None:
-    script = ROOT / "docs" / "examples" / "limits.py"
-    command = [sys.executable, script, "--size", "24", "--samples", "1"]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=ROOT)
-    assert result.returncode == 0, result.stderr
-    lines = re.findall(r"^(.+), 1 samples: cosine (-?[0-9.]+), scale (-?[0-9.]+)$", result.stdout, re.MULTILINE)
+    output = output_of("limits.py", "--size", "24", "--samples", "1")
+    lines = re.findall(r"^(.+), 1 samples: cosine (-?[0-9.]+), scale (-?[0-9.]+)$", output, re.MULTILINE)
     assert len(lines) == 8
     found = {name: (float(cosine), float(scale)) for name, cosine, scale in lines}
     # The right direction, and not the right size.

@@ -400,6 +400,8 @@ def _measure(options: BenchOptions, name: str, done: Mapping[str, Any], update: 
                 if step >= _WARM_UP:
                     seconds[key].append(spent)
     result = {"size": size, "original": loop.original, **compare(seconds, [("original", "ours")])}
+    # With the steps before which a loop loads its scene again, and renders its reference.
+    result["ratio_of_totals"] = sum(seconds["original"]) / sum(seconds["ours"])
     result["errors"] = {key: {"first": values[0], "last": values[-1]} for key, values in errors.items()}
     if options.what.loop_steps:
         update(0, 1, f"{options.what.loop_steps} steps")

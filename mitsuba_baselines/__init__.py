@@ -1,4 +1,4 @@
-"""What shadowmap_dr is compared with: references and pose estimation by Mitsuba's own integrators.
+"""Baselines for shadowmap_dr: references and pose estimation by Mitsuba's own integrators.
 
 Modules: `reference` (path-traced images), `unshadowed` (the same without shadow rays), `proxy` (an area light that
 stands in for a directional one) and `pose` (pose estimation with `direct_projective`). None uses the rasterizer.

@@ -15,7 +15,7 @@ from .reference import Reference, path_traced
 
 @dataclass(frozen=True)
 class Agreement:
-    """How well an automatic derivative image a agrees with a reference f; both numbers count.
+    """Agreement of an automatic derivative image a with a reference f; both numbers count.
 
     Attributes:
         cosine: <a, f> / (|a| |f|), 1 for equal up to a factor.

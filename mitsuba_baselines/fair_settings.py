@@ -92,7 +92,7 @@ def is_fair(setting: ProjectiveSetting, resolution: int, normals: str = "face", 
 
 
 def is_searched(normals: str = "face") -> bool:
-    """Whether a stored search has found a setting with normals "face" or "vertex", at any resolution."""
+    """True if a stored search has found a setting with normals "face" or "vertex", at any resolution."""
     return any(entry["setting"] and entry.get("normals", "face") == normals for entry in _stored().values())
 
 
@@ -207,7 +207,7 @@ def find_fair_setting(
 
 
 def _complete(entry: Mapping[str, Any], starts: int, threshold_deg: float) -> bool:
-    """Whether a candidate has run from all starts, or lost one, so that no more need be known."""
+    """True if a candidate has run from all starts, or lost one, so that no more need be known."""
     runs = entry["runs"]
     return len(runs) >= starts or any(not run["mean_error_deg_last_20"] <= threshold_deg for run in runs)
 

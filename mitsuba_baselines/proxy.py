@@ -192,7 +192,7 @@ def _directional(scene: mi.Scene, light: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _shadow(scene: mi.Scene, receiver: str, casters: tuple[str, ...], direction: np.ndarray) -> tuple[float, float]:
-    """Where the first sensor sees a shadow on the receiver: the largest ratio of the farthest caster's distance along the
+    """Shadow on the receiver that the first sensor sees: the largest ratio of the farthest caster's distance along the
     light to the width of a pixel (across its ray), and the smallest width of a pixel."""
     sensor = scene.sensors()[0]
     width, height = (int(size) for size in sensor.film().crop_size())

@@ -26,7 +26,7 @@ class OutputError(ShadowmapError, OSError):
 
 
 def is_interrupt(error: BaseException | None) -> bool:
-    """Whether an error is Ctrl-C, or what Dr.Jit makes of it where it comes while a recorded function is replayed."""
+    """True if an error is Ctrl-C, or what Dr.Jit makes of it where it comes while a recorded function is replayed."""
     while error is not None:
         if isinstance(error, KeyboardInterrupt):
             return True

@@ -1,4 +1,4 @@
-"""Which LLVM library a process ends up with. Each case runs in a process of its own: Dr.Jit loads LLVM only once."""
+"""Choice of the LLVM library of a process. Each case runs in a process of its own: Dr.Jit loads LLVM only once."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def run(code: str, **environment: str | None) -> subprocess.CompletedProcess[str
 
 
 def installed_hook() -> bool:
-    """Whether this environment has the start-up file that serves scripts which import mitsuba first."""
+    """True if this environment has the start-up file that serves scripts which import mitsuba first."""
     return any(Path(folder, "shadowmap_dr_llvm.pth").is_file() for folder in sys.path if folder)
 
 

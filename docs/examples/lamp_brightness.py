@@ -1,4 +1,4 @@
-"""How bright area lights of all shapes are, near and far, against a dense sum over each lamp. Nothing casts shadows.
+"""Brightness of area lights of all shapes, near and far, against a dense sum over each lamp. Nothing casts shadows.
 
     python docs/examples/lamp_brightness.py [--samples 32] [--out lamp_brightness.json]
 

@@ -1,4 +1,4 @@
-"""How quickly a mesh follows a brush, from the mouse to the picture: measured in a real browser that is driven like a user's.
+"""Time from the mouse to the picture while a mesh follows a brush: measured in a real browser that is driven like a user's.
 
 Starts ``shadowmap-dr model sphere --serve``, paints on the shadow with mouse events, and lets the page tell when the mesh has
 moved. Needs Chromium and ``pip install '.[test]'``.

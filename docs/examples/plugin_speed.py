@@ -1,4 +1,4 @@
-"""What a step costs through `mi.render`, through `mi.render` recorded, and with a recorded `Renderer`, in turns.
+"""Time of a step through `mi.render`, through `mi.render` recorded, and with a recorded `Renderer`, in turns.
 
     python docs/examples/plugin_speed.py [--scene pose] [--shape object] [--resolution 128] [--rounds 50]
 

@@ -1,4 +1,4 @@
-"""What steps cost that differentiate by parameters of different kinds, under different lights.
+"""Time of steps that differentiate by parameters of different kinds, under different lights.
 
     python docs/examples/step_kinds.py [--resolution 1024] [--variant llvm_ad_rgb] [--seconds 2.5] [KIND ...]
 

@@ -18,7 +18,7 @@ from ..errors import ShadowmapError, is_interrupt
 
 @dataclass(frozen=True)
 class Command:
-    """Where a command is defined: a function, or a group of commands, of a module of this package; and what help says of it."""
+    """Definition of a command: a function, or a group of commands, of a module of this package; and its line in the help."""
 
     module: str
     function: str
@@ -134,7 +134,7 @@ def main() -> None:
 
 
 def _drop_output() -> None:
-    """What is still buffered and cannot be written goes nowhere: the interpreter would try again at exit, and complain."""
+    """Send output that is still buffered and cannot be written nowhere: the interpreter would try again at exit, and complain."""
     try:
         sys.stdout.flush()
     except OSError:

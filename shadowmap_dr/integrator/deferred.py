@@ -70,11 +70,11 @@ class DeferredImage:
 
     @property
     def weight(self) -> int:
-        """What the memory for the image grows with, in samples."""
+        """Measure of the image's memory, in samples."""
         return self.samples + self.texels // TEXELS
 
     def is_of(self, sensor: Any, spp: int) -> bool:
-        """Whether it shows what a sensor sees now."""
+        """True if it shows what a sensor sees now."""
         return sensor is self.sensor and spp == self.spp and ParameterState.of(sensor).same(self.camera)
 
     def backward(self, gradient: Any, data: SceneData) -> None:
@@ -107,7 +107,7 @@ class DeferredImages:
             self._state, self._images = now, []
 
     def welcomes(self, now: ParameterState, sensor: Any) -> bool:
-        """Whether an image of the scene as it is now would be attached to :class:`DetachedInputs` alone."""
+        """True if an image of the scene as it is now would be attached to :class:`DetachedInputs` alone."""
         attached = (*now.attached, *ParameterState.of(sensor).attached)
         return bool(attached) and all(name.endswith(_READ) for name in attached)
 

@@ -1,4 +1,4 @@
-"""Which integrators of Mitsuba's hold one of this package."""
+"""Integrators of Mitsuba's that hold one of this package."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Nesting:
                 self._outer.add(outer)
 
     def allows(self) -> bool:
-        """Whether rays may be asked for. Called by ``sample``."""
+        """True if rays may be asked for. Called by ``sample``."""
         outer = _outer(sys._getframe(2))
         return self._nested and (outer is None or outer in self._outer)
 

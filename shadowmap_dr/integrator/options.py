@@ -61,29 +61,29 @@ class Options:
     compat                 conventions of Worchel and Alexa's code
     """
 
-    shadow_map_resolution: int = 256
-    shadow_method: str = "auto"
-    shadow_filter: str = "gaussian"
-    shadow_filter_size: int = 3
-    shadow_antialias: bool = True
-    shadow_bleeding: float = 0.0
-    shadow_order: int = 4
-    shadow_supersampling: int = 1
-    shadow_receiver_range: bool = True
-    shadow_cull_backfaces: bool = False
-    shadow_samples: int = 0
-    area_light_samples: int = 32
-    environment_light_samples: int = 64
-    soft_map_resolution: int = 128
-    emitter_shadows: str = "samples"
-    antialias: bool = True
-    ambient: float = 0.0
-    hide_emitters: bool = False
-    max_depth: int = DIRECT
+    shadow_map_resolution: int = ShadowSettings.resolution
+    shadow_method: str = ShadowSettings.method
+    shadow_filter: str = ShadowSettings.filter
+    shadow_filter_size: int = ShadowSettings.filter_size
+    shadow_antialias: bool = ShadowSettings.antialias
+    shadow_bleeding: float = ShadowSettings.bleeding
+    shadow_order: int = ShadowSettings.order
+    shadow_supersampling: int = ShadowSettings.supersampling
+    shadow_receiver_range: bool = ShadowSettings.receiver_range
+    shadow_cull_backfaces: bool = ShadowSettings.cull_backfaces
+    shadow_samples: int = RenderSettings.shadow_samples
+    area_light_samples: int = RenderSettings.area_light_samples
+    environment_light_samples: int = RenderSettings.environment_light_samples
+    soft_map_resolution: int = RenderSettings.soft_map_resolution
+    emitter_shadows: str = RenderSettings.emitter_shadows
+    antialias: bool = RenderSettings.antialias
+    ambient: float = RenderSettings.ambient
+    hide_emitters: bool = RenderSettings.hide_emitters
+    max_depth: int = RenderSettings.max_depth
     aovs: str = ""
     tessellation: int = 64
     recorded: bool = False
-    compat: bool = False
+    compat: bool = ShadowSettings.compat
 
     @classmethod
     def from_properties(cls, props: Any) -> Options:
@@ -128,39 +128,13 @@ class Options:
         """The same as the renderer wants it. Raises ShadowmapError for values out of range."""
         if self.tessellation < 3:
             raise ShadowmapError(f"tessellation is {self.tessellation}: spheres need at least 3 triangles around them.")
-        try:
-            shadow = ShadowSettings(
-                method=self.shadow_method,
-                resolution=self.shadow_map_resolution,
-                filter=self.shadow_filter,
-                filter_size=self.shadow_filter_size,
-                antialias=self.shadow_antialias,
-                compat=self.compat,
-                bleeding=self.shadow_bleeding,
-                order=self.shadow_order,
-                supersampling=self.shadow_supersampling,
-                receiver_range=self.shadow_receiver_range,
-                cull_backfaces=self.shadow_cull_backfaces,
-            )
-        except ValueError as error:
-            raise ShadowmapError(str(error)) from None
-        return RenderSettings(
-            shadow=shadow,
-            antialias=self.antialias,
-            ambient=self.ambient,
-            hide_emitters=self.hide_emitters,
-            max_depth=self.max_depth,
-            shadow_samples=self.shadow_samples,
-            area_light_samples=self.area_light_samples,
-            environment_light_samples=self.environment_light_samples,
-            soft_map_resolution=self.soft_map_resolution,
-            emitter_shadows=self.emitter_shadows,
-            aovs=tuple(name for _, name in self.labelled_aovs),
-        )
+        own = ("aovs", "tessellation", "recorded")
+        settings = {option.name: getattr(self, option.name) for option in fields(self) if option.name not in own}
+        return RenderSettings.of(**settings, aovs=tuple(name for _, name in self.labelled_aovs))
 
 
 def _near(name: str, known: list[str]) -> str:
-    """What is known, and what is meant, perhaps."""
+    """The known names, and the one that is meant, perhaps."""
     nearest = get_close_matches(name, known, 1)
     return f"it has {', '.join(known)}" + (f"; the nearest is '{nearest[0]}'" if nearest else "")
 

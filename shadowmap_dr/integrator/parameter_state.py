@@ -44,7 +44,7 @@ class ParameterState:
         return cls(numbers, tuple(attached), held)
 
     def same(self, other: ParameterState, names: Iterable[str] | None = None) -> bool:
-        """Whether parameters (all, or those of these names) are the same in both."""
+        """True if parameters (all, or those of these names) are the same in both."""
         if names is None:
             return self.numbers == other.numbers
         return all(self.numbers.get(name) == other.numbers.get(name) for name in names)

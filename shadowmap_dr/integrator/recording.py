@@ -40,7 +40,7 @@ class FrozenPasses:
 
     @property
     def recordings(self) -> int:
-        """How many there have been."""
+        """Number of recordings so far."""
         return self._image.n_recordings + self._gradients.n_recordings
 
 

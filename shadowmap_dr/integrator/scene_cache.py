@@ -1,4 +1,4 @@
-"""What the plug-in keeps of a scene from one rendering to the next."""
+"""State that the plug-in keeps of a scene from one rendering to the next."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _REMEMBERED_SENSORS, _OTHERS = 64, 8
 
 @dataclass
 class SceneCache:
-    """What stays the same between renderings of a scene.
+    """State that stays the same between renderings of a scene.
 
     The scene itself is not kept: it may own the integrator that owns this record.
 
@@ -111,7 +111,7 @@ class SceneCache:
         return fits
 
     def _fits(self, scene: Any, data: SceneData) -> bool:
-        """Whether the cached state fits a scene of the same objects."""
+        """True if the cached state fits a scene of the same objects."""
         if self.sizes != _sizes(data):
             return False
         statics = _statics(scene, data)
@@ -125,7 +125,7 @@ class SceneCache:
             return still and still_aimed(self.renderer.soft, lambda: with_positions(data))
 
     def data(self, scene: Any, sensor: Any) -> SceneData:
-        """What is read from the scene as it is now, with one sensor, attached to the scene's parameters."""
+        """Records of the scene as it is now, with one sensor, attached to the scene's parameters."""
         return refresh(replace(self.renderer.data, scene=scene), sensors=(sensor,))
 
     def render(self, scene: Any, sensor: Any, spp: int, now: ParameterState, inputs: DetachedInputs | None = None) -> Any:

@@ -44,7 +44,7 @@ class StillPasses:
         weight: int,
         names: Callable[[], NamesByLevel],
     ) -> PassCache:
-        """What the next image of a sensor may use, and leave to later ones.
+        """Results that the next image of a sensor may use, and leave to later ones.
 
         Args:
             scene, camera: parameters as they are now.
@@ -76,7 +76,7 @@ class StillPasses:
 
 
 def _still(known: _Known, scene: ParameterState, camera: ParameterState, names: NamesByLevel) -> Still:
-    """What has stayed since the last image, and is not attached."""
+    """The level of all that has stayed since the last image, and is not attached."""
     # Parameters that have come since may mean anything.
     if camera.attached or not camera.same(known.camera) or len(scene.numbers) != len(known.scene.numbers):
         return Still.NOTHING

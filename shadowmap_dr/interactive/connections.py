@@ -41,7 +41,7 @@ class _Client:
 
 
 class Connections:
-    """What pages share. Lives in the event loop's thread; all work on meshes is done in the session's.
+    """State that pages share. Lives in the event loop's thread; all work on meshes is done in the session's.
 
     Each page has a task that sends whatever it lacks of the newest state. What a slow page misses is never queued.
 
@@ -152,7 +152,7 @@ class Connections:
                     await send(content)
 
     def _news(self, client: _Client) -> list[str | bytes]:
-        """What the page does not know yet. It hears of a movement before it sees a frame of it, of rest after the last one."""
+        """Messages that the page has not had yet: of a movement before its first frame, of rest after the last one."""
         # In this order, the status is not older than the snapshot.
         snapshot, status = self.session.snapshot, self.session.status
         target: list[str | bytes] = []

@@ -1,4 +1,4 @@
-"""What server and page tell each other: JSON texts, and binary records for meshes and images.
+"""Messages between server and page: JSON texts, and binary records for meshes and images.
 
 The page sends JSON objects of these types; anything else ends its connection:
 
@@ -127,7 +127,7 @@ def hello(view: ShadowView, name: str) -> str:
 
 
 def status(state: Status) -> str:
-    """What the optimiser does."""
+    """Status of the optimiser."""
     return json.dumps({"type": "status", "phase": state.phase, "message": state.message})
 
 

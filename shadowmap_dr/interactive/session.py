@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Status:
-    """What the optimiser does; the message says why it has failed."""
+    """Status of the optimiser; the message says why it has failed."""
 
     phase: Phase
     message: str = ""

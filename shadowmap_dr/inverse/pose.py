@@ -133,7 +133,7 @@ class PoseFit:
             self._renderer.frusta = replace(self._renderer.frusta, **stored)
 
     def recordings(self) -> int:
-        """How often the step has been recorded so far; stays the same once the fit is warm."""
+        """Number of recordings of the step so far; stays the same once the fit is warm."""
         return int(self._step.n_recordings)
 
     def describe(self) -> dict[str, Any]:

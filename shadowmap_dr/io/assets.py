@@ -1,4 +1,4 @@
-"""Where the scenes, meshes and pictures that come with the package are found."""
+"""Paths of the scenes, meshes and pictures that come with the package."""
 
 from __future__ import annotations
 

@@ -52,12 +52,12 @@ class Frozen:
 
     @property
     def n_recordings(self) -> int:
-        """How many there have been."""
+        """Number of recordings so far."""
         return int(self._recorded.n_recordings)
 
 
 class _Call:
-    """What a recording needs beside its arrays: the arguments and ``results``, as records."""
+    """Inputs of a recording beside its arrays: the arguments and ``results``, as records."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self.function = function
@@ -85,7 +85,7 @@ def take_apart(record: Any) -> tuple[str, list[Any]]:
 
 
 class _Taken:
-    """What :func:`take_apart` has found. (An inner function that calls itself would be garbage that holds arrays.)"""
+    """Findings of :func:`take_apart`. (An inner function that calls itself would be garbage that holds arrays.)"""
 
     def __init__(self) -> None:
         self.texts: list[str] = []

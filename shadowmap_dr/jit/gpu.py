@@ -1,4 +1,4 @@
-"""What Dr.Jit 1.5 cannot do on a GPU, kept away from it. ``docs/dr-jit-faults`` has the proofs."""
+"""Workarounds for operations that Dr.Jit 1.5 cannot do on a GPU. ``docs/dr-jit-faults`` has the proofs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which faces of a mesh have edges and vertices in common (on the host).
+"""Common edges and vertices of the faces of a mesh (on the host).
 
 Half-edges are counted as 3 * face + corner: each leads from that corner to the next one. What copies of a shape have in common is
 found out for the first one only (:class:`~shadowmap_dr.raster.welding.Copies`).

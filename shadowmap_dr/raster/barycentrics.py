@@ -72,7 +72,7 @@ def _at_pixel(index: Any, row: Any, column: Any, active: Any, depths: Any, weigh
 
 
 def _look_up(index: Any, active: Any, depths: Any, weights: Any) -> tuple[Any, Any, Any, Any]:
-    """What `planes` knows of a triangle: depth; barycentrics of vertices 1 and 2 divided by w; 1 / w at the pixel."""
+    """Values of `planes` for a triangle: depth; barycentrics of vertices 1 and 2 divided by w; 1 / w at the pixel."""
     module = backend(depths)
     depth, one, two = (dr.gather(module.Array4f, flat, index, active) for flat in (depths, *weights[:2]))
     return depth, one, two, dr.gather(module.Float, weights[2], index, active)

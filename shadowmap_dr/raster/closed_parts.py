@@ -1,4 +1,4 @@
-"""Which faces no one outside of a mesh ever sees from behind, and in which order that is used best. Found once on the host."""
+"""Faces that no one outside of a mesh ever sees from behind, and the best order to draw them in. Found once on the host."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What triangles look like as functions of the pixel: depths and barycentrics from a few numbers for each triangle.
+"""Triangles as functions of the pixel: depths and barycentrics from a few numbers for each triangle.
 
 NDC depth, and barycentrics divided by w, are affine on the screen, perspective or not. That makes them cheap to evaluate, and
 derivatives of an image of depths may be summed up over the pixels of each triangle before they go on to its vertices.
@@ -38,7 +38,7 @@ def pixel_depth(raster: RasterOutput, positions: Any, faces: Any, reciprocal: An
 
 
 def depth_at(depths: Any, index: Any, row: Any, column: Any, hit: Any) -> tuple[Any, Any, Any]:
-    """What :func:`pixel_depth` returns, for any pixels.
+    """Result of :func:`pixel_depth`, for any pixels.
 
     Args:
         depths: the first result of :func:`planes`.

@@ -110,7 +110,7 @@ class Strips:
     width: int
 
     def gather(self, flat: Any, tiled: bool = False) -> list[Any]:
-        """What a batch of images (``UInt64``) holds for the pixels of each strip; undefined beyond the image. The images are
+        """Numbers of a batch of images (``UInt64``) for the pixels of each strip; undefined beyond the image. The images are
         row-major or, if ``tiled``, in the order of `TileGrid.pixel`."""
         if tiled:  # the order of the strips themselves
             return list(dr.gather(backend(flat).Array4u64, flat, dr.arange(type(self.tile), dr.width(flat) // STRIP)))
@@ -235,7 +235,7 @@ def _for_each_tile(box: tuple[Any, Any, Any, Any], active: Any, visit: Any) -> N
     few = (x1 - x0 + 1) * (y1 - y0 + 1) <= BLOCK * BLOCK
 
     def first(top: Any, left: Any) -> tuple[Any, Any]:
-        """Where to begin in the block with this first tile."""
+        """First place in the block with this first tile."""
         return dr.select(few, dr.maximum(top, y0), top), dr.select(few, dr.maximum(left, x0), left)
 
     def body(row, column, is_tile):  # noqa: ANN001, ANN202
@@ -257,7 +257,7 @@ def _for_each_tile(box: tuple[Any, Any, Any, Any], active: Any, visit: Any) -> N
 
 
 class _Span:
-    """What a triangle does over the pixel centres of a tile or block.
+    """Values of a triangle over the pixel centres of a tile or block.
 
     ``missed``: it contains none of them; ``covered``: it contains all; ``nearest``, ``farthest``: bounds of its depth there.
     """

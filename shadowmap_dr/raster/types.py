@@ -20,7 +20,7 @@ MAX_RESOLUTION = 4096
 
 @dataclass(frozen=True)
 class RasterOutput:
-    """What each pixel of a batch of images sees.
+    """Triangles that the pixels of a batch of images see.
 
     All arrays have ``batch * height * width`` entries, row-major (``(b * height + row) * width + column``).
 
@@ -85,7 +85,7 @@ def check_range(faces: Any, count: int, what: str) -> None:
 
 
 def by_image(index: Any, size: int, batch: int) -> tuple[Any, Any]:
-    """Which image of a batch an index (``UInt32``) below ``batch * size`` belongs to, and the index within that image.
+    """The image of a batch to which an index (``UInt32``) below ``batch * size`` belongs, and the index within that image.
 
     The only image of a batch is a constant: no divisions, and no sizes of meshes in kernels, which then serve other meshes, too.
     """

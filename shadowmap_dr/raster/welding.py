@@ -17,7 +17,7 @@ _MIXERS = tuple(np.uint64(number) for number in (0x9E3779B97F4A7C15, 0xC2B2AE3D2
 
 @dataclass(frozen=True)
 class Welded:
-    """Which vertices count as one, V of them.
+    """Vertices that count as one, V of them.
 
     place  (V,) the first vertex at each one's place
     own    (V,) the first vertex of the same shape there
@@ -29,7 +29,7 @@ class Welded:
 
 @dataclass(frozen=True)
 class Places:
-    """Where vertices are, in the order of x, then y, then z.
+    """Places of vertices, in the order of x, then y, then z.
 
     rank   (V,) of each vertex's place, from 0 on: the same for vertices at the same place, to the last bit
     order  (V,) the vertices, ascending by rank

@@ -104,7 +104,7 @@ class ImagePass:
             cache.crossings = tuple(weights_only(crossings) for crossings in found)
 
     def _uniform(self) -> bool:
-        """Whether an image is a sum over few lights, each times its colour."""
+        """True if an image is a sum over few lights, each times its colour."""
         data, settings = self.light.data, self.light.settings
         lights = (*data.lights, *data.areas)
         if data.environments or not settings.lit or not 0 < len(lights) < MANY_LIGHTS:
@@ -112,7 +112,7 @@ class ImagePass:
         return colours_of(lights) is not None
 
     def _room_for_visible(self, shapes: PlacedShapes, views: Sequence[CameraView]) -> bool:
-        """Whether visibilities of all lights may be kept."""
+        """True if visibilities of all lights may be kept."""
         light = self.light
         if len(light.data.lights) >= MANY_LIGHTS or light.settings.shadow.method == "none":
             return False

@@ -74,7 +74,7 @@ class LightTable:
 
 @dataclass(frozen=True)
 class Places:
-    """Where each pixel looks at the lights, N pixels: offsets from what it sees (Vector3f each), detached.
+    """Points from which each pixel looks at the lights, N pixels: offsets from what it sees (Vector3f each), detached.
 
     ``spots``: to the points where visibility is looked up; ``around``: half way to the pixel's corners.
     """

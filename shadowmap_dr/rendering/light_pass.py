@@ -112,7 +112,7 @@ class LightPass:
 
     @property
     def needs_frames(self) -> bool:
-        """Whether light has to know tangents and texture coordinates of surfaces."""
+        """True if light has to know tangents and texture coordinates of surfaces."""
         textured = any(light.textured for light in self.data.areas)
         return self.data.needs_frames or self.settings.ambient > 0 or textured
 
@@ -280,7 +280,7 @@ class LightPass:
 
 
 def plan_extended_lights(data: SceneData, settings: RenderSettings) -> tuple[SoftPlan, ...]:
-    """How the area lights and environments of a scene are sampled (on the host, once). Refuses what would not fit into arrays."""
+    """Sample the area lights and environments of a scene (on the host, once). Refuses what would not fit into arrays."""
     lights, single = (*data.areas, *data.environments), settings.emitter_shadows == "single"
     soft = plan_soft(lights, data.geometry, settings.area_light_samples, settings.environment_light_samples, single)
     if settings.shadow.method != "none":

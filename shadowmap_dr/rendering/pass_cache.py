@@ -18,7 +18,7 @@ from .light_pass import Visible
 
 
 class Still(IntEnum):
-    """What stays as it is from one image to the next; each includes those before."""
+    """Inputs that stay as they are from one image to the next; each level includes those before."""
 
     NOTHING = 0
     #: Shapes and the camera.

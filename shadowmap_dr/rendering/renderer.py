@@ -22,7 +22,7 @@ from ..scene.lights.read import Light
 from ..scene.load import SceneData, load, refresh
 from ..scene.sensor import Sensor
 from ..scene.untracked import UntrackedState
-from ..shadow import Frusta, ShadowSettings
+from ..shadow import Frusta
 from .extended_lights import SoftFrusta, SoftPlan
 from .film.film import Margin, develop, sample_grid, sample_windows
 from .gbuffer.camera_view import CameraPass, CameraView, GBuffer, PlacedShapes
@@ -79,53 +79,23 @@ class Renderer:
         return take_apart([getattr(self, part.name) for part in fields(self)])
 
     @classmethod
-    def from_scene(
-        cls,
-        scene: Any,
-        *,
-        shadow_map_resolution: int = 256,
-        shadow_method: str = "auto",
-        shadow_filter: str = "gaussian",
-        shadow_filter_size: int = 3,
-        shadow_antialias: bool = True,
-        shadow_bleeding: float = 0.0,
-        shadow_order: int = 4,
-        shadow_supersampling: int = 1,
-        shadow_receiver_range: bool = True,
-        shadow_cull_backfaces: bool = False,
-        compat: bool = False,
-        tessellation: int = 64,
-        **settings: Any,
-    ) -> Renderer:
+    def from_scene(cls, scene: Any, *, tessellation: int = 64, **settings: Any) -> Renderer:
         """Build a renderer for a ``mi.Scene``.
 
-        The scene's meshes are read now, for the last time. ``settings`` are those of :class:`RenderSettings`, ``tessellation`` is
-        the number of triangles around spheres, disks and cylinders.
+        The scene's meshes are read now, for the last time.
+
+        Args:
+            scene: the ``mi.Scene``.
+            tessellation: number of triangles around spheres, disks and cylinders.
+            settings: by the names of the plug-in's parameters (``help(shadowmap_dr.integrator.options.Options)``): fields of
+                :class:`RenderSettings`, and ``shadow_map_resolution``, ``shadow_method``, ... for those of
+                :class:`~shadowmap_dr.shadow.ShadowSettings`.
 
         Raises:
-            ShadowmapError: what the scene has and this renderer does not support, by name; invalid settings.
+            ShadowmapError: what the scene has and this renderer does not support, by name; unknown or invalid settings.
         """
-        known = [setting.name for setting in fields(RenderSettings) if setting.name != "shadow"]
-        for name in settings:
-            if name not in known:
-                raise ShadowmapError(f"There is no setting '{name}'; beside those of shadow maps there are {', '.join(known)}.")
-        try:
-            shadow = ShadowSettings(
-                method=shadow_method,
-                resolution=shadow_map_resolution,
-                filter=shadow_filter,
-                filter_size=shadow_filter_size,
-                antialias=shadow_antialias,
-                compat=compat,
-                bleeding=shadow_bleeding,
-                order=shadow_order,
-                supersampling=shadow_supersampling,
-                receiver_range=shadow_receiver_range,
-                cull_backfaces=shadow_cull_backfaces,
-            )
-        except ValueError as error:
-            raise ShadowmapError(str(error)) from None
-        return cls.from_data(load(scene, tessellation=tessellation), RenderSettings(shadow, **settings))
+        chosen = RenderSettings.of(**settings)
+        return cls.from_data(load(scene, tessellation=tessellation), chosen)
 
     @classmethod
     def from_data(cls, data: SceneData, settings: RenderSettings) -> Renderer:
@@ -290,7 +260,7 @@ class Renderer:
         return lighting
 
     def g_buffer(self, sensor: int = 0) -> GBuffer:
-        """What a camera sees of the scene as it is, for those who shade it themselves again and again. Detached.
+        """Surfaces that a camera sees of the scene as it is, for those who shade it themselves again and again. Detached.
 
         Raises:
             ShadowmapError: there is no such sensor, or it has several cameras, or a reconstruction filter that is not a box.

@@ -1,9 +1,11 @@
-"""How a scene is rendered."""
+"""Settings of a rendering."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
+from difflib import get_close_matches
 from numbers import Integral
+from typing import Any
 
 from ..errors import ShadowmapError
 from ..shadow import ShadowSettings
@@ -11,13 +13,26 @@ from .film.aovs import AOVS
 
 #: Most samples of one extended light.
 MOST_SAMPLES = 4096
+#: Names of settings of shadow maps where all settings are given together -> fields of :class:`ShadowSettings`. Its ``bias`` has
+#: none.
+SHADOW_NAMES = {
+    "shadow_map_resolution": "resolution",
+    "compat": "compat",
+    **{
+        f"shadow_{name}": name
+        for name in (
+            *("method", "filter", "filter_size", "antialias", "bleeding", "order", "supersampling", "receiver_range"),
+            "cull_backfaces",
+        )
+    },
+}
 #: ``max_depth`` of light that is reflected once on its way to the camera.
 DIRECT = 2
 
 
 @dataclass(frozen=True)
 class RenderSettings:
-    """How a scene is rendered.
+    """Settings of a rendering.
 
     Attributes:
         shadow: see :class:`ShadowSettings`.
@@ -74,9 +89,30 @@ class RenderSettings:
         if not (self.ambient >= 0 and self.ambient < float("inf")):
             raise ShadowmapError(f"ambient is {self.ambient}: give a finite radiance of at least 0.")
 
+    @classmethod
+    def of(cls, **named: Any) -> RenderSettings:
+        """From values by the names that the plug-in's parameters and the keywords of ``Renderer.from_scene`` have: those of the
+        fields here, and :data:`SHADOW_NAMES`. Defaults are those of the records.
+
+        Raises:
+            ShadowmapError: an unknown name, with the nearest known one; an invalid value.
+        """
+        own = [setting.name for setting in fields(cls) if setting.name != "shadow"]
+        for name in named:
+            if name not in own and name not in SHADOW_NAMES:
+                known = sorted([*own, *SHADOW_NAMES])
+                nearest = get_close_matches(name, known, 1)
+                hint = f"; the nearest is '{nearest[0]}'" if nearest else ""
+                raise ShadowmapError(f"There is no setting '{name}': there are {', '.join(known)}{hint}.")
+        try:
+            shadow = ShadowSettings(**{SHADOW_NAMES[name]: value for name, value in named.items() if name in SHADOW_NAMES})
+        except ValueError as error:
+            raise ShadowmapError(str(error)) from None
+        return cls(shadow, **{name: value for name, value in named.items() if name in own})
+
     @property
     def lit(self) -> bool:
-        """Whether surfaces reflect light."""
+        """True if surfaces reflect light."""
         return not 0 <= self.max_depth < DIRECT
 
     def look_ups(self, width: int) -> int:

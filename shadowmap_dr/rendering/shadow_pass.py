@@ -1,8 +1,7 @@
-"""Which shadow maps a scene's lights need, where their cameras are, and what each pixel asks of them."""
+"""Shadow maps of a scene's lights: their number, their cameras, and their look-up by pixels."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -15,8 +14,7 @@ from ..errors import ShadowmapError
 from ..jit.arrays import device_array
 from ..raster import RasterOutput, Topology
 from ..scene.geometry import Geometry
-from ..scene.lights.projected import Beam, Projector
-from ..scene.lights.punctual import DirectionalLight, PointLight, SpotLight
+from ..scene.lights.projected import Beam
 from ..scene.lights.read import Light
 from ..shadow import (
     Boxes,
@@ -27,25 +25,15 @@ from ..shadow import (
     Views,
     casting_shapes,
     cube_face,
-    cube_views,
-    directional_view,
     filter_maps,
     fit_frusta,
     render_maps,
     shape_bounds,
     shape_boxes,
-    spot_view,
     stack_views,
     vertices_in_maps,
     visibility,
 )
-
-#: Spot lights and projectors with a wider cone (half-angle in degrees) use the faces of a cube.
-WIDEST_SPOT = 60.0
-# Half-angle in degrees that one map covers, whatever becomes of its light.
-_WIDEST_MAP = 80.0
-# Casters of a beam's shadows are as far from its shape, at least, in units of its reach: it must not shadow itself.
-_BEAM_START = 1e-3
 
 
 @dataclass(frozen=True)
@@ -66,13 +54,13 @@ class MapPlan:
 
     @property
     def maps(self) -> int:
-        """How many maps there are."""
+        """Number of maps."""
         return sum(6 if kind == "cube" else 1 for kind in self.kinds)
 
 
 def plan_maps(lights: Sequence[Light], geometry: Geometry) -> MapPlan:
     """Decide (on the host, once) which maps the lights need and what is known about the shapes."""
-    kinds = tuple(_kind_of(light) for light in lights)
+    kinds = tuple(light.map_kind() for light in lights)
     sizes = [6 if kind == "cube" else 1 for kind in kinds]
     positions = dr.detach(geometry.positions).numpy().reshape(-1, 3)
     faces = geometry.faces.numpy().reshape(-1, 3)
@@ -109,25 +97,6 @@ def check_sizes(maps: int, texels: int, geometry: Geometry, lights: str, remedy:
             f"{maps} shadow maps of {lights}, {texels} x {texels} texels, {geometry.face_count} triangles, are too many: "
             f"{remedy}."
         )
-
-
-def _kind_of(light: Light) -> str:
-    if isinstance(light, DirectionalLight):
-        return "directional"
-    if isinstance(light, Beam):
-        return "beam"
-    if isinstance(light, PointLight):
-        return "cube"
-    half_angle = dr.atan(light.spread) * (180 / math.pi) if isinstance(light, Projector) else light.cutoff_angle
-    return "spot" if float(dr.max(dr.detach(half_angle))[0]) <= WIDEST_SPOT else "cube"
-
-
-def _spread(light: SpotLight | Projector) -> Any:
-    """Tangent of the half-angle that its map has to cover (Float), detached."""
-    if isinstance(light, Projector):
-        return dr.detach(light.spread)
-    # A light of one map that has become wider since is lit beyond it.
-    return dr.tan(dr.minimum(dr.detach(light.cutoff_angle), _WIDEST_MAP) * (math.pi / 180))
 
 
 def make_maps(
@@ -213,22 +182,13 @@ def _culled(plan: MapPlan, count: int, outward: Any) -> Any:
 
 
 def _views(plan: MapPlan, light: Light, kind: str, settings: ShadowSettings) -> tuple[LightView, ...]:
-    if kind == "cube":
-        return cube_views(mi.Point3f(light.position), settings.resolution, settings.filter_size)
-    if kind == "directional":
-        view = directional_view(mi.Vector3f(light.direction))
-        if not settings.compat:
-            return (view,)
-        # The authors' camera stands outside of the scene, facing its centre.
-        origin = mi.Point3f(*plan.center) - view.forward * (2 * plan.radius)
-        return (LightView(view.right, view.up, view.forward, origin, view.spread),)
-    if isinstance(light, Beam):
-        view = directional_view(light.direction)
-        return (LightView(view.right, view.up, view.forward, mi.Vector3f(light.position), view.spread),)
-    assert isinstance(light, SpotLight | Projector)
-    matrix = light.to_world.matrix
-    right, up, forward = (dr.normalize(mi.Vector3f(matrix[0, k], matrix[1, k], matrix[2, k])) for k in range(3))
-    return (spot_view(light.position, right, up, forward, _spread(light)),)
+    views = light.map_views(kind, settings.resolution, settings.filter_size)
+    if kind != "directional" or not settings.compat:
+        return views
+    # The authors' camera stands outside of the scene, facing its centre.
+    (view,) = views
+    origin = mi.Point3f(*plan.center) - view.forward * (2 * plan.radius)
+    return (LightView(view.right, view.up, view.forward, origin, view.spread),)
 
 
 def _within_beams(plan: MapPlan, lights: Sequence[Light], p_light: Any, map_index: Any) -> Any:
@@ -236,18 +196,11 @@ def _within_beams(plan: MapPlan, lights: Sequence[Light], p_light: Any, map_inde
     result = p_light
     for k, light in enumerate(lights):
         if isinstance(light, Beam):
-            reach, start = dr.detach(light.reach), _start_of(light)
+            reach, start = dr.detach(light.reach), light.caster_start
             x, y = dr.clip(p_light.x, -reach, reach), dr.clip(p_light.y, -reach, reach)
             moved = type(p_light)(x, y, dr.maximum(p_light.z, start))
             result = dr.select(map_index == plan.first[k], moved, result)
     return result
-
-
-def _start_of(light: Beam) -> Any:
-    """How far from a beam's shape (Float, detached) its casters begin: beyond what rounding may do to the shape itself."""
-    place = dr.detach(light.position)
-    far = dr.maximum(dr.maximum(dr.abs(place.x), dr.abs(place.y)), dr.abs(place.z))
-    return dr.fma(_BEAM_START, dr.detach(light.reach), 1e-5 * far)
 
 
 def _from_beams_on(plan: MapPlan, lights: Sequence[Light], frusta: Frusta) -> Frusta:
@@ -258,7 +211,7 @@ def _from_beams_on(plan: MapPlan, lights: Sequence[Light], frusta: Frusta) -> Fr
     start = mi.Float(-dr.inf)
     for light, first in zip(lights, plan.first, strict=True):
         if isinstance(light, Beam):
-            start = dr.select(index == first, _start_of(light), start)
+            start = dr.select(index == first, light.caster_start, start)
     near = dr.maximum(frusta.near, start)
     first = dr.maximum(frusta.first, near)
     least = first + 0.1 * dr.maximum(start, 0)
@@ -300,7 +253,7 @@ def _planes(plan: MapPlan, geometry: Geometry) -> tuple[Any, Any]:
 
 
 def _still_planar(plan: MapPlan, geometry: Geometry, planes: tuple[Any, Any]) -> Any:
-    """Which of the shapes that were planar at rest still are (Bool, S): vertices may have moved out of the plane since."""
+    """Shapes that were planar at rest and still are (Bool, S): vertices may have moved out of the plane since."""
     if all(not info.planar or geometry.known_unchanged(info) for info in geometry.shapes):
         return plan.planar
     with dr.suspend_grad():

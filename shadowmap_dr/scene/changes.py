@@ -61,7 +61,7 @@ class ParameterWatch:
         self._then = self._now()
 
     def same(self) -> bool:
-        """Whether all are as when this was last asked, or at the start."""
+        """True if all are as when this was last asked, or at the start."""
         then, self._then = self._then, self._now()
         return self._then == then
 
@@ -70,7 +70,7 @@ class ParameterWatch:
 
 
 def mirrored(shapes: Sequence[Any]) -> np.ndarray:
-    """Whether the ``to_world`` of shapes and instances have a negative determinant (bool, one for each). Read back to the host.
+    """True if the ``to_world`` of shapes and instances have a negative determinant (bool, one for each). Read back to the host.
 
     False where there is None in the place of a shape.
     """
@@ -82,7 +82,7 @@ def mirrored(shapes: Sequence[Any]) -> np.ndarray:
 
 
 class MirrorWatch:
-    """Which of some shapes and instances are mirrored; read back only where a transformation has been given another value."""
+    """Watch over which shapes and instances are mirrored; read back only where a transformation has been given another value."""
 
     def __init__(self, shapes: Sequence[Any]) -> None:
         self._transformations = [Parameter(shape, "to_world") for shape in dict.fromkeys(shapes)]
@@ -91,7 +91,7 @@ class MirrorWatch:
         self._mirrored: np.ndarray | None = None
 
     def same(self) -> bool:
-        """Whether the same ones are mirrored as at the start."""
+        """True if the same ones are mirrored as at the start."""
         matrices, numbers = self._read()
         # Those that are held cannot be taken for others: their variables' numbers are not used again.
         if numbers == self._numbers:
@@ -110,7 +110,7 @@ class MirrorWatch:
 
 
 def _negative(matrices: Sequence[Any]) -> np.ndarray:
-    """Whether the determinants of 4 x 4 matrices without perspective are negative (bool, one for each)."""
+    """True if the determinants of 4 x 4 matrices without perspective are negative (bool, one for each)."""
     return np.linalg.det(read_back(matrices)[:, :, :3]) < 0 if len(matrices) else np.zeros(0, bool)
 
 

@@ -1,4 +1,4 @@
-"""What a scene's shapes are like, found out once: validation of their buffers, and a ``ShapeInfo`` for each."""
+"""Descriptions of a scene's shapes, made once: validation of their buffers, and a ``ShapeInfo`` for each."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ def _corners(parts: Parts, shapes: npt.NDArray[np.bool_]) -> tuple[np.ndarray, n
 
 
 def _faceted(parts: Parts, shapes: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-    """Whether the vertex normals are those of the faces, for those of the shapes that are asked about."""
+    """True if the vertex normals are those of the faces, for those of the shapes that are asked about."""
     found = np.zeros_like(shapes)
     if shapes.any():
         faces, starts, corners = _corners(parts, shapes)
@@ -155,7 +155,7 @@ def _faceted(parts: Parts, shapes: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool
 
 
 def _turned(parts: Parts, shapes: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-    """Whether the vertex normals are on the other side than the winding of the faces says, for some of the shapes."""
+    """True if the vertex normals are on the other side than the winding of the faces says, for some of the shapes."""
     found = np.zeros_like(shapes)
     if shapes.any():
         faces, starts, corners = _corners(parts, shapes)
@@ -165,7 +165,7 @@ def _turned(parts: Parts, shapes: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_
 
 
 def _planar(parts: Parts) -> npt.NDArray[np.bool_]:
-    """Whether all vertices of a shape that belong to faces lie in one plane."""
+    """True if all vertices of a shape that belong to faces lie in one plane."""
     found = _may_be_planar(parts)
     if found.any():
         found[found] = _in_one_plane(parts.only(found))

@@ -38,7 +38,7 @@ _FLAG_BITS = 8
 
 @dataclass(frozen=True)
 class ShapeInfo:
-    """What is known about a shape without looking at its buffers. All fields are static.
+    """Facts about a shape without looking at its buffers. All fields are static.
 
     ``name`` is the Mitsuba id (``instance.child`` for an instanced shape). The shape owns vertices
     ``vertex_start .. vertex_start + vertex_count`` and faces ``face_start .. face_start + face_count`` of the soup.
@@ -162,7 +162,7 @@ class Geometry:
         return found if wanted else ~found
 
     def known_unchanged(self, info: ShapeInfo) -> bool:
-        """Whether a shape is known (on the host) to be as it was when the scene was loaded."""
+        """True if a shape is known (on the host) to be as it was when the scene was loaded."""
         return self.as_loaded and self.changed is not None and info.name not in self.changed
 
     def in_packets(self, lanes: int) -> Geometry:
@@ -261,7 +261,7 @@ def vertex_normals(positions: Any, faces: Any, vertex_count: int) -> Any:
 
 
 def with_faces(faces: np.ndarray, count: int) -> np.ndarray:
-    """Which of ``count`` vertices belong to any of the faces (F, 3), bool."""
+    """Mask (bool) of those of ``count`` vertices that belong to any of the faces (F, 3)."""
     found = np.zeros(count, np.bool_)
     found[faces] = True
     return found

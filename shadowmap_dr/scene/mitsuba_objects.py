@@ -85,13 +85,13 @@ def _collector(variant: str) -> type:
 
 
 def varies(texture: Any) -> bool:
-    """Whether a ``mi.Texture`` may differ from place to place, attributes of meshes aside. Those written in Python may say what
+    """True if a ``mi.Texture`` may differ from place to place, attributes of meshes aside. Those written in Python may say what
     they like: the base class says no for them."""
     return texture.is_spatially_varying() or type(texture) is not mi.Texture
 
 
 def is_plain(bsdf: Any) -> bool:
-    """Whether a BSDF is known to depend on nothing but the cosines of directions: diffuse, of the same colour everywhere."""
+    """True if a BSDF is known to depend on nothing but the cosines of directions: diffuse, of the same colour everywhere."""
     parts = [part for _, part in children(bsdf)]
     if bsdf.class_name() == "TwoSidedBRDF":
         return all(is_plain(part) for part in parts)
@@ -102,7 +102,7 @@ def is_plain(bsdf: Any) -> bool:
 
 
 def is_cosine(bsdf: Any) -> bool:
-    """Whether a BSDF is known to be the cosine of the light's direction times a number that no direction changes: diffuse."""
+    """True if a BSDF is known to be the cosine of the light's direction times a number that no direction changes: diffuse."""
     kind = bsdf.class_name()
     if kind == "SmoothDiffuse":
         textures = [part for _, part in children(bsdf)]
@@ -114,7 +114,7 @@ def is_cosine(bsdf: Any) -> bool:
 
 
 def is_attribute(node: Any, key: str) -> bool:
-    """Whether a parameter is an attribute of a mesh: colours of vertices or faces, for instance."""
+    """True if a parameter is an attribute of a mesh: colours of vertices or faces, for instance."""
     return isinstance(node, mi.Mesh) and key.startswith(("vertex_", "face_")) and key not in _BUFFERS
 
 

@@ -52,7 +52,7 @@ class Filter:
 
     @property
     def is_box(self) -> bool:
-        """Whether a pixel is the plain mean of its own samples."""
+        """True if a pixel is the plain mean of its own samples."""
         return self.kind == "BoxFilter"
 
     def evaluate(self, x: np.ndarray) -> np.ndarray:

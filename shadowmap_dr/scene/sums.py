@@ -82,7 +82,7 @@ def _loop(term: Callable[[Any], Any], count: int | None, zero: Any, active: Any,
 
 
 class _Call:
-    """What a sum is made of, besides arrays of its own. No PyTree: Dr.Jit would hand over ``implicit`` without its gradients."""
+    """Parts of a sum, besides arrays of its own. No PyTree: Dr.Jit would hand over ``implicit`` without its gradients."""
 
     def __init__(self, term: Any, count: int | None, zero: Any, active: Any, implicit: list[Any]) -> None:
         self.term, self.count, self.zero, self.active, self.implicit = term, count, zero, active, implicit
@@ -206,7 +206,7 @@ class _Sum(dr.CustomOp):
         return tree_map(tree, part)
 
     def _joined(self, parts: Sequence[Any]) -> Any:
-        """What slices have found for one array of the lanes' own."""
+        """Results of slices for one array of the lanes' own."""
         first = parts[0]
         if sum(dr.width(part) for part in parts) != self._lanes:
             return _total(parts)  # the lanes share a number

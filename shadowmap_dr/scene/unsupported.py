@@ -1,4 +1,4 @@
-"""What a scene has and images leave out, said in one warning."""
+"""Parts of a scene that images leave out, named in one warning."""
 
 from __future__ import annotations
 

@@ -101,7 +101,7 @@ _NUMBERS, _REMEMBERED = count(1), 64
 
 
 class _Off:
-    """Whether a parameter has been 0 all the time. Its value is read when there is a new one."""
+    """Watch over a parameter that may have been 0 all the time. Its value is read when there is a new one."""
 
     def __init__(self, table: Any, key: str) -> None:
         self._table, self._key, self._known, self._still = table, key, None, True
@@ -116,7 +116,7 @@ class _Off:
 
 
 def _has_switches(node: Any) -> bool:
-    """Whether a BSDF is, or holds, one with lobes that Mitsuba switches on when their parameters are changed."""
+    """True if a BSDF is, or holds, one with lobes that Mitsuba switches on when their parameters are changed."""
     if not isinstance(node, mi.BSDF):
         return False
     return node.class_name().startswith("Principled") or any(_has_switches(child) for _, child in children(node))

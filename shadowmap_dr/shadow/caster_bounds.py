@@ -1,4 +1,4 @@
-"""Which shapes can cast a shadow at all: a wall or a floor with nothing behind it only takes up room in a map."""
+"""Shapes that can cast a shadow at all: a wall or a floor with nothing behind it only takes up room in a map."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def shape_boxes(p_world: Any, shape: Any, count: int) -> Boxes:
 
 
 def casting_shapes(views: Views, planes: tuple[Any, Any], planar: Any, boxes: Boxes, hidden: Any = None) -> Any:
-    """Which shapes can cast a shadow in which map: not planar ones with nothing behind them, as seen from the light.
+    """Shapes that can cast a shadow in each map: not planar ones with nothing behind them, as seen from the light.
 
     Args:
         views: cameras of the M maps.
@@ -84,7 +84,7 @@ def casting_shapes(views: Views, planes: tuple[Any, Any], planar: Any, boxes: Bo
 
 
 def _reach(normal: Any, point: Any, boxes: Boxes) -> Any:
-    """How far the boxes of the other shapes reach on either side of each shape's plane (``Float``, 2 S); at most 0 if they touch.
+    """Reach of the boxes of the other shapes on either side of each shape's plane (``Float``, 2 S); at most 0 if they touch.
 
     The first tenth of what stands on the plane does not count: it may sink in a little, which shall not change the maps.
     """

@@ -14,7 +14,7 @@ FILTERS = ("box", "gaussian", "wendland", "none")
 
 
 def reach_of(filter_size: int) -> float:
-    """How many texels away from a point a look-up reads, at most: those under the filter, and between them."""
+    """Largest distance in texels from a point at which a look-up reads: those under the filter, and between them."""
     return 0.5 * filter_size + 1
 
 

@@ -123,7 +123,7 @@ def cube_views(position: Any, resolution: int, filter_size: int) -> tuple[LightV
 
 
 def cube_face(offset: Any) -> Any:
-    """Which of the six :func:`cube_views` sees a point at ``offset`` from the light (``UInt32``)."""
+    """Number of the one of the six :func:`cube_views` that sees a point at ``offset`` from the light (``UInt32``)."""
     a = dr.abs(offset)
     k = dr.select((a.x >= a.y) & (a.x >= a.z), 0, dr.select(a.y >= a.z, 1, 2))
     component = dr.select(k == 0, offset.x, dr.select(k == 1, offset.y, offset.z))
@@ -231,7 +231,7 @@ def linear_depth(view: Views, frustum: Frusta, depth: Any) -> tuple[Any, Any]:
 
 
 def project(view: Views, frustum: Frusta, p_world: Any) -> tuple[Any, Any, Any, Any]:
-    """Where world-space points lie in a map: (u, v) in -1..1, linear depth, and whether (u, v) are inside.
+    """Places of world-space points in a map: (u, v) in -1..1, linear depth, and whether (u, v) are inside.
 
     Attached to points and light.
     """

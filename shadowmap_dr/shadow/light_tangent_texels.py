@@ -1,4 +1,4 @@
-"""What the texels of directional lights' maps store, and how that changes when the lights turn."""
+"""Texels of directional lights' maps, and their derivatives when the lights turn."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .shadow_map import FAR, interleaved, texel_depths
 
 
 def twist_of(views: Views) -> Any:
-    """How much each view turns about its axis while its axis moves along ``right`` (``Float``, M)."""
+    """Turn of each view about its axis while its axis moves along ``right`` (``Float``, M)."""
     module = backend(views.spread)
     d = [dr.abs(views.forward[c]) for c in range(3)]
     # The world axis that `directional_view` starts from.
@@ -39,7 +39,7 @@ def turned(twist: Any, p: Any) -> tuple[tuple[Any, Any, Any], tuple[Any, Any, An
 
 
 class TangentTexels:
-    """What the texels of a batch of maps store, and its tangents: anti-aliased in the same kernel.
+    """Values of the texels of a batch of maps, and their tangents: anti-aliased in the same kernel.
 
     Texels hold simple functions of their triangles' planes. Those that are mixed compute their neighbours' numbers once more,
     which costs less than to write and read those of all texels.

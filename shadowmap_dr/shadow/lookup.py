@@ -138,7 +138,7 @@ class Texels:
 
 
 def _bilinear(maps: ShadowMaps, map_index: Any, u: Any, v: Any, active: Any, outside_reads_zero: bool = False) -> list[Any]:
-    """What the four texels around (u, v) store, mixed; attached to the texels and to the coordinates."""
+    """Mix of the four texels around (u, v); attached to the texels and to the coordinates."""
     at = Texels(maps, map_index, u, v, active)
     rows = []
     for j in range(2):

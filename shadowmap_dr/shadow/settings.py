@@ -13,7 +13,7 @@ from .methods.registry import DEFAULT, METHODS, PREFILTERED
 
 @dataclass(frozen=True)
 class ShadowSettings:
-    """How shadows are computed.
+    """Settings of shadow maps.
 
     Attributes:
         method: ``auto`` (``evsm4``, or ``vsm`` with ``compat``), ``vsm`` (variance), ``esm`` (exponential), ``evsm2``, ``evsm4``
@@ -94,5 +94,5 @@ class ShadowSettings:
 
     @property
     def filterable(self) -> bool:
-        """Whether what a map stores may be mixed, and so anti-aliased and filtered."""
+        """True if what a map stores may be mixed, and so anti-aliased and filtered."""
         return self.method in PREFILTERED

@@ -120,7 +120,7 @@ def _texels(
 
 @dataclass(frozen=True)
 class TexelDepths:
-    """What each texel sees, one lane each.
+    """Surfaces that texels see, one lane each.
 
     Attributes:
         shown: whether it sees anything of which the depth is kept.

@@ -1,4 +1,4 @@
-"""What tensors must be like: every mistake is one line that names the tensor and says what to do."""
+"""Checks of tensors: every mistake is one line that names the tensor and says what to do."""
 
 from __future__ import annotations
 

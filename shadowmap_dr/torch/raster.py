@@ -18,7 +18,7 @@ from .checks import check_devices, check_floats, check_indices, check_kind, chec
 
 @dataclass(frozen=True)
 class Raster:
-    """What the pixels of B images see.
+    """Triangles that the pixels of B images see.
 
     Attributes:
         triangle: int32 (B, H, W), index of the visible triangle, -1 where there is none.

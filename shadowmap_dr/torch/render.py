@@ -157,7 +157,7 @@ class Renderer:
 
 @dataclass(frozen=True)
 class _Place:
-    """What a tensor is for: ``kind`` is vertices, light or parameter."""
+    """Purpose of a tensor: ``kind`` is vertices, light or parameter."""
 
     kind: str
     name: str

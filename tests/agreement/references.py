@@ -17,7 +17,7 @@ SAMPLES = 4096
 
 @dataclass(frozen=True)
 class Reference:
-    """What Mitsuba's ``direct`` makes of a case.
+    """Image and derivative of a case by Mitsuba's ``direct``.
 
     Attributes:
         image: (H, W, 3), at rest.
@@ -39,7 +39,7 @@ class Reference:
 
 
 def path_of(case: Case) -> Path:
-    """Where the reference of a case is stored."""
+    """Path of the stored reference of a case."""
     return FOLDER / f"{case.name}.npz"
 
 

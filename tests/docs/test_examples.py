@@ -19,7 +19,7 @@ QUICKLY = "import quick_kernels, runpy, sys; del sys.argv[0]; runpy.run_path(sys
 
 
 def output_of(script: str, *options: object) -> str:
-    """What an example prints that runs for a moment. Its kernels are compiled as those of tests."""
+    """Output of an example that runs for a moment. Its kernels are compiled as those of tests."""
     command = [sys.executable, "-c", QUICKLY, ROOT / "docs" / "examples" / script, *options]
     paths = os.pathsep.join([str(SUPPORT), os.environ.get("PYTHONPATH", "")]).strip(os.pathsep)
     environment = {**os.environ, "PYTHONPATH": paths}

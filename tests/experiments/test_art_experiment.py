@@ -28,7 +28,7 @@ TINY = {"picture_size": 32, "turns": 3}
 
 
 class Killed(Exception):
-    """What ends a run in the middle."""
+    """An end of a run in the middle."""
 
 
 @pytest.fixture(autouse=True)

@@ -1,4 +1,4 @@
-"""What is broken in a scene does not end the process: images are finite where the scene is, errors are one line."""
+"""Broken scenes do not end the process: images are finite where the scene is, errors are one line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What parameters change after the first image: an integrator that has seen the scene before renders what a new one does."""
+"""Parameters that change after the first image: an integrator that has seen the scene before renders what a new one does."""
 
 from __future__ import annotations
 

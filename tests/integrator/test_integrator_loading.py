@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import textwrap
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,9 @@ from integrator_scenes import camera, render, shadowmap, small_scene
 
 import shadowmap_dr
 from shadowmap_dr import ShadowmapError
+from shadowmap_dr.integrator.options import Options
+from shadowmap_dr.rendering.settings import SHADOW_NAMES, RenderSettings
+from shadowmap_dr.shadow import ShadowSettings
 
 XML = """
 <scene version="3.0.0">
@@ -160,3 +164,14 @@ def test_order_of_imports(late: bool) -> None:
     )
     script = "\n".join(["import os", *(reversed(lines) if late else lines), script])
     subprocess.run([sys.executable, "-c", script], check=True, timeout=120)
+
+
+def test_parameters_are_the_settings_of_the_renderer() -> None:
+    """Names and defaults, but for those that mean nothing to it or have another form."""
+    own = {"aovs", "tessellation", "recorded"}
+    options = {option.name: option.default for option in fields(Options) if option.name not in own}
+    settings = {setting.name: setting.default for setting in fields(RenderSettings) if setting.name not in ("shadow", "aovs")}
+    shadow = {name: getattr(ShadowSettings, SHADOW_NAMES[name]) for name in SHADOW_NAMES}
+    assert options == {**settings, **shadow}
+    assert {setting.name for setting in fields(ShadowSettings)} == {*SHADOW_NAMES.values(), "bias"}
+    assert RenderSettings.of(**options) == RenderSettings()

@@ -149,7 +149,7 @@ def shown(page: Any, target: int) -> dict[str, Any]:
 
 
 def same_rest(one: Any, other: Any) -> tuple[dict[str, Any], dict[str, Any]]:
-    """What two pages show once both rest at the same version: of a stroke that was just painted more may be on its way."""
+    """Images of two pages once both rest at the same version: of a stroke that was just painted more may be on its way."""
     first = shown(one, 1)
     second = shown(other, first["target"])
     while first["target"] != second["target"]:
@@ -165,7 +165,7 @@ def picture(page: Any, name: str) -> np.ndarray:
 
 
 def clay(image: np.ndarray) -> np.ndarray:
-    """Where the object is seen: it is redder than walls and shadows."""
+    """Pixels of the object: it is redder than walls and shadows."""
     return image[..., 0] > 1.4 * image[..., 2]
 
 
@@ -173,7 +173,7 @@ NOSE = [(46, 32), (50, 32), (54, 32), (58, 32)]
 
 
 def nose(state: dict[str, Any]) -> float:
-    """How far the 20 outermost vertices reach towards where a nose is painted, on average."""
+    """Distance that the 20 outermost vertices reach towards where a nose is painted, on average."""
     return float(np.sort(state["vertices"][:, 0])[-20:].mean())
 
 

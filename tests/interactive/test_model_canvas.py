@@ -1,4 +1,4 @@
-"""What is painted: strokes, images, and undoing them."""
+"""Painting: strokes, images, and undoing them."""
 
 from __future__ import annotations
 

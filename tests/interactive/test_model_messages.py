@@ -1,4 +1,4 @@
-"""What pages and server tell each other."""
+"""Messages between pages and server."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ OWN = {"origin": BASE}
 
 
 class Page:
-    """What a page does: it sorts what it gets, and shows frames."""
+    """A page: it sorts what it gets, and shows frames."""
 
     def __init__(self, connection) -> None:
         self.connection = connection

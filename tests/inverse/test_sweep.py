@@ -33,7 +33,7 @@ def _variant() -> None:
 
 
 def begun(folder: Path) -> Counter[str]:
-    """How often each batch was begun."""
+    """Number of times that each batch was begun."""
     return Counter(path.name.rsplit("-", 1)[0] for path in folder.glob("*-*"))
 
 

@@ -1,4 +1,4 @@
-"""What commands write to terminals and pipes."""
+"""Output of commands on terminals and pipes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What keeps Dr.Jit's faults on GPUs away. Their effects are seen by all tests that run there; these see the causes anywhere."""
+"""Workarounds for Dr.Jit's faults on GPUs. Their effects are seen by all tests that run there; these see the causes anywhere."""
 
 from __future__ import annotations
 

@@ -170,7 +170,7 @@ def test_only_one_thread_waits_for_drjit(variant: str, monkeypatch: pytest.Monke
     original, turns = bridge.to_torch, []
 
     def free() -> bool:
-        """Whether another thread could have its turn now."""
+        """True if another thread could have its turn now."""
         with ThreadPoolExecutor(1) as other:
             return other.submit(lambda: bridge._TURN.acquire(blocking=False) and bridge._TURN.release() is None).result()
 

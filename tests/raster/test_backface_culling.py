@@ -70,7 +70,7 @@ def image_and_gradient(renderer: Renderer) -> tuple[np.ndarray, np.ndarray]:
 
 
 def wrong_pixels(renderer: Renderer, image: np.ndarray) -> int:
-    """How many pixels clearly differ."""
+    """Number of pixels that clearly differ."""
     return int((np.abs(renderer.render().numpy() - image).max(-1) > 0.05).sum())
 
 

@@ -1,4 +1,4 @@
-"""Where colours change steadily and where they jump: surfaces of facets that are bent by little, rims, cuts, turned triangles.
+"""Steady changes and jumps of colours: surfaces of facets that are bent by little, rims, cuts, turned triangles.
 
 Derivatives are compared with central differences of our own image (both are blurred), or with those of the same surface made
 otherwise.

@@ -321,7 +321,7 @@ def test_channels_may_come_one_by_one(variant: str) -> None:
 
 
 def test_derivatives_of_claimed_pixels_match_differences(variant: str) -> None:
-    """What one pixel sees is much smaller than it: the four neighbours claim more than all of it, and share it out."""
+    """One pixel sees a much smaller surface: the four neighbours claim more than all of it, and share it out."""
     size, step = 8, 1e-3
     world = np.array([[0.09, 0.08, 0], [0.17, 0.085, 0], [0.165, 0.17, 0], [0.085, 0.16, 0]])
     world = np.r_[world, [[-0.9, -0.9, 0.5], [0.9, -0.9, 0.5], [0, 0.95, 0.5]]].astype(np.float32)

@@ -192,7 +192,7 @@ TOUCHING = {
 
 @pytest.mark.parametrize("case", TOUCHING)
 def test_a_surface_ends_on_another_one(variant: str, case: str) -> None:
-    """Where shapes touch that have no vertices in common: what one gains and the other loses is what the line sweeps."""
+    """Shapes touch that have no vertices in common: one gains the area that the line sweeps, and the other loses it."""
     size = 64
     first, first_depth, second, second_depth = TOUCHING[case]
     world = np.c_[np.r_[first, second], np.r_[first_depth, second_depth] + 0.2].astype(np.float32)

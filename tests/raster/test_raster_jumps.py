@@ -71,7 +71,7 @@ def test_colours_are_those_at_the_edge(variant: str, degrees: float) -> None:
 
 
 def test_noise_is_not_continued_far(variant: str) -> None:
-    """What colours do beyond the pixels changes no sign, and at most doubles a derivative; between facets of middle size
+    """Colours beyond the pixels change no sign, and at most double a derivative; between facets of middle size
     nothing.
 
     Small ones (0) are shaded as a smooth surface, large ones (1) as they are.

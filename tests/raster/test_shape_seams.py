@@ -40,7 +40,7 @@ def moved_right(made: Any, name: str, gap: float, **options: Any) -> tuple[np.nd
 
 
 def test_shapes_that_part(variant: str) -> None:
-    """What they touched when the scene was loaded does not matter."""
+    """Shapes that they touched when the scene was loaded do not matter."""
     expected, derivative = moved_right(scene(GAP), "right", 0)
     found, other = moved_right(scene(0), "right", GAP)
     assert np.abs(derivative).sum() > 10

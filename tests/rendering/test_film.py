@@ -298,7 +298,7 @@ def test_crop_windows_are_pieces_of_the_film(variant: str, name: str, spp: int) 
 
 
 def test_crop_windows_have_as_many_samples_as_they_would_have_alone(variant: str) -> None:
-    """What lies around them is left out where there is no room for it."""
+    """Pixels around them are left out where there is no room for these."""
     (seen,) = sensors_of(mi.load_dict(camera(4096, crop_width=2048, crop_height=1024, crop_offset_x=5, crop_offset_y=7)))
     assert Margin.of((seen,), 1) == Margin(1, 1, 1, 1) and Margin.of((seen,), 2) == Margin()
     corner = replace(seen, crop_offset=(0, 3072))

@@ -64,7 +64,7 @@ def one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def kernels(made: Any) -> tuple[int, int]:
-    """How many programs a first image takes, and how many operations they have in all."""
+    """Number of programs of a first image, and of their operations in all."""
     dr.kernel_history_clear()
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         np.array(mi.render(made, integrator=integrator(), spp=1))

@@ -33,7 +33,7 @@ def seen_by(kind: str, sensor: Any) -> tuple[Any, Any, Any]:
 
 
 def seen(sensor: Any, x: float = 0.5, y: float = 0.5) -> tuple[Any, Any, Any]:
-    """Where Mitsuba's rays through places (x, y) of all pixels meet a slanted plane: points, the plane's normal, depths."""
+    """Mitsuba's rays through places (x, y) of all pixels on a slanted plane: points, the plane's normal, depths."""
     lane = dr.arange(mi.UInt32, SIZE * (SIZE + 2))
     place = mi.Point2f((lane % SIZE + x) / SIZE, (lane // SIZE + y) / (SIZE + 2))
     ray, _ = sensor.sample_ray(mi.Float(0), mi.Float(0), place, mi.Point2f(0.5))

@@ -1,4 +1,4 @@
-"""How the shadow maps of a scene follow what moves in it and what is seen of it."""
+"""Shadow maps of a scene follow its moving parts and what is seen of it."""
 
 from __future__ import annotations
 
@@ -219,7 +219,7 @@ def test_no_line_where_a_floor_leaves_the_depth_range(variant: str, light: str) 
     axes = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
 
     def meets(more: float) -> np.ndarray:
-        """Whether the way to the light passes through the box, made larger on all sides (slabs)."""
+        """True if the way to the light passes through the box, made larger on all sides (slabs)."""
         ends = np.stack([(sign * (half + more) - (p - centre) @ axes.T) / ((place - p) @ axes.T) for sign in (-1, 1)])
         return ends.min(0).max(-1) <= ends.max(0).min(-1)
 

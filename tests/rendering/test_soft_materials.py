@@ -89,7 +89,7 @@ def plain_floor() -> dict[str, Any]:
 @pytest.mark.parametrize("moves", ["colours alone", "with the caster"])
 @pytest.mark.parametrize("light", LIGHTS)
 def test_plain_colours(variant: str, light: str, moves: str) -> None:
-    """Where nothing else is in the scene, the colours of all shapes lie in one table, which is not as wide as the image."""
+    """In a scene without other materials, the colours of all shapes lie in one table, which is not as wide as the image."""
     colours = {
         "floor": Parameter("floor.bsdf.reflectance.value", brighter, 0.05),
         "box": Parameter("object.bsdf.reflectance.value", brighter, 0.05),

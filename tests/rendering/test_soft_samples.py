@@ -1,4 +1,4 @@
-"""What samples of extended lights stand for: their sums are exact, whatever their number."""
+"""Samples of extended lights: their sums are exact, whatever their number."""
 
 from __future__ import annotations
 

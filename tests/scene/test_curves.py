@@ -38,7 +38,7 @@ def vertices(source: CurveSource) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def joints(source: CurveSource) -> np.ndarray:
-    """Which circles lie between two cones, of which one side is inside of them."""
+    """Circles that lie between two cones, of which one side is inside of them."""
     return getattr(source.plan, "before", mi.UInt32(0)).numpy() != getattr(source.plan, "after", mi.UInt32(0)).numpy()
 
 
@@ -260,7 +260,7 @@ def test_another_number_of_control_points_is_refused(variant: str) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_renderer_gives_the_vertices_for_control_points(variant: str, kind: str) -> None:
-    """What Mitsuba's parameters would give, attached; in a rendering, the same image but for a mesh's normals."""
+    """The vertices that Mitsuba's parameters would give, attached; in a rendering, the same image but for a mesh's normals."""
     parts = {"camera": camera(32), "wire": curve(kind, "wire", GENTLE), "sun": sun(), "floor": floor()}
     scene = mi.load_dict({"type": "scene", **parts}, optimize=False)
     renderer = Renderer.from_scene(scene, shadow_map_resolution=64)

@@ -54,7 +54,7 @@ def sample(emitter: Any, p_world: Any) -> tuple[Any, Any]:
 
 
 def in_rim(light: Any, p_world: Any) -> np.ndarray:
-    """Which points lie where a projector's light fades, unlike Mitsuba's: a narrow strip."""
+    """Mask of points where a projector's light fades, unlike Mitsuba's: a narrow strip."""
     if not isinstance(light, Projector):
         return np.zeros(dr.width(p_world), bool)
     local = mi.Transform4f(light.to_world).inverse() @ p_world
@@ -182,7 +182,7 @@ def test_projector_covers_what_mitsubas_covers(variant: str) -> None:
 @pytest.mark.parametrize("mirror", [False, True], ids=["plain", "mirrored"])
 @pytest.mark.parametrize("flip", [False, True], ids=["outwards", "flipped"])
 def test_beam_is_along_the_normals(variant: str, kind: str, mirror: bool, flip: bool) -> None:
-    """What arrives at points in front of the shape is what Mitsuba's texture has where the normal through them begins."""
+    """Points in front of the shape get the radiance of Mitsuba's texture at the foot of the normal through them."""
     to_world = mi.ScalarTransform4f().look_at([1, 2, 3], [0, 0.3, -1], [0, 1, 0]) @ mi.ScalarTransform4f().scale([0.8, 0.5, 1])
     if mirror:
         to_world = to_world @ mi.ScalarTransform4f().scale([-1, 1, 1])
@@ -228,3 +228,19 @@ def test_parallel_light_needs_a_direction(kind: Any) -> None:
     with pytest.raises(ShadowmapError, match=r"'sun' has the direction \(0, 0, 0\)"):
         DirectionalLight("sun", kind([0.0, 0.0, 0.0]), mi.Color3f(1))
     DirectionalLight("sun", kind([0.0, 0.0, -1.0]), mi.Color3f(1))
+
+
+def test_maps_look_where_lights_shine(variant: str) -> None:
+    """Six faces of a cube, or one map along the axis, wide enough for the cone."""
+    scene = mi.load_dict({"type": "scene", **emitters()})
+    kinds = {"sun": "directional", "bulb": "cube", "cone": "spot", "slide": "spot", "wide": "cube", "beamer": "spot"}
+    for light in lights_of(scene):
+        kind = light.map_kind()
+        assert kind == kinds.get(light.name, kind)
+        views = light.map_views(kind, 64, 3)
+        assert len(views) == (6 if kind == "cube" else 1)
+        if kind != "cube":
+            assert np.allclose(np.array(views[0].forward).ravel(), np.array(light.direction).ravel(), atol=1e-6)
+        if kind == "spot":
+            half_angle = np.degrees(np.arctan(float(views[0].spread[0])))
+            assert half_angle >= float(getattr(light, "cutoff_angle", mi.Float(0))[0]) - 1e-3

@@ -1,4 +1,4 @@
-"""What cannot be rendered: named in one warning, and the rest is rendered as if it were not there."""
+"""Parts of scenes that cannot be rendered: one warning names them, and the rest is rendered as if they were not there."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ def floats(array: Any) -> Any:
 
 
 def stored(method: str, depths: np.ndarray, weights: np.ndarray) -> list[Any]:
-    """What a filter makes of texels at some depths (n, k) with weights (n, k)."""
+    """Filtered texels at some depths (n, k) with weights (n, k)."""
     total: list[Any] = []
     for depth, weight in zip(depths.T, weights.T, strict=True):
         part = [value * floats(weight) for value in PREFILTERED[method].encode(floats(depth), 0, ORDER)]
@@ -251,7 +251,7 @@ def test_two_depths_are_bounded_and_finite_on_any_moments(variant: str) -> None:
 
 @pytest.mark.parametrize("method", PREFILTERED)
 def test_occluders_and_receivers_at_the_ends_of_the_range(variant: str, method: str) -> None:
-    """Where all casters lie before all receivers, one ends up at -1/2 and the other at 1/2."""
+    """If all casters lie before all receivers, one ends up at -1/2 and the other at 1/2."""
     depths = np.full((4, 1), -0.5)
     value = PREFILTERED[method].resolve(stored(method, depths, np.ones((4, 1))), floats([0.3, 0.4, 0.45, 0.5])).numpy()
     assert value.max() < (0.1 if method == "csm" else 0.01)

@@ -75,7 +75,7 @@ class Bowls(LossProblem):
 
 
 def first_time(folder: str, name: str) -> bool:
-    """Whether nobody has asked for this name before, in any process."""
+    """True if nobody has asked for this name before, in any process."""
     try:
         Path(folder, name).touch(exist_ok=False)
     except FileExistsError:

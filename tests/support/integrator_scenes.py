@@ -1,4 +1,4 @@
-"""What the tests of the plug-in render."""
+"""Scenes of the tests of the plug-in."""
 
 from __future__ import annotations
 

@@ -176,7 +176,7 @@ MUTATIONS = (
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the named tests said: ``noticed`` if all failed by an assertion, ``detail`` otherwise says what happened."""
+    """Verdict of the named tests: ``noticed`` if all failed by an assertion, ``detail`` otherwise says what happened."""
 
     name: str
     tests: tuple[str, ...]

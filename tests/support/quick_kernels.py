@@ -30,7 +30,7 @@ def _leave_out_passes() -> None:
 
 
 def without_messages(output: str) -> str:
-    """What a test wrote, without what LLVM says of each pass that it leaves out."""
+    """Output of a test, without LLVM's lines about passes that it leaves out."""
     return "".join(line for line in output.splitlines(keepends=True) if not line.startswith("BISECT: "))
 
 

@@ -1,4 +1,4 @@
-"""What the tests of anti-aliasing draw, and what it is compared with."""
+"""Drawings of the tests of anti-aliasing, and their references."""
 
 from __future__ import annotations
 

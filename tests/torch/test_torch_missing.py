@@ -1,4 +1,4 @@
-"""What happens where PyTorch is not installed."""
+"""Behaviour without PyTorch."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ _FILL = {"orthographic": 0.8, "perspective": 0.92}
 
 @dataclass(frozen=True)
 class ArtOptions:
-    """What to make.
+    """Settings of a piece.
 
     Attributes:
         targets: image files, or names of this package, one for each view; ``text:L`` stands for letters.
@@ -128,7 +128,7 @@ def place(figure_list: list[Any], views: tuple[ShadowView, ...]) -> list[Any]:
 
 
 def build(options: ArtOptions) -> Maker:
-    """What `run_art` lets make its steps."""
+    """The solver whose steps `run_art` takes."""
     views = views_of(options)
     read = [read_target(target) for target in options.targets]
     targets = place([target_images.filled(figure) for figure in read] if options.fill_holes else read, views)

@@ -67,7 +67,7 @@ class Frame:
 
 @dataclass
 class Trace:
-    """What happened.
+    """Course of a run.
 
     Attributes:
         loss: before each step.

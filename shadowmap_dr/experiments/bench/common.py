@@ -1,4 +1,4 @@
-"""What the parts of the benchmark share: what to measure, and how a part of it is described."""
+"""Common to the parts of the benchmark: options, sizes, and the description of a part."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SECTIONS = ("steps", "raster", "scaling", "breakdown", "sums", "loops", "first")
 
 @dataclass(frozen=True)
 class Sizes:
-    """How much is measured.
+    """Sizes and counts of measurements.
 
     Attributes:
         resolutions: of steps, times to pose and breakdowns.
@@ -116,7 +116,7 @@ QUICK = Sizes(
 
 @dataclass(frozen=True)
 class BenchOptions:
-    """What to run.
+    """Options of a run.
 
     Attributes:
         quick: few steps, small sizes.

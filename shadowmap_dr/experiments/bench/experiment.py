@@ -96,7 +96,7 @@ def run_bench(options: BenchOptions, *, console: Console | None = None) -> dict[
 
 
 def failures(record: dict[str, Any], sections: tuple[str, ...]) -> list[str]:
-    """What could not be measured, a line for each."""
+    """Parts that could not be measured, a line for each."""
     return [
         f"{name} {key}: {unit['failed']}"
         for name in sections
@@ -122,7 +122,7 @@ def _measured(unit: Unit, done: dict[str, Any], update: Callable[[int, int, str]
 
 
 def _settings(options: BenchOptions) -> dict[str, Any]:
-    """What results must have been measured with to be kept."""
+    """Settings with which results must have been measured to be kept."""
     return records.plain(
         {
             "quick": options.quick,

@@ -45,7 +45,7 @@ def units(options: BenchOptions) -> list[Unit]:
 
 @dataclass(frozen=True)
 class RasterScene:
-    """What the raster functions need of a scene, and the scene itself for Mitsuba.
+    """Inputs of the raster functions for a scene, and the scene itself for Mitsuba.
 
     Attributes:
         p_rest: Float (3V,), world-space vertices of all shapes.

@@ -1,4 +1,4 @@
-"""What comes out of the benchmark: the rows of its table, the same for documentation, and a plot.
+"""Output of the benchmark: the rows of its table, the same for documentation, and a plot.
 
 ``python -m shadowmap_dr.experiments.bench.report bench.json`` prints the table in Markdown.
 """

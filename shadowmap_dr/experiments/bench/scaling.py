@@ -138,7 +138,7 @@ def measure_case(case: Mapping[str, Any], work: str, rounds: int, emit: Callable
 
 
 def _size(case: Case, quantity: str, results: list[dict[str, Any]]) -> int | None:
-    """What the cost is held against: a number of triangles, pixels, texels, taps or lights."""
+    """Size against which the cost is plotted: a number of triangles, pixels, texels, taps or lights."""
     if quantity == "triangles":
         return next((result["triangles"] for result in results if "triangles" in result), None)
     value = getattr(case, quantity)

@@ -128,7 +128,7 @@ def load() -> list[float] | None:
 
 
 class OtherWork:
-    """How busy other processes keep the machine. A load average cannot tell them from this one."""
+    """Cores that other processes keep busy. A load average cannot tell them from this one."""
 
     def __init__(self) -> None:
         self._began = self._now()
@@ -179,7 +179,7 @@ def forget_peak_memory() -> None:
 
 
 def machine() -> dict[str, Any]:
-    """What a measurement depends on: processor, threads, versions, variant."""
+    """Conditions of a measurement: processor, threads, versions, variant."""
     llvm = _llvm.loaded_version()
     return {
         "processor": _processor(),

@@ -33,7 +33,7 @@ Reference = Literal["own", "mitsuba"]
 
 @dataclass(frozen=True)
 class FaceOptions:
-    """What to run. Everything is run for each mode, number of shadows and head.
+    """Options of a run. Everything is run for each mode, number of shadows and head.
 
     Attributes:
         seeds: artificial heads.
@@ -117,7 +117,7 @@ class Head:
         return cls(seed, identity, expression, model.vertices(identity, expression), start)
 
     def weights(self, mode: Mode) -> Any:
-        """What a fit of this mode should find."""
+        """The weights that a fit of this mode should find."""
         return {"identity": self.identity, "expression": self.expression}.get(
             mode, np.concatenate([self.identity, self.expression])
         )

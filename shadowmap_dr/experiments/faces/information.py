@@ -1,4 +1,4 @@
-"""Which weights of a morphable model a shadow image tells: its derivative by each of them, against what is known beforehand."""
+"""Information about the weights of a morphable model in a shadow image: derivatives by the weights, against their prior."""
 
 from __future__ import annotations
 

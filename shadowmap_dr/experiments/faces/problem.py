@@ -35,7 +35,7 @@ _BESIDE, _ABOVE, _BELOW = 0.35, 0.25, 0.1
 
 @dataclass(frozen=True)
 class FaceScene:
-    """What is the same for all heads.
+    """Scene and settings that are the same for all heads.
 
     Attributes:
         model: faces +x, within [-1, 1]^3.

@@ -1,4 +1,4 @@
-"""What the experiment on faces leaves for readers: tables, a plot, and which expressions a shadow tells."""
+"""Report of the experiment on faces: tables, a plot, and the expressions that a shadow determines."""
 
 from __future__ import annotations
 

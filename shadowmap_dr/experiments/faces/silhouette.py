@@ -26,7 +26,7 @@ _COARSE, _SIZES, _SHIFTS = 32, np.geomspace(0.6, 1.7, 14), np.arange(-5, 6)
 
 @dataclass(frozen=True)
 class Placement:
-    """How an image lies over the window: ``scale`` image pixels for each pixel of the window, and which image point lies at the
+    """Placement of an image over the window: ``scale`` image pixels for each pixel of the window, and the image point at the
     middle of the window (x to the right, y down, in image pixels); whether it has been mirrored first.
     """
 

@@ -38,7 +38,7 @@ STEP_SIZE, _DECAY = 0.02, 0.005
 
 @dataclass(frozen=True)
 class ConvergenceOptions:
-    """What to run. Everything is run for each candidate, occluder, camera, filter size and displacement.
+    """Options of a run. Everything is run for each candidate, occluder, camera, filter size and displacement.
 
     Attributes:
         occluders: names in `OCCLUDERS`: a square of side 0.5, its outlines parallel to the texels; the same, turned by 10 degrees

@@ -82,7 +82,7 @@ def central_derivative(renderer: Renderer, mesh: Mesh, motion: Motion, step: flo
 
 
 def reverse_error(renderer: Renderer, rate: npt.NDArray[np.float64], derivative: Image, seed: int = 0) -> float:
-    """How far <w, derivative> by reverse mode is from that of the given forward derivative, for random weights w.
+    """Relative deviation of <w, derivative> by reverse mode from that of the given forward derivative, for random weights w.
 
     Relative to the sum of the products' magnitudes, since the sum itself nearly cancels.
     """
@@ -111,7 +111,7 @@ def texel_in_pixels(renderer: Renderer, resolution: int) -> tuple[float, float]:
 
 
 def blurred_by_map(image: Image, renderer: Renderer) -> Image:
-    """What a faultless filtered map would make of a sharp derivative image (H, W, C): the same kernel, applied to it.
+    """A sharp derivative image (H, W, C) as a faultless filtered map would blur it: the same kernel, applied to it.
 
     That is the mean over a texel (coverage), the filter's taps, and the bilinear look-up, one after the other. The image is taken
     to be zero beyond its borders. Texels are parallel to the pixels.

@@ -40,7 +40,7 @@ _COARSE_FACES, _DIVISIONS, _TARGET_PIXELS = 2000, 3, 8.0
 
 @dataclass(frozen=True)
 class JacobianOptions:
-    """What to run. Everything is run for each candidate, motion, map size and filter size.
+    """Options of a run. Everything is run for each candidate, motion, map size and filter size.
 
     Attributes:
         motions: names in `gradients.scenes.MOTIONS`.

@@ -31,7 +31,7 @@ CASES = {"anti-aliased": True, "not anti-aliased": False}
 
 @dataclass(frozen=True)
 class PlaneOptions:
-    """What to run. Each camera is run with and without anti-aliased moments.
+    """Options of a run. Each camera is run with and without anti-aliased moments.
 
     Attributes:
         cameras: names in `gradients.scenes.CAMERAS`.

@@ -1,4 +1,4 @@
-"""What derivative images are compared with: path-traced central differences, and Mitsuba's projective integrator."""
+"""References for derivative images: path-traced central differences, and Mitsuba's projective integrator."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MITSUBA_RESOLUTION, MITSUBA_PENUMBRA, _MITSUBA_SPPI = 128, 16.0, 256
 
 @dataclass(frozen=True)
 class Sampling:
-    """How references are made.
+    """Sample counts and step sizes of references.
 
     Attributes:
         resolution: pixels along each side of path-traced images.
@@ -103,7 +103,7 @@ def _digest(mesh: Mesh) -> str:
 def _kept(
     path: Path, identity: dict[str, Any], reuse: bool, make: Callable[[], tuple[Image, dict[str, Any]]]
 ) -> tuple[Image, dict[str, Any]]:
-    """What is made, from the file in which an earlier run with the same identity has left it, if there is one."""
+    """The result of ``make``, read from the file of an earlier run with the same identity if there is one."""
     from mitsuba_baselines import reference
 
     if reuse and path.exists():

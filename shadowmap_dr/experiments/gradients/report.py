@@ -1,4 +1,4 @@
-"""What the experiments on gradients leave for readers: pictures in two colours, plots, tables, and a reading of the numbers."""
+"""Reports of the experiments on gradients: pictures in two colours, plots, tables, and a reading of the numbers."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def _reaches(found: Mapping[str, float], bounds: tuple[float, float, float]) -> 
 
 
 def _blur(entries: Sequence[Mapping[str, Any]]) -> str:
-    """How much of what is missing against path tracing is the map's blur."""
+    """Share of the deviation from path tracing that the map's blur explains."""
     missed = [e for e in entries if "blur" in e and not _reaches(e["traced"], TRACED)]
     if not missed:
         return ""

@@ -141,7 +141,7 @@ class Motion:
 
     @property
     def along_light(self) -> bool:
-        """Whether the shadow stays as it is, since all points move along the light."""
+        """True if all points move along the light, so that the shadow stays as it is."""
         return self.growth == 0 and not any(self.spin) and not any(self.velocity[:2])
 
     @staticmethod

@@ -29,7 +29,7 @@ from .scene import OBJECTS
 
 @dataclass(frozen=True)
 class LightOptions(LightSetting):
-    """What to run: every object with every number of lights and filter size.
+    """Options of a run: every object with every number of lights and filter size.
 
     ``filter_sizes``: 1 for no filter, 0 for no shadows.
     """

@@ -36,7 +36,7 @@ _CURVE_STRIDE = 5
 
 @dataclass(frozen=True, kw_only=True)
 class LightSetting:
-    """What all problems of an experiment have in common.
+    """Settings that all problems of an experiment have in common.
 
     Attributes:
         filter, map_resolution: of the shadow maps.
@@ -82,7 +82,7 @@ class LightProblem(Problem, LightSetting):
 
     @property
     def setting(self) -> str:
-        """What distinguishes this from other settings of the same object, as a part of file names."""
+        """Part of file names that tells this from other settings of the same object."""
         shadow = f"k{self.filter_size}-{self.filter}-m{self.map_resolution}" if self.shadows else "no-shadows"
         reference = f"mitsuba{self.spp}" if self.reference == "mitsuba" else self.reference
         parts = [f"n{self.lights}", shadow, f"r{self.resolution}", f"i{self.iterations}", f"c{self.cone_deg:g}", reference]
@@ -92,7 +92,7 @@ class LightProblem(Problem, LightSetting):
 
     @property
     def shadows(self) -> bool:
-        """Whether there are any."""
+        """True if there are any."""
         return self.filter_size > 0
 
     @property

@@ -1,4 +1,4 @@
-"""What light estimation leaves behind: a table, a plot like the paper's, pictures of some runs."""
+"""Report of light estimation: a table, a plot like the paper's, pictures of some runs."""
 
 from __future__ import annotations
 

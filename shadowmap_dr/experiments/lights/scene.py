@@ -1,4 +1,4 @@
-"""What light estimation starts from: an object on a floor, the camera above it, target directions and starts of all runs."""
+"""Inputs of light estimation: an object on a floor, the camera above it, target directions and starts of all runs."""
 
 from __future__ import annotations
 

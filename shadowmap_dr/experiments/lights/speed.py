@@ -1,4 +1,4 @@
-"""How long a step of light estimation takes for a run: in batches, alone, and the way of a renderer that knows no batches."""
+"""Time of a step of light estimation for a run: in batches, alone, and the way of a renderer that knows no batches."""
 
 from __future__ import annotations
 

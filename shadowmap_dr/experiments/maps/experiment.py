@@ -1,4 +1,4 @@
-"""Which shadow map is best: all methods side by side on scenes that are hard for them, against path tracing."""
+"""Comparison of shadow maps: all methods side by side on scenes that are hard for them, against path tracing."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _REFERENCE_SPP = 1024
 
 @dataclass(frozen=True)
 class MapsOptions:
-    """What to run.
+    """Options of a run.
 
     Attributes:
         scenes: names in `maps.scenes.SCENES`.

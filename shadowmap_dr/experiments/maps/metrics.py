@@ -1,4 +1,4 @@
-"""How far a visibility image is from the reference's: errors, bleeding, acne, and the shift of its contour in texels."""
+"""Deviations of a visibility image from the reference's: errors, bleeding, acne, and the shift of its contour in texels."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Texel:
 def texel_in_pixels(
     p_world: npt.NDArray[np.floating], view: LightView, frusta: Frusta, resolution: int, mask: npt.NDArray[np.bool_]
 ) -> Texel:
-    """What a texel covers in an image.
+    """Size of a texel in an image.
 
     Args:
         p_world: (H, W, 3) positions of what is seen, world space.

@@ -1,4 +1,4 @@
-"""What a shadow map is worth to an optimisation: the share of poses found from shadows alone."""
+"""Value of a shadow map for an optimisation: the share of poses found from shadows alone."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ from .sweep import PoseRuns, make_reference
 
 @dataclass(frozen=True)
 class PoseOptions:
-    """What to run. Everything is run for each object, resolution, run and method."""
+    """Options of a run. Everything is run for each object, resolution, run and method."""
 
     objects: tuple[str, ...] = ("spot",)
     resolutions: tuple[int, ...] = (128,)
@@ -286,7 +286,7 @@ def _checkpoint(problem: PoseProblem, name: str, run: int, options: PoseOptions)
 
 
 def _key(record: dict[str, Any]) -> tuple[Any, ...]:
-    """What a record is about: a newer one with the same key takes its place."""
+    """Subject of a record: a newer one with the same key takes its place."""
     names = ("object", "resolution", "method", "run", "seed", "iterations", "reference", "shadow_only")
     samples = record.get("settings", {}).get("samples_per_pixel", 1)
     variant = record.get("variant", record.get("environment", {}).get("variant"))

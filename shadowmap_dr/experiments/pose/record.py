@@ -25,7 +25,7 @@ TIME_TO_POSE_DEG = 0.1
 def identity(
     problem: PoseProblem, name: str, run: int, method: Method, *, seed: int, iterations: int, reference: ReferenceKind
 ) -> dict[str, Any]:
-    """What a run's record says before the run is made: two records that agree in this are of the same run."""
+    """Contents of a run's record before the run is made: two records that agree in this are of the same run."""
     return records.plain(
         {
             "object": problem.name,
@@ -45,7 +45,7 @@ def identity(
 
 
 def is_of(record: dict[str, Any], wanted: dict[str, Any]) -> bool:
-    """Whether a record is of the run with an identity."""
+    """True if a record is of the run with an identity."""
     environment = record.get("environment")
     # Records from before there was a choice.
     older = {"variant": environment.get("variant")} if isinstance(environment, dict) else {}
@@ -54,7 +54,7 @@ def is_of(record: dict[str, Any], wanted: dict[str, Any]) -> bool:
 
 
 def is_complete(record: dict[str, Any]) -> bool:
-    """Whether a record says what came out of its run: all that is shown of runs, and all that says where they went."""
+    """True if a record says what came out of its run: all that is shown of runs, and all that says where they went."""
     curves = ("loss_curve", "rotation_error_curve", "translation_error_curve")
     results = ("final", "rotation_error_deg", "translation_error_x100", "recovered", "seconds_per_iteration", "seconds_to_pose")
     return all(key in record for key in results) and all(isinstance(record.get(key), list) for key in ("final", *curves))

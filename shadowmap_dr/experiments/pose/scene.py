@@ -1,4 +1,4 @@
-"""What pose estimation starts from: the object, the scene around it, the reference image, the start poses."""
+"""Inputs of pose estimation: the object, the scene around it, the reference image, the start poses."""
 
 from __future__ import annotations
 

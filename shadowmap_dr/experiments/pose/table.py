@@ -103,7 +103,7 @@ def _rounded(curve: Sequence[float | None] | None) -> list[float | None] | None:
 
 
 def _records(row: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """What `Row.plain` wrote, as records again."""
+    """Records from the output of `Row.plain`."""
     names = (*CASES["seen"], *_SETTINGS, "environment", "object", "resolution", "method", "seconds_per_step")
     shared = {name: row[name] for name in names}
     runs = row["runs"]

@@ -38,7 +38,7 @@ Mask = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class SoftOptions:
-    """What to run.
+    """Options of a run.
 
     Attributes:
         scenes: names in `soft.scenes.SCENES`.
@@ -73,7 +73,7 @@ class SoftOptions:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What numbers depend on: a run is resumed with the same."""
+        """Settings on which numbers depend: a run is resumed with the same."""
         kept = asdict(self)
         for name in ("scenes", "out", "resume"):
             kept.pop(name)

@@ -1,4 +1,4 @@
-"""What the experiment with extended lights leaves behind: a table, a reading of it and a sheet of pictures."""
+"""Report of the experiment with extended lights: a table, a reading of it and a sheet of pictures."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def table(record: Mapping[str, Any]) -> Table:
 
 
 def reading(record: Mapping[str, Any], bar: float = 0.02) -> list[str]:
-    """What the numbers say, in sentences."""
+    """Reading of the numbers, in sentences."""
     scenes = record["scenes"]
     rough = {name: entry for name, entry in scenes.items() if not entry["glossy"]}
     above = {n: e["errors"][-1]["error"] for n, e in rough.items() if e["errors"][-1]["error"] > bar}
@@ -62,7 +62,7 @@ def reading(record: Mapping[str, Any], bar: float = 0.02) -> list[str]:
 
 
 def falling(errors: Sequence[float]) -> bool:
-    """Whether errors fall with each step, up to a tenth of the last one, and altogether."""
+    """True if errors fall with each step, up to a tenth of the last one, and altogether."""
     if len(errors) < 2:
         return True
     return errors[-1] < errors[0] and all(b <= a + 0.1 * errors[-1] for a, b in zip(errors, errors[1:], strict=False))
@@ -94,7 +94,7 @@ def save_pictures(path: Path, pictures: Mapping[str, Image]) -> None:
 
 
 def load_pictures(path: Path) -> dict[str, Image]:
-    """What :func:`save_pictures` wrote; nothing if there is no such file."""
+    """Pictures that :func:`save_pictures` wrote; nothing if there is no such file."""
     if not path.exists():
         return {}
     channels, _ = images.read_exr(path)

@@ -27,7 +27,7 @@ Array = npt.NDArray[Any]
 
 @dataclass(frozen=True)
 class ConvertOptions:
-    """How to bring a model into shape.
+    """Options of a conversion.
 
     Attributes:
         facing: axis along which the model's head looks; y is up.

@@ -144,7 +144,7 @@ class MorphFit:
         self._optimizer.set_learning_rate(self._rates)
 
     def recordings(self) -> int:
-        """How often the step has been recorded so far; stays the same once the fit is warm."""
+        """Number of recordings of the step so far; stays the same once the fit is warm."""
         return int(self._step.n_recordings)
 
     def describe(self) -> dict[str, Any]:

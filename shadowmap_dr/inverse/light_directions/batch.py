@@ -34,7 +34,7 @@ _BYTES_OF_PIXEL, _BYTES_OF_LIT_PIXEL = 60, 20
 
 @dataclass(frozen=True)
 class LightState:
-    """Where M lights of a batch are, and the optimiser's moments. A PyTree that may cross ``dr.freeze``.
+    """Directions of the M lights of a batch, and the optimiser's moments. A PyTree that may cross ``dr.freeze``.
 
     ``to_light``, ``m``, ``v``: Vector3f (M,), unit directions and Adam's moments; ``t``: Float of width 1, number of steps;
     ``frusta``: fit of the shadow maps, None without shadows.
@@ -58,7 +58,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class LightHistory:
-    """What happened in N steps of R runs with n lights each.
+    """Course of N steps of R runs with n lights each.
 
     ``losses`` (N, R): before each step. ``directions`` (N + 1, R, n, 3): unit vectors to the lights, first and after each step.
     """
@@ -173,7 +173,7 @@ class LightBatch:
         return replace(state, frusta=_own_arrays(fit_maps(scene, light_views(state.to_light), None)))
 
     def recordings(self) -> int:
-        """How often a step has been recorded so far."""
+        """Number of recordings of a step so far."""
         return int(self._step.n_recordings)
 
     def _vectors(self, directions: npt.ArrayLike) -> tuple[Any, int]:

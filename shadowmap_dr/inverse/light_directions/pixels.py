@@ -22,7 +22,7 @@ _KINDS = "plain diffuse materials under directional lights only"
 
 @dataclass(frozen=True)
 class Pixels:
-    """What the camera sees, P pixels. All arrays are detached and evaluated.
+    """Surfaces that the camera sees, P pixels. All arrays are detached and evaluated.
 
     Attributes:
         height, width: of the image; P = height * width.

@@ -54,7 +54,7 @@ class Method(Protocol):
 
 @dataclass(frozen=True)
 class History:
-    """What happened in N steps.
+    """Course of N steps.
 
     Attributes:
         loss: (N,), the loss before each step.

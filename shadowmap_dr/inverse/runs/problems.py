@@ -1,4 +1,4 @@
-"""What a sweep runs: a problem has settings, numbered runs, something to build once, and a way to do a batch of runs.
+"""Problems that a sweep runs: a problem has settings, numbered runs, something to build once, and a way to do a batch of runs.
 
 Derive from :class:`LossProblem` where a loss can be evaluated for many runs at once, from :class:`MethodProblem` where a
 :class:`shadowmap_dr.inverse.Method` does one run at a time, or from :class:`Problem` for anything else. A problem is a
@@ -55,12 +55,12 @@ class Problem(ABC):
         return range(self.runs)
 
     def batch_size(self, memory: int) -> int:
-        """How many runs to do at once so that they need about ``memory`` bytes at most."""
+        """Number of runs to do at once so that they need about ``memory`` bytes at most."""
         return 1
 
     @abstractmethod
     def build(self) -> Any:
-        """What batches share: scene, renderer, compiled steps. Made once in each process, after the variant is set."""
+        """Objects that batches share: scene, renderer, compiled steps. Made once in each process, after the variant is set."""
 
     @abstractmethod
     def run_batch(
@@ -103,7 +103,7 @@ class LossProblem(Problem):
         """Loss of each of R runs, ``Float`` (R,), attached to ``parameters``, ``Float`` (R P); it depends on that run's only."""
 
     def record(self, run: int, history: History) -> dict[str, Any]:
-        """What to keep of a run: start, final parameters and the loss before each step."""
+        """Record of a run: start, final parameters and the loss before each step."""
         return {"start": history.parameters[0], "final": history.final, "loss_curve": history.loss}
 
     def batch_size(self, memory: int) -> int:
@@ -133,7 +133,7 @@ class MethodProblem(Problem):
         """(P,) start of a run, by its number only."""
 
     def record(self, run: int, history: History) -> dict[str, Any]:
-        """What to keep of a run."""
+        """Record of a run."""
         return {
             "start": history.parameters[0],
             "final": history.final,

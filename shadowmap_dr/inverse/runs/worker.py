@@ -1,4 +1,4 @@
-"""Where batches are done: a process that keeps what a problem has built for as long as batches of the same problem come."""
+"""Worker of batches: a process that keeps what a problem has built for as long as batches of the same problem come."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Batch:
 
 
 def stem(problem: Problem, variant: str) -> str:
-    """What the names of a problem's files begin with: its name, and a digest of all that decides on its results."""
+    """Beginning of the names of a problem's files: its name, and a digest of all that decides on its results."""
     content = json.dumps([plain(problem.settings()), variant], sort_keys=True)
     return f"{problem.name}-{hashlib.sha256(content.encode()).hexdigest()[:8]}"
 

@@ -60,7 +60,7 @@ def write_printable(path: Path, vertices: Array, faces: Faces) -> None:
 
 
 def mesh_report(vertices: Array, faces: Faces) -> dict[str, Any]:
-    """Whether a mesh can be printed: closed, oriented, volume (cubic scene units), share of inverted triangles."""
+    """Printability of a mesh: closed, oriented, volume (cubic scene units), share of inverted triangles."""
     import trimesh
 
     mesh = trimesh.Trimesh(vertices, faces, process=False)

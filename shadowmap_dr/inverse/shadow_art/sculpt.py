@@ -174,7 +174,7 @@ class Sculptor:
         self._solve()
 
     def recordings(self) -> int:
-        """How often a step has been recorded so far; stays the same once the sculptor is warm."""
+        """Number of recordings of a step so far; stays the same once the sculptor is warm."""
         return int(self._gradient.n_recordings)
 
     def describe(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""How smooth a mesh is: a regularisation for optimisers, and how many of its triangles are folded over."""
+"""Smoothness of a mesh: a regularisation for optimisers, and how many of its triangles are folded over."""
 
 from __future__ import annotations
 

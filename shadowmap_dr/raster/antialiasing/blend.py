@@ -232,7 +232,7 @@ class Mixer:
         return result
 
     def _pair(self, pair: Any) -> tuple[Any, Any, Any]:
-        """Whether it is a pair with the lower neighbour, its pixel, and its weight."""
+        """(True for a pair with the lower neighbour, its pixel, its weight)."""
         down, pixel = (pair & 1) != 0, pair >> 1
         below = dr.gather(self.module.Float, self.crossings.down, pixel, down)
         return down, pixel, dr.select(down, below, dr.gather(self.module.Float, self.crossings.right, pixel, ~down))
@@ -242,7 +242,7 @@ class Mixer:
         return pixel + dr.select(down, self.module.UInt32(self.width), 1)
 
     def _is_first(self, shares: list[Any], second: Any, down: Any) -> Any:
-        """Whether a pair is the first with a share among those around one of its pixels (``second``: its second pixel).
+        """True if a pair is the first with a share among those around one of its pixels (``second``: its second pixel).
 
         ``shares`` are those of the right, lower, left and upper neighbour.
         """
@@ -253,7 +253,7 @@ class Mixer:
         return ~dr.select(second, dr.select(down, before[2], before[1]), down & before[0])
 
     def _bare(self, slot: Any) -> Any:
-        """Whether a pair has no edge."""
+        """True if a pair has no edge."""
         return dr.gather(self.module.UInt32, self.crossings.ends, 4 * slot) == NO_VERTEX
 
     def _gain(self, adjoint: Any, pixel: Any, down: Any, weight: Any) -> Any:
@@ -272,7 +272,7 @@ class Mixer:
         return gain * dr.select(weight > 0, scale, -scale)
 
     def _beyond(self, taker: Any, giver: Any, down: Any, place: Any, active: Any) -> list[Any]:
-        """What pixels gain by a larger share of their neighbours, from whom edges at some place separate them, plus their own."""
+        """Gain of pixels by a larger share of their neighbours, from whom edges at some place separate them, plus their own."""
         if self.surroundings is None:
             return self.read(self.original, giver, active)
 

@@ -1,4 +1,4 @@
-"""How much colours jump at an edge between two pixels, from what is seen on both sides of it.
+"""Jumps of colours at an edge between two pixels, from the pixels on both sides of it.
 
 The colours at the pixels' centres differ by more than that: what shading falls by on the way to a rim, say, is no jump, and would
 count twice where the rim moves. So both sides are continued to the edge, as steeply as they change beyond the pixels. The weights
@@ -24,7 +24,7 @@ from .creases import CoplanarCreases, touching
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What it takes to tell whether colours change steadily from a pixel to its neighbour. Detached.
+    """Inputs to tell whether colours change steadily from a pixel to its neighbour. Detached.
 
     Attributes:
         triangle: ``UInt32``, what each pixel sees.
@@ -99,7 +99,7 @@ class Surroundings:
         return result
 
     def _inside(self, pixel: Any, down: Any, ahead: Any, active: Any) -> Any:
-        """Whether the next pixel to the right (left, if not ``ahead``) or below (above) belongs to the same image."""
+        """True if the next pixel to the right (left, if not ``ahead``) or below (above) belongs to the same image."""
         UInt32 = backend(pixel).UInt32
         row_flat = pixel // self.width
         at = dr.select(down, row_flat % self.height, pixel - row_flat * self.width)
@@ -107,7 +107,7 @@ class Surroundings:
         return dr.select(ahead, at < last, at > 0) & active
 
     def _steady(self, crossed: Callable[[Any, Any, Any], Any], near: Any, far: Any, down: Any, ahead: Any, inside: Any) -> Any:
-        """Whether pixels and their neighbours see the same triangle, or others of a smooth surface.
+        """True if pixels and their neighbours see the same triangle, or others of a smooth surface.
 
         That no edge crosses the way to the neighbour would not be enough by itself: edges along it do not count there.
         """
@@ -143,13 +143,13 @@ class Surroundings:
         return same | dr.if_stmt(lanes, smooth, unbroken, lambda *_: module.Bool(False), mode="symbolic", label="smooth")
 
     def _jump(self, edge: Any, soft: Any) -> Any:
-        """Whether an edge is a crease. Folds are none where they are ``soft``."""
+        """True if an edge is a crease. Folds are none where they are ``soft``."""
         Bool = backend(edge).Bool
         found = dr.gather(Bool, self.creases, edge)
         return found if self.folds is None else found & ~(soft & dr.gather(Bool, self.folds.edges, edge))
 
     def _leaves(self, pixel: Any, triangle: Any, down: Any, ahead: Any, soft: Any) -> Any:
-        """Whether the edge at which one leaves a triangle, from a pixel's centre towards a neighbour, is a crease.
+        """True if the edge at which one leaves a triangle, from a pixel's centre towards a neighbour, is a crease.
 
         Folds are none (``soft``) between coplanar triangles, and where triangles are seen as a smooth surface.
         """

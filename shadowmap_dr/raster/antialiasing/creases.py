@@ -32,7 +32,7 @@ class CoplanarCreases:
     normals: Any
 
     def flat(self, here: Any, neighbour: Any) -> Any:
-        """Whether two faces lie in one plane and are turned to the same side, if they have a point in common."""
+        """True if two faces lie in one plane and are turned to the same side, if they have a point in common."""
         Array3f, Array4f = (getattr(backend(here), name) for name in ("Array3f", "Array4f"))
         n, m = (dr.gather(Array4f, self.normals, face) for face in (here, neighbour))
         n, m = Array3f(n.x, n.y, n.z), Array3f(m.x, m.y, m.z)
@@ -108,7 +108,7 @@ def find_creases(
 
 
 def touching(topology: Topology, first: Any, second: Any) -> Any:
-    """Whether two faces (or none) have a corner in common."""
+    """True if two faces (or none) have a corner in common."""
     module = backend(first)
     active = (first != NO_TRIANGLE) & (second != NO_TRIANGLE)
     mine = dr.gather(module.Array3u, topology.welded, first, active)

@@ -1,4 +1,4 @@
-"""Which edges separate neighbouring pixels, where they cross the segments between the pixels' centres, and how that changes."""
+"""Edges that separate neighbouring pixels, and where they cross the segments between the centres, with derivatives."""
 
 from __future__ import annotations
 
@@ -196,7 +196,7 @@ def _measure(
 
 
 def _cut(topology: Topology, raster: RasterOutput, image: Any, pixel: Any, here: Any, there: Any, down: Any, active: Any) -> Any:
-    """Whether triangles without a common corner, seen by pixels and their neighbours, may cut each other between these.
+    """True if triangles without a common corner, seen by pixels and their neighbours, may cut each other between these.
 
     Their planes cross there, and each triangle is seen where it is the nearer one.
     """
@@ -269,7 +269,7 @@ def _weight(
 
 
 def _share(p: Any, q: Any, down: Any, raster: RasterOutput) -> Any:
-    """How much an edge counts for pairs of this kind, from its direction in the image (or its line's, behind the camera)."""
+    """Weight of an edge for pairs of this kind, from its direction in the image (or its line's, behind the camera)."""
     # The line a x + b y + c = 0 in ndc is a (2 / width) x + ... in pixels.
     nx, ny = (p.y * q.w - q.y * p.w) / raster.width, (q.x * p.w - p.x * q.w) / raster.height
     square = nx * nx + ny * ny

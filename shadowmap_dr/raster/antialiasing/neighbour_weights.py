@@ -1,4 +1,4 @@
-"""How much the neighbours of a pixel reach into it."""
+"""Weights with which the neighbours of a pixel reach into it."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from .edge_crossings import Crossings
 
 
 def incoming_weights(crossings: Crossings, width: int) -> tuple[Any, Any, Any, Any]:
-    """How much the right, lower, left and upper neighbour each reach into a pixel of images ``width`` pixels wide."""
+    """Weights with which the right, lower, left and upper neighbour each reach into a pixel of images ``width`` pixels wide."""
     return around(crossings.right, crossings.down, width, 1)
 
 
 def around(right: Any, down: Any, width: int, sign: int, signed: bool = False, at: Any = None) -> tuple[Any, Any, Any, Any]:
-    """How much each neighbour reaches into a pixel, or (``sign`` -1) a pixel into each neighbour; all pixels, or those ``at``.
+    """Weights of each neighbour in a pixel, or (``sign`` -1) a pixel into each neighbour; all pixels, or those ``at``.
 
     Neighbours are the right, lower, left and upper one. Pairs that reach beyond the image have weight 0, which is also what the
     last pixels of the line above and the image before have for the first ones.

@@ -45,7 +45,7 @@ class PairList:
 
     @property
     def lanes(self) -> int:
-        """How many lanes deal with the list in turns."""
+        """Number of lanes that deal with the list in turns."""
         return -(-dr.width(self.pairs) // _ROUNDS)
 
     def at(self, slot: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Where silhouettes cross the image: for each pair of neighbouring pixels, the mesh edge that separates them.
+"""Crossings of silhouettes in the image: for each pair of neighbouring pixels, the mesh edge that separates them.
 
 The usual scheme looks for the separating edge among the three of the triangle that a pixel sampled, which fails once
 triangles are smaller than pixels. Here each silhouette edge of the whole mesh walks along the lines through pixel centres
@@ -241,7 +241,7 @@ def _project(a: Any, b: Any, active: Any, width: int, height: int) -> tuple[Any,
 
 
 def _horizontal_share(dx: Any, dy: Any, active: Any) -> Any:
-    """How much an edge of this direction counts for horizontal pairs of pixels; for vertical ones it is the rest."""
+    """Weight of an edge of this direction for horizontal pairs of pixels; for vertical ones it is the rest."""
     dx, dy = dr.select(active, dx, 0), dr.select(active, dy, 0)
     square = dx * dx + dy * dy
     return dr.clip(0.5 + (dy * dy - dx * dx) / dr.select(square > 0, square, 1), 0, 1)

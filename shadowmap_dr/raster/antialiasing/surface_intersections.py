@@ -1,4 +1,4 @@
-"""Where what two neighbouring pixels see meets, other than in an edge that both have.
+"""Intersections of the surfaces that two neighbouring pixels see, other than in an edge that both have.
 
 Surfaces do so along lines where one passes through another, or stands on it: no silhouette lies between the pixels there, but
 what they see changes at once. So do flat faces of one surface between which there are others, too narrow for a pixel to see: the
@@ -40,7 +40,7 @@ _LANES = 1024
 
 @dataclass(frozen=True)
 class Meetings:
-    """What it takes to find out where the triangles that two neighbouring pixels see meet. Detached.
+    """Inputs to find out where the triangles that two neighbouring pixels see meet. Detached.
 
     Attributes:
         positions: flat clip-space vertices (4 V B), as rasterized.
@@ -186,7 +186,7 @@ class Meetings:
         return Float(share) * beyond_middle(Float(t)), Float(-share * slope), triangles
 
     def _bent(self, triangle: Any, first: Any, corners: Any, planes: list[Any], along: Callable[[Any], Any]) -> Any:
-        """How far from both planes the faces beside a triangle turn, as changes of depth on the way to the neighbour: the most.
+        """Largest turn of the faces beside a triangle away from both planes, as changes of depth on the way to the neighbour.
 
         The ridge itself lies between a face of the one plane and a face of the other.
         """
@@ -203,7 +203,7 @@ class Meetings:
 
 
 def beyond_middle(t: Any) -> Any:
-    """How far (pixels) something lies beyond the border between two pixels, from where it is (0 to 1) between their centres.
+    """Distance (pixels) beyond the border between two pixels, from where it is (0 to 1) between their centres.
 
     Never 0: see ``LEAST_WEIGHT``.
     """

@@ -265,7 +265,7 @@ def _probes(geometry: Geometry, positions: np.ndarray, faces: np.ndarray, own: s
 
 
 def _dented(places: np.ndarray, corners: np.ndarray, normals: np.ndarray) -> bool:
-    """Whether some of the places (N, 3) on a surface lie before the planes of its triangles (F, 3, 3)."""
+    """True if some of the places (N, 3) on a surface lie before the planes of its triangles (F, 3, 3)."""
     offsets = (corners[:, 0] * normals).sum(1)
     highest = max(float((normals @ place - offsets).max()) for place in places)
     return highest > _DENT * np.ptp(corners.reshape(-1, 3), axis=0).max()

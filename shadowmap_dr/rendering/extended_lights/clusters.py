@@ -26,7 +26,7 @@ def surface_clusters(
     """
 
     def urgency(members: np.ndarray) -> float:
-        """Which cluster is halved next: the heaviest, and sooner where normals differ."""
+        """Priority of a cluster to be halved next: the heaviest, and sooner where normals differ."""
         total = float(weights[members].sum())
         if normals is None:
             return total
@@ -158,6 +158,6 @@ def sky_clusters(weights: np.ndarray, count: int) -> np.ndarray:
 
 
 def _halfway(cumulative: np.ndarray) -> int:
-    """Where a rising line passes the middle between its ends: the nearest of its inner points."""
+    """Place where a rising line passes the middle between its ends: the nearest of its inner points."""
     middle = 0.5 * (cumulative[0] + cumulative[-1])
     return int(np.clip(np.argmin(np.abs(cumulative - middle)), 1, len(cumulative) - 2))

@@ -1,4 +1,4 @@
-"""Where the shadow maps of an area light look, so that one of them sees all that casts shadows (on the host)."""
+"""Aim of the shadow maps of an area light, so that one of them sees all that casts shadows (on the host)."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def aim(vertices: Sequence[Points], shapes: Sequence[ShapeInfo], own: int) -> Ai
 
 
 def sees_all(emitter: Points, casters: Sequence[Points], target: tuple[float, float, float]) -> bool:
-    """Whether maps anywhere in the box of an emitter that face a point cover the casters' vertices."""
+    """True if maps anywhere in the box of an emitter that face a point cover the casters' vertices."""
     eyes, centre = _box(emitter), np.array(target)
     # Boxes are a matter of a few points, and mostly enough.
     boxes = np.concatenate([_box(points) for points in casters])
@@ -67,7 +67,7 @@ def _widest(eyes: Points, points: Points, centre: Points) -> float:
 
 
 def _may_cast(shapes: Sequence[ShapeInfo], parts: Sequence[Points], k: int, others: Sequence[int], light: Points) -> bool:
-    """Whether a shape has anything behind it, as seen from the light: walls and floors have not."""
+    """True if a shape has anything behind it, as seen from the light: walls and floors have not."""
     if not shapes[k].planar:
         return True
     own = parts[k]

@@ -106,7 +106,7 @@ def penumbra_visibility(pyramid: Pyramid, which: Any, radius: Any, p_world: Any,
 
 @dataclass(frozen=True)
 class _Place:
-    """Where points lie in their maps: (x, y) in 0..1, distance z along the light's axis, and the tilt of their tangent planes."""
+    """Places of points in their maps: (x, y) in 0..1, distance z along the light's axis, and the tilt of their tangent planes."""
 
     view: Views
     frustum: Frusta
@@ -138,7 +138,7 @@ class _Place:
         return dr.maximum(self.frustum.first, self.frustum.near)
 
     def footprint(self, radius: Any, z_occluder: Any) -> tuple[Any, Any]:
-        """Where rays from the point to the rim of the light pass a distance: half-axes in units of the map."""
+        """Extent of the rays from the point to the rim of the light at a distance: half-axes in units of the map."""
         slope = radius * dr.maximum(self.z - z_occluder, 0) / (self.z * z_occluder)
         return tuple(dr.minimum(0.5 * slope / half, _WIDEST) for half in (self.frustum.half_x, self.frustum.half_y))
 

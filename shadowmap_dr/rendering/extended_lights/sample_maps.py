@@ -49,7 +49,7 @@ _SEEN = 1024
 
 @dataclass(frozen=True)
 class SoftPlan:
-    """How one extended light is sampled, and which maps it has. Static.
+    """Samples of one extended light, and their maps. Static.
 
     ``kind``: ``distant`` or ``near`` (one map for each sample), ``cube`` (six), or ``single`` (one in all, see
     :mod:`shadowmap_dr.rendering.extended_lights.penumbra`). ``first``: number of the first map, single ones and others counted
@@ -97,7 +97,7 @@ def plan_soft(
 
 
 def still_aimed(plans: Sequence[SoftPlan], geometry: Callable[[], Geometry]) -> bool:
-    """Whether the maps of lights that have one for each sample, or one in all, still cover what they are meant to.
+    """True if the maps of lights that have one for each sample, or one in all, still cover what they are meant to.
 
     If there are such lights, the geometry is asked for, and its vertices are read back to the host.
     """

@@ -1,4 +1,4 @@
-"""What an extended light is to the shading: a fixed number of points, or of directions, each with a shadow map of its own."""
+"""Extended lights as the shading knows them: a fixed number of points, or of directions, each with a shadow map of its own."""
 
 from __future__ import annotations
 

@@ -118,7 +118,7 @@ def _measured(light: Environment, rows: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 class SkyWatch:
-    """Whether a sky still shines about where it did when it was divided into parts; it may have been turned meanwhile.
+    """Watch over where a sky shines: it may have been turned since it was divided into parts.
 
     Args:
         lights: environments of a scene, as they are.

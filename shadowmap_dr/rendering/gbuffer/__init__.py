@@ -1,1 +1,1 @@
-"""What cameras see: visibility, points on surfaces, normals, shading edges, footprints of pixels."""
+"""Camera pass: visibility, points on surfaces, normals, shading edges, footprints of pixels."""

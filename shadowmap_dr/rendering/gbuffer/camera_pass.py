@@ -1,4 +1,4 @@
-"""What the camera sees: clip-space vertices, the G-buffer, and points all over it."""
+"""Clip-space vertices for a camera, and points all over what it sees."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def _orthographic_reach(sensor: Sensor, geometry: Geometry) -> Any:
 
 
 def least_gap(sensor: Sensor) -> float:
-    """How far, in NDC depth, an edge must at least lie before what it borders (:func:`~shadowmap_dr.raster.find_crossings`)."""
+    """Least NDC depth by which an edge must lie before what it borders (:func:`~shadowmap_dr.raster.find_crossings`)."""
     # The depths of a perspective camera are as precise, relatively, far away as they are near by.
     return 0.0 if sensor.kind == "perspective" else DEPTH_GAP
 

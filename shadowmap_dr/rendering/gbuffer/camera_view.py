@@ -77,7 +77,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class GBuffer:
-    """What a camera sees, H * W pixels, row-major.
+    """Surfaces that a camera sees, H * W pixels, row-major.
 
     Attributes:
         sensor: the camera.
@@ -160,7 +160,7 @@ class CameraPass:
         return Frame(view, surface_at(self.data, geometry, sensor, hits, *normals, frames=frames), hits.depth, sharpness)
 
     def crossings(self, view: CameraView, sharpness: Any, shapes: PlacedShapes) -> Crossings:
-        """How the samples of a camera mix. ``sharpness``: that of its :class:`Frame`. Detached."""
+        """Edges through which the samples of a camera mix. ``sharpness``: that of its :class:`Frame`. Detached."""
         dr.eval(sharpness)
         return find_crossings(
             view.clip,

@@ -27,7 +27,7 @@ _SMALL, _LARGE = 1.5, 3.0
 
 @dataclass(frozen=True)
 class FlatFaces:
-    """Which flat faces meet at each place of a mesh: those of place v are ``faces[start[v]:start[v + 1]]``, ``UInt32`` each.
+    """Flat faces that meet at each place of a mesh: those of place v are ``faces[start[v]:start[v + 1]]``, ``UInt32`` each.
 
     ``flat``: ``Bool`` (F,), whether a face is one of them.
     """

@@ -78,7 +78,7 @@ class FootprintSamples:
 
 @dataclass(frozen=True)
 class _Axes:
-    """Where a pixel's right and upper side lie in the world, seen at the depth of its surface (Vector3f each), and how it slants.
+    """Offsets to a pixel's right and upper side in the world, seen at the depth of its surface (Vector3f each), and its slant.
 
     ``view`` is the direction in which it is seen, ``normal`` its own, ``slope`` their cosine, kept away from 0.
     """

@@ -56,7 +56,7 @@ class Pairs:
 
 @dataclass(frozen=True)
 class ShadingEdges:
-    """Where shading jumps. A PyTree that may cross ``dr.freeze``.
+    """Edges at which shading jumps. A PyTree that may cross ``dr.freeze``.
 
     always      Bool (3 F,), edges from corner k to k + 1 of a face at which it does whatever moves: at flat faces, between shapes
     bendable    Bool (3 F,), those of them between flat faces of one shape, at which it only does if the surface is bent there, or
@@ -175,12 +175,12 @@ class ShadingEdges:
         return edges
 
     def folds_of(self, normals: Any) -> CoplanarCreases | None:
-        """Which of these edges shading jumps at only if the surface is bent there, for normals of flat faces (Float, 4 F)."""
+        """Edges at which shading jumps only if the surface is bent there, for normals of flat faces (Float, 4 F)."""
         return None if self.folds is None else CoplanarCreases(self.folds, normals)
 
 
 def _may_vary(shape: Any, plain: dict[Any, bool]) -> bool:
-    """Whether texture coordinates may decide on what a shape looks like. ``plain``: what is known of materials, kept here."""
+    """True if texture coordinates may decide on what a shape looks like. ``plain``: what is known of materials, kept here."""
     bsdf = shape.bsdf()
     if bsdf not in plain:
         plain[bsdf] = is_plain(bsdf)

@@ -23,7 +23,7 @@ _MANY_SHAPES = 128
 
 @dataclass(frozen=True)
 class Surface:
-    """What is seen at each pixel, N of them.
+    """Surfaces seen at each pixel, N of them.
 
     p_world  Point3f (N,), attached to vertices and barycentrics
     n_world  Normal3f (N,), unit geometric normal, on the side that the shape calls outside
@@ -53,7 +53,7 @@ class Surface:
 
 
 def plain_colours(data: SceneData) -> Any:
-    """What Mitsuba's BSDFs return for light and viewer along the normal, on either side of each shape.
+    """Values of Mitsuba's BSDFs for light and viewer along the normal, on either side of each shape.
 
     That is all there is to know about a BSDF that is proportional to the cosine (:attr:`SceneData.needs_frames`), and calling
     it for two directions is much cheaper than for each pixel. Float (8 S,), four numbers for each side, attached.

@@ -1,4 +1,4 @@
-"""Where on its triangle each pixel is: the G-buffer before any shading.
+"""Points on triangles that pixels see: the G-buffer before any shading.
 
 Two ways lead here. ``hits_at`` takes barycentrics as they are, attached or not. ``pixel_hits`` knows that the points lie on the
 rays through a camera's pixel centres, and takes the derivative in world space: a moving triangle carries the material point
@@ -80,7 +80,7 @@ def hits_at(geometry: Geometry, triangle: Any, u: Any, v: Any, active: Any = Tru
 
 
 def pixel_hits(geometry: Geometry, sensor: Sensor, triangle: Any, size: tuple[int, int]) -> SurfacePoints:
-    """What the pixel centres of a picture of ``size`` (width, height) see, given its triangles (row-major).
+    """Points that the pixel centres of a picture of ``size`` (width, height) see, given its triangles (row-major).
 
     Attached to positions and camera: each point stays on the ray through its pixel and on its triangle's plane.
     """

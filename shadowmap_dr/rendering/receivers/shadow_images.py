@@ -52,7 +52,7 @@ class ShadowImages:
         return sum(height * width for height, width in self.sizes)
 
     def visibility(self, vertices: Any) -> Any:
-        """What the views' cameras see.
+        """Visibility images of the views' cameras.
 
         Args:
             vertices: ``Float`` (3V,), world space. Attached.

@@ -1,4 +1,4 @@
-"""Where the shadows of shadow art fall: a light, a receiver, and a camera that sees the receiver but not the object.
+"""Views of shadow art: a light, a receiver, and a camera that sees the receiver but not the object.
 
 Neither light nor receiver nor camera ever moves, so all that is left of them is the point of the receiver that each pixel sees.
 """
@@ -102,7 +102,7 @@ def shadow_view(
 
 
 def height(receiver: str, x: npt.NDArray[np.float64], half: float) -> npt.NDArray[np.float64]:
-    """How far the receiver lies out of its plane, towards the object, at a distance x to the right of its middle."""
+    """Distance of the receiver out of its plane, towards the object, at a distance x to the right of its middle."""
     if receiver == "plane":
         return np.zeros_like(x)
     return WAVE_HEIGHT * half / HALF * np.sin(WAVES * np.pi / half * x)

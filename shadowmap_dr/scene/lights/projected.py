@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,14 +10,17 @@ import drjit as dr
 import mitsuba as mi
 
 from ...jit.vectors import normalize_or
+from ...shadow.light_camera import LightView, directional_view
 from ..transforms import axis, translation
-from .light import picture, towards
+from .light import cone_kind, cone_views, picture, towards
 from .soft_outline import BoundedLight, share_inside
 
 # Width of the rim in which light fades, half of it on either side of the outline: through it a moving outline has derivatives.
 # In units of the picture, and of the narrower half of a beam's cross-section. In images it is at least as wide as a pixel.
 _PICTURE_RIM = 1 / 1024
 _BEAM_RIM = 0.005
+# Distance of the first casters from a beam's shape, in units of its reach.
+_BEAM_START = 1e-3
 
 
 @dataclass(frozen=True)
@@ -69,6 +73,12 @@ class Projector(BoundedLight):
         cosine = dr.select(lit, -dr.dot(axis(self.to_world, 2), wo), 1.0)
         weight = picture(self.irradiance, dr.clip(uv, 0, 1), lit) * inside * (dr.pi * self.scale / (dr.square(z) * cosine))
         return wo, dr.select(lit, weight, 0)
+
+    def map_kind(self) -> str:
+        return cone_kind(dr.atan(self.spread) * (180 / math.pi))
+
+    def map_views(self, kind: str, resolution: int, filter_size: int) -> tuple[LightView, ...]:
+        return cone_views(self.to_world, dr.detach(self.spread), kind, resolution, filter_size)
 
     def distances(self, p_world: Any) -> list[Any]:
         """Distances from the edges that bound the light (Float), positive inside, in units of ``falloff_width``. Attached."""
@@ -127,6 +137,20 @@ class Beam(BoundedLight):
     def reach(self) -> Any:
         """Float, world units: nothing of the beam is farther from its axis."""
         return dr.norm(axis(self.to_world, 0)) + dr.norm(axis(self.to_world, 1)) + self.falloff_width
+
+    @property
+    def caster_start(self) -> Any:
+        """Float, world units, detached: least distance of casters from the shape, which must not shadow itself."""
+        place = dr.detach(self.position)
+        far = dr.maximum(dr.maximum(dr.abs(place.x), dr.abs(place.y)), dr.abs(place.z))
+        return dr.fma(_BEAM_START, dr.detach(self.reach), 1e-5 * far)
+
+    def map_kind(self) -> str:
+        return "beam"
+
+    def map_views(self, kind: str, resolution: int, filter_size: int) -> tuple[LightView, ...]:
+        view = directional_view(self.direction)
+        return (LightView(view.right, view.up, view.forward, mi.Vector3f(self.position), view.spread),)
 
     def illuminate(self, p_world: Any, active: Any = True, inside: Any = None) -> tuple[Any, Any]:
         """(wo, weight): unit direction against the beam (Vector3f), and its irradiance (colour) on a surface across it.

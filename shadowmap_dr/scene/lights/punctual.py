@@ -11,8 +11,9 @@ import mitsuba as mi
 
 from ...errors import ShadowmapError
 from ...jit.vectors import unit
+from ...shadow.light_camera import LightView, cube_views, directional_view
 from ..transforms import axis, translation
-from .light import picture, towards
+from .light import cone_kind, cone_views, covered_angle, picture, towards
 from .soft_outline import BoundedLight, share_inside
 
 _DEGREE = math.pi / 180.0
@@ -40,6 +41,12 @@ class DirectionalLight:
         """(wo, weight): unit direction to the light (Vector3f) and its irradiance on a surface that faces it."""
         return -unit(mi.Vector3f(self.direction)), self.irradiance & mi.Bool(active)
 
+    def map_kind(self) -> str:
+        return "directional"
+
+    def map_views(self, kind: str, resolution: int, filter_size: int) -> tuple[LightView, ...]:
+        return (directional_view(mi.Vector3f(self.direction)),)
+
 
 @dataclass(frozen=True)
 class PointLight:
@@ -53,6 +60,12 @@ class PointLight:
         """(wo, weight) with weight = intensity / distance^2."""
         wo, inverse_squared = towards(p_world, self.position)
         return wo, (self.intensity * inverse_squared) & mi.Bool(active)
+
+    def map_kind(self) -> str:
+        return "cube"
+
+    def map_views(self, kind: str, resolution: int, filter_size: int) -> tuple[LightView, ...]:
+        return cube_views(mi.Point3f(self.position), resolution, filter_size)
 
 
 @dataclass(frozen=True)
@@ -110,6 +123,12 @@ class SpotLight(BoundedLight):
             uv = mi.Point2f(0.5 + local.x * scale, 0.5 + local.y * scale)
             weight = weight * picture(self.texture, dr.clip(uv, 0, 1), lit)
         return wo, weight & lit
+
+    def map_kind(self) -> str:
+        return cone_kind(self.cutoff_angle)
+
+    def map_views(self, kind: str, resolution: int, filter_size: int) -> tuple[LightView, ...]:
+        return cone_views(self.to_world, covered_angle(self.cutoff_angle), kind, resolution, filter_size)
 
     def distances(self, p_world: Any) -> list[Any]:
         """Angle between the middle of the rim and points (Float), positive inside, in radians. Attached."""

@@ -1,4 +1,4 @@
-"""Where the vertices of the triangle soup come from: one class for each kind of shape.
+"""Sources of the vertices of the triangle soup: one class for each kind of shape.
 
 A source knows what stays the same for as long as the scene's topology does, and reads anew what parameters may change: vertices
 of a mesh, ``to_world`` of an analytic shape, control points of a curve. Gradients flow to all of these.
@@ -34,7 +34,7 @@ class Buffers:
 
 @dataclass(frozen=True)
 class ShapeSource:
-    """Where the vertices of one shape of the soup come from.
+    """Source of the vertices of one shape of the soup.
 
     ``shape`` is the ``mi.Shape``, ``instance`` the ``mi.Shape`` that places it in the world or None.
     """

@@ -23,7 +23,7 @@ _LEAST_UPRIGHT = 0.02
 
 @dataclass(frozen=True)
 class Layout:
-    """What stays the same about tubes when their circles move: R circles with N corners each, of one curve after the other.
+    """Layout of tubes, which stays the same when their circles move: R circles with N corners each, of one curve after the other.
 
     corners    N
     previous   UInt32 (R,)  the circle before; the first of a curve has itself
@@ -68,7 +68,7 @@ class Layout:
 
 @dataclass(frozen=True)
 class Circles:
-    """Where the circles are, R of them; world space. May carry gradients.
+    """Places of the circles, R of them; world space. May carry gradients.
 
     centre   Point3f   points of the curve
     tangent  Vector3f  unit direction of the curve
@@ -109,7 +109,7 @@ def tube_mesh(layout: Layout, circles: Circles) -> tuple[Any, Any, Any]:
 
 
 def _frames(layout: Layout, tangent: Any) -> tuple[Any, Any, Any]:
-    """Where circles start, a quarter of them further on (Float (3R,) each), and u of their start.
+    """Points where circles start, and a quarter of them further on (Float (3R,) each), and u of their start.
 
     The choice of the start is detached; gradients keep the circles across the curve, and u as Mitsuba has it.
     """

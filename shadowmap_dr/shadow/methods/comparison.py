@@ -23,7 +23,7 @@ def soft_comparison(map_depth: Any, depth: Any, bias: float, softness: float) ->
 
 
 def other_depth(depth: Any, moments: Any) -> tuple[Any, Any]:
-    """What a texel with two surfaces sees beside the nearer or farther one at its centre. Attached to both arguments.
+    """Depth that a texel with two surfaces sees beside the nearer or farther one at its centre. Attached to both arguments.
 
     Args:
         depth: linear depth at the centre of the texel, in -1/2..1/2.

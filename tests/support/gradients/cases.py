@@ -1,4 +1,4 @@
-"""Which scenes there are, and what moves in them."""
+"""Scenes of the gradient tests, and the parameters that move."""
 
 from __future__ import annotations
 

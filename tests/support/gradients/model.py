@@ -17,7 +17,7 @@ from .changes import Change
 
 @dataclass(frozen=True)
 class Parameter:
-    """What moves.
+    """A parameter that moves.
 
     Attributes:
         key: of ``mi.traverse(scene)``.

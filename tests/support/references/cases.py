@@ -1,4 +1,4 @@
-"""Which references are stored: images of the scenes of the package, and derivative images of cases of the gradient suite."""
+"""Stored references: images of the scenes of the package, and derivative images of cases of the gradient suite."""
 
 from __future__ import annotations
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import drjit as dr
 
+from ..scene.changes import leaves
 from ..scene.mitsuba_objects import parameters
 
 
@@ -38,9 +39,7 @@ class ParameterState:
                 continue
             if dr.grad_enabled(value):
                 attached.append(name)
-            found: list[tuple[int, bool]] = []
-            _collect(value, found, held)
-            numbers[name] = tuple(found)
+            numbers[name] = tuple(_number(leaf, held) for leaf in leaves(value))
         return cls(numbers, tuple(attached), held)
 
     def same(self, other: ParameterState, names: Iterable[str] | None = None) -> bool:
@@ -50,16 +49,10 @@ class ParameterState:
         return all(self.numbers.get(name) == other.numbers.get(name) for name in names)
 
 
-def _collect(array: Any, numbers: list[tuple[int, bool]], held: list[Any]) -> None:
-    if dr.is_tensor_v(array):
-        array = array.array
-    if dr.depth_v(array) > 1:
-        for k in range(len(array)):
-            _collect(array[k], numbers, held)
-        return
-    if not dr.is_jit_v(array):
-        numbers.append((hash(tuple(array)), False))
-        return
-    alone = dr.detach(array)
-    numbers.append((alone.index, bool(getattr(array, "index_ad", 0))))
+def _number(leaf: Any, held: list[Any]) -> Any:
+    """Identity of a flat array. An array that would not live on is added to ``held``."""
+    if not dr.is_jit_v(leaf):
+        return tuple(leaf)
+    alone = dr.detach(leaf)
     held.append(type(alone)(alone))
+    return alone.index, bool(getattr(leaf, "index_ad", 0))

@@ -25,8 +25,8 @@ from ..scene.untracked import UntrackedValues
 from ..shadow import Frusta
 from .deferred import TEXELS, DeferredImages, DetachedInputs
 from .parameter_state import ParameterState
+from .pass_caches import PassCaches, names_by_level
 from .recording import FrozenPasses, plain
-from .still_passes import StillPasses, names_by_level
 
 # Sensors whose fit of the shadow maps is remembered, and how many of these may not be the scene's own: some make a new one for
 # each image, and all that are remembered are kept alive. How many objects there are is also a part of what recordings hold for.
@@ -54,7 +54,7 @@ class SceneCache:
     warned    whether it was said what frozen functions of users do not see
     untracked  what recordings do not see, and ``untracked_then`` its values when they were made
     colours   of meshes, for which the renderer's creases were found
-    still     passes whose results hold from one image to the next
+    passes    results of passes for its sensors
     matched   parameters with which the record was last found to be the scene's
     """
 
@@ -74,7 +74,7 @@ class SceneCache:
     mirrors: MirrorWatch = field(default_factory=lambda: MirrorWatch(()))
     checked: Any = None
     warned: bool = False
-    still: StillPasses = field(default_factory=StillPasses)
+    passes: PassCaches = field(default_factory=PassCaches)
     matched: ParameterState | None = None
 
     @classmethod
@@ -150,7 +150,7 @@ class SceneCache:
         with dr.resume_grad():  # which parameters are attached
             camera = ParameterState.of(sensor)
         weight = samples + self.renderer.texels // TEXELS
-        return self.still.cache_for(now, camera, sensor, spp, weight, partial(names_by_level, scene, self.renderer.data))
+        return self.passes.cache_for(now, camera, sensor, spp, weight, partial(names_by_level, scene, self.renderer.data))
 
     def replay(self, scene: Any, sensor: Any, spp: int) -> Any:
         """The same image, detached, recorded when it is first taken."""
@@ -204,7 +204,7 @@ class SceneCache:
         """
         if not (dr.flag(dr.JitFlag.FreezingScope) or self.colours is None or self.colours.same()):
             self.renderer = self.renderer.with_updated_shading_edges()
-            self.still.forget_edges()
+            self.passes.forget_edges()
         kept = self.renderer
         fits = ((frusta, soft_frusta) for known, frusta, soft_frusta in self.fits if known is sensor)
         frusta, soft_frusta = next(fits, (kept.frusta, kept.soft_frusta))

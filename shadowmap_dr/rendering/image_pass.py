@@ -11,6 +11,7 @@ import mitsuba as mi
 
 from ..jit.broadcast import broadcast_differentiable
 from ..raster import Crossings, antialias
+from ..scene.geometry import Geometry
 from .direct_light import shining_side
 from .film.aovs import collect_aovs
 from .film.film import film_channels, interleave
@@ -19,8 +20,8 @@ from .gbuffer.camera_view import CameraPass, CameraView, Frame, PlacedShapes
 from .gbuffer.surface import coloured
 from .light_colours import colours_of
 from .light_loops import MANY_LIGHTS
-from .light_pass import Lighting, LightPass, Shone, Visible
-from .pass_cache import LitFrame, PassCache, Still, colouring_inputs, weights_only
+from .light_pass import IncidentLight, Lighting, LightPass, Visibilities
+from .pass_cache import CacheLevel, LitFrame, PassCache, colouring_inputs, weights_only
 
 # Most numbers of visibility that are kept from one image to the next.
 _MOST_VISIBLE = 1 << 23
@@ -38,15 +39,20 @@ class ImagePass:
     light: LightPass
 
     def image(
-        self, view: CameraView, crossings: Crossings | None, visible: Visible | None, lighting: Lighting, shapes: PlacedShapes
+        self,
+        view: CameraView,
+        crossings: Crossings | None,
+        visible: Visibilities | None,
+        lighting: Lighting,
+        shapes: PlacedShapes,
     ) -> Any:
         """The image of one camera. Attached to all, but not through edges if ``crossings`` are given, nor through visibilities
         if ``visible`` is."""
         light, settings = self.light, self.light.settings
         frame = self.cameras.frame(view, shapes, light.needs_frames)
-        seen, shone, color = frame.surface, *self._reflected(frame, lighting, visible)
+        seen, incident, color = frame.surface, *self._reflected(frame, lighting, visible)
         color = light.with_emission(color, seen, lighting, view.sensor, (view.raster.width, view.raster.height))
-        named = collect_aovs(settings.aovs, seen, view.raster, lighting.lights, shone.visible)
+        named = collect_aovs(settings.aovs, seen, view.raster, lighting.lights, incident.visible)
         if crossings is None and settings.antialias:
             channels = self._channels(color, seen.active, view)
             # In one pass over the pixels, since both need much of the same.
@@ -76,23 +82,24 @@ class ImagePass:
 
     def fill(self, cache: PassCache, shapes: PlacedShapes, views: Sequence[CameraView], lighting: Lighting) -> None:
         """Leave the results of passes to later images, and what follows from them."""
-        if cache.still == Still.NOTHING:
+        if cache.level == CacheLevel.NOTHING:
             return
         settings = self.light.settings
         plain = self.light.data.only_cosines and not settings.aovs and not settings.shadow.compat
-        lit = plain and (cache.still >= Still.RADIANCE or (cache.still == Still.LIGHTS and self._uniform()))
+        lit = plain and (cache.level >= CacheLevel.RADIANCE or (cache.level == CacheLevel.LIGHTS and self._uniform()))
         cache.shapes, cache.views = shapes, tuple(views)
-        if cache.still >= Still.LIGHTS:
+        if cache.level >= CacheLevel.LIGHTS:
             cache.maps = lighting.maps, lighting.soft_maps
-        seen = cache.still >= Still.LIGHTS and not lit and not cache.visible and self._room_for_visible(shapes, views)
+        seen = cache.level >= CacheLevel.LIGHTS and not lit and not cache.visible and self._room_for_visible(views)
         if not (lit or seen) and (cache.crossings or not settings.antialias):
             return
         with dr.suspend_grad():
             frames = [self.cameras.frame(view, shapes, self.light.needs_frames) for view in views]
             self.fill_crossings(cache, shapes, frames)
-            if lit:
-                one = self._uniformly_lit if cache.still == Still.LIGHTS else self._lit
-                cache.lit = tuple(one(frame, lighting, shapes) for frame in frames)
+            if lit and cache.level == CacheLevel.LIGHTS:
+                cache.lit = tuple(self._uniformly_lit(frame, lighting, shapes.geometry) for frame in frames)
+            elif lit:
+                cache.lit = tuple(self._lit(frame, lighting) for frame in frames)
             elif seen:
                 cache.visible = tuple(self.light.visible(frame, lighting) for frame in frames)
             dr.eval(shapes, cache.views, cache.maps, cache.visible, cache.lit)
@@ -111,7 +118,7 @@ class ImagePass:
             return False
         return colours_of(lights) is not None
 
-    def _room_for_visible(self, shapes: PlacedShapes, views: Sequence[CameraView]) -> bool:
+    def _room_for_visible(self, views: Sequence[CameraView]) -> bool:
         """True if visibilities of all lights may be kept."""
         light = self.light
         if len(light.data.lights) >= MANY_LIGHTS or light.settings.shadow.method == "none":
@@ -119,34 +126,34 @@ class ImagePass:
         each = len(light.data.lights) + sum(plan.count for plan in light.soft)
         return each * sum(view.raster.width * view.raster.height for view in views) <= _MOST_VISIBLE
 
-    def _reflected(self, frame: Frame, lighting: Lighting, visible: Visible | None) -> tuple[Shone, Any]:
+    def _reflected(self, frame: Frame, lighting: Lighting, visible: Visibilities | None) -> tuple[IncidentLight, Any]:
         """(the light on a frame, reflected radiance (colour, N) towards the camera)."""
         light, colour = self.light, frame.surface.colour
         if colour is None:
-            shone = light.shone(frame, lighting, visible)
-            return shone, light.radiance(frame.surface, lighting, shone)
+            incident = light.incident_light(frame, lighting, visible)
+            return incident, light.radiance(frame.surface, lighting, incident)
         # In the same order as where the light is known already, so that images of a scene that stays are the same bit by bit.
         white = _white(frame)
-        shone = light.shone(white, lighting, visible)
-        irradiance = light.radiance(white.surface, lighting, shone)
+        incident = light.incident_light(white, lighting, visible)
+        irradiance = light.radiance(white.surface, lighting, incident)
         if dr.grad_enabled(colour) and lighting.samples:
             dr.eval(irradiance)  # its loops would run again for the derivative
-        return shone, colour * irradiance
+        return incident, colour * irradiance
 
-    def _lit(self, frame: Frame, lighting: Lighting, shapes: PlacedShapes) -> LitFrame:
+    def _lit(self, frame: Frame, lighting: Lighting) -> LitFrame:
         view, light = frame.view, self.light
         size = view.raster.width, view.raster.height
         white = _white(frame)
-        irradiance = light.radiance(white.surface, lighting, light.shone(white, lighting))
+        irradiance = light.radiance(white.surface, lighting, light.incident_light(white, lighting))
         none = dr.zeros(mi.UnpolarizedSpectrum, dr.width(frame.surface.shape))
         emitted = light.with_emission(none, frame.surface, lighting, view.sensor, size)
         return LitFrame(view, colouring_inputs(frame.surface), frame.sharpness, irradiance, emitted)
 
-    def _uniformly_lit(self, frame: Frame, lighting: Lighting, shapes: PlacedShapes) -> LitFrame:
+    def _uniformly_lit(self, frame: Frame, lighting: Lighting, geometry: Geometry) -> LitFrame:
         light = self.light
         settings, surface = light.settings, frame.surface
         none, white = dr.zeros(mi.UnpolarizedSpectrum, dr.width(surface.shape)), _white(frame)
-        terms = light.white_terms(white, lighting, shapes.geometry)
+        terms = light.white_terms(white, lighting, geometry)
         front = shining_side(surface)
         if settings.hide_emitters or settings.max_depth == 0:
             front &= mi.Bool(False)

@@ -31,9 +31,9 @@ from .extended_lights import (
     fit_soft_maps,
     make_soft_maps,
     plan_soft,
+    sample_visibilities,
     samples_of,
     soft_light,
-    visible_parts,
 )
 from .gbuffer.camera_view import Frame, PlacedShapes
 from .gbuffer.pixel_footprint import FootprintSamples, footprint_points
@@ -63,7 +63,7 @@ class Lighting:
 
 
 @dataclass(frozen=True)
-class Visible:
+class Visibilities:
     """Visibility of lights from the samples of a camera, N of them. Detached.
 
     Attributes:
@@ -76,14 +76,14 @@ class Visible:
 
 
 @dataclass(frozen=True)
-class Shone:
+class IncidentLight:
     """The light that reaches the samples of a frame, N of them.
 
     Attributes:
         lights: lights that are summed up one by one, with their soft outlines.
         visible: ``Float`` (N,) each, the visibility of these lights.
         looped: radiance towards the camera (colour, N) of all others that have no extent.
-        parts: as :attr:`Visible.parts`, None where visibility has to be looked up.
+        parts: as :attr:`Visibilities.parts`, None where visibility has to be looked up.
     """
 
     lights: tuple[Any, ...]
@@ -169,22 +169,22 @@ class LightPass:
             return Lighting((), None, data.areas, (), None)
         return Lighting(data.lights, maps[0], data.areas, self._samples(data.areas, geometry), maps[1])
 
-    def shone(self, frame: Frame, lighting: Lighting, known: Visible | None = None) -> Shone:
+    def incident_light(self, frame: Frame, lighting: Lighting, known: Visibilities | None = None) -> IncidentLight:
         """The light of all lights on what a camera sees. ``known``: visibilities, where they still hold. Attached."""
         if known is not None:
-            return Shone(self._outlined(frame, lighting.lights), known.lights, 0, known.parts)
+            return IncidentLight(self._outlined(frame, lighting.lights), known.lights, 0, known.parts)
         looped, written = self._in_tables(frame, lighting)
         lights = [lighting.lights[k] for k in written]
         visible = self.visibilities(frame, lighting, written, lights)
-        return Shone(self._outlined(frame, lights), visible, looped, (None,) * len(lighting.samples))
+        return IncidentLight(self._outlined(frame, lights), visible, looped, (None,) * len(lighting.samples))
 
-    def visible(self, frame: Frame, lighting: Lighting) -> Visible:
+    def visible(self, frame: Frame, lighting: Lighting) -> Visibilities:
         """Visibility of all lights from what a camera sees. Detached."""
         with dr.suspend_grad():
             numbers = list(range(len(lighting.lights)))
             lights = self.visibilities(frame, lighting, numbers, list(lighting.lights))
             pairs = zip(self.soft, lighting.samples, strict=True) if self.settings.lit else ()
-            return Visible(lights, tuple(visible_parts(frame.surface, *pair, lighting.soft_maps) for pair in pairs))
+            return Visibilities(lights, tuple(sample_visibilities(frame.surface, *pair, lighting.soft_maps) for pair in pairs))
 
     def white_terms(self, frame: Frame, lighting: Lighting, geometry: Geometry) -> tuple[Any, ...]:
         """Radiance towards the camera (Float, N) of each of the lights on white surfaces, if it were white. Detached.
@@ -201,17 +201,17 @@ class LightPass:
             terms += [soft_light(seen, plan, own, maps, nodes) for plan, own in extended]
             return tuple(term[0] for term in terms)
 
-    def radiance(self, seen: Surface, lighting: Lighting, shone: Shone) -> Any:
-        """Reflected radiance (colour, N) towards the camera. ``shone``: on the same surfaces. Attached to all of these."""
+    def radiance(self, seen: Surface, lighting: Lighting, incident: IncidentLight) -> Any:
+        """Reflected radiance (colour, N) towards the camera. ``incident``: on the same surfaces. Attached to all of these."""
         gate = not self.settings.shadow.compat
         color = dr.zeros(mi.UnpolarizedSpectrum, dr.width(seen.shape))
         nodes = self.data.materials()
-        for light, fraction in zip(shone.lights, shone.visible, strict=True):
+        for light, fraction in zip(incident.lights, incident.visible, strict=True):
             color += direct_light(seen, light, fraction, nodes, gate=gate)
         soft = self.soft if self.settings.lit else ()
-        for plan, samples, parts in zip(soft, lighting.samples, shone.parts, strict=True):
+        for plan, samples, parts in zip(soft, lighting.samples, incident.parts, strict=True):
             color += soft_light(seen, plan, samples, lighting.soft_maps, nodes, gate=gate, visible=parts)
-        return shone.looped + self.with_ambient(color, seen)
+        return incident.looped + self.with_ambient(color, seen)
 
     def with_ambient(self, color: Any, seen: Surface) -> Any:
         """The same radiance with reflected light that nothing shadows."""

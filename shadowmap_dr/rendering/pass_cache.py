@@ -14,10 +14,10 @@ from ..shadow import ShadowMaps
 from .extended_lights import SoftMaps
 from .gbuffer.camera_view import CameraView, PlacedShapes
 from .gbuffer.surface import Surface
-from .light_pass import Visible
+from .light_pass import Visibilities
 
 
-class Still(IntEnum):
+class CacheLevel(IntEnum):
     """Inputs that stay as they are from one image to the next; each level includes those before."""
 
     NOTHING = 0
@@ -57,30 +57,30 @@ class PassCache:
     """Results of the passes of one image, detached.
 
     Attributes:
-        still: what has not changed since the image before, and carries no gradients. Images leave results here that depend on
-            nothing else.
+        level: inputs that have not changed since the image before, and carry no gradients. Images leave results here that depend
+            on nothing else.
         shapes, views, crossings: with ``VIEW``; the latter two for each camera of a film.
         maps: shadow maps of lights, and of extended lights; with ``LIGHTS``.
         visible: what they let through, if there is room for it; with ``LIGHTS``.
         lit: only colours are left to do; with ``RADIANCE``, or with ``LIGHTS`` where radiance is the same all over each light.
     """
 
-    still: Still = Still.NOTHING
+    level: CacheLevel = CacheLevel.NOTHING
     shapes: PlacedShapes | None = None
     views: tuple[CameraView, ...] = ()
     crossings: tuple[Crossings, ...] = ()
     maps: tuple[ShadowMaps | None, SoftMaps | None] | None = None
-    visible: tuple[Visible, ...] = ()
+    visible: tuple[Visibilities, ...] = ()
     lit: tuple[LitFrame, ...] = ()
 
-    def keep(self, still: Still) -> None:
-        """Drop results that depend on more than what is still."""
-        self.still = still
-        if still < Still.VIEW:
+    def keep(self, level: CacheLevel) -> None:
+        """Drop results that depend on more than the inputs of a level."""
+        self.level = level
+        if level < CacheLevel.VIEW:
             self.shapes, self.views, self.crossings = None, (), ()
-        if still < Still.LIGHTS:
+        if level < CacheLevel.LIGHTS:
             self.maps, self.visible, self.lit = None, (), ()
-        if still < Still.RADIANCE and not all(frame.terms for frame in self.lit):
+        if level < CacheLevel.RADIANCE and not all(frame.terms for frame in self.lit):
             self.lit = ()
 
     def forget_edges(self) -> None:

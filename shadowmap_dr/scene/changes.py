@@ -18,7 +18,7 @@ def fingerprint(value: Any) -> Any:
     Of arrays it tells which they are, not what is in them, and keeps them alive, so that no others can be taken for them.
     """
     if dr.is_array_v(value):
-        return tuple(_Same(leaf) for leaf in _leaves(dr.detach(value)))
+        return tuple(_Same(leaf) for leaf in leaves(dr.detach(value)))
     matrix = getattr(value, "matrix", None)
     if matrix is None:
         return repr(value)
@@ -37,14 +37,15 @@ class _Same:
     __hash__ = None  # type: ignore[assignment]
 
 
-def _leaves(array: Any) -> Iterator[Any]:
+def leaves(array: Any) -> Iterator[Any]:
+    """The flat arrays of a nested array or tensor, in a fixed order."""
     if dr.is_tensor_v(array):
         yield array.array
     elif dr.depth_v(array) == 1:
         yield array
     else:
         for part in array:
-            yield from _leaves(part)
+            yield from leaves(part)
 
 
 class ParameterWatch:

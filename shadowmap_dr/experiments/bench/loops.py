@@ -202,8 +202,8 @@ def moved_light(integrator: dict[str, Any], size: int) -> Iterator[float]:
         params.update()
         dr.forward(x, dr.ADFlag.ClearEdges)
         image = mi.render(scene, params, spp=4 * _SPP, seed=step)
-        slope, image = np.array(dr.forward_to(image)), np.array(image)  # no image may wait while another scene is differentiated
-        offset -= 0.5 * float(((image - reference) * slope).sum() / (slope**2).sum())
+        slope = np.array(dr.forward_to(image))
+        offset -= 0.5 * float(((np.array(image) - reference) * slope).sum() / (slope**2).sum())
         step += 1
         yield abs(offset)
 

@@ -13,7 +13,7 @@ from .sample_maps import (
     still_aimed,
 )
 from .samples import LightSamples
-from .shading import soft_light, visible_parts
+from .shading import sample_visibilities, soft_light
 from .sky_samples import SkyWatch
 
 __all__ = [
@@ -30,5 +30,5 @@ __all__ = [
     "samples_of",
     "soft_light",
     "still_aimed",
-    "visible_parts",
+    "sample_visibilities",
 ]

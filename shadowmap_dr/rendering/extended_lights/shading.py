@@ -32,7 +32,7 @@ def soft_light(
 
     ``maps`` None: unshadowed. ``nodes``: all BSDFs that ``seen`` may call, and shapes whose
     attributes these read. ``gate``: see :func:`shadowmap_dr.rendering.direct_light.direct_light`. ``visible``: from
-    :func:`visible_parts`, to be looked up instead of the maps.
+    :func:`sample_visibilities`, to be looked up instead of the maps.
     Gradients flow to all of surface, samples, maps and BSDFs.
     """
     if samples.distant and reflects_only(nodes):
@@ -74,7 +74,7 @@ def soft_light(
     return light * penumbra_visibility(maps.single, mi.UInt32(plan.first), radius, seen.p_world, seen.n_world, seen.active)
 
 
-def visible_parts(seen: Surface, plan: SoftPlan, samples: LightSamples, maps: SoftMaps | None) -> Any:
+def sample_visibilities(seen: Surface, plan: SoftPlan, samples: LightSamples, maps: SoftMaps | None) -> Any:
     """Visibility (Float, K P) of the K samples of an extended light, one after the other, or None where there are no such maps.
 
     Detached. For images that differ in nothing but materials and the colours of lights.

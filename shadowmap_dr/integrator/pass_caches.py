@@ -1,4 +1,4 @@
-"""Passes of the last image of each sensor whose results still hold for the next one."""
+"""Caches of the passes of each sensor's last image, and which of their results hold for the next one."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from ..rendering.pass_cache import PassCache, Still
+from ..rendering.pass_cache import CacheLevel, PassCache
 from ..scene.load import SceneData
 from ..scene.mitsuba_objects import children, is_attribute, owners
 from .deferred import MOST_SAMPLES
 from .parameter_state import ParameterState
 
-#: Names of the parameters of a scene that must stay for each level to hold.
-NamesByLevel = dict[Still, list[str]]
+#: Names of the parameters of a scene that must stay for each level to be valid.
+NamesByLevel = dict[CacheLevel, list[str]]
 
 
 @dataclass
@@ -28,11 +28,11 @@ class _Known:
     cache: PassCache
 
 
-class StillPasses:
+class PassCaches:
     """Results of passes for each sensor of a scene."""
 
     def __init__(self) -> None:
-        self._names: NamesByLevel | None = None
+        self._names: NamesByLevel = {}
         self._known: list[_Known] = []
 
     def cache_for(
@@ -52,13 +52,13 @@ class StillPasses:
             weight: what the memory for the image's passes grows with, in samples.
             names: makes :func:`names_by_level` of the scene. Called at the second image.
         """
-        if self._names is None and self._known:
+        if not self._names and self._known:
             self._names = names()
         known = next((one for one in self._known if one.sensor is sensor and one.spp == spp), None)
         if known is None or known.weight != weight:
             known = _Known(sensor, spp, weight, scene, camera, PassCache())
         else:
-            known.cache.keep(_still(known, scene, camera, self._names or names()))
+            known.cache.keep(_valid_level(known, scene, camera, self._names))
             known.scene, known.camera = scene, camera
         others = [one for one in self._known if one.sensor is not sensor or one.spp != spp]
         room = MOST_SAMPLES
@@ -75,17 +75,17 @@ class StillPasses:
             known.cache.forget_edges()
 
 
-def _still(known: _Known, scene: ParameterState, camera: ParameterState, names: NamesByLevel) -> Still:
+def _valid_level(known: _Known, scene: ParameterState, camera: ParameterState, names: NamesByLevel) -> CacheLevel:
     """The level of all that has stayed since the last image, and is not attached."""
     # Parameters that have come since may mean anything.
     if camera.attached or not camera.same(known.camera) or len(scene.numbers) != len(known.scene.numbers):
-        return Still.NOTHING
-    attached, still = set(scene.attached), Still.NOTHING
-    for level in (Still.VIEW, Still.LIGHTS, Still.RADIANCE):
+        return CacheLevel.NOTHING
+    attached, valid = set(scene.attached), CacheLevel.NOTHING
+    for level in (CacheLevel.VIEW, CacheLevel.LIGHTS, CacheLevel.RADIANCE):
         if attached.intersection(names[level]) or not scene.same(known.scene, names[level]):
-            return still
-        still = level
-    return still
+            return valid
+        valid = level
+    return valid
 
 
 def names_by_level(scene: Any, data: SceneData) -> NamesByLevel:
@@ -94,7 +94,7 @@ def names_by_level(scene: Any, data: SceneData) -> NamesByLevel:
     materials, lights = set(_below({source.shape.bsdf() for source in data.sources})), set(_below(emitters))
     # Alpha tests decide on what is seen.
     solid = not any(info.see_through for info in data.geometry.shapes)
-    names: NamesByLevel = {level: [] for level in Still}
+    names: NamesByLevel = {level: [] for level in CacheLevel}
     for name, node in owners(scene):
         shared = node in materials and node in lights
         if node in cameras:
@@ -102,11 +102,11 @@ def names_by_level(scene: Any, data: SceneData) -> NamesByLevel:
         if solid and not shared and (node in materials or is_attribute(node, name.rpartition(".")[2])):
             continue
         if node in emitters:
-            level = Still.LIGHTS
+            level = CacheLevel.LIGHTS
         elif node in lights and not shared:
-            level = Still.RADIANCE
+            level = CacheLevel.RADIANCE
         else:
-            level = Still.VIEW
+            level = CacheLevel.VIEW
         names[level].append(name)
     return names
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from integrator_scenes import ball, camera, floor, shadowmap, small_scene, sun
 
-from shadowmap_dr.integrator.still_passes import StillPasses
-from shadowmap_dr.rendering.pass_cache import PassCache, Still
+from shadowmap_dr.integrator.pass_caches import PassCaches
+from shadowmap_dr.rendering.pass_cache import CacheLevel, PassCache
 
 SIZE = 24
 FEW = {
@@ -112,15 +112,15 @@ class Pair:
         self.params, self.step = mi.traverse(self.scene), 0
         self.start = {key: type(value)(value) for key, value in self.params if dr.is_array_v(value)}
         self.kept: list[PassCache] = []
-        cache_for = StillPasses.cache_for
+        cache_for = PassCaches.cache_for
 
-        def chosen(passes: StillPasses, *arguments: Any) -> PassCache:
+        def chosen(passes: PassCaches, *arguments: Any) -> PassCache:
             cache = cache_for(passes, *arguments)
-            keeps = any(record.still is passes for record in self.integrators[0].shell.scenes)
+            keeps = any(record.passes is passes for record in self.integrators[0].shell.scenes)
             self.kept += [cache] if keeps else []
             return cache if keeps else PassCache()
 
-        monkeypatch.setattr(StillPasses, "cache_for", chosen)
+        monkeypatch.setattr(PassCaches, "cache_for", chosen)
 
     def check(self, attached: dict[str, Any]) -> None:
         """Images of both, and their derivatives by attached values, which are put into the scene."""
@@ -218,13 +218,13 @@ def test_what_is_kept_depends_on_what_changes(variant: str, monkeypatch: pytest.
     pair, rng = Pair(parts(), options, spp, monkeypatch), np.random.default_rng(0)
     values = changes(pair, rng)
     coloured = kept_after(pair, FLOOR, values[FLOOR])
-    assert coloured.still == Still.RADIANCE and coloured.lit and not coloured.lit[0].terms
+    assert coloured.level == CacheLevel.RADIANCE and coloured.lit and not coloured.lit[0].terms
     dimmed = kept_after(pair, SUN, values[SUN])
-    assert dimmed.still == Still.LIGHTS and len(dimmed.lit[0].terms) == 3
+    assert dimmed.level == CacheLevel.LIGHTS and len(dimmed.lit[0].terms) == 3
     lifted = kept_after(pair, "bulb.position", values["bulb.position"])
-    assert lifted.still == Still.VIEW and lifted.views and lifted.maps is None and not lifted.lit
+    assert lifted.level == CacheLevel.VIEW and lifted.views and lifted.maps is None and not lifted.lit
     moved = kept_after(pair, BALL, values[BALL])
-    assert moved.still == Still.NOTHING and not moved.views and moved.shapes is None
+    assert moved.level == CacheLevel.NOTHING and not moved.views and moved.shapes is None
 
 
 def test_visibilities_are_kept_where_materials_know_directions(variant: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -236,10 +236,10 @@ def test_visibilities_are_kept_where_materials_know_directions(variant: str, mon
 
 
 def test_large_images_keep_nothing(variant: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shadowmap_dr.integrator.still_passes.MOST_SAMPLES", SIZE**2)
+    monkeypatch.setattr("shadowmap_dr.integrator.pass_caches.MOST_SAMPLES", SIZE**2)
     parts, options, _ = SCENES["colours"]
     pair = Pair(parts(), options, 4, monkeypatch)
-    assert kept_after(pair, FLOOR, changes(pair, np.random.default_rng(0))[FLOOR]).still == Still.NOTHING
+    assert kept_after(pair, FLOOR, changes(pair, np.random.default_rng(0))[FLOOR]).level == CacheLevel.NOTHING
 
 
 def test_other_integrators_may_clear_the_graph(variant: str) -> None:

@@ -37,9 +37,16 @@ class ParameterState:
             if not dr.is_array_v(value):
                 numbers[name] = (value,)
                 continue
+            own = type(value)(dr.detach(value))
+            if not dr.is_jit_v(value):
+                numbers[name] = tuple(map(tuple, leaves(own)))
+                continue
+            held.append(own)
+            which = [leaf.index for leaf in leaves(own)]
             if dr.grad_enabled(value):
                 attached.append(name)
-            numbers[name] = tuple(_number(leaf, held) for leaf in leaves(value))
+                which += [bool(leaf.index_ad) for leaf in leaves(value)]
+            numbers[name] = tuple(which)
         return cls(numbers, tuple(attached), held)
 
     def same(self, other: ParameterState, names: Iterable[str] | None = None) -> bool:
@@ -47,12 +54,3 @@ class ParameterState:
         if names is None:
             return self.numbers == other.numbers
         return all(self.numbers.get(name) == other.numbers.get(name) for name in names)
-
-
-def _number(leaf: Any, held: list[Any]) -> Any:
-    """Identity of a flat array. An array that would not live on is added to ``held``."""
-    if not dr.is_jit_v(leaf):
-        return tuple(leaf)
-    alone = dr.detach(leaf)
-    held.append(type(alone)(alone))
-    return alone.index, bool(getattr(leaf, "index_ad", 0))

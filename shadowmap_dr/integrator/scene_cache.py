@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import ShadowmapError, warn
+from ..jit.gc import gc_paused
 from ..rendering.extended_lights import SkyWatch, SoftFrusta, still_aimed
 from ..rendering.pass_cache import PassCache
 from ..rendering.renderer import Renderer
@@ -82,7 +83,8 @@ class SceneCache:
         """Read a scene. Raises ShadowmapError for what is broken; ``warn``: of what is left out."""
         if dr.flag(dr.JitFlag.FreezingScope):
             raise ShadowmapError("A scene cannot be read while a function is frozen: render it once with this integrator before.")
-        with dr.suspend_grad():
+        # Of a scene of thousands of shapes so many objects are made that collections would take a tenth of the time.
+        with dr.suspend_grad(), gc_paused():
             data = replace(load(scene, tessellation=tessellation, warn=warn), sensors=(sensors_of(sensor),))
             renderer = replace(Renderer.from_data(data, settings), untracked=None)
             sky, untracked = (

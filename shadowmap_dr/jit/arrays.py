@@ -14,6 +14,9 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
+# Waiting for Dr.Jit to read an array takes less time than a copy of this size.
+_MANY_BYTES = 1 << 20
+
 _DTYPES = {dr.VarType.Float32: np.float32, dr.VarType.UInt32: np.uint32, dr.VarType.Bool: np.bool_}
 
 
@@ -22,8 +25,12 @@ def device_array(kind: type, values: npt.ArrayLike) -> Any:
 
     Numbers are converted as NumPy does it. ``values`` may change afterwards. The array is evaluated.
     """
-    copy = np.array(values, _DTYPES[dr.type_v(kind)], order="C")  # Dr.Jit may come to read it only later
-    return own_memory(kind(copy.ravel()))
+    host = np.ascontiguousarray(values, _DTYPES[dr.type_v(kind)])
+    if host.nbytes < _MANY_BYTES:
+        return own_memory(kind(host.ravel().copy()))  # Dr.Jit may come to read it only later
+    array = own_memory(kind(host.ravel()))
+    dr.sync_thread()
+    return array
 
 
 def own_memory(array: Any) -> Any:

@@ -122,4 +122,6 @@ class _Taken:
 @functools.cache
 def _parts_of(kind: type) -> tuple[str, ...] | None:
     """Names of the fields of a dataclass, no names for other types, None for those whose ``repr`` tells everything."""
-    return None if issubclass(kind, _PLAIN) else (fields_of(kind) or ())
+    if issubclass(kind, _PLAIN):
+        return None
+    return () if hasattr(kind, "recording_text") else fields_of(kind) or ()

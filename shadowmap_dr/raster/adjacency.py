@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from .index_buffer import IndexBufferBuilder
+from .types import NO_VERTEX
 from .welding import Copies, Index, runs
 
 Vertices = npt.NDArray[np.uint32]
@@ -116,32 +118,62 @@ class EdgeBlocks:
                 places.append(before[np.searchsorted(starts[order], group.faces)] + np.searchsorted(single, 3 * group.faces))
         return cls(copies, places, len(single) + int(before[-1]))
 
-    def fill(self, values: Sequence[npt.NDArray[np.integer[Any]]], target: npt.NDArray[np.uint32], kind: str) -> None:
-        """Write numbers of edges (E, 2), given for the first copy of each group, for all copies to ``target`` (count.., 2).
+    def buffer(
+        self, dtype: type, values: Sequence[npt.NDArray[np.integer[Any]]], rest: npt.NDArray[np.integer[Any]], kind: str
+    ) -> Any:
+        """Numbers of all edges and of those that come last, ``rest`` (R, 2): ``dtype`` (2 (count + R),).
 
-        ``kind``: ``vertices`` or ``faces``, of which the numbers of copies differ.
+        ``values``: for the edges (E, 2) of the first copy of each group. ``kind``: ``vertices`` or ``faces``; the numbers of
+        copies differ by that of their first one.
         """
+        buffer = IndexBufferBuilder(dtype, 2 * (self.count + len(rest)))
         for group, places, own in zip(self.copies, self.places, values, strict=True):
             if len(group.faces) == 1:
-                target[places] = own
-                continue
-            first = group.vertices if kind == "vertices" else group.faces
-            shifts = (first - first[0]).astype(np.uint32)
-            own = own.astype(np.uint32)
-            for place, shift in zip(places.tolist(), shifts, strict=True):
-                np.add(own, shift, out=target[place : place + len(own)])
+                buffer.put((2 * places[:, None] + np.arange(2)).ravel(), own.ravel())
+            else:
+                first = group.vertices if kind == "vertices" else group.faces
+                buffer.repeat(own.ravel(), 2 * places, first - first[0])
+        buffer.put(2 * self.count + np.arange(2 * len(rest)), rest.ravel())
+        return buffer.build()
 
 
-def parts_of(copies: Sequence[Copies], corners: Vertices, own: Index) -> tuple[Index, int]:
-    """Number of the connected part of each face, from 0 on, and how many there are. Arguments as for :meth:`InnerEdges.of`."""
-    parts, done = np.empty(len(corners) // 3, np.uint32), 0
+def across_edges(
+    dtype: type, copies: Sequence[Copies], inner: Sequence[InnerEdges], corners: Vertices, one: Index, two: Index
+) -> Any:
+    """``Topology.beyond``: the third vertex of the face on the other side of each half-edge, ``dtype`` (3 F,).
+
+    ``inner``: edges of each group of copies. ``one``, ``two``: half-edges of the edges between shapes.
+    """
+    buffer = IndexBufferBuilder(dtype, len(corners))
+    for group, edges in zip(copies, inner, strict=True):
+        halves = np.concatenate([edges.pair, edges.partner])
+        numbers = np.concatenate([edges.thirds[:, 1], edges.thirds[:, 0]])
+        if len(group.faces) == 1:
+            buffer.put(halves, numbers)
+        else:
+            own = np.full(3 * len(group.rows), NO_VERTEX, np.uint32)
+            own[halves - 3 * group.faces[0]] = numbers
+            buffer.repeat(own, 3 * group.faces, group.vertices - group.vertices[0])
+    buffer.put(one, third(corners, two))
+    buffer.put(two, third(corners, one))
+    return buffer.build()
+
+
+def parts_of(dtype: type, copies: Sequence[Copies], corners: Vertices, own: Index) -> tuple[Any, int]:
+    """Number of the connected part of each face, from 0 on (``dtype`` (F,)), and how many there are.
+
+    Other arguments as for :meth:`InnerEdges.of`.
+    """
+    parts, done = IndexBufferBuilder(dtype, len(corners) // 3), 0
     for group in copies:
         welded = np.unique(own[corners[group.halves]], return_inverse=True)[1].reshape(-1, 3)
         local, count = _connected(welded)
-        parts[group.rows] = local + done
-        group.fill(parts, count * np.arange(len(group.faces)))
+        if len(group.faces) == 1:
+            parts.put(group.rows, local + done)
+        else:
+            parts.repeat(local + done, group.faces, count * np.arange(len(group.faces)))
         done += count * len(group.faces)
-    return parts, done
+    return parts.build(), done
 
 
 def _connected(welded: Index) -> tuple[Index, int]:

@@ -9,7 +9,7 @@ import drjit as dr
 import numpy as np
 
 from ..jit.arrays import device_array
-from .adjacency import EdgeBlocks, InnerEdges, after, edge_keys, pairs_of, parts_of, third
+from .adjacency import EdgeBlocks, InnerEdges, across_edges, after, edge_keys, pairs_of, parts_of, third
 from .types import NO_VERTEX
 from .welding import Index, Places, copies_of, weld
 
@@ -105,7 +105,7 @@ def build_topology(
     if low < 0 or high >= len(positions):
         raise ValueError(f"faces refer to vertices {low}..{high}, but there are {len(positions)}")
     faces = np.ascontiguousarray(faces, np.uint32)
-    owners = None if shapes is None else np.asarray(shapes, np.int64)
+    owners = None if shapes is None else np.asarray(shapes)
     vertices = weld(positions, owners)
     copies = copies_of(faces, vertices.own, owners)
     corners, places = faces.ravel(), vertices.place.astype(np.uint32)[faces.ravel()]
@@ -116,19 +116,11 @@ def build_topology(
     # vertices in a file.
     alone, chosen = (_by_place(halves, corners, positions) for halves in (alone, one))
     one, two = chosen, two[np.searchsorted(one, chosen)]
-    beyond = np.full(len(corners), NO_VERTEX, np.uint32)
-    for group, edges in zip(copies, inner, strict=True):
-        beyond[edges.pair], beyond[edges.partner] = edges.thirds[:, 1], edges.thirds[:, 0]
-        group.fill(beyond)
-    beyond[one], beyond[two] = third(corners, two), third(corners, one)
-    blocks = EdgeBlocks.of(copies, inner)
     # Those between shapes come last, and each of them again, without extent, as an edge of its other face.
-    count, rest = blocks.count, np.concatenate([alone, one])
-    ends, thirds = np.empty((count + len(rest), 2), np.uint32), np.empty((count + len(rest), 2), np.uint32)
-    blocks.fill([edges.ends for edges in inner], ends, "vertices")
-    blocks.fill([edges.thirds for edges in inner], thirds, "vertices")
-    ends[count:, 0], ends[count:, 1] = corners[rest], corners[after(rest)]
-    thirds[count:, 0], thirds[count:, 1] = third(corners, rest), beyond[rest]
+    blocks, rest = EdgeBlocks.of(copies, inner), np.concatenate([alone, one])
+    ends = np.stack([corners[rest], corners[after(rest)]], 1)
+    across = np.concatenate([np.full(len(alone), NO_VERTEX, np.uint32), third(corners, two)])
+    thirds = np.stack([third(corners, rest), across], 1)
     seams = None
     if len(one):
         other = np.stack([corners[two], corners[after(two)]], 1)
@@ -138,18 +130,18 @@ def build_topology(
         thirds = np.concatenate([thirds, np.full_like(other, NO_VERTEX)])
     veiled = (None, None)
     if see_through_faces is not None:
-        owner = np.empty((len(ends), 2), np.uint32)
-        blocks.fill([np.stack([edges.pair, edges.partner], 1) // 3 for edges in inner], owner, "faces")
-        owner[count:, 0], owner[count:, 1] = np.concatenate([rest, two]) // 3, np.concatenate([alone, two, two]) // 3
-        veiled = device_array(dr.mask_t(dtype), see_through_faces), device_array(dtype, owner)
-    parts, part_count = parts_of(copies, corners, vertices.own)
+        owner = np.stack([np.concatenate([rest, two]), np.concatenate([alone, two, two])], 1) // 3
+        owners_of_edges = [np.stack([edges.pair, edges.partner], 1) // 3 for edges in inner]
+        veiled = device_array(dr.mask_t(dtype), see_through_faces), blocks.buffer(dtype, owners_of_edges, owner, "faces")
+    parts, part_count = parts_of(dtype, copies, corners, vertices.own)
     return Topology(
-        device_array(dtype, ends),
-        device_array(dtype, thirds),
-        len(ends),
-        *(device_array(dtype, values) for values in (corners, places, parts)),
+        blocks.buffer(dtype, [edges.ends for edges in inner], ends, "vertices"),
+        blocks.buffer(dtype, [edges.thirds for edges in inner], thirds, "vertices"),
+        blocks.count + len(ends),
+        *(device_array(dtype, values) for values in (corners, places)),
+        parts,
         part_count,
-        device_array(dtype, beyond),
+        across_edges(dtype, copies, inner, corners, one, two),
         high + 1,
         seams,
         *veiled,

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from .types import NO_VERTEX
-
 Index = npt.NDArray[np.int64]
 
 # Odd numbers without a pattern, by which coordinates are mixed.
-_MIXERS = tuple(np.uint64(number) for number in (0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9))
+_MIXERS = tuple(np.uint32(number) for number in (0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D))
 
 
 @dataclass(frozen=True)
@@ -53,7 +52,7 @@ class Places:
         return cls(ranks, order)
 
 
-def weld(positions: npt.NDArray[np.float32], shapes: Index | None) -> Welded:
+def weld(positions: npt.NDArray[np.float32], shapes: npt.NDArray[np.integer[Any]] | None) -> Welded:
     """Find the vertices (V, 3) at the same place, to the last bit. ``shapes`` (V,): whose they are, None if all are of one."""
     place = np.arange(len(positions))
     some = _perhaps_shared(positions)
@@ -68,7 +67,7 @@ def weld(positions: npt.NDArray[np.float32], shapes: Index | None) -> Welded:
     if shapes is None:
         return Welded(place, place)
     own = np.arange(len(place))
-    key = place[shared] * (int(shapes.max()) + 1) + shapes[shared]
+    key = place[shared] * (int(shapes.max()) + 1) + shapes[shared].astype(np.int64)
     order = np.argsort(key)
     starts, sizes = runs(key[order])
     own[shared[order]] = np.repeat(np.minimum.reduceat(shared[order], starts), sizes)
@@ -80,15 +79,16 @@ def _perhaps_shared(positions: npt.NDArray[np.float32]) -> Index:
 
     Sums of their bits are compared. Sorting plain numbers is many times as fast as finding their order.
     """
-    x, y, z = np.ascontiguousarray(positions).view(np.uint32).astype(np.uint64).T
-    mixed = x * _MIXERS[0] + y * _MIXERS[1] + z * _MIXERS[2]
-    mixed ^= mixed >> np.uint64(32)
+    bits = np.ascontiguousarray(positions).view(np.uint32)
+    # Multiplication moves bits upwards only, and coordinates on a grid have zeros as their last bits.
+    mixed = (bits ^ bits >> np.uint32(16)) @ np.array(_MIXERS)
+    mixed ^= mixed >> np.uint32(15)
     ascending = np.sort(mixed)
     several = ascending[1:][ascending[1:] == ascending[:-1]]
     if not len(several):
         return np.zeros(0, np.int64)
     # A table of the last bits sorts most of them out.
-    last = np.uint64((1 << 20) - 1)
+    last = np.uint32((1 << 20) - 1)
     marked = np.zeros(1 << 20, bool)
     marked[several & last] = True
     found = np.flatnonzero(marked[mixed & last])
@@ -129,51 +129,51 @@ class Copies:
         """Numbers that belong to the first copy (N,), for all of them (copies * N,): greater by ``step`` for each face."""
         return (values + step * (self.faces - self.faces[0])[:, None]).ravel()
 
-    def fill(self, target: npt.NDArray[np.uint32], shift: Index | None = None) -> None:
-        """Copy numbers of the faces of the first copy to the places of the others in ``target``, (F,) or (3 F,).
 
-        ``shift``: what to add for each copy; None: numbers are vertices, or ``NO_VERTEX``.
-        """
-        if len(self.faces) == 1:
-            return
-        each, count = (3, 3 * len(self.rows)) if shift is None else (1, len(self.rows))
-        first = target[each * self.faces[0] :][:count]
-        none = None if shift is not None else first == NO_VERTEX
-        shift = self.vertices - self.vertices[0] if shift is None else shift
-        for face, add in zip(self.faces[1:].tolist(), shift[1:].tolist(), strict=True):
-            part = target[each * face : each * face + count]
-            np.add(first, np.uint32(add), out=part)
-            if none is not None:
-                part[none] = NO_VERTEX
-
-
-def copies_of(faces: npt.NDArray[np.uint32], own: Index, shapes: Index | None) -> list[Copies]:
+def copies_of(faces: npt.NDArray[np.uint32], own: Index, shapes: npt.NDArray[np.integer[Any]] | None) -> list[Copies]:
     """All shapes that have faces (F, 3), in groups of copies. ``own`` and ``shapes`` (V,): as in :func:`weld`.
 
     Everything is one shape unless each has its vertices, and its faces, in one piece of its own.
     """
-    whole = [_alone(np.arange(len(faces)))]
-    if shapes is None or (np.diff(shapes) < 0).any():
-        return whole
-    owners = shapes.astype(np.int32)[faces]
-    owner = owners[:, 0]
-    if (np.diff(owner) < 0).any() or (owners != owner[:, None]).any():
-        return whole
-    starts, sizes = runs(owner)
-    first = np.searchsorted(shapes, owner[starts])
-    last = np.searchsorted(shapes, owner[starts], "right")
-    local_faces = faces - np.repeat(first.astype(np.uint32), sizes)[:, None]
-    local_own = own - np.repeat(*runs(shapes))
-    found: dict[tuple[bytes, bytes], list[int]] = {}
-    for k, (start, size, low, high) in enumerate(zip(starts, sizes, first, last, strict=True)):
-        key = local_faces[start : start + size].tobytes(), local_own[low:high].tobytes()
-        found.setdefault(key, []).append(k)
-    single = [members[0] for members in found.values() if len(members) == 1]
-    several = [members for members in found.values() if len(members) > 1]
+    found = None if shapes is None else _members(faces, own, shapes)
+    if found is None:
+        return [_alone(np.arange(len(faces)))]
+    starts, sizes, first, members_of = found
+    single = [members[0] for members in members_of if len(members) == 1]
+    several = [members for members in members_of if len(members) > 1]
     copies = [Copies(starts[k], first[k], starts[k[0]] + np.arange(sizes[k[0]])) for k in several]
     if single:
         copies.append(_alone(np.concatenate([starts[k] + np.arange(sizes[k]) for k in single])))
     return copies
+
+
+def _members(
+    faces: npt.NDArray[np.uint32], own: Index, shapes: npt.NDArray[np.integer[Any]]
+) -> tuple[Index, Index, Index, list[list[int]]] | None:
+    """First face, number of faces, first vertex of each shape, and which shapes are copies of each other.
+
+    None if vertices or faces of a shape are scattered. One shape after the other is looked at, which is fast as long as it fits
+    into a cache.
+    """
+    if (shapes[1:] < shapes[:-1]).any():
+        return None
+    low, count = runs(shapes)
+    # Where the faces of each shape begin if they stand in order. What does not is found below.
+    starts = np.searchsorted(faces[:, 0], low)
+    sizes = np.diff(np.append(starts, len(faces)))
+    if starts[0] or (sizes < 0).any():
+        return None
+    kept = sizes > 0
+    starts, sizes, low, count = starts[kept], sizes[kept], low[kept], count[kept]
+    found: dict[tuple[bytes, bytes], list[int]] = {}
+    for k, (start, size, first, vertices) in enumerate(zip(*(a.tolist() for a in (starts, sizes, low, count)), strict=True)):
+        # Vertices before the first one are large numbers here.
+        local = faces[start : start + size] - np.uint32(first)
+        if local.max() >= vertices:
+            return None
+        key = local.tobytes(), (own[first : first + vertices] - first).tobytes()
+        found.setdefault(key, []).append(k)
+    return starts, sizes, low, list(found.values())
 
 
 def _alone(rows: Index) -> Copies:

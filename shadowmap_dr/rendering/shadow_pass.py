@@ -13,7 +13,7 @@ import numpy as np
 from ..errors import ShadowmapError
 from ..jit.arrays import device_array
 from ..raster import RasterOutput, Topology
-from ..scene.geometry import Geometry
+from ..scene.geometry import Geometry, rows_of
 from ..scene.lights.projected import Beam
 from ..scene.lights.read import Light
 from ..shadow import (
@@ -34,6 +34,9 @@ from ..shadow import (
     vertices_in_maps,
     visibility,
 )
+
+# Vertices whose coordinates are looked at at once on the host: temporary arrays of all of them would take longer to allocate.
+_PIECE = 1 << 15
 
 
 @dataclass(frozen=True)
@@ -64,22 +67,35 @@ def plan_maps(lights: Sequence[Light], geometry: Geometry) -> MapPlan:
     sizes = [6 if kind == "cube" else 1 for kind in kinds]
     positions = dr.detach(geometry.positions).numpy().reshape(-1, 3)
     faces = geometry.faces.numpy().reshape(-1, 3)
-    planes = [info.face_start for info in geometry.shapes]
-    for k, info in enumerate(geometry.shapes):
-        if info.planar and info.face_count > 1:
-            own = positions[faces[info.face_start : info.face_start + info.face_count]].astype(np.float64)
-            n = np.cross(own[:, 1] - own[:, 0], own[:, 2] - own[:, 0])
-            planes[k] += int(np.argmax((n**2).sum(1)))
-    columns = [column.astype(np.float64) for column in positions.T]
-    center = [0.5 * (column.min() + column.max()) for column in columns]
+    planes = np.array([info.face_start for info in geometry.shapes])
+    planar = np.flatnonzero([info.planar for info in geometry.shapes])
+    if len(planar):
+        rows = rows_of(planes[planar], np.array([geometry.shapes[k].face_count for k in planar]))
+        own = positions[faces[rows]].astype(np.float64)
+        squared = (np.cross(own[:, 1] - own[:, 0], own[:, 2] - own[:, 0]) ** 2).sum(1)
+        # Of each shape the last one that is written stays: the first one of the largest.
+        order = np.lexsort((-rows, squared))
+        largest = np.empty(len(geometry.shapes), np.int64)
+        largest[geometry.face_shape.numpy()[rows[order]]] = rows[order]
+        planes[planar] = largest[planar]
+    center, radius = _sphere_around(positions)
     return MapPlan(
         kinds,
         tuple(int(n) for n in np.cumsum([0, *sizes])[:-1]),
         device_array(mi.UInt32, planes),
         device_array(mi.Bool, [info.planar for info in geometry.shapes]),
-        tuple(float(c) for c in center),
-        float(np.sqrt(sum((column - middle) ** 2 for column, middle in zip(columns, center, strict=True)).max())) or 1.0,
+        center,
+        radius or 1.0,
     )
+
+
+def _sphere_around(positions: np.ndarray) -> tuple[tuple[float, float, float], float]:
+    """Center of the box around points (V, 3), and the largest distance from it."""
+    pieces = [positions[start : start + _PIECE].T for start in range(0, len(positions), _PIECE)]
+    low, high = (np.array([[end(column) for column in piece] for piece in pieces], np.float64) for end in (np.min, np.max))
+    x, y, z = (0.5 * (low.min(0) + high.max(0))).tolist()
+    squared = (sum((column.astype(np.float64) - c) ** 2 for column, c in zip(p, (x, y, z), strict=True)).max() for p in pieces)
+    return (x, y, z), float(np.sqrt(max(squared)))
 
 
 def check_sizes(maps: int, texels: int, geometry: Geometry, lights: str, remedy: str) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import drjit as dr
@@ -37,15 +37,14 @@ class _Same:
     __hash__ = None  # type: ignore[assignment]
 
 
-def leaves(array: Any) -> Iterator[Any]:
+def leaves(array: Any) -> list[Any]:
     """The flat arrays of a nested array or tensor, in a fixed order."""
     if dr.is_tensor_v(array):
-        yield array.array
-    elif dr.depth_v(array) == 1:
-        yield array
-    else:
-        for part in array:
-            yield from leaves(part)
+        return [array.array]
+    found = [array]
+    for _ in range(dr.depth_v(array) - 1):
+        found = [part for whole in found for part in whole]
+    return found
 
 
 class ParameterWatch:
@@ -68,18 +67,6 @@ class ParameterWatch:
 
     def _now(self) -> list[Any]:
         return [fingerprint(table[key]) for table, key in self._held]
-
-
-def mirrored(shapes: Sequence[Any]) -> np.ndarray:
-    """True if the ``to_world`` of shapes and instances have a negative determinant (bool, one for each). Read back to the host.
-
-    False where there is None in the place of a shape.
-    """
-    asked = [k for k, shape in enumerate(shapes) if shape is not None]
-    found = np.zeros(len(shapes), bool)
-    if asked:
-        found[asked] = _negative([Parameter(shapes[k], "to_world").now().matrix for k in asked])
-    return found
 
 
 class MirrorWatch:

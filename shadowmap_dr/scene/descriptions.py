@@ -11,8 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import ShadowmapError
-from .changes import mirrored
-from .geometry import ShapeInfo, with_faces
+from .geometry import ShapeInfo, rows_of, with_faces
 from .shapes.sources import ShapeSource
 
 # How far, in relation to its extent, squared, the vertices of a shape in one plane are from it.
@@ -40,9 +39,13 @@ class Parts:
         """The same of some of the shapes."""
         if shapes.all():
             return self
-        vertices, faces = np.repeat(shapes, self.vertex_counts), np.repeat(shapes, self.face_counts)
         counts = self.vertex_counts[shapes], self.face_counts[shapes]
+        vertices, faces = rows_of(self.vertex_starts[shapes], counts[0]), self.face_rows(shapes)
         return Parts(self.points[vertices], self.normals[vertices], self.faces[faces], *counts)
+
+    def face_rows(self, shapes: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
+        """Rows of the faces of some of the shapes."""
+        return rows_of(self.face_starts[shapes], self.face_counts[shapes])
 
     @property
     def vertex_starts(self) -> npt.NDArray[np.int64]:
@@ -59,17 +62,18 @@ def describe_all(
     names: Sequence[str],
     sources: Sequence[ShapeSource],
     held: Sequence[tuple[bool, bool]],
+    mirrored: tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]],
     parts: Parts,
 ) -> tuple[ShapeInfo, ...]:
     """Validate the buffers of all shapes and describe them.
 
-    ``held``: which of them have (normals, texture coordinates).
+    ``held``: which of them have (normals, texture coordinates). ``mirrored``: as :meth:`~shadowmap_dr.scene.soup.Soup.mirrored`.
 
     Raises:
         ShadowmapError: a mesh is broken.
     """
     _validate(names, parts)
-    own, placed = mirrored([s.own_placement for s in sources]), mirrored([s.instance for s in sources])
+    own, placed = mirrored
     meshes = np.array([isinstance(source.shape, mi.Mesh) for source in sources])
     kinds = [source.shape.class_name() for source in sources]
     has_normals = np.array([normals for normals, _ in held])
@@ -135,9 +139,8 @@ def _validate(names: Sequence[str], parts: Parts) -> None:
 
 def _corners(parts: Parts, shapes: npt.NDArray[np.bool_]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(faces of some shapes (K, 3) as vertices of all, the first face of each such shape, the vertices' points, (K, 3, 3))."""
-    chosen = np.repeat(shapes, parts.face_counts)
-    faces = parts.faces[chosen] + np.repeat(parts.vertex_starts, parts.face_counts)[chosen, None]
     counts = parts.face_counts[shapes]
+    faces = parts.faces[parts.face_rows(shapes)] + np.repeat(parts.vertex_starts[shapes], counts)[:, None]
     return faces, np.cumsum(counts) - counts, parts.points[faces].astype(np.float64)
 
 
@@ -179,8 +182,8 @@ def _may_be_planar(parts: Parts) -> npt.NDArray[np.bool_]:
     points = parts.points[corners].astype(np.float64)
     points -= points.mean(1, keepdims=True)
     least = np.linalg.eigvalsh(np.einsum("spi,spj->sij", points, points))[:, 0]
-    starts, columns = parts.vertex_starts, parts.points.T.astype(np.float64)
-    extent = np.stack([np.maximum.reduceat(c, starts) - np.minimum.reduceat(c, starts) for c in columns])
+    low, high = (end.reduceat(parts.points, parts.vertex_starts).astype(np.float64) for end in (np.minimum, np.maximum))
+    extent = (high - low).T
     # The sum over all vertices is at most that of a box's diagonals, and these corners count as often as they are chosen.
     return least <= 2 * 3 * _TRIED * _FLAT * parts.vertex_counts * (extent**2).sum(0)
 

@@ -269,9 +269,9 @@ def _described(names: list[str], sources: list[ShapeSource], faces: list[np.ndar
     """The soup of shapes, with the faces of each, and what they are like."""
     with dr.suspend_grad():
         soup = Soup(names, sources)
-        points, normals = (buffer.numpy().reshape(-1, 3) for buffer in soup.own())
+    points, normals = (buffer.numpy().reshape(-1, 3) for buffer in soup.own())
     parts = Parts(points, normals, np.concatenate(faces), soup.counts, np.array([len(own) for own in faces]))
-    return soup, describe_all(names, sources, soup.held, parts)
+    return soup, describe_all(names, sources, soup.held, soup.mirrored(), parts)
 
 
 def _pointers(kind: type, objects: list[Any]) -> Any:

@@ -155,6 +155,8 @@ class Soup:
         self._index = device_array(mi.UInt32, first + np.arange(len(first)))
         self._shape = device_array(mi.UInt32, np.repeat(np.arange(len(counts)), self.counts))
         self._rows = [device_array(mi.UInt32, r) if (np.array(r) != _NONE).any() else None for r in (own_rows, instance_rows)]
+        none = len(self._placements)
+        self._placement_rows = [np.array([none if row == _NONE else row for row in rows]) for rows in (own_rows, instance_rows)]
         total = sum(root.count for root in self._roots)
         self._host = [np.zeros((total, size), np.float32) for size in (3, 3, 2)]
         self._local: list[Any] = []
@@ -162,6 +164,7 @@ class Soup:
         self._transformations: Any = None
         self._settled: Vertices | None = None
         self._over: tuple[tuple[int, ...], list[Any]] = ((), [])
+        self._just_read = False
 
     def recording_text(self) -> str:
         """Nothing that recordings depend on is kept here: they get the vertices themselves."""
@@ -172,8 +175,9 @@ class Soup:
 
         ``single``: the vertices (:class:`Vertices`, as a tuple) of the shape of that number, attached.
         """
-        for reading in self._all_readings():
-            reading.look()
+        if not self._just_read:
+            self._look()
+        self._just_read = False
         still = self._still()
         attached = tuple(k for k, readings in enumerate(self._readings) if any(r.attached for r in readings))
         if not attached:
@@ -188,13 +192,14 @@ class Soup:
         targets = zip(under, parts, (threes, threes, twos, threes), strict=True)
         return Vertices(*(_written_over(buffer, list(pieces), index) for buffer, pieces, index in targets))
 
-    def _all_readings(self) -> list[_Reading]:
-        return [*(root.reading for root in self._roots), *(placement.reading for placement in self._placements)]
+    def _look(self) -> None:
+        for holder in (*self._roots, *self._placements):
+            holder.reading.look()
 
-    def _still(self) -> Vertices:
-        """The vertices of all shapes, detached; those of shapes that carry gradients are of no use."""
-        roots = [root for root in self._roots if root.reading.changed and not root.reading.attached]
-        moved = [p for p in self._placements if p.reading.changed and not p.reading.attached]
+    def _still(self, attached_too: bool = False) -> Vertices:
+        """The vertices of all shapes, detached. Those of shapes that carry gradients are of no use unless ``attached_too``."""
+        roots = [root for root in self._roots if root.reading.changed and (attached_too or not root.reading.attached)]
+        moved = [p for p in self._placements if p.reading.changed and (attached_too or not p.reading.attached)]
         if self._settled is None or roots or moved:
             self._read_roots(roots)
             matrices = [placement.matrices() for placement in moved]
@@ -220,10 +225,24 @@ class Soup:
             self._local = [device_array(mi.Float, host) for host in self._host]
 
     def own(self) -> tuple[Any, Any]:
-        """Positions and normals as Mitsuba holds them: before the transformations of instances. Detached."""
-        self.vertices(lambda _: ())
-        local = [dr.gather(mi.Vector3f, buffer, self._index) for buffer in self._local[:2]]
-        return tuple(dr.ravel(values) for values in self._moved(*local, self._rows[0]))
+        """Positions and normals as Mitsuba holds them: before the transformations of instances. Detached.
+
+        The next call of :meth:`vertices` takes what was read for this one.
+        """
+        self._look()
+        self._just_read = True
+        with dr.suspend_grad():
+            self._still(attached_too=True)
+            local = [dr.gather(mi.Vector3f, buffer, self._index) for buffer in self._local[:2]]
+            return tuple(dr.ravel(values) for values in self._moved(*local, self._rows[0]))
+
+    def mirrored(self) -> tuple[np.ndarray, np.ndarray]:
+        """True if shapes' own ``to_world``, or those of their instances, mirror them (bool (S,) each), as last read.
+
+        False for shapes without.
+        """
+        negative = np.linalg.det(self._table[:, :_POINTS].reshape(-1, 3, 4)[:, :, :3].astype(np.float64)) < 0
+        return tuple(np.append(negative, False)[rows] for rows in self._placement_rows)
 
     def _placed(self) -> Vertices:
         points, directions, texcoords = self._local

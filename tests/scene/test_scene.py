@@ -227,7 +227,7 @@ def test_faces_out_of_range_and_empty_meshes_are_named(variant: str) -> None:
 
     def describe(faces: np.ndarray) -> None:
         parts = Parts(points, np.zeros_like(points), faces, np.array([len(points)]), np.array([len(faces)]))
-        describe_all(["broken"], [source], [(False, False)], parts)
+        describe_all(["broken"], [source], [(False, False)], (np.array([False]), np.array([False])), parts)
 
     with pytest.raises(ShadowmapError, match="Face 1 of shape 'broken' refers to vertex 3.* 3 vertices"):
         describe(np.array([[0, 1, 2], [0, 1, 3]], np.uint32))

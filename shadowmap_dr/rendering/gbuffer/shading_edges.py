@@ -219,10 +219,10 @@ def _edges(geometry: Geometry, topology: Topology, everywhere: np.ndarray) -> tu
     faces, welded = (a.numpy() for a in (geometry.faces, topology.welded))
     several = np.zeros(geometry.vertex_count, bool)
     several[welded[faces != welded]] = True
-    chosen = several[welded]
-    chosen |= chosen.reshape(-1, 3)[:, [1, 2, 0]].ravel()
-    chosen |= np.repeat(everywhere, 3)
-    half = np.flatnonzero(chosen)
+    at_corners = several[welded].reshape(-1, 3)
+    rows = np.flatnonzero(at_corners[:, 0] | at_corners[:, 1] | at_corners[:, 2] | everywhere)
+    chosen = at_corners[rows] | at_corners[rows][:, [1, 2, 0]] | everywhere[rows, None]
+    half = (3 * rows[:, None] + np.arange(3))[chosen]
     after = half + np.where(half % 3 == 2, -2, 1)
     start, end = welded[half].astype(np.int64), welded[after].astype(np.int64)
     key = np.minimum(start, end) * geometry.vertex_count + np.maximum(start, end)

@@ -1,1 +1,1 @@
-"""The experiments, one module each. Nothing here is needed to render or differentiate a scene."""
+"""The experiments, one package each. Nothing here is needed to render or differentiate a scene."""

@@ -1,1 +1,1 @@
-"""The benchmark: steps, rasterization, how costs grow, and where the time goes."""
+"""The benchmark: steps, rasterization, growth of costs, and time by pass."""

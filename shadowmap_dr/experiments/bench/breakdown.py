@@ -1,4 +1,4 @@
-"""Benchmark: where the time of a step goes, by pass, and how much of it is tracing and Python."""
+"""Benchmark: time of a step by pass, and the share of tracing and Python."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import importlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import fields, is_dataclass
-from typing import Any
+from typing import Any, ParamSpec
 from unittest import mock
 
 import drjit as dr
@@ -17,11 +17,14 @@ import numpy as np
 from ...inverse import PoseFit
 from ...inverse.pose import _pose_step
 from ...jit.gc import gc_quiet
+from ...jit.types import AnyArray, ArrayT, Float, PyTree
 from ..common.timing import Contender, alternate, summary, timed
 from .common import BenchOptions, Unit, Update
 from .scaling import Case
 
-#: The passes of a step in their order: label, and the function (module:name below `shadowmap_dr`) that makes them up.
+P = ParamSpec("P")
+
+#: Passes of a step in order: label, and the pass's function (`module:name` below `shadowmap_dr`).
 PASSES = (
     ("vertices", "scene.geometry:Geometry.with_positions"),
     ("facets: mean normals", "rendering.gbuffer.camera_view:mean_normals"),
@@ -51,15 +54,15 @@ def units(options: BenchOptions) -> list[Unit]:
 
 
 def measure(options: BenchOptions, method: str, resolution: int, done: Mapping[str, Any], update: Update) -> dict[str, Any]:
-    """Time of the kernels of each pass, and the part of a step in which no kernel runs.
+    """Time of the kernels of each pass, and the share of a step in which no kernel runs.
 
-    For the passes, a step is run piece by piece: everything is evaluated at the end of each pass, in both directions. This
-    hinders fusion across passes, so that the sum over the passes is somewhat more than the kernels of a whole step.
+    To measure the passes, everything is evaluated at the end of each pass, in both directions. This prevents fusion across
+    passes, so that the sum over the passes is somewhat more than the kernels of a whole step.
     """
     rounds = options.what.rounds
     update(0, 1, "set-up")
     fit = Case(resolution=resolution, method=method).fit(options.work)
-    calls = {"frozen": fit.step, "not frozen": functools.partial(unfrozen_step, fit)}
+    calls: dict[str, Callable[[], object]] = {"frozen": fit.step, "not frozen": functools.partial(unfrozen_step, fit)}
     samples = alternate({name: Contender(call, rounds) for name, call in calls.items()}, update)
     result: dict[str, Any] = {"resolution": resolution, "method": method}
     for name, call in calls.items():
@@ -69,17 +72,18 @@ def measure(options: BenchOptions, method: str, resolution: int, done: Mapping[s
             "seconds": summary(samples[name]),
             "seconds_in_kernels": float(np.median(busy)),
             "kernels": len(kernels[0]),
-            # Tracing, Python, and the launch of the kernels. Of the same calls, since the clock of kernels costs time, too.
+            # Tracing, Python and kernel launches. Both times are of the same calls, since timing the kernels takes time, too.
             "share_outside_kernels": float(np.median(np.maximum(0, 1 - busy / np.array(walls)))),
         }
     result["passes"] = _passes(fit, rounds, update)
     return result
 
 
-def unfrozen_step(fit: PoseFit) -> Any:
-    """A step of a fit, traced anew."""
-    constants = {"shape": fit._shape, "shift_z": fit._shift_z, "spp": fit._spp}
-    return _pose_step(fit._renderer, fit._optimizer, fit._p_rest, fit._reference, **constants)
+def unfrozen_step(fit: PoseFit) -> Float:
+    """A step of a fit without `dr.freeze`. Returns the loss, Float (1,)."""
+    return _pose_step(
+        fit._renderer, fit._optimizer, fit._p_rest, fit._reference, shape=fit._shape, shift_z=fit._shift_z, spp=fit._spp
+    )
 
 
 @contextmanager
@@ -90,8 +94,8 @@ def _history() -> Iterator[None]:
         dr.kernel_history_clear()
 
 
-def _kernels(call: Callable[[], Any], rounds: int) -> tuple[list[float], list[list[float]]]:
-    """Seconds of some calls, and of each kernel of theirs."""
+def _kernels(call: Callable[[], object], rounds: int) -> tuple[list[float], list[list[float]]]:
+    """Seconds of each call, and of each of its kernels."""
     walls, kernels = [], []
     with gc_quiet(), _history():
         for _ in range(min(rounds, 20) + 1):
@@ -101,7 +105,7 @@ def _kernels(call: Callable[[], Any], rounds: int) -> tuple[list[float], list[li
 
 
 class Recorder:
-    """Notes to which pass the kernels belong: those launched between two calls of `drain` go to the pass named then."""
+    """Record of kernel times by pass: `drain` books the kernels launched since its last call to the current pass."""
 
     def __init__(self) -> None:
         self.forward: dict[str, list[float]] = {}
@@ -121,11 +125,11 @@ class Recorder:
         self.drain()
         self.going_back, self.behind = True, name
 
-    def wrap(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        """The function, with everything evaluated before and after it."""
+    def wrap(self, name: str, function: Callable[P, ArrayT]) -> Callable[P, ArrayT]:
+        """The function of a pass, with its arguments and its result evaluated, so that its kernels are those of the pass."""
 
         @functools.wraps(function)
-        def wrapped(*args: Any, **kwargs: Any) -> Any:
+        def wrapped(*args: P.args, **kwargs: P.kwargs) -> ArrayT:
             dr.eval(args, kwargs)
             self.drain()
             self.stack.append(name)
@@ -139,9 +143,9 @@ class Recorder:
 
 
 class _Mark(dr.CustomOp):
-    """Identity, whose backward pass evaluates the gradients that have come so far."""
+    """Identity. Its backward pass evaluates the gradients, so that the kernels up to here end with the pass."""
 
-    def eval(self, value: Any, recorder: Recorder, label: str) -> Any:
+    def eval(self, value: list[AnyArray], recorder: Recorder, label: str) -> list[AnyArray]:
         self.recorder, self.label = recorder, label
         return value
 
@@ -152,17 +156,22 @@ class _Mark(dr.CustomOp):
         self.set_grad_in("value", gradient)
 
 
-def _marked(value: Any, recorder: Recorder, label: str) -> Any:
-    """The same tree of arrays with the differentiable ones behind a common `_Mark`."""
-    leaves: list[Any] = []
-    _mapped(value, lambda leaf: leaves.append(leaf) or leaf)
+def _marked(value: ArrayT, recorder: Recorder, label: str) -> ArrayT:
+    """A copy of a tree of arrays with all attached arrays passed through one `_Mark`."""
+    leaves: list[AnyArray] = []
+
+    def collected(leaf: AnyArray) -> AnyArray:
+        leaves.append(leaf)
+        return leaf
+
+    _mapped(value, collected)
     if not leaves:
         return value
     marked = iter(dr.custom(_Mark, leaves, recorder, label))
     return _mapped(value, lambda leaf: next(marked))
 
 
-def _mapped(value: Any, function: Callable[[Any], Any]) -> Any:
+def _mapped(value: PyTree, function: Callable[[AnyArray], AnyArray]) -> PyTree:
     """A copy of a tree (sequences, records, Mitsuba's structures) with the attached arrays replaced by the function's results."""
     if dr.is_array_v(value):
         return function(value) if dr.is_float_v(value) and dr.grad_enabled(value) else value
@@ -213,17 +222,17 @@ def _passes(fit: PoseFit, rounds: int, update: Update) -> list[dict[str, Any]]:
     return [entry for entry in result if entry["kernels"]]
 
 
-def _switch(records: list[Recorder], name: str, function: Callable[..., Any]) -> Callable[..., Any]:
-    def call(*args: Any, **kwargs: Any) -> Any:
+def _switch(records: list[Recorder], name: str, function: Callable[P, ArrayT]) -> Callable[P, ArrayT]:
+    def call(*args: P.args, **kwargs: P.kwargs) -> ArrayT:
         return records[-1].wrap(name, function)(*args, **kwargs)
 
     return call
 
 
-def find(place: str) -> tuple[Any, str]:
+def find(place: str) -> tuple[object, str]:
     """Owner (module or class) and name of a function `module:name` or `module:class.name`."""
     module, _, path = place.partition(":")
-    owner: Any = importlib.import_module(f"shadowmap_dr.{module}")
+    owner: object = importlib.import_module(f"shadowmap_dr.{module}")
     *classes, attribute = path.split(".")
     for name in classes:
         owner = getattr(owner, name)

@@ -1,4 +1,4 @@
-"""The process that `bench.common.run_child` starts: reads a task from the standard input, writes results, one a line."""
+"""Child process of `bench.common.run_child`: reads a task from standard input and writes results, each a line of JSON."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ...io import records
 
 def main() -> None:
     task = json.load(sys.stdin)
-    if not task["variant"].startswith("cuda"):  # which reserves far more addresses than it uses
+    if not task["variant"].startswith("cuda"):  # CUDA reserves far more addresses than it uses
         _limit_memory()
     mi.set_variant(task["variant"])
     dr.set_thread_count(task["threads"])
@@ -30,7 +30,7 @@ def main() -> None:
 
 
 def _limit_memory() -> None:
-    """Fail before the machine has no memory left, for the system might end other processes then."""
+    """Limit the memory of this process: without memory left, the system might end other processes."""
     try:
         import resource
 

@@ -1,4 +1,4 @@
-"""Common to the parts of the benchmark: options, sizes, and the description of a part."""
+"""Parts of the benchmark that its sections share: options, sizes, and the units of measurement."""
 
 from __future__ import annotations
 
@@ -28,18 +28,19 @@ class Sizes:
         rounds: measured steps of each of our contenders; `mitsuba_rounds` those of Mitsuba's.
         default_steps: steps of Mitsuba's default setting for each resolution.
         starts, iterations: of the times to pose.
-        path_traced: whether the reference images are path-traced or, faster, our own.
+        path_traced: reference images are path-traced; False: rendered with this library, which is faster.
         meshes, raster_resolutions: of rasterization alone, see `common.meshes.make`.
-        worst: worst cases, with the well-behaved mesh that each is compared with; see `common.meshes`.
+        worst: worst cases -> the well-behaved mesh to compare each with; see `common.meshes`.
         full_raster: mesh and resolutions for the forward and backward pass through the raster functions.
         call_seconds: a rasterization that is predicted to take longer than this is left out.
         series: quantity -> values; see `bench.scaling`.
-        light_resolutions: sizes of images, beside that of the series, for which the numbers of lights are compared.
+        light_resolutions: image sizes, beside that of the series, at which numbers of lights are compared.
+        passes: runs through each series.
         large: mesh and resolution of the largest step.
         batch, batch_resolution: number and size of small images.
-        sums: (pixels along each side, samples a pixel) whose derivatives are added up; see `bench.sums`.
+        sums: (pixels along each side, samples per pixel) over which derivatives are summed; see `bench.sums`.
         loop_size: pixels along each side of images in the loops of `bench.loops`.
-        loop_steps: steps over which their memory is watched, 0 for not at all.
+        loop_steps: steps over which their memory is measured, 0 for none.
         crowds: scenes of many shapes; see `bench.first.Crowd`.
     """
 
@@ -121,10 +122,10 @@ class BenchOptions:
     Attributes:
         quick: few steps, small sizes.
         out: JSON file; a plot and the files that the benchmark works with lie beside it.
-        only: names of sections; the others' results stay as they are in the file.
-        resume: keep what the file has of a run with the same options.
+        only: names of sections to measure; results of other sections in the file are kept.
+        resume: keep results in the file that were measured with the same options.
         mitsuba_seconds: limit for each part of the work that waits for Mitsuba's integrator.
-        sizes: what is measured, by default as `quick` says.
+        sizes: sizes of the measurements; None: those for `quick`.
     """
 
     quick: bool = False
@@ -154,15 +155,15 @@ class BenchOptions:
         return self.out.parent / f"{self.out.stem}-files"
 
 
-#: Told how much of how much is done, and a note.
+#: Callback for progress: number of finished parts, total, note.
 Update = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True)
 class Unit:
-    """A part of a section that is measured at one go and stored when it is complete.
+    """A part of a section, measured in one go and stored when complete.
 
-    `run` gets the units of the section that are complete so far, and an `Update`. It returns a JSON value.
+    `run` gets the results of the section's complete units so far, and an `Update`. It returns a JSON value.
     """
 
     name: str
@@ -170,7 +171,7 @@ class Unit:
 
 
 def run_child(function: str, arguments: Mapping[str, Any], seconds: float) -> dict[str, Any]:
-    """Calls a function in a process of its own, where memory is counted from nothing and a crash ends nothing else.
+    """Call a function in a process of its own: its memory is measured alone, and a crash ends nothing else.
 
     Args:
         function: `module:name` within `shadowmap_dr.experiments`; it takes the arguments and `emit`, which stores a
@@ -179,7 +180,7 @@ def run_child(function: str, arguments: Mapping[str, Any], seconds: float) -> di
         seconds: after this time the process is ended.
 
     Returns:
-        The result. If the process failed, the last preliminary one with the entry `failed`, a line that says why.
+        The result. If the process failed: the last preliminary result with the entry `failed`, the reason in one line.
     """
     package = str(Path(__file__).resolve().parents[3])
     paths = filter(None, (package, os.environ.get("PYTHONPATH")))

@@ -1,7 +1,7 @@
-"""The benchmark behind `shadowmap-dr bench`: steps, rasterization, growth, and where the time goes.
+"""The benchmark behind `shadowmap-dr bench`: steps, rasterization, growth of costs, and time by pass.
 
-A section is measured in units. Each is stored in the JSON file when it is complete, so that nothing is lost with a run that
-is killed, and goes on after the last complete one with `resume`.
+A section is measured in units. Each unit is stored in the JSON file when it is complete: a killed run loses only the unit in
+progress, and `resume` continues after the last complete one.
 """
 
 from __future__ import annotations
@@ -15,12 +15,13 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 from rich.console import Console
+from rich.progress import TaskID
 
 from ... import __version__
 from ...errors import ShadowmapError
 from ...io import console as io_console
 from ...io import files, records
-from ..common.timing import OtherWork, load, machine
+from ..common.timing import DRJIT_VERSION, OtherWork, load, machine
 from . import breakdown as bench_breakdown
 from . import first as bench_first
 from . import loops as bench_loops
@@ -47,10 +48,10 @@ UNITS: dict[str, Callable[[BenchOptions], list[Unit]]] = {
 def run_bench(options: BenchOptions, *, console: Console | None = None) -> dict[str, Any]:
     """Measure the sections and write `options.out` and a plot beside it (`.png`).
 
-    A unit that fails is stored with the entry `failed` and does not keep the others from being measured.
+    A unit that fails is stored with the entry `failed`; the others are still measured.
 
     Returns:
-        What is in the JSON file: `sections` (by name, each with `command`, `settings`, `machine` and `units`),
+        Content of the JSON file: `sections` (by name, each with `command`, `settings`, `machine` and `units`),
         `machine`, `load_before` and `load_after`, and `figures`, the rows of the table.
     """
     console = console or Console(stderr=True)
@@ -63,8 +64,8 @@ def run_bench(options: BenchOptions, *, console: Console | None = None) -> dict[
     for name in plan:
         section = record["sections"].get(name, {})
         keep = options.resume and section.get("settings") == settings
-        units = {key: value for key, value in section.get("units", {}).items() if "failed" not in value} if keep else {}
-        record["sections"][name] = {"command": command, "settings": settings, "machine": machine(), "units": units}
+        kept = {key: value for key, value in section.get("units", {}).items() if "failed" not in value} if keep else {}
+        record["sections"][name] = {"command": command, "settings": settings, "machine": machine(), "units": kept}
     _write(options, record)
 
     with io_console.progress(console) as progress:
@@ -77,7 +78,7 @@ def run_bench(options: BenchOptions, *, console: Console | None = None) -> dict[
                     continue
                 inner = progress.add_task(f"{name} {unit.name}", total=None, note="")
 
-                def update(count: int, total: int, note: str, inner: Any = inner) -> None:
+                def update(count: int, total: int, note: str, inner: TaskID = inner) -> None:
                     progress.update(inner, completed=count, total=total, note=note)
 
                 done[unit.name] = _measured(unit, done, update)
@@ -85,7 +86,7 @@ def run_bench(options: BenchOptions, *, console: Console | None = None) -> dict[
                 _write(options, record)
                 line = f"{name} {unit.name}: {bench_report.outcome(done[unit.name])}"
                 progress.console.print(line, highlight=False, markup=False)
-                # What a unit leaves behind would count as memory of the next.
+                # Memory that a unit leaves allocated would count as memory of the next.
                 dr.flush_malloc_cache()
             progress.remove_task(task)
     record["load_after"] = load()
@@ -96,7 +97,7 @@ def run_bench(options: BenchOptions, *, console: Console | None = None) -> dict[
 
 
 def failures(record: dict[str, Any], sections: tuple[str, ...]) -> list[str]:
-    """Parts that could not be measured, a line for each."""
+    """Units that could not be measured, a line for each."""
     return [
         f"{name} {key}: {unit['failed']}"
         for name in sections
@@ -132,7 +133,7 @@ def _settings(options: BenchOptions) -> dict[str, Any]:
             "threads": dr.thread_count(),
             "shadowmap_dr": __version__,
             "mitsuba": mi.__version__,
-            "drjit": dr.__version__,
+            "drjit": DRJIT_VERSION,
         }
     )
 

@@ -1,7 +1,7 @@
 """Benchmark: seconds from a loaded scene to its first picture, where scenes have many shapes.
 
-Each scene is loaded anew for each picture, after others of its kind have been rendered: kernels are compiled then, as they are in
-the second process that works on a scene. Mitsuba's `direct` renders the same scenes in turns.
+Each picture is of a newly loaded scene. Other scenes of its kind have been rendered before, so that kernels are compiled, as they
+are in the second process that renders a scene. Mitsuba's `direct` renders the same scenes in turns.
 """
 
 from __future__ import annotations
@@ -16,10 +16,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...jit.types import Point3f
 from ..common.timing import compare, timed
 from .common import BenchOptions, Unit, Update, run_child
 
-# Pictures of each scene, and the time after which a scene is given up.
+# Pictures of each scene, and the time limit (seconds) of a scene's process.
 _ROUNDS, _SECONDS = 3, 900.0
 _KINDS = ("cube", "rectangle", "sphere", "cylinder", "disk")
 _GROUPED = ("cube", "sphere", "cylinder")
@@ -30,11 +31,11 @@ class Crowd:
     """A scene of many shapes.
 
     Attributes:
-        instances: of groups of shapes, in turns.
-        groups: how many of these there are, 0 for none.
-        shapes: single ones.
-        kinds: of these, in turns.
-        lights: points, spots and directional lights, in turns.
+        instances: number of instances; they take the shape groups in turns.
+        groups: number of shape groups.
+        shapes: number of single shapes.
+        kinds: plug-ins of the single shapes, in turns.
+        lights: number of lights; directional, point and spot lights in turns.
     """
 
     instances: int = 0
@@ -53,7 +54,7 @@ class Crowd:
             parts.append(f"{self.lights} lights")
         return ", ".join(parts)
 
-    def scene(self, seed: int) -> Any:
+    def scene(self, seed: int) -> mi.Scene:
         """A new scene (64 x 64 pixels) with shapes and lights in other places for each ``seed``."""
         place = functools.partial(_place, np.random.default_rng(seed))
         film = {"type": "hdrfilm", "width": 64, "height": 64, "pixel_format": "rgb", "rfilter": {"type": "box"}}
@@ -83,7 +84,7 @@ class Crowd:
         return mi.load_dict(parts)
 
 
-def _place(random: np.random.Generator) -> Any:
+def _place(random: np.random.Generator) -> mi.ScalarTransform4f:
     x, y = random.uniform(-2, 2, 2).tolist()
     return mi.ScalarTransform4f().translate([x, y, 0.2]).scale(0.2)
 
@@ -100,26 +101,26 @@ def _measure(crowd: Crowd, done: Mapping[str, Any], update: Update) -> dict[str,
 
 
 def measure_first(crowd: Mapping[str, Any], emit: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
-    """Seconds of first pictures, and of a first backward pass."""
+    """Seconds of first pictures by both integrators, and of our first backward pass."""
     made = Crowd(**{**crowd, "kinds": tuple(crowd["kinds"])})
     methods = {"ours": "shadowmap", "direct": "direct"}
     seconds: dict[str, list[float]] = {name: [] for name in (*methods, "backward")}
     for seed in range(1 + _ROUNDS):
         for name, plugin in methods.items():
-            # Earlier scenes are in reference cycles (`mi.traverse` makes some). While they live, Mitsuba compiles calls of them.
+            # `mi.traverse` puts earlier scenes into reference cycles. While they live, Mitsuba compiles calls of their objects.
             scene = integrator = None
             gc.collect()
             scene, integrator = made.scene(seed), mi.load_dict({"type": plugin})
             dr.sync_thread()
-            seconds[name].append(timed(lambda scene=scene, integrator=integrator: mi.render(scene, integrator=integrator, spp=1)))
+            seconds[name].append(timed(functools.partial(mi.render, scene, integrator=integrator, spp=1)))
             if name == "ours":
-                seconds["backward"].append(timed(lambda scene=scene, integrator=integrator: _derivative(scene, integrator)))
-    # What was not compiled before this process began was in the first of these.
+                seconds["backward"].append(timed(functools.partial(_derivative, scene, integrator)))
+    # The first calls include the compilation of kernels that Dr.Jit had not cached on disk.
     return {"uncompiled": {name: values.pop(0) for name, values in seconds.items()}, **compare(seconds, [("ours", "direct")])}
 
 
-def _derivative(scene: Any, integrator: Any) -> Any:
-    """Gradient of the image's sum by the place of the floor."""
+def _derivative(scene: mi.Scene, integrator: mi.Integrator) -> Point3f:
+    """Gradient of the image's sum by the position of the floor."""
     params, change = mi.traverse(scene), mi.Point3f(0)
     dr.enable_grad(change)
     params["floor.to_world"] = mi.Transform4f().translate(change) @ mi.Transform4f(params["floor.to_world"])

@@ -1,7 +1,7 @@
-"""Loops as Mitsuba's users write them, in which nothing but the integrator's dictionary is exchanged.
+"""Optimisation loops as Mitsuba's users write them; only the integrator's dictionary is replaced.
 
-Rebuilt from Mitsuba's and Dr.Jit's public documentation. Each loop is a generator: it takes one step at a time and yields how far
-the parameters are from the true ones, so that loops with different integrators can take turns.
+Rebuilt from Mitsuba's and Dr.Jit's public documentation. Each loop is a generator that takes one step at a time and yields the
+error of its parameters, so that loops with different integrators can take turns.
 """
 
 from __future__ import annotations
@@ -10,20 +10,25 @@ import functools
 import pickle
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import numpy.typing as npt
 
 from ...io import assets
 from ...jit.gc import gc_quiet
+from ...jit.types import AnyArray, TensorXf
 from ..common.timing import compare, forget_peak_memory, peak_memory, timed
 from .common import BenchOptions, Unit, Update, run_child
 
-#: The integrator that takes the place of the originals.
+if TYPE_CHECKING:
+    import drjit.opt
+
+#: The integrator that replaces the originals.
 OURS: dict[str, Any] = {"type": "shadowmap"}
-# Originals: for materials and lights, and for what moves. Their sample counts are the defaults.
+# Original integrators for materials and lights, and for moving shapes and lights. Their sample counts are the defaults.
 _MATERIALS: dict[str, Any] = {"type": "prb", "max_depth": 2}
 _MOVES: dict[str, Any] = {"type": "direct_projective", "guiding": "none"}
 
@@ -39,8 +44,8 @@ _SECONDS = 1800.0
 
 @dataclass(frozen=True)
 class Loop:
-    """``steps(integrator, size)`` makes the generator; ``original``: dictionary of Mitsuba's integrator; ``bar``: share of the
-    first error that is left after ``count`` steps."""
+    """``steps(integrator, size)`` makes the generator; ``original``: dictionary of Mitsuba's integrator; ``bar``: largest share
+    of the first error after ``count`` steps."""
 
     steps: Callable[[dict[str, Any], int], Iterator[float]]
     original: dict[str, Any]
@@ -48,15 +53,15 @@ class Loop:
     bar: float = 0.5
 
 
-def _scene_dict(integrator: dict[str, Any], size: int, **changes: Any) -> dict[str, Any]:
-    """A head over a floor under a lamp; ``changes``: other parts, None for those that are left out."""
+def _scene_dict(integrator: dict[str, Any], size: int, **changes: object) -> dict[str, Any]:
+    """A head over a floor under a lamp; ``changes``: parts to add or replace, None to leave a part out."""
     t = mi.ScalarTransform4f()
     head = {
         "type": "ply",
         "filename": str(assets.mesh("suzanne")),
         "to_world": t.translate([0, 0, 0.5]).rotate([1, 0, 0], 90).scale(0.4),
     }
-    parts = {
+    parts: dict[str, object] = {
         "type": "scene",
         "integrator": integrator,
         "sensor": {**_camera(-np.pi / 2), "film": _film(size, size)},
@@ -86,12 +91,17 @@ def _diffuse(colour: Sequence[float]) -> dict[str, Any]:
     return {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(colour)}}
 
 
-def _error(value: Any, true: Any) -> float:
-    return float(np.abs(np.ravel(dr.detach(value)) - np.ravel(true)).mean())
+def _error(value: AnyArray, true: npt.ArrayLike) -> float:
+    return float(np.abs(np.array(dr.detach(value)).ravel() - np.ravel(true)).mean())
 
 
 def _descend(
-    scene: Any, names: Sequence[str], starts: Sequence[Any], true: Sequence[Any], rate: float, bounds: tuple[float, float] | None
+    scene: mi.Scene,
+    names: Sequence[str],
+    starts: Sequence[AnyArray],
+    true: Sequence[npt.ArrayLike],
+    rate: float,
+    bounds: tuple[float, float],
 ) -> Iterator[float]:
     """The loop of Mitsuba's tutorials: Adam, clipping, `params.update(opt)`."""
     reference = mi.render(scene, spp=_MANY)
@@ -105,7 +115,7 @@ def _descend(
         image = mi.render(scene, params, spp=_SPP, seed=step)
         dr.backward(dr.mean(dr.square(image - reference), axis=None))
         opt.step()
-        for name in names if bounds else ():
+        for name in names:
             opt[name] = dr.clip(opt[name], *bounds)
         params.update(opt)
         step += 1
@@ -172,7 +182,7 @@ def pytorch(integrator: dict[str, Any], size: int) -> Iterator[float]:
     reference, params = mi.render(scene, spp=_MANY).torch(), mi.traverse(scene)
 
     @dr.wrap(source="torch", target="drjit")
-    def render(colour: Any, seed: int = 0) -> Any:
+    def render(colour: Any, seed: int = 0) -> TensorXf:  # Any: callers pass a `torch.Tensor`, `dr.wrap` makes it a TensorXf
         params[_FLOOR] = dr.unravel(mi.Color3f, colour.array)
         params.update()
         return mi.render(scene, params, spp=_SPP, seed=seed)
@@ -191,7 +201,7 @@ def pytorch(integrator: dict[str, Any], size: int) -> Iterator[float]:
 
 
 def moved_light(integrator: dict[str, Any], size: int) -> Iterator[float]:
-    """Forward-mode derivatives by the place of the lamp, and a step of Gauss and Newton."""
+    """Forward-mode derivatives by the position of the lamp, and Gauss-Newton steps."""
     scene = mi.load_dict(_scene_dict(integrator, size))
     reference, params = np.array(mi.render(scene, spp=_MANY)), mi.traverse(scene)
     pose, offset, step = mi.Transform4f(params["lamp.to_world"]), 0.4, 0
@@ -222,8 +232,16 @@ def large_steps(integrator: dict[str, Any], size: int) -> Iterator[float]:
         step += 1
 
 
-def _smooth_step(scene: Any, params: Any, name: str, smooth: Any, opt: Any, reference: Any, step: int) -> float:
-    """A step of the variable ``u`` of vertices (`mi.ad.LargeSteps`). The image's RMSE before it."""
+def _smooth_step(
+    scene: mi.Scene,
+    params: mi.SceneParameters,
+    name: str,
+    smooth: Any,  # Any: `mi.ad.LargeSteps`, of which typings/mitsuba knows nothing
+    opt: drjit.opt.Adam,
+    reference: TensorXf,
+    step: int,
+) -> float:
+    """A step of the vertices' variable ``u`` (`mi.ad.LargeSteps`). Returns the image's RMSE before it."""
     params[name] = smooth.from_differential(opt["u"])
     params.update()
     loss = dr.mean(dr.square(mi.render(scene, params, spp=_SPP, seed=step) - reference), axis=None)
@@ -284,7 +302,8 @@ def vertex_colours(integrator: dict[str, Any], size: int) -> Iterator[float]:
     true = np.repeat([_TRUE_BALL], len(mesh.vertices), 0).astype(np.float32)
     ball.add_attribute("vertex_color", 3, true.ravel())
     scene = mi.load_dict(_scene_dict(integrator, size, ball=ball))
-    return _descend(scene, ["ball.vertex_color"], [dr.full(mi.Float, 0.5, true.size)], [true], 0.02, (0, 1))
+    start = dr.full(mi.Float, 0.5, true.size)
+    return _descend(scene, ["ball.vertex_color"], [start], [true], 0.02, (0, 1))
 
 
 def more_and_more_lights(integrator: dict[str, Any], size: int) -> Iterator[float]:
@@ -316,7 +335,7 @@ def more_and_more_lights(integrator: dict[str, Any], size: int) -> Iterator[floa
 
 
 def saved_and_loaded(integrator: dict[str, Any], size: int) -> Iterator[float]:
-    """A run that is stored every ten steps, and goes on from the file in a scene that is loaded again."""
+    """A run that is pickled every ten steps, and continues from there in a scene that is loaded again."""
     stored = pickle.dumps([0.1, 0.9, 0.3])
     while True:
         scene = mi.load_dict(_scene_dict(integrator, size))
@@ -356,7 +375,7 @@ def two_scenes(integrator: dict[str, Any], size: int) -> Iterator[float]:
 
 
 def cells_run_again(integrator: dict[str, Any], size: int) -> Iterator[float]:
-    """A notebook's cell: all made anew every ten steps, while what it made before is still known."""
+    """A notebook's cell, run again every ten steps: a new scene is loaded while the old one is still referenced."""
     while True:
         loop = clipped_colours(integrator, size)
         for _ in range(10):
@@ -387,20 +406,24 @@ def units(options: BenchOptions) -> list[Unit]:
 
 
 def _measure(options: BenchOptions, name: str, done: Mapping[str, Any], update: Update) -> dict[str, Any]:
-    """Steps in turns with the original's, the errors at the end, and how memory grows over many steps."""
+    """Time of our steps and the original's in turns, first and last errors, and the growth of memory over many steps."""
     loop, size = LOOPS[name], options.what.loop_size
     both = {"ours": loop.steps(OURS, size), "original": loop.steps(loop.original, size)}
     seconds: dict[str, list[float]] = {key: [] for key in both}
     errors: dict[str, list[float]] = {key: [] for key in both}
+
+    def advance(key: str) -> None:
+        errors[key].append(next(both[key]))
+
     with gc_quiet():
         for step in range(loop.count):
             update(step, loop.count, name)
-            for key, steps in both.items():
-                spent = timed(lambda key=key, steps=steps: errors[key].append(next(steps)))
+            for key in both:
+                spent = timed(functools.partial(advance, key))
                 if step >= _WARM_UP:
                     seconds[key].append(spent)
     result = {"size": size, "original": loop.original, **compare(seconds, [("original", "ours")])}
-    # With the steps before which a loop loads its scene again, and renders its reference.
+    # Unlike the ratio of medians, this includes the steps for which a loop loads its scene again and renders its reference.
     result["ratio_of_totals"] = sum(seconds["original"]) / sum(seconds["ours"])
     result["errors"] = {key: {"first": values[0], "last": values[-1]} for key, values in errors.items()}
     if options.what.loop_steps:
@@ -411,7 +434,7 @@ def _measure(options: BenchOptions, name: str, done: Mapping[str, Any], update: 
 
 
 def measure_memory(name: str, size: int, count: int, emit: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
-    """Most memory (bytes) of this process up to a number of steps, and in all those after."""
+    """Peak memory (bytes) of this process in the first steps, and in all later ones."""
     steps = LOOPS[name].steps(OURS, size)
     for step in range(count):
         next(steps)

@@ -1,11 +1,14 @@
-"""Plot of the benchmark: how costs grow, beside Embree's, and the passes of a step."""
+"""Plot of the benchmark: growth of costs, beside Embree's, and the passes of a step."""
 
 from __future__ import annotations
 
 import os
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ...io.files import atomic
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 _LABELS = {
     "triangles": "triangles",
@@ -14,12 +17,12 @@ _LABELS = {
     "filter_size": "filter size in texels",
     "lights": "directional lights",
 }
-#: Meshes that stand beside the curves of rasterization, and their markers.
+#: Markers of the meshes that are drawn beside the curves of rasterization.
 _ODD = {"slivers": "x", "even": "+", "screen-filling": "v"}
 
 
 def plot(path: str | os.PathLike[str], record: dict[str, Any]) -> None:
-    """Draw a panel for each thing that the record knows about. Times are medians, bars their quartiles."""
+    """Draw a panel for each measurement of the record. Times are medians, bars their quartiles."""
     from matplotlib.figure import Figure  # without pyplot there is no global state and no display is needed
 
     sections = {name: _complete(section["units"]) for name, section in record["sections"].items()}
@@ -49,7 +52,7 @@ def _complete(units: dict[str, Any]) -> dict[str, Any]:
     return {key: unit for key, unit in units.items() if "failed" not in unit and "skipped" not in unit}
 
 
-def _series(axes: Any, unit: dict[str, Any]) -> None:
+def _series(axes: Axes, unit: dict[str, Any]) -> None:
     points = [point for point in unit["points"] if "seconds" in point]
     sizes = [point["size"] for point in points]
     _curve(axes, sizes, [point["seconds"] for point in points], "C0", "time")
@@ -63,7 +66,7 @@ def _series(axes: Any, unit: dict[str, Any]) -> None:
     memory.set_ylim(bottom=0)
 
 
-def _batch(axes: Any, unit: dict[str, Any]) -> None:
+def _batch(axes: Axes, unit: dict[str, Any]) -> None:
     for k, kind in enumerate(("raster", "sensors")):
         values = unit[kind]["images_per_second"]
         axes.plot([int(count) for count in values], list(values.values()), "o-", color=f"C{k}", label=kind, markersize=4)
@@ -72,7 +75,7 @@ def _batch(axes: Any, unit: dict[str, Any]) -> None:
     axes.legend(fontsize=8)
 
 
-def _raster(axes: Any, units: list[dict[str, Any]]) -> None:
+def _raster(axes: Axes, units: list[dict[str, Any]]) -> None:
     for k, resolution in enumerate(sorted({unit["resolution"] for unit in units})):
         own = sorted((unit for unit in units if unit["resolution"] == resolution), key=lambda unit: unit["triangles"])
         for unit in own:
@@ -92,7 +95,7 @@ def _marker(unit: dict[str, Any]) -> str | None:
     return _ODD.get(unit["mesh"].rsplit("-", 1)[0])
 
 
-def _steps(axes: Any, units: list[dict[str, Any]]) -> None:
+def _steps(axes: Axes, units: list[dict[str, Any]]) -> None:
     for k, (name, label) in enumerate((("shadows", "with shadows"), ("rasterizer", "without"), ("mitsuba", "Mitsuba"))):
         own = [unit for unit in units if name in unit["seconds"]]
         _curve(axes, [unit["resolution"] for unit in own], [unit["seconds"][name] for unit in own], f"C{k}", label)
@@ -104,7 +107,7 @@ def _steps(axes: Any, units: list[dict[str, Any]]) -> None:
     axes.legend(fontsize=8)
 
 
-def _passes(axes: Any, unit: dict[str, Any]) -> None:
+def _passes(axes: Axes, unit: dict[str, Any]) -> None:
     passes = unit["passes"][::-1]
     names = [entry["pass"] for entry in passes]
     forward, backward = ([1e3 * entry[f"{way}_seconds"] for entry in passes] for way in ("forward", "backward"))
@@ -116,13 +119,13 @@ def _passes(axes: Any, unit: dict[str, Any]) -> None:
     axes.legend(fontsize=8)
 
 
-def _curve(axes: Any, sizes: list[float], seconds: list[dict[str, float]], colour: str, label: str) -> None:
+def _curve(axes: Axes, sizes: list[float], seconds: list[dict[str, float]], colour: str, label: str) -> None:
     medians = [1e3 * entry["median"] for entry in seconds]
     spread = [[1e3 * (e["median"] - e["q1"]) for e in seconds], [1e3 * (e["q3"] - e["median"]) for e in seconds]]
     axes.errorbar(sizes, medians, yerr=spread, fmt="o-", color=colour, label=label, markersize=4, capsize=2)
 
 
-def _logarithmic(axes: Any, x_label: str, y_label: str) -> None:
+def _logarithmic(axes: Axes, x_label: str, y_label: str) -> None:
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.set_xlabel(x_label)
@@ -130,8 +133,8 @@ def _logarithmic(axes: Any, x_label: str, y_label: str) -> None:
     axes.grid(True, alpha=0.3)
 
 
-def _ticks(axes: Any, values: list[float]) -> None:
-    """Ticks where there are points, and nowhere else."""
+def _ticks(axes: Axes, values: list[float]) -> None:
+    """Set ticks at the points only."""
     short = [f"{v / 1e6:.3g}M" if v >= 1e6 else f"{v / 1e3:.3g}k" if v >= 1e4 else f"{v:g}" for v in values]
     axes.set_xticks(values, short, fontsize=8)
     axes.set_xticks([], minor=True)

@@ -1,26 +1,27 @@
-"""Benchmark: rasterization alone beside ray casting with Embree through Mitsuba, and the whole of the raster functions."""
+"""Benchmark: rasterization alone, beside ray casting with Embree through Mitsuba, and all raster functions together."""
 
 from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...jit.types import Float, Matrix4f, UInt32
 from ...raster import Topology, antialias, build_topology, interpolate, rasterize
 from ...scene.load import load
 from ..common import meshes as bench_meshes
 from ..common.timing import Contender, alternate, compare
 from .common import BenchOptions, Unit, Update
 
-#: Milliseconds that others measured with Meta's DRTK (C++ kernels for the CPU), Spot over the wall.
+DRTK_NOTE = "DRTK, native C++ kernels, 2 threads, on two cores with AVX-512; measured earlier and quoted, not measured here."
+#: Milliseconds of Meta's DRTK (C++ kernels for the CPU) for Spot over the wall, as `DRTK_NOTE` says.
 DRTK_MS = {
-    "note": "DRTK, native C++ kernels, 2 threads, on two cores with AVX-512; measured earlier and quoted, not measured here.",
     "rasterize": {"128": 0.34, "512": 2.4, "1024": 9.0},
     "rasterize and interpolate": {"128": 0.46, "512": 4.6, "1024": 18.0},
     "forward and backward": {"128": 4.4, "512": 70.0, "1024": 270.0},
@@ -30,7 +31,7 @@ RATIOS = (("embree update and trace", "ours"), ("embree trace", "ours"))
 
 
 def units(options: BenchOptions) -> list[Unit]:
-    """Each mesh at each resolution, worst cases, then forward and backward passes."""
+    """A unit for each mesh at each resolution, worst cases included, then the forward and backward passes."""
     what = options.what
     result = [
         Unit(f"{kind}@{resolution}", functools.partial(measure_raster, options, kind, resolution))
@@ -48,19 +49,20 @@ class RasterScene:
     """Inputs of the raster functions for a scene, and the scene itself for Mitsuba.
 
     Attributes:
+        scene: the ``mi.Scene``.
         p_rest: Float (3V,), world-space vertices of all shapes.
         moving: Float (V,), 1 for the vertices of the object, 0 for those of the wall.
-        matrix: 4 x 4, world to clip space, one number per entry.
+        matrix: Matrix4f of scalars, world to clip space.
         faces: UInt32 (3F,).
-        shape_rest: Float, vertices of the object alone.
+        shape_rest: Float (3W,), world-space vertices of the object alone.
     """
 
-    scene: Any
-    p_rest: Any
-    moving: Any
-    matrix: Any
-    faces: Any
-    shape_rest: Any
+    scene: mi.Scene
+    p_rest: Float
+    moving: Float
+    matrix: Matrix4f
+    faces: UInt32
+    shape_rest: Float
 
     @property
     def triangles(self) -> int:
@@ -78,25 +80,25 @@ def raster_scene(options: BenchOptions, kind: str, resolution: int) -> RasterSce
     info = next(info for info in geometry.shapes if info.name == "object")
     index = dr.arange(mi.UInt32, geometry.vertex_count)
     moving = (index >= info.vertex_start) & (index < info.vertex_start + info.vertex_count)
-    # The planes of the scene's camera (0.01 and 10,000) would leave hardly any precision to the depths.
+    # The clip planes of the scene's camera (0.01 and 10,000) would leave little precision for depths.
     camera = replace(data.sensors[0][0], near=mi.Float(1), far=mi.Float(20))
     matrix = mi.Matrix4f(camera.view_projection)
     p_rest = mi.Float(dr.detach(geometry.positions))
-    shape_rest = dr.ravel(geometry.shape_positions("object"))
+    shape_rest = cast("Float", dr.ravel(geometry.shape_positions("object")))
     result = RasterScene(scene, p_rest, dr.select(moving, mi.Float(1), 0), matrix, mi.UInt32(geometry.faces), shape_rest)
     dr.make_opaque(result.p_rest, result.moving, result.matrix, result.faces, result.shape_rest)
     return result
 
 
-def offsets(batch: int = 1) -> Iterator[Any]:
-    """Endless small offsets in x, Float (batch,), so that the vertices are different ones each time."""
+def offsets(batch: int = 1) -> Iterator[Float]:
+    """Endless small offsets in x, Float (batch,), so that vertices differ from call to call."""
     values = [mi.Float(np.linspace(0.001 * k, 0.001 * k + 0.01, batch, dtype=np.float32)) for k in range(8)]
     dr.make_opaque(values)
     return itertools.cycle(values)
 
 
-def to_clip(p_rest: Any, moving: Any, matrix: Any, offset: Any) -> Any:
-    """Clip-space vertices (Float, 4 V B) of the scene with the object moved by each of the B offsets. Attached to `p_rest`."""
+def to_clip(p_rest: Float, moving: Float, matrix: Matrix4f, offset: Float) -> Float:
+    """Clip-space vertices, Float (4VB,), of the scene, its object moved by each of the B offsets. Gradients flow to `p_rest`."""
     vertices, batch = dr.width(p_rest) // 3, dr.width(offset)
     lane = dr.arange(mi.UInt32, vertices * batch)
     image = lane // vertices if batch > 1 else dr.zeros(mi.UInt32, vertices)
@@ -104,24 +106,26 @@ def to_clip(p_rest: Any, moving: Any, matrix: Any, offset: Any) -> Any:
     p = dr.gather(mi.Point3f, p_rest, vertex)
     x = dr.fma(dr.gather(mi.Float, moving, vertex), dr.gather(mi.Float, offset, image), p.x)
     row = [dr.fma(matrix[r, 0], x, dr.fma(matrix[r, 1], p.y, dr.fma(matrix[r, 2], p.z, matrix[r, 3]))) for r in range(4)]
-    return dr.ravel(mi.Point4f(*row))
+    return cast("Float", dr.ravel(mi.Point4f(*row)))
 
 
-def _visible(p_rest: Any, moving: Any, matrix: Any, faces: Any, offset: Any, *, size: int) -> tuple[Any, ...]:
+def _visible(
+    p_rest: Float, moving: Float, matrix: Matrix4f, faces: UInt32, offset: Float, *, size: int
+) -> tuple[UInt32, Float, Float, Float]:
     clip = to_clip(p_rest, moving, matrix, offset)
     raster = rasterize(clip, faces, (size, size), batch=dr.width(offset), check_indices=False)
     return raster.triangle, raster.u, raster.v, raster.depth
 
 
-def _forward(p_rest: Any, moving: Any, matrix: Any, faces: Any, offset: Any, *, size: int) -> Any:
+def _forward(p_rest: Float, moving: Float, matrix: Matrix4f, faces: UInt32, offset: Float, *, size: int) -> Float:
     clip = to_clip(p_rest, moving, matrix, offset)
     raster = rasterize(clip, faces, (size, size), batch=dr.width(offset), check_indices=False)
     return interpolate(mi.TensorXf(p_rest, (dr.width(p_rest) // 3, 3)), raster, faces, check_indices=False).array
 
 
 def _forward_backward(
-    p_rest: Any, moving: Any, matrix: Any, faces: Any, offset: Any, topology: Topology, target: Any, *, size: int
-) -> tuple[Any, Any]:
+    p_rest: Float, moving: Float, matrix: Matrix4f, faces: UInt32, offset: Float, topology: Topology, target: Float, *, size: int
+) -> tuple[Float, Float]:
     """Loss and its gradient with respect to the vertices: rasterize, interpolate positions, anti-alias, compare."""
     p_world = mi.Float(p_rest)
     dr.enable_grad(p_world)
@@ -135,27 +139,27 @@ def _forward_backward(
 
 
 def measure_raster(options: BenchOptions, kind: str, resolution: int, done: Mapping[str, Any], update: Update) -> dict[str, Any]:
-    """Rasterization of moved vertices, Mitsuba's update of its acceleration structure and rays for all pixels, rays alone."""
+    """Times of our rasterization of moved vertices, of Mitsuba's BVH update with rays for all pixels, and of the rays alone."""
     predicted = _predicted(options, kind, resolution, done)
     if predicted > options.what.call_seconds:
         return {"mesh": kind, "resolution": resolution, "skipped": f"predicted to take {predicted:.0f} s a call"}
     update(0, 1, "mesh")
     data = raster_scene(options, kind, resolution)
-    ours = dr.freeze(_visible)
+    ours: Any = dr.freeze(_visible)  # Any: Dr.Jit's stubs do not know `n_recordings`
     params, ray, moves = mi.traverse(data.scene), camera_rays(data.scene, resolution), offsets()
 
-    def rasterize_moved() -> Any:
+    def rasterize_moved() -> tuple[UInt32, Float, Float, Float]:
         result = ours(data.p_rest, data.moving, data.matrix, data.faces, next(moves), size=resolution)
         dr.eval(result)
         return result
 
-    def trace() -> Any:
-        # Not frozen: that makes it slower.
+    def trace() -> mi.PreliminaryIntersection3f:
+        # Not frozen: `dr.freeze` makes it slower.
         hit = data.scene.ray_intersect_preliminary(ray, coherent=True)
         dr.eval(hit)
         return hit
 
-    def update_and_trace() -> Any:
+    def update_and_trace() -> mi.PreliminaryIntersection3f:
         offset = dr.gather(mi.Float, next(moves), dr.zeros(mi.UInt32, dr.width(data.shape_rest)))
         x_only = dr.arange(mi.UInt32, dr.width(data.shape_rest)) % 3 == 0
         params["object.vertex_positions"] = dr.select(x_only, data.shape_rest + offset, data.shape_rest)
@@ -182,7 +186,7 @@ def measure_raster(options: BenchOptions, kind: str, resolution: int, done: Mapp
 
 
 def _predicted(options: BenchOptions, kind: str, resolution: int, done: Mapping[str, Any]) -> float:
-    """Seconds that a rasterization may take, from the next smaller image; 0 if there is none."""
+    """Predicted seconds of a rasterization, from the time for the next smaller image; 0 if there is none."""
     smaller = [r for r in options.what.raster_resolutions if r < resolution]
     before = done.get(f"{kind}@{max(smaller)}", {}) if smaller else {}
     if "skipped" in before:
@@ -190,8 +194,8 @@ def _predicted(options: BenchOptions, kind: str, resolution: int, done: Mapping[
     return before["seconds"]["ours"]["median"] * (resolution / max(smaller)) ** 2 if "seconds" in before else 0.0
 
 
-def camera_rays(scene: Any, resolution: int) -> Any:
-    """Rays through all pixel centres, in memory."""
+def camera_rays(scene: mi.Scene, resolution: int) -> mi.Ray3f:
+    """Rays through all pixel centres, evaluated."""
     index = dr.arange(mi.UInt32, resolution * resolution)
     row = index // resolution
     position = mi.Point2f(index - row * resolution, row)
@@ -201,20 +205,20 @@ def camera_rays(scene: Any, resolution: int) -> Any:
 
 
 def measure_full(options: BenchOptions, kind: str, resolution: int, done: Mapping[str, Any], update: Update) -> dict[str, Any]:
-    """Raster functions only: rasterize; with interpolation; with anti-aliasing, loss and backward pass."""
+    """Time of the raster functions: rasterize; with interpolation; with anti-aliasing, loss and backward pass."""
     update(0, 1, "mesh")
     data = raster_scene(options, kind, resolution)
     topology, moves = data.topology(), offsets()
     common = (data.p_rest, data.moving, data.matrix, data.faces)
     target = mi.Float(_forward(*common, mi.Float([0.2]), size=resolution))
     dr.make_opaque(target, topology)
-    steps = {
+    steps: dict[str, tuple[Callable[..., object], tuple[object, ...]]] = {
         "rasterize": (dr.freeze(_visible), ()),
         "rasterize and interpolate": (dr.freeze(_forward), ()),
         "forward and backward": (dr.freeze(_forward_backward), (topology, target)),
     }
 
-    def call(name: str) -> Any:
+    def call(name: str) -> object:
         step, more = steps[name]
         result = step(*common, next(moves), *more, size=resolution)
         dr.eval(result)
@@ -223,8 +227,8 @@ def measure_full(options: BenchOptions, kind: str, resolution: int, done: Mappin
     limits: dict[str, Any] = {"rounds": options.what.rounds, "seconds": options.what.call_seconds}
     samples = alternate({name: Contender(functools.partial(call, name), **limits) for name in steps}, update)
     result = {"mesh": kind, "triangles": data.triangles, "resolution": resolution, **compare(samples)}
-    drtk = {name: DRTK_MS[name][str(resolution)] for name in steps if str(resolution) in DRTK_MS[name]}  # type: ignore[index]
+    drtk = {name: DRTK_MS[name][str(resolution)] for name in steps if str(resolution) in DRTK_MS[name]}
     if kind.startswith("spot-6k") and drtk:
-        result["drtk_ms"] = {"note": DRTK_MS["note"], **drtk}
+        result["drtk_ms"] = {"note": DRTK_NOTE, **drtk}
         result["drtk_over_ours"] = {name: ms / 1e3 / result["seconds"][name]["median"] for name, ms in drtk.items()}
     return result

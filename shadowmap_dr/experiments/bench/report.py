@@ -1,4 +1,4 @@
-"""Output of the benchmark: the rows of its table, the same for documentation, and a plot.
+"""Output of the benchmark: its table, for the terminal and for documentation, and a plot.
 
 ``python -m shadowmap_dr.experiments.bench.report bench.json`` prints the table in Markdown.
 """
@@ -27,19 +27,19 @@ OVER_MITSUBA = 100.0
 OVER_EMBREE = {128: 3.0, 512: 3.0, 1024: 1.5, 2048: 1.5}
 OVER_DRTK = {128: 4.0, 512: 10.0, 1024: 10.0}
 WORST_CASE = 5.0
-#: Linear growth, with room for what a fit to noisy times may be off.
+#: Linear growth, with tolerance for the fit to noisy times.
 EXPONENT = 1.05
 LARGE_MS, LARGE_GIB = 250.0, 3.0
-#: Cores that other work may use before times are called doubtful.
+#: Cores that other processes may use before times are marked as doubtful.
 BUSY = 0.3
-#: First pictures: over the time of Mitsuba's `direct`, and seconds more.
+#: First pictures take at most this multiple of Mitsuba's `direct` and some seconds more; first backward passes, seconds.
 FIRST_OVER_DIRECT, FIRST_SECONDS, BACKWARD_SECONDS = 2.0, 0.5, 5.0
 EIGHT_LIGHTS, BATCH, OUTSIDE_KERNELS = 4.5, 1.2, 0.10
 
 
 @dataclass(frozen=True)
 class Row:
-    """A line of the table. `met`: whether the aim was reached, None where there is none."""
+    """A line of the table. `met`: True if the aim was reached, None without an aim."""
 
     what: str
     size: str
@@ -61,7 +61,7 @@ COLUMNS = ["", "size", "ours", "other", "ratio", "aim"]
 
 
 def rows(record: dict[str, Any]) -> list[Row]:
-    """All that a record can tell, in the order of the sections."""
+    """Rows of all measurements in a record, in the order of the sections."""
     makers = {
         "steps": _step_rows,
         "raster": _raster_rows,
@@ -83,7 +83,7 @@ def rows(record: dict[str, Any]) -> list[Row]:
 
 
 def table(record: dict[str, Any]) -> Table:
-    """For the terminal."""
+    """The table for the terminal."""
     result = console.table("Medians; ratios are those of medians", COLUMNS, [])
     kind = None
     for row in rows(record):
@@ -95,7 +95,7 @@ def table(record: dict[str, Any]) -> Table:
 
 
 def markdown(record: dict[str, Any]) -> str:
-    """For documentation: the machine and the command, then the table."""
+    """Markdown for documentation: machine and command, then the table."""
     machine = record["machine"]
     units = [unit for section in record["sections"].values() for unit in section["units"].values()]
     others = [unit["cores_used_by_others"] for unit in units if unit.get("cores_used_by_others") is not None]

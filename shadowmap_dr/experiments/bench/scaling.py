@@ -1,9 +1,9 @@
-"""Benchmark: how the cost of a step grows with the size of everything, and how much memory it takes."""
+"""Benchmark: growth of a step's time and memory with the sizes of its inputs."""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...inverse import PoseFit
+from ...jit.types import AnyArray, Float
 from ...rendering.renderer import Renderer
 from ..common import meshes as bench_meshes
 from ..common.timing import Contender, alternate, compare, exponent, forget_peak_memory, peak_memory, summary
@@ -36,7 +37,7 @@ class Case:
     views: int = 1
 
     def fit(self, work: Path) -> PoseFit:
-        """The step, ready to be called."""
+        """The fit that takes these steps. ``work``: folder of meshes."""
         path = bench_meshes.stored(self.mesh, work)
         scene = bench_meshes.scene(path, self.resolution, self.lights, self.views)
         renderer = Renderer.from_scene(
@@ -44,11 +45,11 @@ class Case:
         )
         p_rest = np.array(renderer.data.geometry.shape_positions("object")).T
         reference = np.zeros((self.resolution, self.resolution * self.views, 3), np.float32)
-        # Hardly any movement: all steps of a case cost the same.
+        # Hardly any movement, so that all steps of a case cost the same.
         return PoseFit(renderer, "object", p_rest, reference, step_size=1e-4)
 
 
-#: What changes in each series, and what stays: cases in which the quantity at hand makes up much of a step.
+#: Series -> the field of `Case` that changes, and the other settings: steps of which this quantity makes up much.
 BASES = {
     "triangles": ("mesh", Case(resolution=512)),
     "resolution": ("resolution", Case()),
@@ -69,7 +70,7 @@ def units(options: BenchOptions) -> list[Unit]:
 
 
 def measure_series(options: BenchOptions, name: str, done: Mapping[str, Any], update: Update) -> dict[str, Any]:
-    """Each case in a process of its own, for the sake of the memory; there and back, so that a drift of the load cancels."""
+    """Measure each case in a process of its own, for its peak memory, in alternating order, against drifts of the load."""
     field, base = BASES[name]
     cases = [replace(base, **{field: value}) for value in options.what.series[name]]
     there = list(range(len(cases)))
@@ -82,11 +83,11 @@ def measure_series(options: BenchOptions, name: str, done: Mapping[str, Any], up
     good = [point for point in points if "seconds" in point]
     sizes, medians = [point["size"] for point in good], [point["seconds"]["median"] for point in good]
     result: dict[str, Any] = {"quantity": name, "points": points, "exponent": exponent(sizes, medians)}
-    # The fixed cost of a step flattens the small end; the large end says how it goes on.
+    # The fixed cost of a step flattens the curve at small sizes; the last two sizes show the trend.
     result["exponent_of_the_last_two"] = exponent(sizes[-2:], medians[-2:])
     if name == "lights":
         result["in turns"] = _in_turns(options, cases, update)
-        # What a light adds does not depend much on the image; the rest of a step does.
+        # The cost of a light hardly depends on the image's size; the rest of a step does.
         result["in turns, larger images"] = {
             str(resolution): _in_turns(options, [replace(case, resolution=resolution) for case in cases], update)
             for resolution in options.what.light_resolutions
@@ -95,7 +96,7 @@ def measure_series(options: BenchOptions, name: str, done: Mapping[str, Any], up
 
 
 def _in_turns(options: BenchOptions, cases: list[Case], update: Update) -> dict[str, Any]:
-    """Steps with one and with several lights."""
+    """Times of the steps of all cases, which differ in the number of lights, in turns."""
     update(0, 1, f"all numbers of lights in turns at {cases[0].resolution}")
     fits = {str(case.lights): case.fit(options.work) for case in cases}
     samples = alternate({key: Contender(fit.step, options.what.rounds) for key, fit in fits.items()}, update)
@@ -119,7 +120,7 @@ def _in_child(options: BenchOptions, case: Case) -> dict[str, Any]:
 
 
 def measure_case(case: Mapping[str, Any], work: str, rounds: int, emit: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
-    """Seconds of the steps of a case, and the most memory (bytes) that this process occupied: in all, and in the steps."""
+    """Seconds of the steps of a case, and peak memory (bytes) of this process: overall, at its start, and in the steps."""
     imported = peak_memory()
     fit = Case(**case).fit(Path(work))
     set_up = peak_memory()
@@ -159,7 +160,7 @@ def _point(case: Case, results: list[dict[str, Any]], size: int | None) -> dict[
 
 
 def measure_batch(options: BenchOptions, done: Mapping[str, Any], update: Update) -> dict[str, Any]:
-    """Images a second of batches beside those of as many frozen single steps, each of which waits for the device.
+    """Images per second of batches, and of as many frozen single steps, each of which waits for the device.
 
     Two kinds: the raster functions with a batch of poses (forward and backward), and a `Renderer` whose sensor is a batch
     of cameras (one set of vertices, one shadow pass).
@@ -186,8 +187,10 @@ def measure_batch(options: BenchOptions, done: Mapping[str, Any], update: Update
     return result
 
 
-def _raster_call(step: Any, common: tuple[Any, ...], moves: Any, more: tuple[Any, ...], size: int) -> Callable[[], Any]:
-    def call() -> Any:
+def _raster_call(
+    step: Callable[..., object], common: tuple[AnyArray, ...], moves: Iterator[Float], more: tuple[object, ...], size: int
+) -> Callable[[], object]:
+    def call() -> object:
         result = step(*common, next(moves), *more, size=size)
         dr.eval(result)
         return result

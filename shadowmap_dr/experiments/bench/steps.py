@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -23,8 +23,11 @@ from ..pose.record import seconds_to_pose
 from ..pose.scene import PoseProblem, make_problem, path_traced_reference, pose_errors, start_pose
 from .common import BenchOptions, Unit, Update, run_child
 
+if TYPE_CHECKING:
+    from mitsuba_baselines.pose import MitsubaPose
+
 OBJECT = "spot"
-#: Memory that Mitsuba's integrator takes for each of the samples that are alive at once (bytes, roughly).
+#: Memory of Mitsuba's integrator for each sample of a kernel launch (bytes, roughly).
 BYTES_PER_SAMPLE = 60
 SEED = 0
 RATIOS = (("mitsuba", "shadows"), ("mitsuba", "rasterizer"), ("shadows", "rasterizer"))
@@ -45,7 +48,7 @@ def units(options: BenchOptions) -> list[Unit]:
 def measure_steps(options: BenchOptions, resolution: int, done: Mapping[str, Any], update: Update) -> dict[str, Any]:
     """Step times at a resolution: ours with and without shadows, Mitsuba's at its fair setting and at its default.
 
-    The default runs in a process of its own: at large images it may run out of memory.
+    The default runs in a process of its own, which may run out of memory at large images.
     """
     what = options.what
     problem, reference, path = _problem(options, resolution, update)
@@ -65,7 +68,7 @@ def measure_steps(options: BenchOptions, resolution: int, done: Mapping[str, Any
         **compare(samples, RATIOS),
         "mitsuba": _setting(methods.get("mitsuba"), resolution, left_out),
     }
-    result["recordings"] = {name: methods[name].recordings() for name in methods if name != "mitsuba"}  # type: ignore[attr-defined]
+    result["recordings"] = {name: methods[name].recordings() for name in methods if name != "mitsuba"}
     steps = what.default_steps.get(resolution, 0)
     if steps:
         update(0, 1, "Mitsuba's default setting")
@@ -145,7 +148,7 @@ def _fit(method: Method, run: int, iterations: int, limit: float, note: Callable
     seconds: list[float] = []
     while len(seconds) < iterations and sum(seconds) < limit:
         seconds.append(timed(method.step))
-        parameters.append(method.parameters())  # read back at the end: nobody waits for it now
+        parameters.append(method.parameters())  # read back at the end, so that steps do not wait for it
         note(len(seconds))
     rotation, offset = pose_errors([np.asarray(entry, np.float64) for entry in parameters])
     cut = len(seconds) < iterations
@@ -157,7 +160,7 @@ def _fit(method: Method, run: int, iterations: int, limit: float, note: Callable
         "translation_error_x100": offset[-1],
         "iterations": len(seconds),
         "seconds_total": sum(seconds),
-        # Nobody knows whether the error of a run that was cut short would have stayed small.
+        # In a run that was cut short, the error might have grown again.
         "seconds_to_pose": None if cut else seconds_to_pose(rotation, np.array(seconds)),
         "cut_short": cut,
     }
@@ -176,7 +179,7 @@ def _times(entries: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _setting(method: Any, resolution: int, left_out: str | None) -> dict[str, Any]:
+def _setting(method: MitsubaPose | None, resolution: int, left_out: str | None) -> dict[str, Any]:
     from mitsuba_baselines.fair_settings import fair_setting, is_fair
 
     setting = fair_setting(resolution)
@@ -185,7 +188,7 @@ def _setting(method: Any, resolution: int, left_out: str | None) -> dict[str, An
 
 
 def _methods(problem: PoseProblem, reference: Image) -> tuple[dict[str, Any], str | None]:
-    """All methods, but for Mitsuba's if its samples do not fit into the memory; and why it was left out."""
+    """All methods, without Mitsuba's if its samples do not fit into memory, and the reason for leaving it out."""
     from mitsuba_baselines.fair_settings import fair_setting
 
     setting = fair_setting(problem.resolution)
@@ -198,7 +201,7 @@ def _methods(problem: PoseProblem, reference: Image) -> tuple[dict[str, Any], st
 
 
 def _problem(options: BenchOptions, resolution: int, update: Update) -> tuple[PoseProblem, Image, Path]:
-    """The pose problem, its reference image, and the file where that lies."""
+    """The pose problem, its reference image, and the image's file."""
     update(0, 1, "reference image")
     problem = make_problem(OBJECT, resolution, work=options.work)
     if options.what.path_traced:

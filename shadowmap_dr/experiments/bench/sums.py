@@ -1,8 +1,8 @@
-"""Benchmark: whether derivatives of millions of samples add up, in reverse mode as in forward mode.
+"""Benchmark: agreement of reverse mode, which sums the derivatives of millions of samples, with forward mode.
 
-For a parameter p and an image I the derivative of <I, w> by p is worked out twice: backwards, where the device adds up the terms
-of all samples in single precision, and as the sum of the derivative image, added up in double precision on the host. ``w`` is
-constant where p is a colour: then all terms are alike, which is the worst case for such sums.
+For a parameter p and an image I the derivative of <I, w> by p is computed twice: in reverse mode, where the device sums the terms
+of all samples in single precision, and as the sum of the derivative image, in double precision on the host. ``w`` is constant
+where p is a colour: all terms are alike then, which is the worst case for such sums.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...errors import ShadowmapError
+from ...jit.types import Float, TensorXf
 from ...rendering.renderer import Renderer
 from .common import BenchOptions, Unit, Update, run_child
 
@@ -67,7 +68,7 @@ SUMS = (
 
 
 def units(options: BenchOptions) -> list[Unit]:
-    """A unit for each kind of parameter, of all sizes and modes that it has."""
+    """A unit for each kind of parameter, with all its sizes and modes."""
     return [Unit(str(case), functools.partial(_measure, options, case)) for case in SUMS]
 
 
@@ -92,16 +93,16 @@ def measure_sum(
 
 
 def both(case: Sum, size: int, spp: int, mode: str = "plug-in") -> tuple[float, float]:
-    """The derivative of <image, w> by a change of the parameter: in reverse mode, and summed up from the derivative image.
+    """The derivative of <image, w> by a change of the parameter: in reverse mode, and summed from the derivative image.
 
     Args:
-        case: the parameter, and what surrounds it.
+        case: the parameter, its light and its material.
         size: pixels along each side of the image.
-        spp: samples a pixel.
-        mode: of :data:`MODES`, for the reverse mode; forward mode always takes the plug-in.
+        spp: samples per pixel.
+        mode: one of :data:`MODES`, for the reverse mode; forward mode always uses the plug-in.
     """
     reverse = _reverse(case, size, spp, mode)
-    # Calls of materials go to those of all scenes that there are; forward mode fails where others are attached, too.
+    # Virtual calls of materials trace those of all living scenes; forward mode fails if another scene's are attached, too.
     gc.collect()
     return reverse, _forward(case, size, spp)
 
@@ -125,26 +126,25 @@ def _forward(case: Sum, size: int, spp: int) -> float:
     return float((np.array(image, dtype=np.float64) * _weights(case, size)).sum())
 
 
-#: What a renderer takes as an argument.
+#: Parameters that a renderer takes as arguments.
 _OF_RENDERERS = ("irradiance.value", "intensity.value", "position", "vertex_positions")
 
 
 def _of_renderer(case: Sum, size: int, spp: int, frozen: bool) -> float:
-    """The same through a renderer, whose lights and vertices are arguments."""
+    """Reverse mode through a renderer, whose lights and vertices are arguments."""
     scene, _ = _changed(case, size)
     renderer, weights = Renderer.from_scene(scene), mi.TensorXf(_weights(case, size))
     name, _, field = case.parameter.removesuffix(".value").partition(".")
 
-    def step(change: Any, weights: Any, renderer: Renderer) -> Any:
+    def step(change: Float, weights: TensorXf, renderer: Renderer) -> Float:
         dr.enable_grad(change)
         if field == "vertex_positions":
             points = renderer.data.geometry.shape_positions(name)
             image = renderer.render(vertex_positions={name: _moved(case, points, change)}, spp=spp)
         else:
             light = renderer.light(name)
-            image = renderer.render(
-                lights={name: replace(light, **{field: _moved(case, getattr(light, field), change)})}, spp=spp
-            )
+            lights: dict[str, Any] = {name: replace(light, **{field: _moved(case, getattr(light, field), change)})}
+            image = renderer.render(lights=lights, spp=spp)
         dr.backward(dr.sum((image * weights).array))
         return dr.grad(change)
 
@@ -155,10 +155,10 @@ def _of_renderer(case: Sum, size: int, spp: int, frozen: bool) -> float:
 
 
 def _weights(case: Sum, size: int) -> np.ndarray:
-    """w (size, size, 3), its mean about 1 over the number of values."""
+    """Weights w (size, size, 3) with a sum of about 1."""
     weights = np.full((size, size, 3), 1 / (3 * size * size), np.float32)
     if _moves(case):
-        # What leaves a pixel comes to the next one: constant weights would leave nothing but rounding errors.
+        # A motion takes radiance from one pixel to the next: under constant weights the sum would be rounding errors only.
         y, x = np.mgrid[:size, :size] / size
         weights *= (1 + x + 0.5 * y)[..., None].astype(np.float32)
     return weights
@@ -168,7 +168,7 @@ def _moves(case: Sum) -> bool:
     return case.parameter.endswith(("to_world", "position", "vertex_positions"))
 
 
-def _moved(case: Sum, value: Any, change: Any) -> Any:
+def _moved(case: Sum, value: Any, change: Float) -> Any:  # Any: transforms, points or colours, by the parameter
     """A parameter's value, changed."""
     if case.parameter.endswith("to_world"):
         move = mi.Transform4f().translate([change, 0.3 * change, 0.5 * change]).rotate([0.2, 0.3, 1], change * 20)
@@ -183,8 +183,8 @@ def _moved(case: Sum, value: Any, change: Any) -> Any:
     return value + change
 
 
-def _changed(case: Sum, size: int) -> tuple[mi.Scene, Any]:
-    """The scene, and the number 0 that its parameter hangs on."""
+def _changed(case: Sum, size: int) -> tuple[mi.Scene, Float]:
+    """The scene, and the change of its parameter: an attached zero, Float (1,)."""
     t = mi.ScalarTransform4f()
     film = {"type": "hdrfilm", "rfilter": {"type": "box"}, "width": size, "height": size, "pixel_format": "rgb"}
     camera = t.look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])
@@ -205,8 +205,8 @@ def _changed(case: Sum, size: int) -> tuple[mi.Scene, Any]:
     return scene, change
 
 
-def _floor(case: Sum) -> Any:
-    """Two triangles that cover all that the camera sees; with vertices as parameters, if these are asked for."""
+def _floor(case: Sum) -> dict[str, Any] | mi.Mesh:
+    """A rectangle that fills the camera's view; a mesh of two triangles where vertices are the parameter."""
     material = _materials()[case.material]
     if not case.parameter.endswith("vertex_positions"):
         return {"type": "rectangle", "bsdf": material}

@@ -1,4 +1,4 @@
-"""Meshes of the benchmark: known ones, subdivided, two that are as bad as they get for a rasterizer, and one to compare with."""
+"""Meshes of the benchmark: subdivided known meshes, two worst cases for a rasterizer, and a well-behaved mesh for comparison."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Mesh:
     faces: Array
 
 
-#: What `make` accepts, with the number of triangles.
+#: Names that `make` accepts, with their numbers of triangles.
 KINDS = {
     "teapot-1k": 992,
     "spot-6k": 5856,
@@ -107,7 +107,7 @@ def even(count: int, seed: int = 0) -> Mesh:
     """Equilateral triangles of one size at random places and depths, as many as in `slivers` and covering as many pixels."""
     corners, depth = _slivers(count, seed)
     rng = np.random.default_rng(seed)
-    # What lies outside the image does not count.
+    # The mean area of the parts inside the image, estimated from random points.
     u, v = rng.random((2, 64, 1, 1))
     u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
     samples = corners[:, 0] + u * (corners[:, 1] - corners[:, 0]) + v * (corners[:, 2] - corners[:, 0])
@@ -165,7 +165,7 @@ def stored(kind: str, folder: Path) -> Path:
     return path
 
 
-def scene(mesh: Path, resolution: int, lights: int = 1, sensors: int = 1) -> Any:
+def scene(mesh: Path, resolution: int, lights: int = 1, sensors: int = 1) -> mi.Scene:
     """`scenes/pose.xml` with a mesh, more lights from directions around the first (of the same total irradiance), or the
     same camera several times side by side."""
     text = assets.scene("pose").read_text(encoding="utf-8")

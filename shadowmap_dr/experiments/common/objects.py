@@ -1,9 +1,8 @@
-"""Mesh files of a user's own in the experiments: loaded by Mitsuba, checked, and brought into [-1, 1]^3."""
+"""Users' own mesh files in the experiments: loaded by Mitsuba, checked, and scaled into [-1, 1]^3."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -22,7 +21,7 @@ def check_suffix(path: Path) -> str:
     return kind[1:]
 
 
-def load_mesh(path: Path) -> Any:
+def load_mesh(path: Path) -> mi.Mesh:
     """``mi.Mesh`` from a file, flat shaded; ShadowmapError if it cannot be read."""
     try:
         return mi.load_dict({"type": check_suffix(path), "filename": str(path), "face_normals": True})
@@ -30,12 +29,12 @@ def load_mesh(path: Path) -> Any:
         raise ShadowmapError(f"cannot load the object {path}: {' '.join(str(error).split())}") from error
 
 
-def positions(mesh: Any) -> npt.NDArray[np.float32]:
+def positions(mesh: mi.Mesh) -> npt.NDArray[np.float32]:
     """(V, 3) vertices of a mesh."""
     return np.array(mi.traverse(mesh)["vertex_positions"], np.float32).reshape(-1, 3)
 
 
-def placement(mesh: Any, path: Path) -> tuple[npt.NDArray[np.float64], float]:
+def placement(mesh: mi.Mesh, path: Path) -> tuple[npt.NDArray[np.float64], float]:
     """Centre (3,) of a mesh's bounding box, and the factor that makes its longest side 2.
 
     Raises ShadowmapError for a mesh without triangles, without extent, or with vertices that are not finite.
@@ -57,7 +56,7 @@ def occluder(
     points: npt.NDArray[np.float32],
     faces: npt.NDArray[np.uint32],
     colour: tuple[float, ...] = (0.5, 0.5, 0.5),
-) -> Any:
+) -> mi.Mesh:
     """A ``mi.Mesh`` of (V, 3) vertices and (F, 3) faces, diffuse on both sides."""
     props = mi.Properties()
     diffuse = {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(colour)}}

@@ -1,4 +1,4 @@
-"""Timing that can be trusted on a shared machine: contenders take turns, and what else ran there is written down."""
+"""Timing on a shared machine: contenders take turns, and the load by other processes is recorded."""
 
 from __future__ import annotations
 
@@ -20,23 +20,25 @@ from ...jit.gc import gc_quiet
 
 #: Calls before the measured ones, which compile kernels and fill caches.
 WARM_UP = 5
+#: Dr.Jit's version.
+DRJIT_VERSION: str = dr.__version__  # type: ignore[attr-defined]  # Dr.Jit's stubs lack it
 
 
 @dataclass(frozen=True)
 class Contender:
-    """Something to be timed.
+    """A call to be timed.
 
     Attributes:
-        call: one unit of work; the device is waited for afterwards, inside the measured time.
-        rounds: how many measured calls at most.
+        call: one unit of work. The measured time includes waiting for the device.
+        rounds: largest number of measured calls.
         warm_up: calls before the first measured one.
-        settle: unmeasured calls whenever its turn comes, since the others have filled the caches of the processor meanwhile.
-        burst: measured calls each turn.
-        seconds: measured calls (and warm-up) end when they have used up this time, but one call is always measured. If
-            already the first warm-up call takes longer, that one counts.
+        settle: unmeasured calls at the start of each turn, since the other contenders have overwritten the processor's caches.
+        burst: measured calls in each turn.
+        seconds: time limit of warm-up and measured calls together; at least one call is measured. If the warm-up exceeds
+            the limit, its last call counts as measured.
     """
 
-    call: Callable[[], Any]
+    call: Callable[[], object]
     rounds: int = 20
     warm_up: int = WARM_UP
     settle: int = 1
@@ -44,10 +46,10 @@ class Contender:
     seconds: float = 60.0
 
 
-def timed(call: Callable[[], Any]) -> float:
+def timed(call: Callable[[], object]) -> float:
     """Seconds that one call takes, the work of the device included."""
     began = time.perf_counter()
-    result = call()  # kept until the end: freeing a result is not a part of the work
+    result = call()  # kept until the end: freeing the result is not part of the work
     dr.sync_thread()
     seconds = time.perf_counter() - began
     del result
@@ -57,14 +59,14 @@ def timed(call: Callable[[], Any]) -> float:
 def alternate(
     contenders: Mapping[str, Contender], on_call: Callable[[int, int, str], None] = lambda done, total, name: None
 ) -> dict[str, list[float]]:
-    """Times several contenders in turns, so that a change of the machine's load meets all of them.
+    """Time several contenders in turns, so that a change of the machine's load affects all of them.
 
     Args:
         contenders: by name.
-        on_call: told after each call how many are done of how many at most, and whose turn it is.
+        on_call: called after each call with the number of finished calls, the largest total, and the contender's name.
 
     Returns:
-        Seconds of each measured call.
+        Seconds of each measured call, by contender.
     """
     samples: dict[str, list[float]] = {name: [] for name in contenders}
     spent = dict.fromkeys(contenders, 0.0)
@@ -103,40 +105,40 @@ def alternate(
 
 
 def summary(seconds: Sequence[float]) -> dict[str, Any]:
-    """Median, quartiles, least and number of the measured times (seconds)."""
+    """Median, quartiles and minimum of the measured times (seconds), and their number."""
     q1, median, q3 = np.quantile(seconds, (0.25, 0.5, 0.75))
     return {"median": float(median), "q1": float(q1), "q3": float(q3), "min": float(min(seconds)), "count": len(seconds)}
 
 
 def compare(samples: Mapping[str, Sequence[float]], ratios: Sequence[tuple[str, str]] = ()) -> dict[str, Any]:
-    """Summaries of all contenders, and ratios of medians for pairs (numerator, denominator) that are both there."""
+    """Summaries of all contenders, and ratios of medians for the pairs (numerator, denominator) that were both measured."""
     times = {name: summary(values) for name, values in samples.items() if len(values)}
     pairs = {f"{a} / {b}": times[a]["median"] / times[b]["median"] for a, b in ratios if a in times and b in times}
     return {"seconds": times, "ratio_of_medians": pairs}
 
 
 def exponent(sizes: Sequence[float], costs: Sequence[float]) -> float | None:
-    """Slope of log(cost) over log(size) by least squares: 1 is linear growth. None for less than two different sizes."""
+    """Slope of log(cost) over log(size) by least squares: 1 is linear growth. None for fewer than two different sizes."""
     if len(set(sizes)) < 2:
         return None
     return float(np.polyfit(np.log(np.asarray(sizes, float)), np.log(np.asarray(costs, float)), 1)[0])
 
 
 def load() -> list[float] | None:
-    """Load averages over 1, 5 and 15 minutes, None where the system does not tell."""
+    """Load averages over 1, 5 and 15 minutes, None on systems without them."""
     return list(os.getloadavg()) if hasattr(os, "getloadavg") else None
 
 
 class OtherWork:
-    """Cores that other processes keep busy. A load average cannot tell them from this one."""
+    """Measurement of the cores that other processes keep busy. A load average includes this process."""
 
     def __init__(self) -> None:
         self._began = self._now()
 
     def cores(self) -> float | None:
-        """Cores that processes other than this one and its children have used on average since the start of this record.
+        """Average number of cores used by processes other than this one and its children since the object was made.
 
-        None where the system does not tell (Linux does).
+        None on systems without `/proc/stat` (Linux has it).
         """
         before, now = self._began, self._now()
         if before is None or now is None or now[0] <= before[0]:
@@ -145,7 +147,7 @@ class OtherWork:
 
     @staticmethod
     def _now() -> tuple[float, float, float] | None:
-        """Seconds: of the clock, of all processors' work, of the work of this process and its finished children."""
+        """Seconds: of the clock, of work on all processors, of work by this process and its finished children."""
         try:
             ticks = [int(text) for text in Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:8]]
             busy = (sum(ticks) - ticks[3] - ticks[4]) / os.sysconf("SC_CLK_TCK")  # all but idle and waiting for disks
@@ -156,9 +158,9 @@ class OtherWork:
 
 
 def peak_memory() -> int:
-    """Most memory (bytes) that this process has occupied so far."""
+    """Peak resident memory (bytes) of this process so far."""
     try:
-        # Not `ru_maxrss`, which a process inherits from the one that started it.
+        # Not `ru_maxrss`, which a process inherits from its parent.
         for line in Path("/proc/self/status").read_text().splitlines():
             if line.startswith("VmHWM:"):
                 return 1024 * int(line.split()[1])
@@ -171,7 +173,7 @@ def peak_memory() -> int:
 
 
 def forget_peak_memory() -> None:
-    """Lets `peak_memory` count from what is occupied now, where the system can do that (Linux)."""
+    """Reset `peak_memory` to the memory in use now, on systems that can (Linux)."""
     try:
         Path("/proc/self/clear_refs").write_text("5")
     except OSError:
@@ -190,7 +192,7 @@ def machine() -> dict[str, Any]:
         "variant": mi.variant(),
         "shadowmap_dr": __version__,
         "mitsuba": mi.__version__,
-        "drjit": dr.__version__,
+        "drjit": DRJIT_VERSION,
         "llvm": ".".join(map(str, llvm)) if llvm else None,
         "python": platform.python_version(),
         "numpy": np.__version__,

@@ -1,4 +1,4 @@
-"""Faces from profile shadows: the weights of a morphable model are found from the shadow of a head, or a silhouette."""
+"""Faces from profile shadows: weights of a morphable model are fitted to the shadow of a head, or to a silhouette."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 from rich.console import Console
-from rich.progress import Progress
+from rich.progress import Progress, TaskID
 
 from ...errors import ShadowmapError
 from ...inverse import History, optimize
+from ...inverse.faces.morph_fit import MorphFit
 from ...inverse.faces.morphable import MorphableModel
 from ...io import console as io_console
 from ...io import files, records
@@ -42,14 +44,14 @@ class FaceOptions:
         model: morphable model (.npz); None: the head of this package.
         iterations: steps of Adam.
         prior: strength of the prior on the weights, see `MorphFit`.
-        translate: look for the head's place as well.
-        reference: shadow images of this library, or path-traced ones.
+        translate: fit the head's position as well.
+        reference: target shadows by this library, or path-traced.
         height: rows of the image.
         map_resolution, filter_size: of the shadow maps, texels.
         spp: samples per pixel of path-traced images.
-        samples: points on each surface of which distances are taken.
+        samples: points on each surface from which distances are measured.
         out: folder for the results.
-        resume: keep finished runs, go on with killed ones.
+        resume: keep finished runs, continue killed ones.
     """
 
     seeds: tuple[int, ...] = SEEDS
@@ -93,7 +95,7 @@ class FaceOptions:
 
 
 def check_numbers(iterations: int, prior: float) -> None:
-    """ShadowmapError for what no fit can be run with."""
+    """ShadowmapError for numbers of iterations or a prior that no fit can use."""
     if iterations < 1:
         raise ShadowmapError(f"{iterations} iterations: give at least 1.")
     if not (np.isfinite(prior) and prior >= 0):
@@ -102,11 +104,11 @@ def check_numbers(iterations: int, prior: float) -> None:
 
 @dataclass(frozen=True)
 class Head:
-    """An artificial head: its seed, weights, and vertices (V, 3); and those of what a fit starts from."""
+    """An artificial head: its seed, weights (K,) and (E,), vertices (V, 3), and the vertices from which a fit starts."""
 
     seed: int
-    identity: Any
-    expression: Any
+    identity: npt.NDArray[np.float64]
+    expression: npt.NDArray[np.float64]
     vertices: FloatArray
     start: FloatArray
 
@@ -116,15 +118,15 @@ class Head:
         start = model.vertices(identity) if mode == "expression" else model.mean
         return cls(seed, identity, expression, model.vertices(identity, expression), start)
 
-    def weights(self, mode: Mode) -> Any:
-        """The weights that a fit of this mode should find."""
+    def weights(self, mode: Mode) -> npt.NDArray[np.float64]:
+        """The true weights of the head, as far as a fit of this mode looks for them."""
         return {"identity": self.identity, "expression": self.expression}.get(
             mode, np.concatenate([self.identity, self.expression])
         )
 
 
 def run_faces(options: FaceOptions, *, console: Console | None = None) -> dict[str, Any]:
-    """Run all, and write results below `options.out`.
+    """Run the experiment and write its results below `options.out`.
 
     Files: `faces.json` (settings and a record for each run), `faces.md` (tables), for each mode `MODE-profiles-1.png` and
     `-3.png` (shadows), `MODE-errors.png` (distances drawn on the heads), `convergence.png`, heads as `.ply`. Returns the record.
@@ -163,7 +165,7 @@ def _one(
     progress: Progress,
     sheets: faces_pictures.Sheets,
 ) -> None:
-    """Run one fit, unless it has been run; note its record, and its pictures."""
+    """Run a fit unless its record is known; store the record and the pictures."""
     key = f"{mode} | {scene.lights} | {head.seed}"
     if options.reference == "own":
         target = scene.shadow(head.vertices)
@@ -206,12 +208,12 @@ def _one(
     )
 
 
-def _measured(scene: FaceScene, head: Head, mode: Mode, options: FaceOptions, fit: Any, history: History) -> dict[str, Any]:
+def _measured(scene: FaceScene, head: Head, mode: Mode, options: FaceOptions, fit: MorphFit, history: History) -> dict[str, Any]:
     faces, mask = scene.model.faces, scene.model.mask
     found, true = fit.vertices(history.final), np.asarray(head.weights(mode))
     weights = history.final[: fit.count]
     difference = fit.render(history.final)[..., 0] - np.array(fit.reference)
-    result = {
+    result: dict[str, Any] = {
         "mode": mode,
         "lights": scene.lights,
         "seed": head.seed,
@@ -232,7 +234,7 @@ def _measured(scene: FaceScene, head: Head, mode: Mode, options: FaceOptions, fi
 
 
 def _started(path: Path, options: FaceOptions, model: MorphableModel) -> dict[str, Any]:
-    """The record of an earlier call with the same settings, or an empty one."""
+    """The stored record of a call with the same settings if the run is resumed, else an empty one."""
     settings = records.plain(
         {
             "model": faces_report.digest(model),
@@ -254,5 +256,5 @@ def _started(path: Path, options: FaceOptions, model: MorphableModel) -> dict[st
     return {"settings": settings, "machine": machine(), "runs": {}}
 
 
-def _show(progress: Progress, task: Any, done: int) -> None:
+def _show(progress: Progress, task: TaskID, done: int) -> None:
     progress.update(task, completed=done)

@@ -1,4 +1,4 @@
-"""A head from a silhouette in an image file."""
+"""Fit of a head to a silhouette in an image file."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
+from rich.progress import Progress, TaskID
 
 from ...inverse import optimize
 from ...io import console as io_console
@@ -20,16 +21,16 @@ from .experiment import STEP_SIZE, TRANSLATION_STEP, check_numbers
 from .problem import FaceScene, Mode, default_model
 from .silhouette import place, read_silhouette, resample
 
-#: Ten times as strong as for artificial heads: a silhouette from elsewhere is not exactly the shadow of any head of a model.
+#: Ten times as strong as for artificial heads: no head of the model casts exactly the silhouette of another source.
 PRIOR = 3e-4
 
 
 @dataclass(frozen=True)
 class ImageOptions:
-    """A silhouette and how to fit it; the other attributes are those of `faces.FaceOptions`.
+    """A silhouette and options of its fit; attributes not listed are those of `faces.FaceOptions`.
 
     Attributes:
-        image: file; what is not head may be white or black, or transparent.
+        image: file; the background may be white, black or transparent.
         mode: ``identity`` or ``both``.
     """
 
@@ -49,10 +50,10 @@ class ImageOptions:
 
 
 def run_image(options: ImageOptions, *, console: Console | None = None) -> dict[str, Any]:
-    """Fit a head to the silhouette, its place included; the record.
+    """Fit a head and its position to the silhouette. Returns the record.
 
-    Writes into `options.out`, with the image's name in front: `-face.json`, `-shadows.png` (the silhouette as it was laid over
-    the shadow of the mean head, that shadow, the result), `-heads.png`, `-face.ply`.
+    Writes into `options.out`, with the image's name as prefix: `-face.json`, `-shadows.png` (the silhouette, aligned with the
+    shadow of the mean head; that shadow; the result), `-heads.png`, `-face.ply`.
     """
     console = console or Console(stderr=True)
     name = options.image.stem
@@ -111,5 +112,5 @@ def run_image(options: ImageOptions, *, console: Console | None = None) -> dict[
     return record
 
 
-def _show(progress: Any, task: Any, done: int) -> None:
+def _show(progress: Progress, task: TaskID, done: int) -> None:
     progress.update(task, completed=done)

@@ -1,4 +1,4 @@
-"""Information about the weights of a morphable model in a shadow image: derivatives by the weights, against their prior."""
+"""Information of a shadow image about the weights of a morphable model: derivatives by the weights, against their prior."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from ...inverse.faces.morph_fit import MorphFit
 
 FloatArray = npt.NDArray[np.float64]
 
-#: A weight is seen if the image leaves at most this standard deviation of it, where the prior alone leaves 1.
+#: A weight counts as visible if its posterior standard deviation is at most this; that of the prior is 1.
 SEEN = 0.5
 _SIDES = re.compile(r"(.*?)[ _]?(Left|Right|_L|_R)$")
 
 
 @dataclass(frozen=True)
 class Contrast:
-    """A weight, or the common or opposite part of a left and a right one, as a unit vector (N,) of weights."""
+    """A weight, or the sum or difference of a left and a right weight, as a unit vector (N,) of weights."""
 
     name: str
     vector: FloatArray
@@ -42,11 +42,11 @@ def image_derivatives(fit: MorphFit, parameters: npt.ArrayLike) -> FloatArray:
 
 
 def posterior_covariance(derivatives: npt.ArrayLike, prior: float) -> FloatArray:
-    """(N, N) covariance that an image leaves, for weights that are standard normal beforehand (Laplace's approximation).
+    """(N, N) posterior covariance of weights with a standard normal prior, given an image (Laplace's approximation).
 
     Args:
         derivatives: (pixels, N), see `image_derivatives`.
-        prior: as of `MorphFit`, above 0: it says how large errors of pixels are.
+        prior: as of `MorphFit`, above 0: it fixes the standard deviation s of a pixel.
 
     The Fisher information of the image, J^T J / s^2 with s^2 = prior * pixels / N, is added to that of the prior.
     """
@@ -58,9 +58,9 @@ def posterior_covariance(derivatives: npt.ArrayLike, prior: float) -> FloatArray
 
 
 def contrasts(names: tuple[str, ...]) -> list[Contrast]:
-    """The weights by name; of those that come as left and right (``...Left``, ``..._L``) their sum and their difference.
+    """The weights by name; for left and right pairs (``...Left``, ``..._L``), their sum and their difference.
 
-    A profile does not tell left from right: of a pair, only the sum can be seen.
+    A profile does not show which side of the face moves: of a pair, only the sum is visible.
     """
     pairs: dict[str, dict[str, int]] = {}
     for k, name in enumerate(names):
@@ -80,7 +80,7 @@ def contrasts(names: tuple[str, ...]) -> list[Contrast]:
 def recovery(
     names: tuple[str, ...], covariance: npt.ArrayLike, true: npt.ArrayLike, found: npt.ArrayLike
 ) -> list[dict[str, Any]]:
-    """For each contrast, the best seen first: what the image leaves of its standard deviation, its true and its found value."""
+    """For each contrast, the best determined first: posterior standard deviation, true value, found value and error."""
     c, error = np.asarray(covariance, np.float64), np.asarray(found, np.float64) - np.asarray(true, np.float64)
     rows = []
     for contrast in contrasts(names):

@@ -13,11 +13,11 @@ from ...errors import ShadowmapError
 
 FloatArray = npt.NDArray[np.float64]
 
-# Triangles are stood for by points no farther apart than this share of the surface's extent; the nearest points say which
-# triangles may be the nearest.
+# Triangles are sampled by points no farther apart than this share of the surface's extent. The triangles of the nearest points
+# are the candidates for the nearest triangle.
 _SPACING = 0.01
 _CANDIDATES = 16
-# Points whose candidates are looked at together: bounds the memory.
+# Points whose candidates are tested together; bounds the memory.
 _CHUNK = 20_000
 
 
@@ -26,7 +26,7 @@ class SurfaceDistance:
     """Distances between two surfaces, in the units of their vertices.
 
     Attributes:
-        mean: of the distances to the other surface of points spread evenly over one; averaged over both directions.
+        mean: mean distance of points spread evenly over one surface from the other; averaged over both directions.
         hausdorff: the largest distance found, in either direction (the vertices are among the points).
         forward, backward: mean from the first surface to the second, and from the second to the first.
     """
@@ -38,7 +38,7 @@ class SurfaceDistance:
 
 
 def check_libraries() -> None:
-    """ShadowmapError if SciPy, with which distances are measured, is not installed."""
+    """ShadowmapError if SciPy, which measures distances, is not installed."""
     if importlib.util.find_spec("scipy") is None:
         raise ShadowmapError("measuring faces needs scipy: pip install 'shadowmap-dr[faces]'.")
 
@@ -51,8 +51,8 @@ def surface_distance(
     Args:
         a, b: (V, 3) vertices of two surfaces.
         faces: (F, 3) triangles of both.
-        mask: (V,) bool: points are sampled on triangles whose three vertices are all in the mask. They are compared with the
-            whole of the other surface, so that where the mask ends does not count as a difference.
+        mask: (V,) bool: points are sampled on triangles whose three vertices are all in the mask. Distances are
+            to the whole other surface, so that the border of the mask does not count as a difference.
         samples: points spread over each surface, beside its vertices.
         seed: of the points.
     """
@@ -106,13 +106,13 @@ def distances(points: npt.ArrayLike, vertices: npt.ArrayLike, faces: npt.ArrayLi
 
 
 def _stand_ins(triangles: FloatArray, spacing: float) -> tuple[FloatArray, npt.NDArray[np.int64]]:
-    """Points on all triangles, no farther apart than ``spacing``, and whose they are."""
+    """Points on all triangles, no farther apart than ``spacing``, and the triangle of each."""
     edges = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max(1)
     parts = np.maximum(1, np.ceil(edges / spacing)).astype(np.int64)
     points, owners = [], []
     for n in np.unique(parts):
         chosen = np.flatnonzero(parts == n)
-        # Centroids of the triangle's upright parts when its edges are cut into n pieces.
+        # Centroids of the upright parts of a triangle whose edges are cut into n pieces.
         i, j = (a.ravel() for a in np.meshgrid(np.arange(n), np.arange(n), indexing="ij"))
         i, j = i[i + j < n], j[i + j < n]
         weights = np.stack([i + 1 / 3, j + 1 / 3, n - i - j - 2 / 3], 1) / n

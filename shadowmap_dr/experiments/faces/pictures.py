@@ -16,7 +16,7 @@ from ...io.files import atomic
 from ...io.images import to_srgb
 from .metrics import distances
 
-#: Distance that has the last colour of the map (head within [-1, 1]^3).
+#: Distance at the end of the colour map (head within [-1, 1]^3).
 COLOUR_END = 0.05
 _SIZE = 220
 _GREY = 0.6
@@ -24,18 +24,29 @@ _GREY = 0.6
 _EYE, _FOV_DEG = (4.2, 0.9, 4.6), 18.0
 
 
+FloatArray = npt.NDArray[np.float32]
+
+
 class Sheets:
     """Collects the pictures of a mode; heads are rows."""
 
     def __init__(self, model: MorphableModel, mode: str) -> None:
         self._model, self._mode = model, mode
-        self._profiles: dict[int, dict[str, dict[str, Any]]] = {}
-        self._heads: dict[int, dict[str, Any]] = {}
+        self._profiles: dict[int, dict[str, dict[str, FloatArray]]] = {}
+        self._heads: dict[int, dict[str | int, FloatArray]] = {}
 
     def add(
-        self, seed: int, lights: int, true: Any, start: Any, found: Any, target: Any, shadow_start: Any, shadow_found: Any
+        self,
+        seed: int,
+        lights: int,
+        true: FloatArray,
+        start: FloatArray,
+        found: FloatArray,
+        target: FloatArray,
+        shadow_start: FloatArray,
+        shadow_found: FloatArray,
     ) -> None:
-        """Vertices (V, 3) of the true head, the start and the result; (H, W, 1) shadows of the three."""
+        """Add a head: vertices (V, 3) of the true head, the start and the result; the shadows (H, W, 1) of the three."""
         self._profiles.setdefault(lights, {})[f"head {seed}"] = {
             "target": target,
             "start": shadow_start,
@@ -46,14 +57,15 @@ class Sheets:
         heads[lights] = found
 
     def write(self, out: Path) -> None:
-        """`MODE-profiles-N.png` for each number N of shadows, and `MODE-errors.png`."""
+        """Write `MODE-profiles-N.png` for each number N of shadows, and `MODE-errors.png`."""
         for lights, rows in self._profiles.items():
             plots.image_sheet(out / f"{self._mode}-profiles-{lights}.png", rows)
         rows = {}
         for seed, heads in self._heads.items():
             faces = self._model.faces
             row = {"head": picture(heads["true"], faces, self._model.mask)}
-            for key in ("start", *sorted(k for k in heads if isinstance(k, int))):
+            keys: list[str | int] = ["start", *sorted(k for k in heads if isinstance(k, int))]
+            for key in keys:
                 title = f"{key} shadow{'s' * (key > 1)}" if isinstance(key, int) else key
                 error = distances(heads[key], heads["true"], faces)
                 row[title] = picture(heads[key], faces, self._model.mask, error)
@@ -102,11 +114,11 @@ def picture(
         optimize=False,
     )
     image = np.array(mi.render(scene, integrator=mi.load_dict({"type": "shadowmap"}), spp=9))
-    return image[..., :3] + (1 - image[..., 3:4])  # before white
+    return image[..., :3] + (1 - image[..., 3:4])  # over white
 
 
 def error_sheet(path: str | os.PathLike[str], rows: dict[str, dict[str, npt.NDArray[np.float32]]]) -> None:
-    """A grid of pictures with the scale of the colours beside it."""
+    """Draw a grid of pictures with the colour bar beside it."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
     from matplotlib.figure import Figure  # without pyplot there is no global state and no display is needed
@@ -135,7 +147,7 @@ def write_ply(path: str | os.PathLike[str], vertices: npt.ArrayLike, faces: npt.
     meshes.write_ply(path, mesh)
 
 
-def _mesh(vertices: npt.NDArray[np.float32], faces: npt.NDArray[Any]) -> Any:
+def _mesh(vertices: npt.NDArray[np.float32], faces: npt.NDArray[Any]) -> mi.Mesh:
     mesh = mi.Mesh("head", len(vertices), len(faces))
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = mi.Float(vertices.ravel())

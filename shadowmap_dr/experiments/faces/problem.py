@@ -1,4 +1,4 @@
-"""Heads from profile shadows, the set-up: a head in profile before a wall, one or three lights, artificial heads, references."""
+"""Set-up of the experiment on faces: a head in profile before a wall, one or three lights, artificial heads, references."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from ...shadow import ShadowSettings
 Mode = Literal["identity", "both", "expression"]
 FloatArray = npt.NDArray[np.float32]
 
-#: What is looked for: identity; identity and expression; expression of a head whose identity is known.
+#: Weights to be found: identity; identity and expression; expression of a head whose identity is known.
 MODES: tuple[Mode, ...] = ("identity", "both", "expression")
 #: Numbers of lights, and the angle between two of them.
 LIGHTS = (1, 3)
 ANGLE_DEG = 15.0
 RECEIVER_Z = -2.0
-#: The slab before the receiver in which a head may lie, and half the side of the cube into which a model must have been scaled.
+#: Depth before the receiver in which a head may lie, and half the side of the cube that a model must fit into.
 _REACH, _CUBE = 6.0, 1.25
 # Space around the shadow of the mean head: beside and above it, and below the place where the neck begins.
 _BESIDE, _ABOVE, _BELOW = 0.35, 0.25, 0.1
@@ -39,9 +39,9 @@ class FaceScene:
 
     Attributes:
         model: faces +x, within [-1, 1]^3.
-        lights: how many there are: 1 (along -z) or 3 (two more, turned about the vertical by +- 15 degrees).
+        lights: number of lights: 1 (along -z) or 3 (two more, turned about the vertical by +-15 degrees).
         window: the part of the receiver that the image shows. It ends above the torso.
-        shadows: makes images.
+        shadows: renders the images.
     """
 
     model: MorphableModel
@@ -60,7 +60,7 @@ class FaceScene:
             height: rows of the image.
             map_resolution, filter_size: of the shadow maps (Gaussian), in texels.
 
-        Raises ShadowmapError for settings that cannot be, or for a model that is not scaled into the unit cube.
+        Raises ShadowmapError for invalid settings, or for a model that is not scaled into the unit cube.
         """
         if lights not in LIGHTS:
             raise ShadowmapError(f"{lights} shadows: choose {' or '.join(map(str, LIGHTS))}.")
@@ -81,13 +81,20 @@ class FaceScene:
         return cls(model, lights, window, shadows)
 
     def shadow(self, vertices: npt.ArrayLike) -> FloatArray:
-        """(H, W) visibility behind a head with the given (V, 3) vertices, made with this library."""
+        """(H, W) visibility behind a head with the given (V, 3) vertices, rendered with this library. No gradients."""
         with dr.suspend_grad():
             image = self.shadows.render(mi.Float(np.asarray(vertices, np.float32).ravel()))
             return np.array(image).reshape(self.shadows.shape)
 
-    def fit(self, mode: Mode, reference: npt.ArrayLike, *, identity: npt.ArrayLike = (), **options: Any) -> MorphFit:
-        """The fit of a mode; ``identity`` are the known weights of mode ``expression``. Options as those of `MorphFit`."""
+    def fit(
+        self,
+        mode: Mode,
+        reference: npt.ArrayLike,
+        *,
+        identity: npt.ArrayLike = (),
+        **options: Any,  # Any: keyword arguments of `MorphFit`, of different types
+    ) -> MorphFit:
+        """The fit of a mode to a reference (H, W); ``identity``: the known weights in mode ``expression``."""
         known = identity if mode == "expression" else ()
         if mode != "identity" and not len(self.model.expression):
             raise ShadowmapError(f"mode {mode}: this model has no expressions, choose identity.")
@@ -106,7 +113,7 @@ def light_directions(lights: int) -> list[tuple[float, float, float]]:
 
 
 def make_window(head: npt.ArrayLike, lights: int) -> Window:
-    """The rectangle that shows the shadows of a mean head, given its (N, 3) vertices above the neck, and some space around."""
+    """The rectangle around the shadows of a mean head with a margin. ``head``: its (N, 3) vertices above the neck."""
     low, high = np.min(head, axis=0), np.max(head, axis=0)
     aside = np.tan(np.radians(ANGLE_DEG)) * abs(RECEIVER_Z) if lights > 1 else 0.0
     first = (float(low[0] - _BESIDE - aside), float(low[1] - _BELOW))
@@ -116,8 +123,8 @@ def make_window(head: npt.ArrayLike, lights: int) -> Window:
 def artificial_weights(model: MorphableModel, seed: int, mode: Mode) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """(identity (K,), expression (E,)) weights of an artificial head: standard normal, from the seed only.
 
-    Expressions are the same for both modes that have them, and zero in mode ``identity``; they are positive, since shapes of
-    expressions are poses of muscles, which pull in one direction.
+    Expressions are the same in both modes that have them, and zero in mode ``identity``. They are positive, since shapes of
+    expressions are poses of muscles, which pull in one direction only.
     """
     if seed < 0:
         raise ShadowmapError(f"a head of seed {seed}: give 0 or more.")
@@ -168,7 +175,7 @@ def path_traced_shadow(scene: FaceScene, vertices: npt.ArrayLike, spp: int) -> F
     }
     directions = light_directions(scene.lights)
     for k, direction in enumerate(directions):
-        irradiance = np.pi / len(directions) / -direction[2]  # as much light on the receiver from each of them
+        irradiance = np.pi / len(directions) / -direction[2]  # equal light on the receiver from each of them
         description[f"light{k}"] = {
             "type": "directional",
             "direction": list(direction),

@@ -22,7 +22,7 @@ _TITLES = {"identity": "Identity", "both": "Identity and expression", "expressio
 
 
 def digest(model: MorphableModel) -> str:
-    """Tells models apart: a hash of all their numbers."""
+    """Hash of a model's numbers, which tells models apart."""
     total = hashlib.sha256()
     for name in ("mean", "faces", "identity", "expression", "mask"):
         total.update(getattr(model, name).tobytes())
@@ -30,13 +30,13 @@ def digest(model: MorphableModel) -> str:
 
 
 def runs_of(record: Mapping[str, Any], mode: str, lights: int | None = None) -> list[dict[str, Any]]:
-    """The records of a mode (and a number of shadows), by seed."""
+    """The records of a mode (and of a number of shadows), sorted by seed."""
     runs = [r for r in record["runs"].values() if r["mode"] == mode and lights in (None, r["lights"])]
     return sorted(runs, key=lambda run: run["seed"])
 
 
 def summary(record: Mapping[str, Any], mode: str) -> dict[int, dict[str, float]]:
-    """Means over the heads for each number of shadows: distances, those of the start, how much is gained, seconds."""
+    """Means over the heads for each number of shadows: distances at end and start, share gained, seconds."""
     result = {}
     for lights in sorted({run["lights"] for run in runs_of(record, mode)}):
         runs = runs_of(record, mode, lights)
@@ -53,8 +53,8 @@ def summary(record: Mapping[str, Any], mode: str) -> dict[int, dict[str, float]]
 
 
 def rows(record: Mapping[str, Any], mode: str) -> tuple[list[str], list[list[str]]]:
-    """A row for each head, then the means, then those of the paper: mean and largest distance of the start, and of what is found
-    with 1 and with 3 shadows; milliseconds for a step.
+    """Columns, and a row for each head, for the means and for the paper's means: mean and largest distance at the start, and of
+    the results with 1 and with 3 shadows; milliseconds of a step.
     """
     means = summary(record, mode)
     columns = ["head", "start mean", "start max"]
@@ -92,13 +92,13 @@ def rows(record: Mapping[str, Any], mode: str) -> tuple[list[str], list[list[str
 
 
 def tables(record: Mapping[str, Any]) -> list[Table]:
-    """For the terminal: one for each mode."""
+    """Tables for the terminal, one for each mode."""
     modes = [mode for mode in _TITLES if runs_of(record, mode)]
     return [console.table(f"{_TITLES[mode]}: distances, ms a step", *rows(record, mode)) for mode in modes]
 
 
 def seen_expressions(record: Mapping[str, Any], lights: int) -> list[dict[str, Any]]:
-    """Expressions by how well the shadow should tell them: predicted deviation and error, root mean squares over heads."""
+    """Expressions, the best determined first: predicted deviation, error and true value, root mean squares over heads."""
     runs = [run for run in runs_of(record, "expression", lights) if "recovery" in run]
     names = [row["name"] for row in runs[0]["recovery"]] if runs else []
     result = []
@@ -110,7 +110,7 @@ def seen_expressions(record: Mapping[str, Any], lights: int) -> list[dict[str, A
 
 
 def reading(record: Mapping[str, Any]) -> list[str]:
-    """Lines of Markdown."""
+    """The report as lines of Markdown."""
     lines = ["# Faces from profile shadows", ""]
     for mode, title in _TITLES.items():
         if not runs_of(record, mode):
@@ -146,7 +146,7 @@ def _expressions(record: Mapping[str, Any], lights: int) -> list[str]:
 
 
 def write(out: Path, record: Mapping[str, Any]) -> None:
-    """`faces.md` and `convergence.png`."""
+    """Write `faces.md` and `convergence.png`."""
     with atomic(out / "faces.md") as temporary:
         temporary.write_text("\n".join(reading(record)) + "\n", encoding="utf-8")
     curves: dict[str, list[Any]] = {}

@@ -1,4 +1,4 @@
-"""Silhouette images as targets: read, checked, turned to face right, scaled and laid over the shadow of the mean head."""
+"""Silhouette images as targets: read, checked, mirrored to face right, and aligned with the shadow of the mean head."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ FloatArray = npt.NDArray[np.float32]
 LEAST_SIDE, LEAST_CONTRAST = 16, 0.2
 #: Share of the picture that a silhouette may cover.
 LEAST_SHARE, MOST_SHARE = 0.02, 0.95
-# Rows of the pictures in which the first, coarse search is made; ratios of sizes and shifts (rows) that it tries.
+# The coarse search: rows of its pictures, ratios of sizes and shifts (rows) that it tries.
 _COARSE, _SIZES, _SHIFTS = 32, np.geomspace(0.6, 1.7, 14), np.arange(-5, 6)
 
 
 @dataclass(frozen=True)
 class Placement:
-    """Placement of an image over the window: ``scale`` image pixels for each pixel of the window, and the image point at the
-    middle of the window (x to the right, y down, in image pixels); whether it has been mirrored first.
+    """Placement of an image over the window: ``scale`` image pixels per pixel of the window, and the image point at the middle of
+    the window (x to the right, y down, in image pixels). ``mirrored``: the image is mirrored first.
     """
 
     scale: float
@@ -39,17 +39,17 @@ class Placement:
 def read_silhouette(path: str | Path) -> FloatArray:
     """(H, W) visibility in 0..1 of an image file: 0 in the silhouette, 1 around it, in between at soft edges.
 
-    Which of the two is darker does not matter: what touches the upper corners is the background. Transparency is background too.
+    The silhouette may be the darker or the brighter part: the upper corners are background, as are transparent pixels.
 
     Raises ShadowmapError for files that are no images, and for images that show no silhouette: empty, of one colour, too small,
-    or covered by it altogether.
+    or covered by it completely.
     """
     grey = _grey(Path(path))
     if min(grey.shape) < LEAST_SIDE:
         raise ShadowmapError(f"{path} has {grey.shape[1]} x {grey.shape[0]} pixels: give at least {LEAST_SIDE} x {LEAST_SIDE}.")
     low, high = np.quantile(grey, 0.005), np.quantile(grey, 0.995)
     if high - low < LEAST_CONTRAST:
-        low, high = float(grey.min()), float(grey.max())
+        low, high = grey.min(), grey.max()
     if high - low < LEAST_CONTRAST:
         raise ShadowmapError(f"{path} is of one colour (grey {low:.2f} to {high:.2f}): give an image of a silhouette.")
     values = np.clip((grey - low) / (high - low), 0, 1)
@@ -62,9 +62,9 @@ def read_silhouette(path: str | Path) -> FloatArray:
 
 
 def place(silhouette: FloatArray, shadow: FloatArray) -> Placement:
-    """Lay a silhouette (any size) over a shadow (H, W) so that the squared difference is least; both mirror images are tried.
+    """Align a silhouette (any size) with a shadow (H, W) by the least squared difference; both mirror images are tried.
 
-    A coarse search over sizes and places is followed by a fine one. Beyond the image's border, its border goes on.
+    A coarse search over sizes and positions is followed by a fine one. Beyond the image's border, its border pixels are repeated.
     """
     coarse = _shrunk(shadow, _COARSE)
     best, least = None, np.inf
@@ -90,14 +90,15 @@ def place(silhouette: FloatArray, shadow: FloatArray) -> Placement:
 
 
 def resample(silhouette: FloatArray, shape: tuple[int, int], placement: Placement) -> FloatArray:
-    """(H, W) image that a window of that shape shows of a silhouette. Its pixels are means over what they cover."""
+    """(H, W) image of a placed silhouette in a window of that shape. Pixels are means over their areas."""
     image = silhouette[:, ::-1] if placement.mirrored else silhouette
     n = int(np.clip(np.ceil(placement.scale), 1, 8))  # samples along each side of a pixel
     fine = _sampled(image, (shape[0] * n, shape[1] * n), replace(placement, scale=placement.scale / n))
     return fine.reshape(shape[0], n, shape[1], n).mean((1, 3)).astype(np.float32)
 
 
-def _grey(path: Path) -> FloatArray:
+def _grey(path: Path) -> npt.NDArray[np.floating[Any]]:
+    """Grey values (H, W) in 0..1 of an image file, over white."""
     if not path.is_file():
         raise ShadowmapError(f"no image {str(path)!r}: the file does not exist.")
     if path.suffix.lower() == ".exr":
@@ -111,7 +112,7 @@ def _grey(path: Path) -> FloatArray:
         raise ShadowmapError(f"cannot read {path}: it is no image, or it is damaged.") from error
     alpha = pixels[..., 3]
     grey = pixels[..., :3].mean(2)
-    if alpha.min() < 0.5:  # the outline is drawn by what is transparent, whatever the colours are
+    if alpha.min() < 0.5:  # transparency draws the outline, unless the opaque part has two colours
         opaque = grey[alpha > 0.5]
         if not opaque.size or opaque.max() - opaque.min() < LEAST_CONTRAST:
             return 1 - alpha
@@ -119,7 +120,7 @@ def _grey(path: Path) -> FloatArray:
 
 
 def _head(image: FloatArray) -> tuple[tuple[float, float], float]:
-    """Middle (x, y) and height of what is dark, in pixels, from its topmost row to the bottom of the picture."""
+    """Middle (x, y) and height of the dark part, in pixels."""
     dark = 1 - np.asarray(image, np.float64)
     rows = np.flatnonzero(dark.max(1) > 0.5)
     top = float(rows[0]) if len(rows) else 0.0
@@ -130,7 +131,7 @@ def _head(image: FloatArray) -> tuple[tuple[float, float], float]:
 
 
 def _shrunk(image: FloatArray, rows: int) -> FloatArray:
-    """The picture with so many rows of square pixels, each a mean."""
+    """The picture with the given number of rows; its square pixels are means."""
     height, width = image.shape
     columns = max(1, round(width * rows / height))
     return resample(image, (rows, columns), Placement(height / rows, width / 2, height / 2, False))
@@ -144,7 +145,7 @@ def _sampled(image: FloatArray, shape: tuple[int, int], placement: Placement) ->
     return _lines(rows, x, 1)
 
 
-def _lines(image: npt.NDArray[Any], at: npt.NDArray[np.float64], axis: int) -> npt.NDArray[Any]:
+def _lines(image: npt.NDArray[Any], at: npt.NDArray[np.floating[Any]], axis: int) -> npt.NDArray[Any]:
     last = image.shape[axis] - 1
     at = np.clip(at, 0, last)
     first = np.minimum(at.astype(np.int64), max(last - 1, 0))
@@ -158,7 +159,7 @@ def _difference(image: FloatArray, shadow: FloatArray, placement: Placement) -> 
 
 
 def _refined(silhouette: FloatArray, shadow: FloatArray, start: Placement) -> Placement:
-    """Pattern search: steps along size and place that shrink until they are a small part of a pixel of the window."""
+    """Pattern search over size and position, with steps that shrink to a tenth of a pixel of the window."""
     image = silhouette[:, ::-1] if start.mirrored else silhouette
     best, least, step = start, _difference(image, shadow, start), 4.0
     height = shadow.shape[0]

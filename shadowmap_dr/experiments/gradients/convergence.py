@@ -1,4 +1,4 @@
-"""From how far away is an occluder recovered? It is displaced sideways, and only its shadow is seen."""
+"""Recovery of an occluder that is displaced sideways, from its shadow alone."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from . import scenes as gradients_scenes
 from .fit import ShadowFit
 from .images import CANDIDATES, Image, check_chosen, check_maps
 
-#: Error in texels below which an occluder counts as recovered, and largest error that is hoped for.
+#: Error in texels below which an occluder counts as recovered, and the error to aim for.
 RECOVERED, HOPED_FOR = 1.0, 0.1
 OCCLUDERS = ("plane", "turned plane", "ring")
 # Above the perspective camera, which must not see the occluder.
@@ -41,18 +41,18 @@ class ConvergenceOptions:
     """Options of a run. Everything is run for each candidate, occluder, camera, filter size and displacement.
 
     Attributes:
-        occluders: names in `OCCLUDERS`: a square of side 0.5, its outlines parallel to the texels; the same, turned by 10 degrees
-            about the light; a ring 0.59 wide.
+        occluders: names in `OCCLUDERS`: a square of side 0.5, its outlines parallel to the texels; the same square, turned by 10
+            degrees about the light; a ring 0.59 wide.
         cameras: names in `gradients.scenes.CAMERAS`.
         candidates: kinds of shadow map, names in `images.CANDIDATES`.
         filter_sizes: texels along each side of the Gaussian; 1 for none.
         displacements: along x, world units.
         map_resolution: texels along each side of the map.
         resolution: pixels along each side of the image.
-        iterations: steps of Adam, the last of which are 200 times as small as the first.
+        iterations: steps of Adam. The step size falls to 1/200 of the first.
         spp: samples per pixel of the path-traced reference.
         out: folder for the results.
-        resume: keep runs that an earlier call with the same sizes has finished.
+        resume: keep the finished runs of an earlier call with the same sizes.
     """
 
     occluders: tuple[str, ...] = OCCLUDERS
@@ -86,7 +86,7 @@ class ConvergenceOptions:
 
 
 def run_convergence(options: ConvergenceOptions, *, console: Console | None = None) -> dict[str, Any]:
-    """Run all; writes `convergence.json`, `convergence.md`, a plot and pictures into `options.out`, and returns the record."""
+    """Run all; write `convergence.json`, `convergence.md`, a plot and pictures into `options.out`. Returns the record."""
     console = console or Console(stderr=True)
     path = files.check_output(options.out / "convergence.json", (".json",))
     record = _started(path, options)
@@ -149,7 +149,7 @@ def _started(path: Path, options: ConvergenceOptions) -> dict[str, Any]:
     if options.resume and path.exists():
         record = records.read_record(path, identity, "runs")
         for run in record["runs"].values():
-            run.setdefault("candidate", "default")  # for records from before there were others
+            run.setdefault("candidate", "default")  # records of earlier versions have this one only
         return record
     return {"settings": identity, "machine": machine(), "runs": {}}
 
@@ -175,7 +175,7 @@ def _fit(label: str, name: str, camera: str, taps: int, options: ConvergenceOpti
     mesh = occluder(name)
     scene = gradients_scenes.build(mesh, options.resolution, camera)
     reference = path_traced(scene, spp=options.spp).image
-    filters = {"shadow_filter": "gaussian" if taps > 1 else "none", "shadow_filter_size": taps}
+    filters: dict[str, Any] = {"shadow_filter": "gaussian" if taps > 1 else "none", "shadow_filter_size": taps}
     renderer = Renderer.from_scene(scene, shadow_map_resolution=options.map_resolution, **filters, **CANDIDATES[label])
     basis = np.zeros((1, *mesh.vertices.shape))
     basis[0, :, 0] = 1
@@ -186,14 +186,14 @@ def _fit(label: str, name: str, camera: str, taps: int, options: ConvergenceOpti
 
 
 def occluder(name: str) -> Mesh:
-    """One of `OCCLUDERS`, in its target position."""
+    """The mesh of one of `OCCLUDERS`, in its target position."""
     if name == "ring":
         return gradients_scenes.ring(8000, _Z, _RING)
     return gradients_scenes.plane(_PLANE, _Z, 0.0 if name == "plane" else _TURN_DEG)
 
 
 def _curves(record: Mapping[str, Any]) -> dict[str, dict[str, list[list[float]]]]:
-    """Error over iterations, a panel for each occluder and camera, a colour for each filter."""
+    """Curves of the error over iterations: a panel for each occluder and camera, a colour for each filter."""
     panels: dict[str, dict[str, list[list[float]]]] = {}
     for run in record["runs"].values():
         label = ", ".join([f"filter {run['filter']}" if run["filter"] > 1 else "no filter", *_unless_default(run["candidate"])])
@@ -203,7 +203,7 @@ def _curves(record: Mapping[str, Any]) -> dict[str, dict[str, list[list[float]]]
 
 
 def convergence_rows(record: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
-    """A row for each occluder, camera, filter and kind of map: how far it is recovered from, and how well."""
+    """Columns, and a row for each occluder, camera, filter and kind of map: displacements of recovery, and largest error."""
     groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
     for run in record["runs"].values():
         groups.setdefault((run["occluder"], run["camera"], run["filter"], run["candidate"]), []).append(run)
@@ -218,7 +218,7 @@ def convergence_rows(record: Mapping[str, Any]) -> tuple[list[str], list[list[st
 
 
 def largest_recovered(runs: list[Mapping[str, Any]]) -> float:
-    """Largest displacement from which, and from all smaller ones, the occluder was recovered; 0 if there is none."""
+    """Largest displacement such that the occluder was recovered from it and from all smaller ones; 0 if there is none."""
     largest = 0.0
     for run in sorted(runs, key=lambda run: run["displacement"]):
         if not run["recovered"]:
@@ -228,12 +228,12 @@ def largest_recovered(runs: list[Mapping[str, Any]]) -> float:
 
 
 def convergence_table(record: Mapping[str, Any]) -> Table:
-    """For the terminal."""
+    """The table for the terminal."""
     return io_console.table("Displaced occluders (error of the recovered ones in texels)", *convergence_rows(record))
 
 
 def read_convergence(record: Mapping[str, Any]) -> str:
-    """Markdown: the table, and what it says."""
+    """Report in Markdown: the table and its summary."""
     s, runs = record["settings"], list(record["runs"].values())
     found = [run for run in runs if run["recovered"]]
     near = [run for run in found if run["error_texels"] <= HOPED_FOR]

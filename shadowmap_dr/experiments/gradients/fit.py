@@ -1,4 +1,4 @@
-"""Recovery of an occluder from its shadow: vertices that depend linearly on a few parameters, fitted to a shadow image."""
+"""Fit of an occluder to its shadow image; the vertices depend linearly on a few parameters."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ import numpy.typing as npt
 
 from ...errors import ShadowmapError
 from ...jit.arrays import device_array
+from ...jit.types import Float, TensorXf
 from ...rendering.renderer import Renderer
 from .images import SHAPE
 
 
 class ShadowFit:
-    """Fits p_rest + sum of parameter k times basis k to a shadow image, by Adam on the mean squared difference.
+    """Fit of p_rest + sum_k parameter_k basis_k to a shadow image, by Adam on the mean squared difference.
 
     A `Method` of the optimisation loop. A step is recorded once with `dr.freeze` and replayed from then on.
 
     Args:
-        renderer: renders one channel, the visibility.
+        renderer: a renderer of one channel, the visibility.
         p_rest: (V, 3) positions of the occluder's vertices for parameters of zero.
         basis: (P, V, 3) derivative of the vertices by each parameter.
         reference: (H, W, 1) visibility to fit.
         step_size: of Adam.
-        decay: by which the size of a step has shrunk at the end (its logarithm falls evenly), and after how many steps that is;
-            None: it stays.
+        decay: factor of the step size at the end, reached exponentially, and number of steps until then; None: constant steps.
         settings: further entries for `describe`.
 
-    Raises ShadowmapError where shapes do not fit, or the reference is not finite.
+    Raises ShadowmapError if shapes do not match, or if the reference is not finite.
     """
 
     def __init__(
@@ -58,6 +58,10 @@ class ShadowFit:
         self._reference = mi.TensorXf(device_array(mi.Float, image), image.shape)
         self._step_size, self._decay, self._settings = step_size, decay, dict(settings or {})
         self._step = dr.freeze(_step)
+        self._values: list[Float]
+        self._m: list[Float]
+        self._v: list[Float]
+        self._t: int
         self.reset(np.zeros(len(directions)))
 
     def reset(self, start: npt.ArrayLike) -> None:
@@ -65,22 +69,22 @@ class ShadowFit:
         zero = np.zeros(len(self._basis))
         self.load_state({"parameters": np.asarray(start, np.float64), "m": zero, "v": zero, "t": np.zeros(1, np.int64)})
 
-    def step(self) -> Any:
-        """One step; returns the loss before it, Float (1,), without waiting for it."""
+    def step(self) -> Float:
+        """Take a step. Returns the loss before it, Float (1,), without waiting for the device."""
         self._t += 1
         size = self._step_size
         if self._decay is not None:
             factor, steps = self._decay
             size *= factor ** min(1.0, (self._t - 1) / max(1, steps - 1))
-        # The bias of young moments is corrected here; arrays, since changed Python numbers would be recorded anew.
+        # Adam's bias correction is part of the step size, which is an array: a changed Python number would be recorded again.
         size *= np.sqrt(1 - _BETAS[1] ** self._t) / (1 - _BETAS[0] ** self._t)
         loss, self._values, self._m, self._v = self._step(
             self._renderer, self._values, self._m, self._v, dr.opaque(mi.Float, size), self._rest, self._basis, self._reference
         )
         return loss
 
-    def parameters(self) -> Any:
-        """Float (P,), on the device."""
+    def parameters(self) -> Float:
+        """Current parameters, Float (P,), on the device."""
         return dr.concat(self._values)
 
     def render(self, parameters: npt.ArrayLike) -> npt.NDArray[np.float32]:
@@ -90,7 +94,7 @@ class ShadowFit:
             return np.array(copy.copy(self._renderer).render({SHAPE: _vertices(self._rest, self._basis, values)}))
 
     def state(self) -> dict[str, npt.NDArray[Any]]:
-        """Parameters and moments (P,), step count t (1,), and the fit of the shadow map."""
+        """Parameters and moments (P,), step count t (1,), and the frustum of the shadow map."""
         arrays = {"parameters": self._values, "m": self._m, "v": self._v}
         state = {name: np.array(dr.concat(array)) for name, array in arrays.items()}
         frusta = self._renderer.frusta
@@ -99,7 +103,7 @@ class ShadowFit:
         return state | {"t": np.array([self._t])}
 
     def load_state(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
-        """Go on from what `state` returned."""
+        """Continue from the result of `state`."""
         count = len(self._basis)
         for name in ("parameters", "m", "v"):
             if np.shape(state[name]) != (count,):
@@ -108,7 +112,7 @@ class ShadowFit:
             [dr.opaque(mi.Float, float(x)) for x in state[name]] for name in ("parameters", "m", "v")
         )
         self._t = int(np.asarray(state["t"]).reshape(-1)[0])
-        # The fit of the shadow map follows the occluder with some inertia: each run starts from the same one, or from its own.
+        # The map's frustum follows the occluder with inertia: a run starts from the initial frustum, or from its stored one.
         self._renderer = copy.copy(self._initial)
         fit = {name.removeprefix("frusta."): value for name, value in state.items() if name.startswith("frusta.")}
         stored = {name: device_array(mi.Float, value) for name, value in fit.items()}
@@ -123,7 +127,7 @@ class ShadowFit:
 _BETAS, _EPSILON = (0.9, 0.999), 1e-8
 
 
-def _vertices(rest: Any, basis: list[Any], values: list[Any]) -> Any:
+def _vertices(rest: Float, basis: list[Float], values: list[Float]) -> Float:
     result = rest
     for direction, value in zip(basis, values, strict=True):
         result = dr.fma(direction, value, result)
@@ -131,14 +135,22 @@ def _vertices(rest: Any, basis: list[Any], values: list[Any]) -> Any:
 
 
 def _step(
-    renderer: Renderer, values: list[Any], m: list[Any], v: list[Any], size: Any, rest: Any, basis: list[Any], reference: Any
-) -> tuple[Any, list[Any], list[Any], list[Any]]:
+    renderer: Renderer,
+    values: list[Float],
+    m: list[Float],
+    v: list[Float],
+    size: Float,
+    rest: Float,
+    basis: list[Float],
+    reference: TensorXf,
+) -> tuple[Float, list[Float], list[Float], list[Float]]:
+    """A step of Adam: the loss before it, new values, new moments."""
     values = [dr.detach(value) for value in values]
     dr.enable_grad(values)
     image = renderer.render({SHAPE: _vertices(rest, basis, values)})
     loss = dr.mean(dr.square(image.array - reference.array))
     new_values, new_m, new_v = [], [], []
-    if dr.grad_enabled(loss):  # not so where the map is not anti-aliased and nothing else moves the shadow
+    if dr.grad_enabled(loss):  # without an anti-aliased map the loss may not depend on the vertices
         dr.backward(loss)
     for value, mean, square in zip(values, m, v, strict=True):
         gradient = dr.grad(value)

@@ -1,10 +1,10 @@
-"""Derivative images of a shadow by a motion of its occluder, and what a shadow map's own blur makes of a sharp one."""
+"""Derivative images of a shadow by a motion of its occluder, and sharp derivative images with the blur of a shadow map."""
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Collection, Iterable, Mapping
-from typing import Any
+from typing import Any, cast
 
 import drjit as dr
 import mitsuba as mi
@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...errors import ShadowmapError
+from ...jit.types import Float
 from ...rendering.renderer import Renderer
 from ...shadow import ShadowSettings, directional_view
 from ...shadow.filters import filter_kernel
@@ -22,7 +23,7 @@ Image = npt.NDArray[np.float32]
 
 SHAPE = "occluder"
 
-#: What may be compared: a label, and options of the `Renderer`.
+#: Kinds of shadow map to compare: label -> options of the `Renderer`.
 CANDIDATES: dict[str, dict[str, Any]] = {
     "default": {},
     "no anti-aliasing": {"shadow_antialias": False},
@@ -36,10 +37,10 @@ CANDIDATES: dict[str, dict[str, Any]] = {
 
 
 def check_chosen(chosen: Mapping[str, tuple[Collection[Any], Collection[str] | None]]) -> None:
-    """ShadowmapError for a kind of which nothing was chosen, or something that is not among the known names (None: any).
+    """ShadowmapError for an option without values, or with an unknown value.
 
     Args:
-        chosen: what is chosen (a word for the message) -> what was, and the known names.
+        chosen: kind of option (a word for the message) -> its values, and the known names (None: any value).
     """
     for kind, (values, known) in chosen.items():
         if not values:
@@ -50,7 +51,7 @@ def check_chosen(chosen: Mapping[str, tuple[Collection[Any], Collection[str] | N
 
 
 def check_maps(resolutions: Iterable[int], filter_sizes: Iterable[int]) -> None:
-    """ShadowmapError for sizes of maps and filters (1 for none) that do not go together."""
+    """ShadowmapError for combinations of map and filter sizes (1 for none) that are not possible."""
     for taps in filter_sizes:
         for resolution in resolutions:
             try:
@@ -60,31 +61,31 @@ def check_maps(resolutions: Iterable[int], filter_sizes: Iterable[int]) -> None:
 
 
 def image_of(renderer: Renderer, mesh: Mesh) -> Image:
-    """The renderer's image (H, W, C) with the occluder's vertices elsewhere; the renderer stays as it is."""
+    """The renderer's image (H, W, C) with a mesh's vertices as the occluder's. The renderer is not changed. No gradients."""
     with dr.suspend_grad():
         return np.array(copy.copy(renderer).render({SHAPE: mi.Float(mesh.vertices.ravel())}))
 
 
 def forward_derivative(renderer: Renderer, rate: npt.NDArray[np.float64]) -> tuple[Image, Image]:
     """Image and derivative image (H, W, C), by forward mode, for vertices that move at a rate (V, 3)."""
-    offset = dr.opaque(mi.Float, 0.0)  # a literal zero would take on the size of what it is first multiplied with
+    offset = dr.opaque(mi.Float, 0.0)  # opaque: a literal zero would take the size of its first product
     dr.enable_grad(offset)
-    rest = dr.detach(dr.ravel(renderer.data.geometry.shape_positions(SHAPE)))
+    rest = cast("Float", dr.detach(dr.ravel(renderer.data.geometry.shape_positions(SHAPE))))
     image = copy.copy(renderer).render({SHAPE: rest + mi.Float(rate.astype(np.float32).ravel()) * offset})
     dr.forward(offset)
     return np.array(dr.detach(image)), np.array(dr.grad(image))
 
 
 def central_derivative(renderer: Renderer, mesh: Mesh, motion: Motion, step: float) -> Image:
-    """The same by central differences of the renderer's own images."""
+    """Derivative image (H, W, C) by central differences of the renderer's own images."""
     high, low = (image_of(renderer, motion.moved(mesh, sign * step)) for sign in (1, -1))
     return (high - low) / np.float32(2 * step)
 
 
 def reverse_error(renderer: Renderer, rate: npt.NDArray[np.float64], derivative: Image, seed: int = 0) -> float:
-    """Relative deviation of <w, derivative> by reverse mode from that of the given forward derivative, for random weights w.
+    """Deviation of <w, derivative> by reverse mode from its value for a forward-mode derivative image, for random weights w.
 
-    Relative to the sum of the products' magnitudes, since the sum itself nearly cancels.
+    Relative to the sum of the products' magnitudes, since the products nearly cancel.
     """
     weights = np.random.default_rng(seed).normal(size=derivative.shape).astype(np.float32)
     moved = mi.Float(dr.detach(dr.ravel(renderer.data.geometry.shape_positions(SHAPE))))
@@ -97,24 +98,24 @@ def reverse_error(renderer: Renderer, rate: npt.NDArray[np.float64], derivative:
 
 
 def texel_in_pixels(renderer: Renderer, resolution: int) -> tuple[float, float]:
-    """Width and height of a texel in pixels, for a camera that looks along the light (-z, its image's axes x and y) and sees
-    the receiver."""
+    """Width and height of a texel in pixels, for the camera that looks along the light (-z, with image axes x and y) at the
+    receiver."""
     frusta = renderer.frusta
     if frusta is None:
         raise ShadowmapError("the renderer has no shadow map: choose a shadow_method that has one.")
     pixel = 2 * RECEIVER_HALF / resolution
     size = renderer.settings.shadow.resolution
     x, y = (2 * float(half[0]) / size / pixel for half in (frusta.half_x, frusta.half_y))
-    # The light's own axes may be the image's the other way round.
+    # The light's x axis may be the image's y axis.
     right = np.abs(np.array(dr.detach(directional_view(mi.Vector3f(0, 0, -1)).right)).ravel())
     return (x, y) if right[0] > right[1] else (y, x)
 
 
 def blurred_by_map(image: Image, renderer: Renderer) -> Image:
-    """A sharp derivative image (H, W, C) as a faultless filtered map would blur it: the same kernel, applied to it.
+    """A sharp derivative image (H, W, C), blurred as by an exact filtered shadow map.
 
-    That is the mean over a texel (coverage), the filter's taps, and the bilinear look-up, one after the other. The image is taken
-    to be zero beyond its borders. Texels are parallel to the pixels.
+    The kernel is that of the mean over a texel (coverage), the filter's taps, and the bilinear look-up, in this order. The image
+    counts as zero beyond its borders. Texels are parallel to the pixels.
     """
     shadow = renderer.settings.shadow
     height, width, _ = image.shape
@@ -127,7 +128,7 @@ def blurred_by_map(image: Image, renderer: Renderer) -> Image:
     return np.fft.irfft2(transformed, s=shape, axes=(0, 1))[:height, :width].astype(np.float32)
 
 
-def _response(frequency: npt.NDArray[np.float64], texel: float, taps: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def _response(frequency: npt.NDArray[np.floating[Any]], texel: float, taps: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """Fourier transform of coverage (a box), bilinear look-up (a tent, two boxes) and taps, at cycles per pixel."""
     offsets = np.arange(len(taps)) - len(taps) // 2
     filtered = (taps * np.cos(2 * np.pi * np.outer(frequency * texel, offsets))).sum(1)

@@ -1,4 +1,4 @@
-"""Are the derivatives of shadows right? Derivative images against central differences, our own and path-traced, and Mitsuba's."""
+"""Derivative images of shadows, compared with central differences (our own and path-traced) and with Mitsuba's."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 from rich.console import Console
@@ -34,7 +35,7 @@ from .images import (
 from .references import Sampling, path_traced_derivative, projective_image
 from .scenes import MOTIONS
 
-# Faces of the coarse occluder in the test of tessellation, and how often each is divided in four: 64-fold.
+# Test of tessellation: faces of the coarse occluder, number of subdivisions (each in four, together 64-fold), motion in pixels.
 _COARSE_FACES, _DIVISIONS, _TARGET_PIXELS = 2000, 3, 8.0
 
 
@@ -52,7 +53,7 @@ class JacobianOptions:
         spp: samples per pixel of the path-traced images.
         mitsuba_passes: passes of Mitsuba's projective integrator, 0 to leave it out.
         out: folder for the results.
-        resume: keep what an earlier run with the same occluder, image and samples has measured.
+        resume: keep measurements of an earlier run with the same occluder, image and samples.
     """
 
     motions: tuple[str, ...] = tuple(MOTIONS)
@@ -83,7 +84,7 @@ class JacobianOptions:
 
 
 def run_jacobian(options: JacobianOptions, *, console: Console | None = None) -> dict[str, Any]:
-    """Measure all; writes `jacobian.json`, `jacobian.md`, pictures and a plot into `options.out` and returns the record."""
+    """Run all; write `jacobian.json`, `jacobian.md`, pictures and a plot into `options.out`. Returns the record."""
     console = console or Console(stderr=True)
     path = files.check_output(options.out / "jacobian.json", (".json",))
     record = _started(path, options)
@@ -131,7 +132,7 @@ def run_jacobian(options: JacobianOptions, *, console: Console | None = None) ->
 
 
 def _started(path: Path, options: JacobianOptions) -> dict[str, Any]:
-    """A new record, or the stored one to go on with."""
+    """The stored record if the run is resumed, else a new one."""
     identity = {"resolution": options.resolution, "requested_faces": options.faces, "spp": options.spp}
     if options.resume and path.exists():
         return records.read_record(path, identity, "references", "mitsuba", "entries", "tessellation")
@@ -143,14 +144,14 @@ def _key(label: str, motion: str, size: int, taps: int) -> str:
     return f"{label} | {motion} | {size} | {taps}"
 
 
-def make_renderer(scene: Any, label: str, size: int, taps: int) -> Renderer:
-    """A renderer for a candidate with maps of so many texels; ``taps`` is the Gaussian's size, 1 for no filter."""
-    filters = {"shadow_filter": "gaussian" if taps > 1 else "none", "shadow_filter_size": taps}
+def make_renderer(scene: mi.Scene, label: str, size: int, taps: int) -> Renderer:
+    """A renderer for a candidate; ``size``: texels along each side of the map, ``taps``: size of the Gaussian, 1 for none."""
+    filters: dict[str, Any] = {"shadow_filter": "gaussian" if taps > 1 else "none", "shadow_filter_size": taps}
     return Renderer.from_scene(scene, shadow_map_resolution=size, **filters, **CANDIDATES[label])
 
 
 def _measure(mesh: Mesh, label: str, name: str, size: int, taps: int, traced: Image, options: JacobianOptions) -> dict[str, Any]:
-    """Agreement of one derivative image with all that it can be compared with."""
+    """Agreement of one derivative image with all its references."""
     motion, resolution = MOTIONS[name], options.resolution
     renderer = make_renderer(gradients_scenes.build(mesh, resolution), label, size, taps)
     rate = motion.rate(mesh)
@@ -176,7 +177,7 @@ def _measure(mesh: Mesh, label: str, name: str, size: int, taps: int, traced: Im
         "own": _agreement(derivative, own, footprint),
         "traced": _agreement(derivative, traced, footprint),
         "traced_blurred": _agreement(derivative, blurred, footprint),
-        # What the blur of the map alone leaves of the agreement with a sharp shadow: no map with this filter comes closer.
+        # Agreement of an exact map with a sharp shadow: only its blur counts. No map with this filter comes closer.
         "blur": _agreement(blurred, traced, footprint),
     }
 
@@ -219,7 +220,7 @@ def _pictures(
     motion, size = MOTIONS[name], options.map_resolutions[0]
     scene = gradients_scenes.build(mesh, options.resolution)
     blank = np.zeros((options.resolution, options.resolution))
-    row = {"path-traced differences": traced[name][..., 0]}
+    row: dict[str, npt.NDArray[np.floating[Any]]] = {"path-traced differences": traced[name][..., 0]}
     if options.mitsuba_passes:
         row["Mitsuba, area light"] = mitsuba[name][..., 0] if name in mitsuba else blank
     taps = options.filter_sizes[min(1, len(options.filter_sizes) - 1)]
@@ -233,6 +234,6 @@ def _pictures(
 
 
 def _middle(image: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.floating[Any]]:
-    """An image without the eighth along each side that no shadow reaches."""
+    """An image without the outer eighth along each side, which no shadow reaches."""
     border = len(image) // 8
     return image[border : len(image) - border, border : len(image) - border]

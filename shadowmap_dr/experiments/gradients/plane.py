@@ -1,4 +1,4 @@
-"""The smallest case: one vertex of a square occluder is out of place, with and without anti-aliased shadow maps."""
+"""The smallest case: recovery of one displaced vertex of a square occluder, with and without anti-aliased shadow maps."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class PlaneOptions:
 
 
 def run_plane(options: PlaneOptions, *, console: Console | None = None) -> dict[str, Any]:
-    """Run all; writes `minimal-plane.json`, `minimal-plane.md`, a plot and pictures, and returns the record."""
+    """Run all; write `minimal-plane.json`, `minimal-plane.md`, a plot and pictures into `options.out`. Returns the record."""
     from mitsuba_baselines.reference import path_traced
 
     console = console or Console(stderr=True)
@@ -130,7 +130,7 @@ def _label(run: Mapping[str, Any]) -> str:
 
 
 def plane_rows(record: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
-    """A row for each run."""
+    """Columns, and a row for each run."""
     rows = [
         [
             f"{run['camera']}, {_label(run)}",
@@ -144,12 +144,12 @@ def plane_rows(record: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
 
 
 def plane_table(record: Mapping[str, Any]) -> Table:
-    """For the terminal."""
+    """The table for the terminal."""
     return io_console.table("A vertex recovered from the shadow (distance from its place, world units)", *plane_rows(record))
 
 
 def read_plane(record: Mapping[str, Any]) -> str:
-    """Markdown: the table, and what it says."""
+    """Report in Markdown: the table and its summary."""
     s = record["settings"]
     lines = [
         "# A square with one vertex out of place",

@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from ...errors import ShadowmapError
@@ -17,8 +18,8 @@ from . import scenes as gradients_scenes
 from .images import Image
 from .scenes import MOTIONS, Motion
 
-#: Pixels along each side of Mitsuba's image, and width of the penumbra of its area light in these pixels. A light that is small
-#: enough for the half pixel of a sharp shadow is met by no sample of the integrator, or by few.
+#: Pixels along each side of Mitsuba's image, and width of the penumbra of its area light in these pixels. Hardly any sample of
+#: the integrator would meet a light that is small enough for a penumbra of half a pixel.
 MITSUBA_RESOLUTION, MITSUBA_PENUMBRA, _MITSUBA_SPPI = 128, 16.0, 256
 
 
@@ -29,8 +30,8 @@ class Sampling:
     Attributes:
         resolution: pixels along each side of path-traced images.
         spp: their samples per pixel.
-        folder: where references are kept.
-        reuse: take what is there, if it is of the same occluder and as many samples.
+        folder: folder of stored references.
+        reuse: use stored references of the same occluder and as many samples.
     """
 
     resolution: int
@@ -66,8 +67,8 @@ def path_traced_derivative(mesh: Mesh, name: str, sampling: Sampling) -> tuple[I
 def projective_image(mesh: Mesh, name: str, sampling: Sampling, passes: int) -> tuple[Image, dict[str, Any]]:
     """Mitsuba's derivative image (h, w, 1) with an area light, and its settings.
 
-    They hold its agreement with path-traced differences under parallel light (`agreement_directional`) and under the same area
-    light (`agreement_area`).
+    The settings hold its agreement with path-traced differences under parallel light (`agreement_directional`) and under the same
+    area light (`agreement_area`).
     """
     from mitsuba_baselines.derivatives import agreement, central_difference
     from mitsuba_baselines.projective import projective_derivative
@@ -92,7 +93,7 @@ def projective_image(mesh: Mesh, name: str, sampling: Sampling, passes: int) -> 
     return _kept(sampling.folder / f"{name}-mitsuba.exr", identity, sampling.reuse, make)
 
 
-def _builder(mesh: Mesh, motion: Motion, resolution: int, camera: str) -> Callable[[float], Any]:
+def _builder(mesh: Mesh, motion: Motion, resolution: int, camera: str) -> Callable[[float], mi.Scene]:
     return lambda t: gradients_scenes.build(motion.moved(mesh, t), resolution, camera)
 
 

@@ -1,4 +1,4 @@
-"""Reports of the experiments on gradients: pictures in two colours, plots, tables, and a reading of the numbers."""
+"""Report of the experiment on derivative images: a plot, tables, and a summary of the numbers."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ...io import console
 from ...io.console import markdown
 from ...io.files import atomic
 
-#: What a derivative is expected to reach: least cosine, and bounds of the scale.
+#: Aims for derivative images: least cosine, and bounds of the scale.
 OWN, TRACED = (0.98, 0.97, 1.03), (0.95, 0.95, 1.05)
 REVERSE, TESSELLATION = 1e-4, 0.02
 _KINDS = {
@@ -24,7 +24,7 @@ _KINDS = {
 
 
 def plot_agreement(path: str | os.PathLike[str], record: Mapping[str, Any]) -> None:
-    """Scale and loss of cosine over map sizes, a line for each filter, a column for each reference; means over motions."""
+    """Plot scale and 1 - cosine over map sizes: a line for each filter, a column for each reference; means over motions."""
     from matplotlib.figure import Figure
 
     entries = [e for e in _compared(record) if e["candidate"] == _first_candidate(record)]
@@ -81,12 +81,12 @@ def jacobian_rows(record: Mapping[str, Any]) -> tuple[list[str], list[list[str]]
 
 
 def jacobian_table(record: Mapping[str, Any]) -> Table:
-    """For the terminal."""
+    """The table for the terminal."""
     return console.table("Derivative images: worst cosine c and scale s over all motions", *jacobian_rows(record))
 
 
 def read_jacobian(record: Mapping[str, Any]) -> str:
-    """Markdown: tables, and what the numbers say."""
+    """Report in Markdown: tables and their summary."""
     lines = ["# Derivative images of a shadow", ""]
     s = record["settings"]
     motions = ", ".join(sorted({e["motion"] for e in record["entries"].values()}))
@@ -132,7 +132,7 @@ def _reaches(found: Mapping[str, float], bounds: tuple[float, float, float]) -> 
 
 
 def _blur(entries: Sequence[Mapping[str, Any]]) -> str:
-    """Share of the deviation from path tracing that the map's blur explains."""
+    """A sentence on the part of the deviation from path tracing that the map's blur explains."""
     missed = [e for e in entries if "blur" in e and not _reaches(e["traced"], TRACED)]
     if not missed:
         return ""

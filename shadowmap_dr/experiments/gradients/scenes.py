@@ -1,4 +1,4 @@
-"""Scene of the experiments on gradients: a receiver, an occluder above it, parallel light, a camera that sees the shadow only.
+"""Scene of the experiments on gradients: a receiver, an occluder above it, parallel light, a camera that sees only the shadow.
 
 Its image *is* the visibility: a white diffuse receiver that faces a light of irradiance pi has radiance 1 where it is lit.
 """
@@ -20,7 +20,7 @@ from ..common.objects import occluder
 #: z of the receiver, and half of its side.
 RECEIVER_Z, RECEIVER_HALF = -2.0, 1.0
 #: orthographic: parallel to the light, between occluder and receiver. perspective: beside the light, and not parallel to it.
-#: pinhole: a perspective camera in the place of the orthographic one, whose image of the receiver is the same, pixel by pixel:
+#: pinhole: a perspective camera in the place of the orthographic one, with the same image of the receiver, pixel by pixel:
 #: Mitsuba's projective integrators refuse orthographic cameras.
 CAMERAS = ("orthographic", "perspective", "pinhole")
 _BETWEEN_Z = -1.0
@@ -29,7 +29,7 @@ _BESIDE, _FOV_DEG = (1.0, 0.0, 0.75), 50.0
 Array = npt.NDArray[np.float32]
 
 
-def build(mesh: Mesh, resolution: int, camera: str = "orthographic") -> Any:
+def build(mesh: Mesh, resolution: int, camera: str = "orthographic") -> mi.Scene:
     """``mi.Scene`` with the shapes ``receiver`` and ``occluder``, the emitter ``light`` (along -z) and the sensor ``camera``.
 
     Args:
@@ -47,7 +47,7 @@ def build(mesh: Mesh, resolution: int, camera: str = "orthographic") -> Any:
         "rfilter": {"type": "box"},
         "pixel_format": "luminance",
         "component_format": "float32",
-        "sample_border": camera == "pinhole",  # which Mitsuba wants for derivatives of shapes
+        "sample_border": camera == "pinhole",  # Mitsuba requires it for derivatives of shapes
     }
     if camera == "orthographic":
         place = t().look_at([0, 0, _BETWEEN_Z], [0, 0, RECEIVER_Z], [0, 1, 0]) @ t().scale([RECEIVER_HALF, RECEIVER_HALF, 1])
@@ -82,7 +82,7 @@ def build(mesh: Mesh, resolution: int, camera: str = "orthographic") -> Any:
 
 
 def ring(faces: int = 130_000, z: float = 0.0, radius: float = 0.6) -> Mesh:
-    """A bumpy ring of about so many triangles, turned by a few degrees about all axes, around the z axis at a height z."""
+    """A bumpy ring of about ``faces`` triangles around the z axis at a height z, turned by a few degrees about all axes."""
     across = max(3, round(float(np.sqrt(faces / 3.25))))
     across -= across % 2
     around = max(3, round(faces / (2 * across)))
@@ -98,7 +98,7 @@ def plane(half: float, z: float, turn_deg: float = 0.0) -> Mesh:
 
 
 def tessellated(mesh: Mesh, times: int) -> Mesh:
-    """The same surface with each triangle in 4 ** times."""
+    """The same surface with each triangle divided into 4 ** times triangles."""
     for _ in range(times):
         mesh = subdivided(mesh)
     return mesh
@@ -130,9 +130,9 @@ class Motion:
         return np.cross(np.array(self.spin), points - middle) + self.growth * (points - middle) + np.array(self.velocity)
 
     def step(self, mesh: Mesh, resolution: int, pixels: float = 1.0) -> float:
-        """Half the distance in t of two renderings between which no point of the shadow moves by more than so many pixels.
+        """Step h such that between t = -h and h no point of the shadow moves by more than ``pixels``.
 
-        Where the shadow does not move at all (along the light) the distance of the points themselves counts.
+        If the shadow does not move at all (motion along the light), the points themselves move by ``pixels`` at most.
         """
         rate = self.rate(mesh)
         across = float(np.linalg.norm(rate[:, :2], axis=1).max())
@@ -141,7 +141,7 @@ class Motion:
 
     @property
     def along_light(self) -> bool:
-        """True if all points move along the light, so that the shadow stays as it is."""
+        """True if all points move along the light, so that the shadow does not change."""
         return self.growth == 0 and not any(self.spin) and not any(self.velocity[:2])
 
     @staticmethod
@@ -150,7 +150,7 @@ class Motion:
         return points, 0.5 * (points.min(0) + points.max(0))
 
 
-#: What the shadow is differentiated by.
+#: Motions by which the shadow is differentiated.
 MOTIONS: Mapping[str, Motion] = {
     "x": Motion(velocity=(1, 0, 0)),
     "y": Motion(velocity=(0, 1, 0)),

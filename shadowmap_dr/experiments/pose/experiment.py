@@ -1,4 +1,4 @@
-"""Pose estimation: three methods find an object's pose from an image of it and its shadow on a wall.
+"""Pose estimation: three methods recover an object's pose from an image of the object and its shadow on a wall.
 
 Protocol: the object in front of a wall is turned about the vertical axis and shifted in the plane of the wall; the target
 pose is zero. Methods: `shadows` (this library), `rasterizer` (the same without shadows) and `mitsuba` (Mitsuba's
@@ -82,11 +82,11 @@ def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Co
     resolution a folder with the reference, the images at start and end and their difference from the reference, a plot
     of the convergence (`convergence.png`) and a sheet with the images of the first run (`images.png`).
 
-    Records that are complete are kept if `options.resume` is set, and a run that was killed goes on from its last
-    checkpoint, at most ten iterations before the end. Returns the records of this call's runs, in the order of the file.
+    Complete records are kept if `options.resume` is set, and a killed run continues from its last checkpoint, at most ten
+    iterations back. Returns the records of this call's runs, in the order of the file.
 
     With a scheduler (see :func:`shadowmap_dr.inverse.run_sweep`) its workers make the runs, with methods of :func:`build_method`.
-    Times of runs that shared a machine are not those of runs that had it for themselves.
+    Runs that share a machine take longer than runs alone.
     """
     console = console or Console(stderr=True)
     if build is build_method:
@@ -124,7 +124,7 @@ def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Co
         for _, problem in problems.values():
             task = progress.add_task(f"{problem.folder} reference and methods", total=None, note="")
             reference = _reference(problem, options, build)
-            # Built once and used for all runs: what a method compiled stays warm, and what cannot be built fails at once.
+            # Built once for all runs: compiled kernels are reused, and a method that cannot be built fails at once.
             methods = {name: build(name, problem, reference) for name in options.methods}
             progress.remove_task(task)
             for method in methods.values():
@@ -156,7 +156,7 @@ def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Co
 
 
 def table(records: Sequence[dict[str, Any]]) -> Table:
-    """Mean errors and times over the runs, a row for each object, resolution and method (the paper's Table 1)."""
+    """Table of mean errors and times over the runs: a row for each object, resolution and method (the paper's Table 1)."""
     rows = []
     for group in _groups(records):
         first = group[0]
@@ -192,7 +192,7 @@ def _run_one(
     stored: Sequence[dict[str, Any]],
     on_step: Callable[[int], None],
 ) -> dict[str, Any]:
-    """The record of a run: a stored one if there is one for exactly these settings, else that of a run made now."""
+    """The record of a run: the stored record with exactly these settings if there is one, else that of a new run."""
     wanted = _identity(problem, name, run, options, method)
     for record in stored:
         if is_of(record, wanted):
@@ -206,11 +206,11 @@ def _run_one(
 def _sweep(
     problems: Mapping[str, tuple[str, PoseProblem]], options: PoseOptions, stored: Sequence[dict[str, Any]], console: Console
 ) -> list[dict[str, Any]]:
-    """Records of the runs that are not among the stored ones, made by the workers of a scheduler."""
+    """Make the runs without stored records with the workers of a scheduler. Returns their records."""
     build = functools.partial(build_method, samples=options.samples)
     missing = []
     for folder, (object_, problem) in problems.items():
-        # Workers find it here, or make it again where they do not see this folder.
+        # For the workers; those that do not see this folder make the reference again.
         reference = _reference(problem, options, build)
         for name in options.methods:
             method = build(name, problem, reference)
@@ -286,7 +286,7 @@ def _checkpoint(problem: PoseProblem, name: str, run: int, options: PoseOptions)
 
 
 def _key(record: dict[str, Any]) -> tuple[Any, ...]:
-    """Subject of a record: a newer one with the same key takes its place."""
+    """Identity of a record's run: a newer record with the same key replaces it."""
     names = ("object", "resolution", "method", "run", "seed", "iterations", "reference", "shadow_only")
     samples = record.get("settings", {}).get("samples_per_pixel", 1)
     variant = record.get("variant", record.get("environment", {}).get("variant"))
@@ -294,7 +294,7 @@ def _key(record: dict[str, Any]) -> tuple[Any, ...]:
 
 
 def _normals(record: dict[str, Any]) -> str:
-    """Records from before there was a choice are of flat shading."""
+    """Kind of normals of a record; records of earlier versions are of flat shading."""
     return record.get("normals", "face")
 
 

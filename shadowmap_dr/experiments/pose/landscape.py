@@ -1,4 +1,4 @@
-"""Slices through the loss of a pose: where a run ended, and what lies between there and the target.
+"""Slices through the loss of a pose: the loss between the end of a run and the target.
 
 ``python -m shadowmap_dr.experiments.pose.landscape FOLDER --object hand --run 0 --out FILE.png`` draws the loss over the
 rotation for a run whose record and reference image lie in a folder of the pose experiment.
@@ -26,25 +26,25 @@ from .methods import METHODS, build_method
 from .scene import make_problem
 
 Render = Callable[[npt.NDArray[np.float64]], npt.NDArray[Any]]
-#: Central differences for the offset, and the farthest that one step moves it, in scene units.
+#: Step of central differences for the offset, and longest step of the offset, in scene units.
 _DIFFERENCE, _LONGEST = 0.01, 0.05
 
 
 def slices(
     render: Render, reference: npt.ArrayLike, angles: npt.ArrayLike, end: npt.ArrayLike, steps: int = 3
 ) -> dict[str, npt.NDArray[np.float64]]:
-    """Loss over the rotation along three lines.
+    """Loss over the rotation along three lines of offsets.
 
     Args:
         render: image (H, W, C) at (rotation in radians, x, y).
         reference: image to be matched.
         angles: (N,) rotations in radians, in order.
-        end: (3,) where a run ended.
-        steps: of Gauss and Newton's method for the best offset at each angle, which starts from that of the angle before.
+        end: (3,) pose at the end of a run.
+        steps: Gauss-Newton steps for the best offset at each angle, from the best offset at the previous angle.
 
     Returns:
-        (N,) mean squared differences: `target` with the offset zero, `end` with that of the end, `best` with the best one (the
-        least of what was tried: these two, and searches from both ends of the range); and `best_offset`, (N, 2).
+        (N,) mean squared differences: `target` with the offset zero, `end` with the offset at the end of the run, `best` with
+        the best offset (of these two and of searches from both ends of the range); and `best_offset`, (N, 2).
     """
     reference, angles, end = (np.asarray(value, np.float64) for value in (reference, angles, end))
 
@@ -76,7 +76,7 @@ def _best_offset(
     steps: int,
     loss: Callable[[npt.NDArray[np.float64]], float],
 ) -> tuple[npt.NDArray[np.float64], float]:
-    """Offset and loss after some steps of Gauss and Newton's method at a fixed angle."""
+    """Offset and loss after Gauss-Newton steps at a fixed angle."""
     best = offset, loss(np.array([angle, *offset]))
     for _ in range(steps):
         pose = np.array([angle, *offset])
@@ -96,7 +96,7 @@ def _best_offset(
 def plot_slices(
     path: str | os.PathLike[str], title: str, angles: npt.ArrayLike, lines: Mapping[str, npt.ArrayLike], record: Mapping[str, Any]
 ) -> None:
-    """Draw the slices with the way that a run took, and the run's errors over its steps."""
+    """Draw the slices with the path of a run, and the run's errors over its steps."""
     from matplotlib.figure import Figure  # without pyplot there is no global state and no display is needed
 
     figure = Figure(figsize=(11, 4), layout="constrained")
@@ -127,9 +127,9 @@ def plot_slices(
 def landscape(
     folder: Path, wanted: Mapping[str, Any], out: Path, *, renderer: str | None = None, width_deg: float = 35.0, count: int = 71
 ) -> dict[str, Any]:
-    """Draw the slices for the record of a folder in which `wanted` (object, resolution, method, run, ...) holds.
+    """Draw the slices for the record in a folder that matches `wanted` (object, resolution, method, run, ...).
 
-    The images are those of the run's own method unless another one is named as `renderer`: Mitsuba's are slow and noisy.
+    `renderer`: method that renders the images, by default the run's own (Mitsuba's is slow and noisy).
     Returns angles in degrees and the slices. Raises ShadowmapError if there is no such record or no reference image.
     """
     records = io_records.read_json(folder / "pose.json")
@@ -138,7 +138,7 @@ def landscape(
     record = next((entry for entry in records if all(entry.get(key) == value for key, value in wanted.items())), None)
     if record is None:
         raise ShadowmapError(f"{folder / 'pose.json'} has no run with " + ", ".join(f"{k} {v}" for k, v in wanted.items()) + ".")
-    copy = folder / "objects" / f"{record['object']}.ply"  # of a mesh file of the user's
+    copy = folder / "objects" / f"{record['object']}.ply"  # scaled copy of a user's mesh file
     problem = make_problem(
         record["object"],
         record["resolution"],

@@ -24,9 +24,9 @@ Builder = Callable[[str, PoseProblem, Image], Method]
 
 
 def usual_methods(shadow_only: bool = False, normals: str = "face") -> tuple[str, ...]:
-    """The methods that are run if nobody names any: Mitsuba's only where it can find a pose."""
+    """The default methods: Mitsuba's only where it can find a pose."""
     if shadow_only:
-        # Its integrator hardly ever samples silhouettes of shadows this sharp; it needs to see the object.
+        # Mitsuba's integrator hardly ever samples silhouettes of shadows this sharp: the camera must see the object.
         return METHODS[:2]
     from mitsuba_baselines.fair_settings import is_searched
 
@@ -39,8 +39,8 @@ def build_method(
     """One of the three methods for a problem and its reference image.
 
     Args:
-        samples: Per pixel, of our own methods.
-        setting: Sample counts of Mitsuba's; default: the fair ones, or what stands in for them.
+        samples: samples per pixel of our own methods.
+        setting: sample counts of Mitsuba's; None: the result of `fair_setting`.
     """
     if name == "mitsuba":
         from mitsuba_baselines.fair_settings import fair_setting
@@ -87,7 +87,7 @@ def shadow_settings(method: str) -> dict[str, Any]:
 
 
 def fairness(method: Method, problem: PoseProblem) -> dict[str, bool]:
-    """For Mitsuba's method: whether a search found its sample counts to be the cheapest ones that converge."""
+    """For Mitsuba's method: ``fair`` is True if a search found its sample counts to be the cheapest that converge."""
     setting = getattr(method, "setting", None)
     if setting is None:
         return {}

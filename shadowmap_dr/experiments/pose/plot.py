@@ -17,7 +17,7 @@ _LIMIT_DEG = 0.2
 def plot_convergence(
     path: str | os.PathLike[str], curves: Mapping[tuple[str, int], Mapping[str, Sequence[Sequence[float | None]]]]
 ) -> None:
-    """Draw the median rotation error over the steps and the band between the quartiles of the runs.
+    """Draw the median rotation error of the runs over the steps, and the band between the quartiles.
 
     Args:
         path: file to write (.png, .pdf, .svg).
@@ -25,7 +25,7 @@ def plot_convergence(
     """
     from matplotlib.figure import Figure  # without pyplot there is no global state and no display is needed
 
-    objects, resolutions = (sorted({key[i] for key in curves}) for i in (0, 1))
+    objects, resolutions = sorted({name for name, _ in curves}), sorted({resolution for _, resolution in curves})
     figure = Figure(figsize=(1.2 + 3.4 * len(resolutions), 0.6 + 2.2 * len(objects)), layout="constrained")
     grid = figure.subplots(len(objects), len(resolutions), sharex=True, sharey=True, squeeze=False)
     handles = {}
@@ -34,7 +34,7 @@ def plot_convergence(
             axes = grid[i, j]
             for method, runs in curves.get((name, resolution), {}).items():
                 errors = np.array(runs, np.float64)  # None, of a run that failed, becomes NaN
-                with warnings.catch_warnings():  # no run may have come as far as a step: a gap in the plot
+                with warnings.catch_warnings():  # a step that no run reached leaves a gap in the plot
                     warnings.simplefilter("ignore", RuntimeWarning)
                     low, middle, high = np.nanpercentile(errors, (25, 50, 75), axis=0)
                 (line,) = axes.plot(middle, COLOURS.get(method, "0.3"), linewidth=1.4, label=method)

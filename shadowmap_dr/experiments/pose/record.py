@@ -1,4 +1,4 @@
-"""The record of a run of pose estimation: what identifies it, and what came out."""
+"""The record of a run of pose estimation: its identity and its results."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ import numpy.typing as npt
 from ... import __version__
 from ...inverse import History, Method, optimize
 from ...io import records
+from ..common.timing import DRJIT_VERSION
 from .methods import fairness
 from .scene import PoseProblem, ReferenceKind, pose_errors, start_pose
 
@@ -25,7 +26,7 @@ TIME_TO_POSE_DEG = 0.1
 def identity(
     problem: PoseProblem, name: str, run: int, method: Method, *, seed: int, iterations: int, reference: ReferenceKind
 ) -> dict[str, Any]:
-    """Contents of a run's record before the run is made: two records that agree in this are of the same run."""
+    """Entries of a run's record that are known before the run. Records that agree in them are of the same run."""
     return records.plain(
         {
             "object": problem.name,
@@ -45,23 +46,23 @@ def identity(
 
 
 def is_of(record: dict[str, Any], wanted: dict[str, Any]) -> bool:
-    """True if a record is of the run with an identity."""
+    """True if a record is of the run with the identity ``wanted``."""
     environment = record.get("environment")
-    # Records from before there was a choice.
+    # Records of earlier versions hold the variant elsewhere.
     older = {"variant": environment.get("variant")} if isinstance(environment, dict) else {}
     found = essence({**older, **record})
     return all(found.get(key) == value for key, value in essence(wanted).items())
 
 
 def is_complete(record: dict[str, Any]) -> bool:
-    """True if a record says what came out of its run: all that is shown of runs, and all that says where they went."""
+    """True if a record has all results of its run, including the curves over the steps."""
     curves = ("loss_curve", "rotation_error_curve", "translation_error_curve")
     results = ("final", "rotation_error_deg", "translation_error_x100", "recovered", "seconds_per_iteration", "seconds_to_pose")
     return all(key in record for key in results) and all(isinstance(record.get(key), list) for key in ("final", *curves))
 
 
-def essence(value: Any) -> Any:
-    """Settings without what was measured of them, whose last digits depend on the number of threads, and without verdicts."""
+def essence(value: Any) -> Any:  # Any: JSON
+    """Settings without residuals, whose last digits depend on the number of threads, and without verdicts on fairness."""
     if isinstance(value, dict):
         left_out = ("fair", "meets_fair_criterion")
         return {k: essence(v) for k, v in value.items() if not (k in left_out or k.endswith("_residual"))}
@@ -71,7 +72,7 @@ def essence(value: Any) -> Any:
 def make_record(
     method: Method, wanted: dict[str, Any], checkpoint: Path | None, on_step: Callable[[int], None]
 ) -> dict[str, Any]:
-    """Make the run with an identity."""
+    """Make the run with the identity ``wanted``. Returns its record."""
     iterations, start = wanted["iterations"], wanted["start"]
     history = optimize(method, start, iterations, checkpoint=checkpoint, settings=essence(wanted), on_step=on_step)
     return {**wanted, **_results(history), "environment": _environment()}
@@ -106,7 +107,7 @@ def _environment() -> dict[str, Any]:
     return {
         "shadowmap_dr": __version__,
         "mitsuba": mi.__version__,
-        "drjit": dr.__version__,
+        "drjit": DRJIT_VERSION,
         "variant": mi.variant(),
         "threads": dr.thread_count(),
         "load_average": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,

@@ -23,7 +23,7 @@ NormalKind = Literal["face", "vertex"]
 REFERENCE_SPP = 512
 MAX_OFFSET = 0.25
 MAX_ROTATION_DEG = 30.0
-# In the shadow-only case the object moves along the light, behind the camera, so that its shadow stays where it was.
+# In the shadow-only case the object is shifted along the light, behind the camera, which leaves its shadow in place.
 SHADOW_ONLY_SHIFT = 10.0
 MAX_RESOLUTION = 4096
 
@@ -40,7 +40,7 @@ class PoseProblem:
         p_rest: (V, 3) float32 vertex positions, in [-1, 1]^3.
         resolution: width and height of the image in pixels.
         shadow_only: the camera sees the object's shadow, but not the object.
-        normals: the object is shaded with the normals of its faces, or smoothly with those of its vertices.
+        normals: flat shading with face normals, or smooth shading with vertex normals.
         scene: Mitsuba scene with the object in its target pose, as `scenes/pose.xml` describes it.
     """
 
@@ -50,11 +50,11 @@ class PoseProblem:
     resolution: int
     shadow_only: bool
     normals: NormalKind
-    scene: Any
+    scene: mi.Scene
 
     @property
     def shift_z(self) -> float:
-        """Offset of the object along the light's direction of travel, reversed, in scene units."""
+        """Offset of the object towards the light (in z), in scene units."""
         return SHADOW_ONLY_SHIFT if self.shadow_only else 0.0
 
     @property
@@ -85,7 +85,7 @@ def make_problem(
         resolution: 1 to 4096 pixels.
         shadow_only, normals: see PoseProblem.
         work: folder for the scaled copy of a mesh file.
-        scaled: such a copy, to be taken as it is for the object of this name.
+        scaled: an existing scaled copy; `name` is then only its name in records.
     """
     if not 1 <= resolution <= MAX_RESOLUTION:
         raise ShadowmapError(f"a resolution of {resolution} pixels: give 1 to {MAX_RESOLUTION}.")
@@ -97,9 +97,9 @@ def make_problem(
     p_rest = positions(plain)
     problem = PoseProblem(label, mesh, p_rest, resolution, shadow_only, normals, None)
     if shadow_only:
-        # A file of its own: Mitsuba's directional light learns the extent of the scene only when the scene is loaded.
+        # A shifted mesh file: Mitsuba's directional light reads the extent of the scene only when the scene is loaded.
         mesh = work / f"{label}-shadow-only.ply"
-        _write_mesh(plain, p_rest + np.float32([0, 0, problem.shift_z]), mesh)
+        _write_mesh(plain, p_rest + np.array([0, 0, problem.shift_z], np.float32), mesh)
     flat = "true" if normals == "face" else "false"
     try:
         scene = mi.load_file(
@@ -125,7 +125,7 @@ def pose_errors(parameters: npt.ArrayLike) -> tuple[npt.NDArray[np.float64], npt
 
 
 def path_traced_reference(problem: PoseProblem, path: Path) -> npt.NDArray[np.float32]:
-    """The path-traced image of the target pose under the true directional light, (H, W, 3), kept in the file `path`."""
+    """The path-traced image of the target pose under the true directional light, (H, W, 3), stored in the file `path`."""
     from mitsuba_baselines.reference import path_traced
 
     settings = {
@@ -144,14 +144,14 @@ def path_traced_reference(problem: PoseProblem, path: Path) -> npt.NDArray[np.fl
             if json.loads(metadata.get(_REFERENCE_KEY, "{}")) == settings and image.shape[2] == colours:
                 return image
         except (ShadowmapError, json.JSONDecodeError):
-            pass  # a file that cannot be read is made again
+            pass  # an unreadable file is made again
     image = np.asarray(path_traced(problem.scene, spp=REFERENCE_SPP).image, np.float32)
     images.write_image(path, image, {_REFERENCE_KEY: json.dumps(settings)})
     return image
 
 
 def _import_mesh(path: Path, work: Path) -> tuple[str, Path]:
-    """Name and PLY file of a mesh file of the user's, centred and scaled into [-1, 1]^3."""
+    """Name and scaled PLY copy, in [-1, 1]^3, of a user's mesh file."""
     mesh = load_mesh(path)
     centre, scale = placement(mesh, path)
     target = work / f"{path.stem}.ply"
@@ -159,7 +159,7 @@ def _import_mesh(path: Path, work: Path) -> tuple[str, Path]:
     return path.stem, target
 
 
-def _write_mesh(mesh: Any, positions: npt.NDArray[Any], path: Path) -> None:
+def _write_mesh(mesh: mi.Mesh, positions: npt.NDArray[Any], path: Path) -> None:
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = mi.Float(positions.astype(np.float32).ravel())
     parameters.update()

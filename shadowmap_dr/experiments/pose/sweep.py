@@ -1,4 +1,4 @@
-"""Runs of pose estimation as a sweep: those that are missing are done by the workers of a scheduler."""
+"""Runs of pose estimation as problems of a sweep, for the workers of a scheduler."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class PoseRuns(Problem):
         object: name of a mesh of this package, or a mesh file that workers can read.
         folder: name of the problem's folder in ``out``.
         method: one of METHODS.
-        numbers: of the runs: their starts follow from these.
+        numbers: numbers of the runs, which determine their starts.
         out: folder with reference images; workers that do not see it make their own.
         resolution, iterations, seed, reference, shadow_only, normals, samples: as in `PoseOptions`.
     """
@@ -77,16 +77,17 @@ class PoseRuns(Problem):
         self, built: tuple[PoseProblem, Method], runs: Sequence[int], checkpoint: Path | None, on_step: Callable[[int], None]
     ) -> list[dict[str, Any]]:
         problem, method = built
-        options = {"seed": self.seed, "iterations": self.iterations, "reference": self.reference}
         records = []
         for run in runs:
-            wanted = identity(problem, self.method, run, method, **options)
+            wanted = identity(
+                problem, self.method, run, method, seed=self.seed, iterations=self.iterations, reference=self.reference
+            )
             records.append(make_record(method, wanted, checkpoint, on_step))
         return records
 
 
 def make_reference(problem: PoseProblem, kind: ReferenceKind, folder: Path, build: Builder) -> Image:
-    """The reference image of a problem, and a copy of it in a folder; a path-traced one is made once."""
+    """The reference image of a problem, also written into a folder. A path-traced image in the folder is reused."""
     if kind == "mitsuba":
         return path_traced_reference(problem, folder / "reference.exr")
     blank = np.zeros((problem.resolution, problem.resolution, 3), np.float32)

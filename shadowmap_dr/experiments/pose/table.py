@@ -1,8 +1,8 @@
-"""The table of poses found: all records of the pose experiment together, compared with Mitsuba's on the same starts.
+"""The table of recovered poses: all records of the pose experiment, compared with Mitsuba's from the same starts.
 
 ``python -m shadowmap_dr.experiments.pose.table FOLDER... --out docs/results`` reads the `pose.json` of each folder and writes
 `pose.json` (all rows, compact), `pose-table.md` (the same for readers) and plots of the convergence `pose-*.png`. A FOLDER may
-hold an earlier table: what it has is kept, and runs of folders named after it take the place of its own.
+hold an earlier table: its runs are kept unless folders named after it have them, too.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from ...errors import ShadowmapError
 from ...io import files
@@ -23,10 +24,10 @@ from ...io.console import markdown
 from .plot import plot_convergence
 from .record import essence
 
-#: How far a median of ours may lie above Mitsuba's: degrees, and 100 x offset.
+#: Largest excess of a median of ours over Mitsuba's: degrees, and 100 x offset.
 ALLOWED_DEG, ALLOWED_X100 = 0.05, 0.05
 METHODS = ("shadows", "rasterizer", "mitsuba")
-#: What is run: records with these values belong to it.
+#: Cases of the table: records with these values belong to the case.
 CASES: dict[str, dict[str, Any]] = {
     "seen": {"shadow_only": False, "reference": "mitsuba", "normals": "face", "samples_per_pixel": 1},
     "four-samples": {"shadow_only": False, "reference": "mitsuba", "normals": "face", "samples_per_pixel": 4},
@@ -56,13 +57,13 @@ _ERRORS = ("rotation_error_deg", "translation_error_x100")
 _CURVE = "rotation_error_curve"
 _PER_RUN = ("seed", "run", "start", "final", *_ERRORS, "recovered")
 _SETTINGS = ("seed", "iterations", "settings")
-#: Of the errors along a run, which only plots need (they take most of the file's room).
+#: Significant digits of the errors along a run: only plots need them, and they make up most of the file.
 _CURVE_DIGITS = 3
 
 
 @dataclass
 class Row:
-    """The runs of a method on an object at a resolution, by (seed, run). `seconds`: per step, None if nobody timed it alone."""
+    """The runs of a method on an object at a resolution, by (seed, run). `seconds`: per step, None if not timed alone."""
 
     case: str
     object: str
@@ -71,8 +72,8 @@ class Row:
     runs: dict[tuple[int, int], dict[str, Any]] = field(default_factory=dict)
     seconds: float | None = None
 
-    def errors(self, key: str, starts: Iterable[tuple[int, int]] | None = None) -> np.ndarray:
-        """Final errors of the runs (of those from the starts); infinite where a run failed."""
+    def errors(self, key: str, starts: Iterable[tuple[int, int]] | None = None) -> npt.NDArray[np.float64]:
+        """Final errors of all runs, or of the runs from the given starts; infinite where a run failed."""
         runs = self.runs.values() if starts is None else [self.runs[start] for start in starts]
         return np.array([np.inf if record[key] is None else record[key] for record in runs], np.float64)
 
@@ -80,7 +81,7 @@ class Row:
         return sum(self.runs[start]["recovered"] for start in (self.runs if starts is None else starts))
 
     def plain(self) -> dict[str, Any]:
-        """For the record: settings, the runs, and what they come to."""
+        """JSON values for the file: settings, runs, means, medians and recovered runs."""
         records = list(self.runs.values())
         environment = {key: value for key, value in records[0]["environment"].items() if key != "load_average"}
         return {
@@ -98,8 +99,8 @@ class Row:
 
 
 def _rounded(curve: Sequence[float | None] | None) -> list[float | None] | None:
-    """A curve to a few significant digits; None, and its entries that are, stay."""
-    return curve and [None if value is None else float(f"{value:.{_CURVE_DIGITS}g}") for value in curve]
+    """A curve to a few significant digits. A curve or entries that are None remain None."""
+    return None if curve is None else [None if value is None else float(f"{value:.{_CURVE_DIGITS}g}") for value in curve]
 
 
 def _records(row: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -111,10 +112,10 @@ def _records(row: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def rows(records: Iterable[Mapping[str, Any]], timed: Iterable[Mapping[str, Any]] = ()) -> list[Row]:
-    """Records by case, object, resolution and method, in this order; of two records of the same run the later one counts.
+    """Records grouped and sorted by case, object, resolution and method. Of two records of the same run the later one counts.
 
     Args:
-        records: of the pose experiment; those of other experiments with it (own references of hidden objects) are left out.
+        records: of the pose experiment; records that belong to none of `CASES` are left out.
         timed: records whose times were taken while nothing else ran; only their times count.
 
     Raises:
@@ -139,13 +140,8 @@ def rows(records: Iterable[Mapping[str, Any]], timed: Iterable[Mapping[str, Any]
                 which = f"runs {first['run']} and {run} of {row.method} for {row.object} at {row.resolution}"
                 raise ShadowmapError(f"{which} were made with different settings: run one of them again.")
         row.seconds = float(np.median(seconds[key])) if key in seconds else first.get("seconds_per_step")
-    order = (list(CASES).index, str, int, METHODS.index)
-    return sorted(
-        result.values(),
-        key=lambda row: tuple(
-            rank(value) for rank, value in zip(order, (row.case, row.object, row.resolution, row.method), strict=True)
-        ),
-    )
+    cases = list(CASES)
+    return sorted(result.values(), key=lambda row: (cases.index(row.case), row.object, row.resolution, METHODS.index(row.method)))
 
 
 def _made_with(record: Mapping[str, Any]) -> list[Any]:
@@ -153,7 +149,7 @@ def _made_with(record: Mapping[str, Any]) -> list[Any]:
 
 
 def _row_key(record: Mapping[str, Any]) -> tuple[str, str, int, str] | None:
-    values = {"normals": "face", **record}  # records from before there was a choice
+    values = {"normals": "face", **record}  # records of earlier versions lack the entry
     values["samples_per_pixel"] = record["settings"].get("samples_per_pixel", 1)
     for case, wanted in CASES.items():
         if all(values[name] == value for name, value in wanted.items()):
@@ -162,15 +158,15 @@ def _row_key(record: Mapping[str, Any]) -> tuple[str, str, int, str] | None:
 
 
 def comparison(table: Sequence[Row]) -> list[dict[str, Any]]:
-    """Ours with shadows against Mitsuba's for each case, object and resolution, over the starts that both have run from.
+    """Ours with shadows against Mitsuba's for each case, object and resolution, over their common starts.
 
-    The differences are those of medians, ours less Mitsuba's (degrees, 100 x offset). `met`: neither is above what is allowed,
-    and no fewer runs are recovered.
+    Differences are those of medians, ours less Mitsuba's (degrees, 100 x offset). `met`: neither is above the allowed excess,
+    and ours recovers no fewer runs.
     """
     pairs = [(ours, theirs) for ours in table for theirs in table if ours.method == "shadows" and theirs.method == "mitsuba"]
     result = []
     for ours, theirs in pairs:
-        same = {**CASES[ours.case], "samples_per_pixel": 1} == CASES[theirs.case]  # those are our own samples
+        same = {**CASES[ours.case], "samples_per_pixel": 1} == CASES[theirs.case]  # the samples are those of our own methods
         if not same or (ours.object, ours.resolution) != (theirs.object, theirs.resolution):
             continue
         starts = [key for key in theirs.runs if key in ours.runs and theirs.runs[key]["start"] == ours.runs[key]["start"]]
@@ -189,7 +185,7 @@ def comparison(table: Sequence[Row]) -> list[dict[str, Any]]:
 
 
 def document(table: Sequence[Row]) -> str:
-    """Markdown: a summary, the comparison with Mitsuba, then a table for each case."""
+    """The document in Markdown: a summary, the comparison with Mitsuba, then a table for each case."""
     lines = [
         "# Poses found",
         "",
@@ -311,7 +307,7 @@ def read(folders: Iterable[str | Path]) -> list[dict[str, Any]]:
 def write(out: Path, records: Sequence[Mapping[str, Any]], timed: Sequence[Mapping[str, Any]] = ()) -> list[Row]:
     """Write `pose.json`, `pose-table.md` and plots into the folder `out`; returns the rows.
 
-    Cases in which the curve of a run is not known (tables from before curves were kept) get no plot: the one in `out` stays.
+    Cases with a run without a curve (in tables of earlier versions) get no plot; an existing plot in `out` is kept.
     """
     table = rows(records, timed)
     files.check_output(out / "pose.json", (".json",))

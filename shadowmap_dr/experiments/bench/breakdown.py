@@ -143,7 +143,7 @@ class Recorder:
 
 
 class _Mark(dr.CustomOp):
-    """Identity. Its backward pass evaluates the gradients, so that the kernels up to here end with the pass."""
+    """Identity. Its backward pass evaluates the gradients and tells the recorder the pass that begins."""
 
     def eval(self, value: list[AnyArray], recorder: Recorder, label: str) -> list[AnyArray]:
         self.recorder, self.label = recorder, label

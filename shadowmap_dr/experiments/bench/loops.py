@@ -36,7 +36,7 @@ _FLOOR, _BALL = "floor.bsdf.reflectance.value", "ball.bsdf.reflectance.value"
 _TRUE_FLOOR, _TRUE_BALL, _TRUE_LAMP = (0.5, 0.5, 0.5), (0.6, 0.3, 0.2), (12.0, 12.0, 12.0)
 # Samples of reference images and of steps.
 _MANY, _SPP = 64, 4
-# Steps that are not timed, and those of a long run after which its memory counts.
+# Steps that are not timed; steps of a long run after which its memory is measured.
 _WARM_UP, _SETTLED = 3, 100
 # A loop that takes longer than this hangs.
 _SECONDS = 1800.0

@@ -32,7 +32,7 @@ EXPONENT = 1.05
 LARGE_MS, LARGE_GIB = 250.0, 3.0
 #: Cores that other processes may use before times are marked as doubtful.
 BUSY = 0.3
-#: First pictures take at most this multiple of Mitsuba's `direct` and some seconds more; first backward passes, seconds.
+#: A first picture may take this multiple of Mitsuba's `direct` and these seconds more; a first backward pass, these seconds.
 FIRST_OVER_DIRECT, FIRST_SECONDS, BACKWARD_SECONDS = 2.0, 0.5, 5.0
 EIGHT_LIGHTS, BATCH, OUTSIDE_KERNELS = 4.5, 1.2, 0.10
 

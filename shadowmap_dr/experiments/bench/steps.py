@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from mitsuba_baselines.pose import MitsubaPose
 
 OBJECT = "spot"
-#: Memory of Mitsuba's integrator for each sample of a kernel launch (bytes, roughly).
+#: Memory of Mitsuba's integrator for each sample that is alive at the same time (bytes, roughly).
 BYTES_PER_SAMPLE = 60
 SEED = 0
 RATIOS = (("mitsuba", "shadows"), ("mitsuba", "rasterizer"), ("shadows", "rasterizer"))

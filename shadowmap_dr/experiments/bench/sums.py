@@ -31,7 +31,7 @@ _SECONDS = 900.0
 
 @dataclass(frozen=True)
 class Sum:
-    """A parameter of a floor with a ball over it: ``light`` and ``material`` by name, ``parameter`` as `mi.traverse` calls it."""
+    """A parameter of a floor with a ball over it: ``light`` and ``material`` by name, ``parameter`` by that in `mi.traverse`."""
 
     light: str
     material: str

@@ -1,1 +1,1 @@
-"""Faces from profile shadows: heads, metrics, what a silhouette tells, and reports."""
+"""Faces from profile shadows: heads, metrics, the information of a silhouette, and reports."""

@@ -1,1 +1,1 @@
-"""Derivatives of shadows: images of them, convergence, and the minimal plane."""
+"""Derivatives of shadows: derivative images, convergence, and the minimal plane."""

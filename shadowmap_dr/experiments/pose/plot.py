@@ -1,4 +1,4 @@
-"""Plots of the pose experiment: convergence over many runs, and slices through the loss."""
+"""Plot of the pose experiment: convergence over many runs."""
 
 from __future__ import annotations
 

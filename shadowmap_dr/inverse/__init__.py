@@ -1,4 +1,4 @@
-"""Inverse problems: what is optimised (parametrisations), how (loops that survive being killed), and sweeps over many runs."""
+"""Inverse problems: parametrisations, optimisation loops that resume from checkpoints, and sweeps over many runs."""
 
 from ..rendering.receivers.shadow_views import ShadowView, shadow_view
 from .faces.blend_shapes import blend

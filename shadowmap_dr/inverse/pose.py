@@ -1,11 +1,11 @@
-"""A rigid pose with three parameters: rotation about the vertical axis, then an offset parallel to the image of the wall."""
+"""A rigid pose with three parameters: a rotation about the vertical axis, then an offset in x and y."""
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
 from dataclasses import fields, replace
-from typing import Any
+from typing import Any, cast
 
 import drjit as dr
 import mitsuba as mi
@@ -14,9 +14,10 @@ import numpy.typing as npt
 
 from ..errors import ShadowmapError
 from ..jit.arrays import device_array
+from ..jit.types import Float, TensorXf
 
 
-def apply_pose(p_rest: Any, pose: Any, shift_z: float = 0.0) -> Any:
+def apply_pose(p_rest: Float, pose: Float, shift_z: float = 0.0) -> Float:
     """Vertex positions of an object in a pose.
 
     Args:
@@ -27,22 +28,22 @@ def apply_pose(p_rest: Any, pose: Any, shift_z: float = 0.0) -> Any:
     Returns Float (3V,): R_y(rotation) p + (x, y, shift_z). Gradients flow to `p_rest` and `pose`.
     """
     count = dr.width(p_rest) // 3
-    # One copy of the pose for each vertex: the backward pass then adds up all three derivatives in one kernel.
+    # Each vertex gathers the pose: the backward pass then adds up all three derivatives in one kernel.
     rotation, x, y = dr.gather(mi.Vector3f, pose, dr.zeros(mi.UInt32, count))
     p = dr.gather(mi.Point3f, p_rest, dr.arange(mi.UInt32, count))
     s, c = dr.sincos(rotation)
-    return dr.ravel(mi.Point3f(c * p.x + s * p.z + x, p.y + y, c * p.z - s * p.x + shift_z))
+    return cast(Float, dr.ravel(mi.Point3f(c * p.x + s * p.z + x, p.y + y, c * p.z - s * p.x + shift_z)))
 
 
 class PoseFit:
     """Fits a pose to a reference image by gradient descent (Adam) on the mean squared difference of linear colours.
 
     A `Method` of the optimisation loop. A step - vertices, rendering, loss, backward pass, Adam - is recorded once with
-    `dr.freeze` and replayed from then on, without a read-back. Neither Mitsuba's meshes nor its ray tracing are touched.
+    `dr.freeze` and replayed from then on, without a read-back. Mitsuba's meshes stay as they are, and no rays are traced.
 
     Args:
-        renderer: a `shadowmap_dr.Renderer`, or anything with `render(vertex_positions={name: Float (3V,)})` -> tensor
-            (H, W, C), that can cross `dr.freeze`.
+        renderer: a `shadowmap_dr.Renderer`, or another object that can cross `dr.freeze` and has a method
+            `render(vertex_positions={name: Float (3V,)})` -> tensor (H, W, C).
         shape: name of the shape that moves.
         p_rest: (V, 3) or (3V,) positions of its vertices in the object's own space.
         reference: (H, W, C) linear image.
@@ -50,11 +51,13 @@ class PoseFit:
         shift_z: see `apply_pose`.
         spp: samples per pixel that the renderer is asked for.
         settings: further entries for `describe`.
+
+    Raises ShadowmapError for a reference that is no image or not finite.
     """
 
     def __init__(
         self,
-        renderer: Any,
+        renderer: Any,  # Any: a Renderer, or another object with `render`
         shape: str,
         p_rest: npt.ArrayLike,
         reference: npt.ArrayLike,
@@ -73,7 +76,7 @@ class PoseFit:
         self._p_rest = device_array(mi.Float, p_rest)
         self._reference = mi.TensorXf(device_array(mi.Float, image), image.shape)
         self._step_size, self._betas, self._shift_z = step_size, betas, shift_z
-        self._spp = {} if spp == 1 else {"spp": spp}  # the default need not be known to the renderer
+        self._spp = {} if spp == 1 else {"spp": spp}  # renderers without the option `spp` render the default
         self._settings = dict(settings or {})
         self._step = dr.freeze(_pose_step)
         self.reset(np.zeros(3))
@@ -82,13 +85,13 @@ class PoseFit:
         """Start from (rotation in radians, x, y) with empty moments."""
         self.load_state({"parameters": np.asarray(start), "m": np.zeros(3), "v": np.zeros(3), "t": np.zeros(1)})
 
-    def step(self) -> Any:
-        """One step; returns the loss before it, Float (1,), without waiting for it."""
-        constants = {"shape": self._shape, "shift_z": self._shift_z, "spp": self._spp}
+    def step(self) -> Float:
+        """Take one step. Returns the loss before the step, Float (1,), without waiting for the device."""
+        constants: dict[str, Any] = {"shape": self._shape, "shift_z": self._shift_z, "spp": self._spp}
         return self._step(self._renderer, self._optimizer, self._p_rest, self._reference, **constants)
 
-    def parameters(self) -> Any:
-        """Float (3,): rotation in radians, x, y; detached, on the device."""
+    def parameters(self) -> Float:
+        """Current parameters, Float (3,): rotation in radians, x, y. Detached, on the device."""
         return dr.detach(self._optimizer["pose"])
 
     def render(self, parameters: npt.ArrayLike) -> npt.NDArray[np.float32]:
@@ -96,18 +99,18 @@ class PoseFit:
         pose = device_array(mi.Float, parameters)
         positions = apply_pose(self._p_rest, pose, self._shift_z)
         with dr.suspend_grad():
-            # A copy, since a renderer keeps the fit of its shadow maps from one image to the next.
+            # On a copy: a renderer keeps the fit of its shadow maps from one image to the next.
             return np.array(copy.copy(self._renderer).render(vertex_positions={self._shape: positions}, **self._spp))
 
     def gradient(self, parameters: npt.ArrayLike) -> npt.NDArray[np.float32]:
-        """(3,) derivative of the loss with respect to the parameters; leaves the state of the fit alone."""
+        """(3,) derivative of the loss by the parameters. The state of the fit stays as it is."""
         pose = device_array(mi.Float, parameters)
         dr.enable_grad(pose)
         _gradient(copy.copy(self._renderer), pose, self._p_rest, self._reference, self._shape, self._shift_z, self._spp)
         return np.array(dr.grad(pose))
 
     def state(self) -> dict[str, npt.NDArray[Any]]:
-        """Parameters (3,), Adam's moments m and v (3,), step count t (1,), and the fit of the shadow maps if there is one."""
+        """Parameters (3,), Adam's moments m and v (3,), step count t (1,), and the fit of the renderer's shadow maps, if any."""
         pose, _, _, (t, m, v, _) = self._optimizer.state["pose"]
         state = {"parameters": np.array(dr.detach(pose)), "m": np.array(m), "v": np.array(v), "t": np.array(t)}
         frusta = getattr(self._renderer, "frusta", None)
@@ -116,7 +119,7 @@ class PoseFit:
         return state
 
     def load_state(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
-        """Go on from what `state` returned."""
+        """Continue from a result of `state`. Raises ShadowmapError if it does not hold three parameters."""
         pose = device_array(mi.Float, state["parameters"])
         if dr.width(pose) != 3:
             raise ShadowmapError(f"a pose of {dr.width(pose)} numbers: give rotation (radians), x and y.")
@@ -125,7 +128,7 @@ class PoseFit:
         t = device_array(type(t), state["t"])
         m, v = (device_array(type(m), state[name]) for name in ("m", "v"))
         self._optimizer.state["pose"] = value, promoted, rate, (t, m, v, v_max)
-        # The fit of the shadow maps follows the object with some inertia: each run starts from the same fit, or from its own.
+        # The fit of the shadow maps depends on earlier images: a new run starts from the first fit, a resumed run from its own.
         self._renderer = copy.copy(self._initial_renderer)
         fit = {name.removeprefix("frusta."): value for name, value in state.items() if name.startswith("frusta.")}
         stored = {name: device_array(mi.Float, value) for name, value in fit.items()}
@@ -133,18 +136,26 @@ class PoseFit:
             self._renderer.frusta = replace(self._renderer.frusta, **stored)
 
     def recordings(self) -> int:
-        """Number of recordings of the step so far; stays the same once the fit is warm."""
-        return int(self._step.n_recordings)
+        """Number of recordings of the step so far. It stays the same once the fit is warm."""
+        return int(self._step.n_recordings)  # type: ignore[attr-defined]  # Dr.Jit's stub returns the plain function
 
     def describe(self) -> dict[str, Any]:
         """Settings for the record."""
         return {**self._settings, "optimizer": "Adam", "step_size": self._step_size, "betas": list(self._betas)}
 
 
-def _gradient(renderer: Any, pose: Any, p_rest: Any, reference: Any, shape: str, shift_z: float, spp: dict[str, int]) -> Any:
-    """Add the derivative of the mean squared difference to the gradient of ``pose``; returns the difference, Float (1,)."""
+def _gradient(
+    renderer: Any,  # Any: see `PoseFit`
+    pose: Float,
+    p_rest: Float,
+    reference: TensorXf,
+    shape: str,
+    shift_z: float,
+    spp: dict[str, int],
+) -> Float:
+    """Add the derivative of the loss to the gradient of ``pose``. Returns the loss (mean squared difference), Float (1,)."""
     image = renderer.render(vertex_positions={shape: apply_pose(p_rest, pose, shift_z)}, **spp)
-    # By hand, since the loss and its derivative then read the image together, once.
+    # Derived by hand: one kernel then reads the image for both the loss and its derivative.
     difference = dr.detach(image.array) - reference.array
     square, slope = dr.square(difference), difference * (2 / dr.width(difference))
     dr.eval(square, slope)
@@ -155,8 +166,15 @@ def _gradient(renderer: Any, pose: Any, p_rest: Any, reference: Any, shape: str,
 
 
 def _pose_step(
-    renderer: Any, optimizer: Any, p_rest: Any, reference: Any, *, shape: str, shift_z: float, spp: dict[str, int]
-) -> Any:
+    renderer: Any,  # Any: see `PoseFit`
+    optimizer: mi.ad.Optimizer,
+    p_rest: Float,
+    reference: TensorXf,
+    *,
+    shape: str,
+    shift_z: float,
+    spp: dict[str, int],
+) -> Float:
     loss = _gradient(renderer, optimizer["pose"], p_rest, reference, shape, shift_z, spp)
     optimizer.step()
     return loss

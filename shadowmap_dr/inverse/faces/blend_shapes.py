@@ -1,23 +1,24 @@
-"""Weighted sums of many shapes (blend shapes, morphable models), as a matrix product that is cheap in both directions."""
+"""Weighted sums of many shapes (blend shapes, morphable models): a matrix product with a fast backward pass."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import cast
 
 import drjit as dr
 
 from ...jit.arrays import backend
+from ...jit.types import Bool, Float, UInt32
 
-# Lanes that share the adjoint's sum over all coordinates for one weight: enough to keep a vector machine busy.
+# Lanes that share the backward pass's sum over all coordinates for one weight: enough to occupy the device.
 _LANES = 64
 
 
-def blend(rest: Any, basis: Any, weights: Any) -> Any:
+def blend(rest: Float, basis: Float, weights: Float) -> Float:
     """``rest + weights @ basis``: positions as a linear function of weights.
 
     Args:
         rest: ``Float`` (N,), for instance N = 3V flat vertex positions, any space and unit. Attached.
-        basis: ``Float`` (K * N,), row-major: the change of coordinate i by weight k is entry ``k * N + i``. Taken as constant.
+        basis: ``Float`` (K * N,), row-major: the change of coordinate i by weight k is entry ``k * N + i``. Detached.
         weights: ``Float`` (K,), K >= 1. Attached.
 
     Returns:
@@ -33,35 +34,38 @@ def blend(rest: Any, basis: Any, weights: Any) -> Any:
 
 
 class _Product(dr.CustomOp):
-    """``basis @ weights`` for a fixed matrix. Built-in gathers would add the derivatives up one atomic operation at a time."""
+    """``basis @ weights`` for a constant matrix. The backward pass of built-in gathers would add up derivatives by atomics."""
 
-    def eval(self, weights: Any, basis: Any) -> Any:
+    def eval(self, weights: Float, basis: Float) -> Float:
         self.basis, self.count = basis, dr.width(weights)
         return _apply(basis, weights)
 
     def forward(self) -> None:
-        self.set_grad_out(_apply(self.basis, self.grad_in("weights")))
+        self.set_grad_out(_apply(self.basis, cast(Float, self.grad_in("weights"))))
 
     def backward(self) -> None:
-        self.set_grad_in("weights", _apply_transposed(self.basis, self.grad_out(), self.count))
+        self.set_grad_in("weights", _apply_transposed(self.basis, cast(Float, self.grad_out()), self.count))
 
 
-def _apply(basis: Any, weights: Any) -> Any:
-    """(K * N,) times (K,): a lane for each coordinate, which adds up K numbers."""
+def _apply(basis: Float, weights: Float) -> Float:
+    """(K * N,) times (K,): the lane of each coordinate adds up K products."""
     module = backend(basis)
     count = dr.width(weights)
     rows = dr.width(basis) // count
     dr.eval(weights)
     row = dr.arange(module.UInt32, rows)
 
-    def add(k: Any, total: Any) -> tuple[Any, Any]:
+    def unfinished(k: UInt32, _: Float) -> Bool:
+        return k < count
+
+    def add(k: UInt32, total: Float) -> tuple[UInt32, Float]:
         return k + 1, dr.fma(dr.gather(module.Float, basis, k * rows + row), dr.gather(module.Float, weights, k), total)
 
-    return dr.while_loop((module.UInt32(0), dr.zeros(module.Float, rows)), lambda k, _: k < count, add, mode="symbolic")[1]
+    return dr.while_loop((module.UInt32(0), dr.zeros(module.Float, rows)), unfinished, add, mode="symbolic")[1]
 
 
-def _apply_transposed(basis: Any, gradient: Any, count: int) -> Any:
-    """(K * N,) times (N,): some lanes for each weight share the coordinates; then their sums are added up."""
+def _apply_transposed(basis: Float, gradient: Float, count: int) -> Float:
+    """Transposed (K * N,) times (N,): some lanes of each weight share the coordinates, then their partial sums are added up."""
     module = backend(basis)
     rows = dr.width(gradient)
     dr.eval(gradient)
@@ -70,10 +74,13 @@ def _apply_transposed(basis: Any, gradient: Any, count: int) -> Any:
     # Neighbouring lanes read neighbouring numbers.
     first = lane - weight * _LANES
 
-    def add(row: Any, total: Any) -> tuple[Any, Any]:
+    def unfinished(row: UInt32, _: Float) -> Bool:
+        return row < rows
+
+    def add(row: UInt32, total: Float) -> tuple[UInt32, Float]:
         return row + _LANES, dr.fma(
             dr.gather(module.Float, basis, weight * rows + row), dr.gather(module.Float, gradient, row), total
         )
 
     state = (first, dr.zeros(module.Float, count * _LANES))
-    return dr.block_sum(dr.while_loop(state, lambda row, _: row < rows, add, mode="symbolic")[1], _LANES)
+    return dr.block_sum(dr.while_loop(state, unfinished, add, mode="symbolic")[1], _LANES)

@@ -1,4 +1,4 @@
-"""Other people's morphable models in this package's format: a folder of OBJ files (ICT-FaceKit), arrays (Basel-like)."""
+"""Import of morphable models in other formats: a folder of OBJ files (ICT-FaceKit), arrays (Basel-like)."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ class ConvertOptions:
 
     Attributes:
         facing: axis along which the model's head looks; y is up.
-        neck: height (y, the model's own units) above which vertices count as head; None: all do.
-        components: how many identity components to keep; None: all.
-        expression_scale: share of a full expression that a weight of 1 stands for. (Expressions of ICT-FaceKit are full at 1;
-            those of Basel-like models have standard deviations of their own: 1 suits them.)
+        neck: height (y, the model's own units) above which vertices belong to the head; None: all belong to it.
+        components: number of identity components to keep; None: all.
+        expression_scale: share of a full expression that a weight of 1 stands for. (ICT-FaceKit's expressions are full at a
+            weight of 1. Basel-like models give standard deviations of their expressions: use 1 for them.)
     """
 
     facing: str = "+z"
@@ -53,7 +53,7 @@ class ConvertOptions:
 
 def convert(source: str | os.PathLike[str], options: ConvertOptions) -> MorphableModel:
     """Read a folder (see `from_folder`) or an `.npz` file (see `from_basel`), turn the head to face +x and scale it into
-    [-1, 1]^3. Raises ShadowmapError for what is no model.
+    [-1, 1]^3. Raises ShadowmapError if the source holds no model.
     """
     path = Path(source)
     if path.is_dir():
@@ -64,9 +64,10 @@ def convert(source: str | os.PathLike[str], options: ConvertOptions) -> Morphabl
 
 
 def from_folder(folder: Path, options: ConvertOptions) -> MorphableModel:
-    """A folder of OBJ files with the same vertices and faces, as ICT-FaceKit's `FaceXModel`: `generic_neutral_mesh.obj` is the
-    mean, `identityNNN.obj` the mean plus an identity component (weights are standard normal), all others the mean plus a full
-    expression. Polygons are cut into triangles.
+    """Read a folder of OBJ files with the same vertices and faces, such as ICT-FaceKit's `FaceXModel`.
+
+    `generic_neutral_mesh.obj` is the mean, `identityNNN.obj` the mean plus an identity component (weights are standard normal),
+    every other file the mean plus a full expression. Polygons are cut into triangles.
     """
     files = {path.stem: path for path in sorted(folder.glob("*.obj"))}
     if Path(NEUTRAL).stem not in files:
@@ -86,9 +87,11 @@ def from_folder(folder: Path, options: ConvertOptions) -> MorphableModel:
 
 
 def from_basel(path: Path, options: ConvertOptions) -> MorphableModel:
-    """Arrays as in the Basel Face Model: `shape_mean` (3V,) or (V, 3); `shape_basis` (3V, K) of unit vectors or of any length;
-    `shape_std` (K,) (or `shape_variance`), which they are multiplied by; `triangles` (F, 3) or (3, F), from 0 or from 1 on; and,
-    where there are expressions, `expression_basis`, `expression_std` (or `_variance`) and `expression_mean` likewise.
+    """Read an `.npz` file with arrays as in the Basel Face Model.
+
+    `shape_mean` (3V,) or (V, 3); `shape_basis` (3V, K), vectors of any length; `shape_std` (K,) or `shape_variance`, their
+    standard deviations or variances; `triangles` (F, 3) or (3, F), counted from 0 or from 1. Optional, for expressions:
+    `expression_basis`, `expression_std` (or `_variance`) and `expression_mean` likewise.
     """
     arrays = _arrays(path)
     missing = [name for name in ("shape_mean", "shape_basis", "triangles") if name not in arrays]
@@ -102,13 +105,14 @@ def from_basel(path: Path, options: ConvertOptions) -> MorphableModel:
         mean = mean + offset
     identity = _components(path, arrays, "shape", len(mean))[: options.components]
     expression = _components(path, arrays, "expression", len(mean)) * options.expression_scale
-    kinds = (("identity", identity), ("expression", expression))
-    names = (tuple(f"{kind} {k + 1}" for k in range(len(basis))) for kind, basis in kinds)
-    return _placed(mean, _triangles(path, arrays["triangles"], len(mean)), identity, expression, *names, options)
+    identity_names = tuple(f"identity {k + 1}" for k in range(len(identity)))
+    expression_names = tuple(f"expression {k + 1}" for k in range(len(expression)))
+    faces = _triangles(path, arrays["triangles"], len(mean))
+    return _placed(mean, faces, identity, expression, identity_names, expression_names, options)
 
 
 def read_obj(path: Path) -> tuple[Array, npt.NDArray[np.int32]]:
-    """Vertices (V, 3) and triangles (F, 3) of a Wavefront OBJ file; polygons become fans."""
+    """Vertices (V, 3) and triangles (F, 3) of a Wavefront OBJ file. Polygons become fans. ShadowmapError if it is damaged."""
     vertices: list[list[float]] = []
     faces: list[tuple[int, int, int]] = []
     try:
@@ -153,7 +157,7 @@ def _points(arrays: dict[str, Array], name: str) -> Array:
 
 
 def _components(path: Path, arrays: dict[str, Array], kind: str, vertices: int) -> Array:
-    """(K, V, 3), scaled by the standard deviations."""
+    """Components (K, V, 3), scaled by their standard deviations."""
     basis = arrays.get(f"{kind}_basis")
     if basis is None:
         return np.zeros((0, vertices, 3))

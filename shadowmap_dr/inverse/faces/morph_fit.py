@@ -1,4 +1,4 @@
-"""Fits the weights of a morphable model, and where it stands, to a shadow image on a planar receiver."""
+"""Fit of a morphable model's weights, and of its position, to a shadow image on a planar receiver."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from ...errors import ShadowmapError
 from ...jit.arrays import device_array
+from ...jit.types import Float
 from ...rendering.receivers.planar_receiver import ReceiverShadows
 from .blend_shapes import blend
 
@@ -19,26 +20,26 @@ BETAS = (0.9, 0.999)
 
 
 class MorphFit:
-    """Finds weights (and a translation) whose shadow is a given one, by Adam.
+    """Fits weights (and a translation) to a shadow image by gradient descent (Adam).
 
-    Minimised is the mean squared difference of visibility plus ``prior`` times the mean square of the weights. For images with
-    normally distributed errors of variance s^2 the most probable weights belong to prior = s^2 * weights / pixels.
+    The loss is the mean squared difference of visibility plus ``prior`` times the mean square of the weights. For images with
+    normally distributed errors of variance s^2, prior = s^2 * weights / pixels gives the most probable weights.
 
     A `Method` of the optimisation loop. A step - vertices, shadow maps, image, backward pass, Adam - is recorded once with
     `dr.freeze` and replayed from then on, without a read-back. Parameters are the weights, followed by the translation (x, y) in
-    world units where there is one.
+    world units if ``translate`` is set.
 
     Args:
-        shadows: of the model's faces.
+        shadows: shadow images of the model's faces.
         rest: (V, 3) vertices where all weights are zero, world space.
         basis: (N, V, 3) change of the vertices by each weight, N >= 1.
         reference: (H, W) visibility to fit, the shape of ``shadows.shape``.
-        translate: move the model parallel to the receiver as well.
+        translate: fit an offset of the model parallel to the receiver, too.
         prior: strength of the prior that weights are normally distributed, 0 or more.
         step_size, translation_step: of Adam, for weights and translation.
         settings: further entries for `describe`.
 
-    Raises ShadowmapError where shapes do not fit, or the reference is not finite.
+    Raises ShadowmapError if shapes do not match, the reference is not finite, or the prior is negative.
     """
 
     def __init__(
@@ -62,7 +63,7 @@ class MorphFit:
         if not (np.isfinite(prior) and prior >= 0):
             raise ShadowmapError(f"a prior of {prior}: give a finite number, 0 or more.")
         self.count, self.translate = len(directions), translate
-        if translate:  # moving is one more way in which vertices depend linearly on numbers
+        if translate:  # vertices depend linearly on the translation, too: two more columns of the basis
             moves = np.zeros((2, *positions.shape), np.float32)
             moves[0, :, 0] = moves[1, :, 1] = 1
             directions = np.concatenate([directions, moves])
@@ -77,17 +78,17 @@ class MorphFit:
         self.reset(np.zeros(len(directions)))
 
     def reset(self, start: npt.ArrayLike) -> None:
-        """Start from (N,) weights, followed by (x, y) where the model moves, with empty moments."""
+        """Start from (N,) weights, followed by (x, y) if ``translate`` is set, with empty moments."""
         size = len(self._sizes())
         zero = np.zeros(self.count + (2 if self.translate else 0))
         self.load_state({"parameters": np.asarray(start), "m": zero, "v": zero, "t": np.zeros(size)})
 
-    def step(self) -> Any:
-        """One step; returns the loss before it, Float (1,), without waiting for it."""
+    def step(self) -> Float:
+        """Take one step. Returns the loss before the step, Float (1,), without waiting for the device."""
         return self._step(self._shadows, self._optimizer, self._rest, self._basis, self._reference, self._prior)
 
-    def parameters(self) -> Any:
-        """Float (N,) or (N + 2,): weights, and the translation; detached, on the device."""
+    def parameters(self) -> Float:
+        """Current parameters, Float (N,) or (N + 2,): weights, and the translation. Detached, on the device."""
         return dr.detach(_all_parameters(self._optimizer))
 
     def vertices(self, parameters: npt.ArrayLike) -> npt.NDArray[np.float32]:
@@ -95,8 +96,8 @@ class MorphFit:
         with dr.suspend_grad():
             return np.array(blend(self._rest, self._basis, self._checked(parameters))).reshape(-1, 3)
 
-    def image(self, values: Any) -> Any:
-        """Visibility, Float (H * W,), for parameters on the device (Float). Attached."""
+    def image(self, values: Float) -> Float:
+        """Visibility, Float (H * W,), for parameters on the device, Float (N,) or (N + 2,). Attached."""
         return self._shadows.render(blend(self._rest, self._basis, values))
 
     def render(self, parameters: npt.ArrayLike) -> npt.NDArray[np.float32]:
@@ -105,13 +106,13 @@ class MorphFit:
             return np.array(self.image(self._checked(parameters))).reshape(*self._shadows.shape, 1)
 
     def gradient(self, parameters: npt.ArrayLike) -> npt.NDArray[np.float32]:
-        """Derivative of the loss by each parameter; leaves the state of the fit alone."""
+        """Derivative of the loss by each parameter. The state of the fit stays as it is."""
         values = self._checked(parameters)
         dr.enable_grad(values)
         dr.backward(self._loss(values))
         return np.array(dr.grad(values))
 
-    def _loss(self, values: Any) -> Any:
+    def _loss(self, values: Float) -> Float:
         weights = dr.gather(mi.Float, values, dr.arange(mi.UInt32, self.count))
         return _loss(self._shadows, self._rest, self._basis, self._reference, self._prior, values, weights)
 
@@ -124,7 +125,7 @@ class MorphFit:
         return {name: np.concatenate([np.array(part).reshape(-1) for part in parts]) for name, parts in joined.items()}
 
     def load_state(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
-        """Go on from what `state` returned."""
+        """Continue from a result of `state`. Raises ShadowmapError if it holds another number of parameters."""
         sizes = self._sizes()
         split = {name: np.asarray(state[name]).reshape(-1) for name in ("parameters", "m", "v", "t")}
         total = sum(sizes.values())
@@ -144,8 +145,8 @@ class MorphFit:
         self._optimizer.set_learning_rate(self._rates)
 
     def recordings(self) -> int:
-        """Number of recordings of the step so far; stays the same once the fit is warm."""
-        return int(self._step.n_recordings)
+        """Number of recordings of the step so far. It stays the same once the fit is warm."""
+        return int(self._step.n_recordings)  # type: ignore[attr-defined]  # Dr.Jit's stub returns the plain function
 
     def describe(self) -> dict[str, Any]:
         """Settings for the record."""
@@ -155,7 +156,7 @@ class MorphFit:
     def _sizes(self) -> dict[str, int]:
         return {"weights": self.count} | ({"translation": 2} if self.translate else {})
 
-    def _checked(self, parameters: npt.ArrayLike) -> Any:
+    def _checked(self, parameters: npt.ArrayLike) -> Float:
         values = np.asarray(parameters, np.float32).reshape(-1)
         total = sum(self._sizes().values())
         if len(values) != total:
@@ -163,18 +164,22 @@ class MorphFit:
         return device_array(mi.Float, values)
 
 
-def _all_parameters(optimizer: Any) -> Any:
+def _all_parameters(optimizer: mi.ad.Optimizer) -> Float:
     weights = optimizer["weights"]
     return dr.concat([weights, optimizer["translation"]]) if "translation" in optimizer else weights
 
 
-def _loss(shadows: Any, rest: Any, basis: Any, reference: Any, prior: Any, values: Any, weights: Any) -> Any:
-    """Mean squared difference, plus the prior; attached to the parameters."""
+def _loss(
+    shadows: ReceiverShadows, rest: Float, basis: Float, reference: Float, prior: Float, values: Float, weights: Float
+) -> Float:
+    """Mean squared difference, plus the prior. Attached to the parameters."""
     image = shadows.render(blend(rest, basis, values))
     return dr.mean(dr.square(image - reference)) + prior * dr.mean(dr.square(weights))
 
 
-def _step(shadows: Any, optimizer: Any, rest: Any, basis: Any, reference: Any, prior: Any) -> Any:
+def _step(
+    shadows: ReceiverShadows, optimizer: mi.ad.Optimizer, rest: Float, basis: Float, reference: Float, prior: Float
+) -> Float:
     loss = _loss(shadows, rest, basis, reference, prior, _all_parameters(optimizer), optimizer["weights"])
     dr.backward(loss)
     optimizer.step()

@@ -1,4 +1,4 @@
-"""Morphable models: a mean shape, and how identity and expression change it. The file format, and its checks."""
+"""Morphable models: a mean shape and its changes by identity and expression. The file format and its checks."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy.typing as npt
 from ...errors import ShadowmapError
 from ...io.files import atomic, read_arrays
 
-#: Arrays that every model file holds, and what may be left out.
+#: Arrays that every model file holds, and optional arrays.
 REQUIRED, OPTIONAL = ("mean", "faces", "identity"), ("expression", "identity_names", "expression_names", "mask")
 
 
@@ -22,17 +22,17 @@ class MorphableModel:
     """vertices = mean + sum of identity weights times ``identity`` + sum of expression weights times ``expression``.
 
     The weights have mean zero and variance one over the population that a model describes. The head faces +x, y is up; heads of
-    the package fit into [-1, 1]^3. Building one checks it.
+    the package fit into [-1, 1]^3. The constructor checks and converts the arrays.
 
     Attributes:
         mean: (V, 3) float32, vertices of the mean shape.
         faces: (F, 3) int32, triangles.
-        identity: (K, V, 3) float32, K >= 1.
-        expression: (E, V, 3) float32, E may be 0.
+        identity: (K, V, 3) float32, change of the vertices by each weight, K >= 1.
+        expression: (E, V, 3) float32 likewise, E >= 0.
         identity_names, expression_names: K and E names.
-        mask: (V,) bool, vertices above the neck: what is measured, and seen in the shadow image.
+        mask: (V,) bool, vertices above the neck: the shadow image shows them, and errors are measured on them.
 
-    Raises ShadowmapError where shapes do not fit together, numbers are not finite, or faces name vertices that do not exist.
+    Raises ShadowmapError if shapes do not match, numbers are not finite, or faces name vertices that do not exist.
     """
 
     mean: npt.NDArray[np.float32]
@@ -49,7 +49,7 @@ class MorphableModel:
             raise ShadowmapError(f"a morphable model's mean of shape {mean.shape}: give (V, 3) with at least 3 vertices.")
         if not np.ptp(mean, axis=0).any():
             raise ShadowmapError("a morphable model's mean has all vertices in one place: give vertices of a surface.")
-        values = {
+        values: dict[str, Any] = {
             "mean": mean,
             "faces": _faces(self.faces, len(mean)),
             "identity": _basis("identity", self.identity, mean.shape),
@@ -75,7 +75,7 @@ class MorphableModel:
         return {"identity": self.identity, "expression": self.expression}[kind]
 
     def vertices(self, identity: npt.ArrayLike = (), expression: npt.ArrayLike = ()) -> npt.NDArray[np.float32]:
-        """(V, 3) vertices for weights of shape (up to K,) and (up to E,); weights that are left out are zero."""
+        """(V, 3) vertices for at most K and at most E weights. Missing weights are zero. ShadowmapError for too many."""
         result = self.mean.astype(np.float64)
         for kind, weights in (("identity", identity), ("expression", expression)):
             w = np.asarray(weights, np.float64).reshape(-1)
@@ -86,7 +86,7 @@ class MorphableModel:
         return result.astype(np.float32)
 
     def describe(self) -> str:
-        """One line: how large the model is."""
+        """Size of the model, in one line."""
         return (
             f"{len(self.mean)} vertices, {len(self.faces)} triangles, {len(self.identity)} identity and {len(self.expression)} "
             "expression components"
@@ -94,10 +94,12 @@ class MorphableModel:
 
 
 def load_model(path: str | os.PathLike[str]) -> MorphableModel:
-    """Read a model from an `.npz` file with the arrays `mean`, `faces`, `identity` and, if wanted, `expression`,
-    `identity_names`, `expression_names` and `mask` (see MorphableModel; missing names are numbers, a missing mask is everything).
+    """Read a model from an `.npz` file.
 
-    Raises ShadowmapError for files that are no such model, naming the file and what is wrong.
+    Arrays are `mean`, `faces` and `identity`, optionally `expression`, `identity_names`, `expression_names` and `mask` (see
+    MorphableModel). Default names are numbered, the default mask holds all vertices.
+
+    Raises ShadowmapError, which names file and fault, for a file that holds no model.
     """
     path = Path(path)
     if not path.is_file():
@@ -121,7 +123,7 @@ def from_arrays(
     expression_names: npt.ArrayLike | None = None,
     mask: npt.ArrayLike | None = None,
 ) -> MorphableModel:
-    """A model from arrays, some of which may be left out; see `load_model`."""
+    """Make a model from arrays. Optional arrays and their defaults: see `load_model`."""
     vertices = np.shape(mean)[0] if np.ndim(mean) else 0
 
     def names(kind: str, given: npt.ArrayLike | None, basis: npt.ArrayLike) -> tuple[str, ...]:
@@ -130,18 +132,18 @@ def from_arrays(
 
     moving = np.zeros((0, vertices, 3), np.float32) if expression is None else expression
     return MorphableModel(
-        mean=mean,  # type: ignore[arg-type]
-        faces=faces,  # type: ignore[arg-type]
-        identity=identity,  # type: ignore[arg-type]
-        expression=moving,  # type: ignore[arg-type]
+        mean=np.asarray(mean),
+        faces=np.asarray(faces),
+        identity=np.asarray(identity),
+        expression=np.asarray(moving),
         identity_names=names("identity", identity_names, identity),
         expression_names=names("expression", expression_names, moving),
-        mask=np.ones(vertices, bool) if mask is None else mask,  # type: ignore[arg-type]
+        mask=np.ones(vertices, bool) if mask is None else np.asarray(mask),
     )
 
 
 def save_model(path: str | os.PathLike[str], model: MorphableModel, *, half: bool = False) -> None:
-    """Write a model; `half` stores the bases with half precision (relative error 5e-4), which is half the size."""
+    """Write a model as `.npz`. `half` stores the bases in half precision: half the size, relative error 5e-4."""
     precision = np.float16 if half else np.float32
     with atomic(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(
@@ -156,7 +158,7 @@ def save_model(path: str | os.PathLike[str], model: MorphableModel, *, half: boo
         )
 
 
-def _numbers(name: str, value: Any) -> npt.NDArray[np.float32]:
+def _numbers(name: str, value: npt.ArrayLike) -> npt.NDArray[np.float32]:
     array = np.asarray(value)
     if array.dtype.kind not in "fiu":
         raise ShadowmapError(f"a morphable model's {name} holds {array.dtype} instead of numbers.")
@@ -170,7 +172,7 @@ def _numbers(name: str, value: Any) -> npt.NDArray[np.float32]:
     return single
 
 
-def _basis(name: str, value: Any, shape: tuple[int, ...]) -> npt.NDArray[np.float32]:
+def _basis(name: str, value: npt.ArrayLike, shape: tuple[int, ...]) -> npt.NDArray[np.float32]:
     array = _numbers(name, value)
     if array.ndim != 3 or array.shape[1:] != shape:
         raise ShadowmapError(
@@ -179,7 +181,7 @@ def _basis(name: str, value: Any, shape: tuple[int, ...]) -> npt.NDArray[np.floa
     return array
 
 
-def _faces(value: Any, vertices: int) -> npt.NDArray[np.int32]:
+def _faces(value: npt.ArrayLike, vertices: int) -> npt.NDArray[np.int32]:
     array = np.asarray(value)
     if array.dtype.kind not in "iu" or array.ndim != 2 or array.shape[1] != 3 or not len(array):
         raise ShadowmapError(f"a morphable model's faces of shape {array.shape} and type {array.dtype}: give integers (F, 3).")
@@ -189,7 +191,7 @@ def _faces(value: Any, vertices: int) -> npt.NDArray[np.int32]:
     return np.ascontiguousarray(array, np.int32)
 
 
-def _mask(value: Any, vertices: int) -> npt.NDArray[np.bool_]:
+def _mask(value: npt.ArrayLike, vertices: int) -> npt.NDArray[np.bool_]:
     array = np.asarray(value)
     if array.dtype != np.bool_ or array.shape != (vertices,):
         raise ShadowmapError(f"a morphable model's mask of shape {array.shape} and type {array.dtype}: give {vertices} booleans.")

@@ -1,14 +1,13 @@
 """Directions of directional lights from images, many runs at once.
 
-All runs of a batch see the same still scene and differ in their targets and in where they are: R runs with n lights each are
-rendered as one batch of images and of R n shadow maps, and every run has a loss and optimiser moments of its own.
+All runs of a batch share one static scene and differ in their targets and current directions. R runs with n lights each are
+rendered as one batch of R images and R n shadow maps. Every run has its own loss and optimiser moments.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -17,18 +16,19 @@ import numpy.typing as npt
 
 from ...errors import ShadowmapError
 from ...jit.arrays import device_array
+from ...jit.types import Float, Vector3f
 from ...shadow import Frusta
 from .pixels import StillScene
 from .shading import fit_maps, images, light_views, losses_and_gradients, render_lights, with_shadow
 
 FloatArray = npt.NDArray[np.float32]
 
-# Steps that may be waiting for the device. With more, an interrupt is heard late, and progress shown too early.
+# Steps that may wait for the device. With more, an interrupt is handled late, and progress runs ahead of the device.
 _AHEAD = 10
 
-# Bytes of one shadow map with all that belongs to it, for each texel (measured, `vsm`).
+# Bytes of one shadow map and its intermediate arrays, for each texel (measured, `vsm`).
 _BYTES_OF_TEXEL = 150
-# The same for each pixel of a run's image, and for each pixel and light.
+# Likewise for each pixel of a run's image, and for each pixel and light.
 _BYTES_OF_PIXEL, _BYTES_OF_LIT_PIXEL = 60, 20
 
 
@@ -40,16 +40,16 @@ class LightState:
     ``frusta``: fit of the shadow maps, None without shadows.
     """
 
-    to_light: Any
-    m: Any
-    v: Any
-    t: Any
+    to_light: Vector3f
+    m: Vector3f
+    v: Vector3f
+    t: Float
     frusta: Frusta | None
 
 
 @dataclass(frozen=True)
 class Stage:
-    """Some steps with one filter: ``iterations`` with ``filter_size`` texels (None: the scene's own) and Adam's ``step_size``."""
+    """Steps with one filter: number ``iterations``, ``filter_size`` in texels (None: the scene's own), Adam's ``step_size``."""
 
     iterations: int
     filter_size: int | None = None
@@ -60,7 +60,8 @@ class Stage:
 class LightHistory:
     """Course of N steps of R runs with n lights each.
 
-    ``losses`` (N, R): before each step. ``directions`` (N + 1, R, n, 3): unit vectors to the lights, first and after each step.
+    ``losses`` (N, R): before each step. ``directions`` (N + 1, R, n, 3): unit vectors to the lights, at the start and after each
+    step.
     """
 
     losses: FloatArray
@@ -68,10 +69,10 @@ class LightHistory:
 
 
 class LightBatch:
-    """Gradient descent (Adam) on the mean squared difference of linear colours, for many runs in one still scene.
+    """Gradient descent (Adam) on the mean squared difference of linear colours, for many runs in one static scene.
 
     A step - shadow maps with tangents, shading, losses, their derivatives, Adam, back to unit length - is recorded once with
-    `dr.freeze` for each number of runs and filter, and replayed from then on, without a read-back. Vertices have no derivatives.
+    `dr.freeze` for each number of runs and filter, and replayed from then on, without a read-back. Vertices have no gradients.
 
     Args:
         scene: see :class:`StillScene`.
@@ -85,11 +86,11 @@ class LightBatch:
 
     @property
     def lights(self) -> int:
-        """n, lights of each run."""
+        """Number n of lights of each run."""
         return self.scene.lights
 
     def render(self, directions: npt.ArrayLike) -> FloatArray:
-        """Linear images (R, H, W, C) under lights in the directions (R, n, 3) (to the lights, any length). Detached."""
+        """Linear images (R, H, W, C) for the directions (R, n, 3) to the lights, of any length. Detached."""
         vectors, runs = self._vectors(directions)
         with dr.suspend_grad():
             _, light, _ = render_lights(self.scene, vectors, None)
@@ -98,9 +99,9 @@ class LightBatch:
             return np.stack([np.array(plane).reshape(shape) for plane in planes], -1)
 
     def loss_and_gradient(self, directions: npt.ArrayLike, targets: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Losses (R,) and their derivatives (R, n, 3) by the directions (R, n, 3) to the lights, which are made unit vectors.
+        """Losses (R,) and their derivatives (R, n, 3) by the directions (R, n, 3) to the lights.
 
-        Derivatives lie in the tangent planes: they are those by unnormalised directions of length 1.
+        Directions are normalised first. Derivatives lie in the tangent planes of the unit sphere.
         """
         vectors, runs = self._vectors(directions)
         with dr.suspend_grad():
@@ -113,23 +114,24 @@ class LightBatch:
         starts: npt.ArrayLike,
         targets: npt.ArrayLike,
         stages: tuple[Stage, ...] = (Stage(200),),
-        on_step: Any = lambda done: None,
+        on_step: Callable[[int], None] = lambda done: None,
     ) -> LightHistory:
         """Optimise all runs.
 
         Args:
             starts: (R, n, 3) directions to the lights.
             targets: (R, H, W, C) linear images.
-            stages: one after the other; moments stay.
-            on_step: told how many steps have been started, at most :data:`_AHEAD` of which are not done yet.
+            stages: run one after the other. Adam's moments carry over.
+            on_step: called with the number of started steps; at most :data:`_AHEAD` of them are not finished.
 
         Raises:
-            ShadowmapError: arrays of other shapes, or that are not finite.
+            ShadowmapError: arrays have other shapes, or are not finite.
         """
         vectors, runs = self._vectors(starts)
         wanted = self._targets(targets, runs)
         scenes = [self.scene if s.filter_size is None else with_shadow(self.scene, filter_size=s.filter_size) for s in stages]
-        losses, directions = [], [vectors]
+        losses: list[Float] = []
+        directions = [vectors]
         with dr.suspend_grad():
             state = self._first_state(vectors)
             for stage, scene in zip(stages, scenes, strict=True):
@@ -147,36 +149,36 @@ class LightBatch:
         kept = np.stack([np.array(d).T for d in directions]).reshape(shape)
         return LightHistory(np.array([np.array(loss) for loss in losses], np.float32).reshape(-1, runs), kept)
 
-    def stepper(self, starts: npt.ArrayLike, targets: npt.ArrayLike) -> Callable[[], Any]:
-        """A function that does one (recorded) step of all runs each time it is called, for measurements. Returns their losses."""
+    def stepper(self, starts: npt.ArrayLike, targets: npt.ArrayLike) -> Callable[[], Float]:
+        """Make a function for measurements that takes one recorded step of all runs and returns their losses, Float (R,)."""
         vectors, runs = self._vectors(starts)
         wanted, rate = self._targets(targets, runs), dr.opaque(mi.Float, 0.01)
         with dr.suspend_grad():
             states = [self._first_state(vectors)]
             states[0] = self._fitted(states[0], self.scene)
 
-        def step() -> Any:
+        def step() -> Float:
             with dr.suspend_grad():
                 states[0], losses = self._step(self.scene, states[0], wanted, rate, runs, self._betas)
             return losses
 
         return step
 
-    def _first_state(self, vectors: Any) -> LightState:
-        moments = [mi.Vector3f(*(_zeros(dr.width(vectors)) for _ in range(3))) for _ in range(2)]
-        return LightState(vectors, *moments, _zeros(1), None)
+    def _first_state(self, vectors: Vector3f) -> LightState:
+        m, v = (mi.Vector3f(*(_zeros(dr.width(vectors)) for _ in range(3))) for _ in range(2))
+        return LightState(vectors, m, v, _zeros(1), None)
 
     def _fitted(self, state: LightState, scene: StillScene) -> LightState:
-        """With the first fit of the maps: made here, so that the recorded step always starts from one."""
+        """The state with a first fit of the maps, so that the recorded step always starts from a fit."""
         if scene.shadow.method == "none":
             return state
         return replace(state, frusta=_own_arrays(fit_maps(scene, light_views(state.to_light), None)))
 
     def recordings(self) -> int:
         """Number of recordings of a step so far."""
-        return int(self._step.n_recordings)
+        return int(self._step.n_recordings)  # type: ignore[attr-defined]  # Dr.Jit's stub returns the plain function
 
-    def _vectors(self, directions: npt.ArrayLike) -> tuple[Any, int]:
+    def _vectors(self, directions: npt.ArrayLike) -> tuple[Vector3f, int]:
         array = np.asarray(directions, np.float64)
         if array.ndim != 3 or array.shape[1:] != (self.lights, 3) or not len(array):
             raise ShadowmapError(f"directions of shape {array.shape}: give (R, {self.lights}, 3) for R runs.")
@@ -186,7 +188,7 @@ class LightBatch:
         unit = (array / length).reshape(-1, 3).astype(np.float32)
         return mi.Vector3f(*(device_array(mi.Float, unit[:, c]) for c in range(3))), len(array)
 
-    def _targets(self, targets: npt.ArrayLike, runs: int) -> list[Any]:
+    def _targets(self, targets: npt.ArrayLike, runs: int) -> list[Float]:
         pixels, array = self.scene.pixels, np.asarray(targets, np.float32)
         shape = (runs, pixels.height, pixels.width, pixels.channels)
         if array.shape != shape or not np.isfinite(array).all():
@@ -195,31 +197,31 @@ class LightBatch:
 
 
 def batch_bytes(lights: int, pixels: int, channels: int = 3, map_resolution: int = 0) -> int:
-    """About how much memory (bytes) each run of a batch needs; ``map_resolution`` 0: without shadows.
+    """Approximate memory of each run of a batch, in bytes.
 
     Args:
-        lights: of a run.
-        pixels: of an image with so many ``channels``.
-        map_resolution: texels along each side of a map, times its supersampling.
+        lights: number of lights of a run.
+        pixels, channels: of an image.
+        map_resolution: texels along each side of a map, times its supersampling; 0: no shadows.
     """
     return lights * _BYTES_OF_TEXEL * map_resolution**2 + pixels * (lights * _BYTES_OF_LIT_PIXEL + channels * _BYTES_OF_PIXEL)
 
 
-def _zeros(count: int) -> Any:
-    """An array of its own: to a recorded function, constants and arrays that are passed twice are something else."""
+def _zeros(count: int) -> Float:
+    """A new evaluated array: recorded functions treat literals, and arrays that are passed twice, differently."""
     return dr.opaque(mi.Float, 0, count)
 
 
 def _own_arrays(frusta: Frusta) -> Frusta:
-    """A copy in which no two fields are the same array."""
+    """A copy whose fields do not share arrays."""
     copy = Frusta(*(getattr(frusta, f.name) + _zeros(dr.width(frusta.near)) for f in fields(frusta)))
     dr.eval(copy)
     return copy
 
 
 def _step(
-    scene: StillScene, state: LightState, targets: list[Any], rate: Any, runs: int, betas: tuple[float, float]
-) -> tuple[LightState, Any]:
+    scene: StillScene, state: LightState, targets: list[Float], rate: Float, runs: int, betas: tuple[float, float]
+) -> tuple[LightState, Float]:
     views, light, frusta = render_lights(scene, state.to_light, state.frusta)
     losses, gradient = losses_and_gradients(scene, views, light, targets, runs)
     t = state.t + 1

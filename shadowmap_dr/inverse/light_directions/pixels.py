@@ -1,17 +1,19 @@
-"""A still scene under lights that change: all that shading by directional lights needs to know of it, computed once."""
+"""A static scene under directional lights that change: everything that their shading needs, computed once."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import cast
 
 import drjit as dr
 import mitsuba as mi
 
 from ...errors import ShadowmapError
 from ...jit.arrays import device_array
+from ...jit.types import Bool, Float, Normal3f, Point3f, UInt32, Vector3f
 from ...raster import Topology, build_topology, drawing_order, outward_faces
 from ...raster.antialiasing.blend import Mixer
+from ...raster.antialiasing.edge_crossings import Crossings
 from ...rendering.renderer import GBuffer, Renderer
 from ...rendering.shadow_pass import boxes_of, shape_planes
 from ...scene.lights.punctual import DirectionalLight
@@ -22,86 +24,90 @@ _KINDS = "plain diffuse materials under directional lights only"
 
 @dataclass(frozen=True)
 class Pixels:
-    """Surfaces that the camera sees, P pixels. All arrays are detached and evaluated.
+    """Surfaces that the camera sees in P pixels. All arrays are detached and evaluated.
 
     Attributes:
         height, width: of the image; P = height * width.
-        points: where visibility is looked up (list of Point3f, P each).
-        n_shading, n_world: Vector3f (P,), shading and geometric unit normals on the camera's side.
-        colours: reflected radiance for unit irradiance at normal incidence, one Float (P,) for each channel; 0 where nothing is.
-        active: Bool (P,), whether there is anything.
-        incoming, outgoing: Float (4 P,), shares of the right, lower, left and upper neighbours in a pixel's colour, and of a
-            pixel's colour in these neighbours' (anti-aliasing of the image).
+        points: points of the visibility look-ups, world space (list of Point3f, P each).
+        n_shading, n_world: (P,), shading and geometric unit normals on the camera's side.
+        colours: reflected radiance for unit irradiance at normal incidence, one Float (P,) for each channel; 0 on the background.
+        active: Bool (P,), pixels that show a surface.
+        incoming, outgoing: Float (4 P,), anti-aliasing of the image: shares of the right, lower, left and upper neighbours in a
+            pixel's colour, and shares of the pixel's colour in these neighbours.
     """
 
     height: int
     width: int
-    points: list[Any]
-    n_shading: Any
-    n_world: Any
-    colours: list[Any]
-    active: Any
-    incoming: Any
-    outgoing: Any
+    points: list[Point3f]
+    n_shading: Normal3f
+    n_world: Normal3f
+    colours: list[Float]
+    active: Bool
+    incoming: Float
+    outgoing: Float
 
     @property
     def count(self) -> int:
-        """P."""
+        """Number P of pixels."""
         return self.height * self.width
 
     @property
     def channels(self) -> int:
-        """Colour channels."""
+        """Number of colour channels."""
         return len(self.colours)
 
 
 @dataclass(frozen=True)
 class StillScene:
-    """A scene in which nothing but the directions of its n directional lights changes. A PyTree that may cross ``dr.freeze``.
+    """A static scene: only the directions of its n directional lights change. A PyTree that may cross ``dr.freeze``.
 
     Attributes:
-        pixels: what the camera sees.
-        irradiance: for each light its colour, Float of width 1 for each channel.
-        shadow: how shadows are computed.
-        p_world, faces, topology, outward, vertex_shape, shapes: the mesh of all S shapes, and its faces that hide their backs.
-        planes, planar, boxes: what is known about the shapes, see :func:`shadowmap_dr.shadow.casting_shapes`.
-        seen: points on what is in view, and which of them there are.
+        pixels: surfaces that the camera sees.
+        irradiance: of each light, a Float of width 1 for each channel.
+        shadow: settings of the shadow maps.
+        p_world, faces, topology: merged mesh of all S shapes.
+        outward: Bool, faces that shadow maps show from the front only.
+        vertex_shape, shapes: number of each vertex's shape, and S.
+        planes, planar, boxes: extents of the shapes, see :func:`shadowmap_dr.shadow.casting_shapes`.
+        seen: visible points, and a mask of the valid ones.
     """
 
     pixels: Pixels
-    irradiance: list[list[Any]]
+    irradiance: list[list[Float]]
     shadow: ShadowSettings
-    p_world: Any
-    faces: Any
+    p_world: Point3f
+    faces: UInt32
     topology: Topology
-    outward: Any
-    vertex_shape: Any
+    outward: Bool
+    vertex_shape: UInt32
     shapes: int
-    planes: Any
-    planar: Any
+    planes: tuple[Vector3f, Point3f]
+    planar: Bool
     boxes: Boxes
-    seen: Any
+    seen: tuple[Point3f, Bool]
 
     @property
     def lights(self) -> int:
-        """n."""
+        """Number n of lights."""
         return len(self.irradiance)
 
     @classmethod
     def of(cls, renderer: Renderer, sensor: int = 0) -> StillScene:
-        """Take a scene apart that a renderer holds.
+        """Extract the arrays of a renderer's scene.
 
-        Raises ShadowmapError for anything but plain diffuse materials under directional lights, shadow maps that are not
-        pre-filtered, and a film with another filter than a box.
+        Raises ShadowmapError for anything but plain diffuse materials under directional lights, for shadow maps that are not
+        pre-filtered, and for a film whose filter is not a box.
         """
         data, settings = renderer.data, renderer.settings
         if data.areas or data.environments or settings.ambient > 0 or settings.aovs:
             raise ShadowmapError(f"the scene has extended or ambient light, or AOVs: batches of lights know {_KINDS}.")
+        lights: list[DirectionalLight] = []
         for light in data.lights:
             if not isinstance(light, DirectionalLight):
                 raise ShadowmapError(f"light '{light.name}' is a {type(light).__name__}: batches of lights know {_KINDS}.")
-        if not data.lights:
-            raise ShadowmapError("the scene has no light: give it directional ones.")
+            lights.append(light)
+        if not lights:
+            raise ShadowmapError("the scene has no light: add a directional light.")
         if data.needs_frames or any(info.see_through for info in data.geometry.shapes):
             raise ShadowmapError(f"the scene has textures, gloss or transparency: batches of lights know {_KINDS}.")
         shadow = settings.shadow
@@ -118,7 +124,7 @@ class StillScene:
             faces = faces[drawing_order(faces, vertices)]
             topology = build_topology(faces, vertices, mi.UInt32)
             channels = buffer.sensor.channels
-            irradiance = [[mi.Float(light.irradiance[c]) for c in range(channels)] for light in data.lights]
+            irradiance = [[mi.Float(light.irradiance[c]) for c in range(channels)] for light in lights]
             scene = cls(
                 _pixels(buffer, channels),
                 irradiance,
@@ -138,8 +144,8 @@ class StillScene:
             return scene
 
 
-def mixed_pixels(pixels: Pixels, colours: list[Any]) -> Any:
-    """Anti-aliased image, flat with interleaved channels, of the colours of its pixels (Float (P,) each). Attached to them."""
+def mixed_pixels(pixels: Pixels, colours: list[Float]) -> Float:
+    """Anti-alias an image of one Float (P,) for each channel. Returns Float (P C,), interleaved. Attached to ``colours``."""
     dr.eval(colours)
     pixel = dr.arange(mi.UInt32, pixels.count)
     share = dr.gather(mi.Vector4f, pixels.incoming, pixel)
@@ -147,7 +153,7 @@ def mixed_pixels(pixels: Pixels, colours: list[Any]) -> Any:
     for k, neighbour in enumerate((pixel + 1, pixel + pixels.width, pixel - 1, pixel - pixels.width)):
         taken = share[k] > 0
         result = [r + share[k] * dr.gather(mi.Float, c, neighbour, taken) for c, r in zip(colours, result, strict=True)]
-    return dr.ravel(mi.Vector3f(*result)) if len(result) == 3 else result[0]
+    return cast(Float, dr.ravel(mi.Vector3f(*result))) if len(result) == 3 else result[0]
 
 
 def _pixels(buffer: GBuffer, channels: int) -> Pixels:
@@ -164,17 +170,18 @@ def _pixels(buffer: GBuffer, channels: int) -> Pixels:
     count = camera.width * camera.height
     incoming, outgoing = dr.zeros(mi.Float, 4 * count), dr.zeros(mi.Float, 4 * count)
     if buffer.crossings is not None:
-        incoming, outgoing = _shares(buffer, camera.width, count)
+        incoming, outgoing = _shares(buffer.crossings, camera.width, count)
     colours = [dr.select(surface.active, colour[c], 0) for c in range(channels)]
     points = [mi.Point3f(point) for point in buffer.points]
     active = mi.Bool(surface.active)
     return Pixels(camera.height, camera.width, points, shading, n_world, colours, active, incoming, outgoing)
 
 
-def _shares(buffer: GBuffer, width: int, count: int) -> tuple[Any, Any]:
-    mixer = Mixer([dr.zeros(mi.Float, count)], width, buffer.crossings)
+def _shares(crossings: Crossings, width: int, count: int) -> tuple[Float, Float]:
+    """``incoming`` and ``outgoing`` of :class:`Pixels`."""
+    mixer = Mixer([dr.zeros(mi.Float, count)], width, crossings)
     pixel = dr.arange(mi.UInt32, count)
-    right, down = buffer.crossings.right, buffer.crossings.down
+    right, down = crossings.right, crossings.down
     incoming, outgoing = mixer.around(right, down, 1), mixer.around(right, down, -1)
     scale = dr.rcp(dr.maximum(1, sum(incoming)))
     dr.eval(scale)
@@ -182,4 +189,5 @@ def _shares(buffer: GBuffer, width: int, count: int) -> tuple[Any, Any]:
         weight * dr.gather(mi.Float, scale, neighbour, weight > 0)
         for weight, neighbour in zip(outgoing, mixer.neighbours(pixel), strict=True)
     ]
-    return dr.ravel(mi.Vector4f(*(weight * scale for weight in incoming))), dr.ravel(mi.Vector4f(*given))
+    shares = mi.Vector4f(*(weight * scale for weight in incoming)), mi.Vector4f(*given)
+    return cast(Float, dr.ravel(shares[0])), cast(Float, dr.ravel(shares[1]))

@@ -1,26 +1,28 @@
-"""Images of R runs at once, each with n directional lights of its own, and the derivatives of their losses by all directions.
+"""Images of R runs at once, each with its own n directional lights, and the derivatives of their losses by all directions.
 
-Lanes are runs times pixels, and runs times lights times pixels; maps are those of all lights of all runs. What the image loses
-against its target is passed back through the anti-aliasing of the image, a sum over neighbours; from there on each light's
-derivatives are known already, since visibility comes with its tangents (:mod:`shadowmap_dr.shadow.light_tangents`).
+Lanes are runs times pixels, or runs times lights times pixels; the maps are those of all lights of all runs. The backward pass
+is written by hand: the derivative of the loss passes through the anti-aliasing of the image, a sum over neighbours, and is then
+multiplied by each light's tangents, which come with visibility (:mod:`shadowmap_dr.shadow.light_tangents`). Callers
+suspend gradients.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import drjit as dr
 import mitsuba as mi
 
+from ...jit.types import Bool, Float, UInt32, Vector3f, Vector4f
 from ...shadow import Frusta, Views, casting_shapes, directional_view, fit_frusta, shape_bounds, to_light_space
 from ...shadow.light_camera import of_map
 from ...shadow.light_tangents import TangentMaps, tangent_maps, tangent_visibility
 from .pixels import StillScene
 
 
-def light_views(to_light: Any) -> Views:
-    """Cameras of directional lights, given the directions *to* them (Vector3f, M, any length)."""
+def light_views(to_light: Vector3f) -> Views:
+    """Cameras of M directional lights, from the directions *to* them (any length)."""
     view, count = directional_view(-mi.Vector3f(to_light)), dr.width(to_light)
     zero = dr.zeros(mi.Float, count)
     views = Views(view.right, view.up, view.forward, mi.Vector3f(zero, zero, zero), zero, zero + dr.inf)
@@ -41,10 +43,10 @@ def fit_maps(scene: StillScene, views: Views, previous: Frusta | None) -> Frusta
     return fit_frusta(views, bounds, casts, scene.shapes, s.resolution, s.filter_size, previous, scene.seen, s.receiver_range)
 
 
-def lit(scene: StillScene, views: Views, maps: TangentMaps | None) -> Any:
-    """Cosine times visibility of each pixel under each light of each run, and its changes as the light turns by a and by b.
+def lit(scene: StillScene, views: Views, maps: TangentMaps | None) -> Float:
+    """Cosine times visibility of each pixel under each light of each run, and its derivatives by both rotations of the light.
 
-    Flat Float (4 M P), packets of four: the value, both changes, nothing. Pixels run fastest.
+    Flat Float (4 M P), packets of four: the value, the two derivatives, zero. Pixels run fastest.
     """
     pixels = scene.pixels
     lane = dr.arange(mi.UInt32, views.count * pixels.count)
@@ -52,7 +54,7 @@ def lit(scene: StillScene, views: Views, maps: TangentMaps | None) -> Any:
     pixel = lane - index * pixels.count
     view = of_map(views, index, views.count)
 
-    def at(table: Any) -> Any:
+    def at(table: Vector3f) -> Vector3f:
         return mi.Vector3f(*(dr.gather(mi.Float, table[c], pixel) for c in range(3)))
 
     n, wo = at(pixels.n_shading), -view.forward
@@ -63,18 +65,18 @@ def lit(scene: StillScene, views: Views, maps: TangentMaps | None) -> Any:
         found = [tangent_visibility(maps, index, at(points), active) for points in pixels.points]
         value, by_a, by_b = (sum(f[k] for f in found) * (1 / len(found)) for k in range(3))
     cosine = dr.select(active, cosine, 0)
-    # The direction to the light moves against the axis of its map.
+    # As the light turns, the direction to it moves against the axes of its map.
     change_a, change_b = (dr.select(active, -dr.dot(n, axis), 0) for axis in (view.right, view.up))
-    result = mi.Vector4f(
+    packets = mi.Vector4f(
         cosine * value, dr.fma(cosine, by_a, change_a * value), dr.fma(cosine, by_b, change_b * value), mi.Float(0)
     )
-    result = dr.ravel(result)
+    result = cast(Float, dr.ravel(packets))
     dr.eval(result)
     return result
 
 
-def images(scene: StillScene, light: Any, runs: int) -> list[Any]:
-    """Anti-aliased images of all runs, one Float (R P) for each channel, from what :func:`lit` returns."""
+def images(scene: StillScene, light: Float, runs: int) -> list[Float]:
+    """Anti-aliased images of all runs, one Float (R P) for each channel. ``light``: result of :func:`lit`."""
     pixels = scene.pixels
     lane = dr.arange(mi.UInt32, runs * pixels.count)
     run = lane // pixels.count
@@ -87,12 +89,12 @@ def images(scene: StillScene, light: Any, runs: int) -> list[Any]:
     colours = [total * dr.gather(mi.Float, pixels.colours[c], pixel) for c, total in enumerate(colours)]
     dr.eval(colours)
     share = dr.gather(mi.Vector4f, pixels.incoming, pixel)
-    touched = sum(share) > 0
+    touched = cast(Float, sum(share)) > 0
     return _mixed(colours, colours, share, touched, lane, pixels.width)
 
 
-def _mixed(own: list[Any], around: list[Any], share: Any, active: Any, lane: Any, width: int) -> list[Any]:
-    """``own`` and the four neighbours' values by their shares: each share is taken from ``own``."""
+def _mixed(own: list[Float], around: list[Float], share: Vector4f, active: Bool, lane: UInt32, width: int) -> list[Float]:
+    """Blend of ``own`` with the four neighbours' values by their shares; ``own`` keeps the rest."""
     kept = 1 - sum(share)
     result = [kept * value for value in own]
     for k, neighbour in enumerate((lane + 1, lane + width, lane - 1, lane - width)):
@@ -101,15 +103,18 @@ def _mixed(own: list[Any], around: list[Any], share: Any, active: Any, lane: Any
     return result
 
 
-def losses_and_gradients(scene: StillScene, views: Views, light: Any, targets: Any, runs: int) -> tuple[Any, Any]:
-    """Mean squared difference of each run's image from its target (Float, R), and its derivatives by the directions.
+def losses_and_gradients(
+    scene: StillScene, views: Views, light: Float, targets: list[Float], runs: int
+) -> tuple[Float, Vector3f]:
+    """Mean squared difference of each run's image from its target, and its derivatives by the directions.
 
     Args:
-        light: from :func:`lit`.
-        targets: for each channel a Float (R P).
+        light: result of :func:`lit`.
+        targets: a Float (R P) for each channel.
 
     Returns:
-        losses, and Vector3f (M,): derivative of the run's loss by a unit vector to each light, in its tangent plane.
+        losses Float (R,), and Vector3f (M,): derivatives of a run's loss by the unit vectors to its lights, in their tangent
+        planes.
     """
     pixels = scene.pixels
     lane = dr.arange(mi.UInt32, runs * pixels.count)
@@ -117,9 +122,9 @@ def losses_and_gradients(scene: StillScene, views: Views, light: Any, targets: A
     differences = [image - target for image, target in zip(images(scene, light, runs), targets, strict=True)]
     dr.eval(differences)
     number = pixels.count * pixels.channels
-    losses = dr.block_sum(sum(dr.square(d) for d in differences), pixels.count) * (1 / number)
+    losses = dr.block_sum(cast(Float, sum(dr.square(d) for d in differences)), pixels.count) * (1 / number)
 
-    # Back through the mixing of pixels: what a pixel gave to its neighbours, and what it kept.
+    # Back through the anti-aliasing: the shares of a pixel in its neighbours, and in itself.
     kept = 1 - sum(dr.gather(mi.Vector4f, pixels.incoming, pixel))
     given = dr.gather(mi.Vector4f, pixels.outgoing, pixel)
     adjoint = [kept * d for d in differences]
@@ -146,8 +151,8 @@ def losses_and_gradients(scene: StillScene, views: Views, light: Any, targets: A
     return losses, -(views.right * by_a + views.up * by_b)
 
 
-def render_lights(scene: StillScene, to_light: Any, frusta: Frusta | None) -> tuple[Views, Any, Frusta | None]:
-    """(cameras, what :func:`lit` returns, frusta) for directions to M lights (Vector3f): those of run 0 first."""
+def render_lights(scene: StillScene, to_light: Vector3f, frusta: Frusta | None) -> tuple[Views, Float, Frusta | None]:
+    """(cameras, result of :func:`lit`, new frusta) for the directions to M lights, those of run 0 first."""
     views = light_views(to_light)
     if scene.shadow.method == "none":
         return views, lit(scene, views, None), frusta
@@ -157,5 +162,5 @@ def render_lights(scene: StillScene, to_light: Any, frusta: Frusta | None) -> tu
 
 
 def with_shadow(scene: StillScene, **changes: Any) -> StillScene:
-    """The same scene with other shadows."""
+    """The same scene with other shadow settings, by their names in `ShadowSettings`."""
     return replace(scene, shadow=replace(scene.shadow, **changes))

@@ -1,1 +1,1 @@
-"""Loops that survive being killed, and sweeps over many runs."""
+"""Optimisation loops that resume from checkpoints, and sweeps over many runs."""

@@ -1,4 +1,4 @@
-"""The optimisation loop: steps are timed, their losses stay on the device, and a killed run goes on from a checkpoint."""
+"""The optimisation loop: it times steps, keeps losses on the device, and resumes killed runs from checkpoints."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeAlias
 
 import drjit as dr
 import numpy as np
@@ -16,37 +16,40 @@ import numpy.typing as npt
 from ...errors import ShadowmapError
 from ...io.files import atomic, read_arrays
 from ...io.records import plain
+from ...jit.types import Float
 
 WARM_UP_STEPS = 5
 CHECKPOINT_INTERVAL = 10
 
 FloatArray = npt.NDArray[np.float64]
+#: One or more numbers, on the host or the device.
+Numbers: TypeAlias = "float | npt.NDArray[Any] | Float"
 
 
 class Method(Protocol):
-    """Something that estimates a few parameters step by step.
+    """An estimator of a few parameters that works step by step.
 
-    `step` and `parameters` may return Dr.Jit arrays: the loop reads them back only at checkpoints, so that a step is not
-    slowed down by waiting for numbers that nobody looks at yet.
+    `step` and `parameters` may return Dr.Jit arrays: the loop reads them back only at checkpoints, so that steps do not wait for
+    read-backs.
     """
 
     def reset(self, start: npt.ArrayLike) -> None:
         """Start anew from the given parameters, with empty optimiser moments."""
 
-    def step(self) -> Any:
-        """One step. Returns the loss *before* it (a number or an array with one entry)."""
+    def step(self) -> Numbers:
+        """Take one step. Returns the loss *before* the step (a number or an array with one entry)."""
 
-    def parameters(self) -> Any:
-        """Current parameters, an array of numbers."""
+    def parameters(self) -> Numbers:
+        """Current parameters, an array (P,)."""
 
     def render(self, parameters: npt.ArrayLike) -> npt.NDArray[np.float32]:
         """Linear image (H, W, C) for the given parameters."""
 
     def state(self) -> dict[str, npt.NDArray[Any]]:
-        """All that `load_state` needs to go on exactly from here: parameters and optimiser moments."""
+        """Parameters and optimiser moments, from which `load_state` continues exactly."""
 
     def load_state(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
-        """Go on from what `state` returned, possibly in another process."""
+        """Continue from a result of `state`, possibly of another process."""
 
     def describe(self) -> dict[str, Any]:
         """Settings for the record, as JSON values."""
@@ -59,7 +62,7 @@ class History:
     Attributes:
         loss: (N,), the loss before each step.
         parameters: (N + 1, P), the start and the parameters after each step.
-        seconds: (N,), wall-clock time of each step, the device's work included.
+        seconds: (N,), wall-clock time of each step, including the device's work.
         warm: (N,) bool, False for the first five steps of each process, which compile and fill caches.
     """
 
@@ -79,7 +82,7 @@ class History:
 
     @property
     def seconds_per_iteration(self) -> float:
-        """Median time of a step after the warm-up (of all steps where there are no others)."""
+        """Median time of a step after the warm-up, or of all steps if all belong to the warm-up; NaN without steps."""
         if not len(self.seconds):
             return float("nan")
         return float(np.median(self.seconds[self.warm] if self.warm.any() else self.seconds))
@@ -104,8 +107,9 @@ def optimize(
         method: see Method.
         start: (P,) start parameters.
         iterations: number of steps, at least 1.
-        checkpoint: file to write every ten steps and to go on from if it exists. It stays after the last step.
-        settings: JSON values that identify the run; a checkpoint with other ones is an error.
+        checkpoint: file that is written every ten steps, and from which the run resumes if it exists. It stays after the last
+            step.
+        settings: JSON values that identify the run; a checkpoint with other settings is an error.
         on_step: called with the number of finished steps.
 
     Raises ShadowmapError if the checkpoint belongs to another run, has more steps, or cannot be read or written.
@@ -131,8 +135,8 @@ def optimize(
     if history.iterations >= iterations:
         return history
 
-    losses: list[Any] = []
-    parameters: list[Any] = []
+    losses: list[Numbers] = []
+    parameters: list[Numbers] = []
     seconds: list[float] = []
     first = history.iterations
     for i in range(first, iterations):
@@ -160,7 +164,7 @@ def optimize(
 
 
 def _save(path: Path, fingerprint: str, history: History, state: Mapping[str, npt.NDArray[Any]]) -> None:
-    arrays = {f"state/{name}": np.asarray(array) for name, array in state.items()}
+    arrays: dict[str, Any] = {f"state/{name}": np.asarray(array) for name, array in state.items()}
     arrays |= {f"history/{name}": array for name, array in vars(history).items()}
     with atomic(path) as temporary, temporary.open("wb") as file:
         np.savez(file, fingerprint=np.array(fingerprint), **arrays)

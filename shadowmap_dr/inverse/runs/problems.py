@@ -1,9 +1,9 @@
-"""Problems that a sweep runs: a problem has settings, numbered runs, something to build once, and a way to do a batch of runs.
+"""Problems of a sweep: settings, numbered runs, objects that are built once, and a function that does a batch of runs.
 
-Derive from :class:`LossProblem` where a loss can be evaluated for many runs at once, from :class:`MethodProblem` where a
-:class:`shadowmap_dr.inverse.Method` does one run at a time, or from :class:`Problem` for anything else. A problem is a
-description: a frozen dataclass of plain values that can be pickled and sent to workers. All that is expensive or belongs to a
-device is made in ``build``.
+Derive from :class:`LossProblem` if the loss can be evaluated for many runs at once, from :class:`MethodProblem` if a
+:class:`shadowmap_dr.inverse.Method` does one run at a time, or from :class:`Problem` otherwise. A problem is a description: a
+frozen dataclass of plain values that can be pickled and sent to workers. Method ``build`` makes everything that is expensive or
+lives on a device.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import functools
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 import mitsuba as mi
@@ -22,28 +22,35 @@ import numpy.typing as npt
 
 from ...errors import ShadowmapError
 from ...jit.arrays import device_array
+from ...jit.types import Float
 from .loop import History, Method, optimize
 
 FloatArray = npt.NDArray[np.float64]
 
 
 class Problem(ABC):
-    """Numbered runs with something in common. Subclasses have (as fields, properties or class attributes):
+    """Numbered runs that share settings and objects. Subclasses have these fields, properties or class attributes:
 
     Attributes:
-        name: what files and progress bars call it: letters, digits, '.', '_' and '-'.
-        runs: how many runs there are, numbered from 0 unless ``run_numbers`` says otherwise.
-        steps: of each run.
+        name: name in files and progress bars: letters, digits, '.', '_' and '-'.
+        runs: number of runs, counted from 0 unless ``run_numbers`` says otherwise.
+        steps: number of steps of each run.
     """
 
-    name: str
-    runs: int
-    steps: int
+    # Read-only for type checkers, so that subclasses may compute them.
+    if TYPE_CHECKING:
+
+        @property
+        def name(self) -> str: ...
+        @property
+        def runs(self) -> int: ...
+        @property
+        def steps(self) -> int: ...
 
     def settings(self) -> dict[str, Any]:
-        """JSON values that decide on the results: records on disk with other ones are not taken for these runs.
+        """JSON values that the results depend on: records on disk with other settings are not used for these runs.
 
-        By default the number of steps and all fields of the dataclass but the number of runs.
+        Default: the number of steps and all fields of the dataclass except the number of runs.
         """
         if not dataclasses.is_dataclass(self):
             raise ShadowmapError(f"problem '{self.name}' is no dataclass: give it a method settings().")
@@ -51,44 +58,48 @@ class Problem(ABC):
         return {"steps": self.steps, **own}
 
     def run_numbers(self) -> Sequence[int]:
-        """The numbers of the runs, in the order of the results."""
+        """Numbers of the runs, in the order of the results."""
         return range(self.runs)
 
     def batch_size(self, memory: int) -> int:
-        """Number of runs to do at once so that they need about ``memory`` bytes at most."""
+        """Number of runs in a batch that needs at most about ``memory`` bytes."""
         return 1
 
     @abstractmethod
-    def build(self) -> Any:
-        """Objects that batches share: scene, renderer, compiled steps. Made once in each process, after the variant is set."""
+    def build(self) -> Any:  # Any: each problem builds its own type
+        """Make the objects that batches share (scene, renderer, compiled steps), once in each process, with the variant set."""
 
     @abstractmethod
     def run_batch(
-        self, built: Any, runs: Sequence[int], checkpoint: Path | None, on_step: Callable[[int], None]
+        self,
+        built: Any,  # Any: result of `build`
+        runs: Sequence[int],
+        checkpoint: Path | None,
+        on_step: Callable[[int], None],
     ) -> list[dict[str, Any]]:
         """Do some runs.
 
         Args:
-            built: from :meth:`build`.
-            runs: their numbers. Results depend on these alone, not on which other runs are in the batch.
-            checkpoint: file from which a killed batch may go on, None where there is no place for one. Others may lie beside it,
-                with names that begin with its stem. All are deleted when the result is on disk.
-            on_step: to be told how many steps are done.
+            built: result of :meth:`build`.
+            runs: their numbers. The result of a run depends on its number alone, not on the other runs of the batch.
+            checkpoint: file from which a killed batch can resume, None for no checkpoints. Further files may lie beside it, with
+                names that begin with its stem. All are deleted when the result is on disk.
+            on_step: to be called with the number of finished steps.
 
         Returns:
-            For each run a record of JSON values.
+            A record of JSON values for each run.
         """
 
 
 class LossProblem(Problem):
-    """Parameters, a loss and starts: what is to be found is where the loss of each run is least (Adam).
+    """Minimisation of a loss over P parameters from the start of each run, with Adam.
 
-    Runs have P parameters each; a batch of R runs has R P in one array, run by run, and Adam's moments for each of them.
+    A batch of R runs holds R P parameters in one array, run by run, and Adam's moments for each of them.
     """
 
     step_size: float = 0.01
     betas: tuple[float, float] = (0.9, 0.999)
-    #: Bytes that one run of a batch needs, about.
+    #: Approximate memory of one run of a batch, in bytes.
     bytes_per_run: int = 1 << 20
 
     def settings(self) -> dict[str, Any]:
@@ -96,11 +107,11 @@ class LossProblem(Problem):
 
     @abstractmethod
     def start(self, run: int) -> npt.ArrayLike:
-        """(P,) start of a run, by its number only."""
+        """Start (P,) of a run; depends on its number only."""
 
     @abstractmethod
-    def losses(self, built: Any, parameters: Any, runs: Sequence[int]) -> Any:
-        """Loss of each of R runs, ``Float`` (R,), attached to ``parameters``, ``Float`` (R P); it depends on that run's only."""
+    def losses(self, built: Any, parameters: Float, runs: Sequence[int]) -> Float:  # Any: result of `build`
+        """Loss of each of R runs, ``Float`` (R,). Attached to ``parameters``, ``Float`` (R P): each loss to those of its run."""
 
     def record(self, run: int, history: History) -> dict[str, Any]:
         """Record of a run: start, final parameters and the loss before each step."""
@@ -110,7 +121,11 @@ class LossProblem(Problem):
         return max(1, memory // self.bytes_per_run)
 
     def run_batch(
-        self, built: Any, runs: Sequence[int], checkpoint: Path | None, on_step: Callable[[int], None]
+        self,
+        built: Any,  # Any: result of `build`
+        runs: Sequence[int],
+        checkpoint: Path | None,
+        on_step: Callable[[int], None],
     ) -> list[dict[str, Any]]:
         starts = np.stack([np.asarray(self.start(run), np.float64).ravel() for run in runs])
         fit = _BatchFit(functools.partial(self.losses, built, runs=tuple(runs)), len(runs), self.step_size, self.betas)
@@ -126,14 +141,14 @@ class LossProblem(Problem):
 
 
 class MethodProblem(Problem):
-    """Runs that a :class:`shadowmap_dr.inverse.Method` (which ``build`` returns) does one by one, such as `PoseFit`."""
+    """Runs that a :class:`shadowmap_dr.inverse.Method`, such as `PoseFit`, does one by one; ``build`` returns the method."""
 
     @abstractmethod
     def start(self, run: int) -> npt.ArrayLike:
-        """(P,) start of a run, by its number only."""
+        """Start (P,) of a run; depends on its number only."""
 
     def record(self, run: int, history: History) -> dict[str, Any]:
-        """Record of a run."""
+        """Record of a run: start, final parameters, the loss before each step and the time of a step."""
         return {
             "start": history.parameters[0],
             "final": history.final,
@@ -156,9 +171,13 @@ class MethodProblem(Problem):
 class _BatchFit:
     """Adam on all parameters of a batch: a `Method` of the optimisation loop whose loss is the sum of all runs' losses."""
 
-    def __init__(self, losses: Callable[[Any], Any], runs: int, step_size: float, betas: tuple[float, float]) -> None:
+    def __init__(self, losses: Callable[[Float], Float], runs: int, step_size: float, betas: tuple[float, float]) -> None:
         self._loss, self._runs, self._step_size, self._betas = losses, runs, step_size, betas
-        self._losses: list[Any] = []
+        self._losses: list[Float] = []
+        self._parameters: Float
+        self._m: Float
+        self._v: Float
+        self._t: Float
         self.reset(np.zeros(1))
 
     def loss_curves(self) -> npt.NDArray[np.float32]:
@@ -170,7 +189,7 @@ class _BatchFit:
         zero = np.zeros_like(start)
         self.load_state({"parameters": start, "m": zero, "v": zero, "t": np.zeros(1), "losses": np.empty(0)})
 
-    def step(self) -> Any:
+    def step(self) -> Float:
         parameters = mi.Float(self._parameters)
         dr.enable_grad(parameters)
         losses = self._loss(parameters)
@@ -183,13 +202,14 @@ class _BatchFit:
         self._t = self._t + 1
         self._m = first * self._m + (1 - first) * gradient
         self._v = second * self._v + (1 - second) * gradient * gradient
-        rate = self._step_size * dr.sqrt(1 - dr.power(second, self._t)) / (1 - dr.power(first, self._t))
+        unbiased = 1 - cast(Float, dr.power(second, self._t))
+        rate = self._step_size * dr.sqrt(unbiased) / (1 - cast(Float, dr.power(first, self._t)))
         self._parameters = self._parameters - rate * self._m / (dr.sqrt(self._v) + 1e-8)
         dr.eval(self._parameters, self._m, self._v, self._t, losses)
         self._losses.append(losses)
         return dr.sum(losses)
 
-    def parameters(self) -> Any:
+    def parameters(self) -> Float:
         return self._parameters
 
     def render(self, parameters: npt.ArrayLike) -> npt.NDArray[np.float32]:

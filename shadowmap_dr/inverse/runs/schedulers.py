@@ -1,4 +1,4 @@
-"""Who does the batches of a sweep: this process, processes on this machine, or the workers of a Dask cluster."""
+"""Schedulers of a sweep's batches: this process, processes on this machine, or the workers of a Dask cluster."""
 
 from __future__ import annotations
 
@@ -7,13 +7,17 @@ import threading
 import uuid
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ...errors import OutputError, ShadowmapError, is_interrupt
 from .worker import Batch, Worker
 
-#: How a scheduler is named.
+if TYPE_CHECKING:
+    from distributed import Client
+
+#: Names of schedulers.
 SCHEDULERS = "local, processes:N or tcp://HOST:PORT"
 
 MOST_THREADS = 1024
@@ -22,7 +26,7 @@ Report = Callable[[Batch, dict[str, Any]], None]
 
 
 def check_scheduler(name: str) -> None:
-    """Raise ShadowmapError for a name of no scheduler, or if what it needs is not installed."""
+    """Raise ShadowmapError if no scheduler has this name, or if its package Dask is not installed."""
     kind, _, count = name.partition(":")
     if name == "local":
         return
@@ -38,7 +42,7 @@ def check_scheduler(name: str) -> None:
 
 
 def check_threads(threads: int) -> None:
-    """Raise ShadowmapError for a number of Dr.Jit threads that cannot be."""
+    """Raise ShadowmapError for an impossible number of Dr.Jit threads."""
     if not 0 <= threads <= MOST_THREADS:
         raise ShadowmapError(f"{threads} threads: give 1 to {MOST_THREADS}, or 0 for all.")
 
@@ -52,10 +56,10 @@ def do_batches(
     on_done: Report,
     on_step: Callable[[Batch, int], None] = lambda batch, done: None,
 ) -> None:
-    """Do all units; ``on_done`` gets each one's result as soon as it is there, in the order in which they end.
+    """Do all batches; ``on_done`` gets the result of each as soon as it ends.
 
-    A unit whose worker died is done again by another one. ``on_step`` is called by the scheduler ``local`` only.
-    Raises what a unit raised, after all others are done.
+    If a worker dies, another worker repeats its batch. Only the scheduler ``local`` calls ``on_step``. Errors of batches are
+    raised after all other batches are done.
     """
     failed = (_do_here if scheduler == "local" else _do_elsewhere)(batches, scheduler, threads, folder, on_done, on_step)
     if failed:
@@ -71,12 +75,13 @@ def do_batches(
 def _do_here(
     batches: Sequence[Batch], _: str, threads: int, folder: Path, on_done: Report, on_step: Callable[[Batch, int], None]
 ) -> list[Exception]:
-    worker, failed = Worker(threads), []
+    failed: list[Exception] = []
+    worker = Worker(threads)
     for batch in batches:
         try:
-            result = worker.do(batch, folder, lambda done, batch=batch: on_step(batch, done))
+            result = worker.do(batch, folder, partial(on_step, batch))
         except OutputError:
-            raise  # where a checkpoint cannot be written, no other could be
+            raise  # the next checkpoint could not be written either
         except Exception as error:
             if is_interrupt(error):
                 raise KeyboardInterrupt from error
@@ -93,7 +98,7 @@ def _do_elsewhere(
 
     failed: list[Exception] = []
     with _client(scheduler) as client:
-        # Other sweeps on the same cluster may have units of the same name, whose results are not ours.
+        # Other sweeps on the same cluster may have batches of the same name with other results.
         sweep = uuid.uuid4().hex
         futures = {
             client.submit(_do, batch, str(folder), threads, pure=False, key=f"{batch.file}-{sweep}", retries=0): batch
@@ -113,12 +118,12 @@ def _do_elsewhere(
 
 
 @contextmanager
-def _client(scheduler: str) -> Iterator[Any]:
+def _client(scheduler: str) -> Iterator[Client]:
     from distributed import Client, LocalCluster
 
     if scheduler.startswith("processes:"):
         count = int(scheduler.partition(":")[2])
-        # One thread for Python; those of Dr.Jit are its own affair. Workers start anew when they die.
+        # One Python thread each; Dr.Jit has its own threads. Dask restarts workers that die.
         with (
             LocalCluster(
                 n_workers=count, threads_per_worker=1, processes=True, dashboard_address=None, memory_limit=0
@@ -128,17 +133,17 @@ def _client(scheduler: str) -> Iterator[Any]:
             yield client
         return
     client = None
-    with suppress(OSError, ValueError, TypeError):  # the last two for ports that are none, and missing certificates
+    with suppress(OSError, ValueError, TypeError):  # the last two: invalid ports and missing certificates
         client = Client(scheduler, timeout=20)
     if client is None:
-        # What is left of it waits for a lock when it is collected: forever, if that is in the thread that starts the next one.
+        # Collect the failed client here: its destructor waits for a lock, forever in the thread that starts the next client.
         gc.collect()
         raise ShadowmapError(f"no Dask scheduler answers at {scheduler}: start one, or give its address.")
     with client:
         yield client
 
 
-#: The worker of this process, if it is a worker, for as long as nobody asks for another number of threads.
+#: Worker of this process, at most one; replaced when another number of threads is asked for.
 _WORKER: list[Worker] = []
 _LOCK = threading.Lock()
 

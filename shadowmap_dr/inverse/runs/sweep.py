@@ -1,4 +1,4 @@
-"""Sweeps: all runs of some problems, in batches, each with a file of its own, so that whatever is killed goes on from there."""
+"""Sweeps: all runs of some problems, in batches. Each batch writes its own file, so that killed sweeps can resume."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from .problems import Problem
 from .schedulers import check_scheduler, check_threads, do_batches
 from .worker import Batch, stem
 
-#: Bytes that a batch may need if nobody says otherwise.
+#: Default limit of a batch's memory, in bytes.
 MEMORY = 1 << 31
-#: How the names of checkpoints end: those of batches, and of single runs of a batch.
+#: Ends of the names of checkpoints, of batches and of single runs of a batch.
 _CHECKPOINT = r"\.checkpoint(-[0-9a-f]{8})?(-run\d+)?\.npz"
 
 
@@ -37,25 +37,25 @@ def run_sweep(
     """Do all runs of some problems.
 
     Each batch leaves a file ``out/batches/NAME-DIGEST-FIRST-LAST.json`` with the records of its runs, which appears when it is
-    complete. DIGEST is one of the settings and the variant: files of the same problem with other settings are left alone.
+    complete. DIGEST is a hash of settings and variant: files of the same problem with other settings stay.
 
     Args:
-        problems: with different names.
+        problems: must have different names.
         out: folder for results.
         scheduler: ``local`` (this process), ``processes:N`` (on this machine) or the address of a Dask scheduler
             (``tcp://host:port``). Scheduler and workers must have this package, and the module of the problems, installed.
         variant: Mitsuba variant, here and in workers.
-        threads: Dr.Jit threads of each process, 0 for as many as there are cores.
-        memory: bytes that a batch may need, about.
-        resume: keep records on disk whose settings are those of their problem. They may come from batches of another size, or
-            from another scheduler. Otherwise files of these problems with these settings are deleted first.
+        threads: Dr.Jit threads of each process, 0 for one for each core.
+        memory: approximate limit of a batch's memory, in bytes.
+        resume: keep records on disk with the settings of their problem; batches of another size or another scheduler may have
+            written them. Otherwise the files of these problems with these settings are deleted first.
 
     Returns:
-        For each problem's name its records, in the order of the runs.
+        Records by the name of the problem, in the order of the runs.
 
     Raises:
-        ShadowmapError: names that are no file names, or not different; an unknown scheduler; what a batch raised (results of the
-            others are on disk by then).
+        ShadowmapError: names are equal or no file names; the scheduler is unknown; a batch failed (the results of the others are
+            on disk by then).
     """
     check_scheduler(scheduler)
     check_threads(threads)
@@ -93,14 +93,14 @@ def run_sweep(
             progress.update(total, advance=1)
 
         do_batches(batches, scheduler, threads=threads, folder=folder.resolve(), on_done=on_done, on_step=on_step)
-    for problem in problems:  # those of batches of another size, which were killed
+    for problem in problems:  # checkpoints of killed batches of another size
         for path in _files(problem, folder, variant, _CHECKPOINT):
             path.unlink(missing_ok=True)
     return {problem.name: [done[problem.name][run] for run in problem.run_numbers()] for problem in problems}
 
 
 def _batches(problem: Problem, variant: str, done: dict[int, Any], memory: int) -> list[Batch]:
-    """Batches, as equal in size as can be, of the runs that are still to be done."""
+    """Batches of the remaining runs, of nearly equal size."""
     left = [run for run in problem.run_numbers() if run not in done]
     if not left:
         return []
@@ -110,14 +110,15 @@ def _batches(problem: Problem, variant: str, done: dict[int, Any], memory: int) 
 
 
 def _files(problem: Problem, folder: Path, variant: str, ending: str = r"\.json") -> list[Path]:
-    """Files of a problem's batches: not those of problems whose names begin with its own."""
+    """Files of a problem's batches, without those of problems whose names begin with its name."""
     pattern = re.compile(re.escape(stem(problem, variant)) + r"-\d+-\d+" + ending)
     return [path for path in sorted(folder.glob("*")) if pattern.fullmatch(path.name)]
 
 
 def stored_records(problem: Problem, out: Path, variant: str) -> dict[int, Any]:
-    """Records by run from complete batches below ``out`` that were made with the problem's settings in a variant."""
-    wanted, found = records.plain(problem.settings()), {}
+    """Records by run, from complete batches below ``out`` with the problem's settings and this variant."""
+    wanted = records.plain(problem.settings())
+    found: dict[int, Any] = {}
     for path in _files(problem, out / "batches", variant):
         try:
             result = records.read_json(path)
@@ -125,5 +126,5 @@ def stored_records(problem: Problem, out: Path, variant: str) -> dict[int, Any]:
                 pairs = zip(result["runs"], result["records"], strict=True)
                 found |= {run: record for run, record in pairs if run in problem.run_numbers()}
         except (ShadowmapError, KeyError, TypeError, ValueError):
-            continue  # whatever cannot be read is done again
+            continue  # runs of unreadable files are done again
     return found

@@ -1,4 +1,4 @@
-"""Worker of batches: a process that keeps what a problem has built for as long as batches of the same problem come."""
+"""Worker of batches: keeps the built objects of a problem while batches of the same problem follow."""
 
 from __future__ import annotations
 
@@ -29,49 +29,50 @@ class Batch:
 
     @property
     def title(self) -> str:
-        """For people."""
+        """Title for progress bars."""
         return f"{self.problem.name} runs {self.runs[0]}-{self.runs[-1]}"
 
     @property
     def file(self) -> str:
-        """Name of the result's file."""
+        """Name of the result file."""
         return f"{stem(self.problem, self.variant)}-{self.runs[0]:06d}-{self.runs[-1]:06d}.json"
 
     @property
     def checkpoint(self) -> str:
-        """Name of its checkpoint's file. Batches of another size may have left gaps, and checkpoints hold for their runs only."""
+        """Name of the checkpoint file. It belongs to exactly these runs: if they have gaps, their hash is a part of it."""
         whole = len(self.runs) == self.runs[-1] - self.runs[0] + 1
         which = "" if whole else "-" + hashlib.sha256(repr(self.runs).encode()).hexdigest()[:8]
         return f"{Path(self.file).stem}.checkpoint{which}.npz"
 
 
 def stem(problem: Problem, variant: str) -> str:
-    """Beginning of the names of a problem's files: its name, and a digest of all that decides on its results."""
+    """Beginning of the names of a problem's files: its name, and a hash of settings and variant."""
     content = json.dumps([plain(problem.settings()), variant], sort_keys=True)
     return f"{problem.name}-{hashlib.sha256(content.encode()).hexdigest()[:8]}"
 
 
 class Worker:
-    """Does units, one at a time, in this process.
+    """Does batches, one at a time, in this process.
 
     Args:
-        threads: of Dr.Jit, 0 for as many as there are. With a single one, Mitsuba 3.9 waits forever when it reads or writes an
-            EXR file: problems must not do that.
+        threads: number of Dr.Jit threads, 0 for the default. With a single thread, Mitsuba 3.9 waits forever when it reads or
+            writes an EXR file: problems must not do that.
     """
 
     def __init__(self, threads: int = 0) -> None:
         self.threads = threads
-        self._key, self._built = "", None
+        self._key = ""
+        self._built: Any = None  # Any: result of `Problem.build`
         self._lock = threading.Lock()
 
     def do(self, batch: Batch, folder: Path | None, on_step: Callable[[int], None] = lambda done: None) -> dict[str, Any]:
-        """The content of the unit's result file: settings, variant, runs, records, seconds.
+        """Do a batch. Returns the content of its result file: settings, variant, runs, records, seconds, threads.
 
-        ``folder``: for checkpoints; where it does not exist (workers on other machines), there are none. They stay: whoever has
-        written the result deletes them.
+        ``folder``: for checkpoints; without it (workers on other machines) there are none. The caller deletes them when the
+        result is on disk.
         """
         with self._lock, gc_quiet():
-            # Both belong to a thread, and workers may use another one each time.
+            # Variant and thread count belong to a Python thread, and Dask may use another thread each time.
             if mi.variant() != batch.variant:
                 mi.set_variant(batch.variant)
             if self.threads and dr.thread_count() != self.threads:
@@ -79,7 +80,7 @@ class Worker:
             key = stem(batch.problem, batch.variant)
             began = time.perf_counter()
             if key != self._key:
-                self._key, self._built = "", None  # the old one's memory first
+                self._key, self._built = "", None  # frees the memory of the old problem first
                 self._key, self._built = key, batch.problem.build()
             built = time.perf_counter()
             checkpoint = None

@@ -1,9 +1,9 @@
-"""Shadow art from many objects: copies of one mesh are moved, turned and scaled until their common shadow is a picture."""
+"""Shadow art from many objects: copies of one mesh are moved, turned and scaled until their joint shadow matches a picture."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import drjit as dr
 import mitsuba as mi
@@ -12,38 +12,39 @@ import numpy.typing as npt
 
 from ...errors import ShadowmapError
 from ...jit.arrays import device_array
+from ...jit.types import Float, Point3f
 from ...rendering.receivers.shadow_images import ShadowImages, image_loss, shadow_images
 from ...rendering.receivers.shadow_views import ShadowView
 from .sculpt import checked_target
 
 # Numbers of each copy: offset (3), quaternion (4: x, y, z, w), logarithm of the scale.
 _NUMBERS = 8
-# Where the first copy is: at the origin, unturned, this large. World units for a mesh in [-1, 1]^3.
+# Scale of the first copy, at the origin and not turned. World units for a mesh in [-1, 1]^3.
 _FIRST_SCALE = 0.7
-# Two copies take the place of one: how much smaller they are, and how far from its middle, in units of its scale.
+# Two copies replace one: their relative scale, and their distances from its centre, in units of its scale.
 _SHRINK, _ASIDE, _APART = 0.8, 0.35, 0.3
-# Middles of new copies are no farther from the origin along the first view's light, which would not bring them back.
+# Largest distance of new copies' centres from the origin along the first view's light, which cannot bring them back.
 _REACH = 1.0
 
 Array = npt.NDArray[np.float32]
 
 
 class Collection:
-    """Copies of a mesh whose common shadows become like target images. It starts with one copy; their number doubles.
+    """Copies of a mesh, fitted so that their joint shadows match target images. Begins with one copy; their number doubles.
 
     Args:
-        vertices: (V, 3) of the mesh, in [-1, 1]^3 about.
+        vertices: (V, 3) of the mesh, about in [-1, 1]^3.
         faces: (F, 3).
         views: one or more, see `shadow_view`.
         targets: visibility (H, W) in 0 (dark) to 1 (lit) for each view.
         interval: steps after which each copy is replaced by two.
-        most: copies at most.
+        most: largest number of copies.
         step_size: of Adam, on offsets (world units), quaternions and logarithms of scales.
-        seed: of the directions in which copies part.
+        seed: of the random directions in which the two new copies move apart.
         map_resolution, filter_size, method: of the shadow maps.
         settings: further entries for `describe`.
 
-    Raises ShadowmapError for a mesh, targets or settings that cannot be used.
+    Raises ShadowmapError for an unusable mesh, target or setting.
     """
 
     def __init__(
@@ -70,30 +71,30 @@ class Collection:
         self._targets = [checked_target(image, view) for image, view in zip(targets, self.views, strict=True)]
         self._wanted = device_array(mi.Float, np.concatenate([image.ravel() for image in self._targets]))
         self._rest, self._rest_faces = np.array(vertices, np.float32), np.array(faces, np.uint32)
-        self._shadow = {"map_resolution": map_resolution, "filter_size": filter_size, "method": method}
+        self._shadow: dict[str, Any] = {"map_resolution": map_resolution, "filter_size": filter_size, "method": method}
         self._interval, self._most, self._seed = interval, most, seed
         self._step_size, self._settings = step_size, dict(settings or {})
         self.reset()
 
     @property
     def count(self) -> int:
-        """Copies there are now."""
+        """Current number of copies."""
         return self._count
 
     @property
     def faces(self) -> npt.NDArray[np.uint32]:
-        """(count * F, 3)."""
+        """Faces of all copies, (count * F, 3)."""
         shift = np.arange(self._count, dtype=np.uint32) * np.uint32(len(self._rest))
         return (self._rest_faces + shift[:, None, None]).reshape(-1, 3)
 
     def reset(self) -> None:
-        """Start anew with one copy."""
+        """Restart with one copy."""
         numbers = np.array([0, 0, 0, 0, 0, 0, 1, np.log(_FIRST_SCALE)])
         zero = np.zeros_like(numbers)
         self.load_state({"numbers": numbers, "m": zero, "v": zero, "t": np.zeros(1), "steps": np.zeros(1)})
 
-    def step(self) -> Any:
-        """One step, before which copies may double; returns the loss before it, ``Float`` (1,), without waiting for it."""
+    def step(self) -> Float:
+        """Double the copies if it is time, then take one step. Returns the loss before it, ``Float`` (1,), without waiting."""
         if self._steps and self._steps % self._interval == 0 and 2 * self._count <= self._most:
             self._double()
         numbers = self._optimizer["numbers"]
@@ -104,16 +105,16 @@ class Collection:
         return loss
 
     def vertices(self) -> Array:
-        """(count * V, 3), world space, after the last step."""
+        """Vertices of all copies, (count * V, 3), world space, after the last step."""
         placed = _placed(dr.detach(self._optimizer["numbers"]), self._points)
         return np.array(placed, np.float32).reshape(-1, 3)
 
     def visibility(self) -> list[Array]:
-        """(H, W) for each view: 0 (dark) to 1 (lit), top row first."""
+        """Visibility image (H, W) of each view: 0 (dark) to 1 (lit), top row first."""
         return self._shadows.images(self._look(dr.detach(self._optimizer["numbers"]), self._points, self._shadows))
 
     def target(self, view: int) -> Array:
-        """(H, W), a copy."""
+        """Target image (H, W) of a view, a copy."""
         return self._targets[view].copy()
 
     def state(self) -> dict[str, npt.NDArray[Any]]:
@@ -123,7 +124,7 @@ class Collection:
         return {**{name: np.array(array) for name, array in arrays.items()}, "steps": np.array([self._steps])}
 
     def load_state(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
-        """Go on from what `state` returned, whatever number of copies it has."""
+        """Continue from a result of `state`, with any number of copies. Raises ShadowmapError if numbers are missing."""
         numbers, m, v = (device_array(mi.Float, state[name]) for name in ("numbers", "m", "v"))
         if dr.width(numbers) % _NUMBERS or {dr.width(m), dr.width(v)} != {dr.width(numbers)}:
             raise ShadowmapError(f"a state of {dr.width(numbers)} numbers: it must hold {_NUMBERS} for each copy.")
@@ -143,16 +144,16 @@ class Collection:
         }  # fmt: skip
 
     def _prepare(self, count: int) -> None:
-        """Everything that depends on the number of copies."""
+        """Set up everything that depends on the number of copies."""
         self._count = count
-        # Apart from each other, so that no two copies are taken for one where they touch.
+        # Apart from each other: coinciding vertices of two copies must not be merged.
         apart = self._rest + np.arange(count, dtype=np.float32)[:, None, None] * np.float32(4)
         self._shadows = shadow_images(apart.reshape(-1, 3), self.faces, self.views, **self._shadow)
         self._points = mi.Point3f(*(device_array(mi.Float, np.tile(self._rest[:, c], count)) for c in range(3)))
         self._gradient, self._look = dr.freeze(_gradient), dr.freeze(_look)
 
     def _double(self) -> None:
-        """Two smaller copies for each: side by side in the image, one before the other."""
+        """Replace each copy by two smaller ones, side by side in the image and at different depths."""
         rows = np.array(dr.detach(self._optimizer["numbers"]), np.float64).reshape(_NUMBERS, -1)
         angle = np.random.default_rng([self._seed, self._count]).uniform(0, 2 * np.pi, self._count)
         size = np.exp(rows[7])
@@ -170,12 +171,12 @@ class Collection:
         self.load_state({"numbers": numbers, "m": zero, "v": zero, "t": np.zeros(1), "steps": np.array([self._steps])})
 
 
-def _placed(numbers: Any, points: Any) -> Any:
-    """Vertices ``Float`` (3 * N * V,) of N copies. Attached to the numbers; ``points`` are those of the mesh, N times."""
+def _placed(numbers: Float, points: Point3f) -> Float:
+    """Vertices ``Float`` (3 * N * V,) of N copies, attached to ``numbers``. ``points``: the mesh's vertices, repeated N times."""
     count = dr.width(numbers) // _NUMBERS
     each = dr.width(points) // count
     copy = dr.arange(mi.UInt32, count)
-    # Each number is read once, so that no atomics are needed; the derivative of a repetition is a sum over neighbours.
+    # Each number is gathered once, so that no atomics are needed; the backward pass of `repeat` is a sum over neighbours.
     rows = (dr.gather(mi.Float, numbers, copy + row * count, mode=dr.ReduceMode.NoConflicts) for row in range(_NUMBERS))
     x, y, z, *quaternion, scale = (dr.repeat(row, each) for row in rows)
     i, j, k, w = quaternion
@@ -183,10 +184,10 @@ def _placed(numbers: Any, points: Any) -> Any:
     p = mi.Vector3f(points)
     # A quaternion q of any length turns p by q p q* / |q|^2.
     turned = p + (2 * dr.rcp(norm)) * dr.cross(axis, dr.cross(axis, p) + w * p)
-    return dr.ravel(mi.Point3f(dr.exp(scale) * turned + mi.Vector3f(x, y, z)))
+    return cast(Float, dr.ravel(mi.Point3f(dr.exp(scale) * turned + mi.Vector3f(x, y, z))))
 
 
-def _gradient(numbers: Any, points: Any, wanted: Any, shadows: ShadowImages) -> tuple[Any, Any]:
+def _gradient(numbers: Float, points: Point3f, wanted: Float, shadows: ShadowImages) -> tuple[Float, Float]:
     """(loss, derivative of the loss by the numbers)."""
     numbers = mi.Float(numbers)
     dr.enable_grad(numbers)
@@ -197,5 +198,5 @@ def _gradient(numbers: Any, points: Any, wanted: Any, shadows: ShadowImages) -> 
     return loss, dr.grad(numbers)
 
 
-def _look(numbers: Any, points: Any, shadows: ShadowImages) -> Any:
+def _look(numbers: Float, points: Point3f, shadows: ShadowImages) -> Float:
     return shadows.visibility(_placed(numbers, points))

@@ -1,10 +1,10 @@
-"""Meshes read and placed around the origin; written in colour with the walls of their shadows, and for printing."""
+"""Mesh files of shadow art: in colour with the receivers of the shadows, and for 3D printing."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,16 +15,19 @@ from ...io.meshes import Array, Faces
 from ...rendering.receivers.shadow_views import ShadowView, height
 from .smoothness import inverted_share
 
-#: Largest side of a mesh that is to be printed, in millimetres.
+if TYPE_CHECKING:
+    import trimesh
+
+#: Largest side of a mesh for printing, in millimetres.
 PRINT_SIZE_MM = 80.0
-# From the bottom to the top of an object, sRGB: dusk, coral, sand.
+# sRGB colours from the bottom to the top of an object: dusk, coral, sand.
 _PALETTE = np.array([[0.22, 0.24, 0.45], [0.84, 0.38, 0.36], [0.96, 0.80, 0.56]])
-# Cells along a wall in the file with colours: enough for its waves.
+# Cells along each side of a receiver in the coloured file: enough for its waves.
 _WALL_CELLS = 64
 
 
 def vertex_colours(vertices: Array) -> npt.NDArray[np.uint8]:
-    """(V, 4) sRGB and opacity, by height."""
+    """(V, 4) uint8, sRGB and opacity, by height."""
     y = vertices[:, 1].astype(np.float64)
     t = (y - y.min()) / max(float(np.ptp(y)), 1e-9) * (len(_PALETTE) - 1)
     columns = [np.interp(t, np.arange(len(_PALETTE)), _PALETTE[:, c]) for c in range(3)]
@@ -32,14 +35,15 @@ def vertex_colours(vertices: Array) -> npt.NDArray[np.uint8]:
 
 
 def write_meshes(folder: Path, vertices: Array, faces: Faces, views: Sequence[ShadowView], images: Sequence[Array]) -> None:
-    """`mesh.ply`, `mesh.obj`, and `mesh.glb`: the object with colours, and the receivers with the shadows (H, W) on them."""
+    """Write `mesh.ply`, `mesh.obj` and, with colours and with the shadows (H, W) on their receivers, `mesh.glb`."""
     import trimesh
 
     plain = trimesh.Trimesh(vertices, faces, process=False)
     coloured = trimesh.Trimesh(vertices, faces, process=False, vertex_colors=vertex_colours(vertices))
-    scene = trimesh.Scene({"object": coloured})
+    scene = trimesh.Scene()
+    scene.add_geometry(coloured, geom_name="object")
     for k, (view, image) in enumerate(zip(views, images, strict=True)):
-        if view.camera == "orthographic":  # only then the image is the receiver, edge to edge
+        if view.camera == "orthographic":  # the image shows exactly the receiver
             scene.add_geometry(_wall(view, image), geom_name=f"receiver {k + 1}")
     for name, content in (("mesh.ply", plain), ("mesh.obj", plain), ("mesh.glb", scene)):
         with files.atomic(folder / name) as temporary:
@@ -47,7 +51,7 @@ def write_meshes(folder: Path, vertices: Array, faces: Faces, views: Sequence[Sh
 
 
 def write_printable(path: Path, vertices: Array, faces: Faces) -> None:
-    """A binary STL in millimetres, z up, standing on z = 0, outside out."""
+    """Write a binary STL in millimetres: z up, standing on z = 0, faces outward."""
     import trimesh
 
     scale = PRINT_SIZE_MM / float(np.ptp(vertices, axis=0).max())
@@ -60,7 +64,7 @@ def write_printable(path: Path, vertices: Array, faces: Faces) -> None:
 
 
 def mesh_report(vertices: Array, faces: Faces) -> dict[str, Any]:
-    """Printability of a mesh: closed, oriented, volume (cubic scene units), share of inverted triangles."""
+    """Printability of a mesh: closed, oriented, volume (cubic scene units), share of inverted triangles. JSON values."""
     import trimesh
 
     mesh = trimesh.Trimesh(vertices, faces, process=False)
@@ -75,14 +79,15 @@ def mesh_report(vertices: Array, faces: Faces) -> dict[str, Any]:
 
 
 def error_picture(image: Array, target: Array) -> npt.NDArray[np.float32]:
-    """(H, W, 3), linear: grey where both are dark, red where the shadow is missing, blue where it is too much."""
+    """(H, W, 3), linear: grey where image and target are dark, red where shadow is missing, blue where it is superfluous."""
     missing, superfluous = np.clip(image - target, 0, 1), np.clip(target - image, 0, 1)
     both = np.clip(1 - np.maximum(image, target), 0, 1)
     ground = 1 - 0.6 * both
     return np.stack([ground - superfluous, ground - missing - 0.6 * superfluous, ground - missing], -1).clip(0, 1)
 
 
-def _wall(view: ShadowView, image: Array) -> Any:
+def _wall(view: ShadowView, image: Array) -> trimesh.Trimesh:
+    """A view's receiver with the image as its texture."""
     import trimesh
     from PIL import Image
 

@@ -1,4 +1,4 @@
-"""Shadow art: a mesh is deformed, step by step, until its shadows are what the targets show."""
+"""Shadow art: a mesh is deformed step by step until its shadows match target images."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from ...errors import ShadowmapError
 from ...jit.arrays import device_array
+from ...jit.types import Float, UInt32
 from ...rendering.receivers.shadow_images import ShadowImages, image_loss, shadow_images
 from ...rendering.receivers.shadow_views import ShadowView
 from .smoothness import normal_consistency
@@ -22,28 +23,28 @@ Array = npt.NDArray[np.float32]
 class Sculptor:
     """Deforms a mesh so that its shadows match target images, which may change at any time.
 
-    A `Method` of the optimisation loop; and what an interactive program calls:
+    For the optimisation loop of shadow art and for interactive programs:
 
         sculptor = Sculptor(vertices, faces, [shadow_view()])
-        image = sculptor.visibility()[0]      # what the shadow looks like now: the first thing to paint on
+        image = sculptor.visibility()[0]      # the current shadow, to paint on
         while True:                           # all in one thread
-            sculptor.set_target(0, painted)   # whenever the user has changed it: costs less than a millisecond
+            sculptor.set_target(0, painted)   # whenever the user changes it: takes less than a millisecond
             loss = sculptor.step()
-            send(sculptor.vertices(), sculptor.faces, sculptor.visibility()[0])  # as often as somebody looks
+            send(sculptor.vertices(), sculptor.faces, sculptor.visibility()[0])  # as often as the display needs it
 
-    The first step compiles (a second or so) and is recorded; a new target is not. After an abrupt change of a target, `calm` lets
-    the optimiser forget how large gradients used to be, or else the first steps towards the new target may be small. `state` and
-    `load_state` serve undo and checkpoints, `reset` starts anew. Instances are not thread-safe: create and use one in a single
-    thread, and hand arrays, which are copies, to other ones.
+    The first step compiles (about a second) and is recorded; a new target needs neither. After an abrupt change of a target, call
+    `calm`: it resets Adam's moments, whose large past gradients would make the first steps towards the new target small. `state`
+    and `load_state` serve undo and checkpoints, `reset` restarts. Instances are not thread-safe: create and use one in a single
+    thread, and hand the arrays, which are copies, to other threads.
 
-    A step is: vertices from the variable u = (1 + lambda L) v of Nicolet et al., "Large Steps in Inverse Rendering of Geometry"
-    (2021), where L is the mesh's Laplacian; shadow maps; visibility of what the cameras see; loss; derivatives; Adam with one
-    step size for all of u. The loss is the mean squared difference of visibility, summed over the views, plus `consistency` times
-    `normal_consistency`. What is between the vertices and their derivative is recorded once with `dr.freeze`; the solver, which
-    is no part of Dr.Jit, stays outside.
+    A step consists of: vertices from the variable u = (1 + lambda L) v of Nicolet et al., "Large Steps in Inverse Rendering of
+    Geometry" (2021), where L is the mesh's Laplacian; shadow maps; visibility of the receivers in the cameras' images; loss;
+    derivatives; Adam with one step size for all of u. The loss is the mean squared difference of visibility, summed over the
+    views, plus `consistency` times `normal_consistency`. Everything from the vertices to their derivative is recorded once with
+    `dr.freeze`; the linear solver of cholespy stays outside.
 
     Args:
-        vertices: (V, 3), world space, objects around the origin (see `shadow_view`). Vertices at the same place stay together.
+        vertices: (V, 3), world space, objects around the origin (see `shadow_view`). Vertices at the same position stay together.
         faces: (F, 3).
         views: one or more, see `shadow_view`.
         targets: visibility (H, W) in 0 (dark) to 1 (lit) for each view, top row first. None: the shadows of the mesh as it is.
@@ -53,7 +54,7 @@ class Sculptor:
         map_resolution, filter_size, method: of the shadow maps.
         settings: further entries for `describe`.
 
-    Raises ShadowmapError for a mesh, targets or settings that cannot be used, and where the package cholespy is missing.
+    Raises ShadowmapError for an unusable mesh, target or setting, and if the package cholespy is missing.
     """
 
     def __init__(
@@ -83,7 +84,7 @@ class Sculptor:
         self._start = np.array(vertices, np.float32)
         self._faces = np.array(faces, np.uint32)
         self._step_size, self._settings = step_size, dict(settings or {})
-        # An array, so that the recorded step does not depend on a number of Python's.
+        # An array: a Python number would become a constant of the recorded step.
         self._consistency, self._smoothness = dr.opaque(mi.Float, consistency), smoothness
         self._solver = _large_steps(mi.Float(self._start.ravel()), self._shadows.faces, smoothness)
         self._gradient, self._look = dr.freeze(_gradient), dr.freeze(_look)
@@ -94,22 +95,22 @@ class Sculptor:
             raise ShadowmapError(f"{len(targets)} targets for {len(self.views)} views: give one for each.")
         else:
             self._targets = [checked_target(image, view) for image, view in zip(targets, self.views, strict=True)]
-        self._wanted = None
+        self._wanted: Float | None = None
 
     @property
     def faces(self) -> npt.NDArray[np.uint32]:
-        """(F, 3), a copy; they never change."""
+        """Faces (F, 3), a copy. They never change."""
         return self._faces.copy()
 
     @property
     def steps(self) -> int:
-        """Steps done since the start, or since what `load_state` was given."""
+        """Number of steps since the start, the steps before a loaded state included."""
         return self._steps
 
     def set_target(self, view: int, image: npt.ArrayLike) -> None:
         """Replace the target of a view by a visibility image (H, W), 0 dark to 1 lit, of the same size. The mesh stays.
 
-        Raises ShadowmapError, and keeps the old target, where there is no such view, or the image cannot be used.
+        Raises ShadowmapError, and keeps the old target, if there is no such view or the image cannot be used.
         """
         if not 0 <= view < len(self.views):
             raise ShadowmapError(f"no view {view}: there are {len(self.views)}, counted from 0.")
@@ -117,11 +118,11 @@ class Sculptor:
         self._wanted = None
 
     def target(self, view: int) -> Array:
-        """(H, W), a copy."""
+        """Target image (H, W) of a view, a copy."""
         return self._targets[view].copy()
 
-    def step(self) -> Any:
-        """One step; returns the loss before it, ``Float`` (1,), without waiting for it."""
+    def step(self) -> Float:
+        """Take one step. Returns the loss before the step, ``Float`` (1,), without waiting for the device."""
         if self._wanted is None:
             self._wanted = device_array(mi.Float, np.concatenate([image.ravel() for image in self._targets]))
         loss, slope = self._gradient(dr.detach(self._vertices), self._wanted, self._consistency, self._shadows)
@@ -134,15 +135,15 @@ class Sculptor:
         return loss
 
     def vertices(self) -> Array:
-        """(V, 3), world space, after the last step."""
+        """Vertices (V, 3), world space, after the last step."""
         return np.array(dr.detach(self._vertices), np.float32).reshape(-1, 3)
 
     def visibility(self) -> list[Array]:
-        """(H, W) for each view: what its camera sees now, 0 (dark) to 1 (lit), top row first. 1 where it sees no receiver."""
+        """Visibility image (H, W) of each view: 0 (dark) to 1 (lit), 1 where the camera sees no receiver. Top row first."""
         return self._shadows.images(self._look(dr.detach(self._vertices), self._shadows))
 
     def reset(self, vertices: npt.ArrayLike | None = None) -> None:
-        """Start anew, from the first mesh or from other (V, 3) vertices of it, with an optimiser that knows of nothing."""
+        """Restart from the first mesh or from other vertices (V, 3), with empty moments."""
         start = self._start if vertices is None else np.asarray(vertices, np.float32)
         if start.shape != self._start.shape or not np.isfinite(start).all():
             raise ShadowmapError(f"vertices of shape {start.shape}: give {self._start.shape} finite numbers.")
@@ -150,19 +151,19 @@ class Sculptor:
         self.load_state({"u": u, "m": np.zeros_like(u), "v": np.zeros_like(u), "t": np.zeros(1), "steps": np.zeros(1)})
 
     def calm(self) -> None:
-        """Keep the mesh, but forget all past gradients."""
+        """Keep the mesh, but reset Adam's moments."""
         state = self.state()
         zero = np.zeros_like(state["m"])
         self.load_state({**state, "m": zero, "v": zero, "t": np.zeros(1)})
 
     def state(self) -> dict[str, npt.NDArray[Any]]:
-        """The variable u, Adam's moments m and v, its step count t and the number of steps; all that `load_state` needs."""
+        """The variable u, Adam's moments m and v, its step count t and the number of steps: the input of `load_state`."""
         u, _, _, (t, m, v, _) = self._optimizer.state["u"]
         arrays = {"u": dr.detach(u), "m": m, "v": v, "t": t}
         return {**{name: np.array(array) for name, array in arrays.items()}, "steps": np.array([self._steps])}
 
     def load_state(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
-        """Go on from what `state` returned, possibly in another process. Targets stay as they are."""
+        """Continue from a result of `state`, possibly of another process. Targets stay as they are."""
         u, m, v = (device_array(mi.Float, state[name]) for name in ("u", "m", "v"))
         if {dr.width(u), dr.width(m), dr.width(v)} != {3 * self._solver.n_verts}:
             raise ShadowmapError(f"a state of {dr.width(u)} numbers for a mesh of {3 * self._solver.n_verts}.")
@@ -174,8 +175,8 @@ class Sculptor:
         self._solve()
 
     def recordings(self) -> int:
-        """Number of recordings of a step so far; stays the same once the sculptor is warm."""
-        return int(self._gradient.n_recordings)
+        """Number of recordings of a step so far. It stays the same once the sculptor is warm."""
+        return int(self._gradient.n_recordings)  # type: ignore[attr-defined]  # Dr.Jit's stub returns the plain function
 
     def describe(self) -> dict[str, Any]:
         """Settings for the record."""
@@ -190,12 +191,12 @@ class Sculptor:
         }  # fmt: skip
 
     def _solve(self) -> None:
-        """Vertices from u, attached."""
+        """Solve for the vertices from u. Attached."""
         self._vertices = self._solver.from_differential(self._optimizer["u"])
         dr.eval(self._vertices)
 
 
-def _large_steps(vertices: Any, faces: Any, smoothness: float) -> Any:
+def _large_steps(vertices: Float, faces: UInt32, smoothness: float) -> mi.ad.LargeSteps:
     try:
         return mi.ad.LargeSteps(vertices, faces, lambda_=smoothness)
     except ModuleNotFoundError as error:
@@ -205,7 +206,7 @@ def _large_steps(vertices: Any, faces: Any, smoothness: float) -> Any:
 
 
 def checked_target(image: npt.ArrayLike, view: ShadowView) -> Array:
-    """A copy of a view's target (H, W). Raises ShadowmapError where it has another shape, or values outside of 0..1."""
+    """A copy of a view's target (H, W). Raises ShadowmapError for another shape, or values outside of 0..1."""
     pixels = np.array(image, np.float32)
     if pixels.shape != view.shape:
         raise ShadowmapError(f"a target of shape {pixels.shape} for images of shape {view.shape}.")
@@ -214,7 +215,7 @@ def checked_target(image: npt.ArrayLike, view: ShadowView) -> Array:
     return pixels
 
 
-def _gradient(vertices: Any, wanted: Any, consistency: Any, shadows: ShadowImages) -> tuple[Any, Any]:
+def _gradient(vertices: Float, wanted: Float, consistency: Float, shadows: ShadowImages) -> tuple[Float, Float]:
     """(loss, derivative of the loss by the vertices)."""
     vertices = mi.Float(vertices)
     dr.enable_grad(vertices)
@@ -227,5 +228,5 @@ def _gradient(vertices: Any, wanted: Any, consistency: Any, shadows: ShadowImage
     return loss, dr.grad(vertices)
 
 
-def _look(vertices: Any, shadows: ShadowImages) -> Any:
+def _look(vertices: Float, shadows: ShadowImages) -> Float:
     return shadows.visibility(vertices)

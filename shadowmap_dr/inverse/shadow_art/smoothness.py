@@ -1,24 +1,23 @@
-"""Smoothness of a mesh: a regularisation for optimisers, and how many of its triangles are folded over."""
+"""Smoothness of a mesh: a regularisation term, and the share of triangles that are folded over."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
+from ...jit.types import Float
 from ...raster import NO_VERTEX, Topology
 
-#: Neighbouring triangles whose normals differ by more than this have turned over, one of them at least.
+#: If the normals of neighbouring triangles differ by more than this, at least one of the triangles is inverted.
 INVERTED_DEG = 150.0
-# Edges of triangles without area have no normals to compare.
+# Below this, a triangle has no area, and no normal to compare.
 _LEAST_LENGTH = 1e-20
 
 
-def normal_consistency(vertices: Any, topology: Topology) -> Any:
-    """Mean of 1 - cos(angle between normals) over the edges between two triangles, 0 for a plane and at most 2.
+def normal_consistency(vertices: Float, topology: Topology) -> Float:
+    """Mean of 1 - cos(angle between normals) over the edges between two triangles: 0 for a plane, at most 2.
 
     Args:
         vertices: ``Float`` (3V,). Attached.
@@ -36,17 +35,21 @@ def normal_consistency(vertices: Any, topology: Topology) -> Any:
     one, other = dr.cross(along, c - a), dr.cross(d - a, along)
     square = dr.squared_norm(one) * dr.squared_norm(other)
     proper = inner & (square > _LEAST_LENGTH)
-    cosine = dr.dot(one, other) * dr.rsqrt(dr.select(proper, square, 1))
-    count = dr.maximum(dr.sum(dr.select(inner, mi.Float(1), 0)), 1)
-    return dr.sum(dr.select(proper, 1 - cosine, 0)) / count
+    cosine = dr.dot(one, other)
+    divisor = dr.select(proper, square, 1)
+    cosine = cosine * dr.rsqrt(divisor)
+    counted = dr.select(inner, mi.Float(1), 0)
+    count = dr.maximum(dr.sum(counted), 1)
+    deviation = dr.select(proper, 1 - cosine, 0)
+    return dr.sum(deviation) / count
 
 
 def inverted_share(vertices: npt.ArrayLike, faces: npt.ArrayLike) -> float:
-    """Share of the triangles, 0 to 1, that stand at more than 150 degrees to a neighbour.
+    """Share of the triangles, 0 to 1, whose normals differ by more than 150 degrees from a neighbour's.
 
     Args:
         vertices: (V, 3).
-        faces: (F, 3). Neighbours have two vertices in common, by index.
+        faces: (F, 3). Neighbours share two vertex indices.
     """
     p, f = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
     normals = np.cross(p[f[:, 1]] - p[f[:, 0]], p[f[:, 2]] - p[f[:, 0]])

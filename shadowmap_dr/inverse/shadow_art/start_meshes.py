@@ -1,4 +1,4 @@
-"""Meshes that optimisations start from."""
+"""Start meshes of optimisations."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from ...errors import ShadowmapError
 
 
 def even_sphere(rings: int = 40, radius: float = 1.0) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint32]]:
-    """A closed sphere of 8 rings^2 triangles of the same area, without poles where they would crowd: (V, 3) and (F, 3).
+    """A closed sphere of 8 rings^2 triangles of equal area, not denser at the poles: vertices (V, 3) and faces (F, 3).
 
-    From each pole to the equator there are so many rings, ring i with 4 i vertices at a height of 1 - (i / rings)^2. 40 rings
-    make 12,800 triangles and 6,402 vertices. Faces wind outward.
+    From each pole to the equator, ring i of ``rings`` has 4 i vertices at height 1 - (i / rings)^2 of the unit sphere. 40 rings
+    make 12,800 triangles and 6,402 vertices. Faces wind outward. Raises ShadowmapError unless ``rings`` is 1 to 1000.
     """
     if not 1 <= rings <= 1000:
         raise ShadowmapError(f"a sphere of {rings} rings: choose from 1 to 1000.")

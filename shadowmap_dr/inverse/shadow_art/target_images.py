@@ -1,4 +1,4 @@
-"""Figures: what a shadow shall look like, read from images, drawings and text, and placed in a view."""
+"""Target images of shadows: figures from image files, drawings and text, placed in a view."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import os
 import re
 import zlib
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -16,23 +16,26 @@ import numpy.typing as npt
 
 from ...errors import ShadowmapError
 
+if TYPE_CHECKING:
+    import PIL.Image
+
 #: Suffixes that `read_figure` knows.
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".gif", ".bmp", ".svg", ".svgz")
 
-# Pixels along the longer side of drawings and letters, and the most that an image may have.
+# Pixels along the longer side of rasterized drawings; largest number of pixels of an image.
 _SIDE, _MOST_PIXELS = 1024, 64_000_000
-# How much longer one side of a drawing may be than the other. Lengths in it, and units in pixels.
+# Largest aspect ratio of a drawing; syntax of its lengths, and their units in pixels.
 _MOST_SIDES_DIFFER = 64
 _LENGTH = re.compile(r"\+?([0-9.]+(?:[eE][-+]?[0-9]+)?)(|%|px|pt|pc|mm|cm|in|em|ex)")
 _UNITS = {"": 1, "px": 1, "pt": 4 / 3, "pc": 16, "mm": 96 / 25.4, "cm": 960 / 25.4, "in": 96, "em": 12, "ex": 6}
-# Coverage above this counts as figure; the least share of an image that a figure may cover.
+# Pixels with more coverage belong to the figure; smallest share of an image that a figure may cover.
 _INSIDE, _LEAST_SHARE = 0.5, 1e-4
 
 Array = npt.NDArray[np.float32]
 
 
-def scaled_to_bytes(image: Any) -> Any:
-    """A Pillow image of at most 8 bits a channel: Pillow itself would clip grey ones of 16 bits rather than scale them."""
+def scaled_to_bytes(image: PIL.Image.Image) -> PIL.Image.Image:
+    """Convert a Pillow image to 8 bits a channel. Pillow itself would clip 16-bit grey images instead of scaling them."""
     from PIL import Image
 
     if not image.mode.startswith("I"):
@@ -41,18 +44,18 @@ def scaled_to_bytes(image: Any) -> Any:
 
 
 def read_figure(path: str | os.PathLike[str]) -> Array:
-    """The figure in an image file.
+    """Read the figure in an image file.
 
-    Where the image has transparent parts the figure is what is not transparent; else what differs in brightness from the image's
+    If the image has transparent parts, its opaque part is the figure. Otherwise the figure differs in brightness from the image's
     border: dark on light or light on dark.
 
     Args:
         path: an image file, see `SUFFIXES`. Drawings (SVG) need the package resvg-py.
 
     Returns:
-        float32 (H, W), coverage from 0 to 1, the image's size and aspect ratio.
+        float32 (H, W), coverage from 0 to 1, in the image's size and aspect ratio.
 
-    Raises ShadowmapError where there is no such file, it cannot be read, or shows nothing.
+    Raises ShadowmapError if the file does not exist, cannot be read, or shows no figure.
     """
     path = Path(path)
     if not path.is_file():
@@ -79,13 +82,13 @@ def read_figure(path: str | os.PathLike[str]) -> Array:
 
 
 def figure_of(pixels: npt.ArrayLike) -> Array:
-    """The figure in an image (H, W, 4) of 0..1: red, green, blue, and opacity. See `read_figure`."""
+    """The figure (H, W) in an image (H, W, 4) of 0..1: red, green, blue, and opacity. See `read_figure`."""
     image = np.asarray(pixels, np.float32)
     alpha = image[..., 3]
     if alpha.min() < 0.25 and alpha.max() > 0.75:
         figure = alpha
     else:
-        grey = (image[..., :3] @ np.float32([0.2126, 0.7152, 0.0722])) * alpha + (1 - alpha)
+        grey = (image[..., :3] @ np.array([0.2126, 0.7152, 0.0722], np.float32)) * alpha + (1 - alpha)
         border = float(np.median(np.concatenate([grey[0], grey[-1], grey[:, 0], grey[:, -1]])))
         extreme = float(grey.min() if border > 0.5 else grey.max())
         contrast = border - extreme
@@ -96,7 +99,7 @@ def figure_of(pixels: npt.ArrayLike) -> Array:
 
 
 def text_figure(text: str) -> Array:
-    """Letters (H, W), bold, cut out closely."""
+    """The figure (H, W) of bold letters, with a margin of one pixel. ShadowmapError for letters that the font lacks."""
     from matplotlib import font_manager
     from PIL import Image, ImageDraw, ImageFont
 
@@ -111,11 +114,11 @@ def text_figure(text: str) -> Array:
     left, top, right, bottom = (int(x) for x in canvas.multiline_textbbox((0, 0), text, font=font))
     image = Image.new("L", (right - left + 2, bottom - top + 2), 0)
     ImageDraw.Draw(image).multiline_text((1 - left, 1 - top), text, fill=255, font=font, align="center")
-    return _cropped(np.asarray(image, np.float32) / 255)
+    return _cropped(np.asarray(image, np.float32) / np.float32(255))
 
 
 def filled(figure: npt.ArrayLike) -> Array:
-    """The figure (H, W) with its enclosed holes filled: what a sphere can at best show without touching itself."""
+    """The figure (H, W) with its enclosed holes filled: the best that the shadow of a deformed sphere can match."""
     from PIL import Image, ImageDraw
 
     inside = np.asarray(figure, np.float32)
@@ -129,16 +132,16 @@ def filled(figure: npt.ArrayLike) -> Array:
 
 
 def fit(figure: npt.ArrayLike, seen: npt.NDArray[np.bool_], fill: float = 0.8, high: float | None = None) -> Array:
-    """A target image: the figure, dark on a lit ground, as large as it can be in what a camera sees of its receiver.
+    """A target image: the figure, dark on a lit ground, as large as the visible part of the receiver allows.
 
     Args:
         figure: (H, W) coverage, any size and aspect ratio; its empty margin does not count.
-        seen: (H, W) of the view, which pixels see the receiver.
-        fill: by how much smaller than possible it is, to leave a margin.
-        high: height of the figure in the view, in pixels, instead of what `fill` makes it.
+        seen: (H, W) of the view, pixels that see the receiver.
+        fill: size relative to the largest possible one, to leave a margin.
+        high: height of the figure in the view, in pixels, instead of `fill`.
 
     Returns:
-        float32 (H, W) of the view: visibility, 0 (dark) to 1 (lit), the figure's middle in that of what is seen.
+        float32 (H, W) of the view: visibility, 0 (dark) to 1 (lit), the figure centred in the visible part of the receiver.
     """
     shape = _cropped(np.asarray(figure, np.float32))
     row, column = (axis.mean() for axis in np.nonzero(seen))
@@ -165,7 +168,7 @@ def _within(shape: Array, seen: npt.NDArray[np.bool_], row: float, column: float
 
 
 def _placed(shape: Array, size: tuple[int, ...], row: float, column: float, scale: float) -> Array:
-    """Coverage of a view's pixels (box-filtered) by a figure with its middle at a place, at a scale."""
+    """Box-filtered coverage of a view's pixels by a figure, centred at (row, column) and scaled."""
     from PIL import Image
 
     # Pillow's transform does not filter; a large image with sharp pixels is reduced instead.
@@ -185,7 +188,7 @@ def _cropped(figure: Array) -> Array:
     if not len(rows):
         raise ShadowmapError("a figure that covers nothing.")
     cut = figure[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    return np.pad(cut, 1)  # so that edges are soft
+    return np.pad(cut, 1)  # margin for soft edges
 
 
 def _rasterized(path: Path) -> bytes:
@@ -195,39 +198,40 @@ def _rasterized(path: Path) -> bytes:
         raise ShadowmapError(f"{path}: drawings need the package resvg-py: pip install 'shadowmap-dr[art]'.") from error
     try:
         width, height = _drawn_size(path)
-        # The longer side is bounded: in a narrow drawing the other one would have millions of pixels.
+        # Only one side is given to resvg: in a narrow drawing the other side could have millions of pixels.
         if max(width, height) > _MOST_SIDES_DIFFER * min(width, height):
             raise ShadowmapError(
                 f"cannot read {path}: a drawing of {width:g} x {height:g} is too narrow; its sides may differ by "
                 f"{_MOST_SIDES_DIFFER} times."
             )
-        side = {"width": _SIDE} if width >= height else {"height": _SIDE}
+        side: dict[str, Any] = {"width": _SIDE} if width >= height else {"height": _SIDE}
         return bytes(resvg_py.svg_to_bytes(svg_path=str(path), dpi=96, **side))
     except (ValueError, ElementTree.ParseError, OSError, EOFError, zlib.error) as error:
         raise ShadowmapError(f"cannot read {path}: it is no drawing, or it is damaged.") from error
 
 
 def _drawn_size(path: Path) -> tuple[float, float]:
-    """(width, height) of a drawing in pixels, at least 1. ValueError for what is none."""
+    """(width, height) of a drawing in pixels, at least 1. ValueError if the file holds no drawing."""
     with gzip.open(path) if path.suffix.lower() == ".svgz" else path.open("rb") as file:
         root = next((element for _, element in ElementTree.iterparse(file, ("start",))), None)
     if root is None or root.tag.rpartition("}")[2] != "svg":
         raise ValueError("no element svg")
     box = [float(number) for number in re.split(r"[\s,]+", root.get("viewBox", "").strip()) if number]
     box = box[2:] if len(box) == 4 else []
-    sides = [_length(root.get(name, ""), whole) for name, whole in zip(("width", "height"), box or (100.0, 100.0), strict=True)]
+    given = [_length(root.get(name, ""), whole) for name, whole in zip(("width", "height"), box or (100.0, 100.0), strict=True)]
     if box:
-        # One length alone keeps the proportions.
-        scales = [side / whole for side, whole in zip(sides, box, strict=True) if side is not None] or [1.0]
-        sides = [scales[0] * whole if side is None else side for side, whole in zip(sides, box, strict=True)]
-    sides = [100.0 if side is None else side for side in sides]
+        # If one length is missing, it follows from the other and the proportions of the box.
+        scales = [side / whole for side, whole in zip(given, box, strict=True) if side is not None] or [1.0]
+        sides = [scales[0] * whole if side is None else side for side, whole in zip(given, box, strict=True)]
+    else:
+        sides = [100.0 if side is None else side for side in given]
     if not (np.isfinite(sides).all() and min(sides) > 0):
         raise ValueError("no extent")
     return max(sides[0], 1.0), max(sides[1], 1.0)
 
 
 def _length(text: str, whole: float) -> float | None:
-    """A length of a drawing in pixels, at 96 to the inch; None if it is not given. ``whole``: what shares of it refer to."""
+    """A length of a drawing in pixels, at 96 to the inch; None if it is no length. ``whole``: 100 %, in pixels."""
     found = _LENGTH.fullmatch(text.strip())
     if found is None:
         return None

@@ -1,7 +1,8 @@
 """Baselines for shadowmap_dr: references and pose estimation by Mitsuba's own integrators.
 
-Modules: `reference` (path-traced images), `unshadowed` (the same without shadow rays), `proxy` (an area light that
-stands in for a directional one) and `pose` (pose estimation with `direct_projective`). None uses the rasterizer.
+Modules: `reference` (path-traced images), `unshadowed` (images without shadow rays), `derivatives` (central differences),
+`projective` (derivatives by `direct_projective`), `proxy` (an area light in place of a directional one), `pose` (pose estimation
+with `direct_projective`) and `fair_settings` (its sample counts). None of them uses the rasterizer.
 """
 
 from __future__ import annotations

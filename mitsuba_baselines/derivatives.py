@@ -1,4 +1,4 @@
-"""Derivative images by central differences of path-traced renderings, and how well two derivative images agree."""
+"""Derivative images by central differences of path-traced renderings, and the agreement of two derivative images."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from .reference import Reference, path_traced
 
 @dataclass(frozen=True)
 class Agreement:
-    """Agreement of an automatic derivative image a with a reference f; both numbers count.
+    """Agreement of an automatic derivative image a with a reference f.
 
     Attributes:
         cosine: <a, f> / (|a| |f|), 1 for equal up to a factor.
-        scale: <a, f> / <f, f>, the factor itself.
+        scale: <a, f> / <f, f>, the factor, 1 for equal images.
     """
 
     cosine: float
@@ -27,12 +27,12 @@ class Agreement:
 
 
 def agreement(automatic: np.ndarray, reference: np.ndarray, filter_footprint: float = 0.0) -> Agreement:
-    """Compares two derivative images after a blur and a sum over colour channels.
+    """Compare two derivative images after a sum over colour channels and a blur.
 
     Args:
         automatic, reference: (H, W, C) arrays.
-        filter_footprint: Width of the shadow filter in image pixels; the blur is a box of max(5, 2 x footprint) pixels
-            (made odd, at the borders over what there is).
+        filter_footprint: Width of the shadow filter in image pixels; the blur is a box of max(5, 2 x footprint) pixels,
+            rounded up to an odd number; at the borders, of the pixels within the image.
 
     Raises:
         ShadowmapError: The shapes differ or the reference is all zero.
@@ -61,7 +61,9 @@ def central_difference(
 
     Args:
         build: Makes the scene for a parameter value.
-        step: In units of the parameter; the two renderings' shadow boundaries should lie 0.5 to 1 pixel apart.
+        step: In units of the parameter; shadow boundaries of the two renderings should lie 0.5 to 1 pixel apart.
+        at: Parameter value of the derivative.
+        spp, seed, integrator: See `path_traced`.
 
     Returns:
         The derivative image, (H, W, C) float32, with `step`, `at` and the renderings' settings.

@@ -1,6 +1,6 @@
-"""The cheapest sample counts with which Mitsuba's projective pose estimation converges.
+"""Fair settings: the cheapest sample counts with which Mitsuba's projective pose estimation converges.
 
-`find_fair_setting` searches them; what it found is stored in `fair_settings.json`, read by `fair_setting` and extended by
+`find_fair_setting` searches for them. Results are stored in `fair_settings.json`, read by `fair_setting` and extended by
 ``python -m mitsuba_baselines.fair_settings --search RESOLUTION``.
 """
 
@@ -31,11 +31,11 @@ from .reference import path_traced
 STORE = Path(__file__).with_name("fair_settings.json")
 MAX_RESOLUTION = 4096
 
+# Counts that the stratified sampler takes without rounding. The noise of the shadow boundaries' derivative (sppi) limits
+# convergence, since hardly any sample hits the small light: the other counts are not searched alone.
 CANDIDATES = tuple(
     ProjectiveSetting(*counts)
     for counts in (
-        # Counts that the stratified sampler takes without rounding. What limits convergence is the noise of the shadow
-        # boundaries' derivative (sppi): nearly no sample meets the small light, so the others are not searched alone.
         (1, 1, 1),
         (1, 1, 4),
         (1, 1, 16),
@@ -63,14 +63,14 @@ CANDIDATES = tuple(
 
 
 def fair_setting(resolution: int, normals: str = "face") -> ProjectiveSetting:
-    """The stored fair setting at a resolution, with normals "face" or "vertex"; where none was found, the one at
-    the nearest resolution, with as many samples for the whole image.
+    """The stored fair setting at a resolution, with normals "face" or "vertex".
 
-    Such a stand-in (`is_fair` tells) is on the cheap side: a proxy light has a size in pixels, and the smaller it is, the more
-    samples miss it.
+    Without a stored setting at this resolution, returns the setting at the nearest resolution, with the same number of samples in
+    the whole image. Such a substitute (see `is_fair`) is rather too cheap: the proxy light has a fixed size in pixels, and the
+    smaller it is, the more samples miss it.
 
     Raises:
-        ShadowmapError: No search is stored that found a setting.
+        ShadowmapError: No stored search has found a setting.
     """
     found, setting = _nearest(resolution, normals)
     if found == resolution:
@@ -81,7 +81,7 @@ def fair_setting(resolution: int, normals: str = "face") -> ProjectiveSetting:
 
 
 def is_fair(setting: ProjectiveSetting, resolution: int, normals: str = "face", mesh: str = "spot") -> bool:
-    """True if a stored search with this very mesh and resolution found the setting to be the cheapest one that converges."""
+    """True if a stored search with exactly this mesh and resolution found the setting to be the cheapest that converges."""
     return any(
         entry["setting"] == asdict(setting)
         and entry["resolution"] == resolution
@@ -109,27 +109,29 @@ def find_fair_setting(
     report: Callable[[str], None] = lambda line: None,
     save: Callable[[dict[str, Any]], None] = lambda record: None,
 ) -> dict[str, Any]:
-    """Searches the cheapest setting that converges.
+    """Search for the cheapest setting that converges.
 
-    All candidates are timed; then, cheapest first, each runs from the protocol's starts until one start fails. The first
-    one whose mean rotation error over the last 20 iterations is at most the threshold on all starts is the fair setting.
-    Where an earlier search has found one, it is timed beside the candidates, and what costs more is not tried.
+    All candidates are timed; then, cheapest first, each runs from the protocol's starts until one start fails. The fair setting
+    is the first candidate whose mean rotation error over the last 20 iterations is at most the threshold for all starts. If an
+    earlier search has found a setting, it is timed beside the candidates, and more expensive candidates are not tried.
 
     Args:
         resolution, mesh, normals: Of the pose scene; mesh is a name or a file, normals "face" or "vertex".
-        threshold_deg: Degrees.
-        earlier: Record of a search that was cut short: what it measured is not measured again.
+        candidates: Settings to try.
+        starts, iterations: Number of starts, and of steps from each.
+        threshold_deg: Largest rotation error, degrees.
+        earlier: Record of an interrupted search; its measurements are not repeated.
         report: Called with a line about each measurement.
-        save: Called with the record so far after each run and each candidate.
+        save: Called with the current record after each run and each candidate.
 
-    Raises ShadowmapError if the earlier search was one of something else.
+    Raises ShadowmapError if the earlier search had another protocol.
 
     Returns:
         A record of JSON values: `setting` (None if no candidate converged), `measurements` with the mean errors in
         degrees, the final offsets and the median seconds per iteration of each candidate, the seconds per iteration of
-        those not tried, the proxy and the machine.
+        untried candidates, the proxy and the machine.
     """
-    protocol = {
+    protocol: dict[str, Any] = {
         "resolution": resolution,
         "mesh": mesh,
         "normals": normals,
@@ -139,7 +141,7 @@ def find_fair_setting(
     }
     earlier = earlier or protocol
     for name, value in protocol.items():
-        # Searches from before there was a choice are with flat shading.
+        # Old records without the entry `normals` are of flat shading.
         found = earlier.get(name, "face" if name == "normals" else value)
         if found != value:
             raise ShadowmapError(f"the earlier search had {name} {found}, not {value}: choose another file for this one.")
@@ -207,13 +209,13 @@ def find_fair_setting(
 
 
 def _complete(entry: Mapping[str, Any], starts: int, threshold_deg: float) -> bool:
-    """True if a candidate has run from all starts, or lost one, so that no more need be known."""
+    """True if a candidate has run from all starts, or has failed from one."""
     runs = entry["runs"]
     return len(runs) >= starts or any(not run["mean_error_deg_last_20"] <= threshold_deg for run in runs)
 
 
 def _cheapest(measurements: list[dict[str, Any]], starts: int, threshold_deg: float) -> dict[str, Any] | None:
-    """The setting with the fastest steps among those that converged from all starts; None if none did."""
+    """The setting with the fastest steps among the settings that converged from all starts; None without such a setting."""
     passed = [
         entry
         for entry in measurements
@@ -226,7 +228,8 @@ def _cheapest(measurements: list[dict[str, Any]], starts: int, threshold_deg: fl
 def _measure(pose: MitsubaPose, run: int, iterations: int) -> dict[str, Any]:
     """One run from a start of the protocol."""
     pose.reset(pose_start(run))
-    trace, seconds = [], []
+    trace: list[np.ndarray] = []
+    seconds: list[float] = []
     for _ in range(iterations):
         seconds.append(_timed(pose.step))
         trace.append(pose.parameters())
@@ -240,7 +243,8 @@ def _measure(pose: MitsubaPose, run: int, iterations: int) -> dict[str, Any]:
     }
 
 
-def _timed(step: Callable[[], Any]) -> float:
+def _timed(step: Callable[[], object]) -> float:
+    """Seconds of a step, including the device's work."""
     begin = time.perf_counter()
     step()
     dr.sync_thread()
@@ -248,7 +252,7 @@ def _timed(step: Callable[[], Any]) -> float:
 
 
 def _stored(path: Path | None = None) -> dict[str, dict[str, Any]]:
-    """Searches by name, those of this package if no file is given."""
+    """Searches by name, from a file or from this package."""
     path = path or STORE
     table = json.loads(path.read_text()) if path.is_file() else {}
     if not isinstance(table, dict) or not all(isinstance(entry, dict) for entry in table.values()):
@@ -295,7 +299,7 @@ def _search(options: argparse.Namespace) -> None:
     key = str(options.search) if options.normals == "face" else f"{options.search} {options.normals} normals"
 
     def save(record: dict[str, Any]) -> None:
-        # Read again each time: another search may have written its own record meanwhile.
+        # Read the file again each time: another search may have written its record meanwhile.
         table = {**_stored(options.output), key: record}
         with atomic(options.output) as temporary:
             temporary.write_text(json.dumps(table, indent=1) + "\n")

@@ -1,7 +1,7 @@
 """Pose estimation with Mitsuba's `direct_projective` integrator and an area light in place of the directional one.
 
-`MitsubaPose` has the interface of the other methods of the pose experiment. :mod:`mitsuba_baselines.fair_settings` has its sample
-counts.
+`MitsubaPose` has the interface of the other methods of the pose experiment. Sample counts for it are in
+:mod:`mitsuba_baselines.fair_settings`.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from shadowmap_dr.errors import ShadowmapError
 from shadowmap_dr.inverse.pose import apply_pose
+from shadowmap_dr.jit.types import Float
 
 from .proxy import Proxy, calibrate, with_proxy
 
@@ -30,11 +31,11 @@ class ProjectiveSetting:
 
     Attributes:
         sppc: For the continuous part of the derivative.
-        sppp: For silhouettes as the camera sees them.
-        sppi: For silhouettes as the light sees them, which move shadows.
+        sppp: For silhouettes seen from the camera.
+        sppi: For silhouettes seen from the light, which move shadows.
         guiding: "none", "grid" or "octree" (Mitsuba's default, rebuilt at every step).
-        spp: For the image in the loss. These samples are far cheaper than those of derivatives, and near the solution the
-            noise of the loss is what shakes the pose.
+        spp: For the image in the loss. These samples are far cheaper than samples of derivatives, and near the solution the
+            noise of the loss disturbs the pose most.
     """
 
     sppc: int
@@ -54,10 +55,11 @@ class ProjectiveSetting:
 
     @classmethod
     def parse(cls, text: str) -> ProjectiveSetting:
-        """From "sppc/sppp/sppi", optionally with "/guiding" and "/spp". Raises ShadowmapError for anything else."""
+        """Parse "sppc/sppp/sppi", optionally with "/guiding" and "/spp". Raises ShadowmapError for other texts."""
         part = text.split("/")
         try:
-            return cls(*map(int, part[:3]), *part[3:4], *map(int, part[4:]))
+            counts: list[Any] = [*map(int, part[:3]), *part[3:4], *map(int, part[4:])]
+            return cls(*counts)
         except ShadowmapError:
             raise
         except (TypeError, ValueError) as error:
@@ -65,7 +67,7 @@ class ProjectiveSetting:
 
 
 class MitsubaPose:
-    """Fits the pose of a mesh to a reference image with Mitsuba's projective integrator and Adam.
+    """Fit of a mesh's pose to a reference image with Mitsuba's projective integrator and Adam.
 
     Args:
         scene_path: XML scene with the parameters `$object` and `$resolution` and the ids `object`, `wall`, `light` (a
@@ -75,15 +77,15 @@ class MitsubaPose:
         setting: Sample counts and guiding.
         reference: (H, W, C) linear image to fit.
         step_size, betas: Of Adam.
-        seed: Of the sampling; step i uses seeds of its own.
+        seed: Of the sampling; each step derives its own seeds.
         shift_z: Constant offset in z on top of the pose.
         proxy: Area light to use; default: calibrated here for this scene and resolution. (With `shift_z`, Mitsuba's directional
-            light in that scene knows only the extent that the scene was loaded with, which `image_residual` suffers from:
-            give a proxy calibrated with a scene whose mesh file lies where the object is.)
+            light knows only the extent of the scene as it was loaded, and `image_residual` is wrong: give a proxy calibrated
+            with a scene whose mesh file already contains the shift.)
         normals: "face" or "vertex": flat or smooth shading of the object, the scene's parameter `$face_normals`.
 
     Raises:
-        ShadowmapError: The reference's shape does not fit the resolution, or see `proxy.calibrate`.
+        ShadowmapError: The reference has another shape or is not finite, or `proxy.calibrate` fails.
     """
 
     def __init__(
@@ -125,16 +127,20 @@ class MitsubaPose:
                 "guiding": setting.guiding,
             }
         )
+        self._parameters: npt.NDArray[np.float64]
+        self._m: npt.NDArray[np.float64]
+        self._v: npt.NDArray[np.float64]
+        self._t: int
         self.reset((0.0, 0.0, 0.0))
 
     def reset(self, start: npt.ArrayLike) -> None:
-        """Starts anew at (rotation in radians, x, y) with empty moments."""
+        """Restart at (rotation in radians, x, y) with empty moments."""
         self.load_state(
             {"parameters": np.asarray(start, np.float64), "m": np.zeros(3), "v": np.zeros(3), "t": np.zeros(1, np.int64)}
         )
 
     def step(self) -> float:
-        """One step of Adam. Returns the loss before it: the mean squared difference of linear colours."""
+        """Take one step of Adam. Returns the loss before the step: the mean squared difference of linear colours."""
         loss, gradient = self.loss_and_gradient(self._parameters)
         beta1, beta2 = self.betas
         self._t += 1
@@ -145,9 +151,9 @@ class MitsubaPose:
         return loss
 
     def loss_and_gradient(self, parameters: npt.ArrayLike) -> tuple[float, np.ndarray]:
-        """Loss and its (3,) estimated gradient at a pose. The state stays as it is, but for the mesh in the scene.
+        """Loss and its estimated gradient (3,) at a pose. The state stays as it is, except for the mesh in the scene.
 
-        The image in the loss and the derivative use different random numbers, else the gradient were biased.
+        The image in the loss and the derivative use different random numbers: otherwise the gradient would be biased.
         """
         pose = mi.Float(np.asarray(parameters, np.float32))
         dr.enable_grad(pose)
@@ -164,7 +170,7 @@ class MitsubaPose:
         return float(loss[0]), np.array(dr.grad(pose), dtype=np.float64)
 
     def parameters(self) -> np.ndarray:
-        """(3,) rotation in radians, x, y."""
+        """Current parameters (3,): rotation in radians, x, y."""
         return self._parameters.copy()
 
     def render(self, parameters: npt.ArrayLike, spp: int = 64) -> np.ndarray:
@@ -177,7 +183,7 @@ class MitsubaPose:
         return {"parameters": self._parameters.copy(), "m": self._m.copy(), "v": self._v.copy(), "t": np.array([self._t])}
 
     def load_state(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
-        """Goes on from what `state` returned."""
+        """Continue from a result of `state`. Raises ShadowmapError if it does not hold three parameters."""
         parameters = np.array(state["parameters"], np.float64)
         if parameters.shape != (3,):
             raise ShadowmapError(f"a pose of shape {parameters.shape}: give rotation (radians), x and y.")
@@ -197,20 +203,21 @@ class MitsubaPose:
             "proxy": self.proxy.record(),
         }
 
-    def _place(self, pose: Any) -> None:
+    def _place(self, pose: Float) -> None:
+        """Move the mesh in the scene."""
         self._params["object.vertex_positions"] = apply_pose(self._rest, pose, self.shift_z)
         self._params.update()
 
 
 def pose_start(run: int, seed: int = 0) -> np.ndarray:
-    """(3,) start of a run by the protocol: rotation in radians, x, y."""
+    """Start (3,) of a run by the protocol: rotation in radians, x, y."""
     rng = np.random.default_rng(seed + run)
     x, y = rng.uniform(-0.25, 0.25, size=2)
     return np.array([np.radians(rng.uniform(-30, 30)), x, y])
 
 
-def load_scene(scene_path: str | Path, mesh_path: str | Path, resolution: int, normals: str) -> Any:
-    """``mi.Scene`` with an object, normals "face" or "vertex". ShadowmapError if it cannot be loaded."""
+def load_scene(scene_path: str | Path, mesh_path: str | Path, resolution: int, normals: str) -> mi.Scene:
+    """Load a scene with an object, normals "face" or "vertex". Raises ShadowmapError if it cannot be loaded."""
     flat = "true" if normals == "face" else "false"
     try:
         return mi.load_file(str(scene_path), optimize=False, object=str(mesh_path), resolution=resolution, face_normals=flat)

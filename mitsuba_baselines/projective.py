@@ -1,4 +1,4 @@
-"""Derivative images by Mitsuba's projective integrator, whose shadow boundaries need an area light."""
+"""Derivative images by Mitsuba's projective integrator, which differentiates shadow boundaries of area lights only."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def projective_derivative(
 ) -> Reference:
     """Derivative image of a shadow by `direct_projective` in forward mode, as the mean over passes.
 
-    Only silhouettes as the light sees them are sampled: what the camera sees must not move, and its shading not change.
+    Only silhouettes seen from the light are sampled: visible surfaces must not move, and their shading must not change.
 
     Args:
         scene: With area lights and a perspective sensor (the integrator refuses orthographic ones).
@@ -37,21 +37,22 @@ def projective_derivative(
         sppi: Samples per pixel and pass.
         passes: Number of passes, at least 2.
         guiding: "none", "grid" or "octree".
+        seed: Seed of the first pass.
         on_pass: Called after each pass.
 
     Returns:
-        (H, W, C) float32 with settings; `halves_cosine` is the agreement of the means of even and odd passes, after a blur of 5
-        pixels: what noise alone costs.
+        (H, W, C) float32 with settings; `halves_cosine` is the agreement of the means of even and odd passes after a blur of 5
+        pixels: the effect of noise alone.
 
     Raises:
-        ShadowmapError: Less than two passes.
+        ShadowmapError: There are less than two passes.
     """
     if passes < 2:
-        raise ShadowmapError(f"{passes} passes: give at least 2, so that the noise can be told.")
+        raise ShadowmapError(f"{passes} passes: give at least 2, so that the noise can be measured.")
     params = mi.traverse(scene)
     key = f"{shape}.vertex_positions"
     rest = mi.Float(dr.detach(params[key]))
-    halves = [0.0, 0.0]
+    halves: list[np.ndarray] = [np.zeros(()), np.zeros(())]
     for index in range(passes):
         integrator = mi.load_dict({"type": "direct_projective", "sppc": 0, "sppp": 0, "sppi": sppi, "guiding": guiding})
         moved = mi.Float(rest)

@@ -1,8 +1,8 @@
 """A small, far area light in place of a directional light.
 
-Mitsuba's projective integrators see no derivative of the shadow boundaries of delta lights, but those of area lights. The
-proxy is a disk that faces the receiver, so far away and so small that the image is that of the directional light up to
-half a pixel of penumbra. How well it does that is measured with Mitsuba, not assumed.
+Mitsuba's projective integrators differentiate the shadow boundaries of area lights, but not of delta lights. The proxy is a
+disk that faces the receiver, so far away and so small that its image equals that of the directional light up to half a pixel of
+penumbra. The deviation is measured with Mitsuba.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ MAX_DOUBLINGS = 8
 
 @dataclass(frozen=True)
 class Proxy:
-    """An area light that stands in for a directional light, and what was measured about it.
+    """An area light in place of a directional light, and its measured deviations.
 
     Attributes:
         direction: Unit direction in which the light travels (world).
         irradiance: RGB irradiance E of the directional light on a plane facing it.
         centre: World position of the disk.
-        distance: From the disk to the receiver's middle.
+        distance: From the disk to the receiver's centre.
         diameter: Of the disk, world units.
         radiance: RGB, E distance^2 / area.
-        pixel_size: Smallest width of a pixel in the visible shadow, across its ray, world units.
+        pixel_size: Smallest width of a pixel in the visible shadow, perpendicular to its ray, world units.
         caster_height: Largest distance along the light from a caster's bounding sphere to the receiver.
-        penumbra_px: Largest width of a penumbra where the camera sees the shadow, in pixels: at each such pixel the
-            distance to the farthest caster, found by tracing rays, times the light's angle over the pixel's width.
+        penumbra_px: Largest width of a penumbra in the visible shadow, in pixels: at each pixel, the distance to the farthest
+            caster, found by ray tracing, times the light's angle, divided by the pixel's width.
         parallax_px: Largest displacement of a shadow against parallel light, in pixels.
         irradiance_residual: Largest relative deviation from the directional light over the receiver without casters,
             measured by rendering both.
@@ -85,19 +85,19 @@ def calibrate(
     max_parallax_px: float = 0.25,
     uniformity: float = 0.005,
 ) -> Proxy:
-    """Finds and measures the area light that replaces a directional light of a scene.
+    """Find and measure the area light that replaces a directional light of a scene.
 
-    Distance: enough for the irradiance to be uniform over the whole receiver and up to the casters, and for shadows to lie
-    where those of parallel light lie. Diameter: as large as the penumbra allows, since Mitsuba's derivative noise falls
-    with it.
+    The distance is large enough for a uniform irradiance over the whole receiver and up to the casters, and for shadows at the
+    same place as under parallel light. The diameter is as large as the penumbra allows, since a larger light reduces the noise of
+    Mitsuba's derivatives.
 
     Args:
-        scene: Loaded with `optimize=False`; its first sensor decides on the size of a pixel.
+        scene: Loaded with `optimize=False`; its first sensor determines the size of a pixel.
         light, receiver, casters: Ids of the directional light, of a planar shape and of meshes. Casters may turn about
-            the centres of their bounding boxes: bounding spheres count.
-        max_penumbra_px: Bound of `penumbra_px` (protocol: 0.5).
-        max_parallax_px: Bound of `parallax_px`.
-        uniformity: Bound of `irradiance_residual` (protocol: 0.005); the distance is doubled until it holds.
+            the centres of their bounding boxes: the proxy is made for their bounding spheres.
+        max_penumbra_px: Upper bound of `penumbra_px` (protocol: 0.5).
+        max_parallax_px: Upper bound of `parallax_px`.
+        uniformity: Upper bound of `irradiance_residual` (protocol: 0.005); the distance is doubled until it holds.
 
     Returns:
         The proxy with its measured residuals. No gradients.
@@ -124,7 +124,7 @@ def calibrate(
     extent = float(np.linalg.norm(p_receiver - middle, axis=1).max())
     distance = max(
         1.1 * extent * np.sqrt(2 / uniformity),  # on a plane facing the light the irradiance falls like cos^4
-        2.2 * height / uniformity,  # casters are nearer to the light and must not be brighter
+        2.2 * height / uniformity,  # casters are nearer to the light and must not get more of it
         reach * height / (max_parallax_px * pixel_size),
     )
     for _ in range(MAX_DOUBLINGS):
@@ -153,7 +153,7 @@ def calibrate(
 
 
 def with_proxy(scene: mi.Scene, proxy: Proxy, light: str = "light", *, only: tuple[str, ...] | None = None) -> mi.Scene:
-    """The scene with the directional light replaced; shapes and sensors are shared with the given scene.
+    """The scene with its directional light replaced. Shapes and sensors are shared with the given scene.
 
     Args:
         only: Ids of the shapes to keep; default: all.
@@ -162,6 +162,7 @@ def with_proxy(scene: mi.Scene, proxy: Proxy, light: str = "light", *, only: tup
 
 
 def _rebuilt(scene: mi.Scene, light: str, substitute: mi.Object, only: tuple[str, ...] | None) -> mi.Scene:
+    """The scene with a light replaced, and only the given shapes (None: all)."""
     description: dict[str, object] = {"type": "scene"}
     if scene.integrator() is not None:
         description["integrator"] = scene.integrator()
@@ -192,8 +193,8 @@ def _directional(scene: mi.Scene, light: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _shadow(scene: mi.Scene, receiver: str, casters: tuple[str, ...], direction: np.ndarray) -> tuple[float, float]:
-    """Shadow on the receiver that the first sensor sees: the largest ratio of the farthest caster's distance along the
-    light to the width of a pixel (across its ray), and the smallest width of a pixel."""
+    """Measures of the shadow on the receiver in the first sensor's image: the largest ratio of the farthest caster's distance
+    along the light to the width of a pixel (perpendicular to its ray), and the smallest width of a pixel."""
     sensor = scene.sensors()[0]
     width, height = (int(size) for size in sensor.film().crop_size())
     index = dr.arange(mi.UInt32, width * height)
@@ -201,7 +202,7 @@ def _shadow(scene: mi.Scene, receiver: str, casters: tuple[str, ...], direction:
     ray, _ = sensor.sample_ray(0.0, 0.5, position, mi.Point2f(0.5))
     si = scene.ray_intersect(ray)
     shapes = {shape.id(): shape for shape in scene.shapes()}
-    # An id would do, but merged scenes give several shapes the same one.
+    # Compare pointers: in merged scenes several shapes have the same id.
     seen = si.is_valid() & (si.shape == mi.ShapePtr(shapes[receiver]))
     t = dr.select(seen, si.t, 0)
     size = mi.Float(dr.inf)
@@ -223,7 +224,7 @@ def _shadow(scene: mi.Scene, receiver: str, casters: tuple[str, ...], direction:
 
 
 def _bounding_sphere(shape: mi.Shape) -> tuple[np.ndarray, float]:
-    """About the centre of the bounding box; (3,) and radius."""
+    """Bounding sphere about the centre of the bounding box: centre (3,) and radius."""
     box = _corners(shape.bbox())
     centre = box.mean(0)
     points = np.array(mi.traverse(shape)["vertex_positions"]).reshape(-1, 3) if isinstance(shape, mi.Mesh) else box
@@ -231,7 +232,7 @@ def _bounding_sphere(shape: mi.Shape) -> tuple[np.ndarray, float]:
 
 
 def _irradiance_residual(scene: mi.Scene, proxy: Proxy, light: str, receiver: str) -> float:
-    """Largest relative deviation of the receiver's irradiance over its whole area, both lights rendered alone."""
+    """Largest relative deviation of the irradiance over the whole receiver, both lights rendered alone."""
     box = _corners([shape for shape in scene.shapes() if shape.id() == receiver][0].bbox())
     extent = np.linalg.norm(box - box.mean(0), axis=1).max()
     eye = box.mean(0) - 4 * extent * np.array(proxy.direction)
@@ -256,12 +257,13 @@ def _irradiance_residual(scene: mi.Scene, proxy: Proxy, light: str, receiver: st
         alone = _rebuilt(scene, light, substitute, (receiver,))
         images.append(np.array(mi.render(alone, sensor=sensor, integrator=integrator, spp=256)))
     near, far = images
-    # Pixels on the receiver's border are covered partly and by different samples.
+    # Pixels on the receiver's border are covered partly, and differently in each image.
     inside = far.sum(-1) > 0.98 * far.sum(-1).max()
     return float(np.abs(near[inside] / np.maximum(far[inside], 1e-12) - 1)[far[inside] > 0].max())
 
 
 def _image_residual(scene: mi.Scene, proxy: Proxy, light: str) -> float:
+    """Relative RMS difference of the images with either light."""
     width, height = scene.sensors()[0].film().crop_size()
     spp = int(np.clip(2**22 // (int(width) * int(height)), 16, 256))
     near, far = (path_traced(each, spp=spp).image for each in (with_proxy(scene, proxy, light), scene))

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -22,16 +23,16 @@ SAMPLES_PER_LAUNCH = 1 << 24
 
 @dataclass(frozen=True)
 class Reference:
-    """An image and how it was made.
+    """An image and its settings.
 
     Attributes:
         image: (H, W, C) float32, linear radiance; row 0 is the top.
-        settings: What made it, as plain JSON values. `relative_standard_error` is the root mean square over pixels and
-            channels of the mean's standard error, divided by the image's mean (present from two passes on).
+        settings: Settings of the rendering, as plain JSON values. `relative_standard_error` is the root mean square over pixels
+            and channels of the mean's standard error, divided by the image's mean (only for two or more passes).
     """
 
     image: np.ndarray
-    settings: dict[str, object] = field(default_factory=dict)
+    settings: dict[str, Any] = field(default_factory=dict)
 
 
 def path_traced(
@@ -44,19 +45,19 @@ def path_traced(
     hide_emitters: bool = False,
     passes: int | None = None,
 ) -> Reference:
-    """Renders a scene's direct light with shadows.
+    """Render a scene's direct light with shadows.
 
-    Where all emitters are delta lights (directional, spot, point), one light at a time is rendered and the images are
-    added up: the same integrator, but without the noise of choosing a light at random. `spp` counts per light.
+    If all emitters are delta lights (directional, spot, point), each light is rendered alone and the images are added up: the
+    integrator is the same, but without the noise of choosing a light at random. `spp` counts per light.
 
     Args:
         scene: Scene whose film has a box filter.
         spp: Samples per pixel (and light), at least 1, rounded up to squares per pass; protocol: 512 or more.
-        seed: Same seed, same image. Two images with one seed share their noise as far as their paths agree.
+        seed: Same seed, same image. Images with the same seed share the noise of paths that they have in common.
         sensor: Index of the sensor.
-        integrator: `"direct"`, or `"volpath"` (depth 2), which is the same transport but looks through `mask` BSDFs
-            that `direct` takes for opaque. Default: `volpath` if a shape has such a BSDF, else `direct`.
-        hide_emitters: Show black instead of emitters in view.
+        integrator: `"direct"`, or `"volpath"` (depth 2): the same transport, but shadow rays pass through `mask` BSDFs, which are
+            opaque to `direct`. Default: `volpath` if a shape has such a BSDF, else `direct`.
+        hide_emitters: Show black instead of visible emitters.
         passes: Number of passes; default: 8, or more to stay below `SAMPLES_PER_LAUNCH`.
 
     Returns:
@@ -68,7 +69,7 @@ def path_traced(
     name = integrator or ("volpath" if has_masks(scene) else "direct")
     if name not in ("direct", "volpath"):
         raise ShadowmapError(f"integrator {name!r} is no reference for direct light: use 'direct' or 'volpath'.")
-    description: dict[str, object] = {"type": name, "hide_emitters": hide_emitters}
+    description: dict[str, Any] = {"type": name, "hide_emitters": hide_emitters}
     if name == "volpath":
         description["max_depth"] = 2
     plugin = mi.load_dict(description)
@@ -80,7 +81,7 @@ def path_traced(
     def render_all(samples: int, pass_seed: int) -> np.ndarray:
         if weights is None or len(weights) < 2:
             return render(samples, pass_seed)
-        total = 0.0
+        total: np.ndarray = np.zeros((), np.float32)
         for index, key in enumerate(weights):
             with _only(scene, weights, key):
                 total = total + render(samples, _mix(pass_seed, index))
@@ -99,7 +100,7 @@ def path_traced(
 def accumulate(
     scene: mi.Scene,
     render: Callable[[int, int], np.ndarray],
-    settings: dict[str, object],
+    settings: dict[str, Any],
     *,
     spp: int,
     seed: int,
@@ -109,8 +110,8 @@ def accumulate(
     """Mean of `render(samples, seed)` over passes with different seeds, with its standard error.
 
     Args:
-        render: Makes an (H, W, C) image of the given samples per pixel.
-        settings: Copied into the result beside the sampling's own.
+        render: Makes an (H, W, C) image with the given samples per pixel and seed.
+        settings: Copied into the result, beside the settings of the sampling.
 
     Raises:
         ShadowmapError: The film's filter is not a box, or spp < 1.
@@ -122,9 +123,10 @@ def accumulate(
         raise ShadowmapError(f"spp is {spp}: give at least 1.")
     width, height = film.crop_size()
     count = passes or max(min(8, math.ceil(spp / 16)), math.ceil(spp * int(width) * int(height) / SAMPLES_PER_LAUNCH))
-    per_pass = math.ceil(math.sqrt(spp / count)) ** 2  # stratified samplers want a square
-    mean, square = 0.0, 0.0
-    for index in range(count):  # Welford's update: sums of squares would cancel
+    per_pass = math.ceil(math.sqrt(spp / count)) ** 2  # stratified samplers need a square
+    mean: np.ndarray = np.zeros(())
+    square: np.ndarray = np.zeros(())
+    for index in range(count):  # Welford's update avoids the cancellation of sums of squares
         image = render(per_pass, _mix(seed, 1000 + index)).astype(np.float64)
         step = image - mean
         mean = mean + step / (index + 1)
@@ -146,18 +148,16 @@ def accumulate(
 
 
 def has_masks(scene: mi.Scene) -> bool:
-    """True if a shape (outside of shape groups) has a BSDF that lets light pass straight through, such as `mask`."""
+    """True if a shape (outside of shape groups) has a BSDF with straight transmission, such as `mask`."""
     bsdfs = (shape.bsdf() for shape in scene.shapes())
     return any(bsdf is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in bsdfs)
 
 
 def save(path: str | Path, reference: Reference, *, half: bool = False) -> None:
-    """Writes an EXR with the settings in its header (JSON under `shadowmap_settings`).
-
-    The file appears complete or not at all.
+    """Write an EXR file with the settings in its header (JSON under `shadowmap_settings`). The write is atomic.
 
     Args:
-        half: 16-bit floats: half the size, relative error up to 5e-4 per value.
+        half: Store 16-bit floats: half the size, relative error up to 5e-4 per value.
 
     Raises:
         OutputError: The file cannot be written.
@@ -169,10 +169,10 @@ def save(path: str | Path, reference: Reference, *, half: bool = False) -> None:
 
 
 def load(path: str | Path) -> Reference:
-    """Reads what `save` wrote; an EXR of other origin has empty settings.
+    """Read a file that `save` has written; other EXR files have empty settings.
 
     Raises:
-        ShadowmapError: No such file, or a damaged one.
+        ShadowmapError: The file does not exist, or is damaged.
     """
     if not Path(path).is_file():
         raise ShadowmapError(f"no file {str(path)!r}: make references with tests/support/references/make.py.")
@@ -186,18 +186,18 @@ def load(path: str | Path) -> Reference:
 
 
 def _mix(*numbers: int) -> int:
-    """A 32-bit seed from several numbers; neighbouring Mitsuba seeds are correlated in some samplers."""
+    """A 32-bit seed from several numbers: neighbouring Mitsuba seeds are correlated in some samplers."""
     return int(np.random.SeedSequence(numbers).generate_state(1)[0])
 
 
 def _selection_weights(scene: mi.Scene) -> dict[str, float] | None:
-    """Parameters with which the lights are chosen and their values, or None if not all are delta lights."""
+    """Sampling weights of the lights by the names of their parameters, or None if not all lights are delta lights."""
     if not all(
         mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaPosition)
         or mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaDirection)
         for emitter in scene.emitters()
     ):
-        return None  # an emitter with an extent also counts in passes that do not choose it: rays of the BSDF hit it
+        return None  # BSDF samples hit an extended emitter even in passes that do not sample it
     params = mi.traverse(scene)
     keys = [key for key in params.keys() if key.rpartition(".")[2] == "sampling_weight"]
     return {key: float(params[key]) for key in keys} if len(keys) == len(scene.emitters()) else None
@@ -205,7 +205,7 @@ def _selection_weights(scene: mi.Scene) -> dict[str, float] | None:
 
 @contextmanager
 def _only(scene: mi.Scene, weights: dict[str, float], chosen: str) -> Iterator[None]:
-    """Lets emitter sampling choose one light only."""
+    """Restrict emitter sampling to one light."""
     params = mi.traverse(scene)
 
     def assign(values: dict[str, float]) -> None:

@@ -1,18 +1,20 @@
-"""Direct light without shadows: what shading alone must reproduce.
+"""Direct light without shadows: reference images for shading.
 
 Importing this module registers the integrator `direct_unshadowed` in the current variant and in those set later.
 
-Conventions, where a shadow ray would have decided something:
+Conventions for cases that a shadow ray would decide:
 
-- A light that the shading normal sees in front but the geometric normal behind (or the other way round) gives nothing:
-  on a closed surface its shadow ray would hit the surface's own other side. Viewer and light must be on the same side
-  of the geometric normal exactly where the BSDF takes them to be on the same side of the shading normal; so transmission
-  and two-sided materials are treated alike. `geometric_gate = False` leaves this out.
-- Masks are looked through, weighted by their transparency.
-- Environments (`constant`, `envmap`) neither light the scene nor show behind it.
+- A light in front of the shading normal but behind the geometric normal (or the other way round) contributes nothing: on a
+  closed surface its shadow ray would hit the surface itself. Viewer and light must be on the same side of the geometric normal
+  if and only if they are on the same side of the shading normal; this covers transmission and two-sided materials, too.
+  `geometric_gate = False` disables this test.
+- Camera rays pass through masks, weighted by their transparency.
+- Environments (`constant`, `envmap`) neither light the scene nor appear in the background.
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -36,17 +38,17 @@ def unshadowed(
     geometric_gate: bool = True,
     hide_emitters: bool = False,
 ) -> Reference:
-    """Renders a scene's direct light without shadow rays.
+    """Render a scene's direct light without shadow rays.
 
-    Every light is evaluated at every sample (nothing is chosen at random), with the same `sample_direction` and
-    `bsdf.eval` as `direct`. Delta lights leave no noise but that of the pixel's sub-positions; area lights are sampled.
+    Every light is evaluated at every sample (none is chosen at random), with the same `sample_direction` and `bsdf.eval` as
+    `direct`. With delta lights, the positions within the pixel are the only source of noise; area lights are sampled.
 
     Args:
         scene: Scene whose film has a box filter.
         spp: Samples per pixel; protocol: 64 or more.
         seed, sensor: As in `reference.path_traced`.
         geometric_gate: See the module's description.
-        hide_emitters: Show black instead of area lights in view.
+        hide_emitters: Show black instead of visible area lights.
 
     Returns:
         The reference, (H, W, C) float32. No gradients.
@@ -60,7 +62,7 @@ def unshadowed(
     def render(samples: int, pass_seed: int) -> np.ndarray:
         return np.array(mi.render(scene, sensor=sensor, integrator=integrator, spp=samples, seed=pass_seed))
 
-    settings: dict[str, object] = {
+    settings: dict[str, Any] = {
         "kind": "unshadowed",
         "integrator": NAME,
         "geometric_gate": geometric_gate,
@@ -71,7 +73,7 @@ def unshadowed(
 
 
 def register() -> None:
-    """Makes `direct_unshadowed` loadable in the current variant; does nothing if it is already."""
+    """Register `direct_unshadowed` in the current variant, unless it is registered."""
     variant = mi.variant()
     if variant is None or not variant.startswith(("llvm", "cuda")) or variant.endswith("polarized"):
         return
@@ -82,7 +84,7 @@ def register() -> None:
 
 
 def _integrator_class() -> type:
-    """The integrator's class; its base exists only once a variant is set and differs between variants."""
+    """Make the integrator's class. Its base class depends on the variant, and exists only once a variant is set."""
 
     class DirectUnshadowed(mi.SamplingIntegrator):
         def __init__(self, props: mi.Properties) -> None:
@@ -117,7 +119,7 @@ def _integrator_class() -> type:
             return radiance, hit, []
 
         def reflected(self, si, bsdf, light, sampler, active):  # noqa: ANN001, ANN202
-            """Light of one emitter that leaves the surface towards the viewer."""
+            """Light of one emitter that the surface reflects towards the viewer."""
             ds, weight = light.sample_direction(si, sampler.next_2d(active), active)
             active = active & (ds.pdf > 0)
             wo = si.to_local(ds.d)

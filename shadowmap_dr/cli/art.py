@@ -1,4 +1,4 @@
-"""The command `shadowmap-dr art`: objects whose shadows are pictures."""
+"""The command `shadowmap-dr art`: objects whose shadows match pictures."""
 
 from __future__ import annotations
 
@@ -20,37 +20,33 @@ def art(
     ] = None,
     text: Annotated[list[str] | None, typer.Option(metavar="LETTERS", help="Letters instead of an image; repeatable.")] = None,
     mesh: Annotated[
-        str | None, typer.Option(metavar="NAME|FILE", help="What is deformed [default: a sphere of 12,800 triangles].")
+        str | None, typer.Option(metavar="NAME|FILE", help="Mesh to deform [default: a sphere of 12,800 triangles].")
     ] = None,
     collection: Annotated[
-        str | None, typer.Option(metavar="NAME|FILE", help="Copies of this mesh cast the shadow: moved, turned and scaled.")
+        str | None, typer.Option(metavar="NAME|FILE", help="Mesh whose moved, turned and scaled copies cast the shadow.")
     ] = None,
-    copies: Annotated[int, typer.Option(metavar="N", help="Copies at most; their number doubles every 150 steps.")] = 128,
-    receiver: Annotated[str, typer.Option(metavar="plane|wavy", help="What the shadow falls on.")] = "plane",
+    copies: Annotated[int, typer.Option(metavar="N", help="Largest number of copies; it doubles every 150 steps.")] = 128,
+    receiver: Annotated[str, typer.Option(metavar="plane|wavy", help="Receiver of the shadow.")] = "plane",
     camera: Annotated[
-        str, typer.Option(metavar="orthographic|perspective", help="Seen straight on, or in perspective from the side.")
+        str, typer.Option(metavar="orthographic|perspective", help="Frontal view, or perspective from the side.")
     ] = "orthographic",
-    iterations: Annotated[
-        int | None, typer.Option(help="Steps of the optimiser [default: 400, and 1100 of a collection].")
-    ] = None,
-    smoothness: Annotated[float, typer.Option(help="How stiff the mesh is; finer meshes need more.")] = 20.0,
-    remesh: Annotated[
-        int | None, typer.Option(metavar="STEPS", help="Mesh the surface anew after so many steps, again and again.")
-    ] = None,
+    iterations: Annotated[int | None, typer.Option(help="Steps of the optimiser [default: 400; 1100 for a collection].")] = None,
+    smoothness: Annotated[float, typer.Option(help="Stiffness of the mesh; finer meshes need more.")] = 20.0,
+    remesh: Annotated[int | None, typer.Option(metavar="STEPS", help="Remesh the surface every so many steps.")] = None,
     fill_holes: Annotated[bool, typer.Option("--fill-holes", help="Fill enclosed holes of the targets.")] = False,
     resolution: Annotated[int, typer.Option(help="Pixels along each side of the shadow images.")] = 256,
     map_resolution: Annotated[
-        int | None, typer.Option(help="Texels along each side of the shadow maps [default: as many as pixels].")
+        int | None, typer.Option(help="Texels along each side of the shadow maps [default: the resolution].")
     ] = None,
     animate: Annotated[str, typer.Option(metavar="webp|gif|none", help="Kind of the animated pictures.")] = "webp",
-    printable: Annotated[bool, typer.Option("--printable", help="Write an STL file, too, and report on the mesh.")] = False,
+    printable: Annotated[bool, typer.Option("--printable", help="Also write an STL file, and report on the mesh.")] = False,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("art"),
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with a killed run of the same settings.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Resume a killed run with the same settings.")] = False,
     variant: Variant = DEFAULT_VARIANT,
 ) -> None:
     """Deform an object until its shadow is a given picture, or its two shadows two pictures.
 
-    Or move, turn and scale copies of one (--collection), which start as one and double every 150 steps.
+    With --collection, move, turn and scale copies of a mesh instead: one copy at first, twice as many every 150 steps.
 
     Writes meshes (PLY, OBJ, GLB), images of shadows and errors, animated pictures, and OUT/art.json.
     """

@@ -17,21 +17,24 @@ from .options import Variant
 
 
 def bench(
-    quick: Annotated[bool, typer.Option("--quick", help="Small sizes and few steps: some minutes instead of hours.")] = False,
-    out: Annotated[Path, typer.Option(help="JSON file to write; a plot lies beside it.")] = Path("bench.json"),
+    quick: Annotated[bool, typer.Option("--quick", help="Small sizes and few steps: minutes instead of hours.")] = False,
+    out: Annotated[Path, typer.Option(help="JSON file to write; a plot is written beside it.")] = Path("bench.json"),
     only: Annotated[
         list[str] | None,
         typer.Option(metavar="|".join(bench_common.SECTIONS), help="Section to measure; repeatable [default: all]."),
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Keep what a killed run with the same options has measured.")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Keep the measurements of a killed run with the same options.")
+    ] = False,
     mitsuba_seconds: Annotated[
-        float, typer.Option(help="Limit for each part that waits for Mitsuba's integrator; what it cuts off is recorded.")
+        float,
+        typer.Option(help="Time limit of each part that runs Mitsuba's integrator; the record names parts that it cut off."),
     ] = 900.0,
     variant: Variant = DEFAULT_VARIANT,
 ) -> None:
-    """Measure steps, rasterization, how costs grow, and where the time goes, beside Mitsuba and Embree.
+    """Measure times of steps and rasterization, growth of costs, and profiles, beside Mitsuba and Embree.
 
-    Writes a JSON file, a plot, and a folder of meshes and reference images. Sections that are not measured stay as they are.
+    Writes a JSON file, a plot, and a folder of meshes and reference images. The file keeps sections that are not measured.
     """
     options = bench_common.BenchOptions(
         quick=quick,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, cast
 
 import typer
 from rich.console import Console
@@ -35,42 +35,41 @@ def face(
         list[str] | None,
         typer.Option(
             metavar="|".join(faces_problem.MODES),
-            help="What is looked for: identity, identity and expression, expression of a known head; repeatable "
-            "[default: identity].",
+            help="Unknowns: identity, identity and expression, or expression of a known head; repeatable [default: identity].",
         ),
     ] = None,
     image: Annotated[
-        Path | None, typer.Option(help="Silhouette to find a head for, in place of artificial heads (.png, .jpg, .exr).")
+        Path | None, typer.Option(help="Silhouette to find a head for, instead of artificial heads (.png, .jpg, .exr).")
     ] = None,
     prior: Annotated[
         float | None, typer.Option(help="Strength of the prior on the weights, 0 for none [default: 3e-5, 3e-4 with --image].")
     ] = None,
     model: Annotated[Path | None, typer.Option(help="Morphable model (.npz) [default: the head of this package].")] = None,
     iterations: Annotated[int, typer.Option(help="Steps of the optimiser.")] = 400,
-    translate: Annotated[bool, typer.Option("--translate", help="Look for the head's place too (always with --image).")] = False,
+    translate: Annotated[bool, typer.Option("--translate", help="Fit the head's position, too (always with --image).")] = False,
     reference: Annotated[
-        str, typer.Option(metavar="own|mitsuba", help="Shadows to start from: made with this library, or path-traced.")
+        str, typer.Option(metavar="own|mitsuba", help="Target shadows: rendered by this library, or path-traced.")
     ] = "own",
     height: Annotated[int, typer.Option(help="Rows of the shadow image.")] = 192,
     map_resolution: Annotated[int, typer.Option(help="Texels along each side of a shadow map.")] = 256,
     filter_size: Annotated[int, typer.Option(help="Texels along each side of the filter.")] = 3,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("face"),
-    resume: Annotated[bool, typer.Option("--resume", help="Keep finished runs, go on with killed ones.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Keep finished runs, resume killed ones.")] = False,
     variant: Variant = DEFAULT_VARIANT,
 ) -> None:
-    """Find heads from their profile shadows with a morphable model, and measure how far they are off.
+    """Find heads from their profile shadows with a morphable model, and measure the errors.
 
     Writes OUT/faces.json, tables (.md), shadows, errors drawn on the heads, and the heads (.ply). With --image: the head for a
-    silhouette, which is scaled and laid over the shadow of the mean head first.
+    silhouette, which is first scaled and aligned with the shadow of the mean head.
     """
     if context.invoked_subcommand is not None:
         return
     if image is not None:
         for name, given in (("--head", head), ("--shadows", shadows)):
             if given:
-                raise ShadowmapError(f"{name} says which artificial heads to look for: leave it out with --image.")
+                raise ShadowmapError(f"{name} chooses artificial heads: leave it out with --image.")
         if reference != "own":
-            raise ShadowmapError("--reference says how artificial shadows are made: leave it out with --image.")
+            raise ShadowmapError("--reference is an option of artificial heads: leave it out with --image.")
         modes = mode or ["identity"]
         if len(modes) > 1 or modes[0] not in faces_problem.MODES or modes[0] == "expression":
             raise ShadowmapError(f"--mode {' '.join(modes)}: with --image, choose identity or both.")
@@ -95,15 +94,16 @@ def face(
         typer.echo(f"Record, pictures and head: {out}")
         return
     defaults = faces_experiment.FaceOptions()
+    # `FaceOptions` checks the choices.
     artificial = faces_experiment.FaceOptions(
         seeds=tuple(head or defaults.seeds),
         lights=tuple(shadows or defaults.lights),
-        modes=tuple(mode or defaults.modes),
+        modes=cast(tuple[faces_problem.Mode, ...], tuple(mode or defaults.modes)),
         model=model,
         iterations=iterations,
         prior=defaults.prior if prior is None else prior,
         translate=translate,
-        reference=reference,
+        reference=cast(faces_experiment.Reference, reference),
         height=height,
         map_resolution=map_resolution,
         filter_size=filter_size,
@@ -124,10 +124,10 @@ def convert(
     ],
     output: Annotated[Path, typer.Argument(help="Model to write (.npz).")],
     facing: Annotated[
-        str, typer.Option(metavar="|".join(convert_model.FACING), help="Where the model's head looks; y is up.")
+        str, typer.Option(metavar="|".join(convert_model.FACING), help="Axis along which the model's head looks; y is up.")
     ] = "+z",
     neck: Annotated[
-        float | None, typer.Option(help="Height, in the model's units, above which vertices are head [default: all are].")
+        float | None, typer.Option(help="Height, in the model's units, above which vertices belong to the head [default: all].")
     ] = None,
     components: Annotated[int | None, typer.Option(help="Identity components to keep [default: all].")] = None,
     expression_scale: Annotated[
@@ -135,7 +135,7 @@ def convert(
         typer.Option(help="Share of a full expression that a weight of 1 stands for [default: 0.5 for OBJ files, 1 for arrays]."),
     ] = None,
 ) -> None:
-    """Bring another morphable model into the format of this package."""
+    """Convert a morphable model to the format of this package."""
     files.check_output(output, (".npz",))
     scale = expression_scale if expression_scale is not None else 0.5 if source.is_dir() else 1.0
     options = convert_model.ConvertOptions(facing=facing, neck=neck, components=components, expression_scale=scale)

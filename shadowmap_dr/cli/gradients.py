@@ -1,12 +1,13 @@
-"""The commands `shadowmap-dr gradients ...`: whether derivatives of shadows are right, and what can be found with them."""
+"""The commands `shadowmap-dr gradients ...`: accuracy of the derivatives of shadows, and optimisations with them."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich.console import Console
+from rich.table import Table
 
 from ..experiments.gradients import convergence as convergence_experiment
 from ..experiments.gradients import jacobian as jacobian_experiment
@@ -17,15 +18,15 @@ from ..experiments.gradients.images import CANDIDATES
 from ..variants import DEFAULT_VARIANT, set_variant
 from .options import Variant, given
 
-app = typer.Typer(help="Measure the derivatives of shadows, and what can be found with them.", no_args_is_help=True)
+app = typer.Typer(help="Measure the derivatives of shadows, and test them in optimisations.", no_args_is_help=True)
 
 _FULL_MAPS, _FULL_SPP = (128, 256, 512, 1024), 512
 _FULL_DISPLACEMENTS = (0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7)
 _FULL_FILTERS = (1, 3, 5, 9, 15)
 
 Out = Annotated[Path, typer.Option(help="Folder for the results.")]
-Full = Annotated[bool, typer.Option("--full", help="The whole grid: many minutes instead of two or three.")]
-Resume = Annotated[bool, typer.Option("--resume", help="Keep what a killed run with the same settings has measured.")]
+Full = Annotated[bool, typer.Option("--full", help="Full grid: many minutes instead of two or three.")]
+Resume = Annotated[bool, typer.Option("--resume", help="Keep the measurements of a killed run with the same settings.")]
 Candidates = Annotated[
     list[str] | None,
     typer.Option("--candidate", metavar="|".join(CANDIDATES), help="Kind of shadow map; repeatable [default: default]."),
@@ -55,9 +56,9 @@ def jacobian(
     resume: Resume = False,
     variant: Variant = DEFAULT_VARIANT,
 ) -> None:
-    """Compare derivative images of a shadow with central differences, our own and path-traced ones.
+    """Compare derivative images of a shadow with central differences of our own and of path-traced images.
 
-    Writes OUT/jacobian.json, a reading of it (.md), a sheet of derivative images and a plot.
+    Writes OUT/jacobian.json, a summary of it (.md), a sheet of derivative images and a plot.
     """
     defaults = jacobian_experiment.JacobianOptions()
     options = jacobian_experiment.JacobianOptions(
@@ -87,7 +88,9 @@ def convergence(
     ] = None,
     candidate: Candidates = None,
     filter_size: FilterSizes = None,
-    displacement: Annotated[list[float] | None, typer.Option(help="Start of a run, along x; repeatable.")] = None,
+    displacement: Annotated[
+        list[float] | None, typer.Option(help="Displacement at the start of a run, along x; repeatable.")
+    ] = None,
     map_resolution: Annotated[int, typer.Option(help="Texels along each side of the map.")] = 256,
     resolution: Annotated[int, typer.Option(help="Image width and height in pixels.")] = 512,
     iterations: Annotated[int, typer.Option(help="Steps of the optimiser.")] = 250,
@@ -98,7 +101,7 @@ def convergence(
 ) -> None:
     """Recover a displaced occluder from its shadow, from near and far.
 
-    Writes OUT/convergence.json, a reading of it (.md), a plot and pictures.
+    Writes OUT/convergence.json, a summary of it (.md), a plot and pictures.
     """
     defaults = convergence_experiment.ConvergenceOptions()
     options = convergence_experiment.ConvergenceOptions(
@@ -131,7 +134,7 @@ def minimal_plane(
 ) -> None:
     """Recover one displaced vertex of a square from its shadow, with and without anti-aliased shadow maps.
 
-    Writes OUT/minimal-plane.json, a reading of it (.md), a plot and pictures.
+    Writes OUT/minimal-plane.json, a summary of it (.md), a plot and pictures.
     """
     defaults = plane_experiment.PlaneOptions()
     options = plane_experiment.PlaneOptions(
@@ -146,9 +149,9 @@ def minimal_plane(
     _show(plane_experiment.plane_table(plane_experiment.run_plane(options)), out, "minimal-plane")
 
 
-def _show(table: Any, out: Path, name: str) -> None:
+def _show(table: Table, out: Path, name: str) -> None:
     Console().print(table)
-    # The reading after its tables, which the terminal has seen.
+    # The sentences of the summary only: the table has just been printed.
     text = (out / f"{name}.md").read_text(encoding="utf-8")
     typer.echo("\n".join(line for line in text.splitlines() if line and not line.startswith(("|", "#"))))
     typer.echo(f"Record, pictures and plots: {out}")

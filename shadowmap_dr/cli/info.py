@@ -1,4 +1,4 @@
-"""The command `shadowmap-dr info`: versions, libraries, and what comes with the package."""
+"""The command `shadowmap-dr info`: versions, libraries, and the package's scenes and meshes."""
 
 from __future__ import annotations
 
@@ -20,8 +20,7 @@ def info() -> None:
     rows = [
         ("shadowmap_dr", __version__),
         ("mitsuba", mi.__version__),
-        ("drjit", dr.__version__),
-        *((name, _version(name)) for name in ("numpy", "OpenEXR")),
+        *((name, _version(name)) for name in ("drjit", "numpy", "OpenEXR")),
         ("python", platform.python_version()),
         ("LLVM version", ".".join(map(str, llvm)) if llvm else "none"),
         ("LLVM library", str(_llvm.loaded_library() or "none")),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, cast
 
 import typer
 from rich.console import Console
@@ -12,7 +12,7 @@ from ..errors import ShadowmapError
 from ..experiments.lights import experiment as lights_experiment
 from ..experiments.lights import report as lights_report
 from ..experiments.lights import speed as lights_speed
-from ..experiments.lights.problem import LightProblem
+from ..experiments.lights.problem import LightProblem, ReferenceKind, StrategyKind
 from ..experiments.lights.scene import OBJECTS
 from ..inverse.runs.schedulers import check_scheduler
 from ..io import console, files, records
@@ -33,7 +33,7 @@ def lights(
         list[int] | None, typer.Option("--filter-size", help="Texels of the filter, 1 for none; repeatable [default: 3].")
     ] = None,
     shadows: Annotated[
-        bool | None, typer.Option("--shadows/--no-shadows", help="With shadows only, or without only [default: both].")
+        bool | None, typer.Option("--shadows/--no-shadows", help="Only with shadows, or only without [default: both].")
     ] = None,
     map_resolution: Annotated[int, typer.Option(help="Texels along each side of a shadow map.")] = 256,
     resolution: Annotated[int, typer.Option(help="Image width and height in pixels.")] = 128,
@@ -41,19 +41,17 @@ def lights(
     strategy: Annotated[
         str, typer.Option(metavar="plain|coarse", help="coarse: larger steps and a larger filter in the first half.")
     ] = "plain",
-    starts: Annotated[int, typer.Option(help="Starts of each run; the one that ends with the least loss counts.")] = 1,
-    reference: Annotated[str, typer.Option(metavar="own|mitsuba", help="Who renders the targets.")] = "own",
+    starts: Annotated[int, typer.Option(help="Starts of each run; the start with the least final loss counts.")] = 1,
+    reference: Annotated[str, typer.Option(metavar="own|mitsuba", help="Renderer of the targets.")] = "own",
     spp: Annotated[int, typer.Option(help="Samples per pixel of path-traced targets.")] = 512,
     cone: Annotated[float, typer.Option(help="Opening angle in degrees of the cone that directions are drawn from.")] = 60,
     seed: Annotated[int, typer.Option(help="Seed of targets and starts.")] = 0,
-    memory: Annotated[int, typer.Option(help="MiB that a batch of runs may need, about.")] = 2048,
+    memory: Annotated[int, typer.Option(help="Approximate memory limit of a batch of runs, in MiB.")] = 2048,
     scheduler: Scheduler = "local",
     threads: SchedulerThreads = 0,
     full: Annotated[bool, typer.Option("--full", help="1 to 5 lights, all filters, 150 runs: hours.")] = False,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("lights"),
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Keep batches that are complete, and summaries of other settings.")
-    ] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Keep complete batches, and summaries of other settings.")] = False,
     variant: Variant = DEFAULT_VARIANT,
 ) -> None:
     """Find the directions of lights by comparing images, many runs at once.
@@ -69,6 +67,7 @@ def lights(
     sizes = tuple(size for size in sizes if size or shadows is not True) if shadows is not False else (0,)
     if filter_size and shadows is None:
         sizes = (*sizes, 0)
+    # `LightOptions` checks the choices.
     options = lights_experiment.LightOptions(
         objects=tuple(object or defaults.objects),
         lights=tuple(count or (_FULL_LIGHTS if full else defaults.lights)),
@@ -78,9 +77,9 @@ def lights(
         map_resolution=map_resolution,
         resolution=resolution,
         iterations=iterations,
-        strategy=strategy,
+        strategy=cast(StrategyKind, strategy),
         starts=starts,
-        reference=reference,
+        reference=cast(ReferenceKind, reference),
         spp=spp,
         seed=seed,
         cone_deg=cone,
@@ -100,11 +99,11 @@ def lights_times(
     object: Annotated[str, typer.Option(metavar="|".join(OBJECTS), help="Object, by name or mesh file.")] = "bunny",
     count: Annotated[int, typer.Option("--lights", help="Lights, 1 to 5.")] = 1,
     batch: Annotated[list[int] | None, typer.Option(help="Runs of a batch; repeatable [default: 1, 16, 150].")] = None,
-    workers: Annotated[bool, typer.Option(help="Compare one with two Dask workers, too.")] = True,
+    workers: Annotated[bool, typer.Option(help="Also compare one Dask worker with two.")] = True,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("lights-times"),
     variant: Variant = DEFAULT_VARIANT,
 ) -> None:
-    """Measure how long a step of light estimation takes for a run, in batches and alone, and what more workers bring.
+    """Measure the time of a step of light estimation for a run, in batches and alone, and the gain by more workers.
 
     Writes OUT/times.json. Nothing else should run on the machine.
     """
@@ -122,7 +121,7 @@ def lights_times(
         for name, entry in times.items()
     ]
     Console().print(console.table("A step of a run", ["way", "ms", "/ largest batch"], rows))
-    record = {"steps": steps}
+    record: dict[str, Any] = {"steps": steps}
     records.write_json(path, record)
     if workers:
         record["workers"] = lights_speed.measure_workers(LightProblem(object, count, 32, iterations=60), (1, 2), out)

@@ -26,7 +26,7 @@ def maps(
     map_resolution: Annotated[int, typer.Option(help="Texels along each side of a shadow map.")] = 256,
     filter_size: Annotated[int, typer.Option(help="Texels along each side of the filter.")] = 3,
     spp: Annotated[int, typer.Option(help="Samples per pixel of the path-traced images.")] = 1024,
-    pose_runs: Annotated[int, typer.Option(help="Poses to be found with each shadow map, from shadows alone.")] = 10,
+    pose_runs: Annotated[int, typer.Option(help="Poses to find with each shadow map, from shadows alone.")] = 10,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("maps"),
     variant: Variant = DEFAULT_VARIANT,
 ) -> None:

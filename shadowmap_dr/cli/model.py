@@ -1,13 +1,15 @@
-"""The command `shadowmap-dr model`: a mesh follows what is painted on its shadow."""
+"""The command `shadowmap-dr model`: a mesh is deformed by painting on its shadow."""
 
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
+import numpy.typing as npt
 import typer
 
 from ..errors import ShadowmapError
@@ -17,34 +19,35 @@ from ..interactive.modeller import Modeller
 from ..inverse import Sculptor, even_sphere, shadow_view
 from ..io import assets, files
 from ..io.meshes import read_placed_mesh
+from ..rendering.receivers.shadow_views import ShadowView
 from ..variants import DEFAULT_VARIANT, set_variant
 from .options import Variant
 
-#: Light direction and what is up in the shadow.
+#: Light direction, and direction that is up in the shadow image.
 VIEWS = {"front": ((0, 0, -1), (0, 1, 0)), "side": ((-1, 0, 0), (0, 1, 0)), "top": ((0, -1, 0), (0, 0, -1))}
 _SPHERE = "sphere"
-#: Weight of normal consistency: weak, so that what nobody paints on keeps its details.
+#: Weight of normal consistency: weak, so that parts without changes keep their details.
 CONSISTENCY = 0.001
 
 
 def model(
-    mesh: Annotated[str, typer.Argument(metavar="NAME|FILE", help=f"What is deformed: a mesh file, a name, or '{_SPHERE}'.")],
+    mesh: Annotated[str, typer.Argument(metavar="NAME|FILE", help=f"Mesh to deform: a file, a name, or '{_SPHERE}'.")],
     serve: Annotated[bool, typer.Option("--serve", help="Paint in the browser instead of in an image file.")] = False,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page on 127.0.0.1; 0 for any free one.")] = 8711,
-    image: Annotated[Path, typer.Option(help="The shadow's file, .png, to edit in a paint program.")] = Path("shadow.png"),
+    image: Annotated[Path, typer.Option(help="Image of the shadow (.png), to edit in a paint program.")] = Path("shadow.png"),
     output: Annotated[Path, typer.Option("-o", "--output", help=f"Mesh to write: .{', .'.join(exports.FORMATS)}.")] = Path(
         "model.ply"
     ),
-    view: Annotated[str, typer.Option(metavar="|".join(VIEWS), help="Where the light comes from.")] = "front",
+    view: Annotated[str, typer.Option(metavar="|".join(VIEWS), help="Side that the light comes from.")] = "front",
     resolution: Annotated[int, typer.Option(min=32, max=512, help="Pixels along each side of the shadow.")] = 256,
-    smoothness: Annotated[float, typer.Option(help="How stiff the mesh is; finer meshes need more.")] = 20.0,
-    step_size: Annotated[float, typer.Option(help="How far a step goes.")] = 0.2,
+    smoothness: Annotated[float, typer.Option(help="Stiffness of the mesh; finer meshes need more.")] = 20.0,
+    step_size: Annotated[float, typer.Option(help="Length of a step.")] = 0.2,
     variant: Variant = DEFAULT_VARIANT,
 ) -> None:
     """Deform a mesh by painting on its shadow.
 
-    Writes the shadow into an image file, and deforms the mesh whenever that file is saved by a paint program; or, with --serve,
-    shows a page on which one paints and watches. Ctrl-C ends it. The mesh is saved when it comes to rest, and at the end.
+    Writes the shadow into an image file, and deforms the mesh whenever a paint program saves that file. With --serve, serves a
+    web page for painting instead. Ctrl-C ends it. The mesh is saved when it comes to rest, and at the end.
     """
     if view not in VIEWS:
         raise ShadowmapError(f"no view {view!r}: choose from {', '.join(VIEWS)}.")
@@ -57,13 +60,14 @@ def model(
     shadow = shadow_view(*VIEWS[view], size=resolution)
 
     def build() -> Modeller:
-        options = {
+        options: dict[str, Any] = {
             "step_size": step_size, "smoothness": smoothness, "consistency": CONSISTENCY, "map_resolution": resolution
         }  # fmt: skip
         return Modeller(Sculptor(vertices, faces, [shadow], **options))
 
-    def save(moved: Any) -> None:
-        exports.write_mesh(output, moved * scale + middle, faces)
+    def save(moved: np.ndarray) -> None:
+        placed: npt.NDArray[Any] = moved * scale + middle
+        exports.write_mesh(output, placed, faces)
 
     if serve:
         _serve(build, shadow, _SPHERE if path is None else path.stem, port, save)
@@ -74,7 +78,7 @@ def model(
     typer.echo(f"Mesh: {output}")
 
 
-def _serve(build: Any, shadow: Any, name: str, port: int, save: Any) -> None:
+def _serve(build: Callable[[], Modeller], shadow: ShadowView, name: str, port: int, save: Callable[[np.ndarray], None]) -> None:
     try:
         from ..interactive.connections import Connections
         from ..interactive.server import listen, serve
@@ -96,7 +100,7 @@ def _serve(build: Any, shadow: Any, name: str, port: int, save: Any) -> None:
 
 @contextmanager
 def _interrupts() -> Iterator[list[int]]:
-    """Collects interrupts, which then do not break into a step. A terminal that is closed is one of them."""
+    """Collect signals to end (interrupt, termination, closed terminal) instead of interrupting a step."""
     caught: list[int] = []
     numbers = {getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)}
     before = {number: signal.signal(number, lambda n, _: caught.append(n)) for number in numbers}

@@ -9,7 +9,7 @@ import typer
 Variant = Annotated[str, typer.Option(help="Mitsuba variant; the cuda ones need an NVIDIA GPU.")]
 
 Scheduler = Annotated[
-    str, typer.Option(metavar="local|processes:N|tcp://HOST:PORT", help="Who does the runs: this process or workers.")
+    str, typer.Option(metavar="local|processes:N|tcp://HOST:PORT", help="Scheduler of the runs: this process, or workers.")
 ]
 SchedulerThreads = Annotated[int, typer.Option("--threads", help="Threads of each process, 0 for one for each core.")]
 
@@ -18,5 +18,5 @@ _T = TypeVar("_T")
 
 
 def given(value: _T | None, default: _T) -> _T:
-    """An option's value, or the default where it has not been given: 0 is a value."""
+    """An option's value, or the default if it is None. (0 is a value.)"""
     return default if value is None else value

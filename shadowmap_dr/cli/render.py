@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import mitsuba as mi
 import numpy as np
@@ -21,7 +21,7 @@ def render(
     scene: Annotated[str, typer.Argument(help="Mitsuba XML file, or the name of a scene of this package.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Image to write: .exr (all channels) or .png (sRGB).")],
     define: Annotated[
-        list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="Value of a $NAME in the scene; repeatable.")
+        list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="Value of the parameter $NAME of the scene; repeatable.")
     ] = None,
     integrator: Annotated[str, typer.Option(help="Integrator plug-in, or 'scene' for the scene's own.")] = "shadowmap",
     size: Annotated[str | None, typer.Option(metavar="WxH", help="Image size in pixels.")] = None,
@@ -29,7 +29,7 @@ def render(
     seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Seed of the sampler.")] = 0,
     aovs: Annotated[
         str | None,
-        typer.Option(help="Further channels, separated by commas, as the integrator (or Mitsuba's aov) names them."),
+        typer.Option(help="Further channels, separated by commas: the integrator's names, or those of Mitsuba's aov."),
     ] = None,
     variant: Variant = DEFAULT_VARIANT,
 ) -> None:
@@ -74,7 +74,7 @@ def render(
 
 
 def _definitions(entries: list[str]) -> dict[str, str]:
-    values = {}
+    values: dict[str, str] = {}
     for entry in entries:
         match = re.fullmatch(r"([A-Za-z_]\w*)=(.*)", entry)
         if match is None:
@@ -98,7 +98,7 @@ def _size(text: str) -> tuple[int, int]:
     return width, height
 
 
-def _load(path: Path, values: dict[str, str]) -> Any:
+def _load(path: Path, values: dict[str, str]) -> mi.Scene:
     try:
         loaded = mi.load_file(str(path), **values)
     except RuntimeError as error:
@@ -110,7 +110,7 @@ def _load(path: Path, values: dict[str, str]) -> Any:
     return loaded
 
 
-def _resized(scene: Any, width: int, height: int) -> Any:
+def _resized(scene: mi.Scene, width: int, height: int) -> mi.Scene:
     parameters = mi.traverse(scene)
     names = [name for name in parameters.keys() if re.search(r"(^|\.)film\.size$", name)]  # noqa: SIM118
     if not names:
@@ -123,7 +123,7 @@ def _resized(scene: Any, width: int, height: int) -> Any:
     return scene
 
 
-def _integrator(scene: Any, name: str, aovs: str | None) -> Any:
+def _integrator(scene: mi.Scene, name: str, aovs: str | None) -> mi.Integrator:
     if aovs is not None and name != "shadowmap" and not re.fullmatch(r"[\w.]+:\w+(,[\w.]+:\w+)*", aovs):
         # Mitsuba ends the process on some of these instead of raising an error.
         raise ShadowmapError(f"--aovs {aovs}: the integrator {name} takes NAME:TYPE pairs, for instance d:depth,n:sh_normal.")
@@ -142,7 +142,7 @@ def _integrator(scene: Any, name: str, aovs: str | None) -> Any:
         raise ShadowmapError(f"--integrator {name}: {_one_line(error)}") from error
 
 
-def _channel_names(integrator: Any, count: int) -> list[str]:
+def _channel_names(integrator: mi.Integrator, count: int) -> list[str]:
     """OpenEXR names of the channels of an image, colours first."""
     # Mitsuba's `aov` lists the nested image's channels as img.R, img.G, ... although it returns them as colours.
     further = [name for name in integrator.aov_names() if not name.startswith("img.")]
@@ -155,15 +155,15 @@ def _colours(names: list[str]) -> int:
 
 
 def _root(error: BaseException) -> BaseException:
-    """The exception that started a chain: Dr.Jit wraps what an integrator raises."""
+    """First exception of a chain: Dr.Jit wraps the exceptions of integrators."""
     while (cause := error.__cause__ or error.__context__) is not None:
         error = cause
     return error
 
 
 def _one_line(error: BaseException) -> str:
-    """Message of a Mitsuba exception without line breaks and without the position in Mitsuba's own source."""
+    """Message of a Mitsuba exception, without line breaks and positions in Mitsuba's source."""
     text = str(error)
-    if "Traceback (most recent call last)" in text:  # raised by a plug-in written in Python: its own message comes last
+    if "Traceback (most recent call last)" in text:  # raised by a Python plug-in: the message is the last line
         return re.sub(r"^[\w.]*(?:Error|Exception): ", "", text.strip().splitlines()[-1])
     return re.sub(r"\[\w+\.(?:cpp|h):\d+\] ?", "", " ".join(text.split()))

@@ -38,13 +38,13 @@ def soft(
     full: Annotated[bool, typer.Option("--full", help="Larger images, more samples: an hour instead of minutes.")] = False,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("soft"),
     resume: Annotated[
-        bool, typer.Option("--resume", help="Keep scenes that a killed run with the same settings has finished.")
+        bool, typer.Option("--resume", help="Keep the finished scenes of a killed run with the same settings.")
     ] = False,
     variant: Variant = DEFAULT_VARIANT,
 ) -> None:
-    """Compare images under area lights and skies with path-traced ones: errors, how they fall with samples, and times.
+    """Compare images under area lights and skies with path-traced ones: errors, their convergence with samples, and times.
 
-    Writes OUT/soft.json, a reading of it (.md) and a sheet of pictures (.png).
+    Writes OUT/soft.json, a summary of it (.md) and a sheet of pictures (.png).
     """
     defaults = soft_experiment.SoftOptions()
     options = soft_experiment.SoftOptions(

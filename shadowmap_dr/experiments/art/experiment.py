@@ -1,8 +1,8 @@
-"""Shadow art: an object is deformed until its shadows are what one or two images show.
+"""Shadow art: an object is deformed until its shadows match one or two images.
 
 Protocol: a sphere of 12,800 triangles (or any mesh) between directional lights and receivers; 400 steps; intersection over union
-with the target where visibility is below one half. Targets with enclosed holes are compared with the filled target, too: a sphere
-has no holes.
+with the target, of pixels with visibility below one half. Targets with enclosed holes are also compared after filling the holes,
+since a sphere has none.
 """
 
 from __future__ import annotations
@@ -13,7 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from rich.console import Console
+from rich.progress import Progress
 from rich.table import Table
 
 from ... import __version__
@@ -30,8 +32,11 @@ from .run import Frame, Maker, Trace, intersection_over_union, make
 
 #: Light directions of the first and the second view; y is up in both.
 DIRECTIONS = ((0.0, 0.0, -1.0), (-1.0, 0.0, 0.0))
-# How much of what a camera sees of its receiver a target fills, with the image's margin in mind.
+# Size of a target relative to the largest that fits into the visible part of the receiver.
 _FILL = {"orthographic": 0.8, "perspective": 0.92}
+
+
+Array = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -39,24 +44,26 @@ class ArtOptions:
     """Settings of a piece.
 
     Attributes:
-        targets: image files, or names of this package, one for each view; ``text:L`` stands for letters.
-        mesh: what is deformed: None for the sphere, a name of this package, or a file.
-        collection: a name or a file of a mesh: many copies of it, moved, turned and scaled, cast the shadow instead.
+        targets: image files, or names of this package, one for each view; ``text:L`` is a target of letters.
+        mesh: mesh to deform: None for the sphere, a name of this package, or a file.
+        collection: name or file of a mesh whose moved, turned and scaled copies cast the shadow instead.
         receiver, camera: see `shadow_view`.
         resolution: pixels along each side of the shadow images.
-        map_resolution: texels along each side of the shadow maps; None: as many as pixels.
-        iterations: steps; None: 400, and 1100 of a collection.
+        map_resolution: texels along each side of the shadow maps; None: ``resolution``.
+        iterations: steps; None: 400, or 1100 for a collection.
         step_size, smoothness, consistency: of the `Sculptor`; a `Collection` has its own step size.
-        remesh: steps after which the deformed surface is meshed anew, again and again; None: never.
+        remesh: steps between two remeshings of the deformed surface; None: never.
         fill_holes: fill enclosed holes of the targets.
-        interval, most: steps after which copies double, and copies at most, see `Collection`.
+        interval, most: steps between two doublings of the copies, and their largest number, see `Collection`.
         seed: of the collection.
-        animate: suffix of the animations (.webp or .gif), None for none.
-        picture_size: pixels along each side of animations, half of those of the still picture.
+        animate: suffix of the animations (.webp or .gif), None for no animations.
+        picture_size: pixels along each side of animations; the still picture has twice as many.
         turns: frames of the turntable.
         printable: write an STL file, and report whether the mesh is closed.
         out: folder for the results.
-        resume: go on from a checkpoint in it.
+        resume: continue from a checkpoint in ``out``.
+
+    Raises ShadowmapError for settings that are out of range or contradict each other.
     """
 
     targets: tuple[str, ...]
@@ -93,18 +100,19 @@ class ArtOptions:
             raise ShadowmapError("a mesh to deform and a collection: choose one of the two.")
         if self.remesh is not None and self.collection is not None:
             raise ShadowmapError("the copies of a collection are not deformed, and cannot be remeshed: leave one of the two out.")
-        if self.iterations is None:
-            object.__setattr__(self, "iterations", 400 if self.collection is None else 1100)
-        if self.iterations < 1:
-            raise ShadowmapError(f"{self.iterations} iterations: at least one is needed.")
+        default = 400 if self.collection is None else 1100
+        steps = default if self.iterations is None else self.iterations
+        object.__setattr__(self, "iterations", steps)
+        if steps < 1:
+            raise ShadowmapError(f"{steps} iterations: at least one is needed.")
         if not 16 <= self.picture_size <= 1024 or self.turns < 1:
             raise ShadowmapError(f"pictures of {self.picture_size} pixels, {self.turns} of a turn: give 16 to 1024, at least 1.")
         if self.animate is not None and self.animate not in art_pictures.ANIMATIONS:
             raise ShadowmapError(f"no animation {self.animate!r}: choose from {', '.join(art_pictures.ANIMATIONS)}.")
 
 
-def read_target(target: str) -> Any:
-    """The figure (H, W) of a target of `ArtOptions`."""
+def read_target(target: str) -> Array:
+    """Read the figure (H, W) of a target of `ArtOptions`."""
     if target.startswith("text:"):
         return target_images.text_figure(target.removeprefix("text:"))
     return target_images.read_figure(assets.target(target))
@@ -118,8 +126,8 @@ def views_of(options: ArtOptions) -> tuple[ShadowView, ...]:
     )
 
 
-def place(figure_list: list[Any], views: tuple[ShadowView, ...]) -> list[Any]:
-    """Target images: as large as they can be, but of equal height in all views, which share the vertical axis."""
+def place(figure_list: list[Array], views: tuple[ShadowView, ...]) -> list[Array]:
+    """Target images, as large as possible but of equal height in all views, which share the vertical axis."""
     fill = _FILL[views[0].camera]
     if len(views) == 1:
         return [target_images.fit(figure_list[0], views[0].seen, fill)]
@@ -128,7 +136,7 @@ def place(figure_list: list[Any], views: tuple[ShadowView, ...]) -> list[Any]:
 
 
 def build(options: ArtOptions) -> Maker:
-    """The solver whose steps `run_art` takes."""
+    """Make the optimiser of a piece."""
     views = views_of(options)
     read = [read_target(target) for target in options.targets]
     targets = place([target_images.filled(figure) for figure in read] if options.fill_holes else read, views)
@@ -150,18 +158,20 @@ def build(options: ArtOptions) -> Maker:
 
 
 def run_art(options: ArtOptions, *, console: Console | None = None) -> dict[str, Any]:
-    """Make one piece; writes all files into ``options.out`` and returns the record of `art.json`."""
+    """Make one piece, write all files into ``options.out``, and return the record of `art.json`."""
+    assert options.iterations is not None  # `ArtOptions` replaces None
+    steps = options.iterations
     console = console or Console(stderr=True)
     path = files.check_output(options.out / "art.json", (".json",))
     checkpoint = options.out / "checkpoint.npz"
     if not options.resume:
         checkpoint.unlink(missing_ok=True)
     maker = build(options)
-    settings = {"targets": [_name(target) for target in options.targets], "iterations": options.iterations, **maker.describe()}
+    settings = {"targets": [_name(target) for target in options.targets], "iterations": steps, **maker.describe()}
     with io_console.progress(console) as progress:
-        task = progress.add_task("steps", total=options.iterations, note="")
+        task = progress.add_task("steps", total=steps, note="")
         trace = make(
-            maker, options.iterations, checkpoint=checkpoint, fingerprint=_fingerprint(settings, maker),
+            maker, steps, checkpoint=checkpoint, fingerprint=_fingerprint(settings, maker),
             on_step=lambda done, note: progress.update(task, completed=done, note=note),
         )  # fmt: skip
         record = records.plain(
@@ -188,7 +198,7 @@ def _results(maker: Maker, trace: Trace) -> dict[str, Any]:
     for k, (view, image) in enumerate(zip(maker.views, maker.visibility(), strict=True)):
         target = maker.target(k)
         whole = 1 - target_images.filled(1 - target)
-        holes = np.count_nonzero((whole < 0.5) & (target > 0.5)) / max(np.count_nonzero(whole < 0.5), 1)
+        holes = np.count_nonzero((whole < 0.5) & (target > 0.5)) / max(int(np.count_nonzero(whole < 0.5)), 1)
         views.append({
             "iou": intersection_over_union(image, target, view.seen),
             "iou_filled": intersection_over_union(image, whole, view.seen),
@@ -205,8 +215,8 @@ def _results(maker: Maker, trace: Trace) -> dict[str, Any]:
     }
 
 
-def _write(options: ArtOptions, maker: Maker, trace: Trace, progress: Any) -> list[str]:
-    """All files but the record; returns their names."""
+def _write(options: ArtOptions, maker: Maker, trace: Trace, progress: Progress) -> list[str]:
+    """Write all files except the record. Returns their names."""
     out, last = options.out, Frame(trace.iterations, maker.vertices(), maker.faces)
     images = maker.visibility()
     exports.write_meshes(out, last.vertices, last.faces, maker.views, images)
@@ -234,7 +244,7 @@ def _write(options: ArtOptions, maker: Maker, trace: Trace, progress: Any) -> li
 
 
 def table(record: dict[str, Any]) -> Table:
-    """For the terminal."""
+    """Table for the terminal, a row for each view."""
     rows = []
     for name, view in zip(record["settings"]["targets"], record["views"], strict=True):
         whole = f"{view['iou_filled']:.4f}" if view["holes"] > 0 else "the same"
@@ -245,7 +255,7 @@ def table(record: dict[str, Any]) -> Table:
 
 
 def summary(record: dict[str, Any]) -> str:
-    """One line about mesh and time."""
+    """Mesh and times, in one line."""
     mesh, settings = record["mesh"], record["settings"]
     closed = "watertight" if mesh["watertight"] else "not watertight"
     return (

@@ -1,9 +1,9 @@
-"""The gallery of shadow art, and how well shadows match: all pieces by one command.
+"""The gallery of shadow art and the accuracy of its shadows: all pieces by one command.
 
     python -m shadowmap_dr.experiments.art.gallery
 
-makes every piece with the settings of `shadowmap-dr art`, and from what they leave behind a folder of animations, a sheet of
-pictures, and a record of all numbers with the tables that the documents show.
+makes every piece with the settings of `shadowmap-dr art`, and from their files a folder of animations, a sheet of pictures, and a
+record of all numbers with the tables of the documentation.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ from ...variants import DEFAULT_VARIANT
 from ..common.timing import machine
 from .experiment import ArtOptions, run_art
 
-#: Targets without holes, the thin-legged horse apart, and those with holes.
+#: Targets without holes, except the thin-legged horse, and targets with holes.
 WHOLE, HOLED = ("airplane", "heart", "elephant", "palm"), ("cat", "duck", "rabbit", "kettle")
-# What a gallery shows of each piece.
+# Animations of each piece in the gallery.
 _SHOWN = ("turntable.webp", "steps.webp")
 _PICTURE_SIZE, _TURNS = 256, 32
-# What the record of all pieces has no room for.
+# Entries of a piece's record that the record of all pieces leaves out.
 _LEFT_OUT = ("machine", "loss_curve", "iou_curve", "files")
 
 
 @dataclass(frozen=True)
 class Piece:
-    """One piece: its name, the group it is counted in, what `ArtOptions` make it, and whether the gallery shows it.
+    """One piece: its name, the group in the tables, its `ArtOptions`, and its title in the gallery.
 
-    ``title`` is what the gallery says about it.
+    Pieces without a title are not in the gallery.
     """
 
     name: str
@@ -87,14 +87,14 @@ PIECES = _pieces()
 def run_gallery(
     names: Iterable[str], work: Path, out: Path, results: Path, *, resume: bool = False, console: Console | None = None
 ) -> dict[str, Any]:
-    """Make pieces by name; write what the documents show of them. Returns the record.
+    """Make pieces by name, and write gallery, tables and record. Returns the record.
 
     Args:
         names: of `PIECES`.
-        work: folder for all files of all pieces, one folder each.
-        out: folder for what the gallery shows.
-        results: JSON file for the numbers; a file of tables (.md) lies beside it.
-        resume: keep pieces that are finished.
+        work: folder for all files of all pieces, a folder for each.
+        out: folder of the gallery.
+        results: JSON file for the numbers; a file of tables (.md) is written beside it.
+        resume: keep finished pieces.
     """
     console = console or Console(stderr=True)
     files.check_output(results, (".json",))
@@ -128,7 +128,7 @@ def run_gallery(
 
 
 def summary(records: Mapping[str, Any]) -> dict[str, Any]:
-    """Means and worst cases."""
+    """Means and worst cases of all records."""
     whole = [records[name]["views"][0]["iou"] for name in WHOLE if name in records]
     double = [view["iou"] for record in records.values() if record["group"] == "two views" for view in record["views"]]
     deformed = [record for record in records.values() if record["group"] != "collection"]
@@ -167,7 +167,8 @@ def document(record: Mapping[str, Any]) -> list[str]:
 def gallery(pieces: Sequence[Piece], records: Mapping[str, Any]) -> list[str]:
     """Markdown: animations, shadows and a line for each piece."""
     lines = ["# Gallery of shadow art", "", "Left: a turn of the finished object; its shadow is right at the beginning only. "
-             "Then: how it came about, and what the cameras see.", "", "    python -m shadowmap_dr.experiments.art.gallery", "",
+             "Then: the steps of the optimisation, and the shadow images.", "",
+             "    python -m shadowmap_dr.experiments.art.gallery", "",
              "makes all of it. [../art.md](../art.md) says how.", ""]  # fmt: skip
     for piece in pieces:
         ious = ", ".join(f"{view['iou']:.3f}" for view in records[piece.name]["views"])
@@ -188,12 +189,12 @@ def _command(piece: Piece) -> str:
 
 
 def _shadow_images(piece: Piece) -> list[str]:
-    """Names of the images of what its cameras see."""
+    """Names of a piece's shadow images."""
     return [f"shadow-{k + 1}.png" for k in range(len(piece.options["targets"]))]
 
 
 def _sheet(path: Path, pictures: Sequence[Path], columns: int = 5, size: int = 256) -> None:
-    """All still pictures side by side."""
+    """Write all still pictures side by side."""
     from PIL import Image
 
     rows = -(-len(pictures) // columns)
@@ -212,9 +213,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     names = [piece.name for piece in PIECES]
     parser.add_argument("names", nargs="*", metavar="PIECE", help=f"pieces to make [all]: {', '.join(names)}")
     parser.add_argument("--work", type=Path, default=Path("art-gallery"), help="folder for all files of the pieces")
-    parser.add_argument("--out", type=Path, default=Path("docs/gallery"), help="folder for what the gallery shows")
+    parser.add_argument("--out", type=Path, default=Path("docs/gallery"), help="folder of the gallery")
     parser.add_argument("--results", type=Path, default=Path("docs/results/art.json"), help="JSON file for the numbers")
-    parser.add_argument("--resume", action="store_true", help="keep finished pieces, go on with a killed one")
+    parser.add_argument("--resume", action="store_true", help="keep finished pieces, resume a killed one")
     options = parser.parse_args(arguments)
     try:
         unknown = sorted(set(options.names) - set(names))

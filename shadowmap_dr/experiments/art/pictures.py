@@ -1,4 +1,4 @@
-"""Pictures of shadow art: the object before its receivers, a turntable, and how it came about."""
+"""Pictures of shadow art: the object in front of its receivers, a turntable, and the steps of the optimisation."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from ..common.objects import occluder
 from .run import Frame
 
 ANIMATIONS = (".webp", ".gif")
-#: Milliseconds that a frame of an animation stays, and the last one of a history.
+#: Duration of a frame of an animation, and of the last frame of a history, in milliseconds.
 FRAME_MS, LAST_MS = 70, 1500
 
 # Linear colours.
 _OBJECT, _WALLS, _AMBIENT = (0.72, 0.36, 0.26), ((0.8, 0.78, 0.74), (0.55, 0.62, 0.68)), 0.22
-# From where the camera looks, at what, and its horizontal angle, for one receiver and for two.
+# Origin, target and horizontal field of view (degrees) of the camera, for one receiver and for two.
 _PLACES = {1: ((-7.4, 1.9, 5.0), (-0.3, -0.2, -1.9), 40.0), 2: ((8.0, 3.6, 8.0), (-1.1, -0.1, -1.1), 34.0)}
-# Walls reach beyond the picture; where there are two, they end at each other. In multiples of the receiver's half-side.
+# Extent of walls, beyond the picture, in multiples of the receiver's half-side. Two walls end at each other.
 _WALL_REACH = 9.0
 _MAP_RESOLUTION = 1024
 
@@ -35,7 +35,7 @@ Pixels = npt.NDArray[np.uint8]
 
 
 class Stage:
-    """A scene with an object of given faces, its receivers and their lights, seen from aside.
+    """A scene with an object, its receivers and their lights, seen from the side.
 
     Args:
         vertices, faces: (V, 3) and (F, 3).
@@ -65,7 +65,7 @@ class Stage:
         self._points = points
 
     def picture(self, vertices: npt.ArrayLike | None = None) -> Pixels:
-        """(H, W, 3) sRGB of the object with these vertices (V, 3), or those that it had in the beginning."""
+        """Picture (H, W, 3), sRGB, of the object with the given vertices (V, 3), or with its first vertices."""
         points = self._points if vertices is None else np.asarray(vertices, np.float32)
         with dr.suspend_grad():
             image = self._renderer.render({"object": mi.Float(np.ascontiguousarray(points).ravel())}, spp=4)
@@ -74,8 +74,9 @@ class Stage:
 
 def turntable(frame: Frame, views: Sequence[ShadowView], size: int, count: int = 40,
               on_frame: Callable[[], None] = lambda: None) -> list[Pixels]:  # fmt: skip
-    """A whole turn of the object about the vertical axis; the shadows are right only at its start."""
-    stage, pictures = Stage(frame.vertices, frame.faces, views, size), []
+    """A full turn of the object about the vertical axis. The shadows match their targets in the first frame only."""
+    stage = Stage(frame.vertices, frame.faces, views, size)
+    pictures: list[Pixels] = []
     for angle in 2 * np.pi * np.arange(count) / count:
         s, c = np.sin(angle), np.cos(angle)
         pictures.append(stage.picture(frame.vertices @ np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]], np.float32)))
@@ -98,7 +99,7 @@ def history(frames: Sequence[Frame], views: Sequence[ShadowView], size: int,
 
 
 def write_animation(path: Path, pictures: Sequence[Pixels], last_ms: int = FRAME_MS) -> None:
-    """An animated image, .webp or .gif, that repeats for ever."""
+    """Write an animated image, .webp or .gif, in an endless loop. Raises ShadowmapError for another suffix."""
     from PIL import Image
 
     if path.suffix.lower() not in ANIMATIONS:
@@ -113,7 +114,7 @@ def write_animation(path: Path, pictures: Sequence[Pixels], last_ms: int = FRAME
 
 
 def write_picture(path: Path, picture: Pixels) -> None:
-    """An 8-bit sRGB image."""
+    """Write an 8-bit sRGB image."""
     from PIL import Image
 
     with files.atomic(path) as temporary:
@@ -121,9 +122,9 @@ def write_picture(path: Path, picture: Pixels) -> None:
 
 
 def _wall(view: ShadowView, corner: bool, cells: int = 256) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint32]]:
-    """The plane, or waves, that the receiver is a part of. At a corner it ends where the other receiver's plane is."""
+    """Mesh of a receiver, extended beyond the picture; at a corner it ends at the other receiver's plane."""
     reach, end = _WALL_REACH * view.half, DISTANCE * view.half / HALF
-    # The first view's other wall is on its left, the second's on its right.
+    # The other wall is on the left of the first view, and on the right of the second.
     first = view.right[0] > 0.5
     left, right = (-end if corner and first else -reach), (end if corner and not first else reach)
     x, y = (a.ravel() for a in np.meshgrid(np.linspace(left, right, cells + 1), np.linspace(-reach, reach, cells + 1)))

@@ -1,4 +1,4 @@
-"""The loop of shadow art: steps, how well shadows match on the way, frames for an animation, checkpoints."""
+"""The optimisation loop of shadow art: steps, accuracy of the shadows, frames of an animation, checkpoints."""
 
 from __future__ import annotations
 
@@ -15,42 +15,43 @@ import numpy.typing as npt
 from ...errors import ShadowmapError
 from ...inverse.runs.loop import WARM_UP_STEPS
 from ...io.files import atomic, read_arrays
+from ...jit.types import Float
 from ...rendering.receivers.shadow_views import ShadowView
 
-#: Steps between two looks at the shadows, and between two checkpoints.
+#: Steps between two measurements of the shadows, and between two checkpoints.
 LOOK_INTERVAL, CHECKPOINT_INTERVAL = 10, 50
-#: Frames of the animation, at most.
+#: Largest number of frames of the animation.
 FRAMES = 48
 
 Array = npt.NDArray[np.float32]
 
 
 class Maker(Protocol):
-    """Something whose shadows become more like their targets step by step."""
+    """An optimiser of shadow art, such as `Sculptor`."""
 
     views: tuple[ShadowView, ...]
 
     @property
     def faces(self) -> npt.NDArray[np.uint32]:
-        """(F, 3); a step may change them."""
+        """Faces (F, 3); a step may change them."""
 
-    def step(self) -> Any:
-        """One step. Returns the loss before it, an array with one entry."""
+    def step(self) -> Float:
+        """Take one step. Returns the loss before the step, ``Float`` (1,)."""
 
     def vertices(self) -> Array:
-        """(V, 3), world space."""
+        """Vertices (V, 3), world space."""
 
     def visibility(self) -> list[Array]:
-        """(H, W) for each view."""
+        """Visibility image (H, W) of each view."""
 
     def target(self, view: int) -> Array:
-        """(H, W)."""
+        """Target image (H, W) of a view."""
 
     def state(self) -> dict[str, npt.NDArray[Any]]:
-        """All that `load_state` needs to go on exactly from here."""
+        """State from which `load_state` continues exactly."""
 
     def load_state(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
-        """Go on from what `state` returned."""
+        """Continue from a result of `state`."""
 
     def describe(self) -> dict[str, Any]:
         """Settings for the record, as JSON values."""
@@ -58,7 +59,7 @@ class Maker(Protocol):
 
 @dataclass(frozen=True)
 class Frame:
-    """The mesh after so many steps: (V, 3) and (F, 3)."""
+    """The mesh after ``step`` steps: vertices (V, 3) and faces (F, 3)."""
 
     step: int
     vertices: Array
@@ -71,9 +72,10 @@ class Trace:
 
     Attributes:
         loss: before each step.
-        seconds: wall-clock time of each step; `warm` is False for those that compile or record.
-        looks: step, and the intersection over union of each view after it.
-        frames: meshes on the way, the first and the last included.
+        seconds: wall-clock time of each step.
+        warm: False for steps that compile or record.
+        looks: pairs of a step and the intersection over union of each view after it.
+        frames: some meshes of the run, including the first and the last.
     """
 
     loss: list[float] = field(default_factory=list)
@@ -88,13 +90,16 @@ class Trace:
 
     @property
     def seconds_per_iteration(self) -> float:
-        """Median of the warm steps."""
+        """Median time of the warm steps, or of all steps if none is warm."""
         warm = [s for s, w in zip(self.seconds, self.warm, strict=True) if w]
         return float(np.median(warm or self.seconds))
 
 
 def intersection_over_union(image: npt.ArrayLike, target: npt.ArrayLike, seen: npt.NDArray[np.bool_] | None = None) -> float:
-    """Of what is dark (visibility below one half) in two (H, W) images, where ``seen``; 1 where both are lit all over."""
+    """Intersection over union of the dark pixels (visibility below one half) of two (H, W) images, within ``seen``.
+
+    It is 1 if neither image has dark pixels.
+    """
     dark, wanted = np.asarray(image) < 0.5, np.asarray(target) < 0.5
     if seen is not None:
         dark, wanted = dark & seen, wanted & seen
@@ -103,7 +108,7 @@ def intersection_over_union(image: npt.ArrayLike, target: npt.ArrayLike, seen: n
 
 
 def frame_steps(iterations: int) -> frozenset[int]:
-    """After which steps a frame is kept: more of them in the beginning, when most happens."""
+    """Steps after which a frame is kept: denser in the beginning, when the mesh changes most."""
     share = np.linspace(0, 1, min(FRAMES, iterations + 1))
     return frozenset(int(s) for s in np.round(iterations * share**2))
 
@@ -120,9 +125,9 @@ def make(
 
     Args:
         maker: at its start.
-        checkpoint: file to write every 50 steps, and to go on from if it exists.
-        fingerprint: identifies the run; a checkpoint with another one is an error.
-        on_step: told the number of finished steps and how well the shadows match.
+        checkpoint: file that is written every 50 steps, and from which the run resumes if it exists.
+        fingerprint: identifies the run; a checkpoint with another fingerprint is an error.
+        on_step: called with the number of finished steps and a text about the accuracy of the shadows.
 
     Raises ShadowmapError if the checkpoint belongs to another run, cannot be read, or cannot be written.
     """
@@ -162,7 +167,7 @@ def make(
 
 
 def _save(path: Path, fingerprint: str, trace: Trace, state: Mapping[str, npt.NDArray[Any]]) -> None:
-    arrays: dict[str, npt.NDArray[Any]] = {f"state/{name}": np.asarray(array) for name, array in state.items()}
+    arrays: dict[str, Any] = {f"state/{name}": np.asarray(array) for name, array in state.items()}
     arrays |= {f"trace/{name}": np.array(getattr(trace, name)) for name in ("loss", "seconds", "warm")}
     arrays["looks/step"] = np.array([step for step, _ in trace.looks])
     arrays["looks/iou"] = np.array([values for _, values in trace.looks])

@@ -1,8 +1,9 @@
-"""Light estimation: the directions of n lights are found by comparing images of an object and its shadow, thousands of times.
+"""Light estimation: find the directions of n lights from images of an object and its shadow, in thousands of runs.
 
 Protocol: an object on a floor, seen from above, under n directional lights of known, equal irradiance. Targets and starts are
-drawn from a cone about the vertical, by the number of the run only: all settings and objects have the same. Adam on unit vectors,
-mean squared error. Estimated and true directions are matched greedily; their mean dot product is the alignment.
+drawn from a cone about the vertical. They depend on the number of the run only, and are the same for all settings and objects.
+Adam on unit vectors, mean squared error. Estimated and true directions are matched greedily; their mean dot product is the
+alignment.
 """
 
 from __future__ import annotations
@@ -29,9 +30,14 @@ from .scene import OBJECTS
 
 @dataclass(frozen=True)
 class LightOptions(LightSetting):
-    """Options of a run: every object with every number of lights and filter size.
+    """Options of the experiment: every object with every number of lights and filter size.
 
-    ``filter_sizes``: 1 for no filter, 0 for no shadows.
+    Attributes:
+        objects, lights: see `LightProblem`.
+        filter_sizes: texels along each side of the filter, 1 for no filter, 0 for no shadows.
+        runs: number of runs of each problem.
+        out: folder for the results.
+        resume, scheduler, threads, memory: see :func:`shadowmap_dr.inverse.run_sweep`.
     """
 
     objects: tuple[str, ...] = OBJECTS
@@ -57,7 +63,7 @@ class LightOptions(LightSetting):
             check_problem(problem)
 
     def problems(self) -> list[LightProblem]:
-        """One for each setting and object, settings first."""
+        """A problem for each object of each setting."""
         common = {f.name: getattr(self, f.name) for f in fields(LightSetting)}
         # Workers may have another working directory.
         known = assets.mesh_names()
@@ -74,9 +80,9 @@ def run_lights(options: LightOptions, *, variant: str = "llvm_ad_rgb", console: 
     """Run the experiment and write its results below `options.out`.
 
     Files: `lights.json` (one summary for each setting), `lights.png` (alignment over iterations and over filter sizes),
-    `pictures.png` (the first run of each object), and a file for each batch in `batches`. Summaries of settings that other calls
-    with the same folder have left in `lights.json` stay if `options.resume` is set, and summaries of the same settings go on to
-    count the objects and runs of which batches are in the folder. Returns the summaries.
+    `pictures.png` (the first run of each object), and a file for each batch in `batches`. If `options.resume` is set,
+    `lights.json` keeps the summaries of other settings, and summaries of the same settings still count the objects and runs of
+    earlier calls whose batches are in the folder. Returns the summaries.
     """
     path = files.check_output(options.out / "lights.json", (".json",))
     problems = options.problems()
@@ -109,7 +115,7 @@ def run_lights(options: LightOptions, *, variant: str = "llvm_ad_rgb", console: 
 
 
 def summary(problems: Sequence[LightProblem], records: Sequence[Sequence[dict[str, Any]]]) -> dict[str, Any]:
-    """Statistics over all objects and runs of one setting."""
+    """Statistics over all objects and runs of one setting, as JSON values."""
     final = np.array([[record["alignment"] for record in own] for own in records])
     curves = np.array([record["alignment_curve"] for own in records for record in own])
     settings = {"filter": "gaussian", **problems[0].settings()}
@@ -150,14 +156,14 @@ def _stored(path: Path) -> list[dict[str, Any]]:
 def _widened(
     group: Sequence[LightProblem], earlier: dict[str, Any], out: Path, variant: str
 ) -> tuple[list[LightProblem], list[list[dict[str, Any]]]] | None:
-    """Problems and records of a setting's earlier summary and of this call, None if the folder does not have all of them."""
+    """Problems and records of an earlier summary and this call together, None if the folder lacks some of them."""
     runs = max(group[0].runs, earlier["runs"])
     objects = list(dict.fromkeys([*earlier["objects"], *(problem.object for problem in group)]))
     problems = [replace(group[0], object=name, runs=runs) for name in objects]
     try:
         found = [stored_records(problem, out, variant) for problem in problems]
     except ShadowmapError:
-        return None  # a mesh file is not there any more
+        return None  # a mesh file has been removed
     if any(len(own) < runs for own in found):
         return None
     return problems, [[own[run] for run in range(runs)] for own in found]

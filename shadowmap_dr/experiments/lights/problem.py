@@ -1,4 +1,4 @@
-"""Light estimation as a problem for sweeps: one object under n lights with one setting, and all its runs."""
+"""Light estimation as a problem of sweeps: all runs of one object under n lights with one setting."""
 
 from __future__ import annotations
 
@@ -28,23 +28,24 @@ StrategyKind = Literal["plain", "coarse"]
 STEP_SIZE = 0.01
 FILTERS = ("gaussian", "box", "wendland")
 MOST_SAMPLES = 1 << 16
-#: With the strategy ``coarse`` half of the iterations have this step size and filter.
+#: Step size and filter size of the first half of the iterations with the strategy ``coarse``.
 COARSE_STEP_SIZE, COARSE_FILTER = 0.05, 15
-# A record's curve has every so many iterations.
+# Iterations between two points of a record's curve.
 _CURVE_STRIDE = 5
 
 
 @dataclass(frozen=True, kw_only=True)
 class LightSetting:
-    """Settings that all problems of an experiment have in common.
+    """Settings that all problems of an experiment share.
 
     Attributes:
         filter, map_resolution: of the shadow maps.
         resolution: of the images.
         iterations: steps of the optimiser.
         strategy: ``plain``, or ``coarse``: the first half of the iterations with larger steps and a larger filter.
-        starts: of each run; the one that ends with the least loss counts.
-        reference: who renders the targets. ``spp``: samples of each pixel and light, if Mitsuba does, rounded up to a square.
+        starts: number of starts of each run; the start with the least final loss counts.
+        reference: renderer of the targets: ``own`` or ``mitsuba`` (path tracing).
+        spp: samples per pixel and light of path-traced targets, rounded up to a square.
         seed, cone_deg: see :func:`shadowmap_dr.experiments.lights.scene.target_and_starts`.
     """
 
@@ -66,9 +67,9 @@ class LightProblem(Problem, LightSetting):
 
     Attributes:
         object: name of a mesh of this package, or path of a mesh file, which is centred and scaled into [-1, 1]^3.
-        lights: n, of each run.
-        runs: how many.
-        filter_size: texels along each side of the filter of the shadow maps, 1 for none; 0: no shadows at all.
+        lights: number n of lights of each run.
+        runs: number of runs.
+        filter_size: texels along each side of the shadow maps' filter, 1 for no filter, 0 for no shadows.
     """
 
     object: str
@@ -82,7 +83,7 @@ class LightProblem(Problem, LightSetting):
 
     @property
     def setting(self) -> str:
-        """Part of file names that tells this from other settings of the same object."""
+        """Name of the setting in file names: differs from other settings of the same object."""
         shadow = f"k{self.filter_size}-{self.filter}-m{self.map_resolution}" if self.shadows else "no-shadows"
         reference = f"mitsuba{self.spp}" if self.reference == "mitsuba" else self.reference
         parts = [f"n{self.lights}", shadow, f"r{self.resolution}", f"i{self.iterations}", f"c{self.cone_deg:g}", reference]
@@ -92,7 +93,7 @@ class LightProblem(Problem, LightSetting):
 
     @property
     def shadows(self) -> bool:
-        """True if there are any."""
+        """True if the images have shadows."""
         return self.filter_size > 0
 
     @property
@@ -103,16 +104,16 @@ class LightProblem(Problem, LightSetting):
         own = super().settings()
         unused = [] if self.shadows else ["filter", "map_resolution"]
         unused += ["spp"] if self.reference == "own" else []
-        for name in unused:  # that they have other values makes no other runs
+        for name in unused:  # their values do not change the runs
             del own[name]
         if self.object in assets.mesh_names():
             return own
-        content = assets.mesh(self.object).read_bytes()  # a file of the same name may have become another one
+        content = assets.mesh(self.object).read_bytes()  # the file may change, under the same name
         return {**own, "object_digest": hashlib.sha256(content).hexdigest()[:12]}
 
     @property
     def stages(self) -> tuple[Stage, ...]:
-        """Steps, filters and step sizes."""
+        """Stages of the optimisation: steps, filters and step sizes."""
         if self.strategy == "plain":
             return (Stage(self.iterations, None, STEP_SIZE),)
         first = self.iterations // 2
@@ -133,10 +134,10 @@ class LightProblem(Problem, LightSetting):
         return LightBatch(StillScene.of(Renderer.from_scene(scene, **self.renderer_settings())))
 
     def renderer_settings(self) -> dict[str, Any]:
-        """Options of the `Renderer`."""
+        """Options of `Renderer.from_scene`."""
         if not self.shadows:
             return {"shadow_method": "none"}
-        # A filter of one texel is none, until a stage makes it larger.
+        # One texel is no filter, until a stage makes it larger.
         return {
             "shadow_method": "vsm",
             "shadow_map_resolution": self.map_resolution,
@@ -180,15 +181,15 @@ class LightProblem(Problem, LightSetting):
 
 
 def curve_iterations(iterations: int) -> list[int]:
-    """Numbers of the steps after which a run's curve has its points: every fifth, and the last."""
+    """Steps after which a run's curve has points: every fifth, and the last."""
     return [*range(0, iterations, _CURVE_STRIDE), iterations]
 
 
 def check_problem(problem: LightProblem) -> None:
-    """Raise ShadowmapError for settings that cannot be, before any work is done."""
+    """Raise ShadowmapError for impossible settings, before any work is done."""
     check_scene(problem.object, problem.lights, problem.resolution)
     if problem.filter not in FILTERS:
-        raise ShadowmapError(f"no filter {problem.filter!r}: choose {', '.join(FILTERS)}; one of 1 texel is none.")
+        raise ShadowmapError(f"no filter {problem.filter!r}: choose {', '.join(FILTERS)}; 1 texel is no filter.")
     for what, value in (("runs", problem.runs), ("iterations", problem.iterations), ("starts", problem.starts)):
         if value < 1:
             raise ShadowmapError(f"{value} {what}: give at least 1.")
@@ -209,7 +210,7 @@ def check_problem(problem: LightProblem) -> None:
             raise ShadowmapError(str(error)) from None
 
 
-def _path_traced(scene: Any, target: npt.NDArray[np.float64], spp: int, seed: int) -> npt.NDArray[np.float32]:
+def _path_traced(scene: mi.Scene, target: npt.NDArray[np.float64], spp: int, seed: int) -> npt.NDArray[np.float32]:
     """Path-traced image under lights in the directions ``target`` (n, 3)."""
     from mitsuba_baselines.reference import path_traced
 

@@ -1,10 +1,10 @@
-"""Report of light estimation: a table, a plot like the paper's, pictures of some runs."""
+"""Report of light estimation: a table, a plot, and pictures of some runs."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.table import Table
@@ -13,9 +13,12 @@ from ...io import console, plots
 from ...io.files import atomic
 from .problem import LightProblem
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 
 def table(summaries: Sequence[dict[str, Any]]) -> Table:
-    """A row for each setting."""
+    """Table with a row for each setting."""
     rows = [
         [
             str(entry["lights"]),
@@ -44,9 +47,9 @@ def label_of(entry: dict[str, Any]) -> str:
 
 
 def plot(path: Path, summaries: Sequence[dict[str, Any]]) -> None:
-    """Alignment over iterations for each number of lights, and at the end over the size of the filter.
+    """Plot the alignment over iterations for each number of lights, and the final alignment over the filter size.
 
-    Bands and bars are standard deviations; of more than three curves in one picture only the first one has a band.
+    Bands and bars are standard deviations. With more than three curves in a panel, only the first has a band.
     """
     from matplotlib.figure import Figure
 
@@ -73,8 +76,8 @@ def plot(path: Path, summaries: Sequence[dict[str, Any]]) -> None:
         figure.savefig(temporary, dpi=100)
 
 
-def _plot_sizes(axes: Any, summaries: Sequence[dict[str, Any]]) -> None:
-    """Alignment at the end over the size of the filter, a line for each number of lights and type of filter."""
+def _plot_sizes(axes: Axes, summaries: Sequence[dict[str, Any]]) -> None:
+    """Plot the final alignment over the filter size, a line for each number of lights and type of filter."""
     series: dict[tuple[int, str], list[dict[str, Any]]] = {}
     for entry in sorted(summaries, key=lambda entry: (entry["lights"], entry["filter_size"])):
         series.setdefault((entry["lights"], entry["filter"]), []).append(entry)
@@ -91,7 +94,7 @@ def _plot_sizes(axes: Any, summaries: Sequence[dict[str, Any]]) -> None:
 
 
 def pictures(path: Path, problems: Sequence[LightProblem], records: Sequence[Sequence[dict[str, Any]]]) -> None:
-    """Sheet of images of the first run of each object: target, start, result, and how far the result is from the target."""
+    """Write a sheet of the first run of each object: target, start, result, and their difference from the target."""
     rows = {}
     for problem, own in zip(problems, records, strict=True):
         batch, record = problem.build(), own[0]
@@ -102,4 +105,5 @@ def pictures(path: Path, problems: Sequence[LightProblem], records: Sequence[Seq
 
 
 def _is_plain(entry: dict[str, Any]) -> bool:
+    """True for the settings of the plot over filter sizes."""
     return entry["strategy"] == "plain" and entry["starts"] == 1 and entry["reference"] == "own" and entry["cone_deg"] == 60

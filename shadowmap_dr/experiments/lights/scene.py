@@ -1,4 +1,4 @@
-"""Inputs of light estimation: an object on a floor, the camera above it, target directions and starts of all runs."""
+"""Inputs of light estimation: an object on a floor, a camera above it, target directions and starts of all runs."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ FloatArray = npt.NDArray[np.float64]
 
 
 def check_scene(name: str, lights: int, resolution: int) -> Path:
-    """The object's file; ShadowmapError if there is no such object, or no such scene."""
+    """The object's file. Raises ShadowmapError if the object does not exist, or a number is out of range."""
     if not 1 <= lights <= MOST_LIGHTS:
         raise ShadowmapError(f"{lights} lights: give 1 to {MOST_LIGHTS}.")
     if not 1 <= resolution <= 4096:
@@ -35,12 +35,12 @@ def check_scene(name: str, lights: int, resolution: int) -> Path:
     return path
 
 
-def make_scene(name: str, lights: int, resolution: int) -> Any:
-    """``mi.Scene``: an object of [-1, 1]^3 on a diffuse floor, seen from above, under equal directional lights.
+def make_scene(name: str, lights: int, resolution: int) -> mi.Scene:
+    """Make a scene: an object in [-1, 1]^3 on a diffuse floor, seen from above, under equal directional lights.
 
     Args:
         name: name of a mesh of this package, or a mesh file, which is centred and scaled into [-1, 1]^3.
-        lights: how many, called ``light_0``, ``light_1``, ... All shine straight down.
+        lights: number of lights, called ``light_0``, ``light_1``, ... All shine straight down.
         resolution: width and height of the image in pixels.
     """
     path = check_scene(name, lights, resolution)
@@ -58,7 +58,7 @@ def make_scene(name: str, lights: int, resolution: int) -> Any:
         "type": "scene",
         "integrator": {"type": "direct"},
         "camera": {"type": "perspective", "fov": 40, "to_world": camera, "film": film},
-        # A rectangle's normal is +z: turned to face up.
+        # A rectangle's normal is +z: turn it to face up.
         "floor": {
             "type": "rectangle",
             "to_world": transform().translate([0, ground, 0]).rotate([1, 0, 0], -90).scale(5),
@@ -82,7 +82,7 @@ def make_scene(name: str, lights: int, resolution: int) -> Any:
 
 
 def random_directions(generator: np.random.Generator, count: int, cone_deg: float = CONE_DEG) -> FloatArray:
-    """(count, 3) unit vectors, uniform by solid angle in a cone about +y with this opening angle."""
+    """(count, 3) unit vectors, uniform by solid angle in a cone about +y with an opening angle of ``cone_deg``."""
     cosine = 1 - generator.uniform(0, 1, count) * (1 - math.cos(math.radians(cone_deg / 2)))
     angle = generator.uniform(0, 2 * math.pi, count)
     sine = np.sqrt(1 - cosine**2)
@@ -94,7 +94,7 @@ def target_and_starts(
 ) -> tuple[FloatArray, FloatArray]:
     """Directions *to* the lights, target (lights, 3) and starts (starts, lights, 3) of a run.
 
-    They depend on seed, run, number of lights and cone only: further starts leave the target and the first one as they are.
+    They depend on seed, run, number of lights and cone only: more starts do not change the target and the first start.
     """
     generator = np.random.default_rng((seed, run))
     target = random_directions(generator, lights, cone_deg)

@@ -1,4 +1,4 @@
-"""Time of a step of light estimation for a run: in batches, alone, and the way of a renderer that knows no batches."""
+"""Time of a step of light estimation for a run: in batches, alone, and with a renderer without batches."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import dataclasses
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import drjit as dr
 import mitsuba as mi
@@ -17,17 +17,19 @@ from ...inverse import LightBatch, StillScene, run_sweep
 from ...inverse.light_directions.batch import batch_bytes
 from ...inverse.light_directions.pixels import mixed_pixels
 from ...jit.arrays import device_array
+from ...jit.types import Float, Vector3f
 from ...rendering.renderer import Renderer
 from ...rendering.shadow_pass import light_visibility, make_maps
+from ...scene.lights.punctual import DirectionalLight
 from ..common import timing
 from .problem import LightProblem
 from .scene import make_scene
 
 
 def measure_workers(problem: LightProblem, counts: Sequence[int], out: Path) -> dict[str, Any]:
-    """Seconds of a sweep with so many Dask workers on this machine, one Dr.Jit thread each, once warm.
+    """Seconds of a warm sweep for each number of Dask workers on this machine, with one Dr.Jit thread each.
 
-    All do the same batches, of which there are a few for each worker; the first sweep, which compiles, is not timed.
+    All sweeps do the same batches, several for each worker. A first sweep, which compiles, is not timed.
     """
     from distributed import LocalCluster
 
@@ -57,18 +59,20 @@ def measure_workers(problem: LightProblem, counts: Sequence[int], out: Path) -> 
 
 
 def measure(problem: LightProblem, batches: Sequence[int], seconds: float = 6.0) -> dict[str, Any]:
-    """Seconds that a step takes for each run.
+    """Seconds of a step for each run.
 
-    Contenders take turns: batches of several sizes; ``reverse``, a single run whose frozen step takes its derivatives backwards
-    through ordinary shadow maps, but reuses the G-buffer, too; ``renderer``, the frozen step of a user who calls ``render``.
-    All do the same step up to Adam, which costs next to nothing.
+    Contenders take turns: batches of several sizes; ``reverse``, a single run whose frozen step differentiates ordinary shadow
+    maps in reverse mode, but also reuses the G-buffer; ``renderer``, the frozen step of a user who calls ``render``. All do the
+    same step; the last two leave out Adam, whose time is negligible.
     """
     renderer = Renderer.from_scene(make_scene(problem.object, problem.lights, problem.resolution), **problem.renderer_settings())
     still = StillScene.of(renderer)
     batch = LightBatch(still)
     targets, starts = problem.directions(range(max(batches)))
     images = batch.render(targets)
-    contenders = {f"batch of {size}": batch.stepper(starts[:size, 0], images[:size]) for size in batches}
+    contenders: dict[str, Callable[[], object]] = {
+        f"batch of {size}": batch.stepper(starts[:size, 0], images[:size]) for size in batches
+    }
     contenders["reverse"] = _single(_reverse_image, (renderer, still), starts[0, 0], images[0])
     contenders["renderer"] = _single(_rendered_image, (renderer,), starts[0, 0], images[0])
     sizes = [*batches, 1, 1]
@@ -81,11 +85,12 @@ def measure(problem: LightProblem, batches: Sequence[int], seconds: float = 6.0)
     return {**timing.compare(per_run, ratios), "settings": problem.settings(), "machine": timing.machine()}
 
 
-def _single(image: Callable[..., Any], scene: tuple[Any, ...], start: np.ndarray, target: np.ndarray) -> Callable[[], Any]:
+def _single(image: Callable[..., Float], scene: tuple[Any, ...], start: np.ndarray, target: np.ndarray) -> Callable[[], object]:
+    """Frozen step of one run without Adam. ``image(*scene, to_light)`` renders it."""
     wanted = device_array(mi.Float, target)
     vectors = [mi.Vector3f(*(float(c) for c in direction)) for direction in start]
 
-    def step(scene: tuple[Any, ...], vectors: list[Any], wanted: Any) -> Any:
+    def step(scene: tuple[Any, ...], vectors: list[Vector3f], wanted: Float) -> tuple[Float, list[Vector3f]]:
         dr.enable_grad(vectors)
         pixels = image(*scene, vectors)
         difference = dr.detach(pixels) - wanted
@@ -102,17 +107,17 @@ def _single(image: Callable[..., Any], scene: tuple[Any, ...], start: np.ndarray
     return lambda: frozen(scene, [mi.Vector3f(v) for v in copies], wanted)
 
 
-def _lights(renderer: Renderer, to_light: list[Any]) -> list[Any]:
-    old = renderer.data.lights
+def _lights(renderer: Renderer, to_light: list[Vector3f]) -> list[DirectionalLight]:
+    old = cast(tuple[DirectionalLight, ...], renderer.data.lights)
     return [dataclasses.replace(light, direction=-dr.normalize(v)) for light, v in zip(old, to_light, strict=True)]
 
 
-def _rendered_image(renderer: Renderer, to_light: list[Any]) -> Any:
+def _rendered_image(renderer: Renderer, to_light: list[Vector3f]) -> Float:
     return renderer.render(lights={light.name: light for light in _lights(renderer, to_light)}).array
 
 
-def _reverse_image(renderer: Renderer, still: StillScene, to_light: list[Any]) -> Any:
-    """The image from a G-buffer that exists already, with ordinary maps."""
+def _reverse_image(renderer: Renderer, still: StillScene, to_light: list[Vector3f]) -> Float:
+    """Image from the G-buffer in ``still``, with ordinary shadow maps."""
     pixels, lights = still.pixels, _lights(renderer, to_light)
     maps = None
     if still.shadow.method != "none":

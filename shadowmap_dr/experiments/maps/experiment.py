@@ -1,4 +1,4 @@
-"""Comparison of shadow maps: all methods side by side on scenes that are hard for them, against path tracing."""
+"""Comparison of shadow maps: all methods on difficult scenes, against path tracing."""
 
 from __future__ import annotations
 
@@ -7,18 +7,20 @@ import statistics
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 from rich.console import Console
+from rich.progress import Progress
 from rich.table import Table
 
 from ...errors import ShadowmapError
 from ...io import console as io_console
 from ...io import files, plots, records
+from ...jit.types import Float
 from ...rendering.renderer import Renderer
 from ...shadow import ShadowSettings, directional_view
 from ..common.timing import Contender, alternate, machine
@@ -26,7 +28,7 @@ from . import pose as maps_pose
 from . import scenes as maps_scenes
 from .metrics import Image, Texel, metrics, texel_in_pixels
 
-#: What is compared: a label, and options of the `Renderer`.
+#: Labels of the compared shadow maps, and their options of the `Renderer`.
 CANDIDATES: dict[str, dict[str, Any]] = {
     "plain vsm": {"shadow_method": "vsm", "shadow_receiver_range": False},
     "vsm": {"shadow_method": "vsm"},
@@ -45,16 +47,16 @@ _REFERENCE_SPP = 1024
 
 @dataclass(frozen=True)
 class MapsOptions:
-    """Options of a run.
+    """Options of the experiment.
 
     Attributes:
         scenes: names in `maps.scenes.SCENES`.
         candidates: names in `CANDIDATES`.
-        resolution: of images, pixels; several for each texel, so that edges can be located.
+        resolution: pixels along each side of images; several for each texel, so that edges can be located.
         map_resolution, filter_size: of the shadow maps.
-        reference_spp: samples of the path-traced images.
-        rounds: measured renderings of each candidate.
-        pose_runs: poses to be found with each candidate, from shadows alone; 0 leaves this out.
+        reference_spp: samples per pixel of the path-traced images.
+        rounds: number of timed renderings of each candidate.
+        pose_runs: number of poses to find with each candidate, from shadows alone; 0 skips this part.
         out: folder for the results.
     """
 
@@ -84,7 +86,7 @@ class MapsOptions:
 
 
 def run_maps(options: MapsOptions, *, console: Console | None = None) -> dict[str, Any]:
-    """Measure all candidates on all scenes; writes `maps.json` and `maps.png` into `options.out` and returns the record."""
+    """Measure all candidates on all scenes, write `maps.json` and `maps.png` into `options.out`, and return the record."""
     console = console or Console(stderr=True)
     files.check_output(options.out / "maps.json", (".json",))
     record: dict[str, Any] = {"settings": asdict(options), "machine": machine(), "candidates": CANDIDATES, "scenes": {}}
@@ -117,8 +119,8 @@ def run_maps(options: MapsOptions, *, console: Console | None = None) -> dict[st
     return record
 
 
-def _poses(options: MapsOptions, progress: Any) -> dict[str, Any]:
-    """Poses found with each candidate."""
+def _poses(options: MapsOptions, progress: Progress) -> dict[str, Any]:
+    """Pose estimation with each candidate."""
     task = progress.add_task("poses", total=len(options.candidates) * options.pose_runs, note="reference")
     problem, reference = maps_pose.shadow_problem(options.out / "pose")
     result = {}
@@ -130,22 +132,22 @@ def _poses(options: MapsOptions, progress: Any) -> dict[str, Any]:
 
 
 def _settings(label: str, options: MapsOptions) -> dict[str, Any]:
-    """Of the `Renderer`."""
+    """Options of `Renderer.from_scene` for a candidate."""
     sizes = {"shadow_map_resolution": options.map_resolution, "shadow_filter_size": options.filter_size}
     return {**sizes, **CANDIDATES[label]}
 
 
-def _renderer(scene: Any, label: str, options: MapsOptions) -> Renderer:
+def _renderer(scene: mi.Scene, label: str, options: MapsOptions) -> Renderer:
     return Renderer.from_scene(scene, **_settings(label, options), aovs=("visibility",))
 
 
 def visibility_image(renderer: Renderer) -> Image:
-    """(H, W): how much of the light each pixel's surface gets, 0 to 1."""
+    """Visibility image (H, W), 0 (dark) to 1 (lit)."""
     return np.array(renderer.render())[..., 3]
 
 
-def reference_visibility(scene: Any, spp: int) -> tuple[Image, npt.NDArray[np.bool_]]:
-    """Path-traced visibility (H, W), as the ratio of images with and without shadows, and where that makes sense."""
+def reference_visibility(scene: mi.Scene, spp: int) -> tuple[Image, npt.NDArray[np.bool_]]:
+    """Path-traced visibility (H, W), the ratio of images with and without shadows, and a mask of its valid pixels."""
     from mitsuba_baselines.reference import path_traced
     from mitsuba_baselines.unshadowed import unshadowed
 
@@ -156,7 +158,7 @@ def reference_visibility(scene: Any, spp: int) -> tuple[Image, npt.NDArray[np.bo
 
 
 def _step(options: MapsOptions) -> float:
-    """Half the distance of the two renderings of a central difference: their shadows lie a pixel apart."""
+    """Step of a central difference, world units: shadows of its two renderings lie one pixel apart."""
     return 0.5 * 2 * maps_scenes.HALF / options.resolution
 
 
@@ -167,22 +169,22 @@ def _reference_derivative(name: str, options: MapsOptions) -> Image:
     return central_difference(build, _step(options), spp=max(1, options.reference_spp)).image
 
 
-def _positions(scene: Any) -> Image:
-    """(H, W, 3): what each pixel sees, world space."""
+def _positions(scene: mi.Scene) -> Image:
+    """Positions (H, W, 3) of the visible surfaces, world space."""
     return np.array(Renderer.from_scene(scene, shadow_method="none", aovs=("position",)).render())[..., 3:6]
 
 
 def _texel(name: str, p_world: Image, renderer: Renderer, mask: npt.NDArray[np.bool_]) -> Texel:
-    """Of a renderer's maps, on what is seen. They are fitted to the scene: the size of the image says nothing about it."""
+    """Size of a texel of a renderer's map on the visible surfaces; it depends on the fit of the map to the scene."""
     assert renderer.frusta is not None  # all candidates have maps
     view = directional_view(mi.Vector3f(*maps_scenes.SCENES[name][1]))
     return texel_in_pixels(p_world, view, renderer.frusta, renderer.settings.shadow.resolution, mask)
 
 
 def _derivative_agreement(name: str, label: str, reference: Image, footprint: float, options: MapsOptions) -> dict[str, float]:
-    """Forward derivative of the image by the offset of what casts the shadow, against path-traced central differences.
+    """Agreement of the forward derivative of the image by the casters' offset with path-traced central differences.
 
-    ``footprint``: width of the filter in pixels.
+    ``footprint``: width of the filter in image pixels.
     """
     from mitsuba_baselines.derivatives import agreement
 
@@ -193,10 +195,10 @@ def _derivative_agreement(name: str, label: str, reference: Image, footprint: fl
     low, high = (maps_scenes.SCENES[name][0](sign * step) for sign in (-1, 1))
     for key, (points, _) in high.items():
         rates[key] = (points.astype(np.float64) - low[key][0]).ravel() / (2 * step)
-    offset = dr.opaque(mi.Float, 0.0)  # a literal zero would take on the size of what it is first multiplied with
+    offset = dr.opaque(mi.Float, 0.0)  # a literal zero would be broadcast at its first product
     dr.enable_grad(offset)
     positions = {
-        key: dr.ravel(renderer.data.geometry.shape_positions(key)) + mi.Float(rate.astype(np.float32)) * offset
+        key: cast(Float, dr.ravel(renderer.data.geometry.shape_positions(key))) + mi.Float(rate.astype(np.float32)) * offset
         for key, rate in rates.items()
     }
     image = renderer.render(positions)
@@ -206,8 +208,8 @@ def _derivative_agreement(name: str, label: str, reference: Image, footprint: fl
     return {"derivative_cosine": result.cosine, "derivative_scale": result.scale}
 
 
-def _add_times(entries: dict[str, dict[str, Any]], scene: Any, options: MapsOptions) -> None:
-    """Seconds of a frozen rendering, less those of one without shadows: map, filter and look-ups. All take turns."""
+def _add_times(entries: dict[str, dict[str, Any]], scene: mi.Scene, options: MapsOptions) -> None:
+    """Add the times of map, filter and look-ups: frozen renderings minus one without shadows. All take turns."""
 
     def contender(settings: dict[str, Any]) -> Contender:
         renderer = Renderer.from_scene(scene, **settings)
@@ -226,7 +228,7 @@ def _add_times(entries: dict[str, dict[str, Any]], scene: Any, options: MapsOpti
 
 
 def table(record: dict[str, Any]) -> Table:
-    """A row for each scene and method."""
+    """Table with a row for each scene and method."""
     columns = ["scene, method", "RMSE", "shadowed", "bleeding", "acne", "shift", "cosine", "scale", "time"]
     rows: list[Sequence[str]] = []
     for scene, entries in record["scenes"].items():

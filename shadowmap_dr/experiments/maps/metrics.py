@@ -1,4 +1,4 @@
-"""Deviations of a visibility image from the reference's: errors, bleeding, acne, and the shift of its contour in texels."""
+"""Deviations of a visibility image from the reference: errors, light bleeding, acne, and shift of the contour in texels."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numpy.typing as npt
 
 from ...shadow import Frusta, LightView
 
-# Visibility counts as dark or lit, in the reference, below and above these.
+# Reference visibility below counts as dark, above as lit.
 _DARK, _LIT = 0.002, 0.998
-# Length of a contour by the lines that it crosses, along rows, columns and both diagonals (Cauchy and Crofton): exact on average
-# over all directions, and within 6 % for each.
+# Length of a contour from its crossings with lines along rows, columns and both diagonals (Cauchy and Crofton): exact on average
+# over all directions, within 6 % for each direction.
 _LENGTH = np.pi / 8
-# Points along both sides of a pixel at which it is decided on which side of a contour they lie.
+# Sample points along each side of a pixel that tell the two sides of a contour apart.
 _FINER = 16
 
 Image = npt.NDArray[np.float32]
@@ -22,11 +22,11 @@ Image = npt.NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Texel:
-    """A texel of a shadow map on the surfaces that are seen, in pixels; medians over the image.
+    """Size of a shadow map's texel on the visible surfaces, in image pixels; medians over the image.
 
     Attributes:
-        size: side of a square of the same area.
-        longest: the longer of its two sides.
+        size: side of a square of the texel's area.
+        longest: longer side of the texel.
     """
 
     size: float
@@ -39,11 +39,11 @@ def texel_in_pixels(
     """Size of a texel in an image.
 
     Args:
-        p_world: (H, W, 3) positions of what is seen, world space.
-        view: of a directional light.
-        frusta: what its one map covers.
+        p_world: (H, W, 3) positions of the visible surfaces, world space.
+        view: view of a directional light.
+        frusta: frustum of its single map.
         resolution: texels along each side of the map.
-        mask: (H, W), where something is seen.
+        mask: (H, W), pixels that show a surface.
     """
     columns = []
     for axis, half in ((view.right, frusta.half_x), (view.up, frusta.half_y)):
@@ -52,20 +52,20 @@ def texel_in_pixels(
         columns.append(np.stack([across, rows], -1))
     texels_by_pixel = np.stack(columns, -2)[mask]
     area = np.abs(np.linalg.det(texels_by_pixel))
-    # Surfaces that light only grazes have texels without end.
+    # Texels on surfaces at grazing angles are unbounded: leave them out.
     struck = area > 1e-6 * np.median(area)
     sides = np.linalg.norm(np.linalg.inv(texels_by_pixel[struck]), axis=-2)
     return Texel(float(np.median(area)) ** -0.5, float(np.median(sides.max(-1))))
 
 
 def metrics(image: Image, reference: Image, mask: npt.NDArray[np.bool_], texel: Texel, filter_size: int) -> dict[str, float]:
-    """Errors of a visibility image (H, W): root mean squares, bleeding, acne, shift of the contour in texels."""
+    """Errors of a visibility image (H, W): root mean squares, light bleeding, acne, shift of the contour in texels."""
     error = np.where(mask, image - reference, 0)
 
     def root_mean_square(where: npt.NDArray[np.bool_]) -> float:
         return float(np.sqrt(np.mean(np.square(error[where])))) if where.any() else float("nan")
 
-    # A filter's footprint away from edges: their blur is no bleeding, and no acne.
+    # Keep a filter's footprint away from edges: their blur is neither bleeding nor acne.
     distance = int(np.ceil((filter_size + 1) * texel.longest))
     dark, lit = (_eroded(mask & where, distance) for where in (reference < _DARK, reference > _LIT))
     return {
@@ -78,8 +78,8 @@ def metrics(image: Image, reference: Image, mask: npt.NDArray[np.bool_], texel: 
 
 
 def contour_shift(image: Image, reference: Image, mask: npt.NDArray[np.bool_]) -> float:
-    """Mean distance in pixels between the lines where two images are one half: area between them by the length of the second."""
-    mask = _eroded(mask, 1)  # what is averaged below lies within it
+    """Mean distance in pixels between the contours at one half: area between them, divided by the reference's length."""
+    mask = _eroded(mask, 1)  # the mask then holds all pixels of the averages below
     want = reference > 0.5
     low, high, all_ = slice(None, -1), slice(1, None), slice(None)
 
@@ -92,17 +92,18 @@ def contour_shift(image: Image, reference: Image, mask: npt.NDArray[np.bool_]) -
 
 
 def _area_between(image: Image, reference: Image, mask: npt.NDArray[np.bool_]) -> float:
-    """Area in pixels where one image, interpolated between the pixels' centres, is above one half and the other is not.
+    """Area in pixels where one image, interpolated between pixel centres, is above one half and the other is not.
 
-    With pixels that are counted whole, an edge along their rows would be off by all of a pixel or by nothing. Both images are
-    averaged over 3 x 3 pixels first: then interpolation finds sharp edges, too, where they are.
+    Counting whole pixels, an edge along pixel rows would be off by a full pixel or not at all. Both images are averaged over
+    3 x 3 pixels first, so that interpolation locates sharp edges, too.
     """
     image, reference = _averaged(image), _averaged(reference)
     corners = [(slice(i, i - 1 or None), slice(j, j - 1 or None)) for i in (0, 1) for j in (0, 1)]
-    inside, above = np.ones_like(mask[1:, 1:]), []
+    inside = np.ones_like(mask[1:, 1:])
+    above = []
     for corner in corners:
         inside &= mask[corner]
-    # Cells between four pixels, all of which lie on one side in both images, are told by any of their corners.
+    # Cells whose four corners lie on one side in each image count whole.
     for values in (image, reference):
         above.append(sum((values[corner] > 0.5).astype(np.int64) for corner in corners))
     crossed = inside & (((above[0] > 0) & (above[0] < 4)) | ((above[1] > 0) & (above[1] < 4)))
@@ -124,7 +125,7 @@ def _averaged(image: Image) -> npt.NDArray[np.floating]:
 
 
 def _eroded(mask: npt.NDArray[np.bool_], distance: int) -> npt.NDArray[np.bool_]:
-    """Pixels whose whole neighbourhood of so many pixels (a square, within the image) is in the mask."""
+    """Pixels whose square neighbourhood (``distance`` pixels to each side, within the image) lies in the mask."""
     result = mask
     for axis in (0, 1):
         counts = np.cumsum(np.pad(~result, [(1, 0) if k == axis else (0, 0) for k in (0, 1)]), axis=axis)

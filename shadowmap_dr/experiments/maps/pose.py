@@ -1,4 +1,4 @@
-"""Value of a shadow map for an optimisation: the share of poses found from shadows alone."""
+"""Value of a shadow map for optimisation: the share of poses found from shadows alone."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ RESOLUTION, ITERATIONS, OBJECT = 128, 150, "spot"
 
 
 def shadow_problem(work: Path) -> tuple[PoseProblem, npt.NDArray[np.float32]]:
-    """Spot out of the camera's view, its shadow in it; and the path-traced image (H, W, 3) of the target pose."""
+    """The problem, with Spot's shadow but not Spot in view, and the path-traced image (H, W, 3) of the target pose."""
     problem = make_problem(OBJECT, RESOLUTION, shadow_only=True, work=work)
     return problem, path_traced_reference(problem, work / f"{problem.folder}.exr")
 
@@ -31,9 +31,9 @@ def poses_found(
     runs: int,
     advance: Callable[[], None] = lambda: None,
 ) -> dict[str, Any]:
-    """Fit the pose from so many starts (seed 0) with a `Renderer` of these settings; ``advance`` is called after each run.
+    """Fit the pose from ``runs`` starts (seed 0) with a `Renderer` of these settings; ``advance`` is called after each run.
 
-    Returns the number of runs, how many found the pose, and the median errors of all: degrees, 100 x offset.
+    Returns the numbers of all and of successful runs, and the median errors of all runs: degrees, 100 x offset.
     """
     renderer = Renderer.from_scene(problem.scene, **settings)
     fit = PoseFit(renderer, "object", problem.p_rest, reference, step_size=STEP_SIZE, betas=BETAS, shift_z=problem.shift_z)

@@ -1,4 +1,4 @@
-"""Scenes that are hard for pre-filtered shadow maps: a receiver seen from above under a directional light."""
+"""Difficult scenes for pre-filtered shadow maps: a receiver seen from above under a directional light."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ def merged(meshes: list[Mesh]) -> Mesh:
 
 
 def _overlap(offset: float) -> dict[str, Mesh]:
-    """Occluders at heights 4 and 1 whose shadows overlap partly: a high variance of depth within the shadow."""
+    """Occluders at heights 4 and 1 with partly overlapping shadows: high variance of depth within the shadow."""
     high = box((-1.2 + offset - 1.0, 4.0, -0.9), (0.3 + offset - 1.0, 4.1, 0.6))
     low = box((-0.6, 1.0, -0.3), (0.9, 1.1, 1.2))
     return {"high": high, "low": low}
 
 
 def _tiers(offset: float) -> dict[str, Mesh]:
-    """The same with occluders that are seen, beside their shadows."""
+    """Likewise, but the occluders are visible beside their shadows."""
     return {"high": box((-1.9 + offset, 2.4, -0.9), (-0.4 + offset, 2.5, 0.6)), "low": box((-0.9, 0.8, -0.3), (0.3, 0.9, 1.2))}
 
 
@@ -52,7 +52,7 @@ def _fence(offset: float) -> dict[str, Mesh]:
 
 
 def _sheet(offset: float) -> dict[str, Mesh]:
-    """A crumpled sheet that shadows itself: ridges in random directions."""
+    """A crumpled sheet with ridges in random directions, which shadows itself."""
     n = 241
     rng = np.random.default_rng(5)
     line = np.linspace(-1.7, 1.7, n)
@@ -70,7 +70,7 @@ def _sheet(offset: float) -> dict[str, Mesh]:
 
 
 def _deep(offset: float) -> dict[str, Mesh]:
-    """Occluders at heights 1 and 1000: all that is near the floor has a thousandth of the depth range."""
+    """Occluders at heights 1 and 1000: everything near the floor shares a thousandth of the depth range."""
     far = 1000.0
     return {
         "near": merged([box((-1.0 + offset, 0.3, -0.8), (-0.6 + offset, 1.0, -0.4)), box((0.2, 0.3, -0.2), (1.2, 0.4, 0.6))]),
@@ -78,11 +78,11 @@ def _deep(offset: float) -> dict[str, Mesh]:
     }
 
 
-# Direction in which light travels, for each unit downwards.
+# Travel directions of light, scaled to one unit downwards.
 _SLANT = (0.25, -1.0, 0.15)
 _LOW_SLANT = (0.35, -1.0, -0.55)
 
-#: Name -> (meshes for an offset along x of what casts the shadow, direction of the light).
+#: Name -> (function that makes the meshes for an offset of the casters along x, travel direction of the light).
 SCENES: Mapping[str, tuple[Callable[[float], dict[str, Mesh]], tuple[float, float, float]]] = {
     "overlap": (_overlap, _SLANT),
     "tiers": (_tiers, (0.6, -1.0, 0.1)),
@@ -92,10 +92,10 @@ SCENES: Mapping[str, tuple[Callable[[float], dict[str, Mesh]], tuple[float, floa
 }
 
 
-def build(name: str, resolution: int, offset: float = 0.0) -> Any:
-    """A ``mi.Scene``: diffuse floor (y = 0) and occluders, a directional light, an orthographic camera that looks down.
+def build(name: str, resolution: int, offset: float = 0.0) -> mi.Scene:
+    """Make a scene: diffuse floor (y = 0) and occluders, a directional light, an orthographic camera that looks down.
 
-    The camera is above the sheet, the fence and the tiers, and below the other occluders, which it does not see.
+    The camera is above the sheet, the fence and the tiers, and below the other occluders, which are not visible.
     """
     meshes, direction = SCENES[name]
     height = {"overlap": 0.25, "deep": 0.25, "tiers": 4.0}.get(name, 3.0)
@@ -118,4 +118,4 @@ def build(name: str, resolution: int, offset: float = 0.0) -> Any:
     }
     for key, (points, faces) in meshes(offset).items():
         scene[key] = occluder(key, points, faces)
-    return mi.load_dict(scene, optimize=False)  # else Mitsuba would merge meshes, and they lose their names
+    return mi.load_dict(scene, optimize=False)  # otherwise Mitsuba would merge the meshes, and their names were lost

@@ -1,4 +1,4 @@
-"""Light of extended emitters against path tracing: how far off it is, how that falls with samples, and what it costs."""
+"""Comparison of extended lights with path tracing: errors, their convergence with samples, and times."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import statistics
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import drjit as dr
 import mitsuba as mi
@@ -18,18 +18,19 @@ from rich.console import Console
 from ...errors import ShadowmapError
 from ...io import console as io_console
 from ...io import files, records
+from ...jit.types import UInt32
 from ...rendering.renderer import Renderer
 from ..common.timing import Contender, alternate, machine
 from . import report as soft_report
 from . import scenes as soft_scenes
 
-#: Error that scenes are held to, relative to the mean of the image, with this many samples of each area light and of the sky.
+#: Largest acceptable error, relative to the mean of the image, with these samples of each area light and of the sky.
 BAR, BAR_SAMPLES = 0.02, (64, 128)
-# Distances from the camera whose second difference, relative to themselves, is larger lie on either side of an outline.
+# A larger second difference of the distances from the camera, relative to the distance, marks a silhouette.
 _JUMP = 0.01
-# Errors below this are not told from none (relative to the mean of the image); samples of one image that Mitsuba takes at once.
+# Smallest measurable error, relative to the mean of the image; largest number of samples of one Mitsuba launch.
 _RESOLVED, _MOST_SAMPLES = 5e-3, (1 << 32) - 1
-# Seconds and renderings at most that a time is measured for.
+# Limits of a measurement of time: seconds and renderings.
 _TIMED_SECONDS, _TIMED_ROUNDS = 10.0, 9
 
 Image = npt.NDArray[np.float32]
@@ -38,18 +39,18 @@ Mask = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class SoftOptions:
-    """Options of a run.
+    """Options of the experiment.
 
     Attributes:
         scenes: names in `soft.scenes.SCENES`.
         samples: pairs (of each area light, of the environment).
-        resolution: of images, pixels.
+        resolution: pixels along each side of images.
         map_resolution: texels along each side of each sample's shadow map.
         spp: samples per pixel of our images.
         reference_spp: samples per pixel of each of the two path-traced images.
-        timed: whether times are measured.
+        timed: measure times, too.
         out: folder for the results.
-        resume: keep scenes that an earlier run with the same settings has finished.
+        resume: keep finished scenes of an earlier run with the same settings.
     """
 
     scenes: tuple[str, ...] = tuple(soft_scenes.SCENES)
@@ -73,7 +74,7 @@ class SoftOptions:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Settings on which numbers depend: a run is resumed with the same."""
+        """Settings that the results depend on: a resumed run must have the same."""
         kept = asdict(self)
         for name in ("scenes", "out", "resume"):
             kept.pop(name)
@@ -82,9 +83,9 @@ class SoftOptions:
 
 @dataclass(frozen=True)
 class Traced:
-    """Two independent path-traced images (H, W, 3), and which of their pixels count: surfaces, away from outlines.
+    """Two independent path-traced images (H, W, 3) of ``spp`` samples per pixel each, and the mask of the pixels that count.
 
-    ``spp``: samples per pixel of each.
+    Pixels count if they show a surface, away from silhouettes.
     """
 
     first: Image
@@ -94,27 +95,27 @@ class Traced:
 
     @property
     def image(self) -> Image:
-        """Mean of both."""
+        """Mean of both images."""
         return 0.5 * (self.first + self.second)
 
     @property
     def level(self) -> float:
-        """Mean radiance where pixels count."""
+        """Mean radiance of the pixels that count."""
         return float(self.image[self.mask].mean())
 
     @property
     def variance(self) -> float:
-        """Mean variance of :attr:`image`, as the difference of the two tells it."""
+        """Mean variance of :attr:`image`, estimated from the difference of the two images."""
         difference = (self.first - self.second)[self.mask].astype(np.float64)
         return float(np.square(difference).mean()) / 4
 
     def error(self, image: Image) -> float:
-        """Relative root mean square error of an image, the reference's own variance subtracted."""
+        """Relative root mean square error of an image, without the variance of the reference."""
         square = float(np.square((image - self.image)[self.mask].astype(np.float64)).mean())
         return math.sqrt(max(square - self.variance, 0.0)) / self.level
 
     def bias(self, image: Image) -> float:
-        """Relative error of the mean."""
+        """Relative error of an image's mean."""
         return float(image[self.mask].mean()) / self.level - 1
 
     @property
@@ -124,7 +125,7 @@ class Traced:
 
 
 def run_soft(options: SoftOptions, *, console: Console | None = None) -> dict[str, Any]:
-    """Measure all scenes; writes `soft.json`, `soft.md` and `soft.png` into `options.out` and returns the record."""
+    """Measure all scenes, write `soft.json`, `soft.md` and `soft.png` into `options.out`, and return the record."""
     path = options.out / "soft.json"
     files.check_output(path, (".json",))
     record: dict[str, Any] = {"settings": options.settings, "machine": machine(), "scenes": _kept(path, options)}
@@ -156,7 +157,7 @@ def _kept(path: Path, options: SoftOptions) -> dict[str, Any]:
 
 
 def measure(name: str, options: SoftOptions, step: Callable[..., None]) -> tuple[dict[str, Any], dict[str, Image]]:
-    """Errors and times of one scene, and its pictures: reference and our best image."""
+    """Errors and times of one scene, and its pictures: the reference and our image with the most samples."""
     scene = soft_scenes.build(name, options.resolution)
     step("reference", done=0)
     traced = path_traced_twice(scene, options.reference_spp)
@@ -182,8 +183,8 @@ def measure(name: str, options: SoftOptions, step: Callable[..., None]) -> tuple
     return entry, {"path traced": traced.image, "ours": image}
 
 
-def one_map(scene: Any, traced: Traced, options: SoftOptions) -> dict[str, float] | None:
-    """Error of the fast mode, with the most samples for shading; None where no light of the scene is fit for it."""
+def one_map(scene: mi.Scene, traced: Traced, options: SoftOptions) -> dict[str, float] | None:
+    """Errors of the fast mode with the most samples for shading; None if it supports no light of the scene."""
     area, sky = options.samples[-1]
     renderer = Renderer.from_scene(scene, area_light_samples=area, environment_light_samples=sky, emitter_shadows="single")
     if not any(plan.kind == "single" for plan in renderer.soft):
@@ -192,29 +193,29 @@ def one_map(scene: Any, traced: Traced, options: SoftOptions) -> dict[str, float
     return {"error": traced.error(image), "bias": traced.bias(image)}
 
 
-def make_renderer(scene: Any, samples: tuple[int, int], map_resolution: int) -> Renderer:
-    """A renderer with so many samples of (each area light, the environment)."""
+def make_renderer(scene: mi.Scene, samples: tuple[int, int], map_resolution: int) -> Renderer:
+    """A renderer with the given samples of (each area light, the environment)."""
     area, sky = samples
     return Renderer.from_scene(scene, area_light_samples=area, environment_light_samples=sky, soft_map_resolution=map_resolution)
 
 
-def path_traced_twice(scene: Any, spp: int) -> Traced:
-    """Two independent references of ``spp`` samples per pixel each."""
+def path_traced_twice(scene: mi.Scene, spp: int) -> Traced:
+    """Render two independent references of ``spp`` samples per pixel each."""
     from mitsuba_baselines.reference import path_traced
 
     first, second = (path_traced(scene, spp=spp, seed=seed, integrator="direct") for seed in (0, 1))
     return Traced(first.image[..., :3], second.image[..., :3], counted_pixels(scene), int(first.settings["spp"]))
 
 
-def counted_pixels(scene: Any) -> Mask:
-    """Bool (H, W): pixels that show a surface which does not shine, and no outline within one pixel; found by ray tracing."""
+def counted_pixels(scene: mi.Scene) -> Mask:
+    """Mask (H, W) of pixels that show no emitter and are more than one pixel away from silhouettes, found by ray tracing."""
     sensor = scene.sensors()[0]
     width, height = (int(v) for v in sensor.film().crop_size())
     lane = dr.arange(mi.UInt32, width * height)
     position = mi.Point2f((mi.Float(lane % width) + 0.5) / width, (mi.Float(lane // width) + 0.5) / height)
     ray, _ = sensor.sample_ray(0.0, 0.5, position, mi.Point2f(0.5))
     hit = scene.ray_intersect(ray)
-    shape = dr.reinterpret_array(mi.UInt32, hit.shape).numpy().reshape(height, width)
+    shape = cast(UInt32, dr.reinterpret_array(mi.UInt32, hit.shape)).numpy().reshape(height, width)
     distance = np.where(hit.is_valid().numpy(), hit.t.numpy(), 0).reshape(height, width)
     surface = (hit.is_valid() & ~hit.shape.is_emitter()).numpy().reshape(height, width)
     outline = np.zeros((height, width), bool)
@@ -223,7 +224,7 @@ def counted_pixels(scene: Any) -> Mask:
         differs = s[1:] != s[:-1]
         o[1:] |= differs
         o[:-1] |= differs
-        # Large on both sides of a jump, and there only.
+        # The second difference is large on both sides of a jump only.
         o[1:-1] |= np.abs(d[2:] - 2 * d[1:-1] + d[:-2]) > _JUMP * d[1:-1]
     grown = outline.copy()
     for y in (-1, 0, 1):
@@ -235,16 +236,16 @@ def counted_pixels(scene: Any) -> Mask:
 
 
 def equal_error_samples(error: float, noise: float, pixels: int) -> int:
-    """Samples per pixel with which path tracing has an error, if it is ``noise`` with one.
+    """Samples per pixel with which path tracing has the given error, if its error is ``noise`` with one sample.
 
-    In favour of path tracing an error that the references cannot tell from none counts as `_RESOLVED`, and images of more samples
-    than Mitsuba takes at once count as ones of so many.
+    In favour of path tracing, smaller errors than `_RESOLVED` count as `_RESOLVED`, and the samples of an image are limited to
+    those of one launch.
     """
     wanted = math.ceil((noise / max(error, _RESOLVED)) ** 2)
     return min(max(1, wanted), _MOST_SAMPLES // pixels)
 
 
-def _times(scene: Any, errors: list[dict[str, Any]], noise: float, options: SoftOptions) -> dict[str, Any]:
+def _times(scene: mi.Scene, errors: list[dict[str, Any]], noise: float, options: SoftOptions) -> dict[str, Any]:
     """Seconds of our image with the most samples, and of a path-traced one with the same error."""
     best = errors[-1]
     width, height = (int(side) for side in scene.sensors()[0].film().crop_size())
@@ -252,7 +253,7 @@ def _times(scene: Any, errors: list[dict[str, Any]], noise: float, options: Soft
     renderer = make_renderer(scene, tuple(best["samples"]), options.map_resolution)
     render = dr.freeze(lambda spp, renderer: renderer.render(spp=spp).array)
     plugin = mi.load_dict({"type": "direct"})
-    limits = {"rounds": _TIMED_ROUNDS, "warm_up": 2, "settle": 0, "burst": 1, "seconds": _TIMED_SECONDS}
+    limits: dict[str, Any] = {"rounds": _TIMED_ROUNDS, "warm_up": 2, "settle": 0, "burst": 1, "seconds": _TIMED_SECONDS}
     contenders = {
         "ours": Contender(lambda: dr.eval(render(options.spp, renderer)), **limits),
         "path traced": Contender(lambda: dr.eval(mi.render(scene, integrator=plugin, spp=spp)), **limits),

@@ -1,4 +1,4 @@
-"""Report of the experiment with extended lights: a table, a reading of it and a sheet of pictures."""
+"""Report of the experiment with extended lights: a table, a summary of it and a sheet of pictures."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def rows(record: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
 
 
 def table(record: Mapping[str, Any]) -> Table:
-    """For the terminal."""
+    """Table for the terminal."""
     columns, lines = rows(record)
     keep = [k for k in range(len(columns)) if k != 1]
     title = "Relative error by samples (area light / sky), and time at equal error (samples per pixel)"
@@ -49,7 +49,7 @@ def table(record: Mapping[str, Any]) -> Table:
 
 
 def reading(record: Mapping[str, Any], bar: float = 0.02) -> list[str]:
-    """Reading of the numbers, in sentences."""
+    """Summary of the record in sentences."""
     scenes = record["scenes"]
     rough = {name: entry for name, entry in scenes.items() if not entry["glossy"]}
     above = {n: e["errors"][-1]["error"] for n, e in rough.items() if e["errors"][-1]["error"] > bar}
@@ -62,14 +62,14 @@ def reading(record: Mapping[str, Any], bar: float = 0.02) -> list[str]:
 
 
 def falling(errors: Sequence[float]) -> bool:
-    """True if errors fall with each step, up to a tenth of the last one, and altogether."""
+    """True if the last error is below the first, and no error exceeds the one before by a tenth of the last error."""
     if len(errors) < 2:
         return True
     return errors[-1] < errors[0] and all(b <= a + 0.1 * errors[-1] for a, b in zip(errors, errors[1:], strict=False))
 
 
 def write(record: Mapping[str, Any], out: Path) -> None:
-    """`soft.md` and `soft.png`."""
+    """Write `soft.md` and `soft.png`."""
     columns, lines = rows(record)
     text = ["# Extended lights", "", *reading(record), "", _markdown(columns), _markdown(["---"] * len(columns))]
     text += [_markdown(line) for line in lines]
@@ -94,7 +94,7 @@ def save_pictures(path: Path, pictures: Mapping[str, Image]) -> None:
 
 
 def load_pictures(path: Path) -> dict[str, Image]:
-    """Pictures that :func:`save_pictures` wrote; nothing if there is no such file."""
+    """Read the pictures of :func:`save_pictures`; an empty dictionary if the file does not exist."""
     if not path.exists():
         return {}
     channels, _ = images.read_exr(path)
@@ -104,7 +104,7 @@ def load_pictures(path: Path) -> dict[str, Image]:
 
 
 def _exposure(image: Image) -> float:
-    """Factor that makes an image neither too dark nor too bright to be seen."""
+    """Factor that brings an image to a visible brightness."""
     return 0.5 / max(float(np.quantile(image, 0.8)), 1e-6)
 
 
@@ -115,7 +115,7 @@ def _paired(sheet: Mapping[str, Mapping[str, Image]]) -> dict[str, dict[str, Ima
     for first, second in zip(names[0::2], [*names[1::2], None], strict=False):
         row = dict(sheet[first])
         if second is not None:
-            # The same titles once more, told apart by a space.
+            # The titles again, with a space to keep the keys different.
             row |= {f"{title} ": image for title, image in sheet[second].items()}
         result[f"{first} | {second}" if second else first] = row
     return result

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import mitsuba as mi
 import numpy as np
@@ -13,6 +13,8 @@ import numpy.typing as npt
 from ...io import assets
 
 Parts = dict[str, Any]
+# Half-sides, one for all axes or one for each.
+Size: TypeAlias = "float | list[float]"
 
 
 @dataclass(frozen=True)
@@ -20,11 +22,11 @@ class SoftScene:
     """A scene without its camera's film.
 
     Attributes:
-        parts: makes its shapes and emitters.
-        about: what it is there for, in a few words.
+        parts: function that makes its shapes and emitters.
+        about: its lights and materials, in a few words.
         camera: (origin, target).
         fov: field of view in degrees.
-        glossy: has materials of a roughness below 0.3, which the bar of this experiment does not cover.
+        glossy: it has materials of a roughness below 0.3, which need not meet the error bound.
     """
 
     parts: Callable[[], Parts]
@@ -34,8 +36,8 @@ class SoftScene:
     glossy: bool = False
 
 
-def build(name: str, resolution: int) -> Any:
-    """A ``mi.Scene`` of :data:`SCENES`, seen by a perspective camera with a square film and a box filter."""
+def build(name: str, resolution: int) -> mi.Scene:
+    """Make a scene of :data:`SCENES`, with a perspective camera, a square film and a box filter."""
     scene = SCENES[name]
     origin, target = scene.camera
     camera = {
@@ -55,14 +57,14 @@ def build(name: str, resolution: int) -> Any:
     return mi.load_dict({"type": "scene", "camera": camera, **scene.parts()}, optimize=False)
 
 
-def _t() -> Any:
+def _t() -> mi.ScalarTransform4f:
     return mi.ScalarTransform4f()
 
 
 # -------------------------------------------------------------------------------------------------------------- materials
 
 
-def _rgb(*value: float) -> Any:
+def _rgb(*value: float) -> Parts:
     return {"type": "rgb", "value": list(value) if len(value) > 1 else value[0]}
 
 
@@ -85,7 +87,7 @@ def _principled(roughness: float, *value: float, metallic: float = 0.0) -> Parts
 
 
 def _tiles() -> Parts:
-    """Colours that change over the floor, slowly enough not to alias."""
+    """A material whose colours change over the floor, slowly enough not to alias."""
     return {"type": "diffuse", "reflectance": {"type": "bitmap", "bitmap": mi.Bitmap(_noise(8, 7, 0.25, 0.75)), "raw": True}}
 
 
@@ -100,7 +102,7 @@ def _floor(bsdf: Parts | None = None, half: float = 4.0) -> Parts:
     return {"type": "rectangle", "to_world": _t().rotate([1, 0, 0], -90) @ _t().scale(half), "bsdf": bsdf or _diffuse(0.5)}
 
 
-def _wall(at: tuple[float, float, float], axis: list[float], angle: float, half: Any, bsdf: Parts | None = None) -> Parts:
+def _wall(at: tuple[float, float, float], axis: list[float], angle: float, half: Size, bsdf: Parts | None = None) -> Parts:
     place = _t().translate(list(at)) @ _t().rotate(axis, angle) @ _t().scale(half)
     return {"type": "rectangle", "to_world": place, "bsdf": bsdf or _diffuse(0.6)}
 
@@ -120,7 +122,7 @@ def _ball(at: tuple[float, float, float], radius: float, bsdf: Parts | None = No
     return {"type": "sphere", "center": list(at), "radius": radius, "bsdf": bsdf or _diffuse(0.7, 0.3, 0.2)}
 
 
-def _box(at: tuple[float, float, float], half: Any, turn: float = 0.0, bsdf: Parts | None = None) -> Parts:
+def _box(at: tuple[float, float, float], half: Size, turn: float = 0.0, bsdf: Parts | None = None) -> Parts:
     place = _t().translate(list(at)) @ _t().rotate([0, 1, 0], turn) @ _t().scale(half)
     return {"type": "cube", "to_world": place, "bsdf": bsdf or _diffuse(0.6)}
 
@@ -133,7 +135,7 @@ def _area(*radiance: float) -> Parts:
 
 
 def _panel(
-    at: tuple[float, float, float], target: tuple[float, float, float], half: Any, emitter: Parts, shape: str = "rectangle"
+    at: tuple[float, float, float], target: tuple[float, float, float], half: Size, emitter: Parts, shape: str = "rectangle"
 ) -> Parts:
     """A rectangle (or disk) that shines towards a point."""
     up = [0, 1, 0] if abs(at[0] - target[0]) + abs(at[2] - target[2]) > 1e-3 else [0, 0, 1]
@@ -153,7 +155,7 @@ def _sky(
     turn: float = 0.0,
     tint: tuple[float, float, float] = (0.5, 0.7, 1.0),
 ) -> Parts:
-    """A sky of its own: brighter towards the zenith, dim ground, and a sun of ``radius`` radians in a direction of its space."""
+    """An analytic sky: brighter towards the zenith, dim ground, and a sun of ``radius`` radians in a local direction."""
     theta = (np.arange(rows) + 0.5) / rows * np.pi
     phi = (np.arange(2 * rows) + 0.5) / (2 * rows) * 2 * np.pi
     up = np.cos(theta)[:, None] * np.ones(2 * rows)
@@ -230,7 +232,7 @@ def _tube() -> Parts:
 
 
 def _painted() -> Parts:
-    """A lamp like a stained window: bars in three colours on black."""
+    """A scene with a lamp like a stained window: bars in three colours on black."""
     image = np.zeros((8, 8, 3), np.float32)
     image[:, 0:2], image[:, 3:5], image[:, 6:8] = (20, 4, 2), (3, 16, 3), (2, 5, 22)
     radiance = {"type": "bitmap", "bitmap": mi.Bitmap(image), "raw": True, "filter_type": "nearest"}
@@ -253,7 +255,7 @@ def _two_colours() -> Parts:
 
 
 def _lantern() -> Parts:
-    """A lamp in the middle of what it lights: it looks around itself."""
+    """A scene around its lamp, which needs shadow maps in all directions."""
     around = [_box((1.1 * np.cos(a), 0.45, 1.1 * np.sin(a)), [0.12, 0.45, 0.12], 45) for a in np.arange(5) * 2 * np.pi / 5 + 0.3]
     return {
         "floor": _floor(),

@@ -282,7 +282,7 @@ def main() -> None:
     parser.add_argument("--mesh", default="spot", help="name or file")
     parser.add_argument("--normals", choices=("face", "vertex"), default="face", help="flat or smooth shading of the object")
     parser.add_argument("--candidates", nargs="+", metavar="C/P/I[/GUIDING[/SPP]]", help="settings to try instead of the usual")
-    parser.add_argument("--output", type=Path, default=STORE, help="JSON file to extend; a search in it goes on")
+    parser.add_argument("--output", type=Path, default=STORE, help="JSON file to extend; an interrupted search in it is resumed")
     try:
         _search(parser.parse_args())
     except (ShadowmapError, OSError, json.JSONDecodeError) as error:

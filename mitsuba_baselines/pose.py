@@ -18,7 +18,6 @@ import numpy.typing as npt
 
 from shadowmap_dr.errors import ShadowmapError
 from shadowmap_dr.inverse.pose import apply_pose
-from shadowmap_dr.jit.types import Float
 
 from .proxy import Proxy, calibrate, with_proxy
 
@@ -203,7 +202,7 @@ class MitsubaPose:
             "proxy": self.proxy.record(),
         }
 
-    def _place(self, pose: Float) -> None:
+    def _place(self, pose: mi.Float) -> None:
         """Move the mesh in the scene."""
         self._params["object.vertex_positions"] = apply_pose(self._rest, pose, self.shift_z)
         self._params.update()

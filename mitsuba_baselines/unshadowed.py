@@ -1,6 +1,6 @@
 """Direct light without shadows: reference images for shading.
 
-Importing this module registers the integrator `direct_unshadowed` in the current variant and in those set later.
+Importing this module registers the integrator `direct_unshadowed` in the current variant and in all variants that are set later.
 
 Conventions for cases that a shadow ray would decide:
 

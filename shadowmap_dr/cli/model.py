@@ -16,10 +16,9 @@ from ..errors import ShadowmapError
 from ..interactive import exports
 from ..interactive.file_session import follow, kept
 from ..interactive.modeller import Modeller
-from ..inverse import Sculptor, even_sphere, shadow_view
+from ..inverse import Sculptor, ShadowView, even_sphere, shadow_view
 from ..io import assets, files
 from ..io.meshes import read_placed_mesh
-from ..rendering.receivers.shadow_views import ShadowView
 from ..variants import DEFAULT_VARIANT, set_variant
 from .options import Variant
 

@@ -36,7 +36,7 @@ def apply_pose(p_rest: Float, pose: Float, shift_z: float = 0.0) -> Float:
 
 
 class PoseFit:
-    """Fits a pose to a reference image by gradient descent (Adam) on the mean squared difference of linear colours.
+    """Fit of a pose to a reference image by gradient descent (Adam) on the mean squared difference of linear colours.
 
     A `Method` of the optimisation loop. A step - vertices, rendering, loss, backward pass, Adam - is recorded once with
     `dr.freeze` and replayed from then on, without a read-back. Mitsuba's meshes stay as they are, and no rays are traced.
@@ -76,7 +76,7 @@ class PoseFit:
         self._p_rest = device_array(mi.Float, p_rest)
         self._reference = mi.TensorXf(device_array(mi.Float, image), image.shape)
         self._step_size, self._betas, self._shift_z = step_size, betas, shift_z
-        self._spp = {} if spp == 1 else {"spp": spp}  # renderers without the option `spp` render the default
+        self._spp = {} if spp == 1 else {"spp": spp}  # left out by default: a renderer need not have this option
         self._settings = dict(settings or {})
         self._step = dr.freeze(_pose_step)
         self.reset(np.zeros(3))

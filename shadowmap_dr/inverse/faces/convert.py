@@ -137,7 +137,7 @@ def read_obj(path: Path) -> tuple[Array, npt.NDArray[np.int32]]:
 def _same(path: Path, mean: Array) -> Array:
     points, _ = read_obj(path)
     if points.shape != mean.shape:
-        raise ShadowmapError(f"{path} has {len(points)} vertices, the mean {len(mean)}: all files must have the same ones.")
+        raise ShadowmapError(f"{path} has {len(points)} vertices, the mean {len(mean)}: all files must have the same vertices.")
     return points
 
 

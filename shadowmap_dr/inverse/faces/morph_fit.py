@@ -20,7 +20,7 @@ BETAS = (0.9, 0.999)
 
 
 class MorphFit:
-    """Fits weights (and a translation) to a shadow image by gradient descent (Adam).
+    """Fit of weights (and a translation) to a shadow image by gradient descent (Adam).
 
     The loss is the mean squared difference of visibility plus ``prior`` times the mean square of the weights. For images with
     normally distributed errors of variance s^2, prior = s^2 * weights / pixels gives the most probable weights.

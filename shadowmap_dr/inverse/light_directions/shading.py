@@ -161,6 +161,6 @@ def render_lights(scene: StillScene, to_light: Vector3f, frusta: Frusta | None) 
     return views, lit(scene, views, maps), maps.maps.frusta
 
 
-def with_shadow(scene: StillScene, **changes: Any) -> StillScene:
+def with_shadow(scene: StillScene, **changes: Any) -> StillScene:  # Any: values of settings
     """The same scene with other shadow settings, by their names in `ShadowSettings`."""
     return replace(scene, shadow=replace(scene.shadow, **changes))

@@ -34,7 +34,7 @@ class Method(Protocol):
     """
 
     def reset(self, start: npt.ArrayLike) -> None:
-        """Start anew from the given parameters, with empty optimiser moments."""
+        """Restart from the given parameters, with empty optimiser moments."""
 
     def step(self) -> Numbers:
         """Take one step. Returns the loss *before* the step (a number or an array with one entry)."""
@@ -124,7 +124,9 @@ def optimize(
         if not np.array_equal(history.parameters[0], np.ravel(start)):
             raise ShadowmapError(f"the checkpoint {checkpoint} began elsewhere: delete it or choose another file.")
         if history.iterations > iterations:
-            raise ShadowmapError(f"the checkpoint {checkpoint} has {history.iterations} steps: delete it, or ask for as many.")
+            raise ShadowmapError(
+                f"the checkpoint {checkpoint} has {history.iterations} steps: delete it, or ask for at least as many."
+            )
     if state is None:
         method.reset(start)
     else:

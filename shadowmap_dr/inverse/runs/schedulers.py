@@ -107,7 +107,7 @@ def _do_elsewhere(
         for future in as_completed(list(futures)):
             batch = futures.pop(future)
             if future.cancelled():
-                raise ShadowmapError(f"the Dask scheduler at {scheduler} is gone: start it and go on from complete batches.")
+                raise ShadowmapError(f"the Dask scheduler at {scheduler} is gone: restart it and resume from complete batches.")
             error = future.exception()
             if error is None:
                 on_done(batch, future.result())

@@ -52,7 +52,7 @@ def stem(problem: Problem, variant: str) -> str:
 
 
 class Worker:
-    """Does batches, one at a time, in this process.
+    """Worker that does batches, one at a time, in this process.
 
     Args:
         threads: number of Dr.Jit threads, 0 for the default. With a single thread, Mitsuba 3.9 waits forever when it reads or

@@ -118,9 +118,9 @@ def remeshed(vertices: npt.ArrayLike, faces: npt.ArrayLike) -> tuple[Array, npt.
     try:
         new_vertices, new_faces = remesh(p, f, i=_ROUNDS, h=length, project=True)
     except Exception as error:  # gpytoolbox does not document its exceptions
-        raise ShadowmapError(f"a mesh of {len(f)} triangles cannot be meshed anew: {' '.join(str(error).split())}.") from error
+        raise ShadowmapError(f"a mesh of {len(f)} triangles cannot be remeshed: {' '.join(str(error).split())}.") from error
     if not len(new_faces) or not np.isfinite(new_vertices).all():
-        raise ShadowmapError(f"a mesh of {len(f)} triangles cannot be meshed anew: nothing is left of it.")
+        raise ShadowmapError(f"a mesh of {len(f)} triangles cannot be remeshed: the result is empty.")
     return np.asarray(new_vertices, np.float32), np.asarray(new_faces, np.uint32)
 
 

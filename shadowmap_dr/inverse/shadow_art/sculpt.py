@@ -21,7 +21,7 @@ Array = npt.NDArray[np.float32]
 
 
 class Sculptor:
-    """Deforms a mesh so that its shadows match target images, which may change at any time.
+    """A mesh that is deformed until its shadows match target images, which may change at any time.
 
     For the optimisation loop of shadow art and for interactive programs:
 

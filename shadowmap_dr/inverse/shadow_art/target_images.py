@@ -61,7 +61,7 @@ def read_figure(path: str | os.PathLike[str]) -> Array:
     if not path.is_file():
         raise ShadowmapError(f"no image {str(path)!r}: the file does not exist.")
     if path.suffix.lower() in (".svg", ".svgz"):
-        data: Any = io.BytesIO(_rasterized(path))
+        data: Path | io.BytesIO = io.BytesIO(_rasterized(path))
     elif path.suffix.lower() in SUFFIXES:
         data = path
     else:

@@ -4,13 +4,16 @@ from . import _llvm
 
 _llvm.ensure()  # before anything imports mitsuba or drjit
 
-from . import integrator  # noqa: E402
+import mitsuba as mi  # noqa: E402
+
+from . import integrator, variants  # noqa: E402
 from .errors import ShadowmapError  # noqa: E402
 from .rendering import Renderer, RenderSettings  # noqa: E402
 from .shadow import ShadowSettings  # noqa: E402
 
 __version__ = "0.1.0"
 
+variants.warn_if_untried(mi.__version__)
 integrator.install()  # the plug-in `shadowmap`, in this variant and all that will be set
 
 __all__ = ["RenderSettings", "Renderer", "ShadowSettings", "ShadowmapError", "__version__"]

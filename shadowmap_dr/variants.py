@@ -5,11 +5,22 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .errors import ShadowmapError
+from .errors import ShadowmapError, warn
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
 #: Endings of variants: those that renderings with shadow maps work in, those with colours, and all.
 SUPPORTED, COLOURED, ANY = ("_ad_rgb", "_ad_mono"), ("_ad_rgb",), ("",)
+
+#: Versions of Mitsuba (major, minor) that the tests have run with.
+_TRIED = ((3, 9),)
+
+
+def warn_if_untried(version: str) -> None:
+    """Warn of a version of Mitsuba (``mi.__version__``) that the tests have never run with."""
+    numbers = tuple(int(part) for part in version.split(".")[:2] if part.isdigit())
+    if numbers not in _TRIED:
+        newest = ".".join(map(str, _TRIED[-1]))
+        warn(f"Mitsuba {version} was never tried with shadowmap_dr. If results look wrong: pip install 'mitsuba=={newest}.*'")
 
 
 def set_variant(name: str, endings: tuple[str, ...] = SUPPORTED) -> None:

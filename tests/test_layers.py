@@ -49,7 +49,7 @@ MAY_IMPORT = {
         ),
     ),
     "cli": ("", "_llvm", "errors", "experiments", "interactive", "inverse", "io", "variants"),
-    "": ("_llvm", "errors", "integrator", "rendering", "shadow"),
+    "": ("_llvm", "errors", "integrator", "rendering", "shadow", "variants"),
 }
 
 #: Packages within packages: what they may import of the one around them.

@@ -1,0 +1,118 @@
+"""The buffers of Mitsuba's meshes. The only module that knows the names that its versions give them.
+
+Mitsuba 3.9 has flat arrays ``vertex_positions``, ``vertex_normals`` and ``vertex_texcoords``. Its development branch has tensors
+``positions``, ``normals`` and ``texcoords`` with a row for each vertex, or for each entry that ``position_index`` or
+``normal_index`` names for a vertex, and reverses faces itself where a mesh has ``flip_normals``
+(https://github.com/mitsuba-renderer/mitsuba3/pull/1933).
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
+
+from ..jit.types import Float, UInt32
+
+
+class MeshNames(NamedTuple):
+    """Names of a mesh's parameters."""
+
+    positions: str
+    normals: str
+    texcoords: str
+
+
+_FLAT = MeshNames("vertex_positions", "vertex_normals", "vertex_texcoords")
+_TENSORS = MeshNames("positions", "normals", "texcoords")
+#: Names of the parameters of meshes that move vertices, in all versions.
+VERTEX_PARAMETERS = frozenset((*_FLAT, *_TENSORS))
+
+
+class MeshBuffers(NamedTuple):
+    """Flat buffers of a mesh of V vertices and F faces, world space; attached where the mesh's own are.
+
+    ``faces`` UInt32 (3F,), ``positions`` Float (3V,), ``normals`` Float (3V,) or (0,), ``texcoords`` Float (2V,) or (0,).
+    """
+
+    faces: UInt32
+    positions: Float
+    normals: Float
+    texcoords: Float
+
+
+def mesh_names(mesh: mi.Mesh) -> MeshNames:
+    """Names of the parameters of a mesh in the version of Mitsuba in use."""
+    return _FLAT if _is_flat(mesh) else _TENSORS
+
+
+def mesh_buffers(mesh: mi.Mesh) -> MeshBuffers:
+    """Read the buffers of a mesh as they are now."""
+    if _is_flat(mesh):
+        vertices = (mesh.vertex_positions_buffer(), mesh.vertex_normals_buffer(), mesh.vertex_texcoords_buffer())
+        return MeshBuffers(mi.UInt32(mesh.faces_buffer()), *(mi.Float(buffer) for buffer in vertices))
+    position_index, normal_index = (_flat_index(mesh, name) for name in ("position_index", "normal_index"))
+    return MeshBuffers(
+        mi.UInt32(mesh.faces().array),
+        _rows(mesh.positions().array, position_index),
+        _rows(mesh.normals().array, normal_index),
+        mi.Float(mesh.texcoords().array),
+    )
+
+
+def has_reversed_faces(shape: mi.Shape) -> bool:
+    """True if the normals of a shape's faces are against their winding, by ``flip_normals``."""
+    if isinstance(shape, mi.Mesh) and not _is_flat(shape):
+        return False
+    return bool(shape.has_flipped_normals())
+
+
+def make_mesh(
+    name: str,
+    positions: npt.ArrayLike,
+    faces: npt.ArrayLike,
+    bsdf: mi.BSDF | None = None,
+    kind: type | None = None,
+) -> mi.Mesh:
+    """Make a ``mi.Mesh`` of vertices (V, 3) and faces (F, 3).
+
+    Args:
+        name: its id.
+        positions: world space.
+        faces: indices of vertices.
+        bsdf: its material; None for Mitsuba's default.
+        kind: ``mi.Mesh``, or a class that takes its place.
+    """
+    kind = mi.Mesh if kind is None else kind
+    points, corners = np.ascontiguousarray(positions, np.float32), np.ascontiguousarray(faces, np.uint32)
+    props = mi.Properties()
+    if bsdf is not None:
+        props["bsdf"] = bsdf
+    if not _is_flat(kind):
+        return kind(name, faces=mi.TensorXu(corners), positions=mi.TensorXf(points), props=props)
+    mesh = kind(name, len(points), len(corners), props=props)
+    table = mi.traverse(mesh)
+    table[_FLAT.positions], table["faces"] = mi.Float(points.ravel()), mi.UInt32(corners.ravel())
+    table.update()
+    return mesh
+
+
+def _is_flat(mesh: Any) -> bool:  # Any: a mesh or its class
+    return hasattr(mesh, "faces_buffer")
+
+
+def _flat_index(mesh: mi.Mesh, name: str) -> UInt32 | None:
+    """Row for each vertex, or None if vertices and rows are the same."""
+    index = getattr(mesh, name, None)
+    flat = None if index is None else mi.UInt32(dr.ravel(index()))
+    return flat if flat is not None and dr.width(flat) else None
+
+
+def _rows(values: Float, index: UInt32 | None) -> Float:
+    """Values in threes, of the vertices, in order. Attached."""
+    if index is None or not dr.width(values):
+        return mi.Float(values)
+    return mi.Float(dr.ravel(dr.gather(mi.Vector3f, values, index)))

@@ -1,4 +1,4 @@
-"""Files: images, meshes, records, plots, tables for the terminal, and what comes with the package. No rendering."""
+"""Files: images, meshes, records, plots, tables for the terminal, and paths of the package's data. No rendering."""
 
 from .files import atomic, check_output, read_arrays
 from .images import colour_channels, read_exr, read_image, to_srgb, write_exr, write_image, write_png

@@ -1,4 +1,4 @@
-"""Paths of the scenes, meshes and pictures that come with the package."""
+"""Paths of the scenes, meshes and pictures in the package."""
 
 from __future__ import annotations
 

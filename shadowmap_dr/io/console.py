@@ -25,7 +25,7 @@ def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> 
 
 
 def progress(console: Console) -> Progress:
-    """A progress display; add one task for each part of the work, with a field `note`.
+    """A progress display. Add one task for each part of the work, with a text in its field `note`.
 
     Without a terminal (in a pipe, in a file) it writes a line every ten seconds.
     """
@@ -68,5 +68,5 @@ class _ProgressOrLines(Progress):
 
 
 def markdown(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    """Lines of a table."""
+    """Lines of a Markdown table."""
     return [f"| {' | '.join(columns)} |", "|" + "---|" * len(columns), *(f"| {' | '.join(row)} |" for row in rows)]

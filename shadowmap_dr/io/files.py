@@ -21,10 +21,9 @@ SUFFIXES = (".exr", ".png")
 
 @contextmanager
 def atomic(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A temporary file beside `path` that takes its place when the block succeeds, and vanishes when it does not.
+    """A temporary file beside `path` that replaces it when the block succeeds, and is deleted when the block fails.
 
-    Raises OutputError where the file cannot be written (no such directory, no permission, full disk). Parent directories
-    are created.
+    Parent directories are created. Raises OutputError if the file cannot be written (no permission, full disk).
     """
     path = Path(path)
     temporary: Path | None = None
@@ -49,6 +48,7 @@ def atomic(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def make_folder(folder: Path) -> None:
+    """Create a folder and its parents; raises an OSError that names a parent which is a file."""
     for path in (folder, *folder.parents):
         if path.exists() and not path.is_dir():
             raise NotADirectoryError(errno.ENOTDIR, f"{path} is a file")
@@ -56,7 +56,7 @@ def make_folder(folder: Path) -> None:
 
 
 def check_output(path: str | os.PathLike[str], suffixes: tuple[str, ...] = SUFFIXES) -> Path:
-    """Fail early, before any work is done, if `path` cannot be written later. Returns it as a Path."""
+    """Check, before any work is done, that `path` can be written later. Returns it as a Path, or raises OutputError."""
     path = Path(path)
     if path.suffix.lower() not in suffixes:
         raise OutputError(f"cannot write {path}: the suffix {path.suffix!r} is not one of {', '.join(suffixes)}.")
@@ -74,13 +74,13 @@ def check_output(path: str | os.PathLike[str], suffixes: tuple[str, ...] = SUFFI
 
 
 def read_arrays(path: str | os.PathLike[str], only: Collection[str] | None = None) -> dict[str, npt.NDArray[Any]]:
-    """The arrays of an .npz file by name (those of the names in ``only``). ShadowmapError where it cannot be read."""
+    """The arrays of an .npz file by name (only the names in ``only``). Raises ShadowmapError if it cannot be read."""
     try:
         if not zipfile.is_zipfile(path):  # NumPy would call other files pickled objects
             raise ValueError("no archive")
         with np.load(path, allow_pickle=False) as file:
             return {name: file[name] for name in file.files if only is None or name in only}
-    except Exception as error:  # whatever NumPy and the decompressor come across in a damaged file
+    except Exception as error:  # NumPy and the decompressor raise errors of many kinds for damaged files
         reason = "objects are not read" if "pickle" in str(error) else "it is no .npz file, or it is damaged"
         raise ShadowmapError(f"cannot read {path}: {reason}; give an .npz file of plain arrays.") from error
 

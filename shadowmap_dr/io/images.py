@@ -19,9 +19,9 @@ def write_exr(path: str | os.PathLike[str], channels: Mapping[str, Array], metad
     """Write a multi-channel OpenEXR file.
 
     Args:
-        path: where to; parent directories are created.
+        path: file to write; parent directories are created.
         channels: name -> array (H, W) of float16, float32 or uint32, top row first. Usual names: R, G, B, A, Y, depth.Z.
-        metadata: strings that are stored in the header.
+        metadata: strings to store in the header.
 
     Raises OutputError if the file cannot be written.
     """
@@ -40,7 +40,7 @@ def write_exr(path: str | os.PathLike[str], channels: Mapping[str, Array], metad
 
 
 def read_exr(path: str | os.PathLike[str]) -> tuple[dict[str, Array], dict[str, str]]:
-    """Channels (name -> (H, W) array) and the header's strings of an OpenEXR file."""
+    """Channels (name -> (H, W) array) and the header's strings of an OpenEXR file. Raises ShadowmapError if it is unreadable."""
     import OpenEXR
 
     if not Path(path).is_file():
@@ -49,7 +49,7 @@ def read_exr(path: str | os.PathLike[str]) -> tuple[dict[str, Array], dict[str, 
         with OpenEXR.File(str(path), separate_channels=True) as file:
             channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
             metadata = {name: value for name, value in file.header().items() if isinstance(value, str)}
-    except Exception as error:  # whatever the library comes across in a damaged header
+    except Exception as error:  # the library raises errors of many kinds for damaged headers
         raise ShadowmapError(f"cannot read {path}: it is no OpenEXR file, or it is damaged.") from error
     return channels, metadata
 
@@ -58,7 +58,7 @@ def write_png(path: str | os.PathLike[str], image: Array) -> None:
     """Write an image as an 8-bit sRGB PNG. Values outside [0, 1] are clipped.
 
     Args:
-        path: where to; parent directories are created.
+        path: file to write; parent directories are created.
         image: linear (H, W), (H, W, 1), (H, W, 3) or, with alpha, (H, W, 4), top row first.
     """
     from PIL import Image
@@ -76,7 +76,7 @@ def write_png(path: str | os.PathLike[str], image: Array) -> None:
 
 
 def write_image(path: str | os.PathLike[str], image: Array, metadata: Mapping[str, str] | None = None) -> None:
-    """Write a linear (H, W, C) image with 1, 3 or 4 channels as .exr or .png, whichever the suffix says."""
+    """Write a linear (H, W, C) image with 1, 3 or 4 channels as .exr or .png, by the suffix of ``path``."""
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix == ".png":
@@ -99,7 +99,7 @@ def read_image(path: str | os.PathLike[str]) -> npt.NDArray[np.float32]:
 
 
 def colour_channels(count: int) -> tuple[str, ...]:
-    """OpenEXR channel names of an image with that many colour channels."""
+    """OpenEXR channel names of an image with ``count`` colour channels (1 to 4)."""
     names = {1: ("Y",), 2: ("Y", "A"), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}.get(count)
     if names is None:
         raise ShadowmapError(f"an image with {count} colour channels has no OpenEXR channel names: give 1 to 4.")

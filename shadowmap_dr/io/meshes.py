@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -12,21 +12,24 @@ import numpy.typing as npt
 from ..errors import OutputError, ShadowmapError
 from .files import atomic
 
+if TYPE_CHECKING:
+    import mitsuba as mi
+
 Array = npt.NDArray[np.float32]
 Faces = npt.NDArray[np.uint32]
 
 
 def read_mesh(path: Path) -> tuple[Array, Faces]:
-    """(V, 3) vertices, centred and scaled into [-1, 1]^3, and (F, 3) faces of a mesh file; equal vertices are one.
+    """(V, 3) vertices, centred and scaled into [-1, 1]^3, and (F, 3) faces of a mesh file. Equal vertices are merged.
 
-    Raises ShadowmapError where it cannot be read, or is no triangle mesh.
+    Raises ShadowmapError if the file cannot be read or holds no triangle mesh.
     """
     vertices, faces, _ = read_placed_mesh(path)
     return vertices, faces
 
 
 def read_placed_mesh(path: Path) -> tuple[Array, Faces, tuple[npt.NDArray[np.float64], float]]:
-    """As `read_mesh`, and where the mesh was: its middle (3,) and a scale; vertices * scale + middle are the file's."""
+    """As `read_mesh`, with the mesh's original middle (3,) and scale: the file's vertices are vertices * scale + middle."""
     import trimesh
 
     try:
@@ -34,7 +37,7 @@ def read_placed_mesh(path: Path) -> tuple[Array, Faces, tuple[npt.NDArray[np.flo
         if isinstance(mesh, trimesh.Scene):
             mesh = mesh.to_mesh()
         vertices, faces = np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces)
-    except Exception as error:  # whatever the loader of one of a dozen formats may raise
+    except Exception as error:  # loaders of a dozen formats raise errors of many kinds
         raise ShadowmapError(f"cannot read {path}: it is no mesh, or it is damaged.") from error
     if not len(faces) or not np.isfinite(vertices).all():
         raise ShadowmapError(f"{path} has no triangles, or vertices that are not finite.")
@@ -54,10 +57,10 @@ def read_placed_mesh(path: Path) -> tuple[Array, Faces, tuple[npt.NDArray[np.flo
     return unique.astype(np.float32), faces[proper].astype(np.uint32), (middle.astype(np.float64), 0.5 * scale)
 
 
-def write_ply(path: str | os.PathLike[str], mesh: Any) -> None:
-    """Write a ``mi.Mesh`` as a binary PLY file."""
+def write_ply(path: str | os.PathLike[str], mesh: mi.Mesh) -> None:
+    """Write a mesh as a binary PLY file. Raises OutputError if the file cannot be written."""
     with atomic(path) as temporary:
         try:
             mesh.write_ply(str(temporary))
-        except RuntimeError as error:  # Mitsuba's, of a full disk and others
+        except RuntimeError as error:  # Mitsuba raises it for a full disk, for instance
             raise OutputError(f"cannot write {path}: {' '.join(str(error).split())}") from error

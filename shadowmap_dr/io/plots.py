@@ -5,13 +5,16 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from .files import atomic
 from .images import to_srgb
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 Image = npt.NDArray[np.floating[Any]]
 #: Title of a row -> title of a column -> image.
@@ -32,7 +35,7 @@ def plot_curves(
         x_label: label of the horizontal axes.
         columns: panels in a row, or None for all.
     """
-    from matplotlib.figure import Figure  # without pyplot there is no global state and no display is needed
+    from matplotlib.figure import Figure  # unlike pyplot it has no global state and needs no display
 
     across = max(1, min(columns or len(panels), len(panels)))
     down = math.ceil(len(panels) / across)
@@ -56,7 +59,7 @@ def plot_curves(
 def image_sheet(path: str | os.PathLike[str], rows: Rows, size: float = 2.2) -> None:
     """Draw images in a grid: row title -> column title -> linear (H, W, 3) or (H, W, 1) image."""
 
-    def draw(axes: Any, image: Image, _: Mapping[str, Image]) -> None:
+    def draw(axes: Axes, image: Image, _: Mapping[str, Image]) -> None:
         pixels = to_srgb(np.nan_to_num(image))
         pixels = np.repeat(pixels, 3, axis=2) if pixels.shape[2] == 1 else pixels[..., :3]
         axes.imshow(pixels, interpolation="nearest")
@@ -67,16 +70,18 @@ def image_sheet(path: str | os.PathLike[str], rows: Rows, size: float = 2.2) -> 
 def signed_sheet(path: str | os.PathLike[str], rows: Rows, size: float = 2.0) -> None:
     """Draw signed images (H, W) in a grid, blue below zero and red above, with one scale for each row."""
 
-    def draw(axes: Any, image: Image, row: Mapping[str, Image]) -> None:
+    def draw(axes: Axes, image: Image, row: Mapping[str, Image]) -> None:
         limit = max(float(np.percentile(np.abs(other), 99.7)) for other in row.values()) or 1.0
         axes.imshow(np.nan_to_num(image), cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="antialiased")
 
     _grid(path, rows, size, draw)
 
 
-def _grid(path: str | os.PathLike[str], rows: Rows, size: float, draw: Callable[[Any, Image, Mapping[str, Image]], None]) -> None:
-    """A grid of images with titles; ``draw`` is given the axes, the image, and its row."""
-    from matplotlib.figure import Figure  # without pyplot there is no global state and no display is needed
+def _grid(
+    path: str | os.PathLike[str], rows: Rows, size: float, draw: Callable[[Axes, Image, Mapping[str, Image]], None]
+) -> None:
+    """Write a grid of images with titles; ``draw(axes, image, row)`` draws one image."""
+    from matplotlib.figure import Figure  # unlike pyplot it has no global state and needs no display
 
     columns = max(len(row) for row in rows.values())
     aspect = max(image.shape[0] / image.shape[1] for row in rows.values() for image in row.values())

@@ -15,15 +15,15 @@ from ..errors import ShadowmapError
 from .files import atomic
 
 
-def write_json(path: str | os.PathLike[str], value: Any) -> None:
+def write_json(path: str | os.PathLike[str], value: object) -> None:
     """Write `value` (dicts, sequences, NumPy arrays and scalars; numbers that are not finite become null)."""
     text = json.dumps(plain(value), indent=1, allow_nan=False)
     with atomic(path) as temporary:
         temporary.write_text(text + "\n", encoding="utf-8")
 
 
-def read_json(path: str | os.PathLike[str]) -> Any:
-    """The content of a JSON file, or a ShadowmapError that names it."""
+def read_json(path: str | os.PathLike[str]) -> Any:  # Any: JSON
+    """The content of a JSON file. Raises a ShadowmapError that names the file if it cannot be read."""
     try:
         return json.loads(Path(path).read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -33,9 +33,9 @@ def read_json(path: str | os.PathLike[str]) -> Any:
 
 
 def read_record(path: str | os.PathLike[str], settings: Mapping[str, Any], *parts: str) -> dict[str, Any]:
-    """The record of an earlier call, to go on with: a mapping with these ``settings``, and mappings of the names ``parts``.
+    """The record of an earlier run, to be continued: a mapping with these ``settings``, and one mapping for each of ``parts``.
 
-    ShadowmapError where the file holds no such record, or one of other settings.
+    Raises ShadowmapError if the file holds no such record, or a record of other settings.
     """
     record, advice = read_json(path), "choose another folder, or leave out --resume"
     if not isinstance(record, dict) or not all(isinstance(record.get(part), dict) for part in ("settings", *parts)):
@@ -46,8 +46,8 @@ def read_record(path: str | os.PathLike[str], settings: Mapping[str, Any], *part
     return record
 
 
-def plain(value: Any) -> Any:
-    """`value` as JSON can hold it: NumPy values become numbers and lists, numbers that are not finite None."""
+def plain(value: object) -> Any:  # Any: JSON
+    """`value` as JSON can hold it: NumPy values become numbers and lists, numbers that are not finite become None."""
     if isinstance(value, Mapping):
         return {str(key): plain(entry) for key, entry in value.items()}
     if isinstance(value, np.ndarray):

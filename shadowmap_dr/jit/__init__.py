@@ -1,1 +1,1 @@
-"""Arrays and trees of arrays on Dr.Jit: memory, broadcasting, vectors, recordings. Knows no scenes."""
+"""Dr.Jit arrays and trees of arrays: memory, broadcasting, vectors, frozen functions. Independent of scenes."""

@@ -1,66 +1,70 @@
-"""Small tables that many lanes look numbers up in, differentiable without loss.
+"""Look-ups of many lanes in small tables, with exact adjoints.
 
-Two things lose a part of the derivatives otherwise.
+Dr.Jit's default would lose a part of the derivatives for two reasons.
 
-On the LLVM backend ``dr.gather`` has an adjoint of its own for small arrays (``ReduceMode.Expand``, its default there): each
-thread sums up in memory of its own. Dr.Jit 1.5 loses a part of that sum, depending on the thread that comes to run it, where two
-things meet: the array has been read before, and the incoming gradient is a sum of any such kind that is not evaluated yet, which
-it is when what was looked up has itself served as a table. So tables are read in another mode here (:func:`look_up`), and what
-the caller gave never receives such a sum (:func:`from_one_buffer`), since the caller may have looked it up in the default mode.
+On the LLVM backend, ``dr.gather`` has a special adjoint for small arrays (``ReduceMode.Expand``, the default there): each thread
+sums in a private copy. Dr.Jit 1.5 loses a part of that sum, depending on which thread runs it, if the array has been read before
+and the incoming gradient is itself such a sum that is not evaluated yet. That happens if the result of one look-up is the table
+of the next. So tables are read in another mode here (:func:`look_up`). And the caller's arrays never receive such a sum
+(:func:`from_one_buffer`), for the caller may read them in the default mode.
 
-And a sum in single precision that grows term by term rounds each of them to its own last digit: with millions of like terms, all
-in the same direction. So blocks of lanes add to a copy of the table each (:func:`in_copies`), and the copies are added up later.
+Second, a single-precision sum that grows term by term rounds each term to the last digit of the sum: millions of equal terms are
+all rounded in the same direction. So each block of lanes adds to its own copy of the table (:func:`in_copies`). The copies are
+summed at the end.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from types import ModuleType
-from typing import Any
+from typing import TypeVar, cast
 
 import drjit as dr
 import mitsuba as mi
 
 from .arrays import backend
 from .pytree import tree_map
+from .types import AnyArray, Float, PyTree, UInt32
 
-#: Lanes that add to one copy of a table of vertices, cameras or texels: their terms differ from lane to lane.
+_ArrayT = TypeVar("_ArrayT", bound="AnyArray")
+
+#: Lanes that add to one copy of a table of vertices, cameras or texels, whose gradients differ from lane to lane. A power of two.
 LANES = 1 << 20
-#: The same where all terms may be equal, such as those by the strength of a light. A power of two, like the other.
+#: Lanes that add to one copy where all terms may be equal, such as those of a light's intensity. A power of two.
 LIKE_LANES = 1 << 18
 
 
-def look_up(column: Any, index: Any) -> Any:
-    """``column[index]`` for a small ``Float`` array and valid rows (``UInt32``). Attached to the column."""
+def look_up(column: Float, index: UInt32) -> Float:
+    """``column[index]`` for a small array and valid indices. Attached to the column."""
     return dr.gather(type(column), column, index, mode=dr.ReduceMode.Local)
 
 
-def one_buffer(columns: Sequence[Any]) -> Any:
+def one_buffer(columns: Sequence[Float]) -> Float:
     """The numbers of ``Float`` arrays one after the other. Attached; each receives its gradient as a part of a buffer."""
-    # The number at the end makes a buffer even of a single column.
+    # The zero at the end makes this a copy even for a single column.
     return dr.concat([*columns, dr.zeros(type(columns[0]), 1)])
 
 
-def from_one_buffer(columns: Sequence[Any]) -> list[Any]:
+def from_one_buffer(columns: Sequence[Float]) -> list[Float]:
     """Copies of ``Float`` arrays of the same width. Attached; the columns receive their gradients as parts of a buffer."""
     buffer, rows = one_buffer(columns), dr.width(columns[0])
     row = dr.arange(backend(buffer).UInt32, rows)
     return [dr.gather(type(c), buffer, row + k * rows, mode=dr.ReduceMode.NoConflicts) for k, c in enumerate(columns)]
 
 
-def in_copies(arrays: Sequence[Any], lanes: int, block: int = LANES) -> tuple[list[Any], int]:
+def in_copies(arrays: Sequence[Float], lanes: int, block: int = LANES) -> tuple[list[Float], int]:
     """Copies of flat ``Float`` arrays, one for each block of lanes that look numbers up in them (:func:`copy_of_lane`).
 
-    Make them before what hangs on the lanes: derivatives are taken in the reverse order, and the lanes are worked out once more
-    for each place where copies are added.
+    Make all copies before the computations of the lanes. The backward pass runs in reverse order, and recomputes the lanes for
+    each separate sum of copies.
 
     Args:
         arrays: tables.
-        lanes: number of the lanes that will look numbers up.
-        block: of lanes that share a copy, a power of two.
+        lanes: number of lanes that look numbers up.
+        block: number of lanes that share a copy, a power of two.
 
     Returns:
-        The copies of each array, one after the other in one buffer, and their number: 1 if no array is attached. Attached.
+        (for each array, a buffer of its copies one after the other; number of copies, 1 if no array is attached). Attached.
     """
     count = -(-lanes // block)
     if count == 1 or not dr.grad_enabled(list(arrays)):
@@ -68,8 +72,8 @@ def in_copies(arrays: Sequence[Any], lanes: int, block: int = LANES) -> tuple[li
     return dr.custom(Copies, list(arrays), count, False), count
 
 
-def copy_of_lane(module: ModuleType, lanes: int, copies: int, block: int = LANES) -> Any:
-    """The copy (``UInt32``) that each lane is to read; a constant if there is but one."""
+def copy_of_lane(module: ModuleType, lanes: int, copies: int, block: int = LANES) -> UInt32:
+    """Index of the copy that each lane reads; the constant 0 if there is only one."""
     if copies == 1:
         return module.UInt32(0)
     return dr.minimum(dr.arange(module.UInt32, lanes) >> (block.bit_length() - 1), copies - 1)
@@ -78,51 +82,51 @@ def copy_of_lane(module: ModuleType, lanes: int, copies: int, block: int = LANES
 class Copies(dr.CustomOp):
     """Copies of arrays, one after the other, or (``transpose``) the sums of such copies: each is the adjoint of the other.
 
-    Dr.Jit's own adjoint of a repeated gather would add up with atomics.
+    Dr.Jit's own adjoint of a repeated gather would use atomics.
     """
 
-    def eval(self, arrays: list[Any], count: int, transpose: bool) -> list[Any]:
+    def eval(self, arrays: list[Float], count: int, transpose: bool) -> list[Float]:
         self._arguments = count, transpose
         return self._apply(arrays, transpose)
 
     def forward(self) -> None:
-        self.set_grad_out(self._apply(self.grad_in("arrays"), self._arguments[1]))
+        self.set_grad_out(self._apply(cast(list[Float], self.grad_in("arrays")), self._arguments[1]))
 
     def backward(self) -> None:
-        self.set_grad_in("arrays", self._apply(self.grad_out(), not self._arguments[1]))
+        self.set_grad_in("arrays", self._apply(cast(list[Float], self.grad_out()), not self._arguments[1]))
 
     def name(self) -> str:
         return "copies"
 
-    def _apply(self, arrays: list[Any], transpose: bool) -> list[Any]:
+    def _apply(self, arrays: list[Float], transpose: bool) -> list[Float]:
         return [(sum_of_copies if transpose else copied)(array, self._arguments[0]) for array in arrays]
 
 
-def copied(array: Any, count: int) -> Any:
+def copied(array: _ArrayT, count: int) -> _ArrayT:
     """``count`` copies of an array (N) of any Dr.Jit type, one after the other (N * count)."""
     width = dr.width(array)
     lane = dr.arange(backend(array).UInt32, count * width)
     return dr.gather(type(array), array, lane - lane // width * width)
 
 
-def sum_of_copies(array: Any, count: int) -> Any:
+def sum_of_copies(array: _ArrayT, count: int) -> _ArrayT:
     """The sum (N) of ``count`` arrays that lie one after the other (N * count)."""
     width = dr.width(array) // count
     lane = dr.arange(backend(array).UInt32, width)
-    return sum(dr.gather(type(array), array, lane + k * width) for k in range(count))
+    return cast(_ArrayT, sum(dr.gather(type(array), array, lane + k * width) for k in range(count)))
 
 
-def broadcast_differentiable(record: Any, width: int) -> Any:
-    """A copy of ``record`` whose differentiable numbers of width 1 are gathered ``width`` times from one common buffer.
+def broadcast_differentiable(record: PyTree, width: int) -> PyTree:
+    """A copy of ``record`` whose attached numbers of width 1 are gathered ``width`` times from one common buffer.
 
     ``record`` is a Dr.Jit array, a ``mi.Transform4f`` or a dataclass, tuple, list or dict of them. Values and gradients are the
-    same as with implicit broadcasting. The difference is the backward pass: the adjoint of broadcasting sums over all lanes,
-    which evaluates the whole graph anew for *each* number (a direction has three), while the adjoint of a gather is a
-    scatter, and those of all numbers run in one kernel. Records without gradients are returned as they are.
+    same as with implicit broadcasting, but the backward pass is faster. The adjoint of broadcasting is a sum over all lanes: the
+    whole graph is evaluated again for *each* number (a direction has three). The adjoint of a gather is a scatter, and the
+    scatters of all numbers run in one kernel. Detached records are returned unchanged.
     """
-    leaves: list[Any] = []
+    leaves: list[Float] = []
 
-    def collect(number: Any) -> Any:
+    def collect(number: Float) -> Float:
         leaves.append(number)
         return number
 
@@ -135,16 +139,16 @@ def broadcast_differentiable(record: Any, width: int) -> Any:
     first = copy_of_lane(backend(flat), width, copies, LIKE_LANES) * numbers
     position = iter(range(len(leaves)))
 
-    def wide(number: Any) -> Any:
+    def wide(number: Float) -> Float:
         return look_up(flat, dr.full(mi.UInt32, next(position), width) + first)
 
     return tree_map(record, lambda array: _map_numbers(array, wide))
 
 
-def _map_numbers(array: Any, function: Any) -> Any:
-    """Apply a function to all differentiable single numbers of an array; parts without any are kept as they are."""
+def _map_numbers(array: AnyArray, function: Callable[[Float], Float]) -> AnyArray:
+    """Apply a function to all attached numbers of width 1 in an array; other components are kept."""
     if dr.is_tensor_v(array) or not dr.is_float_v(array) or not dr.grad_enabled(array):
         return array
     if dr.depth_v(array) == 1:
-        return function(array) if dr.width(array) == 1 else array
+        return function(cast(Float, array)) if dr.width(array) == 1 else array
     return type(array)(*(_map_numbers(array[i], function) for i in range(len(array))))

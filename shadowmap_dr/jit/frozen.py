@@ -1,47 +1,48 @@
-"""Recording functions of records with ``dr.freeze``, safe from what Dr.Jit 1.5 makes of records.
+"""Frozen functions (``dr.freeze``) of records, without two faults of Dr.Jit 1.5 in its handling of records.
 
 Dr.Jit asks Python for the fields of dataclasses while it holds its own lock. Another thread that holds Python's lock and waits
-for Dr.Jit's, if only to drop an array, would wait forever. And Dr.Jit does not see which of its earlier inputs an input is, if it
-is one of them (``docs/dr-jit-faults/aliases.py``): small numbers and ``True`` often are. So it gets a text, which says all of
-this, and a plain list of arrays and of Mitsuba's objects.
+for Dr.Jit's lock, if only to drop an array, would wait forever. And if an input is the same object as an earlier one, a recording
+ignores which one (``docs/dr-jit-faults/aliases.py``): small numbers and ``True`` often are. So ``dr.freeze`` is given a text that
+describes the structure, and a plain list of arrays and of Mitsuba's objects.
 """
 
 from __future__ import annotations
 
 import enum
-import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import drjit as dr
 
 from .gc import gc_paused
-from .pytree import fields_of, tree_map
+from .pytree import cached_by_type, fields_of, tree_map
+from .types import AnyArray, PyTree
 
 _PLAIN = (int, float, complex, str, bytes, type(None), enum.Enum, type)
 
 
 class Frozen:
-    """A function of records, recorded once for all that differ in the numbers of their arrays alone.
+    """A function of records, recorded once for all arguments that differ only in the contents of their arrays.
 
-    What it returns are records, too. It may attach gradients to its arguments, but what it stores in their attributes is stored
-    when it is recorded and not when it is replayed.
+    The function returns records, too. It may attach gradients to its arguments. Values that it stores in their attributes are
+    stored when it is recorded, but not when it is replayed.
     """
 
-    def __init__(self, function: Callable[..., Any]) -> None:
+    def __init__(self, function: Callable[..., PyTree]) -> None:
         call = _Call(function)
 
-        def recorded(key: str, leaves: list[Any]) -> Any:
+        def recorded(key: str, leaves: list[PyTree]) -> tuple[str, list[AnyArray]]:
             return call.run()
 
-        self._call, self._recorded = call, dr.freeze(recorded)
+        # Any: the stub of `dr.freeze` hides the attribute `n_recordings`.
+        self._call, self._recorded = call, cast(Any, dr.freeze(recorded))
 
-    def __call__(self, *arguments: Any) -> Any:
+    def __call__(self, *arguments: PyTree) -> PyTree:
         call = self._call
         call.arguments = arguments
         try:
             key, leaves = take_apart(arguments)
-            # An array that is yet to be worked out would be another input than the same one later.
+            # Dr.Jit distinguishes evaluated and unevaluated inputs, and would record once for each.
             dr.eval([leaf for leaf in leaves if dr.is_array_v(leaf)])
             with gc_paused():
                 number, arrays = self._recorded(key, leaves)
@@ -57,27 +58,33 @@ class Frozen:
 
 
 class _Call:
-    """Inputs of a recording beside its arrays: the arguments and ``results``, as records."""
+    """Records beside the arrays of a recording: the current arguments, and the ``results`` of all recordings."""
 
-    def __init__(self, function: Callable[..., Any]) -> None:
+    def __init__(self, function: Callable[..., PyTree]) -> None:
         self.function = function
-        self.arguments: tuple[Any, ...] = ()
-        self.results: list[Any] = []
+        self.arguments: tuple[PyTree, ...] = ()
+        self.results: list[PyTree] = []
 
-    def run(self) -> tuple[str, list[Any]]:
-        """Call the function. (Number of the result among all, its arrays)."""
-        result, arrays = self.function(*self.arguments), []
-        tree_map(result, lambda array: arrays.append(array) or array)
-        # Without its arrays, which would stay in memory.
+    def run(self) -> tuple[str, list[AnyArray]]:
+        """Call the function; returns (index of its result in ``results``, arrays of the result)."""
+        result = self.function(*self.arguments)
+        arrays: list[AnyArray] = []
+
+        def collect(array: AnyArray) -> AnyArray:
+            arrays.append(array)
+            return array
+
+        tree_map(result, collect)
+        # Empty arrays take the place of the result's own, which would stay in memory.
         self.results.append(tree_map(result, lambda array: type(array)()))
         return str(len(self.results) - 1), arrays
 
 
-def take_apart(record: Any) -> tuple[str, list[Any]]:
-    """(text that tells everything of a record but the contents of its leaves, leaves).
+def take_apart(record: PyTree) -> tuple[str, list[PyTree]]:
+    """(text that describes everything in a record but the contents of its leaves, leaves).
 
-    Leaves are Dr.Jit's arrays and records, Mitsuba's objects, and whatever else no text describes. The text also says which
-    leaves are the same one. Objects with a method ``recording_text`` give their own text.
+    Leaves are Dr.Jit's arrays and records, Mitsuba's objects, and all other objects that no text describes. The text also says
+    which leaves are the same object. Objects with a method ``recording_text`` give their own text.
     """
     taken = _Taken()
     taken.walk(record)
@@ -89,10 +96,10 @@ class _Taken:
 
     def __init__(self) -> None:
         self.texts: list[str] = []
-        self.leaves: list[Any] = []
+        self.leaves: list[PyTree] = []
         self._numbers: dict[int, int] = {}
 
-    def walk(self, value: Any) -> None:
+    def walk(self, value: PyTree) -> None:
         kind = type(value)
         names = _parts_of(kind)
         if names is None:
@@ -119,9 +126,9 @@ class _Taken:
                 self.leaves.append(value)
 
 
-@functools.cache
+@cached_by_type
 def _parts_of(kind: type) -> tuple[str, ...] | None:
-    """Names of the fields of a dataclass, no names for other types, None for those whose ``repr`` tells everything."""
+    """Names of the fields of a dataclass, an empty tuple for other types, None for types whose ``repr`` is complete."""
     if issubclass(kind, _PLAIN):
         return None
     return () if hasattr(kind, "recording_text") else fields_of(kind) or ()

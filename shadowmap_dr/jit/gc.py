@@ -1,4 +1,4 @@
-"""Keeping Python's garbage collector away from what it disturbs."""
+"""Pauses of Python's garbage collector."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from contextlib import contextmanager
 
 @contextmanager
 def gc_paused() -> Iterator[None]:
-    """No garbage collection within.
+    """Pause garbage collection within the block.
 
-    Scenes that are freed while Dr.Jit records a function end the process, and those freed between two calls make it record anew.
+    A scene that is freed while Dr.Jit records a function ends the process. One freed between two calls causes a new recording.
     """
     enabled = gc.isenabled()
     gc.disable()
@@ -24,7 +24,7 @@ def gc_paused() -> Iterator[None]:
 
 @contextmanager
 def gc_quiet() -> Iterator[None]:
-    """No garbage collection within: a pause would be timed, and freeing scenes makes frozen functions record anew."""
+    """Collect garbage now, not within the block: collection would be timed, and freed scenes cause new recordings."""
     gc.collect()
     with gc_paused():
         yield

@@ -1,4 +1,4 @@
-"""Letting go of kernels: those of an image depend on its size, and Dr.Jit keeps all of them for as long as the process lives."""
+"""A limit on cached kernels: each image size has kernels of its own, and Dr.Jit keeps all of them until the process ends."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from collections.abc import Hashable
 
 import drjit as dr
 
-# A size has about 1 MiB of kernels. Loops over this many sizes keep all of theirs.
+# A size has about 1 MiB of kernels. A loop over at most this many sizes keeps all of its kernels.
 _MOST_SIZES = 64
 
 _sizes: set[Hashable] = set()
 
 
 def note_size(size: Hashable) -> None:
-    """Note that an image of some size is about to be rendered; let all kernels go where there have been many sizes.
+    """Note that an image of some size is about to be rendered; flush Dr.Jit's kernel cache after many sizes.
 
-    Kernels that are needed again come from Dr.Jit's files; recordings find theirs again. Nothing is let go while a function is
+    Dr.Jit loads flushed kernels again from its files, also for frozen functions. The cache is not flushed while a function is
     recorded, or while there are other Python threads: one of them may be running a kernel.
 
     Args:
-        size: tells apart images that need kernels of their own.
+        size: key that differs between images with different kernels.
     """
     if dr.flag(dr.JitFlag.FreezingScope):
         return

@@ -1,4 +1,4 @@
-"""Taking trees of records apart into arrays, and putting them together again with others."""
+"""Trees of records as lists of arrays, and copies of trees with other arrays."""
 
 from __future__ import annotations
 
@@ -6,17 +6,21 @@ import dataclasses
 import functools
 from collections.abc import Callable
 from itertools import count
-from typing import Any
+from typing import TypeVar
 
 import drjit as dr
 import mitsuba as mi
 
+from .types import AnyArray, PyTree
 
-def tree_map(value: Any, function: Callable[[Any], Any]) -> Any:
+ResultT = TypeVar("ResultT")
+
+
+def tree_map(value: PyTree, function: Callable[[AnyArray], AnyArray]) -> PyTree:
     """A copy of a tree with ``function`` applied to all Dr.Jit arrays in it, in a fixed order.
 
-    Trees are made of dataclasses, tuples, lists, dictionaries, transformations and Mitsuba's records; other things in them, and
-    parts of which no array has changed, stay the very same objects.
+    Trees are made of dataclasses, tuples, lists, dictionaries, transformations and Mitsuba's records. Other objects, and records
+    whose arrays are all unchanged, are shared with the copy.
     """
     if dr.is_array_v(value):
         return function(value)
@@ -44,22 +48,27 @@ def tree_map(value: Any, function: Callable[[Any], Any]) -> Any:
     return changed
 
 
-@functools.cache
+def cached_by_type(function: Callable[[type], ResultT]) -> Callable[[type], ResultT]:
+    """``functools.cache`` for functions of a class; mypy does not take a class for hashable."""
+    return functools.cache(function)
+
+
+@cached_by_type
 def fields_of(kind: type) -> tuple[str, ...] | None:
-    """Names of the fields of a dataclass, None for other classes. Asked for again and again, at every step of an optimisation."""
+    """Names of the fields of a dataclass, None for other classes. Cached, for every optimisation step asks for them."""
     return tuple(field.name for field in dataclasses.fields(kind)) if dataclasses.is_dataclass(kind) else None
 
 
-def attached_arrays(record: Any) -> list[Any]:
-    """The arrays of a tree through which gradients flow, in a fixed order."""
+def attached_arrays(record: PyTree) -> list[AnyArray]:
+    """The attached arrays of a tree, in the order of :func:`tree_map`."""
     return attached_places(record)[1]
 
 
-def attached_places(record: Any) -> tuple[tuple[int, ...], list[Any]]:
-    """(where :func:`tree_map` comes to arrays through which gradients flow, counted from 0, and these arrays)."""
+def attached_places(record: PyTree) -> tuple[tuple[int, ...], list[AnyArray]]:
+    """(positions of the attached arrays in the order of :func:`tree_map`, counted from 0; these arrays)."""
     places, found, place = [], [], count()
 
-    def collect(array: Any) -> Any:
+    def collect(array: AnyArray) -> AnyArray:
         here = next(place)
         if _attached(array):
             places.append(here)
@@ -70,17 +79,17 @@ def attached_places(record: Any) -> tuple[tuple[int, ...], list[Any]]:
     return tuple(places), found
 
 
-def with_arrays(record: Any, arrays: list[Any]) -> Any:
-    """The same tree with others in the place of :func:`attached_arrays`."""
+def with_arrays(record: PyTree, arrays: list[AnyArray]) -> PyTree:
+    """A copy of a tree with ``arrays`` in the place of its :func:`attached_arrays`."""
     position = iter(arrays)
     return tree_map(record, lambda array: next(position) if _attached(array) else array)
 
 
-def with_places(record: Any, places: tuple[int, ...], arrays: list[Any]) -> Any:
-    """The same tree with others in the place of arrays of :func:`attached_places`, which need not be attached."""
+def with_places(record: PyTree, places: tuple[int, ...], arrays: list[AnyArray]) -> PyTree:
+    """A copy of a tree with ``arrays`` at positions ``places`` (:func:`attached_places`), which need not be attached here."""
     wanted, place = dict(zip(places, arrays, strict=True)), count()
     return tree_map(record, lambda array: wanted.get(next(place), array))
 
 
-def _attached(array: Any) -> bool:
+def _attached(array: AnyArray) -> bool:
     return dr.is_float_v(array) and dr.grad_enabled(array)

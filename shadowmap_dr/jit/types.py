@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     Texture2f: TypeAlias = ad.Texture2f
 else:
 
-    def __getattr__(name: str) -> Any:
+    def __getattr__(name: str) -> Any:  # Any: all names at run time
         if name.startswith("_"):
             raise AttributeError(name)
         return Any

@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import cast
 
 import drjit as dr
 
 from .arrays import backend
+from .types import Float, UInt32, Vector3f
 
 
-def unit(vector: Any) -> Any:
-    """A vector (``Array3f`` or the like, any length but 0) made unit, attached. Its components' squares may be out of range."""
+def unit(vector: Vector3f) -> Vector3f:
+    """Unit vector along a vector that is not 0, even where squares of its components overflow or underflow. Attached."""
     largest = dr.max(dr.abs(dr.detach(vector)))
-    # The power of two that makes it about 1, made of the exponent's bits: multiplying by it changes no digit.
+    # Scale by the power of two that brings the largest component near 1: this rounds nothing.
     module = backend(largest)
-    exponent = dr.minimum(dr.reinterpret_array(module.UInt32, largest) & 0x7F800000, 0x7E800000)
-    scale = dr.reinterpret_array(module.Float, 0x7F000000 - exponent)
+    exponent = dr.minimum(cast(UInt32, dr.reinterpret_array(module.UInt32, largest)) & 0x7F800000, 0x7E800000)
+    scale = cast(Float, dr.reinterpret_array(module.Float, 0x7F000000 - exponent))
     return dr.normalize(vector * scale)
 
 
-def normalize_or(vector: Any, fallback: Any) -> Any:
-    """Unit vector, or ``fallback`` where the vector is zero. Neither its value nor its gradient is ever NaN there."""
+def normalize_or(vector: Vector3f, fallback: Vector3f) -> Vector3f:
+    """Unit vector, or ``fallback`` where the vector is zero. Neither value nor gradient is NaN there. Attached to both."""
     squared = dr.squared_norm(vector)
     valid = squared > 0
     return dr.select(valid, vector * dr.rsqrt(dr.select(valid, squared, 1.0)), fallback)

@@ -15,7 +15,7 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
-from .types import AnyArray, ArrayT
+from .types import AnyArray, ArrayT, Bool, Float, UInt32
 
 # Waiting for Dr.Jit to read an array takes less time than a copy of this size.
 _MANY_BYTES = 1 << 20
@@ -46,6 +46,29 @@ def own_memory(array: ArrayT) -> ArrayT:
     copy = flat | dr.opaque(kind, False) if dr.is_mask_v(flat) else flat + dr.opaque(kind, 0)
     dr.eval(copy)
     return copy
+
+
+# Dr.Jit's own functions, with the types that its stubs lack.
+
+
+def ravel(array: AnyArray) -> Float:
+    """``dr.ravel`` of floating-point arrays: components interleaved, C order. Attached."""
+    return cast("Float", dr.ravel(array))
+
+
+def replace_grad(value: ArrayT, source: ArrayT) -> ArrayT:
+    """``dr.replace_grad``: the numbers of ``value`` with the derivatives of ``source``."""
+    return cast(Callable[[ArrayT, ArrayT], ArrayT], dr.replace_grad)(value, source)
+
+
+def reinterpret(kind: type[ArrayT], array: AnyArray) -> ArrayT:
+    """``dr.reinterpret_array``: the bits of an array as another type of the same size. Detached."""
+    return cast(ArrayT, dr.reinterpret_array(cast("type[AnyArray]", kind), array))
+
+
+def scatter_inc(target: UInt32, index: UInt32, active: Bool | bool = True) -> UInt32:
+    """``dr.scatter_inc``: increment ``target[index]`` atomically; returns its values before."""
+    return cast("UInt32", dr.scatter_inc(target, index, active))
 
 
 def backend(array: AnyArray) -> ModuleType:

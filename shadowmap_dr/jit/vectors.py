@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import cast
-
 import drjit as dr
 
-from .arrays import backend
-from .types import Float, UInt32, Vector3f
+from .arrays import backend, reinterpret
+from .types import Vector3f
 
 
 def unit(vector: Vector3f) -> Vector3f:
@@ -15,8 +13,8 @@ def unit(vector: Vector3f) -> Vector3f:
     largest = dr.max(dr.abs(dr.detach(vector)))
     # Scale by the power of two that brings the largest component near 1: this rounds nothing.
     module = backend(largest)
-    exponent = dr.minimum(cast(UInt32, dr.reinterpret_array(module.UInt32, largest)) & 0x7F800000, 0x7E800000)
-    scale = cast(Float, dr.reinterpret_array(module.Float, 0x7F000000 - exponent))
+    exponent = dr.minimum(reinterpret(module.UInt32, largest) & 0x7F800000, 0x7E800000)
+    scale = reinterpret(module.Float, 0x7F000000 - exponent)
     return dr.normalize(vector * scale)
 
 

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 
 from ..jit.arrays import backend
+from ..jit.types import Bool, Float, UInt32, Vector4f
 from .screen_planes import offset, pixels, planes
 from .types import NO_TRIANGLE, RasterOutput, by_image
 
@@ -14,7 +13,7 @@ from .types import NO_TRIANGLE, RasterOutput, by_image
 _STRIP = 4
 
 
-def pixel_barycentrics(raster: RasterOutput, positions: Any, faces: Any) -> tuple[Any, Any, Any]:
+def pixel_barycentrics(raster: RasterOutput, positions: Float, faces: UInt32) -> tuple[Float, Float, Float]:
     """Perspective-correct (u, v), 0 where nothing is seen, and NDC depth, 1 there, of each pixel's centre. Detached."""
     with dr.suspend_grad():
         depths, weights = planes(dr.detach(positions), faces, raster, True)
@@ -22,7 +21,7 @@ def pixel_barycentrics(raster: RasterOutput, positions: Any, faces: Any) -> tupl
         return _strips(raster, depths, weights) if raster.width % _STRIP == 0 else _each(raster, depths, weights)
 
 
-def _each(raster: RasterOutput, depths: Any, weights: Any) -> tuple[Any, Any, Any]:
+def _each(raster: RasterOutput, depths: Float, weights: tuple[Float, ...]) -> tuple[Float, Float, Float]:
     """One pixel a lane."""
     index, row, column = pixels(raster)
     hit = raster.valid
@@ -30,12 +29,11 @@ def _each(raster: RasterOutput, depths: Any, weights: Any) -> tuple[Any, Any, An
     return dr.select(hit, u, 0), dr.select(hit, v, 0), dr.select(hit, depth, 1)
 
 
-def _strips(raster: RasterOutput, depths: Any, weights: Any) -> tuple[Any, Any, Any]:
+def _strips(raster: RasterOutput, depths: Float, weights: tuple[Float, ...]) -> tuple[Float, Float, Float]:
     """Four pixels of a row a lane: mostly they see the same triangle, whose look-up they share."""
     module = backend(depths)
-    Float, UInt32 = module.Float, module.UInt32
     count = dr.width(raster.triangle)
-    lane = dr.arange(UInt32, count // _STRIP)
+    lane = dr.arange(module.UInt32, count // _STRIP)
     line = lane * _STRIP // raster.width
     column = lane * _STRIP - line * raster.width
     image, row = by_image(line, raster.height, raster.batch)
@@ -45,7 +43,7 @@ def _strips(raster: RasterOutput, depths: Any, weights: Any) -> tuple[Any, Any, 
     records = _look_up(base + shared, shared != NO_TRIANGLE, depths, weights)
     x, y = offset(records[0], row, column)
 
-    def other(index: Any, row: Any, column: Any, *_: Any) -> tuple[Any, ...]:
+    def other(index: UInt32, row: UInt32, column: UInt32, *_: Float) -> tuple[Float, ...]:
         return _at_pixel(index, row, column, True, depths, weights)
 
     values = []
@@ -59,26 +57,30 @@ def _strips(raster: RasterOutput, depths: Any, weights: Any) -> tuple[Any, Any, 
             mode="symbolic",
         )
         values.append((dr.select(hit, u, 0), dr.select(hit, v, 0), dr.select(hit, depth, 1)))
-    results = tuple(dr.empty(Float, count) for _ in range(3))
+    results = tuple(dr.empty(module.Float, count) for _ in range(3))
     for result, of_pixels in zip(results, zip(*values, strict=True), strict=True):
         dr.scatter(result, module.Array4f(*of_pixels), lane)
     dr.eval(results)
     return results
 
 
-def _at_pixel(index: Any, row: Any, column: Any, active: Any, depths: Any, weights: Any) -> tuple[Any, Any, Any]:
+def _at_pixel(
+    index: UInt32, row: UInt32, column: UInt32, active: Bool | bool, depths: Float, weights: tuple[Float, ...]
+) -> tuple[Float, Float, Float]:
     records = _look_up(index, active, depths, weights)
     return _evaluate(records, *offset(records[0], row, column))
 
 
-def _look_up(index: Any, active: Any, depths: Any, weights: Any) -> tuple[Any, Any, Any, Any]:
+def _look_up(
+    index: UInt32, active: Bool | bool, depths: Float, weights: tuple[Float, ...]
+) -> tuple[Vector4f, Vector4f, Vector4f, Float]:
     """Values of `planes` for a triangle: depth; barycentrics of vertices 1 and 2 divided by w; 1 / w at the pixel."""
     module = backend(depths)
     depth, one, two = (dr.gather(module.Array4f, flat, index, active) for flat in (depths, *weights[:2]))
     return depth, one, two, dr.gather(module.Float, weights[2], index, active)
 
 
-def _evaluate(records: tuple[Any, Any, Any, Any], x: Any, y: Any) -> tuple[Any, Any, Any]:
+def _evaluate(records: tuple[Vector4f, Vector4f, Vector4f, Float], x: Float, y: Float) -> tuple[Float, Float, Float]:
     """(u, v, depth) so many columns and rows from the pixel that a triangle's functions refer to."""
     depth, one, two, at_pixel = records
     inverse_w = dr.fma(one.w, x, dr.fma(two.w, y, at_pixel))

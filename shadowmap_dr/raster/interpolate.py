@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import cast
 
 import drjit as dr
 
-from ..jit.arrays import backend
+from ..jit.arrays import backend, ravel
+from ..jit.types import TensorXf, TensorXu, UInt32
 from .types import RasterOutput, check_range, pixel_coordinates
 
 
-def interpolate(attributes: Any, raster: RasterOutput, faces: Any, *, check_indices: bool = True) -> Any:
+def interpolate(attributes: TensorXf, raster: RasterOutput, faces: TensorXu | UInt32, *, check_indices: bool = True) -> TensorXf:
     """Interpolate vertex attributes over the visible triangles, perspective-correct.
 
     Args:
@@ -34,7 +35,7 @@ def interpolate(attributes: Any, raster: RasterOutput, faces: Any, *, check_indi
     if len(shape) == 3 and shape[0] != raster.batch:
         raise ValueError(f"attributes of shape {shape} do not fit {raster.batch} image(s)")
     module = backend(attributes)
-    face_indices = faces.array if dr.is_tensor_v(faces) else faces
+    face_indices = cast("UInt32", faces.array if dr.is_tensor_v(faces) else faces)
     if dr.width(face_indices) != 3 * raster.face_count:
         raise ValueError(f"faces hold {dr.width(face_indices)} indices, but {raster.face_count} triangles were rasterized")
     if check_indices:
@@ -53,6 +54,6 @@ def interpolate(attributes: Any, raster: RasterOutput, faces: Any, *, check_indi
             total = dr.fma(weights[k], value, total)
         totals.append(dr.select(hit, total, 0))
     # At once: scattered one by one, each channel would be a kernel of its own.
-    result = totals[0] if channels == 1 else dr.ravel(module.ArrayXf(totals))
+    result = totals[0] if channels == 1 else ravel(module.ArrayXf(totals))
     size = (raster.height, raster.width, channels)
     return type(attributes)(result, shape=size if raster.batch == 1 else (raster.batch, *size))

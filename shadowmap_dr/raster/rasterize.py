@@ -6,16 +6,17 @@ from collections.abc import Callable
 from dataclasses import replace
 from operator import index
 from types import ModuleType
-from typing import Any
+from typing import Any, cast
 
 import drjit as dr
 
-from ..jit.arrays import backend
+from ..jit.arrays import backend, ravel, replace_grad
+from ..jit.types import Bool, Float, Float64, TensorXf, TensorXu, UInt32, UInt64, Vector4f
 from .barycentrics import pixel_barycentrics
 from .small_triangles import EMPTY, draw
 from .tile_lists import STRIP, Strips, TileGrid, TileLists, build_tile_lists, nearest_covers, strips
-from .triangle_setup import centred, covers, edge_lines, fragment_key, gather_triangle, set_up
-from .types import MAX_RESOLUTION, NO_TRIANGLE, RasterOutput, by_image, check_range, pixel_coordinates
+from .triangle_setup import Line, centred, covers, edge_lines, fragment_key, gather_triangle, set_up
+from .types import MAX_RESOLUTION, NO_TRIANGLE, RasterOutput, Records, by_image, check_range, pixel_coordinates
 
 #: A triangle that covers more pixels than this, and is not thin, goes through the lists of tiles.
 _LARGE = 512
@@ -24,13 +25,13 @@ _MANY = 1 << 20
 
 
 def rasterize(
-    positions: Any,
-    faces: Any,
+    positions: TensorXf | Float,
+    faces: TensorXu | UInt32,
     resolution: tuple[int, int],
     *,
     batch: int | None = None,
     check_indices: bool = True,
-    transparent: Callable[[RasterOutput], Any] | None = None,
+    transparent: Callable[[RasterOutput], Bool] | None = None,
     layers: int = 4,
 ) -> RasterOutput:
     """Rasterize one or several images of the same triangles.
@@ -64,22 +65,21 @@ def rasterize(
     """
     flat, face_indices, batch, _ = check_mesh(positions, faces, batch, check_indices)
     located = visible_triangles(flat, face_indices, resolution, batch=batch, transparent=transparent, layers=layers)
-    values = pixel_barycentrics(located, flat, face_indices)
+    u, v, depth = pixel_barycentrics(located, flat, face_indices)
     if dr.grad_enabled(flat):
-        values = [dr.replace_grad(value, old) for value, old in zip(values, (located.u, located.v, located.depth), strict=True)]
-    u, v, depth = values
+        u, v, depth = (replace_grad(a, b) for a, b in ((u, located.u), (v, located.v), (depth, located.depth)))
     return replace(located, u=u, v=v, depth=depth)
 
 
 def visible_triangles(
-    positions: Any,
-    faces: Any,
+    positions: TensorXf | Float,
+    faces: TensorXu | UInt32,
     resolution: tuple[int, int],
     *,
     batch: int | None = None,
-    transparent: Callable[[RasterOutput], Any] | None = None,
+    transparent: Callable[[RasterOutput], Bool] | None = None,
     layers: int = 4,
-    one_sided: Any = None,
+    one_sided: Bool | None = None,
 ) -> RasterOutput:
     """As :func:`rasterize`, for positions and faces known to be valid, without the cost of barycentrics and depths.
 
@@ -104,11 +104,13 @@ def check_resolution(resolution: tuple[int, int]) -> tuple[int, int]:
     return height, width
 
 
-def check_mesh(positions: Any, faces: Any, batch: int | None, check_indices: bool) -> tuple[Any, Any, int, int]:
+def check_mesh(
+    positions: TensorXf | Float, faces: TensorXu | UInt32, batch: int | None, check_indices: bool
+) -> tuple[Float, UInt32, int, int]:
     """Validate and flatten vertices and faces; returns (flat positions, flat faces, batch, vertices per image)."""
     for name, array in (("positions", positions), ("faces", faces)):
-        flat = dr.is_jit_v(array) and (dr.is_tensor_v(array) or dr.depth_v(array) == 1)
-        fits = flat and (dr.type_v(array) == dr.VarType.Float32 if name == "positions" else dr.is_integral_v(array))
+        is_flat = dr.is_jit_v(array) and (dr.is_tensor_v(array) or dr.depth_v(array) == 1)
+        fits = is_flat and (dr.type_v(array) == dr.VarType.Float32 if name == "positions" else dr.is_integral_v(array))
         if not fits:
             wanted = "single-precision" if name == "positions" else "integer"
             raise ValueError(f"{name} are of type {type(array).__name__}; expected a Dr.Jit tensor or flat array, {wanted}")
@@ -121,7 +123,7 @@ def check_mesh(positions: Any, faces: Any, batch: int | None, check_indices: boo
             raise ValueError(f"batch={batch} contradicts positions of shape {shape}")
         batch, flat = images, positions.array
     else:
-        flat, batch = positions, 1 if batch is None else batch
+        flat, batch = cast("Float", positions), 1 if batch is None else batch
         if batch < 1:
             raise ValueError(f"batch is {batch}; give 1 or more images")
     if dr.is_tensor_v(faces):
@@ -133,15 +135,15 @@ def check_mesh(positions: Any, faces: Any, batch: int | None, check_indices: boo
         raise ValueError(f"positions hold {count} numbers, which is not {batch} image(s) of one or more 4-component vertices")
     if dr.width(faces) == 0 or dr.width(faces) % 3 != 0:
         raise ValueError(f"faces hold {dr.width(faces)} indices, which is not one or more triangles")
-    faces = backend(flat).UInt32(faces)
+    indices: UInt32 = backend(flat).UInt32(faces)
     vertex_count = count // (4 * batch)
     if check_indices:
-        check_range(faces, vertex_count, "vertex")
-    return flat, faces, batch, vertex_count
+        check_range(indices, vertex_count, "vertex")
+    return flat, indices, batch, vertex_count
 
 
 def _locate(
-    positions: Any, faces: Any, triangle: Any, records: Any, batch: int, vertex_count: int, height: int, width: int
+    positions: Float, faces: UInt32, triangle: UInt32, records: Records, batch: int, vertex_count: int, height: int, width: int
 ) -> RasterOutput:
     """Perspective-correct barycentrics and depth of each pixel centre on its (given) triangle, attached to ``positions``.
 
@@ -154,7 +156,7 @@ def _locate(
     hit = triangle != NO_TRIANGLE
     p0, p1, p2 = gather_triangle(positions, faces, triangle, image * vertex_count, hit)
 
-    def shear(p: Any) -> tuple[Any, Any]:
+    def shear(p: Vector4f) -> tuple[Float, Float]:
         return dr.fma(-p.w, x_rest, dr.fma(-p.w, x, p.x)), dr.fma(-p.w, y_rest, dr.fma(-p.w, y, p.y))
 
     (x0, y0), (x1, y1), (x2, y2) = shear(p0), shear(p1), shear(p2)
@@ -180,14 +182,14 @@ def _locate(
     )
 
 
-def cross2(ax: Any, ay: Any, bx: Any, by: Any) -> Any:
+def cross2(ax: Float, ay: Float, bx: Float, by: Float) -> Float:
     """``ax * by - ay * bx`` without cancellation error (Kahan's compensated difference of products)."""
     product = ay * bx
     rounding = dr.detach(dr.fma(-ay, bx, product))
     return dr.fma(ax, by, -product) + rounding
 
 
-def _exact_ndc(module: Any, index: Any, size: int) -> tuple[Any, Any]:
+def _exact_ndc(module: ModuleType, index: UInt32, size: int) -> tuple[Float, Float]:
     """NDC coordinate of a pixel centre as a sum of two floats: on steep triangles, half an ulp of it shows in the depth."""
     numerator = dr.fma(module.Float(index), 2.0, 1.0 - size)
     ndc = numerator / size
@@ -195,16 +197,16 @@ def _exact_ndc(module: Any, index: Any, size: int) -> tuple[Any, Any]:
 
 
 def _visible_triangles(
-    positions: Any,
-    faces: Any,
+    positions: Float,
+    faces: UInt32,
     batch: int,
     vertex_count: int,
     height: int,
     width: int,
-    transparent: Callable[[RasterOutput], Any] | None,
+    transparent: Callable[[RasterOutput], Bool] | None,
     layers: int,
-    one_sided: Any = None,
-) -> tuple[Any, Any]:
+    one_sided: Bool | None = None,
+) -> tuple[UInt32, Records]:
     """Triangle index of each pixel, row-major, and the records of all triangles."""
     mesh = (positions, faces, batch, vertex_count, height, width)
     if transparent is None:
@@ -221,22 +223,22 @@ def _visible_triangles(
     return _triangle_of(keys), records
 
 
-def _triangle_of(keys: Any) -> Any:
+def _triangle_of(keys: UInt64) -> UInt32:
     """Triangle index of fragment keys: that of an empty one is ``NO_TRIANGLE``."""
     return backend(keys).UInt32(keys)
 
 
 def _nearest_fragments(
-    positions: Any,
-    faces: Any,
+    positions: Float,
+    faces: UInt32,
     batch: int,
     vertex_count: int,
     height: int,
     width: int,
-    behind: Any = None,
+    behind: UInt64 | None = None,
     peel: bool = False,
-    one_sided: Any = None,
-) -> tuple[Any, Any]:
+    one_sided: Bool | None = None,
+) -> tuple[Any, Records]:
     """Triangle of each pixel, row-major, and the edge functions and depth planes of all triangles (see ``Triangles``).
 
     Args:
@@ -245,17 +247,17 @@ def _nearest_fragments(
         one_sided: see :func:`visible_triangles`.
     """
     module = backend(positions)
-    UInt32, UInt64 = module.UInt32, module.UInt64
+    UInt64 = module.UInt64
     face_count = dr.width(faces) // 3
     grid = TileGrid(batch, height, width)
     # The keys of a tile lie side by side: what is near in the image is near in memory, in both directions.
     tiled = not peel and height * width > _LARGE
     keys = _empty_keys(module, grid.pixel_count if tiled else batch * height * width)
-    index = dr.arange(UInt32, batch * face_count)
+    index = dr.arange(module.UInt32, batch * face_count)
     image, triangle = by_image(index, face_count, batch)
     triangles = set_up(gather_triangle(positions, faces, triangle, image * vertex_count, True), height, width)
     # Not one array: Dr.Jit would write its parts in kernels of their own.
-    records = tuple(dr.ravel(coefficients) for coefficients in (triangles.a, triangles.b, triangles.c))
+    records = ravel(triangles.a), ravel(triangles.b), ravel(triangles.c)
 
     x0, y0, x1, y1 = triangles.box
     sides = module.Float(x1 - x0 + (y1 - y0) + 2)
@@ -265,7 +267,7 @@ def _nearest_fragments(
         triangles = replace(triangles, active=triangles.active & ((det < 0) | ~culled))
     small = triangles.active & ((triangles.fragments <= _LARGE) | (triangles.fragments <= 5 * sides))
 
-    def pixel_index(row: Any, column: Any) -> Any:
+    def pixel_index(row: UInt32, column: UInt32) -> UInt32:
         return grid.pixel(image, row, column) if tiled else (image * height + row) * width + column
 
     draw(triangles, keys, behind, pixel_index, triangle, triangles.box, small)
@@ -275,10 +277,10 @@ def _nearest_fragments(
 
     large = triangles.active & ~small
     nearest = nearest_covers(grid, triangles, image, large) if not peel else None
-    first, last = (UInt32(x) | (UInt32(y) << 16) for x, y in ((x0, y0), (x1, y1)))
+    first, last = (module.UInt32(x) | (module.UInt32(y) << 16) for x, y in ((x0, y0), (x1, y1)))
     dr.eval(records, keys, nearest, large, first, last)
 
-    def exact_lines(index: Any) -> Any:
+    def exact_lines(index: UInt32) -> tuple[list[Line], Float64]:
         image, triangle = by_image(index, face_count, batch)
         return edge_lines(gather_triangle(positions, faces, triangle, image * vertex_count, True))
 
@@ -286,12 +288,12 @@ def _nearest_fragments(
     box = tuple(module.Int32(corner) for corner in (first & 0xFFFF, first >> 16, last & 0xFFFF, last >> 16))
     again = replace(triangles, a=a, b=b, c=c, box=box, exact=lambda: exact_lines(index))
     lists = build_tile_lists(grid, again, index, image, triangle, large, nearest, keys, behind, pixel_index)
-    strip, kind = strips(grid, module), UInt64 if peel else UInt32
+    strip, kind = strips(grid, module), UInt64 if peel else module.UInt32
     merged = _merge_large(lists, strip, strip.gather(keys, tiled), behind, records, exact_lines, face_count, kind)
     return merged, records
 
 
-def _empty_keys(module: ModuleType, count: int) -> Any:
+def _empty_keys(module: ModuleType, count: int) -> UInt64:
     if count < _MANY:
         keys = dr.full(module.UInt64, EMPTY, count)
     else:
@@ -304,13 +306,13 @@ def _empty_keys(module: ModuleType, count: int) -> Any:
 def _merge_large(
     lists: TileLists,
     strip: Strips,
-    best: list[Any],
-    behind: Any,
-    records: Any,
-    exact_lines: Callable[[Any], Any],
+    best: list[UInt64],
+    behind: UInt64 | None,
+    records: Records,
+    exact_lines: Callable[[UInt32], tuple[list[Line], Float64]],
     face_count: int,
-    kind: Any,
-) -> Any:
+    kind: Callable[[UInt64], UInt32 | UInt64],
+) -> UInt32 | UInt64:
     """The nearer of what small triangles left at each pixel and of the large ones in its tile's list.
 
     As keys or triangle indices, by the ``kind`` of the result: ``UInt64`` or ``UInt32``.

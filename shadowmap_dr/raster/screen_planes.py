@@ -6,12 +6,11 @@ derivatives of an image of depths may be summed up over the pixels of each trian
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 
-from ..jit.arrays import backend
-from .triangle_setup import edge_lines, gather_triangle
+from ..jit.arrays import backend, ravel, replace_grad
+from ..jit.types import Bool, Float, UInt32, Vector4f
+from .triangle_setup import Corners, edge_lines, gather_triangle
 from .types import MAX_RESOLUTION, RasterOutput, by_image, pixel_coordinates, precise_rcp
 
 # Smallest determinant (twice the area in NDC times all w) of a triangle that a pixel may see.
@@ -19,7 +18,9 @@ _LEAST = 1e-25
 _COLUMN_BITS = (MAX_RESOLUTION - 1).bit_length()
 
 
-def pixel_depth(raster: RasterOutput, positions: Any, faces: Any, reciprocal: Any = None) -> tuple[Any, Any, Any]:
+def pixel_depth(
+    raster: RasterOutput, positions: Float, faces: UInt32, reciprocal: Bool | None = None
+) -> tuple[Float, Float, Float]:
     """NDC depth of what each pixel sees (``Float``, 1 where it sees nothing), and its change by column and row.
 
     The depth is attached to ``positions``: the same as ``raster.depth`` up to rounding, in value and derivative, and several
@@ -37,7 +38,7 @@ def pixel_depth(raster: RasterOutput, positions: Any, faces: Any, reciprocal: An
     return depth_at(depths, *pixels(raster), raster.valid)
 
 
-def depth_at(depths: Any, index: Any, row: Any, column: Any, hit: Any) -> tuple[Any, Any, Any]:
+def depth_at(depths: Float, index: UInt32, row: UInt32, column: UInt32, hit: Bool) -> tuple[Float, Float, Float]:
     """Result of :func:`pixel_depth`, for any pixels.
 
     Args:
@@ -50,13 +51,13 @@ def depth_at(depths: Any, index: Any, row: Any, column: Any, hit: Any) -> tuple[
     return depth, dr.detach(plane.x), dr.detach(plane.y)
 
 
-def pixels(raster: RasterOutput) -> tuple[Any, Any, Any]:
+def pixels(raster: RasterOutput) -> tuple[UInt32, UInt32, UInt32]:
     """(number of the triangle through the batch, row, column) of each pixel."""
     image, row, column = pixel_coordinates(backend(raster.triangle), raster.batch, raster.height, raster.width)
     return image * raster.face_count + raster.triangle, row, column
 
 
-def offset(plane: Any, row: Any, column: Any) -> tuple[Any, Any]:
+def offset(plane: Vector4f, row: UInt32, column: UInt32) -> tuple[Float, Float]:
     """Pixels from the one that a triangle's functions refer to."""
     module = backend(plane)
     corner = module.UInt32(dr.detach(plane.w))
@@ -65,8 +66,8 @@ def offset(plane: Any, row: Any, column: Any) -> tuple[Any, Any]:
 
 
 def planes(
-    positions: Any, faces: Any, raster: RasterOutput, barycentrics: bool, reciprocal: Any = None
-) -> tuple[Any, tuple[Any, ...]]:
+    positions: Float, faces: UInt32, raster: RasterOutput, barycentrics: bool, reciprocal: Bool | None = None
+) -> tuple[Float, tuple[Float, ...]]:
     """Affine functions of the pixel for each triangle of each image: change by column, by row, and value at a pixel.
 
     That pixel lies near the triangle: far away from it, small triangles would lose their depth to rounding. ``reciprocal``: see
@@ -88,7 +89,7 @@ def planes(
         inverted = dr.gather(module.Bool, reciprocal, image)
         heights = [dr.select(inverted, 1, z) for z in heights]
     with dr.suspend_grad():
-        own = [dr.detach(p) for p in corners]
+        own = dr.detach(corners[0]), dr.detach(corners[1]), dr.detach(corners[2])
         lines, det = edge_lines(own)
         # Slivers that hardly are triangles would have infinite weights, and NaN derivatives where no pixel sees them.
         regular = dr.isfinite(det) & (dr.abs(det) > _LEAST)
@@ -111,19 +112,18 @@ def planes(
         # z = A x + B y + C w holds for all corners: what a corner's change violates, the plane's change makes up for.
         excess = [z - slopes[0] * p.x - slopes[1] * p.y - slopes[2] * p.w for p, z in zip(corners, heights, strict=True)]
         value = [
-            dr.replace_grad(v, sum(w * e for w, e in zip(row, excess, strict=True)))
-            for v, row in zip(value, weights, strict=True)
+            replace_grad(v, sum(w * e for w, e in zip(row, excess, strict=True))) for v, row in zip(value, weights, strict=True)
         ]
-    depths = dr.ravel(module.Array4f(*value, Float((near[1] << _COLUMN_BITS) | near[0])))
+    depths = ravel(module.Array4f(*value, Float((near[1] << _COLUMN_BITS) | near[0])))
     if not barycentrics:
         return depths, ()
     with dr.suspend_grad():
         inverse_w = [Float(sum(row)) for row in (change_x, change_y, there)]
         packets = [module.Array4f(*(row[k] for row in weights), inverse_w[k - 1]) for k in (1, 2)]
-        return depths, (*(dr.ravel(packet) for packet in packets), inverse_w[2])
+        return depths, (*(ravel(packet) for packet in packets), inverse_w[2])
 
 
-def _pixel_near(corners: list[Any], axis: int, size: int) -> Any:
+def _pixel_near(corners: Corners, axis: int, size: int) -> UInt32:
     """Column (axis 0) or row (1) of a pixel of the image close to the corners, ``UInt32``."""
     module = backend(corners[0])
     middle = module.Float(0)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import drjit as dr
 
 from ..jit.arrays import backend
+from ..jit.types import Point3f, UInt32
 from .topology import Topology
 from .types import NO_VERTEX
 
@@ -16,7 +16,7 @@ from .types import NO_VERTEX
 _ROUNDING, _SHORT = 1e-6, 1e-5
 
 
-def detach_moved_seams(topology: Topology, points: Any, shapes: Any, hidden: Sequence[int] = ()) -> Topology:
+def detach_moved_seams(topology: Topology, points: Point3f, shapes: UInt32, hidden: Sequence[int] = ()) -> Topology:
     """The topology of a mesh whose shapes may have moved since they bordered on each other.
 
     Args:

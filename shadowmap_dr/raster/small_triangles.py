@@ -7,12 +7,12 @@ with an atomic minimum over ``(depth, triangle)`` keys. Nothing is sorted and no
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import drjit as dr
 
 from ..jit.arrays import backend
-from .triangle_setup import Triangles, centred, covers, fragment_key, rounding_error
+from ..jit.types import Bool, Int32, UInt32, UInt64, Vector4f
+from .triangle_setup import Box, Triangles, centred, covers, fragment_key, rounding_error
 
 #: Key of a pixel that nothing covers.
 EMPTY = 0xFFFFFFFFFFFFFFFF
@@ -20,12 +20,12 @@ EMPTY = 0xFFFFFFFFFFFFFFFF
 
 def draw(
     triangles: Triangles,
-    keys: Any,
-    behind: Any,
-    pixel_index: Callable[[Any, Any], Any],
-    triangle: Any,
-    box: tuple[Any, Any, Any, Any],
-    active: Any,
+    keys: UInt64,
+    behind: UInt64 | None,
+    pixel_index: Callable[[UInt32, UInt32], UInt32],
+    triangle: UInt32,
+    box: Box,
+    active: Bool,
 ) -> None:
     """Merge the fragments of triangles within a box each into an image of keys.
 
@@ -39,14 +39,14 @@ def draw(
     """
     t = triangles
     module = backend(t.a)
-    Float, Int32, UInt32 = module.Float, module.Int32, module.UInt32
-    x0, y0, x1, y1 = (Int32(b) for b in box)
+    Float, UInt32 = module.Float, module.UInt32
+    x0, y0, x1, y1 = (module.Int32(b) for b in box)
     rounding = rounding_error(t.height, t.width)
     tiny = 1e-12
     slope = [dr.select(dr.abs(t.a[k]) < tiny, dr.select(t.a[k] < 0, Float(-tiny), Float(tiny)), t.a[k]) for k in range(3)]
     inverse = [dr.rcp(s) for s in slope]
 
-    def span(row: Any) -> tuple[Any, Any, Any]:
+    def span(row: Int32) -> tuple[Vector4f, Int32, Int32]:
         """Edge functions and depth in the middle of a row, and the columns between the edges, or a few more."""
         _, y = centred(module, row, 0, t.height, t.width)
         at_middle = dr.fma(t.b, y, t.c)
@@ -57,7 +57,7 @@ def draw(
             error = dr.fma(dr.abs(inverse[k]), rounding, 1e-3)
             low = dr.select(slope[k] > 0, dr.maximum(low, crossing - error), low)
             high = dr.select(slope[k] < 0, dr.minimum(high, crossing + error), high)
-        return at_middle, Int32(dr.ceil(dr.minimum(low, t.width))), Int32(dr.floor(dr.maximum(high, -1.0)))
+        return at_middle, module.Int32(dr.ceil(dr.minimum(low, t.width))), module.Int32(dr.floor(dr.maximum(high, -1.0)))
 
     def draw_pixel(row, column, end, at_middle):  # noqa: ANN001, ANN202
         x, _ = centred(module, 0, column, t.height, t.width)

@@ -6,16 +6,16 @@ at once. What a list has no room for is drawn fragment by fragment, so that no a
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import ModuleType
-from typing import Any
 
 import drjit as dr
 
-from ..jit.arrays import backend
+from ..jit.arrays import backend, scatter_inc
+from ..jit.types import Bool, UInt32, UInt64
 from .small_triangles import draw
-from .triangle_setup import Triangles, centred, depth_key, rounding_error
+from .triangle_setup import Box, Triangles, centred, depth_key, rounding_error
 from .types import by_image
 
 #: log2 of the side of a tile in pixels.
@@ -65,16 +65,16 @@ class TileGrid:
         """Of all tiles, what lies beyond the image included."""
         return self.count << (2 * TILE)
 
-    def pixel(self, image: Any, row: Any, column: Any) -> Any:
+    def pixel(self, image: UInt32, row: UInt32, column: UInt32) -> UInt32:
         """Number of a pixel where those of a tile follow each other, row by row."""
         within = ((row & ((1 << TILE) - 1)) << TILE) + (column & ((1 << TILE) - 1))
         return (self.tile(image, row >> TILE, column >> TILE) << (2 * TILE)) + within
 
-    def tile(self, image: Any, row: Any, column: Any) -> Any:
+    def tile(self, image: UInt32, row: UInt32, column: UInt32) -> UInt32:
         """Number of the tile in a row and column of tiles."""
         return (image * self.rows + row) * self.columns + column
 
-    def block(self, image: Any, row: Any, column: Any) -> Any:
+    def block(self, image: UInt32, row: UInt32, column: UInt32) -> UInt32:
         """Number of the block that holds that tile."""
         return (image * self._block_rows + row // BLOCK) * self._block_columns + column // BLOCK
 
@@ -88,8 +88,8 @@ class TileLists:
 
     grid: TileGrid
     capacity: int
-    count: Any
-    items: Any
+    count: UInt32
+    items: UInt32
 
 
 @dataclass(frozen=True)
@@ -100,16 +100,16 @@ class Strips:
     ``column`` is that of the first pixel, ``index`` its position in a flat row-major batch.
     """
 
-    image: Any
-    row: Any
-    column: Any
-    tile: Any
-    index: Any
+    image: UInt32
+    row: UInt32
+    column: UInt32
+    tile: UInt32
+    index: UInt32
     images: int
     height: int
     width: int
 
-    def gather(self, flat: Any, tiled: bool = False) -> list[Any]:
+    def gather(self, flat: UInt64, tiled: bool = False) -> list[UInt64]:
         """Numbers of a batch of images (``UInt64``) for the pixels of each strip; undefined beyond the image. The images are
         row-major or, if ``tiled``, in the order of `TileGrid.pixel`."""
         if tiled:  # the order of the strips themselves
@@ -119,7 +119,7 @@ class Strips:
             return list(dr.gather(backend(flat).Array4u64, flat, self.index // STRIP, inside & (self.column < self.width)))
         return [dr.gather(type(flat), flat, self.index + k, inside & (self.column + k < self.width)) for k in range(STRIP)]
 
-    def written(self, values: list[Any]) -> Any:
+    def written(self, values: Sequence[UInt32 | UInt64]) -> UInt32 | UInt64:
         """A row-major batch of images with a value for each pixel of the strips, evaluated."""
         kind = type(values[0])
         module = backend(values[0])
@@ -154,14 +154,14 @@ def strips(grid: TileGrid, module: ModuleType) -> Strips:
     return Strips(image, row, column, tile, index, grid.batch, grid.height, grid.width)
 
 
-def nearest_covers(grid: TileGrid, triangles: Triangles, image: Any, active: Any) -> Any:
+def nearest_covers(grid: TileGrid, triangles: Triangles, image: UInt32, active: Bool) -> UInt32:
     """``UInt32`` for each tile, then for each block: key of the smallest depth beyond which some triangle that covers all of it
     reaches nowhere. What is noted for a block is not repeated for its tiles."""
     module = backend(triangles.a)
     nearest = dr.full(module.UInt32, 0xFFFFFFFF, grid.count + grid.block_count)
     dr.eval(nearest)
 
-    def visit(row: Any, column: Any, is_tile: Any) -> Any:
+    def visit(row: UInt32, column: UInt32, is_tile: Bool) -> Bool:
         span = _Span(triangles, row, column, is_tile)
         node = dr.select(is_tile, grid.tile(image, row, column), grid.count + grid.block(image, row, column))
         dr.scatter_reduce(dr.ReduceOp.Min, nearest, depth_key(span.farthest), node, span.covered, mode=dr.ReduceMode.Direct)
@@ -174,14 +174,14 @@ def nearest_covers(grid: TileGrid, triangles: Triangles, image: Any, active: Any
 def build_tile_lists(
     grid: TileGrid,
     triangles: Triangles,
-    index: Any,
-    image: Any,
-    triangle: Any,
-    active: Any,
-    nearest: Any,
-    keys: Any,
-    behind: Any,
-    pixel_index: Callable[[Any, Any], Any],
+    index: UInt32,
+    image: UInt32,
+    triangle: UInt32,
+    active: Bool,
+    nearest: UInt32 | None,
+    keys: UInt64,
+    behind: UInt64 | None,
+    pixel_index: Callable[[UInt32, UInt32], UInt32],
 ) -> TileLists:
     """Enter large triangles into the lists of the tiles where they may be seen.
 
@@ -200,7 +200,7 @@ def build_tile_lists(
     items = dr.empty(module.UInt32, grid.count * CAPACITY)
     dr.eval(count, items)
 
-    def visit(row: Any, column: Any, is_tile: Any) -> Any:
+    def visit(row: UInt32, column: UInt32, is_tile: Bool) -> Bool:
         span = _Span(triangles, row, column, is_tile)
         tile = grid.tile(image, row, column)
         seen = ~span.missed
@@ -209,7 +209,7 @@ def build_tile_lists(
             seen &= depth <= dr.gather(module.UInt32, nearest, grid.count + grid.block(image, row, column), seen)
             seen &= ~is_tile | (depth <= dr.gather(module.UInt32, nearest, tile, seen & is_tile))
         wanted = seen & is_tile
-        slot = dr.scatter_inc(count, tile, wanted)
+        slot = scatter_inc(count, tile, wanted)
         fits = wanted & (slot < CAPACITY)
         dr.scatter(items, index, tile * CAPACITY + slot, fits)
         x0, y0, x1, y1 = triangles.box
@@ -224,34 +224,36 @@ def build_tile_lists(
     return TileLists(grid, CAPACITY, count, items)
 
 
-def _for_each_tile(box: tuple[Any, Any, Any, Any], active: Any, visit: Any) -> None:
+def _for_each_tile(box: Box, active: Bool, visit: Callable[[UInt32, UInt32, Bool], Bool]) -> None:
     """Call ``visit(row, column, is_tile)`` in a symbolic loop over the tiles that a box touches.
 
     A box of many tiles is walked block by block: a block is visited first (``is_tile`` is false, row and column are those of its
     first tile), and its tiles only if that returns true.
     """
-    UInt32 = backend(box[0]).UInt32
-    x0, y0, x1, y1 = (UInt32(dr.select(active, b, 0)) >> TILE for b in box)
+    module = backend(box[0])
+    x0, y0, x1, y1 = (module.UInt32(dr.select(active, b, 0)) >> TILE for b in box)
     few = (x1 - x0 + 1) * (y1 - y0 + 1) <= BLOCK * BLOCK
 
-    def first(top: Any, left: Any) -> tuple[Any, Any]:
+    def first(top: UInt32, left: UInt32) -> tuple[UInt32, UInt32]:
         """First place in the block with this first tile."""
         return dr.select(few, dr.maximum(top, y0), top), dr.select(few, dr.maximum(left, x0), left)
 
     def body(row, column, is_tile):  # noqa: ANN001, ANN202
         descend = visit(row, column, is_tile)
-        top, left = row & ~UInt32(BLOCK - 1), column & ~UInt32(BLOCK - 1)
+        top, left = row & ~module.UInt32(BLOCK - 1), column & ~module.UInt32(BLOCK - 1)
         right, bottom = dr.minimum(left + BLOCK - 1, x1), dr.minimum(top + BLOCK - 1, y1)
         next_row = is_tile & (column == right)
         leave = dr.select(is_tile, next_row & (row == bottom), ~descend)
         last = left + BLOCK > x1
-        block_row, block_column = first(dr.select(last, top + BLOCK, top), dr.select(last, x0 & ~UInt32(BLOCK - 1), left + BLOCK))
+        block_row, block_column = first(
+            dr.select(last, top + BLOCK, top), dr.select(last, x0 & ~module.UInt32(BLOCK - 1), left + BLOCK)
+        )
         tile_row = dr.select(is_tile, dr.select(next_row, row + 1, row), dr.maximum(top, y0))
         tile_column = dr.select(is_tile & ~next_row, column + 1, dr.maximum(left, x0))
         row, column = dr.select(leave, block_row, tile_row), dr.select(leave, block_column, tile_column)
         return row, column, ~leave | few
 
-    row, column = first(y0 & ~UInt32(BLOCK - 1), x0 & ~UInt32(BLOCK - 1))
+    row, column = first(y0 & ~module.UInt32(BLOCK - 1), x0 & ~module.UInt32(BLOCK - 1))
     state = (dr.select(active, row, y1 + 1), column, few)
     dr.while_loop(state, lambda row, *_: row <= y1, body, mode="symbolic", label="tiles")
 
@@ -262,7 +264,7 @@ class _Span:
     ``missed``: it contains none of them; ``covered``: it contains all; ``nearest``, ``farthest``: bounds of its depth there.
     """
 
-    def __init__(self, t: Triangles, row: Any, column: Any, is_tile: Any) -> None:
+    def __init__(self, t: Triangles, row: UInt32, column: UInt32, is_tile: Bool) -> None:
         module = backend(t.a)
         half = dr.select(is_tile, module.Float(0.5 * ((1 << TILE) - 1)), 0.5 * ((BLOCK << TILE) - 1))
         x, y = centred(module, row << TILE, column << TILE, t.height, t.width)

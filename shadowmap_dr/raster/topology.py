@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import numpy as np
 
 from ..jit.arrays import device_array
+from ..jit.types import Bool, UInt32
 from .adjacency import EdgeBlocks, InnerEdges, across_edges, after, edge_keys, pairs_of, parts_of, third
 from .types import NO_VERTEX
 from .welding import Index, Places, copies_of, weld
@@ -25,16 +25,17 @@ class Seams:
         count: S.
     """
 
-    mine: Any
-    other: Any
-    opposite: Any
-    slots: Any
+    mine: UInt32
+    other: UInt32
+    opposite: UInt32
+    slots: UInt32
     count: int
 
     @classmethod
-    def of(cls, dtype: type, mine: np.ndarray, other: np.ndarray, opposite: np.ndarray, slots: np.ndarray) -> Seams:
+    def of(cls, dtype: type[UInt32], mine: np.ndarray, other: np.ndarray, opposite: np.ndarray, slots: np.ndarray) -> Seams:
         """From NumPy arrays (S, 2) each."""
-        return cls(*(device_array(dtype, array) for array in (mine, other, opposite, slots)), len(mine))
+        a, b, c, d = (device_array(dtype, array) for array in (mine, other, opposite, slots))
+        return cls(a, b, c, d, len(mine))
 
 
 @dataclass(frozen=True)
@@ -59,24 +60,24 @@ class Topology:
             ``see_through_faces``.
     """
 
-    edges: Any
-    opposite: Any
+    edges: UInt32
+    opposite: UInt32
     count: int
-    faces: Any
-    welded: Any
-    parts: Any
+    faces: UInt32
+    welded: UInt32
+    parts: UInt32
     part_count: int
-    beyond: Any
+    beyond: UInt32
     vertex_count: int
     seams: Seams | None = None
-    see_through_faces: Any = None
-    owners: Any = None
+    see_through_faces: Bool | None = None
+    owners: UInt32 | None = None
 
 
 def build_topology(
     faces: np.ndarray,
     positions: np.ndarray,
-    dtype: type,
+    dtype: type[UInt32],
     shapes: np.ndarray | None = None,
     see_through_faces: np.ndarray | None = None,
 ) -> Topology:
@@ -128,23 +129,26 @@ def build_topology(
         seams = Seams.of(dtype, ends[-len(one) :], other, thirds[-len(one) :], np.stack([one, two], 1))
         ends = np.concatenate([ends, np.zeros_like(other)])
         thirds = np.concatenate([thirds, np.full_like(other, NO_VERTEX)])
-    veiled = (None, None)
+    veils = owners_of_edges = None
     if see_through_faces is not None:
         owner = np.stack([np.concatenate([rest, two]), np.concatenate([alone, two, two])], 1) // 3
-        owners_of_edges = [np.stack([edges.pair, edges.partner], 1) // 3 for edges in inner]
-        veiled = device_array(dr.mask_t(dtype), see_through_faces), blocks.buffer(dtype, owners_of_edges, owner, "faces")
+        inner_owners = [np.stack([edges.pair, edges.partner], 1) // 3 for edges in inner]
+        veils = device_array(dr.mask_t(dtype), see_through_faces)
+        owners_of_edges = blocks.buffer(dtype, inner_owners, owner, "faces")
     parts, part_count = parts_of(dtype, copies, corners, vertices.own)
     return Topology(
-        blocks.buffer(dtype, [edges.ends for edges in inner], ends, "vertices"),
-        blocks.buffer(dtype, [edges.thirds for edges in inner], thirds, "vertices"),
-        blocks.count + len(ends),
-        *(device_array(dtype, values) for values in (corners, places)),
-        parts,
-        part_count,
-        across_edges(dtype, copies, inner, corners, one, two),
-        high + 1,
-        seams,
-        *veiled,
+        edges=blocks.buffer(dtype, [edges.ends for edges in inner], ends, "vertices"),
+        opposite=blocks.buffer(dtype, [edges.thirds for edges in inner], thirds, "vertices"),
+        count=blocks.count + len(ends),
+        faces=device_array(dtype, corners),
+        welded=device_array(dtype, places),
+        parts=parts,
+        part_count=part_count,
+        beyond=across_edges(dtype, copies, inner, corners, one, two),
+        vertex_count=high + 1,
+        seams=seams,
+        see_through_faces=veils,
+        owners=owners_of_edges,
     )
 
 

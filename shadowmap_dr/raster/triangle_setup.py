@@ -4,12 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from types import ModuleType
+from typing import TypeAlias
 
 import drjit as dr
 
-from ..jit.arrays import backend
+from ..jit.arrays import backend, reinterpret
+from ..jit.types import Bool, Float, Float64, Int32, UInt32, UInt64, Vector4f
 from .types import precise_rcp
+
+#: Clip-space vertices of triangles.
+Corners: TypeAlias = tuple[Vector4f, Vector4f, Vector4f]
+#: Coefficients (a, b, c) of an affine function ``a x + b y + c``.
+Line: TypeAlias = tuple[Float64, Float64, Float64]
+#: Inclusive pixel bounds: first column, first row, last column, last row.
+Box: TypeAlias = tuple[Int32, Int32, Int32, Int32]
 
 # Boxes are widened by this many pixels so that rounding in the single-precision edge functions cannot lose a pixel.
 _BOX_MARGIN = 1.0 / 512.0
@@ -31,32 +40,32 @@ class Triangles:
         height, width: of an image.
     """
 
-    a: Any
-    b: Any
-    c: Any
-    exact: Callable[[], tuple[list[tuple[Any, Any, Any]], Any]]
-    box: tuple[Any, Any, Any, Any]
-    active: Any
-    fragments: Any
+    a: Vector4f
+    b: Vector4f
+    c: Vector4f
+    exact: Callable[[], tuple[list[Line], Float64]]
+    box: Box
+    active: Bool
+    fragments: Float
     height: int
     width: int
 
 
-def gather_triangle(positions: Any, faces: Any, triangle: Any, first_vertex: Any, active: Any) -> tuple[Any, Any, Any]:
+def gather_triangle(positions: Float, faces: UInt32, triangle: UInt32, first_vertex: UInt32, active: Bool | bool) -> Corners:
     """Clip-space corners (``Array4f``) of triangles of one image of the batch."""
     module = backend(positions)
     i = dr.gather(module.Array3u, faces, triangle, active)
     return tuple(dr.gather(module.Array4f, positions, first_vertex + i[k], active) for k in range(3))
 
 
-def set_up(corners: tuple[Any, Any, Any], height: int, width: int) -> Triangles:
+def set_up(corners: Corners, height: int, width: int) -> Triangles:
     """Edge functions, depth plane and bounds of triangles with the given clip-space corners.
 
     Edge functions are cross products of float32 (x, y, w) evaluated in float64: every product is then exact, so the two
     triangles that share an edge get coefficients that are exact negatives, whatever their vertex order or indices.
     """
     module = backend(corners[0])
-    Float, Float64, Int32 = module.Float, module.Float64, module.Int32
+    Float64, Int32 = module.Float64, module.Int32
     lines, det = edge_lines(corners)
     zs = [Float64(p.z) for p in corners]
     active = dr.isfinite(det) & (det != 0)
@@ -65,7 +74,7 @@ def set_up(corners: tuple[Any, Any, Any], height: int, width: int) -> Triangles:
 
     # NDC -> pixels counted from the image centre, where single precision loses least.
     sx, sy = 2.0 / width, 2.0 / height
-    coefficients: list[list[Any]] = [[], [], []]
+    coefficients: list[list[Float]] = [[], [], []]
     for a, b, c in lines:
         norm = dr.sqrt(a * a * (sx * sx) + b * b * (sy * sy))
         # Between two corners with w = 0 the edge is infinitely far away: all of the image is on one side of it.
@@ -73,10 +82,10 @@ def set_up(corners: tuple[Any, Any, Any], height: int, width: int) -> Triangles:
         scale = sign / dr.select(distant, 1, norm)
         c = dr.select(distant, dr.sign(c) * _DISTANT, c)
         for store, value in zip(coefficients, (a * sx * scale, b * sy * scale, c * scale), strict=True):
-            store.append(Float(value))
+            store.append(module.Float(value))
     plane = [sum(zs[k] * lines[k][c] for k in range(3)) * inv_det for c in range(3)]
     for store, value in zip(coefficients, (plane[0] * sx, plane[1] * sy, plane[2]), strict=True):
-        store.append(Float(value))
+        store.append(module.Float(value))
 
     x_min, y_min, x_max, y_max, seen = _screen_bounds(corners, height, width)
     active &= seen
@@ -89,22 +98,22 @@ def set_up(corners: tuple[Any, Any, Any], height: int, width: int) -> Triangles:
     )
     active &= (box[0] <= box[2]) & (box[1] <= box[3])
 
-    columns, rows = Float(box[2] - box[0] + 1), Float(box[3] - box[1] + 1)
+    columns, rows = module.Float(box[2] - box[0] + 1), module.Float(box[3] - box[1] + 1)
     # det is twice the area in NDC times the product of the w, where all of them are positive.
     w3 = corners[0].w * corners[1].w * corners[2].w
     before = (corners[0].w > 0) & (corners[1].w > 0) & (corners[2].w > 0)
-    area = dr.abs(Float(det)) * (width * height / 8) / dr.select(before, w3, 1)
+    area = dr.abs(module.Float(det)) * (width * height / 8) / dr.select(before, w3, 1)
     fragments = dr.select(before, dr.minimum(area + (columns + rows), columns * rows), columns * rows)
     a, b, c = (module.Array4f(*values) for values in coefficients)
     return Triangles(a, b, c, lambda: (lines, det), box, active, fragments, height, width)
 
 
-def edge_lines(corners: tuple[Any, Any, Any]) -> tuple[list[tuple[Any, Any, Any]], Any]:
+def edge_lines(corners: Corners) -> tuple[list[Line], Float64]:
     """Homogeneous lines (opposite to vertices 0, 1, 2), not oriented, and the determinant whose sign orients them."""
     module = backend(corners[0])
     xs, ys, ws = ([module.Float64(p[c]) for p in corners] for c in (0, 1, 3))
 
-    def line(a: int, b: int) -> tuple[Any, Any, Any]:
+    def line(a: int, b: int) -> Line:
         return ys[a] * ws[b] - ys[b] * ws[a], xs[b] * ws[a] - xs[a] * ws[b], xs[a] * ys[b] - xs[b] * ys[a]
 
     lines = [line(1, 2), line(2, 0), line(0, 1)]
@@ -116,12 +125,21 @@ def rounding_error(height: int, width: int) -> float:
     return max(width, height) * 3e-7
 
 
-def centred(module: Any, row: Any, column: Any, height: int, width: int) -> tuple[Any, Any]:
+def centred(
+    module: ModuleType, row: UInt32 | Int32 | int, column: UInt32 | Int32 | int, height: int, width: int
+) -> tuple[Float, Float]:
     """Pixel centres counted from the image centre."""
     return module.Float(column) + (0.5 - 0.5 * width), module.Float(row) + (0.5 - 0.5 * height)
 
 
-def covers(values: Any, row: Any, column: Any, height: int, width: int, exact_lines: Callable[[], Any]) -> Any:
+def covers(
+    values: Vector4f,
+    row: UInt32 | Int32,
+    column: UInt32 | Int32,
+    height: int,
+    width: int,
+    exact_lines: Callable[[], tuple[list[Line], Float64]],
+) -> Bool:
     """Does a triangle contain a pixel's centre, between the near and the far plane?
 
     Single precision decides unless the centre lies within its rounding error of an edge. There (rarely) double precision
@@ -150,37 +168,36 @@ def covers(values: Any, row: Any, column: Any, height: int, width: int, exact_li
         return covered
 
     undecided = in_range & (dr.abs(least) <= rounding_error(height, width))
-    covered = dr.if_stmt((row, column), undecided, exact, lambda row, column: least > 0, mode="symbolic", label="exact edge test")
+    covered = dr.if_stmt((row, column), undecided, exact, lambda *_: least > 0, mode="symbolic", label="exact edge test")
     return covered & in_range
 
 
-def depth_key(depth: Any) -> Any:
+def depth_key(depth: Float) -> UInt32:
     """``UInt32`` in the order of the (finite) depths."""
     module = backend(depth)
-    bits = dr.reinterpret_array(module.UInt32, depth + 0.0)  # -0 becomes +0
+    bits: UInt32 = reinterpret(module.UInt32, depth + 0.0)  # -0 becomes +0
     return bits ^ dr.select(bits >> 31 != 0, module.UInt32(0xFFFFFFFF), module.UInt32(0x80000000))
 
 
-def fragment_key(depth: Any, triangle: Any) -> Any:
+def fragment_key(depth: Float, triangle: UInt32) -> UInt64:
     """``UInt64`` whose minimum is the nearest fragment; equal depths go to the lower triangle index."""
     UInt64 = backend(depth).UInt64
     return (UInt64(depth_key(depth)) << 32) | UInt64(triangle)
 
 
-def _screen_bounds(corners: tuple[Any, Any, Any], height: int, width: int) -> tuple[Any, Any, Any, Any, Any]:
+def _screen_bounds(corners: Corners, height: int, width: int) -> tuple[Float, Float, Float, Float, Bool]:
     """Pixel bounds of the part of a triangle in front of the near plane, and whether there is any within the depth range.
 
     Where a visible point has ``w <= 0`` (no camera does that, but a caller's matrix may), the whole image is the bound.
     """
     module = backend(corners[0])
-    Float, Bool = module.Float, module.Bool
-    x_min, y_min, x_max, y_max = Float(dr.inf), Float(dr.inf), Float(-dr.inf), Float(-dr.inf)
-    unbounded, beyond_far = Bool(False), Bool(True)
+    x_min, y_min, x_max, y_max = module.Float(dr.inf), module.Float(dr.inf), module.Float(-dr.inf), module.Float(-dr.inf)
+    unbounded, beyond_far = module.Bool(False), module.Bool(True)
     near = [p.z + p.w for p in corners]
     for p in corners:
         beyond_far &= p.z > p.w
 
-    def include(x: Any, y: Any, w: Any, use: Any) -> None:
+    def include(x: Float, y: Float, w: Float, use: Bool) -> None:
         nonlocal x_min, y_min, x_max, y_max, unbounded
         ok = use & (w > 0)
         unbounded |= use & ~(w > 0)
@@ -202,8 +219,9 @@ def _screen_bounds(corners: tuple[Any, Any, Any], height: int, width: int) -> tu
         include(q.x, q.y, q.w, crosses)
 
     # Clamp before the conversion to integers: a vertex near the camera plane projects beyond their range.
-    def to_pixel(ndc: Any, size: int) -> Any:
-        return dr.clip(dr.fma(ndc, 0.5 * size, 0.5 * size), -2.0, size + 2.0)
+    def to_pixel(ndc: Float, size: int) -> Float:
+        pixel = dr.fma(ndc, 0.5 * size, 0.5 * size)
+        return dr.clip(pixel, -2.0, size + 2.0)
 
     seen = ~beyond_far & (unbounded | (x_max >= x_min))
     wide = unbounded | ~seen

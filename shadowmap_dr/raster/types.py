@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from types import ModuleType
-from typing import Any
+from typing import TypeAlias
 
 import drjit as dr
 import numpy as np
 
 from ..jit.arrays import backend
+from ..jit.types import Bool, Float, Float64, UInt32, Vector4f
+
+#: Edge functions and depth planes of triangles: coefficients a, b, c, four numbers a triangle each.
+Records: TypeAlias = tuple[Float, Float, Float]
 
 #: Triangle index of a pixel that no triangle covers.
 NO_TRIANGLE = 0xFFFFFFFF
@@ -36,18 +40,18 @@ class RasterOutput:
     of *which* triangle is visible is the business of :func:`shadowmap_dr.raster.antialias`).
     """
 
-    triangle: Any
-    u: Any
-    v: Any
-    depth: Any
-    w: Any
-    records: Any
+    triangle: UInt32
+    u: Float
+    v: Float
+    depth: Float
+    w: Float
+    records: Records
     face_count: int
     batch: int
     height: int
     width: int
 
-    def edge_functions(self, image: Any, triangle: Any, active: Any = True) -> tuple[Any, Any, Any]:
+    def edge_functions(self, image: UInt32, triangle: UInt32, active: Bool | bool = True) -> tuple[Vector4f, Vector4f, Vector4f]:
         """``a x + b y + c``, x and y in pixels from the image centre, as three ``Array4f``. Detached.
 
         Components 0, 1, 2: distance (pixels) from the edges opposite to vertices 0, 1, 2, positive inside; 3: NDC depth.
@@ -58,7 +62,7 @@ class RasterOutput:
         a, b, c = (dr.gather(Array4f, record, index, active) for record in self.records)
         return a, b, c
 
-    def depth_plane(self, image: Any, triangle: Any, active: Any = True) -> tuple[Any, Any, Any]:
+    def depth_plane(self, image: UInt32, triangle: UInt32, active: Bool | bool = True) -> tuple[Float, Float, Float]:
         """The last component of :func:`edge_functions` alone: (dx, dy, d), each ``Float``."""
         Float = backend(self.records[0]).Float
         index = 4 * (image * self.face_count + triangle) + 3
@@ -66,25 +70,25 @@ class RasterOutput:
         return dx, dy, d
 
     @property
-    def valid(self) -> Any:
+    def valid(self) -> Bool:
         """Mask of the pixels that see a triangle."""
         return self.triangle != NO_TRIANGLE
 
 
-def precise_rcp(x: Any) -> Any:
-    """``1 / x`` to full precision. ``dr.rcp`` of a double is good for some 20 bits only on a GPU."""
+def precise_rcp(x: Float64) -> Float64:
+    """``1 / x`` to full precision. On a GPU, ``dr.rcp`` of a double is good for only some 20 bits."""
     with dr.scoped_set_flag(dr.JitFlag.FastMath, False):
         return dr.rcp(x)
 
 
-def check_range(faces: Any, count: int, what: str) -> None:
+def check_range(faces: UInt32, count: int, what: str) -> None:
     """Raise ValueError if faces refer to a ``what`` (vertex, row) of number ``count`` or more. Reads back one number."""
     largest = int(np.max(dr.max(faces).numpy()))
     if largest >= count:
         raise ValueError(f"faces refer to {what} {largest}, but there are only {count}")
 
 
-def by_image(index: Any, size: int, batch: int) -> tuple[Any, Any]:
+def by_image(index: UInt32, size: int, batch: int) -> tuple[UInt32, UInt32]:
     """The image of a batch to which an index (``UInt32``) below ``batch * size`` belongs, and the index within that image.
 
     The only image of a batch is a constant: no divisions, and no sizes of meshes in kernels, which then serve other meshes, too.
@@ -95,7 +99,7 @@ def by_image(index: Any, size: int, batch: int) -> tuple[Any, Any]:
     return image, index - image * size
 
 
-def pixel_coordinates(module: ModuleType, batch: int, height: int, width: int) -> tuple[Any, Any, Any]:
+def pixel_coordinates(module: ModuleType, batch: int, height: int, width: int) -> tuple[UInt32, UInt32, UInt32]:
     """Image index, row and column (``UInt32``) of every entry of a flat row-major batch of images."""
     index = dr.arange(module.UInt32, batch * height * width)
     row_flat = index // width
@@ -103,7 +107,7 @@ def pixel_coordinates(module: ModuleType, batch: int, height: int, width: int) -
     return image, row, index - row_flat * width
 
 
-def zeros(module: ModuleType, size: int, count: int) -> list[Any]:
+def zeros(module: ModuleType, size: int, count: int) -> list[Float]:
     """``count`` evaluated ``Float`` arrays of zeros, to be written to.
 
     One kernel of all threads writes them: one thread would fill an array with a constant. ``size`` is at most 2^28.

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import cast
 
 import drjit as dr
 
+from ...jit.types import Bool, Float, TensorXf
 from ..topology import Topology
 from ..types import RasterOutput
 from .blend import blend
@@ -15,19 +16,19 @@ from .edge_crossings import DEPTH_GAP, Crossings, find_crossings
 
 
 def antialias(
-    values: Any,
+    values: TensorXf | Float | list[Float] | tuple[Float, ...],
     raster: RasterOutput,
-    positions: Any,
+    positions: TensorXf | Float,
     topology: Topology,
     *,
     crossings: Crossings | None = None,
-    creases: Any = None,
-    crease_weights: Any = None,
+    creases: Bool | None = None,
+    crease_weights: Float | None = None,
     meetings: bool = False,
     gap: float = DEPTH_GAP,
     folds: CoplanarCreases | None = None,
     continued: bool = False,
-) -> Any:
+) -> TensorXf | Float:
     """Blend each pixel with the neighbours from which a silhouette separates it, by the share of the pixel they cover.
 
     Where a silhouette crosses the segment between two pixel centres, the pixel into which the other one's surface reaches
@@ -59,7 +60,7 @@ def antialias(
     Source: the idea of blending along the axis that crosses the edge is that of Laine et al., "Modular Primitives for
     High-Performance Differentiable Rendering", 2020, section 3.6; the search for edges and the weights are different.
     """
-    is_tensor = dr.is_tensor_v(values)
+    tensor = cast("TensorXf", values) if dr.is_tensor_v(values) else None
     flat = _checked_values(values, raster)
     positions, vertex_count = _flat_positions(positions, raster, topology)
     crease_weights = _checked_creases(creases, crease_weights, raster)
@@ -69,10 +70,10 @@ def antialias(
         raise ValueError(f"crossings are those of {dr.width(crossings.right)} pixels, but {_size_of(raster)} are given")
     surroundings = Surroundings.of(raster, positions, topology, creases, folds, crease_weights) if continued else None
     blended = blend(flat, positions, raster, crossings, surroundings)
-    return type(values)(blended, shape=values.shape) if is_tensor else blended
+    return blended if tensor is None else type(tensor)(blended, shape=tensor.shape)
 
 
-def _checked_values(values: Any, raster: RasterOutput) -> Any:
+def _checked_values(values: TensorXf | Float | list[Float] | tuple[Float, ...], raster: RasterOutput) -> Float | list[Float]:
     """Flat values, or a list of channels of full width."""
     pixels = raster.batch * raster.height * raster.width
     where = _size_of(raster)
@@ -80,7 +81,7 @@ def _checked_values(values: Any, raster: RasterOutput) -> Any:
         if not values or any(dr.width(channel) not in (1, pixels) for channel in values):
             raise ValueError(f"channels hold {[dr.width(channel) for channel in values]} numbers for {where}")
         return [channel if dr.width(channel) == pixels else channel + dr.zeros(type(channel), pixels) for channel in values]
-    flat = values
+    flat = cast("Float", values)
     if dr.is_tensor_v(values):
         size, shape = (raster.batch, raster.height, raster.width), tuple(values.shape)
         if shape[:-1] != size and (raster.batch > 1 or shape[:-1] != size[1:]):
@@ -92,7 +93,7 @@ def _checked_values(values: Any, raster: RasterOutput) -> Any:
     return flat
 
 
-def _checked_creases(creases: Any, weights: Any, raster: RasterOutput) -> Any:
+def _checked_creases(creases: Bool | None, weights: Float | None, raster: RasterOutput) -> Float | None:
     """Weights of creases, one for each pixel; None for 1."""
     pixels, edges = raster.batch * raster.height * raster.width, 3 * raster.face_count
     if creases is not None and dr.width(creases) != edges:
@@ -108,8 +109,8 @@ def _size_of(raster: RasterOutput) -> str:
     return f"{raster.batch} image(s) of {raster.height} x {raster.width} pixels"
 
 
-def _flat_positions(positions: Any, raster: RasterOutput, topology: Topology) -> tuple[Any, int]:
-    flat = positions.array if dr.is_tensor_v(positions) else positions
+def _flat_positions(positions: TensorXf | Float, raster: RasterOutput, topology: Topology) -> tuple[Float, int]:
+    flat = positions.array if dr.is_tensor_v(positions) else cast("Float", positions)
     if dr.width(flat) % (4 * raster.batch) != 0:
         raise ValueError(f"positions hold {dr.width(flat)} numbers, which is not {raster.batch} image(s) of (V, 4) vertices")
     vertices = dr.width(flat) // (4 * raster.batch)

@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import cast
 
 import drjit as dr
 
-from ...jit.arrays import backend
+from ...jit.arrays import backend, reinterpret
+from ...jit.types import AnyArray, Bool, Float, UInt32, Vector4f
 from ..topology import NO_VERTEX
 from ..types import RasterOutput
 from .colour_jumps import Surroundings
 from .edge_crossings import Crossings
-from .neighbour_weights import around
+from .neighbour_weights import around, weight_sum
 from .pixel_pairs import each_number
 
 
 def blend(
-    values: Any, positions: Any, raster: RasterOutput, crossings: Crossings, surroundings: Surroundings | None = None
-) -> Any:
+    values: Float | list[Float],
+    positions: Float,
+    raster: RasterOutput,
+    crossings: Crossings,
+    surroundings: Surroundings | None = None,
+) -> Float:
     """Apply the weights of all pairs of pixels.
 
     Args:
@@ -43,25 +48,25 @@ class _Blend(dr.CustomOp):
 
     def eval(
         self,
-        values: Any,
-        positions: Any,
+        values: Float | list[Float],
+        positions: Float,
         width: int,
         crossings: Crossings,
         wanted: tuple[bool, bool],
         surroundings: Surroundings | None,
-    ) -> Any:
+    ) -> Float:
         self.mixer = Mixer(values, width, crossings, surroundings)
         self.wanted, self.vertices = wanted, dr.width(positions)
         return self.mixer.values
 
     def forward(self) -> None:
-        values = self.grad_in("values") if self.wanted[0] else None
-        positions = self.grad_in("positions") if self.wanted[1] else None
+        values = cast("Float | list[Float]", self.grad_in("values")) if self.wanted[0] else None
+        positions = cast("Float", self.grad_in("positions")) if self.wanted[1] else None
         dr.eval(values, positions)
         self.set_grad_out(self.mixer.tangent(values, positions))
 
     def backward(self) -> None:
-        adjoint = self.grad_out()
+        adjoint = cast("Float", self.grad_out())
         dr.eval(adjoint)
         if self.wanted[0]:
             self.set_grad_in("values", self.mixer.adjoint_of_values(adjoint))
@@ -76,7 +81,9 @@ class Mixer:
     more than all of it they cannot have: ``scale = 1 / max(1, sum of weights)``.
     """
 
-    def __init__(self, values: Any, width: int, crossings: Crossings, surroundings: Surroundings | None = None) -> None:
+    def __init__(
+        self, values: Float | list[Float], width: int, crossings: Crossings, surroundings: Surroundings | None = None
+    ) -> None:
         self.module = backend(crossings.right)
         self.crossings, self.width, self.surroundings = crossings, width, surroundings
         self.pixels = dr.width(crossings.right)
@@ -88,33 +95,33 @@ class Mixer:
         self.values = self._mix()
         dr.eval(self.values, self.claims)
 
-    def _mix(self) -> Any:
+    def _mix(self) -> Float:
         if not self.planar:
             return self._mix_few()
         pixel = dr.arange(self.module.UInt32, self.pixels)
         incoming = self.around(self.crossings.right, self.crossings.down, 1)
         own = self.read(self.original, pixel)
 
-        def mix(pixel: Any, *lanes: Any) -> tuple[Any, ...]:
+        def mix(pixel: UInt32, *lanes: Float) -> tuple[Float, ...]:
             incoming, own = lanes[:4], lanes[4:]
-            claims = sum(incoming)
+            claims = weight_sum(incoming)
             dr.scatter(self.claims, claims, pixel)
             return tuple(self._mixed(pixel, incoming, claims, own))
 
-        return self.written(self._where(sum(incoming) > 0, mix, pixel, (*incoming, *own), own))
+        return self.written(self._where(weight_sum(incoming) > 0, mix, pixel, (*incoming, *own), own))
 
-    def _mix_few(self) -> Any:
+    def _mix_few(self) -> Float:
         # Of interleaved values all are copied, and those of the few blended pixels overwritten.
-        result = self.copied(self.original)
+        result = self.copied(cast("Float", self.original))
         dr.eval(result)
 
-        def visit(slot: Any, pair: Any) -> None:
+        def visit(slot: UInt32, pair: UInt32) -> None:
             down, pixel, weight = self._pair(pair)
 
-            def mix(pixel: Any, down: Any, weight: Any) -> Any:
+            def mix(pixel: UInt32, down: Bool, weight: Float) -> Float:
                 taker = dr.select(weight > 0, self._neighbour(pixel, down), pixel)
                 incoming = self.around(self.crossings.right, self.crossings.down, 1, at=taker)
-                claims = sum(incoming)
+                claims = weight_sum(incoming)
                 # Of the pairs of which a pixel takes, one does the work.
                 first = self._is_first(incoming, taker != pixel, down)
                 dr.scatter(self.claims, claims, taker, first)
@@ -122,12 +129,12 @@ class Mixer:
                 dr.scatter(result, self.packet(mixed), taker, first)
                 return weight
 
-            dr.if_stmt((pixel, down, weight), weight != 0, mix, lambda pixel, down, weight: weight, mode="symbolic")
+            dr.if_stmt((pixel, down, weight), weight != 0, mix, lambda *lanes: lanes[2], mode="symbolic")
 
         self.crossings.pairs.for_each(visit)
         return result
 
-    def _mixed(self, pixel: Any, incoming: Sequence[Any], claims: Any, own: Sequence[Any]) -> list[Any]:
+    def _mixed(self, pixel: UInt32, incoming: Sequence[Float], claims: Float, own: Sequence[Float]) -> list[Float]:
         scale = _scale(claims)
         total = list(own)
         for weight, neighbour in zip(incoming, self.neighbours(pixel), strict=True):
@@ -136,7 +143,7 @@ class Mixer:
             total = [dr.fma(factor, dr.select(weight > 0, v - o, 0), t) for v, o, t in zip(other, own, total, strict=True)]
         return total
 
-    def adjoint_of_values(self, adjoint: Any) -> Any:
+    def adjoint_of_values(self, adjoint: Float) -> Float | list[Float]:
         """Gradient to the values from that of the result."""
         if not self.planar:
             return self._adjoint_of_few(adjoint)
@@ -145,22 +152,22 @@ class Mixer:
         incoming, outgoing = self.around(right, down, 1), self.around(right, down, -1)
         own = self.read(adjoint, pixel)
 
-        def spread(pixel: Any, *lanes: Any) -> tuple[Any, ...]:
+        def spread(pixel: UInt32, *lanes: Float) -> tuple[Float, ...]:
             return tuple(self._spread(adjoint, pixel, lanes[:4], lanes[4:8], lanes[8:]))
 
-        touched = sum(incoming) + sum(outgoing) > 0
+        touched = weight_sum(incoming) + weight_sum(outgoing) > 0
         result = self._where(touched, spread, pixel, (*incoming, *outgoing, *own), own)
         dr.eval(result)  # more than one kernel may want it
         return result
 
-    def _adjoint_of_few(self, adjoint: Any) -> Any:
+    def _adjoint_of_few(self, adjoint: Float) -> Float:
         result = self.copied(adjoint)
         dr.eval(result)
 
-        def visit(slot: Any, end: Any) -> None:
+        def visit(slot: UInt32, end: UInt32) -> None:
             down, pixel, weight = self._pair(self.crossings.pairs.at(slot))
 
-            def spread(pixel: Any, down: Any, weight: Any, end: Any) -> Any:
+            def spread(pixel: UInt32, down: Bool, weight: Float, end: UInt32) -> Float:
                 second = end != 0
                 pixel = dr.select(second, self._neighbour(pixel, down), pixel)
                 signed = self.around(self.crossings.right, self.crossings.down, 1, True, pixel)
@@ -171,7 +178,7 @@ class Mixer:
                 return weight
 
             lanes = (pixel, down, weight, end)
-            dr.if_stmt(lanes, weight != 0, spread, lambda pixel, down, weight, end: weight, mode="symbolic")
+            dr.if_stmt(lanes, weight != 0, spread, lambda *lanes: lanes[2], mode="symbolic")
 
         # Both pixels of each pair.
         pairs = self.crossings.pairs
@@ -180,9 +187,9 @@ class Mixer:
         return result
 
     def _spread(
-        self, adjoint: Any, pixel: Any, incoming: Sequence[Any], outgoing: Sequence[Any], own: Sequence[Any]
-    ) -> list[Any]:
-        claims = sum(incoming)
+        self, adjoint: Float, pixel: UInt32, incoming: Sequence[Float], outgoing: Sequence[Float], own: Sequence[Float]
+    ) -> list[Float]:
+        claims = weight_sum(incoming)
         kept = 1 - claims * _scale(claims)
         total = [kept * o for o in own]
         for weight, neighbour in zip(outgoing, self.neighbours(pixel), strict=True):
@@ -191,57 +198,60 @@ class Mixer:
             total = [dr.fma(factor, v, t) for v, t in zip(other, total, strict=True)]
         return total
 
-    def adjoint_of_positions(self, adjoint: Any, size: int) -> Any:
+    def adjoint_of_positions(self, adjoint: Float, size: int) -> Float:
         """Gradient to the flat positions from that of the result."""
         module = self.module
-        Float, Array4f = module.Float, module.Array4f
-        result = dr.zeros(Float, size)
+        Array4f = module.Array4f
+        result = dr.zeros(module.Float, size)
         crossings = self.crossings
 
-        def visit(slot: Any, pair: Any) -> None:
+        def visit(slot: UInt32, pair: UInt32) -> None:
             down, pixel, weight = self._pair(pair)
 
-            def add(slot: Any, pixel: Any, down: Any, weight: Any) -> Any:
+            def add(slot: UInt32, pixel: UInt32, down: Bool, weight: Float) -> Float:
                 gain, ends = self._gain(adjoint, pixel, down, weight), dr.gather(module.Array4u, crossings.ends, slot)
                 _add(result, gain, dr.gather(Array4f, crossings.slopes, slot), ends.x, ends.y, ends.x != NO_VERTEX)
                 two = ends.z != NO_VERTEX
 
-                def second(slot: Any, gain: Any, c: Any, d: Any) -> Any:
+                def second(slot: UInt32, gain: Float, c: UInt32, d: UInt32) -> Float:
                     _add(result, gain, dr.gather(Array4f, crossings.second_slopes, slot), c, d, True)
                     return gain
 
-                return dr.if_stmt((slot, gain, ends.z, ends.w), two, second, lambda slot, gain, c, d: gain, mode="symbolic")
+                return dr.if_stmt((slot, gain, ends.z, ends.w), two, second, lambda *lanes: lanes[1], mode="symbolic")
 
-            dr.if_stmt((slot, pixel, down, weight), weight != 0, add, lambda slot, pixel, down, weight: weight, mode="symbolic")
+            dr.if_stmt((slot, pixel, down, weight), weight != 0, add, lambda *lanes: lanes[3], mode="symbolic")
 
-        def meet(slot: Any) -> None:
+        crossings.pairs.for_each(visit)
+        meetings = crossings.meetings
+        if meetings is None:
+            return result
+
+        def meet(slot: UInt32) -> None:
             down, pixel, weight = self._pair(crossings.pairs.at(slot))
             active = (weight != 0) & self._bare(slot)
 
-            def add(pixel: Any, down: Any, weight: Any) -> Any:
+            def add(pixel: UInt32, down: Bool, weight: Float) -> Float:
                 gain = self._gain(adjoint, pixel, down, weight)
-                for vertex, slope in crossings.meetings.slopes(pixel, down):
+                for vertex, slope in meetings.slopes(pixel, down):
                     dr.scatter_add(result, slope * gain, vertex)
                 return weight
 
-            dr.if_stmt((pixel, down, weight), active, add, lambda pixel, down, weight: weight, mode="symbolic")
+            dr.if_stmt((pixel, down, weight), active, add, lambda *lanes: lanes[2], mode="symbolic")
 
-        crossings.pairs.for_each(visit)
-        if crossings.meetings is not None:
-            crossings.meetings.for_each(meet)
+        meetings.for_each(meet)
         return result
 
-    def _pair(self, pair: Any) -> tuple[Any, Any, Any]:
+    def _pair(self, pair: UInt32) -> tuple[Bool, UInt32, Float]:
         """(True for a pair with the lower neighbour, its pixel, its weight)."""
         down, pixel = (pair & 1) != 0, pair >> 1
         below = dr.gather(self.module.Float, self.crossings.down, pixel, down)
         return down, pixel, dr.select(down, below, dr.gather(self.module.Float, self.crossings.right, pixel, ~down))
 
-    def _neighbour(self, pixel: Any, down: Any) -> Any:
+    def _neighbour(self, pixel: UInt32, down: Bool) -> UInt32:
         """The second pixel of a pair."""
         return pixel + dr.select(down, self.module.UInt32(self.width), 1)
 
-    def _is_first(self, shares: list[Any], second: Any, down: Any) -> Any:
+    def _is_first(self, shares: Sequence[Float], second: Bool, down: Bool) -> Bool:
         """True if a pair is the first with a share among those around one of its pixels (``second``: its second pixel).
 
         ``shares`` are those of the right, lower, left and upper neighbour.
@@ -252,11 +262,11 @@ class Mixer:
         # The other pixel of the pair: right, lower; left, upper.
         return ~dr.select(second, dr.select(down, before[2], before[1]), down & before[0])
 
-    def _bare(self, slot: Any) -> Any:
+    def _bare(self, slot: UInt32) -> Bool:
         """True if a pair has no edge."""
         return dr.gather(self.module.UInt32, self.crossings.ends, 4 * slot) == NO_VERTEX
 
-    def _gain(self, adjoint: Any, pixel: Any, down: Any, weight: Any) -> Any:
+    def _gain(self, adjoint: Float, pixel: UInt32, down: Bool, weight: Float) -> Float:
         """Gradient to the weight of a pair."""
         # The neighbour takes from the pixel where the weight is positive, else the other way round.
         neighbour = self._neighbour(pixel, down)
@@ -271,28 +281,28 @@ class Mixer:
         gain = sum(a * (v - m) for a, v, m in zip(g, other, mean, strict=True))
         return gain * dr.select(weight > 0, scale, -scale)
 
-    def _beyond(self, taker: Any, giver: Any, down: Any, place: Any, active: Any) -> list[Any]:
+    def _beyond(self, taker: UInt32, giver: UInt32, down: Bool, place: Float, active: Bool | bool) -> list[Float]:
         """Gain of pixels by a larger share of their neighbours, from whom edges at some place separate them, plus their own."""
         if self.surroundings is None:
             return self.read(self.original, giver, active)
 
-        def read(pixel: Any, active: Any) -> list[Any]:
+        def read(pixel: UInt32, active: Bool | bool) -> list[Float]:
             return self.read(self.original, pixel, active)
 
-        def crossed(pixel: Any, down: Any, active: Any) -> Any:
+        def crossed(pixel: UInt32, down: Bool, active: Bool) -> Bool:
             weights = ((self.crossings.right, active & ~down), (self.crossings.down, active & down))
             right, below = (dr.gather(self.module.Float, weight, pixel, wanted) for weight, wanted in weights)
             return (right != 0) | (below != 0)
 
         return self.surroundings.beyond(read, crossed, taker, giver, down, place, active)
 
-    def tangent(self, values: Any, positions: Any) -> Any:
+    def tangent(self, values: Float | list[Float] | None, positions: Float | None) -> Float:
         """Change of the result with that of the values and positions (each or None)."""
         module = self.module
         pixel = dr.arange(module.UInt32, self.pixels)
         crossings = self.crossings
         incoming = self.around(crossings.right, crossings.down, 1)
-        claims = sum(incoming)
+        claims = weight_sum(incoming)
         scale = _scale(claims)
         own = self.read(self.original, pixel)
         change = self.read(values, pixel) if values is not None else [module.Float(0)] * self.channels
@@ -315,13 +325,13 @@ class Mixer:
                 total = [dr.fma(factor, v - m, t) for v, m, t in zip(other, mean, total, strict=True)]
         return self.written(total)
 
-    def _tangent_of_weights(self, positions: Any) -> tuple[Any, Any]:
+    def _tangent_of_weights(self, positions: Float) -> tuple[Float, Float]:
         module = self.module
         Float, Array4f = module.Float, module.Array4f
         crossings = self.crossings
         right, down = dr.zeros(Float, self.pixels), dr.zeros(Float, self.pixels)
 
-        def visit(slot: Any, pair: Any) -> None:
+        def visit(slot: UInt32, pair: UInt32) -> None:
             ends = dr.gather(module.Array4u, crossings.ends, slot)
             change = Float(0)
             for slopes, a, b in ((crossings.slopes, ends.x, ends.y), (crossings.second_slopes, ends.z, ends.w)):
@@ -334,30 +344,42 @@ class Mixer:
             dr.scatter(right, change, pair >> 1, ~is_down)
             dr.scatter(down, change, pair >> 1, is_down)
 
-        def meet(slot: Any) -> None:
+        crossings.pairs.for_each(visit)
+        dr.eval(right, down)
+        meetings = crossings.meetings
+        if meetings is None:
+            return right, down
+
+        def meet(slot: UInt32) -> None:
             is_down, pixel, weight = self._pair(crossings.pairs.at(slot))
-            slopes = crossings.meetings.slopes(pixel, is_down)
+            slopes = meetings.slopes(pixel, is_down)
             change = sum(dr.dot(slope, dr.gather(Array4f, positions, vertex)) for vertex, slope in slopes)
             active = (weight != 0) & self._bare(slot)
             dr.scatter(right, change, pixel, active & ~is_down)
             dr.scatter(down, change, pixel, active & is_down)
 
-        crossings.pairs.for_each(visit)
-        if crossings.meetings is not None:
-            dr.eval(right, down)
-            crossings.meetings.for_each(meet)
+        meetings.for_each(meet)
         dr.eval(right, down)
         return right, down
 
-    def neighbours(self, pixel: Any) -> tuple[Any, Any, Any, Any]:
+    def neighbours(self, pixel: UInt32) -> tuple[UInt32, UInt32, UInt32, UInt32]:
         """Right, lower, left, upper."""
         return pixel + 1, pixel + self.width, pixel - 1, pixel - self.width
 
-    def around(self, right: Any, down: Any, sign: int, signed: bool = False, at: Any = None) -> tuple[Any, Any, Any, Any]:
+    def around(
+        self, right: Float, down: Float, sign: int, signed: bool = False, at: UInt32 | None = None
+    ) -> tuple[Float, Float, Float, Float]:
         """See :func:`around`."""
         return around(right, down, self.width, sign, signed, at)
 
-    def _where(self, active: Any, function: Any, pixel: Any, lanes: tuple[Any, ...], otherwise: list[Any]) -> list[Any]:
+    def _where(
+        self,
+        active: Bool,
+        function: Callable[..., tuple[Float, ...]],
+        pixel: UInt32,
+        lanes: tuple[Float, ...],
+        otherwise: list[Float],
+    ) -> list[Float]:
         """``function(pixel, *lanes)``, one number for each channel, in packets with active lanes; the last lanes elsewhere."""
         count = len(otherwise)
         result = dr.if_stmt(
@@ -365,7 +387,7 @@ class Mixer:
         )
         return list(result)
 
-    def read(self, flat: Any, pixel: Any, active: Any = True) -> list[Any]:
+    def read(self, flat: Float | list[Float], pixel: UInt32, active: Bool | bool = True) -> list[Float]:
         """All channels of pixels."""
         module = self.module
         if isinstance(flat, list):
@@ -375,11 +397,11 @@ class Mixer:
             return list(dr.gather(packet, flat, pixel, active))
         return [dr.gather(module.Float, flat, pixel * self.channels + c, active) for c in range(self.channels)]
 
-    def packet(self, channels: list[Any]) -> Any:
+    def packet(self, channels: list[Float]) -> AnyArray:
         """Channels as what is scattered at once."""
         return channels[0] if self.channels == 1 else self.module.ArrayXf(channels)
 
-    def written(self, channels: list[Any]) -> Any:
+    def written(self, channels: list[Float]) -> Float:
         """Interleave the channels."""
         if self.channels == 1:
             return channels[0]
@@ -387,19 +409,19 @@ class Mixer:
         dr.scatter(result, self.packet(channels), dr.arange(self.module.UInt32, self.pixels))
         return result
 
-    def copied(self, flat: Any) -> Any:
+    def copied(self, flat: Float) -> Float:
         """A copy that may be written to. Not Dr.Jit's, which one thread would make."""
         UInt32 = self.module.UInt32
         # Nothing that Dr.Jit could see to be the same array.
-        bits = dr.reinterpret_array(UInt32, flat) ^ (dr.arange(UInt32, dr.width(flat)) >> 31)
-        return dr.reinterpret_array(self.module.Float, bits)
+        bits = reinterpret(UInt32, flat) ^ (dr.arange(UInt32, dr.width(flat)) >> 31)
+        return reinterpret(self.module.Float, bits)
 
 
-def _scale(claims: Any) -> Any:
+def _scale(claims: Float) -> Float:
     return dr.rcp(dr.maximum(1, claims))
 
 
-def _add(result: Any, gain: Any, slopes: Any, a: Any, b: Any, active: Any) -> None:
+def _add(result: Float, gain: Float, slopes: Vector4f, a: UInt32, b: UInt32, active: Bool | bool) -> None:
     """Pass a weight's gradient on to the ends of its edge."""
     Array4f = type(slopes)
     g = Array4f(gain * slopes.y, gain * slopes.z, 0, gain * slopes.w)

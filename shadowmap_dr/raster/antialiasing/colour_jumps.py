@@ -11,11 +11,11 @@ import functools
 import operator
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 
 from ...jit.arrays import backend
+from ...jit.types import Bool, Float, UInt32
 from ..topology import Topology
 from ..triangle_setup import edge_lines, gather_triangle
 from ..types import NO_TRIANGLE, RasterOutput, by_image
@@ -39,12 +39,12 @@ class Surroundings:
         height, width, vertex_count: of an image.
     """
 
-    triangle: Any
-    positions: Any
+    triangle: UInt32
+    positions: Float
     topology: Topology
-    creases: Any
+    creases: Bool | None
     folds: CoplanarCreases | None
-    sharpness: Any
+    sharpness: Float | None
     batch: int
     height: int
     width: int
@@ -52,7 +52,13 @@ class Surroundings:
 
     @classmethod
     def of(
-        cls, raster: RasterOutput, positions: Any, topology: Topology, creases: Any, folds: CoplanarCreases | None, sharpness: Any
+        cls,
+        raster: RasterOutput,
+        positions: Float,
+        topology: Topology,
+        creases: Bool | None,
+        folds: CoplanarCreases | None,
+        sharpness: Float | None,
     ) -> Surroundings:
         """For flat positions; sharpness as ``crease_weights`` of :func:`find_crossings`."""
         positions, sharpness = dr.detach(positions), None if sharpness is None else dr.detach(sharpness)
@@ -61,14 +67,14 @@ class Surroundings:
 
     def beyond(
         self,
-        read: Callable[[Any, Any], list[Any]],
-        crossed: Callable[[Any, Any, Any], Any],
-        taker: Any,
-        giver: Any,
-        down: Any,
-        place: Any,
-        active: Any = True,
-    ) -> list[Any]:
+        read: Callable[[UInt32, Bool | bool], list[Float]],
+        crossed: Callable[[UInt32, Bool, Bool], Bool],
+        taker: UInt32,
+        giver: UInt32,
+        down: Bool,
+        place: Float,
+        active: Bool | bool = True,
+    ) -> list[Float]:
         """Colours of pixels, plus how much those of their neighbours differ from them at an edge in between.
 
         Both are continued up to the edge, if the next pixel on their other side sees the same surface. The difference has the
@@ -98,7 +104,7 @@ class Surroundings:
             result.append(o + dr.clip(continued, dr.minimum(2 * jump, 0), dr.maximum(2 * jump, 0)))
         return result
 
-    def _inside(self, pixel: Any, down: Any, ahead: Any, active: Any) -> Any:
+    def _inside(self, pixel: UInt32, down: Bool, ahead: Bool, active: Bool | bool) -> Bool:
         """True if the next pixel to the right (left, if not ``ahead``) or below (above) belongs to the same image."""
         UInt32 = backend(pixel).UInt32
         row_flat = pixel // self.width
@@ -106,7 +112,9 @@ class Surroundings:
         last = dr.select(down, UInt32(self.height), self.width) - 1
         return dr.select(ahead, at < last, at > 0) & active
 
-    def _steady(self, crossed: Callable[[Any, Any, Any], Any], near: Any, far: Any, down: Any, ahead: Any, inside: Any) -> Any:
+    def _steady(
+        self, crossed: Callable[[UInt32, Bool, Bool], Bool], near: UInt32, far: UInt32, down: Bool, ahead: Bool, inside: Bool
+    ) -> Bool:
         """True if pixels and their neighbours see the same triangle, or others of a smooth surface.
 
         That no edge crosses the way to the neighbour would not be enough by itself: edges along it do not count there.
@@ -125,14 +133,16 @@ class Surroundings:
         if self.creases is None:
             return same | smooth
 
-        def unbroken(near: Any, far: Any, down: Any, ahead: Any, here: Any, there: Any, soft: Any) -> Any:
+        def unbroken(near: UInt32, far: UInt32, down: Bool, ahead: Bool, here: UInt32, there: UInt32, soft: Bool) -> Bool:
             if self.folds is not None:
                 soft |= touching(self.topology, here, there) & self.folds.flat(here, there)
             jumps = [[self._jump(3 * triangle + k, soft) for k in range(3)] for triangle in (here, there)]
             none = ~functools.reduce(operator.or_, jumps[0] + jumps[1])
             open_ = ~(jumps[0][0] & jumps[0][1] & jumps[0][2]) & ~(jumps[1][0] & jumps[1][1] & jumps[1][2])
 
-            def on_the_way(near: Any, far: Any, down: Any, ahead: Any, here: Any, there: Any, soft: Any, none: Any) -> Any:
+            def on_the_way(
+                near: UInt32, far: UInt32, down: Bool, ahead: Bool, here: UInt32, there: UInt32, soft: Bool, none: Bool
+            ) -> Bool:
                 return ~self._leaves(near, here, down, ahead, soft) & ~self._leaves(far, there, down, ~ahead, soft)
 
             # Few triangles have creases at some of their edges and not at others.
@@ -142,13 +152,13 @@ class Surroundings:
         lanes = near, far, down, ahead, here, there, soft
         return same | dr.if_stmt(lanes, smooth, unbroken, lambda *_: module.Bool(False), mode="symbolic", label="smooth")
 
-    def _jump(self, edge: Any, soft: Any) -> Any:
+    def _jump(self, edge: UInt32, soft: Bool) -> Bool:
         """True if an edge is a crease. Folds are none where they are ``soft``."""
         Bool = backend(edge).Bool
         found = dr.gather(Bool, self.creases, edge)
         return found if self.folds is None else found & ~(soft & dr.gather(Bool, self.folds.edges, edge))
 
-    def _leaves(self, pixel: Any, triangle: Any, down: Any, ahead: Any, soft: Any) -> Any:
+    def _leaves(self, pixel: UInt32, triangle: UInt32, down: Bool, ahead: Bool, soft: Bool) -> Bool:
         """True if the edge at which one leaves a triangle, from a pixel's centre towards a neighbour, is a crease.
 
         Folds are none (``soft``) between coplanar triangles, and where triangles are seen as a smooth surface.

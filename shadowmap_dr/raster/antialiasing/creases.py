@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TypeAlias
 
 import drjit as dr
 
 from ...jit.arrays import backend
+from ...jit.types import AnyArray, Bool, Float, UInt32
 from ..topology import NO_VERTEX, Topology
 from ..types import NO_TRIANGLE, RasterOutput
+
+#: Ends of a first and of a second edge, and the weights of both.
+FoundCreases: TypeAlias = tuple[UInt32, UInt32, UInt32, UInt32, Float, Float]
 
 # Planes that cross so far (relative) beyond two edges still cross at the nearer one, in spite of rounding.
 _SLACK = 0.05
@@ -28,10 +32,10 @@ class CoplanarCreases:
         normals: ``Float`` (4 F,), normals of the faces, of any length, and a number that is not read. Detached.
     """
 
-    edges: Any
-    normals: Any
+    edges: Bool
+    normals: Float
 
-    def flat(self, here: Any, neighbour: Any) -> Any:
+    def flat(self, here: UInt32, neighbour: UInt32) -> Bool:
         """True if two faces lie in one plane and are turned to the same side, if they have a point in common."""
         Array3f, Array4f = (getattr(backend(here), name) for name in ("Array3f", "Array4f"))
         n, m = (dr.gather(Array4f, self.normals, face) for face in (here, neighbour))
@@ -41,16 +45,16 @@ class CoplanarCreases:
 
 
 def find_creases(
-    creases: Any,
+    creases: Bool,
     folds: CoplanarCreases | None,
     topology: Topology,
     raster: RasterOutput,
-    image: Any,
-    pixel: Any,
-    here: Any,
-    neighbour: Any,
-    down: Any,
-) -> tuple[Any, Any, Any, Any, Any, Any]:
+    image: UInt32,
+    pixel: UInt32,
+    here: UInt32,
+    neighbour: UInt32,
+    down: Bool,
+) -> FoundCreases:
     """Creases between pixels and their right or (where ``down``) lower neighbours.
 
     Two triangles of one surface have a corner in common, if they are not much smaller than a pixel. Through one edge one
@@ -68,22 +72,21 @@ def find_creases(
     Returns ends (a, b) of the first edge, ``NO_VERTEX`` where there is none, those of the second, and the weights of both.
     """
     module = backend(here)
-    UInt32, Bool = module.UInt32, module.Bool
     near = touching(topology, here, neighbour)
 
-    def search(image: Any, pixel: Any, here: Any, neighbour: Any, down: Any) -> tuple[Any, Any, Any, Any, Any, Any]:
+    def search(image: UInt32, pixel: UInt32, here: UInt32, neighbour: UInt32, down: Bool) -> FoundCreases:
         row = pixel // raster.width
         x = module.Float(pixel - row * raster.width) + (0.5 - 0.5 * raster.width)
         y = module.Float(row - image * raster.height) + (0.5 - 0.5 * raster.height)
         corner_out, way_out, depth, slope = _way_out(raster, image, here, x, y, down, 1)
         x, y = dr.select(down, x, x + 1), dr.select(down, y + 1, y)
         corner_in, way_in, other_depth, other_slope = _way_out(raster, image, neighbour, x, y, down, -1)
-        hard_out = dr.gather(Bool, creases, 3 * here + corner_out)
-        hard_in = dr.gather(Bool, creases, 3 * neighbour + corner_in)
+        hard_out = dr.gather(module.Bool, creases, 3 * here + corner_out)
+        hard_in = dr.gather(module.Bool, creases, 3 * neighbour + corner_in)
         if folds is not None:
             bent = ~folds.flat(here, neighbour)
-            hard_out &= bent | ~dr.gather(Bool, folds.edges, 3 * here + corner_out)
-            hard_in &= bent | ~dr.gather(Bool, folds.edges, 3 * neighbour + corner_in)
+            hard_out &= bent | ~dr.gather(module.Bool, folds.edges, 3 * here + corner_out)
+            hard_in &= bent | ~dr.gather(module.Bool, folds.edges, 3 * neighbour + corner_in)
         a, b = _ends(topology, here, corner_out, hard_out)
         c, d = _ends(topology, neighbour, corner_in, hard_in)
         # Twice the same edge, or only the second: one edge is what is left.
@@ -95,19 +98,21 @@ def find_creases(
         crossing = (depth - (other_depth - other_slope)) / dr.select(bend == 0, 1, bend)
         between = 1 - way_in - way_out
         second = (crossing - way_out) / dr.select(between == 0, 1, between)
-        second = dr.select((bend != 0) & (between > 0) & (second >= -_SLACK) & (second <= 1 + _SLACK), dr.clip(second, 0, 1), 0.5)
+        cross = (bend != 0) & (between > 0) & (second >= -_SLACK) & (second <= 1 + _SLACK)
+        clipped = dr.clip(second, 0, 1)
+        second = dr.select(cross, clipped, 0.5)
         second = dr.select(two, second, 0)
         return a, b, dr.select(two, c, NO_VERTEX), dr.select(two, d, NO_VERTEX), 1 - second, second
 
-    def nothing(image: Any, pixel: Any, *_: Any) -> tuple[Any, Any, Any, Any, Any, Any]:
-        none, zero = dr.full(UInt32, NO_VERTEX, dr.width(pixel)), dr.zeros(module.Float, dr.width(pixel))
+    def nothing(image: UInt32, pixel: UInt32, *_: AnyArray) -> FoundCreases:
+        none, zero = dr.full(module.UInt32, NO_VERTEX, dr.width(pixel)), dr.zeros(module.Float, dr.width(pixel))
         return none, none, none, none, zero, zero
 
     arguments = (image, pixel, here, neighbour, down)
     return dr.if_stmt(arguments, near, search, nothing, mode="symbolic", label="creases")
 
 
-def touching(topology: Topology, first: Any, second: Any) -> Any:
+def touching(topology: Topology, first: UInt32, second: UInt32) -> Bool:
     """True if two faces (or none) have a corner in common."""
     module = backend(first)
     active = (first != NO_TRIANGLE) & (second != NO_TRIANGLE)
@@ -119,7 +124,9 @@ def touching(topology: Topology, first: Any, second: Any) -> Any:
     return active & common
 
 
-def _way_out(raster: RasterOutput, image: Any, triangle: Any, x: Any, y: Any, down: Any, sign: int) -> tuple[Any, Any, Any, Any]:
+def _way_out(
+    raster: RasterOutput, image: UInt32, triangle: UInt32, x: Float, y: Float, down: Bool, sign: int
+) -> tuple[UInt32, Float, Float, Float]:
     """The edge through which one leaves a triangle from a point inside, along an axis of the image.
 
     Returns the corner at which it starts, the way there in pixels, the depth at the point, and its change with each pixel (along
@@ -137,11 +144,11 @@ def _way_out(raster: RasterOutput, image: Any, triangle: Any, x: Any, y: Any, do
     return _next(opposite), nearest, value.w, dr.select(down, lines[1].w, lines[0].w)
 
 
-def _next(corner: Any) -> Any:
+def _next(corner: UInt32) -> UInt32:
     return dr.select(corner == 2, 0, corner + 1)
 
 
-def _ends(topology: Topology, face: Any, corner: Any, found: Any) -> tuple[Any, Any]:
+def _ends(topology: Topology, face: UInt32, corner: UInt32, found: Bool) -> tuple[UInt32, UInt32]:
     """Vertices of the edge that starts at a corner of a face, ``NO_VERTEX`` if not ``found``."""
     UInt32 = backend(face).UInt32
     ends = (dr.gather(UInt32, topology.faces, 3 * face + k, found) for k in (corner, _next(corner)))

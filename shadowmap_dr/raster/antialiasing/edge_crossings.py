@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 
 from ...jit.arrays import backend
+from ...jit.types import Bool, Float, UInt32, UInt64, Vector4f
 from ..topology import NO_VERTEX, Topology
 from ..types import NO_TRIANGLE, RasterOutput, by_image, zeros
 from .creases import CoplanarCreases, find_creases, touching
@@ -35,22 +35,22 @@ class Crossings:
         meetings: if surfaces that meet without an edge were looked for: what the weights of pairs without ends depend on.
     """
 
-    right: Any
-    down: Any
+    right: Float
+    down: Float
     pairs: PairList
-    ends: Any
-    slopes: Any
-    second_slopes: Any
+    ends: UInt32
+    slopes: Float
+    second_slopes: Float
     meetings: Meetings | None = None
 
 
 def find_crossings(
-    positions: Any,
+    positions: Float,
     topology: Topology,
     raster: RasterOutput,
     vertex_count: int,
-    creases: Any = None,
-    crease_weights: Any = None,
+    creases: Bool | None = None,
+    crease_weights: Float | None = None,
     meetings: bool = False,
     gap: float = DEPTH_GAP,
     folds: CoplanarCreases | None = None,
@@ -105,63 +105,63 @@ def find_crossings(
 
 
 def _measure(
-    positions: Any,
+    positions: Float,
     topology: Topology,
     raster: RasterOutput,
     vertex_count: int,
-    keys: Any,
+    keys: UInt64,
     pairs: PairList,
-    creases: Any,
+    creases: Bool | None,
     folds: CoplanarCreases | None,
-    crease_weights: Any,
+    crease_weights: Float | None,
     meetings: Meetings | None,
 ) -> Crossings:
     module = backend(positions)
-    Float, UInt32, Array4f = module.Float, module.UInt32, module.Array4f
+    Float, Array4f = module.Float, module.Array4f
     pixels = dr.width(raster.triangle)
     right, down = zeros(module, pixels, 2)
     found = Crossings(
         right,
         down,
         pairs,
-        dr.empty(UInt32, 8 * pixels),
+        dr.empty(module.UInt32, 8 * pixels),
         dr.empty(Float, 8 * pixels),
         dr.empty(Float, 8 * pixels),
         meetings,
     )
 
-    def visit(slot: Any, pair: Any) -> None:
+    def visit(slot: UInt32, pair: UInt32) -> None:
         down, pixel = (pair & 1) != 0, pair >> 1
-        step = dr.select(down, UInt32(raster.width), 1)
+        step = dr.select(down, module.UInt32(raster.width), 1)
         row_flat = pixel // raster.width
         image, row = by_image(row_flat, raster.height, raster.batch)
         column = pixel - row_flat * raster.width
         key = dr.gather(module.UInt64, keys, pair)
         silhouette = key != 0
-        ends = dr.gather(module.Array2u, topology.edges, ~UInt32(key & 0xFFFFFFFF), silhouette)
+        ends = dr.gather(module.Array2u, topology.edges, ~module.UInt32(key & 0xFFFFFFFF), silhouette)
         a, b = (dr.select(silhouette, end, NO_VERTEX) for end in (ends.x, ends.y))
-        c, d, weight, weight_2, soft = UInt32(NO_VERTEX), UInt32(NO_VERTEX), Float(1), Float(0), Float(1)
+        c, d, weight, weight_2, soft = module.UInt32(NO_VERTEX), module.UInt32(NO_VERTEX), Float(1), Float(0), Float(1)
         if creases is not None:
             if crease_weights is not None:
                 soft = dr.minimum(*(dr.gather(Float, crease_weights, p, ~silhouette) for p in (pixel, pixel + step)))
 
             def crease(image, pixel, step, down, a, b, soft):  # noqa: ANN001, ANN202
-                here, neighbour = (dr.gather(UInt32, raster.triangle, p) for p in (pixel, pixel + step))
+                here, neighbour = (dr.gather(module.UInt32, raster.triangle, p) for p in (pixel, pixel + step))
                 a, b, c, d, weight, weight_2 = find_creases(creases, folds, topology, raster, image, pixel, here, neighbour, down)
                 return a, b, c, d, soft * weight, soft * weight_2
 
-            none = dr.full(UInt32, NO_VERTEX, dr.width(pair))
+            none = dr.full(module.UInt32, NO_VERTEX, dr.width(pair))
             a, b, c, d, weight, weight_2 = dr.if_stmt(
                 (image, pixel, step, down, a, b, soft),
                 ~silhouette & (soft > 0),
                 crease,
-                lambda image, pixel, step, down, a, b, soft: (a, b, none, none, Float(1), Float(0)),
+                lambda *lanes: (lanes[4], lanes[5], none, none, Float(1), Float(0)),
                 mode="symbolic",
                 label="no silhouette",
             )
         if meetings is not None:
             bare = (a == NO_VERTEX) | (silhouette & (key < BEFORE))
-            here, there = (dr.gather(UInt32, raster.triangle, p, bare) for p in (pixel, pixel + step))
+            here, there = (dr.gather(module.UInt32, raster.triangle, p, bare) for p in (pixel, pixel + step))
             cross = functools.partial(_cut, topology, raster, image, pixel, here, there, down)
             meetings.add(slot, dr.select(bare, here, NO_TRIANGLE), there, soft, cross)
         first = image * vertex_count
@@ -178,7 +178,7 @@ def _measure(
                 (slot, c, d, row, column, down, weight_2, value),
                 c != NO_VERTEX,
                 second,
-                lambda slot, c, d, row, column, down, weight_2, value: value,
+                lambda *lanes: lanes[-1],
                 mode="symbolic",
                 label="second crease",
             )
@@ -195,7 +195,9 @@ def _measure(
     return found
 
 
-def _cut(topology: Topology, raster: RasterOutput, image: Any, pixel: Any, here: Any, there: Any, down: Any, active: Any) -> Any:
+def _cut(
+    topology: Topology, raster: RasterOutput, image: UInt32, pixel: UInt32, here: UInt32, there: UInt32, down: Bool, active: Bool
+) -> Bool:
     """True if triangles without a common corner, seen by pixels and their neighbours, may cut each other between these.
 
     Their planes cross there, and each triangle is seen where it is the nearer one.
@@ -213,9 +215,9 @@ def _cut(topology: Topology, raster: RasterOutput, image: Any, pixel: Any, here:
 
 def _meet(found: Crossings, meetings: Meetings, raster: RasterOutput) -> None:
     """Write the weights of pairs whose triangles meet other than in an edge, which then takes the place of one that touches."""
-    UInt32, Array4u = (getattr(backend(found.ends), name) for name in ("UInt32", "Array4u"))
+    Array4u = backend(found.ends).Array4u
 
-    def visit(slot: Any) -> None:
+    def visit(slot: UInt32) -> None:
         pair = found.pairs.at(slot)
         down, pixel = (pair & 1) != 0, pair >> 1
         value = meetings.weight(pixel, down)
@@ -228,8 +230,8 @@ def _meet(found: Crossings, meetings: Meetings, raster: RasterOutput) -> None:
 
 
 def _weight(
-    positions: Any, a: Any, b: Any, raster: RasterOutput, row: Any, column: Any, down: Any, weight: Any
-) -> tuple[Any, Any]:
+    positions: Float, a: UInt32, b: UInt32, raster: RasterOutput, row: UInt32, column: UInt32, down: Bool, weight: Float
+) -> tuple[Float, Vector4f]:
     """Signed weight of a pair of pixels between which an edge crosses, 0 where there is none, and its derivatives ("slopes").
 
     The homogeneous form is valid, in value and derivative, for edges that reach behind the camera.
@@ -268,7 +270,7 @@ def _weight(
     return weight * beyond_middle(dr.clip(t, 0, 1)), slopes
 
 
-def _share(p: Any, q: Any, down: Any, raster: RasterOutput) -> Any:
+def _share(p: Vector4f, q: Vector4f, down: Bool, raster: RasterOutput) -> Float:
     """Weight of an edge for pairs of this kind, from its direction in the image (or its line's, behind the camera)."""
     # The line a x + b y + c = 0 in ndc is a (2 / width) x + ... in pixels.
     nx, ny = (p.y * q.w - q.y * p.w) / raster.width, (q.x * p.w - p.x * q.w) / raster.height

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterable
+from typing import cast
 
 import drjit as dr
 
 from ...jit.arrays import backend
+from ...jit.types import Float, UInt32
 from .edge_crossings import Crossings
 
 
-def incoming_weights(crossings: Crossings, width: int) -> tuple[Any, Any, Any, Any]:
+def incoming_weights(crossings: Crossings, width: int) -> tuple[Float, Float, Float, Float]:
     """Weights with which the right, lower, left and upper neighbour each reach into a pixel of images ``width`` pixels wide."""
     return around(crossings.right, crossings.down, width, 1)
 
 
-def around(right: Any, down: Any, width: int, sign: int, signed: bool = False, at: Any = None) -> tuple[Any, Any, Any, Any]:
+def around(
+    right: Float, down: Float, width: int, sign: int, signed: bool = False, at: UInt32 | None = None
+) -> tuple[Float, Float, Float, Float]:
     """Weights of each neighbour in a pixel, or (``sign`` -1) a pixel into each neighbour; all pixels, or those ``at``.
 
     Neighbours are the right, lower, left and upper one. Pairs that reach beyond the image have weight 0, which is also what the
@@ -28,4 +32,12 @@ def around(right: Any, down: Any, width: int, sign: int, signed: bool = False, a
     if at is not None:
         right, down = (dr.gather(module.Float, weights, at) for weights in (right, down))
     values = (-sign * right, -sign * down, sign * left, sign * up)
-    return values if signed else tuple(dr.maximum(v, 0) for v in values)
+    if signed:
+        return values
+    right, down, left, up = (dr.maximum(v, 0) for v in values)
+    return right, down, left, up
+
+
+def weight_sum(weights: Iterable[Float]) -> Float:
+    """Sum of at least one weight."""
+    return cast("Float", sum(weights))

@@ -7,11 +7,10 @@ that it crosses, and registers with the pairs of pixels that it separates; the o
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 
-from ...jit.arrays import backend
+from ...jit.arrays import backend, reinterpret, scatter_inc
+from ...jit.types import Bool, Float, UInt32, UInt64, Vector3f, Vector4f
 from ..topology import NO_VERTEX, Topology
 from ..types import NO_TRIANGLE, RasterOutput, by_image
 from .pixel_pairs import PairList
@@ -28,11 +27,11 @@ _MOST_LANES = 32768
 
 
 def register_silhouettes(
-    positions: Any,
+    positions: Float,
     topology: Topology,
     raster: RasterOutput,
     vertex_count: int,
-    keys: Any,
+    keys: UInt64,
     found: PairList | None,
     gap: float,
     touching: bool = False,
@@ -51,43 +50,43 @@ def register_silhouettes(
         touching: whether edges also register that do not lie before, but on a surface of another part.
     """
     module = backend(positions)
-    UInt32 = module.UInt32
     count, records, edges = _collect(positions, topology, raster, vertex_count)
     # Lanes that share an edge take turns: edges differ in length, and few are silhouettes.
     lanes, stride = min(_LANES * raster.batch, _MOST_LANES), _LANES_PER_EDGE
 
-    def walk(lane: Any) -> tuple[Any]:
+    def walk(lane: UInt32) -> tuple[UInt32]:
         slot, turn = lane // stride, lane % stride
         a, b = (dr.gather(module.Array4f, records, 2 * slot + k) for k in range(2))
-        index = dr.gather(UInt32, edges, slot)
+        index = dr.gather(module.UInt32, edges, slot)
         _walk(a, b, index, turn, stride, topology, raster, keys, found, gap, touching)
         return (lane + lanes,)
 
-    dr.while_loop((dr.arange(UInt32, lanes),), lambda lane: lane < count * stride, walk, mode="symbolic", label="silhouettes")
+    dr.while_loop(
+        (dr.arange(module.UInt32, lanes),), lambda *state: state[0] < count * stride, walk, mode="symbolic", label="silhouettes"
+    )
 
 
-def _collect(positions: Any, topology: Topology, raster: RasterOutput, vertex_count: int) -> tuple[Any, Any, Any]:
+def _collect(positions: Float, topology: Topology, raster: RasterOutput, vertex_count: int) -> tuple[UInt32, Float, UInt32]:
     """List the silhouettes that cross lines through pixel centres.
 
     Returns their number (width 1), records and indices ``image * E + edge``. A record holds both ends, x and y in pixels from the
     image's centre and the NDC depth, with the side on which the surface lies (as a sign) and the share of horizontal pairs.
     """
     module = backend(positions)
-    Float, UInt32 = module.Float, module.UInt32
     width, height = raster.width, raster.height
     total = raster.batch * topology.count
-    index = dr.arange(UInt32, total)
+    index = dr.arange(module.UInt32, total)
     image, edge = by_image(index, topology.count, raster.batch)
-    a, b, side, active = _silhouettes(positions, topology, image, edge, vertex_count)
-    a, b, active = _project(a, b, active, width, height)
+    p, q, side, active = _silhouettes(positions, topology, image, edge, vertex_count)
+    a, b, active = _project(p, q, active, width, height)
     share = _horizontal_share(b.x - a.x, b.y - a.y, active)
     _, rows = _lines(a.y, b.y, active & (share > 0), height)
     _, columns = _lines(a.x, b.x, active & (share < 1), width)
     active &= rows + columns > 0
-    count, edges, records = dr.zeros(UInt32, 1), dr.empty(UInt32, total), dr.empty(Float, 8 * total)
+    count, edges, records = dr.zeros(module.UInt32, 1), dr.empty(module.UInt32, total), dr.empty(module.Float, 8 * total)
 
-    def add(index: Any, a: Any, b: Any, side: Any, share: Any) -> Any:
-        slot = dr.scatter_inc(count, UInt32(0))
+    def add(index: UInt32, a: Vector3f, b: Vector3f, side: Float, share: Float) -> UInt32:
+        slot = scatter_inc(count, module.UInt32(0))
         dr.scatter(edges, index, slot)
         dr.scatter(records, module.ArrayXf(*a, side, *b, share), slot)
         return slot
@@ -98,28 +97,28 @@ def _collect(positions: Any, topology: Topology, raster: RasterOutput, vertex_co
 
 
 def _walk(
-    a: Any,
-    b: Any,
-    index: Any,
-    line: Any,
+    a: Vector4f,
+    b: Vector4f,
+    index: UInt32,
+    line: UInt32,
     stride: int,
     topology: Topology,
     raster: RasterOutput,
-    keys: Any,
+    keys: UInt64,
     found: PairList | None,
     gap: float,
     touching: bool,
 ) -> None:
     """Visit every ``stride``-th of the lines through pixel centres that edges cross, beginning with ``line``."""
     module = backend(a)
-    Float, UInt32, UInt64 = module.Float, module.UInt32, module.UInt64
+    Float, UInt64 = module.Float, module.UInt64
     width, height = raster.width, raster.height
     side, share = a.w, b.w
     image, edge = by_image(index, topology.count, raster.batch)
     first_row, rows = _lines(a.y, b.y, share > 0, height)
     first_column, columns = _lines(a.x, b.x, share < 1, width)
 
-    def step(line: Any, again: Any) -> tuple[Any, Any]:
+    def step(line: UInt32, again: Bool) -> tuple[UInt32, Bool]:
         """One line through pixel centres: a row, where the edge separates pixels of two columns, or the other way round."""
         across_rows = line < rows
         down = ~across_rows
@@ -142,10 +141,10 @@ def _walk(
         t = crossing - (near - middle)
         ok = (extent != 0) & (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1) & (near >= 0) & (near + 1 < size)
 
-        row, column = dr.select(down, UInt32(near), at), dr.select(down, at, UInt32(near))
+        row, column = dr.select(down, module.UInt32(near), at), dr.select(down, at, module.UInt32(near))
         pixel = (image * height + row) * width + column
-        here = dr.gather(UInt32, raster.triangle, pixel, ok)
-        neighbour = dr.gather(UInt32, raster.triangle, pixel + dr.select(down, UInt32(width), 1), ok)
+        here = dr.gather(module.UInt32, raster.triangle, pixel, ok)
+        neighbour = dr.gather(module.UInt32, raster.triangle, pixel + dr.select(down, module.UInt32(width), 1), ok)
         ok &= here != neighbour
         covers_here = dr.select(down, -side, side) * extent > 0
         hidden = dr.select(covers_here, neighbour, here)
@@ -156,24 +155,24 @@ def _walk(
         on = module.Bool(False)
         if touching:
             on = ok & ~before & (z < depth + least) & (here != NO_TRIANGLE) & (neighbour != NO_TRIANGLE)
-            on &= dr.gather(UInt32, topology.parts, here, on) != dr.gather(UInt32, topology.parts, neighbour, on)
+            on &= dr.gather(module.UInt32, topology.parts, here, on) != dr.gather(module.UInt32, topology.parts, neighbour, on)
         ok &= before | on
 
         if topology.see_through_faces is not None:
             # What is seen through hides nothing: an edge of it counts where its own surface is seen beside it.
             seen = dr.select(covers_here, here, neighbour)
             hit, counts = ok & (seen != NO_TRIANGLE), module.Bool(False)
-            part = dr.gather(UInt32, topology.parts, seen, hit)
+            part = dr.gather(module.UInt32, topology.parts, seen, hit)
             for owner in dr.gather(module.Array2u, topology.owners, edge, ok):
-                counts |= hit & (part == dr.gather(UInt32, topology.parts, owner, hit))
+                counts |= hit & (part == dr.gather(module.UInt32, topology.parts, owner, hit))
                 counts |= ~dr.gather(module.Bool, topology.see_through_faces, owner, ok)
             ok &= counts
 
         reach = dr.select(covers_here, t, 1 - t)
-        key = (UInt64(dr.reinterpret_array(UInt32, reach)) << 32) | UInt64(~edge)
+        key = (UInt64(reinterpret(module.UInt32, reach)) << 32) | UInt64(~edge)
         if touching:
             key |= dr.select(before, UInt64(BEFORE), 0)
-        pair = 2 * pixel + dr.select(down, UInt32(1), 0)
+        pair = 2 * pixel + dr.select(down, module.UInt32(1), 0)
         # Not "Auto", which would give each thread a copy of a small buffer.
         dr.scatter_reduce(dr.ReduceOp.Max, keys, key, pair, ok, mode=dr.ReduceMode.Direct)
         if found is not None:
@@ -183,14 +182,16 @@ def _walk(
     count = rows + columns
     dr.while_loop(
         (line, module.Bool(False)),
-        lambda line, again: line < count,
+        lambda line, *_: line < count,
         step,
         mode="symbolic",
         label="lines that edges cross",
     )
 
 
-def _silhouettes(positions: Any, topology: Topology, image: Any, edge: Any, vertex_count: int) -> tuple[Any, Any, Any, Any]:
+def _silhouettes(
+    positions: Float, topology: Topology, image: UInt32, edge: UInt32, vertex_count: int
+) -> tuple[Vector4f, Vector4f, Float, Bool]:
     """Clip-space end points of edges, on which side of them their surface is, and whether it is on one side only."""
     module = backend(positions)
     Array4f, Array2u = module.Array4f, module.Array2u
@@ -207,7 +208,7 @@ def _silhouettes(positions: Any, topology: Topology, image: Any, edge: Any, vert
     return a, b, side, (sides[0] * sides[1] >= 0) & (side != 0)
 
 
-def _orientation(a: Any, b: Any, o: Any) -> Any:
+def _orientation(a: Vector4f, b: Vector4f, o: Vector4f) -> Float:
     """Sign of the determinant of three homogeneous (x, y, w) points, in double precision."""
     Float64 = backend(a).Float64
     ax, ay, aw = Float64(a.x), Float64(a.y), Float64(a.w)
@@ -216,14 +217,14 @@ def _orientation(a: Any, b: Any, o: Any) -> Any:
     return backend(a).Float(dr.select(det == 0, 0, dr.sign(det)))
 
 
-def _project(a: Any, b: Any, active: Any, width: int, height: int) -> tuple[Any, Any, Any]:
+def _project(a: Vector4f, b: Vector4f, active: Bool, width: int, height: int) -> tuple[Vector3f, Vector3f, Bool]:
     """Clip edges at the near plane and project them: (x, y in pixels from the image's centre, NDC depth), and which are left."""
     module = backend(a)
     near_a, near_b = a.z + a.w, b.z + b.w
     # Infinite ones would be projected to the middle of the image.
     active = active & dr.isfinite(near_a + a.x + a.y + near_b + b.x + b.y) & ((near_a > 0) | (near_b > 0))
 
-    def clip(p: Any, q: Any, near_p: Any, near_q: Any) -> Any:
+    def clip(p: Vector4f, q: Vector4f, near_p: Float, near_q: Float) -> Vector4f:
         # From the end in front, as rasterization does.
         s = near_q / dr.select(near_p < 0, near_q - near_p, 1)
         return dr.select(near_p < 0, dr.fma(p - q, s, q), p)
@@ -231,23 +232,23 @@ def _project(a: Any, b: Any, active: Any, width: int, height: int) -> tuple[Any,
     a, b = clip(a, b, near_a, near_b), clip(b, a, near_b, near_a)
     active &= (a.w > 0) & (b.w > 0)
 
-    def project(p: Any) -> Any:
+    def project(p: Vector4f) -> Vector3f:
         inv = dr.rcp(dr.select(active, p.w, 1))
         return module.Array3f(p.x * inv * (0.5 * width), p.y * inv * (0.5 * height), p.z * inv)
 
-    a, b = project(a), project(b)
-    active &= dr.isfinite(a.x + a.y + b.x + b.y)
-    return a, b, active
+    start, end = project(a), project(b)
+    active &= dr.isfinite(start.x + start.y + end.x + end.y)
+    return start, end, active
 
 
-def _horizontal_share(dx: Any, dy: Any, active: Any) -> Any:
+def _horizontal_share(dx: Float, dy: Float, active: Bool) -> Float:
     """Weight of an edge of this direction for horizontal pairs of pixels; for vertical ones it is the rest."""
     dx, dy = dr.select(active, dx, 0), dr.select(active, dy, 0)
     square = dx * dx + dy * dy
     return dr.clip(0.5 + (dy * dy - dx * dx) / dr.select(square > 0, square, 1), 0, 1)
 
 
-def _lines(p: Any, q: Any, active: Any, size: int) -> tuple[Any, Any]:
+def _lines(p: Float, q: Float, active: Bool, size: int) -> tuple[UInt32, UInt32]:
     """First of the lines through pixel centres within [p, q] (pixels from the image's centre), and their number."""
     module = backend(p)
     p, q = dr.select(active, p, 0), dr.select(active, q, 0)
@@ -258,7 +259,7 @@ def _lines(p: Any, q: Any, active: Any, size: int) -> tuple[Any, Any]:
     return module.UInt32(first), module.UInt32(dr.select(active, dr.maximum(last - first + 1, 0), 0))
 
 
-def _depth_on_plane(raster: RasterOutput, image: Any, triangle: Any, x: Any, y: Any, active: Any) -> Any:
+def _depth_on_plane(raster: RasterOutput, image: UInt32, triangle: UInt32, x: Float, y: Float, active: Bool) -> Float:
     """NDC depth of a triangle's plane at centred pixel coordinates; the far plane where there is no triangle."""
     hit = active & (triangle != NO_TRIANGLE)
     dx, dy, d = raster.depth_plane(image, triangle, hit)

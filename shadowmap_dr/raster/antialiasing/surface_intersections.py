@@ -13,13 +13,14 @@ import functools
 import operator
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import cast
 
 import drjit as dr
 
-from ...jit.arrays import backend
+from ...jit.arrays import backend, scatter_inc
+from ...jit.types import Bool, Float, Float64, UInt32, Vector4f
 from ..topology import NO_VERTEX, Topology
-from ..triangle_setup import edge_lines, gather_triangle
+from ..triangle_setup import Corners, Line, edge_lines, gather_triangle
 from ..types import NO_TRIANGLE, RasterOutput, by_image, precise_rcp
 from .pixel_pairs import each_number
 
@@ -55,31 +56,31 @@ class Meetings:
         slots, count: ``UInt32``, pairs without an edge that may meet, as slots in the list of all pairs, and how many there are.
     """
 
-    positions: Any
-    faces: Any
-    parts: Any
-    beyond: Any
-    triangle: Any
+    positions: Float
+    faces: UInt32
+    parts: UInt32
+    beyond: UInt32
+    triangle: UInt32
     batch: int
     height: int
     width: int
     vertex_count: int
     unconnected: bool
-    creases: Any
-    crease_weights: Any
-    slots: Any
-    count: Any
+    creases: Bool | None
+    crease_weights: Float | None
+    slots: UInt32
+    count: UInt32
 
     @classmethod
     def of(
         cls,
-        positions: Any,
+        positions: Float,
         topology: Topology,
         raster: RasterOutput,
         vertex_count: int,
         unconnected: bool = True,
-        creases: Any = None,
-        crease_weights: Any = None,
+        creases: Bool | None = None,
+        crease_weights: Float | None = None,
     ) -> Meetings:
         size = raster.batch, raster.height, raster.width, vertex_count
         surfaces = topology.faces, topology.parts, topology.beyond, raster.triangle
@@ -87,7 +88,7 @@ class Meetings:
         found = dr.empty(UInt32, 2 * dr.width(raster.triangle)), dr.zeros(UInt32, 1)
         return cls(dr.detach(positions), *surfaces, *size, unconnected, creases, crease_weights, *found)
 
-    def add(self, slot: Any, here: Any, there: Any, soft: Any, cross: Callable[[Any], Any]) -> None:
+    def add(self, slot: UInt32, here: UInt32, there: UInt32, soft: Float, cross: Callable[[Bool], Bool]) -> None:
         """List a pair if what it sees may meet. To be traced only once.
 
         Args:
@@ -103,17 +104,17 @@ class Meetings:
         listed = both & dr.select(apart, self.unconnected, folded)
         if self.unconnected:
             listed |= cross(both & ~listed)
-        dr.scatter(self.slots, slot, dr.scatter_inc(self.count, UInt32(0), listed), listed)
+        dr.scatter(self.slots, slot, scatter_inc(self.count, UInt32(0), listed), listed)
 
-    def for_each(self, visit: Callable[[Any], None]) -> None:
+    def for_each(self, visit: Callable[[UInt32], None]) -> None:
         """Call ``visit(slot)``, which writes somewhere, for all pairs that were listed: few, and dear to visit."""
         each_number(self.count, _LANES, lambda k: visit(dr.gather(type(k), self.slots, k)))
 
-    def weight(self, pixel: Any, down: Any) -> Any:
+    def weight(self, pixel: UInt32, down: Bool) -> Float:
         """Signed weight (see :class:`Crossings`) of pairs of pixels that see triangles, 0 where these do not meet in between."""
         return self._between(pixel, down)[0]
 
-    def slopes(self, pixel: Any, down: Any) -> list[tuple[Any, Any]]:
+    def slopes(self, pixel: UInt32, down: Bool) -> list[tuple[UInt32, Vector4f]]:
         """(vertex, change of the weight with its clip-space position, ``Array4f``) for all six vertices."""
         _, rate, triangles = self._between(pixel, down)
         Array4f = backend(rate).Array4f
@@ -124,16 +125,19 @@ class Meetings:
             result += [(vertices[k], direction * (sign * rate * weights[k])) for k in range(3)]
         return result
 
-    def _between(self, pixel: Any, down: Any) -> tuple[Any, Any, list[Any]]:
+    def _between(self, pixel: UInt32, down: Bool) -> tuple[Float, Float, list[tuple[list[UInt32], list[Float], list[Float]]]]:
         """Weight, its change with the first depth minus the second, and (vertices, depth plane, barycentrics / w) of both."""
         module = backend(self.positions)
-        Float, Float64, UInt32 = module.Float, module.Float64, module.UInt32
+        Float, UInt32 = module.Float, module.UInt32
         row_flat = pixel // self.width
         image, row = by_image(row_flat, self.height, self.batch)
         column = pixel - row_flat * self.width
         first = image * self.vertex_count
         # Centre of the pixel, and the way to its neighbour, in NDC.
-        x, y = (2 * Float64(column) + (1 - self.width)) / self.width, (2 * Float64(row) + (1 - self.height)) / self.height
+        x, y = (
+            (2 * module.Float64(column) + (1 - self.width)) / self.width,
+            (2 * module.Float64(row) + (1 - self.height)) / self.height,
+        )
         step_x, step_y = 2 / self.width, 2 / self.height
         step = dr.select(down, UInt32(self.width), 1)
         found, seen, parts = [], [], []
@@ -153,7 +157,7 @@ class Meetings:
             seen.append((triangle, first, corners))
         planes = [plane for _, _, plane in found]
 
-        def along(plane: Any) -> Any:
+        def along(plane: Line) -> Float64:
             """Its change on the way to the neighbour."""
             return dr.select(down, plane[1] * step_y, plane[0] * step_x)
 
@@ -185,7 +189,9 @@ class Meetings:
         triangles = [(vertices, [Float(v) for v in plane], at[k]) for k, (vertices, _, plane) in enumerate(found)]
         return Float(share) * beyond_middle(Float(t)), Float(-share * slope), triangles
 
-    def _bent(self, triangle: Any, first: Any, corners: Any, planes: list[Any], along: Callable[[Any], Any]) -> Any:
+    def _bent(
+        self, triangle: UInt32, first: UInt32, corners: Corners, planes: list[Line], along: Callable[[Line], Float64]
+    ) -> Float64:
         """Largest turn of the faces beside a triangle away from both planes, as changes of depth on the way to the neighbour.
 
         The ridge itself lies between a face of the one plane and a face of the other.
@@ -202,7 +208,7 @@ class Meetings:
         return most
 
 
-def beyond_middle(t: Any) -> Any:
+def beyond_middle(t: Float) -> Float:
     """Distance (pixels) beyond the border between two pixels, from where it is (0 to 1) between their centres.
 
     Never 0: see ``LEAST_WEIGHT``.
@@ -210,9 +216,11 @@ def beyond_middle(t: Any) -> Any:
     return dr.select(t == 0.5, LEAST_WEIGHT, t - 0.5)
 
 
-def _plane(corners: tuple[Any, Any, Any]) -> tuple[list[list[Any]], list[Any]]:
+def _plane(corners: Corners) -> tuple[list[Line], Line]:
     """Barycentrics / w of a triangle as affine functions (a, b, c: a x + b y + c) in NDC, and its depth as such a one."""
     lines, det = edge_lines(corners)
     inverse = dr.select(det != 0, precise_rcp(dr.select(det != 0, det, 1)), 0)
-    lines = [[c * inverse for c in line] for line in lines]
-    return lines, [sum(line[c] * type(det)(p.z) for line, p in zip(lines, corners, strict=True)) for c in range(3)]
+    lines = [(a * inverse, b * inverse, c * inverse) for a, b, c in lines]
+    return lines, cast(
+        Line, tuple(sum(line[c] * type(det)(p.z) for line, p in zip(lines, corners, strict=True)) for c in range(3))
+    )

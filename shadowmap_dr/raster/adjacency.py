@@ -1,7 +1,7 @@
 """Common edges and vertices of the faces of a mesh (on the host).
 
-Half-edges are counted as 3 * face + corner: each leads from that corner to the next one. What copies of a shape have in common is
-found out for the first one only (:class:`~shadowmap_dr.raster.welding.Copies`).
+Half-edge 3 * face + corner leads from that corner to the next one. Copies of a shape are adjacent alike, so that only the first
+copy is processed (:class:`~shadowmap_dr.raster.welding.Copies`).
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..jit.types import UInt32
 from .index_buffer import IndexBufferBuilder
 from .types import NO_VERTEX
 from .welding import Copies, Index, runs
@@ -22,12 +23,12 @@ Vertices = npt.NDArray[np.uint32]
 
 @dataclass(frozen=True)
 class InnerEdges:
-    """Edges of the first of some copies. Degenerate faces (two corners at the same place) are left out.
+    """Edges of the first copy of a shape. Degenerate faces (two corners at the same place) are left out.
 
     Attributes:
-        pair, partner: half-edges (P,) at which exactly two faces meet: the first and the second of each.
+        pair, partner: (P,) first and second half-edge of each edge at which exactly two faces meet.
         alone: all other half-edges.
-        ends, thirds: (P, 2) vertices of the edges, and third vertices of both faces.
+        ends, thirds: (P, 2) vertices of the paired edges, and third vertices of both faces.
     """
 
     pair: Index
@@ -38,10 +39,10 @@ class InnerEdges:
 
     @classmethod
     def of(cls, copies: Copies, corners: Vertices, own: Index) -> InnerEdges:
-        """Find them.
+        """Find the edges.
 
         Args:
-            copies: of a shape.
+            copies: copies of a shape.
             corners: (3 F,) vertices of all faces.
             own: (V,) as in :class:`~shadowmap_dr.raster.welding.Welded`.
         """
@@ -49,7 +50,7 @@ class InnerEdges:
         welded = own[corners[half]].reshape(-1, 3)
         half = half[np.repeat((welded != welded[:, [1, 2, 0]]).all(1), 3)]
         pair, partner, alone = pairs_of(half, edge_keys(own, corners, half))
-        # Which face's vertices an edge has, and so which ones of several at a place receive its gradients: the lower corner's.
+        # An edge takes the vertices of the face with the lower corner: of several vertices at a place, these receive gradients.
         ranks = [h % 3 * len(corners) + h // 3 for h in (pair, partner)]
         pair, partner = np.where(ranks[0] < ranks[1], [pair, partner], [partner, pair])
         ends = np.stack([corners[pair], corners[after(pair)]], 1)
@@ -58,23 +59,23 @@ class InnerEdges:
 
 
 def after(halves: Index) -> Index:
-    """The half-edges that follow these in their faces."""
+    """The next half-edge of the same face, for each half-edge."""
     return halves + np.where(halves % 3 == 2, -2, 1)
 
 
 def third(corners: Vertices, halves: Index) -> Vertices:
-    """The vertices of the faces of half-edges that are not theirs."""
+    """The third vertex of the face, for each half-edge."""
     return corners[halves + np.where(halves % 3 == 0, 2, -1)]
 
 
 def edge_keys(welded: Index, corners: Vertices, halves: Index) -> Index:
-    """One number for each edge, whichever way it runs. ``welded`` (V,): one number for all vertices that count as one."""
+    """One number for each edge, in either direction. ``welded`` (V,): the same number for vertices that count as one."""
     start, end = welded[corners[halves]], welded[corners[after(halves)]]
     return np.minimum(start, end) * len(welded) + np.maximum(start, end)
 
 
 def pairs_of(halves: Index, keys: Index) -> tuple[Index, Index, Index]:
-    """Those whose key exactly one other has, too (the first and the second of each two), and the rest, ascending."""
+    """(first, second, other half-edges): pairs of half-edges that alone share a key, and all others, ascending."""
     if not len(halves):
         return halves, halves, halves
     order = np.argsort(keys)
@@ -87,13 +88,12 @@ def pairs_of(halves: Index, keys: Index) -> tuple[Index, Index, Index]:
 
 @dataclass(frozen=True)
 class EdgeBlocks:
-    """An order of the edges of copies: by the lower half-edge of each, as if no shape were a copy.
+    """Order of the edges of all copies: by the lower half-edge of each edge, as if no shape were a copy.
 
     Attributes:
-        copies: as for :func:`parts_of`.
-        places: for each group of copies where the edges of each copy begin (copies,); for shapes without a copy where each edge
-            lies.
-        count: of all edges.
+        copies: groups of copies.
+        places: for each group, the first index of each copy's edges (copies,); for shapes without a copy, the index of each edge.
+        count: number of all edges.
     """
 
     copies: Sequence[Copies]
@@ -102,7 +102,7 @@ class EdgeBlocks:
 
     @classmethod
     def of(cls, copies: Sequence[Copies], inner: Sequence[InnerEdges]) -> EdgeBlocks:
-        """``inner``: edges of each group."""
+        """Order the edges of groups of copies; ``inner`` holds the edges of each group."""
         groups = list(zip(copies, inner, strict=True))
         starts = np.concatenate([group.faces for group in copies if len(group.faces) > 1] or [np.zeros(0, np.int64)])
         sizes = [np.full(len(group.faces), len(edges.pair)) for group, edges in groups if len(group.faces) > 1]
@@ -119,12 +119,12 @@ class EdgeBlocks:
         return cls(copies, places, len(single) + int(before[-1]))
 
     def buffer(
-        self, dtype: type, values: Sequence[npt.NDArray[np.integer[Any]]], rest: npt.NDArray[np.integer[Any]], kind: str
-    ) -> Any:
-        """Numbers of all edges and of those that come last, ``rest`` (R, 2): ``dtype`` (2 (count + R),).
+        self, dtype: type[UInt32], values: Sequence[npt.NDArray[np.integer[Any]]], rest: npt.NDArray[np.integer[Any]], kind: str
+    ) -> UInt32:
+        """Indices of all edges, then ``rest`` (R, 2): ``dtype`` (2 (count + R),).
 
-        ``values``: for the edges (E, 2) of the first copy of each group. ``kind``: ``vertices`` or ``faces``; the numbers of
-        copies differ by that of their first one.
+        ``values``: indices for the edges (E, 2) of the first copy of each group, of ``vertices`` or ``faces`` (``kind``). They are
+        shifted for each copy.
         """
         buffer = IndexBufferBuilder(dtype, 2 * (self.count + len(rest)))
         for group, places, own in zip(self.copies, self.places, values, strict=True):
@@ -138,8 +138,8 @@ class EdgeBlocks:
 
 
 def across_edges(
-    dtype: type, copies: Sequence[Copies], inner: Sequence[InnerEdges], corners: Vertices, one: Index, two: Index
-) -> Any:
+    dtype: type[UInt32], copies: Sequence[Copies], inner: Sequence[InnerEdges], corners: Vertices, one: Index, two: Index
+) -> UInt32:
     """``Topology.beyond``: the third vertex of the face on the other side of each half-edge, ``dtype`` (3 F,).
 
     ``inner``: edges of each group of copies. ``one``, ``two``: half-edges of the edges between shapes.
@@ -159,7 +159,7 @@ def across_edges(
     return buffer.build()
 
 
-def parts_of(dtype: type, copies: Sequence[Copies], corners: Vertices, own: Index) -> tuple[Any, int]:
+def parts_of(dtype: type[UInt32], copies: Sequence[Copies], corners: Vertices, own: Index) -> tuple[UInt32, int]:
     """Number of the connected part of each face, from 0 on (``dtype`` (F,)), and how many there are.
 
     Other arguments as for :meth:`InnerEdges.of`.
@@ -177,10 +177,10 @@ def parts_of(dtype: type, copies: Sequence[Copies], corners: Vertices, own: Inde
 
 
 def _connected(welded: Index) -> tuple[Index, int]:
-    """Number of the connected part of each face (F, 3), from 0 on, and how many there are.
+    """(index of the connected part of each face (F, 3), number of parts).
 
-    All vertices point to themselves at first. Those that the corners of a face point to are redirected to the lowest of them and
-    chains are cut short, until nothing changes: as many rounds as the logarithm of a part's size, about.
+    Pointer jumping: all vertices point to themselves at first. The targets of a face's corners are redirected to the lowest of
+    them, and chains are shortened, until nothing changes. The number of rounds is about the logarithm of a part's size.
     """
     target = np.arange(welded.max() + 1)
     while True:

@@ -9,12 +9,12 @@ from ..jit.types import Bool, Float, UInt32, Vector4f
 from .screen_planes import offset, pixels, planes
 from .types import NO_TRIANGLE, RasterOutput, by_image
 
-# Pixels of a lane, as many as a packet holds.
+# Pixels of a lane: the size of a packet.
 _STRIP = 4
 
 
 def pixel_barycentrics(raster: RasterOutput, positions: Float, faces: UInt32) -> tuple[Float, Float, Float]:
-    """Perspective-correct (u, v), 0 where nothing is seen, and NDC depth, 1 there, of each pixel's centre. Detached."""
+    """Perspective-correct (u, v, NDC depth) of each pixel's centre; (0, 0, 1) where no triangle is visible. Detached."""
     with dr.suspend_grad():
         depths, weights = planes(dr.detach(positions), faces, raster, True)
         dr.eval(depths, weights)
@@ -30,7 +30,7 @@ def _each(raster: RasterOutput, depths: Float, weights: tuple[Float, ...]) -> tu
 
 
 def _strips(raster: RasterOutput, depths: Float, weights: tuple[Float, ...]) -> tuple[Float, Float, Float]:
-    """Four pixels of a row a lane: mostly they see the same triangle, whose look-up they share."""
+    """Four pixels of a row a lane. Mostly they see the same triangle, and share its look-up."""
     module = backend(depths)
     count = dr.width(raster.triangle)
     lane = dr.arange(module.UInt32, count // _STRIP)
@@ -74,14 +74,14 @@ def _at_pixel(
 def _look_up(
     index: UInt32, active: Bool | bool, depths: Float, weights: tuple[Float, ...]
 ) -> tuple[Vector4f, Vector4f, Vector4f, Float]:
-    """Values of `planes` for a triangle: depth; barycentrics of vertices 1 and 2 divided by w; 1 / w at the pixel."""
+    """Functions of a triangle from `planes`: depth; barycentrics of vertices 1 and 2 divided by w; 1 / w at the pixel."""
     module = backend(depths)
     depth, one, two = (dr.gather(module.Array4f, flat, index, active) for flat in (depths, *weights[:2]))
     return depth, one, two, dr.gather(module.Float, weights[2], index, active)
 
 
 def _evaluate(records: tuple[Vector4f, Vector4f, Vector4f, Float], x: Float, y: Float) -> tuple[Float, Float, Float]:
-    """(u, v, depth) so many columns and rows from the pixel that a triangle's functions refer to."""
+    """(u, v, depth) at an offset (``x`` columns, ``y`` rows) from the reference pixel of a triangle's functions."""
     depth, one, two, at_pixel = records
     inverse_w = dr.fma(one.w, x, dr.fma(two.w, y, at_pixel))
     w = dr.rcp(dr.select(inverse_w != 0, inverse_w, 1))

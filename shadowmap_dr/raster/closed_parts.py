@@ -1,4 +1,4 @@
-"""Faces that no one outside of a mesh ever sees from behind, and the best order to draw them in. Found once on the host."""
+"""Faces whose backs are invisible from outside the mesh, and a fast drawing order. Computed once on the host."""
 
 from __future__ import annotations
 
@@ -10,11 +10,10 @@ from .topology import Topology
 def outward_faces(topology: Topology, positions: np.ndarray) -> np.ndarray:
     """Faces of the parts of a mesh that are closed and turned outwards (bool, F).
 
-    A ray from outside meets the front of such a part before it meets its back: of what is outermost, faces that turn away need
-    not be drawn.
+    A ray from outside meets the front of such a part before its back, so that backfaces need not be drawn.
 
     Args:
-        topology: of the mesh.
+        topology: topology of the mesh.
         positions: (V, 3) vertices.
 
     A part is closed if each of its edges has exactly two faces, which run along it in opposite directions, and turned outwards
@@ -33,7 +32,7 @@ def outward_faces(topology: Topology, positions: np.ndarray) -> np.ndarray:
     closed = np.ones(topology.part_count, bool)
     closed[owner[~fine]] = False
     a, b, c = (np.asarray(positions, np.float64)[faces[:, k]] for k in range(3))
-    # Each part around a point of its own, where least is lost.
+    # Volumes relative to a point of each part keep rounding errors small.
     first = np.zeros((topology.part_count, 3))
     first[parts] = a
     origin = first[parts]
@@ -48,8 +47,8 @@ _BINS = 24
 def drawing_order(faces: np.ndarray, positions: np.ndarray) -> np.ndarray:
     """An order of faces (F,) in which neighbours face the same way and have about the same size.
 
-    Triangles are drawn in packets, which take as long as their largest triangle: where those that turn away are left out, it pays
-    that all of a packet do.
+    Triangles are drawn in packets, each as slow as its largest triangle. With backface culling, packets that face away as a whole
+    cost nothing.
 
     Args:
         faces: (F, 3) vertex indices.

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..jit.arrays import device_array
+from ..jit.types import UInt32
 from .types import NO_VERTEX
 
 Numbers = npt.NDArray[np.integer[Any]]
@@ -25,7 +26,7 @@ class IndexBufferBuilder:
         size: how many numbers there are.
     """
 
-    def __init__(self, dtype: type, size: int) -> None:
+    def __init__(self, dtype: type[UInt32], size: int) -> None:
         self._dtype, self._size = dtype, size
         self._scattered: list[tuple[npt.ArrayLike, Numbers]] = []
         self._copied: list[tuple[Numbers, Numbers, Numbers]] = []
@@ -38,7 +39,7 @@ class IndexBufferBuilder:
         """Numbers (N,) in one piece at each of ``starts`` (C,), greater by one of ``shifts`` (C,) there. ``NO_VERTEX`` stays."""
         self._copied.append((numbers.astype(np.uint32), starts, shifts.astype(np.uint32)))
 
-    def build(self) -> Any:
+    def build(self) -> UInt32:
         """The buffer, ``dtype``; ``NO_VERTEX`` where nothing was put."""
         if sum(len(numbers) * len(starts) for numbers, starts, _ in self._copied) >= _MANY:
             return self._on_device()
@@ -56,7 +57,7 @@ class IndexBufferBuilder:
             buffer[places] = numbers
         return buffer
 
-    def _on_device(self) -> Any:
+    def _on_device(self) -> UInt32:
         dtype = self._dtype
         buffer = dr.full(dtype, NO_VERTEX, self._size)
         dr.make_opaque(buffer)

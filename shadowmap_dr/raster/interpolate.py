@@ -17,14 +17,14 @@ def interpolate(attributes: TensorXf, raster: RasterOutput, faces: TensorXu | UI
     Args:
         attributes: tensor (V, C), the same for all images, or (B, V, C).
         raster: rasterizer output.
-        faces: indices into ``attributes``, tensor (F, 3) or flat: those given to the rasterizer, or others for the same
-            triangles (such as those of texture coordinates).
-        check_indices: verify that no index is out of range, which reads back one number; a caller that has checked its
-            (constant) faces before switches it off, as it must inside ``dr.freeze``.
+        faces: indices into ``attributes``, tensor (F, 3) or flat: the faces given to the rasterizer, or other indices for the
+            same triangles (such as those of texture coordinates).
+        check_indices: verify that no index is out of range. This reads back one number. Switch it off for (constant) faces
+            that have been checked before, and inside ``dr.freeze``.
 
     Returns:
-        Tensor (H, W, C), or (B, H, W, C) for more than one image; 0 where nothing is seen. Gradients flow to ``attributes`` and,
-        through the barycentrics, to the positions that were rasterized.
+        Tensor (H, W, C), or (B, H, W, C) for more than one image; 0 where no triangle is visible. Gradients flow to
+        ``attributes`` and, through the barycentrics, to the rasterized positions.
 
     Raises:
         ValueError: attributes or faces do not fit the images or each other; an index is out of range.
@@ -53,7 +53,7 @@ def interpolate(attributes: TensorXf, raster: RasterOutput, faces: TensorXu | UI
             value = dr.gather(module.Float, attributes.array, (first + corners[k]) * channels + c, hit)
             total = dr.fma(weights[k], value, total)
         totals.append(dr.select(hit, total, 0))
-    # At once: scattered one by one, each channel would be a kernel of its own.
+    # All channels in one kernel: separate scatters would be separate kernels.
     result = totals[0] if channels == 1 else ravel(module.ArrayXf(totals))
     size = (raster.height, raster.width, channels)
     return type(attributes)(result, shape=size if raster.batch == 1 else (raster.batch, *size))

@@ -1,4 +1,4 @@
-"""Visibility: which triangle does each pixel see, and where on it."""
+"""Visibility: the triangle that each pixel sees, and the barycentrics of the seen point."""
 
 from __future__ import annotations
 
@@ -47,11 +47,11 @@ def rasterize(
         resolution: (height, width) in pixels, each 1 to 4096. Pixel (row j, column i) has its centre at
             ``ndc = (2 (i + 0.5) / width - 1, 2 (j + 0.5) / height - 1)``: row 0 lies at y = -1.
         batch: number of images B, needed only where ``positions`` is flat and holds more than one.
-        check_indices: verify that no index is out of range. This reads back one number; a caller that has checked its
-            (constant) faces before switches it off, as it must inside ``dr.freeze``.
-        transparent: alpha test. Gets what the pixels see (detached) and returns a mask of those that see through it, to what
-            lies behind. No gradients.
-        layers: how many surfaces are tested at most, one behind the other; the last one counts as opaque.
+        check_indices: verify that no index is out of range. This reads back one number. Switch it off for (constant) faces
+            that have been checked before, and inside ``dr.freeze``.
+        transparent: alpha test. A function of a :class:`RasterOutput` (detached) that returns the mask of pixels whose surface
+            is transparent there; these pixels see the surface behind it. No gradients.
+        layers: maximum number of surfaces tested for each pixel, front to back. The last surface counts as opaque.
 
     Returns:
         :class:`RasterOutput`; barycentrics and depth carry gradients to ``positions``.
@@ -83,8 +83,11 @@ def visible_triangles(
 ) -> RasterOutput:
     """As :func:`rasterize`, for positions and faces known to be valid, without the cost of barycentrics and depths.
 
-    These are there, and attached, but not prepared: whoever uses them pays for them. ``one_sided``: ``Bool`` (F,), faces that are
-    drawn only where their corners run from +x to -y, that is, clockwise where y points up; or (B F,), those of each image.
+    Barycentrics and depths are attached but not evaluated, so that they cost nothing unless they are used.
+
+    Args:
+        one_sided: faces, (F,) or (B F,) for each image, that are drawn only if their corners run from +x to -y, that is,
+            clockwise where y points up.
     """
     flat, face_indices, batch, vertex_count = check_mesh(positions, faces, batch, False)
     size = (batch, vertex_count, *check_resolution(resolution))
@@ -183,14 +186,14 @@ def _locate(
 
 
 def cross2(ax: Float, ay: Float, bx: Float, by: Float) -> Float:
-    """``ax * by - ay * bx`` without cancellation error (Kahan's compensated difference of products)."""
+    """``ax * by - ay * bx`` without cancellation error (Kahan's compensated difference of products). Attached."""
     product = ay * bx
     rounding = dr.detach(dr.fma(-ay, bx, product))
     return dr.fma(ax, by, -product) + rounding
 
 
 def _exact_ndc(module: ModuleType, index: UInt32, size: int) -> tuple[Float, Float]:
-    """NDC coordinate of a pixel centre as a sum of two floats: on steep triangles, half an ulp of it shows in the depth."""
+    """NDC coordinate of a pixel centre as a sum of two floats: on steep triangles, an error of half an ulp shows in the depth."""
     numerator = dr.fma(module.Float(index), 2.0, 1.0 - size)
     ndc = numerator / size
     return ndc, dr.fma(-ndc, size, numerator) / size
@@ -224,7 +227,7 @@ def _visible_triangles(
 
 
 def _triangle_of(keys: UInt64) -> UInt32:
-    """Triangle index of fragment keys: that of an empty one is ``NO_TRIANGLE``."""
+    """Triangle index of fragment keys: ``NO_TRIANGLE`` for an empty key."""
     return backend(keys).UInt32(keys)
 
 
@@ -242,21 +245,21 @@ def _nearest_fragments(
     """Triangle of each pixel, row-major, and the edge functions and depth planes of all triangles (see ``Triangles``).
 
     Args:
-        behind: ``UInt64`` keys: pixels see only what lies behind.
-        peel: return fragment keys instead of triangles, and do not leave out what large triangles hide.
+        behind: keys: pixels see only fragments with larger keys, that is, farther ones.
+        peel: return fragment keys (``UInt64``) instead of triangles (``UInt32``), and keep triangles that large ones hide.
         one_sided: see :func:`visible_triangles`.
     """
     module = backend(positions)
     UInt64 = module.UInt64
     face_count = dr.width(faces) // 3
     grid = TileGrid(batch, height, width)
-    # The keys of a tile lie side by side: what is near in the image is near in memory, in both directions.
+    # The keys of a tile are contiguous, so that neighbours in the image are near in memory in both directions.
     tiled = not peel and height * width > _LARGE
     keys = _empty_keys(module, grid.pixel_count if tiled else batch * height * width)
     index = dr.arange(module.UInt32, batch * face_count)
     image, triangle = by_image(index, face_count, batch)
     triangles = set_up(gather_triangle(positions, faces, triangle, image * vertex_count, True), height, width)
-    # Not one array: Dr.Jit would write its parts in kernels of their own.
+    # Three flat arrays: Dr.Jit would write the components of a nested array in separate kernels.
     records = ravel(triangles.a), ravel(triangles.b), ravel(triangles.c)
 
     x0, y0, x1, y1 = triangles.box
@@ -297,7 +300,7 @@ def _empty_keys(module: ModuleType, count: int) -> UInt64:
     if count < _MANY:
         keys = dr.full(module.UInt64, EMPTY, count)
     else:
-        # One thread fills an array with a constant; a kernel of all threads takes a third of the time.
+        # Dr.Jit fills constant arrays with one thread. A kernel of all threads takes a third of the time.
         keys = module.UInt64(EMPTY) ^ module.UInt64(dr.arange(module.UInt32, count) >> 31)
     dr.eval(keys)
     return keys
@@ -313,9 +316,9 @@ def _merge_large(
     face_count: int,
     kind: Callable[[UInt64], UInt32 | UInt64],
 ) -> UInt32 | UInt64:
-    """The nearer of what small triangles left at each pixel and of the large ones in its tile's list.
+    """Nearest fragment of each pixel: of ``best``, the keys after the small triangles, and of the large ones in its tile's list.
 
-    As keys or triangle indices, by the ``kind`` of the result: ``UInt64`` or ``UInt32``.
+    Returns keys or triangle indices, by ``kind``: ``UInt64`` or ``UInt32``.
     """
     grid = lists.grid
     module = backend(best[0])
@@ -329,7 +332,7 @@ def _merge_large(
     def visit(position, end, *best):  # noqa: ANN001, ANN002, ANN202
         index = dr.gather(UInt32, lists.items, position)
         a, b, c = (dr.gather(module.Array4f, record, index) for record in records)
-        # What a triangle's look-up costs is shared by the pixels of a strip.
+        # The pixels of a strip share the look-up of a triangle.
         values = [dr.fma(a, x + k, dr.fma(b, y, c)) for k in range(STRIP)]
         nearer = []
         for k, old in enumerate(best):

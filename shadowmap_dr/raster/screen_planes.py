@@ -1,7 +1,7 @@
-"""Triangles as functions of the pixel: depths and barycentrics from a few numbers for each triangle.
+"""Depth and barycentrics of a triangle as affine functions of the pixel.
 
-NDC depth, and barycentrics divided by w, are affine on the screen, perspective or not. That makes them cheap to evaluate, and
-derivatives of an image of depths may be summed up over the pixels of each triangle before they go on to its vertices.
+NDC depth, and barycentrics divided by w, are affine on the screen, in perspective, too. So they are cheap to evaluate, and
+gradients of an image of depths can be summed over the pixels of each triangle before they go on to its vertices.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from ..jit.types import Bool, Float, UInt32, Vector4f
 from .triangle_setup import Corners, edge_lines, gather_triangle
 from .types import MAX_RESOLUTION, RasterOutput, by_image, pixel_coordinates, precise_rcp
 
-# Smallest determinant (twice the area in NDC times all w) of a triangle that a pixel may see.
+# Smallest determinant (twice the area in NDC times all three w) of a visible triangle.
 _LEAST = 1e-25
 _COLUMN_BITS = (MAX_RESOLUTION - 1).bit_length()
 
@@ -21,17 +21,16 @@ _COLUMN_BITS = (MAX_RESOLUTION - 1).bit_length()
 def pixel_depth(
     raster: RasterOutput, positions: Float, faces: UInt32, reciprocal: Bool | None = None
 ) -> tuple[Float, Float, Float]:
-    """NDC depth of what each pixel sees (``Float``, 1 where it sees nothing), and its change by column and row.
+    """NDC depth of the visible surface (1 where there is none), and its change by column and by row.
 
-    The depth is attached to ``positions``: the same as ``raster.depth`` up to rounding, in value and derivative, and several
-    times cheaper in both directions. The changes are detached, 0 where nothing is seen.
+    The depth is attached to ``positions``. It equals ``raster.depth`` up to rounding, in value and derivative, and is several
+    times cheaper in both directions. The changes are detached, 0 where no triangle is visible.
 
     Args:
-        raster: of these positions and faces.
+        raster: output of the rasterizer for these positions and faces.
         positions, faces: flat arrays, as rasterized.
-        reciprocal: ``Bool``, for each image: whether it is to be 1 / w in the place of the depth. In perspective that is the same
-            up to a scale and an offset, but next to the offset, which is huge where the near plane is close, it would drown
-            in rounding.
+        reciprocal: for each image, True to return 1 / w instead of the depth. In perspective, the depth is an affine function
+            of 1 / w, whose huge offset (if the near plane is close) would drown 1 / w in rounding.
     """
     depths, _ = planes(positions, faces, raster, False, reciprocal)
     dr.eval(depths)
@@ -39,11 +38,11 @@ def pixel_depth(
 
 
 def depth_at(depths: Float, index: UInt32, row: UInt32, column: UInt32, hit: Bool) -> tuple[Float, Float, Float]:
-    """Result of :func:`pixel_depth`, for any pixels.
+    """Result of :func:`pixel_depth` at any pixels.
 
     Args:
-        depths: the first result of :func:`planes`.
-        index: number of the triangle through the batch, where there is one (``hit``).
+        depths: first result of :func:`planes`.
+        index: index of the triangle in the batch, where a triangle is visible (``hit``).
     """
     plane = dr.gather(backend(depths).Array4f, depths, index, hit)
     x, y = offset(plane, row, column)
@@ -52,13 +51,13 @@ def depth_at(depths: Float, index: UInt32, row: UInt32, column: UInt32, hit: Boo
 
 
 def pixels(raster: RasterOutput) -> tuple[UInt32, UInt32, UInt32]:
-    """(number of the triangle through the batch, row, column) of each pixel."""
+    """(index of the triangle in the batch, row, column) of each pixel."""
     image, row, column = pixel_coordinates(backend(raster.triangle), raster.batch, raster.height, raster.width)
     return image * raster.face_count + raster.triangle, row, column
 
 
 def offset(plane: Vector4f, row: UInt32, column: UInt32) -> tuple[Float, Float]:
-    """Pixels from the one that a triangle's functions refer to."""
+    """(columns, rows) from the reference pixel of a triangle's functions."""
     module = backend(plane)
     corner = module.UInt32(dr.detach(plane.w))
     x = module.Float(module.Int32(column) - module.Int32(corner & (MAX_RESOLUTION - 1)))
@@ -68,14 +67,18 @@ def offset(plane: Vector4f, row: UInt32, column: UInt32) -> tuple[Float, Float]:
 def planes(
     positions: Float, faces: UInt32, raster: RasterOutput, barycentrics: bool, reciprocal: Bool | None = None
 ) -> tuple[Float, tuple[Float, ...]]:
-    """Affine functions of the pixel for each triangle of each image: change by column, by row, and value at a pixel.
+    """Affine functions of the pixel for each triangle of each image: change by column, by row, and value at a reference pixel.
 
-    That pixel lies near the triangle: far away from it, small triangles would lose their depth to rounding. ``reciprocal``: see
-    :func:`pixel_depth`.
+    The reference pixel lies near the triangle: far away from it, small triangles would lose their depth to rounding.
 
-    Returns a ``Float`` array with four numbers for each triangle: the function of the depth, attached, and the pixel. And,
-    detached and only if asked for, those of the barycentrics of vertices 1 and 2, divided by w, with the changes of 1 / w as
-    the fourth numbers, and the values of 1 / w.
+    Args:
+        barycentrics: also return the functions of the barycentrics.
+        reciprocal: see :func:`pixel_depth`.
+
+    Returns:
+        Four numbers for each triangle, flat: the function of the depth (attached) and the packed reference pixel. And, if asked
+        for, a tuple (detached): four numbers for each of vertices 1 and 2, the function of its barycentric divided by w and the
+        change of 1 / w by column (row); and the values of 1 / w.
     """
     module = backend(positions)
     Float, Float64, UInt32 = module.Float, module.Float64, module.UInt32
@@ -91,7 +94,7 @@ def planes(
     with dr.suspend_grad():
         own = dr.detach(corners[0]), dr.detach(corners[1]), dr.detach(corners[2])
         lines, det = edge_lines(own)
-        # Slivers that hardly are triangles would have infinite weights, and NaN derivatives where no pixel sees them.
+        # Degenerate slivers would have infinite weights, and NaN derivatives although no pixel sees them.
         regular = dr.isfinite(det) & (dr.abs(det) > _LEAST)
         inverse = dr.select(regular, precise_rcp(dr.select(regular, det, 1)), 0)
         near = [_pixel_near(own, axis, size) for axis, size in ((0, width), (1, height))]
@@ -109,7 +112,7 @@ def planes(
         weights = [[Float(w) for w in row] for row in (change_x, change_y, there)]
         value = [Float(v) for v in (dx, dy, d)]
     if dr.grad_enabled(positions):
-        # z = A x + B y + C w holds for all corners: what a corner's change violates, the plane's change makes up for.
+        # z = A x + B y + C w holds for all corners: the change of the plane balances that of each corner.
         excess = [z - slopes[0] * p.x - slopes[1] * p.y - slopes[2] * p.w for p, z in zip(corners, heights, strict=True)]
         value = [
             replace_grad(v, sum(w * e for w, e in zip(row, excess, strict=True))) for v, row in zip(value, weights, strict=True)
@@ -124,7 +127,7 @@ def planes(
 
 
 def _pixel_near(corners: Corners, axis: int, size: int) -> UInt32:
-    """Column (axis 0) or row (1) of a pixel of the image close to the corners, ``UInt32``."""
+    """Column (axis 0) or row (axis 1) of a pixel in the image close to the corners."""
     module = backend(corners[0])
     middle = module.Float(0)
     for p in corners:

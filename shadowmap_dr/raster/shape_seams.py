@@ -1,4 +1,4 @@
-"""Edges at which faces of different shapes border on each other: one surface for as long as both shapes stay where they are."""
+"""Seams: edges that faces of two shapes share, as one surface, until the shapes move apart."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from ..jit.types import Point3f, UInt32
 from .topology import Topology
 from .types import NO_VERTEX
 
-# Vertices of two shapes are at one place still, but for rounding, up to this part of their coordinates, and of the edge's length.
+# Vertices of two shapes still coincide within this fraction of their coordinates (rounding), plus this one of the edge's length.
 _ROUNDING, _SHORT = 1e-6, 1e-5
 
 
 def detach_moved_seams(topology: Topology, points: Point3f, shapes: UInt32, hidden: Sequence[int] = ()) -> Topology:
-    """The topology of a mesh whose shapes may have moved since they bordered on each other.
+    """The topology of a mesh after its shapes may have moved: seams of shapes that no longer touch become boundaries.
 
     Args:
         topology: made with the ``shapes`` of its vertices.
-        points: ``Array3f`` (V,), vertices as they are now, in any space. Detached.
-        shapes: ``UInt32`` (V,), whose they are.
-        hidden: shapes whose faces are not drawn: others that border on them end there.
+        points: (V,) current vertices, in any space. Detached.
+        shapes: (V,) shape of each vertex.
+        hidden: shapes whose faces are not drawn; their seams are boundaries of the other shapes.
     """
     seams = topology.seams
     if seams is None:

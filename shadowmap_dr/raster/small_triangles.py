@@ -1,7 +1,7 @@
-"""Drawing triangles row by row, one lane a triangle: the way for the small and the thin ones, that is, nearly all.
+"""Rasterization of small and thin triangles (nearly all triangles), one lane for each.
 
-Each lane walks the rows of its triangle and, in each, the few columns between its edges, and merges fragments into the image
-with an atomic minimum over ``(depth, triangle)`` keys. Nothing is sorted and no list is kept.
+Each lane walks the rows of its triangle and, in each row, the few columns between its edges. It merges fragments into the image
+with an atomic minimum over ``(depth, triangle)`` keys. There are no lists and no sorting.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from ..jit.arrays import backend
 from ..jit.types import Bool, Int32, UInt32, UInt64, Vector4f
 from .triangle_setup import Box, Triangles, centred, covers, fragment_key, rounding_error
 
-#: Key of a pixel that nothing covers.
+#: Key of a pixel that no triangle covers.
 EMPTY = 0xFFFFFFFFFFFFFFFF
 
 
@@ -27,13 +27,13 @@ def draw(
     box: Box,
     active: Bool,
 ) -> None:
-    """Merge the fragments of triangles within a box each into an image of keys.
+    """Merge the fragments of triangles into an image of keys; only fragments within each triangle's ``box``.
 
     Args:
-        keys: ``UInt64`` for each pixel of the batch, written.
-        behind: None or ``UInt64`` for each pixel, in the order of ``keys``: only fragments with a larger key count.
-        pixel_index: where the keys of a (row, column) of the triangle's image are.
-        triangle: index that goes into the keys.
+        keys: one for each pixel of the batch; modified.
+        behind: None, or one key for each pixel in the order of ``keys``: only fragments with larger keys count.
+        pixel_index: function (row, column) -> index into ``keys``, for the triangle's image.
+        triangle: index that the keys hold.
         box: inclusive bounds (first column, first row, last column, last row), inside the image.
         active: triangles to draw.
     """
@@ -47,10 +47,10 @@ def draw(
     inverse = [dr.rcp(s) for s in slope]
 
     def span(row: Int32) -> tuple[Vector4f, Int32, Int32]:
-        """Edge functions and depth in the middle of a row, and the columns between the edges, or a few more."""
+        """Edge functions and depth in the middle of a row, and the first and last column between the edges (conservative)."""
         _, y = centred(module, row, 0, t.height, t.width)
         at_middle = dr.fma(t.b, y, t.c)
-        # What rounding might hide is left to the coverage test.
+        # The bounds are widened by rounding errors; the coverage test decides.
         low, high = Float(x0), Float(x1)
         for k in range(3):
             crossing = dr.fma(-at_middle[k], inverse[k], 0.5 * t.width - 0.5)
@@ -67,14 +67,14 @@ def draw(
         pixel = pixel_index(UInt32(row), UInt32(column))
         if behind is not None:
             covered &= key > dr.gather(module.UInt64, behind, pixel, covered)
-        # A copy of the image for each thread, Dr.Jit's usual way, would cost far more than a few atomic operations.
+        # Dr.Jit's default mode, a copy of the image for each thread, would cost far more than a few atomic operations.
         dr.scatter_reduce(dr.ReduceOp.Min, keys, key, pixel, covered, mode=dr.ReduceMode.Direct)
         wrap = column >= end
         row = dr.select(wrap, row + 1, row)
         next_middle, start, next_end = span(row)
         return row, dr.select(wrap, start, column + 1), dr.select(wrap, next_end, end), dr.select(wrap, next_middle, at_middle)
 
-    # One loop and not one in another: each lane goes on to its next row when it is done with one, without waiting for others.
+    # One loop instead of two nested ones: a lane proceeds to its next row without waiting for other lanes.
     first, last = dr.select(active, y0, 0), dr.select(active, y1, -1)
     at_middle, start, end = span(first)
     state = (first, start, end, at_middle)

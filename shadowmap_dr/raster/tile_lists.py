@@ -1,7 +1,7 @@
-"""Large triangles: short lists for tiles of 16 x 16 pixels, which the pixels then walk.
+"""Rasterization of large triangles: each tile of 16 x 16 pixels has a short list of triangles, which its pixels walk.
 
-A triangle is kept out of a tile when it misses it, or lies behind one that covers it; if possible, of a block of 4 x 4 tiles
-at once. What a list has no room for is drawn fragment by fragment, so that no array size depends on the data.
+A triangle is not listed for a tile that it misses, or where it lies behind a triangle that covers the tile. Blocks of 4 x 4 tiles
+are tested first. Triangles beyond a list's capacity are drawn as small ones are, so that no array size depends on the data.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ TILE = 4
 BLOCK = 4
 #: Pixels of a strip.
 STRIP = 4
-#: Triangles that a tile's list has room for.
+#: Capacity of a tile's list in triangles.
 CAPACITY = 32
 
 
@@ -62,28 +62,28 @@ class TileGrid:
 
     @property
     def pixel_count(self) -> int:
-        """Of all tiles, what lies beyond the image included."""
+        """Number of pixels of all tiles, including those beyond the image."""
         return self.count << (2 * TILE)
 
     def pixel(self, image: UInt32, row: UInt32, column: UInt32) -> UInt32:
-        """Number of a pixel where those of a tile follow each other, row by row."""
+        """Index of a pixel in the tiled order: the pixels of a tile are contiguous, row by row."""
         within = ((row & ((1 << TILE) - 1)) << TILE) + (column & ((1 << TILE) - 1))
         return (self.tile(image, row >> TILE, column >> TILE) << (2 * TILE)) + within
 
     def tile(self, image: UInt32, row: UInt32, column: UInt32) -> UInt32:
-        """Number of the tile in a row and column of tiles."""
+        """Index of the tile in a row and column of tiles."""
         return (image * self.rows + row) * self.columns + column
 
     def block(self, image: UInt32, row: UInt32, column: UInt32) -> UInt32:
-        """Number of the block that holds that tile."""
+        """Index of the block that holds the tile in a row and column of tiles."""
         return (image * self._block_rows + row // BLOCK) * self._block_columns + column // BLOCK
 
 
 @dataclass(frozen=True)
 class TileLists:
-    """``items[c * capacity:][:count[c]]`` are the triangles (numbered through the batch) that tile ``c`` may see.
+    """Triangles (numbered through the batch) that tile ``c`` may see: ``items[c * capacity:][:count[c]]``.
 
-    ``count`` may exceed the capacity: triangles beyond it are not in the list, but drawn.
+    ``count`` may exceed the capacity. Triangles beyond it are not listed; they are drawn directly.
     """
 
     grid: TileGrid
@@ -94,10 +94,10 @@ class TileLists:
 
 @dataclass(frozen=True)
 class Strips:
-    """All pixels of a batch of images in horizontal strips of four, one lane each; some may reach beyond the image.
+    """All pixels of a batch of images in horizontal strips of four, one lane for each strip. Strips may reach beyond the image.
 
     16 consecutive lanes make up 16 x 4 pixels of one tile, so that the control flow of a SIMD packet hardly ever diverges.
-    ``column`` is that of the first pixel, ``index`` its position in a flat row-major batch.
+    ``column`` is the column of the first pixel, ``index`` its position in a flat row-major batch.
     """
 
     image: UInt32
@@ -110,9 +110,12 @@ class Strips:
     width: int
 
     def gather(self, flat: UInt64, tiled: bool = False) -> list[UInt64]:
-        """Numbers of a batch of images (``UInt64``) for the pixels of each strip; undefined beyond the image. The images are
-        row-major or, if ``tiled``, in the order of `TileGrid.pixel`."""
-        if tiled:  # the order of the strips themselves
+        """Values of the four pixels of each strip, undefined beyond the image.
+
+        Args:
+            flat: values of a batch of images, row-major or, if ``tiled``, in the order of :meth:`TileGrid.pixel`.
+        """
+        if tiled:  # strips are in this order, too
             return list(dr.gather(backend(flat).Array4u64, flat, dr.arange(type(self.tile), dr.width(flat) // STRIP)))
         inside = self.row < self.height
         if self.width % STRIP == 0:
@@ -120,12 +123,12 @@ class Strips:
         return [dr.gather(type(flat), flat, self.index + k, inside & (self.column + k < self.width)) for k in range(STRIP)]
 
     def written(self, values: Sequence[UInt32 | UInt64]) -> UInt32 | UInt64:
-        """A row-major batch of images with a value for each pixel of the strips, evaluated."""
+        """A flat row-major batch of images, evaluated, from the values of the four pixels of each strip."""
         kind = type(values[0])
         module = backend(values[0])
         across = -(-self.width // STRIP)
         rows = self.images * self.height
-        # One packet for each strip: several scatters would be kernels of their own.
+        # One packet scatter for each strip: several scatters would be separate kernels.
         padded = dr.empty(kind, rows * across * STRIP)
         inside = (self.row < self.height) & (self.column < self.width)
         packet = {module.UInt32: module.Array4u, module.UInt64: module.Array4u64}[kind]
@@ -155,8 +158,10 @@ def strips(grid: TileGrid, module: ModuleType) -> Strips:
 
 
 def nearest_covers(grid: TileGrid, triangles: Triangles, image: UInt32, active: Bool) -> UInt32:
-    """``UInt32`` for each tile, then for each block: key of the smallest depth beyond which some triangle that covers all of it
-    reaches nowhere. What is noted for a block is not repeated for its tiles."""
+    """Occlusion depth of each tile, then of each block, as :func:`depth_key`: a triangle that covers it lies before this depth.
+
+    Triangles that cover a whole block count for the block, not for its tiles again.
+    """
     module = backend(triangles.a)
     nearest = dr.full(module.UInt32, 0xFFFFFFFF, grid.count + grid.block_count)
     dr.eval(nearest)
@@ -183,16 +188,16 @@ def build_tile_lists(
     behind: UInt64 | None,
     pixel_index: Callable[[UInt32, UInt32], UInt32],
 ) -> TileLists:
-    """Enter large triangles into the lists of the tiles where they may be seen.
+    """List large triangles for the tiles in which they may be visible.
 
     Args:
         grid: the tiles.
-        triangles: with ``box`` set; ``a``, ``b``, ``c`` of all of them.
-        index, triangle: number of each triangle through the batch, and in its image.
+        triangles: all triangles, one lane for each.
+        index, triangle: index of each triangle in the batch, and in its image.
         image: image of each triangle.
-        active: the large ones.
-        nearest: from :func:`nearest_covers`, or None to keep hidden triangles too.
-        keys, behind, pixel_index: see :func:`shadowmap_dr.raster.small_triangles.draw`, for triangles that find a list full.
+        active: mask of the large triangles.
+        nearest: from :func:`nearest_covers`, or None to keep hidden triangles, too.
+        keys, behind, pixel_index: arguments of :func:`shadowmap_dr.raster.small_triangles.draw` for triangles whose list is full.
     """
     module = backend(triangles.a)
     Int32 = module.Int32
@@ -227,15 +232,15 @@ def build_tile_lists(
 def _for_each_tile(box: Box, active: Bool, visit: Callable[[UInt32, UInt32, Bool], Bool]) -> None:
     """Call ``visit(row, column, is_tile)`` in a symbolic loop over the tiles that a box touches.
 
-    A box of many tiles is walked block by block: a block is visited first (``is_tile`` is false, row and column are those of its
-    first tile), and its tiles only if that returns true.
+    A box of many tiles is walked block by block. A block is visited first (``is_tile`` false, row and column of its first tile);
+    its tiles are visited only if ``visit`` returned True for the block.
     """
     module = backend(box[0])
     x0, y0, x1, y1 = (module.UInt32(dr.select(active, b, 0)) >> TILE for b in box)
     few = (x1 - x0 + 1) * (y1 - y0 + 1) <= BLOCK * BLOCK
 
     def first(top: UInt32, left: UInt32) -> tuple[UInt32, UInt32]:
-        """First place in the block with this first tile."""
+        """(row, column) of the first visit in the block whose first tile is (``top``, ``left``)."""
         return dr.select(few, dr.maximum(top, y0), top), dr.select(few, dr.maximum(left, x0), left)
 
     def body(row, column, is_tile):  # noqa: ANN001, ANN202
@@ -259,9 +264,10 @@ def _for_each_tile(box: Box, active: Bool, visit: Callable[[UInt32, UInt32, Bool
 
 
 class _Span:
-    """Values of a triangle over the pixel centres of a tile or block.
+    """Relation of a triangle to the pixel centres of a tile or block.
 
-    ``missed``: it contains none of them; ``covered``: it contains all; ``nearest``, ``farthest``: bounds of its depth there.
+    ``missed``: the triangle contains none of the centres; ``covered``: it contains all; ``nearest``, ``farthest``: bounds of its
+    depth there.
     """
 
     def __init__(self, t: Triangles, row: UInt32, column: UInt32, is_tile: Bool) -> None:
@@ -271,7 +277,7 @@ class _Span:
         middle = dr.fma(t.a, x + half, dr.fma(t.b, y + half, t.c))
         reach = (dr.abs(t.a) + dr.abs(t.b)) * half
         error = rounding_error(t.height, t.width)
-        # The depth is evaluated elsewhere, with rounding errors relative to its largest term.
+        # Fragments evaluate the depth in another order, with rounding errors relative to the largest term.
         error_depth = 1e-6 * dr.fma(dr.abs(t.a.w), 0.5 * t.width, dr.fma(dr.abs(t.b.w), 0.5 * t.height, dr.abs(t.c.w)))
         self.nearest = middle.w - reach.w - error_depth
         self.farthest = middle.w + reach.w + error_depth

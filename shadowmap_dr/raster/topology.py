@@ -16,12 +16,15 @@ from .welding import Index, Places, copies_of, weld
 
 @dataclass(frozen=True)
 class Seams:
-    """The last edges of a :class:`Topology`: those of S seams, and for each an edge of the other shape, without any extent.
+    """Seams: edges that faces of two shapes share, S of them.
+
+    They are the last 2 S edges of a :class:`Topology`: the seams, then for each seam a placeholder without extent, which becomes
+    the edge of the second shape when the shapes move apart.
 
     Attributes:
-        mine, other: ``UInt32`` (2 S,) ends of each seam, as vertices of its one and its other face, in the same order.
-        opposite: ``UInt32`` (2 S,) third vertices of both faces.
-        slots: ``UInt32`` (2 S,) where in :attr:`Topology.beyond` both faces have the edge.
+        mine, other: (2 S,) ends of each seam, as vertices of its first and of its second face, in the same order.
+        opposite: (2 S,) third vertices of both faces.
+        slots: (2 S,) indices of the edge in :attr:`Topology.beyond` for both faces.
         count: S.
     """
 
@@ -40,24 +43,23 @@ class Seams:
 
 @dataclass(frozen=True)
 class Topology:
-    """Edges of a mesh; constant for as long as its faces and the welding of its vertices are.
+    """Edges of a mesh. They depend on its faces and on the welding of its vertices, but not on where these move.
 
     Attributes:
-        edges: ``UInt32`` (2 E,) vertices a and b of each edge.
-        opposite: ``UInt32`` (2 E,) third vertices of the one or two faces at each edge, ``NO_VERTEX`` at a boundary. An edge of
-            three or more faces stands once for each of them, as a boundary.
+        edges: (2 E,) vertices a and b of each edge.
+        opposite: (2 E,) third vertices of the one or two faces at each edge, ``NO_VERTEX`` at a boundary. An edge of three or
+            more faces is listed once for each of them, as a boundary.
         count: number of edges E.
-        faces, welded: ``UInt32`` (3 F,) vertices of the faces, as they are and each the first one at its place.
-        parts: ``UInt32`` (F,) a number for each face, the same for faces that are connected through common vertices.
-        part_count: how many different numbers there are.
-        beyond: ``UInt32`` (3 F,) for the edge from corner k to k + 1 of each face the third vertex of the face on its other side,
-            ``NO_VERTEX`` where there is none or more than one.
-        vertex_count: how many vertices there are at least: one more than the largest index.
-        seams: where shapes border on each other, or None if they do nowhere.
-        see_through_faces: ``Bool`` (F,), faces that one may see through, or None if there are none. Where one does, their edges
+        faces, welded: (3 F,) vertices of the faces: the original ones, and with each replaced by the first vertex at its place.
+        parts: (F,) part of each face. Faces that are connected through common vertices are one part.
+        part_count: number of parts.
+        beyond: (3 F,) for the edge from corner k to k + 1 of each face, the third vertex of the face on its other side,
+            ``NO_VERTEX`` if there is none or more than one.
+        vertex_count: least number of vertices: one more than the largest index.
+        seams: edges that two shapes share, or None if there are none.
+        see_through_faces: (F,) mask of faces that may be see-through, or None if there are none. Where they are, their edges
             hide nothing.
-        owners: ``UInt32`` (2 E,) faces of each edge, twice the same where they are of one shape; None without
-            ``see_through_faces``.
+        owners: (2 E,) faces of each edge, twice the same at an edge of one shape; None without ``see_through_faces``.
     """
 
     edges: UInt32
@@ -88,10 +90,9 @@ def build_topology(
         positions: (V, 3) vertices. Vertices at the same place count as one: seams of texture coordinates or normals
             duplicate vertices, but are no boundaries of the surface.
         dtype: the ``UInt32`` type of the Dr.Jit backend in use.
-        shapes: (V,) number of the shape that each vertex belongs to. Shapes may move apart: where they border on each other, and
-            nowhere else, their faces have common edges, but they are parts of their own. :func:`detach_moved_seams` tells which
-            still do.
-        see_through_faces: (F,) which faces one may see through.
+        shapes: (V,) index of the shape that each vertex belongs to. Faces of two shapes share the edges at which the shapes touch
+            now, but belong to different parts, for shapes may move apart (:func:`detach_moved_seams`).
+        see_through_faces: (F,) mask of faces that may be see-through.
 
     Degenerate faces (with two corners at the same place) are left out.
 
@@ -113,11 +114,11 @@ def build_topology(
     inner = [InnerEdges.of(group, corners, vertices.own) for group in copies]
     alone = np.concatenate([group.repeated(edges.alone, 3) for group, edges in zip(copies, inner, strict=True)])
     one, two, alone = pairs_of(alone, edge_keys(vertices.place, corners, alone))
-    # Where outlines of sheets lie on one another in an image, the first of them counts. Their places decide, not the order of
-    # vertices in a file.
+    # Of outlines that coincide in an image, the first edge counts. Sort edges by position, so that this does not depend on the
+    # order of vertices in a file.
     alone, chosen = (_by_place(halves, corners, positions) for halves in (alone, one))
     one, two = chosen, two[np.searchsorted(one, chosen)]
-    # Those between shapes come last, and each of them again, without extent, as an edge of its other face.
+    # Seams come last, each followed by its placeholder (see `Seams`).
     blocks, rest = EdgeBlocks.of(copies, inner), np.concatenate([alone, one])
     ends = np.stack([corners[rest], corners[after(rest)]], 1)
     across = np.concatenate([np.full(len(alone), NO_VERTEX, np.uint32), third(corners, two)])
@@ -153,7 +154,7 @@ def build_topology(
 
 
 def _by_place(halves: Index, corners: np.ndarray, positions: np.ndarray) -> Index:
-    """Half-edges (ascending) in the order of the places of their ends, and those at the same place as they are."""
+    """Half-edges (given ascending) in the order of the positions of their ends; the order of equal ones is kept."""
     if not len(halves):
         return halves
     marked = np.zeros(len(positions), bool)

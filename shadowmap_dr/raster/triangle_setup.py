@@ -1,4 +1,4 @@
-"""Triangles made ready for the screen: edge functions, depth plane, bounds, and the coverage test."""
+"""Triangle set-up: edge functions, depth plane, bounds, and the coverage test."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ _DISTANT = 1e9
 
 @dataclass(frozen=True)
 class Triangles:
-    """One lane a triangle, of every image of a batch; not evaluated, so that what follows can join the same kernel.
+    """One lane for each triangle in each image of a batch. Not evaluated, so that later steps can join the same kernel.
 
     Attributes:
         a, b, c: ``Array4f``: three edge functions ``a x + b y + c`` (x, y in pixels from the image centre, distance in pixels,
             positive inside) and, in the fourth component, NDC depth.
-        exact: the same edges as :func:`edge_lines` returns them, for the branch of :func:`covers` that needs them.
+        exact: function that returns the same edges in double precision (:func:`edge_lines`), for a branch of :func:`covers`.
         box: inclusive pixel bounds (first column, first row, last column, last row), inside the image where ``active``.
         active: triangles that may cover a pixel centre.
-        fragments: about how many pixel centres it covers (``Float``), never more than the box holds.
+        fragments: estimate of the number of covered pixel centres, at most the size of the box.
         height, width: of an image.
     """
 
@@ -52,7 +52,7 @@ class Triangles:
 
 
 def gather_triangle(positions: Float, faces: UInt32, triangle: UInt32, first_vertex: UInt32, active: Bool | bool) -> Corners:
-    """Clip-space corners (``Array4f``) of triangles of one image of the batch."""
+    """Clip-space corners of triangles; ``first_vertex`` is the index of their image's first vertex. Attached."""
     module = backend(positions)
     i = dr.gather(module.Array3u, faces, triangle, active)
     return tuple(dr.gather(module.Array4f, positions, first_vertex + i[k], active) for k in range(3))
@@ -72,12 +72,12 @@ def set_up(corners: Corners, height: int, width: int) -> Triangles:
     sign = dr.select(det < 0, Float64(-1), Float64(1))
     inv_det = precise_rcp(dr.select(active, det, 1))
 
-    # NDC -> pixels counted from the image centre, where single precision loses least.
+    # NDC -> pixels from the image centre: this origin keeps single-precision errors smallest.
     sx, sy = 2.0 / width, 2.0 / height
     coefficients: list[list[Float]] = [[], [], []]
     for a, b, c in lines:
         norm = dr.sqrt(a * a * (sx * sx) + b * b * (sy * sy))
-        # Between two corners with w = 0 the edge is infinitely far away: all of the image is on one side of it.
+        # The edge between two corners with w = 0 is infinitely far away: the whole image lies on one side of it.
         distant = norm == 0
         scale = sign / dr.select(distant, 1, norm)
         c = dr.select(distant, dr.sign(c) * _DISTANT, c)
@@ -109,7 +109,7 @@ def set_up(corners: Corners, height: int, width: int) -> Triangles:
 
 
 def edge_lines(corners: Corners) -> tuple[list[Line], Float64]:
-    """Homogeneous lines (opposite to vertices 0, 1, 2), not oriented, and the determinant whose sign orients them."""
+    """Homogeneous edge lines opposite to vertices 0, 1, 2, and the determinant; its sign orients the lines. Attached."""
     module = backend(corners[0])
     xs, ys, ws = ([module.Float64(p[c]) for p in corners] for c in (0, 1, 3))
 
@@ -140,10 +140,10 @@ def covers(
     width: int,
     exact_lines: Callable[[], tuple[list[Line], Float64]],
 ) -> Bool:
-    """Does a triangle contain a pixel's centre, between the near and the far plane?
+    """True if a triangle contains a pixel's centre, between the near and the far plane.
 
-    Single precision decides unless the centre lies within its rounding error of an edge. There (rarely) double precision
-    does, for otherwise the rounded edges that meet in a vertex would leave pinholes or doubly owned pixels around it.
+    Single precision decides unless the centre lies within rounding error of an edge. In these rare cases double precision
+    decides; otherwise rounding around a vertex would leave pinholes, or pixels owned by two triangles.
 
     Args:
         values: ``Array4f``, the edge functions and the depth at the centre.
@@ -173,22 +173,22 @@ def covers(
 
 
 def depth_key(depth: Float) -> UInt32:
-    """``UInt32`` in the order of the (finite) depths."""
+    """Integers in the order of the (finite) depths."""
     module = backend(depth)
     bits: UInt32 = reinterpret(module.UInt32, depth + 0.0)  # -0 becomes +0
     return bits ^ dr.select(bits >> 31 != 0, module.UInt32(0xFFFFFFFF), module.UInt32(0x80000000))
 
 
 def fragment_key(depth: Float, triangle: UInt32) -> UInt64:
-    """``UInt64`` whose minimum is the nearest fragment; equal depths go to the lower triangle index."""
+    """Integers whose minimum is the nearest fragment; of equal depths, the one of the lower triangle index."""
     UInt64 = backend(depth).UInt64
     return (UInt64(depth_key(depth)) << 32) | UInt64(triangle)
 
 
 def _screen_bounds(corners: Corners, height: int, width: int) -> tuple[Float, Float, Float, Float, Bool]:
-    """Pixel bounds of the part of a triangle in front of the near plane, and whether there is any within the depth range.
+    """Pixel bounds of the part of a triangle in front of the near plane, and the mask of triangles within the depth range.
 
-    Where a visible point has ``w <= 0`` (no camera does that, but a caller's matrix may), the whole image is the bound.
+    The bound is the whole image if a visible point has ``w <= 0``; no camera yields such points, but a caller's matrix may.
     """
     module = backend(corners[0])
     x_min, y_min, x_max, y_max = module.Float(dr.inf), module.Float(dr.inf), module.Float(-dr.inf), module.Float(-dr.inf)
@@ -210,7 +210,7 @@ def _screen_bounds(corners: Corners, height: int, width: int) -> tuple[Float, Fl
         include(p.x, p.y, p.w, d >= 0)
     for a, b in ((0, 1), (1, 2), (2, 0)):
         crosses = (near[a] >= 0) != (near[b] >= 0)
-        # From the end in front: the other one may be so far behind that where the edge crosses would be lost in rounding.
+        # Interpolate from the end in front: the other end may be so far behind that rounding would lose the crossing.
         front = near[a] >= 0
         d = dr.select(front, near[a], near[b])
         p, back = dr.select(front, corners[a], corners[b]), dr.select(front, corners[b], corners[a])

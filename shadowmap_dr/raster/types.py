@@ -24,20 +24,20 @@ MAX_RESOLUTION = 4096
 
 @dataclass(frozen=True)
 class RasterOutput:
-    """Triangles that the pixels of a batch of images see.
+    """Visible triangles of the pixels of a batch of images.
 
     All arrays have ``batch * height * width`` entries, row-major (``(b * height + row) * width + column``).
 
     Attributes:
-        triangle: index of the visible triangle, ``NO_TRIANGLE`` where there is none.
+        triangle: index of the visible triangle, ``NO_TRIANGLE`` where no triangle is visible.
         u, v: perspective-correct barycentric weights of the triangle's vertices 1 and 2 (vertex 0 has ``1 - u - v``).
-        depth: ``z / w`` in clip space, 1 (the far plane) where nothing is seen.
-        w: interpolated clip-space ``w`` (distance along the viewing axis of a perspective camera), 1 where nothing is seen.
+        depth: ``z / w`` in clip space, 1 (the far plane) where no triangle is visible.
+        w: interpolated clip-space ``w`` (in perspective, distance along the viewing axis), 1 where no triangle is visible.
         records: per-triangle set-up of the rasterizer (three arrays of 4 floats a triangle), for later passes.
         face_count, batch, height, width: sizes.
 
-    ``u``, ``v``, ``depth`` and ``w`` carry gradients to the clip-space positions (for a fixed visible triangle; the change
-    of *which* triangle is visible is the business of :func:`shadowmap_dr.raster.antialias`).
+    ``u``, ``v``, ``depth`` and ``w`` carry gradients to the clip-space positions, for a fixed visible triangle.
+    :func:`shadowmap_dr.raster.antialias` adds the derivatives of visibility.
     """
 
     triangle: UInt32
@@ -55,7 +55,10 @@ class RasterOutput:
         """``a x + b y + c``, x and y in pixels from the image centre, as three ``Array4f``. Detached.
 
         Components 0, 1, 2: distance (pixels) from the edges opposite to vertices 0, 1, 2, positive inside; 3: NDC depth.
-        For triangles (valid indices where ``active``) of images of the batch.
+
+        Args:
+            image: index of the image in the batch.
+            triangle: valid index where ``active``.
         """
         Array4f = backend(self.records[0]).Array4f
         index = image * self.face_count + triangle
@@ -63,7 +66,7 @@ class RasterOutput:
         return a, b, c
 
     def depth_plane(self, image: UInt32, triangle: UInt32, active: Bool | bool = True) -> tuple[Float, Float, Float]:
-        """The last component of :func:`edge_functions` alone: (dx, dy, d), each ``Float``."""
+        """NDC depth plane alone, the last component of :func:`edge_functions`: (dx, dy, d). Detached."""
         Float = backend(self.records[0]).Float
         index = 4 * (image * self.face_count + triangle) + 3
         dx, dy, d = (dr.gather(Float, record, index, active) for record in self.records)
@@ -82,16 +85,17 @@ def precise_rcp(x: Float64) -> Float64:
 
 
 def check_range(faces: UInt32, count: int, what: str) -> None:
-    """Raise ValueError if faces refer to a ``what`` (vertex, row) of number ``count`` or more. Reads back one number."""
+    """Raise ValueError if an index in ``faces`` is ``count`` or more; ``what`` names the indexed thing. Reads back one number."""
     largest = int(np.max(dr.max(faces).numpy()))
     if largest >= count:
         raise ValueError(f"faces refer to {what} {largest}, but there are only {count}")
 
 
 def by_image(index: UInt32, size: int, batch: int) -> tuple[UInt32, UInt32]:
-    """The image of a batch to which an index (``UInt32``) below ``batch * size`` belongs, and the index within that image.
+    """(image of the batch, index within that image) of an index below ``batch * size``.
 
-    The only image of a batch is a constant: no divisions, and no sizes of meshes in kernels, which then serve other meshes, too.
+    For a batch of one image the image index is a constant 0. Kernels then hold no division and no mesh size, and so serve other
+    meshes, too.
     """
     if batch == 1:
         return type(index)(0), index
@@ -110,10 +114,10 @@ def pixel_coordinates(module: ModuleType, batch: int, height: int, width: int) -
 def zeros(module: ModuleType, size: int, count: int) -> list[Float]:
     """``count`` evaluated ``Float`` arrays of zeros, to be written to.
 
-    One kernel of all threads writes them: one thread would fill an array with a constant. ``size`` is at most 2^28.
+    A kernel of all threads writes them; Dr.Jit fills constant arrays with a single thread. ``size`` is at most 2^28.
     """
     lane = dr.arange(module.UInt32, size)
-    # Different, for Dr.Jit must not see that they are the same.
+    # Different shifts, so that Dr.Jit does not merge the arrays into one.
     arrays = [module.Float(lane >> (31 - k)) for k in range(count)]
     dr.eval(arrays)
     return arrays

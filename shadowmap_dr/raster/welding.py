@@ -1,4 +1,4 @@
-"""Vertices at the same place, and shapes that are copies of each other but for where they are (on the host)."""
+"""Vertices at the same place, and shapes that are moved copies of each other (on the host)."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ import numpy.typing as npt
 
 Index = npt.NDArray[np.int64]
 
-# Odd numbers without a pattern, by which coordinates are mixed.
+# Odd numbers without a pattern, factors of a hash of coordinates.
 _MIXERS = tuple(np.uint32(number) for number in (0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D))
 
 
 @dataclass(frozen=True)
 class Welded:
-    """Vertices that count as one, V of them.
+    """Representatives of V vertices.
 
-    place  (V,) the first vertex at each one's place
-    own    (V,) the first vertex of the same shape there
+    place  (V,) the first vertex at the same place
+    own    (V,) the first vertex of the same shape at the same place
     """
 
     place: Index
@@ -28,9 +28,9 @@ class Welded:
 
 @dataclass(frozen=True)
 class Places:
-    """Places of vertices, in the order of x, then y, then z.
+    """Ranks of vertex positions in the order of x, then y, then z.
 
-    rank   (V,) of each vertex's place, from 0 on: the same for vertices at the same place, to the last bit
+    rank   (V,) rank of each vertex from 0 on, equal for bitwise equal positions
     order  (V,) the vertices, ascending by rank
     """
 
@@ -39,9 +39,9 @@ class Places:
 
     @classmethod
     def of(cls, positions: npt.NDArray[np.float32]) -> Places:
-        """For vertices (V, 3). Sorts whole numbers, which is several times as fast as `numpy.lexsort`."""
+        """Rank vertices (V, 3). Sorts integers, which is several times as fast as `numpy.lexsort`."""
         bits = np.ascontiguousarray(positions).view(np.uint32)
-        # Ordered as the numbers are.
+        # Integers in the order of the floats.
         x, y, z = np.where(bits >> np.uint32(31), ~bits, bits | np.uint32(1 << 31)).astype(np.uint64).T
         shift = np.uint64(32)
         order, before = _sorted(x << shift | y)
@@ -53,7 +53,7 @@ class Places:
 
 
 def weld(positions: npt.NDArray[np.float32], shapes: npt.NDArray[np.integer[Any]] | None) -> Welded:
-    """Find the vertices (V, 3) at the same place, to the last bit. ``shapes`` (V,): whose they are, None if all are of one."""
+    """Find vertices (V, 3) with bitwise equal positions. ``shapes`` (V,): the shape of each vertex, or None for one shape."""
     place = np.arange(len(positions))
     some = _perhaps_shared(positions)
     located = Places.of(positions[some])
@@ -62,7 +62,7 @@ def weld(positions: npt.NDArray[np.float32], shapes: npt.NDArray[np.integer[Any]
     shared = order[np.repeat(sizes > 1, sizes)]
     if not len(shared):
         return Welded(place, place)
-    # Of equal vertices the first one: ``some`` ascends, but the order within a run is any.
+    # Take the lowest of equal vertices: their order within a run is arbitrary.
     place[order] = np.repeat(np.minimum.reduceat(order, starts), sizes)
     if shapes is None:
         return Welded(place, place)
@@ -75,9 +75,9 @@ def weld(positions: npt.NDArray[np.float32], shapes: npt.NDArray[np.integer[Any]
 
 
 def _perhaps_shared(positions: npt.NDArray[np.float32]) -> Index:
-    """Vertices that may lie where another one does, ascending: all that do, and few others.
+    """Vertices that may coincide with another vertex, ascending: all that do, and few others.
 
-    Sums of their bits are compared. Sorting plain numbers is many times as fast as finding their order.
+    Compares hashes of positions. `numpy.sort` of hashes is many times as fast as `numpy.argsort`.
     """
     bits = np.ascontiguousarray(positions).view(np.uint32)
     # Multiplication moves bits upwards only, and coordinates on a grid have zeros as their last bits.
@@ -87,7 +87,7 @@ def _perhaps_shared(positions: npt.NDArray[np.float32]) -> Index:
     several = ascending[1:][ascending[1:] == ascending[:-1]]
     if not len(several):
         return np.zeros(0, np.int64)
-    # A table of the last bits sorts most of them out.
+    # A table of the hashes' last bits excludes most vertices.
     last = np.uint32((1 << 20) - 1)
     marked = np.zeros(1 << 20, bool)
     marked[several & last] = True
@@ -103,7 +103,7 @@ def runs(values: npt.NDArray[np.generic]) -> tuple[Index, Index]:
 
 
 def _sorted(keys: npt.NDArray[np.uint64]) -> tuple[Index, Index]:
-    """(order of keys, the rank of each in this order: the same for equal ones)."""
+    """(order of keys, rank of each key in this order; equal keys have equal ranks)."""
     order = np.argsort(keys)
     keys = keys[order]
     return order, np.concatenate([[0], np.cumsum(keys[1:] != keys[:-1])])
@@ -111,9 +111,9 @@ def _sorted(keys: npt.NDArray[np.uint64]) -> tuple[Index, Index]:
 
 @dataclass(frozen=True)
 class Copies:
-    """Shapes with the same faces and the same vertices welded, counted from each one's first vertex; or all that have no copy.
+    """Shapes with the same faces and welding relative to their first vertices; or all shapes that have no copy.
 
-    ``faces``, ``vertices``: first face and vertex of each copy. ``rows``: faces of the first one, ascending.
+    ``faces``, ``vertices``: first face and first vertex of each copy. ``rows``: faces of the first copy, ascending.
     """
 
     faces: Index
@@ -126,14 +126,14 @@ class Copies:
         return (3 * self.rows[:, None] + np.arange(3)).ravel()
 
     def repeated(self, values: Index, step: int) -> Index:
-        """Numbers that belong to the first copy (N,), for all of them (copies * N,): greater by ``step`` for each face."""
+        """Indices (N,) in the first copy, for all copies (copies * N,): shifted by ``step`` times the shift of faces."""
         return (values + step * (self.faces - self.faces[0])[:, None]).ravel()
 
 
 def copies_of(faces: npt.NDArray[np.uint32], own: Index, shapes: npt.NDArray[np.integer[Any]] | None) -> list[Copies]:
-    """All shapes that have faces (F, 3), in groups of copies. ``own`` and ``shapes`` (V,): as in :func:`weld`.
+    """All shapes with faces (F, 3), in groups of copies. ``own`` and ``shapes`` (V,): as in :func:`weld`.
 
-    Everything is one shape unless each has its vertices, and its faces, in one piece of its own.
+    The mesh counts as one shape unless the vertices and the faces of each shape are contiguous.
     """
     found = None if shapes is None else _members(faces, own, shapes)
     if found is None:

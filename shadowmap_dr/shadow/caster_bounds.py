@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 
 from ..jit.arrays import backend
+from ..jit.types import Bool, Float, Normal3f, Point3f, UInt32
 from .light_camera import Views, of_map
 
 #: Share of a shape's extent that may lie behind a floor on which it stands without the floor casting a shadow on it.
@@ -22,22 +22,22 @@ TOUCH, ROUNDING = 1e-4, 1e-6
 class Boxes:
     """Axis-aligned boxes of S shapes in world space: ``low``, ``high``, ``Array3f`` of width S, evaluated, detached."""
 
-    low: Any
-    high: Any
+    low: Point3f
+    high: Point3f
 
     @property
     def count(self) -> int:
         """S."""
         return dr.width(self.low)
 
-    def corners(self, shape: Any, corner: Any) -> Any:
+    def corners(self, shape: UInt32, corner: UInt32) -> Point3f:
         """``Array3f``: corner number 0 to 7 of the boxes of shapes (``UInt32`` each)."""
         scalar, vector = backend(self.low).Float, backend(self.low).Array3f
         ends = [(dr.gather(scalar, self.high[c], shape), dr.gather(scalar, self.low[c], shape)) for c in range(3)]
         return vector(*(dr.select((corner & (1 << c)) != 0, *end) for c, end in enumerate(ends)))
 
 
-def shape_boxes(p_world: Any, shape: Any, count: int) -> Boxes:
+def shape_boxes(p_world: Point3f, shape: UInt32, count: int) -> Boxes:
     """Boxes around the vertices (``Array3f``, V) of each of ``count`` shapes (``UInt32``, V)."""
     module = backend(shape)
     with dr.suspend_grad():
@@ -54,7 +54,9 @@ def shape_boxes(p_world: Any, shape: Any, count: int) -> Boxes:
         return boxes
 
 
-def casting_shapes(views: Views, planes: tuple[Any, Any], planar: Any, boxes: Boxes, hidden: Any = None) -> Any:
+def casting_shapes(
+    views: Views, planes: tuple[Normal3f, Point3f], planar: Bool, boxes: Boxes, hidden: UInt32 | None = None
+) -> Bool:
     """Shapes that can cast a shadow in each map: not planar ones with nothing behind them, as seen from the light.
 
     Args:
@@ -83,7 +85,7 @@ def casting_shapes(views: Views, planes: tuple[Any, Any], planar: Any, boxes: Bo
         return casts if hidden is None else casts & (shape != dr.gather(module.UInt32, hidden, which))
 
 
-def _reach(normal: Any, point: Any, boxes: Boxes) -> Any:
+def _reach(normal: Normal3f, point: Point3f, boxes: Boxes) -> Float:
     """Reach of the boxes of the other shapes on either side of each shape's plane (``Float``, 2 S); at most 0 if they touch.
 
     The first tenth of what stands on the plane does not count: it may sink in a little, which shall not change the maps.

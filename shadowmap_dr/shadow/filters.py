@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import cast
 
 import drjit as dr
 import numpy as np
 
-from ..jit.arrays import backend
+from ..jit.arrays import backend, ravel
+from ..jit.types import AnyArray, Float, Int32
 
 FILTERS = ("box", "gaussian", "wendland", "none")
 
@@ -63,7 +64,7 @@ def separable_terms(kernel: np.ndarray) -> list[tuple[list[float], list[float]]]
     return [((u[:, k] * s[k]).tolist(), v[k].tolist()) for k in np.nonzero(keep)[0]]
 
 
-def filter_map(values: Any, kernel: np.ndarray, maps: int, height: int, width: int, channels: int) -> Any:
+def filter_map(values: Float, kernel: np.ndarray, maps: int, height: int, width: int, channels: int) -> Float:
     """Convolve maps with a kernel; the border is replicated.
 
     Args:
@@ -74,29 +75,33 @@ def filter_map(values: Any, kernel: np.ndarray, maps: int, height: int, width: i
     """
     if kernel.size == 1:
         return values if kernel.item() == 1 else values * kernel.item()
-    total = None
-    for column, row in separable_terms(kernel):
+
+    def convolved(column: list[float], row: list[float]) -> Float:
         part = dr.custom(_Convolve, values, row, 1, (maps, height, width, channels))
-        part = dr.custom(_Convolve, part, column, 0, (maps, height, width, channels))
-        total = part if total is None else total + part
+        return dr.custom(_Convolve, part, column, 0, (maps, height, width, channels))
+
+    first, *others = separable_terms(kernel)
+    total = convolved(*first)
+    for term in others:
+        total = total + convolved(*term)
     return total
 
 
 class _Convolve(dr.CustomOp):
     """Convolution along one axis (0: rows, 1: columns) with a replicated border; its transpose as the backward pass."""
 
-    def eval(self, values: Any, weights: list[float], axis: int, shape: tuple[int, int, int, int]) -> Any:
+    def eval(self, values: Float, weights: list[float], axis: int, shape: tuple[int, int, int, int]) -> Float:
         self.arguments = (weights, axis, shape)
         return _convolve(values, *self.arguments, transpose=False)
 
     def forward(self) -> None:
-        self.set_grad_out(_convolve(self.grad_in("values"), *self.arguments, transpose=False))
+        self.set_grad_out(_convolve(cast("Float", self.grad_in("values")), *self.arguments, transpose=False))
 
     def backward(self) -> None:
-        self.set_grad_in("values", _convolve(self.grad_out(), *self.arguments, transpose=True))
+        self.set_grad_in("values", _convolve(cast("Float", self.grad_out()), *self.arguments, transpose=True))
 
 
-def _convolve(values: Any, weights: list[float], axis: int, shape: tuple[int, int, int, int], transpose: bool) -> Any:
+def _convolve(values: Float, weights: list[float], axis: int, shape: tuple[int, int, int, int], transpose: bool) -> Float:
     maps, height, width, channels = shape
     if axis == 0 and width * channels % 4 == 0:
         # What lies side by side is treated alike: columns in packets of four numbers.
@@ -113,15 +118,15 @@ def _convolve(values: Any, weights: list[float], axis: int, shape: tuple[int, in
     lane = dr.arange(module.UInt32, maps * height * width * parts)
     at = module.Int32((lane // stride) % n)
 
-    def read(k: int) -> Any:
+    def read(k: int) -> AnyArray:
         clamped = dr.clip(at + k, 0, n - 1)
         return dr.gather(packet, values, module.UInt32(module.Int32(lane) + (clamped - at) * stride))
 
     total = _weighted(read, at, n, weights, transpose)
-    return total if channels == 1 else dr.ravel(total)
+    return cast("Float", total) if channels == 1 else ravel(total)
 
 
-def _convolve_pairs(values: Any, weights: list[float], rows: int, width: int, transpose: bool) -> Any:
+def _convolve_pairs(values: Float, weights: list[float], rows: int, width: int, transpose: bool) -> Float:
     """Rows of texels of two numbers each, two texels a lane, which share what they read."""
     module = backend(values)
     Int32, UInt32 = module.Int32, module.UInt32
@@ -130,7 +135,7 @@ def _convolve_pairs(values: Any, weights: list[float], rows: int, width: int, tr
     own = dr.gather(module.Array4f, values, lane)
     texels = {0: module.Array2f(own.x, own.y), 1: module.Array2f(own.z, own.w)}
 
-    def read(k: int) -> Any:
+    def read(k: int) -> AnyArray:
         """The texel k columns from the first of the two."""
         if k not in texels:
             texels[k] = dr.gather(module.Array2f, values, UInt32(2 * Int32(lane) + (dr.clip(at + k, 0, width - 1) - at)))
@@ -138,15 +143,15 @@ def _convolve_pairs(values: Any, weights: list[float], rows: int, width: int, tr
 
     first = _weighted(read, at, width, weights, transpose)
     second = _weighted(lambda k: read(k + 1), at + 1, width, weights, transpose)
-    return dr.ravel(module.Array4f(*first, *second))
+    return ravel(module.Array4f(*first, *second))
 
 
-def _weighted(read: Callable[[int], Any], at: Any, n: int, weights: list[float], transpose: bool) -> Any:
-    """Sum over the taps; ``read(k)`` is what lies k places from ``at`` (0 to n - 1), or at the border if that is nearer."""
+def _weighted(read: Callable[[int], AnyArray], at: Int32, n: int, weights: list[float], transpose: bool) -> AnyArray:
+    """Sum over the taps; ``read(k)`` gives the texels k places from ``at`` (0 to n - 1), or at the border if that is nearer."""
     module = backend(at)
     radius = len(weights) // 2
-    total = None
-    for k in range(-radius, radius + 1):
+
+    def tap(k: int) -> AnyArray:
         weight = module.Float(weights[k + radius])
         if transpose:
             # Border lanes also receive what taps beyond the border read from them.
@@ -157,6 +162,9 @@ def _weighted(read: Callable[[int], Any], at: Any, n: int, weights: list[float],
                 w = weights[j + radius]
                 weight += dr.select(inside & (at == 0) & (source + j < 0), w, 0)
                 weight += dr.select(inside & (at == n - 1) & (source + j > n - 1), w, 0)
-        term = read(-k if transpose else k) * weight
-        total = term if total is None else total + term
+        return read(-k if transpose else k) * weight
+
+    total = tap(-radius)
+    for k in range(-radius + 1, radius + 1):
+        total = total + tap(k)
     return total

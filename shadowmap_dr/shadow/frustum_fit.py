@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TypeAlias
 
 import drjit as dr
 
 from ..jit.arrays import backend
+from ..jit.types import Bool, Float, Point3f, UInt32
 from .light_camera import Frusta, Views, of_map, to_light_space
+
+#: Bounds in a light's image plane and of depths: (x0, y0, x1, y1, z0, z1).
+Extent: TypeAlias = tuple[Float, Float, Float, Float, Float, Float]
 
 # A frustum is kept while the scene fits and fills at least this fraction of it.
 _KEEP_FILL = 0.6
@@ -31,15 +35,15 @@ class Bounds:
     since a reduction costs more to start than to run.
     """
 
-    negated: Any
+    negated: Float
 
-    def of(self, index: Any) -> tuple[Any, Any, Any, Any, Any, Any]:
+    def of(self, index: UInt32) -> Extent:
         """(x0, y0, x1, y1, z0, z1) of entry ``map * shapes + shape``."""
         x0, y0, z0, x1, y1, z1 = _rows(self.negated, index, 6)
         return -x0, -y0, x1, y1, -z0, z1
 
 
-def _maxima(values: list[Any], index: Any, count: int, active: Any = True) -> Any:
+def _maxima(values: list[Float], index: UInt32, count: int, active: Bool | bool = True) -> Float:
     """Maxima of several values over the lanes with the same ``index`` (below ``count``), interleaved in one buffer."""
     target = dr.full(backend(index).Float, -dr.inf, len(values) * count)
     for k, value in enumerate(values):
@@ -47,11 +51,11 @@ def _maxima(values: list[Any], index: Any, count: int, active: Any = True) -> An
     return target
 
 
-def _rows(flat: Any, index: Any, count: int) -> list[Any]:
+def _rows(flat: Float, index: UInt32, count: int) -> list[Float]:
     return [dr.gather(backend(index).Float, flat, index * count + k) for k in range(count)]
 
 
-def shape_bounds(view: Views, p_light: Any, map_index: Any, shape_index: Any, shape_count: int) -> Bounds:
+def shape_bounds(view: Views, p_light: Point3f, map_index: UInt32, shape_index: UInt32, shape_count: int) -> Bounds:
     """Reduce light-space vertices (one lane for each vertex in each map) to bounds for each shape. Detached."""
     with dr.suspend_grad():
         view, p = dr.detach(view), dr.detach(p_light)
@@ -70,12 +74,12 @@ def shape_bounds(view: Views, p_light: Any, map_index: Any, shape_index: Any, sh
 def fit_frusta(
     views: Views,
     bounds: Bounds,
-    casts: Any,
+    casts: Bool,
     shape_count: int,
     resolution: int,
     filter_size: int,
     previous: Frusta | None,
-    seen: Any = None,
+    seen: tuple[Point3f, Bool] | None = None,
     receiver_range: bool = True,
 ) -> Frusta:
     """Frusta that cover everything that can cast a shadow on what is seen, or the previous ones as long as they still do.
@@ -112,7 +116,7 @@ def fit_frusta(
         return result
 
 
-def _window(views: Views, seen: Any) -> tuple[Any, ...]:
+def _window(views: Views, seen: tuple[Point3f, Bool] | None) -> Extent:
     """(x0, y0, x1, y1) in each map's image plane around what is seen, within the light's own cone, and bounds of its depth."""
     module = backend(views.spread)
     perspective = views.spread > 0
@@ -141,13 +145,13 @@ def _window(views: Views, seen: Any) -> tuple[Any, ...]:
 
 def _fit(
     views: Views,
-    extent: tuple[Any, ...],
-    casts: Any,
-    map_index: Any,
-    window: tuple[Any, ...],
+    extent: Extent,
+    casts: Bool,
+    map_index: UInt32,
+    window: Extent,
     resolution: int,
     filter_size: int,
-) -> tuple[Frusta, tuple[Any, ...]]:
+) -> tuple[Frusta, tuple[Float, ...]]:
     module = backend(views.spread)
     x0, y0, x1, y1, z0, z1 = extent
     needed = _maxima([-x0, -y0, -z0, x1, y1, z1], map_index, views.count, casts)
@@ -182,7 +186,7 @@ def _fit(
     near = dr.select(perspective, dr.maximum(near, 1e-3 * far), near)
     first = dr.maximum(near, receivers - _BEFORE * depth)
 
-    def widen(lo: Any, hi: Any) -> tuple[Any, Any]:
+    def widen(lo: Float, hi: Float) -> tuple[Float, Float]:
         half = 0.5 * (hi - lo)
         grown = half * max(1 + 2 * _MARGIN, 1 / (1 - 2 * (filter_size / 2 + 2) / resolution))
         middle = 0.5 * (lo + hi)
@@ -194,11 +198,11 @@ def _fit(
     return Frusta(cx, cy, hx, hy, near, far, first, last), (x0, y0, x1, y1, z0, z1, receivers)
 
 
-def _still_fits(views: Views, old: Frusta, new: Frusta, needed: tuple[Any, ...], resolution: int, filter_size: int) -> Any:
+def _still_fits(views: Views, old: Frusta, new: Frusta, needed: tuple[Float, ...], resolution: int, filter_size: int) -> Bool:
     x0, y0, x1, y1, z0, z1, receivers = needed
     room = 2 * (filter_size / 2 + 1) / resolution
 
-    def holds(lo: Any, hi: Any, center: Any, half: Any) -> Any:
+    def holds(lo: Float, hi: Float, center: Float, half: Float) -> Bool:
         # A map that reaches its limit needs no room there.
         limit = views.limit * (1 - 1e-5)
         below = (lo >= center - half * (1 - room)) | (center - half <= -limit)

@@ -10,12 +10,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import drjit as dr
 
 from ..jit.arrays import backend
 from ..jit.broadcast import from_one_buffer, look_up
+from ..jit.types import AnyArray, Bool, Float, Point3f, UInt32, Vector3f, Vector4f
 from ..jit.vectors import unit
 
 #: Half-angle (tangent) of one cube face, before the margin for the filter.
@@ -33,35 +34,35 @@ class LightView:
         limit: image coordinates beyond which the map need not reach in any case, not even for a margin: those of a cube's face.
     """
 
-    right: Any
-    up: Any
-    forward: Any
-    origin: Any
-    spread: Any
-    limit: Any = math.inf
+    right: Vector3f
+    up: Vector3f
+    forward: Vector3f
+    origin: Point3f
+    spread: Float
+    limit: Float | float = math.inf
 
 
 @dataclass(frozen=True)
 class Views:
     """The cameras of all M maps: ``Array3f``/``Float`` of width M. Gradients flow to the lights."""
 
-    right: Any
-    up: Any
-    forward: Any
-    origin: Any
-    spread: Any
-    limit: Any
+    right: Vector3f
+    up: Vector3f
+    forward: Vector3f
+    origin: Point3f
+    spread: Float
+    limit: Float
 
     @property
     def count(self) -> int:
         return dr.width(self.spread)
 
-    def columns(self) -> list[Any]:
+    def columns(self) -> list[Float]:
         """All numbers (``Float`` (M,) each) in a fixed order."""
         return [*self.right, *self.up, *self.forward, *self.origin, self.spread, self.limit]
 
     @classmethod
-    def of(cls, columns: Sequence[Any]) -> Views:
+    def of(cls, columns: Sequence[Float]) -> Views:
         """Put together what :meth:`columns` has taken apart."""
         Array3f = backend(columns[0]).Array3f
         return cls(*(Array3f(*columns[k : k + 3]) for k in (0, 3, 6, 9)), *columns[12:])
@@ -77,17 +78,20 @@ class Frusta:
     a shadow.
     """
 
-    center_x: Any
-    center_y: Any
-    half_x: Any
-    half_y: Any
-    near: Any
-    far: Any
-    first: Any
-    last: Any
+    center_x: Float
+    center_y: Float
+    half_x: Float
+    half_y: Float
+    near: Float
+    far: Float
+    first: Float
+    last: Float
 
 
-def directional_view(direction: Any) -> LightView:
+ViewsOrFrusta = TypeVar("ViewsOrFrusta", Views, Frusta)
+
+
+def directional_view(direction: Vector3f) -> LightView:
     """View along a light direction (``Array3f``, any length). The other axes follow from it without a twist of their own."""
     forward = unit(direction)
     # The world axis least aligned with the (detached) direction starts the frame.
@@ -101,17 +105,17 @@ def directional_view(direction: Any) -> LightView:
     return LightView(right, dr.cross(forward, right), forward, vector(zero, zero, zero), zero)
 
 
-def spot_view(position: Any, right: Any, up: Any, forward: Any, tan_cutoff: Any) -> LightView:
+def spot_view(position: Point3f, right: Vector3f, up: Vector3f, forward: Vector3f, tan_cutoff: Float) -> LightView:
     """View along the axis of a cone of light. Up to a half-angle of 60 degrees (tangent 1.73); wider ones use a cube."""
     return LightView(right, up, forward, position, tan_cutoff)
 
 
-def cube_views(position: Any, resolution: int, filter_size: int) -> tuple[LightView, ...]:
+def cube_views(position: Point3f, resolution: int, filter_size: int) -> tuple[LightView, ...]:
     """Six views along the world axes, each slightly wider than 90 degrees so that filters find neighbours, not a border."""
     vector, scalar = type(position), type(position[0])
     spread = scalar(CUBE_FACE / (1.0 - 2.0 * (filter_size // 2 + 1) / resolution))
 
-    def axis(k: int, sign: float) -> Any:
+    def axis(k: int, sign: float) -> Vector3f:
         return vector(*(scalar(sign if c == k else 0.0) for c in range(3)))
 
     views = []
@@ -122,7 +126,7 @@ def cube_views(position: Any, resolution: int, filter_size: int) -> tuple[LightV
     return tuple(views)
 
 
-def cube_face(offset: Any) -> Any:
+def cube_face(offset: Vector3f) -> UInt32:
     """Number of the one of the six :func:`cube_views` that sees a point at ``offset`` from the light (``UInt32``)."""
     a = dr.abs(offset)
     k = dr.select((a.x >= a.y) & (a.x >= a.z), 0, dr.select(a.y >= a.z, 1, 2))
@@ -135,7 +139,7 @@ def stack_views(views: Sequence[LightView]) -> Views:
     module = backend(views[0].spread)
     index = dr.arange(module.UInt32, len(views))
 
-    def stack(values: list[Any]) -> Any:
+    def stack(values: list[Float]) -> Float:
         if len(values) == 1:
             return module.Float(values[0])
         total = module.Float(0)
@@ -143,7 +147,7 @@ def stack_views(views: Sequence[LightView]) -> Views:
             total = dr.select(index == k, value, total)
         return total
 
-    def stack3(name: str) -> Any:
+    def stack3(name: str) -> Vector3f:
         parts = [stack([getattr(v, name)[c] for v in views]) for c in range(3)]
         # A single view's are the caller's own numbers.
         return module.Array3f(*(from_one_buffer(parts) if dr.grad_enabled(parts) else parts))
@@ -158,29 +162,30 @@ def stack_views(views: Sequence[LightView]) -> Views:
     )
 
 
-def of_map(table: Any, index: Any, count: int) -> Any:
+def of_map(table: ViewsOrFrusta, index: UInt32, count: int) -> ViewsOrFrusta:
     """Rows of :class:`Views` or :class:`Frusta` (``count`` of them) for the map that each lane works on."""
     module = backend(index)
 
-    def pick(value: Any) -> Any:
+    def pick(value: AnyArray) -> AnyArray:
         # A single row broadcasts by itself; but the adjoint of that is a reduction of its own for each number, while
         # gathers share one kernel.
         if count == 1 and not dr.grad_enabled(value):
             return value
         if dr.depth_v(value) > 1:
             return module.Array3f(*(look_up(value[c], index) for c in range(3)))
-        return look_up(value, index)
+        return look_up(cast("Float", value), index)
 
-    return type(table)(*(pick(getattr(table, name)) for name in table.__dataclass_fields__))
+    rows: list[Any] = [pick(getattr(table, name)) for name in table.__dataclass_fields__]
+    return type(table)(*rows)
 
 
-def to_light_space(view: Views, p_world: Any) -> Any:
+def to_light_space(view: Views, p_world: Point3f) -> Point3f:
     """(x, y, z) in a light's axes; z is the distance along its axis. Attached to points and light."""
     d = backend(p_world).Array3f(p_world) - view.origin
     return backend(p_world).Array3f(dr.dot(d, view.right), dr.dot(d, view.up), dr.dot(d, view.forward))
 
 
-def vertices_in_maps(views: Views, positions: Any) -> tuple[Any, Any, Any]:
+def vertices_in_maps(views: Views, positions: Float) -> tuple[Point3f, UInt32, UInt32]:
     """All vertices in the light space of each map, map after map.
 
     Args:
@@ -200,7 +205,7 @@ def vertices_in_maps(views: Views, positions: Any) -> tuple[Any, Any, Any]:
     return to_light_space(of_map(views, map_index, count), p_world), map_index, vertex
 
 
-def to_clip(view: Views, frustum: Frusta, p_light: Any) -> Any:
+def to_clip(view: Views, frustum: Frusta, p_light: Point3f) -> Vector4f:
     """Clip-space position (``Array4f``) in a map: its ndc square is the frustum's rectangle, depths near..far are -1..1."""
     perspective = view.spread > 0
     n, f = frustum.near, frustum.far
@@ -212,7 +217,7 @@ def to_clip(view: Views, frustum: Frusta, p_light: Any) -> Any:
     return backend(p_light).Array4f(x, y, dr.fma(a, p_light.z, b), w)
 
 
-def linear_depth(view: Views, frustum: Frusta, depth: Any) -> tuple[Any, Any]:
+def linear_depth(view: Views, frustum: Frusta, depth: Float) -> tuple[Float, Float]:
     """Depth along the light's axis, mapped linearly from first..far to -1/2..1/2, and its derivative by ``depth``.
 
     ``depth``: NDC depth in parallel projections, 1 / w in perspective. Depths before ``first`` are moved to it: -1/2, without
@@ -230,7 +235,7 @@ def linear_depth(view: Views, frustum: Frusta, depth: Any) -> tuple[Any, Any]:
     return dr.select(told_apart, linear, -0.5), dr.select(told_apart, slope, 0)
 
 
-def project(view: Views, frustum: Frusta, p_world: Any) -> tuple[Any, Any, Any, Any]:
+def project(view: Views, frustum: Frusta, p_world: Point3f) -> tuple[Float, Float, Float, Bool]:
     """Places of world-space points in a map: (u, v) in -1..1, linear depth, and whether (u, v) are inside.
 
     Attached to points and light.

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TypeAlias
 
 import drjit as dr
 
 from ..jit.arrays import backend
+from ..jit.types import Float, Point3f, UInt32, Vector3f
 from ..raster import NO_TRIANGLE, NO_VERTEX, Crossings, RasterOutput
-from ..raster.antialiasing.neighbour_weights import incoming_weights
+from ..raster.antialiasing.neighbour_weights import incoming_weights, weight_sum
 from ..raster.screen_planes import depth_at, planes
 from ..raster.types import pixel_coordinates
 from .light_camera import Frusta, Views, of_map
@@ -17,8 +18,11 @@ from .methods.registry import PREFILTERED
 from .settings import ShadowSettings
 from .shadow_map import FAR, interleaved, texel_depths
 
+#: Light-space coordinates (x, y, z), or their changes.
+Coordinates: TypeAlias = tuple[Float, Float, Float]
 
-def twist_of(views: Views) -> Any:
+
+def twist_of(views: Views) -> Float:
     """Turn of each view about its axis while its axis moves along ``right`` (``Float``, M)."""
     module = backend(views.spread)
     d = [dr.abs(views.forward[c]) for c in range(3)]
@@ -26,13 +30,13 @@ def twist_of(views: Views) -> Any:
     use_x = (d[0] <= d[1]) & (d[0] <= d[2])
     use_y = ~use_x & (d[1] <= d[2])
 
-    def component(vector: Any) -> Any:
+    def component(vector: Vector3f) -> Float:
         return dr.select(use_x, vector[0], dr.select(use_y, vector[1], vector[2]))
 
     return module.Float(component(views.forward) / component(views.up))
 
 
-def turned(twist: Any, p: Any) -> tuple[tuple[Any, Any, Any], tuple[Any, Any, Any]]:
+def turned(twist: Float, p: Point3f | Coordinates) -> tuple[Coordinates, Coordinates]:
     """Changes of light-space coordinates (x, y, z) with a, and with b."""
     zero = type(p[0])(0)
     return (dr.fma(twist, p[1], -p[2]), -twist * p[0], p[0]), (zero, -p[2], p[1])
@@ -48,11 +52,11 @@ class TangentTexels:
     def __init__(
         self,
         raster: RasterOutput,
-        clip: Any,
-        faces: Any,
+        clip: Float,
+        faces: UInt32,
         views: Views,
         frusta: Frusta,
-        twist: Any,
+        twist: Float,
         settings: ShadowSettings,
         size: int,
     ) -> None:
@@ -62,14 +66,14 @@ class TangentTexels:
         self.planes, _ = planes(clip, faces, raster, False)
         dr.eval(self.planes)
 
-    def mixed(self, crossings: Crossings | None, rates: tuple[Any, Any] | None) -> tuple[Any, Any]:
+    def mixed(self, crossings: Crossings | None, rates: tuple[Float, Float] | None) -> tuple[Float, Float]:
         """Flat numbers, and flat tangents: a texel's changes with a, then with b."""
         module, size = self.module, self.size
         image, row, column = pixel_coordinates(module, self.raster.batch, size, size)
         texel = dr.arange(module.UInt32, self.raster.batch * size * size)
         free = self.method.encode(module.Float(FAR), module.Float(0), self.settings.order)
 
-        def plain(*lanes: Any) -> tuple[Any, ...]:
+        def plain(*lanes: UInt32) -> tuple[Float, ...]:
             own, changes = self._own(*lanes)
             return (*own, *changes)
 
@@ -83,14 +87,14 @@ class TangentTexels:
             label="texels",
         )
         own, changes = list(result[: len(free)]), list(result[len(free) :])
-        if crossings is None:
+        if crossings is None or rates is None:
             return interleaved(own), interleaved(changes)
         incoming = incoming_weights(crossings, size)
         channels = len(own)
 
-        def mix(texel: Any, image: Any, row: Any, column: Any, *lanes: Any) -> tuple[Any, ...]:
+        def mix(texel: UInt32, image: UInt32, row: UInt32, column: UInt32, *lanes: Float) -> tuple[Float, ...]:
             incoming, own, changes = lanes[:4], lanes[4 : 4 + channels], lanes[4 + channels :]
-            claims = sum(incoming)
+            claims = weight_sum(incoming)
             scale = dr.rcp(dr.maximum(1, claims))
             # Right, lower, left, upper; who holds the weight, and the sign by which it says that the neighbour reaches into here.
             steps = ((0, 1, texel, 0, -1), (1, 0, texel, 1, -1), (0, -1, texel - 1, 0, 1), (-1, 0, texel - size, 1, 1))
@@ -120,7 +124,7 @@ class TangentTexels:
 
         result = dr.if_stmt(
             (texel, image, row, column, *incoming, *own, *changes),
-            sum(incoming) > 0,
+            weight_sum(incoming) > 0,
             mix,
             lambda texel, image, row, column, *lanes: lanes[4:],
             mode="symbolic",
@@ -128,7 +132,7 @@ class TangentTexels:
         )
         return interleaved(list(result[:channels])), interleaved(list(result[channels:]))
 
-    def _own(self, image: Any, row: Any, column: Any, triangle: Any) -> tuple[list[Any], list[Any]]:
+    def _own(self, image: UInt32, row: UInt32, column: UInt32, triangle: UInt32) -> tuple[list[Float], list[Float]]:
         """Numbers that texels store by themselves, and their changes with a, then with b."""
         module, size = self.module, self.size
         view, frustum = of_map(self.views, image, self.views.count), of_map(self.frusta, image, self.views.count)
@@ -156,12 +160,12 @@ class TangentTexels:
         return values, [slope * rate for rate in rates for slope in slopes]
 
 
-def _moved(number: Any, by: int) -> Any:
+def _moved(number: UInt32, by: int) -> UInt32:
     """``UInt32`` plus a whole number of either sign."""
     return number + by if by >= 0 else number - -by
 
 
-def _with_slopes(function: Callable[[Any], list[Any]], x: Any) -> tuple[list[Any], list[Any]]:
+def _with_slopes(function: Callable[[Float], list[Float]], x: Float) -> tuple[list[Float], list[Float]]:
     """Several numbers and their derivatives by the one that they are functions of."""
     with dr.resume_grad():
         x = dr.detach(x, preserve_type=True) + 0
@@ -175,14 +179,14 @@ def _with_slopes(function: Callable[[Any], list[Any]], x: Any) -> tuple[list[Any
     return [dr.detach(v) for v in values], slopes
 
 
-def weight_rates(clip: Any, crossings: Crossings, frusta: Frusta, twist: Any, size: int) -> tuple[Any, Any]:
+def weight_rates(clip: Float, crossings: Crossings, frusta: Frusta, twist: Float, size: int) -> tuple[Float, Float]:
     """Changes with a and b (interleaved, 2 for each pixel) of the weights of right and of lower pairs; undefined for weight 0."""
     module = backend(clip)
     Array2f, Array4f = module.Array2f, module.Array4f
     count, pixels = dr.width(twist), dr.width(crossings.right)
     right, down = dr.empty(module.Float, 2 * pixels), dr.empty(module.Float, 2 * pixels)
 
-    def visit(slot: Any, pair: Any) -> None:
+    def visit(slot: UInt32, pair: UInt32) -> None:
         ends = dr.gather(module.Array4u, crossings.ends, slot)
         has = ends.x != NO_VERTEX
         slope = dr.gather(Array4f, crossings.slopes, slot, has)

@@ -11,12 +11,14 @@ Turning by (a, b) means: the light's ``forward`` axis moves by ``a right + b up`
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 
-from ..jit.arrays import backend
+from ..jit.arrays import backend, ravel
+from ..jit.types import Bool, Float, Point3f, UInt32
 from ..raster import Topology, find_crossings, visible_triangles
 from .filters import filter_kernel, filter_map, separable_terms
 from .light_camera import Frusta, Views, of_map, project, to_clip, to_light_space
@@ -40,8 +42,8 @@ class TangentMaps:
     """
 
     maps: ShadowMaps
-    tangents: Any
-    twist: Any
+    tangents: Float
+    twist: Float
     taps: tuple[list[float], list[float]]
 
 
@@ -50,7 +52,13 @@ _WIDEST_TAPS = 3
 
 
 def tangent_maps(
-    p_world: Any, faces: Any, topology: Topology, views: Views, frusta: Frusta, settings: ShadowSettings, outward: Any = None
+    p_world: Point3f,
+    faces: UInt32,
+    topology: Topology,
+    views: Views,
+    frusta: Frusta,
+    settings: ShadowSettings,
+    outward: Bool | None = None,
 ) -> TangentMaps:
     """Render and filter maps of directional lights, with tangents.
 
@@ -73,7 +81,7 @@ def tangent_maps(
         vertex = lane - index * vertices
         point = module.Array3f(*(dr.gather(module.Float, p_world[c], vertex) for c in range(3)))
         view = of_map(views, index, count)
-        clip = dr.ravel(to_clip(view, of_map(frusta, index, count), to_light_space(view, point)))
+        clip = ravel(to_clip(view, of_map(frusta, index, count), to_light_space(view, point)))
         dr.eval(clip)
         # Seen from the front, outlines run clockwise: a light looks along the third of its right-handed axes.
         raster = visible_triangles(clip, faces, (size, size), batch=count, one_sided=outward)
@@ -97,7 +105,7 @@ def tangent_maps(
         return TangentMaps(ShadowMaps(values, views, frusta, settings, channels), tangents, twist, terms[0])
 
 
-def tangent_visibility(maps: TangentMaps, map_index: Any, p_world: Any, active: Any) -> tuple[Any, Any, Any]:
+def tangent_visibility(maps: TangentMaps, map_index: UInt32, p_world: Point3f, active: Bool) -> tuple[Float, Float, Float]:
     """(visibility, its change with a, with b), ``Float`` each, of world-space points. Detached.
 
     Args:
@@ -119,14 +127,14 @@ def tangent_visibility(maps: TangentMaps, map_index: Any, p_world: Any, active: 
     moves = [(dx * per_x, dy * per_y, dz * per_z) for dx, dy, dz in turned(twist, p)]
     method = PREFILTERED[settings.method]
 
-    def resolve(values: list[Any], depth: Any) -> Any:
+    def resolve(values: list[Float], depth: Float) -> Float:
         value = method.resolve(values, depth)
         return reduced_bleeding(value, settings.bleeding) if method.bleeds else value
 
     def look_up(index, u, v, depth, *moves):  # noqa: ANN001, ANN002, ANN202
         # Beyond the outermost texels' centres nothing changes.
         end = 1 - 1 / settings.resolution
-        moves = [dr.select(dr.abs(u if k % 3 == 0 else v) > end, 0, m) if k % 3 < 2 else m for k, m in enumerate(moves)]
+        rates = [dr.select(dr.abs(u if k % 3 == 0 else v) > end, 0, m) if k % 3 < 2 else m for k, m in enumerate(moves)]
         at, channels = Texels(maps.maps, index, dr.clip(u, -end, end), dr.clip(v, -end, end)), maps.maps.channels
         (values, by_u, by_v), (own, _, _) = (_filtered(at, *numbers, *maps.taps) for numbers in (
             (maps.maps.values, channels), (maps.tangents, 2 * channels)
@@ -136,25 +144,24 @@ def tangent_visibility(maps: TangentMaps, map_index: Any, p_world: Any, active: 
         value, slopes, slope_depth = _with_gradient(resolve, values, depth)
         result = [value]
         for k in range(2):
-            du, dv, dz = moves[3 * k : 3 * k + 3]
+            du, dv, dz = rates[3 * k : 3 * k + 3]
             change = slope_depth * dz
             for c in range(channels):
                 change += slopes[c] * (own[k * channels + c] + half * (by_u[c] * du + by_v[c] * dv))
             result.append(change)
         return tuple(result)
 
-    Float = module.Float
     return dr.if_stmt(
         (map_index, u, v, depth, *moves[0], *moves[1]),
         inside,
         look_up,
-        lambda index, u, *_: (Float(1), Float(0), Float(0)),
+        lambda index, u, *_: (module.Float(1), module.Float(0), module.Float(0)),
         mode="symbolic",
         label="shadow look-up with tangents",
     )
 
 
-def _filtered(at: Texels, flat: Any, channels: int, column: list[float], row: list[float]) -> tuple[list[Any], ...]:
+def _filtered(at: Texels, flat: Float, channels: int, column: list[float], row: list[float]) -> tuple[list[Float], ...]:
     """The numbers at points between texels, under a filter that moves with the points, and their changes by column and by row."""
     across, down = moved_weights(row, at.fx), moved_weights(column, at.fy)
     slope_across, slope_down = ([a - b for a, b in zip([0.0, *line], [*line, 0.0], strict=True)] for line in (row, column))
@@ -173,7 +180,9 @@ def _filtered(at: Texels, flat: Any, channels: int, column: list[float], row: li
     return tuple([number for total in totals for number in entries(total[kind])] for kind in range(3))
 
 
-def _with_gradient(function: Any, values: list[Any], depth: Any) -> tuple[Any, list[Any], Any]:
+def _with_gradient(
+    function: Callable[[list[Float], Float], Float], values: list[Float], depth: Float
+) -> tuple[Float, list[Float], Float]:
     """``function(values, depth)`` and its derivatives by all values and by the depth."""
     with dr.resume_grad():
         inputs = [dr.detach(v) + 0 for v in (*values, depth)]

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import cast
 
 import drjit as dr
 import numpy as np
 
 from ..jit.arrays import backend
 from ..jit.broadcast import copy_of_lane
+from ..jit.types import AnyArray, Bool, Float, Point3f, UInt32
 from .filters import filter_kernel, separable_terms
 from .light_camera import of_map, project, to_light_space
 from .methods.comparison import soft_comparison, standard_visibility
@@ -21,7 +22,7 @@ from .shadow_map import FAR, ShadowMaps
 _SOFTNESS = 0.02
 
 
-def visibility(maps: ShadowMaps, map_index: Any, p_world: Any, active: Any = True) -> Any:
+def visibility(maps: ShadowMaps, map_index: UInt32 | int, p_world: Point3f, active: Bool | bool = True) -> Float:
     """Step 3: fraction of the light that reaches world-space points.
 
     Args:
@@ -34,22 +35,22 @@ def visibility(maps: ShadowMaps, map_index: Any, p_world: Any, active: Any = Tru
         ``Float`` in 0..1; 1 outside the map (0 with ``compat``). Gradients flow to the points, the casters and the light.
     """
     module = backend(maps.values)
-    map_index = module.UInt32(map_index)
-    frustum = of_map(maps.frusta, map_index, maps.count)
+    index: UInt32 = module.UInt32(map_index)
+    frustum = of_map(maps.frusta, index, maps.count)
     if maps.copies > 1:
-        map_index = map_index + copy_of_lane(module, dr.width(p_world), maps.copies) * maps.count
-    view = of_map(maps.views, map_index, maps.views.count)
+        index = index + copy_of_lane(module, dr.width(p_world), maps.copies) * maps.count
+    view = of_map(maps.views, index, maps.views.count)
     u, v, depth, inside = project(view, frustum, p_world)
     if maps.settings.compat:
         p = to_light_space(view, p_world)
-        return dr.select(active, _look_up_compat(maps, map_index, u, v, dr.norm(p), inside & active), 1)
+        return dr.select(active, _look_up_compat(maps, index, u, v, dr.norm(p), inside & active), 1)
     inside &= module.Bool(active)
     depth = dr.select(depth > FAR, FAR, depth)
     look_up = {"standard": _compare, "pcf": _compare_all}.get(maps.settings.method, _resolve)
-    return _where(inside, look_up, maps, map_index, u, v, depth)
+    return _where(inside, look_up, maps, index, u, v, depth)
 
 
-def _where(active: Any, function: Callable[..., Any], maps: ShadowMaps, *lanes: Any) -> Any:
+def _where(active: Bool, function: Callable[..., Float], maps: ShadowMaps, *lanes: AnyArray) -> Float:
     """``function(maps, *lanes)`` where there are active lanes, 1 elsewhere: maps cover the casters, not all that is seen."""
     return dr.if_stmt(
         lanes,
@@ -61,14 +62,14 @@ def _where(active: Any, function: Callable[..., Any], maps: ShadowMaps, *lanes: 
     )
 
 
-def _resolve(maps: ShadowMaps, map_index: Any, u: Any, v: Any, depth: Any) -> Any:
+def _resolve(maps: ShadowMaps, map_index: UInt32, u: Float, v: Float, depth: Float) -> Float:
     """Visibility from filtered numbers."""
     method = PREFILTERED[maps.settings.method]
     value = method.resolve(_bilinear(maps, map_index, u, v, True), depth)
     return reduced_bleeding(value, maps.settings.bleeding) if method.bleeds else value
 
 
-def _compare(maps: ShadowMaps, map_index: Any, u: Any, v: Any, depth: Any) -> Any:
+def _compare(maps: ShadowMaps, map_index: UInt32, u: Float, v: Float, depth: Float) -> Float:
     """One comparison with the nearest texel."""
     module = backend(maps.values)
     size = maps.settings.resolution
@@ -77,7 +78,7 @@ def _compare(maps: ShadowMaps, map_index: Any, u: Any, v: Any, depth: Any) -> An
     return standard_visibility(stored, depth, maps.settings.bias)
 
 
-def _compare_all(maps: ShadowMaps, map_index: Any, u: Any, v: Any, depth: Any) -> Any:
+def _compare_all(maps: ShadowMaps, map_index: UInt32, u: Float, v: Float, depth: Float) -> Float:
     """Comparisons with all texels under the filter, which is moved bilinearly: attached to the point and the texels.
 
     Source: Reeves et al., "Rendering Antialiased Shadows with Depth Maps", 1987.
@@ -97,7 +98,7 @@ def _compare_all(maps: ShadowMaps, map_index: Any, u: Any, v: Any, depth: Any) -
     return dr.clip(total, 0, 1)
 
 
-def _compare_texel(maps: ShadowMaps, texel: Any, depth: Any) -> Any:
+def _compare_texel(maps: ShadowMaps, texel: UInt32, depth: Float) -> Float:
     """Share of a texel that lets light through to a depth."""
     bias = maps.settings.bias
     if maps.channels == 1:
@@ -108,7 +109,7 @@ def _compare_texel(maps: ShadowMaps, texel: Any, depth: Any) -> Any:
     return dr.fma(share, soft_comparison(other, depth, bias, _SOFTNESS) - lit, lit)
 
 
-def moved_weights(weights: list[float], fraction: Any) -> list[Any]:
+def moved_weights(weights: list[float], fraction: Float) -> list[Float]:
     """Weights of a line of taps that is moved by a fraction of a texel: one tap more."""
     padded = np.array([0.0, *weights, 0.0])
     return [dr.fma(fraction, float(a - b), float(b)) for a, b in zip(padded[:-1], padded[1:], strict=True)]
@@ -117,7 +118,7 @@ def moved_weights(weights: list[float], fraction: Any) -> list[Any]:
 class Texels:
     """The texels around points (u, v in -1..1). Texel centres lie at + 1/2."""
 
-    def __init__(self, maps: ShadowMaps, map_index: Any, u: Any, v: Any, active: Any = True) -> None:
+    def __init__(self, maps: ShadowMaps, map_index: UInt32, u: Float, v: Float, active: Bool | bool = True) -> None:
         module = backend(maps.values)
         self.size = size = maps.settings.resolution
         x = dr.select(active, dr.fma(u, 0.5 * size, 0.5 * size - 0.5), 0)
@@ -127,17 +128,19 @@ class Texels:
         self.column, self.row = module.Int32(x0), module.Int32(y0)
         self.base = module.Int32(map_index) * (size * size)
 
-    def index(self, i: int, j: int) -> Any:
+    def index(self, i: int, j: int) -> UInt32:
         """Number of the texel i columns and j rows from the upper left neighbour; the border is replicated."""
         c, r = (dr.clip(x, 0, self.size - 1) for x in (self.column + i, self.row + j))
         return backend(c).UInt32(self.base + r * self.size + c)
 
-    def inside(self, i: int, j: int) -> Any:
+    def inside(self, i: int, j: int) -> Bool:
         c, r = self.column + i, self.row + j
         return (c >= 0) & (c < self.size) & (r >= 0) & (r < self.size)
 
 
-def _bilinear(maps: ShadowMaps, map_index: Any, u: Any, v: Any, active: Any, outside_reads_zero: bool = False) -> list[Any]:
+def _bilinear(
+    maps: ShadowMaps, map_index: UInt32, u: Float, v: Float, active: Bool | bool, outside_reads_zero: bool = False
+) -> list[Float]:
     """Mix of the four texels around (u, v); attached to the texels and to the coordinates."""
     at = Texels(maps, map_index, u, v, active)
     rows = []
@@ -148,7 +151,7 @@ def _bilinear(maps: ShadowMaps, map_index: Any, u: Any, v: Any, active: Any, out
     return [value for a, b in zip(*rows, strict=True) for value in entries(dr.fma(b - a, at.fy, a))]
 
 
-def stored_texel(values: Any, channels: int, texel: Any, active: Any) -> list[Any]:
+def stored_texel(values: Float, channels: int, texel: UInt32, active: Bool | bool) -> list[AnyArray]:
     """All numbers of a texel, in packets as large as there are."""
     module = backend(values)
     size = next(n for n in (4, 2, 1) if channels % n == 0)
@@ -157,10 +160,10 @@ def stored_texel(values: Any, channels: int, texel: Any, active: Any) -> list[An
     return [dr.gather(packet, values, texel * count + k, active) for k in range(count)]
 
 
-def entries(packet: Any) -> list[Any]:
-    return list(packet) if dr.depth_v(packet) > 1 else [packet]
+def entries(packet: AnyArray) -> list[Float]:
+    return list(packet) if dr.depth_v(packet) > 1 else [cast("Float", packet)]
 
 
-def _look_up_compat(maps: ShadowMaps, map_index: Any, u: Any, v: Any, depth: Any, active: Any) -> Any:
+def _look_up_compat(maps: ShadowMaps, map_index: UInt32, u: Float, v: Float, depth: Float, active: Bool) -> Float:
     moments = _bilinear(maps, map_index, dr.select(active, u, 0), dr.select(active, v, 0), active, outside_reads_zero=True)
     return chebyshev_visibility(backend(depth).Array2f(*moments), depth, MINIMUM_VARIANCE_COMPAT)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 
-from ..jit.arrays import backend
+from ..jit.arrays import backend, ravel
 from ..jit.broadcast import in_copies
+from ..jit.types import Bool, Float, Point3f, UInt32
 from ..raster import RasterOutput, Topology, antialias, visible_triangles
 from ..raster.screen_planes import pixel_depth
 from ..raster.types import pixel_coordinates
@@ -38,7 +38,7 @@ class ShadowMaps:
         copies: of values and views, one after the other, one for each block of points (:meth:`for_points`).
     """
 
-    values: Any
+    values: Float
     views: Views
     frusta: Frusta
     settings: ShadowSettings
@@ -57,15 +57,15 @@ class ShadowMaps:
 
 
 def render_maps(
-    p_light: Any,
-    map_index: Any,
-    faces: Any,
+    p_light: Point3f,
+    map_index: UInt32,
+    faces: UInt32,
     topology: Topology,
     views: Views,
     frusta: Frusta,
     settings: ShadowSettings,
-    transparent: Callable[[RasterOutput], Any] | None = None,
-    culled: Any = None,
+    transparent: Callable[[RasterOutput], Bool] | None = None,
+    culled: Bool | None = None,
 ) -> ShadowMaps:
     """Step 1: rasterize all maps at once and store what the method needs of the depths in each texel.
 
@@ -79,8 +79,7 @@ def render_maps(
         culled: ``Bool`` (F,), or (M F,) by map: faces that are left out where they turn away.
     """
     count, size = views.count, settings.resolution * settings.supersampling
-    clip = to_clip(of_map(views, map_index, count), of_map(frusta, map_index, count), p_light)
-    clip = dr.ravel(clip)
+    clip = ravel(to_clip(of_map(views, map_index, count), of_map(frusta, map_index, count), p_light))
     dr.eval(clip)
     # Seen from the front, outlines run clockwise: a light looks along the third of its right-handed axes.
     raster = visible_triangles(clip, faces, (size, size), batch=count, transparent=transparent, one_sided=culled)
@@ -95,16 +94,17 @@ def render_maps(
 
 
 def _texels(
-    raster: RasterOutput, clip: Any, faces: Any, views: Views, frusta: Frusta, settings: ShadowSettings, size: int
-) -> tuple[Any, int]:
+    raster: RasterOutput, clip: Float, faces: UInt32, views: Views, frusta: Frusta, settings: ShadowSettings, size: int
+) -> tuple[Float, int]:
     """Numbers to store (flat) and how many there are in a texel, for maps of ``size`` texels along each side."""
     module = backend(raster.triangle)
     image, row, column = pixel_coordinates(module, views.count, size, size)
     view, frustum = of_map(views, image, views.count), of_map(frusta, image, views.count)
     hit = raster.valid
+    slope_square: Float | float = 0
     if settings.compat:
         depth = _radial_depth(view, frustum, raster, row, column, size)
-        depth, slope_square = dr.select(hit, depth, frustum.far), 0
+        depth = dr.select(hit, depth, frustum.far)
     else:
         seen = pixel_depth(raster, clip, faces, dr.detach(views.spread) > 0)
         texels = texel_depths(seen, hit, view, frustum, settings)
@@ -129,15 +129,17 @@ class TexelDepths:
         seen, dx, dy: depth as :func:`pixel_depth` returns it (attached), and its change by column and by row (detached).
     """
 
-    shown: Any
-    depth: Any
-    slope_square: Any
-    seen: Any
-    dx: Any
-    dy: Any
+    shown: Bool
+    depth: Float
+    slope_square: Float
+    seen: Float
+    dx: Float
+    dy: Float
 
 
-def texel_depths(seen: tuple[Any, Any, Any], hit: Any, view: Views, frustum: Frusta, settings: ShadowSettings) -> TexelDepths:
+def texel_depths(
+    seen: tuple[Float, Float, Float], hit: Bool, view: Views, frustum: Frusta, settings: ShadowSettings
+) -> TexelDepths:
     """Depths in maps, given what :func:`pixel_depth` returns, and where anything is seen.
 
     ``view`` and ``frustum`` are those of each texel's map.
@@ -159,7 +161,7 @@ def texel_depths(seen: tuple[Any, Any, Any], hit: Any, view: Views, frustum: Fru
     return TexelDepths(shown, dr.select(shown, linear, FAR), slope_square, depth, dx, dy)
 
 
-def _two_depths(plain: Any, blended: Any) -> tuple[Any, int]:
+def _two_depths(plain: Float, blended: Float) -> tuple[Float, int]:
     """(depth at the centre, other depth, its share, nothing) of each texel from its moments without and with anti-aliasing.
 
     Blended depths mean nothing to a comparison, but their moments tell what has been blended. The fourth number is there because
@@ -170,10 +172,10 @@ def _two_depths(plain: Any, blended: Any) -> tuple[Any, int]:
     texel = dr.arange(module.UInt32, dr.width(plain) // 2)
     depth = dr.gather(module.Array2f, plain, texel).x
     other, share = other_depth(depth, dr.gather(module.Array2f, blended, texel))
-    return dr.ravel(module.Array4f(depth, other, share, 0)), 4
+    return ravel(module.Array4f(depth, other, share, 0)), 4
 
 
-def block_means(values: Any, size: int, channels: int, factor: int) -> Any:
+def block_means(values: Float, size: int, channels: int, factor: int) -> Float:
     """Means of blocks of factor x factor texels; maps have ``size`` texels along each side."""
     module = backend(values)
     dr.eval(values)
@@ -190,16 +192,16 @@ def block_means(values: Any, size: int, channels: int, factor: int) -> Any:
     return total * (1 / factor**2)
 
 
-def interleaved(values: list[Any]) -> Any:
+def interleaved(values: list[Float]) -> Float:
     """Flat array with the numbers of several arrays in turns."""
     module = backend(values[0])
     if len(values) == 1:
         return values[0]
     packet = {2: module.Array2f, 4: module.Array4f}.get(len(values), module.ArrayXf)
-    return dr.ravel(packet(*values) if packet is not module.ArrayXf else packet(values))
+    return ravel(packet(*values) if packet is not module.ArrayXf else packet(values))
 
 
-def _radial_depth(view: Views, frustum: Frusta, raster: RasterOutput, row: Any, column: Any, size: int) -> Any:
+def _radial_depth(view: Views, frustum: Frusta, raster: RasterOutput, row: UInt32, column: UInt32, size: int) -> Float:
     """Distance from the light camera's origin to what a texel sees."""
     module = backend(raster.triangle)
     perspective = view.spread > 0
@@ -210,7 +212,7 @@ def _radial_depth(view: Views, frustum: Frusta, raster: RasterOutput, row: Any, 
     return dr.sqrt(dr.fma(x, x, dr.fma(y, y, z * z)))
 
 
-def _slope_square(view: Views, frustum: Frusta, linear: Any, slopes: list[Any], size: int) -> Any:
+def _slope_square(view: Views, frustum: Frusta, linear: Float, slopes: list[Float], size: int) -> Float:
     """Squared change of linear depth across a texel, given its change along both axes."""
     n, f = frustum.first, frustum.far
     # The side of a texel in units of depth.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import cast
+from typing import cast, overload
 
 import drjit as dr
 
@@ -13,6 +13,40 @@ from .blend import blend
 from .colour_jumps import Surroundings
 from .creases import CoplanarCreases
 from .edge_crossings import DEPTH_GAP, Crossings, find_crossings
+
+
+@overload
+def antialias(
+    values: TensorXf,
+    raster: RasterOutput,
+    positions: TensorXf | Float,
+    topology: Topology,
+    *,
+    crossings: Crossings | None = ...,
+    creases: Bool | None = ...,
+    crease_weights: Float | None = ...,
+    meetings: bool = ...,
+    gap: float = ...,
+    folds: CoplanarCreases | None = ...,
+    continued: bool = ...,
+) -> TensorXf: ...
+
+
+@overload
+def antialias(
+    values: Float | list[Float] | tuple[Float, ...],
+    raster: RasterOutput,
+    positions: TensorXf | Float,
+    topology: Topology,
+    *,
+    crossings: Crossings | None = ...,
+    creases: Bool | None = ...,
+    crease_weights: Float | None = ...,
+    meetings: bool = ...,
+    gap: float = ...,
+    folds: CoplanarCreases | None = ...,
+    continued: bool = ...,
+) -> Float: ...
 
 
 def antialias(

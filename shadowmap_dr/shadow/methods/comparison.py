@@ -2,27 +2,26 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 
 from ...jit.arrays import backend
+from ...jit.types import Float, Vector2f
 
 # Means that differ by less from the depth at the centre of a texel are equal to it: a few units in the last place.
 _LEAST_DIFFERENCE = 1e-6
 
 
-def standard_visibility(map_depth: Any, depth: Any, bias: float) -> Any:
+def standard_visibility(map_depth: Float, depth: Float, bias: float) -> Float:
     """1 where a receiver lies at most ``bias`` behind the depth in the map, else 0 (Williams 1978). No gradients."""
     return dr.select(dr.detach(depth) <= dr.detach(map_depth) + bias, backend(depth).Float(1), 0)
 
 
-def soft_comparison(map_depth: Any, depth: Any, bias: float, softness: float) -> Any:
+def soft_comparison(map_depth: Float, depth: Float, bias: float, softness: float) -> Float:
     """1 where a receiver lies at most ``bias`` behind the depth in the map, falling to 0 over the next ``softness``. Attached."""
     return 1 - dr.clip((depth - map_depth - bias) / softness, 0, 1)
 
 
-def other_depth(depth: Any, moments: Any) -> tuple[Any, Any]:
+def other_depth(depth: Float, moments: Vector2f) -> tuple[Float, Float]:
     """Depth that a texel with two surfaces sees beside the nearer or farther one at its centre. Attached to both arguments.
 
     Args:
@@ -41,5 +40,7 @@ def other_depth(depth: Any, moments: Any) -> tuple[Any, Any]:
     there = dr.abs(mean) > _LEAST_DIFFERENCE
     mean, square = dr.select(there, mean, 1), dr.select(there, square, 1)
     other = depth + dr.select(there, square / mean, 0)
-    other = dr.select(other < -0.5, -0.5, dr.select(other > 0.5, 0.5, other))
+    before = other < -0.5
+    nearest = dr.select(other > 0.5, 0.5, other)
+    other = dr.select(before, -0.5, nearest)
     return other, dr.select(there, mean * mean / square, 0)

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 
 from ...jit.arrays import backend
+from ...jit.types import Float, Vector2f
 from .variance import chebyshev_visibility
 
 #: The same for warped depths, to first order: with less, surfaces that the light hardly strikes would shadow themselves.
 MINIMUM_WARPED_VARIANCE = 1e-5
 
 
-def exponential_moment(depth: Any, exponent: float) -> Any:
+def exponential_moment(depth: Float, exponent: float) -> Float:
     """``exp(exponent * depth)``: what an exponential shadow map stores. Attached.
 
     Source: Annen et al., "Exponential Shadow Maps", 2008, equation 4.
@@ -21,13 +20,15 @@ def exponential_moment(depth: Any, exponent: float) -> Any:
     return dr.exp(exponent * depth)
 
 
-def exponential_visibility(moment: Any, depth: Any, exponent: float) -> Any:
+def exponential_visibility(moment: Float, depth: Float, exponent: float) -> Float:
     """``min(1, moment * exp(-exponent * depth))`` (Annen et al. 2008, equation 5). Attached."""
     value = moment * dr.exp(-exponent * depth)
-    return dr.select(value < 1, dr.select(value > 0, value, 0), 1)
+    dark = value < 1
+    positive = dr.select(value > 0, value, 0)
+    return dr.select(dark, positive, 1)
 
 
-def warped_moments(depth: Any, slope_square: Any, exponent: float) -> Any:
+def warped_moments(depth: Float, slope_square: Float | float, exponent: float) -> Vector2f:
     """First and second moment (``Array2f``) of ``sign(exponent) * exp(exponent * depth)``, which grows with depth. Attached.
 
     Source: Lauritzen and McCool, "Layered Variance Shadow Maps", 2008, section 4.2. A plane's variance within the texel is
@@ -38,7 +39,7 @@ def warped_moments(depth: Any, slope_square: Any, exponent: float) -> Any:
     return backend(depth).Array2f(warped, dr.fma(warped, warped, 0.25 * dr.detach(slope_square) * slope * slope))
 
 
-def warped_visibility(moments: Any, depth: Any, exponent: float) -> Any:
+def warped_visibility(moments: Vector2f, depth: Float, exponent: float) -> Float:
     """Chebyshev's bound for warped depths. Attached to moments and depth."""
     warped = _warp(depth, exponent)
     # Moments span many orders of magnitude: everything is scaled by the receiver's own warped depth.
@@ -47,5 +48,5 @@ def warped_visibility(moments: Any, depth: Any, exponent: float) -> Any:
     return chebyshev_visibility(relative, warped * scale, MINIMUM_WARPED_VARIANCE * exponent * exponent)
 
 
-def _warp(depth: Any, exponent: float) -> Any:
+def _warp(depth: Float, exponent: float) -> Float:
     return dr.exp(exponent * depth) if exponent > 0 else -dr.exp(exponent * depth)

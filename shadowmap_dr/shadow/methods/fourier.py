@@ -6,15 +6,16 @@ Source: Annen et al., "Convolution Shadow Maps", 2007, equation 8.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import drjit as dr
+
+from ...jit.types import Float
 
 # The series is periodic: where depths differ by the whole range, it must still be far from its next step.
 _BASE = 0.88 * math.pi
 
 
-def fourier_terms(depth: Any, slope_square: Any, order: int) -> list[Any]:
+def fourier_terms(depth: Float, slope_square: Float | float, order: int) -> list[Float]:
     """Sine and cosine of each of ``order`` odd multiples of a base frequency: 2 ``order`` numbers. Attached.
 
     A plane's extent within the texel dampens them as it would those of a normal distribution.
@@ -29,13 +30,13 @@ def fourier_terms(depth: Any, slope_square: Any, order: int) -> list[Any]:
     return terms
 
 
-def fourier_visibility(terms: list[Any], depth: Any) -> Any:
+def fourier_visibility(terms: list[Float], depth: Float) -> Float:
     """Twice the series for the step from 0 (occluder before ``depth``) to 1, cut off at 1: a surface is not its own occluder.
 
     Lanczos' factors suppress the series' ringing, which would show as stripes. Attached.
     """
     order = len(terms) // 2
-    total = 0.5
+    total = type(depth)(0.5)
     for k in range(order):
         frequency = _BASE * (2 * k + 1)
         x = math.pi * (2 * k + 1) / (2 * order + 1)

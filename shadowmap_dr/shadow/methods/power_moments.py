@@ -5,9 +5,9 @@ Source: Peters and Klein, "Moment Shadow Mapping", 2015, algorithm 4 (Hamburger 
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
+
+from ...jit.types import Float
 
 # How far moments are moved towards those of a distribution far from all degenerate ones, so that rounding is harmless.
 _BIAS = 3e-6
@@ -15,7 +15,7 @@ _NEUTRAL = (0.0, 0.375, 0.0, 0.375)
 _TINY = 1e-9
 
 
-def power_moments(depth: Any, slope_square: Any) -> list[Any]:
+def power_moments(depth: Float, slope_square: Float | float) -> list[Float]:
     """The first four moments of twice the depth (-1..1), normally distributed with a plane's variance in the texel. Attached."""
     z = 2 * depth
     # Depths are doubled, variances quadrupled.
@@ -24,7 +24,7 @@ def power_moments(depth: Any, slope_square: Any) -> list[Any]:
     return [z, square + v, z * (square + 3 * v), square * square + 6 * square * v + 3 * v * v]
 
 
-def power_moments_visibility(moments: list[Any], depth: Any) -> Any:
+def power_moments_visibility(moments: list[Float], depth: Float) -> Float:
     """1 minus the least fraction of occluders before ``depth`` that the moments allow. Attached."""
     b = [dr.fma(_BIAS, neutral - m, m) for m, neutral in zip(moments, _NEUTRAL, strict=True)]
     z = 2 * depth
@@ -50,7 +50,7 @@ def power_moments_visibility(moments: list[Any], depth: Any) -> Any:
     gap = _away_from_zero(z - near)
 
     # Weights of z and of the roots: that of point o among x, y and itself is (x y - b0 (x + y) + b1) / ((o - x) (o - y)).
-    def others(x: Any) -> Any:
+    def others(x: Float) -> Float:
         """The numerator where one of the others is x and one is 1 / e, times e."""
         return x - b[0] * dr.fma(x, e, 1) + b[1] * e
 
@@ -63,10 +63,10 @@ def power_moments_visibility(moments: list[Any], depth: Any) -> Any:
     return 1 - dr.clip(shadow, 0, 1)
 
 
-def _at_least(value: Any, least: float) -> Any:
+def _at_least(value: Float, least: Float | float) -> Float:
     return dr.select(value > least, value, least)
 
 
-def _away_from_zero(value: Any, least: float = _TINY) -> Any:
+def _away_from_zero(value: Float, least: float = _TINY) -> Float:
     Float = type(value)
     return dr.select(dr.abs(value) < least, dr.select(value < 0, Float(-least), Float(least)), value)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 
 from ...jit.arrays import backend
+from ...jit.types import Float, Vector2f
 from .exponential import exponential_moment, exponential_visibility, warped_moments, warped_visibility
 from .fourier import fourier_terms, fourier_visibility
 from .power_moments import power_moments, power_moments_visibility
@@ -30,26 +30,26 @@ class Method:
         bleeds: whether cutting off small visibilities makes sense.
     """
 
-    encode: Callable[[Any, Any, int], list[Any]]
-    resolve: Callable[[list[Any], Any], Any]
+    encode: Callable[[Float, Float | float, int], list[Float]]
+    resolve: Callable[[list[Float], Float], Float]
     bleeds: bool = False
 
 
-def _pair(values: list[Any]) -> Any:
+def _pair(values: list[Float]) -> Vector2f:
     return backend(values[0]).Array2f(*values)
 
 
-def _evsm2(values: list[Any], depth: Any) -> Any:
+def _evsm2(values: list[Float], depth: Float) -> Float:
     return reduced_bleeding(warped_visibility(_pair(values), depth, _EVSM2), _LEAK)
 
 
-def _evsm4(values: list[Any], depth: Any) -> Any:
+def _evsm4(values: list[Float], depth: Float) -> Float:
     positive = warped_visibility(_pair(values[:2]), depth, _EVSM4)
     negative = warped_visibility(_pair(values[2:]), depth, _EVSM4_NEGATIVE)
     return reduced_bleeding(_least(positive, negative), _LEAK)
 
 
-def _least(a: Any, b: Any) -> Any:
+def _least(a: Float, b: Float) -> Float:
     return dr.select(a < b, a, b)
 
 

@@ -6,11 +6,10 @@ whatever filters may make of the numbers that are stored.
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 
 from ...jit.arrays import backend
+from ...jit.types import Float, Vector2f
 
 #: Smallest variance that Chebyshev's bound uses, in units of the squared depth range.
 MINIMUM_VARIANCE = 1e-6
@@ -18,7 +17,7 @@ MINIMUM_VARIANCE = 1e-6
 MINIMUM_VARIANCE_COMPAT = 1e-4
 
 
-def variance_moments(depth: Any, slope_square: Any = 0) -> Any:
+def variance_moments(depth: Float, slope_square: Float | float = 0) -> Vector2f:
     """First and second moment (``Array2f``) of the depth within a texel.
 
     Args:
@@ -29,7 +28,7 @@ def variance_moments(depth: Any, slope_square: Any = 0) -> Any:
     return backend(depth).Array2f(depth, dr.fma(depth, depth, 0.25 * dr.detach(slope_square)))
 
 
-def chebyshev_visibility(moments: Any, depth: Any, minimum_variance: Any = MINIMUM_VARIANCE) -> Any:
+def chebyshev_visibility(moments: Vector2f, depth: Float, minimum_variance: Float | float = MINIMUM_VARIANCE) -> Float:
     """Upper bound of the fraction of occluders behind ``depth``.
 
     Source: Donnelly and Lauritzen, "Variance Shadow Maps", 2006, equation 5.
@@ -52,7 +51,7 @@ def chebyshev_visibility(moments: Any, depth: Any, minimum_variance: Any = MINIM
     return dr.select(lit, 1, variance / dr.fma(distance, distance, variance))
 
 
-def reduced_bleeding(visibility: Any, amount: float) -> Any:
+def reduced_bleeding(visibility: Float, amount: float) -> Float:
     """Cut off visibilities below ``amount`` and stretch the rest to 0..1 (Lauritzen 2007, section 8.4.3). Attached."""
     if amount == 0:
         return visibility

@@ -28,10 +28,10 @@ class IndexBufferBuilder:
 
     def __init__(self, dtype: type[UInt32], size: int) -> None:
         self._dtype, self._size = dtype, size
-        self._scattered: list[tuple[npt.ArrayLike, Numbers]] = []
+        self._scattered: list[tuple[Numbers, Numbers]] = []
         self._copied: list[tuple[Numbers, Numbers, Numbers]] = []
 
-    def put(self, places: npt.ArrayLike, numbers: Numbers) -> None:
+    def put(self, places: Numbers, numbers: Numbers) -> None:
         """Numbers (N,) at ``places`` (N,)."""
         self._scattered.append((places, numbers))
 

@@ -41,7 +41,7 @@ _SYSTEM_PATTERNS = (
 def ensure() -> None:
     """Make sure that Dr.Jit uses LLVM >= 17 (or a GPU where there is no LLVM at all).
 
-    Raises LLVMError, one sentence, if that cannot be had. Imports drjit.
+    Raises LLVMError if neither is available. Imports drjit.
     """
     imported_before = "drjit" in sys.modules
     if not imported_before:
@@ -82,7 +82,7 @@ def loaded_version() -> tuple[int, int, int] | None:
 
 
 def loaded_library() -> str | None:
-    """Path of the LLVM library in use, as far as it can be told (Linux: from the process's memory map)."""
+    """Path of the LLVM library in use: on Linux from the process's memory map, elsewhere the environment variable's value."""
     named = os.environ.get(ENVIRONMENT_VARIABLE)
     try:
         mapped = {line.split()[-1] for line in Path("/proc/self/maps").read_text().splitlines() if "libLLVM" in line}
@@ -112,7 +112,7 @@ def _wheel_library() -> Path | None:
 
 
 def _file_version(path: Path) -> int:
-    """Major version by the file's name (libLLVM-15.so, libLLVM.so.19.1, libLLVM-14.0.6.so.1), by its folder, else 0."""
+    """Major version by the file's name (libLLVM-15.so, libLLVM.so.19.1, libLLVM-14.0.6.so.1), its folder or the library, else 0."""
     match = re.search(r"libLLVM-(\d+)|libLLVM\.so\.(\d\d+)|libLLVM\.(\d+)\.dylib", path.name)
     if match is None:
         match = re.search(r"llvm-?@?(\d+)", str(path.parent))
@@ -130,6 +130,7 @@ def _file_version(path: Path) -> int:
 def _choose() -> None:
     """Set the environment variable that Dr.Jit reads, unless it names a usable library already."""
     named = os.environ.get(ENVIRONMENT_VARIABLE)
+    path: Path | None
     if named and Path(named).is_file() and _file_version(Path(named)) >= MIN_VERSION:
         path = Path(named)
     else:
@@ -139,8 +140,8 @@ def _choose() -> None:
         if named:
             warnings.warn(f"{ENVIRONMENT_VARIABLE}={named} is not LLVM {MIN_VERSION} or newer: using {path}.", stacklevel=4)
         os.environ[ENVIRONMENT_VARIABLE] = str(path)
-    # The wheel creates the link libc++.so.1 at the first interpreter start; where the environment cannot be written to,
-    # the link is missing, and loading the runtime beforehand under its own name takes its place.
+    # The wheel creates the link libc++.so.1 when the interpreter first starts. In a read-only environment that link is missing:
+    # loading the runtime beforehand, under its full file name, replaces it.
     folder = path.parent / _RUNTIME_FOLDER
     if folder.is_dir() and not all((folder / name).exists() for name in _RUNTIME):
         for name in _RUNTIME:

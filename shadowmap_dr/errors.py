@@ -26,7 +26,7 @@ class OutputError(ShadowmapError, OSError):
 
 
 def is_interrupt(error: BaseException | None) -> bool:
-    """True if an error is Ctrl-C, or what Dr.Jit makes of it where it comes while a recorded function is replayed."""
+    """True if an error is Ctrl-C, or the error that Dr.Jit raises for Ctrl-C while it replays a recorded function."""
     while error is not None:
         if isinstance(error, KeyboardInterrupt):
             return True
@@ -34,12 +34,12 @@ def is_interrupt(error: BaseException | None) -> bool:
     return False
 
 
-# Packages whose own code a warning does not point to.
+# Packages whose frames a warning skips: it points to the code that called them.
 _CALLED = ("shadowmap_dr", "mitsuba", "drjit")
 
 
 def warn(message: str) -> None:
-    """A ``UserWarning`` that points to who called this package or Mitsuba."""
+    """Issue a ``UserWarning`` that points to the line that called this package or Mitsuba."""
     level, frame = 1, inspect.currentframe()
     while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] in _CALLED:
         level, frame = level + 1, frame.f_back

@@ -8,7 +8,7 @@ import mitsuba as mi
 from .errors import ShadowmapError, warn
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
-#: Endings of variants: those that renderings with shadow maps work in, those with colours, and all.
+#: Endings of variant names: of those that rendering with shadow maps supports, of those with colours, of all.
 SUPPORTED, COLOURED, ANY = ("_ad_rgb", "_ad_mono"), ("_ad_rgb",), ("",)
 
 #: Versions of Mitsuba (major, minor) that the tests have run with.
@@ -26,7 +26,8 @@ def warn_if_untried(version: str) -> None:
 def set_variant(name: str, endings: tuple[str, ...] = SUPPORTED) -> None:
     """Set the Mitsuba variant.
 
-    ShadowmapError if it does not exist, has no device, or is none that the command works in: only those with the ``endings`` are.
+    ``endings``: endings of the variants that the command supports. Raises ShadowmapError if the variant does not exist, does not
+    end in one of these, or has no device.
     """
     fitting = [variant for variant in mi.variants() if variant.endswith(endings)]
     if name not in mi.variants():

@@ -1,4 +1,4 @@
-"""Records of a Mitsuba scene: geometry, lights, sensors, and what has changed in it."""
+"""Records of a Mitsuba scene (geometry, lights, sensors) and watches over its changes."""
 
 from .load import SceneData
 

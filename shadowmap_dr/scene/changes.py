@@ -1,4 +1,4 @@
-"""Changes of Mitsuba's objects: parameters that have been given other values, shapes that are mirrored."""
+"""Changes of Mitsuba's objects: parameters with new values, shapes that a transformation mirrors."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..jit.types import AnyArray, Matrix4f
 from .mitsuba_objects import Parameter
 
 
-def fingerprint(value: Any) -> Any:
-    """Something that is equal to that of another value only if a parameter has not been given another one in between.
+def fingerprint(value: Any) -> object:  # Any: parameters have values of all kinds
+    """Key that changes when a parameter is given another value: the keys of two reads are equal only if it was not.
 
-    Of arrays it tells which they are, not what is in them, and keeps them alive, so that no others can be taken for them.
+    Arrays count by identity, not by contents. The key keeps them alive, so that their variables' numbers are not used again.
     """
     if dr.is_array_v(value):
         return tuple(_Same(leaf) for leaf in leaves(dr.detach(value)))
@@ -28,7 +29,7 @@ def fingerprint(value: Any) -> Any:
 class _Same:
     """An array that is equal to itself alone."""
 
-    def __init__(self, array: Any) -> None:
+    def __init__(self, array: AnyArray) -> None:
         self.array = array
 
     def __eq__(self, other: object) -> bool:
@@ -37,7 +38,7 @@ class _Same:
     __hash__ = None  # type: ignore[assignment]
 
 
-def leaves(array: Any) -> list[Any]:
+def leaves(array: AnyArray) -> list[AnyArray]:
     """The flat arrays of a nested array or tensor, in a fixed order."""
     if dr.is_tensor_v(array):
         return [array.array]
@@ -48,40 +49,40 @@ def leaves(array: Any) -> list[Any]:
 
 
 class ParameterWatch:
-    """Parameters of Mitsuba's objects, read again and again to see whether any has been given another value.
+    """Watch over parameters of Mitsuba's objects: tells if any has been given another value.
 
     Args:
         nodes: the objects. They are kept alive.
-        chosen: (object, name of a parameter of its) -> whether it counts.
+        chosen: predicate of an object and the name of one of its parameters; True for parameters to watch.
     """
 
-    def __init__(self, nodes: Iterable[Any], chosen: Callable[[Any, str], bool]) -> None:
+    def __init__(self, nodes: Iterable[mi.Object], chosen: Callable[[mi.Object, str], bool]) -> None:
         tables = [(node, mi.traverse(node)) for node in {id(node): node for node in nodes}.values()]
         self._held = [(table, key) for node, table in tables for key in table.keys() if chosen(node, key)]
         self._then = self._now()
 
     def same(self) -> bool:
-        """True if all are as when this was last asked, or at the start."""
+        """True if no parameter has a new value since the last call, or since the start."""
         then, self._then = self._then, self._now()
         return self._then == then
 
-    def _now(self) -> list[Any]:
+    def _now(self) -> list[object]:
         return [fingerprint(table[key]) for table, key in self._held]
 
 
 class MirrorWatch:
     """Watch over which shapes and instances are mirrored; read back only where a transformation has been given another value."""
 
-    def __init__(self, shapes: Sequence[Any]) -> None:
+    def __init__(self, shapes: Sequence[mi.Shape]) -> None:
         self._transformations = [Parameter(shape, "to_world") for shape in dict.fromkeys(shapes)]
         self._matrices, self._numbers = self._read()
-        # Read back when it is first asked for: most scenes never change, and the matrices that are held do not.
+        # Read back when a matrix first changes: most scenes never do. The matrices held here stay as they were.
         self._mirrored: np.ndarray | None = None
 
     def same(self) -> bool:
-        """True if the same ones are mirrored as at the start."""
+        """True if the same shapes are mirrored as at the start."""
         matrices, numbers = self._read()
-        # Those that are held cannot be taken for others: their variables' numbers are not used again.
+        # Equal numbers mean the same matrices: those held here keep their variables' numbers from being used again.
         if numbers == self._numbers:
             return True
         if self._mirrored is None:
@@ -92,17 +93,17 @@ class MirrorWatch:
             self._matrices, self._numbers = matrices, numbers
         return same
 
-    def _read(self) -> tuple[list[Any], list[list[int]]]:
+    def _read(self) -> tuple[list[Matrix4f], list[list[int]]]:
         matrices = [dr.detach(transformation.now().matrix) for transformation in self._transformations]
         return matrices, [[entry.index for row in matrix for entry in row] for matrix in matrices]
 
 
-def _negative(matrices: Sequence[Any]) -> np.ndarray:
-    """True if the determinants of 4 x 4 matrices without perspective are negative (bool, one for each)."""
+def _negative(matrices: Sequence[Matrix4f]) -> np.ndarray:
+    """True where the determinant of a 4 x 4 matrix without perspective is negative (bool, one for each)."""
     return np.linalg.det(read_back(matrices)[:, :, :3]) < 0 if len(matrices) else np.zeros(0, bool)
 
 
-def read_back(matrices: Sequence[Any]) -> np.ndarray:
+def read_back(matrices: Sequence[Matrix4f]) -> np.ndarray:
     """The first three rows of 4 x 4 matrices of single numbers, float64 (N, 3, 4)."""
     dr.eval(list(matrices))
     # Entry by entry, since that takes no kernel: most are constants.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -14,9 +13,9 @@ from ..errors import ShadowmapError
 from .geometry import ShapeInfo, rows_of, with_faces
 from .shapes.sources import ShapeSource
 
-# How far, in relation to its extent, squared, the vertices of a shape in one plane are from it.
+# Most squared distance of vertices from a common plane, relative to the shape's squared extent, for a planar shape.
 _FLAT = 1e-10
-# Faces of each shape that are looked at first.
+# Faces of each shape that a first, cheap test of planarity looks at.
 _TRIED = 6
 
 
@@ -36,7 +35,7 @@ class Parts:
     face_counts: npt.NDArray[np.int64]
 
     def only(self, shapes: npt.NDArray[np.bool_]) -> Parts:
-        """The same of some of the shapes."""
+        """The buffers of some of the shapes."""
         if shapes.all():
             return self
         counts = self.vertex_counts[shapes], self.face_counts[shapes]
@@ -67,7 +66,7 @@ def describe_all(
 ) -> tuple[ShapeInfo, ...]:
     """Validate the buffers of all shapes and describe them.
 
-    ``held``: which of them have (normals, texture coordinates). ``mirrored``: as :meth:`~shadowmap_dr.scene.soup.Soup.mirrored`.
+    ``held``: (has normals, has texture coordinates) of each shape. ``mirrored``: see :meth:`~shadowmap_dr.scene.soup.Soup.mirrored`.
 
     Raises:
         ShadowmapError: a mesh is broken.
@@ -77,15 +76,15 @@ def describe_all(
     meshes = np.array([isinstance(source.shape, mi.Mesh) for source in sources])
     kinds = [source.shape.class_name() for source in sources]
     has_normals = np.array([normals for normals, _ in held])
-    # The normals of a cylinder change sides where it is mirrored: they are computed from its parametrisation.
+    # A mirrored cylinder has its normals on the other side: they are computed from its parametrisation.
     turned_over = own & ~meshes
     reversed_ = turned_over != placed
     inverted = turned_over & np.array([kind == "Cylinder" for kind in kinds])
     flipped = np.array([source.shape.has_flipped_normals() for source in sources]) != inverted
-    # Mitsuba takes normals from the winding once vertices change, but a rectangle's never do.
+    # Mitsuba computes normals from the winding once vertices change; those of a rectangle never change.
     turned = _turned(parts, has_normals & np.array([kind == "Rectangle" for kind in kinds]))
     faceted, planar = _faceted(parts, meshes & has_normals & ~reversed_), _planar(parts)
-    see_through: dict[Any, bool] = {}
+    see_through: dict[mi.BSDF, bool] = {}
     infos = []
     columns = (reversed_, flipped, turned, faceted, planar)
     sizes = (parts.vertex_starts, parts.vertex_counts, parts.face_starts, parts.face_counts)
@@ -138,14 +137,14 @@ def _validate(names: Sequence[str], parts: Parts) -> None:
 
 
 def _corners(parts: Parts, shapes: npt.NDArray[np.bool_]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(faces of some shapes (K, 3) as vertices of all, the first face of each such shape, the vertices' points, (K, 3, 3))."""
+    """(faces (K, 3) of some shapes, indexing all vertices; first face of each of these shapes; their corners (K, 3, 3))."""
     counts = parts.face_counts[shapes]
     faces = parts.faces[parts.face_rows(shapes)] + np.repeat(parts.vertex_starts[shapes], counts)[:, None]
     return faces, np.cumsum(counts) - counts, parts.points[faces].astype(np.float64)
 
 
 def _faceted(parts: Parts, shapes: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-    """True if the vertex normals are those of the faces, for those of the shapes that are asked about."""
+    """True if the vertex normals are the normals of the faces; False for all but the given shapes."""
     found = np.zeros_like(shapes)
     if shapes.any():
         faces, starts, corners = _corners(parts, shapes)
@@ -158,7 +157,7 @@ def _faceted(parts: Parts, shapes: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool
 
 
 def _turned(parts: Parts, shapes: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-    """True if the vertex normals are on the other side than the winding of the faces says, for some of the shapes."""
+    """True if the vertex normals oppose the winding of the faces; False for all but the given shapes."""
     found = np.zeros_like(shapes)
     if shapes.any():
         faces, starts, corners = _corners(parts, shapes)
@@ -176,7 +175,7 @@ def _planar(parts: Parts) -> npt.NDArray[np.bool_]:
 
 
 def _may_be_planar(parts: Parts) -> npt.NDArray[np.bool_]:
-    """False for most shapes that are not planar: corners of a few of their faces are not in one plane."""
+    """False for most shapes that are not planar, judged by the corners of a few of their faces."""
     chosen = parts.face_starts[:, None] + np.linspace(0, parts.face_counts - 1, _TRIED).astype(np.int64).T
     corners = parts.faces[chosen].reshape(len(chosen), -1) + parts.vertex_starts[:, None]
     points = parts.points[corners].astype(np.float64)
@@ -184,7 +183,7 @@ def _may_be_planar(parts: Parts) -> npt.NDArray[np.bool_]:
     least = np.linalg.eigvalsh(np.einsum("spi,spj->sij", points, points))[:, 0]
     low, high = (end.reduceat(parts.points, parts.vertex_starts).astype(np.float64) for end in (np.minimum, np.maximum))
     extent = (high - low).T
-    # The sum over all vertices is at most that of a box's diagonals, and these corners count as often as they are chosen.
+    # The sum over all vertices is at most that of a box's diagonals; a corner counts as often as it is chosen.
     return least <= 2 * 3 * _TRIED * _FLAT * parts.vertex_counts * (extent**2).sum(0)
 
 

@@ -1,29 +1,34 @@
 """One merged triangle soup of a scene, in world space, and its vertex normals.
 
-The soup is what the rasterizer draws, from the camera and from the lights alike. Its static part (faces, texture coordinates,
-which shape a triangle belongs to) is separate from the two buffers that move (positions and normals), so that a step of an
-optimisation replaces the latter only and never touches Mitsuba's meshes.
+The rasterizer draws the soup, from the camera and from the lights alike. Its static part (faces, texture coordinates, the shape
+of each triangle) is separate from the two buffers that move (positions and normals): a step of an optimisation replaces only
+these two and never touches Mitsuba's meshes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import numpy.typing as npt
 
 from ..errors import ShadowmapError
 from ..jit.arrays import backend
 from ..jit.broadcast import copy_of_lane, in_copies
+from ..jit.types import AnyArray, Bool, Float, Point3f, UInt32, Vector3u
 from ..jit.vectors import normalize_or
+from .typed import ravel, replace_grad
 
 NO_TRIANGLE = 0xFFFFFFFF
 """Triangle index that means "nothing was hit"."""
 
-# Shapes are told apart by comparing with each of a list, as long as that is cheaper than what it saves.
+NOT_READ: Any = None  # Any: stands for buffers of several types, until ``load.refresh`` reads them
+
+# Shape indices are compared with each index of a list up to this length. Longer lists cost more than they save.
 _MANY_SHAPES = 8
 
 HAS_NORMALS = 1
@@ -88,37 +93,37 @@ class Geometry:
     """All triangles of a scene: V vertices, F faces, S shapes. A PyTree that may cross ``dr.freeze``.
 
     positions      Float  (3V,)  world space, may carry gradients
-    normals        Float  (3V,)  unit vertex normals, world space, may carry gradients; zero for shapes without
-    texcoords      Float  (2V,)  zero for shapes without
+    normals        Float  (3V,)  unit vertex normals, world space, may carry gradients; zero for shapes without normals
+    texcoords      Float  (2V,)  zero for shapes without texture coordinates
     rest_positions Float  (3V,)  positions as Mitsuba holds them, in the shape's own space, attached to Mitsuba's buffers (so that
                                  these cancel where barycentrics are recovered); None when no shape has mesh attributes
     faces          UInt32 (3F,)  indices into the vertices of the whole soup
     face_shape     UInt32 (F,)   index of the shape
     face_info      UInt32 (F,)   index and flags of the shape, see ``shape_and_flags``
-    vertex_shape   UInt32 (V,)
+    vertex_shape   UInt32 (V,)   index of the shape
     shape_face_start  UInt32 (S,)  ``ShapeInfo.face_start`` as an array
     changed        names of the shapes that ``with_positions`` replaced, if only their vertices may carry gradients; else None
     as_loaded      whether the other shapes are as they were when the scene was loaded
-    stand_ins      UInt32 (V,) which vertex each one's place is taken from, None if all have faces: those without, which nobody
-                   sees, lie where another one of their shape does, so that they stretch no bounds (``settled``)
-    packets        Float (4V,), positions with a fourth number, through which derivatives take the way back (``in_packets``)
-    copies         of packets, normals and texture coordinates, one after the other, one for each block of lanes
+    stand_ins      UInt32 (V,), the vertex whose position each vertex takes; None if all vertices have faces. Invisible vertices,
+                   those without faces, take the position of another vertex of their shape and so stretch no bounds (``settled``)
+    packets        Float (4V,), positions padded to four numbers, through which derivatives flow back (``in_packets``)
+    copies         number of copies of packets, normals and texture coordinates in their buffers, one for each block of lanes
     """
 
-    positions: Any
-    normals: Any
-    texcoords: Any
-    rest_positions: Any
-    faces: Any
-    face_shape: Any
-    face_info: Any
-    vertex_shape: Any
-    shape_face_start: Any
+    positions: Float
+    normals: Float
+    texcoords: Float
+    rest_positions: Float | None
+    faces: UInt32
+    face_shape: UInt32
+    face_info: UInt32
+    vertex_shape: UInt32
+    shape_face_start: UInt32
     shapes: tuple[ShapeInfo, ...]
     changed: tuple[str, ...] | None = None
     as_loaded: bool = False
-    stand_ins: Any = None
-    packets: Any = None
+    stand_ins: UInt32 | None = None
+    packets: Float | None = None
     copies: int = 1
 
     @property
@@ -141,18 +146,18 @@ class Geometry:
         known = ", ".join(repr(info.name) for info in self.shapes)
         raise ShadowmapError(f"There is no shape '{name}' in the scene; its shapes are {known}.")
 
-    def shape_positions(self, name: str) -> Any:
+    def shape_positions(self, name: str) -> Point3f:
         """Positions of one shape as Point3f (Vs,), world space, attached."""
         info = self.shape(name)
         return dr.gather(mi.Point3f, self.positions, dr.arange(mi.UInt32, info.vertex_count) + info.vertex_start)
 
-    def shape_and_flags(self, triangle: Any, active: Any) -> tuple[Any, Any]:
+    def shape_and_flags(self, triangle: UInt32, active: Bool | bool) -> tuple[UInt32, UInt32]:
         """(index of the shape, its ``ShapeInfo.flags``), UInt32 each, for each triangle."""
         info = dr.gather(mi.UInt32, self.face_info, triangle, active)
         return info >> _FLAG_BITS, info & (2**_FLAG_BITS - 1)
 
-    def has_changed(self, shape: Any) -> Any:
-        """Bool: which of these shapes (UInt32, index) may have been replaced. The others' vertices carry no gradients."""
+    def has_changed(self, shape: UInt32) -> Bool:
+        """True where a shape (UInt32, index) may have been replaced. Vertices of other shapes carry no gradients."""
         if self.changed is None:
             return mi.Bool(True)
         chosen = [info.name in self.changed for info in self.shapes]
@@ -170,14 +175,14 @@ class Geometry:
         return self.as_loaded and self.changed is not None and info.name not in self.changed
 
     def in_packets(self, lanes: int) -> Geometry:
-        """The same geometry, prepared for look-ups of attached positions, normals and texture coordinates by so many lanes.
+        """The same geometry, prepared for look-ups of attached positions, normals and texture coordinates by ``lanes`` lanes.
 
         Sums over packets of four numbers run several times faster than those of three.
         """
         packets = self.packets
         if dr.grad_enabled(self.positions):
             p = dr.gather(mi.Point3f, self.positions, dr.arange(mi.UInt32, self.vertex_count))
-            packets = dr.ravel(mi.Point4f(p.x, p.y, p.z, 0))
+            packets = ravel(mi.Point4f(p.x, p.y, p.z, 0))
         buffers = [array for array in (packets, self.normals, self.texcoords) if array is not None]
         made, copies = in_copies(buffers, lanes)
         if copies == 1:
@@ -185,30 +190,35 @@ class Geometry:
         *first, normals, texcoords = made
         return replace(self, packets=first[0] if first else None, normals=normals, texcoords=texcoords, copies=copies)
 
-    def row_of_copy(self, lanes: int) -> Any:
-        """First row (UInt32) of the copy of vertices that each of so many lanes reads; a constant if there is but one copy."""
+    def row_of_copy(self, lanes: int) -> UInt32:
+        """First row (UInt32) of the copy of the vertices that each lane reads; a constant if there is only one copy."""
         return copy_of_lane(backend(self.faces), lanes, self.copies) * self.vertex_count
 
-    def vertices(self, index: Any, active: Any = True, changed: Any = None, row: Any = 0) -> Any:
+    def vertices(
+        self, index: UInt32, active: Bool | bool = True, changed: Bool | bool | None = None, row: UInt32 | int = 0
+    ) -> Point3f:
         """Positions (Point3f) of vertices (UInt32); gradients flow only where they may have ``changed`` (None: anywhere).
 
-        ``row``: :meth:`row_of_copy` of the lanes, if they are those that the copies were made for.
+        ``row``: :meth:`row_of_copy` of the lanes, if the copies were made for these lanes.
         """
         p = dr.gather(mi.Point3f, self.positions, index, active)
         if not dr.grad_enabled(self.positions):
             return p
         changed = active if changed is None else changed
         if self.packets is None:
-            return dr.replace_grad(p, dr.gather(mi.Point3f, self.positions, index, changed))
+            return replace_grad(p, dr.gather(mi.Point3f, self.positions, index, changed))
         q = dr.gather(mi.Point4f, self.packets, index + row, changed)
-        return dr.replace_grad(p, mi.Point3f(q.x, q.y, q.z))
+        return replace_grad(p, mi.Point3f(q.x, q.y, q.z))
 
-    def with_positions(self, positions: Mapping[str, Any]) -> Geometry:
-        """Replace the positions of some shapes; returns a new Geometry, this one is left as it was.
+    def with_positions(self, positions: Mapping[str, AnyArray | npt.ArrayLike]) -> Geometry:
+        """A new Geometry with other positions for some shapes.
 
-        Each value is the world-space positions of all Vs vertices of the shape: Float (3Vs,) interleaved as xyzxyz...,
+        Each value holds the world-space positions of all Vs vertices of the shape: Float (3Vs,) interleaved as xyzxyz...,
         TensorXf or NumPy array (Vs, 3), or Point3f/Vector3f (Vs,). Gradients flow through. Normals of shapes that have them
-        are computed anew with Mitsuba's angle weighting (``vertex_normals``), attached. Sizes must be those of the scene.
+        are computed anew with Mitsuba's angle weighting (``vertex_normals``), attached.
+
+        Raises:
+            ShadowmapError: a name or a size that is not the scene's.
         """
         if not isinstance(positions, Mapping):
             raise ShadowmapError(f"vertex_positions is a {type(positions).__name__}: give a dictionary of the shapes' names.")
@@ -222,24 +232,24 @@ class Geometry:
         merged = self.positions
         for name, value in positions.items():
             info = self.shape(name)
-            value = _checked_positions(name, value, info.vertex_count)
-            merged = _write_vertices(merged, value, info.vertex_start, info.vertex_count, self.vertex_count)
+            checked = _checked_positions(name, value, info.vertex_count)
+            merged = _write_vertices(merged, checked, info.vertex_start, info.vertex_count, self.vertex_count)
         normals = self.normals
         for name in positions:
             info = self.shape(name)
             if info.has_normals:
                 smooth = vertex_normals(merged, _faces_of(self.faces, info), self.vertex_count)
                 own = dr.arange(mi.UInt32, info.vertex_count) + info.vertex_start
-                smooth = dr.gather(mi.Normal3f, smooth, own) * (-1 if info.against_winding else 1)
-                normals = _write_vertices(normals, smooth, info.vertex_start, info.vertex_count, self.vertex_count)
+                outward = dr.gather(mi.Normal3f, smooth, own) * (-1 if info.against_winding else 1)
+                normals = _write_vertices(normals, outward, info.vertex_start, info.vertex_count, self.vertex_count)
         return replace(self, positions=self.settled(merged), normals=normals, changed=changed, packets=None)
 
-    def settled(self, positions: Any) -> Any:
-        """Positions (Float, 3V) of which those of vertices without faces are another vertex's."""
-        return positions if self.stand_ins is None else dr.ravel(dr.gather(mi.Point3f, positions, self.stand_ins))
+    def settled(self, positions: Float) -> Float:
+        """Positions (Float, 3V) in which each vertex without faces has moved to its stand-in."""
+        return positions if self.stand_ins is None else ravel(dr.gather(mi.Point3f, positions, self.stand_ins))
 
 
-def vertex_normals(positions: Any, faces: Any, vertex_count: int) -> Any:
+def vertex_normals(positions: Float, faces: Vector3u, vertex_count: int) -> Float:
     """Smooth unit vertex normals: face normals weighted by the angle at the vertex, as Mitsuba does.
 
     positions Float (3V,), any space; faces Vector3u (F,). Returns Float (3V,). Where the face normals of a vertex cancel, or it
@@ -255,13 +265,13 @@ def vertex_normals(positions: Any, faces: Any, vertex_count: int) -> Any:
     area2 = dr.sqrt(dr.select(valid, n_squared, 1.0))
     n = dr.select(valid, n / area2, 0.0)
     angles = (dr.atan2(area2, dr.dot(e01, e02)), dr.atan2(area2, -dr.dot(e01, e12)), dr.atan2(area2, dr.dot(e02, e12)))
-    total = dr.zeros(mi.Float, 3 * vertex_count)
+    sums = dr.zeros(mi.Float, 3 * vertex_count)
     for corner, angle in enumerate(angles):
-        dr.scatter_add(total, n * angle, faces[corner], active=valid)
-    total = dr.unravel(mi.Vector3f, total)
+        dr.scatter_add(sums, n * angle, faces[corner], active=valid)
+    total = dr.unravel(mi.Vector3f, sums)
     # The weights are angles: a sum of this size is the rounding error of faces that lie back to back.
     total = dr.select(dr.squared_norm(total) > 1e-10, total, 0.0)
-    return dr.ravel(normalize_or(total, mi.Vector3f(1.0, 0.0, 0.0)))
+    return ravel(normalize_or(total, mi.Vector3f(1.0, 0.0, 0.0)))
 
 
 def rows_of(starts: np.ndarray, counts: np.ndarray) -> np.ndarray:
@@ -270,7 +280,7 @@ def rows_of(starts: np.ndarray, counts: np.ndarray) -> np.ndarray:
 
 
 def with_faces(faces: np.ndarray, count: int) -> np.ndarray:
-    """Mask (bool) of those of ``count`` vertices that belong to any of the faces (F, 3)."""
+    """Mask (bool) of the vertices, out of ``count``, that belong to a face (F, 3)."""
     found = np.zeros(count, np.bool_)
     found[faces] = True
     return found
@@ -281,7 +291,8 @@ def stand_ins(
 ) -> np.ndarray | None:
     """``Geometry.stand_ins``, uint32 (V,), for faces (F, 3) and each vertex's shape (V,).
 
-    ``meshes`` (S,) tells which shapes come from elsewhere: all vertices of what is tessellated here lie on their surfaces.
+    ``meshes`` (S,): True for shapes that are meshes in Mitsuba. Shapes that are tessellated here need no stand-ins: all their
+    vertices lie on their surfaces.
     """
     chosen = [info for info, mesh in zip(shapes, meshes.tolist(), strict=True) if mesh]
     own = [
@@ -296,8 +307,8 @@ def stand_ins(
     used[faces[own[0]]] = True
     if used.all():
         return None
-    some = faces[[info.face_start for info in shapes], 0]
-    return np.where(used, np.arange(len(used)), some[vertex_shape]).astype(np.uint32)
+    visible = faces[[info.face_start for info in shapes], 0]
+    return np.where(used, np.arange(len(used)), visible[vertex_shape]).astype(np.uint32)
 
 
 def pack_face_info(shapes: tuple[ShapeInfo, ...]) -> np.ndarray:
@@ -306,42 +317,43 @@ def pack_face_info(shapes: tuple[ShapeInfo, ...]) -> np.ndarray:
     return np.repeat(np.array(packed, np.uint32), [info.face_count for info in shapes])
 
 
-def _faces_of(faces: Any, info: ShapeInfo) -> Any:
+def _faces_of(faces: UInt32, info: ShapeInfo) -> Vector3u:
     return dr.gather(mi.Vector3u, faces, dr.arange(mi.UInt32, info.face_count) + info.face_start)
 
 
-def _checked_positions(name: str, value: Any, count: int) -> Any:
-    """Bring positions to Float (3Vs,) or an array of three components; sizes are known without evaluating anything."""
+def _checked_positions(name: str, value: AnyArray | npt.ArrayLike, count: int) -> Float | Point3f:
+    """Convert positions to Float (3Vs,) or Point3f (Vs,). Sizes are checked without evaluating arrays."""
+    array: Any = value  # Any: Dr.Jit's predicates narrow no types
     if not dr.is_array_v(value):
         try:
-            value = mi.TensorXf(np.asarray(value, np.float32))  # Dr.Jit never comes back from a string
+            array = mi.TensorXf(np.asarray(value, np.float32))  # Dr.Jit itself hangs on a string
         except (TypeError, ValueError) as error:
             raise ShadowmapError(f"Positions of shape '{name}' are {value!r:.60}: give an array of {count} points.") from error
-    if dr.is_tensor_v(value):
-        if tuple(value.shape) not in ((count, 3), (3 * count,)):
+    if dr.is_tensor_v(array):
+        if tuple(array.shape) not in ((count, 3), (3 * count,)):
             raise ShadowmapError(
-                f"Positions of shape '{name}' have the tensor shape {tuple(value.shape)}, but it has {count} vertices: "
+                f"Positions of shape '{name}' have the tensor shape {tuple(array.shape)}, but it has {count} vertices: "
                 f"give a tensor of shape ({count}, 3)."
             )
-        value = value.array
-    if dr.depth_v(value) == 2 and dr.size_v(value) == 3:
-        if dr.width(value) not in (1, count):
+        array = array.array
+    if dr.depth_v(array) == 2 and dr.size_v(array) == 3:
+        if dr.width(array) not in (1, count):
             raise ShadowmapError(
-                f"Positions of shape '{name}' are an array of {dr.width(value)} points, but it has {count} vertices."
+                f"Positions of shape '{name}' are an array of {dr.width(array)} points, but it has {count} vertices."
             )
-        return mi.Point3f(value)
-    if dr.depth_v(value) != 1 or dr.width(value) != 3 * count:
+        return mi.Point3f(array)
+    if dr.depth_v(array) != 1 or dr.width(array) != 3 * count:
         raise ShadowmapError(
-            f"Positions of shape '{name}' are an array of {dr.width(value)} numbers, but {count} vertices need {3 * count}."
+            f"Positions of shape '{name}' are an array of {dr.width(array)} numbers, but {count} vertices need {3 * count}."
         )
-    return mi.Float(value)
+    return mi.Float(array)
 
 
-def _write_vertices(target: Any, value: Any, start: int, count: int, total: int) -> Any:
+def _write_vertices(target: Float, value: Float | Point3f, start: int, count: int, total: int) -> Float:
     """A copy of the flat buffer ``target`` with ``count`` vertices from ``start`` on replaced, differentiable in both."""
     points = dr.size_v(value) == 3
     if start == 0 and count == total:
-        return dr.ravel(value) if points and dr.width(value) == count else _fill(value, count)
+        return ravel(value) if points and dr.width(value) == count else _fill(value, count)
     result = type(target)(target)
     index = dr.arange(mi.UInt32, count if points else 3 * count) + (start if points else 3 * start)
     # Not ``Permute``: that promises that all of the target is written, and its gradient would be dropped.
@@ -349,7 +361,7 @@ def _write_vertices(target: Any, value: Any, start: int, count: int, total: int)
     return result
 
 
-def _fill(value: Any, count: int) -> Any:
+def _fill(value: Float | Point3f, count: int) -> Float:
     if dr.size_v(value) == 3:
-        return dr.ravel(dr.gather(mi.Point3f, dr.ravel(value), dr.zeros(mi.UInt32, count)))
-    return value
+        return ravel(dr.gather(mi.Point3f, ravel(value), dr.zeros(mi.UInt32, count)))
+    return cast(Float, value)

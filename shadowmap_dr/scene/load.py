@@ -1,7 +1,7 @@
 """From a Mitsuba scene to the records that the renderer works on.
 
-``load`` does the expensive part once (topology, tessellation, tables, validation); ``refresh`` re-reads what parameters may
-change, attached where they carry gradients.
+``load`` does the expensive part once (topology, tessellation, tables, validation); ``refresh`` reads again all values that
+parameters may change, attached where they carry gradients.
 """
 
 from __future__ import annotations
@@ -14,11 +14,13 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import numpy.typing as npt
 
 from ..errors import ShadowmapError, UnsupportedShape
 from ..jit.arrays import device_array
+from ..jit.types import Float
 from .descriptions import Parts, describe_all
-from .geometry import Geometry, ShapeInfo, pack_face_info, stand_ins
+from .geometry import NOT_READ, Geometry, ShapeInfo, pack_face_info, stand_ins
 from .lights.area import AreaLight
 from .lights.environment import Environment
 from .lights.read import Light, area_lights_of, environments_of, lights_of
@@ -28,7 +30,7 @@ from .shapes.sources import CurveSource, ShapeSource, source_of
 from .soup import Soup, Vertices
 from .unsupported import omissions_of, warn_of
 
-# Vertices of fewer shapes are put together anew for each image.
+# With fewer shapes, their vertices are concatenated anew for each image.
 _MANY_SHAPES = 16
 
 
@@ -36,25 +38,25 @@ _MANY_SHAPES = 16
 class SceneData:
     """A scene as records. A PyTree that may cross ``dr.freeze``.
 
-    sensors       one tuple for each sensor of the scene; a batch sensor's holds several cameras, all others one
+    sensors       one tuple for each sensor of the scene, which holds the cameras of a batch sensor or the one camera
     lights        directional, spot and point lights, projectors and beams
     areas         area lights
     environments  constant, envmap and sunsky emitters (at most one)
-    shape_ptr, bsdf_ptr   mi.ShapePtr, mi.BSDFPtr (S,), by the index that ``geometry.face_shape`` holds
-    variant       of Mitsuba, to which all of them belong
-    soup          the shapes' vertices, None if there are few
-    needs_frames  whether any BSDF asks for more than the cosines of directions: tangents, texture coordinates
-    only_cosines  whether all BSDFs are proportional to the cosine of the light's direction, and know no more of directions
+    shape_ptr, bsdf_ptr   mi.ShapePtr, mi.BSDFPtr (S,), indexed by ``geometry.face_shape``
+    variant       Mitsuba variant of the scene
+    soup          the shapes' vertices, None if there are few shapes
+    needs_frames  whether any BSDF needs more than the cosines of directions: tangents, texture coordinates
+    only_cosines  whether all BSDFs are the cosine of the light's direction times a factor that no direction changes
     """
 
-    scene: Any
+    scene: mi.Scene
     geometry: Geometry
     sensors: tuple[tuple[Sensor, ...], ...]
     lights: tuple[Light, ...]
     areas: tuple[AreaLight, ...]
     environments: tuple[Environment, ...]
-    shape_ptr: Any
-    bsdf_ptr: Any
+    shape_ptr: mi.ShapePtr
+    bsdf_ptr: mi.BSDFPtr
     sources: tuple[ShapeSource, ...]
     variant: str
     needs_frames: bool = True
@@ -62,7 +64,7 @@ class SceneData:
     soup: Soup | None = None
 
     def cameras(self, sensor: int | Sensor) -> tuple[Sensor, ...]:
-        """Those of the scene's sensor of that number, or the one that is given.
+        """Cameras of a sensor: of the scene's sensor with that number, or the given record itself.
 
         Raises:
             ShadowmapError: there is no such sensor; the variant is not the scene's.
@@ -77,8 +79,8 @@ class SceneData:
             raise ShadowmapError(f"There is no sensor {sensor}: the scene has {len(self.sensors)}, counted from 0.")
         return self.sensors[sensor]
 
-    def materials(self) -> list[Any]:
-        """BSDFs, and meshes whose attributes they read: all that Mitsuba shades with."""
+    def materials(self) -> list[mi.Object]:
+        """BSDFs, and meshes whose attributes they may read: all objects that Mitsuba shades with."""
         return [*(source.shape.bsdf() for source in self.sources), *self.with_attributes()]
 
     def light(self, name: str) -> Light | AreaLight:
@@ -90,11 +92,11 @@ class SceneData:
         known = ", ".join(repr(light.name) for light in lights) or "none"
         raise ShadowmapError(f"There is no light '{name}' in the scene; its lights: {known}.")
 
-    def with_attributes(self) -> list[Any]:
+    def with_attributes(self) -> list[mi.Mesh]:
         """Mitsuba's meshes that have attributes, such as colours of vertices, which materials may read."""
         return [source.shape for source, info in zip(self.sources, self.geometry.shapes, strict=True) if info.reads_attributes]
 
-    def curve_vertices(self, name: str, control_points: Any) -> Any:
+    def curve_vertices(self, name: str, control_points: Float | npt.ArrayLike) -> Float:
         """See :meth:`shadowmap_dr.Renderer.curve_vertices`."""
         index = [info.name for info in self.geometry.shapes].index(self.geometry.shape(name).name)
         source = self.sources[index]
@@ -108,13 +110,17 @@ class SceneData:
         return source.placed(source.with_control_points(points)).positions
 
 
-def load(scene: Any, *, tessellation: int = 64, warn: bool = True) -> SceneData:
-    """Read a ``mi.Scene``.
+def load(scene: mi.Scene, *, tessellation: int = 64, warn: bool = True) -> SceneData:
+    """Read a ``mi.Scene``. Needs a variant ``*_ad_rgb`` or ``*_ad_mono``.
 
-    ``tessellation``: triangles around the circumference of spheres, disks and cylinders; curves have fewer in proportion
-    (``sources.source_of``). ``warn``: name all that is left out, since it is not supported, in one ``UserWarning``. Raises
-    ``ShadowmapError`` for what is broken, naming the plug-in and its id, and where nothing is left.
-    Needs a variant ``*_ad_rgb`` or ``*_ad_mono``.
+    Args:
+        scene: the scene.
+        tessellation: triangles around the circumference of spheres, disks and cylinders; curves have fewer in proportion
+            (``sources.source_of``).
+        warn: name all unsupported parts, which are left out, in one ``UserWarning``.
+
+    Raises:
+        ShadowmapError: a part is broken (the message names the plug-in and its id), or no shape is supported.
     """
     if not ("_ad_" in mi.variant() and mi.variant().endswith(("_rgb", "_mono"))):
         raise ShadowmapError(
@@ -147,10 +153,10 @@ def load(scene: Any, *, tessellation: int = 64, warn: bool = True) -> SceneData:
     merged, vertex_shape = np.concatenate(faces) + np.repeat(starts, face_counts)[:, None], np.repeat(shape_index, vertex_counts)
     settled = stand_ins(merged, vertex_shape, infos, np.array([isinstance(s.shape, mi.Mesh) for s in sources]))
     geometry = Geometry(
-        positions=None,  # the four buffers that may change are read by ``refresh``
-        normals=None,
-        texcoords=None,
-        rest_positions=None,
+        positions=NOT_READ,
+        normals=NOT_READ,
+        texcoords=NOT_READ,
+        rest_positions=NOT_READ,
         faces=device_array(mi.UInt32, merged),
         face_shape=device_array(mi.UInt32, np.repeat(shape_index, face_counts)),
         face_info=device_array(mi.UInt32, pack_face_info(infos)),
@@ -183,13 +189,13 @@ def load(scene: Any, *, tessellation: int = 64, warn: bool = True) -> SceneData:
     return replace(data, geometry=replace(data.geometry, as_loaded=True))
 
 
-def refresh(data: SceneData, sensors: tuple[Any, ...] | None = None) -> SceneData:
-    """Read again what scene parameters may have changed: vertices, normals, texture coordinates, lights and sensors.
+def refresh(data: SceneData, sensors: tuple[mi.Sensor, ...] | None = None) -> SceneData:
+    """Read again all values that scene parameters may have changed: vertices, normals, texture coordinates, lights, sensors.
 
-    ``sensors``: of Mitsuba, in place of all of the scene's, for whoever needs but one of many.
-    Values are attached where the scene's parameters are. Topology must be that of ``load``; BSDFs need no refresh, since they
-    are always evaluated by Mitsuba itself. With few shapes nothing is read back to the host. With many, vertices and
-    transformations without gradients are read back when they have been given other values.
+    ``sensors``: Mitsuba's sensors to read instead of all sensors of the scene.
+    Values are attached where the scene's parameters are. Topology must be that of ``load``. BSDFs need no refresh: Mitsuba itself
+    evaluates them. With few shapes nothing is read back to the host. With many, vertices and transformations without gradients
+    are read back when they have been given other values.
     """
     vertices = _vertices(data)
     # Not an empty array: one among the arguments of a frozen function ends the process (Dr.Jit 1.5).
@@ -214,7 +220,7 @@ def refresh(data: SceneData, sensors: tuple[Any, ...] | None = None) -> SceneDat
     )
 
 
-def _shapes_of(scene: Any) -> Iterator[tuple[str, Any, Any]]:
+def _shapes_of(scene: mi.Scene) -> Iterator[tuple[str, mi.Shape, mi.Shape | None]]:
     """(unique name, shape, instance or None) of all shapes, shape groups resolved."""
     groups = _Groups(scene)
     taken: set[str] = set()
@@ -238,35 +244,35 @@ def _unique(name: str, taken: set[str]) -> str:
 class _Groups:
     """The shape groups of a scene.
 
-    An instance has no reference to its group that can be read. But it hands out the arrays that it holds, and so does a group:
-    those of an instance's own group are among them.
+    Mitsuba does not tell the group of an instance. But instances and groups list the arrays that they hold, and an instance holds
+    all arrays of its group.
     """
 
-    def __init__(self, scene: Any) -> None:
+    def __init__(self, scene: mi.Scene) -> None:
         nodes = [node for _, node in children(scene) if node.class_name().startswith("ShapeGroup")]
         self._groups = [
             (held_arrays(node), [child for _, child in children(node) if isinstance(child, mi.Shape)]) for node in nodes
         ]
 
-    def shapes_of(self, instance: Any, name: str) -> list[Any]:
-        """Shapes of the group that an instance shows. ``name`` of the instance, for messages."""
+    def shapes_of(self, instance: mi.Shape, name: str) -> list[mi.Shape]:
+        """Shapes of the group that an instance shows. ``name``: of the instance, for messages."""
         if len(self._groups) == 1:
             return self._groups[0][1]
         held = held_arrays(instance)
         shown = [(len(arrays), shapes) for arrays, shapes in self._groups if arrays and arrays <= held]
         if not shown:
             raise ShadowmapError(f"The shape group of instance '{name}' was not found in the scene.")
-        # A group that shares all its shapes with another one may be part of that.
+        # The arrays of a group may be a part of those of another group, which has the same shapes and more.
         return max(shown, key=lambda group: group[0])[1]
 
 
 def with_positions(data: SceneData) -> Geometry:
-    """The geometry with the vertices as they are now, attached, and nothing else that :func:`refresh` reads."""
+    """The geometry with the current vertex positions, attached. Normals and texture coordinates stay as they were read."""
     return replace(data.geometry, positions=data.geometry.settled(_vertices(data).positions))
 
 
 def _described(names: list[str], sources: list[ShapeSource], faces: list[np.ndarray]) -> tuple[Soup, tuple[ShapeInfo, ...]]:
-    """The soup of shapes, with the faces of each, and what they are like."""
+    """The soup of shapes with these faces, and the description of each shape."""
     with dr.suspend_grad():
         soup = Soup(names, sources)
     points, normals = (buffer.numpy().reshape(-1, 3) for buffer in soup.own())
@@ -274,23 +280,23 @@ def _described(names: list[str], sources: list[ShapeSource], faces: list[np.ndar
     return soup, describe_all(names, sources, soup.held, soup.mirrored(), parts)
 
 
-def _pointers(kind: type, objects: list[Any]) -> Any:
+def _pointers(kind: type, objects: list[mi.Object]) -> mi.ShapePtr | mi.BSDFPtr:
     """Pointers to Mitsuba's objects, evaluated."""
-    # Joined as numbers: a kernel that joins pointers would be another one for each number of shapes.
-    numbers = [dr.reinterpret_array(mi.UInt32, kind(one))[0] for one in objects]
+    # Joined on the host, as numbers: Dr.Jit would compile another kernel for each number of shapes.
+    numbers = [mi.UInt32(dr.reinterpret_array(mi.UInt32, kind(one)))[0] for one in objects]
     return dr.reinterpret_array(kind, device_array(mi.UInt32, numbers))
 
 
 def _vertices(data: SceneData) -> Vertices:
-    """The vertices of all shapes as they are now, attached."""
+    """The current vertices of all shapes, attached."""
     sources, infos = data.sources, data.geometry.shapes
-    if data.soup is None or dr.flag(dr.JitFlag.FreezingScope):  # what is kept would not be read again by a replay
+    if data.soup is None or dr.flag(dr.JitFlag.FreezingScope):  # a replay would not read again the vertices that the soup keeps
         buffers = (_vertex_buffers(source, info) for source, info in zip(sources, infos, strict=True))
         return Vertices(*(dr.concat(list(parts)) for parts in zip(*buffers, strict=True)))
     return data.soup.vertices(lambda k: _vertex_buffers(sources[k], infos[k]))
 
 
-def _vertex_buffers(source: ShapeSource, info: ShapeInfo) -> tuple[Any, Any, Any, Any]:
+def _vertex_buffers(source: ShapeSource, info: ShapeInfo) -> tuple[Float, Float, Float, Float]:
     """(positions, normals, texcoords, rest positions) of one shape: flat, world space (rest: own space), attached."""
     own = source.own()
     if len(own.positions) != 3 * info.vertex_count:

@@ -8,32 +8,34 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ..jit.types import Float, UInt32
+
 _BUFFERS = ("vertex_count", "face_count", "vertex_positions", "vertex_normals", "vertex_texcoords")
 
 
-def parameters(node: Any) -> dict[str, Any]:
+def parameters(node: mi.Object) -> dict[str, Any]:
     """Current (possibly AD-attached) parameters of a Mitsuba object and its children, by their relative names.
 
-    Those without a value are left out: a ``hair`` material has some.
+    Parameters without a value are left out: a ``hair`` material has some.
     """
-    # Without the indexing of `mi.SceneParameters`, which takes as long again to remember what was asked for.
+    # Not by indexing `mi.SceneParameters`, which takes twice as long: it also records the names that were read.
     properties = mi.traverse(node).properties.items()
     found = {name: value if kind is None else mi.get_property(value, kind, owner) for name, (value, kind, owner, _) in properties}
     return {name: value for name, value in found.items() if value is not None}
 
 
-def owners(node: Any) -> list[tuple[str, Any]]:
-    """(relative name, object that has it) of all parameters of a Mitsuba object and its children."""
+def owners(node: mi.Object) -> list[tuple[str, mi.Object]]:
+    """(relative name, owning object) of all parameters of a Mitsuba object and its children."""
     return [(name, owner) for name, (_, _, owner, _) in mi.traverse(node).properties.items()]
 
 
-def children(node: Any) -> list[tuple[str, Any]]:
+def children(node: mi.Object) -> list[tuple[str, mi.Object]]:
     """(name, object) of the direct children of a Mitsuba object, in its own order."""
     return [(name, value) for name, value, _ in _parts_of(node) if isinstance(value, mi.Object)]
 
 
-def held_arrays(node: Any) -> frozenset[int]:
-    """Numbers of the Dr.Jit variables that a Mitsuba object holds, with all that it refers to."""
+def held_arrays(node: mi.Object) -> frozenset[int]:
+    """Numbers of the Dr.Jit variables that a Mitsuba object and the objects it refers to hold."""
     found: list[int] = []
     with dr.scoped_set_flag(dr.JitFlag.EnableObjectTraversal, True):
         node._traverse_1_cb_ro(lambda index, variant, domain: found.append(index))
@@ -41,29 +43,29 @@ def held_arrays(node: Any) -> frozenset[int]:
 
 
 class Parameter:
-    """One parameter of a Mitsuba object itself, read again and again. The object is kept alive.
+    """One parameter of a Mitsuba object itself, not of its children, to be read repeatedly. The object is kept alive.
 
     Raises:
-        KeyError: it has no parameter of that name.
+        KeyError: the object has no parameter of that name.
     """
 
-    def __init__(self, node: Any, name: str) -> None:
+    def __init__(self, node: mi.Object, name: str) -> None:
         self._node, self._name = node, name
         self._place, self._kind = self._found()
 
-    def now(self) -> Any:
-        """Its current, possibly attached, value."""
+    def now(self) -> Any:  # Any: parameters have values of all kinds
+        """The current, possibly attached, value."""
         return self._found()[0] if self._kind is None else mi.get_property(self._place, self._kind, self._node)
 
-    def _found(self) -> tuple[Any, Any]:
+    def _found(self) -> tuple[Any, type | None]:
         for name, value, kind in _parts_of(self._node):
             if name == self._name and not isinstance(value, mi.Object):
                 return value, kind
         raise KeyError(self._name)
 
 
-def _parts_of(node: Any) -> list[tuple[str, Any, Any]]:
-    """(name, child or where a parameter's value is, type of the parameter) of all that a Mitsuba object itself has."""
+def _parts_of(node: mi.Object) -> list[tuple[str, Any, type | None]]:
+    """(name, child or handle of a parameter's value, type of the parameter) of a Mitsuba object's children and parameters."""
     callback = _collector(mi.variant())()
     node.traverse(callback)
     return callback.found
@@ -71,26 +73,28 @@ def _parts_of(node: Any) -> list[tuple[str, Any, Any]]:
 
 @functools.cache
 def _collector(variant: str) -> type:
-    """Mitsuba's base class belongs to the variant that is current."""
+    """A callback class for one variant, from which Mitsuba's base class comes."""
 
     class Collector(mi.TraversalCallback):
         def __init__(self) -> None:
             super().__init__()
-            self.found: list[tuple[str, Any, Any]] = []
+            self.found: list[tuple[str, Any, type | None]] = []
 
-        def put(self, name: str, value: Any, flags: int = 0, cpptype: Any = None) -> None:
+        def put(self, name: str, value: object, flags: int = 0, cpptype: type | None = None) -> None:
             self.found.append((name, value, cpptype))
 
     return Collector
 
 
-def varies(texture: Any) -> bool:
-    """True if a ``mi.Texture`` may differ from place to place, attributes of meshes aside. Those written in Python may say what
-    they like: the base class says no for them."""
+def varies(texture: mi.Texture) -> bool:
+    """True if a ``mi.Texture`` may vary over a surface, attributes of meshes aside.
+
+    Textures written in Python always may: Mitsuba's base class says no for them unless they override it.
+    """
     return texture.is_spatially_varying() or type(texture) is not mi.Texture
 
 
-def is_plain(bsdf: Any) -> bool:
+def is_plain(bsdf: mi.BSDF) -> bool:
     """True if a BSDF is known to depend on nothing but the cosines of directions: diffuse, of the same colour everywhere."""
     parts = [part for _, part in children(bsdf)]
     if bsdf.class_name() == "TwoSidedBRDF":
@@ -101,29 +105,29 @@ def is_plain(bsdf: Any) -> bool:
     return all(isinstance(part, mi.Texture) and not varies(part) and part.class_name() != "MeshAttribute" for part in parts)
 
 
-def is_cosine(bsdf: Any) -> bool:
-    """True if a BSDF is known to be the cosine of the light's direction times a number that no direction changes: diffuse."""
+def is_cosine(bsdf: mi.BSDF) -> bool:
+    """True if a BSDF is known to be the light direction's cosine times a factor independent of directions: diffuse."""
     kind = bsdf.class_name()
     if kind == "SmoothDiffuse":
         textures = [part for _, part in children(bsdf)]
-        # Those written in Python may look at directions.
+        # Textures written in Python may depend on directions.
         return all(type(part) is mi.Texture for part in textures)
     if kind not in ("TwoSidedBRDF", "MaskBSDF"):
         return False
     return all(is_cosine(part) if isinstance(part, mi.BSDF) else type(part) is mi.Texture for _, part in children(bsdf))
 
 
-def is_attribute(node: Any, key: str) -> bool:
+def is_attribute(node: mi.Object, key: str) -> bool:
     """True if a parameter is an attribute of a mesh: colours of vertices or faces, for instance."""
     return isinstance(node, mi.Mesh) and key.startswith(("vertex_", "face_")) and key not in _BUFFERS
 
 
-def attributes(mesh: Any) -> dict[str, Any]:
+def attributes(mesh: mi.Mesh) -> dict[str, Float]:
     """Attributes of a ``mi.Mesh`` by name: flat Float, of all vertices (``vertex_...``) or of all faces (``face_...``)."""
     return {name: value for name, value in parameters(mesh).items() if is_attribute(mesh, name)}
 
 
-def mesh_buffers(mesh: Any) -> tuple[Any, Any, Any, Any]:
+def mesh_buffers(mesh: mi.Mesh) -> tuple[UInt32, Float, Float, Float]:
     """(faces UInt32 (3F,), positions Float (3V,), normals Float (3V,) or (0,), texcoords Float (2V,) or (0,)) of a ``mi.Mesh``.
 
     World space; attached where the mesh's buffers are.

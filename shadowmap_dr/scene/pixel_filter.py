@@ -6,13 +6,16 @@ import math
 import re
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..errors import ShadowmapError
 
-# Points at which a filter is looked at in each cell. With 32 weights are exact to about 1e-5.
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+# Points at which a filter is sampled in each cell. 32 points make weights exact to about 1e-5.
 POINTS = 32
 
 
@@ -22,7 +25,7 @@ class Filter:
 
     kind     Mitsuba's name of its class
     radius   pixels beyond which it is zero
-    border   pixels around the film whose samples it takes in, as Mitsuba has it
+    border   pixels around the film whose samples contribute to it, Mitsuba's ``border_size``
     b, c     parameters of the cubic filters (Mitchell and Netravali's names)
     """
 
@@ -33,8 +36,8 @@ class Filter:
     c: float = 0.0
 
     @classmethod
-    def read(cls, film: Any, owner: str) -> Filter:
-        """The filter of a ``mi.Film``; ``owner`` names the sensor in the ``ShadowmapError`` for one that is not known.
+    def read(cls, film: mi.Film, owner: str) -> Filter:
+        """The filter of a ``mi.Film``. Raises ``ShadowmapError`` for an unknown filter, naming ``owner``, the sensor.
 
         Nothing is read from the device, so this may run in a frozen function.
         """
@@ -59,14 +62,14 @@ class Filter:
         """Weights at distances ``x`` in pixels, not normalised."""
         return np.where(np.abs(x) <= self.radius, _PROFILES[self.kind](self, np.abs(x)), 0.0)
 
-    @lru_cache(maxsize=64)  # noqa: B019  (a pure function of a few numbers, which a step needs again and again)
+    @lru_cache(maxsize=64)  # noqa: B019  (a pure function of a few numbers, called at every step)
     def weights(self, factor: int) -> tuple[float, ...]:
         """Weights of the cells around a pixel's centre, ``factor`` cells to a pixel; symmetric, summing to 1.
 
-        Cells are wide themselves. Were each weighted by the filter's integral over it, edges would come out wider than the
-        filter is: a Gaussian's by a fifth with one cell to a pixel. Instead the blurred step that the weighted cells make of an
-        edge is the best approximation, in the least squares, of the step that the filter makes of it. A filter that is nowhere
-        negative gets no negative weights, which would make dark seams along bright edges.
+        Cells have a width of their own: if each were weighted by the filter's integral over it, edges would be wider than the
+        filter makes them, with one cell to a pixel by a fifth for a Gaussian. Instead the weighted cells turn an edge into the
+        least-squares approximation of the blurred step that the filter makes of it. A filter that is nowhere negative gets no
+        negative weights, which would make dark seams along bright edges.
         """
         most = factor * (2 * self.border + 1)
         reach = self.radius * factor - 1e-4
@@ -88,7 +91,7 @@ class Filter:
         fine = np.linspace(-self.radius, self.radius, 2 * POINTS * factor * math.ceil(self.radius) + 1)
         values = self.evaluate(0.5 * (fine[1:] + fine[:-1]))
         target = np.interp(across, fine, np.concatenate([[0.0], np.cumsum(values) / values.sum()]))
-        # Hat functions at the knots, sampled. The first and the last one have values that are given.
+        # Hat functions at the knots, sampled. The values at the first and the last knot are given: 0 and 1.
         at = across * factor + 0.5 * count
         hats = np.maximum(0.0, 1.0 - np.abs(at[:, None] - np.arange(count + 1)))
         inner, *_ = np.linalg.lstsq(hats[:, 1:-1], target - hats[:, -1], rcond=None)

@@ -7,14 +7,15 @@ topmost row of Mitsuba's film, at y = -w.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from ..errors import ShadowmapError
 from ..jit.broadcast import broadcast_differentiable
+from ..jit.types import Float, Matrix4f, Point2f, Point3f, Vector3f
 from .mitsuba_objects import children, parameters
 from .pixel_filter import Filter
 from .transforms import axis, translation
@@ -26,7 +27,7 @@ _KINDS = {
 }
 
 
-# Mitsuba makes something of about this size of an aperture of zero.
+# Mitsuba replaces an aperture radius of zero by about this number.
 _PINHOLE = 1e-6
 
 
@@ -39,23 +40,23 @@ class Sensor:
     principal_point  Point2f, Mitsuba's principal_point_offset_x/y, as a fraction of the film's width and height
     near, far        Float, clip distances along the viewing direction
     film_size, crop_size, crop_offset   pixels
-    channels         colour channels that the film holds: 1 (luminance) or 3; ``alpha`` says whether one more holds coverage
+    channels         colour channels of the film: 1 (luminance) or 3; ``alpha``: whether the film has one more, for coverage
     filter           the film's reconstruction filter
     sample_border    whether samples beyond the window contribute to its outermost pixels, as the film's parameter says
     film_column      leftmost column of this camera's picture in its film (batch sensors put several side by side)
-    pixel_aspect     width of a pixel for a height of 1; other than 1 where a batch sensor has a crop window, into which Mitsuba
-                     squeezes all that its cameras see
+    pixel_aspect     width of a pixel for a height of 1; other than 1 if a batch sensor has a crop window, into which Mitsuba
+                     squeezes the whole pictures of its cameras
 
     Gradients flow from ``view_projection``, ``origin``, ``direction`` and ``wi_world`` to to_world, x_fov and principal_point.
     """
 
     name: str
     kind: str
-    to_world: Any
-    x_fov: Any
-    principal_point: Any
-    near: Any
-    far: Any
+    to_world: mi.Transform4f
+    x_fov: Float
+    principal_point: Point2f
+    near: Float
+    far: Float
     film_size: tuple[int, int]
     crop_size: tuple[int, int]
     crop_offset: tuple[int, int]
@@ -82,26 +83,26 @@ class Sensor:
         return self.filter.border if self.sample_border else 0
 
     @property
-    def origin(self) -> Any:
+    def origin(self) -> Point3f:
         """Point3f, centre of projection (perspective) or a point on the optical axis (orthographic), world space."""
         return translation(self.to_world)
 
     @property
-    def direction(self) -> Any:
+    def direction(self) -> Vector3f:
         """Vector3f, unit viewing direction, world space."""
         return dr.normalize(axis(self.to_world, 2))
 
     @property
-    def view(self) -> Any:
+    def view(self) -> Matrix4f:
         """Matrix4f, world to camera space."""
         return dr.rcp(mi.Matrix4f(self.to_world.matrix))
 
     @property
-    def reach(self) -> Any:
-        """Float, camera space: how far behind the near plane the far plane is.
+    def reach(self) -> Float:
+        """Float, camera space: distance of the far plane from the near plane.
 
-        An orthographic camera of Mitsuba's, whose transformation scales along its axis, begins at ``near`` in its own units,
-        and its rays are as long as ``far - near`` in those of the world.
+        If its transformation scales along the axis, Mitsuba's orthographic camera takes ``near`` in its own units, but the length
+        of its rays, ``far - near``, in world units.
         """
         between = mi.Float(self.far) - mi.Float(self.near)
         if self.kind == "perspective":
@@ -110,7 +111,7 @@ class Sensor:
         return between / dr.norm(mi.Vector3f(matrix[0, 2], matrix[1, 2], matrix[2, 2]))
 
     @property
-    def projection(self) -> Any:
+    def projection(self) -> Matrix4f:
         """Matrix4f, camera space to clip space, crop window and principal point included."""
         (film_w, film_h), (crop_w, crop_h), (crop_x, crop_y) = self.film_size, self.crop_size, self.crop_offset
         # Position in the crop window in [0, 1] = (position in the film - crop offset) * film size / crop size.
@@ -142,17 +143,17 @@ class Sensor:
         )
 
     @property
-    def view_projection(self) -> Any:
+    def view_projection(self) -> Matrix4f:
         """Matrix4f, world space to clip space: pos_clip = view_projection @ (p_world, 1)."""
         return self.projection @ self.view
 
-    def wi_world(self, p_world: Any) -> Any:
+    def wi_world(self, p_world: Point3f) -> Vector3f:
         """Unit vector from p_world (Point3f) to the camera, world space."""
         if self.kind == "perspective":
             return dr.normalize(self.origin - p_world)
         return -self.direction
 
-    def ray_direction(self, width: int | None = None, height: int | None = None) -> Any:
+    def ray_direction(self, width: int | None = None, height: int | None = None) -> Vector3f:
         """Vector3f (H * W,), unit world-space directions through the pixel centres, row-major. Attached.
 
         ``width`` and ``height`` ask for another grid over the same window (supersampling).
@@ -169,12 +170,14 @@ class Sensor:
         linear = mi.Matrix3f(self.to_world.matrix)
         return dr.normalize(mi.Vector3f(linear @ mi.Vector3f(x, y, 1.0)))
 
-    def pixel_rays(self, width: int, height: int) -> tuple[Any, Any, Any]:
-        """(origin Point3f, direction Vector3f) of the rays through the pixel centres of a ``width`` x ``height`` picture.
+    def pixel_rays(self, width: int, height: int) -> tuple[Point3f, Vector3f, Float]:
+        """Rays through the pixel centres of a ``width`` x ``height`` picture, row-major, and the height of a pixel.
 
-        Row-major, world space, attached. Directions have unit length along the viewing axis (perspective) or in all
-        (orthographic); the one of the two that all rays share may be of width 1. Also returns the height of a pixel (Float,
-        width 1, detached), world units, at unit distance along a perspective camera's axis.
+        Returns:
+            origin: Point3f (H * W,), or of width 1 if all rays share it (perspective). World space, attached.
+            direction: Vector3f (H * W,), or of width 1 if all rays share it (orthographic). World space, attached. Of unit length
+                (orthographic), or with a unit component along the viewing axis (perspective).
+            pixel: Float (1,), height of a pixel, world units, at unit distance along a perspective camera's axis. Detached.
         """
         index = dr.arange(mi.UInt32, width * height)
         row = index // width
@@ -190,7 +193,7 @@ class Sensor:
         else:
             centre += self.origin
             fixed = self.direction
-        # Nine numbers for all pixels: worked out once, and for each pixel their derivatives are summed up in one kernel.
+        # Twelve numbers that all pixels share: evaluated once, and one kernel sums their derivatives over the pixels.
         parts = (fixed, mi.Vector3f(centre), mi.Vector3f(across), mi.Vector3f(down))
         pixel = dr.norm(dr.detach(parts[3])) * (2.0 / height)
         dr.eval(parts, pixel)
@@ -201,7 +204,7 @@ class Sensor:
         return mi.Point3f(varying), fixed, pixel
 
 
-def lenses_of(sensor: Any) -> list[str]:
+def lenses_of(sensor: mi.Sensor) -> list[str]:
     """Sentences (without full stops) about a ``mi.Sensor``, or cameras in a batch sensor, whose aperture is ignored."""
     if dr.flag(dr.JitFlag.FreezingScope):
         return []  # the aperture cannot be read now
@@ -218,12 +221,12 @@ def lenses_of(sensor: Any) -> list[str]:
     return found
 
 
-def _cameras_of(batch: Any) -> list[Any]:
+def _cameras_of(batch: mi.Sensor) -> list[mi.Sensor]:
     return [child for _, child in children(batch) if isinstance(child, mi.Sensor)]
 
 
-def sensors_of(sensor: Any) -> tuple[Sensor, ...]:
-    """Records of a ``mi.Sensor``: one, or for a batch sensor one for each camera in it, left to right."""
+def sensors_of(sensor: mi.Sensor) -> tuple[Sensor, ...]:
+    """Records of a ``mi.Sensor``: one, or one for each camera of a batch sensor, left to right."""
     kind = sensor.class_name()
     if kind == "BatchSensor":
         cameras, film = _cameras_of(sensor), sensor.film()
@@ -239,13 +242,13 @@ def sensors_of(sensor: Any) -> tuple[Sensor, ...]:
 
 
 def _squeezed(camera: Sensor, size: tuple[int, int]) -> Sensor:
-    """A camera that shows all it sees on other pixels: what a batch sensor's crop window does to its cameras in Mitsuba."""
+    """A camera whose whole picture is squeezed into ``size``, as Mitsuba squeezes those of a batch sensor with a crop window."""
     (width, height) = camera.film_size
     aspect = (width * size[1]) / (height * size[0])
     return replace(camera, film_size=size, crop_size=size, crop_offset=(0, 0), pixel_aspect=aspect)
 
 
-def _sensor_of(sensor: Any, film: Any, film_column: int) -> Sensor:
+def _sensor_of(sensor: mi.Sensor, film: mi.Film, film_column: int) -> Sensor:
     kind = _KINDS.get(sensor.class_name())
     if kind is None:
         raise ShadowmapError(
@@ -258,7 +261,7 @@ def _sensor_of(sensor: Any, film: Any, film_column: int) -> Sensor:
     if "pixel_format = xyz" in str(film):
         raise ShadowmapError(f"The film of sensor '{sensor.id()}' stores XYZ, which is not supported: use pixel_format rgb.")
     values = parameters(sensor)
-    window = sensor.film()  # a batch sensor's cameras have their share of the common film's size
+    window = sensor.film()  # for a camera of a batch sensor its own film, not the common one
     alpha = film.base_channels_count() in (2, 4)
     zero = mi.Float(0.0)
     return Sensor(
@@ -269,12 +272,17 @@ def _sensor_of(sensor: Any, film: Any, film_column: int) -> Sensor:
         principal_point=mi.Point2f(values.get("principal_point_offset_x", zero), values.get("principal_point_offset_y", zero)),
         near=mi.Float(values["near_clip"]),
         far=mi.Float(values["far_clip"]),
-        film_size=tuple(int(n) for n in window.size()),
-        crop_size=tuple(int(n) for n in window.crop_size()),
-        crop_offset=tuple(int(n) for n in window.crop_offset()),
+        film_size=_pair(window.size()),
+        crop_size=_pair(window.crop_size()),
+        crop_offset=_pair(window.crop_offset()),
         channels=int(film.base_channels_count()) - alpha,
         alpha=alpha,
         filter=Filter.read(film, sensor.id()),
         sample_border=bool(film.sample_border()),
         film_column=film_column,
     )
+
+
+def _pair(size: Iterable[int]) -> tuple[int, int]:
+    x, y = size
+    return int(x), int(y)

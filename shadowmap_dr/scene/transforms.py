@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import mitsuba as mi
 
+from ..jit.types import Point3f, Vector3f
 
-def translation(to_world: Any) -> Any:
+
+def translation(to_world: mi.Transform4f) -> Point3f:
     """Image of the origin (``mi.Point3f``) under a ``mi.Transform4f``. Attached."""
     matrix = to_world.matrix
     return mi.Point3f(matrix[0, 3], matrix[1, 3], matrix[2, 3])
 
 
-def axis(to_world: Any, k: int) -> Any:
+def axis(to_world: mi.Transform4f, k: int) -> Vector3f:
     """Image of the k-th axis (``mi.Vector3f``, with its scale) under a ``mi.Transform4f``. Attached."""
     matrix = to_world.matrix
     return mi.Vector3f(matrix[0, k], matrix[1, k], matrix[2, k])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import mitsuba as mi
 
@@ -15,10 +14,10 @@ from .sensor import lenses_of
 _LISTED = 4
 
 
-def omissions_of(scene: Any, shapes: Sequence[tuple[str, Any]], unsupported: Sequence[str]) -> tuple[str, ...]:
-    """One sentence without its full stop for all of a kind that images of a scene leave out.
+def omissions_of(scene: mi.Scene, shapes: Sequence[tuple[str, mi.Shape]], unsupported: Sequence[str]) -> tuple[str, ...]:
+    """Sentences, without full stops, about all that images of a scene leave out: one for each kind.
 
-    ``shapes``: (name, ``mi.Shape``) of all that are rendered; ``unsupported``: sentences about those that are not.
+    ``shapes``: (name, ``mi.Shape``) of all rendered shapes; ``unsupported``: sentences about the shapes that are not.
     """
     found = list(unsupported)
     media = [name for name, shape in shapes if shape.is_medium_transition()]
@@ -39,18 +38,18 @@ def omissions_of(scene: Any, shapes: Sequence[tuple[str, Any]], unsupported: Seq
 
 
 def warn_of(omissions: Sequence[str]) -> None:
-    """One ``UserWarning`` that names all omissions; nothing without any."""
+    """Issue one ``UserWarning`` that names all omissions, if there are any."""
     if omissions:
         warn(f"Not all in the scene is supported: {'; '.join(omissions)}.")
 
 
-def _has_extended_lights(scene: Any) -> bool:
+def _has_extended_lights(scene: mi.Scene) -> bool:
     return any(emitter.is_environment() or emitter.class_name() == "AreaLight" for emitter in scene.emitters())
 
 
-def _delta_materials(shapes: Sequence[tuple[str, Any]], mirrored: bool) -> list[str]:
-    """About BSDFs that reflect or refract into single directions. ``mirrored``: whether there is direct light in mirrors."""
-    groups: dict[Any, list[str]] = {}
+def _delta_materials(shapes: Sequence[tuple[str, mi.Shape]], mirrored: bool) -> list[str]:
+    """Sentences about BSDFs that reflect or refract into single directions. ``mirrored``: whether mirrors could show lights."""
+    groups: dict[mi.BSDF, list[str]] = {}
     for name, shape in shapes:
         groups.setdefault(shape.bsdf(), []).append(name)
     found = []
@@ -58,7 +57,7 @@ def _delta_materials(shapes: Sequence[tuple[str, Any]], mirrored: bool) -> list[
         flags, what = bsdf.flags(), f"BSDF '{bsdf.id()}' ({bsdf.class_name()}) of {_named('shape', users)}"
         delta = mi.has_flag(flags, mi.BSDFFlags.DeltaReflection) or mi.has_flag(flags, mi.BSDFFlags.DeltaTransmission)
         if not mi.has_flag(flags, mi.BSDFFlags.Smooth):
-            shown = "is looked and shone through" if mi.has_flag(flags, mi.BSDFFlags.Null) else "renders black"
+            shown = "lets all light through" if mi.has_flag(flags, mi.BSDFFlags.Null) else "renders black"
             found.append(f"{what} has no smooth component and {shown}")
         elif delta and mirrored:
             found.append(f"{what} shows no mirror images of lights, only its smooth component")

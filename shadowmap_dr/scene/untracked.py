@@ -1,13 +1,10 @@
-"""Untracked state of a scene, which a recording does not see: values that Mitsuba holds outside of the arrays that Dr.Jit
-compares.
-"""
+"""Untracked state of a scene: values that Mitsuba holds outside of the arrays that Dr.Jit compares, unseen by recordings."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from contextlib import suppress
 from itertools import count
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -15,33 +12,35 @@ import mitsuba as mi
 from .changes import fingerprint
 from .mitsuba_objects import children, is_attribute
 
-# Of so many objects, what there is to read is found out at once. Mitsuba's textures make arrays when they are asked what they
-# have, and recordings of other scenes, too, are made anew when a scene comes to hold others.
+# Up to this many objects are traversed at once, others when their values are first needed. Traversing makes Mitsuba's textures
+# allocate arrays, and recordings, of other scenes too, are made anew when the arrays of a scene change.
 _FEW = 32
 
 
 class UntrackedValues:
-    """Values that are parts of recordings like constants, so that these hold for no others.
+    """Values that a recording takes for constants: it holds for no others.
 
-    They are shapes of tensors (an ``envmap`` knows its own), Python's numbers and Mitsuba's scalar transformations (``to_uv`` of
+    They are shapes of tensors (an ``envmap`` stores its own), Python's numbers and Mitsuba's scalar transformations (``to_uv`` of
     a bitmap, ``eta`` of a plastic, ``scale`` of a bump map), and arrays that Mitsuba 3.9 does not show to Dr.Jit: textures inside
-    of bump maps, attributes of meshes, and what a ``sunsky`` makes tables from. And that lobes of ``principled`` materials have
-    been switched on: Mitsuba leaves out those that are 0 when they are loaded until they are given another value.
+    bump maps, attributes of meshes, and the parameters of a ``sunsky``'s tables. Lobes of ``principled`` materials count too:
+    Mitsuba leaves out a lobe whose parameter is 0 at loading until the parameter is given another value.
 
     Args:
         nodes: Mitsuba's BSDFs, emitters, and shapes whose attributes are read. They are kept alive.
     """
 
-    def __init__(self, nodes: Iterable[Any]) -> None:
+    def __init__(self, nodes: Iterable[mi.Object]) -> None:
         self._nodes = list(dict.fromkeys(nodes))
         self._known = False
-        self._held, self._sized, self._off = [], [], []
-        self._names: list[tuple[Any, str]] = []
+        self._held: list[tuple[mi.SceneParameters, str]] = []
+        self._sized: list[tuple[mi.SceneParameters, str]] = []
+        self._off: list[_Off] = []
+        self._names: list[tuple[mi.Object, str]] = []
         if len(self._nodes) <= _FEW:
             self._look()
 
     def _look(self) -> None:
-        """Find out what there is to read. Most scenes are never recorded, and do without."""
+        """Find the values to read. Most scenes are never recorded and do without."""
         self._known = True
         for node in self._nodes:
             table, switched = mi.traverse(node), _has_switches(node)
@@ -56,14 +55,14 @@ class UntrackedValues:
                     if switched and isinstance(value, mi.Float):
                         self._off.append(_Off(table, key))
 
-    def names(self) -> list[tuple[Any, str]]:
-        """The parameters among the values, each an object and its name there."""
+    def names(self) -> list[tuple[mi.Object, str]]:
+        """(object, name of one of its parameters) of the parameters among the values."""
         if not self._known:
             self._look()
         return self._names
 
-    def now(self) -> tuple[Any, ...]:
-        """The values as they are: those of two calls are equal if nothing has changed in between."""
+    def now(self) -> tuple[object, ...]:
+        """Keys of the current values: the keys of two calls are equal if nothing has changed in between."""
         if not self._known:
             self._look()
         shapes = (tuple(table[key].shape) for table, key in self._sized)
@@ -71,24 +70,24 @@ class UntrackedValues:
 
 
 class UntrackedState:
-    """Describes the unseen values of objects for recordings of functions: see :func:`shadowmap_dr.jit.frozen.take_apart`.
+    """Description of the untracked values of objects for recordings: see :func:`shadowmap_dr.jit.frozen.take_apart`.
 
     Args:
         nodes: as for :class:`UntrackedValues`.
     """
 
-    def __init__(self, nodes: Iterable[Any]) -> None:
+    def __init__(self, nodes: Iterable[mi.Object]) -> None:
         self._nodes = tuple(nodes)
         self._values = UntrackedValues(self._nodes) if len(self._nodes) <= _FEW else None
-        self._states: list[tuple[tuple[Any, ...], int]] = []
+        self._states: list[tuple[tuple[object, ...], int]] = []
 
     def recording_text(self) -> str:
-        """A number for the values as they are, that no other object has."""
+        """A number for the current values, different from those of all other objects and values."""
         if self._values is None:
             self._values = UntrackedValues(self._nodes)
         now = self._values.now()
         if dr.flag(dr.JitFlag.FreezingScope) and self._states:
-            # What the recorded function has set itself, it sets again.
+            # Values that the recorded function has set itself are set again by a replay.
             self._states[0] = (now, self._states[0][1])
         else:
             found = next((state for state in self._states if state[0] == now), None) or (now, next(_NUMBERS))
@@ -96,17 +95,19 @@ class UntrackedState:
         return f"unseen {self._states[0][1]}"
 
 
-# Of states of objects, and how many of them one object remembers.
+# Numbers for states of objects, and the number of states that one object remembers.
 _NUMBERS, _REMEMBERED = count(1), 64
 
 
 class _Off:
-    """Watch over a parameter that may have been 0 all the time. Its value is read when there is a new one."""
+    """Watch over a parameter that may have been 0 all the time. A new value is read back to the host."""
 
-    def __init__(self, table: Any, key: str) -> None:
-        self._table, self._key, self._known, self._still = table, key, None, True
+    def __init__(self, table: mi.SceneParameters, key: str) -> None:
+        self._table, self._key, self._still = table, key, True
+        self._known: object = None
 
     def still(self) -> bool:
+        """True if the parameter has always been 0."""
         if self._still:
             value = self._table[self._key]
             now = fingerprint(value)
@@ -115,16 +116,16 @@ class _Off:
         return self._still
 
 
-def _has_switches(node: Any) -> bool:
-    """True if a BSDF is, or holds, one with lobes that Mitsuba switches on when their parameters are changed."""
+def _has_switches(node: mi.Object) -> bool:
+    """True if a BSDF, or a BSDF inside it, has lobes that Mitsuba switches on when their parameters change."""
     if not isinstance(node, mi.BSDF):
         return False
     return node.class_name().startswith("Principled") or any(_has_switches(child) for _, child in children(node))
 
 
-def _is_tracked(node: Any, key: str, value: Any) -> bool:
+def _is_tracked(node: mi.Object, key: str, value: object) -> bool:
     if key.endswith("sampling_weight"):
-        return True  # means nothing here
+        return True  # has no effect on images
     if node.class_name().startswith("Sunsky") and key in ("turbidity", "albedo.value"):
         return False
     if "nested_texture." in key or is_attribute(node, key):

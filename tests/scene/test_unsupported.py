@@ -56,7 +56,7 @@ def unsupported() -> dict[str, tuple[dict[str, Any], dict[str, Any], str]]:
         "thin glass": (
             {"ball": ball(bsdf={"type": "thindielectric", "id": "pane"})},
             {"ball": ball(bsdf={"type": "mask", "opacity": 0.0, "bsdf": {"type": "diffuse"}})},
-            r"'pane' \(ThinDielectric\) of shape 'ball' has no smooth component and is looked and shone through",
+            r"'pane' \(ThinDielectric\) of shape 'ball' has no smooth component and lets all light through",
         ),
         "plastic": ({"lamp": lamp(), "ball": ball(bsdf={"type": "plastic"})}, {}, "'ball' shows no mirror images of lights"),
     }

@@ -112,7 +112,7 @@ def _wheel_library() -> Path | None:
 
 
 def _file_version(path: Path) -> int:
-    """Major version by the file's name (libLLVM-15.so, libLLVM.so.19.1, libLLVM-14.0.6.so.1), its folder or the library, else 0."""
+    """Major version by file name (libLLVM-15.so, libLLVM.so.19.1, libLLVM-14.0.6.so.1), folder name or the library, else 0."""
     match = re.search(r"libLLVM-(\d+)|libLLVM\.so\.(\d\d+)|libLLVM\.(\d+)\.dylib", path.name)
     if match is None:
         match = re.search(r"llvm-?@?(\d+)", str(path.parent))

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from numbers import Integral
-from typing import Any
+from typing import Any, cast
 
 import drjit as dr
 import mitsuba as mi
@@ -305,4 +305,4 @@ def _vertex_buffers(source: ShapeSource, info: ShapeInfo) -> tuple[Float, Float,
     world = source.placed(own)
     normals = world.normals if info.has_normals else dr.zeros(mi.Float, 3 * info.vertex_count)
     texcoords = world.texcoords if info.has_texcoords else dr.zeros(mi.Float, 2 * info.vertex_count)
-    return world.positions, normals, texcoords, own.positions
+    return world.positions, cast(Float, normals), cast(Float, texcoords), own.positions

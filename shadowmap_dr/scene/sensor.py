@@ -101,8 +101,8 @@ class Sensor:
     def reach(self) -> Float:
         """Float, camera space: distance of the far plane from the near plane.
 
-        If its transformation scales along the axis, Mitsuba's orthographic camera takes ``near`` in its own units, but the length
-        of its rays, ``far - near``, in world units.
+        Mitsuba's orthographic camera, if its transformation scales along the axis, takes ``near`` in its own units, but the
+        length of its rays, ``far - near``, in world units.
         """
         between = mi.Float(self.far) - mi.Float(self.near)
         if self.kind == "perspective":

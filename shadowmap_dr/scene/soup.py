@@ -1,28 +1,29 @@
-"""The vertices of many shapes at once, by kernels that do not depend on how many shapes there are.
+"""The vertices of many shapes at once, by kernels that do not depend on the number of shapes.
 
-What Mitsuba holds is read again for each image, as it may have been given other values. Shapes that carry no gradients are placed
-in the world together, and only if any of them has changed; the others one by one, and their vertices are written over these.
+Mitsuba's arrays are read again for each image, since they may have new values. Shapes without gradients are placed in the world
+together, and only if any of them has changed. Shapes with gradients are placed one by one; their vertices are then scattered over
+those of the first step.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-import numpy.typing as npt
 
 from ..errors import ShadowmapError
 from ..jit.arrays import device_array
+from ..jit.types import Float, Matrix4f, UInt32, Vector3f
 from .mitsuba_objects import Parameter
 from .shapes.sources import ShapeSource
+from .typed import ravel
 
-# Stands for "no transformation" where a row of the table of transformations is meant.
+# Row of the table of transformations that means "no transformation".
 _NONE = 0xFFFFFFFF
-# Numbers of a row of that table: the first three rows of a matrix, and those of its inverse transpose.
+# Numbers in a row of that table: 3 x 4 of a matrix for points, and then 3 x 3 of its inverse transpose for normals.
 _POINTS, _ROW = 12, 21
 
 
@@ -30,32 +31,32 @@ _POINTS, _ROW = 12, 21
 class Vertices:
     """Vertices of all shapes, flat Float: positions, normals (3V), texture coordinates (2V), positions as Mitsuba holds them.
 
-    Normals and texture coordinates are 0 for shapes without.
+    Normals and texture coordinates are 0 for shapes that have none.
     """
 
-    positions: Any
-    normals: Any
-    texcoords: Any
-    rest: Any
+    positions: Float
+    normals: Float
+    texcoords: Float
+    rest: Float
 
 
 class _Reading:
-    """Arrays of one of Mitsuba's objects, read again and again.
+    """Arrays of one Mitsuba object, read for each image.
 
     Attributes:
-        arrays: as last read, detached. They are held, so that no others can be taken for them.
-        changed: whether they have changed since they were last settled.
+        arrays: the arrays as last read, detached. Holding them keeps their variables' numbers from being used again.
+        changed: whether they have changed since the soup last took them over.
         attached: whether they carry gradients.
     """
 
-    def __init__(self, read: Callable[[], Sequence[Any]]) -> None:
+    def __init__(self, read: Callable[[], Sequence[Float]]) -> None:
         self._read = read
         self._numbers: list[int] = []
-        self.arrays: list[Any] = []
+        self.arrays: list[Float] = []
         self.changed, self.attached = True, False
 
     def look(self) -> None:
-        """Read them."""
+        """Read the arrays."""
         arrays = list(self._read())
         self.attached = dr.grad_enabled(arrays)
         numbers = [array.index for array in arrays]
@@ -66,28 +67,28 @@ class _Reading:
 class _Placement:
     """A ``to_world``, and its row in the table of transformations."""
 
-    def __init__(self, node: Any, row: int) -> None:
+    def __init__(self, node: mi.Shape, row: int) -> None:
         self._parameter, self.row = Parameter(node, "to_world"), row
         self.reading = _Reading(lambda: [entry for line in self._parameter.now().matrix for entry in line])
 
-    def matrices(self) -> list[Any]:
-        """Detached: that of points, and that of normals."""
+    def matrices(self) -> list[Matrix4f]:
+        """Matrix for points and matrix for normals, detached."""
         to_world = self._parameter.now()
         return [dr.detach(to_world.matrix), dr.detach(to_world.inverse_transpose)]
 
     @staticmethod
-    def numbers(matrices: Sequence[Any]) -> list[float]:
+    def numbers(matrices: Sequence[Matrix4f]) -> list[float]:
         """The row of the table, for evaluated matrices. Read back entry by entry, since that takes no kernel."""
         points, normals = matrices
-        first = [points[i, j][0] for i in range(3) for j in range(4)]
-        return first + [normals[i, j][0] for i in range(3) for j in range(3)]
+        first = [points[i][j][0] for i in range(3) for j in range(4)]
+        return first + [normals[i][j][0] for i in range(3) for j in range(3)]
 
 
 @dataclass(frozen=True)
 class _Root:
-    """Vertices before any transformation, from ``start`` on among those of all roots; of several shapes, it may be.
+    """Vertices before any transformation, which several shapes may share. They begin at ``start`` in the buffers of all roots.
 
-    ``name``, ``source``: of the first of these shapes, ``held``: whether they have (normals, texture coordinates).
+    ``name``, ``source``: of the first of these shapes; ``held``: whether they have (normals, texture coordinates).
     """
 
     name: str
@@ -97,19 +98,23 @@ class _Root:
     count: int
     held: tuple[bool, bool]
 
-    def buffers(self) -> tuple[Any, Any, Any]:
-        """Positions, normals and texture coordinates as they are now, detached; None in the place of what there was none of."""
+    def buffers(self) -> tuple[Float, Float | None, Float | None]:
+        """Current positions, normals and texture coordinates, detached; None if the shapes had none when the scene was loaded."""
         with dr.suspend_grad():
             rest = self.source.rest()
             now = len(rest.positions) // 3
             if now != self.count:
                 raise ShadowmapError(f"Shape '{self.name}' now has {now} vertices instead of {self.count}: load the scene again.")
-            chosen = (rest.normals if self.held[0] else None, rest.texcoords if self.held[1] else None)
-            return tuple(None if array is None else dr.detach(array) for array in (rest.positions, *chosen))
+            normals, texcoords = (rest.normals if self.held[0] else None, rest.texcoords if self.held[1] else None)
+            return (
+                dr.detach(rest.positions),
+                None if normals is None else dr.detach(normals),
+                None if texcoords is None else dr.detach(texcoords),
+            )
 
 
 class Soup:
-    """The vertices of all shapes, as long as their numbers stay the same.
+    """The vertices of all shapes. Vertex counts must stay the same.
 
     Args:
         names: of the shapes, for messages.
@@ -124,10 +129,14 @@ class Soup:
         self._roots: list[_Root] = []
         self._placements: list[_Placement] = []
         self.held: list[tuple[bool, bool]] = []
-        roots, rows, counts = {}, {}, []
-        root_of, own_rows, instance_rows = [], [], []
+        roots: dict[int, _Root] = {}
+        rows: dict[mi.Shape, int] = {}
+        counts: list[int] = []
+        root_of: list[_Root] = []
+        own_rows: list[int] = []
+        instance_rows: list[int] = []
         for name, source in zip(names, sources, strict=True):
-            # Those of one kind share their local mesh, instances what they show.
+            # Analytic shapes of one kind share a local mesh; instances share the shapes of their group.
             key = id(source.shape if source.read() else source.rest().positions)
             if key not in roots:
                 rest = source.rest()
@@ -159,21 +168,21 @@ class Soup:
         self._placement_rows = [np.array([none if row == _NONE else row for row in rows]) for rows in (own_rows, instance_rows)]
         total = sum(root.count for root in self._roots)
         self._host = [np.zeros((total, size), np.float32) for size in (3, 3, 2)]
-        self._local: list[Any] = []
+        self._local: list[Float] = []
         self._table = np.zeros((len(self._placements), _ROW), np.float32)
-        self._transformations: Any = None
+        self._transformations: Float | None = None
         self._settled: Vertices | None = None
-        self._over: tuple[tuple[int, ...], list[Any]] = ((), [])
+        self._over: tuple[tuple[int, ...], list[UInt32]] = ((), [])
         self._just_read = False
 
     def recording_text(self) -> str:
-        """Nothing that recordings depend on is kept here: they get the vertices themselves."""
+        """Constant: recordings do not depend on the soup, since they get the vertices themselves."""
         return "soup"
 
-    def vertices(self, single: Callable[[int], tuple[Any, Any, Any, Any]]) -> Vertices:
-        """All vertices as they are now.
+    def vertices(self, single: Callable[[int], tuple[Float, Float, Float, Float]]) -> Vertices:
+        """All current vertices, attached.
 
-        ``single``: the vertices (:class:`Vertices`, as a tuple) of the shape of that number, attached.
+        ``single``: returns the vertices (:class:`Vertices`, as a tuple) of the shape with the given number, attached.
         """
         if not self._just_read:
             self._look()
@@ -197,7 +206,7 @@ class Soup:
             holder.reading.look()
 
     def _still(self, attached_too: bool = False) -> Vertices:
-        """The vertices of all shapes, detached. Those of shapes that carry gradients are of no use unless ``attached_too``."""
+        """The vertices of all shapes, detached. Those of shapes with gradients are meaningless unless ``attached_too``."""
         roots = [root for root in self._roots if root.reading.changed and (attached_too or not root.reading.attached)]
         moved = [p for p in self._placements if p.reading.changed and (attached_too or not p.reading.attached)]
         if self._settled is None or roots or moved:
@@ -224,25 +233,27 @@ class Soup:
         if roots or not self._local:
             self._local = [device_array(mi.Float, host) for host in self._host]
 
-    def own(self) -> tuple[Any, Any]:
+    def own(self) -> tuple[Float, Float]:
         """Positions and normals as Mitsuba holds them: before the transformations of instances. Detached.
 
-        The next call of :meth:`vertices` takes what was read for this one.
+        The next call of :meth:`vertices` reads nothing again.
         """
         self._look()
         self._just_read = True
         with dr.suspend_grad():
             self._still(attached_too=True)
-            local = [dr.gather(mi.Vector3f, buffer, self._index) for buffer in self._local[:2]]
-            return tuple(dr.ravel(values) for values in self._moved(*local, self._rows[0]))
+            p, n = (dr.gather(mi.Vector3f, buffer, self._index) for buffer in self._local[:2])
+            p, n = self._moved(p, n, self._rows[0])
+            return ravel(p), ravel(n)
 
-    def mirrored(self) -> tuple[np.ndarray, np.ndarray]:
-        """True if shapes' own ``to_world``, or those of their instances, mirror them (bool (S,) each), as last read.
+    def mirrored(self) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+        """True if a shape's own ``to_world``, or that of its instance, mirrored it when last read (bool (S,) each).
 
         False for shapes without.
         """
         negative = np.linalg.det(self._table[:, :_POINTS].reshape(-1, 3, 4)[:, :, :3].astype(np.float64)) < 0
-        return tuple(np.append(negative, False)[rows] for rows in self._placement_rows)
+        own, instances = (np.append(negative, False)[rows] for rows in self._placement_rows)
+        return own, instances
 
     def _placed(self) -> Vertices:
         points, directions, texcoords = self._local
@@ -251,14 +262,14 @@ class Soup:
         p, n = self._moved(*own, self._rows[1])
         # Texture coordinates are never transformed.
         uv = dr.gather(mi.Vector2f, texcoords, self._index)
-        found = Vertices(*(dr.ravel(values) for values in (p, n, uv, own[0])))
+        found = Vertices(ravel(p), ravel(n), ravel(uv), ravel(own[0]))
         dr.eval([found.positions, found.normals, found.texcoords, found.rest])
         return found
 
-    def _moved(self, p: Any, n: Any, rows: Any) -> tuple[Any, Any]:
-        """Points and normals (Vector3f) by transformations, as ``sources`` does it for one shape.
+    def _moved(self, p: Vector3f, n: Vector3f, rows: UInt32 | None) -> tuple[Vector3f, Vector3f]:
+        """Transformed points and normals (Vector3f), as ``sources`` transforms those of one shape.
 
-        ``rows``: each shape's row (UInt32) of the table, or none; None if all have none.
+        ``rows``: row of each shape in the table (UInt32), or ``_NONE``; None if no shape has a transformation.
         """
         if rows is None:
             return p, n
@@ -272,8 +283,8 @@ class Soup:
         return dr.select(placed, point, p), dr.select(placed, normal, n)
 
 
-def _written_over(buffer: Any, pieces: Sequence[Any], index: npt.NDArray[np.uint32]) -> Any:
-    """A copy of a buffer with the pieces, one after the other, in the places of ``index``. Attached to the pieces."""
+def _written_over(buffer: Float, pieces: Sequence[Float], index: UInt32) -> Float:
+    """A copy of a buffer with the concatenated pieces scattered to ``index``. Attached to the pieces."""
     result = mi.Float(buffer)
     values = dr.concat(list(pieces)) if len(pieces) > 1 else pieces[0]
     dr.scatter(result, values, index, mode=dr.ReduceMode.NoConflicts)

@@ -1,4 +1,4 @@
-"""Projectors, and flat shapes that shine straight."""
+"""Projectors, and beams: flat shapes that shine along their normals."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ...jit.types import Bool, Color3f, Float, Point2f, Point3f, Vector2f, Vector3f
 from ...jit.vectors import normalize_or
 from ...shadow.light_camera import LightView, directional_view
 from ..transforms import axis, translation
 from .light import cone_kind, cone_views, picture, towards
 from .soft_outline import BoundedLight, share_inside
 
-# Width of the rim in which light fades, half of it on either side of the outline: through it a moving outline has derivatives.
-# In units of the picture, and of the narrower half of a beam's cross-section. In images it is at least as wide as a pixel.
+# Width of the rim in which light fades, half of it on either side of the outline: the rim gives a moving outline derivatives.
+# In units of the picture, and of the narrower half of a beam's cross-section. In images the rim is at least as wide as a pixel.
 _PICTURE_RIM = 1 / 1024
 _BEAM_RIM = 0.005
 # Distance of the first casters from a beam's shape, in units of its reach.
@@ -28,38 +29,38 @@ class Projector(BoundedLight):
     """A picture thrown along the local +z axis: Mitsuba's ``projector``.
 
     to_world    Transform4f
-    irradiance  ``mi.Texture``: the picture, as irradiance on a plane at local z = 1 (times pi, as Mitsuba has it)
+    irradiance  ``mi.Texture``: the picture, as irradiance on a plane at local z = 1 (times pi, as in Mitsuba)
     scale       Float, factor of the irradiance
-    tangents    Vector2f, of the half-angles that the picture covers, in local x and y
+    tangents    Vector2f, tangents of the half-angles that the picture covers, in local x and y
     falloff_width  width of the rim in which the light fades, half of it on either side of the outline, in units of the picture's
-                width and height. Through it a moving outline has derivatives. Elsewhere all is as in Mitsuba.
+                width and height. The rim gives a moving outline derivatives. Outside the rim the light is as in Mitsuba.
     """
 
     name: str
-    to_world: Any
-    irradiance: Any
-    scale: Any
-    tangents: Any
+    to_world: mi.Transform4f
+    irradiance: mi.Texture
+    scale: Float
+    tangents: Vector2f
     falloff_width: float = _PICTURE_RIM
     widest: float = 0.5
 
     @property
-    def position(self) -> Any:
+    def position(self) -> Point3f:
         """Point3f, world space."""
         return translation(self.to_world)
 
     @property
-    def direction(self) -> Any:
+    def direction(self) -> Vector3f:
         """Vector3f, unit axis, the direction in which light travels, world space."""
         return dr.normalize(axis(self.to_world, 2))
 
     @property
-    def spread(self) -> Any:
+    def spread(self) -> Float:
         """Float, tangent of the half-angle of the smallest cone about the axis with a square base that holds the picture."""
         x, y, z = (dr.norm(axis(self.to_world, k)) for k in range(3))
         return dr.maximum(self.tangents.x * x, self.tangents.y * y) * (1 + self.falloff_width) / z
 
-    def illuminate(self, p_world: Any, active: Any = True, inside: Any = None) -> tuple[Any, Any]:
+    def illuminate(self, p_world: Point3f, active: Bool | bool = True, inside: Float | None = None) -> tuple[Vector3f, Color3f]:
         """(wo, weight): unit direction to the projector (Vector3f), and its irradiance (colour) on a surface that faces it.
 
         ``p_world`` Point3f (N,), world space. ``inside``: share of the light at the outline (:func:`share_inside`), Float (N,).
@@ -80,13 +81,13 @@ class Projector(BoundedLight):
     def map_views(self, kind: str, resolution: int, filter_size: int) -> tuple[LightView, ...]:
         return cone_views(self.to_world, dr.detach(self.spread), kind, resolution, filter_size)
 
-    def distances(self, p_world: Any) -> list[Any]:
+    def distances(self, p_world: Point3f) -> list[Float]:
         """Distances from the edges that bound the light (Float), positive inside, in units of ``falloff_width``. Attached."""
         _, uv = self._local(p_world)
         return [0.5 - dr.abs(uv[k] - 0.5) for k in range(2)]
 
-    def _local(self, p_world: Any) -> tuple[Any, Any]:
-        """Place in the projector's own space, and in the picture."""
+    def _local(self, p_world: Point3f) -> tuple[Vector3f, Point2f]:
+        """Points in the projector's own space, and their texture coordinates in the picture."""
         local = dr.rcp(mi.Matrix3f(self.to_world.matrix)) @ mi.Vector3f(p_world - self.position)
         z = dr.select(local.z > 0, local.z, 1.0)
         # As in Mitsuba's cameras, local x points to the left of the picture.
@@ -97,31 +98,31 @@ class Projector(BoundedLight):
 class Beam(BoundedLight):
     """Parallel light from a rectangle or a disk: Mitsuba's ``directionalarea``.
 
-    Mitsuba's particle tracer shows the beam; its other integrators cannot find it.
+    Mitsuba's particle tracer shows the beam; its other integrators cannot sample it.
 
     shape      ``rectangle`` (local -1..1 in x and y) or ``disk`` (local radius 1)
     to_world   Transform4f, of the shape
-    radiance   ``mi.Texture`` over the shape; what Mitsuba calls radiance is irradiance on a surface across the beam
+    radiance   ``mi.Texture`` over the shape; Mitsuba's radiance is here the irradiance on a surface across the beam
     flipped    whether it shines along local -z instead of +z
     falloff_width  Float, world units: width of the rim in which the beam fades, as a projector's picture
     """
 
     name: str
     shape: str
-    to_world: Any
-    radiance: Any
+    to_world: mi.Transform4f
+    radiance: mi.Texture
     flipped: bool
-    falloff_width: Any
+    falloff_width: Float
 
     @property
-    def position(self) -> Any:
+    def position(self) -> Point3f:
         """Point3f, centre of the shape, world space."""
         return translation(self.to_world)
 
     @property
-    def direction(self) -> Any:
+    def direction(self) -> Vector3f:
         """Vector3f, unit normal of the shape, the direction in which light travels, world space."""
-        # A shape without area has no normal; nor does it light anything.
+        # A shape without area has no normal, and lights nothing.
         normal = normalize_or(dr.cross(axis(self.to_world, 0), axis(self.to_world, 1)), mi.Vector3f(0, 0, 1))
         matrix = mi.Matrix3f(self.to_world.matrix)
         # Mitsuba's normals stay on the side of local z where a transform mirrors.
@@ -129,18 +130,18 @@ class Beam(BoundedLight):
         return dr.select(inwards ^ self.flipped, -normal, normal)
 
     @property
-    def widest(self) -> Any:
-        """Float, world units: the rim is never made wider than this."""
+    def widest(self) -> Float:
+        """Float, world units: upper bound of the rim's width."""
         return dr.detach(self.reach)
 
     @property
-    def reach(self) -> Any:
-        """Float, world units: nothing of the beam is farther from its axis."""
+    def reach(self) -> Float:
+        """Float, world units: upper bound of the beam's distance from its axis."""
         return dr.norm(axis(self.to_world, 0)) + dr.norm(axis(self.to_world, 1)) + self.falloff_width
 
     @property
-    def caster_start(self) -> Any:
-        """Float, world units, detached: least distance of casters from the shape, which must not shadow itself."""
+    def caster_start(self) -> Float:
+        """Float, world units, detached: least distance of casters from the shape, which must not shadow its own light."""
         place = dr.detach(self.position)
         far = dr.maximum(dr.maximum(dr.abs(place.x), dr.abs(place.y)), dr.abs(place.z))
         return dr.fma(_BEAM_START, dr.detach(self.reach), 1e-5 * far)
@@ -152,7 +153,7 @@ class Beam(BoundedLight):
         view = directional_view(self.direction)
         return (LightView(view.right, view.up, view.forward, mi.Vector3f(self.position), view.spread),)
 
-    def illuminate(self, p_world: Any, active: Any = True, inside: Any = None) -> tuple[Any, Any]:
+    def illuminate(self, p_world: Point3f, active: Bool | bool = True, inside: Float | None = None) -> tuple[Vector3f, Color3f]:
         """(wo, weight): unit direction against the beam (Vector3f), and its irradiance (colour) on a surface across it.
 
         ``p_world`` Point3f (N,), world space. ``inside``: share of the light at the outline (:func:`share_inside`), Float (N,).
@@ -168,7 +169,7 @@ class Beam(BoundedLight):
             uv = mi.Point2f(*(dr.clip(0.5 + 0.5 * local[k], 0, 1) for k in range(2)))
         return -self.direction, dr.select(lit, picture(self.radiance, uv, lit) * inside, 0)
 
-    def distances(self, p_world: Any) -> list[Any]:
+    def distances(self, p_world: Point3f) -> list[Float]:
         """Distances from the edges that bound the light (Float), positive inside, in units of ``falloff_width``. Attached."""
         _, local, rows = self._local(p_world)
         if self.shape == "disk":
@@ -176,8 +177,8 @@ class Beam(BoundedLight):
             return [(1 - radius) * radius / dr.norm(rows[0] * local.x + rows[1] * local.y)]
         return [(1 - dr.abs(local[k])) / dr.norm(rows[k]) for k in range(2)]
 
-    def _local(self, p_world: Any) -> tuple[Any, Any, list[Any]]:
-        """(distance along the beam, place on the shape (Vector2f), derivatives of its two coordinates)."""
+    def _local(self, p_world: Point3f) -> tuple[Float, Vector2f, list[Vector3f]]:
+        """(distance along the beam, place on the shape (Vector2f), derivatives of its two coordinates by the point)."""
         offset = mi.Vector3f(p_world - self.position)
         along = dr.dot(offset, self.direction)
         inverse = dr.rcp(mi.Matrix3f(self.to_world.matrix))
@@ -185,16 +186,16 @@ class Beam(BoundedLight):
         across = offset - self.direction * along
         local = mi.Vector2f(dr.dot(rows[0], across), dr.dot(rows[1], across))
         if self.shape == "disk":
-            # The centre has neither angle nor derivatives: any other point inside will do.
+            # At the centre angle and derivatives are undefined: any other point inside will do.
             local = mi.Vector2f(dr.select(dr.squared_norm(local) == 0, 1e-6, local.x), local.y)
         return along, local, rows
 
 
-def projector_of(emitter: Any, name: str, values: dict[str, Any], picture: Any) -> Projector:
+def projector_of(emitter: mi.Emitter, name: str, values: dict[str, Any], picture: mi.Texture) -> Projector:
     """Record of a ``mi.Emitter`` called ``projector``. ``values``: its parameters, ``picture``: its texture."""
     to_world = values["to_world"]
     with dr.suspend_grad():
-        # Mitsuba tells the angles of view by where it projects points only. How far away they are has no influence.
+        # Mitsuba exposes the angles of view only through the projection of points. The distance of the point has no influence.
         place = dr.detach(to_world)
         far = 1 + dr.norm(mi.Vector3f(translation(place)))
         si = dr.zeros(mi.SurfaceInteraction3f)
@@ -204,7 +205,7 @@ def projector_of(emitter: Any, name: str, values: dict[str, Any], picture: Any) 
     return Projector(name, to_world, picture, mi.Float(values["scale"]), tangents)
 
 
-def beam_of(emitter: Any, name: str, to_world: Any, radiance: Any) -> Beam:
+def beam_of(emitter: mi.Emitter, name: str, to_world: mi.Transform4f, radiance: mi.Texture) -> Beam:
     """Record of a ``mi.Emitter`` called ``directionalarea``, which belongs to a rectangle or a disk placed by ``to_world``."""
     shape = emitter.get_shape()
     sides = dr.minimum(*(dr.norm(axis(dr.detach(to_world), k)) for k in range(2)))

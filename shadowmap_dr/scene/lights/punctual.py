@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from ...errors import ShadowmapError
+from ...jit.types import Bool, Color3f, Float, Point3f, Vector3f
 from ...jit.vectors import unit
 from ...shadow.light_camera import LightView, cube_views, directional_view
 from ..transforms import axis, translation
@@ -24,11 +24,11 @@ class DirectionalLight:
     """Parallel light. ``direction``: Vector3f, in which light travels, world space, any length but 0; ``irradiance``: colour."""
 
     name: str
-    direction: Any
-    irradiance: Any
+    direction: Vector3f
+    irradiance: Color3f
 
     def __post_init__(self) -> None:
-        # Numbers are looked at on the spot; an array is not waited for, unless it is a constant.
+        # Checks Python numbers and constants only: reading back an evaluated array would wait for the device.
         if dr.is_jit_v(self.direction):
             nowhere = dr.all(self.direction == 0)
             zero = nowhere.state == dr.VarState.Literal and nowhere[0]
@@ -37,7 +37,7 @@ class DirectionalLight:
         if zero:
             raise ShadowmapError(f"light '{self.name}' has the direction (0, 0, 0): give one in which its light travels.")
 
-    def illuminate(self, p_world: Any, active: Any = True) -> tuple[Any, Any]:
+    def illuminate(self, p_world: Point3f, active: Bool | bool = True) -> tuple[Vector3f, Color3f]:
         """(wo, weight): unit direction to the light (Vector3f) and its irradiance on a surface that faces it."""
         return -unit(mi.Vector3f(self.direction)), self.irradiance & mi.Bool(active)
 
@@ -53,10 +53,10 @@ class PointLight:
     """Light from a point. ``position``: Point3f, world space; ``intensity``: colour, W/sr."""
 
     name: str
-    position: Any
-    intensity: Any
+    position: Point3f
+    intensity: Color3f
 
-    def illuminate(self, p_world: Any, active: Any = True) -> tuple[Any, Any]:
+    def illuminate(self, p_world: Point3f, active: Bool | bool = True) -> tuple[Vector3f, Color3f]:
         """(wo, weight) with weight = intensity / distance^2."""
         wo, inverse_squared = towards(p_world, self.position)
         return wo, (self.intensity * inverse_squared) & mi.Bool(active)
@@ -74,39 +74,39 @@ class SpotLight(BoundedLight):
 
     to_world      Transform4f
     intensity     colour on the axis, W/sr
-    cutoff_angle  Float, degrees, half-angle of the cone beyond which there is no light
+    cutoff_angle  Float, degrees, half-angle of the cone outside which there is no light
     beam_width    Float, degrees, half-angle up to which intensity is full; in between it falls off linearly in the angle
     texture       ``mi.Texture`` over the square that circumscribes the cone, or None
     """
 
     name: str
-    to_world: Any
-    intensity: Any
-    cutoff_angle: Any
-    beam_width: Any
-    texture: Any = None
+    to_world: mi.Transform4f
+    intensity: Color3f
+    cutoff_angle: Float
+    beam_width: Float
+    texture: mi.Texture | None = None
 
     @property
-    def position(self) -> Any:
+    def position(self) -> Point3f:
         """Point3f, world space."""
         return translation(self.to_world)
 
     @property
-    def direction(self) -> Any:
+    def direction(self) -> Vector3f:
         """Vector3f, unit axis of the cone, the direction in which light travels, world space."""
         return dr.normalize(axis(self.to_world, 2))
 
     @property
-    def falloff_width(self) -> Any:
+    def falloff_width(self) -> Float:
         """Float, radians: width of the rim in which light falls off from full to none. Attached to both angles."""
         return (self.cutoff_angle - self._full) * _DEGREE
 
     @property
-    def widest(self) -> Any:
-        """Float, radians: the rim is never made wider than this."""
+    def widest(self) -> Float:
+        """Float, radians: upper bound of the rim's width."""
         return dr.detach(self.cutoff_angle) * _DEGREE
 
-    def illuminate(self, p_world: Any, active: Any = True, inside: Any = None) -> tuple[Any, Any]:
+    def illuminate(self, p_world: Point3f, active: Bool | bool = True, inside: Float | None = None) -> tuple[Vector3f, Color3f]:
         """(wo, weight) with weight = intensity * falloff * texture / distance^2.
 
         ``p_world`` Point3f (N,), world space. ``inside``: the falloff, if known
@@ -118,7 +118,7 @@ class SpotLight(BoundedLight):
         lit = (inside > 0) & mi.Bool(active)
         weight = self.intensity * (inside * inverse_squared)
         if self.texture is not None:
-            # Lanes outside the cone may have z = 0, and those within a pixel of it lie off the texture: it may not begin anew.
+            # Lanes outside the cone may have z = 0. Lanes within a pixel of it lie off the texture, which must not repeat there.
             scale = 0.5 * dr.rcp(dr.select(lit, local.z, 1.0) * dr.tan(self.cutoff_angle * _DEGREE))
             uv = mi.Point2f(0.5 + local.x * scale, 0.5 + local.y * scale)
             weight = weight * picture(self.texture, dr.clip(uv, 0, 1), lit)
@@ -130,18 +130,18 @@ class SpotLight(BoundedLight):
     def map_views(self, kind: str, resolution: int, filter_size: int) -> tuple[LightView, ...]:
         return cone_views(self.to_world, covered_angle(self.cutoff_angle), kind, resolution, filter_size)
 
-    def distances(self, p_world: Any) -> list[Any]:
+    def distances(self, p_world: Point3f) -> list[Float]:
         """Angle between the middle of the rim and points (Float), positive inside, in radians. Attached."""
         angle = dr.safe_acos(self._local(towards(p_world, self.position)[0]).z)
         return [0.5 * (self.cutoff_angle + self._full) * _DEGREE - angle]
 
     @property
-    def _full(self) -> Any:
-        """Angle up to which intensity is full, in degrees: a beam wider than the cone ends where that does."""
+    def _full(self) -> Float:
+        """Half-angle in degrees up to which intensity is full, at most that of the cone."""
         return dr.minimum(self.beam_width, self.cutoff_angle)
 
-    def _local(self, wo: Any) -> Any:
-        """Unit direction in the light's own space in which light travels that arrives from ``wo``."""
+    def _local(self, wo: Vector3f) -> Vector3f:
+        """Unit direction, in the light's own space, of light that arrives from the world-space direction ``wo``."""
         return dr.normalize(mi.Vector3f(dr.rcp(mi.Matrix3f(self.to_world.matrix)) @ mi.Vector3f(-wo)))
 
 
@@ -151,7 +151,7 @@ class SquareSpot:
 
     light: SpotLight
 
-    def illuminate(self, p_world: Any, active: Any = True) -> tuple[Any, Any]:
-        """(wo, weight) with weight = intensity. What lies outside of the square is dark by its visibility."""
+    def illuminate(self, p_world: Point3f, active: Bool | bool = True) -> tuple[Vector3f, Color3f]:
+        """(wo, weight) with weight = intensity. Outside the square visibility is 0, not the weight."""
         wo, _ = towards(p_world, self.light.position)
         return wo, self.light.intensity & mi.Bool(active)

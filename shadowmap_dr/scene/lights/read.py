@@ -1,17 +1,17 @@
 """Light records, read from Mitsuba's emitters.
 
-``illuminate`` returns what ``emitter.sample_direction`` returns for the same point, without any visibility. All fields that
-are not names may carry gradients; replace them with ``dataclasses.replace``.
+``illuminate`` agrees with ``emitter.sample_direction`` at the same point, without visibility. All fields but names may carry
+gradients; replace them with ``dataclasses.replace``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from ...jit.types import Color3f
 from ..mitsuba_objects import children, parameters, varies
 from ..transforms import axis
 from .area import AreaLight
@@ -25,11 +25,11 @@ _LIGHTS = ("DirectionalEmitter", "PointLight", "SpotLight", "Projector")
 _BEAMS = ("Rectangle", "Disk")
 
 
-def unsupported_reason(emitter: Any) -> str | None:
-    """Why a ``mi.Emitter`` is not supported, as the end of a sentence about it; None if it is."""
+def unsupported_reason(emitter: mi.Emitter) -> str | None:
+    """Reason for which a ``mi.Emitter`` is not supported, as the end of a sentence about it; None for a supported emitter."""
     kind = emitter.class_name()
     if kind == "AreaLight":
-        # Mitsuba's own direct light from one is far too dark: it has no way to sample such a texture.
+        # Mitsuba's own direct light from such an emitter is far too dark: Mitsuba cannot sample a mesh attribute.
         attributes = any(part.class_name() == "MeshAttribute" for _, part in children(emitter))
         return "has a mesh_attribute for its radiance, which does not shine: use a bitmap" if attributes else None
     if kind in _LIGHTS or kind in ENVIRONMENTS:
@@ -42,10 +42,10 @@ def unsupported_reason(emitter: Any) -> str | None:
     return f"is not supported: use {wanted}"
 
 
-def lights_of(scene: Any) -> tuple[Light, ...]:
-    """Records of the lights of a ``mi.Scene`` without extent, of its projectors and beams, in the scene's order.
+def lights_of(scene: mi.Scene) -> tuple[Light, ...]:
+    """Records of a ``mi.Scene``'s lights without extent, projectors and beams, in the scene's order.
 
-    Area lights and environments have functions of their own; what is not supported (:func:`unsupported_reason`) is left out.
+    Area lights and environments have functions of their own. Unsupported lights (:func:`unsupported_reason`) are left out.
     Names are Mitsuba ids; lights without one are called ``light_0``, ... The sun of a sky called ``sky`` is the light
     ``sky.sun``. Fields are attached where the emitters' parameters are.
     """
@@ -56,15 +56,15 @@ def lights_of(scene: Any) -> tuple[Light, ...]:
     )
 
 
-def area_lights_of(scene: Any, shapes: Sequence[Any]) -> tuple[AreaLight, ...]:
+def area_lights_of(scene: mi.Scene, shapes: Sequence[mi.Shape]) -> tuple[AreaLight, ...]:
     """Records of the area lights of a ``mi.Scene``.
 
-    ``shapes``: its ``mi.Shape`` objects in the order of the soup; the lights of others are left out. Lights have the names of
-    their shapes: emitters inside of shapes are all called the same. What is not supported (:func:`unsupported_reason`) is left
-    out.
+    ``shapes``: its ``mi.Shape`` objects in the order of the soup. Lights of other shapes and unsupported lights
+    (:func:`unsupported_reason`) are left out. Lights have the names of their shapes, since emitters inside shapes all have the
+    same name.
     """
     found = []
-    numbers: dict[Any, int] = {}
+    numbers: dict[mi.Shape, int] = {}
     for name, emitter in named_emitters(scene):
         if emitter.class_name() == "AreaLight" and unsupported_reason(emitter) is None:
             shape = emitter.get_shape()
@@ -78,24 +78,24 @@ def area_lights_of(scene: Any, shapes: Sequence[Any]) -> tuple[AreaLight, ...]:
     return tuple(found)
 
 
-def environments_of(scene: Any) -> tuple[Environment, ...]:
+def environments_of(scene: mi.Scene) -> tuple[Environment, ...]:
     """Records of the ``constant``, ``envmap`` and ``sunsky`` emitters of a ``mi.Scene`` (at most one)."""
     found = ((name, emitter) for name, emitter in named_emitters(scene) if emitter.class_name() in ENVIRONMENTS)
     return tuple(environment_of(emitter, name) for name, emitter in found)
 
 
-def named_emitters(scene: Any) -> list[tuple[str, Any]]:
+def named_emitters(scene: mi.Scene) -> list[tuple[str, mi.Emitter]]:
     """(name, ``mi.Emitter``) of all emitters of a ``mi.Scene``."""
     return [(emitter.id() or f"light_{i}", emitter) for i, emitter in enumerate(scene.emitters())]
 
 
-def _light_of(emitter: Any, name: str) -> Light:
+def _light_of(emitter: mi.Emitter, name: str) -> Light:
     if emitter.class_name() == SUNSKY:
         return DirectionalLight(f"{name}.sun", *SunSky(name, emitter).sun())
     kind, values, parts = emitter.class_name(), parameters(emitter), dict(children(emitter))
     if kind == "DirectionalEmitter":
         direction = axis(values["to_world"], 2)
-        length = dr.norm(direction)  # Mitsuba's becomes brighter with a transformation that scales
+        length = dr.norm(direction)  # in Mitsuba a transformation that scales makes the light brighter
         return DirectionalLight(name, direction / length, colour_of(parts["irradiance"]) * length)
     if kind == "PointLight":
         return PointLight(name, mi.Point3f(values["position"]), colour_of(parts["intensity"]))
@@ -113,6 +113,6 @@ def _light_of(emitter: Any, name: str) -> Light:
     )
 
 
-def colour_of(texture: Any) -> Any:
+def colour_of(texture: mi.Texture) -> Color3f:
     """The colour of a spectrum that does not vary over space, as ``mi.UnpolarizedSpectrum``."""
     return texture.eval(dr.zeros(mi.SurfaceInteraction3f))

@@ -10,8 +10,9 @@ import drjit as dr
 import mitsuba as mi
 
 from ...jit.broadcast import broadcast_differentiable
+from ...jit.types import Bool, Color3f, Float, Point3f, Vector3f
 
-# Of a rim without any width, in units of the rim: it is divided by.
+# Least width of a rim, in units of ``falloff_width``, since it is divided by.
 _NARROWEST = 1e-7
 
 
@@ -19,38 +20,38 @@ class BoundedLight:
     """A light with an outline at which it fades: projectors, beams, spot lights.
 
     falloff_width  width of the rim in which it fades, half of it on either side of the outline (Float, or number)
-    widest  the rim is never made wider than this (detached)
+    widest  upper bound of the rim's width (detached)
     """
 
     falloff_width: Any
     widest: Any
 
-    def illuminate(self, p_world: Any, active: Any = True, inside: Any = None) -> tuple[Any, Any]:
-        """(wo, weight), as of all lights; ``inside``: what :func:`share_inside` returns, if known."""
+    def illuminate(self, p_world: Point3f, active: Bool | bool = True, inside: Float | None = None) -> tuple[Vector3f, Color3f]:
+        """(wo, weight), as for all lights; ``inside``: result of :func:`share_inside`, if known."""
         raise NotImplementedError
 
-    def distances(self, p_world: Any) -> list[Any]:
+    def distances(self, p_world: Point3f) -> list[Float]:
         """Distances from the edges that bound the light (Float), positive inside, in units of ``falloff_width``. Attached."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True)
 class Softened:
-    """A light with an outline on a surface, where the share of its light that is let through is known: Float (N,)."""
+    """A light with an outline, and the share of its light that the outline lets through at surface points: Float (N,)."""
 
     light: BoundedLight
-    inside: Any
+    inside: Float
 
-    def illuminate(self, p_world: Any, active: Any = True) -> tuple[Any, Any]:
-        """As the light's."""
+    def illuminate(self, p_world: Point3f, active: Bool | bool = True) -> tuple[Vector3f, Color3f]:
+        """(wo, weight) of the light with this share."""
         return self.light.illuminate(p_world, active, self.inside)
 
 
-def softened(lights: Sequence[Any], p_world: Any, footprints: Callable[[], Sequence[Any]]) -> tuple[Any, ...]:
-    """The same lights; the outlines of those that have one are at least as soft as pixels are wide.
+def softened(lights: Sequence[Any], p_world: Point3f, footprints: Callable[[], Sequence[Point3f]]) -> tuple[Any, ...]:
+    """The same lights, but with outlines at least as soft as pixels are wide.
 
-    ``p_world`` Point3f (N,); ``footprints`` gives points half way to the corners of each pixel (Point3f (N,) each), and is called
-    only where there are such lights. One sample per pixel is enough then for derivatives of moving outlines.
+    ``p_world`` Point3f (N,); ``footprints`` returns points half way to the corners of each pixel (Point3f (N,) each), and is
+    called only if a light has an outline. One sample per pixel is then enough for derivatives of moving outlines.
     """
     if not any(isinstance(light, BoundedLight) for light in lights):
         return tuple(lights)
@@ -61,11 +62,11 @@ def softened(lights: Sequence[Any], p_world: Any, footprints: Callable[[], Seque
     )
 
 
-def share_inside(light: BoundedLight, p_world: Any, around: Sequence[Any] = ()) -> Any:
+def share_inside(light: BoundedLight, p_world: Point3f, around: Sequence[Point3f] = ()) -> Float:
     """Share of the light (Float, N) that the outline lets through: 1 inside, 0 outside, a ramp in between. Attached.
 
-    ``around``: points half way to the corners of the pixel around each of ``p_world``; the ramp is as wide as the pixel, or else
-    as the rim.
+    ``around``: points half way to the corners of the pixel around each of ``p_world``. The ramp is as wide as the pixel, and at
+    least as wide as the rim.
     """
     distances = light.distances(p_world)
     with dr.suspend_grad():

@@ -1,7 +1,7 @@
 """Sources of the vertices of the triangle soup: one class for each kind of shape.
 
-A source knows what stays the same for as long as the scene's topology does, and reads anew what parameters may change: vertices
-of a mesh, ``to_world`` of an analytic shape, control points of a curve. Gradients flow to all of these.
+A source keeps the data that the topology determines and reads the parameters anew each time: vertices of a mesh, ``to_world`` of
+an analytic shape, control points of a curve. Gradients flow to all of these.
 """
 
 from __future__ import annotations
@@ -15,21 +15,26 @@ import numpy as np
 
 from ...errors import ShadowmapError, UnsupportedShape
 from ...jit.arrays import device_array
+from ...jit.types import Float, UInt32, Vector3f
 from ..mitsuba_objects import Parameter, mesh_buffers, parameters
+from ..typed import ravel
 from . import curves, tubes
 from . import tessellation as shapes_tessellation
 
 _ANALYTIC = {"Sphere": shapes_tessellation.sphere, "Disk": shapes_tessellation.disk, "Cylinder": shapes_tessellation.cylinder}
-_CURVES = {"BSplineCurve": curves.BSplines, "LinearCurve": curves.Polylines}
+_CURVES: dict[str, type[curves.BSplines] | type[curves.Polylines]] = {
+    "BSplineCurve": curves.BSplines,
+    "LinearCurve": curves.Polylines,
+}
 
 
 @dataclass(frozen=True)
 class Buffers:
     """Vertices of a shape, flat Float, attached: positions (3V,), normals (3V,) or None, texture coordinates (2V,) or None."""
 
-    positions: Any
-    normals: Any
-    texcoords: Any
+    positions: Float
+    normals: Float | None
+    texcoords: Float | None
 
 
 @dataclass(frozen=True)
@@ -39,37 +44,37 @@ class ShapeSource:
     ``shape`` is the ``mi.Shape``, ``instance`` the ``mi.Shape`` that places it in the world or None.
     """
 
-    shape: Any
-    instance: Any
+    shape: mi.Shape
+    instance: mi.Shape | None
 
     def own(self) -> Buffers:
-        """Vertices where Mitsuba holds them: before the instance's transformation."""
+        """Vertices as Mitsuba holds them: before the instance's transformation."""
         return self.rest()
 
     def rest(self) -> Buffers:
         """Vertices before any transformation."""
         raise NotImplementedError
 
-    def read(self) -> tuple[Any, ...]:
+    def read(self) -> tuple[Float, ...]:
         """Arrays of Mitsuba's that :meth:`rest` depends on."""
         return ()
 
     @property
-    def own_placement(self) -> Any:
+    def own_placement(self) -> mi.Shape | None:
         """The ``mi.Shape`` whose ``to_world`` leads from :meth:`rest` to :meth:`own`, or None."""
         return None
 
-    def statics(self) -> tuple[Any, ...]:
-        """Arrays that decided on the topology. Where they change, the scene has to be loaded again."""
+    def statics(self) -> tuple[UInt32, ...]:
+        """Arrays that determine the topology. If one changes, the scene has to be loaded again."""
         return ()
 
     def sizes(self) -> tuple[int, ...]:
-        """Lengths of arrays and flags that decided on the topology and on what is read, likewise."""
+        """Lengths of arrays, and flags, that determine the topology. If one changes, the scene has to be loaded again."""
         return ()
 
-    def transformed(self) -> tuple[Any, ...]:
-        """Objects of Mitsuba's whose ``to_world`` places the shape. Where one comes to mirror it, or no longer does, the scene
-        has to be loaded again."""
+    def transformed(self) -> tuple[mi.Shape, ...]:
+        """Objects of Mitsuba's whose ``to_world`` places the shape. If one starts or stops mirroring, the scene has to be loaded
+        again."""
         return () if self.instance is None else (self.instance,)
 
     def placed(self, own: Buffers) -> Buffers:
@@ -85,10 +90,10 @@ class MeshSource(ShapeSource):
         _, positions, normals, texcoords = mesh_buffers(self.shape)
         return Buffers(positions, normals if len(normals) else None, texcoords if len(texcoords) else None)
 
-    def read(self) -> tuple[Any, ...]:
+    def read(self) -> tuple[Float, ...]:
         return mesh_buffers(self.shape)[1:]
 
-    def statics(self) -> tuple[Any, ...]:
+    def statics(self) -> tuple[UInt32, ...]:
         return (mesh_buffers(self.shape)[0],)
 
     def sizes(self) -> tuple[int, ...]:
@@ -100,8 +105,8 @@ class MeshSource(ShapeSource):
 class PlacedSource(ShapeSource):
     """A shape whose only parameter is ``to_world``: ``local`` is a mesh that does not change.
 
-    A rectangle is one, although a ``mi.Mesh``. The vertices that Mitsuba holds of it hang on ``to_world`` by a part of the AD
-    graph that is made when it is updated, and gone once derivatives have passed through: a second image would be left without.
+    A rectangle is such a shape, although it is a ``mi.Mesh``: Mitsuba attaches its vertices to ``to_world`` only when the scene
+    is updated, and a backward pass removes that part of the AD graph, so that a second image would have no derivatives.
     """
 
     local: Buffers
@@ -113,27 +118,27 @@ class PlacedSource(ShapeSource):
         return self.local
 
     @property
-    def own_placement(self) -> Any:
+    def own_placement(self) -> mi.Shape:
         return self.shape
 
-    def transformed(self) -> tuple[Any, ...]:
+    def transformed(self) -> tuple[mi.Shape, ...]:
         return (self.shape, *super().transformed())
 
 
 @dataclass(frozen=True)
 class AnalyticSource(PlacedSource):
-    """A sphere, disk or cylinder. Mitsuba has all other parameters in ``to_world`` (``center``, ``radius``, ``p0``, ``p1``)."""
+    """A sphere, disk or cylinder. Mitsuba's ``to_world`` contains the other parameters (``center``, ``radius``, ``p0``, ``p1``)."""
 
     def sizes(self) -> tuple[int, ...]:
-        # Mitsuba turns a sphere's normals over where ``to_world`` comes to mirror it.
+        # Mitsuba flips a sphere's normals when ``to_world`` starts to mirror it.
         return (self.shape.has_flipped_normals(),)
 
 
 @dataclass(frozen=True)
 class CurveSource(ShapeSource):
-    """B-spline or linear curves: circles about points of the curves that the shape's control points place.
+    """B-spline or linear curves: circles about points of the curves, placed by the shape's control points.
 
-    ``name`` for messages, ``plan`` and ``layout``: which circles there are and how they are joined, ``count``: of control points.
+    ``name``: for messages; ``plan``: the circles; ``layout``: their joints and corners; ``count``: number of control points.
     """
 
     name: str
@@ -149,14 +154,14 @@ class CurveSource(ShapeSource):
             raise ShadowmapError(f"Curve '{self.name}' {changed}: load the scene again.")
         return self.with_control_points(points)
 
-    def read(self) -> tuple[Any, ...]:
+    def read(self) -> tuple[Float, ...]:
         return (mi.Float(parameters(self.shape)["control_points"]),)
 
-    def with_control_points(self, points: Any) -> Buffers:
+    def with_control_points(self, points: Float) -> Buffers:
         """Vertices for control points (x, y, z, radius), flat Float (4P,), attached to them; before the instance's placement."""
         return Buffers(*tubes.tube_mesh(self.layout, self.plan.circles(points)))
 
-    def statics(self) -> tuple[Any, ...]:
+    def statics(self) -> tuple[UInt32, ...]:
         return (mi.UInt32(parameters(self.shape)["segment_indices"]),)
 
     def sizes(self) -> tuple[int, ...]:
@@ -166,12 +171,21 @@ class CurveSource(ShapeSource):
 Found = tuple[ShapeSource, np.ndarray]
 
 
-def source_of(name: str, shape: Any, instance: Any, tessellation: int, known: dict[Any, Any] | None = None) -> Found:
+def source_of(
+    name: str, shape: mi.Shape, instance: mi.Shape | None, tessellation: int, known: dict[Any, Any] | None = None
+) -> Found:
     """The source of a shape's vertices and its faces, uint32 (F, 3).
 
-    ``tessellation``: triangles around spheres, disks and cylinders. Curves have half as many around them and, if they are
-    B-splines, an eighth of it along each segment. ``known``: what other shapes of the scene share, kept here from one call to the
-    next. Raises ``ShadowmapError`` for other shapes and for curves that are broken.
+    Args:
+        name: of the shape, for messages.
+        shape, instance: the ``mi.Shape``, and the instance that places it in the world or None.
+        tessellation: triangles around spheres, disks and cylinders. Curves have half as many around them, and B-splines an eighth
+            of it along each segment.
+        known: cache of data that shapes of one scene share, passed from call to call.
+
+    Raises:
+        UnsupportedShape: the shape is of another kind.
+        ShadowmapError: a curve is broken.
     """
     known = {} if known is None else known
     if shape not in known:
@@ -180,15 +194,15 @@ def source_of(name: str, shape: Any, instance: Any, tessellation: int, known: di
     return replace(source, instance=instance), faces
 
 
-def _new_source(name: str, shape: Any, tessellation: int, known: dict[Any, Any]) -> Found:
+def _new_source(name: str, shape: mi.Shape, tessellation: int, known: dict[Any, Any]) -> Found:
     kind, instance = shape.class_name(), None
     if kind == "Rectangle":
         faces, _, _, texcoords = (buffer.numpy() for buffer in mesh_buffers(shape))
-        # In its own space a rectangle's corners are those of its texture's, from -1 to 1.
+        # In its own space a rectangle has its corners at 2 uv - 1.
         uv = texcoords.reshape(-1, 2)
         if uv.tobytes() not in known:
-            mesh = (np.insert(2 * uv - 1, 2, 0, 1), np.tile(np.float32([0, 0, 1]), (len(uv), 1)), uv)
-            known[uv.tobytes()] = Buffers(*(device_array(mi.Float, a) for a in mesh))
+            corners = (np.insert(2 * uv - 1, 2, 0, 1), np.tile(np.array([0, 0, 1], np.float32), (len(uv), 1)), uv)
+            known[uv.tobytes()] = Buffers(*(device_array(mi.Float, a) for a in corners))
         return PlacedSource(shape, instance, known[uv.tobytes()]), faces.reshape(-1, 3)
     if isinstance(shape, mi.Mesh):
         return MeshSource(shape, instance), mesh_buffers(shape)[0].numpy().reshape(-1, 3)
@@ -211,17 +225,17 @@ def _new_source(name: str, shape: Any, tessellation: int, known: dict[Any, Any])
     )
 
 
-def _placed(buffers: Buffers, to_world: Any) -> Buffers:
-    """Points by a transformation, normals by its inverse transpose (then made unit)."""
+def _placed(buffers: Buffers, to_world: mi.Transform4f) -> Buffers:
+    """Points transformed by ``to_world``, normals by its inverse transpose (and normalised)."""
     matrix = to_world.matrix
     offset = mi.Vector3f(matrix[0, 3], matrix[1, 3], matrix[2, 3])
     positions = mi.Vector3f(mi.Matrix3f(matrix) @ _vectors(buffers.positions)) + offset
     normals = buffers.normals
     if normals is not None:
-        normals = dr.ravel(dr.normalize(mi.Vector3f(mi.Matrix3f(to_world.inverse_transpose) @ _vectors(normals))))
-    return Buffers(dr.ravel(positions), normals, buffers.texcoords)
+        normals = ravel(dr.normalize(mi.Vector3f(mi.Matrix3f(to_world.inverse_transpose) @ _vectors(normals))))
+    return Buffers(ravel(positions), normals, buffers.texcoords)
 
 
-def _vectors(flat: Any) -> Any:
-    # Not ``dr.unravel``, whose adjoint overwrites what other instances of the same buffer have added.
+def _vectors(flat: Float) -> Vector3f:
+    # Not ``dr.unravel``: its adjoint overwrites the gradients that other instances of the same buffer have added.
     return dr.gather(mi.Vector3f, flat, dr.arange(mi.UInt32, dr.width(flat) // 3))

@@ -70,7 +70,7 @@ def _lattice(columns: int, rows: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _circle(turns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Cosine and sine. After a whole turn those of the start to the last bit, or else the surface would be open there."""
+    """Cosine and sine, equal to the last bit after a whole turn: otherwise the surface would be open there."""
     angle = 2 * np.pi * (turns % 1)
     return np.cos(angle), np.sin(angle)
 
@@ -83,5 +83,5 @@ def _quads(columns: int, rows: int) -> np.ndarray:
 
 
 def _mesh(positions: np.ndarray, normals: np.ndarray, texcoords: np.ndarray, faces: np.ndarray) -> LocalMesh:
-    as_float = [np.ascontiguousarray(a, dtype=np.float32) for a in (positions, normals, texcoords)]
-    return LocalMesh(*as_float, np.ascontiguousarray(faces, dtype=np.uint32))
+    positions, normals, texcoords = (np.ascontiguousarray(a, dtype=np.float32) for a in (positions, normals, texcoords))
+    return LocalMesh(positions, normals, texcoords, np.ascontiguousarray(faces, dtype=np.uint32))

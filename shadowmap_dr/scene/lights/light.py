@@ -19,16 +19,20 @@ WIDEST_CONE = 60.0
 _WIDEST_MAP = 80.0
 
 
-class LightRecord(Protocol):
-    """A light without extent: how it illuminates, and the cameras of its shadow maps. A dataclass whose arrays may be attached.
+class Illumination(Protocol):
+    """Unshadowed light without extent, at points."""
+
+    def illuminate(self, p_world: Point3f, active: Bool | bool = True) -> tuple[Vector3f, Color3f]:
+        """(unit direction to the light (Vector3f), irradiance (colour) on a surface that faces it) at points. Attached."""
+
+
+class LightRecord(Illumination, Protocol):
+    """A light without extent: its illumination, and the cameras of its shadow maps. A dataclass whose arrays may be attached.
 
     ``name``: name by which users refer to it.
     """
 
     name: str
-
-    def illuminate(self, p_world: Point3f, active: Bool | bool = True) -> tuple[Vector3f, Color3f]:
-        """(unit direction to the light (Vector3f), irradiance (colour) on a surface that faces it) at points. Attached."""
 
     def map_kind(self) -> str:
         """Kind of its maps, fixed until a scene is read again: ``directional``, ``beam``, ``spot`` (one map each) or ``cube``

@@ -11,6 +11,7 @@ import mitsuba as mi
 
 from ...jit.broadcast import broadcast_differentiable
 from ...jit.types import Bool, Color3f, Float, Point3f, Vector3f
+from .light import Illumination
 
 # Least width of a rim, in units of ``falloff_width``, since it is divided by.
 _NARROWEST = 1e-7
@@ -23,8 +24,8 @@ class BoundedLight:
     widest  upper bound of the rim's width (detached)
     """
 
-    falloff_width: Any
-    widest: Any
+    falloff_width: Any  # Any: a field or a read-only property, an array or a number
+    widest: Any  # Any: as ``falloff_width``
 
     def illuminate(self, p_world: Point3f, active: Bool | bool = True, inside: Float | None = None) -> tuple[Vector3f, Color3f]:
         """(wo, weight), as for all lights; ``inside``: result of :func:`share_inside`, if known."""
@@ -47,7 +48,9 @@ class Softened:
         return self.light.illuminate(p_world, active, self.inside)
 
 
-def softened(lights: Sequence[Any], p_world: Point3f, footprints: Callable[[], Sequence[Point3f]]) -> tuple[Any, ...]:
+def softened(
+    lights: Sequence[Illumination], p_world: Point3f, footprints: Callable[[], Sequence[Point3f]]
+) -> tuple[Illumination, ...]:
     """The same lights, but with outlines at least as soft as pixels are wide.
 
     ``p_world`` Point3f (N,); ``footprints`` returns points half way to the corners of each pixel (Point3f (N,) each), and is

@@ -127,7 +127,7 @@ class PlacedSource(ShapeSource):
 
 @dataclass(frozen=True)
 class AnalyticSource(PlacedSource):
-    """A sphere, disk or cylinder. Mitsuba's ``to_world`` contains the other parameters (``center``, ``radius``, ``p0``, ``p1``)."""
+    """A sphere, disk or cylinder. Mitsuba's ``to_world`` holds the other parameters (``center``, ``radius``, ``p0``, ``p1``)."""
 
     def sizes(self) -> tuple[int, ...]:
         # Mitsuba flips a sphere's normals when ``to_world`` starts to mirror it.

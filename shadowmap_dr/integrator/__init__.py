@@ -1,4 +1,4 @@
-"""The Mitsuba plug-in ``shadowmap``: its parameters, and what it keeps of scenes from one image to the next."""
+"""The Mitsuba plug-in ``shadowmap``: its parameters, and the state of scenes that it keeps from one image to the next."""
 
 from .options import Options
 from .plugin import install

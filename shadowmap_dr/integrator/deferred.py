@@ -1,29 +1,31 @@
 """Images that wait for their backward pass.
 
-``mi.render`` asks an integrator for an image first, and for its derivatives later, when it has to render again unless it has kept
-what the image was computed from.
+``mi.render`` asks an integrator for an image first and for its derivatives later. Then the integrator has to render again, unless
+it has kept the AD graph of the image.
 """
 
 from __future__ import annotations
 
 import weakref
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import drjit as dr
+import mitsuba as mi
 
 from ..jit.gpu import keep_registers
 from ..jit.pytree import attached_arrays, with_arrays
+from ..jit.types import AnyArray, TensorXf
 from ..scene.load import SceneData
 from .parameter_state import ParameterState
 
-#: Samples of pixels of all images that wait; each may hold half a kilobyte.
+#: Most pixel samples of all waiting images together; each may hold half a kilobyte.
 MOST_SAMPLES = 1 << 20
-#: So many texels of shadow maps hold as much as one of these samples.
+#: Texels of shadow maps that take as much memory as one sample.
 TEXELS = 6
 
-# Parameters that an image is attached to through what is read from the scene, and in no other way. Materials and textures are
-# evaluated by Mitsuba itself.
+# Parameters that an image depends on only through the records of its scene. Materials and textures, in contrast, are evaluated by
+# Mitsuba itself.
 _READ = (
     "vertex_positions", "vertex_normals", "vertex_texcoords", "control_points", "to_world",
     "position", "intensity.value", "irradiance.value", "radiance.value", "cutoff_angle", "beam_width",
@@ -31,40 +33,40 @@ _READ = (
 
 
 class DetachedInputs:
-    """Vertices, lights and cameras of a scene as leaves of an AD graph of their own.
+    """Vertices, lights and cameras of a scene as leaves of a separate AD graph.
 
-    What waits for a backward pass must not hang on the scene's parameters meanwhile, not even through what has been read from
-    them: forward passes would run through it, and clear gradients on their way.
+    A waiting image must not be attached to the scene's parameters, not even through records read from them: forward passes would
+    run through its graph and clear gradients on their way.
     """
 
     def __init__(self) -> None:
-        self._leaves: list[Any] = []
+        self._leaves: list[AnyArray] = []
 
     def instead_of(self, data: SceneData) -> SceneData:
-        """The same data with leaves in the place of what is attached."""
+        """The same data with leaves in the place of attached arrays."""
         self._leaves = [dr.detach(array) + 0 for array in attached_arrays(data)]
         dr.enable_grad(self._leaves)
         return with_arrays(data, self._leaves)
 
     def backward(self, data: SceneData) -> None:
-        """Pass the leaves' gradients on to the scene's parameters, through the same data, read again."""
+        """Pass the leaves' gradients on to the scene's parameters. ``data``: the same data, read again."""
         pass_on(attached_arrays(data), [dr.grad(leaf) for leaf in self._leaves])
 
 
 @dataclass(frozen=True)
 class DeferredImage:
-    """An image that waits, what it is attached to, and the sensor's parameters at the time. ``texels``: of its shadow maps."""
+    """A waiting image, its inputs, and the sensor's parameters when it was rendered. ``texels``: of its shadow maps."""
 
-    sensor: Any
+    sensor: mi.Sensor
     spp: int
     texels: int
-    image: Any
+    image: TensorXf
     inputs: DetachedInputs
     camera: ParameterState
 
     @property
     def samples(self) -> int:
-        """Of all pixels, about."""
+        """Approximate number of samples of all pixels."""
         height, width = self.image.shape[:2]
         return height * width * self.spp
 
@@ -73,20 +75,20 @@ class DeferredImage:
         """Measure of the image's memory, in samples."""
         return self.samples + self.texels // TEXELS
 
-    def is_of(self, sensor: Any, spp: int) -> bool:
-        """True if it shows what a sensor sees now."""
+    def is_of(self, sensor: mi.Sensor, spp: int) -> bool:
+        """True if a sensor would take the same image now."""
         return sensor is self.sensor and spp == self.spp and ParameterState.of(sensor).same(self.camera)
 
-    def backward(self, gradient: Any, data: SceneData) -> None:
+    def backward(self, gradient: TensorXf, data: SceneData) -> None:
         """Add the gradients of <image, gradient> to the scene's parameters. ``data``: as read for the image."""
         backward(self.image, gradient)
         self.inputs.backward(data)
 
 
 class DeferredImages:
-    """The images of one state of a scene that wait for their backward passes: one for each sensor, as far as memory allows."""
+    """The waiting images of one state of a scene: one for each sensor, as far as memory allows."""
 
-    #: All there are.
+    #: All objects of this class.
     _everywhere: ClassVar[weakref.WeakSet[DeferredImages]] = weakref.WeakSet()
 
     def __init__(self) -> None:
@@ -96,54 +98,57 @@ class DeferredImages:
 
     @classmethod
     def forget_all(cls) -> None:
-        """Drop all images, of all scenes. Calls of materials go to those of all scenes, so that images may hang on meshes whose
-        attributes any of them reads; and forward passes come to what hangs there, and fail."""
+        """Drop all images, of all scenes.
+
+        Mitsuba's calls of materials reach the materials of all scenes, so an image may be attached to any mesh with attributes.
+        A forward pass that reaches the graph of such an image fails.
+        """
         for waiting in cls._everywhere:
             waiting._images = []
 
     def forget_older(self, now: ParameterState) -> None:
-        """Drop images of the scene before its parameters changed. ``now``: those of the scene."""
+        """Drop images of earlier states of the scene. ``now``: its current parameters."""
         if self._state is None or not now.same(self._state):
             self._state, self._images = now, []
 
-    def welcomes(self, now: ParameterState, sensor: Any) -> bool:
-        """True if an image of the scene as it is now would be attached to :class:`DetachedInputs` alone."""
+    def welcomes(self, now: ParameterState, sensor: mi.Sensor) -> bool:
+        """True if an image of the current scene would depend on attached parameters through :class:`DetachedInputs` only."""
         attached = (*now.attached, *ParameterState.of(sensor).attached)
         return bool(attached) and all(name.endswith(_READ) for name in attached)
 
-    def add(self, sensor: Any, spp: int, texels: int, image: Any, inputs: DetachedInputs) -> None:
-        """Let an attached image wait. Those that have waited longest make room for it."""
+    def add(self, sensor: mi.Sensor, spp: int, texels: int, image: TensorXf, inputs: DetachedInputs) -> None:
+        """Let an attached image wait. The images that have waited longest make room for it."""
         new = DeferredImage(sensor, spp, texels, image, inputs, ParameterState.of(sensor))
         others = [other for other in self._images if other.sensor is not sensor]
         self._images = [*others, new] if new.samples <= MOST_SAMPLES else others
-        # Whatever its maps are, the latest one waits: with a single view, nothing would be saved by rendering it again.
+        # The latest image waits whatever the size of its maps: rendering it again would take as much memory.
         while len(self._images) > 1 and sum(one.weight for one in self._images) > MOST_SAMPLES:
             self._images.pop(0)
 
-    def take(self, now: ParameterState, sensor: Any, spp: int) -> DeferredImage | None:
-        """The image of a scene as a sensor sees it now, if it waits. It does so no longer."""
+    def take(self, now: ParameterState, sensor: mi.Sensor, spp: int) -> DeferredImage | None:
+        """Remove and return the waiting image of the current scene and sensor; None if there is none."""
         self.forget_older(now)
         found = next((one for one in self._images if one.is_of(sensor, spp)), None)
         self._images = [one for one in self._images if one is not found]
         return found
 
 
-def pass_on(arrays: list[Any], gradients: list[Any]) -> None:
-    """Add gradients to all that arrays are attached to."""
+def pass_on(arrays: list[AnyArray], gradients: list[AnyArray]) -> None:
+    """Add gradients to everything that arrays are attached to."""
     for array, gradient in zip(arrays, gradients, strict=True):
         dr.accum_grad(array, gradient)
     _traverse(arrays)
 
 
-def backward(image: Any, gradient: Any) -> None:
-    """Add the gradients of <image, gradient> to all that an image is attached to."""
+def backward(image: TensorXf, gradient: TensorXf) -> None:
+    """Add the gradients of <image, gradient> to everything that an image is attached to."""
     dr.set_grad(image, gradient)
     _traverse(image)
 
 
-def _traverse(end: Any) -> None:
-    """Backwards from what has gradients. The graph stays: another image may hang on the same parts of it, such as those that
-    Mitsuba's shapes hold of what their vertices were computed from."""
+def _traverse(end: AnyArray | list[AnyArray]) -> None:
+    """Propagate gradients backwards from ``end``. The graph stays: other images may depend on the same parts of it, such as those
+    between the vertices of Mitsuba's shapes and the parameters they are computed from."""
     keep_registers()
     dr.enqueue(dr.ADMode.Backward, end)
     dr.traverse(dr.ADMode.Backward, flags=dr.ADFlag.ClearVertices)

@@ -1,25 +1,28 @@
-"""Parameters of the plug-in ``shadowmap``: their names, types and defaults in XML, and what the renderer makes of them."""
+"""Parameters of the plug-in ``shadowmap``: their names, types and defaults in XML, and their translation to settings."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from difflib import get_close_matches
 from fnmatch import fnmatchcase
-from typing import Any
+from typing import TYPE_CHECKING
 
 from ..errors import ShadowmapError, warn
 from ..rendering.settings import DIRECT, RenderSettings
 from ..shadow import ShadowSettings
 
+if TYPE_CHECKING:
+    import mitsuba as mi
+
 PLUGIN = "shadowmap"
 
-# Names that Mitsuba's own `aov` integrator has for channels of ours.
+# Names of Mitsuba's own `aov` integrator for channels of this plug-in.
 _SYNONYMS = {"sh_normal": "normal"}
 # Channels of the image itself.
 COLOURS = ("R", "G", "B", "A", "Y")
 
-# Parameters of Mitsuba's integrators that have no meaning here: scenes keep them when they change to this one. A name that ends
-# with * stands for all that begin so.
+# Parameters of Mitsuba's integrators that are ignored here, so that a scene's description may keep them. A trailing * matches
+# any ending.
 _FOREIGN = (
     "rr_depth", "shading_samples", "emitter_samples", "bsdf_samples", "sppc", "sppp", "sppi", "guiding*", "project_seed",
     "proj_seed*", "samples_per_pass", "timeout", "block_size",
@@ -30,7 +33,7 @@ _FOREIGN = (
 class Options:
     """Parameters of the plug-in, as in XML or a dictionary.
 
-    shadow_map_resolution  texels along each side of a shadow map, six more than the filter has at least, 4096 at most
+    shadow_map_resolution  texels along each side of a shadow map, at least six more than those of the filter, at most 4096
     shadow_method          ``auto`` (``evsm4``), ``vsm``, ``esm``, ``evsm2``, ``evsm4``, ``msm``, ``csm``, ``pcf``, ``standard``
                            (no shadow gradients) or ``none`` (no shadows); see ``shadowmap_dr.shadow.ShadowSettings``
     shadow_filter          ``box``, ``gaussian``, ``wendland`` or ``none``
@@ -39,16 +42,16 @@ class Options:
     shadow_bleeding        visibilities below this count as 0, against light that bleeds through (``vsm``, ``evsm``, ``msm``)
     shadow_order           terms of the Fourier series of ``csm``, an even number from 2 to 16
     shadow_supersampling   texels along each side that are averaged into one of the map, 1 to 8 (pre-filtered methods)
-    shadow_receiver_range  tell depths apart only from the first receiver on, against light that bleeds through
-    shadow_cull_backfaces  leave the backs of closed shapes out of the maps of directional lights: faster, and the same as long as
-                           no shape turns inside out, not even in a fold
+    shadow_receiver_range  resolve depths only from the first receiver on, against light that bleeds through
+    shadow_cull_backfaces  leave the backs of closed shapes out of the maps of directional lights: faster, with the same result as
+                           long as no shape turns inside out, not even in a fold
     area_light_samples     points on each area light that cast shadows (Mitsuba's ``emitter_samples`` is another number)
     environment_light_samples  directions of an environment that cast shadows
-    soft_map_resolution    texels along each side of their shadow maps
+    soft_map_resolution    texels along each side of these points' and directions' shadow maps
     emitter_shadows        ``samples``, or ``single``: one map for each area light, penumbrae estimated from it
-    shadow_samples         look-ups along each side of a pixel, 1 to 8; 0 chooses
+    shadow_samples         look-ups along each side of a pixel, 1 to 8; 0: automatic
     antialias              anti-alias the image; without it outlines have no gradient
-    ambient                radiance of unshadowed light from all directions, beside that of the scene's environment
+    ambient                radiance of unshadowed light from all directions, added to the scene's environment
     hide_emitters          the camera looks through area lights, and sees black instead of environments; both light the scene
     max_depth              as in Mitsuba: 0 is black, 1 shows emitters only, 2 is direct light; more, or -1, is rendered as 2
     aovs                   further channels, separated by commas: names of ``shadowmap_dr.rendering.film.aovs.AOVS``, or
@@ -86,15 +89,16 @@ class Options:
     compat: bool = ShadowSettings.compat
 
     @classmethod
-    def from_properties(cls, props: Any) -> Options:
+    def from_properties(cls, props: mi.Properties) -> Options:
         """Read ``mi.Properties``. Raises ShadowmapError for an unknown parameter or a value of another type."""
         defaults = {f.name: f.default for f in fields(cls)}
-        values, foreign = {}, []
+        values: dict[str, Any] = {}
+        foreign = []
         for name in props.keys():  # noqa: SIM118  (Properties is no dictionary)
             if name in defaults:
                 values[name] = _typed(name, props[name], type(defaults[name]))
             elif any(fnmatchcase(name, pattern) for pattern in _FOREIGN):
-                _ = props[name]  # or Mitsuba would say that nobody has asked for it
+                _ = props[name]  # otherwise Mitsuba would report an unqueried parameter
                 foreign.append(name)
             else:
                 raise ShadowmapError(f"'{PLUGIN}' has no parameter '{name}': {_near(name, sorted(defaults))}.")
@@ -125,7 +129,7 @@ class Options:
         return tuple(pairs)
 
     def render_settings(self) -> RenderSettings:
-        """The same as the renderer wants it. Raises ShadowmapError for values out of range."""
+        """The settings of the renderer. Raises ShadowmapError for values out of range."""
         if self.tessellation < 3:
             raise ShadowmapError(f"tessellation is {self.tessellation}: spheres need at least 3 triangles around them.")
         own = ("aovs", "tessellation", "recorded")
@@ -134,17 +138,17 @@ class Options:
 
 
 def _near(name: str, known: list[str]) -> str:
-    """The known names, and the one that is meant, perhaps."""
+    """Text with the known names and the one most similar to ``name``."""
     nearest = get_close_matches(name, known, 1)
     return f"it has {', '.join(known)}" + (f"; the nearest is '{nearest[0]}'" if nearest else "")
 
 
-def _typed(name: str, value: Any, kind: type) -> Any:
-    # A bool is an int to Python, not to us; and numbers may be written without a decimal point.
+def _typed(name: str, value: object, kind: type) -> object:
+    # Unlike in Python, a bool is no int here; but a float may be written without a decimal point.
     if type(value) is kind:
         return value
     if kind is float and type(value) is int:
         return float(value)
-    words = {int: "an integer", float: "a number", bool: "a boolean", str: "a string"}
+    words: dict[type, str] = {int: "an integer", float: "a number", bool: "a boolean", str: "a string"}
     shown = repr(value) if isinstance(value, bool | int | float | str) else type(value).__name__
     raise ShadowmapError(f"'{name}' of '{PLUGIN}' is {shown}, but must be {words[kind]}.")

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 
+from ..jit.types import AnyArray
 from ..scene.changes import leaves
 from ..scene.mitsuba_objects import parameters
 
@@ -17,21 +19,23 @@ class ParameterState:
     """Parameters of a Mitsuba object and its children, by their relative names.
 
     Attributes:
-        numbers: of each parameter something that is equal to that of another value only if it has not been given another one:
-            of arrays which they are, and whether they are attached.
-        attached: names of those through which gradients flow.
-        held: the arrays, detached. That keeps their variables' numbers from being used again. No AD variable is held: Mitsuba's
-            integrators, which clear the AD graph in forward mode, would fail on it.
+        numbers: keys of the parameters. A parameter's keys at two moments are equal only if it was given no other value in
+            between. Arrays count by identity and by whether they are attached.
+        attached: names of the parameters through which gradients flow.
+        held: the arrays, detached. Holding them keeps their variables' numbers from being used again. No AD variable is held:
+            Mitsuba's integrators, which clear the AD graph in forward mode, would fail on it.
     """
 
     numbers: dict[str, tuple[Any, ...]]
     attached: tuple[str, ...]
-    held: list[Any]
+    held: list[AnyArray]
 
     @classmethod
-    def of(cls, node: Any) -> ParameterState:
-        """The parameters as they are now."""
-        numbers, attached, held = {}, [], []
+    def of(cls, node: mi.Object) -> ParameterState:
+        """The current parameters."""
+        numbers: dict[str, tuple[Any, ...]] = {}
+        attached: list[str] = []
+        held: list[AnyArray] = []
         for name, value in parameters(node).items():
             value = getattr(value, "matrix", value)
             if not dr.is_array_v(value):
@@ -50,7 +54,7 @@ class ParameterState:
         return cls(numbers, tuple(attached), held)
 
     def same(self, other: ParameterState, names: Iterable[str] | None = None) -> bool:
-        """True if parameters (all, or those of these names) are the same in both."""
+        """True if parameters (all, or those in ``names``) are the same in both."""
         if names is None:
             return self.numbers == other.numbers
         return all(self.numbers.get(name) == other.numbers.get(name) for name in names)

@@ -1,10 +1,11 @@
-"""Caches of the passes of each sensor's last image, and which of their results hold for the next one."""
+"""Caches of the passes of each sensor's last image, and the results among them that are valid for the next image."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any
+
+import mitsuba as mi
 
 from ..rendering.pass_cache import CacheLevel, PassCache
 from ..scene.load import SceneData
@@ -12,15 +13,15 @@ from ..scene.mitsuba_objects import children, is_attribute, owners
 from .deferred import MOST_SAMPLES
 from .parameter_state import ParameterState
 
-#: Names of the parameters of a scene that must stay for each level to be valid.
+#: Names of a scene's parameters that must not change for each level to stay valid.
 NamesByLevel = dict[CacheLevel, list[str]]
 
 
 @dataclass
 class _Known:
-    """The cache of a sensor's images with so many samples per pixel, and parameters at the last image. ``weight``: in samples."""
+    """The cache for a sensor's images with ``spp`` samples per pixel, and parameters at the last one. ``weight``: in samples."""
 
-    sensor: Any
+    sensor: mi.Sensor
     spp: int
     weight: int
     scene: ParameterState
@@ -39,18 +40,18 @@ class PassCaches:
         self,
         scene: ParameterState,
         camera: ParameterState,
-        sensor: Any,
+        sensor: mi.Sensor,
         spp: int,
         weight: int,
         names: Callable[[], NamesByLevel],
     ) -> PassCache:
-        """Results that the next image of a sensor may use, and leave to later ones.
+        """Cache of passes for the next image of a sensor, with the results that are still valid.
 
         Args:
-            scene, camera: parameters as they are now.
+            scene, camera: current parameters.
             sensor, spp: of the image.
-            weight: what the memory for the image's passes grows with, in samples.
-            names: makes :func:`names_by_level` of the scene. Called at the second image.
+            weight: measure of the memory for the image's passes, in samples.
+            names: returns :func:`names_by_level` of the scene. Called at the second image.
         """
         if not self._names and self._known:
             self._names = names()
@@ -70,14 +71,14 @@ class PassCaches:
         return known.cache if weight <= MOST_SAMPLES else PassCache()
 
     def forget_edges(self) -> None:
-        """Drop all that depends on the edges at which shading jumps."""
+        """Drop all results that depend on the edges at which shading jumps."""
         for known in self._known:
             known.cache.forget_edges()
 
 
 def _valid_level(known: _Known, scene: ParameterState, camera: ParameterState, names: NamesByLevel) -> CacheLevel:
-    """The level of all that has stayed since the last image, and is not attached."""
-    # Parameters that have come since may mean anything.
+    """The highest level whose parameters are unchanged since the last image, and not attached."""
+    # New parameters may affect any level.
     if camera.attached or not camera.same(known.camera) or len(scene.numbers) != len(known.scene.numbers):
         return CacheLevel.NOTHING
     attached, valid = set(scene.attached), CacheLevel.NOTHING
@@ -88,11 +89,11 @@ def _valid_level(known: _Known, scene: ParameterState, camera: ParameterState, n
     return valid
 
 
-def names_by_level(scene: Any, data: SceneData) -> NamesByLevel:
-    """Names of the parameters of a scene that must stay for each level to hold. Those of materials and sensors are left out."""
+def names_by_level(scene: mi.Scene, data: SceneData) -> NamesByLevel:
+    """Names of a scene's parameters that must not change for each level to stay valid, except those of materials and sensors."""
     emitters, cameras = set(scene.emitters()), set(_below(scene.sensors()))
     materials, lights = set(_below({source.shape.bsdf() for source in data.sources})), set(_below(emitters))
-    # Alpha tests decide on what is seen.
+    # With alpha tests the parameters of materials affect visibility.
     solid = not any(info.see_through for info in data.geometry.shapes)
     names: NamesByLevel = {level: [] for level in CacheLevel}
     for name, node in owners(scene):
@@ -111,8 +112,8 @@ def names_by_level(scene: Any, data: SceneData) -> NamesByLevel:
     return names
 
 
-def _below(nodes: Iterable[Any]) -> Iterator[Any]:
-    """Objects of Mitsuba's and all their parts."""
+def _below(nodes: Iterable[mi.Object]) -> Iterator[mi.Object]:
+    """Mitsuba objects and all their descendants."""
     for node in nodes:
         yield node
         yield from _below(part for _, part in children(node))

@@ -1,8 +1,8 @@
 """The Mitsuba plug-in ``shadowmap``: a thin shell over :class:`shadowmap_dr.Renderer`.
 
 ``import shadowmap_dr`` registers it for every variant ``*_ad_rgb`` and ``*_ad_mono`` that is or will be set; in others, loading
-it raises a ``ShadowmapError``. The module itself holds no types of a variant and no state: what a scene needs once (topology,
-the plan of its shadow maps, their frusta) lives in the integrator that renders it.
+it raises a ``ShadowmapError``. The module itself holds no types of a variant and no state. The integrator that renders a scene
+keeps the scene's state (topology, plan of the shadow maps, their frusta).
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import mitsuba as mi
 
 from ..errors import ShadowmapError
 from ..jit.gpu import keep_registers
+from ..jit.types import Bool, Color3f, Float, TensorXf, UInt32
 from ..rendering.film.aovs import aov_names
 from ..rendering.film.film import put_into_film
 from ..rendering.settings import RenderSettings
@@ -25,7 +26,7 @@ from .options import PLUGIN, Options
 from .parameter_state import ParameterState
 from .scene_cache import SceneCache, same_objects
 
-# Scenes that one integrator remembers; each holds the scene's shapes in memory.
+# Scenes whose state one integrator keeps; each holds the scene's shapes in memory.
 _REMEMBERED_SCENES = 4
 
 
@@ -39,13 +40,13 @@ class Shell:
     light_names: tuple[str, ...] = ()
 
     @classmethod
-    def from_properties(cls, props: Any) -> Shell:
+    def from_properties(cls, props: mi.Properties) -> Shell:
         """Read and check the parameters."""
         options = Options.from_properties(props)
         return cls(options, options.render_settings())
 
-    def primal(self, scene: Any, sensor: Any, spp: int) -> Any:
-        """Detached image of ``mi.render``, which will ask for its derivatives later if parameters are attached."""
+    def primal(self, scene: mi.Scene, sensor: mi.Sensor, spp: int) -> TensorXf:
+        """Detached image for ``mi.render``, which asks for its derivatives later if parameters are attached."""
         _check_samples(spp)
         with dr.resume_grad():
             now = ParameterState.of(scene)
@@ -54,8 +55,7 @@ class Shell:
                 return record.replay(scene, sensor, spp or 1)
             waiting = record.waiting
             waiting.forget_older(now)
-            # Where attributes of meshes are read, Mitsuba finds out with its own vertices where on a triangle they are wanted:
-            # the image would hang on these.
+            # Mitsuba looks up mesh attributes through its own vertices, so the image would be attached to these, too.
             alone = not record.renderer.data.with_attributes() and waiting.welcomes(now, sensor)
             if alone and not dr.flag(dr.JitFlag.FreezingScope):
                 inputs = DetachedInputs()
@@ -66,7 +66,7 @@ class Shell:
         with dr.suspend_grad():
             return record.render(scene, sensor, spp or 1, now)
 
-    def backward(self, scene: Any, sensor: Any, spp: int, gradient: Any) -> None:
+    def backward(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, gradient: TensorXf) -> None:
         """Add the gradients of <image, gradient> to the scene's parameters."""
         _check_samples(spp)
         with dr.resume_grad():
@@ -82,8 +82,8 @@ class Shell:
             if dr.grad_enabled(image):
                 backward(image, gradient)
 
-    def image(self, scene: Any, sensor: Any, spp: int) -> Any:
-        """Attached image. ``spp`` 0 means not given: one sample, anti-aliased."""
+    def image(self, scene: mi.Scene, sensor: mi.Sensor, spp: int) -> TensorXf:
+        """Attached image. ``spp`` 0, Mitsuba's default, means one sample, anti-aliased."""
         _check_samples(spp)
         with dr.resume_grad():
             now = ParameterState.of(scene)
@@ -94,18 +94,18 @@ class Shell:
         return self.options.recorded and not dr.flag(dr.JitFlag.FreezingScope)
 
     def channel_names(self) -> list[str]:
-        """Names of the further channels, in order; those of ``visibility`` follow the lights of the scene rendered last."""
+        """Names of the AOV channels, in order; those of ``visibility`` follow the lights of the scene rendered last."""
         names = []
         for label, name in self.options.labelled_aovs:
             names += [label + channel[len(name) :] for channel in aov_names((name,), list(self.light_names))]
         return names
 
-    def _record(self, scene: Any, sensor: Any, now: ParameterState) -> SceneCache:
+    def _record(self, scene: mi.Scene, sensor: mi.Sensor, now: ParameterState) -> SceneCache:
         for record in self.scenes:
             if record.matches(scene, now):
                 break
         else:
-            # The scene is told from others by its shapes: it may be here again with another topology.
+            # A known scene with another topology has the same shapes; its omissions have been warned of.
             shapes = tuple(scene.shapes())
             known = any(same_objects(other.parts[: len(shapes)], shapes) for other in self.scenes)
             record = SceneCache.build(scene, sensor, self.settings, self.options.tessellation, warn=not known)
@@ -119,8 +119,8 @@ def _check_samples(spp: int) -> None:
         raise ShadowmapError(f"spp is {spp}: give a positive number, or 0 for one anti-aliased sample.")
 
 
-def sensor_of(scene: Any, sensor: Any) -> Any:
-    """The ``mi.Sensor`` meant by a number or an object."""
+def sensor_of(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:
+    """The ``mi.Sensor`` with a number, or the given object itself."""
     if not isinstance(sensor, int):
         return sensor
     sensors = scene.sensors()
@@ -130,22 +130,22 @@ def sensor_of(scene: Any, sensor: Any) -> Any:
 
 
 def make_class() -> type:
-    """The integrator class for the current variant, whose base class is made anew for each."""
+    """The integrator class for the current variant. Its base class belongs to one variant."""
 
-    # Not imported from `mitsuba.ad`: that would load the module a second time, which then stays with the first variant.
+    # Not imported from `mitsuba.ad`: that would load a second copy of the module, which keeps the first variant.
     class ShadowMapIntegrator(mi.ad.integrators.common.ADIntegrator):
         """Renders and differentiates with shadow maps. Parameters: :class:`Options`.
 
-        ``spp`` not given (0) means one anti-aliased sample for each pixel; otherwise a grid of ``ceil(sqrt(spp)) ** 2``, at most
-        16 x 16. The film's reconstruction filter and ``sample_border`` are heeded (not for the further channels of ``aovs``); the
-        scene's sampler is not used, and ``seed`` changes nothing.
+        ``spp`` 0, the default, means one anti-aliased sample per pixel; other values a grid of ``ceil(sqrt(spp)) ** 2``, at most
+        16 x 16. The film's reconstruction filter and ``sample_border`` apply to colour and alpha, not to the channels of
+        ``aovs``. The scene's sampler and ``seed`` have no effect.
         """
 
-        def __init__(self, props: Any) -> None:
+        def __init__(self, props: mi.Properties) -> None:
             self.shell, self.nesting = Shell.from_properties(props), Nesting()
             super().__init__(props)
 
-        def render(self, *arguments: Any, **named: Any) -> Any:
+        def render(self, *arguments: Any, **named: Any) -> TensorXf:  # Any: arguments of ``_render``
             """Image (H, W, C) without gradients. It is put into the sensor's film too, but not while a function is frozen.
 
             Takes Mitsuba's arguments: scene, sensor = 0, seed = 0, spp = 0, develop = True, evaluate = True.
@@ -154,8 +154,14 @@ def make_class() -> type:
             return self._render(*arguments, **named)
 
         def _render(
-            self, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, develop: bool = True, evaluate: bool = True
-        ) -> Any:
+            self,
+            scene: mi.Scene,
+            sensor: int | mi.Sensor = 0,
+            seed: UInt32 | int = 0,
+            spp: int = 0,
+            develop: bool = True,
+            evaluate: bool = True,
+        ) -> TensorXf:
             sensor = sensor_of(scene, sensor)
             if develop and not evaluate:  # through mi.render
                 image = self.shell.primal(scene, sensor, spp)
@@ -167,7 +173,9 @@ def make_class() -> type:
                 put_into_film(sensor.film(), image, self.aov_names())
             return image if develop else mi.TensorXf()
 
-        def render_forward(self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> Any:
+        def render_forward(
+            self, scene: mi.Scene, params: object, sensor: int | mi.Sensor = 0, seed: UInt32 | int = 0, spp: int = 0
+        ) -> TensorXf:
             """Derivative of the image (H, W, C) in the direction of the gradients that the parameters hold."""
             DeferredImages.forget_all()
             keep_registers()
@@ -175,18 +183,29 @@ def make_class() -> type:
                 image = self.shell.image(scene, sensor_of(scene, sensor), spp)
                 if not dr.grad_enabled(image):
                     return dr.zeros(mi.TensorXf, image.shape)
-                # Gradients stay where they have come to: what hangs on the same parts of the graph, such as vertex normals that
-                # Mitsuba has computed from vertices, gets there once only, and other images need it.
+                # Only edges are cleared. Gradients of shared parts of the graph, such as vertex normals that Mitsuba has computed
+                # from vertices, are propagated only once, and other images need them.
                 dr.forward_to(image, flags=dr.ADFlag.ClearEdges)
                 return dr.grad(image)
 
-        def render_backward(self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> None:
+        def render_backward(
+            self,
+            scene: mi.Scene,
+            params: object,
+            grad_in: TensorXf,
+            sensor: int | mi.Sensor = 0,
+            seed: UInt32 | int = 0,
+            spp: int = 0,
+        ) -> None:
             """Add the gradients of <image, grad_in> to the parameters."""
             self.shell.backward(scene, sensor_of(scene, sensor), spp, grad_in)
             dr.eval()
 
-        def sample(self, *_: Any, **arguments: Any) -> Any:
-            """Nothing along rays: ``aov`` asks for that beside its nested images, and throws it away. Refused to all others."""
+        def sample(self, *_: object, **arguments: object) -> tuple[Color3f, Bool, list[Float], None]:
+            """Empty sample of a ray: ``aov`` samples rays besides rendering nested images, and discards them.
+
+            Raises ShadowmapError for all other integrators.
+            """
             if not self.nesting.allows():
                 raise ShadowmapError(
                     f"'{PLUGIN}' cannot be nested in integrators that sample single rays, such as moment: render it by itself, "
@@ -216,11 +235,11 @@ def register(old: str | None = None, new: str | None = None) -> None:
         mi.register_integrator(PLUGIN, _constructor(variant))
 
 
-def _constructor(variant: str) -> Callable[[Any], Any]:
+def _constructor(variant: str) -> Callable[[mi.Properties], mi.Integrator]:
     if variant.endswith(("_ad_rgb", "_ad_mono")):
         return make_class()
 
-    def refuse(props: Any) -> Any:
+    def refuse(props: mi.Properties) -> mi.Integrator:
         raise ShadowmapError(
             f"'{PLUGIN}' does not work with the variant {variant}: set one whose name ends in _ad_rgb or _ad_mono, "
             "for instance llvm_ad_rgb."

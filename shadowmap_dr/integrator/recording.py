@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import count
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -12,27 +11,30 @@ import mitsuba as mi
 from ..jit.arrays import own_memory
 from ..jit.frozen import Frozen
 from ..jit.pytree import attached_places, tree_map
+from ..jit.types import AnyArray, TensorXf
+from ..rendering.extended_lights import SoftFrusta
 from ..rendering.renderer import Renderer
+from ..shadow import Frusta
 from .deferred import backward, pass_on
 
 
 class FrozenPasses:
-    """The image of a renderer and the gradients of its data, each recorded.
+    """Two recordings: of a renderer's image, and of the gradients of its data.
 
-    Dr.Jit records anew where more than numbers has changed: sizes, types, settings, and how many objects there are in Mitsuba.
-    The backward pass renders again, since nothing that is computed in one recording can wait for the other.
+    Dr.Jit records anew when more than numbers has changed: sizes, types, settings, the number of objects in Mitsuba. The backward
+    pass renders again, since one recording cannot use the intermediate results of another.
     """
 
     def __init__(self) -> None:
         self._image, self._gradients = Frozen(_image), Frozen(_gradients)
 
-    def image(self, spp: int, renderer: Renderer) -> tuple[Any, Any, Any]:
-        """(detached image, fit of the shadow maps, of those of extended lights)."""
+    def image(self, spp: int, renderer: Renderer) -> tuple[TensorXf, Frusta | None, SoftFrusta]:
+        """(detached image, frusta of the shadow maps, frusta of extended lights' shadow maps)."""
         with dr.suspend_grad():
             return self._image(spp, plain(renderer))
 
-    def backward(self, spp: int, gradient: Any, renderer: Renderer) -> None:
-        """Add the gradients of <image, gradient> to all that the renderer's data are attached to."""
+    def backward(self, spp: int, gradient: TensorXf, renderer: Renderer) -> None:
+        """Add the gradients of <image, gradient> to everything that the renderer's data are attached to."""
         places, outer = attached_places(renderer.data)
         if not outer:
             return
@@ -44,22 +46,22 @@ class FrozenPasses:
         return self._image.n_recordings + self._gradients.n_recordings
 
 
-def _owned(gradient: Any) -> Any:
-    """The detached gradient, not in memory of NumPy's or PyTorch's, whose alignment a recording would be particular about."""
+def _owned(gradient: TensorXf) -> TensorXf:
+    """The detached gradient in Dr.Jit's own memory: a recording depends on the alignment of memory of NumPy or PyTorch."""
     return own_memory(gradient) if gradient.array.state == dr.VarState.Evaluated else dr.detach(gradient)
 
 
-def _image(spp: int, renderer: Renderer) -> tuple[Any, Any, Any]:
+def _image(spp: int, renderer: Renderer) -> tuple[TensorXf, Frusta | None, SoftFrusta]:
     image = renderer.render(spp=spp)
     return image, renderer.frusta, renderer.soft_frusta
 
 
-def _gradients(spp: int, places: tuple[int, ...], gradient: Any, renderer: Renderer) -> list[Any]:
+def _gradients(spp: int, places: tuple[int, ...], gradient: TensorXf, renderer: Renderer) -> list[AnyArray]:
     """Gradients of the arrays at some places of the renderer's data."""
-    leaves = []
+    leaves: list[AnyArray] = []
     place = count()
 
-    def attached(array: Any) -> Any:
+    def attached(array: AnyArray) -> AnyArray:
         if next(place) not in places:
             return array
         leaf = dr.detach(array) + 0
@@ -72,13 +74,13 @@ def _gradients(spp: int, places: tuple[int, ...], gradient: Any, renderer: Rende
 
 
 def plain(renderer: Renderer) -> Renderer:
-    """A renderer with detached data that differ in numbers only between cameras of one kind.
+    """A renderer with detached data, of which one recording serves all cameras of one kind.
 
-    All numbers lie in memory, since constants would be part of a recording, and so would that a camera's numbers are those of one
-    of the scene's.
+    All numbers are evaluated copies: a recording would include constants, and also the fact that a camera shares its arrays with
+    a sensor of the scene.
     """
     data = tree_map(renderer.data, dr.detach)
-    one = dr.opaque(mi.Float, 1)  # Dr.Jit would leave out a product with the constant
+    one = dr.opaque(mi.Float, 1)  # Dr.Jit optimises a product with the literal 1 away
     copies = tree_map(data.sensors, lambda array: array * one)
     data = replace(data, sensors=tuple(tuple(replace(camera, name="") for camera in cameras) for cameras in copies))
     renderer = replace(renderer, data=data)

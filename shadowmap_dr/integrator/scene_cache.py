@@ -1,10 +1,9 @@
-"""State that the plug-in keeps of a scene from one rendering to the next."""
+"""State of a scene that the plug-in keeps from one rendering to the next."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -12,11 +11,13 @@ import numpy as np
 
 from ..errors import ShadowmapError, warn
 from ..jit.gc import gc_paused
+from ..jit.types import AnyArray, Float, TensorXf, UInt32
 from ..rendering.extended_lights import SkyWatch, SoftFrusta, still_aimed
 from ..rendering.pass_cache import PassCache
 from ..rendering.renderer import Renderer
 from ..rendering.settings import RenderSettings
 from ..scene.changes import MirrorWatch, ParameterWatch
+from ..scene.geometry import NOT_READ
 from ..scene.lights.read import environments_of
 from ..scene.load import SceneData, load, refresh, with_positions
 from ..scene.mitsuba_objects import parameters
@@ -29,58 +30,60 @@ from .parameter_state import ParameterState
 from .pass_caches import PassCaches, names_by_level
 from .recording import FrozenPasses, plain
 
-# Sensors whose fit of the shadow maps is remembered, and how many of these may not be the scene's own: some make a new one for
-# each image, and all that are remembered are kept alive. How many objects there are is also a part of what recordings hold for.
+# Sensors whose fit of the shadow maps is remembered, and how many of them may be foreign to the scene. Some programs make a new
+# sensor for each image; remembered sensors are kept alive, and recordings hold only for a fixed number of objects.
 _REMEMBERED_SENSORS, _OTHERS = 64, 8
 
 
 @dataclass
 class SceneCache:
-    """State that stays the same between renderings of a scene.
+    """State of a scene that is kept between renderings.
 
     The scene itself is not kept: it may own the integrator that owns this record.
 
     parts     shapes, BSDFs and emitters of the scene; kept alive here, so that comparing them by identity is safe
-    statics   arrays that decided on the topology and on the shadow maps: faces, segments of curves, cutoff angles of spot lights
-    sizes     numbers of vertices and faces, of control points of each curve, and which buffers there are: ``ShapeSource.sizes``
+    statics   arrays that determine the topology and the shadow maps: faces, segments of curves, cutoff angles of spot lights
+    sizes     numbers of vertices, faces and control points, and flags for buffers: ``ShapeSource.sizes``
     lights    names of the lights
-    renderer  without what is re-read for each rendering
-    fits      (sensor, frusta of the shadow maps, of those of extended lights) of the last image that it took, latest first
+    renderer  the renderer, without the data that each rendering reads again
+    fits      (sensor, frusta of the shadow maps, frusta of extended lights' maps) of each sensor's last image, latest first
     waiting   images that wait for their backward passes
-    recorded  both passes, replayed if the plug-in's user wants it; ``recordable``: for names of attached parameters, whether
-              gradients flow through nothing but what is read from the scene
-    sky       where its environments shone
-    mirrors   which shapes were mirrored
+    recorded  recordings of both passes, for the option ``recorded``; ``recordable``: by names of attached parameters, whether
+              gradients flow only through data read from the scene
+    sky       watch over the directions of the environments' light
+    mirrors   watch over mirrored shapes
     checked   vertices that were found to be finite
-    warned    whether it was said what frozen functions of users do not see
-    untracked  what recordings do not see, and ``untracked_then`` its values when they were made
-    colours   of meshes, for which the renderer's creases were found
-    passes    results of passes for its sensors
-    matched   parameters with which the record was last found to be the scene's
+    warned    whether the user was warned of parameters that frozen functions do not see
+    untracked  state that recordings do not see; ``untracked_then``: its values when they were made
+    colours   watch over the mesh colours for which the renderer's creases were found
+    passes    caches of passes for its sensors
+    matched   parameters of the scene at the last successful match
     """
 
-    parts: tuple[Any, ...]
-    statics: tuple[Any, ...]
+    parts: tuple[mi.Object, ...]
+    statics: tuple[AnyArray, ...]
     sizes: tuple[int, ...]
     lights: tuple[str, ...]
     renderer: Renderer
-    fits: list[tuple[Any, Frusta | None, SoftFrusta]] = field(default_factory=list)
+    fits: list[tuple[mi.Sensor, Frusta | None, SoftFrusta]] = field(default_factory=list)
     waiting: DeferredImages = field(default_factory=DeferredImages)
     recorded: FrozenPasses = field(default_factory=FrozenPasses)
     recordable: dict[tuple[str, ...], bool] = field(default_factory=dict)
     untracked: UntrackedValues = field(default_factory=lambda: UntrackedValues(()))
-    untracked_then: tuple[Any, ...] = ()
+    untracked_then: tuple[object, ...] = ()
     colours: ParameterWatch | None = None
     sky: SkyWatch = field(default_factory=lambda: SkyWatch(()))
     mirrors: MirrorWatch = field(default_factory=lambda: MirrorWatch(()))
-    checked: Any = None
+    checked: Float | None = None
     warned: bool = False
     passes: PassCaches = field(default_factory=PassCaches)
     matched: ParameterState | None = None
 
     @classmethod
-    def build(cls, scene: Any, sensor: Any, settings: RenderSettings, tessellation: int, warn: bool = True) -> SceneCache:
-        """Read a scene. Raises ShadowmapError for what is broken; ``warn``: of what is left out."""
+    def build(
+        cls, scene: mi.Scene, sensor: mi.Sensor, settings: RenderSettings, tessellation: int, warn: bool = True
+    ) -> SceneCache:
+        """Read a scene. Raises ShadowmapError for broken parts; ``warn``: issue a warning about omitted parts."""
         if dr.flag(dr.JitFlag.FreezingScope):
             raise ShadowmapError("A scene cannot be read while a function is frozen: render it once with this integrator before.")
         # Of a scene of thousands of shapes so many objects are made that collections would take a tenth of the time.
@@ -96,11 +99,11 @@ class SceneCache:
         mirrors = MirrorWatch([shape for source in data.sources for shape in source.transformed()])
         return replace(record, sky=sky, mirrors=mirrors, untracked=untracked, colours=renderer.creases.watch(data.sources))
 
-    def matches(self, scene: Any, now: ParameterState) -> bool:
-        """True if the cached state still fits the scene, with its parameters as they are ``now``.
+    def matches(self, scene: mi.Scene, now: ParameterState) -> bool:
+        """True if the cached state still fits the scene. ``now``: the scene's current parameters.
 
-        Moved vertices and changed parameters do not invalidate it; a lamp that left the range of its maps does, and a sky that
-        shines from elsewhere.
+        Moved vertices and changed parameters do not invalidate it. A lamp that left the range of its maps does, and a sky whose
+        light comes from other directions.
         """
         data = self.renderer.data
         if not same_objects(self.parts, _parts(scene, data)):
@@ -112,7 +115,7 @@ class SceneCache:
             self.matched = now
         return fits
 
-    def _fits(self, scene: Any, data: SceneData) -> bool:
+    def _fits(self, scene: mi.Scene, data: SceneData) -> bool:
         """True if the cached state fits a scene of the same objects."""
         if self.sizes != _sizes(data):
             return False
@@ -126,15 +129,17 @@ class SceneCache:
             still = self.mirrors.same() and self.sky.same(environments_of(scene))
             return still and still_aimed(self.renderer.soft, lambda: with_positions(data))
 
-    def data(self, scene: Any, sensor: Any) -> SceneData:
-        """Records of the scene as it is now, with one sensor, attached to the scene's parameters."""
+    def data(self, scene: mi.Scene, sensor: mi.Sensor) -> SceneData:
+        """Records of the current scene with one sensor, attached to the scene's parameters."""
         return refresh(replace(self.renderer.data, scene=scene), sensors=(sensor,))
 
-    def render(self, scene: Any, sensor: Any, spp: int, now: ParameterState, inputs: DetachedInputs | None = None) -> Any:
+    def render(
+        self, scene: mi.Scene, sensor: mi.Sensor, spp: int, now: ParameterState, inputs: DetachedInputs | None = None
+    ) -> TensorXf:
         """Image (mi.TensorXf), attached to the scene's parameters unless gradients are suspended.
 
-        ``now``: these parameters. If ``inputs`` is given, the image is attached to these instead of the
-        vertices, lights and cameras.
+        ``now``: the scene's current parameters. ``inputs``: if given, the image is attached to these leaves instead of the
+        scene's vertices, lights and cameras.
         """
         self._name_constants_of_recordings()
         current = self._current(scene, sensor)
@@ -146,16 +151,16 @@ class SceneCache:
         self._remember(scene, sensor, current.frusta, current.soft_frusta)
         return image
 
-    def _passes(self, scene: Any, sensor: Any, spp: int, now: ParameterState) -> PassCache:
-        """Results of passes that hold for the next image."""
+    def _passes(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, now: ParameterState) -> PassCache:
+        """Cache of passes for the next image."""
         samples = int(np.prod(sensor.film().crop_size())) * spp
-        with dr.resume_grad():  # which parameters are attached
+        with dr.resume_grad():  # so that attached parameters are recognised
             camera = ParameterState.of(sensor)
         weight = samples + self.renderer.texels // TEXELS
         return self.passes.cache_for(now, camera, sensor, spp, weight, partial(names_by_level, scene, self.renderer.data))
 
-    def replay(self, scene: Any, sensor: Any, spp: int) -> Any:
-        """The same image, detached, recorded when it is first taken."""
+    def replay(self, scene: mi.Scene, sensor: mi.Sensor, spp: int) -> TensorXf:
+        """The same image, detached, replayed from a recording that the first call makes."""
         self._forget_stale_recordings()
         current = self._current(scene, sensor)
         self._check_vertices(current)
@@ -164,11 +169,11 @@ class SceneCache:
         self._remember(scene, sensor, frusta, soft_frusta)
         return image
 
-    def replay_backward(self, scene: Any, sensor: Any, spp: int, gradient: Any) -> bool:
-        """Add the gradients of <image, gradient> to the scene's parameters, recorded, too.
+    def replay_backward(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, gradient: TensorXf) -> bool:
+        """Add the gradients of <image, gradient> to the scene's parameters, through a recording, too.
 
-        False, and nothing done, if they flow through more than what is read from the scene: materials, textures and the radiance
-        of extended lights are evaluated by Mitsuba itself.
+        Does nothing and returns False if gradients also flow through materials, textures or the radiance of extended lights,
+        which Mitsuba itself evaluates.
         """
         current = self._current(scene, sensor)
         attached = (*ParameterState.of(scene).attached, *ParameterState.of(sensor).attached)
@@ -180,7 +185,7 @@ class SceneCache:
         return self.recordable[attached]
 
     def _name_constants_of_recordings(self) -> None:
-        """Warn, once, of parameters that a frozen function of the user's takes for constants: Dr.Jit does not ask for them."""
+        """Warn, once, of parameters that the user's frozen function takes for constants, since Dr.Jit does not see them."""
         if self.warned or not dr.flag(dr.JitFlag.FreezingScope) or not self.untracked.names():
             return
         self.warned = True
@@ -193,16 +198,16 @@ class SceneCache:
         )
 
     def _forget_stale_recordings(self) -> None:
-        """Recordings hold for the values of materials and lights that they do not see."""
+        """Drop the recordings if values of materials or lights that they do not see have changed."""
         now = self.untracked.now()
         if now != self.untracked_then:
             self.recorded, self.untracked_then = FrozenPasses(), now
 
-    def _current(self, scene: Any, sensor: Any) -> Renderer:
-        """The renderer for the scene as it is now.
+    def _current(self, scene: mi.Scene, sensor: mi.Sensor) -> Renderer:
+        """The renderer for the current scene.
 
-        Each sensor goes on from its own fit. Fitting it again to the same vertices and lights keeps it bit by bit, so the
-        derivatives of a step see the frusta of its image, whatever other sensors have taken in between.
+        Each sensor starts from its own last fit. Fitting again to the same vertices and lights changes no bit, so the backward
+        pass uses the frusta of its image, whatever other sensors have rendered in between.
         """
         if not (dr.flag(dr.JitFlag.FreezingScope) or self.colours is None or self.colours.same()):
             self.renderer = self.renderer.with_updated_shading_edges()
@@ -213,12 +218,13 @@ class SceneCache:
         return replace(kept, data=self.data(scene, sensor), frusta=frusta, soft_frusta=soft_frusta)
 
     def _check_vertices(self, current: Renderer) -> None:
-        """Raise ShadowmapError for vertices that are not finite: triangles would be gone, and their derivatives with them."""
+        """Raise ShadowmapError for vertices that are not finite: their triangles would vanish without a word."""
         geometry = current.data.geometry
         positions = dr.detach(geometry.positions)
         if dr.flag(dr.JitFlag.FreezingScope) or (self.checked is not None and positions.index == self.checked.index):
             return
-        if not dr.all(dr.isfinite(positions)):
+        finite = dr.isfinite(positions)
+        if not dr.all(finite):
             points = positions.numpy().reshape(-1, 3)
             vertex = int(np.flatnonzero(~np.isfinite(points).all(1))[0])
             info = geometry.shapes[int(geometry.vertex_shape[vertex])]
@@ -226,8 +232,8 @@ class SceneCache:
             raise ShadowmapError(f"{where}: positions must be finite.")
         self.checked = positions
 
-    def _remember(self, scene: Any, sensor: Any, frusta: Frusta | None, soft_frusta: SoftFrusta) -> None:
-        """Keep the fit of an image for the next one of this sensor, and warn of lenses when it is seen first."""
+    def _remember(self, scene: mi.Scene, sensor: mi.Sensor, frusta: Frusta | None, soft_frusta: SoftFrusta) -> None:
+        """Keep the fit of an image for the sensor's next image, and warn of the lens of a new sensor foreign to the scene."""
         others = [fit for fit in self.fits if fit[0] is not sensor]
         if len(others) == len(self.fits) and not any(sensor is known for known in scene.sensors()):
             warn_of(lenses_of(sensor))
@@ -240,15 +246,15 @@ class SceneCache:
         self.fits = kept[:_REMEMBERED_SENSORS]
 
 
-def _parts(scene: Any, data: SceneData) -> tuple[Any, ...]:
+def _parts(scene: mi.Scene, data: SceneData) -> tuple[mi.Object, ...]:
     return (*scene.shapes(), *scene.emitters(), *_bsdfs(data))
 
 
-def _bsdfs(data: SceneData) -> list[Any]:
+def _bsdfs(data: SceneData) -> list[mi.BSDF]:
     return [source.shape.bsdf() for source in data.sources]
 
 
-def _statics(scene: Any, data: SceneData) -> tuple[Any, ...]:
+def _statics(scene: mi.Scene, data: SceneData) -> tuple[Float | UInt32, ...]:
     topology = [array for source in data.sources for array in source.statics()]
     cones = [e for e in scene.emitters() if e.class_name() == "SpotLight"]
     return (*topology, *(dr.detach(mi.Float(parameters(cone)["cutoff_angle"])) for cone in cones))
@@ -259,17 +265,17 @@ def _sizes(data: SceneData) -> tuple[int, ...]:
 
 
 def _without_scene(data: SceneData) -> SceneData:
-    """Drop what ``refresh`` reads again."""
-    geometry = replace(data.geometry, positions=None, normals=None, texcoords=None, rest_positions=None)
+    """Drop the data that ``refresh`` reads again."""
+    geometry = replace(data.geometry, positions=NOT_READ, normals=NOT_READ, texcoords=NOT_READ, rest_positions=NOT_READ)
     return replace(data, scene=None, geometry=geometry, sensors=(), lights=(), areas=(), environments=())
 
 
-def same_objects(first: tuple[Any, ...], second: tuple[Any, ...]) -> bool:
+def same_objects(first: tuple[object, ...], second: tuple[object, ...]) -> bool:
     return len(first) == len(second) and all(a is b for a, b in zip(first, second, strict=True))
 
 
-def _same_arrays(first: tuple[Any, ...], second: tuple[Any, ...]) -> bool:
-    """Equality of arrays that are read back only if they are not the very same."""
+def _same_arrays(first: tuple[AnyArray, ...], second: tuple[AnyArray, ...]) -> bool:
+    """Equality of arrays, which are read back only if they are different variables."""
     if len(first) != len(second):
         return False
     for a, b in zip(first, second, strict=True):

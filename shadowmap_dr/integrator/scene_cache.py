@@ -97,7 +97,8 @@ class SceneCache:
         lights = tuple(light.name for light in data.lights) if settings.lit else ()
         record = cls(_parts(scene, data), _statics(scene, data), _sizes(data), lights, renderer.with_data(_without_scene(data)))
         mirrors = MirrorWatch([shape for source in data.sources for shape in source.transformed()])
-        return replace(record, sky=sky, mirrors=mirrors, untracked=untracked, colours=renderer.creases.watch(data.sources))
+        colours = None if renderer.creases is None else renderer.creases.watch(data.sources)
+        return replace(record, sky=sky, mirrors=mirrors, untracked=untracked, colours=colours)
 
     def matches(self, scene: mi.Scene, now: ParameterState) -> bool:
         """True if the cached state still fits the scene. ``now``: the scene's current parameters.
@@ -218,7 +219,7 @@ class SceneCache:
         return replace(kept, data=self.data(scene, sensor), frusta=frusta, soft_frusta=soft_frusta)
 
     def _check_vertices(self, current: Renderer) -> None:
-        """Raise ShadowmapError for vertices that are not finite: their triangles would vanish without a word."""
+        """Raise ShadowmapError for vertices that are not finite: their triangles and derivatives would silently vanish."""
         geometry = current.data.geometry
         positions = dr.detach(geometry.positions)
         if dr.flag(dr.JitFlag.FreezingScope) or (self.checked is not None and positions.index == self.checked.index):

@@ -1,8 +1,8 @@
 """The crossing between PyTorch's autograd and Dr.Jit's.
 
-Dr.Jit's own ``drjit.wrap`` shares memory with both sides and has no graph left after a backward pass: an optimiser that moves its
-parameters between the two passes, or a second backward pass, gets wrong gradients without a word. Here nothing is shared, and
-each backward pass makes a graph of its own.
+Dr.Jit's own ``drjit.wrap`` shares memory with both sides, and a backward pass frees its graph: an optimiser that changes
+parameters between the two passes, or a second backward pass, silently gets wrong gradients. Here no memory is shared, and each
+backward pass builds its own graph.
 """
 
 from __future__ import annotations
@@ -11,63 +11,67 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import ModuleType
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import drjit as dr
 import torch
 
 from ..jit.arrays import backend
+from ..jit.types import AnyArray, ArrayT, Float, TensorXf, UInt32, Vector3f
 from .checks import backend_of
+
+#: Takes the place of an array in a record whose values a PyTorch tensor holds.
+IN_TENSOR: Any = None  # Any: arrays of several types
 
 # Held by the thread in which Dr.Jit works.
 _TURN = threading.RLock()
 
 
 class Operation(Protocol):
-    """Something that Dr.Jit computes from float tensors, and its derivatives. An object is good for one call."""
+    """A differentiable function of float tensors that Dr.Jit evaluates. An object serves one call."""
 
-    def forward(self, arrays: list[Any], wanted: list[bool]) -> Sequence[Any]:
-        """Results (Dr.Jit tensors) for Dr.Jit tensors. ``wanted`` tells which of these need gradients; maybe none."""
+    def forward(self, arrays: list[TensorXf], wanted: list[bool]) -> Sequence[TensorXf]:
+        """Results (Dr.Jit tensors) for Dr.Jit tensors. ``wanted``: whether each of these needs gradients; maybe none does."""
 
-    def backward(self, adjoints: Sequence[Any]) -> Sequence[Any]:
-        """Gradients to the arrays (of those that are not wanted: anything) from those to the results (None: zero)."""
+    def backward(self, adjoints: Sequence[TensorXf | None]) -> Sequence[TensorXf]:
+        """Gradients to the arrays, arbitrary for arrays that need none. ``adjoints``: gradients to the results, None for zero."""
 
 
 class Repeated:
     """A differentiable Dr.Jit function, which is evaluated once more for its derivatives.
 
-    No graph is kept in between: one that is dropped, or that is to serve for another backward pass, Dr.Jit 1.5 never frees.
+    No graph is kept in between: Dr.Jit 1.5 never frees a graph that is dropped or that must serve several backward passes.
     """
 
-    def __init__(self, function: Callable[..., Sequence[Any]]) -> None:
+    def __init__(self, function: Callable[..., Sequence[TensorXf]]) -> None:
         self.function = function
 
-    def forward(self, arrays: list[Any], wanted: list[bool]) -> Sequence[Any]:
+    def forward(self, arrays: list[TensorXf], wanted: list[bool]) -> Sequence[TensorXf]:
         self.arrays, self.wanted = arrays, wanted
         with dr.suspend_grad():
             return self.function(*arrays)
 
-    def backward(self, adjoints: Sequence[Any]) -> Sequence[Any]:
+    def backward(self, adjoints: Sequence[TensorXf | None]) -> Sequence[TensorXf]:
         with dr.resume_grad():
             arrays = attached(self.arrays, self.wanted)
             return gradients(arrays, self.function(*arrays), adjoints)
 
 
-def attached(arrays: Sequence[Any], wanted: Sequence[bool]) -> list[Any]:
-    """The same arrays, with gradients where they are wanted."""
-    copies = [type(array)(array) for array in arrays]
+def attached(arrays: Sequence[ArrayT], wanted: Sequence[bool]) -> list[ArrayT]:
+    """Copies of arrays, with gradients where they are wanted."""
+    copies = [_copy(array) for array in arrays]
     dr.enable_grad([copy for copy, want in zip(copies, wanted, strict=True) if want])
     return copies
 
 
-def gradients(arrays: Sequence[Any], results: Sequence[Any], adjoints: Sequence[Any]) -> list[Any]:
-    """Gradients of the sum of <result, adjoint> to attached arrays. Ends the graph."""
+def gradients(arrays: Sequence[ArrayT], results: Sequence[TensorXf], adjoints: Sequence[TensorXf | None]) -> list[ArrayT]:
+    """Gradients of the sum of <result, adjoint> to attached arrays. Frees the graph."""
     starts = [r for r, a in zip(results, adjoints, strict=True) if a is not None and dr.grad_enabled(r)]
     for result, adjoint in zip(results, adjoints, strict=True):
         if adjoint is not None and dr.grad_enabled(result):
             dr.accum_grad(result, adjoint)
     dr.enqueue(dr.ADMode.Backward, starts)
-    # Not the results' gradients: a result may be an array that was passed through.
+    # Gradients of the graph's ends stay: a result may be one of the arrays itself.
     dr.traverse(dr.ADMode.Backward, dr.ADFlag.ClearInterior | dr.ADFlag.ClearEdges)
     found = [dr.grad(array) for array in arrays]
     dr.eval(found)
@@ -75,19 +79,19 @@ def gradients(arrays: Sequence[Any], results: Sequence[Any], adjoints: Sequence[
 
 
 def cross(operation: Operation, *tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    """Results of an operation on (checked) float32 tensors of one device, at least one, as part of PyTorch's graph."""
+    """Results of an operation as part of PyTorch's graph. ``tensors``: at least one; checked, float32, on one device."""
     return _Crossing.apply(operation, torch.is_grad_enabled(), *tensors)
 
 
-def to_drjit(tensor: torch.Tensor) -> Any:
+def to_drjit(tensor: torch.Tensor) -> Any:  # Any: TensorXf or TensorXi, as the tensor's type
     """A Dr.Jit tensor with memory of its own, float32 or int32."""
-    # Copied by PyTorch, and shared with the copy: that nobody else knows.
+    # The memory of PyTorch's copy is shared: nobody else has this copy.
     copy = tensor.detach().clone(memory_format=torch.contiguous_format)
     module = backend_of(tensor.device)
     return (module.TensorXf if tensor.dtype == torch.float32 else module.TensorXi)(copy)
 
 
-def index_array(indices: torch.Tensor) -> Any:
+def index_array(indices: torch.Tensor) -> UInt32:
     """(Checked) indices as a flat ``UInt32`` array."""
     with drjit_turn(indices.device) as module:
         array = to_drjit(indices.to(torch.int32)).array
@@ -96,42 +100,46 @@ def index_array(indices: torch.Tensor) -> Any:
     return result
 
 
-def number(flat: Any, index: Any) -> Any:
-    """Numbers of a small array, none of them twice."""
+def number(flat: Float, index: UInt32 | int) -> Float:
+    """Numbers of a small array. ``index``: no number twice."""
     return _gathered(backend(flat).Float, flat, index)
 
 
-def vector(flat: Any, index: Any) -> Any:
-    """Vectors (``Array3f``) of a small array of interleaved ones, none of them twice."""
+def vector(flat: Float, index: UInt32 | int) -> Vector3f:
+    """Vectors (``Array3f``) of a small array of interleaved components. ``index``: no vector twice."""
     return _gathered(backend(flat).Array3f, flat, index)
 
 
-def _gathered(kind: Any, flat: Any, index: Any) -> Any:
-    # Said to have no conflicts: the adjoints that Dr.Jit 1.5 chooses by itself for small arrays lose the first of several numbers
-    # whose gradients are sums of the same kind themselves.
+def _gathered(kind: type[ArrayT], flat: Float, index: UInt32 | int) -> ArrayT:
+    # ``NoConflicts``, since the adjoint that Dr.Jit 1.5 chooses for small arrays loses the first of several numbers if their
+    # incoming gradients are sums of the same kind.
     return dr.gather(kind, flat, backend(flat).UInt32(index), mode=dr.ReduceMode.NoConflicts)
 
 
-def to_torch(array: Any) -> torch.Tensor:
-    """A PyTorch tensor with the values of a Dr.Jit tensor, in memory of its own. Only where it is the thread's turn: it waits."""
-    return dr.detach(array).torch().clone()
+def to_torch(array: AnyArray) -> torch.Tensor:
+    """A PyTorch tensor with the values of a Dr.Jit tensor, in memory of its own. Call it in :func:`drjit_turn`: it waits."""
+    return cast(torch.Tensor, dr.detach(array).torch()).clone()
+
+
+def _copy(array: ArrayT) -> ArrayT:
+    copy: Callable[[ArrayT], ArrayT] = type(array)
+    return copy(array)
 
 
 @contextmanager
 def drjit_turn(device: torch.device) -> Iterator[ModuleType]:
-    """Let Dr.Jit work: on what PyTorch has finished, and finishing before PyTorch goes on. Yields the module of its types.
+    """Context in which one thread uses Dr.Jit, synchronised with PyTorch at both ends. Yields the module of Dr.Jit's types.
 
-    Whatever may wait for Dr.Jit belongs inside, reading an array back included. Threads help Dr.Jit while they wait, and sums
-    lose terms where two of them do (Dr.Jit 1.5, ``docs/dr-jit-faults/shared_sums.py``).
+    All calls that may wait for Dr.Jit belong inside, including reading an array back. Waiting threads help Dr.Jit, and sums lose
+    terms if two threads do so at once (Dr.Jit 1.5, ``docs/dr-jit-faults/shared_sums.py``).
 
-    Also keeps alive what is made inside until it is no longer read: arrays that share memory with PyTorch must not be dropped
-    before the end of this context.
+    The end of the context waits for all kernels: arrays that share memory with PyTorch must live until then.
     """
     module = backend_of(device)
     if device.type == "cuda":
         torch.cuda.current_stream(device).synchronize()
-    # Dr.Jit orders what it traces by scopes, which count up across threads. So one thread at a time, each in scopes of its own:
-    # PyTorch may call from another one than before.
+    # Dr.Jit orders traced operations by scopes, which it numbers across threads. PyTorch may call from several threads, so one
+    # thread works at a time, in scopes of its own.
     with _TURN:
         dr.detail.new_scope(dr.backend_v(module.Float))
         try:
@@ -143,7 +151,12 @@ def drjit_turn(device: torch.device) -> Iterator[ModuleType]:
 
 class _Crossing(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, operation: Operation, record: bool, *tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    def forward(
+        ctx: Any,  # Any: PyTorch's stubs lack the attributes of a context
+        operation: Operation,
+        record: bool,
+        *tensors: torch.Tensor,
+    ) -> tuple[torch.Tensor, ...]:
         wanted = [record and needed for needed in ctx.needs_input_grad[2:]]
         with drjit_turn(tensors[0].device):
             arrays = [to_drjit(tensor) for tensor in tensors]
@@ -156,7 +169,10 @@ class _Crossing(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *adjoints: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
+    def backward(
+        ctx: Any,  # Any: PyTorch's stubs lack the attributes of a context
+        *adjoints: torch.Tensor | None,
+    ) -> tuple[torch.Tensor | None, ...]:
         with drjit_turn(ctx.device):
             arrays = [None if adjoint is None else to_drjit(adjoint) for adjoint in adjoints]
             found = ctx.operation.backward(arrays)

@@ -1,15 +1,17 @@
-"""Checks of tensors: every mistake is one line that names the tensor and says what to do."""
+"""Checks of tensors. Every error message is one line that names the tensor and tells how to fix it."""
 
 from __future__ import annotations
 
 from numbers import Integral, Real
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeVar
 
 import drjit as dr
 import torch
 
 from ..errors import ShadowmapError
+
+_NumberT = TypeVar("_NumberT", int, float)
 
 _INTEGERS = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
 
@@ -19,10 +21,10 @@ def backend_of(device: torch.device) -> ModuleType:
     return dr.llvm.ad if device.type == "cpu" else dr.cuda.ad
 
 
-def check_floats(name: str, tensor: Any, *shapes: tuple[int | str, ...]) -> None:
-    """Refuse what is no strided float32 tensor of one of the shapes.
+def check_floats(name: str, tensor: torch.Tensor, *shapes: tuple[int | str, ...]) -> None:
+    """Raise ShadowmapError unless ``tensor`` is a strided float32 tensor of one of the shapes.
 
-    Shapes are tuples of sizes and of names for sizes of any (positive) number; "..." at the start for any leading ones.
+    Shapes are tuples of sizes; a name stands for any positive size, "..." at the start for any leading sizes.
     """
     _check_tensor(name, tensor)
     if tensor.dtype != torch.float32:
@@ -33,8 +35,8 @@ def check_floats(name: str, tensor: Any, *shapes: tuple[int | str, ...]) -> None
         raise ShadowmapError(f"{name}: shape {tuple(tensor.shape)} holds no numbers.")
 
 
-def check_indices(name: str, tensor: Any, count: int, what: str = "vertices") -> None:
-    """Refuse what is no integer tensor (F, 3), F > 0, with indices from 0 to ``count - 1``. Reads them all."""
+def check_indices(name: str, tensor: torch.Tensor, count: int, what: str = "vertices") -> None:
+    """Raise ShadowmapError unless ``tensor`` is integer (F, 3), F > 0, with indices from 0 to ``count - 1``. Reads them all."""
     _check_tensor(name, tensor)
     if tensor.dtype not in _INTEGERS:
         raise ShadowmapError(f"{name}: {tensor.dtype}, but must be integers; convert with .int().")
@@ -46,7 +48,7 @@ def check_indices(name: str, tensor: Any, count: int, what: str = "vertices") ->
 
 
 def check_devices(**tensors: torch.Tensor) -> torch.device:
-    """The device that all (checked) tensors lie on; names are those of arguments."""
+    """The common device of (checked) tensors. Raises ShadowmapError, with the arguments' names, if they have several."""
     (first, tensor), *others = tensors.items()
     for name, other in others:
         if other.device != tensor.device:
@@ -54,27 +56,28 @@ def check_devices(**tensors: torch.Tensor) -> torch.device:
     return tensor.device
 
 
-def check_kind(name: str, value: Any, *kinds: type) -> None:
-    """Refuse objects of other kinds than these."""
+def check_kind(name: str, value: object, *kinds: type) -> None:
+    """Raise ShadowmapError unless ``value`` is an instance of one of the types."""
     if not isinstance(value, kinds):
         wanted = " or ".join(kind.__name__ for kind in kinds)
         raise ShadowmapError(f"{name}: {type(value).__name__}, but must be {wanted}.")
 
 
-def number_of(name: str, value: Any, kind: type[int] | type[float]) -> Any:
-    """A number, NumPy's too, as an int (of a whole one) or a float. Refuses all else."""
+def number_of(name: str, value: object, kind: type[_NumberT]) -> _NumberT:
+    """A number, of Python or NumPy, as an int or a float. Raises ShadowmapError for other objects and for fractions as ints."""
     if not isinstance(value, Integral if kind is int else Real) or isinstance(value, bool):
         raise ShadowmapError(f"{name}: {type(value).__name__}, but must be {kind.__name__}.")
-    return kind(value)
+    number: Any = value  # Any: int() takes no Real in the stubs
+    return kind(number)
 
 
-def check_same(what: str, given: Any, expected: Any, hint: str) -> None:
-    """Refuse sizes that contradict each other."""
+def check_same(what: str, given: object, expected: object, hint: str) -> None:
+    """Raise ShadowmapError unless two sizes are equal."""
     if given != expected:
         raise ShadowmapError(f"{what}: {given} instead of {expected}; {hint}.")
 
 
-def _check_tensor(name: str, tensor: Any) -> None:
+def _check_tensor(name: str, tensor: object) -> None:
     if not isinstance(tensor, torch.Tensor):
         raise ShadowmapError(f"{name}: {type(tensor).__name__}, but must be a torch.Tensor.")
     if tensor.layout != torch.strided:

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import drjit as dr
 import torch
 
 from .. import raster as _raster
 from ..errors import ShadowmapError
+from ..jit.types import TensorXf
 from ..raster import RasterOutput
 from ..raster.rasterize import check_resolution
-from .bridge import Repeated, cross, drjit_turn, index_array, to_torch
+from .bridge import IN_TENSOR, Repeated, cross, drjit_turn, index_array, to_torch
 from .checks import check_devices, check_floats, check_indices, check_kind, check_same
 
 
@@ -21,12 +21,12 @@ class Raster:
     """Triangles that the pixels of B images see.
 
     Attributes:
-        triangle: int32 (B, H, W), index of the visible triangle, -1 where there is none.
+        triangle: int32 (B, H, W), index of the visible triangle, -1 for none.
         u, v: float32 (B, H, W), perspective-correct weights of the triangle's vertices 1 and 2 (vertex 0 has ``1 - u - v``).
         depth: float32 (B, H, W), ``z / w`` in clip space, 1 (the far plane) where nothing is seen.
 
-    ``u``, ``v`` and ``depth`` are attached to the positions, for a fixed visible triangle; that another one becomes visible is
-    the business of :func:`antialias`. To be read only: the other functions know the triangles from elsewhere.
+    ``u``, ``v`` and ``depth`` are attached to the positions, for a fixed visible triangle; :func:`antialias` differentiates
+    changes of visibility. Read only: the other functions ignore a changed ``triangle``.
     """
 
     triangle: torch.Tensor
@@ -43,7 +43,7 @@ class Raster:
 
 @dataclass(frozen=True)
 class Topology:
-    """Edges of a mesh, from :func:`build_topology`. Constant for as long as its faces are.
+    """Edges of a mesh, from :func:`build_topology`. Valid as long as the faces stay the same.
 
     Attributes:
         faces: int32 (F, 3), vertex indices.
@@ -76,7 +76,7 @@ def rasterize(positions: torch.Tensor, faces: torch.Tensor, resolution: tuple[in
     indices = index_array(faces)
     kept: list[RasterOutput] = []
 
-    def run(positions: Any) -> tuple[Any, ...]:
+    def run(positions: TensorXf) -> tuple[TensorXf, ...]:
         output = _raster.rasterize(positions, indices, size, check_indices=False)
         kept.append(output)
         shape = (output.batch, output.height, output.width)
@@ -84,8 +84,8 @@ def rasterize(positions: torch.Tensor, faces: torch.Tensor, resolution: tuple[in
 
     u, v, depth = cross(Repeated(run), positions)
     with drjit_turn(device) as module:
-        # What the pixels see by itself: the rest is in the tensors.
-        found = dr.detach(replace(kept[0], u=None, v=None, depth=None, w=None))
+        # Only the visible triangles: tensors hold the rest.
+        found = dr.detach(replace(kept[0], u=IN_TENSOR, v=IN_TENSOR, depth=IN_TENSOR, w=IN_TENSOR))
         triangle = to_torch(module.TensorXi(module.Int32(found.triangle), u.shape))
     return Raster(triangle, u, v, depth, found)
 
@@ -96,8 +96,8 @@ def interpolate(attributes: torch.Tensor, raster: Raster, faces: torch.Tensor) -
     Args:
         attributes: float32 (V, C), the same for all images, or (B, V, C).
         raster: from :func:`rasterize`.
-        faces: integers (F, 3), indices into ``attributes``: those that were rasterized, or others for the same triangles (such as
-            those of texture coordinates).
+        faces: integers (F, 3), indices into ``attributes``: the faces that were rasterized, or other indices for the same
+            triangles (such as those of texture coordinates).
 
     Returns:
         float32 (B, H, W, C), 0 where nothing is seen. Attached to ``attributes`` and, through ``raster.u`` and ``raster.v``, to
@@ -114,7 +114,7 @@ def interpolate(attributes: torch.Tensor, raster: Raster, faces: torch.Tensor) -
     check_devices(attributes=attributes, faces=faces, raster=raster.triangle, u=raster.u, v=raster.v)
     indices = index_array(faces)
 
-    def run(attributes: Any, u: Any, v: Any) -> tuple[Any, ...]:
+    def run(attributes: TensorXf, u: TensorXf, v: TensorXf) -> tuple[TensorXf, ...]:
         result = _raster.interpolate(attributes, replace(found, u=u.array, v=v.array), indices, check_indices=False)
         return (type(result)(result.array, (*shape, result.shape[-1])),)
 
@@ -126,7 +126,7 @@ def build_topology(faces: torch.Tensor, positions: torch.Tensor) -> Topology:
 
     Args:
         faces: integers (F, 3), vertex indices.
-        positions: float32 (V, 3), vertices. Those at the same place count as one: seams of texture coordinates or normals
+        positions: float32 (V, 3), vertices. Vertices at the same place count as one: seams of texture coordinates or normals
             duplicate vertices, but are no boundaries of the surface.
     """
     check_floats("positions", positions, ("V", 3))
@@ -139,7 +139,7 @@ def build_topology(faces: torch.Tensor, positions: torch.Tensor) -> Topology:
 
 
 def antialias(image: torch.Tensor, raster: Raster, positions: torch.Tensor, topology: Topology) -> torch.Tensor:
-    """Blend pixels along silhouettes by the share that each side covers, which is what makes silhouettes differentiable.
+    """Blend pixels along silhouettes by the share that each side covers, so that silhouettes are differentiable.
 
     See :func:`shadowmap_dr.raster.antialias`.
 
@@ -150,7 +150,7 @@ def antialias(image: torch.Tensor, raster: Raster, positions: torch.Tensor, topo
         topology: of the mesh that was rasterized.
 
     Returns:
-        float32 (B, H, W, C), attached to ``image`` and, through the places of silhouettes, to ``positions``.
+        float32 (B, H, W, C), attached to ``image`` and, through the silhouettes, to ``positions``.
     """
     check_kind("raster", raster, Raster)
     check_kind("topology", topology, Topology)
@@ -162,7 +162,7 @@ def antialias(image: torch.Tensor, raster: Raster, positions: torch.Tensor, topo
     check_same("faces of topology", len(topology.faces), found.face_count, "give that of the mesh that was rasterized")
     check_devices(image=image, raster=raster.triangle, positions=positions, topology=topology.faces)
 
-    def run(image: Any, positions: Any) -> tuple[Any, ...]:
+    def run(image: TensorXf, positions: TensorXf) -> tuple[TensorXf, ...]:
         return (_raster.antialias(image, found, positions, topology._edges),)
 
     return cross(Repeated(run), image, positions)[0]

@@ -15,33 +15,34 @@ import torch
 from ..errors import ShadowmapError
 from ..jit.frozen import Frozen
 from ..jit.pytree import tree_map
-from ..rendering.extended_lights import SkyWatch, still_aimed
+from ..jit.types import TensorXf
+from ..rendering.extended_lights import SkyWatch, SoftFrusta, still_aimed
 from ..rendering.renderer import Renderer as _Renderer
+from ..shadow import Frusta
 from .bridge import attached, cross, drjit_turn, gradients, number, to_torch
 from .checks import check_devices, check_floats, check_kind, number_of
 
 
 class Renderer:
-    """Renders one Mitsuba scene again and again, with vertices, lights and other parameters from tensors.
+    """Differentiable renderer of one Mitsuba scene, with vertices, lights and other parameters from tensors.
 
     Works in the variants ``llvm_ad_rgb`` and ``llvm_ad_mono`` on CPU tensors, in ``cuda_ad_rgb`` and ``cuda_ad_mono`` on CUDA
-    ones.
+    tensors.
 
-    Derivatives see the scene as it is at the time of the backward pass: what is no tensor here (Mitsuba's own parameters) must
-    not be changed between the two passes.
+    The backward pass reads the scene again: Mitsuba's own parameters must not change between the two passes.
     """
 
     def __init__(self, renderer: _Renderer, *, frozen: bool = False) -> None:
         """Wrap a :class:`shadowmap_dr.Renderer`.
 
         Args:
-            renderer: its shadow maps' fit is carried on here; the object itself stays as it is.
-            frozen: record what the passes do (``dr.freeze``) and replay it while only numbers change, which is several times as
-                fast for small images. Calls with ``parameters`` are never recorded.
+            renderer: the renderer. Its current fit of the shadow maps is the start; the object itself is not changed.
+            frozen: record the passes (``dr.freeze``) and replay them while only numbers change, which is several times as fast
+                for small images. Calls with ``parameters`` are never recorded.
         """
         check_kind("renderer", renderer, _Renderer)
         self._renderer = replace(renderer)
-        # What calls with parameters take over from each other: extended lights as they have been divided, and where skies shone.
+        # State that calls with parameters pass on: the division of extended lights, and the directions of environments' light.
         self._planned: dict[str, Any] = {}
         self._variant = mi.variant()
         self._device = _device_of(self._variant)
@@ -50,7 +51,13 @@ class Renderer:
         self._frozen = (Frozen(_forward), Frozen(_backward)) if frozen else None
 
     @classmethod
-    def from_scene(cls, scene: Any, *, frozen: bool = False, **settings: Any) -> Renderer:
+    def from_scene(
+        cls,
+        scene: mi.Scene,
+        *,
+        frozen: bool = False,
+        **settings: Any,  # Any: settings of several types
+    ) -> Renderer:
         """Build a renderer for a ``mi.Scene``. ``settings`` are those of :meth:`shadowmap_dr.Renderer.from_scene`."""
         with drjit_turn(_device_of(mi.variant() or "")):
             renderer = _Renderer.from_scene(scene, **settings)
@@ -87,8 +94,8 @@ class Renderer:
                 ``direction``, ``position`` (3,), ``irradiance``, ``intensity`` (3,) or (1,) as the variant has colours,
                 ``to_world`` (4, 4), ``cutoff_angle``, ``beam_width`` (1,), in degrees.
             parameters: by Mitsuba's names (``mi.traverse(scene)``), new values of anything else: textures (H, W, C) in linear
-                colour, colours, ``to_world`` (4, 4) of cameras. Set in the scene for the time of the call only. All else is
-                read from the scene as it is now, too; and each call loads textures anew.
+                colour, colours, ``to_world`` (4, 4) of cameras. They are set in the scene during the call only. Such a call reads
+                all other parameters from the scene, too, and loads textures anew.
             sensor: number of the scene's sensor.
             spp: samples per pixel, see :meth:`shadowmap_dr.Renderer.render`.
 
@@ -102,12 +109,14 @@ class Renderer:
             check_kind(name, {} if value is None else value, Mapping)
         for name, value in (lights or {}).items():
             check_kind(f"lights['{name}']", value, Mapping)
-        sensor, spp = number_of("sensor", sensor, int), number_of("spp", spp, float)
+        sensor, samples = number_of("sensor", sensor, int), number_of("spp", spp, float)
         given = self._inputs(vertex_positions, lights, parameters)
-        if not 0 <= sensor < len(self._renderer.data.sensors) or not 1 <= spp < math.inf:
+        if not 0 <= sensor < len(self._renderer.data.sensors) or not 1 <= samples < math.inf:
             count = len(self._renderer.data.sensors)
-            raise ShadowmapError(f"sensor {sensor}, spp {spp:g}: there are {count} sensors, counted from 0; spp is 1 or more.")
-        operation = _Rendering(self, tuple(given), sensor, spp)
+            raise ShadowmapError(
+                f"sensor {sensor}, spp {samples:g}: there are {count} sensors, counted from 0; spp is 1 or more."
+            )
+        operation = _Rendering(self, tuple(given), sensor, math.ceil(samples))
         if given:
             return cross(operation, *given.values())[0]
         with drjit_turn(self._device):
@@ -120,7 +129,7 @@ class Renderer:
         lights: Mapping[str, Mapping[str, torch.Tensor]] | None,
         parameters: Mapping[str, torch.Tensor] | None,
     ) -> dict[_Place, torch.Tensor]:
-        """All tensors, checked, by what they are for."""
+        """All tensors, checked, by their purpose."""
         if mi.variant() != self._variant:
             raise ShadowmapError(f"The variant is {mi.variant()}, but this renderer was made for {self._variant}: set that one.")
         given: dict[_Place, torch.Tensor] = {}
@@ -175,17 +184,17 @@ class _Rendering:
         self.changes_scene = any(place.kind == "parameter" for place in places)
         self.functions = (_forward, _backward) if self.changes_scene or owner._frozen is None else owner._frozen
         self.sky = owner._sky
-        # What the forward pass has decided and the backward pass takes up.
+        # Decisions of the forward pass that the backward pass repeats.
         self.fixed: dict[str, Any] = {}
 
-    def forward(self, arrays: list[Any], wanted: list[bool]) -> Sequence[Any]:
+    def forward(self, arrays: list[TensorXf], wanted: list[bool]) -> Sequence[TensorXf]:
         with dr.suspend_grad(), self._scene(arrays) as renderer:
             image, fit = self.functions[0](self.places, *self.camera, arrays, renderer)
-            # While the scene is as it should be.
+            # Evaluated while the scene has the parameters of this call.
             dr.eval(image, fit)
         self.arrays, self.wanted = arrays, wanted
         self.fixed = {"soft": renderer.soft, "frusta": fit[0], "soft_frusta": fit[1]}
-        # All at once, and only now that nothing can fail any more.
+        # The owner changes only now that nothing can fail any more.
         self.owner._renderer.frusta = fit[0]
         if self.changes_scene:
             self.owner._planned, self.owner._sky = {"soft": renderer.soft, "soft_frusta": fit[1]}, self.sky
@@ -193,18 +202,18 @@ class _Rendering:
             self.owner._renderer.soft_frusta = fit[1]
         return (image,)
 
-    def backward(self, adjoints: Sequence[Any]) -> Sequence[Any]:
+    def backward(self, adjoints: Sequence[TensorXf | None]) -> Sequence[TensorXf]:
         with dr.resume_grad():
             arrays = attached(self.arrays, self.wanted)  # before they enter the scene
             with self._scene(arrays) as renderer:
                 return self.functions[1](self.places, *self.camera, self.wanted, arrays, adjoints[0], renderer)
 
     @contextmanager
-    def _scene(self, arrays: list[Any]) -> Iterator[_Renderer]:
-        """The renderer for this call, while the scene has the parameters that it is to have."""
-        # Fitting maps again to what they have been fitted to keeps them bit by bit, as the derivatives want it.
+    def _scene(self, arrays: list[TensorXf]) -> Iterator[_Renderer]:
+        """Context with the renderer for this call, in which the scene has the parameters of this call."""
+        # Fitting maps again to the same vertices changes no bit, so derivatives are those of the image.
         renderer = replace(self.owner._renderer, **(self.fixed or (self.owner._planned if self.changes_scene else {})))
-        # Copies, since a replayed function writes into the records that it is given: another image's backward pass may need them.
+        # Copies, since a replayed function writes into its arguments, which another image's backward pass may need.
         fits = (renderer.frusta, renderer.soft_frusta)
         renderer.frusta, renderer.soft_frusta = tree_map(fits, lambda array: type(array)(array))
         values = {place.name: array for place, array in zip(self.places, arrays, strict=True) if place.kind == "parameter"}
@@ -212,7 +221,7 @@ class _Rendering:
             yield renderer
             return
         table = mi.traverse(renderer.data.scene)
-        # Copies: what the table returns changes with the scene.
+        # Copies: values from the table change with the scene.
         before = {name: type(table[name])(table[name]) for name in values}
         try:
             try:
@@ -226,7 +235,7 @@ class _Rendering:
             _set(table, before)
 
     def _divided(self, renderer: _Renderer) -> _Renderer:
-        """The renderer, with extended lights divided anew where they have changed much since they were."""
+        """The renderer, with extended lights divided anew if they have changed much since their last division."""
         data = renderer.data
         with dr.suspend_grad():
             if self.sky.same(data.environments) and still_aimed(renderer.soft, lambda: data.geometry):
@@ -239,14 +248,16 @@ def _device_of(variant: str) -> torch.device:
     return torch.device("cuda" if variant.startswith("cuda") else "cpu")
 
 
-def _set(table: Any, values: Mapping[str, Any]) -> None:
+def _set(table: mi.SceneParameters, values: Mapping[str, Any]) -> None:
     for name, value in values.items():
         table[name] = value
     table.update()
 
 
-def _forward(places: tuple[_Place, ...], sensor: int, spp: int, arrays: list[Any], renderer: _Renderer) -> tuple[Any, Any]:
-    """Image and the fits of the shadow maps and of those of extended lights."""
+def _forward(
+    places: tuple[_Place, ...], sensor: int, spp: int, arrays: list[TensorXf], renderer: _Renderer
+) -> tuple[TensorXf, tuple[Frusta | None, SoftFrusta]]:
+    """Image and (frusta of the shadow maps, frusta of extended lights' maps)."""
     given = list(zip(places, arrays, strict=True))
     vertices = {place.name: array for place, array in given if place.kind == "vertices"}
     lights: dict[str, Any] = {}
@@ -263,11 +274,11 @@ def _backward(
     sensor: int,
     spp: int,
     wanted: list[bool],
-    arrays: list[Any],
-    adjoint: Any,
+    arrays: list[TensorXf],
+    adjoint: TensorXf | None,
     renderer: _Renderer,
-) -> list[Any]:
-    """Gradients to the arrays from that to the image."""
+) -> list[TensorXf]:
+    """Gradients to the arrays. ``adjoint``: gradient to the image."""
     for array, want in zip(arrays, wanted, strict=True):
         if want:
             dr.enable_grad(array)
@@ -275,7 +286,7 @@ def _backward(
     return gradients(arrays, (image,), (adjoint,))
 
 
-def _shapes_of(what: str, value: Any) -> tuple[tuple[int, ...], ...]:
+def _shapes_of(what: str, value: Any) -> tuple[tuple[int, ...], ...]:  # Any: parameters have values of all kinds
     """Shapes of tensors that may replace a parameter."""
     if _is_transform(value):
         return ((4, 4),)
@@ -288,13 +299,13 @@ def _shapes_of(what: str, value: Any) -> tuple[tuple[int, ...], ...]:
     return ((1,), ()) if len(value) == 1 else ((len(value),),)
 
 
-def _is_transform(value: Any) -> bool:
-    # Mitsuba has several types of them; and arrays have all sorts of attributes.
+def _is_transform(value: object) -> bool:
+    # By attribute, since Mitsuba has several types of transformations. But arrays have attributes of many names.
     return not dr.is_array_v(value) and hasattr(value, "matrix")
 
 
-def _converted(old: Any, array: Any) -> Any:
-    """A (checked) tensor as the type of what it replaces, attached."""
+def _converted(old: Any, array: TensorXf) -> Any:  # Any: parameters have values of all kinds
+    """A (checked) tensor converted to the type of the value that it replaces, attached."""
     if dr.is_tensor_v(old):
         return type(old)(array)
     flat = array.array

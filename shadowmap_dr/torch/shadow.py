@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TypeVar
 
 import drjit as dr
 import torch
@@ -13,10 +13,14 @@ import torch
 from .. import shadow as _shadow
 from ..errors import ShadowmapError
 from ..jit.arrays import backend
+from ..jit.types import TensorXf, UInt32, Vector3f
+from ..scene.typed import ravel
 from ..shadow import Frusta, LightView, ShadowSettings, Views
-from .bridge import Repeated, cross, drjit_turn, index_array, vector
+from .bridge import IN_TENSOR, Repeated, cross, drjit_turn, index_array, vector
 from .checks import check_devices, check_floats, check_kind, check_same, number_of
 from .raster import Topology
+
+_ArrayT = TypeVar("_ArrayT", bound="AnyArray")
 
 # Spot lights with a wider cone (half-angle in degrees) use the faces of a cube.
 _WIDEST_SPOT = 60.0
@@ -55,9 +59,9 @@ class ShadowMaps:
     """M square maps of N x N texels: one for each directional light or spot light up to 60 degrees, six for all others.
 
     Attributes:
-        values: float32 (M, N, N, C), what the method stores of the depths in each texel. Attached to casters and lights.
+        values: float32 (M, N, N, C), the channels that the method stores in each texel. Attached to casters and lights.
         axes: float32 (4, M, 3): each map's right, up and forward axis and its origin, world space. Attached to the lights.
-        settings: how the maps were made.
+        settings: settings of the maps.
         first: number of the first map of each light.
     """
 
@@ -86,9 +90,9 @@ def render_maps(
         topology: of their mesh.
         lights: one or several.
         settings: default ``ShadowSettings()``; ``compat`` and the method ``none`` have no maps of their own.
-        previous: maps of the step before. The part of space that they cover is kept while the casters stay within it and fill
-            most of it, so that an optimisation does not see it move.
-        seen: float32 (..., 3), points all over the receivers: maps need not cover what casts its shadow elsewhere.
+        previous: maps of the step before. Their frusta are kept while the casters stay inside and fill most of them, so that an
+            optimisation does not see them move.
+        seen: float32 (..., 3), points all over the receivers: maps need not cover casters whose shadows miss these points.
 
     Returns:
         Unfiltered maps, attached to ``vertices`` and to the tensors of the lights.
@@ -114,7 +118,7 @@ def render_maps(
     indices = index_array(topology.faces)
     kept: list[tuple[Views, Frusta]] = []
 
-    def run(vertices: Any, *arrays: Any) -> tuple[Any, ...]:
+    def run(vertices: TensorXf, *arrays: TensorXf) -> tuple[TensorXf, ...]:
         given = dict(zip(tensors, arrays, strict=True))
         views = [view for k, light in enumerate(lights) for view in _light_views(light, k, given, settings)]
         stacked = _shadow.stack_views(views)
@@ -122,9 +126,10 @@ def render_maps(
         p_light, map_index, _ = _shadow.vertices_in_maps(stacked, vertices.array)
         frusta = _fit(stacked, p_light, map_index, settings, previous, given.get("seen"))
         maps = _shadow.render_maps(p_light, map_index, indices, topology._edges, stacked, frusta, settings)
-        kept.append((dr.detach(replace(stacked, right=None, up=None, forward=None, origin=None)), frusta))
+        bare = replace(stacked, right=IN_TENSOR, up=IN_TENSOR, forward=IN_TENSOR, origin=IN_TENSOR)
+        kept.append((dr.detach(bare), frusta))
         size = settings.resolution
-        axes = dr.concat([dr.ravel(_full(getattr(stacked, name), count)) for name in _AXES])
+        axes = dr.concat([ravel(_full(getattr(stacked, name), count)) for name in _AXES])
         tensor = type(vertices)
         return tensor(maps.values, (count, size, size, maps.channels)), tensor(axes, (len(_AXES), count, 3))
 
@@ -137,10 +142,10 @@ def render_maps(
 
 
 def filter_maps(maps: ShadowMaps) -> ShadowMaps:
-    """Filter maps with the kernel that their settings name. Methods that compare depths in the look-up have nothing to filter."""
+    """Filter maps with the kernel of their settings. Maps of methods that compare depths in the look-up stay unfiltered."""
     _check_maps(maps)
 
-    def run(values: Any) -> tuple[Any, ...]:
+    def run(values: TensorXf) -> tuple[TensorXf, ...]:
         flat = _shadow.ShadowMaps(values.array, maps._views, maps._frusta, maps.settings, values.shape[-1])
         return (type(values)(_shadow.filter_maps(flat).values, values.shape),)
 
@@ -148,7 +153,7 @@ def filter_maps(maps: ShadowMaps) -> ShadowMaps:
 
 
 def visibility(maps: ShadowMaps, points: torch.Tensor, light: int = 0) -> torch.Tensor:
-    """Fraction of a light that reaches points.
+    """Fraction of a light that reaches each point.
 
     Args:
         maps: filtered maps.
@@ -167,14 +172,14 @@ def visibility(maps: ShadowMaps, points: torch.Tensor, light: int = 0) -> torch.
     count, start = maps.axes.shape[1], maps.first[light]
     size = (*maps.first, count)[light + 1] - start
 
-    def run(points: Any, values: Any, axes: Any) -> tuple[Any, ...]:
+    def run(points: TensorXf, values: TensorXf, axes: TensorXf) -> tuple[TensorXf, ...]:
         module = backend(points)
         row = dr.arange(module.UInt32, count)
         vectors = {name: vector(axes.array, row + k * count) for k, name in enumerate(_AXES)}
         views = replace(maps._views, **vectors)
         flat = _shadow.ShadowMaps(values.array, views, maps._frusta, maps.settings, values.shape[-1])
         p_world = dr.gather(module.Array3f, points.array, dr.arange(module.UInt32, dr.width(points.array) // 3))
-        which: Any = start
+        which: UInt32 | int = start
         if size > 1:
             position = vector(dr.detach(axes.array), _AXES.index("origin") * count + start)
             which = start + _shadow.cube_face(dr.detach(p_world) - position)
@@ -204,11 +209,11 @@ def _has_cube(light: Light) -> bool:
     return isinstance(light, PointLight) or (isinstance(light, SpotLight) and light.cutoff_angle > _WIDEST_SPOT)
 
 
-def _light_views(light: Light, number: int, given: dict[str, Any], settings: ShadowSettings) -> Sequence[LightView]:
-    def own(name: str) -> Any:
+def _light_views(light: Light, number: int, given: dict[str, TensorXf], settings: ShadowSettings) -> Sequence[LightView]:
+    def own(name: str) -> Vector3f:
         return vector(given[f"lights[{number}].{name}"].array, 0)
 
-    if _has_cube(light):
+    if isinstance(light, PointLight) or _has_cube(light):
         return _shadow.cube_views(own("position"), settings.resolution, settings.filter_size)
     view = _shadow.directional_view(own("direction"))
     if isinstance(light, DirectionalLight):
@@ -217,8 +222,15 @@ def _light_views(light: Light, number: int, given: dict[str, Any], settings: Sha
     return (_shadow.spot_view(own("position"), view.right, view.up, view.forward, spread),)
 
 
-def _fit(views: Views, p_light: Any, map_index: Any, settings: ShadowSettings, previous: ShadowMaps | None, seen: Any) -> Frusta:
-    """The casters as one shape that is not flat."""
+def _fit(
+    views: Views,
+    p_light: Vector3f,
+    map_index: UInt32,
+    settings: ShadowSettings,
+    previous: ShadowMaps | None,
+    seen: TensorXf | None,
+) -> Frusta:
+    """Frusta of all maps. The casters count as one shape that is not flat."""
     module = backend(map_index)
     bounds = _shadow.shape_bounds(views, p_light, map_index, module.UInt32(0), 1)
     points = None
@@ -230,8 +242,8 @@ def _fit(views: Views, p_light: Any, map_index: Any, settings: ShadowSettings, p
     return _shadow.fit_frusta(views, bounds, module.Bool(True), 1, size, kernel, frusta, points)
 
 
-def _full(value: Any, width: int) -> Any:
-    """The value repeated to a width, if it is but one."""
+def _full(value: _ArrayT, width: int) -> _ArrayT:
+    """The array itself, or, if its width is 1, its value repeated ``width`` times."""
     return value if dr.width(value) == width else value + dr.zeros(type(value), width)
 
 

@@ -19,7 +19,7 @@ from ..jit.arrays import device_array
 from ..jit.types import Float, Matrix4f, UInt32, Vector3f
 from .mitsuba_objects import Parameter
 from .shapes.sources import ShapeSource
-from .typed import ravel
+from .shapes.typed import ravel
 
 # Row of the table of transformations that means "no transformation".
 _NONE = 0xFFFFFFFF

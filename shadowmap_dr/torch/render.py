@@ -113,9 +113,8 @@ class Renderer:
         given = self._inputs(vertex_positions, lights, parameters)
         if not 0 <= sensor < len(self._renderer.data.sensors) or not 1 <= samples < math.inf:
             count = len(self._renderer.data.sensors)
-            raise ShadowmapError(
-                f"sensor {sensor}, spp {samples:g}: there are {count} sensors, counted from 0; spp is 1 or more."
-            )
+            why = f"there are {count} sensors, counted from 0; spp is 1 or more"
+            raise ShadowmapError(f"sensor {sensor}, spp {samples:g}: {why}.")
         operation = _Rendering(self, tuple(given), sensor, math.ceil(samples))
         if given:
             return cross(operation, *given.values())[0]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import drjit as dr
 import torch
@@ -13,8 +13,7 @@ import torch
 from .. import shadow as _shadow
 from ..errors import ShadowmapError
 from ..jit.arrays import backend
-from ..jit.types import TensorXf, UInt32, Vector3f
-from ..scene.typed import ravel
+from ..jit.types import AnyArray, Float, TensorXf, UInt32, Vector3f
 from ..shadow import Frusta, LightView, ShadowSettings, Views
 from .bridge import IN_TENSOR, Repeated, cross, drjit_turn, index_array, vector
 from .checks import check_devices, check_floats, check_kind, check_same, number_of
@@ -129,7 +128,7 @@ def render_maps(
         bare = replace(stacked, right=IN_TENSOR, up=IN_TENSOR, forward=IN_TENSOR, origin=IN_TENSOR)
         kept.append((dr.detach(bare), frusta))
         size = settings.resolution
-        axes = dr.concat([ravel(_full(getattr(stacked, name), count)) for name in _AXES])
+        axes = dr.concat([cast(Float, dr.ravel(_full(getattr(stacked, name), count))) for name in _AXES])
         tensor = type(vertices)
         return tensor(maps.values, (count, size, size, maps.channels)), tensor(axes, (len(_AXES), count, 3))
 

@@ -17,9 +17,9 @@ from ...errors import ShadowmapError, UnsupportedShape
 from ...jit.arrays import device_array
 from ...jit.types import Float, UInt32, Vector3f
 from ..mitsuba_objects import Parameter, mesh_buffers, parameters
-from ..typed import ravel
 from . import curves, tubes
 from . import tessellation as shapes_tessellation
+from .typed import ravel
 
 _ANALYTIC = {"Sphere": shapes_tessellation.sphere, "Disk": shapes_tessellation.disk, "Cylinder": shapes_tessellation.cylinder}
 _CURVES: dict[str, type[curves.BSplines] | type[curves.Polylines]] = {

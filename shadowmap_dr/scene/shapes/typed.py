@@ -7,7 +7,7 @@ from typing import cast
 
 import drjit as dr
 
-from ..jit.types import AnyArray, ArrayT, Float
+from ...jit.types import AnyArray, ArrayT, Float
 
 
 def ravel(array: AnyArray) -> Float:

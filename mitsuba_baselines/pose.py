@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from shadowmap_dr.errors import ShadowmapError
 from shadowmap_dr.inverse.pose import apply_pose
+from shadowmap_dr.scene.mitsuba_meshes import positions_in, set_positions
 
 from .proxy import Proxy, calibrate, with_proxy
 
@@ -109,8 +110,8 @@ class MitsubaPose:
         self.setting, self.step_size, self.betas, self.seed, self.shift_z = setting, step_size, betas, seed, shift_z
         scene = load_scene(scene_path, mesh_path, resolution, normals)
         params = mi.traverse(scene)
-        self._rest = mi.Float(params["object.vertex_positions"])
-        params["object.vertex_positions"] = apply_pose(self._rest, dr.zeros(mi.Float, 3), shift_z)
+        self._rest = positions_in(params, "object")
+        set_positions(params, apply_pose(self._rest, dr.zeros(mi.Float, 3), shift_z), "object")
         params.update()
         self.proxy = calibrate(scene) if proxy is None else proxy
         self._scene = with_proxy(scene, self.proxy)
@@ -204,7 +205,7 @@ class MitsubaPose:
 
     def _place(self, pose: mi.Float) -> None:
         """Move the mesh in the scene."""
-        self._params["object.vertex_positions"] = apply_pose(self._rest, pose, self.shift_z)
+        set_positions(self._params, apply_pose(self._rest, pose, self.shift_z), "object")
         self._params.update()
 
 

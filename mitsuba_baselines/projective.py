@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from shadowmap_dr.errors import ShadowmapError
+from shadowmap_dr.scene.mitsuba_meshes import positions_in, set_positions
 
 from .derivatives import agreement
 from .reference import Reference
@@ -50,21 +51,20 @@ def projective_derivative(
     if passes < 2:
         raise ShadowmapError(f"{passes} passes: give at least 2, so that the noise can be measured.")
     params = mi.traverse(scene)
-    key = f"{shape}.vertex_positions"
-    rest = mi.Float(dr.detach(params[key]))
+    rest = dr.detach(positions_in(params, shape))
     halves: list[np.ndarray] = [np.zeros(()), np.zeros(())]
     for index in range(passes):
         integrator = mi.load_dict({"type": "direct_projective", "sppc": 0, "sppp": 0, "sppi": sppi, "guiding": guiding})
         moved = mi.Float(rest)
         dr.enable_grad(moved)
         dr.set_grad(moved, mi.Float(np.asarray(rate, np.float32).ravel()))
-        params[key] = moved
+        set_positions(params, moved, shape)
         params.update()
         image = integrator.render_forward(scene, params, sensor=scene.sensors()[0], seed=seed + index, spp=0)
         halves[index % 2] = halves[index % 2] + np.array(image, np.float64)
         if on_pass is not None:
             on_pass()
-    params[key] = rest
+    set_positions(params, rest, shape)
     params.update()
     counts = (passes - passes // 2, passes // 2)
     even, odd = (half / count for half, count in zip(halves, counts, strict=True))

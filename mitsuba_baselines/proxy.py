@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from shadowmap_dr.errors import ShadowmapError
+from shadowmap_dr.scene.mitsuba_meshes import positions_in
 
 from .reference import path_traced
 
@@ -227,7 +228,7 @@ def _bounding_sphere(shape: mi.Shape) -> tuple[np.ndarray, float]:
     """Bounding sphere about the centre of the bounding box: centre (3,) and radius."""
     box = _corners(shape.bbox())
     centre = box.mean(0)
-    points = np.array(mi.traverse(shape)["vertex_positions"]).reshape(-1, 3) if isinstance(shape, mi.Mesh) else box
+    points = np.array(positions_in(mi.traverse(shape))).reshape(-1, 3) if isinstance(shape, mi.Mesh) else box
     return centre, float(np.linalg.norm(points - centre, axis=1).max())
 
 

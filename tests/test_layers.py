@@ -31,7 +31,7 @@ MAY_IMPORT = {
     "torch": ("errors", "jit", "raster", "rendering", "shadow"),
     "inverse": ("errors", "io", "jit", "raster", "rendering", "scene.lights", "shadow"),
     "interactive": ("errors", "inverse", "io"),
-    "mitsuba_baselines": ("", "errors", "inverse", "io"),
+    "mitsuba_baselines": ("", "errors", "inverse", "io", "scene.mitsuba_meshes"),
     "experiments": (
         *(
             "",
@@ -59,7 +59,7 @@ INSIDE = {
         "raster.types",
     ),
     "shadow.methods": (),
-    "scene.shapes": ("scene.mitsuba_objects", "scene.changes"),
+    "scene.shapes": ("scene.mitsuba_meshes", "scene.mitsuba_objects", "scene.changes"),
     "scene.lights": ("scene.geometry", "scene.mitsuba_objects", "scene.changes", "scene.sums", "scene.transforms"),
     "rendering.gbuffer": (),
     "rendering.receivers": (),

@@ -17,6 +17,7 @@ from ..jit.gpu import keep_registers
 from ..jit.pytree import attached_arrays, with_arrays
 from ..jit.types import AnyArray, TensorXf
 from ..scene.load import SceneData
+from ..scene.mitsuba_meshes import VERTEX_PARAMETERS
 from .parameter_state import ParameterState
 
 #: Most pixel samples of all waiting images together; each may hold half a kilobyte.
@@ -27,7 +28,7 @@ TEXELS = 6
 # Parameters that an image depends on only through the records of its scene. Materials and textures, in contrast, are evaluated by
 # Mitsuba itself.
 _READ = (
-    "vertex_positions", "vertex_normals", "vertex_texcoords", "control_points", "to_world",
+    *sorted(VERTEX_PARAMETERS), "control_points", "to_world",
     "position", "intensity.value", "irradiance.value", "radiance.value", "cutoff_angle", "beam_width",
 )  # fmt: skip
 

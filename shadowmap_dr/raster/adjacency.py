@@ -123,8 +123,8 @@ class EdgeBlocks:
     ) -> UInt32:
         """Indices of all edges, then ``rest`` (R, 2): ``dtype`` (2 (count + R),).
 
-        ``values``: indices for the edges (E, 2) of the first copy of each group, of ``vertices`` or ``faces`` (``kind``). They are
-        shifted for each copy.
+        ``values``: for the edges (E, 2) of the first copy of each group, indices of ``vertices`` or ``faces`` (``kind``), which
+        are shifted for each copy.
         """
         buffer = IndexBufferBuilder(dtype, 2 * (self.count + len(rest)))
         for group, places, own in zip(self.copies, self.places, values, strict=True):

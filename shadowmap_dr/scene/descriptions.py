@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from ..errors import ShadowmapError
 from .geometry import ShapeInfo, rows_of, with_faces
+from .mitsuba_meshes import has_reversed_faces
 from .shapes.sources import ShapeSource
 
 # Most squared distance of vertices from a common plane, relative to the shape's squared extent, for a planar shape.
@@ -66,7 +67,7 @@ def describe_all(
 ) -> tuple[ShapeInfo, ...]:
     """Validate the buffers of all shapes and describe them.
 
-    ``held``: (has normals, has texture coordinates) of each shape. ``mirrored``: see :meth:`~shadowmap_dr.scene.soup.Soup.mirrored`.
+    ``held``: (has normals, has texture coordinates) of each shape. ``mirrored``: see ``Soup.mirrored``.
 
     Raises:
         ShadowmapError: a mesh is broken.
@@ -80,7 +81,7 @@ def describe_all(
     turned_over = own & ~meshes
     reversed_ = turned_over != placed
     inverted = turned_over & np.array([kind == "Cylinder" for kind in kinds])
-    flipped = np.array([source.shape.has_flipped_normals() for source in sources]) != inverted
+    flipped = np.array([has_reversed_faces(source.shape) for source in sources]) != inverted
     # Mitsuba computes normals from the winding once vertices change; those of a rectangle never change.
     turned = _turned(parts, has_normals & np.array([kind == "Rectangle" for kind in kinds]))
     faceted, planar = _faceted(parts, meshes & has_normals & ~reversed_), _planar(parts)

@@ -70,6 +70,23 @@ def has_reversed_faces(shape: mi.Shape) -> bool:
     return bool(shape.has_flipped_normals())
 
 
+def positions_in(table: mi.SceneParameters, shape: str = "") -> Float:
+    """Vertices of a mesh, flat (3V,), attached, from ``mi.traverse`` of it or, with the ``shape``'s name, of a scene."""
+    value = table[_position_key(table, shape)]
+    return mi.Float(value.array if dr.is_tensor_v(value) else value)
+
+
+def set_positions(table: mi.SceneParameters, positions: Float, shape: str = "") -> None:
+    """Replace the vertices (3V,) that :func:`positions_in` reads; ``table.update()`` is to follow. Gradients flow to ``positions``."""
+    key = _position_key(table, shape)
+    table[key] = mi.TensorXf(positions, (dr.width(positions) // 3, 3)) if dr.is_tensor_v(table[key]) else positions
+
+
+def _position_key(table: mi.SceneParameters, shape: str) -> str:
+    keys = [f"{shape}.{names.positions}".lstrip(".") for names in (_FLAT, _TENSORS)]
+    return next(key for key in keys if key in table)
+
+
 def make_mesh(
     name: str,
     positions: npt.ArrayLike,

@@ -8,9 +8,10 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..jit.types import Float, UInt32
+from ..jit.types import Float
+from .mitsuba_meshes import VERTEX_PARAMETERS
 
-_BUFFERS = ("vertex_count", "face_count", "vertex_positions", "vertex_normals", "vertex_texcoords")
+_NO_ATTRIBUTES = VERTEX_PARAMETERS | {"vertex_count", "face_count"}
 
 
 def parameters(node: mi.Object) -> dict[str, Any]:
@@ -119,22 +120,9 @@ def is_cosine(bsdf: mi.BSDF) -> bool:
 
 def is_attribute(node: mi.Object, key: str) -> bool:
     """True if a parameter is an attribute of a mesh: colours of vertices or faces, for instance."""
-    return isinstance(node, mi.Mesh) and key.startswith(("vertex_", "face_")) and key not in _BUFFERS
+    return isinstance(node, mi.Mesh) and key.startswith(("vertex_", "face_")) and key not in _NO_ATTRIBUTES
 
 
 def attributes(mesh: mi.Mesh) -> dict[str, Float]:
     """Attributes of a ``mi.Mesh`` by name: flat Float, of all vertices (``vertex_...``) or of all faces (``face_...``)."""
     return {name: value for name, value in parameters(mesh).items() if is_attribute(mesh, name)}
-
-
-def mesh_buffers(mesh: mi.Mesh) -> tuple[UInt32, Float, Float, Float]:
-    """(faces UInt32 (3F,), positions Float (3V,), normals Float (3V,) or (0,), texcoords Float (2V,) or (0,)) of a ``mi.Mesh``.
-
-    World space; attached where the mesh's buffers are.
-    """
-    return (
-        mi.UInt32(mesh.faces_buffer()),
-        mi.Float(mesh.vertex_positions_buffer()),
-        mi.Float(mesh.vertex_normals_buffer()),
-        mi.Float(mesh.vertex_texcoords_buffer()),
-    )

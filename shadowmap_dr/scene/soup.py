@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import numpy.typing as npt
 
 from ..errors import ShadowmapError
 from ..jit.arrays import device_array
@@ -202,8 +203,8 @@ class Soup:
         return Vertices(*(_written_over(buffer, list(pieces), index) for buffer, pieces, index in targets))
 
     def _look(self) -> None:
-        for holder in (*self._roots, *self._placements):
-            holder.reading.look()
+        for reading in (*(root.reading for root in self._roots), *(placement.reading for placement in self._placements)):
+            reading.look()
 
     def _still(self, attached_too: bool = False) -> Vertices:
         """The vertices of all shapes, detached. Those of shapes with gradients are meaningless unless ``attached_too``."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import drjit as dr
 import torch
@@ -174,7 +174,7 @@ def visibility(maps: ShadowMaps, points: torch.Tensor, light: int = 0) -> torch.
     def run(points: TensorXf, values: TensorXf, axes: TensorXf) -> tuple[TensorXf, ...]:
         module = backend(points)
         row = dr.arange(module.UInt32, count)
-        vectors = {name: vector(axes.array, row + k * count) for k, name in enumerate(_AXES)}
+        vectors: dict[str, Any] = {name: vector(axes.array, row + k * count) for k, name in enumerate(_AXES)}
         views = replace(maps._views, **vectors)
         flat = _shadow.ShadowMaps(values.array, views, maps._frusta, maps.settings, values.shape[-1])
         p_world = dr.gather(module.Array3f, points.array, dr.arange(module.UInt32, dr.width(points.array) // 3))

@@ -9,7 +9,14 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from shadowmap_dr.scene.mitsuba_meshes import has_reversed_faces, make_mesh, mesh_buffers, mesh_names
+from shadowmap_dr.scene.mitsuba_meshes import (
+    has_reversed_faces,
+    make_mesh,
+    mesh_buffers,
+    mesh_names,
+    positions_in,
+    set_positions,
+)
 
 POINTS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.5]], np.float32)
 FACES = np.array([[0, 1, 2], [0, 2, 3]], np.uint32)
@@ -74,3 +81,21 @@ def test_flipped_normals_count_once(variant: str, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(mi, "Mesh", NextMesh)
     assert has_reversed_faces(sphere)
     assert not has_reversed_faces(NextMesh("sheet", faces=mi.TensorXu(FACES), positions=mi.TensorXf(POINTS)))
+
+
+class Table(dict):
+    """Parameters of a scene of the development branch."""
+
+
+@pytest.mark.parametrize("shape", ["", "box"])
+def test_vertices_of_a_table_are_read_and_written_in_its_own_form(variant: str, shape: str) -> None:
+    flat = mi.Float(POINTS.ravel())
+    scene = mi.load_dict({"type": "scene", "box": make_mesh("box", POINTS, FACES)}, optimize=False)
+    now = mi.traverse(scene if shape else scene.shapes()[0])
+    name = f"{shape}.positions".lstrip(".")
+    later = Table({name: mi.TensorXf(POINTS)})
+    for table in (now, later):
+        np.testing.assert_array_equal(positions_in(table, shape).numpy(), POINTS.ravel())
+        set_positions(table, 2 * flat, shape)
+        np.testing.assert_array_equal(positions_in(table, shape).numpy(), 2 * POINTS.ravel())
+    assert later[name].shape == (4, 3)

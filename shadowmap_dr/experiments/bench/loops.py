@@ -20,6 +20,7 @@ import numpy.typing as npt
 from ...io import assets
 from ...jit.gc import gc_quiet
 from ...jit.types import AnyArray, TensorXf
+from ...scene.mitsuba_meshes import make_mesh
 from ..common.timing import compare, forget_peak_memory, peak_memory, timed
 from .common import BenchOptions, Unit, Update, run_child
 
@@ -272,14 +273,7 @@ def remeshing(integrator: dict[str, Any], size: int) -> Iterator[float]:
 
 
 def _mesh(vertices: np.ndarray, faces: np.ndarray, bsdf: dict[str, Any]) -> mi.Mesh:
-    properties = mi.Properties()
-    properties["bsdf"] = mi.load_dict(bsdf)
-    mesh = mi.Mesh("ball", len(vertices), len(faces), props=properties)
-    params = mi.traverse(mesh)
-    params["vertex_positions"] = np.ravel(vertices).astype(np.float32)
-    params["faces"] = np.ravel(faces).astype(np.uint32)
-    params.update()
-    return mesh
+    return make_mesh("ball", vertices, faces, mi.load_dict(bsdf))
 
 
 def texture(integrator: dict[str, Any], size: int) -> Iterator[float]:

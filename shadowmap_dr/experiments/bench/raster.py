@@ -15,6 +15,7 @@ import numpy as np
 from ...jit.types import Float, Matrix4f, UInt32
 from ...raster import Topology, antialias, build_topology, interpolate, rasterize
 from ...scene.load import load
+from ...scene.mitsuba_meshes import set_positions
 from ..common import meshes as bench_meshes
 from ..common.timing import Contender, alternate, compare
 from .common import BenchOptions, Unit, Update
@@ -162,7 +163,7 @@ def measure_raster(options: BenchOptions, kind: str, resolution: int, done: Mapp
     def update_and_trace() -> mi.PreliminaryIntersection3f:
         offset = dr.gather(mi.Float, next(moves), dr.zeros(mi.UInt32, dr.width(data.shape_rest)))
         x_only = dr.arange(mi.UInt32, dr.width(data.shape_rest)) % 3 == 0
-        params["object.vertex_positions"] = dr.select(x_only, data.shape_rest + offset, data.shape_rest)
+        set_positions(params, dr.select(x_only, data.shape_rest + offset, data.shape_rest), "object")
         params.update()
         return trace()
 

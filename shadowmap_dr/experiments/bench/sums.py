@@ -20,6 +20,7 @@ import numpy as np
 from ...errors import ShadowmapError
 from ...jit.types import Float, TensorXf
 from ...rendering.renderer import Renderer
+from ...scene.mitsuba_meshes import make_mesh
 from .common import BenchOptions, Unit, Update, run_child
 
 MODES = ("plug-in", "recorded", "renderer", "frozen")
@@ -210,14 +211,8 @@ def _floor(case: Sum) -> dict[str, Any] | mi.Mesh:
     material = _materials()[case.material]
     if not case.parameter.endswith("vertex_positions"):
         return {"type": "rectangle", "bsdf": material}
-    properties = mi.Properties()
-    properties["bsdf"] = mi.load_dict(material)
-    floor = mi.Mesh("floor", 4, 2, props=properties)
-    table = mi.traverse(floor)
-    table["vertex_positions"] = dr.ravel(mi.Point3f([-1, 1, 1, -1], [-1, -1, 1, 1], 0))
-    table["faces"] = mi.UInt32([0, 1, 2, 0, 2, 3])
-    table.update()
-    return floor
+    corners = [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]
+    return make_mesh("floor", corners, [[0, 1, 2], [0, 2, 3]], mi.load_dict(material))
 
 
 def _materials() -> dict[str, Any]:

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from ...errors import ShadowmapError
 from ...io import assets
 from ...io.meshes import write_ply
+from ...scene.mitsuba_meshes import make_mesh, mesh_buffers
 
 Array = npt.NDArray[Any]
 
@@ -57,8 +58,8 @@ def make(kind: str) -> Mesh:
     if kind in KINDS:
         name, levels = kind.split("-")[0], str(round(np.log(KINDS[kind] / (992 if "teapot" in kind else 5856)) / np.log(4)))
     mesh = mi.load_dict({"type": "ply", "filename": str(assets.mesh(name)), "face_normals": True})
-    params = mi.traverse(mesh)
-    result = Mesh(np.array(params["vertex_positions"]).reshape(-1, 3), np.array(params["faces"]).reshape(-1, 3))
+    buffers = mesh_buffers(mesh)
+    result = Mesh(np.array(buffers.positions).reshape(-1, 3), np.array(buffers.faces).reshape(-1, 3))
     for _ in range(int(levels or 0)):
         result = subdivided(result)
     return result
@@ -156,12 +157,7 @@ def stored(kind: str, folder: Path) -> Path:
     path = folder / f"{kind.replace('*', '_')}.ply"
     if not path.exists():
         mesh = make(kind)
-        target = mi.Mesh(kind, len(mesh.vertices), len(mesh.faces))
-        params = mi.traverse(target)
-        params["vertex_positions"] = mi.Float(mesh.vertices.ravel())
-        params["faces"] = mi.UInt32(mesh.faces.ravel())
-        params.update()
-        write_ply(path, target)
+        write_ply(path, make_mesh(kind, mesh.vertices, mesh.faces))
     return path
 
 

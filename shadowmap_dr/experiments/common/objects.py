@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...errors import ShadowmapError
+from ...scene.mitsuba_meshes import make_mesh, mesh_buffers
 
 MESH_SUFFIXES = (".ply", ".obj")
 
@@ -31,7 +32,7 @@ def load_mesh(path: Path) -> mi.Mesh:
 
 def positions(mesh: mi.Mesh) -> npt.NDArray[np.float32]:
     """(V, 3) vertices of a mesh."""
-    return np.array(mi.traverse(mesh)["vertex_positions"], np.float32).reshape(-1, 3)
+    return np.array(mesh_buffers(mesh).positions, np.float32).reshape(-1, 3)
 
 
 def placement(mesh: mi.Mesh, path: Path) -> tuple[npt.NDArray[np.float64], float]:
@@ -58,12 +59,5 @@ def occluder(
     colour: tuple[float, ...] = (0.5, 0.5, 0.5),
 ) -> mi.Mesh:
     """A ``mi.Mesh`` of (V, 3) vertices and (F, 3) faces, diffuse on both sides."""
-    props = mi.Properties()
     diffuse = {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(colour)}}
-    props["bsdf"] = mi.load_dict({"type": "twosided", "bsdf": diffuse})
-    mesh = mi.Mesh(name, len(points), len(faces), props=props)
-    params = mi.traverse(mesh)
-    params["vertex_positions"] = np.ascontiguousarray(points, np.float32).ravel()
-    params["faces"] = np.ascontiguousarray(faces, np.uint32).ravel()
-    params.update()
-    return mesh
+    return make_mesh(name, points, faces, mi.load_dict({"type": "twosided", "bsdf": diffuse}))

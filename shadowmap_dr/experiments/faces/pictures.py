@@ -14,6 +14,7 @@ from ...inverse.faces.morphable import MorphableModel
 from ...io import meshes, plots
 from ...io.files import atomic
 from ...io.images import to_srgb
+from ...scene.mitsuba_meshes import make_mesh
 from .metrics import distances
 
 #: Distance at the end of the colour map (head within [-1, 1]^3).
@@ -148,9 +149,4 @@ def write_ply(path: str | os.PathLike[str], vertices: npt.ArrayLike, faces: npt.
 
 
 def _mesh(vertices: npt.NDArray[np.float32], faces: npt.NDArray[Any]) -> mi.Mesh:
-    mesh = mi.Mesh("head", len(vertices), len(faces))
-    parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = mi.Float(vertices.ravel())
-    parameters["faces"] = mi.UInt32(faces.ravel().astype(np.uint32))
-    parameters.update()
-    return mesh
+    return make_mesh("head", vertices, faces)

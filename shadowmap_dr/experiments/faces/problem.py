@@ -16,6 +16,7 @@ from ...inverse.faces.morph_fit import MorphFit
 from ...inverse.faces.morphable import MorphableModel, load_model
 from ...io import assets
 from ...rendering.receivers.planar_receiver import ReceiverShadows, Window
+from ...scene.mitsuba_meshes import make_mesh
 from ...shadow import ShadowSettings
 
 Mode = Literal["identity", "both", "expression"]
@@ -143,11 +144,7 @@ def path_traced_shadow(scene: FaceScene, vertices: npt.ArrayLike, spp: int) -> F
     center = [0.5 * (a + b) for a, b in zip(window.low, window.high, strict=True)]
     # Between receiver and head.
     eye = [*center, window.z + 0.02]
-    mesh = mi.Mesh("head", len(scene.model.mean), len(scene.model.faces))
-    parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = mi.Float(np.asarray(vertices, np.float32).ravel())
-    parameters["faces"] = mi.UInt32(scene.model.faces.ravel().astype(np.uint32))
-    parameters.update()
+    mesh = make_mesh("head", vertices, scene.model.faces)
     description: dict[str, Any] = {
         "type": "scene",
         "camera": {

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from ...errors import ShadowmapError
 from ...io import assets, images, meshes
+from ...scene.mitsuba_meshes import set_positions
 from ..common.objects import load_mesh, placement, positions
 
 ReferenceKind = Literal["mitsuba", "own"]
@@ -161,6 +162,6 @@ def _import_mesh(path: Path, work: Path) -> tuple[str, Path]:
 
 def _write_mesh(mesh: mi.Mesh, positions: npt.NDArray[Any], path: Path) -> None:
     parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = mi.Float(positions.astype(np.float32).ravel())
+    set_positions(parameters, mi.Float(positions.astype(np.float32).ravel()))
     parameters.update()
     meshes.write_ply(path, mesh)

@@ -18,6 +18,7 @@ from ...jit.arrays import device_array
 from ...raster import CoplanarCreases, Topology
 from ...scene.changes import ParameterWatch
 from ...scene.geometry import Geometry
+from ...scene.mitsuba_meshes import mesh_names
 from ...scene.mitsuba_objects import attributes, is_attribute, is_plain
 
 # Numbers that differ by less (in any component) are the same: colours for the eye, normals but for rounding, since small bends
@@ -124,7 +125,9 @@ class ShadingEdges:
             nodes += [shape, shape.bsdf(), *([shape.emitter()] if shape.is_emitter() else [])]
 
         def counts(node: Any, key: str) -> bool:
-            return not isinstance(node, mi.Shape) or key == "vertex_texcoords" or is_attribute(node, key)
+            if not isinstance(node, mi.Mesh):
+                return not isinstance(node, mi.Shape)
+            return key == mesh_names(node).texcoords or is_attribute(node, key)
 
         return ParameterWatch(nodes, counts)
 

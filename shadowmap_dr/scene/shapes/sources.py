@@ -16,7 +16,8 @@ import numpy as np
 from ...errors import ShadowmapError, UnsupportedShape
 from ...jit.arrays import device_array
 from ...jit.types import Float, UInt32, Vector3f
-from ..mitsuba_objects import Parameter, mesh_buffers, parameters
+from ..mitsuba_meshes import mesh_buffers
+from ..mitsuba_objects import Parameter, parameters
 from . import curves, tubes
 from . import tessellation as shapes_tessellation
 from .typed import ravel

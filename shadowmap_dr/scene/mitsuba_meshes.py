@@ -77,7 +77,7 @@ def positions_in(table: mi.SceneParameters, shape: str = "") -> Float:
 
 
 def set_positions(table: mi.SceneParameters, positions: Float, shape: str = "") -> None:
-    """Replace the vertices (3V,) that :func:`positions_in` reads; ``table.update()`` is to follow. Gradients flow to ``positions``."""
+    """Replace the vertices (3V,) that :func:`positions_in` reads, before ``table.update()``. Gradients flow to ``positions``."""
     key = _position_key(table, shape)
     table[key] = mi.TensorXf(positions, (dr.width(positions) // 3, 3)) if dr.is_tensor_v(table[key]) else positions
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeVar, cast
+from typing import TypeVar, cast
 
 import drjit as dr
 import torch
@@ -174,8 +174,8 @@ def visibility(maps: ShadowMaps, points: torch.Tensor, light: int = 0) -> torch.
     def run(points: TensorXf, values: TensorXf, axes: TensorXf) -> tuple[TensorXf, ...]:
         module = backend(points)
         row = dr.arange(module.UInt32, count)
-        vectors: dict[str, Any] = {name: vector(axes.array, row + k * count) for k, name in enumerate(_AXES)}
-        views = replace(maps._views, **vectors)
+        right, up, forward, origin = (vector(axes.array, row + k * count) for k in range(len(_AXES)))
+        views = replace(maps._views, right=right, up=up, forward=forward, origin=origin)
         flat = _shadow.ShadowMaps(values.array, views, maps._frusta, maps.settings, values.shape[-1])
         p_world = dr.gather(module.Array3f, points.array, dr.arange(module.UInt32, dr.width(points.array) // 3))
         which: UInt32 | int = start

@@ -17,11 +17,10 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import ShadowmapError
-from ..jit.arrays import backend
+from ..jit.arrays import backend, ravel, replace_grad
 from ..jit.broadcast import copy_of_lane, in_copies
 from ..jit.types import AnyArray, Bool, Float, Point3f, UInt32, Vector3u
 from ..jit.vectors import normalize_or
-from .shapes.typed import ravel, replace_grad
 
 NO_TRIANGLE = 0xFFFFFFFF
 """Triangle index that means "nothing was hit"."""

@@ -16,11 +16,10 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import ShadowmapError
-from ..jit.arrays import device_array
+from ..jit.arrays import device_array, ravel
 from ..jit.types import Float, Matrix4f, UInt32, Vector3f
 from .mitsuba_objects import Parameter
 from .shapes.sources import ShapeSource
-from .shapes.typed import ravel
 
 # Row of the table of transformations that means "no transformation".
 _NONE = 0xFFFFFFFF

@@ -14,13 +14,12 @@ import mitsuba as mi
 import numpy as np
 
 from ...errors import ShadowmapError, UnsupportedShape
-from ...jit.arrays import device_array
+from ...jit.arrays import device_array, ravel
 from ...jit.types import Float, UInt32, Vector3f
 from ..mitsuba_meshes import mesh_buffers
 from ..mitsuba_objects import Parameter, parameters
 from . import curves, tubes
 from . import tessellation as shapes_tessellation
-from .typed import ravel
 
 _ANALYTIC = {"Sphere": shapes_tessellation.sphere, "Disk": shapes_tessellation.disk, "Cylinder": shapes_tessellation.cylinder}
 _CURVES: dict[str, type[curves.BSplines] | type[curves.Polylines]] = {

@@ -12,10 +12,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...jit.arrays import device_array
+from ...jit.arrays import device_array, ravel, replace_grad
 from ...jit.types import Float, Point3f, UInt32, Vector3f
 from ...jit.vectors import normalize_or
-from .typed import ravel, replace_grad
 
 # Lower bound of a normal's component away from the curve, relative to a straight tube's. Where a curve bends more than the tube's
 # radius allows, the inner side of the tube is folded, and normals would change sides.

@@ -73,7 +73,7 @@ class Canvas:
 
     def target(self) -> Array:
         """(H, W), visibility from 0 to 1, a copy."""
-        return self._image.astype(np.float32) / 255
+        return np.divide(self._image, 255, dtype=np.float32)
 
     def stroke(self, key: Hashable, mode: Mode, radius: float, points: npt.ArrayLike) -> None:
         """Paint along a line, round, with an edge one pixel soft. A stroke does not get darker where it crosses itself.
@@ -89,13 +89,13 @@ class Canvas:
             raise ShadowmapError(f"a stroke to {mode!r}: choose add or erase.")
         if not (0 < radius < np.inf and len(line) and np.isfinite(line).all()):
             raise ShadowmapError(f"a stroke of {len(line)} points and radius {radius}: give finite ones, at least one point.")
-        known = (k for k, edit in enumerate(self._edits) if edit.key == key and edit.cover is not None)
-        index = next(known, None)
-        if index is None:
+        known = ((k, edit.cover) for k, edit in enumerate(self._edits) if edit.key == key and edit.cover is not None)
+        index, cover = next(known, (None, None))
+        if index is None or cover is None:
             cover = np.zeros(self.shape, np.uint8)
             self._push(_Edit(key, 0 if mode == "add" else 255, cover))
             index = len(self._edits) - 1
-        _cover(self._edits[index].cover, line, radius)
+        _cover(cover, line, radius)
         self._undone.clear()
         self._changed(above=index)
 

@@ -6,7 +6,6 @@ import asyncio
 import itertools
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 import anyio
 from starlette.websockets import WebSocket, WebSocketDisconnect
@@ -118,7 +117,7 @@ class Connections:
                 await client.socket.close(1008, str(error)[:120])
                 return
 
-    def _handle(self, client: _Client, message: Any) -> None:
+    def _handle(self, client: _Client, message: object) -> None:
         if isinstance(message, messages.Seen):
             client.unseen = [number for number in client.unseen if number > message.frame]
             client.wake.set()
@@ -147,9 +146,11 @@ class Connections:
             await client.wake.wait()
             client.wake.clear()
             for content in self._news(client):
-                send = client.socket.send_text if isinstance(content, str) else client.socket.send_bytes
                 with anyio.fail_after(_PATIENCE):
-                    await send(content)
+                    if isinstance(content, str):
+                        await client.socket.send_text(content)
+                    else:
+                        await client.socket.send_bytes(content)
 
     def _news(self, client: _Client) -> list[str | bytes]:
         """Messages that the page has not had yet: of a movement before its first frame, of rest after the last one."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +13,9 @@ from ..errors import ShadowmapError
 from ..inverse.shadow_art import target_images
 from ..inverse.shadow_art.exports import vertex_colours
 from ..io.files import atomic
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 #: Formats of meshes, with their media types.
 FORMATS = {"ply": "application/octet-stream", "obj": "text/plain; charset=utf-8", "glb": "model/gltf-binary"}
@@ -32,7 +35,7 @@ def mesh_bytes(kind: str, vertices: Array, faces: npt.NDArray[np.uint32]) -> byt
 
     colours = vertex_colours(vertices) if kind == "glb" else None
     content = trimesh.Trimesh(vertices, faces, process=False, vertex_colors=colours).export(file_type=kind)
-    return content.encode() if isinstance(content, str) else content
+    return content.encode() if isinstance(content, str) else bytes(content)
 
 
 def write_mesh(path: Path, vertices: Array, faces: npt.NDArray[np.uint32]) -> None:
@@ -72,7 +75,7 @@ def read_shadow(data: bytes, size: tuple[int, int]) -> Array:
         from PIL import Image
 
         ground = ground.resize((width, height), Image.Resampling.BOX if ground.width > width else Image.Resampling.BICUBIC)
-    return np.asarray(ground, np.float32) / 255
+    return np.divide(np.asarray(ground), 255, dtype=np.float32)
 
 
 def read_target(data: bytes, seen: npt.NDArray[np.bool_]) -> Array:
@@ -93,7 +96,7 @@ def read_target(data: bytes, seen: npt.NDArray[np.bool_]) -> Array:
     return target_images.fit(figure, seen)
 
 
-def _open(data: bytes) -> Any:
+def _open(data: bytes) -> Image.Image:
     """All of an image, decoded."""
     from PIL import Image
 
@@ -111,11 +114,11 @@ def _open(data: bytes) -> Any:
         raise ShadowmapError(f"no image, or a damaged one: give {', '.join(_IMAGES)}.") from error
 
 
-def _transparent(image: Any) -> bool:
-    return image.convert("RGBA").getextrema()[3][0] < 255
+def _transparent(image: Image.Image) -> bool:
+    return bool(np.asarray(image.convert("RGBA"))[..., 3].min() < 255)
 
 
-def _on_white(image: Any) -> Any:
+def _on_white(image: Image.Image) -> Image.Image:
     from PIL import Image
 
     coloured = image.convert("RGBA")

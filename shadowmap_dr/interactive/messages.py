@@ -93,7 +93,7 @@ def _stroke(value: dict[str, Any], size: tuple[int, int]) -> Stroke:
     if value.get("mode") not in ("add", "erase"):
         raise MessageError("a stroke that neither adds nor erases.")
     radius, points = value.get("radius"), value.get("points")
-    if not (_number(radius) and 0.5 <= radius <= max(size)):
+    if not (isinstance(radius, int | float) and _number(radius) and 0.5 <= radius <= max(size)):
         raise MessageError(f"a stroke's radius that is no number from 0.5 to {max(size)}.")
     if not (isinstance(points, list) and 2 <= len(points) <= 2 * MOST_POINTS and len(points) % 2 == 0):
         raise MessageError(f"a stroke that has not 1 to {MOST_POINTS} points.")
@@ -105,7 +105,7 @@ def _stroke(value: dict[str, Any], size: tuple[int, int]) -> Stroke:
     return Stroke(_integer(value, "id"), _integer(value, "seq"), value["mode"], float(radius), line)
 
 
-def _number(value: Any) -> bool:
+def _number(value: object) -> bool:
     # A comparison also refuses NaN, and integers that no float can hold.
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e9
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import numpy.typing as npt
 
 from ..errors import ShadowmapError
 from ..inverse import Sculptor
+from ..jit.types import Float
 
 #: It rests once the loss has not fallen by this share, and by this much, for so many steps; and after so many steps at last. At
 #: 256 x 256 pixels, the second is a fifth of what one wrong pixel costs.
@@ -77,7 +76,7 @@ class Modeller:
         """(H, W), visibility from 0 (dark) to 1 (lit)."""
         return self.sculptor.visibility()[0]
 
-    def _judge(self, loss: Any) -> None:
+    def _judge(self, loss: Float) -> None:
         self.loss = float(loss[0])
         if not np.isfinite(self.loss):
             raise ShadowmapError("the mesh has been lost: its vertices are not finite any more.")

@@ -75,7 +75,8 @@ class Session:
         self._condition = threading.Condition()
         self._target: tuple[Array, int] | None = None
         self._target_is_new = self._reset = self._restart = self._closing = False
-        self._status, self._snapshot = Status("starting"), None
+        self._status = Status("starting")
+        self._snapshot: Snapshot | None = None
         self._faces = np.zeros((0, 3), np.uint32)
         self._thread = threading.Thread(target=self._work, name="sculptor", daemon=True)
         self._steps = self._first_number = 0

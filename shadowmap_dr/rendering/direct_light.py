@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from ..jit.broadcast import broadcast_differentiable
+from ..jit.types import Bool, Color3f, Float, Vector3f
 from ..scene.lights.area import AreaLight
-from ..scene.lights.environment import Environment
+from ..scene.lights.environment import Environment, UniformRadiance
 from ..scene.lights.read import Light
 from ..scene.sensor import Sensor
 from ..scene.sums import evaluate
 from .gbuffer.surface import Surface
 
 
-def direct_light(surface: Surface, light: Light, visibility: Any = 1.0, nodes: Sequence[Any] = (), *, gate: bool = True) -> Any:
+def direct_light(
+    surface: Surface, light: Light, visibility: Float | float = 1.0, nodes: Sequence[Any] = (), *, gate: bool = True
+) -> Color3f:
     """Radiance (colour, N) towards the camera of one light: BSDF * light * visibility.
 
     ``visibility`` Float (N,), 0 dark to 1 lit. ``nodes``: :meth:`SceneData.materials`. ``gate`` removes
@@ -33,14 +37,14 @@ def direct_light(surface: Surface, light: Light, visibility: Any = 1.0, nodes: S
     return dr.select(active, _reflected(surface, wo, active, nodes) * weight * visibility, 0.0)
 
 
-def _reflected(surface: Surface, wo: Any, active: Any, nodes: Sequence[Any]) -> Any:
+def _reflected(surface: Surface, wo: Vector3f, active: Bool, nodes: Sequence[Any]) -> Color3f:
     """:meth:`Surface.evaluate` with derivatives by parameters of ``nodes`` that add up without loss."""
     if surface.colour is not None:
         return surface.evaluate(wo, active)
     return evaluate(lambda own: own[0].evaluate(*own[1:]), (surface, wo, mi.Bool(active)), nodes, dr.width(surface.shape))
 
 
-def passes_gate(surface: Surface, wo_world: Any, wo: Any) -> Any:
+def passes_gate(surface: Surface, wo_world: Vector3f, wo: Vector3f) -> Bool:
     """Bool (N,): where no light comes through the triangle's wrong side; ``wo``: the same direction in the shading frame."""
     # Light and viewer lie on the same side of the triangle exactly where they lie on the same side by the shading normal.
     # Holds for reflection and transmission, and for triangles whose vertex normals point the other way.
@@ -49,7 +53,7 @@ def passes_gate(surface: Surface, wo_world: Any, wo: Any) -> Any:
         return (sides > 0) == (wo.z * surface.si.wi.z > 0)
 
 
-def emission(surface: Surface, lights: Sequence[AreaLight]) -> Any:
+def emission(surface: Surface, lights: Sequence[AreaLight]) -> Color3f:
     """Radiance (colour, N) that surfaces give off themselves, seen from the camera. Attached to surface and lights.
 
     Faces shine on the side on which their vertex normals are. Mitsuba asks the interpolated normal itself, which turns away
@@ -61,19 +65,25 @@ def emission(surface: Surface, lights: Sequence[AreaLight]) -> Any:
     si.wi = mi.Vector3f(0, 0, 1)
     for light in lights:
         own = front & (surface.shape == light.shape)
-        radiance = evaluate(lambda at, light=light: light.seen(*at), (si, own), [light.emitter], dr.width(surface.shape))
+        radiance = evaluate(partial(_seen, light), (si, own), [light.emitter], dr.width(surface.shape))
         total += dr.select(own, radiance, 0)
     return total
 
 
-def shining_side(surface: Surface) -> Any:
+def _seen(light: AreaLight, at: tuple[mi.SurfaceInteraction3f, Bool]) -> Color3f:
+    return light.seen(*at)
+
+
+def shining_side(surface: Surface) -> Bool:
     """Bool (N,): where the camera sees the side of a surface on which its vertex normals are."""
     with dr.suspend_grad():
         towards = dr.dot(surface.n_world, surface.wi_world) * dr.dot(surface.n_world, surface.si.sh_frame.n)
         return surface.active & (towards > 0)
 
 
-def ambient_light(surface: Surface, environment: Environment, n_directions: int = 16, nodes: Sequence[Any] = ()) -> Any:
+def ambient_light(
+    surface: Surface, environment: Environment | UniformRadiance, n_directions: int = 16, nodes: Sequence[Any] = ()
+) -> Color3f:
     """Radiance (colour, N) towards the camera of an environment that nothing shadows.
 
     A fixed set of ``n_directions`` cosine-distributed directions in the hemisphere of the shading normal on the viewer's side
@@ -92,7 +102,7 @@ def ambient_light(surface: Surface, environment: Environment, n_directions: int 
     return dr.select(surface.active, total, 0.0)
 
 
-def background(environment: Environment, sensor: Sensor, width: int | None = None, height: int | None = None) -> Any:
+def background(environment: Environment, sensor: Sensor, width: int | None = None, height: int | None = None) -> Color3f:
     """Radiance (colour, H * W) of an environment at every pixel centre, as seen where nothing is in front of it."""
     towards = sensor.ray_direction(width, height)
     return evaluate(environment.radiance, towards, environment.nodes, dr.width(towards))

@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..jit.broadcast import broadcast_differentiable
+from ..jit.types import Bool, Color3f, Float, TensorXf
 from ..raster import Crossings, antialias
 from ..scene.geometry import Geometry
 from .direct_light import shining_side
@@ -45,7 +46,7 @@ class ImagePass:
         visible: Visibilities | None,
         lighting: Lighting,
         shapes: PlacedShapes,
-    ) -> Any:
+    ) -> TensorXf:
         """The image of one camera. Attached to all, but not through edges if ``crossings`` are given, nor through visibilities
         if ``visible`` is."""
         light, settings = self.light, self.light.settings
@@ -68,11 +69,13 @@ class ImagePass:
             return _picture(flat, view, len(channels), named)
         return self._mixed(color, seen.active, view, crossings, named)
 
-    def coloured_image(self, lit: LitFrame, crossings: Crossings | None) -> Any:
+    def coloured_image(self, lit: LitFrame, crossings: Crossings | None) -> TensorXf:
         """The image of one camera, of which light and edges are known already. Attached to materials and the lights' colours."""
         surface, width = coloured(self.light.data, lit.surface, self.light.needs_frames), dr.width(lit.surface.shape)
         irradiance, emitted = lit.irradiance, lit.emitted
+        assert surface.colour is not None, "kept for materials that have one"
         if lit.terms:
+            assert lit.front is not None, "kept together with the terms"
             lights, areas = self.light.data.lights, self.light.data.areas
             colours = broadcast_differentiable(colours_of((*lights, *areas)), width)
             irradiance = irradiance + sum(term * colour for term, colour in zip(lit.terms, colours, strict=True))
@@ -160,10 +163,10 @@ class ImagePass:
         ambient = light.with_ambient(mi.UnpolarizedSpectrum(none), white.surface)
         return LitFrame(frame.view, colouring_inputs(surface), frame.sharpness, ambient, none, terms, front)
 
-    def _channels(self, color: Any, active: Any, view: CameraView) -> list[Any]:
+    def _channels(self, color: Color3f, active: Bool, view: CameraView) -> list[Float]:
         return film_channels(color, active & (self.light.settings.max_depth != 0), view.sensor)
 
-    def _mixed(self, color: Any, active: Any, view: CameraView, crossings: Crossings | None, named: list[Any]) -> Any:
+    def _mixed(self, color: Color3f, active: Bool, view: CameraView, crossings: Crossings | None, named: list[Float]) -> TensorXf:
         """A picture of samples that mix as is known already, or not at all."""
         channels = self._channels(color, active, view)
         if crossings is None:
@@ -178,7 +181,7 @@ def _white(frame: Frame) -> Frame:
     return replace(frame, surface=replace(frame.surface, colour=mi.UnpolarizedSpectrum(1)))
 
 
-def _picture(flat: Any, view: CameraView, channels: int, named: list[Any]) -> Any:
+def _picture(flat: Float, view: CameraView, channels: int, named: list[Float]) -> TensorXf:
     """A tensor of interleaved channels, and further ones (Float each)."""
     height, width = view.raster.height, view.raster.width
     image = mi.TensorXf(flat, shape=(height, width, channels))

@@ -15,6 +15,8 @@ import mitsuba as mi
 
 from ..jit.arrays import device_array
 from ..jit.pytree import tree_map
+from ..jit.types import Bool, Color3f, Float, Point3f, PyTree, UInt32, Vector3f
+from ..scene.lights.light import Illumination
 from ..scene.lights.punctual import SpotLight
 from ..scene.lights.read import Light
 from ..scene.lights.soft_outline import Softened, share_inside
@@ -41,8 +43,8 @@ class LightTable:
     """
 
     light: Light
-    numbers: Any
-    first: Any
+    numbers: Float
+    first: UInt32
     cube: bool
 
     @classmethod
@@ -65,7 +67,7 @@ class LightTable:
         """K."""
         return dr.width(self.first)
 
-    def at(self, index: Any) -> Light:
+    def at(self, index: UInt32) -> Light:
         """The light of that number (UInt32, for each lane). Attached."""
         each, place = dr.width(self.numbers) // self.size, count()
         row = index * each
@@ -79,11 +81,11 @@ class Places:
     ``spots``: to the points where visibility is looked up; ``around``: half way to the pixel's corners.
     """
 
-    spots: list[Any]
-    around: list[Any]
+    spots: list[Vector3f]
+    around: list[Vector3f]
 
     @classmethod
-    def of(cls, p_world: Any, spots: Sequence[Any], around: Sequence[Any]) -> Places:
+    def of(cls, p_world: Point3f, spots: Sequence[Point3f], around: Sequence[Point3f]) -> Places:
         """From such points (Point3f each)."""
         middle = dr.detach(p_world)
         offsets = [[mi.Vector3f(dr.detach(point) - middle) for point in points] for points in (spots, around)]
@@ -99,7 +101,7 @@ def in_tables(lights: Sequence[Light], plan: MapPlan) -> tuple[list[LightTable],
             kinds.setdefault((type(light), kind), []).append(k)
     many = {kind: members for kind, members in kinds.items() if len(members) >= MANY_LIGHTS}
     tables = [
-        LightTable.of([plain[k] for k in members], [plan.first[k] for k in members], kind == "cube")
+        LightTable.of([one for k in members if (one := plain[k]) is not None], [plan.first[k] for k in members], kind == "cube")
         for (_, kind), members in many.items()
     ]
     taken = {k for members in many.values() for k in members}
@@ -111,10 +113,10 @@ def many_lights(
     lights: Sequence[Light],
     plan: MapPlan,
     maps: ShadowMaps | None,
-    spots: Sequence[Any],
-    around: Callable[[], Sequence[Any]],
+    spots: Sequence[Point3f],
+    around: Callable[[], Sequence[Point3f]],
     nodes: Sequence[Any],
-) -> tuple[Any, list[int]]:
+) -> tuple[Color3f | int, list[int]]:
     """(radiance towards the camera of lights of kinds of which there are many, the numbers of the other lights).
 
     ``spots``: points (Point3f (N,) each) where visibility is looked up; ``around``: makes those half way to the pixel's corners.
@@ -127,15 +129,15 @@ def many_lights(
     return sum(light_of_table(seen, places, table, maps, nodes) for table in tables), others
 
 
-def light_of_table(seen: Surface, places: Places, table: LightTable, maps: ShadowMaps | None, nodes: Sequence[Any]) -> Any:
+def light_of_table(seen: Surface, places: Places, table: LightTable, maps: ShadowMaps | None, nodes: Sequence[Any]) -> Color3f:
     """Radiance (colour, N) towards the camera of all lights of a table. Attached to the surface, lights and maps.
 
     ``maps`` None: unshadowed. ``nodes``: :meth:`~shadowmap_dr.scene.load.SceneData.materials`.
     """
 
-    def one_light(index: Any, own: Any, shared: Any) -> Any:
+    def one_light(index: UInt32, own: PyTree, shared: PyTree) -> Color3f:
         (seen, places), (table, maps) = own, shared
-        light: Any = table.at(index)
+        light: Illumination = table.at(index)
         if isinstance(light, SpotLight):
             inside = share_inside(light, seen.p_world, [seen.p_world + offset for offset in places.around])
             light = Softened(light, inside)
@@ -153,22 +155,23 @@ def light_of_table(seen: Surface, places: Places, table: LightTable, maps: Shado
     return sum_over(one_light, table.size, start, (seen, places), (table, maps), implicit, seen.active)
 
 
-def _visibility(table: LightTable, maps: ShadowMaps, index: Any, light: Any, p_world: Any, active: Any) -> Any:
+def _visibility(table: LightTable, maps: ShadowMaps, index: UInt32, light: Any, p_world: Point3f, active: Bool) -> Float:
     which = dr.gather(mi.UInt32, table.first, index)
     if table.cube:
-        position = light.light.position if isinstance(light, Softened) else light.position
+        punctual: Any = light.light if isinstance(light, Softened) else light  # Any: lights with maps of cubes have a position
+        position = punctual.position
         which += cube_face(dr.detach(mi.Vector3f(p_world - position)))
     return visibility(maps, which, p_world, active)
 
 
-def _numbers(light: Light) -> list[Any]:
+def _numbers(light: Light) -> list[Float]:
     """All numbers of a light, in a fixed order."""
-    found: list[Any] = []
+    found: list[Float] = []
     tree_map(light, lambda array: _filled(array, lambda: None, found))
     return found
 
 
-def _filled(array: Any, number: Any, found: list[Any] | None = None) -> Any:
+def _filled(array: Any, number: Callable[[], Float | None], found: list[Float] | None = None) -> Any:
     """An array with other numbers in the place of its own, which are put into ``found`` instead if that is given."""
     if dr.depth_v(array) > 1:
         parts = [_filled(part, number, found) for part in array]
@@ -179,7 +182,7 @@ def _filled(array: Any, number: Any, found: list[Any] | None = None) -> Any:
     return number()
 
 
-def _indices(values: Sequence[int]) -> Any:
+def _indices(values: Sequence[int]) -> UInt32:
     if dr.flag(dr.JitFlag.FreezingScope):
         return dr.concat([mi.UInt32(value) for value in values])
     return device_array(mi.UInt32, values)

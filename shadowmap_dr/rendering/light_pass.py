@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..errors import ShadowmapError
+from ..jit.types import Bool, Color3f, Float, Point3f
 from ..raster import RasterOutput
 from ..scene.geometry import Geometry
 from ..scene.lights.area import AreaLight
@@ -25,6 +26,7 @@ from .direct_light import ambient_light, background, direct_light, emission
 from .extended_lights import (
     LightSamples,
     SoftFrusta,
+    SoftLight,
     SoftMaps,
     SoftPlan,
     check_soft_sizes,
@@ -38,7 +40,7 @@ from .extended_lights import (
 from .gbuffer.camera_view import Frame, PlacedShapes
 from .gbuffer.pixel_footprint import FootprintSamples, footprint_points
 from .gbuffer.surface import Surface
-from .light_colours import white_light
+from .light_colours import white_area_light, white_light
 from .light_loops import MANY_LIGHTS, many_lights
 from .settings import RenderSettings
 from .shadow_pass import MapPlan, fit_maps, light_visibility, make_maps
@@ -87,8 +89,8 @@ class IncidentLight:
     """
 
     lights: tuple[Any, ...]
-    visible: list[Any]
-    looped: Any
+    visible: list[Float]
+    looped: Color3f | int
     parts: tuple[Any, ...]
 
 
@@ -108,7 +110,7 @@ class LightPass:
     settings: RenderSettings
     plan: MapPlan
     soft: tuple[SoftPlan, ...]
-    outward: Any
+    outward: Bool | None
 
     @property
     def needs_frames(self) -> bool:
@@ -121,7 +123,7 @@ class LightPass:
         shapes: PlacedShapes,
         replacements: Mapping[str, Any] | None,
         fits: tuple[Frusta | None, SoftFrusta],
-        transparent: Callable[[RasterOutput], Any] | None,
+        transparent: Callable[[RasterOutput], Bool] | None,
         seen: Callable[[], tuple[Any, Any]],
     ) -> Lighting:
         """All lights and their shadow maps.
@@ -148,14 +150,15 @@ class LightPass:
                 soft_maps = make_soft_maps(self.soft, samples, self.plan, *common, shadow, fits[1], transparent, points)
         return Lighting(lights, maps, areas, samples, soft_maps)
 
-    def fit(self, shapes: PlacedShapes, seen: tuple[Any, Any]) -> tuple[Frusta | None, SoftFrusta]:
+    def fit(self, shapes: PlacedShapes, seen: tuple[Point3f, Bool]) -> tuple[Frusta | None, SoftFrusta]:
         """The first fit of the shadow maps, and of those of extended lights. Arguments as of :meth:`lighting`. Detached."""
         data, settings, geometry = self.data, self.settings, shapes.geometry
         if not settings.lit or settings.shadow.method == "none":
             return None, (None, None)
         with dr.suspend_grad():
             samples = self._samples(data.areas, geometry)
-            frusta, soft = None, (None, None)
+            frusta: Frusta | None = None
+            soft: SoftFrusta = (None, None)
             if data.lights:
                 frusta = fit_maps(self.plan, data.lights, geometry, settings.shadow, None, seen)
             if samples:
@@ -193,7 +196,7 @@ class LightPass:
         """
         with dr.suspend_grad():
             lights, seen = [white_light(light) for light in lighting.lights], frame.surface
-            samples = self._samples(tuple(white_light(area) for area in lighting.areas), geometry)
+            samples = self._samples(tuple(white_area_light(area) for area in lighting.areas), geometry)
             visible = self.visibilities(frame, lighting, list(range(len(lights))), lights)
             reach = zip(self._outlined(frame, lights), visible, strict=True)
             extended, maps, nodes = zip(self.soft, samples, strict=True), lighting.soft_maps, self.data.materials()
@@ -201,7 +204,7 @@ class LightPass:
             terms += [soft_light(seen, plan, own, maps, nodes) for plan, own in extended]
             return tuple(term[0] for term in terms)
 
-    def radiance(self, seen: Surface, lighting: Lighting, incident: IncidentLight) -> Any:
+    def radiance(self, seen: Surface, lighting: Lighting, incident: IncidentLight) -> Color3f:
         """Reflected radiance (colour, N) towards the camera. ``incident``: on the same surfaces. Attached to all of these."""
         gate = not self.settings.shadow.compat
         color = dr.zeros(mi.UnpolarizedSpectrum, dr.width(seen.shape))
@@ -213,14 +216,14 @@ class LightPass:
             color += soft_light(seen, plan, samples, lighting.soft_maps, nodes, gate=gate, visible=parts)
         return incident.looped + self.with_ambient(color, seen)
 
-    def with_ambient(self, color: Any, seen: Surface) -> Any:
+    def with_ambient(self, color: Color3f, seen: Surface) -> Color3f:
         """The same radiance with reflected light that nothing shadows."""
         if self.settings.ambient > 0 and self.settings.lit:
             nodes, uniform = self.data.materials(), UniformRadiance(self.settings.ambient)
             color += ambient_light(seen, uniform, _AMBIENT_DIRECTIONS, nodes)
         return color
 
-    def with_emission(self, color: Any, seen: Surface, lighting: Lighting, sensor: Sensor, size: tuple[int, int]) -> Any:
+    def with_emission(self, color: Color3f, seen: Surface, lighting: Lighting, sensor: Sensor, size: tuple[int, int]) -> Color3f:
         """The same radiance with that of emitters that the camera sees. ``size``: (columns, rows) of samples."""
         if self.settings.hide_emitters or self.settings.max_depth == 0:
             return color
@@ -229,7 +232,7 @@ class LightPass:
             color = dr.select(seen.active, color, background(environment, sensor, *size))
         return color
 
-    def visibilities(self, frame: Frame, lighting: Lighting, numbers: list[int], lights: list[Light]) -> list[Any]:
+    def visibilities(self, frame: Frame, lighting: Lighting, numbers: list[int], lights: Sequence[Light]) -> list[Float]:
         """Visibility (Float, N) of lights from all pixels. ``numbers``: of the lights in the plan."""
         maps = lighting.maps
         if maps is None or not numbers:
@@ -241,15 +244,16 @@ class LightPass:
         ]
 
     def _samples(self, areas: tuple[AreaLight, ...], geometry: Geometry) -> tuple[LightSamples, ...]:
-        extended = (*areas, *self.data.environments)
+        extended: tuple[SoftLight, ...] = (*areas, *self.data.environments)
         return tuple(samples_of(light, plan, geometry) for light, plan in zip(extended, self.soft, strict=True))
 
     def _replaced(self, lights: tuple[Any, ...], replacements: Mapping[str, Any] | None) -> tuple[Any, ...]:
-        for name in replacements or ():
-            old, new = self.data.light(name), replacements[name]
+        given = replacements or {}
+        for name, new in given.items():
+            old = self.data.light(name)
             if type(old) is not type(new):
                 raise ShadowmapError(f"Light '{name}' is a {type(old).__name__}, not a {type(new).__name__}.")
-        return tuple((replacements or {}).get(light.name, light) for light in lights)
+        return tuple(given.get(light.name, light) for light in lights)
 
     def _around(self, frame: Frame) -> list[Any]:
         view, seen = frame.view, frame.surface
@@ -262,7 +266,7 @@ class LightPass:
         shining = [SquareSpot(light) if compat and isinstance(light, SpotLight) else light for light in lights]
         return softened(shining, frame.surface.p_world, lambda: self._around(frame))
 
-    def _in_tables(self, frame: Frame, lighting: Lighting) -> tuple[Any, list[int]]:
+    def _in_tables(self, frame: Frame, lighting: Lighting) -> tuple[Color3f | int, list[int]]:
         """(radiance of lights of kinds of which there are many, numbers of the other lights)."""
         every, seen = list(range(len(lighting.lights))), frame.surface
         if len(every) < MANY_LIGHTS or self.settings.shadow.compat or self.settings.aovs:
@@ -281,7 +285,8 @@ class LightPass:
 
 def plan_extended_lights(data: SceneData, settings: RenderSettings) -> tuple[SoftPlan, ...]:
     """Sample the area lights and environments of a scene (on the host, once). Refuses what would not fit into arrays."""
-    lights, single = (*data.areas, *data.environments), settings.emitter_shadows == "single"
+    lights: tuple[SoftLight, ...] = (*data.areas, *data.environments)
+    single = settings.emitter_shadows == "single"
     soft = plan_soft(lights, data.geometry, settings.area_light_samples, settings.environment_light_samples, single)
     if settings.shadow.method != "none":
         check_soft_sizes(soft, data.geometry, settings.soft_map_resolution)

@@ -9,6 +9,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ..jit.types import Bool, Color3f, Float
 from ..raster import Crossings
 from ..shadow import ShadowMaps
 from .extended_lights import SoftMaps
@@ -45,11 +46,11 @@ class LitFrame:
 
     view: CameraView
     surface: Surface
-    sharpness: Any
-    irradiance: Any
-    emitted: Any
+    sharpness: Float | None
+    irradiance: Color3f
+    emitted: Color3f
     terms: tuple[Any, ...] = ()
-    front: Any = None
+    front: Bool | None = None
 
 
 @dataclass

@@ -16,6 +16,7 @@ from ..jit.call_data import rewrite_scalars
 from ..jit.frozen import take_apart
 from ..jit.gpu import keep_registers
 from ..jit.kernel_cache import note_size
+from ..jit.types import Bool, Float, TensorXf
 from ..raster import Topology, build_topology, outward_faces
 from ..scene.lights.area import AreaLight
 from ..scene.lights.read import Light
@@ -26,7 +27,7 @@ from ..shadow import Frusta
 from .extended_lights import SoftFrusta, SoftPlan
 from .film.film import Margin, develop, sample_grid, sample_windows
 from .gbuffer.camera_view import CameraPass, CameraView, GBuffer, PlacedShapes
-from .gbuffer.facet_normals import flat_faces
+from .gbuffer.facet_normals import FlatFaces, flat_faces
 from .gbuffer.pixel_footprint import footprint_points
 from .gbuffer.shading_edges import ShadingEdges
 from .image_pass import ImagePass
@@ -62,9 +63,9 @@ class Renderer:
     topology: Topology
     plan: MapPlan
     settings: RenderSettings
-    flat: Any = None
+    flat: FlatFaces | None = None
     creases: ShadingEdges | None = None
-    outward: Any = None
+    outward: Bool | None = None
     soft: tuple[SoftPlan, ...] = ()
     frusta: Frusta | None = None
     soft_frusta: SoftFrusta = (None, None)
@@ -79,7 +80,7 @@ class Renderer:
         return take_apart([getattr(self, part.name) for part in fields(self)])
 
     @classmethod
-    def from_scene(cls, scene: Any, *, tessellation: int = 64, **settings: Any) -> Renderer:
+    def from_scene(cls, scene: mi.Scene, *, tessellation: int = 64, **settings: object) -> Renderer:
         """Build a renderer for a ``mi.Scene``.
 
         The scene's meshes are read now, for the last time.
@@ -161,7 +162,7 @@ class Renderer:
         sensor: int | Sensor = 0,
         spp: int = 1,
         cache: PassCache | None = None,
-    ) -> Any:
+    ) -> TensorXf:
         """Render an image.
 
         Args:
@@ -190,7 +191,8 @@ class Renderer:
         cache = cache or PassCache()
         images = ImagePass(self.camera_pass, self.light_pass)
         samples = max(window.width * window.height for window in windows) * factor**2
-        views, lighting, shapes = cache.views, None, cache.shapes
+        views: Sequence[CameraView] = cache.views
+        lighting, shapes = None, cache.shapes
         if shapes is None:
             # Before all else that is attached: derivatives are taken in the reverse order, and pixels should need one pass only.
             shapes = images.cameras.placed(geometry.in_packets(samples))
@@ -207,6 +209,7 @@ class Renderer:
         if cache.lit:
             pictures = [images.coloured_image(*each) for each in zip(cache.lit, crossings, strict=True)]
         else:
+            assert lighting is not None, "made above where surfaces are to be lit"
             visible = cache.visible or (None,) * len(views)
             pictures = [images.image(*each, lighting, shapes) for each in zip(views, crossings, visible, strict=True)]
         return develop([margin.cut(picture, factor) for picture in pictures], windows[0], factor)
@@ -221,7 +224,7 @@ class Renderer:
         """Record of a light of the scene."""
         return self.data.light(name)
 
-    def curve_vertices(self, name: str, control_points: Any) -> Any:
+    def curve_vertices(self, name: str, control_points: Float) -> Float:
         """World-space vertices of a `bsplinecurve` or `linearcurve` for ``vertex_positions`` of :meth:`render`.
 
         Args:

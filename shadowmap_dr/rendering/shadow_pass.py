@@ -12,6 +12,7 @@ import numpy as np
 
 from ..errors import ShadowmapError
 from ..jit.arrays import device_array
+from ..jit.types import Bool, Float, Point3f, UInt32, Vector3f
 from ..raster import RasterOutput, Topology
 from ..scene.geometry import Geometry, rows_of
 from ..scene.lights.projected import Beam
@@ -50,8 +51,8 @@ class MapPlan:
 
     kinds: tuple[str, ...]
     first: tuple[int, ...]
-    planes: Any
-    planar: Any
+    planes: UInt32
+    planar: Bool
     center: tuple[float, float, float]
     radius: float
 
@@ -122,9 +123,9 @@ def make_maps(
     topology: Topology,
     settings: ShadowSettings,
     previous: Frusta | None,
-    transparent: Callable[[RasterOutput], Any] | None = None,
-    seen: Any = None,
-    outward: Any = None,
+    transparent: Callable[[RasterOutput], Bool] | None = None,
+    seen: tuple[Point3f, Bool] | None = None,
+    outward: Bool | None = None,
 ) -> ShadowMaps:
     """Render and filter the maps of all lights as one batch. Attached to lights and vertices.
 
@@ -143,15 +144,20 @@ def fit_maps(
     geometry: Geometry,
     settings: ShadowSettings,
     previous: Frusta | None,
-    seen: Any = None,
+    seen: tuple[Point3f, Bool] | None = None,
 ) -> Frusta:
     """The fit of the maps of :func:`make_maps`, without rendering them. Arguments as there."""
     return _fitted(plan, lights, geometry, settings, previous, seen)[3]
 
 
 def _fitted(
-    plan: MapPlan, lights: Sequence[Light], geometry: Geometry, settings: ShadowSettings, previous: Frusta | None, seen: Any
-) -> tuple[Views, Any, Any, Frusta]:
+    plan: MapPlan,
+    lights: Sequence[Light],
+    geometry: Geometry,
+    settings: ShadowSettings,
+    previous: Frusta | None,
+    seen: tuple[Point3f, Bool] | None,
+) -> tuple[Views, Point3f, UInt32, Frusta]:
     """(cameras of all maps, light-space vertices, the map of each of these, the fit)."""
     views = [view for light, kind in zip(lights, plan.kinds, strict=True) for view in _views(plan, light, kind, settings)]
     stacked = stack_views(views)
@@ -178,7 +184,7 @@ def _fitted(
     return stacked, p_light, lanes, frusta
 
 
-def _culled(plan: MapPlan, count: int, outward: Any) -> Any:
+def _culled(plan: MapPlan, count: int, outward: Bool | None) -> Bool | None:
     """Faces of each map (Bool, for all maps or for all faces of each) of which only fronts are drawn, or None.
 
     Only the maps of directional lights begin before all casters: others may begin inside of one, and see its backs.
@@ -207,7 +213,7 @@ def _views(plan: MapPlan, light: Light, kind: str, settings: ShadowSettings) -> 
     return (LightView(view.right, view.up, view.forward, origin, view.spread),)
 
 
-def _within_beams(plan: MapPlan, lights: Sequence[Light], p_light: Any, map_index: Any) -> Any:
+def _within_beams(plan: MapPlan, lights: Sequence[Light], p_light: Point3f, map_index: UInt32) -> Point3f:
     """Light-space points, moved to the nearest that a beam can reach in the maps of beams."""
     result = p_light
     for k, light in enumerate(lights):
@@ -229,14 +235,14 @@ def _from_beams_on(plan: MapPlan, lights: Sequence[Light], frusta: Frusta) -> Fr
         if isinstance(light, Beam):
             start = dr.select(index == first, light.caster_start, start)
     near = dr.maximum(frusta.near, start)
-    first = dr.maximum(frusta.first, near)
-    least = first + 0.1 * dr.maximum(start, 0)
-    frusta = replace(frusta, near=near, first=first, far=dr.maximum(frusta.far, least), last=dr.maximum(frusta.last, least))
+    nearest = dr.maximum(frusta.first, near)
+    least = nearest + 0.1 * dr.maximum(start, 0)
+    frusta = replace(frusta, near=near, first=nearest, far=dr.maximum(frusta.far, least), last=dr.maximum(frusta.last, least))
     dr.eval(frusta)
     return frusta
 
 
-def _compat_frusta(plan: MapPlan, views: Any) -> Frusta:
+def _compat_frusta(plan: MapPlan, views: Views) -> Frusta:
     """Fixed frusta that hold the whole scene, whatever moves in it."""
     spread = dr.detach(views.spread)
     zero = dr.zeros(mi.Float, views.count)
@@ -252,13 +258,13 @@ def boxes_of(geometry: Geometry) -> Boxes:
     return shape_boxes(p_world, geometry.vertex_shape, len(geometry.shapes))
 
 
-def shape_planes(plan: MapPlan, geometry: Geometry) -> tuple[tuple[Any, Any], Any]:
+def shape_planes(plan: MapPlan, geometry: Geometry) -> tuple[tuple[Vector3f, Point3f], Bool]:
     """((unit normal, point), whether it is one (Bool)) of the plane of each shape where it is now, detached, world space."""
     planes = _planes(plan, geometry)
     return planes, _still_planar(plan, geometry, planes)
 
 
-def _planes(plan: MapPlan, geometry: Geometry) -> tuple[Any, Any]:
+def _planes(plan: MapPlan, geometry: Geometry) -> tuple[Vector3f, Point3f]:
     """(unit normal, point) of each planar shape where it is now, detached, world space."""
     with dr.suspend_grad():
         corners = dr.gather(mi.Vector3u, geometry.faces, plan.planes)
@@ -268,7 +274,7 @@ def _planes(plan: MapPlan, geometry: Geometry) -> tuple[Any, Any]:
         return normal / dr.select(length > 0, length, 1), a
 
 
-def _still_planar(plan: MapPlan, geometry: Geometry, planes: tuple[Any, Any]) -> Any:
+def _still_planar(plan: MapPlan, geometry: Geometry, planes: tuple[Vector3f, Point3f]) -> Bool:
     """Shapes that were planar at rest and still are (Bool, S): vertices may have moved out of the plane since."""
     if all(not info.planar or geometry.known_unchanged(info) for info in geometry.shapes):
         return plan.planar
@@ -282,11 +288,12 @@ def _still_planar(plan: MapPlan, geometry: Geometry, planes: tuple[Any, Any]) ->
         return plan.planar & (farthest <= 1e-4 * plan.radius)
 
 
-def light_visibility(maps: ShadowMaps, plan: MapPlan, light: Light, index: int, p_world: Any, active: Any) -> Any:
+def light_visibility(maps: ShadowMaps, plan: MapPlan, light: Light, index: int, p_world: Point3f, active: Bool) -> Float:
     """Visibility (Float) of light number ``index`` from world-space points. Attached to points, casters and light."""
     # Wide, although it is one number: adjoints of look-ups with it then run in one kernel, others in one for each number.
-    which: Any = dr.full(mi.UInt32, plan.first[index], dr.width(p_world))
+    which: UInt32 = dr.full(mi.UInt32, plan.first[index], dr.width(p_world))
     if plan.kinds[index] == "cube":
-        offset = dr.detach(mi.Vector3f(p_world - light.position))
+        punctual: Any = light  # Any: of the records, those with six maps have a position
+        offset = dr.detach(mi.Vector3f(p_world - punctual.position))
         which = plan.first[index] + cube_face(offset)
     return visibility(maps, which, p_world, active)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+import operator
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -131,7 +133,8 @@ def _reverse_image(renderer: Renderer, still: StillScene, to_light: list[Vector3
         active = pixels.active & (cosine > 0) & (dr.dot(pixels.n_world, axis) > 0)
         shown = mi.Float(1)
         if maps is not None:
-            shown = sum(light_visibility(maps, renderer.plan, light, k, p, active) for p in pixels.points) / len(pixels.points)
+            found = [light_visibility(maps, renderer.plan, light, k, p, active) for p in pixels.points]
+            shown = functools.reduce(operator.add, found) / len(found)
         for c in range(pixels.channels):
             total[c] = total[c] + dr.select(active, cosine * shown * still.irradiance[k][c], 0)
     colours = [value * colour for value, colour in zip(total, pixels.colours, strict=True)]

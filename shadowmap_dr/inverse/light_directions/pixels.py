@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import operator
 from dataclasses import dataclass
 from typing import cast
 
@@ -183,7 +185,8 @@ def _shares(crossings: Crossings, width: int, count: int) -> tuple[Float, Float]
     pixel = dr.arange(mi.UInt32, count)
     right, down = crossings.right, crossings.down
     incoming, outgoing = mixer.around(right, down, 1), mixer.around(right, down, -1)
-    scale = dr.rcp(dr.maximum(1, sum(incoming)))
+    total: Float = functools.reduce(operator.add, incoming)
+    scale = dr.rcp(dr.maximum(1, total))
     dr.eval(scale)
     given = [
         weight * dr.gather(mi.Float, scale, neighbour, weight > 0)

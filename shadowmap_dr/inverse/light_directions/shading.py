@@ -8,6 +8,8 @@ suspend gradients.
 
 from __future__ import annotations
 
+import functools
+import operator
 from dataclasses import replace
 from typing import Any, cast
 
@@ -63,7 +65,8 @@ def lit(scene: StillScene, views: Views, maps: TangentMaps | None) -> Float:
     value, by_a, by_b = mi.Float(1), mi.Float(0), mi.Float(0)
     if maps is not None:
         found = [tangent_visibility(maps, index, at(points), active) for points in pixels.points]
-        value, by_a, by_b = (sum(f[k] for f in found) * (1 / len(found)) for k in range(3))
+        sums = [functools.reduce(operator.add, (f[k] for f in found)) for k in range(3)]
+        value, by_a, by_b = (total * (1 / len(found)) for total in sums)
     cosine = dr.select(active, cosine, 0)
     # As the light turns, the direction to it moves against the axes of its map.
     change_a, change_b = (dr.select(active, -dr.dot(n, axis), 0) for axis in (view.right, view.up))

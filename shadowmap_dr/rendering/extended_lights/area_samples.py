@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...jit.arrays import device_array
+from ...jit.types import ArrayT, Color3f, Float, Point2f, UInt32, Vector3f
 from ...scene.geometry import Geometry, ShapeInfo
 from ...scene.lights.area import AreaLight
 from .clusters import facet_clusters, surface_clusters, unevenness
@@ -50,15 +51,15 @@ class AreaPlan:
               triangles wind the other way: maps show the other sides only
     """
 
-    face: Any
-    u: Any
-    v: Any
-    fraction: Any
-    cluster: Any
-    chosen: Any
+    face: UInt32
+    u: Float
+    v: Float
+    fraction: Float
+    cluster: UInt32
+    chosen: UInt32
     shape: int
     dented: bool
-    facet: Any
+    facet: UInt32
     facets: int
 
 
@@ -133,7 +134,9 @@ def area_samples(light: AreaLight, plan: AreaPlan, geometry: Geometry) -> LightS
     )
 
 
-def _facets(light: AreaLight, plan: AreaPlan, planar: bool, pieces: tuple[Any, Any, Any, Any], place: Any) -> Facets:
+def _facets(
+    light: AreaLight, plan: AreaPlan, planar: bool, pieces: tuple[Vector3f, Vector3f, Float, Color3f], place: Vector3f
+) -> Facets:
     """The disks that shine like an emitter. ``pieces``: their positions, area vectors, areas and radiances."""
     position, vector, area, radiance = pieces
     # Relative to the samples, which keeps digits.
@@ -144,8 +147,9 @@ def _facets(light: AreaLight, plan: AreaPlan, planar: bool, pieces: tuple[Any, A
     sums = cluster_sums(weight, plan.facet, count)
     share = dr.rcp(dr.maximum(sums, 1e-30))
 
-    def mean(values: Any) -> Any:
-        return cluster_sums(values * weight, plan.facet, count) * share
+    def mean(values: ArrayT) -> ArrayT:
+        whole: Any = values  # Any: a number or a vector
+        return cluster_sums(whole * weight, plan.facet, count) * share
 
     n = vector * dr.rcp(dr.maximum(area, 1e-30))
     normal, middle, bend = mean(n), mean(offset), dr.zeros(mi.Float, count)
@@ -168,28 +172,28 @@ def _facets(light: AreaLight, plan: AreaPlan, planar: bool, pieces: tuple[Any, A
     )
 
 
-def _at(values: Any, index: Any) -> Any:
+def _at(values: Vector3f, index: UInt32) -> Vector3f:
     """Vectors of some numbers (Vector3f)."""
     return mi.Vector3f(*(dr.gather(mi.Float, values[c], index) for c in range(3)))
 
 
-def _length(vector: Any) -> Any:
+def _length(vector: Vector3f) -> Float:
     return dr.sqrt(dr.maximum(dr.squared_norm(vector), 1e-20))
 
 
-def _relative(radiance: Any) -> Any:
+def _relative(radiance: Color3f) -> Float:
     """Brightness of pieces (Float, P) in units of their mean, with a little more so that dark parts have a middle, too."""
     bright = dr.maximum(dr.mean(mi.UnpolarizedSpectrum(radiance)), 0)
     return bright * dr.rcp(dr.maximum(dr.detach(dr.mean(bright)), 1e-30)) + _DIM
 
 
-def _triangles(geometry: Geometry, face: Any) -> tuple[Any, Any, Any]:
+def _triangles(geometry: Geometry, face: UInt32) -> tuple[Vector3f, Vector3f, Vector3f]:
     corner = dr.gather(mi.Vector3u, geometry.faces, face)
     a, b, c = (mi.Vector3f(geometry.vertices(corner[k])) for k in range(3))
     return a, b - a, c - a
 
 
-def _uv(geometry: Geometry, face: Any, u: Any, v: Any, info: ShapeInfo) -> Any:
+def _uv(geometry: Geometry, face: UInt32, u: Float, v: Float, info: ShapeInfo) -> Point2f:
     """Texture coordinates (Point2f), as Mitsuba has them: barycentrics on shapes without any."""
     if not info.has_texcoords:
         return mi.Point2f(u, v)

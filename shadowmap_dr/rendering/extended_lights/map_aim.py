@@ -44,7 +44,8 @@ def aim(vertices: Sequence[Points], shapes: Sequence[ShapeInfo], own: int) -> Ai
     points = np.concatenate([vertices[k] for k in casters])
     centre = 0.5 * (points.min(0) + points.max(0))
     eyes = np.concatenate([_box(emitter), emitter[:: max(1, len(emitter) // _EYES)]])
-    return Aim(tuple(float(c) for c in centre), tuple(casters), _widest(eyes, points, centre) > WIDEST - _ROOM)
+    x, y, z = centre.tolist()
+    return Aim((x, y, z), tuple(casters), _widest(eyes, points, centre) > WIDEST - _ROOM)
 
 
 def sees_all(emitter: Points, casters: Sequence[Points], target: tuple[float, float, float]) -> bool:

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from ...jit.types import Bool, Float, Point3f, PyTree, UInt32, Vector2f, Vector3f
 from ...scene.sums import sum_over
 from ...shadow import Frusta, ShadowMaps, Views, chebyshev_visibility
 from ...shadow.light_camera import of_map, to_light_space
@@ -31,7 +31,7 @@ class Pyramid:
     ``values``: flat ``Float``, levels one after the other, two numbers a texel, attached. ``maps``: the finest level.
     """
 
-    values: Any
+    values: Float
     maps: ShadowMaps
     levels: int
 
@@ -48,7 +48,7 @@ class Pyramid:
         dr.eval(values)
         return cls(values, maps, len(levels))
 
-    def look_up(self, which: Any, x: Any, y: Any, level: Any) -> Any:
+    def look_up(self, which: UInt32, x: Float, y: Float, level: UInt32) -> Vector2f:
         """Moments (``Array2f``) at places in 0..1 of map ``which`` on a level (``UInt32``), bilinear; far away outside.
 
         Attached to all but the level.
@@ -71,7 +71,9 @@ class Pyramid:
         return dr.select(inside, dr.fma(rows[1] - rows[0], fy, rows[0]), mi.Vector2f(FAR, FAR * FAR))
 
 
-def penumbra_visibility(pyramid: Pyramid, which: Any, radius: Any, p_world: Any, n_world: Any, active: Any = True) -> Any:
+def penumbra_visibility(
+    pyramid: Pyramid, which: UInt32, radius: Float, p_world: Point3f, n_world: Vector3f, active: Bool | bool = True
+) -> Float:
     """Fraction of a light of this ``radius`` (``Float``, world units, as a disk) that world-space points see (``Float``).
 
     ``which``: map (``UInt32``), drawn from the light's centre. ``n_world``: geometric normals: what lies on the tangent plane of
@@ -81,7 +83,7 @@ def penumbra_visibility(pyramid: Pyramid, which: Any, radius: Any, p_world: Any,
     lanes = (radius, mi.Point3f(p_world), which, dr.detach(n_world), mi.Bool(active))
     start = dr.zeros(mi.Vector2f, dr.width(p_world))
 
-    def occluders(index: Any, lanes: Any, pyramid: Any) -> Any:
+    def occluders(index: UInt32, lanes: PyTree, pyramid: Pyramid) -> Vector2f:
         radius, p_world, which, n_world, active = lanes
         at = _Place.of(pyramid, which, p_world, n_world, active)
         moments, depth = at.look_up(pyramid, which, index, at.footprint(radius, at.nearest), attached=False)
@@ -93,7 +95,7 @@ def penumbra_visibility(pyramid: Pyramid, which: Any, radius: Any, p_world: Any,
     mean = dr.select(some, depths / dr.select(some, blocked, 1), -0.5)
     dr.eval(mean, some)
 
-    def passing(index: Any, lanes: Any, pyramid: Any) -> Any:
+    def passing(index: UInt32, lanes: PyTree, pyramid: Pyramid) -> Vector2f:
         (radius, p_world, which, n_world, active), mean = lanes
         at = _Place.of(pyramid, which, p_world, n_world, active)
         nearer = at.frustum.first + (mean + 0.5) * (at.frustum.far - at.frustum.first)
@@ -110,13 +112,13 @@ class _Place:
 
     view: Views
     frustum: Frusta
-    x: Any
-    y: Any
-    z: Any
-    plane: tuple[Any, Any]
+    x: Float
+    y: Float
+    z: Float
+    plane: tuple[Float, Float]
 
     @classmethod
-    def of(cls, pyramid: Pyramid, which: Any, p_world: Any, n_world: Any, active: Any) -> _Place:
+    def of(cls, pyramid: Pyramid, which: UInt32, p_world: Point3f, n_world: Vector3f, active: Bool) -> _Place:
         maps = pyramid.maps
         count = maps.views.count
         view, frustum = of_map(maps.views, which, count), of_map(maps.frusta, which, count)
@@ -133,16 +135,19 @@ class _Place:
         return cls(view, frustum, x, y, z, plane)
 
     @property
-    def nearest(self) -> Any:
+    def nearest(self) -> Float:
         """Distance at which occluders are looked for."""
         return dr.maximum(self.frustum.first, self.frustum.near)
 
-    def footprint(self, radius: Any, z_occluder: Any) -> tuple[Any, Any]:
+    def footprint(self, radius: Float, z_occluder: Float) -> tuple[Float, Float]:
         """Extent of the rays from the point to the rim of the light at a distance: half-axes in units of the map."""
         slope = radius * dr.maximum(self.z - z_occluder, 0) / (self.z * z_occluder)
-        return tuple(dr.minimum(0.5 * slope / half, _WIDEST) for half in (self.frustum.half_x, self.frustum.half_y))
+        x, y = (dr.minimum(0.5 * slope / half, _WIDEST) for half in (self.frustum.half_x, self.frustum.half_y))
+        return x, y
 
-    def look_up(self, pyramid: Pyramid, which: Any, tap: Any, radii: tuple[Any, Any], attached: bool = True) -> tuple[Any, Any]:
+    def look_up(
+        self, pyramid: Pyramid, which: UInt32, tap: UInt32, radii: tuple[Float, Float], attached: bool = True
+    ) -> tuple[Vector2f, Float]:
         """(moments at one of the places all over an ellipse around the point, depth of the point's tangent plane there)."""
         rx, ry = radii if attached else (dr.detach(r) for r in radii)
         # Each place stands for its share of the ellipse.

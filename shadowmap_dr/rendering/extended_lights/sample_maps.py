@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from ...jit.types import Bool, Point3f, UInt32, Vector3f
 from ...raster import RasterOutput, Topology
 from ...scene.geometry import Geometry
 from ...scene.lights.area import AreaLight
@@ -115,7 +115,9 @@ def check_soft_sizes(plans: Sequence[SoftPlan], geometry: Geometry, texels: int)
 def samples_of(light: SoftLight, plan: SoftPlan, geometry: Geometry) -> LightSamples:
     """The light's samples as it is now. Attached."""
     if isinstance(light, Environment):
+        assert isinstance(plan.parts, SkyPlan)
         return sky_samples(light, plan.parts)
+    assert isinstance(plan.parts, AreaPlan)
     return area_samples(light, plan.parts, geometry)
 
 
@@ -143,8 +145,8 @@ def make_soft_maps(
     topology: Topology,
     settings: tuple[ShadowSettings, ShadowSettings],
     previous: SoftFrusta,
-    transparent: Callable[[RasterOutput], Any] | None = None,
-    seen: Any = None,
+    transparent: Callable[[RasterOutput], Bool] | None = None,
+    seen: tuple[Point3f, Bool] | None = None,
 ) -> SoftMaps:
     """Render and filter the maps of all samples as one batch, and those of single ones as another. Attached to samples, vertices.
 
@@ -165,7 +167,7 @@ def fit_soft_maps(
     geometry: Geometry,
     settings: tuple[ShadowSettings, ShadowSettings],
     previous: SoftFrusta,
-    seen: Any = None,
+    seen: tuple[Point3f, Bool] | None = None,
 ) -> SoftFrusta:
     """The fit of the maps of :func:`make_soft_maps`, without rendering them. Arguments as there."""
     kinds = _kinds(plans, samples, settings, previous)
@@ -188,8 +190,13 @@ def _kinds(
 
 
 def _fitted(
-    lights: _Parts, scene: MapPlan, geometry: Geometry, settings: ShadowSettings, previous: Frusta | None, seen: Any
-) -> tuple[Views, Any, Frusta]:
+    lights: _Parts,
+    scene: MapPlan,
+    geometry: Geometry,
+    settings: ShadowSettings,
+    previous: Frusta | None,
+    seen: tuple[Point3f, Bool] | None,
+) -> tuple[Views, UInt32, Frusta]:
     """(cameras of all maps, the shape that each of these does not see, the fit)."""
     plans = [plan for plan, _ in lights]
     views = _stack([_views(plan, s, settings) for plan, s in lights])
@@ -205,8 +212,8 @@ def _make(
     topology: Topology,
     settings: ShadowSettings,
     previous: Frusta | None,
-    transparent: Callable[[RasterOutput], Any] | None,
-    seen: Any,
+    transparent: Callable[[RasterOutput], Bool] | None,
+    seen: tuple[Point3f, Bool] | None,
 ) -> ShadowMaps:
     plans = [plan for plan, _ in lights]
     views, hidden, frusta = _fitted(lights, scene, geometry, settings, previous, seen)
@@ -218,7 +225,7 @@ def _make(
     return render_maps(p_light, which, geometry.faces, topology, views, frusta, settings, transparent, _facing(plans, geometry))
 
 
-def _facing(plans: Sequence[SoftPlan], geometry: Geometry) -> Any:
+def _facing(plans: Sequence[SoftPlan], geometry: Geometry) -> Bool | None:
     """Faces (Bool, for all faces of each map) that cast shadows only where they face the light, or None."""
     if not any(plan.facing[1] for plan in plans):
         return None
@@ -229,7 +236,7 @@ def _facing(plans: Sequence[SoftPlan], geometry: Geometry) -> Any:
     return (face >= dr.gather(mi.UInt32, first, which)) & (face < dr.gather(mi.UInt32, last, which))
 
 
-def map_of(plan: SoftPlan, table: SampleTable, sample: Any, p_world: Any) -> Any:
+def map_of(plan: SoftPlan, table: SampleTable, sample: UInt32, p_world: Point3f) -> UInt32:
     """Number of the map (UInt32) that tells whether points see a sample (UInt32)."""
     if plan.kind == "cube":
         return plan.first + sample * 6 + cube_face(dr.detach(mi.Vector3f(p_world) - table.place(sample)))
@@ -254,7 +261,7 @@ def _views(plan: SoftPlan, samples: LightSamples, settings: ShadowSettings) -> V
     sample, face = lane // 6, lane % 6
     faces = cube_views(mi.Point3f(0), settings.resolution, settings.filter_size)
 
-    def pick(name: str) -> Any:
+    def pick(name: str) -> Vector3f:
         total = mi.Vector3f(0)
         for k, view in enumerate(faces):
             total = dr.select(face == k, mi.Vector3f(getattr(view, name)), total)
@@ -270,17 +277,27 @@ def _stack(parts: list[Views]) -> Views:
     if len(parts) == 1:
         return parts[0]
 
-    def join(name: str) -> Any:
-        values = [getattr(part, name) for part in parts]
-        if dr.depth_v(values[0]) == 1:
-            return dr.concat(values)
+    def vectors(values: list[Vector3f]) -> Vector3f:
         return mi.Vector3f(*(dr.concat([mi.Float(v[c]) for v in values]) for c in range(3)))
 
-    return Views(*(join(name) for name in Views.__dataclass_fields__))
+    return Views(
+        right=vectors([part.right for part in parts]),
+        up=vectors([part.up for part in parts]),
+        forward=vectors([part.forward for part in parts]),
+        origin=vectors([part.origin for part in parts]),
+        spread=dr.concat([part.spread for part in parts]),
+        limit=dr.concat([part.limit for part in parts]),
+    )
 
 
 def _fit(
-    views: Views, hidden: Any, scene: MapPlan, geometry: Geometry, settings: ShadowSettings, previous: Frusta | None, seen: Any
+    views: Views,
+    hidden: UInt32,
+    scene: MapPlan,
+    geometry: Geometry,
+    settings: ShadowSettings,
+    previous: Frusta | None,
+    seen: tuple[Point3f, Bool] | None,
 ) -> Frusta:
     """Frusta around the boxes of shapes: with so many maps, asking each vertex would cost more than drawing it."""
     with dr.suspend_grad():
@@ -306,7 +323,7 @@ def _fit(
         )
 
 
-def _few(seen: Any) -> Any:
+def _few(seen: tuple[Point3f, Bool] | None) -> tuple[Point3f, Bool] | None:
     """About 1,000 of the seen points."""
     if seen is None:
         return None

@@ -12,6 +12,8 @@ import mitsuba as mi
 import numpy as np
 
 from ...errors import ShadowmapError
+from ...jit.arrays import ravel
+from ...jit.types import ArrayT, Bool, Color3f, Float, Point3f, UInt32, Vector3f, Vector4f
 
 
 @dataclass(frozen=True)
@@ -30,12 +32,12 @@ class Facets:
 
     count: int
     flat: bool
-    middle: Any
-    normal: Any
-    radius: Any
-    bend: Any
+    middle: Vector3f
+    normal: Vector3f
+    radius: Float
+    bend: Float
 
-    def packets(self) -> list[Any]:
+    def packets(self) -> list[Vector4f]:
         """Two rows of four numbers."""
         m, n = self.middle, self.normal
         return [mi.Vector4f(m.x, m.y, m.z, self.radius), mi.Vector4f(n.x, n.y, n.z, self.bend)]
@@ -56,10 +58,10 @@ class LightSamples:
     """
 
     distant: bool
-    place: Any
-    normal: Any
-    power: Any
-    area: Any
+    place: Vector3f
+    normal: Vector3f
+    power: Color3f
+    area: Float
     facets: Facets | None = None
 
     @property
@@ -67,18 +69,19 @@ class LightSamples:
         """N."""
         return dr.width(self.place)
 
-    def centre(self) -> Any:
+    def centre(self) -> Vector3f:
         """Vector3f of width 1, the mean position by area. Attached."""
         total = dr.sum(self.area)
         return mi.Vector3f(*(dr.sum(self.place[c] * self.area) / total for c in range(3)))
 
-    def radius_towards(self, p_world: Any) -> Any:
+    def radius_towards(self, p_world: Point3f) -> Float:
         """Float, radius of a disk of the area that points see of the light, if nothing hides it. Attached."""
-        direction = dr.normalize(mi.Vector3f(p_world) - self.centre())
+        direction: Vector3f = dr.normalize(mi.Vector3f(p_world) - self.centre())
         # The mean normal times the whole area is the area vector of what faces one way; closed surfaces show a quarter of theirs.
         total = dr.sum(self.area)
         facing = mi.Vector3f(*(dr.sum(self.normal[c] * self.area) for c in range(3)))
-        flat = dr.maximum(dr.dot(facing, direction), 0)
+        straight: Float = dr.dot(facing, direction)
+        flat = dr.maximum(straight, 0)
         closed = 0.25 * (total - dr.norm(facing))
         return dr.sqrt(dr.maximum(flat + closed, 1e-12 * total) * (1 / math.pi))
 
@@ -89,7 +92,7 @@ class LightSamples:
         rows = [mi.Vector4f(p.x, p.y, p.z, 0), mi.Vector4f(*colour, *[mi.Float(0)] * (4 - len(colour)))]
         if self.facets:
             rows += self.facets.packets()
-        packets = tuple(dr.ravel(row) for row in rows)
+        packets = tuple(ravel(row) for row in rows)
         dr.eval(packets)
         count, flat = (self.facets.count, self.facets.flat) if self.facets else (1, True)
         return SampleTable(self.distant, self.count, packets, count, flat)
@@ -101,25 +104,25 @@ class SampleTable:
 
     distant: bool
     count: int
-    packets: tuple[Any, ...]
+    packets: tuple[Float, ...]
     facets: int
     flat: bool
 
-    def place(self, index: Any) -> Any:
+    def place(self, index: UInt32) -> Vector3f:
         """Vector3f, where sample ``index`` (UInt32) is, detached."""
         packet = dr.gather(mi.Vector4f, dr.detach(self.packets[0]), index)
         return mi.Vector3f(packet.x, packet.y, packet.z)
 
-    def from_sky(self, index: Any) -> tuple[Any, Any]:
+    def from_sky(self, index: UInt32) -> tuple[Vector3f, Color3f]:
         """(wo, weight) of direction ``index`` (UInt32) of a light infinitely far away, the same at all points. Attached."""
         place = _packet(self.packets[0], index)
         return mi.Vector3f(-place.x, -place.y, -place.z), self._power(index)
 
-    def _power(self, index: Any) -> Any:
+    def _power(self, index: UInt32) -> Color3f:
         colour = _packet(self.packets[1], index)
         return mi.UnpolarizedSpectrum(*(colour[k] for k in range(dr.size_v(mi.UnpolarizedSpectrum))))
 
-    def illuminate(self, index: Any, p_world: Any, sides: Sequence[Any]) -> list[tuple[Any, Any, Any]]:
+    def illuminate(self, index: UInt32, p_world: Point3f, sides: Sequence[Vector3f]) -> list[tuple[Vector3f, Color3f, Bool]]:
         """(wo, weight, reached) of sample ``index`` (UInt32) at points, for the light on each of some sides of them.
 
         wo is a unit direction (Vector3f) to the light in the mean, weight its irradiance on a surface that faces it (colour), and
@@ -160,7 +163,7 @@ class SampleTable:
         return found
 
 
-def _above(vector: Any, along: Any, side: Any, level: Any, variance: Any, squared: Any) -> Any:
+def _above(vector: Vector3f, along: Float, side: Vector3f, level: Float, variance: Float, squared: Float) -> Vector3f:
     """Irradiance (Vector3f) of what is on one side of planes, of a disk that gives ``vector`` in all.
 
     ``level``: of the disk's centre above the plane, around which its points are spread evenly, with a ``variance`` of a third.
@@ -168,13 +171,14 @@ def _above(vector: Any, along: Any, side: Any, level: Any, variance: Any, square
     variance = dr.maximum(variance, dr.maximum(1e-8 * squared, 1e-20))
     inverse = dr.rsqrt(variance)
     reach = variance * inverse
-    share = dr.clip(dr.fma(0.5 * level, inverse, 0.5), 0, 1)
+    place: Float = dr.fma(0.5 * level, inverse, 0.5)
+    share = dr.clip(place, 0, 1)
     upright = dr.dot(vector, side)
     higher = dr.maximum(upright + along * dr.square(1 - share) * reach, 0)
     return dr.select(share > 0, vector * share + side * (higher - upright * share), 0)
 
 
-def disk_irradiance(squared_distance: Any, height: Any, squared_radius: Any) -> tuple[Any, Any]:
+def disk_irradiance(squared_distance: Float, height: Float, squared_radius: Float) -> tuple[Float, Float]:
     """(along, across): along * offset - across * normal is the vector whose product with a unit normal is the irradiance of a
     disk of radiance 1, divided by the disk's area.
 
@@ -201,7 +205,7 @@ def disk_irradiance(squared_distance: Any, height: Any, squared_radius: Any) -> 
     return along * height, scale * axial - along * rise
 
 
-def _shown(height: Any, rise: Any, variance: Any, squared: Any) -> Any:
+def _shown(height: Float, rise: Float, variance: Float, squared: Float) -> Float:
     """Mean height (Float) above what is seen of a facet: what bends turns away little by little.
 
     ``height``: above its disk; ``rise``: of the planes through its pieces above that, in the mean, around which they are spread
@@ -209,15 +213,16 @@ def _shown(height: Any, rise: Any, variance: Any, squared: Any) -> Any:
     """
     variance = dr.maximum(variance, dr.maximum(1e-8 * squared, 1e-20))
     inverse = dr.rsqrt(variance)
-    share = dr.clip(dr.fma(0.5 * (height - rise), inverse, 0.5), 0, 1)
+    place: Float = dr.fma(0.5 * (height - rise), inverse, 0.5)
+    share = dr.clip(place, 0, 1)
     return dr.select(share < 1, share * dr.fma(share, variance * inverse, rise), height)
 
 
-def _packet(flat: Any, index: Any) -> Any:
+def _packet(flat: Float, index: UInt32) -> Vector4f:
     return dr.gather(mi.Vector4f, flat, index, mode=dr.ReduceMode.Local)
 
 
-def brightness(name: str, radiance: Any, count: int) -> np.ndarray:
+def brightness(name: str, radiance: Color3f, count: int) -> np.ndarray:
     """Mean over the channels of radiances (colour, ``count``), on the host, at least 0.
 
     Raises ``ShadowmapError`` if one is not finite: sums over parts would lose it, and the light would just be dark.
@@ -229,17 +234,19 @@ def brightness(name: str, radiance: Any, count: int) -> np.ndarray:
     return np.maximum(values, 0)
 
 
-def cluster_sums(values: Any, cluster: Any, count: int) -> Any:
+def cluster_sums(values: ArrayT, cluster: UInt32, count: int) -> ArrayT:
     """Sums of ``values`` (Float or vector, P) over the pieces that belong to each of ``count`` clusters (UInt32, P). Attached."""
-    if dr.depth_v(values) == 1:
-        return dr.custom(_Sums, mi.Float(values), cluster, count)
-    return type(values)(*(cluster_sums(values[k], cluster, count) for k in range(len(values))))
+    whole: Any = values  # Any: a number or a vector
+    if dr.depth_v(whole) == 1:
+        total: Any = dr.custom(_Sums, mi.Float(whole), cluster, count)  # Any: of the same type
+        return total
+    return type(whole)(*(cluster_sums(whole[k], cluster, count) for k in range(len(whole))))
 
 
 class _Sums(dr.CustomOp):
     """Scatter-add whose derivatives are evaluated at once: pending ones end the process where a loop comes to read them."""
 
-    def eval(self, values: Any, cluster: Any, count: int) -> Any:
+    def eval(self, values: Float, cluster: UInt32, count: int) -> Float:
         self._cluster, self._count = cluster, count
         total = dr.zeros(mi.Float, count)
         dr.scatter_add(total, values, cluster)

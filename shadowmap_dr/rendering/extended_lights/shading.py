@@ -8,6 +8,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ...jit.types import Color3f, Float, PyTree, UInt32, Vector3f
 from ...scene.sums import attached_parameters, sum_over
 from ...shadow import visibility
 from ..direct_light import passes_gate
@@ -16,6 +17,7 @@ from .penumbra import penumbra_visibility
 from .sample_maps import SoftMaps, SoftPlan, map_of
 from .samples import LightSamples
 from .sky_light import reflects_only, sky_light
+from .sky_samples import SkySamples
 
 
 def soft_light(
@@ -26,8 +28,8 @@ def soft_light(
     nodes: Sequence[Any],
     *,
     gate: bool = True,
-    visible: Any = None,
-) -> Any:
+    visible: Float | None = None,
+) -> Color3f:
     """Radiance (colour, P) towards the camera of one extended light.
 
     ``maps`` None: unshadowed. ``nodes``: all BSDFs that ``seen`` may call, and shapes whose
@@ -35,12 +37,12 @@ def soft_light(
     :func:`sample_visibilities`, to be looked up instead of the maps.
     Gradients flow to all of surface, samples, maps and BSDFs.
     """
-    if samples.distant and reflects_only(nodes):
+    if isinstance(samples, SkySamples) and reflects_only(nodes):
         return sky_light(seen, plan, samples, maps, nodes, gate=gate, visible=visible)
     sampled = None if maps is None or plan.kind == "single" else maps.sampled
     transmits = not samples.distant and any(_transmits(node) for node in nodes)
 
-    def one_sample(index: Any, own: Any, shared: Any) -> Any:
+    def one_sample(index: UInt32, own: PyTree, shared: PyTree) -> Color3f:
         (seen, lane), (table, maps, visible) = own, shared
         value, active = mi.UnpolarizedSpectrum(0), mi.Bool(False)
         for wo_world, weight, reached in table.illuminate(index, seen.p_world, sides(seen)):
@@ -56,7 +58,7 @@ def soft_light(
             value *= visibility(maps, map_of(plan, table, index, seen.p_world), seen.p_world, active)
         return dr.select(active, value, 0)
 
-    def sides(seen: Surface) -> list[Any]:
+    def sides(seen: Surface) -> list[Vector3f]:
         """Normals on the sides of the surface that light may come from."""
         n = seen.si.sh_frame.n
         above = mi.Vector3f(dr.select(dr.detach(seen.si.wi.z) < 0, -n, n))
@@ -68,18 +70,18 @@ def soft_light(
     own = seen, None if visible is None else dr.arange(mi.UInt32, lanes)
     shared = samples.table(), sampled, visible
     light = sum_over(one_sample, samples.count, start, own, shared, implicit, seen.active)
-    if maps is None or plan.kind != "single":
+    if maps is None or maps.single is None or plan.kind != "single":
         return light
     radius = samples.radius_towards(seen.p_world)
     return light * penumbra_visibility(maps.single, mi.UInt32(plan.first), radius, seen.p_world, seen.n_world, seen.active)
 
 
-def sample_visibilities(seen: Surface, plan: SoftPlan, samples: LightSamples, maps: SoftMaps | None) -> Any:
+def sample_visibilities(seen: Surface, plan: SoftPlan, samples: LightSamples, maps: SoftMaps | None) -> Float | None:
     """Visibility (Float, K P) of the K samples of an extended light, one after the other, or None where there are no such maps.
 
     Detached. For images that differ in nothing but materials and the colours of lights.
     """
-    if maps is None or plan.kind == "single":
+    if maps is None or maps.sampled is None or plan.kind == "single":
         return None
     with dr.suspend_grad():
         count, table = dr.width(seen.shape), samples.table()
@@ -93,6 +95,6 @@ def sample_visibilities(seen: Surface, plan: SoftPlan, samples: LightSamples, ma
         return found
 
 
-def _transmits(node: Any) -> bool:
+def _transmits(node: mi.Object) -> bool:
     flags = node.flags() if isinstance(node, mi.BSDF) else 0
     return mi.has_flag(flags, mi.BSDFFlags.DiffuseTransmission) or mi.has_flag(flags, mi.BSDFFlags.GlossyTransmission)

@@ -8,6 +8,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ...jit.types import ArrayXf, Color3f, Float, PyTree, UInt32
 from ...scene.sums import attached_parameters, sum_over
 from ...shadow import visibility
 from ..direct_light import passes_gate
@@ -32,8 +33,8 @@ def sky_light(
     nodes: Sequence[Any],
     *,
     gate: bool = True,
-    visible: Any = None,
-) -> Any:
+    visible: Float | None = None,
+) -> Color3f:
     """Radiance (colour, P) towards the camera of an environment, on surfaces that reflect only.
 
     Arguments and gradients as of :func:`~shadowmap_dr.rendering.extended_lights.shading.soft_light`.
@@ -45,7 +46,7 @@ def sky_light(
     """
     channels, lanes = dr.size_v(mi.UnpolarizedSpectrum), dr.width(seen.shape)
 
-    def one_part(index: Any, own: Any, shared: Any) -> Any:
+    def one_part(index: UInt32, own: PyTree, shared: PyTree) -> ArrayXf:
         (seen, lane), (table, widths, maps, known) = own, shared
         towards, power = table.from_sky(index)
         side = dr.select(seen.si.wi.z < 0, mi.Float(-1), 1)
@@ -84,7 +85,7 @@ def sky_light(
     sums = sum_over(one_part, samples.count, start, own, shared, implicit, seen.active)
     if dr.grad_enabled(sums):
         dr.eval(sums)  # derivatives of what follows need them, and would run the loop once more
-    own, further = (mi.UnpolarizedSpectrum(*(sums[first + c] for c in range(channels))) for first in (0, channels))
+    inner, further = (mi.UnpolarizedSpectrum(*(sums[first + c] for c in range(channels))) for first in (0, channels))
     lit, low = sums[2 * channels], sums[2 * channels + 1]
     some = dr.detach(low) > 0
-    return own + further * dr.select(some, lit * dr.rcp(dr.select(some, low, 1)), 0)
+    return inner + further * dr.select(some, lit * dr.rcp(dr.select(some, low, 1)), 0)

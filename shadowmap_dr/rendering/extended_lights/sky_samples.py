@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -9,8 +11,10 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import numpy.typing as npt
 
-from ...jit.arrays import device_array
+from ...jit.arrays import device_array, ravel
+from ...jit.types import Float, UInt32, Vector3f
 from ...scene.changes import fingerprint
 from ...scene.geometry import Geometry
 from ...scene.lights.environment import Environment
@@ -40,10 +44,10 @@ class SkyPlan:
     """
 
     rows: int
-    cluster: Any
-    direction: Any
-    length: Any
-    axes: tuple[Any, Any, Any]
+    cluster: UInt32
+    direction: Vector3f
+    length: Float
+    axes: tuple[Vector3f, Vector3f, Vector3f]
 
 
 def plan_sky(light: Environment, count: int, geometry: Geometry) -> SkyPlan:
@@ -58,7 +62,7 @@ def plan_sky(light: Environment, count: int, geometry: Geometry) -> SkyPlan:
         directions, world = (np.stack([c.numpy() for c in v], -1).astype(np.float64) for v in (local, light.to_world(local)))
     average = (bright * weight).sum() / weight.sum()
     energy = (bright + _DARK * average if average > 0 else np.ones_like(bright)) * weight
-    hidden = np.zeros((rows, 2 * rows), bool)
+    hidden: npt.NDArray[np.bool_] = np.zeros((rows, 2 * rows), bool)
     for normal, least in _floors(geometry):
         hidden |= (world @ normal < -least).reshape(rows, 2 * rows)
     cluster = _divided(energy.reshape(rows, 2 * rows), hidden, count).ravel()
@@ -70,8 +74,12 @@ def plan_sky(light: Environment, count: int, geometry: Geometry) -> SkyPlan:
     cancelled = length < 1e-3 * np.bincount(cluster, energy, count)
     centre = np.where(cancelled[:, None], heaviest, centre / np.maximum(length, 1e-300)[:, None])
     length, axes = _extent(directions, energy, cluster, centre)
-    vectors = [mi.Vector3f(*(device_array(mi.Float, column) for column in v.T)) for v in (centre, *axes)]
-    return SkyPlan(rows, device_array(mi.UInt32, cluster), vectors[0], device_array(mi.Float, length), tuple(vectors[1:]))
+    direction, first, second, third = (_vectors(v) for v in (centre, *axes))
+    return SkyPlan(rows, device_array(mi.UInt32, cluster), direction, device_array(mi.Float, length), (first, second, third))
+
+
+def _vectors(rows: np.ndarray) -> Vector3f:
+    return mi.Vector3f(*(device_array(mi.Float, column) for column in rows.T))
 
 
 def _extent(
@@ -95,9 +103,9 @@ def _extent(
     return np.where(point, 1, np.minimum(length, 1)), [scaled[:, :, k] for k in range(3)]
 
 
-def _divided(energy: np.ndarray, hidden: np.ndarray, count: int) -> np.ndarray:
+def _divided(energy: np.ndarray, hidden: npt.NDArray[np.bool_], count: int) -> np.ndarray:
     """Parts of a sky; fewer in hidden rows, if these are all at the upper or the lower end: no part shall be partly hidden."""
-    full, some = hidden.all(1), hidden.any(1)
+    full, some = np.asarray(hidden.all(1)), hidden.any(1)
     edge = int(np.argmin(full)) if full[0] else len(full) - int(np.argmin(full[::-1]))
     above = bool(full[0])
     split = 0 < edge < len(full) and (full[:edge] == above).all() and (full[edge:] != above).all()
@@ -182,6 +190,10 @@ def _floors(geometry: Geometry) -> list[tuple[np.ndarray, float]]:
     return found
 
 
+#: Fields with defaults cannot precede these; all samples of skies have them.
+NOT_GIVEN: Any = None  # Any: takes the place of arrays
+
+
 @dataclass(frozen=True)
 class SkySamples(LightSamples):
     """Directions of an environment, and how wide the parts are that they stand for.
@@ -189,18 +201,17 @@ class SkySamples(LightSamples):
     length, axes  as of :class:`SkyPlan`, axes in world space, attached to the environment's rotation
     """
 
-    length: Any = None
-    axes: tuple[Any, Any, Any] | None = None
+    length: Float = NOT_GIVEN
+    axes: tuple[Vector3f, Vector3f, Vector3f] = NOT_GIVEN
 
     def widths(self) -> SkyWidths:
         """The widths in packets, for look-ups by many lanes."""
         first, second, third = self.axes
-        rows = (
-            mi.Vector4f(first.x, first.y, first.z, self.length),
-            mi.Vector4f(second.x, second.y, second.z, third.x),
-            mi.Vector2f(third.y, third.z),
+        packets = (
+            ravel(mi.Vector4f(first.x, first.y, first.z, self.length)),
+            ravel(mi.Vector4f(second.x, second.y, second.z, third.x)),
+            ravel(mi.Vector2f(third.y, third.z)),
         )
-        packets = tuple(dr.ravel(row) for row in rows)
         dr.eval(packets)
         return SkyWidths(packets)
 
@@ -209,18 +220,16 @@ class SkySamples(LightSamples):
 class SkyWidths:
     """Widths of the parts of a sky as flat buffers."""
 
-    packets: tuple[Any, Any, Any]
+    packets: tuple[Float, Float, Float]
 
-    def of(self, index: Any, normal: Any) -> tuple[Any, Any]:
+    def of(self, index: UInt32, normal: Vector3f) -> tuple[Float, Float]:
         """(length, half): length of the mean of the directions of part ``index`` (UInt32, P), and how far their cosines to a unit
         ``normal`` (Vector3f, P) lie on either side of the mean cosine, if they are spread evenly (Float). Attached to both.
         """
-        kinds = (mi.Vector4f, mi.Vector4f, mi.Vector2f)
-        a, b, c = (
-            dr.gather(kind, packet, index, mode=dr.ReduceMode.Local) for kind, packet in zip(kinds, self.packets, strict=True)
-        )
+        a, b = (dr.gather(mi.Vector4f, packet, index, mode=dr.ReduceMode.Local) for packet in self.packets[:2])
+        c = dr.gather(mi.Vector2f, self.packets[2], index, mode=dr.ReduceMode.Local)
         axes = (mi.Vector3f(a.x, a.y, a.z), mi.Vector3f(b.x, b.y, b.z), mi.Vector3f(b.w, c.x, c.y))
-        variance = sum(dr.square(dr.dot(axis, normal)) for axis in axes)
+        variance = functools.reduce(operator.add, (dr.square(dr.dot(axis, normal)) for axis in axes))
         # The least keeps the derivative of the root finite.
         return a.w, dr.sqrt(dr.maximum(3 * variance, 1e-8))
 
@@ -231,11 +240,12 @@ def sky_samples(light: Environment, plan: SkyPlan) -> SkySamples:
     radiance = mi.UnpolarizedSpectrum(light.diffuse_radiance(light.to_world(local)))
     count = dr.width(plan.direction)
     power = cluster_sums(radiance * solid_angle, plan.cluster, count)
-    axes = tuple(light.to_world(axis) for axis in plan.axes)
-    return SkySamples(True, -light.to_world(plan.direction), mi.Vector3f(0), power, mi.Float(0), length=plan.length, axes=axes)
+    first, second, third = (light.to_world(axis) for axis in plan.axes)
+    towards, axes = -light.to_world(plan.direction), (first, second, third)
+    return SkySamples(True, towards, mi.Vector3f(0), power, mi.Float(0), length=plan.length, axes=axes)
 
 
-def _grid(rows: int) -> tuple[Any, Any]:
+def _grid(rows: int) -> tuple[Vector3f, Float]:
     """(unit directions Vector3f, solid angles Float) of the cells of a latitude-longitude grid, as ``envmap`` lays out images."""
     columns = 2 * rows
     lane = dr.arange(mi.UInt32, rows * columns)

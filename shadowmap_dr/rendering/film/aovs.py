@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 
+from ...jit.types import Float, UInt32
 from ...raster import RasterOutput
 from ...scene.lights.read import Light
 from ..gbuffer.surface import Surface
@@ -34,8 +33,8 @@ def aov_names(aovs: tuple[str, ...], light_names: list[str]) -> list[str]:
 
 
 def collect_aovs(
-    aovs: tuple[str, ...], seen: Surface, raster: RasterOutput, lights: tuple[Light, ...], visible: list[Any]
-) -> list[Any]:
+    aovs: tuple[str, ...], seen: Surface, raster: RasterOutput, lights: tuple[Light, ...], visible: list[Float]
+) -> list[Float]:
     """Channels (Float, one entry a pixel), 0 where nothing is seen; visibility is 1 there.
 
     ``depth``: distance from the camera, world units (as Mitsuba's). ``position``, ``normal``: world space, the normal is the
@@ -44,11 +43,11 @@ def collect_aovs(
     """
     width = dr.width(raster.triangle)
 
-    def masked(value: Any, empty: float = 0.0) -> Any:
+    def masked(value: Float | UInt32, empty: float = 0.0) -> Float:
         full = dr.select(seen.active, mi.Float(value), empty)
         return full if dr.width(full) == width else full + dr.zeros(mi.Float, width)
 
-    channels: list[Any] = []
+    channels: list[Float] = []
     for name in aovs:
         if name == "depth":
             channels.append(masked(seen.si.t))

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from ...errors import ShadowmapError, warn
+from ...jit.arrays import ravel
+from ...jit.types import Bool, Color3f, Float, TensorXf
 from ...raster import MAX_RESOLUTION
 from ...scene.sensor import Sensor
 from .reconstruction import reconstruct
@@ -43,7 +44,7 @@ class Margin:
         size = width + self.left + self.right, height + self.top + self.bottom
         return replace(camera, crop_size=size, crop_offset=(x - self.left, y - self.top))
 
-    def cut(self, picture: Any, factor: int) -> Any:
+    def cut(self, picture: TensorXf, factor: int) -> TensorXf:
         """A picture (rows, columns, C) of ``factor`` x ``factor`` samples a pixel without the margin."""
         if self == Margin():
             return picture
@@ -97,7 +98,7 @@ def sample_grid(spp: int, windows: Sequence[Sensor]) -> int:
     return factor
 
 
-def develop(pictures: Sequence[Any], camera: Sensor, factor: int) -> Any:
+def develop(pictures: Sequence[TensorXf], camera: Sensor, factor: int) -> TensorXf:
     """Picture (``mi.TensorXf``, H, W, C) of the samples that the cameras of one film took.
 
     Args:
@@ -120,11 +121,11 @@ def develop(pictures: Sequence[Any], camera: Sensor, factor: int) -> Any:
     return dr.concat([image, _means(inner, factor)], axis=2)
 
 
-def _side_by_side(images: Sequence[Any]) -> Any:
+def _side_by_side(images: Sequence[TensorXf]) -> TensorXf:
     return images[0] if len(images) == 1 else dr.concat(list(images), axis=1)
 
 
-def _means(image: Any, factor: int) -> Any:
+def _means(image: TensorXf, factor: int) -> TensorXf:
     """Average factor x factor blocks."""
     if factor == 1:
         return image
@@ -140,7 +141,7 @@ def _means(image: Any, factor: int) -> Any:
     return mi.TensorXf(total * (1 / factor**2), shape=(height, width, channels))
 
 
-def put_into_film(film: Any, image: Any, aovs: list[str]) -> None:
+def put_into_film(film: mi.Film, image: TensorXf, aovs: list[str]) -> None:
     """Make ``film.develop()``, ``film.bitmap()`` and ``film.write()`` give this image (detached)."""
     film.prepare(aovs)
     base = film.base_channels_count()
@@ -155,7 +156,7 @@ def put_into_film(film: Any, image: Any, aovs: list[str]) -> None:
     film.put_block(block)
 
 
-def film_channels(color: Any, active: Any, sensor: Sensor) -> list[Any]:
+def film_channels(color: Color3f, active: Bool, sensor: Sensor) -> list[Float]:
     """Channels (Float) of what a sensor's film holds of a colour: one or three, and where something was hit, if it has alpha."""
     channels = [color[k] for k in range(len(color))]
     if sensor.channels == 1 and len(channels) == 3:
@@ -167,12 +168,12 @@ def film_channels(color: Any, active: Any, sensor: Sensor) -> list[Any]:
     return channels
 
 
-def interleave(channels: list[Any]) -> Any:
+def interleave(channels: list[Float]) -> Float:
     """Flat pixel-interleaved buffer of some channels, all of the same width."""
     if len(channels) == 1:
         return channels[0]
     if len(channels) == 3:
-        return dr.ravel(mi.Vector3f(*channels))
+        return ravel(mi.Vector3f(*channels))
     count = len(channels)
     width = max(dr.width(c) for c in channels)
     index = dr.arange(mi.UInt32, width) * count

@@ -13,10 +13,12 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ...jit.arrays import ravel
+from ...jit.types import Float, TensorXf, UInt32
 from ...scene.pixel_filter import Filter
 
 
-def reconstruct(samples: Any, filter: Filter, factor: int, border: int) -> Any:
+def reconstruct(samples: TensorXf, filter: Filter, factor: int, border: int) -> TensorXf:
     """Pixels (``mi.TensorXf``, H, W, C) from samples ((H + 2 border) * factor, (W + 2 border) * factor, C).
 
     Args:
@@ -39,7 +41,7 @@ def reconstruct(samples: Any, filter: Filter, factor: int, border: int) -> Any:
     return mi.TensorXf(values, shape=(height, width, channels))
 
 
-def _share(at: Any, size: int, weights: tuple[float, ...], factor: int, first: int) -> Any:
+def _share(at: UInt32, size: int, weights: tuple[float, ...], factor: int, first: int) -> Float:
     """1 / (sum of the weights of the samples that exist) for pixels ``at`` along an axis of ``size``."""
     total = mi.Float(1.0)
     for k in range(min(size, -(first // factor))):
@@ -66,15 +68,15 @@ class _Axis:
 class _Gathered(dr.CustomOp):
     """Weighted sums of samples along an axis, and their transpose."""
 
-    def eval(self, values: Any, weights: tuple[float, ...], axis: _Axis) -> Any:
+    def eval(self, values: Float, weights: tuple[float, ...], axis: _Axis) -> Float:
         self.arguments = (weights, axis)
         return _to_pixels(values, *self.arguments)
 
     def forward(self) -> None:
-        self.set_grad_out(_to_pixels(self.grad_in("values"), *self.arguments))
+        self.set_grad_out(_to_pixels(mi.Float(self.grad_in("values")), *self.arguments))
 
     def backward(self) -> None:
-        self.set_grad_in("values", _to_samples(self.grad_out(), *self.arguments))
+        self.set_grad_in("values", _to_samples(mi.Float(self.grad_out()), *self.arguments))
 
 
 def _packets(axis: _Axis) -> tuple[Any, int]:
@@ -84,7 +86,7 @@ def _packets(axis: _Axis) -> tuple[Any, int]:
     return (mi.Vector3f, axis.after // 3) if axis.after % 3 == 0 else (mi.Float, axis.after)
 
 
-def _to_pixels(values: Any, weights: tuple[float, ...], axis: _Axis) -> Any:
+def _to_pixels(values: Float, weights: tuple[float, ...], axis: _Axis) -> Float:
     packet, after = _packets(axis)
     lane = dr.arange(mi.UInt32, axis.before * axis.pixels * after)
     entry = lane // after
@@ -98,10 +100,10 @@ def _to_pixels(values: Any, weights: tuple[float, ...], axis: _Axis) -> Any:
         at = start + k
         inside = True if axis.first >= 0 else (at >= 0) & (at < axis.samples)
         total += dr.gather(packet, values, mi.UInt32((base + at) * after + offset), inside) * weight
-    return total if packet is mi.Float else dr.ravel(total)
+    return total if packet is mi.Float else ravel(total)
 
 
-def _to_samples(values: Any, weights: tuple[float, ...], axis: _Axis) -> Any:
+def _to_samples(values: Float, weights: tuple[float, ...], axis: _Axis) -> Float:
     packet, after = _packets(axis)
     lane = dr.arange(mi.UInt32, axis.before * axis.samples * after)
     entry = lane // after
@@ -114,14 +116,14 @@ def _to_samples(values: Any, weights: tuple[float, ...], axis: _Axis) -> Any:
     place = (entry - before * axis.samples) + (shift * axis.factor - axis.first)
     last = place // axis.factor
     which = place - last * axis.factor
-    last = mi.Int32(last) - shift
+    last_pixel = mi.Int32(last) - shift
     dr.eval(values)
     total = dr.zeros(packet)
     for k in range(pixels):
-        at = last - k
+        at = last_pixel - k
         inside = (at >= 0) & (at < axis.pixels)
         weight = mi.Float(0.0)
         for j, value in enumerate(weights[k * axis.factor : (k + 1) * axis.factor]):
             weight = mi.Float(value) if axis.factor == 1 else dr.select(which == j, value, weight)
         total += dr.gather(packet, values, mi.UInt32((base + at) * after + offset), inside) * weight
-    return total if packet is mi.Float else dr.ravel(total)
+    return total if packet is mi.Float else ravel(total)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from ...jit.arrays import ravel
 from ...jit.broadcast import broadcast_differentiable
+from ...jit.types import Bool, Float, Point3f
 from ...raster import DEPTH_GAP, NO_TRIANGLE, RasterOutput
 from ...scene.geometry import Geometry
 from ...scene.sensor import Sensor
@@ -20,7 +21,7 @@ _ROOM = 1.01
 _SEEN_ACROSS = 128
 
 
-def camera_clip(sensor: Sensor, geometry: Geometry) -> Any:
+def camera_clip(sensor: Sensor, geometry: Geometry) -> Float:
     """Clip-space vertices (Float, 4 V) for the rasterizer. Attached to vertices and camera.
 
     Depths differ from ``Sensor.view_projection``, whose near and far planes (0.01 and 10,000 by default) leave little of
@@ -41,10 +42,10 @@ def camera_clip(sensor: Sensor, geometry: Geometry) -> Any:
     p = dr.gather(mi.Point3f, geometry.positions, dr.arange(mi.UInt32, lanes))
     row = [dr.fma(m[r, 0], p.x, dr.fma(m[r, 1], p.y, dr.fma(m[r, 2], p.z, m[r, 3]))) for r in range(4)]
     # Identities written out: a row of zeros would still be multiplied with every vertex.
-    return dr.ravel(mi.Point4f(*row))
+    return ravel(mi.Point4f(*row))
 
 
-def without_shapes(clip: Any, geometry: Geometry, shapes: Sequence[int]) -> Any:
+def without_shapes(clip: Float, geometry: Geometry, shapes: Sequence[int]) -> Float:
     """Clip-space vertices (Float, 4 V) of which those of some shapes lie behind the camera, where no triangle is drawn."""
     lane = dr.arange(mi.UInt32, dr.width(clip))
     shape = dr.gather(mi.UInt32, geometry.vertex_shape, lane >> 2)
@@ -54,7 +55,7 @@ def without_shapes(clip: Any, geometry: Geometry, shapes: Sequence[int]) -> Any:
     return dr.select(hidden, dr.select((lane & 3) == 3, mi.Float(-1), 0), clip)
 
 
-def seen_points(sensor: Sensor, raster: RasterOutput, geometry: Geometry) -> tuple[Any, Any]:
+def seen_points(sensor: Sensor, raster: RasterOutput, geometry: Geometry) -> tuple[Point3f, Bool]:
     """Points on what a camera sees (Point3f, world space) and which of them there are, at most about 128 x 128. Detached.
 
     They come from the rasterizer's depth planes, without the cost of interpolating the whole image.
@@ -70,7 +71,7 @@ def seen_points(sensor: Sensor, raster: RasterOutput, geometry: Geometry) -> tup
         column = dr.minimum(across * stride + (5 * down + 2 * across) % stride, width - 1)
         triangle = dr.gather(mi.UInt32, raster.triangle, row * width + column)
         hit = triangle != NO_TRIANGLE
-        plane = raster.depth_plane(0, triangle, hit)
+        plane = raster.depth_plane(mi.UInt32(0), triangle, hit)
         x, y = mi.Float(column) + 0.5, mi.Float(row) + 0.5
         depth = dr.fma(plane[0], x - 0.5 * width, dr.fma(plane[1], y - 0.5 * height, plane[2]))
         x, y = 2 / width * x - 1, 2 / height * y - 1
@@ -86,7 +87,7 @@ def seen_points(sensor: Sensor, raster: RasterOutput, geometry: Geometry) -> tup
         return mi.Transform4f(dr.detach(sensor.to_world.matrix)) @ local, hit
 
 
-def _orthographic_reach(sensor: Sensor, geometry: Geometry) -> Any:
+def _orthographic_reach(sensor: Sensor, geometry: Geometry) -> Float:
     """Depth range of an orthographic camera, detached: as far as there are vertices, or up to the far plane."""
     with dr.suspend_grad():
         p = dr.gather(mi.Point3f, geometry.positions, dr.arange(mi.UInt32, geometry.vertex_count))
@@ -102,6 +103,6 @@ def least_gap(sensor: Sensor) -> float:
     return 0.0 if sensor.kind == "perspective" else DEPTH_GAP
 
 
-def within_far_plane(sensor: Sensor, depth: Any) -> Any:
+def within_far_plane(sensor: Sensor, depth: Float | None) -> Bool:
     """Mask of the pixels whose surface (``Hits.depth``) lies before a perspective camera's far plane."""
-    return depth <= dr.detach(sensor.far) if sensor.kind == "perspective" else mi.Bool(True)
+    return mi.Bool(True) if depth is None else depth <= dr.detach(sensor.far)

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from ...jit.types import Bool, Float, Point3f
 from ...raster import Crossings, RasterOutput, Topology, detach_moved_seams, visible_triangles
 from ...raster.antialiasing.edge_crossings import find_crossings
 from ...scene.geometry import Geometry
 from ...scene.load import SceneData
 from ...scene.sensor import Sensor
 from .camera_pass import camera_clip, least_gap, seen_points, within_far_plane, without_shapes
-from .facet_normals import facet_normals, mean_normals, prefilter_normals
+from .facet_normals import FlatFaces, facet_normals, mean_normals, prefilter_normals
 from .shading_edges import ShadingEdges
 from .surface import Surface, normals_at, opacity, surface, surface_at
 from .surface_points import pixel_hits
@@ -30,7 +31,7 @@ class CameraView:
 
     sensor: Sensor
     factor: int
-    clip: Any
+    clip: Float
     raster: RasterOutput
     topology: Topology
 
@@ -52,7 +53,7 @@ class PlacedShapes:
     """
 
     geometry: Geometry
-    facets: Any
+    facets: tuple[Float, Float] | None
     creases: dict[str, Any]
     seen: Topology
     casting: Topology
@@ -71,8 +72,8 @@ class Frame:
 
     view: CameraView
     surface: Surface
-    depth: Any
-    sharpness: Any
+    depth: Float | None
+    sharpness: Float | None
 
 
 @dataclass(frozen=True)
@@ -89,9 +90,9 @@ class GBuffer:
 
     sensor: Sensor
     surface: Surface
-    points: list[Any]
+    points: list[Point3f]
     crossings: Crossings | None
-    seen: tuple[Any, Any]
+    seen: tuple[Point3f, Bool]
 
 
 @dataclass(frozen=True)
@@ -108,7 +109,7 @@ class CameraPass:
 
     data: SceneData
     topology: Topology
-    flat: Any
+    flat: FlatFaces | None
     creases: ShadingEdges | None
     hidden: tuple[int, ...] = ()
 
@@ -131,17 +132,17 @@ class CameraPass:
         raster = visible_triangles(clip, geometry.faces, size, transparent=self.transparent(geometry, sensor))
         return CameraView(sensor, factor, clip, raster, shapes.seen)
 
-    def transparent(self, geometry: Geometry, camera: Sensor) -> Callable[[RasterOutput], Any] | None:
+    def transparent(self, geometry: Geometry, camera: Sensor) -> Callable[[RasterOutput], Bool] | None:
         """Alpha test for cameras and shadow maps (from whichever side); None where no material lets one look through."""
         if not any(info.see_through for info in geometry.shapes):
             return None
 
-        def transparent(raster: RasterOutput) -> Any:
+        def transparent(raster: RasterOutput) -> Bool:
             return opacity(surface(self.data, geometry, camera, raster.triangle, raster.u, raster.v)) < 0.5
 
         return transparent
 
-    def seen(self, views: list[CameraView], geometry: Geometry) -> tuple[Any, Any]:
+    def seen(self, views: Sequence[CameraView], geometry: Geometry) -> tuple[Point3f, Bool]:
         """Points on what cameras see (Point3f, world space), and which of them there are (Bool). Detached."""
         found = [seen_points(view.sensor, view.raster, geometry) for view in views]
         if len(found) == 1:
@@ -155,11 +156,11 @@ class CameraPass:
         hits = pixel_hits(geometry, sensor, raster.triangle, (raster.width, raster.height))
         hits = replace(hits, active=hits.active & within_far_plane(sensor, hits.depth))
         normals, sharpness = normals_at(geometry, hits), None
-        if self.flat is not None:
+        if shapes.facets is not None:
             normals, sharpness = prefilter_normals(hits, normals, self.topology, shapes.facets[1])
         return Frame(view, surface_at(self.data, geometry, sensor, hits, *normals, frames=frames), hits.depth, sharpness)
 
-    def crossings(self, view: CameraView, sharpness: Any, shapes: PlacedShapes) -> Crossings:
+    def crossings(self, view: CameraView, sharpness: Float | None, shapes: PlacedShapes) -> Crossings:
         """Edges through which the samples of a camera mix. ``sharpness``: that of its :class:`Frame`. Detached."""
         dr.eval(sharpness)
         return find_crossings(
@@ -173,7 +174,7 @@ class CameraPass:
             **shapes.creases,
         )
 
-    def _facets(self, geometry: Geometry) -> Any:
+    def _facets(self, geometry: Geometry) -> tuple[Float, Float] | None:
         if self.flat is None:
             return None
         normals = facet_normals(geometry, self.flat)

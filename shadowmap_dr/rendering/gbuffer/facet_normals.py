@@ -9,13 +9,13 @@ facets' mean normal, so that is what is shaded.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...jit.arrays import device_array
+from ...jit.arrays import device_array, ravel
+from ...jit.types import Bool, Float, Normal3f, UInt32, Vector3f, Vector4f
 from ...jit.vectors import normalize_or
 from ...raster import Topology
 from ...scene.geometry import HAS_NORMALS, Geometry
@@ -32,9 +32,9 @@ class FlatFaces:
     ``flat``: ``Bool`` (F,), whether a face is one of them.
     """
 
-    start: Any
-    faces: Any
-    flat: Any
+    start: UInt32
+    faces: UInt32
+    flat: Bool
 
 
 def flat_faces(geometry: Geometry, topology: Topology) -> FlatFaces | None:
@@ -50,7 +50,7 @@ def flat_faces(geometry: Geometry, topology: Topology) -> FlatFaces | None:
     return FlatFaces(device_array(mi.UInt32, start), device_array(mi.UInt32, faces[order // 3]), device_array(mi.Bool, chosen))
 
 
-def facet_normals(geometry: Geometry, flat: FlatFaces) -> Any:
+def facet_normals(geometry: Geometry, flat: FlatFaces) -> Float:
     """Normals of the flat faces, as long as (twice) the faces are large, 0 for others (Float, 4 F). Attached.
 
     Four numbers and not three (the last is 0), since packets of four are read faster.
@@ -59,12 +59,12 @@ def facet_normals(geometry: Geometry, flat: FlatFaces) -> Any:
     corner = dr.gather(mi.Vector3u, geometry.faces, face, flat.flat)
     p = [geometry.vertices(corner[k], flat.flat) for k in range(3)]
     n = dr.cross(p[1] - p[0], p[2] - p[0])
-    normals = dr.ravel(mi.Vector4f(n.x, n.y, n.z, 0))
+    normals = ravel(mi.Vector4f(n.x, n.y, n.z, 0))
     dr.eval(normals)
     return normals
 
 
-def mean_normals(normals: Any, topology: Topology, flat: FlatFaces) -> Any:
+def mean_normals(normals: Float, topology: Topology, flat: FlatFaces) -> Float:
     """Sums of the flat faces' normals (:func:`facet_normals`) at each place (Float, 4 V, by welded vertex). Attached."""
     return dr.custom(_Sums, normals, topology, flat)
 
@@ -72,39 +72,44 @@ def mean_normals(normals: Any, topology: Topology, flat: FlatFaces) -> Any:
 class _Sums(dr.CustomOp):
     """Sums over the faces at each place. Both ways look up what they add: atomic operations would cost several times as much."""
 
-    def eval(self, normals: Any, topology: Topology, flat: FlatFaces) -> Any:
+    def eval(self, normals: Float, topology: Topology, flat: FlatFaces) -> Float:
         self.topology, self.flat, self.faces = topology, flat, dr.width(normals) // 4
         return self._at_places(normals)
 
     def forward(self) -> None:
-        self.set_grad_out(self._at_places(self.grad_in("normals")))
+        self.set_grad_out(self._at_places(mi.Float(self.grad_in("normals"))))
 
     def backward(self) -> None:
         adjoint = self.grad_out()
         dr.eval(adjoint)
         places = dr.gather(mi.Vector3u, self.topology.welded, dr.arange(mi.UInt32, self.faces), self.flat.flat)
-        total = sum(dr.gather(mi.Vector4f, adjoint, places[k], self.flat.flat) for k in range(3))
-        self.set_grad_in("normals", dr.ravel(mi.Vector4f(total)))
+        total = mi.Vector4f(0)
+        for k in range(3):
+            total += dr.gather(mi.Vector4f, adjoint, places[k], self.flat.flat)
+        self.set_grad_in("normals", dr.ravel(total))
 
-    def _at_places(self, normals: Any) -> Any:
+    def _at_places(self, normals: Float) -> Float:
         dr.eval(normals)
         place = dr.arange(mi.UInt32, dr.width(self.flat.start) - 1)
         at, end = dr.gather(mi.UInt32, self.flat.start, place), dr.gather(mi.UInt32, self.flat.start, place + 1)
 
-        def add(at: Any, end: Any, total: Any) -> tuple[Any, Any, Any]:
+        def more(at: UInt32, end: UInt32, total: Vector4f) -> Bool:
+            return at < end
+
+        def add(at: UInt32, end: UInt32, total: Vector4f) -> tuple[UInt32, UInt32, Vector4f]:
             face = dr.gather(mi.UInt32, self.flat.faces, at)
             return at + 1, end, total + dr.gather(mi.Vector4f, normals, face)
 
         state = (at, end, dr.zeros(mi.Vector4f, dr.width(place)))
-        total = dr.while_loop(state, lambda at, end, total: at < end, add, mode="symbolic", label="faces at a place")[2]
-        result = dr.ravel(total)
+        total = dr.while_loop(state, more, add, mode="symbolic", label="faces at a place")[2]
+        result = ravel(total)
         dr.eval(result)
         return result
 
 
 def prefilter_normals(
-    hits: SurfacePoints, normals: tuple[Any, Any], topology: Topology, mean: Any
-) -> tuple[tuple[Any, Any], Any]:
+    hits: SurfacePoints, normals: tuple[Normal3f, Normal3f], topology: Topology, mean: Float
+) -> tuple[tuple[Normal3f, Normal3f], Float]:
     """Replace the normals of flat-shaded facets smaller than pixels by the mean over their neighbourhood.
 
     ``normals`` (geometric, shading) and the result are as :func:`shadowmap_dr.rendering.gbuffer.surface.normals_at`, ``mean`` is
@@ -117,7 +122,9 @@ def prefilter_normals(
         pixel = mi.Float(hits.pixel)
         soft = hits.active & ((hits.flags & HAS_NORMALS) == 0) & (square < dr.square(dr.square(_LARGE * pixel)))
 
-    def mixed(triangle: Any, u: Any, v: Any, n_world: Any, n_shading: Any, square: Any, pixel: Any) -> tuple[Any, Any, Any]:
+    def mixed(
+        triangle: UInt32, u: Float, v: Float, n_world: Vector3f, n_shading: Vector3f, square: Float, pixel: Float
+    ) -> tuple[Normal3f, Normal3f, Float]:
         size = dr.sqrt(dr.sqrt(square))
         mix = dr.detach(dr.clip((_LARGE - size / pixel) / (_LARGE - _SMALL), 0, 1))
         slot = dr.gather(mi.Vector3u, topology.welded, triangle)
@@ -128,12 +135,17 @@ def prefilter_normals(
         normal = mi.Normal3f(normalize_or(n_shading + (normal - n_shading) * mix, n_shading))
         return normal, normal, 1 - mix
 
+    def own_normals(
+        triangle: UInt32, u: Float, v: Float, n_world: Vector3f, n_shading: Vector3f, square: Float, pixel: Float
+    ) -> tuple[Normal3f, Normal3f, Float]:
+        return n_world, n_shading, mi.Float(1)
+
     # Most pixels of a large image see large facets: a branch spares them the look-ups.
     n_world, n_shading, own = dr.if_stmt(
         (hits.triangle, hits.u, hits.v, *normals, square, pixel),
         soft,
         mixed,
-        lambda triangle, u, v, n_world, n_shading, square, pixel: (n_world, n_shading, mi.Float(1)),
+        own_normals,
         mode="symbolic",
         label="soften facets",
     )

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import drjit as dr
 import mitsuba as mi
 
 from ...jit.broadcast import Copies, copied
+from ...jit.types import Bool, Float, Point3f, Vector3f
 from ...scene.sensor import Sensor
 
 #: Up to this many by this many spots are arrays of their own; so are more, if one array of all would be longer than that.
@@ -17,7 +20,9 @@ _WRITTEN_OUT = 2
 _MOST_LANES = 1 << 22
 
 
-def footprint_points(sensor: Sensor, size: tuple[int, int], depth: Any, p_world: Any, n_world: Any, count: int) -> list[Any]:
+def footprint_points(
+    sensor: Sensor, size: tuple[int, int], depth: Float | None, p_world: Point3f, n_world: Vector3f, count: int
+) -> list[Point3f]:
     """``count`` x ``count`` points spread over a pixel's footprint on the tangent plane of what it sees (Point3f each).
 
     Attached to ``p_world`` only: the spread itself is detached. ``depth`` is that of
@@ -45,20 +50,28 @@ class FootprintSamples:
         copies: C, the number of spots in one array.
     """
 
-    points: list[Any]
-    active: Any
+    points: list[Point3f]
+    active: Bool
     copies: int
 
     @classmethod
     def of(
-        cls, sensor: Sensor, size: tuple[int, int], depth: Any, p_world: Any, n_world: Any, active: Any, count: int
+        cls,
+        sensor: Sensor,
+        size: tuple[int, int],
+        depth: Float | None,
+        p_world: Point3f,
+        n_world: Vector3f,
+        active: Bool,
+        count: int,
     ) -> FootprintSamples:
         """``count`` x ``count`` spots of each of N pixels; arguments as of :func:`footprint_points`, and Bool (N,)."""
         copies = count * count
         if count <= _WRITTEN_OUT or copies * dr.width(p_world) > _MOST_LANES:
             return cls(footprint_points(sensor, size, depth, p_world, n_world, count), active, 1)
         dr.eval(p_world, n_world, depth, active)
-        (points,) = dr.custom(Copies, [p_world], copies, False)
+        # As `Copies` types it, for numbers and vectors alike.
+        (points,) = cast("list[Point3f]", dr.custom(Copies, cast("list[Float]", [p_world]), copies, False))
         with dr.suspend_grad():
             number = dr.arange(mi.UInt32, copies * dr.width(p_world)) // dr.width(p_world)
             row = number // count
@@ -68,9 +81,9 @@ class FootprintSamples:
             offset = axes.offset(across, down)
         return cls([points + offset], copied(active, copies), copies)
 
-    def mean(self, look_up: Callable[[Any, Any], Any]) -> Any:
+    def mean(self, look_up: Callable[[Point3f, Bool], Float]) -> Float:
         """Mean (Float, N) of what ``look_up`` finds at points (Point3f, Bool). Attached."""
-        total = sum(look_up(points, self.active) for points in self.points)
+        total = functools.reduce(operator.add, (look_up(points, self.active) for points in self.points))
         if self.copies > 1:
             (total,) = dr.custom(Copies, [total], self.copies, True)
         return total * (1 / (self.copies * len(self.points)))
@@ -83,19 +96,22 @@ class _Axes:
     ``view`` is the direction in which it is seen, ``normal`` its own, ``slope`` their cosine, kept away from 0.
     """
 
-    right: Any
-    up: Any
-    view: Any
-    normal: Any
-    slope: Any
+    right: Vector3f
+    up: Vector3f
+    view: Vector3f
+    normal: Vector3f
+    slope: Float
 
     @classmethod
-    def of(cls, sensor: Sensor, size: tuple[int, int], depth: Any, p_world: Any, n_world: Any) -> _Axes:
+    def of(cls, sensor: Sensor, size: tuple[int, int], depth: Float | None, p_world: Point3f, n_world: Vector3f) -> _Axes:
         width, height = size
         matrix = dr.detach(sensor.to_world.matrix)
-        right, up, forward = (dr.normalize(mi.Vector3f(matrix[0, k], matrix[1, k], matrix[2, k])) for k in range(3))
-        projection = dr.detach(sensor.projection)
+        columns = [mi.Vector3f(matrix[0, k], matrix[1, k], matrix[2, k]) for k in range(3)]
+        axes: list[Vector3f] = [dr.normalize(column) for column in columns]
+        right, up, forward = axes
+        projection: Any = dr.detach(sensor.projection)  # Any: in the stub the entries of matrices are vectors
         if sensor.kind == "perspective":
+            assert depth is not None, "perspective cameras have depths"
             scale = dr.detach(depth)
             view = dr.normalize(dr.detach(p_world) - dr.detach(sensor.origin))
         else:
@@ -112,7 +128,7 @@ class _Axes:
         slope = dr.select(slope < 0, dr.minimum(slope, -0.25), dr.maximum(slope, 0.25))
         return cls(right, up, view, n, slope)
 
-    def offset(self, across: Any, down: Any) -> Any:
+    def offset(self, across: Float | float, down: Float | float) -> Vector3f:
         """From the pixel's centre to a place in its footprint (Vector3f), in shares of its width and height."""
         lateral = self.right * across + self.up * down
         offset = lateral - self.view * (dr.dot(self.normal, lateral) / self.slope)

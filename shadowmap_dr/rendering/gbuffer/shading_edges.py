@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...jit.arrays import device_array
+from ...jit.types import Bool, Float, UInt32
 from ...raster import CoplanarCreases, Topology
 from ...scene.changes import ParameterWatch
 from ...scene.geometry import Geometry
@@ -36,16 +37,16 @@ class Pairs:
     ends          ((UInt32 (K,), UInt32 (K,)), likewise): vertices of one and of the other at the edge's first end; at its second
     """
 
-    one: Any
-    other: Any
-    ends: tuple[tuple[Any, Any], tuple[Any, Any]]
+    one: UInt32
+    other: UInt32
+    ends: tuple[tuple[UInt32, UInt32], ...]
 
-    def mark(self, edges: Any, jump: Any, value: bool = True) -> None:
+    def mark(self, edges: Bool, jump: Bool, value: bool = True) -> None:
         """Set the flags (Bool, 3 F) of the edges for which ``jump`` (Bool, K) holds, on both sides."""
         dr.scatter(edges, mi.Bool(value), self.one, jump)
         dr.scatter(edges, mi.Bool(value), self.other, jump)
 
-    def jump(self, values: Any, size: int, least: float, first: int = 0) -> Any:
+    def jump(self, values: Float, size: int, least: float, first: int = 0) -> Bool:
         """Bool (K,): whether values of vertices (Float, ``size`` each, from that of ``first`` on) differ by more than that."""
         found = dr.full(mi.Bool, False, dr.width(self.one))
         for one, other in self.ends:
@@ -70,10 +71,10 @@ class ShadingEdges:
     textured    (number of the shape, the edges of it at which its texture coordinates may differ)
     """
 
-    always: Any
-    bendable: Any
-    coloured: Any
-    folds: Any
+    always: Bool
+    bendable: Bool | None
+    coloured: Bool | None
+    folds: Bool | None
     seams: Pairs | None
     attributed: tuple[tuple[int, Pairs], ...]
     textured: tuple[tuple[int, Pairs], ...]
@@ -95,17 +96,17 @@ class ShadingEdges:
         own_vertices = (ends[:, :, 0] != ends[:, :, 1]).any(1)
 
         def pairs(chosen: np.ndarray) -> Pairs:
-            ids = [[device_array(mi.UInt32, ends[chosen, end, side]) for side in range(2)] for end in range(2)]
-            edges = [device_array(mi.UInt32, half[chosen]) for half in (one, other)]
-            return Pairs(*edges, tuple(map(tuple, ids)))
+            first, second = ([device_array(mi.UInt32, ends[chosen, end, side]) for side in range(2)] for end in range(2))
+            half, next_half = (device_array(mi.UInt32, half[chosen]) for half in (one, other))
+            return Pairs(half, next_half, ((first[0], first[1]), (second[0], second[1])))
 
         attributed, textured = [], []
         plain: dict[Any, bool] = {}
         doubled = set(np.unique(shape[within & own_vertices]).tolist())
         for index, (info, source) in enumerate(zip(geometry.shapes, sources, strict=True)):
             if info.reads_attributes:
-                of_faces = any(name.startswith("face_") for name in attributes(source.shape))
-                chosen = within & (shape == index) & (own_vertices | of_faces)
+                has_own = any(name.startswith("face_") for name in attributes(source.shape))
+                chosen = within & (shape == index) & (own_vertices | has_own)
                 if chosen.any():
                     attributed.append((index, pairs(chosen)))
             if info.has_texcoords and index in doubled and _may_vary(source.shape, plain):
@@ -124,7 +125,7 @@ class ShadingEdges:
             shape = sources[index].shape
             nodes += [shape, shape.bsdf(), *([shape.emitter()] if shape.is_emitter() else [])]
 
-        def counts(node: Any, key: str) -> bool:
+        def counts(node: mi.Object, key: str) -> bool:
             if not isinstance(node, mi.Mesh):
                 return not isinstance(node, mi.Shape)
             return key == mesh_names(node).texcoords or is_attribute(node, key)
@@ -150,8 +151,8 @@ class ShadingEdges:
                         jump = pairs.jump(values, size, _COLOUR_JUMP, info.vertex_start)
                     else:
                         size = dr.width(values) // info.face_count
-                        faces = (half // 3 - info.face_start for half in (pairs.one, pairs.other))
-                        jump = replace(pairs, ends=(tuple(faces),)).jump(values, size, _COLOUR_JUMP)
+                        faces = pairs.one // 3 - info.face_start, pairs.other // 3 - info.face_start
+                        jump = replace(pairs, ends=(faces,)).jump(values, size, _COLOUR_JUMP)
                     jumps.append((pairs, jump))
             for index, pairs in self.textured:
                 texcoords = mi.Float(sources[index].own().texcoords)
@@ -166,7 +167,7 @@ class ShadingEdges:
             dr.eval(edges, folds)
         return replace(self, coloured=edges, folds=folds)
 
-    def now(self, geometry: Geometry) -> Any:
+    def now(self, geometry: Geometry) -> Bool | None:
         """``Bool`` (3 F,): whether shading jumps at the edge from corner k to k + 1 of a face, with these normals. None if there
         are no such edges whatever moves. Detached."""
         if self.seams is None:
@@ -177,12 +178,12 @@ class ShadingEdges:
             dr.eval(edges)
         return edges
 
-    def folds_of(self, normals: Any) -> CoplanarCreases | None:
+    def folds_of(self, normals: Float | None) -> CoplanarCreases | None:
         """Edges at which shading jumps only if the surface is bent there, for normals of flat faces (Float, 4 F)."""
-        return None if self.folds is None else CoplanarCreases(self.folds, normals)
+        return None if self.folds is None or normals is None else CoplanarCreases(self.folds, normals)
 
 
-def _may_vary(shape: Any, plain: dict[Any, bool]) -> bool:
+def _may_vary(shape: mi.Shape, plain: dict[Any, bool]) -> bool:
     """True if texture coordinates may decide on what a shape looks like. ``plain``: what is known of materials, kept here."""
     bsdf = shape.bsdf()
     if bsdf not in plain:
@@ -190,7 +191,7 @@ def _may_vary(shape: Any, plain: dict[Any, bool]) -> bool:
     return not plain[bsdf] or shape.is_emitter()
 
 
-def _other_colours(shape: Any, texcoords: Any, pairs: Pairs, first: int) -> Any:
+def _other_colours(shape: mi.Shape, texcoords: Float, pairs: Pairs, first: int) -> Bool:
     """Bool (K,): whether a shape has different colours on both sides of edges, seen and lit from right above. Detached.
 
     ``texcoords``: of its own vertices (Float, 2 each), whose first one is vertex ``first``.

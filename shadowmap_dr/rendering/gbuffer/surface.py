@@ -8,8 +8,9 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ...jit.arrays import backend
+from ...jit.arrays import backend, ravel
 from ...jit.broadcast import LIKE_LANES, broadcast_differentiable, copy_of_lane, in_copies
+from ...jit.types import Bool, Color3f, Float, Normal3f, Point3f, UInt32, Vector3f, Vector3u
 from ...jit.vectors import normalize_or
 from ...scene.geometry import FACETED, FLIP_GEOMETRIC, FLIP_SHADING, HAS_NORMALS, HAS_TEXCOORDS, READS_ATTRIBUTES, Geometry
 from ...scene.load import SceneData
@@ -35,16 +36,16 @@ class Surface:
     colour   colour (N,), the BSDF on the viewer's side over the cosine, if no BSDF depends on directions otherwise; else None
     """
 
-    p_world: Any
-    n_world: Any
-    wi_world: Any
-    shape: Any
-    active: Any
-    si: Any
-    bsdf: Any
-    colour: Any = None
+    p_world: Point3f
+    n_world: Vector3f
+    wi_world: Vector3f
+    shape: UInt32
+    active: Bool
+    si: mi.SurfaceInteraction3f
+    bsdf: mi.BSDFPtr
+    colour: Color3f | None = None
 
-    def evaluate(self, wo: Any, active: Any) -> Any:
+    def evaluate(self, wo: Vector3f, active: Bool) -> Color3f:
         """BSDF times cosine (colour, N) for directions to the light in the local frame (Vector3f). Attached to all."""
         if self.colour is None:
             return mi.UnpolarizedSpectrum(self.bsdf.eval(mi.BSDFContext(), self.si, wo, active))
@@ -52,7 +53,7 @@ class Surface:
         return dr.select(active & ~(self.si.wi.z * wo.z <= 0), self.colour * dr.abs(wo.z), 0)
 
 
-def plain_colours(data: SceneData) -> Any:
+def plain_colours(data: SceneData) -> Float:
     """Values of Mitsuba's BSDFs for light and viewer along the normal, on either side of each shape.
 
     That is all there is to know about a BSDF that is proportional to the cosine (:attr:`SceneData.needs_frames`), and calling
@@ -76,12 +77,14 @@ def plain_colours(data: SceneData) -> Any:
             if bsdf not in known:
                 known[bsdf] = mi.UnpolarizedSpectrum(bsdf.eval(mi.BSDFContext(), si, normal))
             colour = dr.select(lane >> 1 == shape, known[bsdf], colour)
-    result = dr.ravel(mi.Vector4f(*colour, *(mi.Float(0) for _ in range(4 - len(colour)))))
+    result = ravel(mi.Vector4f(*colour, *(mi.Float(0) for _ in range(4 - len(colour)))))
     dr.eval(result)
     return result
 
 
-def surface(data: SceneData, geometry: Geometry, sensor: Sensor, triangle: Any, u: Any, v: Any, active: Any = True) -> Surface:
+def surface(
+    data: SceneData, geometry: Geometry, sensor: Sensor, triangle: UInt32, u: Float, v: Float, active: Bool | bool = True
+) -> Surface:
     """Surface records for triangles of the soup.
 
     ``triangle`` UInt32 (N,), 0xFFFFFFFF for none; ``u``, ``v`` Float (N,), barycentrics of the triangle's vertices 1 and 2.
@@ -94,7 +97,7 @@ def surface(data: SceneData, geometry: Geometry, sensor: Sensor, triangle: Any, 
     return surface_at(data, geometry, sensor, hits, *normals_at(geometry, hits))
 
 
-def normals_at(geometry: Geometry, hits: SurfacePoints) -> tuple[Any, Any]:
+def normals_at(geometry: Geometry, hits: SurfacePoints) -> tuple[Normal3f, Normal3f]:
     """(geometric, shading) unit normals (Normal3f, N) on the side that each shape calls outside. Attached."""
     flags = _Flags(geometry, hits.flags)
     n_world = flags.negate(FLIP_GEOMETRIC, hits.n_face)
@@ -102,7 +105,9 @@ def normals_at(geometry: Geometry, hits: SurfacePoints) -> tuple[Any, Any]:
     if not any(info.has_normals for info in infos):
         return n_world, n_world
 
-    def interpolated(face: Any, changed: Any, u: Any, v: Any, n_world: Any, negative: Any, active: Any = True) -> Any:
+    def interpolated(
+        face: Vector3u, changed: Bool, u: Float, v: Float, n_world: Vector3f, negative: Bool, active: Bool | bool = True
+    ) -> Normal3f:
         first, d1, d2 = corner_values(mi.Vector3f, geometry.normals, face, active, changed)
         normal = normalize_or(first + d1 * u + d2 * v, mi.Vector3f(0.0))
         return mi.Normal3f(dr.select(dr.squared_norm(normal) > 0, dr.select(negative, -normal, normal), n_world))
@@ -119,7 +124,14 @@ def normals_at(geometry: Geometry, hits: SurfacePoints) -> tuple[Any, Any]:
 
 
 def surface_at(
-    data: SceneData, geometry: Geometry, sensor: Sensor, hits: SurfacePoints, n_world: Any, n_shading: Any, *, frames: bool = True
+    data: SceneData,
+    geometry: Geometry,
+    sensor: Sensor,
+    hits: SurfacePoints,
+    n_world: Vector3f,
+    n_shading: Vector3f,
+    *,
+    frames: bool = True,
 ) -> Surface:
     """Surface records for points on triangles, with the normals of :func:`normals_at`. Attached to all of these.
 
@@ -157,25 +169,25 @@ def coloured(data: SceneData, seen: Surface, frames: bool) -> Surface:
     return replace(seen, colour=_cosine_colour(data, seen)) if data.only_cosines else seen
 
 
-def _plain_colour(data: SceneData, seen: Surface) -> Any:
+def _plain_colour(data: SceneData, seen: Surface) -> Color3f:
     """``Surface.colour`` of materials that are the same everywhere on a shape."""
-    width, sides, channels = dr.width(seen.shape), plain_colours(data), dr.size_v(mi.UnpolarizedSpectrum)
-    rows = dr.width(sides) // 4
-    (sides,), copies = in_copies([sides], width, LIKE_LANES)
+    width, table, channels = dr.width(seen.shape), plain_colours(data), dr.size_v(mi.UnpolarizedSpectrum)
+    rows = dr.width(table) // 4
+    (sides,), copies = in_copies([table], width, LIKE_LANES)
     row = copy_of_lane(backend(sides), width, copies, LIKE_LANES) * rows
     row += 2 * seen.shape + dr.select(seen.si.wi.z < 0, mi.UInt32(1), 0)
     colour = dr.gather(mi.Vector4f, sides, row, seen.active, mode=dr.ReduceMode.Local)
     return mi.UnpolarizedSpectrum(*(colour[c] for c in range(channels)))
 
 
-def _cosine_colour(data: SceneData, seen: Surface) -> Any:
+def _cosine_colour(data: SceneData, seen: Surface) -> Color3f:
     """``Surface.colour`` of materials with textures: what they return for light along the normal.
 
     They are given what textures read, and no more: derivatives keep all of it in memory.
     """
     si, width = seen.si, dr.width(seen.shape)
 
-    def colour(own: tuple[Any, ...]) -> Any:
+    def colour(own: tuple[Any, ...]) -> Color3f:
         p, uv, primitive, shape, bsdf, behind, active = own
         at = dr.zeros(mi.SurfaceInteraction3f, dr.width(active))
         at.p, at.uv, at.prim_index, at.shape = p, uv, primitive, shape
@@ -205,7 +217,7 @@ def _parametrisation(geometry: Geometry, flags: _Flags, hits: SurfacePoints) -> 
     return uv, dp_du, dp_dv
 
 
-def opacity(surface: Surface) -> Any:
+def opacity(surface: Surface) -> Float:
     """Float (N,): 1 where the surface is solid, 0 where its BSDF (``mask``, ``null``) lets everything through unchanged.
 
     Gradients flow to the BSDF's opacity. Alpha tests compare this with 0.5.
@@ -217,28 +229,29 @@ def opacity(surface: Surface) -> Any:
 class _Flags:
     """Per-pixel booleans of the shape, looked at only if shapes of the scene differ in them."""
 
-    def __init__(self, geometry: Geometry, flags: Any) -> None:
+    def __init__(self, geometry: Geometry, flags: UInt32) -> None:
         self._static = [info.flags for info in geometry.shapes]
         self._flags = flags
 
     def any(self, bit: int) -> bool:
         return any(flags & bit for flags in self._static)
 
-    def test(self, bit: int) -> Any:
+    def test(self, bit: int) -> Bool:
         if all(flags & bit for flags in self._static):
             return mi.Bool(True)
         if not self.any(bit):
             return mi.Bool(False)
         return (self._flags & bit) != 0
 
-    def negate(self, bit: int, vector: Any) -> Any:
+    def negate(self, bit: int, vector: Vector3f) -> Vector3f:
         """-vector where the bit is set."""
         return dr.select(self.test(bit), -vector, vector) if self.any(bit) else vector
 
 
-def _interaction_position(geometry: Geometry, flags: _Flags, hits: SurfacePoints) -> Any:
+def _interaction_position(geometry: Geometry, flags: _Flags, hits: SurfacePoints) -> Point3f:
     """World position; rest-pose position for shapes with mesh attributes, since Mitsuba recovers barycentrics from it."""
     if not flags.any(READS_ATTRIBUTES):
         return hits.p_world
+    assert geometry.rest_positions is not None, "read where meshes have attributes"
     first, d1, d2 = hits.corners(mi.Point3f, geometry.rest_positions)
     return dr.select(flags.test(READS_ATTRIBUTES), first + d1 * hits.u + d2 * hits.v, hits.p_world)

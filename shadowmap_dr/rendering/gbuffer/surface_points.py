@@ -14,9 +14,14 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ...jit.arrays import replace_grad
+from ...jit.types import AnyArray, ArrayT, Bool, Float, Point3f, UInt32, Vector3f, Vector3u
 from ...jit.vectors import normalize_or
 from ...scene.geometry import NO_TRIANGLE, Geometry
 from ...scene.sensor import Sensor
+
+#: Stands for directions to a camera where no camera was given.
+NOT_GIVEN: Any = None  # Any: takes the place of an array
 
 
 @dataclass(frozen=True)
@@ -38,36 +43,36 @@ class SurfacePoints:
     pixel        Float (N,) or of width 1, height of the camera's pixels at that distance, world units, detached; None likewise
     """
 
-    triangle: Any
-    active: Any
-    changed: Any
-    face: Any
-    row: Any
-    shape: Any
-    flags: Any
-    e1: Any
-    e2: Any
-    n_face: Any
-    u: Any
-    v: Any
-    p_world: Any
-    wi_world: Any = None
-    depth: Any = None
-    pixel: Any = None
+    triangle: UInt32
+    active: Bool
+    changed: Bool
+    face: Vector3u
+    row: UInt32
+    shape: UInt32
+    flags: UInt32
+    e1: Vector3f
+    e2: Vector3f
+    n_face: Vector3f
+    u: Float
+    v: Float
+    p_world: Point3f
+    wi_world: Vector3f = NOT_GIVEN
+    depth: Float | None = None
+    pixel: Float | None = None
 
-    def corners(self, kind: Any, buffer: Any) -> tuple[Any, Any, Any]:
+    def corners(self, kind: type[ArrayT], buffer: AnyArray) -> tuple[ArrayT, ArrayT, ArrayT]:
         """A vertex attribute at vertex 0 and the differences of vertices 1 and 2 to it. Attached where vertices move.
 
         ``buffer`` has no copies (``Geometry.copies``).
         """
         return corner_values(kind, buffer, self.face, self.active, self.changed)
 
-    def corners_of_copy(self, kind: Any, buffer: Any) -> tuple[Any, Any, Any]:
+    def corners_of_copy(self, kind: type[ArrayT], buffer: AnyArray) -> tuple[ArrayT, ArrayT, ArrayT]:
         """The same from a buffer that has copies: normals, texture coordinates."""
         return corner_values(kind, buffer, self.face + self.row, self.active, self.changed)
 
 
-def hits_at(geometry: Geometry, triangle: Any, u: Any, v: Any, active: Any = True) -> SurfacePoints:
+def hits_at(geometry: Geometry, triangle: UInt32, u: Float, v: Float, active: Bool | bool = True) -> SurfacePoints:
     """Points with given barycentrics. Attached to them and to the positions."""
     active = mi.Bool(active) & (triangle != NO_TRIANGLE)
     face = dr.gather(mi.Vector3u, geometry.faces, triangle, active)
@@ -79,7 +84,7 @@ def hits_at(geometry: Geometry, triangle: Any, u: Any, v: Any, active: Any = Tru
     return SurfacePoints(triangle, active, active, face, row, shape, flags, e1, e2, _normal(e1, e2), u, v, p_world)
 
 
-def pixel_hits(geometry: Geometry, sensor: Sensor, triangle: Any, size: tuple[int, int]) -> SurfacePoints:
+def pixel_hits(geometry: Geometry, sensor: Sensor, triangle: UInt32, size: tuple[int, int]) -> SurfacePoints:
     """Points that the pixel centres of a picture of ``size`` (width, height) see, given its triangles (row-major).
 
     Attached to positions and camera: each point stays on the ray through its pixel and on its triangle's plane.
@@ -92,7 +97,7 @@ def pixel_hits(geometry: Geometry, sensor: Sensor, triangle: Any, size: tuple[in
     moving = dr.grad_enabled(ray_o, ray_d)
     row = geometry.row_of_copy(dr.width(triangle))
 
-    def intersect(face: Any, active: Any, ray_o: Any, ray_d: Any, row: Any) -> tuple[Any, ...]:
+    def intersect(face: Vector3u, active: Bool, ray_o: Point3f, ray_d: Vector3f, row: UInt32) -> tuple[Any, ...]:
         return _intersect(_triangle(geometry, face, active, row), active, ray_o, ray_d)
 
     if moving or not dr.grad_enabled(geometry.positions):
@@ -104,14 +109,14 @@ def pixel_hits(geometry: Geometry, sensor: Sensor, triangle: Any, size: tuple[in
         # Of the types only: functions that held what they lead to would keep the whole graph alive, if nothing ever traverses it.
         kinds = [type(value) for value in found]
 
-        def none(face: Any, active: Any, ray_o: Any, ray_d: Any, row: Any) -> tuple[Any, ...]:
+        def none(face: Vector3u, active: Bool, ray_o: Point3f, ray_d: Vector3f, row: UInt32) -> tuple[Any, ...]:
             return tuple(dr.zeros(kind) for kind in kinds)
 
         # Derivatives on their own, in a branch: most pixels of many images see nothing that moves.
         attached = dr.if_stmt(
             (face, changed, ray_o, ray_d, row), changed, intersect, none, mode="symbolic", label="attached hits"
         )
-        found = tuple(dr.replace_grad(value, other) for value, other in zip(found, attached, strict=True))
+        found = tuple(replace_grad(value, other) for value, other in zip(found, attached, strict=True))
     e1, e2, normal, u, v, p_world = found
     wi_world = -dr.normalize(ray_d)
     # Along the axis directions have unit length, so this is the length of the ray.
@@ -125,7 +130,9 @@ def pixel_hits(geometry: Geometry, sensor: Sensor, triangle: Any, size: tuple[in
     )
 
 
-def _intersect(triangle: tuple[Any, Any, Any], active: Any, ray_o: Any, ray_d: Any) -> tuple[Any, Any, Any, Any, Any, Any]:
+def _intersect(
+    triangle: tuple[Point3f, Vector3f, Vector3f], active: Bool, ray_o: Point3f, ray_d: Vector3f
+) -> tuple[Any, Any, Any, Any, Any, Any]:
     """(e1, e2, unit normal, u, v, point) where rays meet the planes of their triangles."""
     first, e1, e2 = triangle
     with dr.suspend_grad():
@@ -154,30 +161,32 @@ def _intersect(triangle: tuple[Any, Any, Any], active: Any, ray_o: Any, ray_d: A
             on_ray = ray_o + ray_d * (t + dr.dot(n, p_material - ray_o - ray_d * t) * inverse)
         else:
             on_ray = d * (dr.dot(n, p_material) * inverse)
-        p_world = dr.replace_grad(p_material, mi.Point3f(on_ray))
+        p_world = replace_grad(p_material, mi.Point3f(on_ray))
         slide = p_world - p_material
-        u = dr.replace_grad(u, dr.dot(slide, dual_u))
-        v = dr.replace_grad(v, dr.dot(slide, dual_v))
+        u = replace_grad(u, dr.dot(slide, dual_u))
+        v = replace_grad(v, dr.dot(slide, dual_v))
     return e1, e2, _normal(e1, e2), u, v, p_world
 
 
-def _normal(e1: Any, e2: Any) -> Any:
+def _normal(e1: Vector3f, e2: Vector3f) -> Vector3f:
     return normalize_or(mi.Normal3f(dr.cross(e1, e2)), mi.Normal3f(0.0, 0.0, 1.0))
 
 
-def _triangle(geometry: Geometry, face: Any, active: Any, row: Any) -> tuple[Any, Any, Any]:
+def _triangle(geometry: Geometry, face: Vector3u, active: Bool, row: UInt32) -> tuple[Point3f, Vector3f, Vector3f]:
     first, second, third = (geometry.vertices(face[k], active, row=row) for k in range(3))
     return first, second - first, third - first
 
 
-def corner_values(kind: Any, buffer: Any, face: Any, active: Any, changed: Any) -> tuple[Any, Any, Any]:
+def corner_values(
+    kind: type[ArrayT], buffer: AnyArray, face: Vector3u, active: Bool | bool, changed: Bool
+) -> tuple[ArrayT, ArrayT, ArrayT]:
     """A vertex attribute at the first of three vertices (``face``) and the differences of the others to it.
 
     ``buffer`` is flat, ``kind`` the type of its entries; gradients flow only where vertices may have ``changed``.
     """
-    values = [dr.gather(kind, buffer, face[k], active) for k in range(3)]
+    values: list[Any] = [dr.gather(kind, buffer, face[k], active) for k in range(3)]
     if dr.grad_enabled(buffer):
         # Values for all lanes, gradients only where they lead somewhere: scattering them back is what costs most.
-        values = [dr.replace_grad(dr.detach(x), dr.gather(kind, buffer, face[k], changed)) for k, x in enumerate(values)]
+        values = [replace_grad(dr.detach(x), dr.gather(kind, buffer, face[k], changed)) for k, x in enumerate(values)]
     first, second, third = values
     return first, second - first, third - first

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -19,6 +18,7 @@ import numpy.typing as npt
 
 from ...errors import ShadowmapError
 from ...jit.arrays import device_array
+from ...jit.types import Float, Point3f, UInt32
 from ...raster import Topology, build_topology
 from ...shadow import (
     Frusta,
@@ -72,8 +72,8 @@ class ReceiverShadows:
         shape: (H, W).
     """
 
-    points: Any
-    faces: Any
+    points: Point3f
+    faces: UInt32
     topology: Topology
     views: Views
     frusta: Frusta
@@ -110,8 +110,8 @@ class ReceiverShadows:
         rows, columns = window.pixels(height)
         x = window.low[0] + (np.arange(columns) + 0.5) / columns * window.size[0]
         y = window.high[1] - (np.arange(rows) + 0.5) / rows * window.size[1]
-        x, y = (device_array(mi.Float, a) for a in np.meshgrid(x, y))
-        points = mi.Point3f(x, y, dr.full(mi.Float, window.z, len(x)))
+        across, up = (device_array(mi.Float, a) for a in np.meshgrid(x, y))
+        points = mi.Point3f(across, up, dr.full(mi.Float, window.z, rows * columns))
         triangles = np.asarray(faces).reshape(-1, 3)
         views = stack_views([_view(direction) for direction in directions])
         frusta = _frusta(directions, window, reach)
@@ -126,7 +126,7 @@ class ReceiverShadows:
             (rows, columns),
         )
 
-    def render(self, positions: Any) -> Any:
+    def render(self, positions: Float) -> Float:
         """Mean visibility over the lights.
 
         Args:
@@ -152,8 +152,8 @@ def _view(direction: tuple[float, float, float]) -> LightView:
     All receiver points then have the same depth in all maps, however the light slants, and maps are sampled as the receiver is.
     """
     x, y, z = map(float, direction)
-    axes = [(1.0, 0.0, -x / z), (0.0, 1.0, -y / z), (0.0, 0.0, -1.0), (0.0, 0.0, 0.0)]
-    return LightView(*(mi.Vector3f(*axis) for axis in axes), mi.Float(0))
+    right, up, forward = mi.Vector3f(1.0, 0.0, -x / z), mi.Vector3f(0.0, 1.0, -y / z), mi.Vector3f(0.0, 0.0, -1.0)
+    return LightView(right, up, forward, mi.Vector3f(0.0, 0.0, 0.0), mi.Float(0))
 
 
 def _frusta(directions: Sequence[tuple[float, float, float]], window: Window, reach: float) -> Frusta:

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from ...errors import ShadowmapError
 from ...jit.arrays import device_array
+from ...jit.types import Float, Point3f, UInt32
 from ...raster import Topology, build_topology
 from ...shadow import Frusta, ShadowSettings, Views, filter_maps, render_maps, vertices_in_maps, visibility
 from .shadow_views import ShadowView
@@ -36,11 +37,11 @@ class ShadowImages:
         views, frusta, settings: of the shadow maps, one for each image.
     """
 
-    faces: Any
+    faces: UInt32
     topology: Topology
-    points: Any
-    which: Any
-    weight: Any
+    points: Point3f
+    which: UInt32
+    weight: Float
     sizes: tuple[tuple[int, int], ...]
     views: Views
     frusta: Frusta
@@ -51,7 +52,7 @@ class ShadowImages:
         """Number of pixels in all images together."""
         return sum(height * width for height, width in self.sizes)
 
-    def visibility(self, vertices: Any) -> Any:
+    def visibility(self, vertices: Float) -> Float:
         """Visibility images of the views' cameras.
 
         Args:
@@ -64,7 +65,7 @@ class ShadowImages:
         maps = render_maps(p_light, map_index, self.faces, self.topology, self.views, self.frusta, self.settings)
         return visibility(filter_maps(maps), self.which, self.points)
 
-    def images(self, flat: Any) -> list[npt.NDArray[np.float32]]:
+    def images(self, flat: Float) -> list[npt.NDArray[np.float32]]:
         """Flat pixels, as from `visibility`, as one (H, W) array for each view."""
         values = np.array(dr.detach(flat), np.float32)
         ends = np.cumsum([0, *(height * width for height, width in self.sizes)])
@@ -116,16 +117,19 @@ def shadow_images(
         device_array(mi.Float, np.concatenate([pixels / pixels.sum() for pixels in seen])),
         tuple(view.shape for view in views),
         Views(
-            *(mi.Point3f(*_columns([getattr(view, name) for view in views])) for name in ("right", "up", "forward", "origin")),
-            dr.zeros(mi.Float, len(views)),
-            dr.full(mi.Float, dr.inf, len(views)),
+            right=mi.Vector3f(*_columns([view.right for view in views])),
+            up=mi.Vector3f(*_columns([view.up for view in views])),
+            forward=mi.Vector3f(*_columns([view.forward for view in views])),
+            origin=mi.Point3f(*_columns([view.origin for view in views])),
+            spread=dr.zeros(mi.Float, len(views)),
+            limit=dr.full(mi.Float, dr.inf, len(views)),
         ),
         _frusta(views),
         settings,
     )
 
 
-def image_loss(shadows: ShadowImages, seen: Any, wanted: Any) -> Any:
+def image_loss(shadows: ShadowImages, seen: Float, wanted: Float) -> Float:
     """Mean squared difference of images, summed over the views: ``Float`` (1,), detached. Its derivative is set in ``seen``.
 
     By hand, since the loss and its derivative then read the images together, once. A backward pass from ``seen`` is to follow.

@@ -98,7 +98,7 @@ def shadow_view(
     # Local coordinates: right, up, and towards the object, which is against the light.
     points = origin + local @ np.stack([axes[0], axes[1], -forward])
     single = [a.astype(np.float32) for a in (*axes, origin)]
-    return ShadowView(*single, half, points.astype(np.float32), seen, receiver, camera)
+    return ShadowView(single[0], single[1], single[2], single[3], half, points.astype(np.float32), seen, receiver, camera)
 
 
 def height(receiver: str, x: npt.NDArray[np.float64], half: float) -> npt.NDArray[np.float64]:

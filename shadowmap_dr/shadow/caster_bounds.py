@@ -1,4 +1,4 @@
-"""Shapes that can cast a shadow at all: a wall or a floor with nothing behind it only takes up room in a map."""
+"""Shapes that can cast a shadow. A wall or floor with nothing behind it cannot, and would only waste space in a map."""
 
 from __future__ import annotations
 
@@ -10,39 +10,39 @@ from ..jit.arrays import backend
 from ..jit.types import Bool, Float, Normal3f, Point3f, UInt32
 from .light_camera import Views, of_map
 
-#: Share of a shape's extent that may lie behind a floor on which it stands without the floor casting a shadow on it.
+#: Fraction of a shape's extent that may sink into the floor on which it stands, before the floor counts as its caster.
 SUNK = 0.1
-#: What stands on a floor keeps this far from its border, as a share of the floor's own size.
+#: Distance from a floor's border that a shape on the floor keeps, as a fraction of the floor's size.
 BORDER = 0.01
-#: Shapes touch if they are this close: as a share of the smaller one's size, and, for rounding, of their coordinates.
+#: Distance at which shapes touch: a fraction of the smaller one's size, plus (for rounding) a fraction of their coordinates.
 TOUCH, ROUNDING = 1e-4, 1e-6
 
 
 @dataclass(frozen=True)
 class Boxes:
-    """Axis-aligned boxes of S shapes in world space: ``low``, ``high``, ``Array3f`` of width S, evaluated, detached."""
+    """Axis-aligned boxes of S shapes in world space: corners ``low`` and ``high`` of width S, evaluated, detached."""
 
     low: Point3f
     high: Point3f
 
     @property
     def count(self) -> int:
-        """S."""
+        """Number of boxes S."""
         return dr.width(self.low)
 
     def corners(self, shape: UInt32, corner: UInt32) -> Point3f:
-        """``Array3f``: corner number 0 to 7 of the boxes of shapes (``UInt32`` each)."""
+        """Corners (0 to 7) of the boxes of shapes."""
         scalar, vector = backend(self.low).Float, backend(self.low).Array3f
         ends = [(dr.gather(scalar, self.high[c], shape), dr.gather(scalar, self.low[c], shape)) for c in range(3)]
         return vector(*(dr.select((corner & (1 << c)) != 0, *end) for c, end in enumerate(ends)))
 
 
 def shape_boxes(p_world: Point3f, shape: UInt32, count: int) -> Boxes:
-    """Boxes around the vertices (``Array3f``, V) of each of ``count`` shapes (``UInt32``, V)."""
+    """Boxes around ``count`` shapes. ``p_world`` (V,): vertices; ``shape`` (V,): shape of each vertex. Detached."""
     module = backend(shape)
     with dr.suspend_grad():
         p = dr.detach(p_world)
-        # All maxima, and all in one buffer, since a reduction costs more to start than to run.
+        # Six maxima in one buffer: a reduction costs more to launch than to run.
         extremes = dr.full(module.Float, -dr.inf, 6 * count)
         drawn = dr.isfinite(p.x + p.y + p.z)
         for k, value in enumerate((p.x, p.y, p.z, -p.x, -p.y, -p.z)):
@@ -57,16 +57,17 @@ def shape_boxes(p_world: Point3f, shape: UInt32, count: int) -> Boxes:
 def casting_shapes(
     views: Views, planes: tuple[Normal3f, Point3f], planar: Bool, boxes: Boxes, hidden: UInt32 | None = None
 ) -> Bool:
-    """Shapes that can cast a shadow in each map: not planar ones with nothing behind them, as seen from the light.
+    """Shapes that can cast a shadow in each map: all but planar shapes with nothing behind them, as seen from the light.
 
     Args:
         views: cameras of the M maps.
-        planes: (normal, point) in world space, ``Array3f`` of width S: the plane of each shape that is ``planar`` (``Bool``).
-        boxes: of the S shapes.
-        hidden: shape (``UInt32``, for each map) that casts no shadow in it. None: all may.
+        planes: (normal, point) in world space, of width S: the plane of each planar shape.
+        planar: (S,) mask of the planar shapes.
+        boxes: boxes of the S shapes.
+        hidden: (M,) shape that casts no shadow in each map. None: all shapes may.
 
     Returns:
-        ``Bool`` of width M * S (entry ``map * S + shape``), detached.
+        Mask of width M * S (entry ``map * S + shape``), detached.
     """
     module = backend(views.spread)
     with dr.suspend_grad():
@@ -86,9 +87,9 @@ def casting_shapes(
 
 
 def _reach(normal: Normal3f, point: Point3f, boxes: Boxes) -> Float:
-    """Reach of the boxes of the other shapes on either side of each shape's plane (``Float``, 2 S); at most 0 if they touch.
+    """Reach (2 S) of the other shapes' boxes beyond each shape's plane, on either side; at most 0 if they only touch it.
 
-    The first tenth of what stands on the plane does not count: it may sink in a little, which shall not change the maps.
+    The first tenth of a shape that stands on the plane does not count: the maps shall not change if it sinks in a little.
     """
     module, shapes = backend(boxes.low), boxes.count
     Float = module.Float
@@ -104,7 +105,7 @@ def _reach(normal: Normal3f, point: Point3f, boxes: Boxes) -> Float:
         behind -= n * (dr.select(n > 0, low, high) - p)
         extent += dr.abs(n) * (high - low)
         far = dr.maximum(far, dr.maximum(dr.abs(low), dr.abs(high)))
-        # Within the plane's own outline, along its normal as far as it likes.
+        # A shape stands on the plane if it lies within the plane's outline, at any distance along the normal.
         left, right = dr.gather(Float, boxes.low[c], own), dr.gather(Float, boxes.high[c], own)
         border, room = BORDER * (right - left), dr.abs(n) * sizes[1]
         stands &= (low >= left + border - room) & (high <= right - border + room)

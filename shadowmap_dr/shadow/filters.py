@@ -15,7 +15,7 @@ FILTERS = ("box", "gaussian", "wendland", "none")
 
 
 def reach_of(filter_size: int) -> float:
-    """Largest distance in texels from a point at which a look-up reads: those under the filter, and between them."""
+    """Largest distance (texels) between a point and a texel that its look-up reads, by filter and interpolation."""
     return 0.5 * filter_size + 1
 
 
@@ -27,8 +27,8 @@ def filter_kernel(name: str, size: int, compat: bool = False) -> np.ndarray:
     - ``wendland``: product of (1 - d)^4 (4 d + 1) along both axes with d = distance / ((size + 1) / 2).
     - ``none``: the identity, whatever the size.
 
-    ``compat`` samples the authors' kernels on a size x size grid over [-1, 1]^2 instead: exp(-(x^2 + y^2) / 0.2), and the
-    Wendland function of the radius (0 beyond 1). At size 3 these are nearly the identity.
+    ``compat`` samples Worchel and Alexa's kernels on a size x size grid over [-1, 1]^2 instead: exp(-(x^2 + y^2) / 0.2), and
+    the Wendland function of the radius (0 beyond 1). At size 3 these are nearly the identity.
 
     Raises:
         ValueError: unknown name, or a size that is not odd and positive.
@@ -58,7 +58,7 @@ def _wendland(d: np.ndarray) -> np.ndarray:
 
 
 def separable_terms(kernel: np.ndarray) -> list[tuple[list[float], list[float]]]:
-    """Write a kernel as a sum of (column, row) outer products; one term for a separable kernel, a few for a radial one."""
+    """Terms (column, row) whose outer products sum to a kernel: one for a separable kernel, a few for a radial one."""
     u, s, v = np.linalg.svd(kernel)
     keep = s > 1e-7 * s[0]
     return [((u[:, k] * s[k]).tolist(), v[k].tolist()) for k in np.nonzero(keep)[0]]
@@ -104,13 +104,13 @@ class _Convolve(dr.CustomOp):
 def _convolve(values: Float, weights: list[float], axis: int, shape: tuple[int, int, int, int], transpose: bool) -> Float:
     maps, height, width, channels = shape
     if axis == 0 and width * channels % 4 == 0:
-        # What lies side by side is treated alike: columns in packets of four numbers.
+        # Neighbours in a row have the same taps: process columns in packets of four numbers.
         width, channels = width * channels // 4, 4
     dr.eval(values)
     if axis == 1 and channels == 2 and width % 2 == 0:
         return _convolve_pairs(values, weights, maps * height, width, transpose)
     module = backend(values)
-    # Texels of many numbers are several packets, that is, several lanes.
+    # Texels of more than four numbers are several packets, one lane each.
     parts = max(1, channels // 4)
     channels //= parts
     packet = {1: module.Float, 2: module.Array2f, 4: module.Array4f}[channels]
@@ -127,7 +127,7 @@ def _convolve(values: Float, weights: list[float], axis: int, shape: tuple[int, 
 
 
 def _convolve_pairs(values: Float, weights: list[float], rows: int, width: int, transpose: bool) -> Float:
-    """Rows of texels of two numbers each, two texels a lane, which share what they read."""
+    """Convolve rows of two-channel texels, two texels a lane, which share their reads."""
     module = backend(values)
     Int32, UInt32 = module.Int32, module.UInt32
     lane = dr.arange(UInt32, rows * width // 2)
@@ -136,7 +136,7 @@ def _convolve_pairs(values: Float, weights: list[float], rows: int, width: int, 
     texels = {0: module.Array2f(own.x, own.y), 1: module.Array2f(own.z, own.w)}
 
     def read(k: int) -> AnyArray:
-        """The texel k columns from the first of the two."""
+        """The texel k columns from the first of the lane's two texels."""
         if k not in texels:
             texels[k] = dr.gather(module.Array2f, values, UInt32(2 * Int32(lane) + (dr.clip(at + k, 0, width - 1) - at)))
         return texels[k]
@@ -147,14 +147,14 @@ def _convolve_pairs(values: Float, weights: list[float], rows: int, width: int, 
 
 
 def _weighted(read: Callable[[int], AnyArray], at: Int32, n: int, weights: list[float], transpose: bool) -> AnyArray:
-    """Sum over the taps; ``read(k)`` gives the texels k places from ``at`` (0 to n - 1), or at the border if that is nearer."""
+    """Sum over the taps. ``read(k)``: texels k places from ``at`` (0 to n - 1), clamped to the border."""
     module = backend(at)
     radius = len(weights) // 2
 
     def tap(k: int) -> AnyArray:
         weight = module.Float(weights[k + radius])
         if transpose:
-            # Border lanes also receive what taps beyond the border read from them.
+            # The forward pass reads border texels for taps beyond the border: the adjoints of these taps go to border lanes.
             source = at - k
             inside = (source >= 0) & (source < n)
             weight = dr.select(inside, weight, 0)

@@ -1,4 +1,4 @@
-"""The frusta of the light cameras: fitted to what can cast shadows on what is seen, and stable under small changes."""
+"""Frusta of the light cameras: fitted to casters and visible receivers, and stable under small changes."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from .light_camera import Frusta, Views, of_map, to_light_space
 #: Bounds in a light's image plane and of depths: (x0, y0, x1, y1, z0, z1).
 Extent: TypeAlias = tuple[Float, Float, Float, Float, Float, Float]
 
-# A frustum is kept while the scene fits and fills at least this fraction of it.
+# A frustum is kept while it contains the scene and the scene fills at least this fraction of it.
 _KEEP_FILL = 0.6
 _MARGIN = 0.10
 # Least depth range of a frustum in units of its lateral extent.
 _FLATTEST = 1e-2
-# And of its distance: rounding changes depths by some 1e-7 of that.
+# Least depth range in units of its distance from the light: rounding changes depths by some 1e-7 of the distance.
 _THINNEST = 1e-3
-# Part of the depth range between the last depth at which there may be casters and the far plane (see `texel_depths`).
+# Fraction of the depth range between the last possible caster and the far plane (see `texel_depths`).
 _BEHIND_LAST = 0.04
-# Depths are told apart from this far before the first receiver on, in units of the range from there on.
+# Distance before the first receiver from which on the map resolves depths, in units of the range behind the first receiver.
 _BEFORE = 1.0
 
 
@@ -31,8 +31,8 @@ _BEFORE = 1.0
 class Bounds:
     """Light-space bounds of each shape in each map: image coordinates and depths.
 
-    ``negated`` holds -x0, -y0, -z0, x1, y1, z1 (``Float``, 6 for each shape in each map): all maxima, and all in one buffer,
-    since a reduction costs more to start than to run.
+    ``negated`` holds -x0, -y0, -z0, x1, y1, z1 for each shape in each map: all of them maxima, in one buffer, for a reduction
+    costs more to launch than to run.
     """
 
     negated: Float
@@ -63,10 +63,10 @@ def shape_bounds(view: Views, p_light: Point3f, map_index: UInt32, shape_index: 
         behind = perspective & (p.z <= 0)
         w = dr.select(perspective & ~behind, p.z, 1.0)
         x, y = p.x / w, p.y / w
-        # A vertex behind a spot light bounds nothing: its shape may reach anywhere in the image.
+        # With a vertex behind a spot light, a shape may reach anywhere in the image.
         sides = [dr.select(behind, dr.inf, value) for value in (-x, -y, x, y)]
         values = [*sides[:2], -p.z, *sides[2:], p.z]
-        # What is not finite is not drawn, and bounds nothing.
+        # Vertices that are not finite are not drawn.
         drawn = dr.isfinite(p.x + p.y + p.z)
         return Bounds(_maxima(values, map_index * shape_count + shape_index, view.count * shape_count, drawn))
 
@@ -82,15 +82,19 @@ def fit_frusta(
     seen: tuple[Point3f, Bool] | None = None,
     receiver_range: bool = True,
 ) -> Frusta:
-    """Frusta that cover everything that can cast a shadow on what is seen, or the previous ones as long as they still do.
+    """Frusta that cover all possible casters of visible shadows, or the previous frusta as long as they still do. Detached.
 
     Args:
+        views: cameras of the M maps.
         bounds: from :func:`shape_bounds`.
-        casts: which shapes can cast a shadow in which map (:func:`casting_shapes`; ``Bool``). What is behind a light does not.
+        casts: mask of the shapes that can cast a shadow in each map (:func:`casting_shapes`). Shapes behind a light never do.
+        shape_count: number of shapes.
+        resolution: texels along each side of a map.
+        filter_size: of the maps' filter, in texels.
         previous: frusta of an earlier call. Kept bit by bit while the casters lie inside them with room for the filter
             and fill most of them.
-        seen: points (``Array3f``, world space) all over the receivers in view, and a mask of those that count. None: anywhere.
-        receiver_range: tell depths apart only from a little before the first receiver on, not from the first caster on.
+        seen: (points in world space, spread over the visible receivers; mask of valid points). None: receivers may be anywhere.
+        receiver_range: resolve depths only from shortly before the first receiver on, not from the first caster on.
 
     All arithmetic stays on the device: nothing is read back.
     """
@@ -117,7 +121,7 @@ def fit_frusta(
 
 
 def _window(views: Views, seen: tuple[Point3f, Bool] | None) -> Extent:
-    """(x0, y0, x1, y1) in each map's image plane around what is seen, within the light's own cone, and bounds of its depth."""
+    """(x0, y0, x1, y1, z0, z1): bounds of the visible points in each map's image plane, within the light's cone, and in depth."""
     module = backend(views.spread)
     perspective = views.spread > 0
     limit = dr.select(perspective, views.spread, dr.inf)
@@ -163,22 +167,23 @@ def _fit(
     perspective = views.spread > 0
     x0, y0 = dr.maximum(x0, window[0]), dr.maximum(y0, window[1])
     x1, y1 = dr.minimum(x1, window[2]), dr.minimum(y1, window[3])
-    # Behind all that is seen, casters are of no account; but seen receivers may end before the first of them.
+    # Casters behind all visible receivers do not matter; but visible receivers may end before the first caster.
     z1 = dr.maximum(dr.minimum(z1, window[5]), z0)
-    # How far casters lie before all that is seen does not matter. All of them may.
+    # The distance of casters before all visible receivers does not matter. All casters may lie there.
     receivers = dr.select(dr.isfinite(window[4]), dr.maximum(window[4], z0), z0)
-    # Casters outside of the window leave an empty rectangle; any small one will do.
+    # If all casters lie outside of the window, the rectangle is empty; replace it by any small one.
     x1, y1 = dr.maximum(x1, x0 + 1e-4 * (1 + dr.abs(x0))), dr.maximum(y1, y0 + 1e-4 * (1 + dr.abs(y0)))
-    # A flat caster that faces the light has no depth of its own. In a range of next to nothing all that tilts it would be a huge
-    # change, of which the derivative of visibility is the small difference.
+    # A flat caster that faces the light has no extent in depth. In a tiny range, any tilt would be a huge change of depth, and
+    # the derivative of visibility a small difference of huge numbers.
     lateral = dr.maximum(x1 - x0, y1 - y0) * dr.select(perspective, dr.abs(z1), 1)
     least = dr.maximum(_FLATTEST * lateral, _THINNEST * dr.maximum(dr.abs(z1), 1e-3))
-    # What is seen is known from samples: a little may lie before them.
+    # Visible receivers are known from samples only: some may lie a little before these.
     spread = dr.select(dr.isfinite(window[5]), window[5] - receivers, 0)
     depth = dr.maximum(dr.maximum(z1 - receivers, least), 0.1 * spread)
     near = z0 - 0.05 * dr.maximum(z1 - z0, least)
-    # Where all casters end before what is seen, so does the far plane. If a floor lay right on it, rounding would decide whether
-    # it is drawn: its depth in the map would have a derivative, which that of a point on it, moved to the plane, has not.
+    # If all casters end before the visible receivers, so does the far plane. If a floor lay right on it, rounding would decide
+    # whether the floor is drawn: its depth in the map would have a derivative, but the depth of a receiver, clamped to the far
+    # plane, would have none.
     last = dr.maximum(z1, receivers - 0.1 * depth) + 0.05 * depth
     last = dr.select(perspective, dr.maximum(last, 1e-6), last)
     first = dr.maximum(near, receivers - _BEFORE * depth)
@@ -203,17 +208,17 @@ def _still_fits(views: Views, old: Frusta, new: Frusta, needed: tuple[Float, ...
     room = 2 * (filter_size / 2 + 1) / resolution
 
     def holds(lo: Float, hi: Float, center: Float, half: Float) -> Bool:
-        # A map that reaches its limit needs no room there.
+        # A map that reaches its limit needs no margin there.
         limit = views.limit * (1 - 1e-5)
         below = (lo >= center - half * (1 - room)) | (center - half <= -limit)
         return below & ((hi <= center + half * (1 - room)) | (center + half >= limit))
 
     keep = holds(x0, x1, old.center_x, old.half_x) & holds(y0, y1, old.center_y, old.half_y)
     keep &= (new.half_x >= _KEEP_FILL * old.half_x) & (new.half_y >= _KEEP_FILL * old.half_y)
-    # Where casters surround a light, its near plane follows from the far one alone, and need not follow it closely.
+    # If casters surround a light, its near plane follows from the far plane alone, and need not follow it closely.
     around = (views.spread > 0) & (z0 < new.near)
     keep &= dr.maximum(z0, new.near) >= dr.select(around, 0.5 * old.near, old.near)
-    # Receivers before the range in which depths are told apart would lose their shadows.
+    # Receivers before the resolved depth range would lose their shadows.
     keep &= dr.maximum(receivers, new.first) >= dr.select(around & (old.first <= old.near), 0.5 * old.first, old.first)
     keep &= z1 <= old.last
     keep &= new.far - new.first >= _KEEP_FILL * (old.far - old.first)

@@ -1,8 +1,8 @@
-"""Cameras at the lights: their axes, their frusta, and the projections in between.
+"""Cameras at the lights: axes, frusta, and projections.
 
 A light sees the scene through one map (directional: orthographic; spot: perspective) or six (point: the faces of a cube). The
-maps of all lights form one batch of M images. Axes and origins are attached to the lights' parameters; the frustum (which part
-of the light's image plane the map covers) is detached and stable, so that an optimisation does not see the fit move.
+maps of all lights form one batch of M images. Axes and origins are attached to the lights' parameters. The frustum (the part of
+the light's image plane that the map covers) is detached and stable, so that an optimisation does not see the fit move.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ class LightView:
     """One map's camera.
 
     Attributes:
-        right, up, forward: ``Array3f`` of width 1, orthonormal, world space; light travels along ``forward``.
-        origin: ``Array3f``, world space: the light's position, or any point for a directional light.
+        right, up, forward: orthonormal axes of width 1, world space; light travels along ``forward``.
+        origin: position of the light in world space, or any point for a directional light.
         spread: tangent of the half-angle that the map may cover, or 0 for an orthographic map.
-        limit: image coordinates beyond which the map need not reach in any case, not even for a margin: those of a cube's face.
+        limit: largest image coordinate that the map ever covers, margins included (for faces of a cube).
     """
 
     right: Vector3f
@@ -44,7 +44,7 @@ class LightView:
 
 @dataclass(frozen=True)
 class Views:
-    """The cameras of all M maps: ``Array3f``/``Float`` of width M. Gradients flow to the lights."""
+    """Cameras of all M maps, see :class:`LightView`; arrays of width M. Attached to the lights."""
 
     right: Vector3f
     up: Vector3f
@@ -58,24 +58,24 @@ class Views:
         return dr.width(self.spread)
 
     def columns(self) -> list[Float]:
-        """All numbers (``Float`` (M,) each) in a fixed order."""
+        """All components, (M,) each, in a fixed order."""
         return [*self.right, *self.up, *self.forward, *self.origin, self.spread, self.limit]
 
     @classmethod
     def of(cls, columns: Sequence[Float]) -> Views:
-        """Put together what :meth:`columns` has taken apart."""
+        """Make views from the result of :meth:`columns`."""
         Array3f = backend(columns[0]).Array3f
         return cls(*(Array3f(*columns[k : k + 3]) for k in (0, 3, 6, 9)), *columns[12:])
 
 
 @dataclass(frozen=True)
 class Frusta:
-    """Part of the image plane and of the depth range that each map covers; ``Float`` of width M, detached.
+    """Part of the image plane and of the depth range that each map covers; width M, detached.
 
     A point with light-space coordinates (x, y, z) has image coordinates (x, y) in an orthographic and (x, y) / z in a perspective
-    view; the map covers ``center +- half`` in them and depths from ``near`` to ``far``. It tells depths apart from ``first`` on:
-    what lies before that lies before all receivers, and it does not matter how far. Behind ``last`` nothing casts
-    a shadow.
+    view. The map covers image coordinates ``center +- half`` and depths from ``near`` to ``far``. It resolves depths from
+    ``first`` on; the depths of casters before ``first`` do not matter, for they lie before all receivers. Behind ``last`` there
+    are no casters.
     """
 
     center_x: Float
@@ -92,9 +92,9 @@ ViewsOrFrusta = TypeVar("ViewsOrFrusta", Views, Frusta)
 
 
 def directional_view(direction: Vector3f) -> LightView:
-    """View along a light direction (``Array3f``, any length). The other axes follow from it without a twist of their own."""
+    """View along a light direction of any length, which also determines the other axes. Attached to the direction."""
     forward = unit(direction)
-    # The world axis least aligned with the (detached) direction starts the frame.
+    # Build the frame from the world axis that is least aligned with the (detached) direction.
     d = dr.abs(dr.detach(forward))
     use_x = (d.x <= d.y) & (d.x <= d.z)
     use_y = ~use_x & (d.y <= d.z)
@@ -106,12 +106,12 @@ def directional_view(direction: Vector3f) -> LightView:
 
 
 def spot_view(position: Point3f, right: Vector3f, up: Vector3f, forward: Vector3f, tan_cutoff: Float) -> LightView:
-    """View along the axis of a cone of light. Up to a half-angle of 60 degrees (tangent 1.73); wider ones use a cube."""
+    """View along the axis of a cone of light, up to a half-angle of 60 degrees (tangent 1.73); use a cube for wider cones."""
     return LightView(right, up, forward, position, tan_cutoff)
 
 
 def cube_views(position: Point3f, resolution: int, filter_size: int) -> tuple[LightView, ...]:
-    """Six views along the world axes, each slightly wider than 90 degrees so that filters find neighbours, not a border."""
+    """Six views along the world axes, each slightly wider than 90 degrees, so that filters at a face's edge see its neighbour."""
     vector, scalar = type(position), type(position[0])
     spread = scalar(CUBE_FACE / (1.0 - 2.0 * (filter_size // 2 + 1) / resolution))
 
@@ -127,7 +127,7 @@ def cube_views(position: Point3f, resolution: int, filter_size: int) -> tuple[Li
 
 
 def cube_face(offset: Vector3f) -> UInt32:
-    """Number of the one of the six :func:`cube_views` that sees a point at ``offset`` from the light (``UInt32``)."""
+    """Index of the view among the six :func:`cube_views` that sees a point at ``offset`` from the light."""
     a = dr.abs(offset)
     k = dr.select((a.x >= a.y) & (a.x >= a.z), 0, dr.select(a.y >= a.z, 1, 2))
     component = dr.select(k == 0, offset.x, dr.select(k == 1, offset.y, offset.z))
@@ -149,7 +149,7 @@ def stack_views(views: Sequence[LightView]) -> Views:
 
     def stack3(name: str) -> Vector3f:
         parts = [stack([getattr(v, name)[c] for v in views]) for c in range(3)]
-        # A single view's are the caller's own numbers.
+        # The components of a single view are the caller's own arrays.
         return module.Array3f(*(from_one_buffer(parts) if dr.grad_enabled(parts) else parts))
 
     return Views(
@@ -163,11 +163,11 @@ def stack_views(views: Sequence[LightView]) -> Views:
 
 
 def of_map(table: ViewsOrFrusta, index: UInt32, count: int) -> ViewsOrFrusta:
-    """Rows of :class:`Views` or :class:`Frusta` (``count`` of them) for the map that each lane works on."""
+    """Rows of :class:`Views` or :class:`Frusta` (of width ``count``) for the map ``index`` of each lane. Attached."""
     module = backend(index)
 
     def pick(value: AnyArray) -> AnyArray:
-        # A single row broadcasts by itself; but the adjoint of that is a reduction of its own for each number, while
+        # A single row broadcasts implicitly. But the adjoint of broadcasting is a separate reduction for each number, while
         # gathers share one kernel.
         if count == 1 and not dr.grad_enabled(value):
             return value
@@ -180,7 +180,7 @@ def of_map(table: ViewsOrFrusta, index: UInt32, count: int) -> ViewsOrFrusta:
 
 
 def to_light_space(view: Views, p_world: Point3f) -> Point3f:
-    """(x, y, z) in a light's axes; z is the distance along its axis. Attached to points and light."""
+    """Coordinates (x, y, z) along a light's axes; z is the distance along ``forward``. Attached to points and light."""
     d = backend(p_world).Array3f(p_world) - view.origin
     return backend(p_world).Array3f(dr.dot(d, view.right), dr.dot(d, view.up), dr.dot(d, view.forward))
 
@@ -190,11 +190,10 @@ def vertices_in_maps(views: Views, positions: Float) -> tuple[Point3f, UInt32, U
 
     Args:
         views: of the M maps.
-        positions: flat ``Float`` (3V,), world space.
+        positions: (3 V,), flat, world space.
 
     Returns:
-        ``Array3f`` of width M * V (:func:`to_light_space`), attached to positions and lights, and the map and the vertex of each
-        of these lanes (``UInt32``).
+        (points of width M * V as from :func:`to_light_space`, attached to positions and lights; map of each; vertex of each).
     """
     module, count = backend(positions), views.count
     number = dr.width(positions) // 3
@@ -206,7 +205,7 @@ def vertices_in_maps(views: Views, positions: Float) -> tuple[Point3f, UInt32, U
 
 
 def to_clip(view: Views, frustum: Frusta, p_light: Point3f) -> Vector4f:
-    """Clip-space position (``Array4f``) in a map: its ndc square is the frustum's rectangle, depths near..far are -1..1."""
+    """Clip-space positions in a map: the NDC square is the frustum's rectangle, depths near..far are -1..1. Attached."""
     perspective = view.spread > 0
     n, f = frustum.near, frustum.far
     w = dr.select(perspective, p_light.z, 1.0)
@@ -218,14 +217,13 @@ def to_clip(view: Views, frustum: Frusta, p_light: Point3f) -> Vector4f:
 
 
 def linear_depth(view: Views, frustum: Frusta, depth: Float) -> tuple[Float, Float]:
-    """Depth along the light's axis, mapped linearly from first..far to -1/2..1/2, and its derivative by ``depth``.
+    """Depth along the light's axis, mapped linearly from first..far to -1/2..1/2, and its derivative by ``depth``. Attached.
 
-    ``depth``: NDC depth in parallel projections, 1 / w in perspective. Depths before ``first`` are moved to it: -1/2, without
-    derivative.
+    ``depth``: NDC depth in parallel projections, 1 / w in perspective. Depths before ``first`` become -1/2, without derivative.
     """
     perspective = view.spread > 0
     n, f, first = frustum.near, frustum.far, frustum.first
-    # Where nothing is seen, whatever stands for it is no reason to divide by zero.
+    # Empty texels may hold 0: do not divide by it.
     z = dr.rcp(dr.select(perspective & (depth > 0), depth, 1))
     scale = 1 / (f - first)
     z = dr.select(perspective, z, 0.5 * dr.fma(depth, f - n, f + n))
@@ -236,7 +234,7 @@ def linear_depth(view: Views, frustum: Frusta, depth: Float) -> tuple[Float, Flo
 
 
 def project(view: Views, frustum: Frusta, p_world: Point3f) -> tuple[Float, Float, Float, Bool]:
-    """Places of world-space points in a map: (u, v) in -1..1, linear depth, and whether (u, v) are inside.
+    """Positions of world-space points in a map: (u, v, linear depth, mask of points inside the map), u and v in -1..1.
 
     Attached to points and light.
     """

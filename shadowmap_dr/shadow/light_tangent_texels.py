@@ -1,4 +1,4 @@
-"""Texels of directional lights' maps, and their derivatives when the lights turn."""
+"""Texels of directional lights' maps, and their derivatives by the lights' directions."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ Coordinates: TypeAlias = tuple[Float, Float, Float]
 
 
 def twist_of(views: Views) -> Float:
-    """Turn of each view about its axis while its axis moves along ``right`` (``Float``, M)."""
+    """Rotation (M) of each view about its ``forward`` axis for each unit that this axis moves along ``right``."""
     module = backend(views.spread)
     d = [dr.abs(views.forward[c]) for c in range(3)]
-    # The world axis that `directional_view` starts from.
+    # The world axis from which `directional_view` builds the frame.
     use_x = (d[0] <= d[1]) & (d[0] <= d[2])
     use_y = ~use_x & (d[1] <= d[2])
 
@@ -37,16 +37,16 @@ def twist_of(views: Views) -> Float:
 
 
 def turned(twist: Float, p: Point3f | Coordinates) -> tuple[Coordinates, Coordinates]:
-    """Changes of light-space coordinates (x, y, z) with a, and with b."""
+    """Changes of light-space coordinates (x, y, z) with a, and with b (see :mod:`shadowmap_dr.shadow.light_tangents`)."""
     zero = type(p[0])(0)
     return (dr.fma(twist, p[1], -p[2]), -twist * p[0], p[0]), (zero, -p[2], p[1])
 
 
 class TangentTexels:
-    """Values of the texels of a batch of maps, and their tangents: anti-aliased in the same kernel.
+    """Values and tangents of the texels of a batch of maps, anti-aliased in the same kernel. Detached.
 
-    Texels hold simple functions of their triangles' planes. Those that are mixed compute their neighbours' numbers once more,
-    which costs less than to write and read those of all texels.
+    Texels hold simple functions of their triangles' planes. A blended texel computes its neighbours' values again, which costs
+    less than to write and read the values of all texels.
     """
 
     def __init__(
@@ -67,7 +67,10 @@ class TangentTexels:
         dr.eval(self.planes)
 
     def mixed(self, crossings: Crossings | None, rates: tuple[Float, Float] | None) -> tuple[Float, Float]:
-        """Flat numbers, and flat tangents: a texel's changes with a, then with b."""
+        """(values, tangents) of all texels, flat; the tangents are a texel's changes with a, then with b.
+
+        Blended by the weights of ``crossings`` and their changes ``rates`` (:func:`weight_rates`); not blended if None.
+        """
         module, size = self.module, self.size
         image, row, column = pixel_coordinates(module, self.raster.batch, size, size)
         texel = dr.arange(module.UInt32, self.raster.batch * size * size)
@@ -77,7 +80,7 @@ class TangentTexels:
             own, changes = self._own(*lanes)
             return (*own, *changes)
 
-        # Half of a map may see nothing.
+        # Half of a map may be empty.
         result = dr.if_stmt(
             (image, row, column, self.raster.triangle),
             self.raster.triangle != NO_TRIANGLE,
@@ -96,7 +99,8 @@ class TangentTexels:
             incoming, own, changes = lanes[:4], lanes[4 : 4 + channels], lanes[4 + channels :]
             claims = weight_sum(incoming)
             scale = dr.rcp(dr.maximum(1, claims))
-            # Right, lower, left, upper; who holds the weight, and the sign by which it says that the neighbour reaches into here.
+            # For the right, lower, left and upper neighbour: row and column offset; the texel and direction whose pair holds the
+            # weight; the sign of the weight if the neighbour reaches into this texel.
             steps = ((0, 1, texel, 0, -1), (1, 0, texel, 1, -1), (0, -1, texel - 1, 0, 1), (-1, 0, texel - size, 1, 1))
             others = []
             for weight, (down, right, *_) in zip(incoming, steps, strict=True):
@@ -108,7 +112,7 @@ class TangentTexels:
                 v + sum(dr.select(w > 0, w * scale * (other[0][c] - v), 0) for w, other in zip(incoming, others, strict=True))
                 for c, v in enumerate(own)
             ]
-            # A texel that is wholly claimed shares itself out: more for one neighbour is less for all of them.
+            # A texel that is claimed as a whole: more for one neighbour is less for all others.
             mean = [dr.select(claims >= 1, m, v) for m, v in zip(mixed, own, strict=True)]
             total = list(changes)
             for weight, (numbers, tangents), (_, _, holder, axis, sign) in zip(incoming, others, steps, strict=True):
@@ -118,7 +122,7 @@ class TangentTexels:
                 for k in range(2 * channels):
                     c = k % channels
                     change = factor * (tangents[k] - changes[k]) + rate[k // channels] * (numbers[c] - mean[c])
-                    # Not in place, which would change what is the texel's own, too.
+                    # Not in place: that would change the texel's own tangents, too.
                     total[k] = total[k] + dr.select(there, change, 0)
             return (*mixed, *total)
 
@@ -133,7 +137,7 @@ class TangentTexels:
         return interleaved(list(result[:channels])), interleaved(list(result[channels:]))
 
     def _own(self, image: UInt32, row: UInt32, column: UInt32, triangle: UInt32) -> tuple[list[Float], list[Float]]:
-        """Numbers that texels store by themselves, and their changes with a, then with b."""
+        """Values of texels before blending, and their changes with a, then with b."""
         module, size = self.module, self.size
         view, frustum = of_map(self.views, image, self.views.count), of_map(self.frusta, image, self.views.count)
         twist = dr.gather(module.Float, self.twist, image)
@@ -152,35 +156,35 @@ class TangentTexels:
         )
         slope_x = texels.dx * half_range * (0.5 * size) / frustum.half_x
         slope_y = texels.dy * half_range * (0.5 * size) / frustum.half_y
-        # What lies before the depths that are told apart does not move.
+        # Depths before the resolved range are constant.
         scale = dr.select(texels.shown & (texels.depth > -0.5), dr.rcp(f - frustum.first), 0)
-        # A texel stays where it is while the triangle moves through it.
+        # The texel stays in place while the triangle moves through it.
         rates = [(dz - slope_x * dx - slope_y * dy) * scale for dx, dy, dz in turned(twist, p)]
         values, slopes = _with_slopes(lambda z: self.method.encode(z, texels.slope_square, self.settings.order), texels.depth)
         return values, [slope * rate for rate in rates for slope in slopes]
 
 
 def _moved(number: UInt32, by: int) -> UInt32:
-    """``UInt32`` plus a whole number of either sign."""
+    """Sum of an unsigned and a signed integer."""
     return number + by if by >= 0 else number - -by
 
 
 def _with_slopes(function: Callable[[Float], list[Float]], x: Float) -> tuple[list[Float], list[Float]]:
-    """Several numbers and their derivatives by the one that they are functions of."""
+    """(``function(x)``, derivatives of its results by ``x``). Detached."""
     with dr.resume_grad():
         x = dr.detach(x, preserve_type=True) + 0
         dr.enable_grad(x)
         values = function(x)
         dr.set_grad(x, 1)
         dr.enqueue(dr.ADMode.Forward, x)
-        # A number may be x itself, whose gradient would be cleared on the way.
+        # A result may be x itself, whose gradient would otherwise be cleared in the traversal.
         dr.traverse(dr.ADMode.Forward, flags=dr.ADFlag.ClearEdges)
         slopes = [dr.grad(v) for v in values]
     return [dr.detach(v) for v in values], slopes
 
 
 def weight_rates(clip: Float, crossings: Crossings, frusta: Frusta, twist: Float, size: int) -> tuple[Float, Float]:
-    """Changes with a and b (interleaved, 2 for each pixel) of the weights of right and of lower pairs; undefined for weight 0."""
+    """Changes with a and b of the weights of right and of lower pairs, interleaved; undefined for pairs of weight 0. Detached."""
     module = backend(clip)
     Array2f, Array4f = module.Array2f, module.Array4f
     count, pixels = dr.width(twist), dr.width(crossings.right)

@@ -1,9 +1,9 @@
 """Maps of directional lights together with their derivatives by the lights' directions, in forward mode.
 
-A light's direction has two degrees of freedom, and a map depends on no light but its own. So two tangents for each map and each
-point that asks it are all the derivatives there are, and they need no atomic operations, no second pass over the points, and
-none of the vertices' derivatives: when a light turns, points with light-space coordinates (x, y, z) move by linear functions
-of these, and so does everything that lies on a triangle or an edge.
+A light's direction has two degrees of freedom, and a map depends only on its own light. So two tangents for each map and each
+looked-up point are all derivatives by the lights' directions. They need no atomic operations, no second pass over the points, and
+no derivatives of vertices: when a light turns, points with light-space coordinates (x, y, z) move by linear functions of these
+coordinates, and so do all points on triangles and edges.
 
 Turning by (a, b) means: the light's ``forward`` axis moves by ``a right + b up``. The other axes follow as
 :func:`shadowmap_dr.shadow.directional_view` makes them, which includes a twist about ``forward`` of ``a * twist``.
@@ -35,10 +35,10 @@ class TangentMaps:
     """A batch of M maps of directional lights and how they change when the lights turn. Detached.
 
     Attributes:
-        maps: as :func:`shadowmap_dr.shadow.filter_maps` returns them, but for the filter if it is left to the look-ups.
-        tangents: flat ``Float`` (M * N * N * 2 C): change of a texel's C numbers with a, then with b.
-        twist: ``Float`` (M,).
-        taps: (weights along columns, along rows) of the filter that is left to the look-ups, ([1], [1]) if there is none.
+        maps: maps as :func:`shadowmap_dr.shadow.filter_maps` returns them, or unfiltered if look-ups apply the filter.
+        tangents: (M * N * N * 2 C,), flat: change of a texel's C numbers with a, then with b.
+        twist: (M,) see the head of this module.
+        taps: (weights along columns, along rows) of the filter that look-ups apply, ([1], [1]) if the maps are filtered.
     """
 
     maps: ShadowMaps
@@ -47,7 +47,7 @@ class TangentMaps:
     taps: tuple[list[float], list[float]]
 
 
-# A filter that is left to the look-ups costs (k + 1)^2 texels for each of them; beforehand, it costs 2 k for each texel.
+# A filter of size k reads (k + 1)^2 texels in each look-up; applied beforehand, it reads 2 k texels for each texel of the map.
 _WIDEST_TAPS = 3
 
 
@@ -63,12 +63,12 @@ def tangent_maps(
     """Render and filter maps of directional lights, with tangents.
 
     Args:
-        p_world: ``Array3f`` (V,), vertices.
-        faces: flat ``UInt32`` (3 F,), valid indices.
-        topology: of the mesh.
+        p_world: (V,) vertices.
+        faces: (3 F,), flat, valid indices.
+        topology: topology of the mesh.
         views, frusta: cameras of the M maps, all orthographic, with axes as :func:`directional_view` makes them.
         settings: a pre-filtered method, without ``compat``.
-        outward: ``Bool`` (F,), faces that no light sees from behind before others (:func:`shadowmap_dr.raster.outward_faces`).
+        outward: (F,) faces to cull where they face away from the light (:func:`shadowmap_dr.raster.outward_faces`).
 
     Values agree with :func:`shadowmap_dr.shadow.render_maps`, tangents with its derivatives.
     """
@@ -106,12 +106,13 @@ def tangent_maps(
 
 
 def tangent_visibility(maps: TangentMaps, map_index: UInt32, p_world: Point3f, active: Bool) -> tuple[Float, Float, Float]:
-    """(visibility, its change with a, with b), ``Float`` each, of world-space points. Detached.
+    """(visibility, its change with a, its change with b) of world-space points. Detached.
 
     Args:
-        map_index: ``UInt32`` for each point.
-        p_world: ``Array3f``.
-        active: ``Bool``, points to ask for; the others get (1, 0, 0).
+        maps: from :func:`tangent_maps`.
+        map_index: map of each point.
+        p_world: points.
+        active: mask of the points to look up; the others get (1, 0, 0).
     """
     module = backend(maps.tangents)
     settings, count = maps.maps.settings, maps.maps.views.count
@@ -132,7 +133,7 @@ def tangent_visibility(maps: TangentMaps, map_index: UInt32, p_world: Point3f, a
         return reduced_bleeding(value, settings.bleeding) if method.bleeds else value
 
     def look_up(index, u, v, depth, *moves):  # noqa: ANN001, ANN002, ANN202
-        # Beyond the outermost texels' centres nothing changes.
+        # Beyond the centres of the outermost texels, look-ups are constant.
         end = 1 - 1 / settings.resolution
         rates = [dr.select(dr.abs(u if k % 3 == 0 else v) > end, 0, m) if k % 3 < 2 else m for k, m in enumerate(moves)]
         at, channels = Texels(maps.maps, index, dr.clip(u, -end, end), dr.clip(v, -end, end)), maps.maps.channels
@@ -162,7 +163,7 @@ def tangent_visibility(maps: TangentMaps, map_index: UInt32, p_world: Point3f, a
 
 
 def _filtered(at: Texels, flat: Float, channels: int, column: list[float], row: list[float]) -> tuple[list[Float], ...]:
-    """The numbers at points between texels, under a filter that moves with the points, and their changes by column and by row."""
+    """(values, changes by column, changes by row) of filtered texels at points; the filter moves continuously with the points."""
     across, down = moved_weights(row, at.fx), moved_weights(column, at.fy)
     slope_across, slope_down = ([a - b for a, b in zip([0.0, *line], [*line, 0.0], strict=True)] for line in (row, column))
     totals: list[list[Any]] = []

@@ -1,4 +1,4 @@
-"""Step 3 of a shadow map: how much light reaches points."""
+"""Step 3 of a shadow map: visibility of points from the light."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .methods.registry import PREFILTERED
 from .methods.variance import MINIMUM_VARIANCE_COMPAT, chebyshev_visibility, reduced_bleeding
 from .shadow_map import FAR, ShadowMaps
 
-# Depth over which the comparison of percentage-closer filtering is spread: without it there would be no derivative by depth.
+# Depth range over which the comparison of percentage-closer filtering falls from 1 to 0. A hard one has no derivative by depth.
 _SOFTNESS = 0.02
 
 
@@ -27,9 +27,9 @@ def visibility(maps: ShadowMaps, map_index: UInt32 | int, p_world: Point3f, acti
 
     Args:
         maps: filtered maps.
-        map_index: which map to ask, ``UInt32`` for each point or one number.
-        p_world: ``Array3f``. Attached.
-        active: points to ask for; the others get 1.
+        map_index: index of the map, for each point or one for all.
+        p_world: points. Attached.
+        active: mask of the points to look up; the others get 1.
 
     Returns:
         ``Float`` in 0..1; 1 outside the map (0 with ``compat``). Gradients flow to the points, the casters and the light.
@@ -51,7 +51,7 @@ def visibility(maps: ShadowMaps, map_index: UInt32 | int, p_world: Point3f, acti
 
 
 def _where(active: Bool, function: Callable[..., Float], maps: ShadowMaps, *lanes: AnyArray) -> Float:
-    """``function(maps, *lanes)`` where there are active lanes, 1 elsewhere: maps cover the casters, not all that is seen."""
+    """``function(maps, *lanes)`` where ``active``, 1 elsewhere. A branch, for maps cover the casters, not all visible points."""
     return dr.if_stmt(
         lanes,
         active,
@@ -63,7 +63,7 @@ def _where(active: Bool, function: Callable[..., Float], maps: ShadowMaps, *lane
 
 
 def _resolve(maps: ShadowMaps, map_index: UInt32, u: Float, v: Float, depth: Float) -> Float:
-    """Visibility from filtered numbers."""
+    """Visibility from filtered moments or terms."""
     method = PREFILTERED[maps.settings.method]
     value = method.resolve(_bilinear(maps, map_index, u, v, True), depth)
     return reduced_bleeding(value, maps.settings.bleeding) if method.bleeds else value
@@ -79,7 +79,7 @@ def _compare(maps: ShadowMaps, map_index: UInt32, u: Float, v: Float, depth: Flo
 
 
 def _compare_all(maps: ShadowMaps, map_index: UInt32, u: Float, v: Float, depth: Float) -> Float:
-    """Comparisons with all texels under the filter, which is moved bilinearly: attached to the point and the texels.
+    """Weighted comparisons with all texels under the filter, which moves continuously with the point. Attached to both.
 
     Source: Reeves et al., "Rendering Antialiased Shadows with Depth Maps", 1987.
     """
@@ -99,7 +99,7 @@ def _compare_all(maps: ShadowMaps, map_index: UInt32, u: Float, v: Float, depth:
 
 
 def _compare_texel(maps: ShadowMaps, texel: UInt32, depth: Float) -> Float:
-    """Share of a texel that lets light through to a depth."""
+    """Fraction of a texel that is lit at a depth."""
     bias = maps.settings.bias
     if maps.channels == 1:
         stored = dr.gather(backend(maps.values).Float, maps.values, texel)
@@ -110,7 +110,7 @@ def _compare_texel(maps: ShadowMaps, texel: UInt32, depth: Float) -> Float:
 
 
 def moved_weights(weights: list[float], fraction: Float) -> list[Float]:
-    """Weights of a line of taps that is moved by a fraction of a texel: one tap more."""
+    """Weights of a line of taps after a shift by a fraction of a texel; one more than before. Attached to the fraction."""
     padded = np.array([0.0, *weights, 0.0])
     return [dr.fma(fraction, float(a - b), float(b)) for a, b in zip(padded[:-1], padded[1:], strict=True)]
 
@@ -129,7 +129,7 @@ class Texels:
         self.base = module.Int32(map_index) * (size * size)
 
     def index(self, i: int, j: int) -> UInt32:
-        """Number of the texel i columns and j rows from the upper left neighbour; the border is replicated."""
+        """Index of the texel i columns and j rows from the upper left neighbour; the border is replicated."""
         c, r = (dr.clip(x, 0, self.size - 1) for x in (self.column + i, self.row + j))
         return backend(c).UInt32(self.base + r * self.size + c)
 
@@ -141,7 +141,7 @@ class Texels:
 def _bilinear(
     maps: ShadowMaps, map_index: UInt32, u: Float, v: Float, active: Bool | bool, outside_reads_zero: bool = False
 ) -> list[Float]:
-    """Mix of the four texels around (u, v); attached to the texels and to the coordinates."""
+    """Bilinear interpolation of the four texels around (u, v). Attached to the texels and to the coordinates."""
     at = Texels(maps, map_index, u, v, active)
     rows = []
     for j in range(2):
@@ -152,7 +152,7 @@ def _bilinear(
 
 
 def stored_texel(values: Float, channels: int, texel: UInt32, active: Bool | bool) -> list[AnyArray]:
-    """All numbers of a texel, in packets as large as there are."""
+    """All numbers of a texel, in the largest packets that divide ``channels``."""
     module = backend(values)
     size = next(n for n in (4, 2, 1) if channels % n == 0)
     packet = {1: module.Float, 2: module.Array2f, 4: module.Array4f}[size]

@@ -18,8 +18,8 @@ class ShadowSettings:
     Attributes:
         method: ``auto`` (``evsm4``, or ``vsm`` with ``compat``), ``vsm`` (variance), ``esm`` (exponential), ``evsm2``, ``evsm4``
             (exponential variance, two or four moments), ``msm`` (four power moments), ``csm`` (convolution: Fourier series),
-            ``pcf`` (percentage-closer: depths are compared, and the filter applied, in the look-up; of a texel that an
-            outline crosses both depths, by the share that each covers), ``standard`` (one comparison, no gradients) or ``none``.
+            ``pcf`` (percentage-closer: the look-up compares depths and filters the results; a texel that an outline crosses
+            has two depths, weighted by area), ``standard`` (one comparison, no gradients) or ``none``.
         resolution: texels along each side of a map.
         filter: ``box``, ``gaussian``, ``wendland`` or ``none``.
         filter_size: odd number of texels.
@@ -27,14 +27,13 @@ class ShadowSettings:
         bias: depth offset of ``standard`` and ``pcf``, in units of the depth range of the map.
         bleeding: visibilities below this are cut off and the rest is stretched to 0..1; for ``vsm``, ``evsm`` and ``msm``.
         order: terms of the series of ``csm``, an even number.
-        supersampling: each texel is the mean of so many along both sides, anti-aliased first: coverage and derivatives are more
-            exact, and so many times as many texels are rasterized. For pre-filtered methods.
-        receiver_range: maps tell depths apart only from a little before the first receiver in view on: how far before it casters
-            lie does not matter, and does not bleed.
-        cull_backfaces: leave faces that turn away from the light out of the maps of directional lights, if they belong to parts
-            that were closed and turned outwards when the scene was loaded. Saves a third of drawing. Shadows are the same as long
-            as these parts do not turn inside out, not even in a fold. Not with ``compat``; without effect in scenes with alpha
-            tested materials.
+        supersampling: side of the block of anti-aliased samples whose mean each texel is. Makes coverage and derivatives more
+            exact; rasterizes the square of this number as many texels. For pre-filtered methods.
+        receiver_range: maps resolve depths only from shortly before the first visible receiver on: the distance of casters
+            before it does not matter, and causes no light bleeding.
+        cull_backfaces: do not draw backfaces into the maps of directional lights, if they belong to parts that were closed and
+            turned outwards when the scene was loaded. Saves a third of drawing. Shadows are the same as long as these parts do
+            not turn inside out, not even in a fold. Not with ``compat``; without effect in scenes with alpha tested materials.
         compat: the conventions of Worchel and Alexa's code: unnormalised radial depth, fixed frusta, dark outside of them, their
             kernels, minimum variance 1e-4.
     """
@@ -94,5 +93,5 @@ class ShadowSettings:
 
     @property
     def filterable(self) -> bool:
-        """True if what a map stores may be mixed, and so anti-aliased and filtered."""
+        """True if stored values may be blended, that is, anti-aliased and filtered."""
         return self.method in PREFILTERED

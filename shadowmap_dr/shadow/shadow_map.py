@@ -20,9 +20,9 @@ from .methods.registry import PREFILTERED
 from .methods.variance import variance_moments
 from .settings import ShadowSettings
 
-#: Depth that a texel without geometry holds, and beyond which receivers are moved to it: an unoccluded receiver lies at its mean.
+#: Depth of empty texels. Receivers behind it are moved to it, so that a receiver over empty texels lies at their mean.
 FAR = 0.5
-# A plane's slope counts as variance up to this many texels of depth per texel; silhouettes seen edge-on would have any amount.
+# Largest slope that counts as variance, in texels of depth per texel. Surfaces seen edge-on have unbounded slopes.
 _MAX_SLOPE = 2.0
 
 
@@ -31,11 +31,11 @@ class ShadowMaps:
     """A batch of M square maps.
 
     Attributes:
-        values: flat ``Float`` (M * N * N * C): what the method stores of the depths in each texel, such as two moments. Attached.
+        values: (M * N * N * C,), flat: numbers that the method stores in each texel, such as two moments of depth. Attached.
         views, frusta: cameras of the maps.
-        settings: how they were made.
+        settings: settings of the maps.
         channels: C.
-        copies: of values and views, one after the other, one for each block of points (:meth:`for_points`).
+        copies: number of consecutive copies of values and views, one for each block of points (:meth:`for_points`).
     """
 
     values: Float
@@ -47,11 +47,11 @@ class ShadowMaps:
 
     @property
     def count(self) -> int:
-        """M."""
+        """Number of maps M."""
         return self.views.count // self.copies
 
     def for_points(self, count: int) -> ShadowMaps:
-        """The same maps for look-ups by so many points at once, whose derivatives shall add up without loss. Attached."""
+        """The same maps, copied for look-ups by ``count`` points at once, so that gradients are summed exactly. Attached."""
         (values, *columns), copies = in_copies([self.values, *self.views.columns()], count)
         return replace(self, values=values, views=Views.of(columns), copies=copies) if copies > 1 else self
 
@@ -67,16 +67,16 @@ def render_maps(
     transparent: Callable[[RasterOutput], Bool] | None = None,
     culled: Bool | None = None,
 ) -> ShadowMaps:
-    """Step 1: rasterize all maps at once and store what the method needs of the depths in each texel.
+    """Step 1: rasterize all maps at once and encode the depths in each texel by the method. Attached to ``p_light``.
 
     Args:
-        p_light: ``Array3f`` of width M * V, vertices in each map's light space (:func:`to_light_space`). Attached.
-        map_index: ``UInt32``, the map of each lane of ``p_light``.
-        faces: flat ``UInt32`` (3 F,), valid indices.
-        topology: of the mesh.
+        p_light: (M * V,) vertices in each map's light space (:func:`to_light_space`). Attached.
+        map_index: map of each lane of ``p_light``.
+        faces: (3 F,), flat, valid indices.
+        topology: topology of the mesh.
         views, frusta: cameras of the M maps.
         transparent: alpha test, see :func:`shadowmap_dr.raster.rasterize`.
-        culled: ``Bool`` (F,), or (M F,) by map: faces that are left out where they turn away.
+        culled: (F,), or (M F,) by map: faces that are not drawn where they face away from the light.
     """
     count, size = views.count, settings.resolution * settings.supersampling
     clip = ravel(to_clip(of_map(views, map_index, count), of_map(frusta, map_index, count), p_light))
@@ -96,7 +96,7 @@ def render_maps(
 def _texels(
     raster: RasterOutput, clip: Float, faces: UInt32, views: Views, frusta: Frusta, settings: ShadowSettings, size: int
 ) -> tuple[Float, int]:
-    """Numbers to store (flat) and how many there are in a texel, for maps of ``size`` texels along each side."""
+    """(numbers to store, flat; channels of a texel) for maps of ``size`` texels along each side."""
     module = backend(raster.triangle)
     image, row, column = pixel_coordinates(module, views.count, size, size)
     view, frustum = of_map(views, image, views.count), of_map(frusta, image, views.count)
@@ -120,12 +120,12 @@ def _texels(
 
 @dataclass(frozen=True)
 class TexelDepths:
-    """Surfaces that texels see, one lane each.
+    """Depths of the surfaces that texels see, one lane for each texel.
 
     Attributes:
-        shown: whether it sees anything of which the depth is kept.
-        depth: linear depth (:func:`linear_depth`), ``FAR`` where there is nothing such. Attached.
-        slope_square: squared change of it across a texel, detached.
+        shown: mask of the texels that see a surface whose depth is kept.
+        depth: linear depth (:func:`linear_depth`), ``FAR`` in other texels. Attached.
+        slope_square: squared change of the linear depth across a texel, detached.
         seen, dx, dy: depth as :func:`pixel_depth` returns it (attached), and its change by column and by row (detached).
     """
 
@@ -140,13 +140,17 @@ class TexelDepths:
 def texel_depths(
     seen: tuple[Float, Float, Float], hit: Bool, view: Views, frustum: Frusta, settings: ShadowSettings
 ) -> TexelDepths:
-    """Depths in maps, given what :func:`pixel_depth` returns, and where anything is seen.
+    """Depths in maps.
 
-    ``view`` and ``frustum`` are those of each texel's map.
+    Args:
+        seen: result of :func:`pixel_depth`.
+        hit: mask of the texels that see a surface.
+        view, frustum: those of each texel's map.
+        settings: settings of the maps.
 
-    Floors that cast no shadows may leave the depth range. If their depths just ended with it, all that is there would be darkened
-    along the line where they do: means of depths that end at the far plane lie before the floor, whose own depth ends there, too.
-    So the last of them, which look-ups mix with empty texels, are empty themselves, and that lets more light through, not less.
+    Floors that cast no shadows may leave the depth range. If their depths were only clamped to the far plane, receivers would be
+    darkened along the line where the floor crosses it: filtered depths there lie before the floor. So the last texels of the
+    floor, which look-ups mix with empty texels, are treated as empty. That lets more light through, not less.
     """
     size = settings.resolution * settings.supersampling
     depth, dx, dy = seen
@@ -162,10 +166,10 @@ def texel_depths(
 
 
 def _two_depths(plain: Float, blended: Float) -> tuple[Float, int]:
-    """(depth at the centre, other depth, its share, nothing) of each texel from its moments without and with anti-aliasing.
+    """(depth at the centre, other depth, its share, padding) of each texel from its moments without and with anti-aliasing.
 
-    Blended depths mean nothing to a comparison, but their moments tell what has been blended. The fourth number is there because
-    packets of four are read, and their derivatives added up, much faster than three numbers.
+    Blended depths cannot be compared, but the two depths that were blended follow from the moments. The padding is there because
+    packets of four numbers are read, and their gradients summed, much faster than three numbers.
     """
     module = backend(plain)
     dr.eval(blended)
@@ -187,13 +191,13 @@ def block_means(values: Float, size: int, channels: int, factor: int) -> Float:
     total = module.Float(0)
     for j in range(factor):
         for i in range(factor):
-            # Each number is read once, so that the backward pass needs no atomics; but others may read it too.
+            # Each number is read once here, so that the backward pass needs no atomics. Other operations may read it, too.
             total += dr.gather(module.Float, values, first + (j * size + i) * channels, mode=dr.ReduceMode.NoConflicts)
     return total * (1 / factor**2)
 
 
 def interleaved(values: list[Float]) -> Float:
-    """Flat array with the numbers of several arrays in turns."""
+    """Flat array with the entries of several arrays interleaved. Attached."""
     module = backend(values[0])
     if len(values) == 1:
         return values[0]
@@ -202,7 +206,7 @@ def interleaved(values: list[Float]) -> Float:
 
 
 def _radial_depth(view: Views, frustum: Frusta, raster: RasterOutput, row: UInt32, column: UInt32, size: int) -> Float:
-    """Distance from the light camera's origin to what a texel sees."""
+    """Distance from the light camera's origin to the surface that a texel sees."""
     module = backend(raster.triangle)
     perspective = view.spread > 0
     z = dr.select(perspective, raster.w, dr.fma(0.5 * raster.depth + 0.5, frustum.far - frustum.near, frustum.near))
@@ -223,7 +227,7 @@ def _slope_square(view: Views, frustum: Frusta, linear: Float, slopes: list[Floa
 
 
 def filter_maps(maps: ShadowMaps) -> ShadowMaps:
-    """Step 2: pre-filter. Depths that are compared in the look-up cannot be filtered and pass unchanged."""
+    """Step 2: pre-filter. Maps whose depths are compared in the look-up are returned unchanged. Attached."""
     s = maps.settings
     if not s.filterable:
         return maps

@@ -1,4 +1,4 @@
-"""Analytic anti-aliasing of silhouettes, which is also what makes them differentiable."""
+"""Analytic anti-aliasing of silhouettes; it also makes visibility differentiable."""
 
 from __future__ import annotations
 
@@ -76,13 +76,13 @@ def antialias(
         positions: clip-space vertices as given to the rasterizer.
         topology: :func:`shadowmap_dr.raster.build_topology` of the mesh.
         crossings: result of :func:`find_crossings`, to share the search between several calls.
-        creases, crease_weights: edges of faces that are blended (and differentiated) like silhouettes, and how much, see
+        creases, crease_weights: edges of faces that are blended (and differentiated) like silhouettes, and their weights, see
             :func:`find_crossings`.
-        meetings: blend (and differentiate) where surfaces meet without an edge, too, see :func:`find_crossings`.
-        gap: how far silhouettes must lie before what they border, see :func:`find_crossings`.
-        folds: which of the creases are none between faces in one plane, see :func:`find_crossings`.
-        continued: take derivatives by the edges' places as if values changed up to them as they do on the other sides of the
-            pixels, instead of not at all (:mod:`shadowmap_dr.raster.antialiasing.colour_jumps`).
+        meetings: blend (and differentiate) where surfaces intersect without an edge, too, see :func:`find_crossings`.
+        gap: least depth between a silhouette and the surface behind it, see :func:`find_crossings`.
+        folds: creases that do not count between coplanar faces, see :func:`find_crossings`.
+        continued: for derivatives by the edges' positions, extrapolate values linearly from the pixels to the edge, instead of
+            taking them as constant (:mod:`shadowmap_dr.raster.antialiasing.colour_jumps`).
 
     Returns:
         The blended values in the shape of ``values``; flat, with interleaved channels, for a list. Gradients flow to ``values``

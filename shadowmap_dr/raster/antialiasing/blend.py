@@ -29,9 +29,9 @@ def blend(
     Args:
         values: flat, interleaved channels of all pixels, or a list with one array for each channel. Attached.
         positions: flat clip-space vertices of all images. Attached.
-        raster: what the pixels see.
-        crossings: for the same positions.
-        surroundings: if colours are to be continued up to the edges, see :mod:`shadowmap_dr.raster.antialiasing.colour_jumps`.
+        raster: output of the rasterizer.
+        crossings: edges between pixels, for the same positions.
+        surroundings: given to extrapolate colours to the edges (:mod:`shadowmap_dr.raster.antialiasing.colour_jumps`), or None.
 
     Returns blended values, flat and interleaved.
     """
@@ -44,7 +44,7 @@ def blend(
 
 
 class _Blend(dr.CustomOp):
-    """Blending as one differentiable operation: the derivatives, too, do work only where pixels were blended."""
+    """Blending as one differentiable operation, whose derivatives also work only on blended pixels."""
 
     def eval(
         self,
@@ -75,10 +75,10 @@ class _Blend(dr.CustomOp):
 
 
 class Mixer:
-    """Blended ``values``, and what their derivatives need. Detached.
+    """Blended ``values``, and the data of their derivatives. Detached.
 
-    A pixel mixes ``scale * weight`` of each neighbour that reaches into it. Up to four may each claim half of an isolated pixel;
-    more than all of it they cannot have: ``scale = 1 / max(1, sum of weights)``.
+    A pixel mixes ``scale * weight`` of each neighbour that reaches into it. Up to four neighbours may each claim half of an
+    isolated pixel, but not more than the whole in all: ``scale = 1 / max(1, sum of weights)``.
     """
 
     def __init__(
@@ -111,7 +111,7 @@ class Mixer:
         return self.written(self._where(weight_sum(incoming) > 0, mix, pixel, (*incoming, *own), own))
 
     def _mix_few(self) -> Float:
-        # Of interleaved values all are copied, and those of the few blended pixels overwritten.
+        # Copy all interleaved values, then overwrite those of the few blended pixels.
         result = self.copied(cast("Float", self.original))
         dr.eval(result)
 
@@ -122,7 +122,7 @@ class Mixer:
                 taker = dr.select(weight > 0, self._neighbour(pixel, down), pixel)
                 incoming = self.around(self.crossings.right, self.crossings.down, 1, at=taker)
                 claims = weight_sum(incoming)
-                # Of the pairs of which a pixel takes, one does the work.
+                # A pixel may take from several pairs; only the first of them writes it.
                 first = self._is_first(incoming, taker != pixel, down)
                 dr.scatter(self.claims, claims, taker, first)
                 mixed = self._mixed(taker, incoming, claims, self.read(self.original, taker))
@@ -157,7 +157,7 @@ class Mixer:
 
         touched = weight_sum(incoming) + weight_sum(outgoing) > 0
         result = self._where(touched, spread, pixel, (*incoming, *outgoing, *own), own)
-        dr.eval(result)  # more than one kernel may want it
+        dr.eval(result)  # several kernels may read it
         return result
 
     def _adjoint_of_few(self, adjoint: Float) -> Float:
@@ -252,9 +252,9 @@ class Mixer:
         return pixel + dr.select(down, self.module.UInt32(self.width), 1)
 
     def _is_first(self, shares: Sequence[Float], second: Bool, down: Bool) -> Bool:
-        """True if a pair is the first with a share among those around one of its pixels (``second``: its second pixel).
+        """True if no earlier pair around the pixel has a share; the pixel is the pair's second one if ``second``, else its first.
 
-        ``shares`` are those of the right, lower, left and upper neighbour.
+        ``shares``: shares of the right, lower, left and upper neighbour.
         """
         before = [shares[0] > 0]
         for share in shares[1:3]:
@@ -275,14 +275,14 @@ class Mixer:
         scale = _scale(claims)
         g, own = self.read(adjoint, taker), self.read(self.original, taker)
         other = self._beyond(taker, giver, down, 0.5 - dr.abs(weight), True)
-        shared = claims >= 1  # shares itself out: more for one neighbour is less for all of them
+        shared = claims >= 1  # the pixel is claimed as a whole: more for one neighbour is less for all others
         mixed = self.read(self.values, taker, shared)
         mean = [dr.select(shared, m, o) for m, o in zip(mixed, own, strict=True)]
         gain = sum(a * (v - m) for a, v, m in zip(g, other, mean, strict=True))
         return gain * dr.select(weight > 0, scale, -scale)
 
     def _beyond(self, taker: UInt32, giver: UInt32, down: Bool, place: Float, active: Bool | bool) -> list[Float]:
-        """Gain of pixels by a larger share of their neighbours, from whom edges at some place separate them, plus their own."""
+        """Colours of ``giver``, extrapolated to the edge at ``place`` if there are surroundings, as seen from ``taker``."""
         if self.surroundings is None:
             return self.read(self.original, giver, active)
 
@@ -297,7 +297,7 @@ class Mixer:
         return self.surroundings.beyond(read, crossed, taker, giver, down, place, active)
 
     def tangent(self, values: Float | list[Float] | None, positions: Float | None) -> Float:
-        """Change of the result with that of the values and positions (each or None)."""
+        """Tangent of the result, given those of the values and of the positions (or None)."""
         module = self.module
         pixel = dr.arange(module.UInt32, self.pixels)
         crossings = self.crossings
@@ -309,7 +309,7 @@ class Mixer:
         total = list(change)
         if positions is not None:
             right, down = self._tangent_of_weights(positions)
-            # A weight's sign tells who takes; its change has the sign of the (right, lower) pair's.
+            # The sign of a weight tells which pixel takes; its change has the sign convention of the (right, lower) pair.
             rates = self.around(right, down, 1, signed=True)
             mixed = self.read(self.values, pixel, claims >= 1)
             mean = [dr.select(claims >= 1, m, o) for m, o in zip(mixed, own, strict=True)]
@@ -363,13 +363,13 @@ class Mixer:
         return right, down
 
     def neighbours(self, pixel: UInt32) -> tuple[UInt32, UInt32, UInt32, UInt32]:
-        """Right, lower, left, upper."""
+        """Indices of the right, lower, left and upper neighbours."""
         return pixel + 1, pixel + self.width, pixel - 1, pixel - self.width
 
     def around(
         self, right: Float, down: Float, sign: int, signed: bool = False, at: UInt32 | None = None
     ) -> tuple[Float, Float, Float, Float]:
-        """See :func:`around`."""
+        """Weights of neighbours, see :func:`shadowmap_dr.raster.antialiasing.neighbour_weights.around`."""
         return around(right, down, self.width, sign, signed, at)
 
     def _where(
@@ -380,7 +380,7 @@ class Mixer:
         lanes: tuple[Float, ...],
         otherwise: list[Float],
     ) -> list[Float]:
-        """``function(pixel, *lanes)``, one number for each channel, in packets with active lanes; the last lanes elsewhere."""
+        """``function(pixel, *lanes)``, one number for each channel, where ``active``; elsewhere the last of ``lanes``."""
         count = len(otherwise)
         result = dr.if_stmt(
             (pixel, *lanes), active, function, lambda pixel, *lanes: tuple(lanes[-count:]), mode="symbolic", label="blend"
@@ -398,7 +398,7 @@ class Mixer:
         return [dr.gather(module.Float, flat, pixel * self.channels + c, active) for c in range(self.channels)]
 
     def packet(self, channels: list[Float]) -> AnyArray:
-        """Channels as what is scattered at once."""
+        """Channels as one packet, for a single scatter."""
         return channels[0] if self.channels == 1 else self.module.ArrayXf(channels)
 
     def written(self, channels: list[Float]) -> Float:
@@ -410,9 +410,9 @@ class Mixer:
         return result
 
     def copied(self, flat: Float) -> Float:
-        """A copy that may be written to. Not Dr.Jit's, which one thread would make."""
+        """A writable copy, made by all threads; Dr.Jit's own copy uses a single thread."""
         UInt32 = self.module.UInt32
-        # Nothing that Dr.Jit could see to be the same array.
+        # An expression that Dr.Jit does not recognise as the same array.
         bits = reinterpret(UInt32, flat) ^ (dr.arange(UInt32, dr.width(flat)) >> 31)
         return reinterpret(self.module.Float, bits)
 

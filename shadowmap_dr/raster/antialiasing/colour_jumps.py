@@ -1,8 +1,8 @@
-"""Jumps of colours at an edge between two pixels, from the pixels on both sides of it.
+"""Jumps of colours at an edge between two pixels, estimated from the pixels on both sides.
 
-The colours at the pixels' centres differ by more than that: what shading falls by on the way to a rim, say, is no jump, and would
-count twice where the rim moves. So both sides are continued to the edge, as steeply as they change beyond the pixels. The weights
-of pixels that are mixed do not depend on it, but the derivatives of what is mixed do.
+The difference of the colours at the pixels' centres is not the jump at the edge: it includes the change of shading up to the
+edge, which would count twice when the edge moves. So the colours of both sides are extrapolated linearly to the edge, with the
+slope between each pixel and the next one behind it. Only derivatives use these colours; blended values do not.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from .creases import CoplanarCreases, touching
 
 @dataclass(frozen=True)
 class Surroundings:
-    """Inputs to tell whether colours change steadily from a pixel to its neighbour. Detached.
+    """Inputs of the test whether colours change continuously from a pixel to its neighbour. Detached.
 
     Attributes:
-        triangle: ``UInt32``, what each pixel sees.
+        triangle: triangle that each pixel sees.
         positions: flat clip-space vertices (4 V B), as rasterized.
-        topology: of the mesh.
-        creases: ``Bool`` (3 F,), edges of faces at which colours jump, or None.
-        folds: which of them are none within a plane, or None.
-        sharpness: ``Float`` for each pixel, or None for 1. 1 where a flat face is large enough for its own colour to be seen, 0
-            where faces are so small that it is that of a smooth surface. In between colours are in part at random: there is
-            nothing to continue.
+        topology: topology of the mesh.
+        creases: (3 F,) edges of faces at which colours jump, or None.
+        folds: creases that do not count between coplanar faces, or None.
+        sharpness: for each pixel, or None for 1. It is 1 where flat faces are large enough to show their own colours, 0 where
+            they are so small that they show the colours of a smooth surface. In between, colours are partly random and are not
+            extrapolated.
         batch: number of images.
         height, width, vertex_count: of an image.
     """
@@ -75,17 +75,17 @@ class Surroundings:
         place: Float,
         active: Bool | bool = True,
     ) -> list[Float]:
-        """Colours of pixels, plus how much those of their neighbours differ from them at an edge in between.
+        """Colours of pixels plus the jump to their neighbours' colours at an edge in between.
 
-        Both are continued up to the edge, if the next pixel on their other side sees the same surface. The difference has the
-        sign of that between the pixels, and is at most twice as large, in each channel.
+        Both colours are extrapolated to the edge, if the next pixel behind them sees the same surface. In each channel, the jump
+        has the sign of the difference between the pixels, and is at most twice as large.
 
         Args:
-            read: ``read(pixel, active)``, the channels of pixels.
-            crossed: ``crossed(pixel, down, active)``, whether an edge lies between a pixel and its right (lower) neighbour.
+            read: ``read(pixel, active)`` returns the channels of pixels.
+            crossed: ``crossed(pixel, down, active)`` is True if an edge lies between a pixel and its right (lower) neighbour.
             taker, giver: pixels, and neighbours that reach into them.
-            down: whether these are above or below.
-            place: of the edge, from 0 at the taker's centre to 1 at the giver's.
+            down: True if the neighbours lie above or below.
+            place: position of the edge, from 0 at the taker's centre to 1 at the giver's.
         """
         module = backend(place)
         own, other = read(taker, active), read(giver, active)
@@ -115,9 +115,9 @@ class Surroundings:
     def _steady(
         self, crossed: Callable[[UInt32, Bool, Bool], Bool], near: UInt32, far: UInt32, down: Bool, ahead: Bool, inside: Bool
     ) -> Bool:
-        """True if pixels and their neighbours see the same triangle, or others of a smooth surface.
+        """True if pixels and their neighbours see the same triangle, or triangles of one smooth surface.
 
-        That no edge crosses the way to the neighbour would not be enough by itself: edges along it do not count there.
+        It does not suffice that no edge crosses the segment between the pixels: edges along the segment are not counted there.
         """
         module = backend(near)
         here, there = (dr.gather(module.UInt32, self.triangle, pixel, inside) for pixel in (near, far))
@@ -145,7 +145,7 @@ class Surroundings:
             ) -> Bool:
                 return ~self._leaves(near, here, down, ahead, soft) & ~self._leaves(far, there, down, ~ahead, soft)
 
-            # Few triangles have creases at some of their edges and not at others.
+            # Few triangles have creases at only some of their edges.
             lanes = near, far, down, ahead, here, there, soft, none
             return dr.if_stmt(lanes, open_ & ~none, on_the_way, lambda *lanes: lanes[-1], mode="symbolic", label="rims")
 
@@ -153,15 +153,15 @@ class Surroundings:
         return same | dr.if_stmt(lanes, smooth, unbroken, lambda *_: module.Bool(False), mode="symbolic", label="smooth")
 
     def _jump(self, edge: UInt32, soft: Bool) -> Bool:
-        """True if an edge is a crease. Folds are none where they are ``soft``."""
+        """True if an edge is a crease. Folds do not count where they are ``soft``."""
         Bool = backend(edge).Bool
         found = dr.gather(Bool, self.creases, edge)
         return found if self.folds is None else found & ~(soft & dr.gather(Bool, self.folds.edges, edge))
 
     def _leaves(self, pixel: UInt32, triangle: UInt32, down: Bool, ahead: Bool, soft: Bool) -> Bool:
-        """True if the edge at which one leaves a triangle, from a pixel's centre towards a neighbour, is a crease.
+        """True if a ray from a pixel's centre towards a neighbour leaves the triangle through a crease.
 
-        Folds are none (``soft``) between coplanar triangles, and where triangles are seen as a smooth surface.
+        Folds do not count (``soft``) between coplanar triangles, and where triangles appear as a smooth surface.
         """
         module = backend(pixel)
         Float64 = module.Float64
@@ -175,7 +175,7 @@ class Surroundings:
         sign = dr.select((det < 0) == ahead, 1, -1)
         nearest, edge = Float64(dr.inf), module.UInt32(0)
         for k, (a, b, c) in enumerate(lines):
-            # Distances from the edge opposite to a corner, of any unit, and by how much they shrink on the way.
+            # Distance from the edge opposite to a corner, in any unit, and its decrease along the ray.
             value, rate = dr.abs(dr.fma(a, x, dr.fma(b, y, c))), sign * dr.select(down, b / size_y, a / size_x)
             distance = dr.select(rate > 0, value / rate, dr.inf)
             edge = dr.select(distance < nearest, (k + 1) % 3, edge)

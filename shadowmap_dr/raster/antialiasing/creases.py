@@ -1,4 +1,4 @@
-"""Creases between neighbouring pixels: edges at which no surface ends, but its colour jumps."""
+"""Creases between neighbouring pixels: edges at which the surface continues but its colour jumps."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from ..types import NO_TRIANGLE, RasterOutput
 #: Ends of a first and of a second edge, and the weights of both.
 FoundCreases: TypeAlias = tuple[UInt32, UInt32, UInt32, UInt32, Float, Float]
 
-# Planes that cross so far (relative) beyond two edges still cross at the nearer one, in spite of rounding.
+# Tolerance (relative) for rounding: planes that cross this little beyond two edges count as crossing at the nearer edge.
 _SLACK = 0.05
-# Sine of the angle up to which two faces lie in one plane: rounding of small triangles. Small bends add up over a surface.
+# Sine of the largest angle between coplanar faces, for rounding. It must be small, for bends add up over a surface.
 _FLAT = 1e-4
 
 
 @dataclass(frozen=True)
 class CoplanarCreases:
-    """Creases that are none where the surface is not bent: within a flat face of many triangles, colours do not jump.
+    """Creases that do not count between coplanar faces: within a flat face of many triangles, colours do not jump.
 
-    What they change by from one pixel to the next, because of a texture, say, would count twice if its triangles had edges.
+    A change of colour between two pixels there, due to a texture for instance, would count twice if triangles had edges.
 
     Attributes:
-        edges: ``Bool`` (3 F,), which of the creases from corner k to k + 1 of a face these are.
-        normals: ``Float`` (4 F,), normals of the faces, of any length, and a number that is not read. Detached.
+        edges: (3 F,) mask of these creases, from corner k to k + 1 of a face.
+        normals: (4 F,) normals of the faces, of any length, and a padding number. Detached.
     """
 
     edges: Bool
     normals: Float
 
     def flat(self, here: UInt32, neighbour: UInt32) -> Bool:
-        """True if two faces lie in one plane and are turned to the same side, if they have a point in common."""
+        """True if two faces are parallel and face the same side, so that faces with a common point are coplanar."""
         Array3f, Array4f = (getattr(backend(here), name) for name in ("Array3f", "Array4f"))
         n, m = (dr.gather(Array4f, self.normals, face) for face in (here, neighbour))
         n, m = Array3f(n.x, n.y, n.z), Array3f(m.x, m.y, m.z)
@@ -57,19 +57,20 @@ def find_creases(
 ) -> FoundCreases:
     """Creases between pixels and their right or (where ``down``) lower neighbours.
 
-    Two triangles of one surface have a corner in common, if they are not much smaller than a pixel. Through one edge one
-    leaves the first on the way to the neighbour, through one (the same, as a rule) one enters the other. If they are two, other
-    faces of unknown colour lie in between. Each edge then counts as much as the surface bends there: not at all where it lies
-    within a flat face of many triangles. That follows from where the planes of both triangles cross: at the first edge if all of
-    the bend is there, at the second, or in between. If they do not cross there, each edge counts half.
+    Two triangles of one surface have a corner in common, if they are not much smaller than a pixel. The segment to the
+    neighbour's centre leaves the first triangle through one edge and enters the second through one, usually the same. If the
+    edges differ, other faces of unknown colour lie in between. Each edge is then weighted by the bend of the surface there, which
+    is 0 within a flat face of many triangles. The place where the planes of both triangles cross gives the weights: all for the
+    first edge, all for the second, or in between. If they do not cross between the edges, each edge counts half.
 
     Args:
         creases, folds: see :func:`find_crossings`.
-        topology, raster: the mesh and what the pixels see.
-        image, pixel: which pixels, and in which images of the batch.
+        topology, raster: the mesh and the output of the rasterizer.
+        image, pixel: pixels, and their images in the batch.
         here, neighbour: triangles that the pixels and their neighbours see.
 
-    Returns ends (a, b) of the first edge, ``NO_VERTEX`` where there is none, those of the second, and the weights of both.
+    Returns:
+        Ends (a, b) of the first edge, ends (c, d) of the second, ``NO_VERTEX`` where there is none, and the weights of both.
     """
     module = backend(here)
     near = touching(topology, here, neighbour)
@@ -89,7 +90,7 @@ def find_creases(
             hard_in &= bent | ~dr.gather(module.Bool, folds.edges, 3 * neighbour + corner_in)
         a, b = _ends(topology, here, corner_out, hard_out)
         c, d = _ends(topology, neighbour, corner_in, hard_in)
-        # Twice the same edge, or only the second: one edge is what is left.
+        # If both are the same edge, or only the second one is a crease, one edge remains.
         same = hard_out & hard_in & (((a == c) & (b == d)) | ((a == d) & (b == c)))
         a, b = dr.select(hard_out, a, c), dr.select(hard_out, b, d)
         two = hard_out & hard_in & ~same
@@ -127,10 +128,11 @@ def touching(topology: Topology, first: UInt32, second: UInt32) -> Bool:
 def _way_out(
     raster: RasterOutput, image: UInt32, triangle: UInt32, x: Float, y: Float, down: Bool, sign: int
 ) -> tuple[UInt32, Float, Float, Float]:
-    """The edge through which one leaves a triangle from a point inside, along an axis of the image.
+    """The edge through which a ray along an axis of the image leaves a triangle, from a point inside.
 
-    Returns the corner at which it starts, the way there in pixels, the depth at the point, and its change with each pixel (along
-    the axis, whichever way one goes).
+    Returns:
+        (corner at which the edge starts, distance to it in pixels, depth at the point, change of depth for each pixel in the
+        positive direction of the axis, for either ``sign``).
     """
     module = backend(x)
     lines = raster.edge_functions(image, triangle)

@@ -16,7 +16,7 @@ from .pixel_pairs import PairList, differing_pairs, empty_list
 from .silhouettes import BEFORE, register_silhouettes
 from .surface_intersections import LEAST_WEIGHT, Meetings, beyond_middle
 
-#: How far (NDC depth) an edge must lie before the surface that it borders, with depths as those of the usual matrices.
+#: Least distance (NDC depth) of an edge before the surface behind it, for depths of the usual projection matrices.
 DEPTH_GAP = 2e-7
 
 
@@ -25,14 +25,14 @@ class Crossings:
     """Edges that separate pixels from their right and lower neighbours, for one set of vertex positions. No gradients.
 
     Attributes:
-        right, down: ``Float`` for each pixel, the signed weight of its pair with the right (lower) neighbour. Positive: so much
-            of the pixel reaches into its neighbour; negative: so much of the neighbour into the pixel.
-        pairs: the pairs that may have a weight. What follows is indexed by their slots in this list.
-        ends: ``UInt32``, four for each slot: ends of the edge and of a second one, as vertices of the whole batch; ``NO_VERTEX``
-            where there is none.
-        slopes, second_slopes: ``Float``, four for each slot: the weight changes by the sum over x, y, w (numbers 2 to 4) of
-            slope * (change of the clip-space edge at the crossing), whose ends count by 1 - s and s (number 1).
-        meetings: if surfaces that meet without an edge were looked for: what the weights of pairs without ends depend on.
+        right, down: for each pixel, the signed weight of its pair with the right (lower) neighbour. Positive: the pixel reaches
+            into its neighbour by this much; negative: the neighbour reaches into the pixel.
+        pairs: pairs that may have a weight. The other arrays are indexed by their slots in this list.
+        ends: four for each slot: ends of the edge and of a second edge, as vertices of the whole batch; ``NO_VERTEX`` if there
+            is no edge.
+        slopes, second_slopes: four for each slot: (s, slope x, slope y, slope w). The weight changes by the sum over x, y, w of
+            slope * (change of the clip-space edge at the crossing), where the edge's ends count by 1 - s and s.
+        meetings: intersections of surfaces, which give the weights of pairs without ends; None if these were not searched.
     """
 
     right: Float
@@ -62,14 +62,14 @@ def find_crossings(
         topology: edges of the mesh.
         raster: output of the rasterizer for the same vertices.
         vertex_count: vertices per image, V.
-        creases: ``Bool`` (3 F,), whether the edge from corner k to k + 1 of a face separates pixels that see its two faces, too
-            (between flat-shaded ones, whose colours jump there).
-        crease_weights: ``Float`` for each pixel, between 0 and 1: how much creases count there; 1 if not given.
-        meetings: also look for the lines along which surfaces that are not connected pass through each other or touch. Depths,
-            and what follows from them alone, do not jump there.
-        folds: which of the creases are none between faces in one plane. None: no one.
-        gap: how far (NDC depth) a silhouette must at least lie before what it borders, besides 1e-5 of the depth there. 0 suits
-            depths of which all digits count, such as -near / distance; more those that are close to 1 far away.
+        creases: (3 F,) True if the edge from corner k to k + 1 of a face separates the pixels that see its two faces, as edges of
+            flat-shaded faces do, at which colours jump.
+        crease_weights: weight of creases at each pixel, between 0 and 1; None for 1.
+        meetings: also find the lines along which surfaces that are not connected intersect or touch. Depths do not jump there,
+            nor do values that depend on depth alone.
+        folds: creases that do not count between coplanar faces. None: all creases count.
+        gap: least distance (NDC depth) of a silhouette before the surface behind it, besides 1e-5 of the depth there. Use 0 for
+            depths that keep their relative precision, such as -near / distance, and more for depths that approach 1 far away.
 
     A silhouette is an edge whose faces all lie on one side of it in the image. It separates two pixels that see different
     triangles when it crosses the segment between their centres and lies before the surface that the uncovered one sees
@@ -77,9 +77,9 @@ def find_crossings(
     With ``meetings`` the edge may also lie on that surface, if this is of another part and the two do not meet in a valley.
 
     Between two pixels whose triangles touch, the edges through which one leaves the first triangle and enters the other are
-    creases. If these are two edges, with something unseen in between, each counts as much as the surface bends there. Between
-    flat triangles that do not touch, the crease is where their planes cross, if that is in between and the faces beside the
-    triangles lie in these planes, too.
+    creases. If these are two edges, with invisible faces in between, each edge is weighted by the bend of the surface there.
+    Between flat triangles that do not touch, the crease is the line where their planes cross, if it lies between the pixels and
+    the faces beside the triangles lie in these planes, too.
 
     An edge steeper than 60 degrees counts for horizontal pairs only, one flatter than 30 degrees for vertical pairs only, so that
     the two directions together blend each piece of outline once.
@@ -214,7 +214,7 @@ def _cut(
 
 
 def _meet(found: Crossings, meetings: Meetings, raster: RasterOutput) -> None:
-    """Write the weights of pairs whose triangles meet other than in an edge, which then takes the place of one that touches."""
+    """Write the weights of pairs whose triangles intersect. These replace edges that only touch the surface behind them."""
     Array4u = backend(found.ends).Array4u
 
     def visit(slot: UInt32) -> None:
@@ -261,8 +261,8 @@ def _weight(
     weight = dr.select(has, weight * _share(p, q, down, raster), 0)
 
     # d value = sum over both ends of (1 - s, s) / w * (d along - tilt * d across - (value - tilt * ndc) * d w)
-    # An edge on a pixel's centre may belong to two pairs (t = 0 and 1): half of the pixel is what the one neighbour sees, half
-    # what the other does, and as it moves the one half grows by as much as the other shrinks.
+    # An edge on a pixel's centre may belong to two pairs (t = 0 and 1): each neighbour covers half of the pixel, and when the
+    # edge moves, one half grows as much as the other shrinks.
     slope = dr.select((t >= 0) & (t <= 1), weight * 0.5 * size / w, 0)
     tilt = ((p_along - q_along) - value * (p.w - q.w)) / span
     across = -slope * tilt
@@ -271,7 +271,7 @@ def _weight(
 
 
 def _share(p: Vector4f, q: Vector4f, down: Bool, raster: RasterOutput) -> Float:
-    """Weight of an edge for pairs of this kind, from its direction in the image (or its line's, behind the camera)."""
+    """Weight of an edge for horizontal pairs (vertical ones, if ``down``), from the direction of its line in the image."""
     # The line a x + b y + c = 0 in ndc is a (2 / width) x + ... in pixels.
     nx, ny = (p.y * q.w - q.y * p.w) / raster.width, (q.x * p.w - p.x * q.w) / raster.height
     square = nx * nx + ny * ny

@@ -20,10 +20,15 @@ def incoming_weights(crossings: Crossings, width: int) -> tuple[Float, Float, Fl
 def around(
     right: Float, down: Float, width: int, sign: int, signed: bool = False, at: UInt32 | None = None
 ) -> tuple[Float, Float, Float, Float]:
-    """Weights of each neighbour in a pixel, or (``sign`` -1) a pixel into each neighbour; all pixels, or those ``at``.
+    """Weights of the right, lower, left and upper neighbour in a pixel, or (``sign`` -1) of the pixel in each neighbour.
 
-    Neighbours are the right, lower, left and upper one. Pairs that reach beyond the image have weight 0, which is also what the
-    last pixels of the line above and the image before have for the first ones.
+    Pairs that reach beyond the image have weight 0. So have the pairs of a row's last pixel with the next row's first one, and
+    of the last row with the first row of the next image.
+
+    Args:
+        right, down: see :class:`Crossings`.
+        signed: return negative weights, too, instead of 0.
+        at: pixels; None for all.
     """
     module = backend(right)
     pixel = dr.arange(module.UInt32, dr.width(right)) if at is None else at

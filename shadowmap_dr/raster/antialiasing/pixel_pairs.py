@@ -1,4 +1,4 @@
-"""Pairs of neighbouring pixels, and lists of the few among them that need work.
+"""Pairs of neighbouring pixels, and lists of the few pairs that need work.
 
 Pair ``2 * p`` consists of pixel ``p`` and its right neighbour, pair ``2 * p + 1`` of ``p`` and the lower one.
 """
@@ -14,9 +14,9 @@ from ...jit.arrays import backend, scatter_inc
 from ...jit.types import Bool, UInt32, UInt64
 from ..types import RasterOutput
 
-# A list's slots are dealt out in rounds to one lane for this many: short lists end after the first round.
+# Slots for each lane. Lanes take slots in rounds, so that short lists end after the first round.
 _ROUNDS = 8
-# So many neighbouring lanes work on so many neighbouring numbers.
+# Number of neighbouring lanes that work on neighbouring slots.
 _PACKET = 16
 
 
@@ -24,8 +24,8 @@ _PACKET = 16
 class PairList:
     """Some of the pairs, in no particular order.
 
-    Right pairs fill ``pairs`` from the front, down pairs from the back, or all pairs from the front: that makes ``front[0]`` and
-    ``back[0]`` many. A list numbers them from 0 on, without a gap ("slots"). The sizes of the arrays do not depend on the data.
+    ``front[0]`` pairs fill ``pairs`` from the front, ``back[0]`` pairs from the back. Slots number both without a gap, from 0 on.
+    The sizes of the arrays do not depend on the data. ``touched`` marks listed pairs, in lists to which pairs can be added.
     """
 
     pairs: UInt32
@@ -42,12 +42,12 @@ class PairList:
         dr.scatter(self.pairs, pair, scatter_inc(self.front, UInt32(0), first), first)
 
     def for_each(self, visit: Callable[[UInt32, UInt32], None]) -> None:
-        """Call ``visit(slot, pair)``, which writes somewhere, for all pairs in the list: full packets, whatever the image."""
+        """Call ``visit(slot, pair)``, which scatters its results, for all pairs in the list, in full packets."""
         each_number(self.front + self.back, self.lanes, lambda slot: visit(slot, self.at(slot)))
 
     @property
     def lanes(self) -> int:
-        """Number of lanes that deal with the list in turns."""
+        """Number of lanes that share the list."""
         return -(-dr.width(self.pairs) // _ROUNDS)
 
     def at(self, slot: UInt32) -> UInt32:
@@ -57,10 +57,10 @@ class PairList:
 
 
 def each_number(count: UInt32, lanes: int, visit: Callable[[UInt32], None]) -> None:
-    """Call ``visit(number)``, which writes somewhere, for all ``UInt32`` below ``count``, at most about ``lanes`` at a time.
+    """Call ``visit(number)``, which scatters its results, for all numbers below ``count``, in a loop over about ``lanes`` lanes.
 
-    Neighbouring lanes get neighbouring numbers, in packets, and each packet of lanes as many packets as any other: threads share
-    the lanes out run by run, and all of them shall be busy even if there are few numbers.
+    Neighbouring lanes get neighbouring numbers, in packets, and all packets of lanes get equally many. Threads take contiguous
+    runs of lanes, so that all of them are busy even if there are few numbers.
     """
     module = backend(count)
     UInt64 = module.UInt64
@@ -80,11 +80,11 @@ def each_number(count: UInt32, lanes: int, visit: Callable[[UInt32], None]) -> N
 
 
 def empty_list(raster: RasterOutput) -> tuple[PairList, UInt64]:
-    """A list to which pairs can be added, and for each pair a key (``UInt64``) of 0."""
+    """An empty list to which pairs can be added, and a key of 0 for each pair."""
     module = backend(raster.triangle)
     UInt32 = module.UInt32
     capacity = 2 * dr.width(raster.triangle)
-    # Zeros that a kernel of all threads writes: faster than the one thread that fills an array with a constant.
+    # A kernel of all threads writes these zeros; Dr.Jit fills constant arrays with a single thread.
     touched = dr.arange(UInt32, capacity) >> 31
     keys = module.UInt64(touched)
     dr.eval(touched, keys)
@@ -92,7 +92,7 @@ def empty_list(raster: RasterOutput) -> tuple[PairList, UInt64]:
 
 
 def differing_pairs(raster: RasterOutput) -> tuple[PairList, UInt64]:
-    """Pairs whose pixels see different triangles, and keys (``UInt64``), 0 for these pairs and undefined for others."""
+    """Pairs whose pixels see different triangles, and keys: 0 for these pairs, undefined for others."""
     module = backend(raster.triangle)
     pixels = dr.width(raster.triangle)
     pixel = dr.arange(module.UInt32, pixels)

@@ -15,13 +15,13 @@ from ..topology import NO_VERTEX, Topology
 from ..types import NO_TRIANGLE, RasterOutput, by_image
 from .pixel_pairs import PairList
 
-# An edge must lie this far (relative) before the surface that it borders: it is a discontinuity, not a crease.
+# An edge must lie this far (relative) before the surface behind it to count as a discontinuity.
 _RELATIVE_GAP = 1e-5
-#: Part of the keys of edges that do. Others may be those of a surface that lies on another one.
+#: Bit in the keys of such edges. Edges without it belong to a surface that lies on another one.
 BEFORE = 1 << 62
-# Lines through pixel centres that lie this far (in pixels) beyond an edge's ends are tested, too, in spite of rounding.
+# Margin for rounding: lines through pixel centres up to this far (in pixels) beyond an edge's ends are tested, too.
 _MARGIN = 1.0 / 512.0
-# So many lanes walk along the silhouettes of an image; few, so that threads get equal parts of a short list, too.
+# Lanes that walk along the silhouettes of an image. Few, so that threads get equal parts even of a short list.
 _LANES, _LANES_PER_EDGE = 512, 4
 _MOST_LANES = 32768
 
@@ -40,14 +40,14 @@ def register_silhouettes(
 
     Args:
         positions: flat clip-space vertices, as rasterized. Detached.
-        topology, raster, vertex_count: the mesh and what the pixels see.
-        keys: ``UInt64``, one number for each pair (see :mod:`shadowmap_dr.raster.antialiasing.pixel_pairs`), 0 at first. Gets the
-            largest of the edges' keys: how much of the uncovered pixel the edge's surface hides as the upper half (a float's
-            bits, and ``BEFORE``), the complement of the edge's index as the lower. The outermost edge wins: the result does not
-            depend on the order.
+        topology, raster, vertex_count: the mesh and the output of the rasterizer.
+        keys: one for each pair (see :mod:`shadowmap_dr.raster.antialiasing.pixel_pairs`), 0 at first; modified. Becomes the
+            largest key of the edges between the two pixels. The upper half of a key holds the share of the uncovered pixel that
+            the edge's surface hides (a float's bits, and ``BEFORE``), the lower half the complement of the edge's index. So the
+            outermost edge wins, and the result does not depend on the order.
         found: list to which pairs are added when the first edge registers.
-        gap: NDC depth by which edges lie before what they border, at least.
-        touching: whether edges also register that do not lie before, but on a surface of another part.
+        gap: least NDC depth between an edge and the surface behind it.
+        touching: register also edges that lie on (not before) a surface of another part.
     """
     module = backend(positions)
     count, records, edges = _collect(positions, topology, raster, vertex_count)
@@ -69,8 +69,8 @@ def register_silhouettes(
 def _collect(positions: Float, topology: Topology, raster: RasterOutput, vertex_count: int) -> tuple[UInt32, Float, UInt32]:
     """List the silhouettes that cross lines through pixel centres.
 
-    Returns their number (width 1), records and indices ``image * E + edge``. A record holds both ends, x and y in pixels from the
-    image's centre and the NDC depth, with the side on which the surface lies (as a sign) and the share of horizontal pairs.
+    Returns their number (width 1), records, and indices ``image * E + edge``. A record holds both ends (x and y in pixels from
+    the image's centre, NDC depth), the side on which the surface lies (as a sign), and the share of horizontal pairs.
     """
     module = backend(positions)
     width, height = raster.width, raster.height
@@ -119,7 +119,7 @@ def _walk(
     first_column, columns = _lines(a.x, b.x, share < 1, width)
 
     def step(line: UInt32, again: Bool) -> tuple[UInt32, Bool]:
-        """One line through pixel centres: a row, where the edge separates pixels of two columns, or the other way round."""
+        """Process one line through pixel centres: a row (the edge separates pixels of two columns), or a column."""
         across_rows = line < rows
         down = ~across_rows
         at = dr.select(across_rows, first_row + line, first_column + (line - rows))
@@ -159,7 +159,7 @@ def _walk(
         ok &= before | on
 
         if topology.see_through_faces is not None:
-            # What is seen through hides nothing: an edge of it counts where its own surface is seen beside it.
+            # A see-through face hides nothing: its edge counts only if its own surface is visible beside it.
             seen = dr.select(covers_here, here, neighbour)
             hit, counts = ok & (seen != NO_TRIANGLE), module.Bool(False)
             part = dr.gather(module.UInt32, topology.parts, seen, hit)
@@ -192,7 +192,7 @@ def _walk(
 def _silhouettes(
     positions: Float, topology: Topology, image: UInt32, edge: UInt32, vertex_count: int
 ) -> tuple[Vector4f, Vector4f, Float, Bool]:
-    """Clip-space end points of edges, on which side of them their surface is, and whether it is on one side only."""
+    """Clip-space end points of edges, the side of their surface (a sign), and a mask of edges with surface on one side only."""
     module = backend(positions)
     Array4f, Array2u = module.Array4f, module.Array2u
     ends, opposite = dr.gather(Array2u, topology.edges, edge), dr.gather(Array2u, topology.opposite, edge)
@@ -218,10 +218,13 @@ def _orientation(a: Vector4f, b: Vector4f, o: Vector4f) -> Float:
 
 
 def _project(a: Vector4f, b: Vector4f, active: Bool, width: int, height: int) -> tuple[Vector3f, Vector3f, Bool]:
-    """Clip edges at the near plane and project them: (x, y in pixels from the image's centre, NDC depth), and which are left."""
+    """Clip edges at the near plane and project them to (x, y in pixels from the image's centre, NDC depth).
+
+    Returns both ends, and the mask of edges that are left.
+    """
     module = backend(a)
     near_a, near_b = a.z + a.w, b.z + b.w
-    # Infinite ones would be projected to the middle of the image.
+    # Infinite vertices would be projected to the middle of the image.
     active = active & dr.isfinite(near_a + a.x + a.y + near_b + b.x + b.y) & ((near_a > 0) | (near_b > 0))
 
     def clip(p: Vector4f, q: Vector4f, near_p: Float, near_q: Float) -> Vector4f:
@@ -242,7 +245,7 @@ def _project(a: Vector4f, b: Vector4f, active: Bool, width: int, height: int) ->
 
 
 def _horizontal_share(dx: Float, dy: Float, active: Bool) -> Float:
-    """Weight of an edge of this direction for horizontal pairs of pixels; for vertical ones it is the rest."""
+    """Weight of an edge of this direction for horizontal pairs of pixels; 1 minus it is the weight for vertical pairs."""
     dx, dy = dr.select(active, dx, 0), dr.select(active, dy, 0)
     square = dx * dx + dy * dy
     return dr.clip(0.5 + (dy * dy - dx * dx) / dr.select(square > 0, square, 1), 0, 1)

@@ -1,10 +1,11 @@
-"""Intersections of the surfaces that two neighbouring pixels see, other than in an edge that both have.
+"""Intersections of the surfaces that two neighbouring pixels see, other than in a common edge.
 
-Surfaces do so along lines where one passes through another, or stands on it: no silhouette lies between the pixels there, but
-what they see changes at once. So do flat faces of one surface between which there are others, too narrow for a pixel to see: the
-faces of a box are, seen from the side, if they consist of many triangles. The depths of both triangles are affine on the screen,
-so that the place between the pixels' centres where they are equal follows from six vertices. Within one surface that is true
-only if it is flat up to there, or cuts itself in both triangles; planes of a curved one cross where it is not, too.
+Surfaces intersect along lines where one passes through another, or stands on it. No silhouette lies between the pixels there, but
+the visible surface changes abruptly. The planes of two flat faces of one surface also intersect between pixels if the faces in
+between are too narrow for a pixel to see; that happens to a box of many triangles, seen from the side. The depths of both
+triangles are affine on the screen, so that six vertices give the point between the pixels' centres where they are equal. Within
+one surface this point is valid only if the surface is flat up to there, or cuts itself in both triangles: the planes of a curved
+surface also cross at points that do not lie on it.
 """
 
 from __future__ import annotations
@@ -24,36 +25,37 @@ from ..triangle_setup import Corners, Line, edge_lines, gather_triangle
 from ..types import NO_TRIANGLE, RasterOutput, by_image, precise_rcp
 from .pixel_pairs import each_number
 
-# Depths whose difference changes by less (relative) from one pixel to the next are the same: the surfaces lie on each other.
+# Surfaces coincide if the difference of their depths changes by less than this (relative) from one pixel to the next.
 _LEAST_CHANGE = 1e-6
-# Faces of one surface whose depths change so much alike (relative) from one pixel to the next lie in one plane.
+# Faces of one surface are coplanar if their changes of depth from one pixel to the next differ by less than this (relative).
 _LEAST_FOLD = 0.02
-# Faces beside two triangles may leave both their planes by this part of the bend between them; at twice that there is no crease.
-# On curved surfaces they leave them by more: with one facet in between, by about a half.
+# Largest deviation of adjacent faces from the planes of both triangles, as a fraction of the bend between them. From there the
+# crease fades; at twice this fraction it is gone. On curved surfaces the fraction is larger: about a half with one facet between.
 _BENT = 0.05
-# Least barycentric coordinate of a point inside a triangle and not, but for rounding, on an edge that it shares.
+# Least barycentric coordinate of a point inside a triangle that does not lie, up to rounding, on one of its edges.
 _INSIDE = 1e-4
-# Weight of a pair whose edge lies on the border between its pixels, which mixes nothing: what is 0 has no edge, nor derivatives.
+# Weight of a pair whose edge lies on the border between its pixels. It must not be 0, for a weight of 0 means no edge and no
+# derivatives.
 LEAST_WEIGHT = 1e-12
-# So many lanes take turns at the pairs that are listed; few, so that threads get equal parts of a short list, too.
+# Lanes that share the listed pairs. Few, so that threads get equal parts even of a short list.
 _LANES = 1024
 
 
 @dataclass(frozen=True)
 class Meetings:
-    """Inputs to find out where the triangles that two neighbouring pixels see meet. Detached.
+    """Inputs of the search for intersections of the triangles that two neighbouring pixels see. Detached.
 
     Attributes:
         positions: flat clip-space vertices (4 V B), as rasterized.
-        faces: ``UInt32`` (3 F,).
-        parts, beyond: ``UInt32`` (F,) and (3 F,), see :class:`Topology`.
-        triangle: what each pixel sees.
+        faces: (3 F,) vertex indices.
+        parts, beyond: (F,) and (3 F,), see :class:`Topology`.
+        triangle: triangle that each pixel sees.
         batch: number of images.
         height, width, vertex_count: of an image.
-        unconnected: whether faces of different parts may meet, and those of one cut each other.
-        creases, crease_weights: see :func:`shadowmap_dr.raster.antialiasing.edge_crossings.find_crossings`. Without, faces of one
-            part do not meet.
-        slots, count: ``UInt32``, pairs without an edge that may meet, as slots in the list of all pairs, and how many there are.
+        unconnected: True to intersect faces of different parts, and faces of one part that cut each other.
+        creases, crease_weights: see :func:`shadowmap_dr.raster.antialiasing.edge_crossings.find_crossings`. If None, faces of one
+            part form no creases.
+        slots, count: candidate pairs without an edge, as slots in the list of all pairs, and their number.
     """
 
     positions: Float
@@ -89,13 +91,13 @@ class Meetings:
         return cls(dr.detach(positions), *surfaces, *size, unconnected, creases, crease_weights, *found)
 
     def add(self, slot: UInt32, here: UInt32, there: UInt32, soft: Float, cross: Callable[[Bool], Bool]) -> None:
-        """List a pair if what it sees may meet. To be traced only once.
+        """List a pair if the triangles that its pixels see may intersect. To be traced only once.
 
         Args:
-            slot: of the pair.
-            here, there: triangles that it sees, or none, also if the pair has an edge.
-            soft: how much creases count there (``Float``).
-            cross: ``cross(active)``, whether their planes do in between, as those of a surface that cuts itself there.
+            slot: slot of the pair in the list of all pairs.
+            here, there: triangles that its pixels see; ``NO_TRIANGLE`` if there is none, or if the pair has an edge.
+            soft: weight of creases there.
+            cross: ``cross(active)`` is True if a surface may cut itself between the pixels, by the planes of the triangles.
         """
         UInt32 = backend(slot).UInt32
         both = (here != NO_TRIANGLE) & (there != NO_TRIANGLE)
@@ -107,20 +109,20 @@ class Meetings:
         dr.scatter(self.slots, slot, scatter_inc(self.count, UInt32(0), listed), listed)
 
     def for_each(self, visit: Callable[[UInt32], None]) -> None:
-        """Call ``visit(slot)``, which writes somewhere, for all pairs that were listed: few, and dear to visit."""
+        """Call ``visit(slot)``, which scatters its results, for all listed pairs: few, but each is expensive."""
         each_number(self.count, _LANES, lambda k: visit(dr.gather(type(k), self.slots, k)))
 
     def weight(self, pixel: UInt32, down: Bool) -> Float:
-        """Signed weight (see :class:`Crossings`) of pairs of pixels that see triangles, 0 where these do not meet in between."""
+        """Signed weight (see :class:`Crossings`) of pairs of pixels, 0 where their triangles do not intersect in between."""
         return self._between(pixel, down)[0]
 
     def slopes(self, pixel: UInt32, down: Bool) -> list[tuple[UInt32, Vector4f]]:
-        """(vertex, change of the weight with its clip-space position, ``Array4f``) for all six vertices."""
+        """(vertex, derivative of the weight by its clip-space position) for all six vertices."""
         _, rate, triangles = self._between(pixel, down)
         Array4f = backend(rate).Array4f
         result = []
         for sign, (vertices, plane, weights) in zip((1, -1), triangles, strict=True):
-            # The depth A x + B y + C w = z of a corner: what its change violates, the plane makes up for.
+            # A x + B y + C w = z holds for each corner: the change of the plane balances that of the corner.
             direction = Array4f(-plane[0], -plane[1], 1, -plane[2])
             result += [(vertices[k], direction * (sign * rate * weights[k])) for k in range(3)]
         return result
@@ -133,7 +135,7 @@ class Meetings:
         image, row = by_image(row_flat, self.height, self.batch)
         column = pixel - row_flat * self.width
         first = image * self.vertex_count
-        # Centre of the pixel, and the way to its neighbour, in NDC.
+        # Centre of the pixel, and the offset of its neighbour, in NDC.
         x, y = (
             (2 * module.Float64(column) + (1 - self.width)) / self.width,
             (2 * module.Float64(row) + (1 - self.height)) / self.height,
@@ -141,7 +143,7 @@ class Meetings:
         step_x, step_y = 2 / self.width, 2 / self.height
         step = dr.select(down, UInt32(self.width), 1)
         found, seen, parts = [], [], []
-        # How much ridges and valleys count: smooth surfaces have none.
+        # Weight of ridges and valleys; smooth surfaces have none.
         soft = Float(0 if self.creases is None else 1)
         for p in (pixel, pixel + step):
             triangle = dr.gather(UInt32, self.triangle, p)
@@ -158,15 +160,15 @@ class Meetings:
         planes = [plane for _, _, plane in found]
 
         def along(plane: Line) -> Float64:
-            """Its change on the way to the neighbour."""
+            """Change of depth on a plane from the pixel to its neighbour."""
             return dr.select(down, plane[1] * step_y, plane[0] * step_x)
 
         a, b, c = (u - v for u, v in zip(*planes, strict=True))
-        # First depth minus second here, and its change on the way to the neighbour.
+        # Difference of the depths (first minus second) at the pixel, and its change from the pixel to its neighbour.
         start, change = dr.fma(a, x, dr.fma(b, y, c)), dr.select(down, b * step_y, a * step_x)
         end = start + change
         depth = found[0][2][0] * x + found[0][2][1] * y + found[0][2][2]
-        # Of two surfaces one sees the nearer one. Faces of one surface form a ridge or a valley.
+        # Of two surfaces the nearer one is visible. Faces of one surface form a ridge or a valley.
         folded = parts[0] == parts[1]
         steepness = sum(dr.abs(along(plane)) for plane in planes)
         least = dr.maximum(_LEAST_CHANGE * dr.abs(depth), dr.select(folded, _LEAST_FOLD * steepness, 0))
@@ -177,7 +179,7 @@ class Meetings:
         upwards = (b * step_y) ** 2
         bent = dr.maximum(*(self._bent(*one, planes, along) for one in seen))
         soft *= Float(dr.clip(2 - bent / (_BENT * dr.select(meet, dr.abs(change), 1)), 0, 1))
-        # Where both triangles have the point of the line inside, one passes through the other, whatever is beside them.
+        # If the point lies inside both triangles, one passes through the other, whatever the adjacent faces are.
         x, y = dr.select(down, x, x + t * step_x), dr.select(down, y + t * step_y, y)
         at = [[Float(dr.fma(m, x, dr.fma(n, y, o))) for m, n, o in lines] for _, lines, _ in found]
         inside = start < 0
@@ -192,9 +194,9 @@ class Meetings:
     def _bent(
         self, triangle: UInt32, first: UInt32, corners: Corners, planes: list[Line], along: Callable[[Line], Float64]
     ) -> Float64:
-        """Largest turn of the faces beside a triangle away from both planes, as changes of depth on the way to the neighbour.
+        """Largest deviation of a triangle's adjacent faces from both planes, as change of depth from the pixel to its neighbour.
 
-        The ridge itself lies between a face of the one plane and a face of the other.
+        At a ridge, the adjacent face lies in one of the two planes.
         """
         module = backend(self.positions)
         most = module.Float64(0)
@@ -209,7 +211,7 @@ class Meetings:
 
 
 def beyond_middle(t: Float) -> Float:
-    """Distance (pixels) beyond the border between two pixels, from where it is (0 to 1) between their centres.
+    """Signed distance (pixels) from the border between two pixels, of a point at ``t`` (0 to 1) between their centres.
 
     Never 0: see ``LEAST_WEIGHT``.
     """
@@ -217,7 +219,7 @@ def beyond_middle(t: Float) -> Float:
 
 
 def _plane(corners: Corners) -> tuple[list[Line], Line]:
-    """Barycentrics / w of a triangle as affine functions (a, b, c: a x + b y + c) in NDC, and its depth as such a one."""
+    """Barycentrics / w of a triangle, and its depth, as affine functions (a, b, c: a x + b y + c) in NDC."""
     lines, det = edge_lines(corners)
     inverse = dr.select(det != 0, precise_rcp(dr.select(det != 0, det, 1)), 0)
     lines = [(a * inverse, b * inverse, c * inverse) for a, b, c in lines]

@@ -17,16 +17,16 @@ def standard_visibility(map_depth: Float, depth: Float, bias: float) -> Float:
 
 
 def soft_comparison(map_depth: Float, depth: Float, bias: float, softness: float) -> Float:
-    """1 where a receiver lies at most ``bias`` behind the depth in the map, falling to 0 over the next ``softness``. Attached."""
+    """1 where a receiver lies at most ``bias`` behind the depth in the map, falling to 0 within ``softness``. Attached."""
     return 1 - dr.clip((depth - map_depth - bias) / softness, 0, 1)
 
 
 def other_depth(depth: Float, moments: Vector2f) -> tuple[Float, Float]:
-    """Depth that a texel with two surfaces sees beside the nearer or farther one at its centre. Attached to both arguments.
+    """Depth of the second surface in a texel that sees two, nearer or farther than the one at its centre. Attached to both.
 
     Args:
         depth: linear depth at the centre of the texel, in -1/2..1/2.
-        moments: ``Array2f``, mean and mean square of the depth over the texel.
+        moments: mean and mean square of the depth over the texel.
 
     Returns:
         (the other surface's depth in -1/2..1/2, the share of the texel that it covers in 0..1), such that both surfaces together
@@ -34,7 +34,7 @@ def other_depth(depth: Float, moments: Vector2f) -> tuple[Float, Float]:
     """
     mean = moments.x - depth
     square = dr.fma(-2 * moments.x + depth, depth, moments.y)
-    # No distribution has a mean square below the squared mean: what is left of it is rounding.
+    # No distribution has a mean square below the squared mean; a smaller value is due to rounding.
     least = mean * mean
     square = dr.select(square > least, square, least)
     there = dr.abs(mean) > _LEAST_DIFFERENCE

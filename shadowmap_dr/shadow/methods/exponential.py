@@ -8,12 +8,13 @@ from ...jit.arrays import backend
 from ...jit.types import Float, Vector2f
 from .variance import chebyshev_visibility
 
-#: The same for warped depths, to first order: with less, surfaces that the light hardly strikes would shadow themselves.
+#: Smallest variance of warped depths, to first order, for a squared exponent of 1. With less, surfaces at grazing angles to the
+#: light would shadow themselves.
 MINIMUM_WARPED_VARIANCE = 1e-5
 
 
 def exponential_moment(depth: Float, exponent: float) -> Float:
-    """``exp(exponent * depth)``: what an exponential shadow map stores. Attached.
+    """``exp(exponent * depth)``, the number that an exponential shadow map stores. Attached.
 
     Source: Annen et al., "Exponential Shadow Maps", 2008, equation 4.
     """
@@ -29,7 +30,7 @@ def exponential_visibility(moment: Float, depth: Float, exponent: float) -> Floa
 
 
 def warped_moments(depth: Float, slope_square: Float | float, exponent: float) -> Vector2f:
-    """First and second moment (``Array2f``) of ``sign(exponent) * exp(exponent * depth)``, which grows with depth. Attached.
+    """First and second moment of ``sign(exponent) * exp(exponent * depth)``, which grows with depth. Attached.
 
     Source: Lauritzen and McCool, "Layered Variance Shadow Maps", 2008, section 4.2. A plane's variance within the texel is
     carried over to first order, detached.

@@ -11,14 +11,14 @@ import drjit as dr
 
 from ...jit.types import Float
 
-# The series is periodic: where depths differ by the whole range, it must still be far from its next step.
+# The series is periodic: its next step must be far from depths that differ by the whole range.
 _BASE = 0.88 * math.pi
 
 
 def fourier_terms(depth: Float, slope_square: Float | float, order: int) -> list[Float]:
     """Sine and cosine of each of ``order`` odd multiples of a base frequency: 2 ``order`` numbers. Attached.
 
-    A plane's extent within the texel dampens them as it would those of a normal distribution.
+    A plane's extent within the texel dampens the terms like a normal distribution of the same variance.
     """
     variance = 0.25 * dr.detach(slope_square)
     terms = []
@@ -31,9 +31,9 @@ def fourier_terms(depth: Float, slope_square: Float | float, order: int) -> list
 
 
 def fourier_visibility(terms: list[Float], depth: Float) -> Float:
-    """Twice the series for the step from 0 (occluder before ``depth``) to 1, cut off at 1: a surface is not its own occluder.
+    """Twice the series for the step from 0 (occluder before ``depth``) to 1, clipped to 1: surfaces do not shadow themselves.
 
-    Lanczos' factors suppress the series' ringing, which would show as stripes. Attached.
+    Lanczos factors suppress ringing, which would show as stripes. Attached.
     """
     order = len(terms) // 2
     total = type(depth)(0.5)

@@ -9,7 +9,7 @@ import drjit as dr
 
 from ...jit.types import Float
 
-# How far moments are moved towards those of a distribution far from all degenerate ones, so that rounding is harmless.
+# Fraction by which moments are moved towards those of a non-degenerate distribution, so that rounding is harmless.
 _BIAS = 3e-6
 _NEUTRAL = (0.0, 0.375, 0.0, 0.375)
 _TINY = 1e-9
@@ -43,15 +43,15 @@ def power_moments_visibility(moments: list[Float], depth: Float) -> Float:
     square = half * half
     root = dr.sqrt(_at_least(dr.fma(-c0, c2, square), dr.fma(square, 1e-7, 1e-22)))
     w = _away_from_zero(-half - dr.select(half < 0, -root, root), 1e-11)
-    # One root is ``near``, the other 1 / ``e``. As z moves the latter passes through infinity, where its weight is zero: without
-    # the inverse, derivatives there would be differences of huge numbers.
+    # One root is ``near``, the other 1 / ``e``. As z moves, the second root passes through infinity, where its weight is zero.
+    # Without the inverse, derivatives there would be differences of huge numbers.
     near, e = c0 / w, c2 / w
     to_z, to_near = dr.fma(-z, e, 1), dr.fma(-near, e, 1)
     gap = _away_from_zero(z - near)
 
     # Weights of z and of the roots: that of point o among x, y and itself is (x y - b0 (x + y) + b1) / ((o - x) (o - y)).
     def others(x: Float) -> Float:
-        """The numerator where one of the others is x and one is 1 / e, times e."""
+        """Numerator of a weight, times e, if the other two points are x and 1 / e."""
         return x - b[0] * dr.fma(x, e, 1) + b[1] * e
 
     before_near, before_far = near < z, dr.select(e > 0, to_z < 0, to_z > 0) & (e != 0)

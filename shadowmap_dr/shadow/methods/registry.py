@@ -1,4 +1,4 @@
-"""The pre-filtered shadow maps by name: what each stores for a depth, and how it turns filtered numbers into visibility."""
+"""Pre-filtered shadow maps by name: the encoding of a depth in each, and the visibility from filtered numbers."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from .variance import chebyshev_visibility, reduced_bleeding, variance_moments
 
 # Exponents for which all moments of depths in -1/2..1/2 are far from the limits of single precision.
 _ESM, _EVSM2, _EVSM4, _EVSM4_NEGATIVE = 80.0, 14.0, 20.0, -1.0
-# The least variance of warped depths lets a few thousandths of the light through anything.
+# The minimum variance of warped depths lets a few thousandths of the light through any occluder; these are cut off.
 _LEAK = 2e-3
 
 
 @dataclass(frozen=True)
 class Method:
-    """A shadow map that may be filtered.
+    """A pre-filtered shadow map.
 
     Attributes:
         encode: (linear depth, squared change of depth across a texel, order) -> numbers to store. Attached to the depth.
         resolve: (the filtered numbers, receiver's depth) -> visibility in 0..1. Attached to both.
-        bleeds: whether cutting off small visibilities makes sense.
+        bleeds: True if small visibilities may be cut off, see :attr:`ShadowSettings.bleeding`.
     """
 
     encode: Callable[[Float, Float | float, int], list[Float]]
@@ -77,7 +77,7 @@ PREFILTERED: dict[str, Method] = {
     "csm": Method(fourier_terms, fourier_visibility),
 }
 
-#: Hardly any light bleeding, and no more error than ``vsm`` on any scene of `shadowmap-dr maps`, which compares all of them.
+#: Hardly any light bleeding, and no more error than ``vsm`` on any scene of `shadowmap-dr maps`, which compares all methods.
 DEFAULT = "evsm4"
 
 #: Names of all methods. ``pcf`` and ``standard`` compare depths after the look-up, ``none`` casts no shadows.

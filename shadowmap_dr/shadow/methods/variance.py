@@ -1,7 +1,7 @@
 """Variance shadow maps: two moments of depth, and Chebyshev's bound.
 
 Depths are linear in -1/2..1/2 over the range of a map. All visibilities lie in 0..1 and are finite, with finite derivatives,
-whatever filters may make of the numbers that are stored.
+for any stored numbers.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ MINIMUM_VARIANCE_COMPAT = 1e-4
 
 
 def variance_moments(depth: Float, slope_square: Float | float = 0) -> Vector2f:
-    """First and second moment (``Array2f``) of the depth within a texel.
+    """First and second moment of the depth within a texel.
 
     Args:
         depth: linear depth in -1/2..1/2. Attached.
@@ -34,9 +34,9 @@ def chebyshev_visibility(moments: Vector2f, depth: Float, minimum_variance: Floa
     Source: Donnelly and Lauritzen, "Variance Shadow Maps", 2006, equation 5.
 
     Args:
-        moments: ``Array2f``, filtered. Attached.
+        moments: filtered moments. Attached.
         depth: depth of the receiver in the units of the moments. Attached.
-        minimum_variance: number or ``Float``.
+        minimum_variance: in squared units of the moments.
 
     Returns:
         1 where ``depth <= mean``, else ``s2 / (s2 + (depth - mean)^2)`` with ``s2 = max(m2 - mean^2, minimum_variance)``.

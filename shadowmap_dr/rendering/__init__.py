@@ -1,4 +1,4 @@
-"""The passes that make an image: shadow maps, G-buffer, light, film."""
+"""The passes of an image: shadow maps, G-buffer, light, film."""
 
 from .renderer import Renderer
 from .settings import RenderSettings

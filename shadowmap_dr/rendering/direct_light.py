@@ -23,11 +23,11 @@ from .gbuffer.surface import Surface
 def direct_light(
     surface: Surface, light: Light, visibility: Float | float = 1.0, nodes: Sequence[Any] = (), *, gate: bool = True
 ) -> Color3f:
-    """Radiance (colour, N) towards the camera of one light: BSDF * light * visibility.
+    """Radiance (colour, N) of one light towards the camera: BSDF * light * visibility.
 
-    ``visibility`` Float (N,), 0 dark to 1 lit. ``nodes``: :meth:`SceneData.materials`. ``gate`` removes
-    light that reaches the shading normal from the wrong side of the triangle, as a shadow ray would. Gradients flow to all of
-    surface, light and visibility, not through the gate.
+    ``visibility`` Float (N,), 0 dark to 1 lit. ``nodes``: :meth:`SceneData.materials`. ``gate`` removes light from directions
+    in front of the shading normal but behind the triangle, as a shadow ray would. Gradients flow to surface, light and
+    visibility, not through the gate.
     """
     wo_world, weight = broadcast_differentiable(light, dr.width(surface.shape)).illuminate(surface.p_world, surface.active)
     wo = surface.si.to_local(wo_world)
@@ -38,26 +38,26 @@ def direct_light(
 
 
 def _reflected(surface: Surface, wo: Vector3f, active: Bool, nodes: Sequence[Any]) -> Color3f:
-    """:meth:`Surface.evaluate` with derivatives by parameters of ``nodes`` that add up without loss."""
+    """:meth:`Surface.evaluate` with accurate sums of derivatives by the parameters of ``nodes``."""
     if surface.colour is not None:
         return surface.evaluate(wo, active)
     return evaluate(lambda own: own[0].evaluate(*own[1:]), (surface, wo, mi.Bool(active)), nodes, dr.width(surface.shape))
 
 
 def passes_gate(surface: Surface, wo_world: Vector3f, wo: Vector3f) -> Bool:
-    """Bool (N,): where no light comes through the triangle's wrong side; ``wo``: the same direction in the shading frame."""
-    # Light and viewer lie on the same side of the triangle exactly where they lie on the same side by the shading normal.
-    # Holds for reflection and transmission, and for triangles whose vertex normals point the other way.
+    """Mask (Bool, N) of directions for which triangle and shading normal agree. ``wo``: ``wo_world`` in the shading frame."""
+    # They agree if light and viewer are on the same side of both or on opposite sides of both. This covers reflection and
+    # transmission, and triangles whose vertex normals point to the other side.
     with dr.suspend_grad():
         sides = dr.dot(surface.n_world, wo_world) * dr.dot(surface.n_world, surface.wi_world)
         return (sides > 0) == (wo.z * surface.si.wi.z > 0)
 
 
 def emission(surface: Surface, lights: Sequence[AreaLight]) -> Color3f:
-    """Radiance (colour, N) that surfaces give off themselves, seen from the camera. Attached to surface and lights.
+    """Radiance (colour, N) that surfaces emit towards the camera. Attached to surface and lights.
 
-    Faces shine on the side on which their vertex normals are. Mitsuba asks the interpolated normal itself, which turns away
-    before the outline of a smooth shape is reached: the dark rim hides the outline, and with it what a moving lamp changes.
+    Faces shine on the side of their vertex normals. Mitsuba tests the interpolated normal itself, which turns away before the
+    silhouette of a smooth shape: the dark rim would hide the silhouette, and with it the derivatives of a moving lamp.
     """
     total = dr.zeros(mi.UnpolarizedSpectrum, dr.width(surface.shape))
     front = shining_side(surface)
@@ -75,7 +75,7 @@ def _seen(light: AreaLight, at: tuple[mi.SurfaceInteraction3f, Bool]) -> Color3f
 
 
 def shining_side(surface: Surface) -> Bool:
-    """Bool (N,): where the camera sees the side of a surface on which its vertex normals are."""
+    """Mask (Bool, N) of surfaces whose side with the vertex normals the camera sees."""
     with dr.suspend_grad():
         towards = dr.dot(surface.n_world, surface.wi_world) * dr.dot(surface.n_world, surface.si.sh_frame.n)
         return surface.active & (towards > 0)
@@ -103,6 +103,6 @@ def ambient_light(
 
 
 def background(environment: Environment, sensor: Sensor, width: int | None = None, height: int | None = None) -> Color3f:
-    """Radiance (colour, H * W) of an environment at every pixel centre, as seen where nothing is in front of it."""
+    """Unoccluded radiance (colour, H * W) of an environment at every pixel centre."""
     towards = sensor.ray_direction(width, height)
     return evaluate(environment.radiance, towards, environment.nodes, dr.width(towards))

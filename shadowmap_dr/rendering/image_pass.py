@@ -1,4 +1,4 @@
-"""The image pass: light of the surfaces that a camera sees, emitters, further channels, and how neighbouring samples mix."""
+"""The image pass: reflected light, emitters, AOVs, and the mix of neighbouring samples."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from .light_loops import MANY_LIGHTS
 from .light_pass import IncidentLight, Lighting, LightPass, Visibilities
 from .pass_cache import CacheLevel, LitFrame, PassCache, colouring_inputs, weights_only
 
-# Most numbers of visibility that are kept from one image to the next.
+# Most visibilities (numbers) that are kept from one image to the next.
 _MOST_VISIBLE = 1 << 23
 
 
 @dataclass(frozen=True)
 class ImagePass:
-    """Makes images of what cameras see, as tensors (rows, columns, C) of samples.
+    """Makes the images of cameras, as tensors (rows, columns, C) of samples.
 
     Attributes:
-        cameras, light: the passes before.
+        cameras, light: the camera pass and the light pass.
     """
 
     cameras: CameraPass
@@ -47,8 +47,8 @@ class ImagePass:
         lighting: Lighting,
         shapes: PlacedShapes,
     ) -> TensorXf:
-        """The image of one camera. Attached to all, but not through edges if ``crossings`` are given, nor through visibilities
-        if ``visible`` is."""
+        """The image of one camera. Attached to all inputs, but not through edges if ``crossings`` are given, and not through
+        visibilities if ``visible`` is given."""
         light, settings = self.light, self.light.settings
         frame = self.cameras.frame(view, shapes, light.needs_frames)
         seen, incident, color = frame.surface, *self._reflected(frame, lighting, visible)
@@ -70,7 +70,7 @@ class ImagePass:
         return self._mixed(color, seen.active, view, crossings, named)
 
     def coloured_image(self, lit: LitFrame, crossings: Crossings | None) -> TensorXf:
-        """The image of one camera, of which light and edges are known already. Attached to materials and the lights' colours."""
+        """The image of one camera, given its light and edges. Attached to materials and the lights' colours."""
         surface, width = coloured(self.light.data, lit.surface, self.light.needs_frames), dr.width(lit.surface.shape)
         irradiance, emitted = lit.irradiance, lit.emitted
         assert surface.colour is not None, "kept for materials that have one"
@@ -84,7 +84,7 @@ class ImagePass:
         return self._mixed(surface.colour * irradiance + emitted, lit.surface.active, lit.view, crossings, [])
 
     def fill(self, cache: PassCache, shapes: PlacedShapes, views: Sequence[CameraView], lighting: Lighting) -> None:
-        """Leave the results of passes to later images, and what follows from them."""
+        """Store the results of passes for later images."""
         if cache.level == CacheLevel.NOTHING:
             return
         settings = self.light.settings
@@ -108,13 +108,13 @@ class ImagePass:
             dr.eval(shapes, cache.views, cache.maps, cache.visible, cache.lit)
 
     def fill_crossings(self, cache: PassCache, shapes: PlacedShapes, frames: Sequence[Frame | LitFrame]) -> None:
-        """Leave to later images how samples mix. ``frames``: of all cameras."""
+        """Store the crossings of edges for later images. ``frames``: of all cameras."""
         if self.light.settings.antialias and not cache.crossings:
             found = (self.cameras.crossings(frame.view, frame.sharpness, shapes) for frame in frames)
             cache.crossings = tuple(weights_only(crossings) for crossings in found)
 
     def _uniform(self) -> bool:
-        """True if an image is a sum over few lights, each times its colour."""
+        """True if an image is a sum over few lights, each a product with the light's colour."""
         data, settings = self.light.data, self.light.settings
         lights = (*data.lights, *data.areas)
         if data.environments or not settings.lit or not 0 < len(lights) < MANY_LIGHTS:
@@ -122,7 +122,7 @@ class ImagePass:
         return colours_of(lights) is not None
 
     def _room_for_visible(self, views: Sequence[CameraView]) -> bool:
-        """True if visibilities of all lights may be kept."""
+        """True if the visibilities of all lights fit into the cache."""
         light = self.light
         if len(light.data.lights) >= MANY_LIGHTS or light.settings.shadow.method == "none":
             return False
@@ -130,17 +130,17 @@ class ImagePass:
         return each * sum(view.raster.width * view.raster.height for view in views) <= _MOST_VISIBLE
 
     def _reflected(self, frame: Frame, lighting: Lighting, visible: Visibilities | None) -> tuple[IncidentLight, Any]:
-        """(the light on a frame, reflected radiance (colour, N) towards the camera)."""
+        """(light that reaches a frame, reflected radiance (colour, N) towards the camera)."""
         light, colour = self.light, frame.surface.colour
         if colour is None:
             incident = light.incident_light(frame, lighting, visible)
             return incident, light.radiance(frame.surface, lighting, incident)
-        # In the same order as where the light is known already, so that images of a scene that stays are the same bit by bit.
+        # In the same order as with cached light, so that images of an unchanged scene are equal bit by bit.
         white = _white(frame)
         incident = light.incident_light(white, lighting, visible)
         irradiance = light.radiance(white.surface, lighting, incident)
         if dr.grad_enabled(colour) and lighting.samples:
-            dr.eval(irradiance)  # its loops would run again for the derivative
+            dr.eval(irradiance)  # else the derivative would run its loops again
         return incident, colour * irradiance
 
     def _lit(self, frame: Frame, lighting: Lighting) -> LitFrame:
@@ -167,7 +167,7 @@ class ImagePass:
         return film_channels(color, active & (self.light.settings.max_depth != 0), view.sensor)
 
     def _mixed(self, color: Color3f, active: Bool, view: CameraView, crossings: Crossings | None, named: list[Float]) -> TensorXf:
-        """A picture of samples that mix as is known already, or not at all."""
+        """A picture of samples that mix through known crossings, or not at all."""
         channels = self._channels(color, active, view)
         if crossings is None:
             return _picture(interleave(channels), view, len(channels), named)
@@ -182,7 +182,7 @@ def _white(frame: Frame) -> Frame:
 
 
 def _picture(flat: Float, view: CameraView, channels: int, named: list[Float]) -> TensorXf:
-    """A tensor of interleaved channels, and further ones (Float each)."""
+    """A tensor of interleaved channels, followed by AOVs (Float each)."""
     height, width = view.raster.height, view.raster.width
     image = mi.TensorXf(flat, shape=(height, width, channels))
     if named:

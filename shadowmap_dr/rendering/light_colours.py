@@ -1,4 +1,4 @@
-"""Lights whose radiance is the same all over: a colour times what the same light does in white."""
+"""Lights of uniform colour: their light is the colour times the light of a white copy."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ..scene.mitsuba_objects import varies
 
 
 def colour_of_light(light: Light | AreaLight) -> Color3f | None:
-    """Irradiance, intensity or radiance (colour) of a light that is the same all over, None of others. Attached."""
+    """Irradiance, intensity or radiance (colour) of a light of uniform colour, None of others. Attached."""
     if isinstance(light, AreaLight):
         return None if light.textured else light.radiance(mi.Point2f(0))
     if isinstance(light, DirectionalLight):
@@ -40,7 +40,7 @@ def white_light(light: Light) -> Light:
 
 
 def untextured(light: Light) -> DirectionalLight | PointLight | SpotLight | None:
-    """The same light without a texture, of the same colour all over, or None. A spot light always has one in Mitsuba."""
+    """The same light without a texture if its colour is uniform, else None. Mitsuba's spot lights always have a texture."""
     if not isinstance(light, SpotLight):
         return light if isinstance(light, DirectionalLight | PointLight) else None
     if light.texture is None or varies(light.texture):
@@ -49,13 +49,13 @@ def untextured(light: Light) -> DirectionalLight | PointLight | SpotLight | None
 
 
 def colours_of(lights: Sequence[Light | AreaLight]) -> list[Color3f] | None:
-    """:func:`colour_of_light` of all lights, None if one of them has none."""
+    """:func:`colour_of_light` of all lights; None if the colour of any is not uniform."""
     found = [colour_of_light(light) for light in lights]
     return None if any(colour is None for colour in found) else [mi.UnpolarizedSpectrum(colour) for colour in found]
 
 
 class _White:
-    """An emitter of Mitsuba's interface whose radiance is 1."""
+    """An emitter with Mitsuba's interface and a radiance of 1."""
 
     def eval(self, si: mi.SurfaceInteraction3f, active: Bool | bool = True) -> Color3f:
         return mi.UnpolarizedSpectrum(1) & mi.Bool(active)

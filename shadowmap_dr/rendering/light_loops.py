@@ -1,6 +1,6 @@
 """Many lights of one kind, summed up in a loop on the device.
 
-Written out one after the other, forty lights and their derivatives make a program that takes minutes to compile.
+Unrolled, forty lights and their derivatives make a program that takes minutes to compile.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from .gbuffer.surface import Surface
 from .light_colours import untextured
 from .shadow_pass import MapPlan
 
-#: As many lights of a kind, at least, are summed up in a loop.
+#: Least number of lights of a kind that are summed up in a loop.
 MANY_LIGHTS = 8
 
 
@@ -37,9 +37,9 @@ class LightTable:
 
     Attributes:
         light: the first one, for its type.
-        numbers: ``Float`` (N K,): N numbers of each, one light after the other. Attached.
-        first: ``UInt32`` (K,), number of each one's first map.
-        cube: whether each has the six maps of a cube.
+        numbers: ``Float`` (N K,): the N numbers of each light, one light after the other. Attached.
+        first: ``UInt32`` (K,), number of each light's first map.
+        cube: True if each light has the six maps of a cube.
     """
 
     light: Light
@@ -49,7 +49,7 @@ class LightTable:
 
     @classmethod
     def of(cls, lights: Sequence[Light], first: Sequence[int], cube: bool) -> LightTable:
-        """Put them together."""
+        """Collect lights of one kind. ``first``: number of each light's first map."""
         numbers = [number for light in lights for number in _numbers(light)]
         chosen = [k for k, number in enumerate(numbers) if dr.grad_enabled(number)]
         if dr.flag(dr.JitFlag.FreezingScope):
@@ -68,7 +68,7 @@ class LightTable:
         return dr.width(self.first)
 
     def at(self, index: UInt32) -> Light:
-        """The light of that number (UInt32, for each lane). Attached."""
+        """Light number ``index`` (UInt32, for each lane). Attached."""
         each, place = dr.width(self.numbers) // self.size, count()
         row = index * each
         return tree_map(self.light, lambda array: _filled(array, lambda: dr.gather(mi.Float, self.numbers, row + next(place))))
@@ -76,9 +76,9 @@ class LightTable:
 
 @dataclass(frozen=True)
 class Places:
-    """Points from which each pixel looks at the lights, N pixels: offsets from what it sees (Vector3f each), detached.
+    """Points in the footprints of N pixels, as offsets (Vector3f each) from the pixels' surface points. Detached.
 
-    ``spots``: to the points where visibility is looked up; ``around``: half way to the pixel's corners.
+    ``spots``: points of visibility look-ups; ``around``: points half way to the pixel's corners.
     """
 
     spots: list[Vector3f]
@@ -86,14 +86,14 @@ class Places:
 
     @classmethod
     def of(cls, p_world: Point3f, spots: Sequence[Point3f], around: Sequence[Point3f]) -> Places:
-        """From such points (Point3f each)."""
+        """Convert points (Point3f each) to offsets from ``p_world``."""
         middle = dr.detach(p_world)
         offsets = [[mi.Vector3f(dr.detach(point) - middle) for point in points] for points in (spots, around)]
         return cls(*offsets)
 
 
 def in_tables(lights: Sequence[Light], plan: MapPlan) -> tuple[list[LightTable], list[int]]:
-    """(tables of the lights of kinds of which there are many, the numbers of the others)."""
+    """(tables of lights, one for each kind with many lights; numbers of the lights in no table)."""
     plain = [untextured(light) for light in lights]
     kinds: dict[Any, list[int]] = {}
     for k, (light, kind) in enumerate(zip(plain, plan.kinds, strict=True)):
@@ -117,10 +117,10 @@ def many_lights(
     around: Callable[[], Sequence[Point3f]],
     nodes: Sequence[Any],
 ) -> tuple[Color3f | int, list[int]]:
-    """(radiance towards the camera of lights of kinds of which there are many, the numbers of the other lights).
+    """(radiance towards the camera of all lights in tables (:func:`in_tables`), numbers of the other lights).
 
-    ``spots``: points (Point3f (N,) each) where visibility is looked up; ``around``: makes those half way to the pixel's corners.
-    For the other arguments see :func:`light_of_table`. Attached likewise.
+    ``spots``: points of visibility look-ups (Point3f (N,) each); ``around``: makes the points half way to the pixel's corners.
+    Other arguments and gradients as in :func:`light_of_table`.
     """
     tables, others = in_tables(lights, plan)
     if not tables:

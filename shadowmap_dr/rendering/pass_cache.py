@@ -1,4 +1,4 @@
-"""Results of passes that stay from one image of a camera to the next, where nothing that they depend on changes."""
+"""Results of passes that remain valid from one image of a camera to the next while their inputs do not change."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ from .light_pass import Visibilities
 
 
 class CacheLevel(IntEnum):
-    """Inputs that stay as they are from one image to the next; each level includes those before."""
+    """Inputs that do not change from one image to the next; each level includes the levels before."""
 
     NOTHING = 0
     #: Shapes and the camera.
     VIEW = 1
-    #: Places and directions of lights.
+    #: Positions and directions of lights.
     LIGHTS = 2
-    #: The radiance of lights: all but materials.
+    #: The radiance of lights: all inputs but materials.
     RADIANCE = 3
 
 
 @dataclass(frozen=True)
 class LitFrame:
-    """The samples of one camera, N of them, on materials that know cosines only. Detached.
+    """The samples of one camera, N of them, on materials that depend on cosines only. Detached.
 
     Attributes:
         view: the camera.
-        surface: the surfaces, with what their colours are found by and no more.
+        surface: the surfaces, reduced to the inputs of their colours (:func:`colouring_inputs`).
         sharpness: as :attr:`~shadowmap_dr.rendering.gbuffer.camera_view.Frame.sharpness`.
-        irradiance: radiance towards the camera (colour, N) if all materials were white, of lights whose radiance is known.
-        emitted: radiance (colour, N) of such emitters that the camera sees.
-        terms: of each light of the scene, if their radiance is not known: ``irradiance`` (Float, N) if its colour were white.
-        front: ``Bool`` (N,), where the camera sees the shining side of a surface, if emitters' radiance is not known.
+        irradiance: radiance towards the camera (colour, N) on white materials, of lights whose radiance is fixed.
+        emitted: radiance (colour, N) of visible emitters whose radiance is fixed.
+        terms: for each light of the scene, if the lights' radiance may change: ``irradiance`` (Float, N) of the light in white.
+        front: ``Bool`` (N,), mask of surfaces seen from their shining side, if the lights' radiance may change; else None.
     """
 
     view: CameraView
@@ -58,12 +58,12 @@ class PassCache:
     """Results of the passes of one image, detached.
 
     Attributes:
-        level: inputs that have not changed since the image before, and carry no gradients. Images leave results here that depend
-            on nothing else.
+        level: inputs that have not changed since the previous image, and carry no gradients. Images store here the results that
+            depend on these inputs alone.
         shapes, views, crossings: with ``VIEW``; the latter two for each camera of a film.
         maps: shadow maps of lights, and of extended lights; with ``LIGHTS``.
-        visible: what they let through, if there is room for it; with ``LIGHTS``.
-        lit: only colours are left to do; with ``RADIANCE``, or with ``LIGHTS`` where radiance is the same all over each light.
+        visible: visibilities of lights, unless there are too many; with ``LIGHTS``.
+        lit: lit samples without their colours; with ``RADIANCE``, or with ``LIGHTS`` if the radiance of each light is uniform.
     """
 
     level: CacheLevel = CacheLevel.NOTHING
@@ -90,7 +90,7 @@ class PassCache:
 
 
 def colouring_inputs(surface: Surface) -> Surface:
-    """The same surfaces with nothing but the fields that :func:`~shadowmap_dr.rendering.gbuffer.surface.coloured` looks at."""
+    """The same surfaces with only the fields that :func:`~shadowmap_dr.rendering.gbuffer.surface.coloured` reads."""
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(surface.shape))
     for name in ("p", "uv", "prim_index", "shape"):
         setattr(si, name, getattr(surface.si, name))
@@ -99,6 +99,6 @@ def colouring_inputs(surface: Surface) -> Surface:
 
 
 def weights_only(crossings: Crossings) -> Crossings:
-    """The same without what derivatives by the edges' places need, which is most of it."""
+    """The same crossings without the data for derivatives by the edges' positions, which is most of the data."""
     none = type(crossings.slopes)()
     return replace(crossings, ends=type(crossings.ends)(), slopes=none, second_slopes=none, meetings=None)

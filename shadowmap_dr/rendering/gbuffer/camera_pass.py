@@ -1,4 +1,4 @@
-"""Clip-space vertices for a camera, and points all over what it sees."""
+"""Clip-space vertices of a camera, and sample points on the surfaces that it sees."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ...scene.sensor import Sensor
 
 # Depth range of orthographic cameras, in units of the farthest vertex's distance.
 _ROOM = 1.01
-# About so many pixels along each side are looked at to find out which part of the scene is in view.
+# About this many pixels along each side of the image are sampled to find the part of the scene that is in view.
 _SEEN_ACROSS = 128
 
 
@@ -46,7 +46,7 @@ def camera_clip(sensor: Sensor, geometry: Geometry) -> Float:
 
 
 def without_shapes(clip: Float, geometry: Geometry, shapes: Sequence[int]) -> Float:
-    """Clip-space vertices (Float, 4 V) of which those of some shapes lie behind the camera, where no triangle is drawn."""
+    """Clip-space vertices (Float, 4 V), those of some shapes moved behind the camera, where no triangle is drawn."""
     lane = dr.arange(mi.UInt32, dr.width(clip))
     shape = dr.gather(mi.UInt32, geometry.vertex_shape, lane >> 2)
     hidden = mi.Bool(False)
@@ -66,7 +66,7 @@ def seen_points(sensor: Sensor, raster: RasterOutput, geometry: Geometry) -> tup
         columns, rows = -(-width // stride), -(-height // stride)
         lane = dr.arange(mi.UInt32, rows * columns)
         down, across = lane // columns, lane % columns
-        # One pixel of each cell of a lattice, at another place in each: thin things may lie along a row.
+        # One pixel of each cell of a lattice, at varying places in the cells: thin objects may lie along a row.
         row = dr.minimum(down * stride + (5 * across + 2 * down) % stride, height - 1)
         column = dr.minimum(across * stride + (5 * down + 2 * across) % stride, width - 1)
         triangle = dr.gather(mi.UInt32, raster.triangle, row * width + column)
@@ -88,21 +88,21 @@ def seen_points(sensor: Sensor, raster: RasterOutput, geometry: Geometry) -> tup
 
 
 def _orthographic_reach(sensor: Sensor, geometry: Geometry) -> Float:
-    """Depth range of an orthographic camera, detached: as far as there are vertices, or up to the far plane."""
+    """Depth range of an orthographic camera: to the farthest vertex, or to the far plane if that is nearer. Detached."""
     with dr.suspend_grad():
         p = dr.gather(mi.Point3f, geometry.positions, dr.arange(mi.UInt32, geometry.vertex_count))
-        # In the camera's own units: its transformation may scale. Never 0, also if there is nothing before it.
+        # In camera units, since its transformation may scale. Positive even if no vertex lies in front of the camera.
         z = dr.abs((mi.Transform4f(sensor.view) @ p).z)
         farthest = dr.maximum(dr.max(dr.select(dr.isfinite(z), z, 0)), sensor.near)
         return dr.minimum(sensor.reach, _ROOM * farthest)
 
 
 def least_gap(sensor: Sensor) -> float:
-    """Least NDC depth by which an edge must lie before what it borders (:func:`~shadowmap_dr.raster.find_crossings`)."""
-    # The depths of a perspective camera are as precise, relatively, far away as they are near by.
+    """Least NDC depth of an edge in front of the surface behind it (:func:`~shadowmap_dr.raster.find_crossings`)."""
+    # The depths of a perspective camera have the same relative precision at all distances.
     return 0.0 if sensor.kind == "perspective" else DEPTH_GAP
 
 
 def within_far_plane(sensor: Sensor, depth: Float | None) -> Bool:
-    """Mask of the pixels whose surface (``Hits.depth``) lies before a perspective camera's far plane."""
+    """Mask of the pixels whose surface (``SurfacePoints.depth``) lies before a perspective camera's far plane."""
     return mi.Bool(True) if depth is None else depth <= dr.detach(sensor.far)

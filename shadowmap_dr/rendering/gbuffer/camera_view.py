@@ -1,4 +1,4 @@
-"""The camera pass: which triangles the samples of a camera hit, the surfaces there, and how neighbouring samples mix."""
+"""The camera pass: the triangles that a camera's samples hit, the surfaces there, and how neighbouring samples mix."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from .surface_points import pixel_hits
 
 @dataclass(frozen=True)
 class CameraView:
-    """One camera's visibility: clip-space vertices and what each sample sees, ``factor`` x ``factor`` samples a pixel.
+    """One camera's visibility: clip-space vertices and the triangle at each sample, ``factor`` x ``factor`` samples a pixel.
 
-    ``topology``: edges of the shapes that it sees, where they are now.
+    ``topology``: edges of the shapes that the camera sees, at their current places.
     """
 
     sensor: Sensor
@@ -37,17 +37,17 @@ class CameraView:
 
     @property
     def columns(self) -> int:
-        """Samples across the camera's whole picture, whatever part of it is rendered."""
+        """Samples across the whole film, also when only a crop window is rendered."""
         return self.sensor.film_size[0] * self.factor
 
 
 @dataclass(frozen=True)
 class PlacedShapes:
-    """The shapes of a scene where they are now, and all that follows from their places alone.
+    """The shapes of a scene at their current places, and all records that depend on these places alone.
 
     Attributes:
         geometry: the triangles.
-        facets: (normals of flat faces, their sums at each place), None if there are none.
+        facets: (normals of flat faces (Float, 4 F), their sums at each place (Float, 4 V)), None without flat faces.
         creases: edges at which shading jumps, as arguments of :func:`~shadowmap_dr.raster.find_crossings`.
         seen, casting: edges of the shapes that cameras see, and of those that cast shadows.
     """
@@ -67,7 +67,7 @@ class Frame:
         view: the camera and the triangles that it sees.
         surface: the surfaces there.
         depth: ``SurfacePoints.depth``, or None.
-        sharpness: ``Float`` (N,), how much edges between facets still show, or None for all of it.
+        sharpness: ``Float`` (N,), visibility of edges between facets, 0 to 1; None where all are fully visible.
     """
 
     view: CameraView
@@ -82,10 +82,10 @@ class GBuffer:
 
     Attributes:
         sensor: the camera.
-        surface: what each pixel sees.
-        points: where visibility is looked up, all over the pixel (list of Point3f, H * W each); a pixel's is their mean.
+        surface: the surface at each pixel.
+        points: places of visibility look-ups, spread over the pixel (Point3f, H * W each); a pixel's visibility is their mean.
         crossings: how pixels mix, None without anti-aliasing.
-        seen: points all over what is seen (Point3f, world space) and a mask of those that there are.
+        seen: sample points on all surfaces that the camera sees (Point3f, world space) and a mask of the valid ones.
     """
 
     sensor: Sensor
@@ -97,7 +97,7 @@ class GBuffer:
 
 @dataclass(frozen=True)
 class CameraPass:
-    """Renders what cameras see of a scene.
+    """Renders the surfaces that cameras see.
 
     Attributes:
         data: records of the scene.
@@ -114,7 +114,7 @@ class CameraPass:
     hidden: tuple[int, ...] = ()
 
     def placed(self, geometry: Geometry) -> PlacedShapes:
-        """The shapes at places of theirs. Attached to the geometry."""
+        """Records of the shapes at the places that a geometry gives them. Attached to the geometry."""
         facets = self._facets(geometry)
         creases = {}
         if self.creases is not None:
@@ -133,7 +133,7 @@ class CameraPass:
         return CameraView(sensor, factor, clip, raster, shapes.seen)
 
     def transparent(self, geometry: Geometry, camera: Sensor) -> Callable[[RasterOutput], Bool] | None:
-        """Alpha test for cameras and shadow maps (from whichever side); None where no material lets one look through."""
+        """Alpha test for cameras and shadow maps (from either side); None if no material is see-through."""
         if not any(info.see_through for info in geometry.shapes):
             return None
 
@@ -143,7 +143,7 @@ class CameraPass:
         return transparent
 
     def seen(self, views: Sequence[CameraView], geometry: Geometry) -> tuple[Point3f, Bool]:
-        """Points on what cameras see (Point3f, world space), and which of them there are (Bool). Detached."""
+        """Points on surfaces that cameras see (Point3f, world space), and a mask of the valid ones. Detached."""
         found = [seen_points(view.sensor, view.raster, geometry) for view in views]
         if len(found) == 1:
             return found[0]

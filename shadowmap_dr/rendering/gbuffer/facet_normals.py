@@ -1,9 +1,9 @@
 """Flat-shaded surfaces whose facets are smaller than a pixel.
 
-The colour of a flat-shaded mesh jumps from facet to facet. Facets larger than pixels are dealt with by anti-aliasing the edges
-between them. Smaller ones cannot be sampled: a pixel's centre sees one facet of many at random, and the derivative of what it
-sees says nothing about that of the pixel's average. What a pixel shows there is, up to the size of a facet, the shading of the
-facets' mean normal, so that is what is shaded.
+The colour of a flat-shaded mesh jumps from facet to facet. Anti-aliasing of the edges between facets handles facets larger than
+pixels. Smaller facets cannot be sampled: a pixel's centre sees one of many facets at random, and the derivative of its colour is
+unrelated to the derivative of the pixel's average. Up to the size of a facet, that average is the shading of the facets' mean
+normal, so the mean normal is shaded.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ _SMALL, _LARGE = 1.5, 3.0
 
 @dataclass(frozen=True)
 class FlatFaces:
-    """Flat faces that meet at each place of a mesh: those of place v are ``faces[start[v]:start[v + 1]]``, ``UInt32`` each.
+    """Flat faces that meet at each place of a mesh: place v has the faces ``faces[start[v]:start[v + 1]]``, ``UInt32`` each.
 
-    ``flat``: ``Bool`` (F,), whether a face is one of them.
+    ``flat``: ``Bool`` (F,), True for flat faces.
     """
 
     start: UInt32
@@ -38,7 +38,7 @@ class FlatFaces:
 
 
 def flat_faces(geometry: Geometry, topology: Topology) -> FlatFaces | None:
-    """Faces of shapes without vertex normals, by welded vertex; None if there are none (on the host, once)."""
+    """Faces of shapes without vertex normals, by welded vertex; None if all shapes have some (on the host, once)."""
     flat = np.array([not info.has_normals for info in geometry.shapes])
     if not flat.any():
         return None
@@ -70,7 +70,7 @@ def mean_normals(normals: Float, topology: Topology, flat: FlatFaces) -> Float:
 
 
 class _Sums(dr.CustomOp):
-    """Sums over the faces at each place. Both ways look up what they add: atomic operations would cost several times as much."""
+    """Sums over the faces at each place. Both passes gather their terms: atomic additions would cost several times as much."""
 
     def eval(self, normals: Float, topology: Topology, flat: FlatFaces) -> Float:
         self.topology, self.flat, self.faces = topology, flat, dr.width(normals) // 4
@@ -113,11 +113,11 @@ def prefilter_normals(
     """Replace the normals of flat-shaded facets smaller than pixels by the mean over their neighbourhood.
 
     ``normals`` (geometric, shading) and the result are as :func:`shadowmap_dr.rendering.gbuffer.surface.normals_at`, ``mean`` is
-    the sum that :func:`mean_normals` returns. Also returns how much of their own normal is left (Float, 0 to 1), by which the
-    edges between them still show. Gradients flow to the vertices through the new normals, not through the size of the facets.
+    the sum that :func:`mean_normals` returns. Also returns the share of a facet's own normal in the result (Float, 0 to 1), by
+    which edges between facets remain visible. Gradients flow to the vertices through the new normals, not through facet sizes.
     """
     with dr.suspend_grad():
-        # Sizes are square roots of (twice the) areas, and compared without taking any.
+        # A facet's size is the square root of (twice) its area. Fourth powers are compared, to avoid the roots.
         square = dr.squared_norm(dr.cross(dr.detach(hits.e1), dr.detach(hits.e2)))
         pixel = mi.Float(hits.pixel)
         soft = hits.active & ((hits.flags & HAS_NORMALS) == 0) & (square < dr.square(dr.square(_LARGE * pixel)))
@@ -140,7 +140,7 @@ def prefilter_normals(
     ) -> tuple[Normal3f, Normal3f, Float]:
         return n_world, n_shading, mi.Float(1)
 
-    # Most pixels of a large image see large facets: a branch spares them the look-ups.
+    # Most pixels of a large image see large facets: the branch skips their look-ups.
     n_world, n_shading, own = dr.if_stmt(
         (hits.triangle, hits.u, hits.v, *normals, square, pixel),
         soft,

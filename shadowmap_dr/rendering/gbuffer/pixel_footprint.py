@@ -1,4 +1,4 @@
-"""The spots on a surface that a pixel looks at, and the mean of what is found there."""
+"""Sample points spread over a pixel's footprint on a surface, and means over them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ...jit.broadcast import Copies, copied
 from ...jit.types import Bool, Float, Point3f, Vector3f
 from ...scene.sensor import Sensor
 
-#: Up to this many by this many spots are arrays of their own; so are more, if one array of all would be longer than that.
+# Grids of up to this many points a side get an array for each point; larger grids do so if one array would exceed that length.
 _WRITTEN_OUT = 2
 _MOST_LANES = 1 << 22
 
@@ -38,16 +38,16 @@ def footprint_points(
 
 @dataclass(frozen=True)
 class FootprintSamples:
-    """The points of :func:`footprint_points` for all pixels, for means over what is found there.
+    """The points of :func:`footprint_points` for all pixels, for means over them.
 
-    Many spots of few pixels are one array: the first of all pixels, the second of all, and so on. Written out one by one, they
-    would all be compiled, which takes time that grows faster than their number. Few spots are an array each, and so are those
-    of large images, which have no use for more lanes, and none of the memory for them.
+    Many points of few pixels are stored in one array: the first point of all pixels, then the second, and so on. Written out one
+    by one, all would be compiled, in a time that grows faster than their number. Few points are an array each. So are the points
+    of large images, which have enough lanes already, and no memory for more.
 
     Attributes:
         points: Point3f (C N,) each, attached to the pixels' own points.
         active: Bool (C N,).
-        copies: C, the number of spots in one array.
+        copies: C, the number of points of a pixel in one array.
     """
 
     points: list[Point3f]
@@ -65,7 +65,7 @@ class FootprintSamples:
         active: Bool,
         count: int,
     ) -> FootprintSamples:
-        """``count`` x ``count`` spots of each of N pixels; arguments as of :func:`footprint_points`, and Bool (N,)."""
+        """``count`` x ``count`` points of each of N pixels. ``active``: Bool (N,); others as in :func:`footprint_points`."""
         copies = count * count
         if count <= _WRITTEN_OUT or copies * dr.width(p_world) > _MOST_LANES:
             return cls(footprint_points(sensor, size, depth, p_world, n_world, count), active, 1)
@@ -82,7 +82,7 @@ class FootprintSamples:
         return cls([points + offset], copied(active, copies), copies)
 
     def mean(self, look_up: Callable[[Point3f, Bool], Float]) -> Float:
-        """Mean (Float, N) of what ``look_up`` finds at points (Point3f, Bool). Attached."""
+        """Mean (Float, N) of the values that ``look_up`` returns for points (Point3f) and their masks (Bool). Attached."""
         total = functools.reduce(operator.add, (look_up(points, self.active) for points in self.points))
         if self.copies > 1:
             (total,) = dr.custom(Copies, [total], self.copies, True)
@@ -91,9 +91,9 @@ class FootprintSamples:
 
 @dataclass(frozen=True)
 class _Axes:
-    """Offsets to a pixel's right and upper side in the world, seen at the depth of its surface (Vector3f each), and its slant.
+    """Width and height of a pixel at its surface as world-space vectors (``right``, ``up``), and the surface's slant.
 
-    ``view`` is the direction in which it is seen, ``normal`` its own, ``slope`` their cosine, kept away from 0.
+    ``view`` is the viewing direction, ``normal`` the surface's normal, ``slope`` their cosine, kept away from 0.
     """
 
     right: Vector3f
@@ -124,13 +124,13 @@ class _Axes:
         up *= 2 / (height * dr.abs(projection[1, 1])) * scale
         n = dr.detach(n_world)
         slope = dr.dot(n, view)
-        # Seen at a grazing angle the footprint grows without bound; four pixels long is as much as makes sense.
+        # At grazing angles the footprint grows without bound: it is cut off at a length of four pixels.
         slope = dr.select(slope < 0, dr.minimum(slope, -0.25), dr.maximum(slope, 0.25))
         return cls(right, up, view, n, slope)
 
     def offset(self, across: Float | float, down: Float | float) -> Vector3f:
-        """From the pixel's centre to a place in its footprint (Vector3f), in shares of its width and height."""
+        """Offset from the pixel's centre to a place in its footprint (Vector3f); arguments in shares of its width and height."""
         lateral = self.right * across + self.up * down
         offset = lateral - self.view * (dr.dot(self.normal, lateral) / self.slope)
-        # On the surface also where the footprint has been cut short: beside it there is shadow.
+        # Projected onto the surface also where the footprint was cut off: points beside the surface would be in shadow.
         return offset - self.normal * dr.dot(self.normal, offset)

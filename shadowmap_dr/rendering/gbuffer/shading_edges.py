@@ -1,7 +1,7 @@
-"""Edges of faces at which the colour of a surface jumps, so that they have to be anti-aliased like outlines.
+"""Edges of faces at which the colour of a surface jumps, so that they have to be anti-aliased like silhouettes.
 
-Which these are follows from the faces where they are flat. Between smooth ones it depends on numbers that may change: what a mesh
-holds twice, for each side of a line on it, may be equal now and different in the next step of an optimisation.
+Edges of flat faces are known from the faces. Between smooth faces they depend on numbers that may change: vertices that a mesh
+duplicates along a seam may have equal attributes now and different ones in the next step of an optimisation.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from ...scene.geometry import Geometry
 from ...scene.mitsuba_meshes import mesh_names
 from ...scene.mitsuba_objects import attributes, is_attribute, is_plain
 
-# Numbers that differ by less (in any component) are the same: colours for the eye, normals but for rounding, since small bends
-# add up over a surface.
+# Numbers that differ by less (in any component) count as equal. The eye sees no such difference between colours. For normals, it
+# allows for rounding only, since small bends add up over a surface.
 _NORMAL_JUMP, _COLOUR_JUMP = 1e-4, 1e-3
 # Where along an edge the colours of both sides are compared.
 _LOOKED_AT = (0.02, 0.5, 0.98)
@@ -47,7 +47,10 @@ class Pairs:
         dr.scatter(edges, mi.Bool(value), self.other, jump)
 
     def jump(self, values: Float, size: int, least: float, first: int = 0) -> Bool:
-        """Bool (K,): whether values of vertices (Float, ``size`` each, from that of ``first`` on) differ by more than that."""
+        """Mask (Bool, K) of edges whose sides differ by more than ``least``.
+
+        ``values``: of vertices (Float, ``size`` numbers each), beginning with those of vertex ``first``.
+        """
         found = dr.full(mi.Bool, False, dr.width(self.one))
         for one, other in self.ends:
             for k in range(size):
@@ -60,15 +63,15 @@ class Pairs:
 class ShadingEdges:
     """Edges at which shading jumps. A PyTree that may cross ``dr.freeze``.
 
-    always      Bool (3 F,), edges from corner k to k + 1 of a face at which it does whatever moves: at flat faces, between shapes
-    bendable    Bool (3 F,), those of them between flat faces of one shape, at which it only does if the surface is bent there, or
-                None if there are none
-    coloured    as ``always``, and where colours of meshes (attributes, textures, emission) differ: :meth:`with_colours`. None if
-                there is no edge at all at which shading may ever jump
-    folds       as ``bendable``, but for where colours of meshes differ
-    seams       edges of smooth shapes whose faces have vertices of their own there, None if there are none
-    attributed  (number of the shape, the edges of it at which its attributes may differ)
-    textured    (number of the shape, the edges of it at which its texture coordinates may differ)
+    always      Bool (3 F,), edges from corner k to k + 1 of a face at which shading always jumps: at flat faces, between shapes
+    bendable    Bool (3 F,), the subset of ``always`` between flat faces of one shape, where shading jumps only if the surface is
+                bent; None without such edges
+    coloured    ``always``, and edges at which colours of meshes (attributes, textures, emission) differ: :meth:`with_colours`.
+                None if shading can jump at no edge
+    folds       ``bendable`` without the edges at which colours of meshes differ
+    seams       edges of smooth shapes along which vertices are duplicated, None without such edges
+    attributed  (number of the shape, its edges at which attributes may differ)
+    textured    (number of the shape, its edges at which texture coordinates may differ)
     """
 
     always: Bool
@@ -81,10 +84,10 @@ class ShadingEdges:
 
     @classmethod
     def of(cls, geometry: Geometry, topology: Topology, sources: Sequence[Any]) -> ShadingEdges:
-        """Find all edges that may matter (on the host, once)."""
+        """Find all edges at which shading may ever jump (on the host, once)."""
         shapes = geometry.face_shape.numpy()
         smooth = np.array([info.has_normals for info in geometry.shapes])
-        # Faces with attributes of their own may differ at any edge, others only where there is more than one vertex at a place.
+        # Face attributes may differ at any edge, vertex attributes only where vertices are duplicated.
         of_faces = np.array([info.reads_attributes for info in geometry.shapes])
         one, other, ends = _edges(geometry, topology, of_faces[shapes])
         shape, next_shape = shapes[one // 3], shapes[other // 3]
@@ -119,7 +122,7 @@ class ShadingEdges:
         return found.with_colours(geometry, sources)
 
     def watch(self, sources: Sequence[Any]) -> ParameterWatch:
-        """All on which :meth:`with_colours` depends: attributes, texture coordinates, materials and emission of shapes."""
+        """Watch over all inputs of :meth:`with_colours`: attributes, texture coordinates, materials and emission of shapes."""
         nodes = [sources[index].shape for index, _ in self.attributed]
         for index, _ in self.textured:
             shape = sources[index].shape
@@ -133,9 +136,9 @@ class ShadingEdges:
         return ParameterWatch(nodes, counts)
 
     def with_colours(self, geometry: Geometry, sources: Sequence[Any]) -> ShadingEdges:
-        """The same for the attributes, texture coordinates and textures that meshes have now.
+        """The same edges, updated for the current attributes, texture coordinates and textures of meshes.
 
-        Texture coordinates that jump are not enough: on both sides of most seams of a texture, there is the same colour.
+        Colours are compared, not texture coordinates: most seams of a texture have the same colour on both sides.
         """
         if not self.attributed and not self.textured:
             return self
@@ -168,8 +171,10 @@ class ShadingEdges:
         return replace(self, coloured=edges, folds=folds)
 
     def now(self, geometry: Geometry) -> Bool | None:
-        """``Bool`` (3 F,): whether shading jumps at the edge from corner k to k + 1 of a face, with these normals. None if there
-        are no such edges whatever moves. Detached."""
+        """Mask (Bool, 3 F) of the edges from corner k to k + 1 of a face at which shading jumps, given the geometry's normals.
+
+        None if shading can jump at no edge. Detached.
+        """
         if self.seams is None:
             return self.coloured
         with dr.suspend_grad():
@@ -179,12 +184,12 @@ class ShadingEdges:
         return edges
 
     def folds_of(self, normals: Float | None) -> CoplanarCreases | None:
-        """Edges at which shading jumps only if the surface is bent there, for normals of flat faces (Float, 4 F)."""
+        """Edges at which shading jumps only if the surface is bent there. ``normals``: of flat faces (Float, 4 F), if any."""
         return None if self.folds is None or normals is None else CoplanarCreases(self.folds, normals)
 
 
 def _may_vary(shape: mi.Shape, plain: dict[Any, bool]) -> bool:
-    """True if texture coordinates may decide on what a shape looks like. ``plain``: what is known of materials, kept here."""
+    """True if a shape's colour may depend on texture coordinates. ``plain``: cache of :func:`is_plain`, filled here."""
     bsdf = shape.bsdf()
     if bsdf not in plain:
         plain[bsdf] = is_plain(bsdf)
@@ -192,9 +197,9 @@ def _may_vary(shape: mi.Shape, plain: dict[Any, bool]) -> bool:
 
 
 def _other_colours(shape: mi.Shape, texcoords: Float, pairs: Pairs, first: int) -> Bool:
-    """Bool (K,): whether a shape has different colours on both sides of edges, seen and lit from right above. Detached.
+    """Mask (Bool, K) of edges with different colours on both sides, seen and lit along the normal. Detached.
 
-    ``texcoords``: of its own vertices (Float, 2 each), whose first one is vertex ``first``.
+    ``texcoords``: of the shape's vertices (Float, 2 each), of which the first is vertex ``first`` of the scene.
     """
     ends = [[dr.gather(mi.Point2f, dr.detach(texcoords), v - first) for v in sides] for sides in pairs.ends]
     places = [dr.lerp(ends[0][side], ends[1][side], t) for t in _LOOKED_AT for side in range(2)]
@@ -218,7 +223,7 @@ def _other_colours(shape: mi.Shape, texcoords: Float, pairs: Pairs, first: int) 
 def _edges(geometry: Geometry, topology: Topology, everywhere: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Edges at which two faces meet: half-edges (E,) of one and of the other, vertices (E, ends, sides) at both ends.
 
-    Of faces that are not meant by ``everywhere`` (F,) only those from or to a place where there is more than one vertex.
+    ``everywhere`` (F,) selects faces of which all edges are returned; of others, only edges with an end at duplicated vertices.
     """
     faces, welded = (a.numpy() for a in (geometry.faces, topology.welded))
     several = np.zeros(geometry.vertex_count, bool)
@@ -234,7 +239,7 @@ def _edges(geometry: Geometry, topology: Topology, everywhere: np.ndarray) -> tu
     same = key[order][1:] == key[order][:-1]
     one, other = order[:-1][same], order[1:][same]
     first, second = faces[half].astype(np.int64), faces[after].astype(np.int64)
-    # The other's half-edge may run either way.
+    # The half-edge of the other face may run in either direction.
     reverse = start[one] != start[other]
     ends = np.stack(
         [

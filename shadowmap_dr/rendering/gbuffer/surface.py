@@ -1,4 +1,4 @@
-"""Surface records: what is seen at each pixel, with its materials."""
+"""Surface records: the surface that each pixel sees, with its material."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ...scene.sensor import Sensor
 from ...scene.sums import evaluate
 from .surface_points import SurfacePoints, corner_values, hits_at
 
-# The BSDFs of fewer shapes are called one by one: quicker again and again, but their program grows with their number.
+# The BSDFs of fewer shapes are called one by one. That runs faster, but the program grows with their number.
 _MANY_SHAPES = 128
 
 
@@ -30,7 +30,7 @@ class Surface:
     n_world  Normal3f (N,), unit geometric normal, on the side that the shape calls outside
     wi_world Vector3f (N,), unit vector to the camera
     shape    UInt32 (N,), index into ``geometry.shapes``
-    active   Bool (N,), false where nothing was hit; there all records are finite and meaningless
+    active   Bool (N,), false where nothing was hit; there all other fields are finite and meaningless
     si       mi.SurfaceInteraction3f, for BSDF evaluation. ``si.p`` is the *rest-pose* position for shapes with mesh attributes
     bsdf     mi.BSDFPtr (N,)
     colour   colour (N,), the BSDF on the viewer's side over the cosine, if no BSDF depends on directions otherwise; else None
@@ -49,15 +49,15 @@ class Surface:
         """BSDF times cosine (colour, N) for directions to the light in the local frame (Vector3f). Attached to all."""
         if self.colour is None:
             return mi.UnpolarizedSpectrum(self.bsdf.eval(mi.BSDFContext(), self.si, wo, active))
-        # Directions that are NaN give NaN, as BSDFs do: a broken light is not just dark.
+        # NaN directions give NaN, as BSDFs do: a broken light must not look like a dark one.
         return dr.select(active & ~(self.si.wi.z * wo.z <= 0), self.colour * dr.abs(wo.z), 0)
 
 
 def plain_colours(data: SceneData) -> Float:
     """Values of Mitsuba's BSDFs for light and viewer along the normal, on either side of each shape.
 
-    That is all there is to know about a BSDF that is proportional to the cosine (:attr:`SceneData.needs_frames`), and calling
-    it for two directions is much cheaper than for each pixel. Float (8 S,), four numbers for each side, attached.
+    They determine a BSDF that is proportional to the cosine (:attr:`SceneData.needs_frames`), and evaluating two directions is
+    much cheaper than evaluating each pixel. Float (8 S,), four numbers for each side, attached.
     """
     bsdfs = [source.shape.bsdf() for source in data.sources]
     lane = dr.arange(mi.UInt32, 2 * len(bsdfs))
@@ -70,7 +70,7 @@ def plain_colours(data: SceneData) -> Float:
         pointer = dr.gather(mi.BSDFPtr, data.bsdf_ptr, lane >> 1)
         colour = mi.UnpolarizedSpectrum(pointer.eval(mi.BSDFContext(), si, normal))
     else:
-        # One by one: calls through pointers in small kernels come out wrong when a frozen function is replayed.
+        # One by one: replays of frozen functions give wrong results for calls through pointers in small kernels.
         colour = dr.zeros(mi.UnpolarizedSpectrum, dr.width(lane))
         known: dict[Any, Any] = {}
         for shape, bsdf in enumerate(bsdfs):
@@ -135,8 +135,8 @@ def surface_at(
 ) -> Surface:
     """Surface records for points on triangles, with the normals of :func:`normals_at`. Attached to all of these.
 
-    ``frames``: whether tangents and texture coordinates are needed; without them ``si`` serves materials only that know nothing
-    but cosines (:attr:`shadowmap_dr.scene.load.SceneData.needs_frames`).
+    ``frames``: compute tangents and texture coordinates. Without them, ``si`` suits only materials that depend on nothing but
+    cosines (:attr:`shadowmap_dr.scene.load.SceneData.needs_frames`).
     """
     active, shape = hits.active, hits.shape
     flags = _Flags(geometry, hits.flags)
@@ -159,10 +159,10 @@ def surface_at(
 
 
 def coloured(data: SceneData, seen: Surface, frames: bool) -> Surface:
-    """The same surfaces with the colours of the materials as they are now, if these know cosines only. Attached to both.
+    """The same surfaces with the materials' current colours, if materials depend on cosines only. Attached to both.
 
-    Of ``seen`` it takes the shape, the BSDF, whether it is active, the side seen (``si.wi.z``), and (``frames``: as for
-    :func:`surface_at`) with textures the rest that these read: place, texture coordinates, number of the triangle, ``si.shape``.
+    It reads these fields of ``seen``: ``shape``, ``bsdf``, ``active`` and ``si.wi.z``; with ``frames`` (as in :func:`surface_at`)
+    also the inputs of textures: ``si.p``, ``si.uv``, ``si.prim_index`` and ``si.shape``.
     """
     if not frames:
         return replace(seen, colour=_plain_colour(data, seen))
@@ -170,7 +170,7 @@ def coloured(data: SceneData, seen: Surface, frames: bool) -> Surface:
 
 
 def _plain_colour(data: SceneData, seen: Surface) -> Color3f:
-    """``Surface.colour`` of materials that are the same everywhere on a shape."""
+    """``Surface.colour`` of materials without textures."""
     width, table, channels = dr.width(seen.shape), plain_colours(data), dr.size_v(mi.UnpolarizedSpectrum)
     rows = dr.width(table) // 4
     (sides,), copies = in_copies([table], width, LIKE_LANES)
@@ -181,9 +181,9 @@ def _plain_colour(data: SceneData, seen: Surface) -> Color3f:
 
 
 def _cosine_colour(data: SceneData, seen: Surface) -> Color3f:
-    """``Surface.colour`` of materials with textures: what they return for light along the normal.
+    """``Surface.colour`` of materials with textures: their values for light along the normal.
 
-    They are given what textures read, and no more: derivatives keep all of it in memory.
+    They receive only the inputs of textures, since derivatives keep all inputs in memory.
     """
     si, width = seen.si, dr.width(seen.shape)
 
@@ -201,7 +201,7 @@ def _cosine_colour(data: SceneData, seen: Surface) -> Color3f:
 
 
 def _parametrisation(geometry: Geometry, flags: _Flags, hits: SurfacePoints) -> tuple[Any, Any, Any]:
-    """Texture coordinates and the derivatives of the position by them; a shape without any has uv = barycentrics."""
+    """(texture coordinates, derivatives of the position by u and by v); on shapes without any, uv are the barycentrics."""
     uv, dp_du, dp_dv = mi.Point2f(hits.u, hits.v), mi.Vector3f(hits.e1), mi.Vector3f(hits.e2)
     if not any(info.has_texcoords for info in geometry.shapes):
         return uv, dp_du, dp_dv
@@ -227,7 +227,7 @@ def opacity(surface: Surface) -> Float:
 
 
 class _Flags:
-    """Per-pixel booleans of the shape, looked at only if shapes of the scene differ in them."""
+    """Per-pixel booleans of the shape, read only if shapes of the scene differ in them."""
 
     def __init__(self, geometry: Geometry, flags: UInt32) -> None:
         self._static = [info.flags for info in geometry.shapes]
@@ -249,7 +249,7 @@ class _Flags:
 
 
 def _interaction_position(geometry: Geometry, flags: _Flags, hits: SurfacePoints) -> Point3f:
-    """World position; rest-pose position for shapes with mesh attributes, since Mitsuba recovers barycentrics from it."""
+    """World position; for shapes with mesh attributes, rest-pose position, from which Mitsuba recovers barycentrics."""
     if not flags.any(READS_ATTRIBUTES):
         return hits.p_world
     assert geometry.rest_positions is not None, "read where meshes have attributes"

@@ -1,9 +1,9 @@
 """Points on triangles that pixels see: the G-buffer before any shading.
 
-Two ways lead here. ``hits_at`` takes barycentrics as they are, attached or not. ``pixel_hits`` knows that the points lie on the
-rays through a camera's pixel centres, and takes the derivative in world space: a moving triangle carries the material point
-p_m = sum b_i p_i along, and the ray o + t d then meets the triangle's plane at t = n.(p_m - o) / n.d. That is the same as the
-derivative of perspective-correct barycentrics through clip space, and much shorter.
+``hits_at`` takes given barycentrics, attached or not. ``pixel_hits`` assumes that the points lie on the rays through a camera's
+pixel centres, and differentiates in world space: a moving triangle carries the material point p_m = sum b_i p_i along, and the
+ray o + t d then meets the triangle's plane at t = n.(p_m - o) / n.d. This equals the derivative of perspective-correct
+barycentrics through clip space, and is much shorter.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class SurfacePoints:
 
     triangle     UInt32 (N,), 0xFFFFFFFF for none
     active       Bool (N,), false where nothing was hit; there all other fields are finite and meaningless
-    changed      Bool (N,), where vertices may have been replaced, or carry gradients
+    changed      Bool (N,), true where vertices may have been replaced, or carry gradients
     face         Vector3u (N,), the triangle's vertices
     row          UInt32 (N,), or a constant: ``Geometry.row_of_copy``
     shape, flags UInt32 (N,), index of the shape and its ``ShapeInfo.flags``
@@ -68,7 +68,7 @@ class SurfacePoints:
         return corner_values(kind, buffer, self.face, self.active, self.changed)
 
     def corners_of_copy(self, kind: type[ArrayT], buffer: AnyArray) -> tuple[ArrayT, ArrayT, ArrayT]:
-        """The same from a buffer that has copies: normals, texture coordinates."""
+        """As :meth:`corners`, from a buffer that has copies: normals, texture coordinates."""
         return corner_values(kind, buffer, self.face + self.row, self.active, self.changed)
 
 
@@ -106,20 +106,20 @@ def pixel_hits(geometry: Geometry, sensor: Sensor, triangle: UInt32, size: tuple
         with dr.suspend_grad():
             found = intersect(face, active, ray_o, ray_d, row)
 
-        # Of the types only: functions that held what they lead to would keep the whole graph alive, if nothing ever traverses it.
+        # The types only: a function that holds the arrays would keep the whole AD graph alive if nothing ever traverses it.
         kinds = [type(value) for value in found]
 
         def none(face: Vector3u, active: Bool, ray_o: Point3f, ray_d: Vector3f, row: UInt32) -> tuple[Any, ...]:
             return tuple(dr.zeros(kind) for kind in kinds)
 
-        # Derivatives on their own, in a branch: most pixels of many images see nothing that moves.
+        # Derivatives separately, in a branch: in many images most pixels see nothing that moves.
         attached = dr.if_stmt(
             (face, changed, ray_o, ray_d, row), changed, intersect, none, mode="symbolic", label="attached hits"
         )
         found = tuple(replace_grad(value, other) for value, other in zip(found, attached, strict=True))
     e1, e2, normal, u, v, p_world = found
     wi_world = -dr.normalize(ray_d)
-    # Along the axis directions have unit length, so this is the length of the ray.
+    # Directions have unit length along the axis, so the ray's parameter is the depth.
     depth = None
     if sensor.kind == "perspective":
         d = dr.detach(ray_d)
@@ -133,7 +133,7 @@ def pixel_hits(geometry: Geometry, sensor: Sensor, triangle: UInt32, size: tuple
 def _intersect(
     triangle: tuple[Point3f, Vector3f, Vector3f], active: Bool, ray_o: Point3f, ray_d: Vector3f
 ) -> tuple[Any, Any, Any, Any, Any, Any]:
-    """(e1, e2, unit normal, u, v, point) where rays meet the planes of their triangles."""
+    """Intersections of rays with the planes of their triangles."""
     first, e1, e2 = triangle
     with dr.suspend_grad():
         q, a, b, o, d = (dr.detach(x) for x in (first, e1, e2, ray_o, ray_d))
@@ -142,12 +142,12 @@ def _intersect(
         edge_on = ~(dr.abs(across) > 0)
         inverse = dr.rcp(dr.select(edge_on, 1, across))
         s = o - q
-        # The rasterizer found the pixel inside; what rounding adds on triangles seen edge-on shall not leave them.
+        # The rasterizer found the pixel inside: rounding, on triangles seen edge-on, must not move the point outside.
         u = dr.maximum(dr.dot(d, dr.cross(s, b)) * inverse, 0)
         v = dr.maximum(dr.dot(d, dr.cross(a, s)) * inverse, 0)
         excess = dr.rcp(dr.maximum(u + v, 1))
         u, v = dr.select(active, u * excess, 0), dr.select(active, v * excess, 0)
-        # Where a triangle is seen exactly edge-on the derivative is infinite; none is taken.
+        # The derivative is infinite where a triangle is seen exactly edge-on: it is set to 0.
         inverse = dr.select(edge_on, 0, inverse)
         area2 = dr.squared_norm(n)
         dual = dr.select(area2 > 0, dr.rcp(area2), 0)
@@ -186,7 +186,7 @@ def corner_values(
     """
     values: list[Any] = [dr.gather(kind, buffer, face[k], active) for k in range(3)]
     if dr.grad_enabled(buffer):
-        # Values for all lanes, gradients only where they lead somewhere: scattering them back is what costs most.
+        # Values for all lanes, gradients only where vertices may have changed: scattering gradients back costs most.
         values = [replace_grad(dr.detach(x), dr.gather(kind, buffer, face[k], changed)) for k, x in enumerate(values)]
     first, second, third = values
     return first, second - first, third - first

@@ -91,6 +91,21 @@ def test_tessellation_agrees_with_the_analytic_shape(variant: str, kind: str, fl
         assert np.mean(difference.reshape(-1, use.sum()).max(0) > tolerance) < (0.1 if name == "stretch" else 0.03), name
 
 
+@pytest.mark.parametrize("count", [1, 16], ids=["few", "many"])
+def test_normals_of_stretched_shapes_are_perpendicular(variant: str, count: int) -> None:
+    """Spheres that become ellipsoids, whose normals are gradients of |inverse(M) (p - c)|^2. Many shapes are placed together."""
+    place = mi.ScalarTransform4f().translate([0.2, 0.1, -0.3]).rotate([0.6, 0, 0.8], 30).scale([0.5, 1, 2])
+    copy = {"type": "instance", "to_world": place, "group": {"type": "ref", "id": "group"}}
+    group = {"type": "shapegroup", "ball": {"type": "sphere"}}
+    scene = mi.load_dict({"type": "scene", "group": group, **{f"copy{k}": copy for k in range(count)}}, optimize=False)
+    data = load(scene, tessellation=12)
+    assert (data.soup is not None) == (count > 1)
+    matrix = np.array(place.matrix, np.float64)
+    points, normals = (buffer.numpy().reshape(-1, 3) for buffer in (data.geometry.positions, data.geometry.normals))
+    gradient = (points - matrix[:3, 3]) @ np.linalg.inv(matrix[:3, :3] @ matrix[:3, :3].T)
+    np.testing.assert_allclose(normals, gradient / np.linalg.norm(gradient, axis=1, keepdims=True), atol=1e-4)
+
+
 def test_tessellation_size(variant: str) -> None:
     scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere"}})
     assert load(scene, tessellation=8).geometry.face_count == 8 * (4 - 1) * 2

@@ -16,7 +16,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
@@ -137,13 +137,66 @@ def _half_a_texel_off(function: Callable[..., Any]) -> Callable[..., Any]:
     return shifted
 
 
+def _edges_to_nobody(function: Callable[..., Any]) -> Callable[..., Any]:
+    def covers(values: Any, *_: Any) -> Any:
+        return (values.x > 0) & (values.y > 0) & (values.z > 0) & (values.w >= -1) & (values.w <= 1)
+
+    return covers
+
+
+def _unwelded(function: Callable[..., Any]) -> Callable[..., Any]:
+    def apart(positions: Any, shapes: Any) -> Any:
+        import numpy as np
+
+        every = np.arange(len(positions))
+        return replace(function(positions, shapes), place=every, own=every)
+
+    return apart
+
+
+def _sum_is_not_one(function: Callable[..., Any]) -> Callable[..., Any]:
+    def unnormalised(*arguments: Any, **options: Any) -> Any:
+        kernel = function(*arguments, **options)
+        return kernel / kernel.max()
+
+    return unnormalised
+
+
+def _always(function: Callable[..., Any]) -> Callable[..., Any]:
+    return lambda *arguments: function(*arguments) | True
+
+
+def _normals_moved_as_points(function: Callable[..., Any]) -> Callable[..., Any]:
+    return lambda buffers, to_world: function(buffers, SimpleNamespace(matrix=to_world.matrix, inverse_transpose=to_world.matrix))
+
+
+def _first_of_them(function: Callable[..., Any]) -> Callable[..., Any]:
+    return lambda array: function(array)[:1]
+
+
+def _power_without_area(function: Callable[..., Any]) -> Callable[..., Any]:
+    def bare(*arguments: Any) -> Any:
+        samples = function(*arguments)
+        return replace(samples, power=samples.power / samples.area)
+
+    return bare
+
+
+def _one_sample_further(function: Callable[..., Any]) -> Callable[..., Any]:
+    return lambda values, weights, axis: function(values, weights, replace(axis, first=axis.first + 1))
+
+
+def _camera_stays(function: Callable[..., Any]) -> Callable[..., Any]:
+    return lambda known, scene, camera, names: function(known, scene, known.camera, names)
+
+
 MUTATIONS = (
     Mutation("halve the shadow gradient", "shadow.methods.variance", "chebyshev_visibility", _halved_gradient,
              (TRACED.format("sun_box_light_direction"),)),
     Mutation("flip the light of the maps", "shadow.light_camera", "directional_view", _flipped_direction,
              ("rendering/test_references.py::test_shadows_of_1024_texels[llvm_ad_rgb-pose]",)),
     Mutation("flip the light of the shading", "scene.lights.punctual", "DirectionalLight.illuminate", _flipped_shading,
-             ("rendering/test_references.py::test_shading_without_shadows[llvm_ad_rgb-pose]",)),
+             ("scene/test_lights.py::test_equals_sample_direction[llvm_ad_rgb-rgb-sun]",)),
     Mutation("switch moment anti-aliasing off", "shadow.shadow_map", "antialias", _no_antialiasing,
              (TRACED.format("sun_box_light_direction"),), only_there=True),
     Mutation("detach the light's rotation", "shadow.light_camera", "directional_view", _detached_rotation,
@@ -151,7 +204,7 @@ MUTATIONS = (
     Mutation("detach the spot light's position", "shadow.light_camera", "spot_view", _detached_position,
              (TRACED.format("spot_box_spot_position"),)),
     Mutation("leave the shadows out", "shadow.methods.variance", "chebyshev_visibility", _always_lit,
-             ("rendering/test_references.py::test_shadows_of_1024_texels[llvm_ad_rgb-gallery]",)),
+             ("shadow/test_shadow_methods.py::test_one_surface_shadows_what_lies_behind_it[llvm_ad_rgb-vsm]",)),
     Mutation("look half a texel off", "shadow.lookup", "_bilinear", _half_a_texel_off,
              ("shadow/test_shadow_maps.py::test_compat_follows_the_authors_formulas[llvm_ad_rgb-spot]",)),
     Mutation("do not see where surfaces meet", "raster.antialiasing.surface_intersections", "Meetings.weight", _nowhere,
@@ -171,6 +224,26 @@ MUTATIONS = (
              (DIFFERENCES.format("spot_cow-spot_cone"),)),
     Mutation("detach an orthographic camera's rays", "scene.sensor", "Sensor.pixel_rays", _detached_rays,
              (DIFFERENCES.format("orthographic_cow-camera_turn"),)),
+    Mutation("leave points on edges to nobody", "raster.triangle_setup", "covers", _edges_to_nobody,
+             ("raster/test_raster_rasterize.py::test_shared_edges_leave_no_hole_and_no_double_owner[llvm_ad_rgb]",)),
+    Mutation("weld no vertices", "raster.welding", "weld", _unwelded,
+             ("raster/test_raster_antialias.py::test_seams_are_welded[llvm_ad_rgb]",)),
+    Mutation("do not normalise a filter", "shadow.filters", "filter_kernel", _sum_is_not_one,
+             ("shadow/test_shadow_filters.py::test_formulas",)),
+    Mutation("keep frusta for ever", "shadow.frustum_fit", "_still_fits", _always,
+             ("shadow/test_shadow_maps.py::test_a_small_move_leaves_the_frustum_alone_and_a_large_one_refits[llvm_ad_rgb-spot]",)),
+    Mutation("transform normals as if they were points", "scene.shapes.sources", "_placed", _normals_moved_as_points,
+             ("scene/test_scene.py::test_normals_of_stretched_shapes_are_perpendicular[llvm_ad_rgb-few]",)),
+    Mutation("notice changes of first components only", "scene.changes", "leaves", _first_of_them,
+             ("integrator/test_changed_scenes.py::test_fingerprints_are_those_of_one_array[llvm_ad_rgb]",)),
+    Mutation("let light through a triangle's back", "rendering.direct_light", "passes_gate", _always,
+             ("rendering/test_shading.py::test_gate_closes_where_a_shadow_ray_would[llvm_ad_rgb]",)),
+    Mutation("forget the area of a lamp's parts", "rendering.extended_lights.area_samples", "area_samples", _power_without_area,
+             ("rendering/test_soft_samples.py::test_power_adds_up_to_radiance_times_area[llvm_ad_rgb-rectangle-9]",)),
+    Mutation("give gradients of pixels to the next sample", "rendering.film.reconstruction", "_to_samples", _one_sample_further,
+             ("rendering/test_reconstruction.py::test_reconstruct_in_all_modes[llvm_ad_rgb-3-gaussian-1-False]",)),
+    Mutation("do not notice that a camera moves", "integrator.pass_caches", "_valid_level", _camera_stays,
+             ("integrator/test_pass_caches.py::test_nothing_that_is_kept_shows[llvm_ad_rgb-unlit]",)),
 )  # fmt: skip
 
 
@@ -309,9 +382,9 @@ def main() -> None:
 
     def report(verdict: Verdict) -> None:
         mark = "ok    " if verdict.noticed else "MISSED"
-        print(f"{mark} {verdict.name:34} {verdict.detail}", flush=True)
+        print(f"{mark} {verdict.name:43} {verdict.detail}", flush=True)
         for test in verdict.tests:
-            print(f"{'':6} {'':34} {test}", flush=True)
+            print(f"{'':6} {'':43} {test}", flush=True)
 
     verdicts = check_all(report=report)
     sys.exit(0 if all(verdict.noticed for verdict in verdicts) else 1)

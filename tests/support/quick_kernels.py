@@ -1,9 +1,9 @@
 """Importing this imports shadowmap_dr, and Dr.Jit with it, for kernels that compile quickly. To be imported before Dr.Jit.
 
-Kernels of tests are compiled without LLVM's optional passes: thousands of kernels that run once each, in 40 % of the time. What
-is tested is the code that Dr.Jit is given, which is the same. Processes that tests start (the command line, examples,
-tutorials) compile as users' do what no test has compiled yet; so do all tests with ``SHADOWMAP_TESTS_OPTIMIZE=1``. With
-``pytest -s``, LLVM is seen to name each pass that it leaves out.
+Kernels of tests are compiled without LLVM's optional passes and with its fast register allocator: thousands of kernels that run
+once each, in a third of the time. The code that Dr.Jit is given, which is what is tested, is the same. Processes that tests start
+(the command line, examples, tutorials) compile as users' do what no test has compiled yet; so do all tests with
+``SHADOWMAP_TESTS_OPTIMIZE=1``. With ``pytest -s``, LLVM is seen to name each pass that it leaves out.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from pathlib import Path
 
 #: Dr.Jit finds kernels again by what they compute, however they were compiled: those of users are to stay quick to run.
 FOLDER = Path(__file__).parents[2] / ".pytest_cache" / "kernels"
-# An option of LLVM's own tools, which the library has, too.
-_NO_PASSES = b"-opt-bisect-limit=0"
+# Options of LLVM's own tools, which the library has, too.
+_OPTIONS = (b"-opt-bisect-limit=0", b"-regalloc=fast", b"-optimize-regalloc=false")
 
 
 def _leave_out_passes() -> None:
@@ -25,7 +25,7 @@ def _leave_out_passes() -> None:
 
     library = _llvm.loaded_library()
     if library is not None and _llvm.loaded_version() is not None:
-        arguments = (ctypes.c_char_p * 2)(b"tests", _NO_PASSES)
+        arguments = (ctypes.c_char_p * (1 + len(_OPTIONS)))(b"tests", *_OPTIONS)
         ctypes.CDLL(library).LLVMParseCommandLineOptions(len(arguments), arguments, b"")
 
 

@@ -61,13 +61,13 @@ def write_shadow(path: Path, shadow: npt.NDArray[np.uint8]) -> None:
         temporary.write_bytes(content)
 
 
-def read_shadow(data: bytes, size: tuple[int, int]) -> Array:
+def read_shadow(data: bytes, shape: tuple[int, int]) -> Array:
     """A painted shadow: visibility (H, W) from an image of any size, grey values as they are; transparent is lit.
 
     Raises ShadowmapError where the image is damaged (half of a file is), too large, or of another aspect ratio.
     """
     image = _open(data)
-    height, width = size
+    height, width = shape
     if abs(image.width * height - image.height * width) > 0.02 * image.height * width:
         raise ShadowmapError(f"an image of {image.width} x {image.height} pixels: the shadow has {width} x {height}.")
     ground = _on_white(image)

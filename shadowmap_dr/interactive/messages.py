@@ -63,12 +63,12 @@ class Seen:
     frame: int
 
 
-def parse(text: str, size: tuple[int, int]) -> Stroke | Seen | Command:
+def parse(text: str, shape: tuple[int, int]) -> Stroke | Seen | Command:
     """A page's message.
 
     Args:
         text: as received.
-        size: (H, W) of the canvas; strokes may begin and end a little outside of it.
+        shape: (H, W) of the canvas; strokes may begin and end a little outside of it.
 
     Raises MessageError.
     """
@@ -80,7 +80,7 @@ def parse(text: str, size: tuple[int, int]) -> Stroke | Seen | Command:
         raise MessageError("a message that is no JSON.") from None
     kind = value.get("type") if isinstance(value, dict) else None
     if kind == "stroke":
-        return _stroke(value, size)
+        return _stroke(value, shape)
     if kind == "seen":
         return Seen(_integer(value, "frame"))
     if kind in _COMMANDS:
@@ -88,13 +88,13 @@ def parse(text: str, size: tuple[int, int]) -> Stroke | Seen | Command:
     raise MessageError("a message of an unknown type.")
 
 
-def _stroke(value: dict[str, Any], size: tuple[int, int]) -> Stroke:
-    height, width = size
+def _stroke(value: dict[str, Any], shape: tuple[int, int]) -> Stroke:
+    height, width = shape
     if value.get("mode") not in ("add", "erase"):
         raise MessageError("a stroke that neither adds nor erases.")
     radius, points = value.get("radius"), value.get("points")
-    if not (isinstance(radius, int | float) and _number(radius) and 0.5 <= radius <= max(size)):
-        raise MessageError(f"a stroke's radius that is no number from 0.5 to {max(size)}.")
+    if not (isinstance(radius, int | float) and _number(radius) and 0.5 <= radius <= max(shape)):
+        raise MessageError(f"a stroke's radius that is no number from 0.5 to {max(shape)}.")
     if not (isinstance(points, list) and 2 <= len(points) <= 2 * MOST_POINTS and len(points) % 2 == 0):
         raise MessageError(f"a stroke that has not 1 to {MOST_POINTS} points.")
     if not all(_number(x) for x in points):

@@ -52,7 +52,7 @@ class ImagePass:
         light, settings = self.light, self.light.settings
         frame = self.cameras.frame(view, shapes, light.needs_frames)
         seen, incident, color = frame.surface, *self._reflected(frame, lighting, visible)
-        color = light.with_emission(color, seen, lighting, view.sensor, (view.raster.width, view.raster.height))
+        color = light.with_emission(color, seen, lighting, view.sensor, view.size)
         named = collect_aovs(settings.aovs, seen, view.raster, lighting.lights, incident.visible)
         if crossings is None and settings.antialias:
             channels = self._channels(color, seen.active, view)
@@ -145,11 +145,10 @@ class ImagePass:
 
     def _lit(self, frame: Frame, lighting: Lighting) -> LitFrame:
         view, light = frame.view, self.light
-        size = view.raster.width, view.raster.height
         white = _white(frame)
         irradiance = light.radiance(white.surface, lighting, light.incident_light(white, lighting))
         none = dr.zeros(mi.UnpolarizedSpectrum, dr.width(frame.surface.shape))
-        emitted = light.with_emission(none, frame.surface, lighting, view.sensor, size)
+        emitted = light.with_emission(none, frame.surface, lighting, view.sensor, view.size)
         return LitFrame(view, colouring_inputs(frame.surface), frame.sharpness, irradiance, emitted)
 
     def _uniformly_lit(self, frame: Frame, lighting: Lighting, geometry: Geometry) -> LitFrame:

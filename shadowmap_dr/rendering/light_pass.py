@@ -20,7 +20,7 @@ from ..scene.lights.punctual import SpotLight, SquareSpot
 from ..scene.lights.read import Light
 from ..scene.lights.soft_outline import softened
 from ..scene.load import SceneData
-from ..scene.sensor import Sensor
+from ..scene.sensor import ImageSize, Sensor
 from ..shadow import Frusta, ShadowMaps
 from .direct_light import ambient_light, background, direct_light, emission
 from .extended_lights import (
@@ -223,13 +223,13 @@ class LightPass:
             color += ambient_light(seen, uniform, _AMBIENT_DIRECTIONS, nodes)
         return color
 
-    def with_emission(self, color: Color3f, seen: Surface, lighting: Lighting, sensor: Sensor, size: tuple[int, int]) -> Color3f:
-        """The same radiance with that of emitters that the camera sees. ``size``: (columns, rows) of samples."""
+    def with_emission(self, color: Color3f, seen: Surface, lighting: Lighting, sensor: Sensor, size: ImageSize) -> Color3f:
+        """The same radiance with that of emitters that the camera sees. ``size``: in samples."""
         if self.settings.hide_emitters or self.settings.max_depth == 0:
             return color
         color += emission(seen, lighting.areas)
         for environment in self.data.environments:
-            color = dr.select(seen.active, color, background(environment, sensor, *size))
+            color = dr.select(seen.active, color, background(environment, sensor, size.width, size.height))
         return color
 
     def visibilities(self, frame: Frame, lighting: Lighting, numbers: list[int], lights: Sequence[Light]) -> list[Float]:
@@ -257,8 +257,7 @@ class LightPass:
 
     def _around(self, frame: Frame) -> list[Any]:
         view, seen = frame.view, frame.surface
-        size = view.raster.width, view.raster.height
-        return footprint_points(view.sensor, size, frame.depth, seen.p_world, seen.n_world, 2)
+        return footprint_points(view.sensor, view.size, frame.depth, seen.p_world, seen.n_world, 2)
 
     def _outlined(self, frame: Frame, lights: Sequence[Light]) -> tuple[Any, ...]:
         """Lights with outlines as soft as pixels are wide."""
@@ -279,8 +278,8 @@ class LightPass:
 
     def _spots(self, frame: Frame) -> FootprintSamples:
         view, seen = frame.view, frame.surface
-        size, count = (view.raster.width, view.raster.height), self.settings.look_ups(view.columns)
-        return FootprintSamples.of(view.sensor, size, frame.depth, seen.p_world, seen.n_world, seen.active, count)
+        count = self.settings.look_ups(view.columns)
+        return FootprintSamples.of(view.sensor, view.size, frame.depth, seen.p_world, seen.n_world, seen.active, count)
 
 
 def plan_extended_lights(data: SceneData, settings: RenderSettings) -> tuple[SoftPlan, ...]:

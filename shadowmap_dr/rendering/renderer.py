@@ -277,7 +277,7 @@ class Renderer:
             shapes = cameras.placed(geometry)
             view = cameras.view(windows[0], shapes, 1)
             frame = cameras.frame(view, shapes, self.data.needs_frames)
-            seen, size, samples = frame.surface, (view.raster.width, view.raster.height), self.settings.look_ups(view.columns)
-            points = footprint_points(windows[0], size, frame.depth, seen.p_world, seen.n_world, samples)
+            seen, samples = frame.surface, self.settings.look_ups(view.columns)
+            points = footprint_points(windows[0], view.size, frame.depth, seen.p_world, seen.n_world, samples)
             crossings = cameras.crossings(view, frame.sharpness, shapes) if self.settings.antialias else None
             return GBuffer(windows[0], seen, points, crossings, cameras.seen([view], geometry))

@@ -32,6 +32,14 @@ _PINHOLE = 1e-6
 
 
 @dataclass(frozen=True)
+class ImageSize:
+    """Size of an image in pixels or samples."""
+
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
 class Sensor:
     """A pinhole (``kind='perspective'``) or orthographic camera. Replace fields with ``dataclasses.replace``.
 
@@ -57,8 +65,8 @@ class Sensor:
     principal_point: Point2f
     near: Float
     far: Float
-    film_size: tuple[int, int]
-    crop_size: tuple[int, int]
+    film_size: ImageSize
+    crop_size: ImageSize
     crop_offset: tuple[int, int]
     channels: int
     alpha: bool
@@ -70,12 +78,12 @@ class Sensor:
     @property
     def width(self) -> int:
         """Columns of the picture (the crop window)."""
-        return self.crop_size[0]
+        return self.crop_size.width
 
     @property
     def height(self) -> int:
         """Rows of the picture (the crop window)."""
-        return self.crop_size[1]
+        return self.crop_size.height
 
     @property
     def border(self) -> int:
@@ -113,7 +121,8 @@ class Sensor:
     @property
     def projection(self) -> Matrix4f:
         """Matrix4f, camera space to clip space, crop window and principal point included."""
-        (film_w, film_h), (crop_w, crop_h), (crop_x, crop_y) = self.film_size, self.crop_size, self.crop_offset
+        film_w, film_h = self.film_size.width, self.film_size.height
+        crop_w, crop_h, (crop_x, crop_y) = self.width, self.height, self.crop_offset
         # Position in the crop window in [0, 1] = (position in the film - crop offset) * film size / crop size.
         zoom = (film_w / crop_w, film_h / crop_h)
         aspect = self.pixel_aspect * film_w / film_h
@@ -236,15 +245,15 @@ def sensors_of(sensor: mi.Sensor) -> tuple[Sensor, ...]:
                 f"The crop window of batch sensor '{sensor.id()}' has {columns} columns for {len(cameras)} cameras: "
                 "choose a multiple of them."
             )
-        share = (columns // len(cameras), int(film.crop_size()[1]))
-        return tuple(_squeezed(_sensor_of(camera, film, i * share[0]), share) for i, camera in enumerate(cameras))
+        share = ImageSize(columns // len(cameras), int(film.crop_size()[1]))
+        return tuple(_squeezed(_sensor_of(camera, film, i * share.width), share) for i, camera in enumerate(cameras))
     return (_sensor_of(sensor, sensor.film(), 0),)
 
 
-def _squeezed(camera: Sensor, size: tuple[int, int]) -> Sensor:
+def _squeezed(camera: Sensor, size: ImageSize) -> Sensor:
     """A camera whose whole picture is squeezed into ``size``, as Mitsuba squeezes those of a batch sensor with a crop window."""
-    (width, height) = camera.film_size
-    aspect = (width * size[1]) / (height * size[0])
+    film = camera.film_size
+    aspect = (film.width * size.height) / (film.height * size.width)
     return replace(camera, film_size=size, crop_size=size, crop_offset=(0, 0), pixel_aspect=aspect)
 
 
@@ -272,8 +281,8 @@ def _sensor_of(sensor: mi.Sensor, film: mi.Film, film_column: int) -> Sensor:
         principal_point=mi.Point2f(values.get("principal_point_offset_x", zero), values.get("principal_point_offset_y", zero)),
         near=mi.Float(values["near_clip"]),
         far=mi.Float(values["far_clip"]),
-        film_size=_pair(window.size()),
-        crop_size=_pair(window.crop_size()),
+        film_size=ImageSize(*_pair(window.size())),
+        crop_size=ImageSize(*_pair(window.crop_size())),
         crop_offset=_pair(window.crop_offset()),
         channels=int(film.base_channels_count()) - alpha,
         alpha=alpha,

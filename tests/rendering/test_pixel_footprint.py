@@ -11,7 +11,7 @@ import pytest
 
 from shadowmap_dr.rendering.gbuffer import pixel_footprint
 from shadowmap_dr.rendering.gbuffer.pixel_footprint import FootprintSamples, footprint_points
-from shadowmap_dr.scene.sensor import Sensor, sensors_of
+from shadowmap_dr.scene.sensor import ImageSize, Sensor, sensors_of
 
 SIZE = 12
 
@@ -47,7 +47,7 @@ def seen(sensor: Any, x: float = 0.5, y: float = 0.5) -> tuple[Any, Any, Any]:
 def test_spots_are_where_rays_through_the_pixel_meet_the_surface(variant: str, kind: str, count: int) -> None:
     mitsuba_sensor, sensor = camera(kind)
     points, normal, depth = seen_by(kind, mitsuba_sensor)
-    spots = footprint_points(sensor, (SIZE, SIZE + 2), depth, points, normal, count)
+    spots = footprint_points(sensor, ImageSize(SIZE, SIZE + 2), depth, points, normal, count)
     pixel = float(dr.norm(dr.gather(mi.Point3f, points, 1) - dr.gather(mi.Point3f, points, 0))[0])
     for number, spot in enumerate(reversed(spots)):  # from the lower right; a mean does not mind
         wanted, _, _ = seen(mitsuba_sensor, (number % count + 0.5) / count, (number // count + 0.5) / count)
@@ -63,7 +63,7 @@ def test_spots_lie_on_surfaces_seen_from_the_side(variant: str, kind: str) -> No
     view = dr.normalize(mi.Vector3f(along))
     side = dr.normalize(dr.cross(view, mi.Vector3f(0.2, 1, 0.1)))
     normal = dr.normalize(side - 0.03 * view)
-    for spot in footprint_points(sensor, (SIZE, SIZE + 2), depth, points, normal, 2):
+    for spot in footprint_points(sensor, ImageSize(SIZE, SIZE + 2), depth, points, normal, 2):
         away = spot - points
         assert float(dr.min(dr.norm(away))[0]) > 1e-4
         assert float(dr.max(dr.abs(dr.dot(away, normal)) / dr.norm(away))[0]) < 1e-3
@@ -73,7 +73,7 @@ def test_spots_lie_on_surfaces_seen_from_the_side(variant: str, kind: str) -> No
 @pytest.mark.parametrize("kind", ["perspective", "orthographic"])
 def test_means_and_their_derivatives_are_those_of_sums_written_out(variant: str, kind: str, count: int) -> None:
     mitsuba_sensor, sensor = camera(kind)
-    arguments = sensor, (SIZE, SIZE + 2)
+    arguments = sensor, ImageSize(SIZE, SIZE + 2)
     active = dr.arange(mi.UInt32, SIZE * (SIZE + 2)) % 7 > 0
 
     def curved(points: Any, active: Any) -> Any:
@@ -110,7 +110,7 @@ def test_many_spots_are_one_array(variant: str, monkeypatch: pytest.MonkeyPatch)
     points, normal, depth = seen(mitsuba_sensor)
 
     def spots(count: int) -> FootprintSamples:
-        return FootprintSamples.of(sensor, (SIZE, SIZE + 2), depth, points, normal, mi.Bool(True), count)
+        return FootprintSamples.of(sensor, ImageSize(SIZE, SIZE + 2), depth, points, normal, mi.Bool(True), count)
 
     for count, arrays in ((1, 1), (2, 4), (3, 1), (8, 1)):
         assert len(spots(count).points) == arrays and arrays * spots(count).copies == count**2

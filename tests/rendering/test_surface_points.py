@@ -13,6 +13,7 @@ import pytest
 from shadowmap_dr import Renderer
 from shadowmap_dr.rendering.gbuffer.surface import normals_at
 from shadowmap_dr.rendering.gbuffer.surface_points import SurfacePoints, hits_at, pixel_hits
+from shadowmap_dr.scene.sensor import ImageSize
 
 SIZE = 40
 
@@ -59,7 +60,7 @@ def test_derivatives_are_those_of_the_barycentrics(variant: str, kind: str) -> N
         return [np.array(x) for x in values], [p.grad.numpy(), np.array(rows.grad)[:3].ravel()]
 
     want, want_gradients = gradients(lambda g, s, raster: hits_at(g, raster.triangle, raster.u, raster.v))
-    got, got_gradients = gradients(lambda g, s, raster: pixel_hits(g, s, raster.triangle, (raster.width, raster.height)))
+    got, got_gradients = gradients(lambda g, s, raster: pixel_hits(g, s, raster.triangle, ImageSize(raster.width, raster.height)))
     for k, (a, b) in enumerate(zip(want, got, strict=True)):
         # Points five units away agree to a few roundings, more where one sees a face nearly edge-on; in units of edges, some as
         # short as a thirtieth, that is as much more.

@@ -13,7 +13,7 @@ from ...errors import ShadowmapError, warn
 from ...jit.arrays import ravel
 from ...jit.types import Bool, Color3f, Float, TensorXf
 from ...raster import MAX_RESOLUTION
-from ...scene.sensor import Sensor
+from ...scene.sensor import ImageSize, Sensor
 from .reconstruction import reconstruct
 
 
@@ -33,15 +33,15 @@ class Margin:
         ``factor`` x ``factor`` samples a pixel; none where the rasterizer has no room for more.
         """
         (camera, *others), room = cameras, MAX_RESOLUTION // factor - 2
-        if others or camera.border > 0 or max(camera.crop_size) > room:
+        if others or camera.border > 0 or max(camera.width, camera.height) > room:
             return cls()
-        (width, height), (w, h), (x, y) = camera.film_size, camera.crop_size, camera.crop_offset
-        return cls(int(x > 0), int(y > 0), int(x + w < width), int(y + h < height))
+        film, (x, y) = camera.film_size, camera.crop_offset
+        return cls(int(x > 0), int(y > 0), int(x + camera.width < film.width), int(y + camera.height < film.height))
 
     def around(self, camera: Sensor) -> Sensor:
         """A camera whose window has the margin, too."""
-        (width, height), (x, y) = camera.crop_size, camera.crop_offset
-        size = width + self.left + self.right, height + self.top + self.bottom
+        x, y = camera.crop_offset
+        size = ImageSize(camera.width + self.left + self.right, camera.height + self.top + self.bottom)
         return replace(camera, crop_size=size, crop_offset=(x - self.left, y - self.top))
 
     def cut(self, picture: TensorXf, factor: int) -> TensorXf:
@@ -64,9 +64,8 @@ def sample_windows(cameras: Sequence[Sensor]) -> tuple[Sensor, ...]:
     windows = []
     for k, camera in enumerate(cameras):
         left, right = border * (k == 0), border * (k == len(cameras) - 1)
-        width, height = camera.crop_size
         x, y = camera.crop_offset
-        size = (width + left + right, height + 2 * border)
+        size = ImageSize(camera.width + left + right, camera.height + 2 * border)
         windows.append(replace(camera, crop_size=size, crop_offset=(x - left, y - border)))
     return _checked(tuple(windows))
 

@@ -14,7 +14,7 @@ from ...raster import Crossings, RasterOutput, Topology, detach_moved_seams, vis
 from ...raster.antialiasing.edge_crossings import find_crossings
 from ...scene.geometry import Geometry
 from ...scene.load import SceneData
-from ...scene.sensor import Sensor
+from ...scene.sensor import ImageSize, Sensor
 from .camera_pass import camera_clip, least_gap, seen_points, within_far_plane, without_shapes
 from .facet_normals import FlatFaces, facet_normals, mean_normals, prefilter_normals
 from .shading_edges import ShadingEdges
@@ -36,9 +36,14 @@ class CameraView:
     topology: Topology
 
     @property
+    def size(self) -> ImageSize:
+        """Samples of the camera's window."""
+        return ImageSize(self.raster.width, self.raster.height)
+
+    @property
     def columns(self) -> int:
         """Samples across the whole film, also when only a crop window is rendered."""
-        return self.sensor.film_size[0] * self.factor
+        return self.sensor.film_size.width * self.factor
 
 
 @dataclass(frozen=True)
@@ -153,7 +158,7 @@ class CameraPass:
     def frame(self, view: CameraView, shapes: PlacedShapes, frames: bool) -> Frame:
         """The surfaces that a camera sees, attached. ``frames``: as for :func:`surface_at`."""
         sensor, raster, geometry = view.sensor, view.raster, shapes.geometry
-        hits = pixel_hits(geometry, sensor, raster.triangle, (raster.width, raster.height))
+        hits = pixel_hits(geometry, sensor, raster.triangle, view.size)
         hits = replace(hits, active=hits.active & within_far_plane(sensor, hits.depth))
         normals, sharpness = normals_at(geometry, hits), None
         if shapes.facets is not None:

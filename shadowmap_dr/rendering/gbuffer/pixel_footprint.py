@@ -13,7 +13,7 @@ import mitsuba as mi
 
 from ...jit.broadcast import Copies, copied
 from ...jit.types import Bool, Float, Point3f, Vector3f
-from ...scene.sensor import Sensor
+from ...scene.sensor import ImageSize, Sensor
 
 # Grids of up to this many points a side get an array for each point; larger grids do so if one array would exceed that length.
 _WRITTEN_OUT = 2
@@ -21,7 +21,7 @@ _MOST_LANES = 1 << 22
 
 
 def footprint_points(
-    sensor: Sensor, size: tuple[int, int], depth: Float | None, p_world: Point3f, n_world: Vector3f, count: int
+    sensor: Sensor, size: ImageSize, depth: Float | None, p_world: Point3f, n_world: Vector3f, count: int
 ) -> list[Point3f]:
     """``count`` x ``count`` points spread over a pixel's footprint on the tangent plane of what it sees (Point3f each).
 
@@ -58,7 +58,7 @@ class FootprintSamples:
     def of(
         cls,
         sensor: Sensor,
-        size: tuple[int, int],
+        size: ImageSize,
         depth: Float | None,
         p_world: Point3f,
         n_world: Vector3f,
@@ -103,8 +103,7 @@ class _Axes:
     slope: Float
 
     @classmethod
-    def of(cls, sensor: Sensor, size: tuple[int, int], depth: Float | None, p_world: Point3f, n_world: Vector3f) -> _Axes:
-        width, height = size
+    def of(cls, sensor: Sensor, size: ImageSize, depth: Float | None, p_world: Point3f, n_world: Vector3f) -> _Axes:
         matrix = dr.detach(sensor.to_world.matrix)
         columns = [mi.Vector3f(matrix[0, k], matrix[1, k], matrix[2, k]) for k in range(3)]
         axes: list[Vector3f] = [dr.normalize(column) for column in columns]
@@ -120,8 +119,8 @@ class _Axes:
             right *= dr.norm(mi.Vector3f(matrix[0, 0], matrix[1, 0], matrix[2, 0]))
             up *= dr.norm(mi.Vector3f(matrix[0, 1], matrix[1, 1], matrix[2, 1]))
             view = forward
-        right *= 2 / (width * dr.abs(projection[0, 0])) * scale
-        up *= 2 / (height * dr.abs(projection[1, 1])) * scale
+        right *= 2 / (size.width * dr.abs(projection[0, 0])) * scale
+        up *= 2 / (size.height * dr.abs(projection[1, 1])) * scale
         n = dr.detach(n_world)
         slope = dr.dot(n, view)
         # At grazing angles the footprint grows without bound: it is cut off at a length of four pixels.

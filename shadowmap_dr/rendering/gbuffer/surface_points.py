@@ -18,7 +18,7 @@ from ...jit.arrays import replace_grad
 from ...jit.types import AnyArray, ArrayT, Bool, Float, Point3f, UInt32, Vector3f, Vector3u
 from ...jit.vectors import normalize_or
 from ...scene.geometry import NO_TRIANGLE, Geometry
-from ...scene.sensor import Sensor
+from ...scene.sensor import ImageSize, Sensor
 
 #: Stands for directions to a camera where no camera was given.
 NOT_GIVEN: Any = None  # Any: takes the place of an array
@@ -84,8 +84,8 @@ def hits_at(geometry: Geometry, triangle: UInt32, u: Float, v: Float, active: Bo
     return SurfacePoints(triangle, active, active, face, row, shape, flags, e1, e2, _normal(e1, e2), u, v, p_world)
 
 
-def pixel_hits(geometry: Geometry, sensor: Sensor, triangle: UInt32, size: tuple[int, int]) -> SurfacePoints:
-    """Points that the pixel centres of a picture of ``size`` (width, height) see, given its triangles (row-major).
+def pixel_hits(geometry: Geometry, sensor: Sensor, triangle: UInt32, size: ImageSize) -> SurfacePoints:
+    """Points that the pixel centres of a picture of a size see, given its triangles (row-major).
 
     Attached to positions and camera: each point stays on the ray through its pixel and on its triangle's plane.
     """
@@ -93,7 +93,7 @@ def pixel_hits(geometry: Geometry, sensor: Sensor, triangle: UInt32, size: tuple
     face = dr.gather(mi.Vector3u, geometry.faces, triangle, active)
     shape, flags = geometry.shape_and_flags(triangle, active)
     changed = active & geometry.has_changed(shape)
-    ray_o, ray_d, pixel = sensor.pixel_rays(*size)
+    ray_o, ray_d, pixel = sensor.pixel_rays(size.width, size.height)
     moving = dr.grad_enabled(ray_o, ray_d)
     row = geometry.row_of_copy(dr.width(triangle))
 

@@ -33,7 +33,7 @@ class ShadowImages:
             light into the receiver's plane: behind all casters, nothing changes along the light.
         which: ``UInt32``, the number of the image of each pixel.
         weight: ``Float``, one over the number of pixels of this image that see a receiver, 0 for those that see none.
-        sizes: (H, W) of each image.
+        shapes: (H, W) of each image, as NumPy has them.
         views, frusta, settings: of the shadow maps, one for each image.
     """
 
@@ -42,7 +42,7 @@ class ShadowImages:
     points: Point3f
     which: UInt32
     weight: Float
-    sizes: tuple[tuple[int, int], ...]
+    shapes: tuple[tuple[int, int], ...]
     views: Views
     frusta: Frusta
     settings: ShadowSettings
@@ -50,7 +50,7 @@ class ShadowImages:
     @property
     def pixels(self) -> int:
         """Number of pixels in all images together."""
-        return sum(height * width for height, width in self.sizes)
+        return sum(height * width for height, width in self.shapes)
 
     def visibility(self, vertices: Float) -> Float:
         """Visibility images of the views' cameras.
@@ -68,8 +68,8 @@ class ShadowImages:
     def images(self, flat: Float) -> list[npt.NDArray[np.float32]]:
         """Flat pixels, as from `visibility`, as one (H, W) array for each view."""
         values = np.array(dr.detach(flat), np.float32)
-        ends = np.cumsum([0, *(height * width for height, width in self.sizes)])
-        return [values[ends[k] : ends[k + 1]].reshape(size) for k, size in enumerate(self.sizes)]
+        ends = np.cumsum([0, *(height * width for height, width in self.shapes)])
+        return [values[ends[k] : ends[k + 1]].reshape(size) for k, size in enumerate(self.shapes)]
 
 
 def shadow_images(

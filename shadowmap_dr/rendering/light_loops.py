@@ -155,7 +155,7 @@ def light_of_table(seen: Surface, places: Places, table: LightTable, maps: Shado
     return sum_over(one_light, table.size, start, (seen, places), (table, maps), implicit, seen.active)
 
 
-def _visibility(table: LightTable, maps: ShadowMaps, index: UInt32, light: Any, p_world: Point3f, active: Bool) -> Float:
+def _visibility(table: LightTable, maps: ShadowMaps, index: UInt32, light: Illumination, p_world: Point3f, active: Bool) -> Float:
     which = dr.gather(mi.UInt32, table.first, index)
     if table.cube:
         punctual: Any = light.light if isinstance(light, Softened) else light  # Any: lights with maps of cubes have a position

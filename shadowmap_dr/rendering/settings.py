@@ -90,7 +90,7 @@ class RenderSettings:
             raise ShadowmapError(f"ambient is {self.ambient}: give a finite radiance of at least 0.")
 
     @classmethod
-    def of(cls, **named: Any) -> RenderSettings:
+    def of(cls, **named: Any) -> RenderSettings:  # Any: checked by the records
         """From values by the names that the plug-in's parameters and the keywords of ``Renderer.from_scene`` have: those of the
         fields here, and :data:`SHADOW_NAMES`. Defaults are those of the records.
 

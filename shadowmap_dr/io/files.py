@@ -17,6 +17,8 @@ import numpy.typing as npt
 from ..errors import OutputError, ShadowmapError
 
 SUFFIXES = (".exr", ".png")
+#: Most bytes of the arrays of an archive that is read.
+MOST_DECODED = 8_000_000_000
 
 
 @contextmanager
@@ -78,8 +80,18 @@ def read_arrays(path: str | os.PathLike[str], only: Collection[str] | None = Non
     try:
         if not zipfile.is_zipfile(path):  # NumPy would call other files pickled objects
             raise ValueError("no archive")
+        with zipfile.ZipFile(path) as archive:
+            sizes = {entry.filename.removesuffix(".npy"): entry.file_size for entry in archive.infolist()}
+        decoded = sum(size for name, size in sizes.items() if only is None or name in only)
+        if decoded > MOST_DECODED:
+            raise ShadowmapError(
+                f"cannot read {path}: its arrays take {decoded / 1e6:.0f} MB, more than {MOST_DECODED / 1e6:.0f} MB: "
+                "give smaller ones."
+            )
         with np.load(path, allow_pickle=False) as file:
             return {name: file[name] for name in file.files if only is None or name in only}
+    except ShadowmapError:
+        raise
     except Exception as error:  # NumPy and the decompressor raise errors of many kinds for damaged files
         reason = "objects are not read" if "pickle" in str(error) else "it is no .npz file, or it is damaged"
         raise ShadowmapError(f"cannot read {path}: {reason}; give an .npz file of plain arrays.") from error

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +14,9 @@ from ..errors import OutputError, ShadowmapError
 from .files import SUFFIXES, atomic
 
 Array = npt.NDArray[np.generic]
+
+#: Most pixels of an image that is read, and most bytes of memory that its decoded pixels take.
+MOST_PIXELS, MOST_DECODED = 64_000_000, 1_000_000_000
 
 
 def write_exr(path: str | os.PathLike[str], channels: Mapping[str, Array], metadata: Mapping[str, str] | None = None) -> None:
@@ -46,12 +50,39 @@ def read_exr(path: str | os.PathLike[str]) -> tuple[dict[str, Array], dict[str, 
     if not Path(path).is_file():
         raise ShadowmapError(f"no image {str(path)!r}: the file does not exist.")
     try:
+        with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
+            for k in range(len(file.parts)):  # headers are empty after the block
+                _check_header(path, file.header(k))
         with OpenEXR.File(str(path), separate_channels=True) as file:
             channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
             metadata = {name: value for name, value in file.header().items() if isinstance(value, str)}
+    except ShadowmapError:
+        raise
     except Exception as error:  # the library raises errors of many kinds for damaged headers
         raise ShadowmapError(f"cannot read {path}: it is no OpenEXR file, or it is damaged.") from error
     return channels, metadata
+
+
+def check_size(path: str | os.PathLike[str], width: int, height: int, pixel_bytes: int) -> None:
+    """ShadowmapError, with numbers, if an image is too large to decode. ``pixel_bytes``: bytes of a decoded pixel."""
+    decoded = width * height * pixel_bytes
+    if width * height > MOST_PIXELS or decoded > MOST_DECODED:
+        raise ShadowmapError(
+            f"cannot read {path}: {width} x {height} pixels, {decoded / 1e6:.0f} MB decoded, are too many; at most "
+            f"{MOST_PIXELS} pixels and {MOST_DECODED / 1e6:.0f} MB can be: make the image smaller."
+        )
+
+
+def _check_header(path: str | os.PathLike[str], header: Mapping[str, Any]) -> None:
+    """Check what the header of an OpenEXR file announces."""
+    low, high = (np.asarray(corner).astype(np.int64).tolist() for corner in header["dataWindow"])
+    width, height = high[0] - low[0] + 1, high[1] - low[1] + 1
+    pixel_bytes = 4 * max(1, len(header.get("channels", ())))
+    check_size(path, width, height, pixel_bytes)
+    if "tiles" in header:  # whole tiles are decoded, also beyond the image
+        check_size(path, int(header["tiles"].xSize), int(header["tiles"].ySize), pixel_bytes)
+    if "deep" in str(header.get("type", "")).lower():
+        raise ShadowmapError(f"cannot read {path}: its pixels are deep; give a flat image.")
 
 
 def write_png(path: str | os.PathLike[str], image: Array) -> None:

@@ -11,8 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...errors import ShadowmapError
-from ...inverse.shadow_art.target_images import scaled_to_bytes
-from ...io.images import read_image, to_srgb
+from ...io.pictures import read_picture
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -101,15 +100,7 @@ def _grey(path: Path) -> npt.NDArray[np.floating[Any]]:
     """Grey values (H, W) in 0..1 of an image file, over white."""
     if not path.is_file():
         raise ShadowmapError(f"no image {str(path)!r}: the file does not exist.")
-    if path.suffix.lower() == ".exr":
-        return to_srgb(read_image(path).mean(2))
-    from PIL import Image
-
-    try:
-        with Image.open(path) as image:
-            pixels = np.asarray(scaled_to_bytes(image).convert("RGBA"), np.float32) / 255
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise ShadowmapError(f"cannot read {path}: it is no image, or it is damaged.") from error
+    pixels = read_picture(path)
     alpha = pixels[..., 3]
     grey = pixels[..., :3].mean(2)
     if alpha.min() < 0.5:  # transparency draws the outline, unless the opaque part has two colours

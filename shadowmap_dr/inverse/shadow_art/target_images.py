@@ -2,45 +2,26 @@
 
 from __future__ import annotations
 
-import gzip
-import io
 import os
-import re
-import zlib
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-from xml.etree import ElementTree
 
 import numpy as np
 import numpy.typing as npt
 
 from ...errors import ShadowmapError
+from ...io.pictures import SUFFIXES as PICTURE_SUFFIXES
+from ...io.pictures import read_picture, scaled_to_bytes
+from .drawings import rasterized
 
-if TYPE_CHECKING:
-    import PIL.Image
+__all__ = ["SUFFIXES", "figure_height", "figure_of", "filled", "fit", "read_figure", "scaled_to_bytes", "text_figure"]
 
 #: Suffixes that `read_figure` knows.
-SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".gif", ".bmp", ".svg", ".svgz")
+SUFFIXES = (*PICTURE_SUFFIXES, ".svg", ".svgz")
 
-# Pixels along the longer side of rasterized drawings; largest number of pixels of an image.
-_SIDE, _MOST_PIXELS = 1024, 64_000_000
-# Largest aspect ratio of a drawing; syntax of its lengths, and their units in pixels.
-_MOST_SIDES_DIFFER = 64
-_LENGTH = re.compile(r"\+?([0-9.]+(?:[eE][-+]?[0-9]+)?)(|%|px|pt|pc|mm|cm|in|em|ex)")
-_UNITS = {"": 1, "px": 1, "pt": 4 / 3, "pc": 16, "mm": 96 / 25.4, "cm": 960 / 25.4, "in": 96, "em": 12, "ex": 6}
 # Pixels with more coverage belong to the figure; smallest share of an image that a figure may cover.
 _INSIDE, _LEAST_SHARE = 0.5, 1e-4
 
 Array = npt.NDArray[np.float32]
-
-
-def scaled_to_bytes(image: PIL.Image.Image) -> PIL.Image.Image:
-    """Convert a Pillow image to 8 bits a channel. Pillow itself would clip 16-bit grey images instead of scaling them."""
-    from PIL import Image
-
-    if not image.mode.startswith("I"):
-        return image
-    return Image.fromarray((np.asarray(image).astype(np.uint32).clip(0, 65535) >> 8).astype(np.uint8))
 
 
 def read_figure(path: str | os.PathLike[str]) -> Array:
@@ -60,21 +41,10 @@ def read_figure(path: str | os.PathLike[str]) -> Array:
     path = Path(path)
     if not path.is_file():
         raise ShadowmapError(f"no image {str(path)!r}: the file does not exist.")
-    if path.suffix.lower() in (".svg", ".svgz"):
-        data: Path | io.BytesIO = io.BytesIO(_rasterized(path))
-    elif path.suffix.lower() in SUFFIXES:
-        data = path
-    else:
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
         raise ShadowmapError(f"cannot read {path}: the suffix {path.suffix!r} is not one of {', '.join(SUFFIXES)}.")
-    from PIL import Image
-
-    try:
-        with Image.open(data) as image:
-            if image.width * image.height > _MOST_PIXELS:
-                raise ShadowmapError(f"cannot read {path}: {image.width} x {image.height} pixels are too many.")
-            pixels = np.asarray(scaled_to_bytes(image).convert("RGBA"), np.float32) / 255
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise ShadowmapError(f"cannot read {path}: it is no image, or it is damaged.") from error
+    pixels = read_picture(path, rasterized(path) if suffix in (".svg", ".svgz") else None)
     try:
         return figure_of(pixels)
     except ShadowmapError as error:
@@ -189,50 +159,3 @@ def _cropped(figure: Array) -> Array:
         raise ShadowmapError("a figure that covers nothing.")
     cut = figure[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     return np.pad(cut, 1)  # margin for soft edges
-
-
-def _rasterized(path: Path) -> bytes:
-    try:
-        import resvg_py
-    except ModuleNotFoundError as error:
-        raise ShadowmapError(f"{path}: drawings need the package resvg-py: pip install 'shadowmap-dr[art]'.") from error
-    try:
-        width, height = _drawn_size(path)
-        # Only one side is given to resvg: in a narrow drawing the other side could have millions of pixels.
-        if max(width, height) > _MOST_SIDES_DIFFER * min(width, height):
-            raise ShadowmapError(
-                f"cannot read {path}: a drawing of {width:g} x {height:g} is too narrow; its sides may differ by "
-                f"{_MOST_SIDES_DIFFER} times."
-            )
-        side: dict[str, Any] = {"width": _SIDE} if width >= height else {"height": _SIDE}
-        return bytes(resvg_py.svg_to_bytes(svg_path=str(path), dpi=96, **side))
-    except (ValueError, ElementTree.ParseError, OSError, EOFError, zlib.error) as error:
-        raise ShadowmapError(f"cannot read {path}: it is no drawing, or it is damaged.") from error
-
-
-def _drawn_size(path: Path) -> tuple[float, float]:
-    """(width, height) of a drawing in pixels, at least 1. ValueError if the file holds no drawing."""
-    with gzip.open(path) if path.suffix.lower() == ".svgz" else path.open("rb") as file:
-        root = next((element for _, element in ElementTree.iterparse(file, ("start",))), None)
-    if root is None or root.tag.rpartition("}")[2] != "svg":
-        raise ValueError("no element svg")
-    box = [float(number) for number in re.split(r"[\s,]+", root.get("viewBox", "").strip()) if number]
-    box = box[2:] if len(box) == 4 else []
-    given = [_length(root.get(name, ""), whole) for name, whole in zip(("width", "height"), box or (100.0, 100.0), strict=True)]
-    if box:
-        # If one length is missing, it follows from the other and the proportions of the box.
-        scales = [side / whole for side, whole in zip(given, box, strict=True) if side is not None] or [1.0]
-        sides = [scales[0] * whole if side is None else side for side, whole in zip(given, box, strict=True)]
-    else:
-        sides = [100.0 if side is None else side for side in given]
-    if not (np.isfinite(sides).all() and min(sides) > 0):
-        raise ValueError("no extent")
-    return max(sides[0], 1.0), max(sides[1], 1.0)
-
-
-def _length(text: str, whole: float) -> float | None:
-    """A length of a drawing in pixels, at 96 to the inch; None if it is no length. ``whole``: 100 %, in pixels."""
-    found = _LENGTH.fullmatch(text.strip())
-    if found is None:
-        return None
-    return float(found[1]) * (whole / 100 if found[2] == "%" else _UNITS[found[2]])

@@ -9,6 +9,7 @@ import typer
 from rich.console import Console
 
 from ..errors import ShadowmapError
+from ..experiments.common.ranges import check_range
 from ..experiments.faces import experiment as faces_experiment
 from ..experiments.faces import image as faces_image
 from ..experiments.faces import problem as faces_problem
@@ -136,6 +137,11 @@ def convert(
     ] = None,
 ) -> None:
     """Convert a morphable model to the format of this package."""
+    if components is not None:
+        check_range("--components", components, (1, 100_000))
+    for name, value in (("--neck", neck), ("--expression-scale", expression_scale)):
+        if value is not None:
+            check_range(name, value, (-1e30, 1e30))
     files.check_output(output, (".npz",))
     scale = expression_scale if expression_scale is not None else 0.5 if source.is_dir() else 1.0
     options = convert_model.ConvertOptions(facing=facing, neck=neck, components=components, expression_scale=scale)

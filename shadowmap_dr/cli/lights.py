@@ -9,10 +9,11 @@ import typer
 from rich.console import Console
 
 from ..errors import ShadowmapError
+from ..experiments.common.ranges import FILTER_SIDE, check_range
 from ..experiments.lights import experiment as lights_experiment
 from ..experiments.lights import report as lights_report
 from ..experiments.lights import speed as lights_speed
-from ..experiments.lights.problem import LightProblem, ReferenceKind, StrategyKind
+from ..experiments.lights.problem import LightProblem, ReferenceKind, StrategyKind, check_problem
 from ..experiments.lights.scene import OBJECTS
 from ..inverse.runs.schedulers import check_scheduler
 from ..io import console, files, records
@@ -58,8 +59,9 @@ def lights(
 
     Writes OUT/lights.json, a plot of alignments (lights.png), pictures of some runs, and a file for each batch.
     """
-    if filter_size and min(filter_size) < 1:
-        raise ShadowmapError(f"a filter of {min(filter_size)} texels: give 1 or more, or --no-shadows.")
+    check_range("--memory", memory, (1, 1 << 30))
+    for size in filter_size or ():
+        check_range("--filter-size", size, FILTER_SIDE)
     if filter_size and shadows is False:
         raise ShadowmapError("--filter-size and --no-shadows: leave one of the two out.")
     defaults = lights_experiment.LightOptions()
@@ -108,13 +110,15 @@ def lights_times(
     Writes OUT/times.json. Nothing else should run on the machine.
     """
     sizes = tuple(dict.fromkeys(batch or (1, 16, 150)))
-    if min(sizes) < 1:
-        raise ShadowmapError(f"a batch of {min(sizes)} runs: give at least 1.")
+    for size in sizes:
+        check_range("--batch", size, (1, 100_000))
+    problem = LightProblem(object, count, max(sizes))
+    check_problem(problem)
     path = files.check_output(out / "times.json", (".json",))
     if workers:
         check_scheduler("processes:1")
     set_variant(variant)
-    steps = lights_speed.measure(LightProblem(object, count, max(sizes)), sizes)
+    steps = lights_speed.measure(problem, sizes)
     times, ratios = steps["seconds"], steps["ratio_of_medians"]
     rows = [
         [name, f"{1e3 * entry['median']:.2f}", f"{ratios.get(f'{name} / batch of {max(sizes)}', 1):.2f}"]

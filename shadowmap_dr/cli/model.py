@@ -13,6 +13,7 @@ import numpy.typing as npt
 import typer
 
 from ..errors import ShadowmapError
+from ..experiments.common.ranges import check_range
 from ..interactive import exports
 from ..interactive.file_session import follow, kept
 from ..interactive.modeller import Modeller
@@ -50,6 +51,8 @@ def model(
     """
     if view not in VIEWS:
         raise ShadowmapError(f"no view {view!r}: choose from {', '.join(VIEWS)}.")
+    check_range("--smoothness", smoothness, (0.0, 1e6))
+    check_range("--step-size", step_size, (1e-6, 100.0))
     files.check_output(output, tuple(f".{kind}" for kind in exports.FORMATS))
     if not serve:
         files.check_output(image, (".png",))

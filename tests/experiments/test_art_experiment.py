@@ -177,11 +177,11 @@ def test_errors_are_red_where_the_shadow_is_missing_and_blue_where_it_is_too_muc
         (["--text", "a", "--receiver", "ball"], "ball"),
         (["--text", "a", "--camera", "fisheye"], "fisheye"),
         (["--text", "a", "--animate", "mp4"], "mp4"),
-        (["--text", "a", "--iterations", "0"], "0 iterations"),
+        (["--text", "a", "--iterations", "0"], "--iterations) is 0"),
         (["--text", "a", "--mesh", "spot", "--collection", "spot"], "one of the two"),
         (["--text", "a", "--remesh", "9", "--collection", "spot"], "one of the two"),
         (["--text", "a", "--mesh", "nothing"], "nothing"),
-        (["--text", "a", "--resolution", "5"], "5 x 5"),
+        (["--text", "a", "--resolution", "5"], "--resolution) is 5"),
     ],
 )
 def test_bad_arguments_are_one_line(variant, tmp_path, arguments, words):

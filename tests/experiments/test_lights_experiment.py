@@ -178,11 +178,11 @@ def test_path_traced_targets_show_the_same_lights() -> None:
 
 def test_bad_input_is_named(tmp_path: Path) -> None:
     for changes, message in (
-        ({"lights": (6,)}, "6 lights"),
+        ({"lights": (6,)}, "lights.* is 6"),
         ({"objects": ()}, "no object"),
         ({"filter_sizes": (3, 3)}, "twice"),
-        ({"runs": 0}, "0 runs"),
-        ({"cone_deg": 200.0}, "cone of 200"),
+        ({"runs": 0}, "runs.* is 0"),
+        ({"cone_deg": 200.0}, "--cone. is 200"),
         ({"reference": "other"}, "'other'"),
         ({"strategy": "fine"}, "'fine'"),
         ({"objects": ("nothing",)}, "no mesh 'nothing'"),
@@ -190,7 +190,7 @@ def test_bad_input_is_named(tmp_path: Path) -> None:
         ({"strategy": "coarse", "map_resolution": 16}, "filter size 15 is too large"),
         ({"filter": "none"}, "no filter 'none'"),
         ({"threads": 10**8}, "100000000 threads"),
-        ({"spp": 10**11}, "100000000000 samples"),
+        ({"spp": 10**11}, "spp.* is 100000000000"),
         ({"scheduler": "nobody"}, "'nobody'"),
     ):
         with pytest.raises(ShadowmapError, match=message):

@@ -26,6 +26,7 @@ from ...io import assets, files, meshes, records
 from ...io import console as io_console
 from ...io import images as io_images
 from ...rendering.receivers.shadow_views import CAMERAS, RECEIVERS, ShadowView
+from ..common.ranges import MAP_SIDE, SEED, STEPS, bounded, check_ranges
 from ..common.timing import machine
 from . import pictures as art_pictures
 from .run import Frame, Maker, Trace, intersection_over_union, make
@@ -71,25 +72,26 @@ class ArtOptions:
     collection: str | None = None
     receiver: str = "plane"
     camera: str = "orthographic"
-    resolution: int = 256
-    map_resolution: int | None = None
-    iterations: int | None = None
-    step_size: float = 0.2
-    smoothness: float = 20.0
-    consistency: float = 0.2
-    remesh: int | None = None
+    resolution: int = bounded(256, (16, 2048))
+    map_resolution: int | None = bounded(None, MAP_SIDE)
+    iterations: int | None = bounded(None, STEPS)
+    step_size: float = bounded(0.2, (1e-6, 100.0))
+    smoothness: float = bounded(20.0, (0.0, 1e6))
+    consistency: float = bounded(0.2, (0.0, 1e6))
+    remesh: int | None = bounded(None, STEPS)
     fill_holes: bool = False
-    interval: int = 150
-    most: int = 128
-    seed: int = 0
+    interval: int = bounded(150, STEPS)
+    most: int = bounded(128, (1, 4096), "--copies")
+    seed: int = bounded(0, SEED)
     animate: str | None = ".webp"
-    picture_size: int = 320
-    turns: int = 40
+    picture_size: int = bounded(320, (16, 1024))
+    turns: int = bounded(40, (1, 1000))
     printable: bool = False
     out: Path = Path("art")
     resume: bool = False
 
     def __post_init__(self) -> None:
+        check_ranges(self)
         if not 1 <= len(self.targets) <= len(DIRECTIONS):
             raise ShadowmapError(f"{len(self.targets)} targets: give one, or two for two views.")
         if self.receiver not in RECEIVERS:
@@ -103,10 +105,6 @@ class ArtOptions:
         default = 400 if self.collection is None else 1100
         steps = default if self.iterations is None else self.iterations
         object.__setattr__(self, "iterations", steps)
-        if steps < 1:
-            raise ShadowmapError(f"{steps} iterations: at least one is needed.")
-        if not 16 <= self.picture_size <= 1024 or self.turns < 1:
-            raise ShadowmapError(f"pictures of {self.picture_size} pixels, {self.turns} of a turn: give 16 to 1024, at least 1.")
         if self.animate is not None and self.animate not in art_pictures.ANIMATIONS:
             raise ShadowmapError(f"no animation {self.animate!r}: choose from {', '.join(art_pictures.ANIMATIONS)}.")
 

@@ -18,6 +18,7 @@ from ...inverse.faces.morph_fit import MorphFit
 from ...inverse.faces.morphable import MorphableModel
 from ...io import console as io_console
 from ...io import files, records
+from ..common.ranges import FILTER_SIDE, MAP_SIDE, SAMPLES, SEED, SIDE, STEPS, bounded, check_ranges
 from ..common.timing import machine
 from . import pictures as faces_pictures
 from . import report as faces_report
@@ -54,23 +55,24 @@ class FaceOptions:
         resume: keep finished runs, continue killed ones.
     """
 
-    seeds: tuple[int, ...] = SEEDS
-    lights: tuple[int, ...] = LIGHTS
+    seeds: tuple[int, ...] = bounded(SEEDS, SEED, "--head")
+    lights: tuple[int, ...] = bounded(LIGHTS, (1, 3), "--shadows")
     modes: tuple[Mode, ...] = ("identity",)
     model: Path | None = None
-    iterations: int = 400
-    prior: float = PRIOR
+    iterations: int = bounded(400, STEPS)
+    prior: float = bounded(PRIOR, (0.0, 1e6))
     translate: bool = False
     reference: Reference = "own"
-    height: int = 192
-    map_resolution: int = 256
-    filter_size: int = 3
-    spp: int = 512
-    samples: int = 30_000
+    height: int = bounded(192, SIDE)
+    map_resolution: int = bounded(256, MAP_SIDE)
+    filter_size: int = bounded(3, FILTER_SIDE)
+    spp: int = bounded(512, SAMPLES)
+    samples: int = bounded(30_000, (100, 10_000_000))
     out: Path = field(default=Path("face"))
     resume: bool = False
 
     def __post_init__(self) -> None:
+        check_ranges(self)
         for name, values, known in (
             ("head", self.seeds, None),
             ("number of shadows", self.lights, LIGHTS),
@@ -83,23 +85,8 @@ class FaceOptions:
                     raise ShadowmapError(f"no {name} {value!r}: choose from {', '.join(map(str, known))}.")
                 if values.count(value) > 1:
                     raise ShadowmapError(f"the {name} {value} is given twice: name each once.")
-        for seed in self.seeds:
-            if seed < 0:
-                raise ShadowmapError(f"a head of seed {seed}: give 0 or more.")
-        check_numbers(self.iterations, self.prior)
-        for name, number, least in (("samples per pixel", self.spp, 1), ("points on a surface", self.samples, 100)):
-            if number < least:
-                raise ShadowmapError(f"{number} {name}: give at least {least}.")
         if self.reference not in ("own", "mitsuba"):
             raise ShadowmapError(f"no reference {self.reference!r}: choose own or mitsuba.")
-
-
-def check_numbers(iterations: int, prior: float) -> None:
-    """ShadowmapError for numbers of iterations or a prior that no fit can use."""
-    if iterations < 1:
-        raise ShadowmapError(f"{iterations} iterations: give at least 1.")
-    if not (np.isfinite(prior) and prior >= 0):
-        raise ShadowmapError(f"a prior of {prior}: give a finite number, 0 or more.")
 
 
 @dataclass(frozen=True)

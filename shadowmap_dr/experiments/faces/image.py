@@ -14,10 +14,11 @@ from rich.progress import Progress, TaskID
 from ...inverse import optimize
 from ...io import console as io_console
 from ...io import files, plots, records
+from ..common.ranges import FILTER_SIDE, MAP_SIDE, SIDE, STEPS, bounded, check_ranges
 from ..common.timing import machine
 from . import pictures as faces_pictures
 from . import report as faces_report
-from .experiment import STEP_SIZE, TRANSLATION_STEP, check_numbers
+from .experiment import STEP_SIZE, TRANSLATION_STEP
 from .problem import FaceScene, Mode, default_model
 from .silhouette import place, read_silhouette, resample
 
@@ -37,16 +38,16 @@ class ImageOptions:
     image: Path
     mode: Mode = "identity"
     model: Path | None = None
-    iterations: int = 400
-    prior: float = PRIOR
-    height: int = 192
-    map_resolution: int = 256
-    filter_size: int = 3
+    iterations: int = bounded(400, STEPS)
+    prior: float = bounded(PRIOR, (0.0, 1e6))
+    height: int = bounded(192, SIDE)
+    map_resolution: int = bounded(256, MAP_SIDE)
+    filter_size: int = bounded(3, FILTER_SIDE)
     out: Path = Path("face")
     resume: bool = False
 
     def __post_init__(self) -> None:
-        check_numbers(self.iterations, self.prior)
+        check_ranges(self)
 
 
 def run_image(options: ImageOptions, *, console: Console | None = None) -> dict[str, Any]:

@@ -12,13 +12,13 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from ...errors import ShadowmapError
 from ...inverse import optimize
 from ...io import console as io_console
 from ...io import files, plots, records
 from ...io.console import markdown
 from ...rendering.renderer import Renderer
 from ..common.meshes import Mesh
+from ..common.ranges import FILTER_SIDE, MAP_SIDE, SAMPLES, SIDE, STEPS, bounded, check_ranges
 from ..common.timing import machine
 from . import scenes as gradients_scenes
 from .fit import ShadowFit
@@ -58,16 +58,17 @@ class ConvergenceOptions:
     occluders: tuple[str, ...] = OCCLUDERS
     cameras: tuple[str, ...] = ("orthographic", "perspective")
     candidates: tuple[str, ...] = ("default",)
-    filter_sizes: tuple[int, ...] = (1, 3, 15)
-    displacements: tuple[float, ...] = (0.1, 0.3, 0.5, 0.65)
-    map_resolution: int = 256
-    resolution: int = 512
-    iterations: int = 250
-    spp: int = 512
+    filter_sizes: tuple[int, ...] = bounded((1, 3, 15), FILTER_SIDE, "--filter-size")
+    displacements: tuple[float, ...] = bounded((0.1, 0.3, 0.5, 0.65), (1e-6, MAX_DISPLACEMENT), "--displacement")
+    map_resolution: int = bounded(256, MAP_SIDE)
+    resolution: int = bounded(512, SIDE)
+    iterations: int = bounded(250, STEPS)
+    spp: int = bounded(512, SAMPLES)
     out: Path = Path("gradients")
     resume: bool = False
 
     def __post_init__(self) -> None:
+        check_ranges(self)
         check_chosen(
             {
                 "occluder": (self.occluders, OCCLUDERS),
@@ -77,12 +78,7 @@ class ConvergenceOptions:
                 "displacement": (self.displacements, None),
             }
         )
-        for value in self.displacements:
-            if not 0 < value <= MAX_DISPLACEMENT:
-                raise ShadowmapError(f"a displacement of {value}: give more than 0 and at most {MAX_DISPLACEMENT}.")
         check_maps((self.map_resolution,), self.filter_sizes)
-        if self.resolution < 16 or self.iterations < 1 or self.spp < 1:
-            raise ShadowmapError("resolution, iterations and samples must be at least 16, 1 and 1.")
 
 
 def run_convergence(options: ConvergenceOptions, *, console: Console | None = None) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from ...io import console as io_console
 from ...io import files, plots, records
 from ...rendering.renderer import Renderer
 from ..common.meshes import Mesh
+from ..common.ranges import FILTER_SIDE, MAP_SIDE, SIDE, bounded, check_ranges
 from ..common.timing import machine
 from . import report as gradients_report
 from . import scenes as gradients_scenes
@@ -58,16 +59,17 @@ class JacobianOptions:
 
     motions: tuple[str, ...] = tuple(MOTIONS)
     candidates: tuple[str, ...] = ("default",)
-    map_resolutions: tuple[int, ...] = (256, 1024)
-    filter_sizes: tuple[int, ...] = (1, 3, 5, 9, 15)
-    resolution: int = 512
-    faces: int = 130_000
-    spp: int = 128
-    mitsuba_passes: int = 2
+    map_resolutions: tuple[int, ...] = bounded((256, 1024), MAP_SIDE, "--map-resolution")
+    filter_sizes: tuple[int, ...] = bounded((1, 3, 5, 9, 15), FILTER_SIDE, "--filter-size")
+    resolution: int = bounded(512, SIDE)
+    faces: int = bounded(130_000, (20, 10_000_000))
+    spp: int = bounded(128, (2, 65_536))
+    mitsuba_passes: int = bounded(2, (0, 10_000))
     out: Path = Path("gradients")
     resume: bool = False
 
     def __post_init__(self) -> None:
+        check_ranges(self)
         check_chosen(
             {
                 "motion": (self.motions, MOTIONS),
@@ -77,9 +79,7 @@ class JacobianOptions:
             }
         )
         check_maps(self.map_resolutions, self.filter_sizes)
-        if self.resolution < 16 or self.faces < 20 or self.spp < 2:
-            raise ShadowmapError("resolution, faces and samples must be at least 16, 20 and 2.")
-        if self.mitsuba_passes < 0 or self.mitsuba_passes == 1:
+        if self.mitsuba_passes == 1:
             raise ShadowmapError(f"{self.mitsuba_passes} passes of Mitsuba: give 0 for none, or at least 2.")
 
 

@@ -11,12 +11,12 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from ...errors import ShadowmapError
 from ...inverse import optimize
 from ...io import console as io_console
 from ...io import files, plots, records
 from ...io.console import markdown
 from ...rendering.renderer import Renderer
+from ..common.ranges import FILTER_SIDE, MAP_SIDE, SAMPLES, SIDE, STEPS, bounded, check_ranges
 from ..common.timing import machine
 from . import scenes as gradients_scenes
 from .fit import ShadowFit
@@ -43,18 +43,17 @@ class PlaneOptions:
     """
 
     cameras: tuple[str, ...] = ("orthographic", "perspective")
-    map_resolution: int = 256
-    filter_size: int = 3
-    resolution: int = 512
-    iterations: int = 150
-    spp: int = 512
+    map_resolution: int = bounded(256, MAP_SIDE)
+    filter_size: int = bounded(3, FILTER_SIDE)
+    resolution: int = bounded(512, SIDE)
+    iterations: int = bounded(150, STEPS)
+    spp: int = bounded(512, SAMPLES)
     out: Path = Path("gradients")
 
     def __post_init__(self) -> None:
+        check_ranges(self)
         check_chosen({"camera": (self.cameras, gradients_scenes.CAMERAS)})
         check_maps((self.map_resolution,), (self.filter_size,))
-        if self.resolution < 16 or self.iterations < 1 or self.spp < 1:
-            raise ShadowmapError("resolution, iterations and samples must be at least 16, 1 and 1.")
 
 
 def run_plane(options: PlaneOptions, *, console: Console | None = None) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from ...inverse.runs.sweep import MEMORY, stored_records
 from ...io import assets, files
 from ...io import records as io_records
 from ..common import timing
+from ..common.ranges import RUNS, bounded, check_ranges
 from .problem import LightProblem, LightSetting, check_problem, curve_iterations
 from .report import pictures, plot
 from .scene import OBJECTS
@@ -41,23 +42,22 @@ class LightOptions(LightSetting):
     """
 
     objects: tuple[str, ...] = OBJECTS
-    lights: tuple[int, ...] = (1,)
-    filter_sizes: tuple[int, ...] = (3, 0)
-    runs: int = 16
+    lights: tuple[int, ...] = bounded((1,), (1, 5))
+    filter_sizes: tuple[int, ...] = bounded((3, 0), (0, 255), "--filter-size")
+    runs: int = bounded(16, RUNS)
     out: Path = Path("lights")
     resume: bool = False
     scheduler: str = "local"
     threads: int = 0
-    memory: int = MEMORY
+    memory: int = bounded(MEMORY, (1, 1 << 50))
 
     def __post_init__(self) -> None:
+        check_ranges(self)
         for name, values in (("object", self.objects), ("number of lights", self.lights), ("filter size", self.filter_sizes)):
             if not values:
                 raise ShadowmapError(f"no {name} given: name at least one.")
             if len(set(values)) != len(values):
                 raise ShadowmapError(f"one {name} is given twice in {', '.join(map(str, values))}: name each once.")
-        if self.memory < 1:
-            raise ShadowmapError(f"{self.memory} bytes of memory: give at least 1.")
         check_threads(self.threads)
         for problem in self.problems():
             check_problem(problem)

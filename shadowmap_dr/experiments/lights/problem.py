@@ -20,7 +20,8 @@ from ...inverse.light_directions.batch import batch_bytes
 from ...io import assets
 from ...rendering.renderer import Renderer
 from ...shadow import ShadowSettings
-from .scene import CONE_DEG, alignment, check_scene, make_scene, target_and_starts
+from ..common.ranges import MAP_SIDE, RUNS, SEED, STEPS, bounded, check_ranges, required
+from .scene import CONE_DEG, MOST_LIGHTS, alignment, check_scene, make_scene, target_and_starts
 
 ReferenceKind = Literal["own", "mitsuba"]
 StrategyKind = Literal["plain", "coarse"]
@@ -50,15 +51,15 @@ class LightSetting:
     """
 
     filter: str = "gaussian"
-    map_resolution: int = 256
-    resolution: int = 128
-    iterations: int = 200
+    map_resolution: int = bounded(256, MAP_SIDE)
+    resolution: int = bounded(128, (4, 4096))
+    iterations: int = bounded(200, STEPS)
     strategy: StrategyKind = "plain"
-    starts: int = 1
+    starts: int = bounded(1, (1, 1000))
     reference: ReferenceKind = "own"
-    spp: int = 512
-    seed: int = 0
-    cone_deg: float = CONE_DEG
+    spp: int = bounded(512, (1, MOST_SAMPLES))
+    seed: int = bounded(0, SEED)
+    cone_deg: float = bounded(CONE_DEG, (1e-3, 178.0), "--cone")
 
 
 @dataclass(frozen=True)
@@ -73,9 +74,9 @@ class LightProblem(Problem, LightSetting):
     """
 
     object: str
-    lights: int
-    runs: int
-    filter_size: int = 3
+    lights: int = required((1, MOST_LIGHTS))
+    runs: int = required(RUNS)
+    filter_size: int = bounded(3, (0, 255))
 
     @property
     def name(self) -> str:
@@ -187,22 +188,14 @@ def curve_iterations(iterations: int) -> list[int]:
 
 def check_problem(problem: LightProblem) -> None:
     """Raise ShadowmapError for impossible settings, before any work is done."""
+    check_ranges(problem)
     check_scene(problem.object, problem.lights, problem.resolution)
     if problem.filter not in FILTERS:
         raise ShadowmapError(f"no filter {problem.filter!r}: choose {', '.join(FILTERS)}; 1 texel is no filter.")
-    for what, value in (("runs", problem.runs), ("iterations", problem.iterations), ("starts", problem.starts)):
-        if value < 1:
-            raise ShadowmapError(f"{value} {what}: give at least 1.")
-    if not 0 < problem.cone_deg <= 178:
-        raise ShadowmapError(f"a cone of {problem.cone_deg:g} degrees: give more than 0 and at most 178.")
-    if problem.seed < 0:
-        raise ShadowmapError(f"the seed {problem.seed}: give 0 or more.")
     if problem.reference not in ("own", "mitsuba"):
         raise ShadowmapError(f"no reference {problem.reference!r}: choose own or mitsuba.")
     if problem.strategy not in ("plain", "coarse"):
         raise ShadowmapError(f"no strategy {problem.strategy!r}: choose plain or coarse.")
-    if not 1 <= problem.spp <= MOST_SAMPLES:
-        raise ShadowmapError(f"{problem.spp} samples per pixel: give 1 to {MOST_SAMPLES}.")
     for size in (problem.filter_size, *(stage.filter_size for stage in problem.stages)):
         try:
             ShadowSettings(filter=problem.filter, filter_size=max(1, size or 1), resolution=problem.map_resolution)

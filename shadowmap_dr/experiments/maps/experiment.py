@@ -23,6 +23,7 @@ from ...io import files, plots, records
 from ...jit.types import Float
 from ...rendering.renderer import Renderer
 from ...shadow import ShadowSettings, directional_view
+from ..common.ranges import FILTER_SIDE, MAP_SIDE, SAMPLES, bounded, check_ranges
 from ..common.timing import Contender, alternate, machine
 from . import pose as maps_pose
 from . import scenes as maps_scenes
@@ -62,23 +63,22 @@ class MapsOptions:
 
     scenes: tuple[str, ...] = tuple(maps_scenes.SCENES)
     candidates: tuple[str, ...] = tuple(CANDIDATES)
-    resolution: int = 512
-    map_resolution: int = 256
-    filter_size: int = 3
-    reference_spp: int = _REFERENCE_SPP
-    rounds: int = 30
-    pose_runs: int = 10
+    resolution: int = bounded(512, (8, 4096))
+    map_resolution: int = bounded(256, MAP_SIDE)
+    filter_size: int = bounded(3, FILTER_SIDE)
+    reference_spp: int = bounded(_REFERENCE_SPP, SAMPLES, "--spp")
+    rounds: int = bounded(30, (1, 10_000))
+    pose_runs: int = bounded(10, (0, 100_000))
     out: Path = Path("maps")
 
     def __post_init__(self) -> None:
+        check_ranges(self)
         for kind, names, known in (("scene", self.scenes, maps_scenes.SCENES), ("method", self.candidates, CANDIDATES)):
             if not names:
                 raise ShadowmapError(f"no {kind} given: name at least one.")
             for name in names:
                 if name not in known:
                     raise ShadowmapError(f"no {kind} {name!r}: choose from {', '.join(map(repr, known))}.")
-        if self.resolution < 8 or self.reference_spp < 1 or self.rounds < 1 or self.pose_runs < 0:
-            raise ShadowmapError("resolution, samples, rounds and runs must be at least 8, 1, 1 and 0.")
         try:
             ShadowSettings(resolution=self.map_resolution, filter_size=self.filter_size)
         except ValueError as error:

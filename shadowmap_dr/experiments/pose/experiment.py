@@ -28,6 +28,7 @@ from ...io import console as io_console
 from ...io import files, plots
 from ...io import images as io_images
 from ...io import records as io_records
+from ..common.ranges import RUNS, SEED, STEPS, bounded, check_ranges
 from .methods import METHODS, Builder, Image, build_method, fairness
 from .record import identity, is_complete, is_of, make_record
 from .scene import NormalKind, PoseProblem, ReferenceKind, make_problem, start_pose
@@ -39,21 +40,22 @@ class PoseOptions:
     """Options of a run. Everything is run for each object, resolution, run and method."""
 
     objects: tuple[str, ...] = ("spot",)
-    resolutions: tuple[int, ...] = (128,)
+    resolutions: tuple[int, ...] = bounded((128,), (8, 4096), "--resolution")
     methods: tuple[str, ...] = METHODS
-    runs: int = 1
-    seed: int = 0
-    iterations: int = 150
+    runs: int = bounded(1, RUNS)
+    seed: int = bounded(0, SEED)
+    iterations: int = bounded(150, STEPS)
     reference: ReferenceKind = "mitsuba"
     shadow_only: bool = False
     normals: NormalKind = "face"
-    samples: int = 1
+    samples: int = bounded(1, (1, 4096))
     out: Path = Path("pose")
     resume: bool = False
     scheduler: str = "local"
     threads: int = 0
 
     def __post_init__(self) -> None:
+        check_ranges(self)
         for name, values in (("object", self.objects), ("resolution", self.resolutions), ("method", self.methods)):
             if not values:
                 raise ShadowmapError(f"no {name} given: name at least one.")
@@ -62,11 +64,6 @@ class PoseOptions:
         for method in self.methods:
             if method not in METHODS:
                 raise ShadowmapError(f"no method {method!r}: choose from {', '.join(METHODS)}.")
-        for name, value in (("runs", self.runs), ("iterations", self.iterations), ("samples per pixel", self.samples)):
-            if value < 1:
-                raise ShadowmapError(f"{value} {name}: give at least 1.")
-        if self.seed < 0:
-            raise ShadowmapError(f"the seed {self.seed}: give 0 or more.")
         check_threads(self.threads)
         if self.reference not in ("mitsuba", "own"):
             raise ShadowmapError(f"no reference {self.reference!r}: choose mitsuba or own.")

@@ -20,6 +20,8 @@ from ...io import console as io_console
 from ...io import files, records
 from ...jit.types import UInt32
 from ...rendering.renderer import Renderer
+from ...rendering.settings import MOST_SAMPLES
+from ..common.ranges import MAP_SIDE, SAMPLES, bounded, check_range, check_ranges
 from ..common.timing import Contender, alternate, machine
 from . import report as soft_report
 from . import scenes as soft_scenes
@@ -55,22 +57,24 @@ class SoftOptions:
 
     scenes: tuple[str, ...] = tuple(soft_scenes.SCENES)
     samples: tuple[tuple[int, int], ...] = ((16, 32), (32, 64), (64, 128))
-    resolution: int = 96
-    map_resolution: int = 128
-    spp: int = 16
-    reference_spp: int = 512
+    resolution: int = bounded(96, (8, 4096))
+    map_resolution: int = bounded(128, MAP_SIDE)
+    spp: int = bounded(16, SAMPLES)
+    reference_spp: int = bounded(512, (16, 65_536))
     timed: bool = True
     out: Path = Path("soft")
     resume: bool = False
 
     def __post_init__(self) -> None:
+        check_ranges(self)
         if not self.scenes or not self.samples:
             raise ShadowmapError("no scene or no number of samples given: name at least one.")
         for name in self.scenes:
             if name not in soft_scenes.SCENES:
                 raise ShadowmapError(f"no scene {name!r}: choose from {', '.join(soft_scenes.SCENES)}.")
-        if self.resolution < 8 or self.reference_spp < 16 or self.spp < 1:
-            raise ShadowmapError("resolution, reference samples and samples must be at least 8, 16 and 1.")
+        for pair in self.samples:
+            for name, value in zip(("area", "sky"), pair, strict=True):
+                check_range(f"number of {name} samples (--samples)", value, (1, MOST_SAMPLES))
 
     @property
     def settings(self) -> dict[str, Any]:

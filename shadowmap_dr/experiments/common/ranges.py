@@ -1,0 +1,53 @@
+"""Ranges of numbers in option records: declared beside the defaults, checked in one place for commands and Python alike."""
+
+from __future__ import annotations
+
+from dataclasses import field, fields
+from numbers import Integral, Real
+from typing import Any, TypeVar
+
+from ...errors import ShadowmapError
+
+T = TypeVar("T")
+Range = tuple[float, float]
+
+#: Usual ranges: sides of images and of shadow maps, sides of filters, samples per pixel, steps, runs, and seeds.
+SIDE, MAP_SIDE, FILTER_SIDE, SAMPLES, STEPS, RUNS, SEED = (
+    *((16, 4096), (8, 4096), (1, 255), (1, 65_536), (1, 1_000_000), (1, 1_000_000), (0, 2**31 - 1)),
+)
+
+
+def bounded(default: T, allowed: Range, option: str = "") -> T:
+    """Declare a field of a record, or a tuple of such values.
+
+    Args:
+        default: its default.
+        allowed: least and largest value; whole numbers if both are.
+        option: of the command, if it is not named like the field.
+    """
+    result: T = field(default=default, metadata={"allowed": allowed, "option": option})
+    return result
+
+
+def required(allowed: Range, option: str = "") -> Any:  # Any: the field's type
+    """Declare a field without a default. See `bounded`."""
+    return field(metadata={"allowed": allowed, "option": option})
+
+
+def check_ranges(record: Any) -> None:  # Any: a dataclass
+    """ShadowmapError, with option, value and range, for the first number of a record that lies outside of its range."""
+    for declared in fields(record):
+        if "allowed" in declared.metadata:
+            value = getattr(record, declared.name)
+            option = declared.metadata["option"] or f"--{declared.name.replace('_', '-')}"
+            for number in value if isinstance(value, tuple) else () if value is None else (value,):
+                check_range(f"{declared.name} ({option})", number, declared.metadata["allowed"])
+
+
+def check_range(name: str, value: Any, allowed: Range) -> None:  # Any: what users give
+    """ShadowmapError if a number is no (whole) number between two others, both included. NaN lies between none."""
+    low, high = allowed
+    whole = isinstance(low, int) and isinstance(high, int)
+    kind = Integral if whole else Real
+    if not (isinstance(value, kind) and not isinstance(value, bool) and low <= value <= high):
+        raise ShadowmapError(f"{name} is {value!r}: give a {'whole ' if whole else ''}number from {low} to {high}.")

@@ -6,8 +6,9 @@ import importlib
 import importlib.metadata
 import os
 import sys
+import warnings
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TextIO
 
 import typer
 import typer.core
@@ -112,6 +113,7 @@ def _program() -> None:
 
 def main() -> None:
     """Entry point. Every expected failure gives one line on standard error and a non-zero exit status."""
+    warnings.showwarning = _show_warning
     try:
         status = typer.main.get_command(app)(standalone_mode=False)
         sys.stdout.flush()  # here, where a failure still gives one line
@@ -122,6 +124,8 @@ def main() -> None:
     except BrokenPipeError:  # the reader of standard output has closed it
         _drop_output()
         sys.exit(1)
+    except UnicodeError as error:  # a name, or an argument, of bytes that are no text
+        _fail(f"a name is not UTF-8 ({error}): choose another, or rename the file", 1)
     except OSError as error:  # for instance a full disk behind the standard output
         _drop_output()
         _fail(str(error), 1)
@@ -144,5 +148,23 @@ def _drop_output() -> None:
 
 
 def _fail(message: str, status: int) -> None:
-    Console(stderr=True, soft_wrap=True, highlight=False, markup=False).print(f"error: {' '.join(message.split())}")
+    _note(f"error: {message}")
     sys.exit(status)
+
+
+def _note(message: object) -> None:
+    """A line on standard error; names of files may hold bytes that are no text."""
+    line = " ".join(str(message).split()).encode("utf-8", "backslashreplace").decode("utf-8")
+    Console(stderr=True, soft_wrap=True, highlight=False, markup=False).print(line)
+
+
+def _show_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
+    """A warning as a line, without the line of code that gave it."""
+    _note(f"{'warning' if issubclass(category, UserWarning) else category.__name__}: {message}")

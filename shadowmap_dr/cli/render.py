@@ -80,6 +80,7 @@ def _definitions(entries: list[str]) -> dict[str, str]:
         if match is None:
             raise ShadowmapError(f"-D {entry}: write it as NAME=VALUE, for instance -D resolution=256.")
         name, value = match.groups()
+        files.check_name(value)
         if name in values:
             raise ShadowmapError(f"-D {entry}: {name} has a value already, {values[name]!r}.")
         if value.strip().lower() in ("nan", "-nan", "inf", "-inf", "+inf", "infinity", "-infinity"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..errors import ShadowmapError
+from .files import check_name
 
 
 def scenes_dir() -> Path:
@@ -49,6 +50,7 @@ def target(name: str) -> Path:
 def _find(name: str, suffix: str, folder: Path, known: list[str], kind: str) -> Path:
     if name in known:
         return folder / (name + suffix)
+    check_name(name)
     path = Path(name)
     if path.is_file():
         return path.resolve()

@@ -60,6 +60,7 @@ def make_folder(folder: Path) -> None:
 def check_output(path: str | os.PathLike[str], suffixes: tuple[str, ...] = SUFFIXES) -> Path:
     """Check, before any work is done, that `path` can be written later. Returns it as a Path, or raises OutputError."""
     path = Path(path)
+    check_name(path)
     if path.suffix.lower() not in suffixes:
         raise OutputError(f"cannot write {path}: the suffix {path.suffix!r} is not one of {', '.join(suffixes)}.")
     try:
@@ -73,6 +74,21 @@ def check_output(path: str | os.PathLike[str], suffixes: tuple[str, ...] = SUFFI
     except OSError as error:
         raise OutputError(f"cannot write {path}: {error.strerror or error}.") from error
     return path
+
+
+def check_readable(path: Path) -> None:
+    """ShadowmapError if a file does not exist, or if libraries cannot be told its name: names may be of any bytes."""
+    check_name(path)
+    if not path.is_file():
+        raise ShadowmapError(f"no file {str(path)!r}.")
+
+
+def check_name(path: str | os.PathLike[str]) -> None:
+    """OutputError if a name is not UTF-8: Mitsuba, OpenEXR and JSON cannot hold it."""
+    try:
+        os.fspath(path).encode("utf-8")
+    except UnicodeEncodeError:
+        raise OutputError(f"the name {os.fspath(path)!r} is not UTF-8: choose another, or rename the file.") from None
 
 
 def read_arrays(path: str | os.PathLike[str], only: Collection[str] | None = None) -> dict[str, npt.NDArray[Any]]:

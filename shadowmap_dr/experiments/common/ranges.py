@@ -49,5 +49,6 @@ def check_range(name: str, value: Any, allowed: Range) -> None:  # Any: what use
     low, high = allowed
     whole = isinstance(low, int) and isinstance(high, int)
     kind = Integral if whole else Real
-    if not (isinstance(value, kind) and not isinstance(value, bool) and low <= value <= high):
+    is_number = isinstance(value, kind) and not isinstance(value, bool)
+    if not is_number or not low <= value <= high:
         raise ShadowmapError(f"{name} is {value!r}: give a {'whole ' if whole else ''}number from {low} to {high}.")

@@ -12,7 +12,8 @@ import numpy.typing as npt
 
 from ...errors import ShadowmapError
 from ...io import assets
-from ..common.objects import check_suffix, load_mesh, placement
+from ...io.meshes import check_suffix, read_mesh
+from ..common.objects import load_mesh, occluder
 
 OBJECTS = ("bunny", "dragon", "hand", "spot", "teapot", "suzanne")
 #: Opening angle (degrees) of the cone about the vertical in which the directions to the lights lie.
@@ -20,6 +21,8 @@ CONE_DEG = 60.0
 MOST_LIGHTS = 5
 #: Irradiance of all lights together on a surface that faces them.
 IRRADIANCE = math.pi
+# Of the object.
+_REFLECTANCE = 0.7
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -44,13 +47,18 @@ def make_scene(name: str, lights: int, resolution: int) -> mi.Scene:
         resolution: width and height of the image in pixels.
     """
     path = check_scene(name, lights, resolution)
-    thing = load_mesh(path)
+    if name in assets.mesh_names():
+        thing = load_mesh(path)
+        shape: mi.Mesh | dict[str, Any] = {
+            "type": "ply",
+            "filename": str(path),
+            "face_normals": True,
+            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": _REFLECTANCE}},
+        }
+    else:
+        thing = shape = occluder("object", *read_mesh(path), (_REFLECTANCE,) * 3, both_sides=False)
+    ground = float(thing.bbox().min.y)
     transform = mi.ScalarTransform4f
-    ground, place = float(thing.bbox().min.y), transform()
-    if name not in assets.mesh_names():
-        centre, scale = placement(thing, path)
-        ground = scale * (ground - float(centre[1]))
-        place = transform().scale(scale).translate((-centre).tolist())
     grey = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}
     film = {"type": "hdrfilm", "width": resolution, "height": resolution, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
     camera = transform().look_at(origin=[0, 6.5, 4], target=[0, ground + 0.5, 0], up=[0, 1, 0])
@@ -64,13 +72,7 @@ def make_scene(name: str, lights: int, resolution: int) -> mi.Scene:
             "to_world": transform().translate([0, ground, 0]).rotate([1, 0, 0], -90).scale(5),
             "bsdf": grey,
         },
-        "object": {
-            "type": check_suffix(path),
-            "filename": str(path),
-            "face_normals": True,
-            "to_world": place,
-            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.7}},
-        },
+        "object": shape,
     }
     for k in range(lights):
         scene[f"light_{k}"] = {

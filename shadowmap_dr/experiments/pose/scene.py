@@ -16,7 +16,7 @@ import numpy.typing as npt
 from ...errors import ShadowmapError
 from ...io import assets, images, meshes
 from ...scene.mitsuba_meshes import set_positions
-from ..common.objects import load_mesh, placement, positions
+from ..common.objects import load_mesh, occluder, positions
 
 ReferenceKind = Literal["mitsuba", "own"]
 NormalKind = Literal["face", "vertex"]
@@ -82,7 +82,7 @@ def make_problem(
     """Load an object and build the scene around it.
 
     Args:
-        name: name of a mesh of this package, or a .ply or .obj file, which is centred and scaled into [-1, 1]^3.
+        name: name of a mesh of this package, or a mesh file, which is centred and scaled into [-1, 1]^3.
         resolution: 1 to 4096 pixels.
         shadow_only, normals: see PoseProblem.
         work: folder for the scaled copy of a mesh file.
@@ -153,10 +153,9 @@ def path_traced_reference(problem: PoseProblem, path: Path) -> npt.NDArray[np.fl
 
 def _import_mesh(path: Path, work: Path) -> tuple[str, Path]:
     """Name and scaled PLY copy, in [-1, 1]^3, of a user's mesh file."""
-    mesh = load_mesh(path)
-    centre, scale = placement(mesh, path)
+    vertices, faces = meshes.read_mesh(path)
     target = work / f"{path.stem}.ply"
-    _write_mesh(mesh, (positions(mesh) - centre) * scale, target)
+    meshes.write_ply(target, occluder(path.stem, vertices, faces))
     return path.stem, target
 
 

@@ -58,7 +58,9 @@ def ensure() -> None:
         return
     if imported_before and find() is not None:
         raise LLVMError(f"Dr.Jit was imported first and found {found}: import shadowmap_dr before mitsuba and drjit.")
-    raise LLVMError(f"Dr.Jit found {found}: {_remedy()}.")
+    named = os.environ.get(ENVIRONMENT_VARIABLE)
+    fault = f" ({named} {_named_fault(named)})" if named and version is None else ""
+    raise LLVMError(f"Dr.Jit found {found}{fault}: {_remedy()}.")
 
 
 def find() -> Path | None:
@@ -68,7 +70,7 @@ def find() -> Path | None:
         return bundled
     system = {Path(p).resolve() for pattern in _SYSTEM_PATTERNS for p in glob.glob(pattern)}
     usable = [(_file_version(path), str(path)) for path in system]
-    usable = [entry for entry in usable if entry[0] >= MIN_VERSION]
+    usable = [entry for entry in usable if entry[0] >= MIN_VERSION and _is_library(Path(entry[1]))]
     return Path(max(usable)[1]) if usable else None
 
 
@@ -96,7 +98,7 @@ def loaded_library() -> str | None:
 def _wheel_library() -> Path | None:
     for folder in dict.fromkeys((sysconfig.get_path("data"), sys.prefix, sys.base_prefix)):
         for path in sorted(Path(folder, "lib").glob("libLLVM.so.*")):
-            if (path.parent / _RUNTIME_FOLDER).is_dir() and _file_version(path) >= MIN_VERSION:
+            if (path.parent / _RUNTIME_FOLDER).is_dir() and _file_version(path) >= MIN_VERSION and _is_library(path):
                 return path
     # `pip install --user` and `--target` put the library elsewhere; the wheel's own file list knows where.
     try:
@@ -106,7 +108,7 @@ def _wheel_library() -> Path | None:
     for entry in files:
         if entry.name.startswith("libLLVM.so."):
             path = Path(str(entry.locate())).resolve()
-            if path.is_file():
+            if path.is_file() and _is_library(path):
                 return path
     return None
 
@@ -130,18 +132,55 @@ def _file_version(path: Path) -> int:
 def _choose() -> None:
     """Set the environment variable that Dr.Jit reads, unless it names a usable library already."""
     named = os.environ.get(ENVIRONMENT_VARIABLE)
-    path: Path | None
-    if named and Path(named).is_file() and _file_version(Path(named)) >= MIN_VERSION:
-        path = Path(named)
-    else:
-        path = find()
-        if path is None:
-            return
-        if named:
-            warnings.warn(f"{ENVIRONMENT_VARIABLE}={named} is not LLVM {MIN_VERSION} or newer: using {path}.", stacklevel=4)
-        os.environ[ENVIRONMENT_VARIABLE] = str(path)
-    # The wheel creates the link libc++.so.1 when the interpreter first starts. In a read-only environment that link is missing:
-    # loading the runtime beforehand, under its full file name, replaces it.
+    reason = _named_fault(named) if named else ""
+    if named and not reason:
+        return
+    path = find()
+    if path is None:
+        return
+    if named:
+        warnings.warn(f"{ENVIRONMENT_VARIABLE}={named} {reason}: using {path}.", stacklevel=4)
+    _load_runtime(path)
+    os.environ[ENVIRONMENT_VARIABLE] = str(path)
+
+
+def _named_fault(named: str) -> str:
+    """What is wrong with the library that the environment names, empty if it is usable."""
+    path = Path(named)
+    if not path.is_file() or _file_version(path) < MIN_VERSION:
+        return f"is not LLVM {MIN_VERSION} or newer"
+    _load_runtime(path)
+    return _load_fault(path)
+
+
+def _load_fault(path: Path) -> str:
+    """Why a file that is named like an LLVM library is none, empty if it is one. Loads it, as Dr.Jit does afterwards."""
+    if not _is_library(path):
+        return "is named like an LLVM library, but is no shared library"
+    try:
+        ctypes.CDLL(str(path)).LLVMGetVersion  # noqa: B018
+    except OSError as error:
+        return f"is named like an LLVM library, but cannot be loaded ({error})"
+    except AttributeError:
+        return "is named like an LLVM library, but is another one"
+    return ""
+
+
+def _is_library(path: Path) -> bool:
+    """True if a file begins like a shared library (ELF, Mach-O, or several of the latter)."""
+    try:
+        with path.open("rb") as file:
+            return file.read(4) in (b"\x7fELF", b"\xcf\xfa\xed\xfe", b"\xca\xfe\xba\xbe")
+    except OSError:
+        return False
+
+
+def _load_runtime(path: Path) -> None:
+    """Load the C++ runtime of the wheel's library where its links are missing.
+
+    The wheel creates the link libc++.so.1 at the first interpreter start. Where the environment cannot be written to, the link is
+    missing, and the runtime is loaded beforehand under its own name.
+    """
     folder = path.parent / _RUNTIME_FOLDER
     if folder.is_dir() and not all((folder / name).exists() for name in _RUNTIME):
         for name in _RUNTIME:

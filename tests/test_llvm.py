@@ -77,6 +77,31 @@ def test_unusable_library_in_the_environment_is_replaced(named: str) -> None:
     assert named in result.stderr
 
 
+@needs_llvm
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (b"no library", "but is no shared library"),
+        (b"\x7fELF and no more", "but cannot be loaded"),
+        (b"", "but is no shared library"),
+        (None, "but is another one"),
+    ],
+)
+def test_files_that_are_only_named_like_llvm(tmp_path: Path, content: bytes | None, reason: str) -> None:
+    path = tmp_path / "libLLVM-19.so"
+    path.write_bytes(Path(_another_library()).read_bytes() if content is None else content)
+    result = run("import shadowmap_dr" + USE, DRJIT_LIBLLVM_PATH=str(path))
+    assert result.returncode == 0, result.stderr
+    assert f"{path} is named like an LLVM library, {reason}" in " ".join(result.stderr.split())
+
+
+def _another_library() -> str:
+    """Path of a shared library of this process that is not LLVM."""
+    import _ctypes
+
+    return str(_ctypes.__file__)
+
+
 @no_gpu
 @pytest.mark.parametrize("named", ["/nowhere/libLLVM.so", *OLD[:1]])
 def test_one_clear_sentence_when_it_is_too_late(named: str) -> None:

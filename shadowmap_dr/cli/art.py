@@ -72,4 +72,6 @@ def art(
     record = art_experiment.run_art(options)
     Console().print(art_experiment.table(record))
     typer.echo(art_experiment.summary(record))
+    for message in record["warnings"]:
+        typer.echo(f"warning: {message}", err=True)
     typer.echo(f"Meshes, pictures and record: {out}")

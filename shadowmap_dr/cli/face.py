@@ -92,6 +92,9 @@ def face(
             f"root mean square difference of the shadows: {record['image_error_start']:.4f} at the start, "
             f"{record['image_error']:.4f} at the end"
         )
+        typer.echo(f"share of heads whose weights are as far from the mean head's: {record['chance_of_weights']:.2g}")
+        for message in faces_image.doubts(record):
+            typer.echo(f"warning: {message}", err=True)
         typer.echo(f"Record, pictures and head: {out}")
         return
     defaults = faces_experiment.FaceOptions()

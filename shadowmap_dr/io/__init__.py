@@ -2,7 +2,7 @@
 
 from .files import atomic, check_output, read_arrays
 from .images import colour_channels, read_exr, read_image, to_srgb, write_exr, write_image, write_png
-from .records import read_json, read_record, write_json
+from .records import read_json, read_record, write_json, write_record
 
 __all__ = [
     "atomic",
@@ -17,5 +17,6 @@ __all__ = [
     "write_exr",
     "write_image",
     "write_json",
+    "write_record",
     "write_png",
 ]

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import os
+import platform
+import re
 import tempfile
 import zipfile
 from collections.abc import Collection, Iterator
@@ -17,6 +20,10 @@ import numpy.typing as npt
 from ..errors import OutputError, ShadowmapError
 
 SUFFIXES = (".exr", ".png")
+# Names of temporary files: machine, process, and what `tempfile` adds. Folders that were searched for those of killed processes.
+_HOST = hashlib.sha256(platform.node().encode()).hexdigest()[:8]
+_TEMPORARY = re.compile(r"\..*-(?P<host>[0-9a-f]{8})-(?P<process>[0-9]{1,9})-[a-z0-9_]{8}(\.[^.]*)?", re.DOTALL)
+_CLEARED: set[Path] = set()
 #: Most bytes of the arrays of an archive that is read.
 MOST_DECODED = 8_000_000_000
 
@@ -33,7 +40,8 @@ def atomic(path: str | os.PathLike[str]) -> Iterator[Path]:
         if path.is_dir():
             raise IsADirectoryError(errno.EISDIR, "Is a directory")
         make_folder(path.parent)
-        handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
+        remove_leftovers(path.parent)
+        handle, name = tempfile.mkstemp(prefix=f".{path.stem}-{_HOST}-{os.getpid()}-", suffix=path.suffix, dir=path.parent)
         os.close(handle)
         temporary = Path(name)
         yield temporary
@@ -57,6 +65,28 @@ def make_folder(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
 
 
+def remove_leftovers(folder: Path) -> None:
+    """Remove temporary files of `atomic` that killed processes of this machine have left; once a process and folder."""
+    folder = folder.resolve()
+    if folder in _CLEARED:
+        return
+    _CLEARED.add(folder)
+    for path in folder.iterdir():
+        found = _TEMPORARY.fullmatch(path.name)
+        if found and found["host"] == _HOST and not _is_running(int(found["process"])):
+            path.unlink(missing_ok=True)
+
+
+def _is_running(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        return True
+    return True
+
+
 def check_output(path: str | os.PathLike[str], suffixes: tuple[str, ...] = SUFFIXES) -> Path:
     """Check, before any work is done, that `path` can be written later. Returns it as a Path, or raises OutputError."""
     path = Path(path)
@@ -69,6 +99,7 @@ def check_output(path: str | os.PathLike[str], suffixes: tuple[str, ...] = SUFFI
         if path.exists() and not os.access(path, os.W_OK):
             raise PermissionError(errno.EACCES, "Permission denied")
         make_folder(path.parent)
+        remove_leftovers(path.parent)
         with tempfile.TemporaryFile(dir=path.parent):
             pass
     except OSError as error:

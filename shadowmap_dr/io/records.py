@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
+import itertools
 import json
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..errors import ShadowmapError
+from ..errors import OutputError, ShadowmapError, warn
 from .files import atomic
 
 
@@ -28,22 +30,73 @@ def read_json(path: str | os.PathLike[str]) -> Any:  # Any: JSON
         return json.loads(Path(path).read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise ShadowmapError(f"no file {str(path)!r}.") from None
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise ShadowmapError(f"cannot read {path}: {' '.join(str(error).split())}.") from error
 
 
-def read_record(path: str | os.PathLike[str], settings: Mapping[str, Any], *parts: str) -> dict[str, Any]:
-    """The record of an earlier run, to be continued: a mapping with these ``settings``, and one mapping for each of ``parts``.
+def digest(value: Any) -> str:  # Any: JSON
+    """Short hash of a JSON value, which tells whether a stored one has been edited."""
+    return hashlib.sha256(json.dumps(plain(value), sort_keys=True).encode()).hexdigest()[:12]
 
-    Raises ShadowmapError if the file holds no such record, or a record of other settings.
+
+def write_record(path: str | os.PathLike[str], record: Mapping[str, Any], *parts: str) -> None:
+    """Write a record that `read_record` goes on with, with a digest of each entry of its mappings ``parts``."""
+    checks = {part: {key: digest(entry) for key, entry in record[part].items()} for part in parts}
+    write_json(path, {**record, "checks": checks})
+
+
+def read_record(path: str | os.PathLike[str], fresh: Mapping[str, Any], parts: Mapping[str, Collection[str]]) -> dict[str, Any]:
+    """A record to go on with: ``fresh``, and the entries of an earlier call in the file.
+
+    Entries that were edited or damaged are left out, to be made again, and a file that holds no record is set aside. A warning
+    says so.
+
+    Args:
+        path: the file.
+        fresh: record without entries, with ``settings``.
+        parts: names of the mappings of entries; keys that entries without digests need, which earlier versions wrote.
+
+    Raises ShadowmapError if the file is a record of other settings.
     """
-    record, advice = read_json(path), "choose another folder, or leave out --resume"
+    try:
+        record = read_json(path)
+    except ShadowmapError:
+        record = None
     if not isinstance(record, dict) or not all(isinstance(record.get(part), dict) for part in ("settings", *parts)):
-        raise ShadowmapError(f"{path} is no record of this experiment: {advice}.")
+        set_aside(path)
+        return dict(fresh)
+    settings = plain(fresh["settings"])
     found = {key: record["settings"].get(key) for key in settings}
-    if found != plain(settings):
-        raise ShadowmapError(f"{path} belongs to a run with other settings, {found}: {advice}.")
-    return record
+    if found != settings:
+        raise ShadowmapError(
+            f"{path} belongs to a run with other settings, {found}: choose another folder, or leave out --resume."
+        )
+    checks, result = record.get("checks"), dict(fresh)
+    for part, needed in parts.items():
+        entries = record[part]
+        own = checks.get(part) if isinstance(checks, dict) else {}
+        own = own if isinstance(own, dict) else {}
+        result[part] = {
+            key: entry
+            for key, entry in entries.items()
+            if (own.get(key) == digest(entry) if checks is not None else isinstance(entry, dict) and entry.keys() >= set(needed))
+        }
+        lost = len(entries) - len(result[part])
+        if lost:
+            warn(f"{path}: {lost} of {len(entries)} entries of {part!r} were edited or are damaged: they are made again.")
+    return result
+
+
+def set_aside(path: str | os.PathLike[str]) -> None:
+    """Give a file that is no record of an experiment another name, and say so in a warning: nothing is lost."""
+    path = Path(path)
+    names = (path.with_name(f"{path.name}.{k}.bak") for k in itertools.count(1))
+    other = next(name for name in names if not name.exists())
+    try:
+        path.replace(other)
+    except OSError as error:
+        raise OutputError(f"{path} is no record of this experiment, and cannot be renamed: {error.strerror or error}.") from error
+    warn(f"{path} is no record of this experiment, or is damaged: it is now {other.name}, and all runs are made again.")
 
 
 def plain(value: object) -> Any:  # Any: JSON

@@ -169,3 +169,29 @@ def test_narrow_drawings_are_refused(tmp_path: Path, size: str) -> None:
     path.write_text(f'<svg xmlns="http://www.w3.org/2000/svg" {size}><rect width="1" height="1"/></svg>')
     with pytest.raises(ShadowmapError, match="cannot read .*a.svg"):
         target_images.read_figure(path)
+
+
+def test_noisy_grey_photographs_are_cut_at_otsus_threshold(tmp_path: Path) -> None:
+    """The extremes of noise are no figure: such a picture ended at an intersection over union of 0.01."""
+    row, column = np.mgrid[:240, :320]
+    disk = ((column - 160) / 75) ** 2 + ((row - 120) / 85) ** 2 < 1
+    noise = np.random.default_rng(0).normal(0, 0.09, disk.shape)
+    grey = np.where(disk, 0.35, 0.6) + 0.15 * (column / 320 - 0.5) + noise
+    for name, values in (("dark.png", grey), ("bright.png", 1 - grey)):
+        Image.fromarray((np.clip(values, 0, 1) * 255).astype(np.uint8)).save(tmp_path / name)
+        figure = target_images.read_figure(tmp_path / name) > 0.5
+        assert (figure & disk).sum() > 0.95 * (figure | disk).sum()
+
+
+def test_otsus_threshold_separates_best() -> None:
+    values = np.random.default_rng(0).random(500)
+    threshold, separation = target_images.otsu(values)
+
+    def between(t: float) -> float:
+        below, above = values[values < t], values[values >= t]
+        return len(below) * len(above) * (below.mean() - above.mean()) ** 2 / len(values) ** 2
+
+    best = max(between(t) for t in np.linspace(0.01, 0.99, 99))
+    assert between(threshold) >= 0.99 * best and separation == pytest.approx(best / values.var(), rel=0.02)
+    assert target_images.otsu([0.2, 0.2, 0.8])[0] == pytest.approx(0.5, abs=0.01)
+    assert target_images.otsu([0.2, 0.8])[1] == pytest.approx(1) and target_images.otsu([0.3, 0.3])[1] == 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -148,14 +149,66 @@ def test_meshes_on_a_full_disk(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("content", ["[]", "3", '{"settings": null, "runs": {}}', '{"settings": {"a": 1}}', '{"runs": {}}'])
 def test_records_of_something_else(tmp_path: Path, content: str) -> None:
-    path = tmp_path / "record.json"
-    path.write_text(content)
-    with pytest.raises(ShadowmapError, match=r"record\.json is no record of this experiment.*leave out --resume"):
-        records.read_record(path, {"a": 1}, "runs")
-    path.write_text('{"settings": {"a": [1, 2], "b": 3}, "runs": {"x": 1}}')
-    assert records.read_record(path, {"a": (1, 2)}, "runs")["runs"] == {"x": 1}
+    """They are set aside, and the experiment begins anew."""
+    path, fresh = tmp_path / "record.json", {"settings": {"a": (1, 2)}, "runs": {}}
+    for k in (1, 2):
+        path.write_text(content)
+        with pytest.warns(UserWarning, match=rf"record\.json is no record .* it is now record\.json\.{k}\.bak") as caught:
+            assert records.read_record(path, fresh, {"runs": ()}) == fresh
+        assert len(caught) == 1 and not path.exists() and (tmp_path / f"record.json.{k}.bak").read_text() == content
+
+
+def test_edited_entries_of_records_are_made_again(tmp_path: Path) -> None:
+    path, fresh = tmp_path / "record.json", {"settings": {"a": (1, 2)}, "runs": {}}
+    runs = {"x": {"n": np.float32(0.1), "bad": float("nan")}, "y": {"n": 2}, "z": 3}
+    records.write_record(path, {"settings": {"a": (1, 2), "b": 3}, "runs": runs}, "runs")
+    assert records.read_record(path, fresh, {"runs": ()})["runs"] == records.plain(runs)
+    record = records.read_json(path)
+    record["runs"]["y"]["n"] = 4
+    record["runs"]["w"] = {"n": 5}
+    path.write_text(json.dumps(record))
+    with pytest.warns(UserWarning, match=r"record\.json: 2 of 4 entries of 'runs' were edited or are damaged"):
+        assert list(records.read_record(path, fresh, {"runs": ()})["runs"]) == ["x", "z"]
     with pytest.raises(ShadowmapError, match=r"record\.json belongs to a run with other settings"):
-        records.read_record(path, {"a": (1, 3)}, "runs")
+        records.read_record(path, {"settings": {"a": (1, 3)}}, {"runs": ()})
+    for checks in ([], {"runs": 3}, {"runs": {"x": None}}):
+        path.write_text(json.dumps({**record, "checks": checks}))
+        with pytest.warns(UserWarning, match="4 of 4"):
+            assert records.read_record(path, fresh, {"runs": ()})["runs"] == {}
+
+
+def test_records_of_earlier_versions_need_some_keys(tmp_path: Path) -> None:
+    path, fresh = tmp_path / "record.json", {"settings": {}, "runs": {}}
+    path.write_text('{"settings": {}, "runs": {"x": {"n": 1}, "y": {}, "z": 3}}')
+    with pytest.warns(UserWarning, match="2 of 3"):
+        assert records.read_record(path, fresh, {"runs": ("n",)})["runs"] == {"x": {"n": 1}}
+
+
+@pytest.mark.parametrize("content", [b"{", b"\xff\xfe", b"[" * 100_000, b"1" * 10_000, b""])
+def test_files_that_are_no_json_are_one_line(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "a.json").write_bytes(content)
+    with pytest.raises(ShadowmapError, match=r"cannot read .*a\.json") as caught:
+        records.read_json(tmp_path / "a.json")
+    assert "\n" not in str(caught.value)
+
+
+def test_temporary_files_of_killed_processes_are_removed(tmp_path: Path) -> None:
+    code = (
+        "import os, signal, sys; from pathlib import Path; from shadowmap_dr.io import files\n"
+        "with files.atomic(Path(sys.argv[1])) as temporary: os.kill(os.getpid(), signal.SIGKILL)"
+    )
+    path = tmp_path / "checkpoints" / "run.npz"
+    assert subprocess.run([sys.executable, "-c", code, str(path)]).returncode == -9
+    (left,) = path.parent.iterdir()
+    other = path.parent / left.name.replace(files._HOST, "0" * 8)  # of another machine
+    own = path.parent / ".notes-2024.npz"
+    other.touch(), own.touch()
+    with files.atomic(path) as temporary:
+        assert not left.exists() and other.exists() and own.exists()
+        files._CLEARED.clear()
+        files.remove_leftovers(path.parent)
+        assert temporary.exists()  # of a process that runs
+    assert sorted(path.parent.iterdir()) == sorted([path, other, own])
 
 
 def test_json_of_numpy_values(tmp_path: Path) -> None:

@@ -29,6 +29,7 @@ from ...rendering.receivers.shadow_views import CAMERAS, RECEIVERS, ShadowView
 from ..common.ranges import MAP_SIDE, SEED, STEPS, bounded, check_ranges
 from ..common.timing import machine
 from . import pictures as art_pictures
+from .advice import warnings_of
 from .run import Frame, Maker, Trace, intersection_over_union, make
 
 #: Light directions of the first and the second view; y is up in both.
@@ -165,6 +166,8 @@ def run_art(options: ArtOptions, *, console: Console | None = None) -> dict[str,
     if not options.resume:
         checkpoint.unlink(missing_ok=True)
     maker = build(options)
+    for k in range(len(maker.views)):  # before the long part: what was understood of the pictures
+        io_images.write_png(options.out / f"target-{k + 1}.png", maker.target(k))
     settings = {"targets": [_name(target) for target in options.targets], "iterations": steps, **maker.describe()}
     with io_console.progress(console) as progress:
         task = progress.add_task("steps", total=steps, note="")
@@ -177,6 +180,8 @@ def run_art(options: ArtOptions, *, console: Console | None = None) -> dict[str,
         )
         written = _write(options, maker, trace, progress)
     record["files"] = written
+    targets = [np.asarray(maker.target(k), np.float32) for k in range(len(maker.views))]
+    record["warnings"] = warnings_of(record, targets, fill_holes=options.fill_holes)
     records.write_json(path, record)
     checkpoint.unlink(missing_ok=True)
     return record

@@ -142,10 +142,25 @@ def _stored(options: BenchOptions) -> dict[str, Any]:
     """The record in the file, or an empty one."""
     if not options.out.exists():
         return {"sections": {}}
-    record = records.read_json(options.out)
+    try:
+        record = records.read_json(options.out)
+    except ShadowmapError:
+        record = None
     if not isinstance(record, dict) or record.get("format") != FORMAT or not isinstance(record.get("sections"), dict):
-        raise ShadowmapError(f"{options.out} is no record of a benchmark: choose another file.")
-    return record
+        if not options.resume:
+            raise ShadowmapError(f"{options.out} is no record of a benchmark, or is damaged: choose another file.")
+        records.set_aside(options.out)
+        return {"sections": {}}
+    sound = {name: section for name, section in record["sections"].items() if _is_sound(section)}
+    if len(sound) < len(record["sections"]):
+        records.set_aside(options.out)
+    return {**record, "sections": sound}
+
+
+def _is_sound(section: Any) -> bool:  # Any: JSON
+    """True if a section has the structure that reports read."""
+    units = section.get("units") if isinstance(section, dict) else None
+    return isinstance(units, dict) and all(isinstance(unit, dict) for unit in units.values())
 
 
 def _write(options: BenchOptions, record: dict[str, Any]) -> None:

@@ -178,7 +178,7 @@ def _one(
         history = optimize(fit, start, options.iterations, checkpoint=checkpoint, settings=settings, on_step=show)
         progress.remove_task(steps)
         record["runs"][key] = _measured(scene, head, mode, options, fit, history)
-        records.write_json(path, record)
+        records.write_record(path, record, "runs")
         checkpoint.unlink(missing_ok=True)
     final = np.array(record["runs"][key]["final"], np.float64)
     found = fit.vertices(final)
@@ -238,9 +238,22 @@ def _started(path: Path, options: FaceOptions, model: MorphableModel) -> dict[st
             "translation_step": TRANSLATION_STEP,
         }
     )
+    record: dict[str, Any] = {"settings": settings, "machine": machine(), "runs": {}}
     if options.resume and path.exists():
-        return records.read_record(path, settings, "runs")
-    return {"settings": settings, "machine": machine(), "runs": {}}
+        needed = (
+            "mode",
+            "lights",
+            "seed",
+            "distance",
+            "start_distance",
+            "image_error",
+            "weight_error",
+            "final",
+            "true",
+            "loss_curve",
+        )
+        return records.read_record(path, record, {"runs": needed})
+    return record
 
 
 def _show(progress: Progress, task: TaskID, done: int) -> None:

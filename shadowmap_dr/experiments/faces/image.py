@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from rich.console import Console
 from rich.progress import Progress, TaskID
 
@@ -24,6 +26,8 @@ from .silhouette import place, read_silhouette, resample
 
 #: Ten times as strong as for artificial heads: no head of the model casts exactly the silhouette of another source.
 PRIOR = 3e-4
+# Doubts about a picture: rarer weights, larger differences of the shadows.
+_LEAST_CHANCE, _MOST_ERROR = 1e-3, 0.1
 
 
 @dataclass(frozen=True)
@@ -48,6 +52,35 @@ class ImageOptions:
 
     def __post_init__(self) -> None:
         check_ranges(self)
+
+
+def chance_of_weights(weights: npt.ArrayLike) -> float:
+    """Share of heads of the model whose weights are as far from the mean head's as these, 0 to 1.
+
+    Weights of a model are standard normal, so that the sum of K squares has a chi-square distribution. Its cube root is nearly
+    normal (E. B. Wilson and M. M. Hilferty, "The distribution of chi-square", PNAS, 1931).
+    """
+    values = np.asarray(weights, np.float64).ravel()
+    spread = 2 / (9 * max(values.size, 1))
+    z = (np.cbrt(np.square(values).mean() if values.size else 1.0) - (1 - spread)) / math.sqrt(spread)
+    return 0.5 * math.erfc(z / math.sqrt(2))
+
+
+def doubts(record: dict[str, Any]) -> list[str]:
+    """Reasons why the picture of a record may show no head of the model, with what to try."""
+    result, chance, error = [], record["chance_of_weights"], record["image_error"]
+    if chance < _LEAST_CHANCE:
+        size = float(np.sqrt(np.mean(np.square(record["weights"]))))
+        result.append(
+            f"the head is unlikely: one of {1 / max(chance, 1e-9):.0e} heads or fewer has such weights (root mean square {size:.1f} "
+            "standard deviations); give a profile silhouette, or a larger --prior."
+        )
+    if error > _MOST_ERROR:
+        result.append(
+            f"the shadow of the head differs from the picture (root mean square {error:.2f}): give a profile silhouette of a "
+            "head, dark on light."
+        )
+    return result
 
 
 def run_image(options: ImageOptions, *, console: Console | None = None) -> dict[str, Any]:
@@ -97,6 +130,7 @@ def run_image(options: ImageOptions, *, console: Console | None = None) -> dict[
             "image_error": float(np.sqrt(np.mean(images["difference"] ** 2))),
             "image_error_start": float(np.sqrt(np.mean(np.square(images["mean head"] - images["target"])))),
             "weights": history.final[: fit.count],
+            "chance_of_weights": chance_of_weights(history.final[: fit.count]),
             "translation": history.final[fit.count :],
             "seconds_per_iteration": history.seconds_per_iteration,
             "loss_curve": history.loss,

@@ -122,15 +122,22 @@ def run_convergence(options: ConvergenceOptions, *, console: Console | None = No
                     "error_curve_texels": errors,
                     "loss_curve": history.loss,
                 }
-                records.write_json(path, record)
+                records.write_record(path, record, "runs")
                 progress.advance(task)
     record = records.plain(record)
-    records.write_json(path, record)
+    records.write_record(path, record, "runs")
     plots.image_sheet(options.out / "convergence-images.png", sheet)
     plots.plot_curves(options.out / "convergence.png", _curves(record), columns=2)
     with files.atomic(options.out / "convergence.md") as temporary:
         temporary.write_text(read_convergence(record), encoding="utf-8")
     return record
+
+
+# Without `candidate`: records of earlier versions.
+_NEEDED = (
+    *("occluder", "camera", "filter", "displacement", "texel", "error_texels", "recovered", "seconds_per_iteration"),
+    *("error_curve_texels", "loss_curve"),
+)
 
 
 def _started(path: Path, options: ConvergenceOptions) -> dict[str, Any]:
@@ -142,12 +149,12 @@ def _started(path: Path, options: ConvergenceOptions) -> dict[str, Any]:
         "step_size": STEP_SIZE,
         "decay": _DECAY,
     }
+    record: dict[str, Any] = {"settings": identity, "machine": machine(), "runs": {}}
     if options.resume and path.exists():
-        record = records.read_record(path, identity, "runs")
+        record = records.read_record(path, record, {"runs": _NEEDED})
         for run in record["runs"].values():
             run.setdefault("candidate", "default")  # records of earlier versions have this one only
-        return record
-    return {"settings": identity, "machine": machine(), "runs": {}}
+    return record
 
 
 def _key(label: str, name: str, camera: str, taps: int, displacement: float) -> str:

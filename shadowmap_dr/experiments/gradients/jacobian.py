@@ -83,6 +83,13 @@ class JacobianOptions:
             raise ShadowmapError(f"{self.mitsuba_passes} passes of Mitsuba: give 0 for none, or at least 2.")
 
 
+#: Mappings of entries in the record, and what reports read of entries at least.
+PARTS: dict[str, tuple[str, ...]] = {
+    **{"references": (), "mitsuba": (), "entries": ("candidate", "motion")},
+    "tessellation": ("image_change", "gradient_change"),
+}
+
+
 def run_jacobian(options: JacobianOptions, *, console: Console | None = None) -> dict[str, Any]:
     """Run all; write `jacobian.json`, `jacobian.md`, pictures and a plot into `options.out`. Returns the record."""
     console = console or Console(stderr=True)
@@ -115,14 +122,14 @@ def run_jacobian(options: JacobianOptions, *, console: Console | None = None) ->
         mitsuba = {}
         for name in track("Mitsuba, projective", moving if options.mitsuba_passes else []):
             mitsuba[name], record["mitsuba"][name] = projective_image(mesh, name, sampling, options.mitsuba_passes)
-            records.write_json(path, record)
+            records.write_record(path, record, *PARTS)
         for label, name, size, taps in track("derivative images", work):
             entry = _measure(mesh, label, name, size, taps, traced[name], options)
             record["entries"][_key(label, name, size, taps)] = entry
-            records.write_json(path, record)
+            records.write_record(path, record, *PARTS)
         for name in track("64-fold tessellation", [name for name in moving if name not in record["tessellation"]]):
             record["tessellation"][name] = _tessellation(name, options)
-        records.write_json(path, record)
+        records.write_record(path, record, *PARTS)
         pictures = {name: _pictures(mesh, name, traced, mitsuba, options) for name in track("pictures", list(options.motions))}
     plots.signed_sheet(options.out / "jacobian.png", pictures)
     gradients_report.plot_agreement(options.out / "jacobian-agreement.png", record)
@@ -134,10 +141,10 @@ def run_jacobian(options: JacobianOptions, *, console: Console | None = None) ->
 def _started(path: Path, options: JacobianOptions) -> dict[str, Any]:
     """The stored record if the run is resumed, else a new one."""
     identity = {"resolution": options.resolution, "requested_faces": options.faces, "spp": options.spp}
+    empty: dict[str, Any] = {"settings": identity, "machine": machine(), "candidates": CANDIDATES, **{part: {} for part in PARTS}}
     if options.resume and path.exists():
-        return records.read_record(path, identity, "references", "mitsuba", "entries", "tessellation")
-    empty: dict[str, Any] = {"settings": identity, "machine": machine(), "candidates": CANDIDATES}
-    return empty | {"references": {}, "mitsuba": {}, "entries": {}, "tessellation": {}}
+        return records.read_record(path, empty, PARTS)
+    return empty
 
 
 def _key(label: str, motion: str, size: int, taps: int) -> str:

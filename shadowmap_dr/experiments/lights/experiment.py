@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from ...errors import ShadowmapError
+from ...errors import ShadowmapError, warn
 from ...inverse import run_sweep
 from ...inverse.runs.schedulers import check_threads
 from ...inverse.runs.sweep import MEMORY, stored_records
@@ -143,14 +143,34 @@ def summary(problems: Sequence[LightProblem], records: Sequence[Sequence[dict[st
 def _stored(path: Path) -> list[dict[str, Any]]:
     if not path.exists():
         return []
-    value = io_records.read_json(path)
+    try:
+        value = io_records.read_json(path)
+    except ShadowmapError:
+        value = None
     summaries = value.get("summaries") if isinstance(value, dict) else None
     needed = {"setting", "lights", "filter", "filter_size", "cone_deg", "strategy", "starts", "reference", "objects", "runs"}
     needed |= {"alignment_mean", "alignment_std", "alignment_least", "share_from_0.995"}
     needed |= {"curve_iterations", "curve_mean", "curve_std"}
-    if not isinstance(summaries, list) or not all(isinstance(entry, dict) and needed <= entry.keys() for entry in summaries):
-        raise ShadowmapError(f"{path} holds no summaries of this experiment: choose another folder.")
-    return summaries
+    if not isinstance(summaries, list):
+        io_records.set_aside(path)
+        return []
+    kept = [entry for entry in summaries if isinstance(entry, dict) and needed <= entry.keys() and _is_sound(entry)]
+    if len(kept) < len(summaries):
+        warn(f"{path}: {len(summaries) - len(kept)} of {len(summaries)} summaries were edited or are damaged: they are left out.")
+    return kept
+
+
+def _is_sound(entry: dict[str, Any]) -> bool:
+    """True if what the next call reads of a summary has the right types."""
+    curves = [entry[f"curve_{name}"] for name in ("iterations", "mean", "std")]
+    numbers = [entry[name] for name in ("lights", "filter_size", "runs", "cone_deg", "starts", "alignment_mean", "alignment_std")]
+    return (
+        isinstance(entry["setting"], str)
+        and isinstance(entry["objects"], list)
+        and all(isinstance(name, str) for name in entry["objects"])
+        and all(isinstance(curve, list) and len(curve) == len(curves[0]) for curve in curves)
+        and all(isinstance(number, int | float) for curve in (numbers, *curves) for number in curve)
+    )
 
 
 def _widened(

@@ -30,7 +30,7 @@ from ...io import images as io_images
 from ...io import records as io_records
 from ..common.ranges import RUNS, SEED, STEPS, bounded, check_ranges
 from .methods import METHODS, Builder, Image, build_method, fairness
-from .record import identity, is_complete, is_of, make_record
+from .record import identity, is_of, make_record, stored_records
 from .scene import NormalKind, PoseProblem, ReferenceKind, make_problem, start_pose
 from .sweep import PoseRuns, make_reference
 
@@ -92,13 +92,7 @@ def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Co
     files.check_output(out / "pose.json", (".json",))
     stored: list[dict[str, Any]] = []
     if options.resume and (out / "pose.json").exists():
-        stored = io_records.read_json(out / "pose.json")
-        if not isinstance(stored, list) or not all(
-            isinstance(record, dict) and isinstance(record.get("settings"), dict) and isinstance(record.get("environment"), dict)
-            for record in stored
-        ):
-            raise ShadowmapError(f"{out / 'pose.json'} is no list of records: choose another folder.")
-        stored = [record for record in stored if is_complete(record)]
+        stored = stored_records(out / "pose.json")
 
     problems = {
         problem.folder: (name, problem)

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ... import __version__
+from ...errors import ShadowmapError, warn
 from ...inverse import History, Method, optimize
 from ...io import records
 from ..common.timing import DRJIT_VERSION
@@ -54,11 +55,45 @@ def is_of(record: dict[str, Any], wanted: dict[str, Any]) -> bool:
     return all(found.get(key) == value for key, value in essence(wanted).items())
 
 
+def stored_records(path: Path) -> list[dict[str, Any]]:
+    """Complete records in a file of an earlier call; a warning tells of others. A file without records is set aside."""
+    try:
+        found = records.read_json(path)
+    except ShadowmapError:
+        found = None
+    if not isinstance(found, list) or not all(isinstance(record, dict) for record in found):
+        records.set_aside(path)
+        return []
+    kept = [record for record in found if is_complete(record)]
+    if len(kept) < len(found):
+        warn(f"{path}: {len(found) - len(kept)} of {len(found)} records were edited or are damaged: their runs are made again.")
+    return kept
+
+
 def is_complete(record: dict[str, Any]) -> bool:
-    """True if a record has all results of its run, including the curves over the steps."""
-    curves = ("loss_curve", "rotation_error_curve", "translation_error_curve")
-    results = ("final", "rotation_error_deg", "translation_error_x100", "recovered", "seconds_per_iteration", "seconds_to_pose")
-    return all(key in record for key in results) and all(isinstance(record.get(key), list) for key in ("final", *curves))
+    """True if a record has all results of its run, including the curves over the steps, with the right types and lengths."""
+    numbers = ("rotation_error_deg", "translation_error_x100", "seconds_per_iteration", "seconds_to_pose", "seconds_total")
+    known = ("resolution", "run", "seed", "iterations")
+    if not all(isinstance(record.get(name), dict) for name in ("settings", "environment")):
+        return False
+    if not all(isinstance(record.get(name), str) for name in ("object", "method", "reference")):
+        return False
+    if not all(isinstance(record.get(name), int) for name in known) or not isinstance(record.get("recovered"), bool):
+        return False
+    steps = record["iterations"]
+    lengths = {
+        **{"start": len(start_pose(0, 0)), "final": len(start_pose(0, 0)), "loss_curve": steps},
+        **{"rotation_error_curve": steps + 1, "translation_error_curve": steps + 1},
+    }
+    return all(name in record and _is_number(record[name]) for name in numbers) and all(
+        isinstance(record.get(name), list) and len(record[name]) == length and all(map(_is_number, record[name]))
+        for name, length in lengths.items()
+    )
+
+
+def _is_number(value: Any) -> bool:  # Any: JSON
+    """True for numbers, and for None, which stands for numbers that are not finite."""
+    return value is None or (isinstance(value, int | float) and not isinstance(value, bool))
 
 
 def essence(value: Any) -> Any:  # Any: JSON

@@ -145,10 +145,10 @@ def run_soft(options: SoftOptions, *, console: Console | None = None) -> dict[st
 
             entry, pictures = measure(name, options, step)
             record["scenes"][name] = entry
-            records.write_json(path, record)
+            records.write_record(path, record, "scenes")
             soft_report.save_pictures(options.out / "pictures" / f"{name}.exr", pictures)
     record["scenes"] = {name: record["scenes"][name] for name in soft_scenes.SCENES if name in record["scenes"]}
-    records.write_json(path, record)
+    records.write_record(path, record, "scenes")
     soft_report.write(record, options.out)
     return record
 
@@ -156,8 +156,9 @@ def run_soft(options: SoftOptions, *, console: Console | None = None) -> dict[st
 def _kept(path: Path, options: SoftOptions) -> dict[str, Any]:
     if not options.resume or not path.exists():
         return {}
-    scenes = records.read_record(path, options.settings, "scenes")["scenes"]
-    return {name: entry for name, entry in scenes.items() if isinstance(entry, dict) and "errors" in entry}
+    needed = ("about", "glossy", "counted", "reference_noise", "noise_of_one_sample", "errors")
+    scenes: dict[str, Any] = records.read_record(path, {"settings": options.settings, "scenes": {}}, {"scenes": needed})["scenes"]
+    return scenes
 
 
 def measure(name: str, options: SoftOptions, step: Callable[..., None]) -> tuple[dict[str, Any], dict[str, Image]]:

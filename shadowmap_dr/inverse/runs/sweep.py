@@ -10,7 +10,7 @@ from typing import Any
 import mitsuba as mi
 from rich.console import Console
 
-from ...errors import OutputError, ShadowmapError
+from ...errors import OutputError, ShadowmapError, warn
 from ...io import console as io_console
 from ...io import records
 from .problems import Problem
@@ -122,9 +122,13 @@ def stored_records(problem: Problem, out: Path, variant: str) -> dict[int, Any]:
     for path in _files(problem, out / "batches", variant):
         try:
             result = records.read_json(path)
+            if "check" in result and result["check"] != records.digest([result["runs"], result["records"]]):
+                raise ValueError("edited")
+            if not all(isinstance(run, int) for run in result["runs"]):
+                raise ValueError("no runs")
             if result["settings"] == wanted and result["variant"] == variant:
                 pairs = zip(result["runs"], result["records"], strict=True)
                 found |= {run: record for run, record in pairs if run in problem.run_numbers()}
         except (ShadowmapError, KeyError, TypeError, ValueError):
-            continue  # runs of unreadable files are done again
+            warn(f"{path} was edited or is damaged: its runs are made again.")
     return found

@@ -14,7 +14,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ...io.records import plain
+from ...io.records import digest, plain
 from ...jit.gc import gc_quiet
 from .problems import Problem
 
@@ -94,6 +94,7 @@ class Worker:
                 "variant": batch.variant,
                 "runs": batch.runs,
                 "records": records,
+                "check": digest([batch.runs, records]),
                 "seconds": {"build": built - began, "runs": ended - built},
                 "threads": dr.thread_count(),
             }

@@ -13,13 +13,15 @@ from ...io.pictures import SUFFIXES as PICTURE_SUFFIXES
 from ...io.pictures import read_picture, scaled_to_bytes
 from .drawings import rasterized
 
-__all__ = ["SUFFIXES", "figure_height", "figure_of", "filled", "fit", "read_figure", "scaled_to_bytes", "text_figure"]
+__all__ = ["SUFFIXES", "figure_height", "figure_of", "filled", "fit", "otsu", "read_figure", "scaled_to_bytes", "text_figure"]
 
 #: Suffixes that `read_figure` knows.
 SUFFIXES = (*PICTURE_SUFFIXES, ".svg", ".svgz")
 
 # Pixels with more coverage belong to the figure; smallest share of an image that a figure may cover.
 _INSIDE, _LEAST_SHARE = 0.5, 1e-4
+# Brightness falls into two classes if Otsu's threshold separates it at least so well.
+_SEPARATED = 0.85
 
 Array = npt.NDArray[np.float32]
 
@@ -28,7 +30,8 @@ def read_figure(path: str | os.PathLike[str]) -> Array:
     """Read the figure in an image file.
 
     If the image has transparent parts, its opaque part is the figure. Otherwise the figure differs in brightness from the image's
-    border: dark on light or light on dark.
+    border: dark on light or light on dark. Drawings keep their soft edges. Photographs and noisy images, whose brightness does
+    not fall into two classes, are smoothed and cut at Otsu's threshold.
 
     Args:
         path: an image file, see `SUFFIXES`. Drawings (SVG) need the package resvg-py.
@@ -59,13 +62,50 @@ def figure_of(pixels: npt.ArrayLike) -> Array:
         figure = alpha
     else:
         grey = (image[..., :3] @ np.array([0.2126, 0.7152, 0.0722], np.float32)) * alpha + (1 - alpha)
+        threshold, separation = otsu(grey)
+        if separation < _SEPARATED:
+            grey = _smoothed(grey)
+            threshold, _ = otsu(grey)
         border = float(np.median(np.concatenate([grey[0], grey[-1], grey[:, 0], grey[:, -1]])))
-        extreme = float(grey.min() if border > 0.5 else grey.max())
+        light = border > (threshold if separation < _SEPARATED else 0.5)
+        extreme = float(grey.min() if light else grey.max())
         contrast = border - extreme
-        figure = np.clip((border - grey) / contrast, 0, 1) if abs(contrast) > 0.1 else np.zeros_like(grey)
+        if abs(contrast) <= 0.1:
+            figure = np.zeros_like(grey)
+        elif separation < _SEPARATED:
+            figure = ((grey <= threshold) == light).astype(np.float32)
+        else:
+            figure = np.clip((border - grey) / contrast, 0, 1)
     if (figure > _INSIDE).mean() < _LEAST_SHARE:
         raise ShadowmapError("it shows no figure: draw something dark on a light ground, or on a transparent one.")
     return np.ascontiguousarray(figure, np.float32)
+
+
+def otsu(grey: npt.ArrayLike) -> tuple[float, float]:
+    """Threshold between two classes of values in 0..1, and how well it separates them: 1 for two values, 0.64 for normal noise.
+
+    Nobuyuki Otsu, "A threshold selection method from gray-level histograms", IEEE Trans. Systems, Man, and Cybernetics, 1979:
+    the threshold with the largest variance between the classes, and that variance as a share of all.
+    """
+    counts, edges = np.histogram(np.asarray(grey), 256, (0, 1))
+    middles, shares = 0.5 * (edges[1:] + edges[:-1]), counts / max(counts.sum(), 1)
+    below, mean = np.cumsum(shares), np.cumsum(shares * middles)
+    variance = float(shares @ np.square(middles - mean[-1]))
+    between = np.square(mean[-1] * below - mean) / np.maximum(below * (1 - below), 1e-12)
+    best = np.flatnonzero(between >= between.max() - 1e-12)  # all thresholds of a gap are equally good
+    threshold = 0.5 * (edges[best[0] + 1] + edges[best[-1] + 1])
+    return float(threshold), float(between.max() / variance) if variance > 1e-12 else 0.0
+
+
+def _smoothed(grey: Array) -> Array:
+    """Medians over squares a fiftieth of the image wide: noise and texture vanish, outlines stay."""
+    from PIL import Image, ImageFilter
+
+    image = Image.fromarray((np.clip(grey, 0, 1) * 255).round().astype(np.uint8))
+    times = max(1, max(image.size) // 512)
+    size = 2 * (max(image.size) // times // 100) + 1
+    small = image.reduce(times).filter(ImageFilter.MedianFilter(max(3, size)))
+    return np.asarray(small.resize(image.size, Image.Resampling.BILINEAR), np.float32) / np.float32(255)
 
 
 def text_figure(text: str) -> Array:

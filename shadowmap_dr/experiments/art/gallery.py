@@ -102,7 +102,7 @@ def run_gallery(
     records: dict[str, Any] = {}
     for number, piece in enumerate(chosen):
         path = work / piece.name / "art.json"
-        if not (resume and path.exists()):
+        if not (resume and path.exists() and _is_finished(path)):
             console.print(f"{number + 1} of {len(chosen)}: {piece.name}")
             run_art(
                 ArtOptions(**piece.options, animate=".webp" if piece.shown else None, picture_size=_PICTURE_SIZE, turns=_TURNS,
@@ -125,6 +125,18 @@ def run_gallery(
             temporary.write_text("\n".join(gallery(shown, records)) + "\n", encoding="utf-8")
         _sheet(out / "gallery.png", [work / piece.name / "picture.png" for piece in shown])
     return record
+
+
+def _is_finished(path: Path) -> bool:
+    """True if a file holds the record of a finished piece; other files are set aside."""
+    try:
+        record = io_records.read_json(path)
+    except ShadowmapError:
+        record = None
+    sound = isinstance(record, dict) and {"settings", "views", "mesh", "iou_curve"} <= record.keys()
+    if not sound:
+        io_records.set_aside(path)
+    return sound
 
 
 def summary(records: Mapping[str, Any]) -> dict[str, Any]:

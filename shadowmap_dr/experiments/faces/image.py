@@ -72,8 +72,8 @@ def doubts(record: dict[str, Any]) -> list[str]:
     if chance < _LEAST_CHANCE:
         size = float(np.sqrt(np.mean(np.square(record["weights"]))))
         result.append(
-            f"the head is unlikely: one of {1 / max(chance, 1e-9):.0e} heads or fewer has such weights (root mean square {size:.1f} "
-            "standard deviations); give a profile silhouette, or a larger --prior."
+            f"the head is unlikely: one of {1 / max(chance, 1e-9):.0e} heads or fewer has such weights (root mean square "
+            f"{size:.1f} standard deviations); give a profile silhouette, or a larger --prior."
         )
     if error > _MOST_ERROR:
         result.append(

@@ -1,0 +1,77 @@
+"""Files of earlier calls that were edited, cut, or written by others: one warning, and the runs are made again."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from shadowmap_dr.errors import ShadowmapError
+from shadowmap_dr.experiments.art import gallery
+from shadowmap_dr.experiments.bench import experiment as bench
+from shadowmap_dr.experiments.bench.common import BenchOptions
+from shadowmap_dr.experiments.lights import experiment as lights
+from shadowmap_dr.experiments.pose.record import stored_records
+
+FOREIGN = ["", "{", "[", "3", '"text"', "null", '{"a": 1}', "[1, 2]", '[{"a": []}]', "\x00", "[" * 50_000]
+
+POSE: dict[str, Any] = {
+    **{"object": "spot", "method": "shadows", "reference": "own", "resolution": 8, "run": 0, "seed": 0, "iterations": 2},
+    **{"settings": {}, "environment": {}, "start": [0, 0, 0], "final": [0, None, 0], "recovered": False},
+    **{"rotation_error_deg": 1.0, "translation_error_x100": 1.0, "seconds_per_iteration": None},
+    **{"seconds_to_pose": None, "seconds_total": 1.0, "loss_curve": [1, 1]},
+    **{"rotation_error_curve": [1, 1, 1], "translation_error_curve": [1, 1, 1]},
+}
+
+LIGHTS: dict[str, Any] = {
+    **{"setting": "a", "lights": 1, "filter": "box", "filter_size": 3, "cone_deg": 60.0, "strategy": "plain", "starts": 1},
+    **{"reference": "own", "objects": ["spot"], "runs": 1, "alignment_mean": 1.0, "alignment_std": 0.0, "alignment_least": 1.0},
+    **{"share_from_0.995": 1.0, "curve_iterations": [0], "curve_mean": [1.0], "curve_std": [0.0]},
+}
+
+
+def _warned(path: Path, content: str, read: Any) -> Any:
+    path.write_text(content)
+    with pytest.warns(UserWarning, match=path.name) as caught:
+        result = read()
+    assert len(caught) == 1 and "\n" not in str(caught[0].message)
+    return result
+
+
+@pytest.mark.parametrize("content", FOREIGN)
+def test_foreign_files_are_set_aside(tmp_path: Path, content: str) -> None:
+    path = tmp_path / "a.json"
+    options = BenchOptions(out=path, resume=True)
+    assert _warned(path, content, lambda: stored_records(path)) == []
+    assert _warned(path, content, lambda: lights._stored(path)) == []
+    assert _warned(path, content, lambda: bench._stored(options)) == {"sections": {}}
+    assert _warned(path, content, lambda: gallery._is_finished(path)) is False
+    path.write_text(content)
+    with pytest.raises(ShadowmapError, match=r"a\.json is no record of a benchmark"):
+        bench._stored(BenchOptions(out=path))
+    assert path.read_text() == content
+
+
+@pytest.mark.parametrize("name", sorted(POSE))
+@pytest.mark.parametrize("value", ["", [], {}, [None, "x"], {"x": 1}])
+def test_edited_records_of_poses_are_made_again(tmp_path: Path, name: str, value: object) -> None:
+    path = tmp_path / "pose.json"
+    edited = {**POSE, name: value}
+    if isinstance(value, type(POSE[name])) and not isinstance(value, list):
+        pytest.skip("of the right type")
+    assert _warned(path, json.dumps([POSE, edited]), lambda: stored_records(path)) == [POSE]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        path.write_text(json.dumps([POSE]))
+        assert stored_records(path) == [POSE]
+
+
+@pytest.mark.parametrize("name", ["setting", "objects", "runs", "curve_mean", "alignment_mean", "cone_deg"])
+@pytest.mark.parametrize("value", [None, {}, [None]])
+def test_edited_summaries_of_lights_are_left_out(tmp_path: Path, name: str, value: object) -> None:
+    path = tmp_path / "lights.json"
+    content = json.dumps({"summaries": [LIGHTS, {**LIGHTS, name: value}]})
+    assert _warned(path, content, lambda: lights._stored(path)) == [LIGHTS]

@@ -145,7 +145,7 @@ def _choose() -> None:
 
 
 def _named_fault(named: str) -> str:
-    """What is wrong with the library that the environment names, empty if it is usable."""
+    """The fault of the library that the environment names, empty if it is usable."""
     path = Path(named)
     if not path.is_file() or _file_version(path) < MIN_VERSION:
         return f"is not LLVM {MIN_VERSION} or newer"
@@ -154,7 +154,7 @@ def _named_fault(named: str) -> str:
 
 
 def _load_fault(path: Path) -> str:
-    """Why a file that is named like an LLVM library is none, empty if it is one. Loads it, as Dr.Jit does afterwards."""
+    """The reason why a file named like an LLVM library is none, empty if it is one. Loads it, as Dr.Jit does afterwards."""
     if not _is_library(path):
         return "is named like an LLVM library, but is no shared library"
     try:

@@ -17,7 +17,7 @@ from .options import Scheduler, SchedulerThreads, Variant
 
 def pose(
     object_: Annotated[
-        list[str] | None, typer.Option("--object", metavar="NAME|FILE", help="Mesh of this package, .ply or .obj; repeatable.")
+        list[str] | None, typer.Option("--object", metavar="NAME|FILE", help="Mesh of this package, or a mesh file; repeatable.")
     ] = None,
     resolution: Annotated[list[int] | None, typer.Option(help="Image width and height in pixels; repeatable.")] = None,
     method: Annotated[

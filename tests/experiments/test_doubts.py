@@ -1,4 +1,4 @@
-"""What art and faces say where a picture is not matched: why, and what to try."""
+"""Warnings of art and faces where a picture is not matched: reasons, and what to try."""
 
 from __future__ import annotations
 

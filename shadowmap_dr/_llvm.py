@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import ctypes
 import glob
-import importlib.metadata
 import os
 import re
 import sys
@@ -101,6 +100,8 @@ def _wheel_library() -> Path | None:
             if (path.parent / _RUNTIME_FOLDER).is_dir() and _file_version(path) >= MIN_VERSION and _is_library(path):
                 return path
     # `pip install --user` and `--target` put the library elsewhere; the wheel's own file list knows where.
+    import importlib.metadata  # slow, and seldom needed
+
     try:
         files = importlib.metadata.distribution(WHEEL).files or ()
     except importlib.metadata.PackageNotFoundError:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import importlib.metadata
 import os
 import sys
 import warnings
@@ -12,7 +11,6 @@ from typing import Any, TextIO
 
 import typer
 import typer.core
-from rich.console import Console
 
 from ..errors import ShadowmapError, is_interrupt
 
@@ -154,6 +152,8 @@ def _fail(message: str, status: int) -> None:
 
 def _note(message: object) -> None:
     """A line on standard error; names of files may hold bytes that are no text."""
+    from rich.console import Console
+
     line = " ".join(str(message).split()).encode("utf-8", "backslashreplace").decode("utf-8")
     Console(stderr=True, soft_wrap=True, highlight=False, markup=False).print(line)
 

@@ -1,9 +1,7 @@
 """The Mitsuba plug-in ``shadowmap``: its parameters, and the state of scenes that it keeps from one image to the next."""
 
-from .options import Options
-from .plugin import install
+from .registration import install
 
 __all__ = [
-    "Options",
     "install",
 ]

@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Any
 from ..errors import ShadowmapError, warn
 from ..rendering.settings import DIRECT, RenderSettings
 from ..shadow import ShadowSettings
+from .name import PLUGIN
 
 if TYPE_CHECKING:
     import mitsuba as mi
-
-PLUGIN = "shadowmap"
 
 # Names of Mitsuba's own `aov` integrator for channels of this plug-in.
 _SYNONYMS = {"sh_normal": "normal"}

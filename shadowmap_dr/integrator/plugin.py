@@ -7,7 +7,6 @@ keeps the scene's state (topology, plan of the shadow maps, their frusta).
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -21,8 +20,9 @@ from ..rendering.film.aovs import aov_names
 from ..rendering.film.film import put_into_film
 from ..rendering.settings import RenderSettings
 from .deferred import DeferredImages, DetachedInputs, backward
+from .name import PLUGIN
 from .nesting import Nesting
-from .options import PLUGIN, Options
+from .options import Options
 from .parameter_state import ParameterState
 from .scene_cache import SceneCache, same_objects
 
@@ -226,29 +226,3 @@ def make_class() -> type:
             return f"ShadowMapIntegrator[{', '.join(f'{k}={v!r}' for k, v in vars(self.shell.options).items())}]"
 
     return ShadowMapIntegrator
-
-
-def register(old: str | None = None, new: str | None = None) -> None:
-    """Make the plug-in known to the current variant, if there is one. Called by Mitsuba whenever the variant changes."""
-    variant = new or mi.variant()
-    if variant is not None:
-        mi.register_integrator(PLUGIN, _constructor(variant))
-
-
-def _constructor(variant: str) -> Callable[[mi.Properties], mi.Integrator]:
-    if variant.endswith(("_ad_rgb", "_ad_mono")):
-        return make_class()
-
-    def refuse(props: mi.Properties) -> mi.Integrator:
-        raise ShadowmapError(
-            f"'{PLUGIN}' does not work with the variant {variant}: set one whose name ends in _ad_rgb or _ad_mono, "
-            "for instance llvm_ad_rgb."
-        )
-
-    return refuse
-
-
-def install() -> None:
-    """Register the plug-in now and for all variants that will be set."""
-    mi.detail.add_variant_callback(register)
-    register()

@@ -21,8 +21,8 @@ from shadowmap_dr.errors import ShadowmapError
     ({"mesh": "spot", "output": Path("mesh.stl")}, ".stl"),
     ({"mesh": "spot", "image": Path("shadow.jpg")}, ".jpg"),
     ({"mesh": "broken.ply"}, "broken.ply"),
-    ({"mesh": "spot", "step_size": -1.0, "resolution": 32}, "--step-size is -1.0"),
-    ({"mesh": "spot", "step_size": -1.0, "resolution": 32, "serve": True}, "--step-size is -1.0"),
+    ({"mesh": "spot", "step_size": -1.0, "resolution": 32}, "--step-size. is -1.0"),
+    ({"mesh": "spot", "step_size": -1.0, "resolution": 32, "serve": True}, "--step-size. is -1.0"),
 ])  # fmt: skip
 def test_bad_input_is_one_line(variant, tmp_path, monkeypatch, arguments, reason):
     monkeypatch.chdir(tmp_path)

@@ -13,7 +13,6 @@ import pytest
 from shadowmap_dr.cli import main
 from shadowmap_dr.errors import ShadowmapError
 from shadowmap_dr.experiments.art.experiment import ArtOptions
-from shadowmap_dr.experiments.common.ranges import bounded, check_ranges
 from shadowmap_dr.experiments.faces.experiment import FaceOptions
 from shadowmap_dr.experiments.faces.image import ImageOptions
 from shadowmap_dr.experiments.gradients.convergence import ConvergenceOptions
@@ -23,6 +22,8 @@ from shadowmap_dr.experiments.lights.experiment import LightOptions
 from shadowmap_dr.experiments.maps.experiment import MapsOptions
 from shadowmap_dr.experiments.pose.experiment import PoseOptions
 from shadowmap_dr.experiments.soft.experiment import SoftOptions
+from shadowmap_dr.io.options import option
+from shadowmap_dr.io.ranges import check_ranges
 
 RECORDS: list[tuple[Any, dict[str, Any]]] = [
     (ArtOptions, {"targets": ("heart",)}),
@@ -58,8 +59,8 @@ def test_every_number_of_every_record_has_a_range(record: Any, required: dict[st
 def test_both_ends_belong_to_a_range() -> None:
     @dataclasses.dataclass
     class Record:
-        side: int = bounded(4, (2, 8))
-        weights: tuple[float, ...] = bounded((0.5,), (0.0, 1.0), "--weight")
+        side: int = option(4, allowed=(2, 8), help="Side.")
+        weights: tuple[float, ...] = option((0.5,), allowed=(0.0, 1.0), names=("--weight",), help="Weight.")
 
     for good in (Record(2), Record(8), Record(np.int64(3)), Record(weights=(0, 1, np.float32(0.25)))):  # type: ignore[arg-type]
         check_ranges(good)

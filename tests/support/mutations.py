@@ -313,7 +313,7 @@ class _Recorder:
 
     def apply(self, mutation: Mutation) -> Callable[[], None]:
         """Break the package. Returns what mends it."""
-        import shadowmap_dr.rendering.renderer  # noqa: F401  (everything a rendering calls is loaded now)
+        import shadowmap_dr.integrator.plugin  # noqa: F401  (everything a rendering calls is loaded now)
 
         owner: Any = sys.modules[f"shadowmap_dr.{mutation.module}"]
         *classes, attribute = mutation.function.split(".")

@@ -25,8 +25,9 @@ from ...inverse.shadow_art import exports, target_images
 from ...io import assets, files, meshes, records
 from ...io import console as io_console
 from ...io import images as io_images
+from ...io.options import option, setting
+from ...io.ranges import MAP_SIDE, SEED, STEPS, check_ranges
 from ...rendering.receivers.shadow_views import CAMERAS, RECEIVERS, ShadowView
-from ..common.ranges import MAP_SIDE, SEED, STEPS, bounded, check_ranges
 from ..common.timing import machine
 from . import pictures as art_pictures
 from .advice import warnings_of
@@ -41,55 +42,53 @@ _FILL = {"orthographic": 0.8, "perspective": 0.92}
 Array = npt.NDArray[np.float32]
 
 
+def _suffix(kind: str) -> str | None:
+    """Suffix of animated pictures by the kind on the command line."""
+    return None if kind == "none" else f".{kind}"
+
+
 @dataclass(frozen=True)
 class ArtOptions:
     """Settings of a piece.
 
-    Attributes:
-        targets: image files, or names of this package, one for each view; ``text:L`` is a target of letters.
-        mesh: mesh to deform: None for the sphere, a name of this package, or a file.
-        collection: name or file of a mesh whose moved, turned and scaled copies cast the shadow instead.
-        receiver, camera: see `shadow_view`.
-        resolution: pixels along each side of the shadow images.
-        map_resolution: texels along each side of the shadow maps; None: ``resolution``.
-        iterations: steps; None: 400, or 1100 for a collection.
-        step_size, smoothness, consistency: of the `Sculptor`; a `Collection` has its own step size.
-        remesh: steps between two remeshings of the deformed surface; None: never.
-        fill_holes: fill enclosed holes of the targets.
-        interval, most: steps between two doublings of the copies, and their largest number, see `Collection`.
-        seed: of the collection.
-        animate: suffix of the animations (.webp or .gif), None for no animations.
-        picture_size: pixels along each side of animations; the still picture has twice as many.
-        turns: frames of the turntable.
-        printable: write an STL file, and report whether the mesh is closed.
-        out: folder for the results.
-        resume: continue from a checkpoint in ``out``.
+    ``targets`` are image files, names of this package, or ``text:L`` for letters; one for each view. ``animate`` is the suffix of
+    the animations (.webp or .gif), None for no animations. For ``receiver`` and ``camera`` see `shadow_view`.
 
     Raises ShadowmapError for settings that are out of range or contradict each other.
     """
 
-    targets: tuple[str, ...]
-    mesh: str | None = None
-    collection: str | None = None
-    receiver: str = "plane"
-    camera: str = "orthographic"
-    resolution: int = bounded(256, (16, 2048))
-    map_resolution: int | None = bounded(None, MAP_SIDE)
-    iterations: int | None = bounded(None, STEPS)
-    step_size: float = bounded(0.2, (1e-6, 100.0))
-    smoothness: float = bounded(20.0, (0.0, 1e6))
-    consistency: float = bounded(0.2, (0.0, 1e6))
-    remesh: int | None = bounded(None, STEPS)
-    fill_holes: bool = False
-    interval: int = bounded(150, STEPS)
-    most: int = bounded(128, (1, 4096), "--copies")
-    seed: int = bounded(0, SEED)
-    animate: str | None = ".webp"
-    picture_size: int = bounded(320, (16, 1024))
-    turns: int = bounded(40, (1, 1000))
-    printable: bool = False
-    out: Path = Path("art")
-    resume: bool = False
+    targets: tuple[str, ...] = option(
+        names=("--target",), metavar="NAME|IMAGE", help="Image (PNG, JPEG, SVG, ...) of a shadow; twice for two views."
+    )
+    mesh: str | None = option(None, metavar="NAME|FILE", shown="a sphere of 12,800 triangles", help="Mesh to deform.")
+    collection: str | None = option(None, metavar="NAME|FILE", help="Mesh whose moved, turned and scaled copies cast the shadow.")
+    most: int = option(
+        128, names=("--copies",), metavar="N", allowed=(1, 4096), help="Largest number of copies; it doubles every 150 steps."
+    )
+    receiver: str = option("plane", choices=RECEIVERS, help="Receiver of the shadow.")
+    camera: str = option("orthographic", choices=CAMERAS, help="Frontal view, or perspective from the side.")
+    iterations: int | None = option(None, shown="400; 1100 for a collection", allowed=STEPS, help="Steps of the optimiser.")
+    smoothness: float = option(20.0, allowed=(0.0, 1e6), help="Stiffness of the mesh; finer meshes need more.")
+    remesh: int | None = option(None, metavar="STEPS", allowed=STEPS, help="Remesh the surface every so many steps.")
+    fill_holes: bool = option(False, help="Fill enclosed holes of the targets.")
+    resolution: int = option(256, allowed=(16, 2048), help="Pixels along each side of the shadow images.")
+    map_resolution: int | None = option(
+        None, shown="the resolution", allowed=MAP_SIDE, help="Texels along each side of the shadow maps."
+    )
+    animate: str | None = option(
+        ".webp", metavar="webp|gif|none", shown="webp", parse=_suffix, help="Kind of the animated pictures."
+    )
+    printable: bool = option(False, help="Also write an STL file, and report on the mesh.")
+    out: Path = option(Path("art"), help="Folder for the results.")
+    resume: bool = option(False, help="Resume a killed run with the same settings.")
+    step_size: float = setting(0.2, allowed=(1e-06, 100.0), help="Step size of the `Sculptor`; a `Collection` has its own.")
+    consistency: float = setting(0.2, allowed=(0.0, 1e6), help="Weight of normal consistency of the `Sculptor`.")
+    interval: int = setting(150, allowed=STEPS, help="Steps between two doublings of the copies, see `Collection`.")
+    seed: int = setting(0, allowed=SEED, help="Seed of the collection.")
+    picture_size: int = setting(
+        320, allowed=(16, 1024), help="Pixels along each side of animations; the still picture has twice as many."
+    )
+    turns: int = setting(40, allowed=(1, 1000), help="Frames of the turntable.")
 
     def __post_init__(self) -> None:
         check_ranges(self)

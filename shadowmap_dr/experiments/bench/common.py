@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ...errors import ShadowmapError
+from ...io.options import option, setting
 
 SECTIONS = ("steps", "raster", "scaling", "breakdown", "sums", "loops", "first")
 
@@ -119,21 +120,17 @@ QUICK = Sizes(
 class BenchOptions:
     """Options of a run.
 
-    Attributes:
-        quick: few steps, small sizes.
-        out: JSON file; a plot and the files that the benchmark works with lie beside it.
-        only: names of sections to measure; results of other sections in the file are kept.
-        resume: keep results in the file that were measured with the same options.
-        mitsuba_seconds: limit for each part of the work that waits for Mitsuba's integrator.
-        sizes: sizes of the measurements; None: those for `quick`.
+    Results in ``out`` of sections that ``only`` does not name are kept. Files that the benchmark works with lie beside it.
     """
 
-    quick: bool = False
-    out: Path = Path("bench.json")
-    only: tuple[str, ...] = SECTIONS
-    resume: bool = False
-    mitsuba_seconds: float = 900.0
-    sizes: Sizes | None = None
+    quick: bool = option(False, help="Small sizes and few steps: minutes instead of hours.")
+    out: Path = option(Path("bench.json"), help="JSON file to write; a plot is written beside it.")
+    only: tuple[str, ...] = option(SECTIONS, choices=SECTIONS, shown="all", help="Section to measure; repeatable.")
+    resume: bool = option(False, help="Keep the measurements of a killed run with the same options.")
+    mitsuba_seconds: float = option(
+        900.0, help="Time limit of each part that runs Mitsuba's integrator; the record names parts that it cut off."
+    )
+    sizes: Sizes | None = setting(None, help="Sizes of the measurements; None: those for `quick`.")
 
     def __post_init__(self) -> None:
         for name in self.only:

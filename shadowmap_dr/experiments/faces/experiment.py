@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,7 +18,8 @@ from ...inverse.faces.morph_fit import MorphFit
 from ...inverse.faces.morphable import MorphableModel
 from ...io import console as io_console
 from ...io import files, records
-from ..common.ranges import FILTER_SIDE, MAP_SIDE, SAMPLES, SEED, SIDE, STEPS, bounded, check_ranges
+from ...io.options import option, setting
+from ...io.ranges import FILTER_SIDE, MAP_SIDE, SAMPLES, SEED, SIDE, STEPS, check_ranges
 from ..common.timing import machine
 from . import pictures as faces_pictures
 from . import report as faces_report
@@ -38,38 +39,37 @@ Reference = Literal["own", "mitsuba"]
 class FaceOptions:
     """Options of a run. Everything is run for each mode, number of shadows and head.
 
-    Attributes:
-        seeds: artificial heads.
-        lights: numbers of shadows, 1 or 3.
-        modes: see `faces.problem.MODES`.
-        model: morphable model (.npz); None: the head of this package.
-        iterations: steps of Adam.
-        prior: strength of the prior on the weights, see `MorphFit`.
-        translate: fit the head's position as well.
-        reference: target shadows by this library, or path-traced.
-        height: rows of the image.
-        map_resolution, filter_size: of the shadow maps, texels.
-        spp: samples per pixel of path-traced images.
-        samples: points on each surface from which distances are measured.
-        out: folder for the results.
-        resume: keep finished runs, continue killed ones.
+    For ``modes`` see `faces.problem.MODES`, for ``prior`` see `MorphFit`.
     """
 
-    seeds: tuple[int, ...] = bounded(SEEDS, SEED, "--head")
-    lights: tuple[int, ...] = bounded(LIGHTS, (1, 3), "--shadows")
-    modes: tuple[Mode, ...] = ("identity",)
-    model: Path | None = None
-    iterations: int = bounded(400, STEPS)
-    prior: float = bounded(PRIOR, (0.0, 1e6))
-    translate: bool = False
-    reference: Reference = "own"
-    height: int = bounded(192, SIDE)
-    map_resolution: int = bounded(256, MAP_SIDE)
-    filter_size: int = bounded(3, FILTER_SIDE)
-    spp: int = bounded(512, SAMPLES)
-    samples: int = bounded(30_000, (100, 10_000_000))
-    out: Path = field(default=Path("face"))
-    resume: bool = False
+    seeds: tuple[int, ...] = option(SEEDS, names=("--head",), allowed=SEED, help="Seed of an artificial head; repeatable.")
+    lights: tuple[int, ...] = option(
+        LIGHTS,
+        names=("--shadows",),
+        choices=map(str, LIGHTS),
+        shown="both",
+        allowed=(1, 3),
+        help="Number of shadows; repeatable.",
+    )
+    modes: tuple[Mode, ...] = option(
+        ("identity",),
+        names=("--mode",),
+        help="Unknowns: identity, identity and expression, or expression of a known head; repeatable.",
+    )
+    prior: float = option(
+        PRIOR, shown="3e-5, 3e-4 with --image", allowed=(0.0, 1e6), help="Strength of the prior on the weights, 0 for none."
+    )
+    model: Path | None = option(None, shown="the head of this package", help="Morphable model (.npz).")
+    iterations: int = option(400, allowed=STEPS, help="Steps of the optimiser.")
+    translate: bool = option(False, help="Fit the head's position, too (always with --image).")
+    reference: Reference = option("own", help="Target shadows: rendered by this library, or path-traced.")
+    height: int = option(192, allowed=SIDE, help="Rows of the shadow image.")
+    map_resolution: int = option(256, allowed=MAP_SIDE, help="Texels along each side of a shadow map.")
+    filter_size: int = option(3, allowed=FILTER_SIDE, help="Texels along each side of the filter.")
+    out: Path = option(Path("face"), help="Folder for the results.")
+    resume: bool = option(False, help="Keep finished runs, resume killed ones.")
+    spp: int = setting(512, allowed=SAMPLES, help="Samples per pixel of path-traced images.")
+    samples: int = setting(30_000, allowed=(100, 10_000_000), help="Points on each surface from which distances are measured.")
 
     def __post_init__(self) -> None:
         check_ranges(self)

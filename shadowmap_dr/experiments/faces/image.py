@@ -16,11 +16,12 @@ from rich.progress import Progress, TaskID
 from ...inverse import optimize
 from ...io import console as io_console
 from ...io import files, plots, records
-from ..common.ranges import FILTER_SIDE, MAP_SIDE, SIDE, STEPS, bounded, check_ranges
+from ...io.options import setting
+from ...io.ranges import FILTER_SIDE, MAP_SIDE, SIDE, STEPS, check_ranges
 from ..common.timing import machine
 from . import pictures as faces_pictures
 from . import report as faces_report
-from .experiment import STEP_SIZE, TRANSLATION_STEP
+from .experiment import STEP_SIZE, TRANSLATION_STEP, FaceOptions
 from .problem import FaceScene, Mode, default_model
 from .silhouette import place, read_silhouette, resample
 
@@ -41,14 +42,14 @@ class ImageOptions:
 
     image: Path
     mode: Mode = "identity"
-    model: Path | None = None
-    iterations: int = bounded(400, STEPS)
-    prior: float = bounded(PRIOR, (0.0, 1e6))
-    height: int = bounded(192, SIDE)
-    map_resolution: int = bounded(256, MAP_SIDE)
-    filter_size: int = bounded(3, FILTER_SIDE)
-    out: Path = Path("face")
-    resume: bool = False
+    model: Path | None = FaceOptions.model
+    iterations: int = setting(FaceOptions.iterations, help="Steps of the optimiser.", allowed=STEPS)
+    prior: float = setting(PRIOR, help="Strength of the prior on the weights.", allowed=(0.0, 1e6))
+    height: int = setting(FaceOptions.height, help="Rows of the shadow image.", allowed=SIDE)
+    map_resolution: int = setting(FaceOptions.map_resolution, help="Texels along each side of a shadow map.", allowed=MAP_SIDE)
+    filter_size: int = setting(FaceOptions.filter_size, help="Texels along each side of the filter.", allowed=FILTER_SIDE)
+    out: Path = FaceOptions.out
+    resume: bool = FaceOptions.resume
 
     def __post_init__(self) -> None:
         check_ranges(self)

@@ -16,9 +16,10 @@ from ...inverse import optimize
 from ...io import console as io_console
 from ...io import files, plots, records
 from ...io.console import markdown
+from ...io.options import option, setting
+from ...io.ranges import FILTER_SIDE, MAP_SIDE, SAMPLES, SIDE, STEPS, check_ranges
 from ...rendering.renderer import Renderer
 from ..common.meshes import Mesh
-from ..common.ranges import FILTER_SIDE, MAP_SIDE, SAMPLES, SIDE, STEPS, bounded, check_ranges
 from ..common.timing import machine
 from . import scenes as gradients_scenes
 from .fit import ShadowFit
@@ -40,32 +41,43 @@ STEP_SIZE, _DECAY = 0.02, 0.005
 class ConvergenceOptions:
     """Options of a run. Everything is run for each candidate, occluder, camera, filter size and displacement.
 
-    Attributes:
-        occluders: names in `OCCLUDERS`: a square of side 0.5, its outlines parallel to the texels; the same square, turned by 10
-            degrees about the light; a ring 0.59 wide.
-        cameras: names in `gradients.scenes.CAMERAS`.
-        candidates: kinds of shadow map, names in `images.CANDIDATES`.
-        filter_sizes: texels along each side of the Gaussian; 1 for none.
-        displacements: along x, world units.
-        map_resolution: texels along each side of the map.
-        resolution: pixels along each side of the image.
-        iterations: steps of Adam. The step size falls to 1/200 of the first.
-        spp: samples per pixel of the path-traced reference.
-        out: folder for the results.
-        resume: keep the finished runs of an earlier call with the same sizes.
+    The occluders are a square of side 0.5, its outlines parallel to the texels; the same square, turned by 10 degrees about the
+    light; a ring 0.59 wide. The step size of Adam falls to 1/200 of the first.
     """
 
-    occluders: tuple[str, ...] = OCCLUDERS
-    cameras: tuple[str, ...] = ("orthographic", "perspective")
-    candidates: tuple[str, ...] = ("default",)
-    filter_sizes: tuple[int, ...] = bounded((1, 3, 15), FILTER_SIDE, "--filter-size")
-    displacements: tuple[float, ...] = bounded((0.1, 0.3, 0.5, 0.65), (1e-6, MAX_DISPLACEMENT), "--displacement")
-    map_resolution: int = bounded(256, MAP_SIDE)
-    resolution: int = bounded(512, SIDE)
-    iterations: int = bounded(250, STEPS)
-    spp: int = bounded(512, SAMPLES)
-    out: Path = Path("gradients")
-    resume: bool = False
+    occluders: tuple[str, ...] = option(
+        OCCLUDERS, names=("--occluder",), choices=OCCLUDERS, shown="all", help="Occluder; repeatable."
+    )
+    cameras: tuple[str, ...] = option(
+        ("orthographic", "perspective"),
+        names=("--camera",),
+        metavar="orthographic|perspective",
+        shown="both",
+        help="Camera; repeatable.",
+    )
+    candidates: tuple[str, ...] = option(
+        ("default",), names=("--candidate",), choices=CANDIDATES, help="Kind of shadow map; repeatable."
+    )
+    filter_sizes: tuple[int, ...] = option(
+        (1, 3, 15),
+        full=(1, 3, 5, 9, 15),
+        names=("--filter-size",),
+        allowed=FILTER_SIDE,
+        help="Texels along each side of the filter, 1 for none; repeatable.",
+    )
+    displacements: tuple[float, ...] = option(
+        (0.1, 0.3, 0.5, 0.65),
+        full=(0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7),
+        names=("--displacement",),
+        allowed=(1e-06, MAX_DISPLACEMENT),
+        help="Displacement at the start of a run, along x; repeatable.",
+    )
+    map_resolution: int = option(256, allowed=MAP_SIDE, help="Texels along each side of the map.")
+    resolution: int = option(512, allowed=SIDE, help="Image width and height in pixels.")
+    iterations: int = option(250, allowed=STEPS, help="Steps of the optimiser.")
+    out: Path = option(Path("gradients"), help="Folder for the results.")
+    resume: bool = option(False, help="Keep the measurements of a killed run with the same settings.")
+    spp: int = setting(512, allowed=SAMPLES, help="Samples per pixel of the path-traced reference.")
 
     def __post_init__(self) -> None:
         check_ranges(self)

@@ -15,9 +15,10 @@ from rich.console import Console
 from ...errors import ShadowmapError
 from ...io import console as io_console
 from ...io import files, plots, records
+from ...io.options import option
+from ...io.ranges import FILTER_SIDE, MAP_SIDE, SIDE, check_ranges
 from ...rendering.renderer import Renderer
 from ..common.meshes import Mesh
-from ..common.ranges import FILTER_SIDE, MAP_SIDE, SIDE, bounded, check_ranges
 from ..common.timing import machine
 from . import report as gradients_report
 from . import scenes as gradients_scenes
@@ -42,31 +43,33 @@ _COARSE_FACES, _DIVISIONS, _TARGET_PIXELS = 2000, 3, 8.0
 
 @dataclass(frozen=True)
 class JacobianOptions:
-    """Options of a run. Everything is run for each candidate, motion, map size and filter size.
+    """Options of a run. Everything is run for each candidate, motion, map size and filter size."""
 
-    Attributes:
-        motions: names in `gradients.scenes.MOTIONS`.
-        candidates: names in `CANDIDATES`.
-        map_resolutions: texels along each side of the map.
-        filter_sizes: texels along each side of the Gaussian; 1 for none.
-        resolution: pixels along each side of the image.
-        faces: of the occluder, roughly.
-        spp: samples per pixel of the path-traced images.
-        mitsuba_passes: passes of Mitsuba's projective integrator, 0 to leave it out.
-        out: folder for the results.
-        resume: keep measurements of an earlier run with the same occluder, image and samples.
-    """
-
-    motions: tuple[str, ...] = tuple(MOTIONS)
-    candidates: tuple[str, ...] = ("default",)
-    map_resolutions: tuple[int, ...] = bounded((256, 1024), MAP_SIDE, "--map-resolution")
-    filter_sizes: tuple[int, ...] = bounded((1, 3, 5, 9, 15), FILTER_SIDE, "--filter-size")
-    resolution: int = bounded(512, SIDE)
-    faces: int = bounded(130_000, (20, 10_000_000))
-    spp: int = bounded(128, (2, 65_536))
-    mitsuba_passes: int = bounded(2, (0, 10_000))
-    out: Path = Path("gradients")
-    resume: bool = False
+    motions: tuple[str, ...] = option(
+        tuple(MOTIONS), names=("--motion",), choices=MOTIONS, shown="all", help="Motion of the occluder; repeatable."
+    )
+    candidates: tuple[str, ...] = option(
+        ("default",), full=tuple(CANDIDATES), names=("--candidate",), choices=CANDIDATES, help="Kind of shadow map; repeatable."
+    )
+    map_resolutions: tuple[int, ...] = option(
+        (256, 1024),
+        full=(128, 256, 512, 1024),
+        names=("--map-resolution",),
+        allowed=MAP_SIDE,
+        help="Texels along each side of the map; repeatable.",
+    )
+    filter_sizes: tuple[int, ...] = option(
+        (1, 3, 5, 9, 15),
+        names=("--filter-size",),
+        allowed=FILTER_SIDE,
+        help="Texels along each side of the filter, 1 for none; repeatable.",
+    )
+    resolution: int = option(512, allowed=SIDE, help="Image width and height in pixels.")
+    faces: int = option(130_000, allowed=(20, 10_000_000), help="Triangles of the occluder, roughly.")
+    spp: int = option(128, full=512, allowed=(2, 65536), help="Samples per pixel of the path-traced images.")
+    mitsuba_passes: int = option(2, allowed=(0, 10000), help="Passes of Mitsuba's projective integrator, 0 for none.")
+    out: Path = option(Path("gradients"), help="Folder for the results.")
+    resume: bool = option(False, help="Keep the measurements of a killed run with the same settings.")
 
     def __post_init__(self) -> None:
         check_ranges(self)

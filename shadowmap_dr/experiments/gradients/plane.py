@@ -15,8 +15,9 @@ from ...inverse import optimize
 from ...io import console as io_console
 from ...io import files, plots, records
 from ...io.console import markdown
+from ...io.options import option, setting
+from ...io.ranges import FILTER_SIDE, MAP_SIDE, SAMPLES, SIDE, STEPS, check_ranges
 from ...rendering.renderer import Renderer
-from ..common.ranges import FILTER_SIDE, MAP_SIDE, SAMPLES, SIDE, STEPS, bounded, check_ranges
 from ..common.timing import machine
 from . import scenes as gradients_scenes
 from .fit import ShadowFit
@@ -31,24 +32,21 @@ CASES = {"anti-aliased": True, "not anti-aliased": False}
 
 @dataclass(frozen=True)
 class PlaneOptions:
-    """Options of a run. Each camera is run with and without anti-aliased moments.
+    """Options of a run. Each camera is run with and without anti-aliased moments."""
 
-    Attributes:
-        cameras: names in `gradients.scenes.CAMERAS`.
-        map_resolution, filter_size: of the shadow map.
-        resolution: pixels along each side of the image.
-        iterations: steps of Adam.
-        spp: samples per pixel of the path-traced reference.
-        out: folder for the results.
-    """
-
-    cameras: tuple[str, ...] = ("orthographic", "perspective")
-    map_resolution: int = bounded(256, MAP_SIDE)
-    filter_size: int = bounded(3, FILTER_SIDE)
-    resolution: int = bounded(512, SIDE)
-    iterations: int = bounded(150, STEPS)
-    spp: int = bounded(512, SAMPLES)
-    out: Path = Path("gradients")
+    cameras: tuple[str, ...] = option(
+        ("orthographic", "perspective"),
+        names=("--camera",),
+        metavar="orthographic|perspective",
+        shown="both",
+        help="Camera; repeatable.",
+    )
+    map_resolution: int = option(256, allowed=MAP_SIDE, help="Texels along each side of the map.")
+    filter_size: int = option(3, allowed=FILTER_SIDE, help="Texels along each side of the filter.")
+    resolution: int = option(512, allowed=SIDE, help="Image width and height in pixels.")
+    iterations: int = option(150, allowed=STEPS, help="Steps of the optimiser.")
+    out: Path = option(Path("gradients"), help="Folder for the results.")
+    spp: int = setting(512, allowed=SAMPLES, help="Samples per pixel of the path-traced reference.")
 
     def __post_init__(self) -> None:
         check_ranges(self)

@@ -22,34 +22,51 @@ from ...inverse.runs.schedulers import check_threads
 from ...inverse.runs.sweep import MEMORY, stored_records
 from ...io import assets, files
 from ...io import records as io_records
+from ...io.options import option
+from ...io.ranges import RUNS, check_ranges
 from ..common import timing
-from ..common.ranges import RUNS, bounded, check_ranges
+from ..common.options import scheduler_option, threads_option
 from .problem import LightProblem, LightSetting, check_problem, curve_iterations
 from .report import pictures, plot
 from .scene import OBJECTS
+
+
+def _mebibytes(count: int) -> int:
+    return count << 20
 
 
 @dataclass(frozen=True)
 class LightOptions(LightSetting):
     """Options of the experiment: every object with every number of lights and filter size.
 
-    Attributes:
-        objects, lights: see `LightProblem`.
-        filter_sizes: texels along each side of the filter, 1 for no filter, 0 for no shadows.
-        runs: number of runs of each problem.
-        out: folder for the results.
-        resume, scheduler, threads, memory: see :func:`shadowmap_dr.inverse.run_sweep`.
+    A filter size of 0 is for no shadows. The limit of ``memory`` is in bytes. For ``scheduler``, ``threads``, ``memory`` and
+    ``resume`` see :func:`shadowmap_dr.inverse.run_sweep`.
     """
 
-    objects: tuple[str, ...] = OBJECTS
-    lights: tuple[int, ...] = bounded((1,), (1, 5))
-    filter_sizes: tuple[int, ...] = bounded((3, 0), (0, 255), "--filter-size")
-    runs: int = bounded(16, RUNS)
-    out: Path = Path("lights")
-    resume: bool = False
-    scheduler: str = "local"
-    threads: int = 0
-    memory: int = bounded(MEMORY, (1, 1 << 50))
+    objects: tuple[str, ...] = option(
+        OBJECTS, names=("--object",), choices=OBJECTS, shown="all", help="Object, by name or mesh file; repeatable."
+    )
+    lights: tuple[int, ...] = option((1,), full=(1, 2, 3, 4, 5), allowed=(1, 5), help="Lights, 1 to 5; repeatable.")
+    filter_sizes: tuple[int, ...] = option(
+        (3, 0),
+        full=(1, 3, 5, 9, 15, 0),
+        names=("--filter-size",),
+        shown="3",
+        allowed=(0, 255),
+        help="Texels of the filter, 1 for none; repeatable.",
+    )
+    runs: int = option(16, full=150, allowed=RUNS, help="Runs of each object and setting.")
+    memory: int = option(
+        MEMORY,
+        shown=f"{MEMORY >> 20}",
+        parse=_mebibytes,
+        allowed=(1, 1 << 50),
+        help="Approximate memory limit of a batch of runs, in MiB.",
+    )
+    scheduler: str = scheduler_option()
+    threads: int = threads_option()
+    out: Path = option(Path("lights"), help="Folder for the results.")
+    resume: bool = option(False, help="Keep complete batches, and summaries of other settings.")
 
     def __post_init__(self) -> None:
         check_ranges(self)

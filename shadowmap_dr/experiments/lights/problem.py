@@ -18,9 +18,10 @@ from ...errors import ShadowmapError
 from ...inverse import LightBatch, Problem, Stage, StillScene
 from ...inverse.light_directions.batch import batch_bytes
 from ...io import assets
+from ...io.options import option, setting
+from ...io.ranges import MAP_SIDE, RUNS, SEED, STEPS, check_ranges
 from ...rendering.renderer import Renderer
 from ...shadow import ShadowSettings
-from ..common.ranges import MAP_SIDE, RUNS, SEED, STEPS, bounded, check_ranges, required
 from .scene import CONE_DEG, MOST_LIGHTS, alignment, check_scene, make_scene, target_and_starts
 
 ReferenceKind = Literal["own", "mitsuba"]
@@ -39,27 +40,27 @@ _CURVE_STRIDE = 5
 class LightSetting:
     """Settings that all problems of an experiment share.
 
-    Attributes:
-        filter, map_resolution: of the shadow maps.
-        resolution: of the images.
-        iterations: steps of the optimiser.
-        strategy: ``plain``, or ``coarse``: the first half of the iterations with larger steps and a larger filter.
-        starts: number of starts of each run; the start with the least final loss counts.
-        reference: renderer of the targets: ``own`` or ``mitsuba`` (path tracing).
-        spp: samples per pixel and light of path-traced targets, rounded up to a square.
-        seed, cone_deg: see :func:`shadowmap_dr.experiments.lights.scene.target_and_starts`.
+    With the strategy ``coarse``, the first half of the iterations has larger steps and a larger filter. For ``seed`` and
+    ``cone_deg`` see :func:`shadowmap_dr.experiments.lights.scene.target_and_starts`.
     """
 
-    filter: str = "gaussian"
-    map_resolution: int = bounded(256, MAP_SIDE)
-    resolution: int = bounded(128, (4, 4096))
-    iterations: int = bounded(200, STEPS)
-    strategy: StrategyKind = "plain"
-    starts: int = bounded(1, (1, 1000))
-    reference: ReferenceKind = "own"
-    spp: int = bounded(512, (1, MOST_SAMPLES))
-    seed: int = bounded(0, SEED)
-    cone_deg: float = bounded(CONE_DEG, (1e-3, 178.0), "--cone")
+    filter: str = option("gaussian", choices=FILTERS, help="Filter of the shadow maps.")
+    map_resolution: int = option(256, allowed=MAP_SIDE, help="Texels along each side of a shadow map.")
+    resolution: int = option(128, allowed=(4, 4096), help="Image width and height in pixels.")
+    iterations: int = option(200, allowed=STEPS, help="Steps of the optimiser.")
+    strategy: StrategyKind = option("plain", help="coarse: larger steps and a larger filter in the first half.")
+    starts: int = option(1, allowed=(1, 1000), help="Starts of each run; the start with the least final loss counts.")
+    reference: ReferenceKind = option("own", help="Renderer of the targets.")
+    spp: int = option(
+        512, allowed=(1, MOST_SAMPLES), help="Samples per pixel and light of path-traced targets, rounded up to a square."
+    )
+    cone_deg: float = option(
+        CONE_DEG,
+        names=("--cone",),
+        allowed=(0.001, 178.0),
+        help="Opening angle in degrees of the cone that directions are drawn from.",
+    )
+    seed: int = option(0, allowed=SEED, help="Seed of targets and starts.")
 
 
 @dataclass(frozen=True)
@@ -74,9 +75,9 @@ class LightProblem(Problem, LightSetting):
     """
 
     object: str
-    lights: int = required((1, MOST_LIGHTS))
-    runs: int = required(RUNS)
-    filter_size: int = bounded(3, (0, 255))
+    lights: int = setting(help="Number n of lights of each run.", allowed=(1, MOST_LIGHTS))
+    runs: int = setting(help="Number of runs.", allowed=RUNS)
+    filter_size: int = setting(3, help="Texels of the filter, 1 for none, 0 for no shadows.", allowed=(0, 255))
 
     @property
     def name(self) -> str:

@@ -18,6 +18,8 @@ from rich.console import Console
 from ...inverse import LightBatch, StillScene, run_sweep
 from ...inverse.light_directions.batch import batch_bytes
 from ...inverse.light_directions.pixels import mixed_pixels
+from ...io.options import option
+from ...io.ranges import check_ranges
 from ...jit.arrays import device_array
 from ...jit.types import Float, Vector3f
 from ...rendering.renderer import Renderer
@@ -25,7 +27,21 @@ from ...rendering.shadow_pass import light_visibility, make_maps
 from ...scene.lights.punctual import DirectionalLight
 from ..common import timing
 from .problem import LightProblem
-from .scene import make_scene
+from .scene import OBJECTS, make_scene
+
+
+@dataclasses.dataclass(frozen=True)
+class TimesOptions:
+    """Options of the measurement. ``lights`` are those of each run, ``batches`` the numbers of runs in a batch."""
+
+    object: str = option("bunny", choices=OBJECTS, help="Object, by name or mesh file.")
+    lights: int = option(1, help="Lights, 1 to 5.")
+    batches: tuple[int, ...] = option((1, 16, 150), names=("--batch",), allowed=(1, 100_000), help="Runs of a batch; repeatable.")
+    workers: bool = option(True, help="Also compare one Dask worker with two.")
+    out: Path = option(Path("lights-times"), help="Folder for the results.")
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
 
 
 def measure_workers(problem: LightProblem, counts: Sequence[int], out: Path) -> dict[str, Any]:

@@ -20,10 +20,11 @@ from rich.table import Table
 from ...errors import ShadowmapError
 from ...io import console as io_console
 from ...io import files, plots, records
+from ...io.options import option, setting
+from ...io.ranges import FILTER_SIDE, MAP_SIDE, SAMPLES, check_ranges
 from ...jit.types import Float
 from ...rendering.renderer import Renderer
 from ...shadow import ShadowSettings, directional_view
-from ..common.ranges import FILTER_SIDE, MAP_SIDE, SAMPLES, bounded, check_ranges
 from ..common.timing import Contender, alternate, machine
 from . import pose as maps_pose
 from . import scenes as maps_scenes
@@ -43,33 +44,28 @@ CANDIDATES: dict[str, dict[str, Any]] = {
     "msm, cut": {"shadow_method": "msm", "shadow_bleeding": 0.1},
     "csm": {"shadow_method": "csm", "shadow_order": 8},
 }
-_REFERENCE_SPP = 1024
 
 
 @dataclass(frozen=True)
 class MapsOptions:
     """Options of the experiment.
 
-    Attributes:
-        scenes: names in `maps.scenes.SCENES`.
-        candidates: names in `CANDIDATES`.
-        resolution: pixels along each side of images; several for each texel, so that edges can be located.
-        map_resolution, filter_size: of the shadow maps.
-        reference_spp: samples per pixel of the path-traced images.
-        rounds: number of timed renderings of each candidate.
-        pose_runs: number of poses to find with each candidate, from shadows alone; 0 skips this part.
-        out: folder for the results.
+    An image has several pixels for each texel, so that edges can be located.
     """
 
-    scenes: tuple[str, ...] = tuple(maps_scenes.SCENES)
-    candidates: tuple[str, ...] = tuple(CANDIDATES)
-    resolution: int = bounded(512, (8, 4096))
-    map_resolution: int = bounded(256, MAP_SIDE)
-    filter_size: int = bounded(3, FILTER_SIDE)
-    reference_spp: int = bounded(_REFERENCE_SPP, SAMPLES, "--spp")
-    rounds: int = bounded(30, (1, 10_000))
-    pose_runs: int = bounded(10, (0, 100_000))
-    out: Path = Path("maps")
+    scenes: tuple[str, ...] = option(
+        tuple(maps_scenes.SCENES), names=("--scene",), choices=maps_scenes.SCENES, shown="all", help="Scene; repeatable."
+    )
+    candidates: tuple[str, ...] = option(
+        tuple(CANDIDATES), names=("--method",), choices=CANDIDATES, shown="all", help="Shadow map; repeatable."
+    )
+    resolution: int = option(512, allowed=(8, 4096), help="Image width and height in pixels.")
+    map_resolution: int = option(256, allowed=MAP_SIDE, help="Texels along each side of a shadow map.")
+    filter_size: int = option(3, allowed=FILTER_SIDE, help="Texels along each side of the filter.")
+    reference_spp: int = option(1024, names=("--spp",), allowed=SAMPLES, help="Samples per pixel of the path-traced images.")
+    pose_runs: int = option(10, allowed=(0, 100000), help="Poses to find with each shadow map, from shadows alone; 0 for none.")
+    out: Path = option(Path("maps"), help="Folder for the results.")
+    rounds: int = setting(30, allowed=(1, 10000), help="Number of timed renderings of each shadow map.")
 
     def __post_init__(self) -> None:
         check_ranges(self)

@@ -28,7 +28,9 @@ from ...io import console as io_console
 from ...io import files, plots
 from ...io import images as io_images
 from ...io import records as io_records
-from ..common.ranges import RUNS, SEED, STEPS, bounded, check_ranges
+from ...io.options import option
+from ...io.ranges import RUNS, SEED, STEPS, check_ranges
+from ..common.options import scheduler_option, threads_option
 from .methods import METHODS, Builder, Image, build_method, fairness
 from .record import identity, is_of, make_record, stored_records
 from .scene import NormalKind, PoseProblem, ReferenceKind, make_problem, start_pose
@@ -39,20 +41,30 @@ from .sweep import PoseRuns, make_reference
 class PoseOptions:
     """Options of a run. Everything is run for each object, resolution, run and method."""
 
-    objects: tuple[str, ...] = ("spot",)
-    resolutions: tuple[int, ...] = bounded((128,), (8, 4096), "--resolution")
-    methods: tuple[str, ...] = METHODS
-    runs: int = bounded(1, RUNS)
-    seed: int = bounded(0, SEED)
-    iterations: int = bounded(150, STEPS)
-    reference: ReferenceKind = "mitsuba"
-    shadow_only: bool = False
-    normals: NormalKind = "face"
-    samples: int = bounded(1, (1, 4096))
-    out: Path = Path("pose")
-    resume: bool = False
-    scheduler: str = "local"
-    threads: int = 0
+    objects: tuple[str, ...] = option(
+        ("spot",), names=("--object",), metavar="NAME|FILE", help="Mesh of this package, .ply or .obj; repeatable."
+    )
+    resolutions: tuple[int, ...] = option(
+        (128,), names=("--resolution",), allowed=(8, 4096), help="Image width and height in pixels; repeatable."
+    )
+    methods: tuple[str, ...] = option(
+        METHODS,
+        names=("--method",),
+        choices=METHODS,
+        shown="all; the first two with --shadow-only or --normals vertex",
+        help="Method; repeatable.",
+    )
+    runs: int = option(1, allowed=RUNS, help="Number of runs, each with its own start.")
+    seed: int = option(0, allowed=SEED, help="Seed of the starts: run r uses seed + r.")
+    iterations: int = option(150, allowed=STEPS, help="Steps of the optimiser.")
+    reference: ReferenceKind = option("mitsuba", help="Reference image: path-traced, or rendered by this library.")
+    shadow_only: bool = option(False, help="The camera sees the shadow but not the object.")
+    normals: NormalKind = option("face", help="Shading of the object: flat, or smooth.")
+    samples: int = option(1, allowed=(1, 4096), help="Samples per pixel of our own methods.")
+    out: Path = option(Path("pose"), help="Folder for the results.")
+    resume: bool = option(False, help="Keep finished runs, resume killed ones.")
+    scheduler: str = scheduler_option()
+    threads: int = threads_option()
 
     def __post_init__(self) -> None:
         check_ranges(self)

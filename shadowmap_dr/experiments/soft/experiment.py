@@ -18,10 +18,11 @@ from rich.console import Console
 from ...errors import ShadowmapError
 from ...io import console as io_console
 from ...io import files, records
+from ...io.options import option
+from ...io.ranges import MAP_SIDE, SAMPLES, check_range, check_ranges
 from ...jit.types import UInt32
 from ...rendering.renderer import Renderer
 from ...rendering.settings import MOST_SAMPLES
-from ..common.ranges import MAP_SIDE, SAMPLES, bounded, check_range, check_ranges
 from ..common.timing import Contender, alternate, machine
 from . import report as soft_report
 from . import scenes as soft_scenes
@@ -39,31 +40,38 @@ Image = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 
 
+def _pair(text: str) -> tuple[int, int]:
+    """Two numbers of samples as the command line has them, for instance 64/128."""
+    area, _, sky = text.partition("/")
+    if not (area.isdecimal() and sky.isdecimal() and int(area) and int(sky)):
+        raise ShadowmapError(f"--samples {text}: give two positive numbers, as in 64/128.")
+    return int(area), int(sky)
+
+
 @dataclass(frozen=True)
 class SoftOptions:
-    """Options of the experiment.
+    """Options of the experiment."""
 
-    Attributes:
-        scenes: names in `soft.scenes.SCENES`.
-        samples: pairs (of each area light, of the environment).
-        resolution: pixels along each side of images.
-        map_resolution: texels along each side of each sample's shadow map.
-        spp: samples per pixel of our images.
-        reference_spp: samples per pixel of each of the two path-traced images.
-        timed: measure times, too.
-        out: folder for the results.
-        resume: keep finished scenes of an earlier run with the same settings.
-    """
-
-    scenes: tuple[str, ...] = tuple(soft_scenes.SCENES)
-    samples: tuple[tuple[int, int], ...] = ((16, 32), (32, 64), (64, 128))
-    resolution: int = bounded(96, (8, 4096))
-    map_resolution: int = bounded(128, MAP_SIDE)
-    spp: int = bounded(16, SAMPLES)
-    reference_spp: int = bounded(512, (16, 65_536))
-    timed: bool = True
-    out: Path = Path("soft")
-    resume: bool = False
+    scenes: tuple[str, ...] = option(
+        tuple(soft_scenes.SCENES), names=("--scene",), choices=soft_scenes.SCENES, shown="all", help="Scene; repeatable."
+    )
+    samples: tuple[tuple[int, int], ...] = option(
+        ((16, 32), (32, 64), (64, 128)),
+        full=((16, 32), (32, 64), (64, 128), (128, 256)),
+        metavar="AREA/SKY",
+        shown="16/32, 32/64, 64/128",
+        parse=_pair,
+        help="Samples of each area light and of the sky; repeatable.",
+    )
+    resolution: int = option(96, full=192, allowed=(8, 4096), help="Image width and height in pixels.")
+    map_resolution: int = option(128, allowed=MAP_SIDE, help="Texels along each side of the map of each sample.")
+    spp: int = option(16, allowed=SAMPLES, help="Samples per pixel of our images.")
+    reference_spp: int = option(
+        512, full=2048, allowed=(16, 65536), help="Samples per pixel of each of the two path-traced images."
+    )
+    timed: bool = option(True, names=("--times/--no-times",), help="Measure times.")
+    out: Path = option(Path("soft"), help="Folder for the results.")
+    resume: bool = option(False, help="Keep the finished scenes of a killed run with the same settings.")
 
     def __post_init__(self) -> None:
         check_ranges(self)

@@ -13,6 +13,8 @@ import numpy.typing as npt
 
 from ...errors import ShadowmapError
 from ...io.files import read_arrays
+from ...io.options import option
+from ...io.ranges import check_ranges
 from .morphable import MorphableModel, from_arrays
 
 FACING = ("+x", "-x", "+z", "-z")
@@ -29,24 +31,23 @@ Array = npt.NDArray[Any]
 class ConvertOptions:
     """Options of a conversion.
 
-    Attributes:
-        facing: axis along which the model's head looks; y is up.
-        neck: height (y, the model's own units) above which vertices belong to the head; None: all belong to it.
-        components: number of identity components to keep; None: all.
-        expression_scale: share of a full expression that a weight of 1 stands for. (ICT-FaceKit's expressions are full at a
-            weight of 1. Basel-like models give standard deviations of their expressions: use 1 for them.)
+    ICT-FaceKit's expressions are full at a weight of 1. Basel-like models give standard deviations of their expressions: their
+    ``expression_scale`` is 1.
     """
 
-    facing: str = "+z"
-    neck: float | None = None
-    components: int | None = None
-    expression_scale: float = 0.5
+    facing: str = option("+z", choices=FACING, help="Axis along which the model's head looks; y is up.")
+    neck: float | None = option(
+        None, shown="all", allowed=(-1e30, 1e30), help="Height, in the model's units, above which vertices belong to the head."
+    )
+    components: int | None = option(None, shown="all", allowed=(1, 100_000), help="Identity components to keep.")
+    expression_scale: float = option(
+        0.5, shown="0.5 for OBJ files, 1 for arrays", help="Share of a full expression that a weight of 1 stands for."
+    )
 
     def __post_init__(self) -> None:
         if self.facing not in FACING:
             raise ShadowmapError(f"a head facing {self.facing!r}: choose from {', '.join(FACING)}.")
-        if self.components is not None and self.components < 1:
-            raise ShadowmapError(f"{self.components} components: give at least 1.")
+        check_ranges(self)
         if not (np.isfinite(self.expression_scale) and self.expression_scale > 0):
             raise ShadowmapError(f"an expression scale of {self.expression_scale}: give a positive number.")
 

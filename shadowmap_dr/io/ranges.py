@@ -1,15 +1,13 @@
-"""Ranges of numbers in option records: declared beside the defaults, checked in one place for commands and Python alike."""
+"""Ranges of numbers in option records: declared with the fields, checked in one place for commands and Python alike."""
 
 from __future__ import annotations
 
-from dataclasses import field, fields
+from dataclasses import fields
 from numbers import Integral, Real
-from typing import Any, TypeVar
+from typing import Any
 
-from ...errors import ShadowmapError
-
-T = TypeVar("T")
-Range = tuple[float, float]
+from ..errors import ShadowmapError
+from .options import Range, description
 
 #: Usual ranges: sides of images and of shadow maps, sides of filters, samples per pixel, steps, runs, and seeds.
 SIDE, MAP_SIDE, FILTER_SIDE, SAMPLES, STEPS, RUNS, SEED = (
@@ -17,31 +15,15 @@ SIDE, MAP_SIDE, FILTER_SIDE, SAMPLES, STEPS, RUNS, SEED = (
 )
 
 
-def bounded(default: T, allowed: Range, option: str = "") -> T:
-    """Declare a field of a record, or a tuple of such values.
-
-    Args:
-        default: its default.
-        allowed: least and largest value; whole numbers if both are.
-        option: of the command, if it is not named like the field.
-    """
-    result: T = field(default=default, metadata={"allowed": allowed, "option": option})
-    return result
-
-
-def required(allowed: Range, option: str = "") -> Any:  # Any: the field's type
-    """Declare a field without a default. See `bounded`."""
-    return field(metadata={"allowed": allowed, "option": option})
-
-
 def check_ranges(record: Any) -> None:  # Any: a dataclass
     """ShadowmapError, with option, value and range, for the first number of a record that lies outside of its range."""
     for declared in fields(record):
-        if "allowed" in declared.metadata:
+        of = description(declared)
+        if of.allowed is not None:
             value = getattr(record, declared.name)
-            option = declared.metadata["option"] or f"--{declared.name.replace('_', '-')}"
+            option = of.names[0].split("/")[0] if of.names else f"--{declared.name.replace('_', '-')}"
             for number in value if isinstance(value, tuple) else () if value is None else (value,):
-                check_range(f"{declared.name} ({option})", number, declared.metadata["allowed"])
+                check_range(f"{declared.name} ({option})", number, of.allowed)
 
 
 def check_range(name: str, value: Any, allowed: Range) -> None:  # Any: what users give

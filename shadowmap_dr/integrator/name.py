@@ -1,0 +1,3 @@
+"""The name of the plug-in."""
+
+PLUGIN = "shadowmap"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Any, ClassVar
@@ -11,13 +11,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..errors import ShadowmapError
+from ..errors import ShadowmapError, warn
 from ..jit.call_data import rewrite_scalars
 from ..jit.frozen import take_apart
 from ..jit.gpu import keep_registers
 from ..jit.kernel_cache import note_size
 from ..jit.types import Bool, Float, TensorXf
 from ..raster import Topology, build_topology, outward_faces
+from ..scene.geometry import Geometry
 from ..scene.lights.area import AreaLight
 from ..scene.lights.read import Light
 from ..scene.load import SceneData, load, refresh
@@ -25,7 +26,7 @@ from ..scene.sensor import Sensor
 from ..scene.untracked import UntrackedState
 from ..shadow import Frusta
 from .extended_lights import SoftFrusta, SoftPlan
-from .film.film import Margin, develop, sample_grid, sample_windows
+from .film.film import Margin, check_samples, develop, sample_grid, sample_windows
 from .gbuffer.camera_view import CameraPass, CameraView, GBuffer, PlacedShapes
 from .gbuffer.facet_normals import FlatFaces, flat_faces
 from .gbuffer.pixel_footprint import footprint_points
@@ -180,11 +181,13 @@ class Renderer:
             Attached to vertices, lights, cameras, and the BSDFs and textures of the scene.
         """
         keep_registers()
+        check_samples(spp)
         self.note_kernels(spp, sensor)
         cameras, geometry = self.data.cameras(sensor), self.data.geometry
         rewrite_scalars(self.data.materials())
         if vertex_positions is not None:
             geometry = geometry.with_positions(vertex_positions)
+            _warn_of_lost_vertices(geometry, vertex_positions)
         windows = sample_windows(cameras)
         factor = sample_grid(spp, windows)
         margin = Margin.of(cameras, factor) if self.settings.antialias else Margin()
@@ -281,3 +284,20 @@ class Renderer:
             points = footprint_points(windows[0], view.size, frame.depth, seen.p_world, seen.n_world, samples)
             crossings = cameras.crossings(view, frame.sharpness, shapes) if self.settings.antialias else None
             return GBuffer(windows[0], seen, points, crossings, cameras.seen([view], geometry))
+
+
+def _warn_of_lost_vertices(geometry: Geometry, names: Iterable[str]) -> None:
+    """Name the shapes that have vertices that are not finite: their triangles are left out. Reads back; not in recordings."""
+    if dr.flag(dr.JitFlag.FreezingScope) or dr.flag(dr.JitFlag.SymbolicScope):
+        return
+    with dr.suspend_grad():
+        good = dr.isfinite(dr.detach(geometry.positions))
+        if dr.all(good):
+            return
+        finite = np.asarray(good.numpy().reshape(-1, 3).all(1))
+    for name in names:
+        info = geometry.shape(name)
+        lost = int(np.count_nonzero(~finite[info.vertex_start : info.vertex_start + info.vertex_count]))
+        if lost:
+            count = f"{lost} of {info.vertex_count} vertices of shape '{info.name}'"
+            warn(f"{count} are not finite (NaN or infinite): the triangles at these are left out.")

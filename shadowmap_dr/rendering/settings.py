@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
 from difflib import get_close_matches
-from numbers import Integral
+from numbers import Integral, Real
 from typing import Any
 
 from ..errors import ShadowmapError
@@ -70,7 +70,7 @@ class RenderSettings:
             if name not in AOVS:
                 raise ShadowmapError(f"There is no AOV '{name}': choose from {', '.join(AOVS)}.")
         for name in ("shadow_samples", "area_light_samples", "environment_light_samples", "max_depth"):
-            if not isinstance(getattr(self, name), Integral):
+            if isinstance(getattr(self, name), bool) or not isinstance(getattr(self, name), Integral):
                 raise ShadowmapError(f"{name} is {getattr(self, name)!r}: give an integer.")
         if self.max_depth < -1:
             raise ShadowmapError(f"max_depth is {self.max_depth}: choose -1 (no limit), or 0 and more.")
@@ -86,8 +86,8 @@ class RenderSettings:
             raise ShadowmapError(f"shadow map resolution is {size}; with emitter_shadows 'single' choose a power of two from 8")
         if self.shadow.method != "none":
             _ = self.soft_shadow  # whether such maps can be
-        if not (self.ambient >= 0 and self.ambient < float("inf")):
-            raise ShadowmapError(f"ambient is {self.ambient}: give a finite radiance of at least 0.")
+        if isinstance(self.ambient, bool) or not isinstance(self.ambient, Real) or not 0 <= self.ambient < float("inf"):
+            raise ShadowmapError(f"ambient is {self.ambient!r}: give a finite radiance of at least 0.")
 
     @classmethod
     def of(cls, **named: Any) -> RenderSettings:  # Any: checked by the records

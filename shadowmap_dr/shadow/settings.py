@@ -10,6 +10,9 @@ from ..raster import MAX_RESOLUTION
 from .filters import FILTERS, filter_kernel
 from .methods.registry import DEFAULT, METHODS, PREFILTERED
 
+#: Most texels along each side of a filter.
+MAX_FILTER_SIZE = 255
+
 
 @dataclass(frozen=True)
 class ShadowSettings:
@@ -53,6 +56,8 @@ class ShadowSettings:
 
     def __post_init__(self) -> None:
         for name in ("resolution", "filter_size", "order", "supersampling"):
+            if isinstance(getattr(self, name), bool):
+                raise ValueError(f"shadow map {name} is {getattr(self, name)!r}; give a whole number")
             try:
                 object.__setattr__(self, name, index(getattr(self, name)))
             except TypeError:
@@ -84,6 +89,8 @@ class ShadowSettings:
             )
         if self.supersampling > 1 and self.method != "none" and (self.compat or not self.filterable):
             raise ValueError(f"shadow method {self.method!r} cannot be supersampled; use a pre-filtered one without compat")
+        if not 1 <= self.filter_size <= MAX_FILTER_SIZE:
+            raise ValueError(f"shadow filter size is {self.filter_size}; it must be odd, and lie between 1 and {MAX_FILTER_SIZE}")
         filter_kernel(self.filter, self.filter_size)
         if self.filter_size + 6 > self.resolution and self.method != "none":
             raise ValueError(

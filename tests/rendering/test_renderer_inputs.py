@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -84,8 +85,15 @@ def test_a_vertex_that_is_not_finite_takes_its_triangles_only(renderer: Renderer
     lowest = int(points[:, 2].argmin())
     expected = renderer.render(vertex_positions={"ball": mi.Float(points.ravel())}).numpy()
     points[lowest, axis] = value
-    found = renderer.render(vertex_positions={"ball": mi.Float(points.ravel())}).numpy()
+    with pytest.warns(UserWarning, match="1 of 162 vertices of shape 'ball' are not finite"):
+        found = renderer.render(vertex_positions={"ball": mi.Float(points.ravel())}).numpy()
     assert (np.abs(found - expected).max(2) > 0.05).sum() <= 2
+
+
+@pytest.mark.parametrize("spp", [0, -1, float("nan"), "4", None, True, 10**9, float("inf")])
+def test_numbers_of_samples_that_are_none(renderer: Renderer, spp: Any) -> None:
+    with pytest.raises(ShadowmapError, match=rf"spp is {re.escape(repr(spp))}: give at"):
+        renderer.render(spp=spp)
 
 
 def test_wrong_kinds_and_sizes(renderer: Renderer) -> None:
@@ -104,6 +112,9 @@ def test_wrong_kinds_and_sizes(renderer: Renderer) -> None:
         ({"shadow_map_resolution": 5000}, "resolution is 5000"),
         ({"shadow_filter": "tent"}, "shadow filter 'tent' is unknown"),
         ({"shadow_filter_size": 8}, "8"),
+        ({"shadow_filter_size": 99999}, "shadow filter size is 99999; it must be odd, and lie between 1 and 255"),
+        ({"shadow_map_resolution": True}, "resolution is True"),
+        ({"ambient": "1"}, "ambient is '1'"),
         ({"shadow_filter_size": 9, "shadow_map_resolution": 8}, "too large for maps of 8 texels"),
         ({"shadow_samples": 9}, "shadow_samples is 9"),
         ({"shadow_samples": 1.5}, "shadow_samples is 1.5: give an integer"),

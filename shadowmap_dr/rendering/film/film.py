@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from numbers import Real
 
 import drjit as dr
 import mitsuba as mi
@@ -15,6 +16,9 @@ from ...jit.types import Bool, Color3f, Float, TensorXf
 from ...raster import MAX_RESOLUTION
 from ...scene.sensor import ImageSize, Sensor
 from .reconstruction import reconstruct
+
+#: Most samples per pixel that may be asked for, as on the command line.
+MOST_SAMPLES = 1 << 24
 
 
 @dataclass(frozen=True)
@@ -78,13 +82,20 @@ def _checked(windows: tuple[Sensor, ...]) -> tuple[Sensor, ...]:
     return windows
 
 
-def sample_grid(spp: int, windows: Sequence[Sensor]) -> int:
+def check_samples(spp: float) -> None:
+    """ShadowmapError unless ``spp`` is a number of samples per pixel."""
+    if isinstance(spp, bool) or not isinstance(spp, Real) or not spp >= 1:
+        raise ShadowmapError(f"spp is {spp!r}: give at least 1 sample per pixel.")
+    if spp > MOST_SAMPLES:
+        raise ShadowmapError(f"spp is {spp!r}: give at most {MOST_SAMPLES} samples per pixel; no more than 256 are taken.")
+
+
+def sample_grid(spp: float, windows: Sequence[Sensor]) -> int:
     """Samples along each side of a pixel: at most 16, and as many as the rasterizer's largest image has room for.
 
     A warning names both counts where that is less than was asked for.
     """
-    if spp < 1:
-        raise ShadowmapError(f"spp is {spp}: give at least 1 sample per pixel.")
+    check_samples(spp)
     widest = max(windows, key=lambda window: max(window.width, window.height))
     wanted = min(math.isqrt(math.ceil(spp) - 1) + 1, 16)
     factor = max(1, min(wanted, MAX_RESOLUTION // max(widest.width, widest.height)))

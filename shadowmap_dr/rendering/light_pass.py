@@ -51,7 +51,7 @@ _AMBIENT_DIRECTIONS = 16
 
 @dataclass(frozen=True)
 class Lighting:
-    """The lights of one rendering with their shadow maps, None where there are none."""
+    """The lights of one rendering and their shadow maps, or None without maps."""
 
     lights: tuple[Light, ...]
     maps: ShadowMaps | None
@@ -60,7 +60,7 @@ class Lighting:
     soft_maps: SoftMaps | None
 
     def for_points(self, count: int) -> Lighting:
-        """The same for look-ups by so many points at once (:meth:`~shadowmap_dr.shadow.ShadowMaps.for_points`)."""
+        """The same maps, prepared for look-ups by this many points (:meth:`~shadowmap_dr.shadow.ShadowMaps.for_points`)."""
         return self if self.maps is None else replace(self, maps=self.maps.for_points(count))
 
 
@@ -70,7 +70,7 @@ class Visibilities:
 
     Attributes:
         lights: ``Float`` (N,) of each light without extent.
-        parts: ``Float`` (K N,) of each extended light, of its K samples one after the other, or None.
+        parts: for each extended light ``Float`` (K N,), all pixels for its first sample, then for the second, ..., or None.
     """
 
     lights: list[Any]
@@ -82,10 +82,10 @@ class IncidentLight:
     """The light that reaches the samples of a frame, N of them.
 
     Attributes:
-        lights: lights that are summed up one by one, with their soft outlines.
-        visible: ``Float`` (N,) each, the visibility of these lights.
-        looped: radiance towards the camera (colour, N) of all others that have no extent.
-        parts: as :attr:`Visibilities.parts`, None where visibility has to be looked up.
+        lights: lights that are added one by one, with soft outlines.
+        visible: visibility of each of these lights, ``Float`` (N,).
+        looped: radiance (colour, N) towards the camera from all other lights without extent, or 0.
+        parts: see :attr:`Visibilities.parts`; None: look visibility up in the maps.
     """
 
     lights: tuple[Any, ...]
@@ -96,13 +96,13 @@ class IncidentLight:
 
 @dataclass(frozen=True)
 class LightPass:
-    """Renders shadow maps, and adds up the light that they let through.
+    """Shadow maps of all lights, and the light that reaches surfaces.
 
     Attributes:
         data: records of the scene.
-        settings: how to render.
-        plan: which shadow maps there are.
-        soft: how extended lights are sampled, and which maps these samples have.
+        settings: settings of the rendering.
+        plan: shadow maps of lights without extent.
+        soft: samples of extended lights, and the shadow maps of the samples.
         outward: ``Bool`` (F,), faces that shadow maps show from the front only, or None.
     """
 
@@ -130,10 +130,10 @@ class LightPass:
 
         Args:
             shapes: where they are now.
-            replacements: records of lights by name, in the place of the scene's.
-            fits: of the shadow maps, and of those of extended lights, in an earlier rendering.
+            replacements: records of lights, by name, that replace those of the scene.
+            fits: fit of the shadow maps, and of the maps of extended lights, in an earlier rendering.
             transparent: alpha test, see :meth:`CameraPass.transparent`.
-            seen: makes points on what cameras see, see :meth:`CameraPass.seen`.
+            seen: returns points on visible surfaces, see :meth:`CameraPass.seen`.
         """
         data, settings = self.data, self.settings
         if not settings.lit:
@@ -151,7 +151,7 @@ class LightPass:
         return Lighting(lights, maps, areas, samples, soft_maps)
 
     def fit(self, shapes: PlacedShapes, seen: tuple[Point3f, Bool]) -> tuple[Frusta | None, SoftFrusta]:
-        """The first fit of the shadow maps, and of those of extended lights. Arguments as of :meth:`lighting`. Detached."""
+        """Fit the maps of all lights for the first time. Arguments as of :meth:`lighting`. Detached."""
         data, settings, geometry = self.data, self.settings, shapes.geometry
         if not settings.lit or settings.shadow.method == "none":
             return None, (None, None)
@@ -166,14 +166,14 @@ class LightPass:
             return frusta, soft
 
     def relit(self, maps: tuple[ShadowMaps | None, SoftMaps | None], geometry: Geometry) -> Lighting:
-        """The scene's lights as they are now, with the shadow maps of an image of the same places of shapes and lights."""
+        """The scene's current lights with shadow maps of an earlier image, in which shapes and lights had the same places."""
         data = self.data
         if not self.settings.lit:
             return Lighting((), None, data.areas, (), None)
         return Lighting(data.lights, maps[0], data.areas, self._samples(data.areas, geometry), maps[1])
 
     def incident_light(self, frame: Frame, lighting: Lighting, known: Visibilities | None = None) -> IncidentLight:
-        """The light of all lights on what a camera sees. ``known``: visibilities, where they still hold. Attached."""
+        """Light that reaches the surfaces that a camera sees. ``known``: visibilities that still hold. Attached."""
         if known is not None:
             return IncidentLight(self._outlined(frame, lighting.lights), known.lights, 0, known.parts)
         looped, written = self._in_tables(frame, lighting)
@@ -182,7 +182,7 @@ class LightPass:
         return IncidentLight(self._outlined(frame, lights), visible, looped, (None,) * len(lighting.samples))
 
     def visible(self, frame: Frame, lighting: Lighting) -> Visibilities:
-        """Visibility of all lights from what a camera sees. Detached."""
+        """Visibility of all lights from the surfaces that a camera sees. Detached."""
         with dr.suspend_grad():
             numbers = list(range(len(lighting.lights)))
             lights = self.visibilities(frame, lighting, numbers, list(lighting.lights))
@@ -190,7 +190,7 @@ class LightPass:
             return Visibilities(lights, tuple(sample_visibilities(frame.surface, *pair, lighting.soft_maps) for pair in pairs))
 
     def white_terms(self, frame: Frame, lighting: Lighting, geometry: Geometry) -> tuple[Any, ...]:
-        """Radiance towards the camera (Float, N) of each of the lights on white surfaces, if it were white. Detached.
+        """Radiance (Float, N) towards the camera for each light, if light and surfaces were white. Detached.
 
         For lights that have a colour (:mod:`shadowmap_dr.rendering.light_colours`), and surfaces whose colour is white.
         """
@@ -205,7 +205,7 @@ class LightPass:
             return tuple(term[0] for term in terms)
 
     def radiance(self, seen: Surface, lighting: Lighting, incident: IncidentLight) -> Color3f:
-        """Reflected radiance (colour, N) towards the camera. ``incident``: on the same surfaces. Attached to all of these."""
+        """Reflected radiance (colour, N) towards the camera. ``incident``: light on these surfaces. Attached to all arguments."""
         gate = not self.settings.shadow.compat
         color = dr.zeros(mi.UnpolarizedSpectrum, dr.width(seen.shape))
         nodes = self.data.materials()
@@ -217,14 +217,14 @@ class LightPass:
         return incident.looped + self.with_ambient(color, seen)
 
     def with_ambient(self, color: Color3f, seen: Surface) -> Color3f:
-        """The same radiance with reflected light that nothing shadows."""
+        """Radiance plus reflected ambient light, which nothing shadows."""
         if self.settings.ambient > 0 and self.settings.lit:
             nodes, uniform = self.data.materials(), UniformRadiance(self.settings.ambient)
             color += ambient_light(seen, uniform, _AMBIENT_DIRECTIONS, nodes)
         return color
 
     def with_emission(self, color: Color3f, seen: Surface, lighting: Lighting, sensor: Sensor, size: ImageSize) -> Color3f:
-        """The same radiance with that of emitters that the camera sees. ``size``: in samples."""
+        """Radiance plus that of emitters that the camera sees. ``size``: samples of the image."""
         if self.settings.hide_emitters or self.settings.max_depth == 0:
             return color
         color += emission(seen, lighting.areas)
@@ -233,7 +233,7 @@ class LightPass:
         return color
 
     def visibilities(self, frame: Frame, lighting: Lighting, numbers: list[int], lights: Sequence[Light]) -> list[Float]:
-        """Visibility (Float, N) of lights from all pixels. ``numbers``: of the lights in the plan."""
+        """Visibility (Float, N) of lights from all pixels. ``numbers``: indices of the lights in the plan."""
         maps = lighting.maps
         if maps is None or not numbers:
             return [mi.Float(1) for _ in lights]
@@ -266,7 +266,7 @@ class LightPass:
         return softened(shining, frame.surface.p_world, lambda: self._around(frame))
 
     def _in_tables(self, frame: Frame, lighting: Lighting) -> tuple[Color3f | int, list[int]]:
-        """(radiance of lights of kinds of which there are many, numbers of the other lights)."""
+        """(radiance of all lights of frequent kinds, indices of the other lights)."""
         every, seen = list(range(len(lighting.lights))), frame.surface
         if len(every) < MANY_LIGHTS or self.settings.shadow.compat or self.settings.aovs:
             return 0, every
@@ -283,7 +283,7 @@ class LightPass:
 
 
 def plan_extended_lights(data: SceneData, settings: RenderSettings) -> tuple[SoftPlan, ...]:
-    """Sample the area lights and environments of a scene (on the host, once). Refuses what would not fit into arrays."""
+    """Sample the area lights and environments of a scene (on the host, once). ShadowmapError if maps are too many."""
     lights: tuple[SoftLight, ...] = (*data.areas, *data.environments)
     single = settings.emitter_shadows == "single"
     soft = plan_soft(lights, data.geometry, settings.area_light_samples, settings.environment_light_samples, single)

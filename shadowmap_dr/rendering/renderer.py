@@ -43,21 +43,21 @@ class Renderer:
     """Renders one scene again and again, with other vertices, lights or cameras.
 
     A PyTree: pass it to functions decorated with ``dr.freeze``. A step touches neither Mitsuba's meshes nor its acceleration
-    structures. The only state is the fit of the shadow maps (``frusta``, ``soft_frusta``): it stays as it is while the casters
-    move within it.
+    structures. The only state is the fit of the shadow maps (``frusta``, ``soft_frusta``). It stays the same while casters move
+    within it.
 
     Attributes:
         data: records of the scene.
         topology: edges of the merged mesh.
-        plan: which shadow maps there are.
-        settings: how to render.
+        plan: shadow maps of lights without extent.
+        settings: settings of the rendering.
         flat: faces that are shaded flat, or None.
         creases: edges of faces at which shading jumps. Attributes and textures of meshes count as they were when the scene was
             read.
         outward: ``Bool`` (F,), faces that shadow maps show from the front only, or None.
-        soft: how extended lights (area lights, environments) are sampled, and which maps these samples have.
-        frusta: fit of the shadow maps in the last rendering, None before the first. ``soft_frusta``: of those of extended lights.
-        untracked: what recordings do not see of the scene, or None if whoever records takes care of it.
+        soft: samples of extended lights (area lights, environments), and the shadow maps of the samples.
+        frusta: fit of the shadow maps in the last rendering, None before the first. ``soft_frusta``: for extended lights.
+        untracked: parameters of the scene that recordings do not see, or None if the caller watches them.
     """
 
     data: SceneData
@@ -77,7 +77,7 @@ class Renderer:
 
     @property
     def recording_parts(self) -> tuple[str, list[Any]]:
-        """Text for what a recording holds, arrays and objects of Mitsuba's. Read by ``dr.freeze``."""
+        """(text of everything that a recording depends on, arrays and objects of Mitsuba's). ``dr.freeze`` reads it."""
         return take_apart([getattr(self, part.name) for part in fields(self)])
 
     @classmethod
@@ -94,7 +94,7 @@ class Renderer:
                 :class:`~shadowmap_dr.shadow.ShadowSettings`.
 
         Raises:
-            ShadowmapError: what the scene has and this renderer does not support, by name; unknown or invalid settings.
+            ShadowmapError: the scene has parts that are not supported, by name; a setting is unknown or invalid.
         """
         chosen = RenderSettings.of(**settings)
         return cls.from_data(load(scene, tessellation=tessellation), chosen)
@@ -141,14 +141,14 @@ class Renderer:
 
     @property
     def texels(self) -> int:
-        """Of all shadow maps, before supersampled ones are made smaller."""
+        """Texels of all shadow maps, before supersampled maps are averaged."""
         if self.settings.shadow.method == "none":
             return 0
         side = self.settings.shadow.resolution * self.settings.shadow.supersampling
         return self.plan.maps * side**2 + sum(plan.maps for plan in self.soft) * self.settings.soft_map_resolution**2
 
     def with_updated_shading_edges(self) -> Renderer:
-        """The same renderer with the edges at which colours of meshes jump as they are now."""
+        """The same renderer with the edges at which colours of meshes jump, found again."""
         sources = self.data.sources
         return replace(self, creases=self.creases and self.creases.with_colours(self.data.geometry, sources))
 
@@ -218,7 +218,7 @@ class Renderer:
         return develop([margin.cut(picture, factor) for picture in pictures], windows[0], factor)
 
     def note_kernels(self, spp: int, sensor: int | Sensor = 0) -> None:
-        """Before an image is taken: let kernels of others go, if there have been many sizes."""
+        """Let kernels of other image sizes go, if there were many. Call before an image is rendered."""
         cameras = self.data.cameras(sensor)
         sizes = [(camera.film_size, camera.crop_size, camera.crop_offset) for camera in cameras]
         note_size((*sizes, spp, self.settings.shadow.resolution))
@@ -244,13 +244,13 @@ class Renderer:
 
     @property
     def camera_pass(self) -> CameraPass:
-        """The pass that finds out what cameras see."""
+        """The pass that renders visible surfaces."""
         hidden = tuple(light.shape for light in self.data.areas) if self.settings.hide_emitters else ()
         return CameraPass(self.data, self.topology, self.flat, self.creases if self.settings.antialias else None, hidden)
 
     @property
     def light_pass(self) -> LightPass:
-        """The pass that finds out what light reaches it."""
+        """The pass that renders shadow maps and light."""
         return LightPass(self.data, self.settings, self.plan, self.soft, self.outward)
 
     def _lighting(self, views: Sequence[CameraView], shapes: PlacedShapes, replacements: Mapping[str, Any] | None) -> Lighting:
@@ -266,7 +266,7 @@ class Renderer:
         return lighting
 
     def g_buffer(self, sensor: int = 0) -> GBuffer:
-        """Surfaces that a camera sees of the scene as it is, for those who shade it themselves again and again. Detached.
+        """Surfaces of the current scene that a camera sees, for callers who shade them themselves. Detached.
 
         Raises:
             ShadowmapError: there is no such sensor, or it has several cameras, or a reconstruction filter that is not a box.

@@ -45,7 +45,7 @@ class MapPlan:
     """The maps of each light. Static, made once for a scene.
 
     ``kinds``: ``directional``, ``beam``, ``spot`` (one map each) or ``cube`` (six). ``first``: number of each light's first map.
-    ``planes``: the largest face (index) of each planar shape, any of others. ``planar``: Bool (S,).
+    ``planes``: index of the largest face of each planar shape, of any face for other shapes. ``planar``: Bool (S,).
     ``center``, ``radius``: a sphere around the scene at rest, world space, for the fixed frusta of ``compat``.
     """
 
@@ -63,7 +63,7 @@ class MapPlan:
 
 
 def plan_maps(lights: Sequence[Light], geometry: Geometry) -> MapPlan:
-    """Decide (on the host, once) which maps the lights need and what is known about the shapes."""
+    """Choose the maps of the lights, and find planar shapes (on the host, once)."""
     kinds = tuple(light.map_kind() for light in lights)
     sizes = [6 if kind == "cube" else 1 for kind in kinds]
     positions = dr.detach(geometry.positions).numpy().reshape(-1, 3)
@@ -100,14 +100,14 @@ def _sphere_around(positions: np.ndarray) -> tuple[tuple[float, float, float], f
 
 
 def check_sizes(maps: int, texels: int, geometry: Geometry, lights: str, remedy: str) -> None:
-    """Refuse (ShadowmapError) maps that would not fit into arrays: lanes are counted with 32 bits.
+    """ShadowmapError if maps are too many for arrays, whose lanes are counted with 32 bits.
 
     Args:
-        maps: how many there are.
-        texels: along each side of one of them.
-        geometry: the scene's.
-        lights: whose maps they are, for the message.
-        remedy: what to do about it, for the message.
+        maps: number of maps.
+        texels: texels along each side of a map.
+        geometry: geometry of the scene.
+        lights: name of the lights, for the message.
+        remedy: advice, for the message.
     """
     if maps * max(geometry.vertex_count, geometry.face_count, 4 * texels * texels) >= 2**31:
         raise ShadowmapError(
@@ -187,7 +187,7 @@ def _fitted(
 def _culled(plan: MapPlan, count: int, outward: Bool | None) -> Bool | None:
     """Faces of each map (Bool, for all maps or for all faces of each) of which only fronts are drawn, or None.
 
-    Only the maps of directional lights begin before all casters: others may begin inside of one, and see its backs.
+    Only maps of directional lights begin before all casters. Other maps may begin inside of a caster and see its back faces.
     """
     directional = [first for kind, first in zip(plan.kinds, plan.first, strict=True) if kind == "directional"]
     if outward is None or not directional:
@@ -214,7 +214,7 @@ def _views(plan: MapPlan, light: Light, kind: str, settings: ShadowSettings) -> 
 
 
 def _within_beams(plan: MapPlan, lights: Sequence[Light], p_light: Point3f, map_index: UInt32) -> Point3f:
-    """Light-space points, moved to the nearest that a beam can reach in the maps of beams."""
+    """Light-space points; in maps of beams each is moved to the nearest point that the beam reaches."""
     result = p_light
     for k, light in enumerate(lights):
         if isinstance(light, Beam):

@@ -1,4 +1,4 @@
-"""Area lights: points on the emitting surface that stand for the parts of it around them."""
+"""Area lights: sample points on the emitting surface, each for a part of the surface."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ class AreaPlan:
 
     face      UInt32 (P,), triangle of the soup that a piece lies in
     u, v      Float (P,), barycentrics of its centre
-    fraction  Float (P,), its share of the triangle's area, negative where the emitter shines on the side that winds the other way
-    cluster   UInt32 (P,), which of the N clusters it belongs to
-    chosen    UInt32 (N,), the piece in whose centre a cluster's sample lies
+    fraction  Float (P,), share of the triangle's area; negative where the emitter shines on the back of the triangle
+    cluster   UInt32 (P,), cluster of the piece, one of N
+    chosen    UInt32 (N,), piece whose centre is the sample of a cluster
     shape     index of the emitter's shape
-    facet     UInt32 (P,), which facet it belongs to, ``facets`` for each cluster
-    facets    number of disks that stand for the part of a sample
-    dented    whether parts of the emitter look at the shining side of others. False if it shines on the side from which its
-              triangles wind the other way: maps show the other sides only
+    facet     UInt32 (P,), facet of the piece; each cluster has ``facets`` of them
+    facets    number of disks that represent the part of a sample
+    dented    True if parts of the emitter face the shining side of other parts. False if the emitter shines on the backs of its
+              triangles, since maps then show the fronts only
     """
 
     face: UInt32
@@ -66,7 +66,7 @@ class AreaPlan:
 def plan_area(light: AreaLight, geometry: Geometry, count: int) -> AreaPlan:
     """Divide an emitter into ``count`` parts (on the host, once).
 
-    Parts that face the rest of the scene, or shine brighter, are smaller: what no other surface sees gets few samples.
+    Parts that face the rest of the scene, or are brighter, are smaller. Parts that no other surface sees get few samples.
     """
     info = geometry.shapes[light.shape]
     positions = dr.detach(geometry.positions).numpy().reshape(-1, 3).astype(np.float64)
@@ -115,7 +115,7 @@ def _divided(planar: bool, pieces: tuple[np.ndarray, ...], nearest: np.ndarray) 
 
 
 def area_samples(light: AreaLight, plan: AreaPlan, geometry: Geometry) -> LightSamples:
-    """The samples of an emitter where it is now. Attached to its vertices and its radiance."""
+    """Current samples of an emitter. Attached to its vertices and its radiance."""
     info, count = geometry.shapes[plan.shape], dr.width(plan.chosen)
     first, e1, e2 = _triangles(geometry, plan.face)
     vector = dr.cross(e1, e2) * (0.5 * plan.fraction)
@@ -173,7 +173,7 @@ def _facets(
 
 
 def _at(values: Vector3f, index: UInt32) -> Vector3f:
-    """Vectors of some numbers (Vector3f)."""
+    """Vectors (Vector3f) with these indices."""
     return mi.Vector3f(*(dr.gather(mi.Float, values[c], index) for c in range(3)))
 
 
@@ -182,7 +182,7 @@ def _length(vector: Vector3f) -> Float:
 
 
 def _relative(radiance: Color3f) -> Float:
-    """Brightness of pieces (Float, P) in units of their mean, with a little more so that dark parts have a middle, too."""
+    """Brightness of pieces (Float, P) relative to their mean, plus a small number, so that dark parts have a centre, too."""
     bright = dr.maximum(dr.mean(mi.UnpolarizedSpectrum(radiance)), 0)
     return bright * dr.rcp(dr.maximum(dr.detach(dr.mean(bright)), 1e-30)) + _DIM
 

@@ -1,4 +1,4 @@
-"""Aim of the shadow maps of an area light, so that one of them sees all that casts shadows (on the host)."""
+"""Aim of the shadow maps of an area light. Each map has to see all casters (on the host)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Points = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Aim:
-    """``target``: middle of the shapes ``casters``; ``surrounded``: no map sees them all from everywhere on the emitter."""
+    """``target``: middle of the shapes ``casters``; ``surrounded``: from some points of the emitter no map sees them all."""
 
     target: tuple[float, float, float]
     casters: tuple[int, ...]
@@ -38,7 +38,7 @@ def shape_vertices(geometry: Geometry) -> list[Points]:
 
 
 def aim(vertices: Sequence[Points], shapes: Sequence[ShapeInfo], own: int) -> Aim:
-    """Look from the emitter ``own`` at what can cast shadows on something."""
+    """Aim of maps on the emitter ``own``, at the shapes that can cast shadows."""
     emitter, others = vertices[own], [k for k in range(len(shapes)) if k != own]
     casters = [k for k in others if _may_cast(shapes, vertices, k, others, emitter.mean(0))] or others or [own]
     points = np.concatenate([vertices[k] for k in casters])
@@ -68,7 +68,7 @@ def _widest(eyes: Points, points: Points, centre: Points) -> float:
 
 
 def _may_cast(shapes: Sequence[ShapeInfo], parts: Sequence[Points], k: int, others: Sequence[int], light: Points) -> bool:
-    """True if a shape has anything behind it, as seen from the light: walls and floors have not."""
+    """True if something lies behind a shape, as seen from the light. Nothing lies behind walls and floors."""
     if not shapes[k].planar:
         return True
     own = parts[k]

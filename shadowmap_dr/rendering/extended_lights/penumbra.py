@@ -1,4 +1,4 @@
-"""Penumbrae from a single shadow map: how far occluders lie before the receiver tells how wide the shadow's edge is.
+"""Penumbrae from a single shadow map: their width follows from the distance of occluders to the receiver.
 
 Percentage-closer soft shadows on a pyramid of filtered moments. Sources: Fernando, "Percentage-Closer Soft Shadows", 2005; Yang
 et al., "Variance Soft Shadow Mapping", 2010 (mean depth of occluders from moments, section 3.1).
@@ -136,7 +136,7 @@ class _Place:
 
     @property
     def nearest(self) -> Float:
-        """Distance at which occluders are looked for."""
+        """Distance at which the search for occluders begins."""
         return dr.maximum(self.frustum.first, self.frustum.near)
 
     def footprint(self, radius: Float, z_occluder: Float) -> tuple[Float, Float]:
@@ -148,7 +148,7 @@ class _Place:
     def look_up(
         self, pyramid: Pyramid, which: UInt32, tap: UInt32, radii: tuple[Float, Float], attached: bool = True
     ) -> tuple[Vector2f, Float]:
-        """(moments at one of the places all over an ellipse around the point, depth of the point's tangent plane there)."""
+        """(moments at a sample place of an ellipse around the point, depth of the point's tangent plane at that place)."""
         rx, ry = radii if attached else (dr.detach(r) for r in radii)
         # Each place stands for its share of the ellipse.
         texels = dr.detach(dr.maximum(rx, ry)) * (pyramid.maps.settings.resolution * math.sqrt(math.pi / _TAPS))

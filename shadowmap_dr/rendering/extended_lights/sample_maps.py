@@ -1,4 +1,4 @@
-"""Shadow maps of light samples: one each, all of a scene in one batch."""
+"""Shadow maps of light samples, one for each sample. All maps of a scene are one batch."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class SoftPlan:
 def plan_soft(
     lights: Sequence[SoftLight], geometry: Geometry, area_count: int, sky_count: int, single: bool = False
 ) -> tuple[SoftPlan, ...]:
-    """Sample the lights and decide on their maps (on the host, once). ``single``: area lights get one map where one is enough."""
+    """Choose samples of the lights, and their maps (on the host, once). ``single``: area lights get one map if one suffices."""
     plans: list[SoftPlan] = []
     first = {True: 0, False: 0}
     for light in lights:
@@ -97,9 +97,9 @@ def plan_soft(
 
 
 def still_aimed(plans: Sequence[SoftPlan], geometry: Callable[[], Geometry]) -> bool:
-    """True if the maps of lights that have one for each sample, or one in all, still cover what they are meant to.
+    """True if the maps of ``near`` and ``single`` lights still cover their casters.
 
-    If there are such lights, the geometry is asked for, and its vertices are read back to the host.
+    Calls ``geometry`` and reads its vertices back only if there are such lights.
     """
     aimed = [plan for plan in plans if plan.kind in ("near", "single")]
     vertices = shape_vertices(geometry()) if aimed else []
@@ -107,13 +107,13 @@ def still_aimed(plans: Sequence[SoftPlan], geometry: Callable[[], Geometry]) -> 
 
 
 def check_soft_sizes(plans: Sequence[SoftPlan], geometry: Geometry, texels: int) -> None:
-    """Refuse (ShadowmapError) what would not fit into arrays."""
+    """ShadowmapError if maps are too many for arrays."""
     remedy = "lower area_light_samples, environment_light_samples or soft_map_resolution"
     check_sizes(sum(plan.maps for plan in plans), texels, geometry, "extended lights", remedy)
 
 
 def samples_of(light: SoftLight, plan: SoftPlan, geometry: Geometry) -> LightSamples:
-    """The light's samples as it is now. Attached."""
+    """Current samples of a light. Attached."""
     if isinstance(light, Environment):
         assert isinstance(plan.parts, SkyPlan)
         return sky_samples(light, plan.parts)
@@ -150,8 +150,8 @@ def make_soft_maps(
 ) -> SoftMaps:
     """Render and filter the maps of all samples as one batch, and those of single ones as another. Attached to samples, vertices.
 
-    ``scene`` tells the shapes' planes, ``settings`` are those of either kind, ``previous`` is the fit of an earlier call; the
-    rest is as in :func:`shadowmap_dr.rendering.shadow_pass.make_maps`.
+    ``scene``: planes of the shapes. ``settings``: for either kind of map. ``previous``: fit of an earlier call. For other
+    arguments see :func:`shadowmap_dr.rendering.shadow_pass.make_maps`.
     """
     made: list[ShadowMaps | None] = []
     for own, setting, fit in _kinds(plans, samples, settings, previous):
@@ -184,7 +184,7 @@ def _kinds(
     settings: tuple[ShadowSettings, ShadowSettings],
     previous: SoftFrusta,
 ) -> Iterator[tuple[_Parts, ShadowSettings, Frusta | None]]:
-    """(lights, settings of their maps, fit of an earlier call): of maps for each sample, and of single ones."""
+    """(lights, settings of their maps, fit of an earlier call), for maps of samples, then for single maps."""
     for single, setting, fit in zip((False, True), settings, previous, strict=True):
         yield [(p, s) for p, s in zip(plans, samples, strict=True) if (p.kind == "single") == single], setting, fit
 
@@ -197,7 +197,7 @@ def _fitted(
     previous: Frusta | None,
     seen: tuple[Point3f, Bool] | None,
 ) -> tuple[Views, UInt32, Frusta]:
-    """(cameras of all maps, the shape that each of these does not see, the fit)."""
+    """(cameras of all maps, hidden shape of each map, the fit)."""
     plans = [plan for plan, _ in lights]
     views = _stack([_views(plan, s, settings) for plan, s in lights])
     hidden = dr.concat([dr.full(mi.UInt32, plan.hides, plan.maps) for plan in plans])
@@ -226,7 +226,7 @@ def _make(
 
 
 def _facing(plans: Sequence[SoftPlan], geometry: Geometry) -> Bool | None:
-    """Faces (Bool, for all faces of each map) that cast shadows only where they face the light, or None."""
+    """Mask (Bool, all faces of each map) of faces that cast shadows only where they face the light, or None."""
     if not any(plan.facing[1] for plan in plans):
         return None
     first, last = (dr.concat([dr.full(mi.UInt32, plan.facing[k], plan.maps) for plan in plans]) for k in range(2))
@@ -237,7 +237,7 @@ def _facing(plans: Sequence[SoftPlan], geometry: Geometry) -> Bool | None:
 
 
 def map_of(plan: SoftPlan, table: SampleTable, sample: UInt32, p_world: Point3f) -> UInt32:
-    """Number of the map (UInt32) that tells whether points see a sample (UInt32)."""
+    """Index of the map (UInt32) in which points look up the visibility of a sample (UInt32)."""
     if plan.kind == "cube":
         return plan.first + sample * 6 + cube_face(dr.detach(mi.Vector3f(p_world) - table.place(sample)))
     return plan.first + sample
@@ -299,7 +299,7 @@ def _fit(
     previous: Frusta | None,
     seen: tuple[Point3f, Bool] | None,
 ) -> Frusta:
-    """Frusta around the boxes of shapes: with so many maps, asking each vertex would cost more than drawing it."""
+    """Frusta around the boxes of shapes. With many maps, a fit to each vertex would cost more than drawing it."""
     with dr.suspend_grad():
         shapes, count = len(geometry.shapes), views.count
         boxes = boxes_of(geometry)
@@ -324,7 +324,7 @@ def _fit(
 
 
 def _few(seen: tuple[Point3f, Bool] | None) -> tuple[Point3f, Bool] | None:
-    """About 1,000 of the seen points."""
+    """A subset of about 1,000 visible points."""
     if seen is None:
         return None
     points, active = seen

@@ -1,4 +1,4 @@
-"""Extended lights as the shading knows them: a fixed number of points, or of directions, each with a shadow map of its own."""
+"""Samples of extended lights: a fixed number of points, or of directions, each with its own shadow map."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ class Facets:
     """Disks that shine like the N parts of an emitter: ``count`` for each part, one after the other, F in all.
 
     count   static
-    flat    whether none of them stands for something that bends (static)
+    flat    True if all parts are flat (static)
     middle  Vector3f (F,), centres, world space
-    normal  Vector3f (F,), mean normals of what they stand for, times their share of the part
+    normal  Vector3f (F,), mean normals of the represented surface, times its share of the part
     radius  Float (F,)
-    bend    Float (F,), standard deviation of normals, negative where they are bent inwards
+    bend    Float (F,), standard deviation of normals, negative for concave surfaces
 
     All may carry gradients.
     """
@@ -38,21 +38,21 @@ class Facets:
     bend: Float
 
     def packets(self) -> list[Vector4f]:
-        """Two rows of four numbers."""
+        """The fields as two rows of four numbers."""
         m, n = self.middle, self.normal
         return [mi.Vector4f(m.x, m.y, m.z, self.radius), mi.Vector4f(n.x, n.y, n.z, self.bend)]
 
 
 @dataclass(frozen=True)
 class LightSamples:
-    """N points of a light that is near (an area light), or N directions of one that is infinitely far away.
+    """N points of a near light (an area light), or N directions of a light at infinity.
 
-    distant  which of the two (static)
+    distant  True for directions (static)
     place    Vector3f (N,), positions, or unit directions in which light travels, world space
-    normal   Vector3f (N,), mean normals of the parts, shorter than 1 where these are curved (unused if distant)
+    normal   Vector3f (N,), mean normals of the parts, shorter than 1 for curved parts (unused if distant)
     power    colour (N,), radiance times area, or irradiance on a surface that faces the light
     area     Float (N,), share of the emitter's area (unused if distant)
-    facets   what the parts shine like, near points; None if distant
+    facets   disks that shine like the parts at near points; None if distant
 
     All may carry gradients.
     """
@@ -86,7 +86,7 @@ class LightSamples:
         return dr.sqrt(dr.maximum(flat + closed, 1e-12 * total) * (1 / math.pi))
 
     def table(self) -> SampleTable:
-        """The same numbers in packets, for look-ups by many lanes."""
+        """The samples in packets of four numbers, for look-ups by many lanes."""
         p, c = self.place, self.power
         colour = [c[k] for k in range(dr.size_v(type(c)))]
         rows = [mi.Vector4f(p.x, p.y, p.z, 0), mi.Vector4f(*colour, *[mi.Float(0)] * (4 - len(colour)))]
@@ -109,7 +109,7 @@ class SampleTable:
     flat: bool
 
     def place(self, index: UInt32) -> Vector3f:
-        """Vector3f, where sample ``index`` (UInt32) is, detached."""
+        """Vector3f, place of sample ``index`` (UInt32), detached."""
         packet = dr.gather(mi.Vector4f, dr.detach(self.packets[0]), index)
         return mi.Vector3f(packet.x, packet.y, packet.z)
 
@@ -164,7 +164,7 @@ class SampleTable:
 
 
 def _above(vector: Vector3f, along: Float, side: Vector3f, level: Float, variance: Float, squared: Float) -> Vector3f:
-    """Irradiance (Vector3f) of what is on one side of planes, of a disk that gives ``vector`` in all.
+    """Irradiance (Vector3f) of the part of a disk on one side of planes. The whole disk gives ``vector``.
 
     ``level``: of the disk's centre above the plane, around which its points are spread evenly, with a ``variance`` of a third.
     """
@@ -244,7 +244,7 @@ def cluster_sums(values: ArrayT, cluster: UInt32, count: int) -> ArrayT:
 
 
 class _Sums(dr.CustomOp):
-    """Scatter-add whose derivatives are evaluated at once: pending ones end the process where a loop comes to read them."""
+    """Scatter-add whose derivatives are evaluated at once. If a loop reads pending derivatives, Dr.Jit ends the process."""
 
     def eval(self, values: Float, cluster: UInt32, count: int) -> Float:
         self._cluster, self._count = cluster, count

@@ -1,4 +1,4 @@
-"""Light of extended lights on what is seen: a sum over their samples, in one loop on the device."""
+"""Reflected light of extended lights: a sum over their samples, in one loop on the device."""
 
 from __future__ import annotations
 
@@ -77,9 +77,9 @@ def soft_light(
 
 
 def sample_visibilities(seen: Surface, plan: SoftPlan, samples: LightSamples, maps: SoftMaps | None) -> Float | None:
-    """Visibility (Float, K P) of the K samples of an extended light, one after the other, or None where there are no such maps.
+    """Visibility (Float, K P) of the K samples of an extended light, sample by sample, or None without maps of samples.
 
-    Detached. For images that differ in nothing but materials and the colours of lights.
+    Detached. For images that differ only in materials and in the colours of lights.
     """
     if maps is None or maps.sampled is None or plan.kind == "single":
         return None

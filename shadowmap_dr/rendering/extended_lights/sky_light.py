@@ -1,4 +1,4 @@
-"""Light of an environment on what is seen: a sum over the parts of the sky, of which a surface's horizon may hide a share."""
+"""Reflected light of an environment: a sum over the parts of the sky. A surface's horizon may hide a share of a part."""
 
 from __future__ import annotations
 

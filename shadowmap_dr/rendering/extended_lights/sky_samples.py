@@ -1,4 +1,4 @@
-"""Environments: directions that stand for the parts of the sky around them."""
+"""Environments: sample directions, each for a part of the sky."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class SkyPlan:
 def plan_sky(light: Environment, count: int, geometry: Geometry) -> SkyPlan:
     """Divide a sky into ``count`` parts of about the same energy (on the host, once).
 
-    Light from below a floor that everything stands on reaches nothing: parts down there are large.
+    Light from below a floor that everything stands on reaches nothing, so parts below it are large.
     """
     rows = int(np.clip(light.rows, *_ROWS))
     bright, weight = _measured(light, rows)
@@ -126,10 +126,10 @@ def _measured(light: Environment, rows: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 class SkyWatch:
-    """Watch over where a sky shines: it may have been turned since it was divided into parts.
+    """Watch over the distribution of a sky's light, which may have been turned since the sky was divided into parts.
 
     Args:
-        lights: environments of a scene, as they are.
+        lights: current environments of a scene.
     """
 
     def __init__(self, lights: Sequence[Environment]) -> None:
@@ -138,7 +138,7 @@ class SkyWatch:
         self._versions = [_version(light) for light in lights]
 
     def same(self, lights: Sequence[Environment]) -> bool:
-        """``lights``: the environments now. Reads them back only if one has changed since it was asked last."""
+        """True if ``lights``, the current environments, shine as before. Reads back only what has changed since the last call."""
         for k, (light, rows) in enumerate(zip(lights, self._rows, strict=True)):
             version = _version(light)
             if version == self._versions[k]:
@@ -150,14 +150,14 @@ class SkyWatch:
 
 
 def _shares(light: Environment, rows: int) -> np.ndarray:
-    """Share of the cells in a sky's energy."""
+    """Share of each cell in the energy of a sky."""
     bright, weight = _measured(light, rows)
     energy = bright * weight
     return energy / energy.sum() if energy.sum() > 0 else weight / weight.sum()
 
 
 def _version(light: Environment) -> tuple[Any, ...]:
-    """Something that changes when the parameters do, other than ``to_world``."""
+    """A value that changes when a parameter other than ``to_world`` does."""
     held = (value for key, value in parameters(light.emitter).items() if key not in ("to_world", "sampling_weight"))
     return tuple(fingerprint(value) for value in held)
 
@@ -196,7 +196,7 @@ NOT_GIVEN: Any = None  # Any: takes the place of arrays
 
 @dataclass(frozen=True)
 class SkySamples(LightSamples):
-    """Directions of an environment, and how wide the parts are that they stand for.
+    """Directions of an environment, and the widths of their parts.
 
     length, axes  as of :class:`SkyPlan`, axes in world space, attached to the environment's rotation
     """
@@ -235,7 +235,7 @@ class SkyWidths:
 
 
 def sky_samples(light: Environment, plan: SkyPlan) -> SkySamples:
-    """Samples of an environment as it is now. Attached to its radiance, all of it, and to its rotation."""
+    """Current samples of an environment. Attached to all of its radiance, and to its rotation."""
     local, solid_angle = _grid(plan.rows)
     radiance = mi.UnpolarizedSpectrum(light.diffuse_radiance(light.to_world(local)))
     count = dr.width(plan.direction)

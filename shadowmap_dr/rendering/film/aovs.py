@@ -1,4 +1,4 @@
-"""Further image channels that the passes produce anyway."""
+"""Further image channels, which are by-products of the passes."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def aov_names(aovs: tuple[str, ...], light_names: list[str]) -> list[str]:
 def collect_aovs(
     aovs: tuple[str, ...], seen: Surface, raster: RasterOutput, lights: tuple[Light, ...], visible: list[Float]
 ) -> list[Float]:
-    """Channels (Float, one entry a pixel), 0 where nothing is seen; visibility is 1 there.
+    """Channels (Float, one entry a pixel), 0 in the background, but visibility 1.
 
     ``depth``: distance from the camera, world units (as Mitsuba's). ``position``, ``normal``: world space, the normal is the
     shading normal. ``shape_index``, ``prim_index``: counted from 0, -1 where nothing is seen. Not anti-aliased, and not passed

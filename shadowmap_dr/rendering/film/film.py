@@ -1,4 +1,4 @@
-"""Films: the window of samples that a picture needs, the picture made of them, and Mitsuba's film that is to hold it."""
+"""Films: windows of samples, pictures made of samples, and Mitsuba's film that holds a picture."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MOST_SAMPLES = 1 << 24
 
 @dataclass(frozen=True)
 class Margin:
-    """Pixels of the film around a crop window, with which its outermost ones are blended where edges pass between them."""
+    """Pixels of the film around a crop window. Anti-aliasing blends them with the outermost pixels of the window."""
 
     left: int = 0
     top: int = 0
@@ -32,7 +32,7 @@ class Margin:
 
     @classmethod
     def of(cls, cameras: Sequence[Sensor], factor: int) -> Margin:
-        """One pixel on each side that is not the film's own, so that a picture is the same whether it is cut before or after.
+        """One pixel on each side that lies in the film: pictures are the same whether cropped before or after.
 
         ``factor`` x ``factor`` samples a pixel; none where the rasterizer has no room for more.
         """
@@ -43,7 +43,7 @@ class Margin:
         return cls(int(x > 0), int(y > 0), int(x + camera.width < film.width), int(y + camera.height < film.height))
 
     def around(self, camera: Sensor) -> Sensor:
-        """A camera whose window has the margin, too."""
+        """A camera whose window includes the margin."""
         x, y = camera.crop_offset
         size = ImageSize(camera.width + self.left + self.right, camera.height + self.top + self.bottom)
         return replace(camera, crop_size=size, crop_offset=(x - self.left, y - self.top))
@@ -58,7 +58,7 @@ class Margin:
 
 
 def sample_windows(cameras: Sequence[Sensor]) -> tuple[Sensor, ...]:
-    """Cameras whose windows include what a film samples beyond its border (``sample_border``).
+    """Cameras whose windows include the samples beyond the film's border (``sample_border``).
 
     Cameras of one film lie side by side: the first one gets a border on its left, the last one on its right.
     """
@@ -93,7 +93,7 @@ def check_samples(spp: float) -> None:
 def sample_grid(spp: float, windows: Sequence[Sensor]) -> int:
     """Samples along each side of a pixel: at most 16, and as many as the rasterizer's largest image has room for.
 
-    A warning names both counts where that is less than was asked for.
+    A warning names both counts where fewer samples are taken than were asked for.
     """
     check_samples(spp)
     widest = max(windows, key=lambda window: max(window.width, window.height))
@@ -167,7 +167,7 @@ def put_into_film(film: mi.Film, image: TensorXf, aovs: list[str]) -> None:
 
 
 def film_channels(color: Color3f, active: Bool, sensor: Sensor) -> list[Float]:
-    """Channels (Float) of what a sensor's film holds of a colour: one or three, and where something was hit, if it has alpha."""
+    """Channels (Float) of a colour in a sensor's film: one or three, and coverage if the film has alpha."""
     channels = [color[k] for k in range(len(color))]
     if sensor.channels == 1 and len(channels) == 3:
         channels = [mi.luminance(color)]

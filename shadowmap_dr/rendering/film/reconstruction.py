@@ -80,7 +80,7 @@ class _Gathered(dr.CustomOp):
 
 
 def _packets(axis: _Axis) -> tuple[Any, int]:
-    """Type of what is moved at once, and how many of them lie after an entry of the axis."""
+    """(type of packets that are gathered, number of packets after each entry of the axis)."""
     if axis.after % 4 == 0:
         return mi.Vector4f, axis.after // 4
     return (mi.Vector3f, axis.after // 3) if axis.after % 3 == 0 else (mi.Float, axis.after)

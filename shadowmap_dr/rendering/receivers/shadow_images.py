@@ -1,4 +1,4 @@
-"""Shadow images of one mesh in several views, straight from the shadow maps: no camera pass, for nothing but shadows moves."""
+"""Shadow images of one mesh in several views, straight from the shadow maps. Only shadows move, so there is no camera pass."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _FIRST, _NEAR = 0.5, 12.0
 
 @dataclass(frozen=True)
 class ShadowImages:
-    """All that is constant while a mesh changes its vertices. Can cross ``dr.freeze``, as the last argument.
+    """Constants of shadow images while a mesh changes its vertices. May cross ``dr.freeze`` as the last argument.
 
     Attributes:
         faces, topology: of the mesh.

@@ -1,6 +1,6 @@
 """Views of shadow art: a light, a receiver, and a camera that sees the receiver but not the object.
 
-Neither light nor receiver nor camera ever moves, so all that is left of them is the point of the receiver that each pixel sees.
+Light, receiver and camera never move. A view therefore holds the point of the receiver that each pixel sees, and no camera.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ class ShadowView:
         origin: (3,) middle of the receiver.
         half: half of the receiver's side.
         points: (H, W, 3) the point of the receiver that each pixel sees; anything where ``seen`` is False.
-        seen: (H, W) which pixels see the receiver.
-        receiver, camera: what they are, for records.
+        seen: (H, W) True for pixels that see the receiver.
+        receiver, camera: their names, for records.
     """
 
     right: Array

@@ -135,9 +135,7 @@ def _parameter(field: Field[Any], option: Option, kind: object) -> inspect.Param
         single = type(get_args(single)[0])
     if option.parse is not None:
         single = next(kind for name, kind in get_type_hints(option.parse).items() if name != "return")
-    info = typer.Option(
-        *names, help=_help(field, option, names), metavar=metavar, min=option.least, max=option.most, show_default=False
-    )
+    info = typer.Option(*names, help=_help(field, option, names), metavar=metavar, show_default=False)
     annotation = _ANNOTATED[(_LIST[single] if repeated else single) | None, info]
     return inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
 

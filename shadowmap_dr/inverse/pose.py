@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from ..errors import ShadowmapError
 from ..jit.arrays import device_array
+from ..jit.frozen import recordings_of
 from ..jit.types import Float, TensorXf
 
 
@@ -137,7 +138,7 @@ class PoseFit:
 
     def recordings(self) -> int:
         """Number of recordings of the step so far. It stays the same once the fit is warm."""
-        return int(self._step.n_recordings)  # type: ignore[attr-defined]  # Dr.Jit's stub returns the plain function
+        return recordings_of(self._step)
 
     def describe(self) -> dict[str, Any]:
         """Settings for the record."""

@@ -120,7 +120,7 @@ def _loaded(data: bytes, kind: str) -> tuple[npt.NDArray[np.float64], npt.NDArra
             mesh = mesh.to_mesh()
         faces = getattr(mesh, "faces", np.empty((0, 3)))  # point clouds have none
         return np.asarray(mesh.vertices, np.float64).reshape(-1, 3), np.asarray(faces, np.int64).reshape(-1, 3)
-    except Exception:
+    except Exception:  # of many kinds: trimesh refuses binary lists of different lengths, as of triangles beside quads
         if binary is None:
             raise
     try:

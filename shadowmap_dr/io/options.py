@@ -9,6 +9,8 @@ from typing import Any, TypeVar
 _T = TypeVar("_T")
 #: Least and largest value, both included; whole numbers if both are.
 Range = tuple[float, float]
+# No default. Any: takes the place of a value of the field's type.
+_NONE: Any = MISSING
 # Place of a description in a field's metadata.
 _KEY = "option"
 
@@ -25,7 +27,6 @@ class Option:
         shown: the default in the help; None: as Python prints it.
         parse: function from a value of the command line to one of the field, for each value of a tuple. The command line takes
             values of the type of its parameter.
-        least, most: bounds of a number on the command line.
         allowed: range of the number, or of each of a tuple, on the command line and in Python (`io.ranges.check_ranges`).
         listed: False for fields that only Python sets.
     """
@@ -36,24 +37,20 @@ class Option:
     metavar: str | None = None
     shown: str | None = None
     parse: Callable[[Any], Any] | None = None
-    least: float | None = None
-    most: float | None = None
     allowed: Range | None = None
     listed: bool = True
 
 
 def option(
-    default: _T = MISSING,  # type: ignore[assignment]
+    default: _T = _NONE,
     *,
     help: str,
     names: Iterable[str] = (),
     choices: Iterable[str] = (),
     metavar: str | None = None,
     shown: str | None = None,
-    full: _T = MISSING,  # type: ignore[assignment]
+    full: _T = _NONE,
     parse: Callable[[Any], Any] | None = None,
-    least: float | None = None,
-    most: float | None = None,
     allowed: Range | None = None,
 ) -> _T:
     """A field of a record that is an option of a command, see :class:`Option`. Without a default, the field needs a value.
@@ -61,10 +58,10 @@ def option(
     ``choices`` are shown in the help in place of ``metavar``; those of a ``Literal`` are known. The record checks them.
     """
     metavar = "|".join(choices) or metavar
-    return _described(default, Option(help, full, tuple(names), metavar, shown, parse, least, most, allowed))
+    return _described(default, Option(help, full, tuple(names), metavar, shown, parse, allowed))
 
 
-def setting(default: _T = MISSING, *, help: str, allowed: Range | None = None) -> _T:  # type: ignore[assignment]
+def setting(default: _T = _NONE, *, help: str, allowed: Range | None = None) -> _T:
     """A field of a record that has no option: only Python sets it."""
     return _described(default, Option(help, MISSING, allowed=allowed, listed=False))
 

@@ -21,6 +21,11 @@ from .types import AnyArray, PyTree
 _PLAIN = (int, float, complex, str, bytes, type(None), enum.Enum, type)
 
 
+def recordings_of(function: Callable[..., Any]) -> int:
+    """Number of recordings of a function decorated with ``dr.freeze``. The decorator's stub hides the attribute."""
+    return int(cast(Any, function).n_recordings)
+
+
 class Frozen:
     """A function of records, recorded once for all arguments that differ only in the contents of their arrays.
 
@@ -34,8 +39,7 @@ class Frozen:
         def recorded(key: str, leaves: list[PyTree]) -> tuple[str, list[AnyArray]]:
             return call.run()
 
-        # Any: the stub of `dr.freeze` hides the attribute `n_recordings`.
-        self._call, self._recorded = call, cast(Any, dr.freeze(recorded))
+        self._call, self._recorded = call, dr.freeze(recorded)
 
     def __call__(self, *arguments: PyTree) -> PyTree:
         call = self._call
@@ -54,7 +58,7 @@ class Frozen:
     @property
     def n_recordings(self) -> int:
         """Number of recordings so far."""
-        return int(self._recorded.n_recordings)
+        return recordings_of(self._recorded)
 
 
 class _Call:

@@ -92,7 +92,6 @@ def make_mesh(
     positions: npt.ArrayLike,
     faces: npt.ArrayLike,
     bsdf: mi.BSDF | None = None,
-    kind: type | None = None,
 ) -> mi.Mesh:
     """Make a ``mi.Mesh`` of vertices (V, 3) and faces (F, 3).
 
@@ -101,16 +100,14 @@ def make_mesh(
         positions: world space.
         faces: indices of vertices.
         bsdf: its material; None for Mitsuba's default.
-        kind: ``mi.Mesh``, or a class that takes its place.
     """
-    kind = mi.Mesh if kind is None else kind
     points, corners = np.ascontiguousarray(positions, np.float32), np.ascontiguousarray(faces, np.uint32)
     props = mi.Properties()
     if bsdf is not None:
         props["bsdf"] = bsdf
-    if not _is_flat(kind):
-        return kind(name, faces=mi.TensorXu(corners), positions=mi.TensorXf(points), props=props)
-    mesh = kind(name, len(points), len(corners), props=props)
+    if not _is_flat(mi.Mesh):
+        return mi.Mesh(name, faces=mi.TensorXu(corners), positions=mi.TensorXf(points), props=props)
+    mesh = mi.Mesh(name, len(points), len(corners), props=props)
     table = mi.traverse(mesh)
     table[_FLAT.positions], table["faces"] = mi.Float(points.ravel()), mi.UInt32(corners.ravel())
     table.update()

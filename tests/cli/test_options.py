@@ -14,6 +14,7 @@ import typer
 from shadowmap_dr.cli import main
 from shadowmap_dr.cli.main import COMMANDS
 from shadowmap_dr.cli.options import After, Given, Variant, from_record
+from shadowmap_dr.errors import ShadowmapError
 from shadowmap_dr.experiments.art.experiment import ArtOptions
 from shadowmap_dr.experiments.bench.common import BenchOptions
 from shadowmap_dr.experiments.faces.experiment import FaceOptions
@@ -28,6 +29,7 @@ from shadowmap_dr.experiments.soft.experiment import SoftOptions
 from shadowmap_dr.interactive.options import ModelOptions
 from shadowmap_dr.inverse.faces.convert import ConvertOptions
 from shadowmap_dr.io.options import described, description, option, setting
+from shadowmap_dr.io.ranges import check_ranges
 
 # Records of the commands, and the parameters that are no fields of them.
 RECORDS: dict[str, tuple[type[Any], set[str]]] = {
@@ -98,9 +100,12 @@ class Toy:
     flag: bool = option(False, help="Flag.")
     checked: bool = option(True, help="Checks.")
     twice: int = option(6, parse=doubled, shown="3", help="Half of a number.")
-    few: int = option(1, least=0, most=5, full=4, help="Few.")
+    few: int = option(1, allowed=(0, 5), full=4, help="Few.")
     out: Path = option(Path("out"), help="Results.")
     hidden: int = setting(7, help="Not for the command line.")
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
 
 
 @pytest.fixture
@@ -141,11 +146,16 @@ def test_full_replaces_defaults_only(run: Any) -> None:
     assert run("--full", "--size", "3", "--few", "1")[1] == Toy(sizes=(3,), few=1)
 
 
-@pytest.mark.parametrize("words", ["--few 6", "--twice x", "--size x", "--hidden 1", "--no-flag"])
+@pytest.mark.parametrize("words", ["--twice x", "--size x", "--hidden 1", "--no-flag"])
 def test_bad_values(run: Any, words: str) -> None:
     with pytest.raises(Exception) as refused:
         run(*words.split())
     assert words.split()[0] in refused.value.format_message()  # type: ignore[attr-defined]
+
+
+def test_numbers_out_of_range(run: Any) -> None:
+    with pytest.raises(ShadowmapError, match=r"few \(--few\) is 6: give a whole number from 0 to 5\."):
+        run("--few", "6")
 
 
 def test_order_and_help(run: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

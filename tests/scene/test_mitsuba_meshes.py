@@ -44,9 +44,11 @@ class NextMesh:
         return mi.UInt32() if self._index is None else self._index
 
 
-@pytest.mark.parametrize("kind", [None, NextMesh])
-def test_buffers_of_a_new_mesh_are_those_given(variant: str, kind: type | None) -> None:
-    buffers = mesh_buffers(make_mesh("sheet", POINTS, FACES, kind=kind))
+@pytest.mark.parametrize("later", [False, True])
+def test_buffers_of_a_new_mesh_are_those_given(variant: str, later: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    if later:
+        monkeypatch.setattr(mi, "Mesh", NextMesh)
+    buffers = mesh_buffers(make_mesh("sheet", POINTS, FACES))
     np.testing.assert_array_equal(buffers.positions.numpy().reshape(-1, 3), POINTS)
     np.testing.assert_array_equal(buffers.faces.numpy().reshape(-1, 3), FACES)
     assert len(buffers.normals) == len(buffers.texcoords) == 0
@@ -58,7 +60,8 @@ def test_names_follow_the_version(variant: str) -> None:
     table = mi.traverse(mesh)
     assert mesh_names(mesh).positions == "vertex_positions"
     assert mesh_names(mesh).positions in table
-    assert tuple(mesh_names(make_mesh("sheet", POINTS, FACES, kind=NextMesh))) == ("positions", "normals", "texcoords")
+    later = NextMesh("sheet", faces=mi.TensorXu(FACES), positions=mi.TensorXf(POINTS))
+    assert tuple(mesh_names(later)) == ("positions", "normals", "texcoords")
 
 
 def test_shared_rows_are_given_to_each_vertex_and_gather_its_gradients(variant: str) -> None:

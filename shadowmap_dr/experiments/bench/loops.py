@@ -237,7 +237,7 @@ def _smooth_step(
     scene: mi.Scene,
     params: mi.SceneParameters,
     name: str,
-    smooth: Any,  # Any: `mi.ad.LargeSteps`, of which typings/mitsuba knows nothing
+    smooth: Any,  # Any: `mi.ad.LargeSteps`, of which the stub of Mitsuba says nothing
     opt: drjit.opt.Adam,
     reference: TensorXf,
     step: int,

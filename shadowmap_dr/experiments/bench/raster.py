@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...jit.frozen import recordings_of
 from ...jit.types import Float, Matrix4f, UInt32
 from ...raster import Topology, antialias, build_topology, interpolate, rasterize
 from ...scene.load import load
@@ -146,7 +147,7 @@ def measure_raster(options: BenchOptions, kind: str, resolution: int, done: Mapp
         return {"mesh": kind, "resolution": resolution, "skipped": f"predicted to take {predicted:.0f} s a call"}
     update(0, 1, "mesh")
     data = raster_scene(options, kind, resolution)
-    ours: Any = dr.freeze(_visible)  # Any: Dr.Jit's stubs do not know `n_recordings`
+    ours = dr.freeze(_visible)
     params, ray, moves = mi.traverse(data.scene), camera_rays(data.scene, resolution), offsets()
 
     def rasterize_moved() -> tuple[UInt32, Float, Float, Float]:
@@ -178,7 +179,7 @@ def measure_raster(options: BenchOptions, kind: str, resolution: int, done: Mapp
     )
     covered = np.array(rasterize_moved()[0]) != 0xFFFFFFFF
     result = {"mesh": kind, "triangles": data.triangles, "resolution": resolution, **compare(samples, RATIOS)}
-    result |= {"recordings": ours.n_recordings, "pixels_covered": float(covered.mean())}
+    result |= {"recordings": recordings_of(ours), "pixels_covered": float(covered.mean())}
     partner = done.get(f"{options.what.worst.get(kind)}@{resolution}", {})
     if "seconds" in partner:
         name = f"{kind} / {partner['mesh']}"

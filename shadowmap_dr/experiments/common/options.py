@@ -13,3 +13,9 @@ def scheduler_option() -> str:
 def threads_option() -> int:
     """Dr.Jit's threads in each process of a sweep."""
     return option(0, help="Threads of each process, 0 for one for each core.")
+
+
+def cameras_option() -> tuple[str, ...]:
+    """Cameras of the experiments on derivatives of one shadow."""
+    cameras = ("orthographic", "perspective")
+    return option(cameras, names=("--camera",), choices=cameras, shown="both", help="Camera; repeatable.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import os
 import platform
 import sys
@@ -21,7 +22,7 @@ from ...jit.gc import gc_quiet
 #: Calls before the measured ones, which compile kernels and fill caches.
 WARM_UP = 5
 #: Dr.Jit's version.
-DRJIT_VERSION: str = dr.__version__  # type: ignore[attr-defined]  # Dr.Jit's stubs lack it
+DRJIT_VERSION = importlib.metadata.version("drjit")
 
 
 @dataclass(frozen=True)

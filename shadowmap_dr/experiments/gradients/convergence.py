@@ -20,6 +20,7 @@ from ...io.options import option, setting
 from ...io.ranges import FILTER_SIDE, MAP_SIDE, SAMPLES, SIDE, STEPS, check_ranges
 from ...rendering.renderer import Renderer
 from ..common.meshes import Mesh
+from ..common.options import cameras_option
 from ..common.timing import machine
 from . import scenes as gradients_scenes
 from .fit import ShadowFit
@@ -48,13 +49,7 @@ class ConvergenceOptions:
     occluders: tuple[str, ...] = option(
         OCCLUDERS, names=("--occluder",), choices=OCCLUDERS, shown="all", help="Occluder; repeatable."
     )
-    cameras: tuple[str, ...] = option(
-        ("orthographic", "perspective"),
-        names=("--camera",),
-        metavar="orthographic|perspective",
-        shown="both",
-        help="Camera; repeatable.",
-    )
+    cameras: tuple[str, ...] = cameras_option()
     candidates: tuple[str, ...] = option(
         ("default",), names=("--candidate",), choices=CANDIDATES, help="Kind of shadow map; repeatable."
     )

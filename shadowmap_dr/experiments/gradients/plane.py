@@ -18,6 +18,7 @@ from ...io.console import markdown
 from ...io.options import option, setting
 from ...io.ranges import FILTER_SIDE, MAP_SIDE, SAMPLES, SIDE, STEPS, check_ranges
 from ...rendering.renderer import Renderer
+from ..common.options import cameras_option
 from ..common.timing import machine
 from . import scenes as gradients_scenes
 from .fit import ShadowFit
@@ -34,13 +35,7 @@ CASES = {"anti-aliased": True, "not anti-aliased": False}
 class PlaneOptions:
     """Options of a run. Each camera is run with and without anti-aliased moments."""
 
-    cameras: tuple[str, ...] = option(
-        ("orthographic", "perspective"),
-        names=("--camera",),
-        metavar="orthographic|perspective",
-        shown="both",
-        help="Camera; repeatable.",
-    )
+    cameras: tuple[str, ...] = cameras_option()
     map_resolution: int = option(256, allowed=MAP_SIDE, help="Texels along each side of the map.")
     filter_size: int = option(3, allowed=FILTER_SIDE, help="Texels along each side of the filter.")
     resolution: int = option(512, allowed=SIDE, help="Image width and height in pixels.")

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from ...errors import ShadowmapError
 from ...jit.arrays import device_array
+from ...jit.frozen import recordings_of
 from ...jit.types import Float
 from ...rendering.receivers.planar_receiver import ReceiverShadows
 from .blend_shapes import blend
@@ -146,7 +147,7 @@ class MorphFit:
 
     def recordings(self) -> int:
         """Number of recordings of the step so far. It stays the same once the fit is warm."""
-        return int(self._step.n_recordings)  # type: ignore[attr-defined]  # Dr.Jit's stub returns the plain function
+        return recordings_of(self._step)
 
     def describe(self) -> dict[str, Any]:
         """Settings for the record."""

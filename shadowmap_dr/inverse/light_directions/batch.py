@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from ...errors import ShadowmapError
 from ...jit.arrays import device_array
+from ...jit.frozen import recordings_of
 from ...jit.types import Float, Vector3f
 from ...shadow import Frusta
 from .pixels import StillScene
@@ -176,7 +177,7 @@ class LightBatch:
 
     def recordings(self) -> int:
         """Number of recordings of a step so far."""
-        return int(self._step.n_recordings)  # type: ignore[attr-defined]  # Dr.Jit's stub returns the plain function
+        return recordings_of(self._step)
 
     def _vectors(self, directions: npt.ArrayLike) -> tuple[Vector3f, int]:
         array = np.asarray(directions, np.float64)

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from ...errors import ShadowmapError
 from ...jit.arrays import device_array
+from ...jit.frozen import recordings_of
 from ...jit.types import Float, UInt32
 from ...rendering.receivers.shadow_images import ShadowImages, image_loss, shadow_images
 from ...rendering.receivers.shadow_views import ShadowView
@@ -176,7 +177,7 @@ class Sculptor:
 
     def recordings(self) -> int:
         """Number of recordings of a step so far. It stays the same once the sculptor is warm."""
-        return int(self._gradient.n_recordings)  # type: ignore[attr-defined]  # Dr.Jit's stub returns the plain function
+        return recordings_of(self._gradient)
 
     def describe(self) -> dict[str, Any]:
         """Settings for the record."""

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from ..errors import ShadowmapError
 from ..jit.arrays import device_array, ravel
 from ..jit.types import Float, Matrix4f, UInt32, Vector3f
+from ..jit.vectors import normalize_or
 from .mitsuba_objects import Parameter
 from .shapes.sources import ShapeSource
 
@@ -279,7 +280,7 @@ class Soup:
         matrix, offset = mi.Matrix3f(*(m[4 * i + j] for i in range(3) for j in range(3))), mi.Vector3f(m[3], m[7], m[11])
         point, normal = mi.Vector3f(matrix @ p) + offset, mi.Vector3f(mi.Matrix3f(*m[_POINTS:]) @ n)
         # Shapes without normals have zeros.
-        normal = dr.select(dr.squared_norm(normal) > 0, dr.normalize(normal), 0)
+        normal = normalize_or(normal, mi.Vector3f(0))
         return dr.select(placed, point, p), dr.select(placed, normal, n)
 
 

@@ -79,6 +79,22 @@ def test_samples_lie_on_the_emitter_and_face_outwards(variant: str, kind: str) -
     assert np.linalg.norm(places[:, None] - places[None], axis=-1)[~np.eye(32, dtype=bool)].min() > 0.02
 
 
+@pytest.mark.parametrize("distance", [1e3, 1e5, 1e7])
+def test_derivatives_of_light_from_far_away(variant: str, distance: float) -> None:
+    """Irradiance falls with the squared distance, and so does its derivative; directions do not turn."""
+    table = samples(4, lamp=lamp("rectangle")).table()
+    rise = dr.opaque(mi.Float, distance)
+    dr.enable_grad(rise)
+    place = table.place(mi.UInt32(0))
+    (wo, weight, reached), *_ = table.illuminate(
+        mi.UInt32(0), mi.Point3f(place + mi.Vector3f(0, -1, 0) * rise), [mi.Vector3f(0, 1, 0)]
+    )
+    assert dr.all(reached) and weight[0][0] > 0
+    dr.forward(rise, flags=dr.ADFlag.ClearInterior)
+    assert dr.grad(weight)[0][0] == pytest.approx(-2 * weight[0][0] / distance, rel=1e-3)
+    assert np.abs(np.array(dr.grad(wo))).max() < 1e-4 / distance
+
+
 def test_power_of_a_texture_is_that_of_its_parts(variant: str) -> None:
     """Nearest texels in a plane: halves of different colours, and a dark quarter."""
     image = np.zeros((2, 2, 3), np.float32)

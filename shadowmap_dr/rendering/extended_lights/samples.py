@@ -14,6 +14,7 @@ import numpy as np
 from ...errors import ShadowmapError
 from ...jit.arrays import ravel
 from ...jit.types import ArrayT, Bool, Color3f, Float, Point3f, UInt32, Vector3f, Vector4f
+from ...jit.vectors import direction_and_length
 
 
 @dataclass(frozen=True)
@@ -156,10 +157,8 @@ class SampleTable:
                 vectors[i] += _above(vector, along, side, dr.dot(offset, side), reach, squared) * size
         found = []
         for vector in vectors:
-            squared = dr.squared_norm(vector)
-            reached = dr.detach(squared) > 0
-            inverse = dr.rsqrt(dr.select(reached, squared, 1))
-            found.append((vector * inverse, power * (squared * inverse), reached))
+            direction, irradiance, reached = direction_and_length(vector)
+            found.append((direction, power * irradiance, reached))
         return found
 
 

@@ -13,13 +13,19 @@ from ..scene.mitsuba_objects import children, is_attribute, owners
 from .deferred import MOST_SAMPLES
 from .parameter_state import ParameterState
 
+# Images whose parameters are remembered.
+_MOST_KNOWN = 64
+
 #: Names of a scene's parameters that must not change for each level to stay valid.
 NamesByLevel = dict[CacheLevel, list[str]]
 
 
 @dataclass
 class _Known:
-    """The cache for a sensor's images with ``spp`` samples per pixel, and parameters at the last one. ``weight``: in samples."""
+    """The cache for a sensor's images with ``spp`` samples per pixel, and parameters at the last one.
+
+    ``weight``: in samples; ``room``: False if there is no memory for the cache, which then stays empty.
+    """
 
     sensor: mi.Sensor
     spp: int
@@ -27,6 +33,7 @@ class _Known:
     scene: ParameterState
     camera: ParameterState
     cache: PassCache
+    room: bool = True
 
 
 class PassCaches:
@@ -56,19 +63,23 @@ class PassCaches:
         if not self._names and self._known:
             self._names = names()
         known = next((one for one in self._known if one.sensor is sensor and one.spp == spp), None)
+        # An image of this sensor with other samples tells too what does not change, such as the reference of an optimisation.
+        last = known or next((one for one in self._known if one.sensor is sensor), None)
+        level = CacheLevel.NOTHING
+        if last is not None and (known is None or known.room):
+            level = _valid_level(last, scene, camera, self._names)
         if known is None or known.weight != weight:
             known = _Known(sensor, spp, weight, scene, camera, PassCache())
-        else:
-            known.cache.keep(_valid_level(known, scene, camera, self._names))
-            known.scene, known.camera = scene, camera
-        others = [one for one in self._known if one.sensor is not sensor or one.spp != spp]
-        room = MOST_SAMPLES
-        self._known = []
-        for one in [known, *others]:
-            room -= one.weight
-            if room >= 0:
-                self._known.append(one)
-        return known.cache if weight <= MOST_SAMPLES else PassCache()
+        known.cache.keep(level)
+        known.scene, known.camera = scene, camera
+        self._known = [known, *(one for one in self._known if one.sensor is not sensor or one.spp != spp)][:_MOST_KNOWN]
+        left = MOST_SAMPLES
+        for one in self._known:
+            left -= one.weight
+            one.room = left >= 0
+            if not one.room:
+                one.cache = PassCache()
+        return known.cache
 
     def forget_edges(self) -> None:
         """Drop all results that depend on the edges at which shading jumps."""

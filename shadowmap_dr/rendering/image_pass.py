@@ -134,11 +134,11 @@ class ImagePass:
         light, colour = self.light, frame.surface.colour
         if colour is None:
             incident = light.incident_light(frame, lighting, visible)
-            return incident, light.radiance(frame.surface, lighting, incident)
+            return incident, light.radiance(frame, lighting, incident)
         # In the same order as with cached light, so that images of an unchanged scene are equal bit by bit.
         white = _white(frame)
         incident = light.incident_light(white, lighting, visible)
-        irradiance = light.radiance(white.surface, lighting, incident)
+        irradiance = light.radiance(white, lighting, incident)
         if dr.grad_enabled(colour) and lighting.samples:
             dr.eval(irradiance)  # else the derivative would run its loops again
         return incident, colour * irradiance
@@ -146,7 +146,7 @@ class ImagePass:
     def _lit(self, frame: Frame, lighting: Lighting) -> LitFrame:
         view, light = frame.view, self.light
         white = _white(frame)
-        irradiance = light.radiance(white.surface, lighting, light.incident_light(white, lighting))
+        irradiance = light.radiance(white, lighting, light.incident_light(white, lighting))
         none = dr.zeros(mi.UnpolarizedSpectrum, dr.width(frame.surface.shape))
         emitted = light.with_emission(none, frame.surface, lighting, view.sensor, view.size)
         return LitFrame(view, colouring_inputs(frame.surface), frame.sharpness, irradiance, emitted)

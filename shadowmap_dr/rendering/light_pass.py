@@ -36,8 +36,10 @@ from .extended_lights import (
     sample_visibilities,
     samples_of,
     soft_light,
+    turns_of,
 )
-from .gbuffer.camera_view import Frame, PlacedShapes
+from .extended_lights.turns import Turns
+from .gbuffer.camera_view import CameraView, Frame, PlacedShapes
 from .gbuffer.pixel_footprint import FootprintSamples, footprint_points
 from .gbuffer.surface import Surface
 from .light_colours import white_area_light, white_light
@@ -187,7 +189,9 @@ class LightPass:
             numbers = list(range(len(lighting.lights)))
             lights = self.visibilities(frame, lighting, numbers, list(lighting.lights))
             pairs = zip(self.soft, lighting.samples, strict=True) if self.settings.lit else ()
-            return Visibilities(lights, tuple(sample_visibilities(frame.surface, *pair, lighting.soft_maps) for pair in pairs))
+            maps, seen = lighting.soft_maps, frame.surface
+            parts = (sample_visibilities(seen, plan, own, maps, _turns(own, frame.view)) for plan, own in pairs)
+            return Visibilities(lights, tuple(parts))
 
     def white_terms(self, frame: Frame, lighting: Lighting, geometry: Geometry) -> tuple[Any, ...]:
         """Radiance (Float, N) towards the camera for each light, if light and surfaces were white. Detached.
@@ -201,19 +205,20 @@ class LightPass:
             reach = zip(self._outlined(frame, lights), visible, strict=True)
             extended, maps, nodes = zip(self.soft, samples, strict=True), lighting.soft_maps, self.data.materials()
             terms = [direct_light(seen, light, fraction) for light, fraction in reach]
-            terms += [soft_light(seen, plan, own, maps, nodes) for plan, own in extended]
+            terms += [soft_light(seen, plan, own, maps, nodes, turns=_turns(own, frame.view)) for plan, own in extended]
             return tuple(term[0] for term in terms)
 
-    def radiance(self, seen: Surface, lighting: Lighting, incident: IncidentLight) -> Color3f:
+    def radiance(self, frame: Frame, lighting: Lighting, incident: IncidentLight) -> Color3f:
         """Reflected radiance (colour, N) towards the camera. ``incident``: light on these surfaces. Attached to all arguments."""
-        gate = not self.settings.shadow.compat
+        gate, seen = not self.settings.shadow.compat, frame.surface
         color = dr.zeros(mi.UnpolarizedSpectrum, dr.width(seen.shape))
         nodes = self.data.materials()
         for light, fraction in zip(incident.lights, incident.visible, strict=True):
             color += direct_light(seen, light, fraction, nodes, gate=gate)
         soft = self.soft if self.settings.lit else ()
         for plan, samples, parts in zip(soft, lighting.samples, incident.parts, strict=True):
-            color += soft_light(seen, plan, samples, lighting.soft_maps, nodes, gate=gate, visible=parts)
+            turns = _turns(samples, frame.view)
+            color += soft_light(seen, plan, samples, lighting.soft_maps, nodes, gate=gate, visible=parts, turns=turns)
         return incident.looped + self.with_ambient(color, seen)
 
     def with_ambient(self, color: Color3f, seen: Surface) -> Color3f:
@@ -290,3 +295,7 @@ def plan_extended_lights(data: SceneData, settings: RenderSettings) -> tuple[Sof
     if settings.shadow.method != "none":
         check_soft_sizes(soft, data.geometry, settings.soft_map_resolution)
     return soft
+
+
+def _turns(samples: LightSamples, view: CameraView) -> Turns | None:
+    return turns_of(samples, view.size, view.factor)

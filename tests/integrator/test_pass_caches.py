@@ -95,6 +95,13 @@ SCENES: dict[str, tuple[Callable[[], dict[str, Any]], dict[str, Any], int]] = {
         1,
     ),
     "unlit": (lambda: {"floor": floor(bsdf=grey()), "lamp": lamp()}, {"hide_emitters": True, "shadow_method": "none"}, 1),
+    # Samples of a pixel take turns at the points of the lamp.
+    "turns": (lambda: {"floor": floor(bsdf=grey()), "lamp": lamp()}, {"area_light_samples": 16}, 64),
+    "turns on gloss": (
+        lambda: {"floor": floor(bsdf=grey()), "lamp": lamp(), "box": plate({"type": "roughplastic"})},
+        {"area_light_samples": 16},
+        64,
+    ),
     "many lights": (
         lambda: {"floor": floor(bsdf=grey()), **{f"bulb{k}": {**bulb(), "position": [k / 4, 1, 2.5]} for k in range(9)}},
         {},
@@ -227,6 +234,20 @@ def test_what_is_kept_depends_on_what_changes(variant: str, monkeypatch: pytest.
     assert moved.level == CacheLevel.NOTHING and not moved.views and moved.shapes is None
 
 
+def test_images_with_other_samples_tell_what_does_not_change(variant: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A reference with many samples, then a loop with few, whose first image keeps its passes; in turns, too."""
+    parts, options, _ = SCENES["lamp"]
+    pair, rng = Pair(parts(), options, 16, monkeypatch), np.random.default_rng(0)
+    values = changes(pair, rng)
+    pair.check({})
+    assert pair.kept[-1].level == CacheLevel.NOTHING
+    pair.spp = 1
+    assert kept_after(pair, FLOOR, values[FLOOR], 1).level == CacheLevel.RADIANCE and pair.kept[-1].lit
+    for spp, key in ((4, BALL), (16, FLOOR), (1, "lamp.emitter.radiance.value"), (1, FLOOR), (4, FLOOR), (16, BALL), (1, FLOOR)):
+        pair.spp = spp
+        pair.check({key: values[key]()})
+
+
 def test_visibilities_are_kept_where_materials_know_directions(variant: str, monkeypatch: pytest.MonkeyPatch) -> None:
     parts, options, spp = SCENES["gloss"]
     pair = Pair(parts(), options, spp, monkeypatch)
@@ -236,10 +257,14 @@ def test_visibilities_are_kept_where_materials_know_directions(variant: str, mon
 
 
 def test_large_images_keep_nothing(variant: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shadowmap_dr.integrator.pass_caches.MOST_SAMPLES", SIZE**2)
+    monkeypatch.setattr("shadowmap_dr.integrator.pass_caches.MOST_SAMPLES", 4 * SIZE**2)
     parts, options, _ = SCENES["colours"]
     pair = Pair(parts(), options, 4, monkeypatch)
-    assert kept_after(pair, FLOOR, changes(pair, np.random.default_rng(0))[FLOOR]).level == CacheLevel.NOTHING
+    values = changes(pair, np.random.default_rng(0))
+    assert kept_after(pair, FLOOR, values[FLOOR]).level == CacheLevel.NOTHING
+    # But they tell smaller images what does not change.
+    pair.spp = 1
+    assert kept_after(pair, FLOOR, values[FLOOR], 1).level == CacheLevel.RADIANCE
 
 
 def test_other_integrators_may_clear_the_graph(variant: str) -> None:

@@ -13,7 +13,7 @@ from .sample_maps import (
     still_aimed,
 )
 from .samples import LightSamples
-from .shading import sample_visibilities, soft_light
+from .shading import sample_visibilities, soft_light, turns_of
 from .sky_samples import SkyWatch
 
 __all__ = [
@@ -31,4 +31,5 @@ __all__ = [
     "soft_light",
     "still_aimed",
     "sample_visibilities",
+    "turns_of",
 ]

@@ -286,7 +286,8 @@ def _importance(centres: np.ndarray, normals: np.ndarray, probes: np.ndarray) ->
     middle = probes.mean(0)
     centres, probes = centres - middle, probes - middle
     seen, nearest = np.zeros(len(centres)), np.zeros(len(centres))
-    for block in np.array_split(np.arange(len(centres)), max(1, len(centres) // 4096)):
+    # Blocks that stay in a core's cache.
+    for block in np.array_split(np.arange(len(centres)), max(1, len(centres) // 128)):
         own, n = centres[block], normals[block]
         squared = (own**2).sum(1)[:, None] + (probes**2).sum(1) - 2 * own @ probes.T
         distance = np.sqrt(np.maximum(squared, 1e-24))

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ...jit.types import Color3f, Float, PyTree, UInt32, Vector3f
+from ...scene.sensor import ImageSize
 from ...scene.sums import attached_parameters, sum_over
 from ...shadow import visibility
 from ..direct_light import passes_gate
@@ -18,6 +19,7 @@ from .sample_maps import SoftMaps, SoftPlan, map_of
 from .samples import LightSamples
 from .sky_light import reflects_only, sky_light
 from .sky_samples import SkySamples
+from .turns import Turns
 
 
 def soft_light(
@@ -29,12 +31,13 @@ def soft_light(
     *,
     gate: bool = True,
     visible: Float | None = None,
+    turns: Turns | None = None,
 ) -> Color3f:
     """Radiance (colour, P) towards the camera of one extended light.
 
     ``maps`` None: unshadowed. ``nodes``: all BSDFs that ``seen`` may call, and shapes whose
     attributes these read. ``gate``: see :func:`shadowmap_dr.rendering.direct_light.direct_light`. ``visible``: from
-    :func:`sample_visibilities`, to be looked up instead of the maps.
+    :func:`sample_visibilities`, to be looked up instead of the maps. ``turns``: from :func:`turns_of`.
     Gradients flow to all of surface, samples, maps and BSDFs.
     """
     if isinstance(samples, SkySamples) and reflects_only(nodes):
@@ -42,8 +45,11 @@ def soft_light(
     sampled = None if maps is None or plan.kind == "single" else maps.sampled
     transmits = not samples.distant and any(_transmits(node) for node in nodes)
 
-    def one_sample(index: UInt32, own: PyTree, shared: PyTree) -> Color3f:
-        (seen, lane), (table, maps, visible) = own, shared
+    turns = turns or Turns(samples.count)
+
+    def one_sample(number: UInt32, own: PyTree, shared: PyTree) -> Color3f:
+        (seen, lane, group), (table, maps, visible) = own, shared
+        index = turns.point(number, group)
         value, active = mi.UnpolarizedSpectrum(0), mi.Bool(False)
         for wo_world, weight, reached in table.illuminate(index, seen.p_world, sides(seen)):
             wo = seen.si.to_local(wo_world)
@@ -53,7 +59,7 @@ def soft_light(
             value += dr.select(passes, seen.evaluate(wo, passes) * weight, 0)
             active |= passes
         if visible is not None:
-            value *= dr.gather(mi.Float, visible, index * lanes + lane, active)
+            value *= dr.gather(mi.Float, visible, number * lanes + lane, active)
         elif maps is not None:
             value *= visibility(maps, map_of(plan, table, index, seen.p_world), seen.p_world, active)
         return dr.select(active, value, 0)
@@ -67,28 +73,44 @@ def soft_light(
     lanes = dr.width(seen.shape)
     start = dr.zeros(mi.UnpolarizedSpectrum, lanes)
     implicit = [] if seen.colour is not None else attached_parameters(nodes)
-    own = seen, None if visible is None else dr.arange(mi.UInt32, lanes)
+    own = seen, None if visible is None else dr.arange(mi.UInt32, lanes), turns.group
     shared = samples.table(), sampled, visible
-    light = sum_over(one_sample, samples.count, start, own, shared, implicit, seen.active)
+    light = sum_over(one_sample, turns.length, start, own, shared, implicit, seen.active)
+    if turns.groups > 1:
+        light *= turns.groups
     if maps is None or maps.single is None or plan.kind != "single":
         return light
     radius = samples.radius_towards(seen.p_world)
     return light * penumbra_visibility(maps.single, mi.UInt32(plan.first), radius, seen.p_world, seen.n_world, seen.active)
 
 
-def sample_visibilities(seen: Surface, plan: SoftPlan, samples: LightSamples, maps: SoftMaps | None) -> Float | None:
+def turns_of(samples: LightSamples, size: ImageSize, factor: int) -> Turns | None:
+    """How the samples of an image take turns at the points of an area light. Parts of the sky are all seen by all samples.
+
+    ``size``: samples of the image; ``factor``: samples along each side of a pixel.
+    """
+    return None if samples.distant else Turns.of(samples.count, size, factor)
+
+
+def sample_visibilities(
+    seen: Surface, plan: SoftPlan, samples: LightSamples, maps: SoftMaps | None, turns: Turns | None = None
+) -> Float | None:
     """Visibility (Float, K P) of the K samples of an extended light, sample by sample, or None without maps of samples.
 
-    Detached. For images that differ only in materials and in the colours of lights.
+    With ``turns``: of the points that each lane sees, turn by turn. Detached. For images that differ only in materials and in
+    the colours of lights.
     """
     if maps is None or maps.sampled is None or plan.kind == "single":
         return None
     with dr.suspend_grad():
+        turns = turns or Turns(samples.count)
         count, table = dr.width(seen.shape), samples.table()
-        lane = dr.arange(mi.UInt32, samples.count * count)
-        sample = lane // count
-        dr.eval(seen.p_world, seen.active)
-        pixel = lane - sample * count
+        lane = dr.arange(mi.UInt32, turns.length * count)
+        number = lane // count
+        dr.eval(seen.p_world, seen.active, turns.group)
+        pixel = lane - number * count
+        group = None if turns.group is None else dr.gather(mi.UInt32, turns.group, pixel)
+        sample = turns.point(number, group)
         p_world, active = dr.gather(mi.Point3f, seen.p_world, pixel), dr.gather(mi.Bool, seen.active, pixel)
         found = visibility(maps.sampled, map_of(plan, table, sample, p_world), p_world, active)
         dr.eval(found)

@@ -48,6 +48,7 @@ class Options:
     environment_light_samples  directions of an environment that cast shadows
     soft_map_resolution    texels along each side of these points' and directions' shadow maps
     emitter_shadows        ``samples``, or ``single``: one map for each area light, penumbrae estimated from it
+    light_memory           GiB for the shadow maps of lights; more lights are rendered one slice after the other
     shadow_samples         look-ups along each side of a pixel, 1 to 8; 0: automatic
     antialias              anti-alias the image; without it outlines have no gradient
     ambient                radiance of unshadowed light from all directions, added to the scene's environment
@@ -78,6 +79,7 @@ class Options:
     environment_light_samples: int = RenderSettings.environment_light_samples
     soft_map_resolution: int = RenderSettings.soft_map_resolution
     emitter_shadows: str = RenderSettings.emitter_shadows
+    light_memory: float = RenderSettings.light_memory
     antialias: bool = RenderSettings.antialias
     ambient: float = RenderSettings.ambient
     hide_emitters: bool = RenderSettings.hide_emitters

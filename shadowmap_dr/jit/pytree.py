@@ -79,6 +79,18 @@ def attached_places(record: PyTree) -> tuple[tuple[int, ...], list[AnyArray]]:
     return tuple(places), found
 
 
+def attached_of(tree: PyTree, places: tuple[int, ...]) -> list[AnyArray]:
+    """The arrays at some places of a tree, counted in the order of :func:`tree_map`."""
+    found: list[AnyArray] = []
+
+    def collect(array: AnyArray) -> AnyArray:
+        found.append(array)
+        return array
+
+    tree_map(tree, collect)
+    return [found[place] for place in places]
+
+
 def with_arrays(record: PyTree, arrays: list[AnyArray]) -> PyTree:
     """A copy of a tree with ``arrays`` in the place of its :func:`attached_arrays`."""
     position = iter(arrays)

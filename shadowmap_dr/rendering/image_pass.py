@@ -51,7 +51,7 @@ class ImagePass:
         visibilities if ``visible`` is given."""
         light, settings = self.light, self.light.settings
         frame = self.cameras.frame(view, shapes, light.needs_frames)
-        seen, incident, color = frame.surface, *self._reflected(frame, lighting, visible)
+        seen, incident, color = frame.surface, *self._reflected(frame, lighting, visible, shapes)
         color = light.with_emission(color, seen, lighting, view.sensor, view.size)
         named = collect_aovs(settings.aovs, seen, view.raster, lighting.lights, incident.visible)
         if crossings is None and settings.antialias:
@@ -129,9 +129,14 @@ class ImagePass:
         each = len(light.data.lights) + sum(plan.count for plan in light.soft)
         return each * sum(view.raster.width * view.raster.height for view in views) <= _MOST_VISIBLE
 
-    def _reflected(self, frame: Frame, lighting: Lighting, visible: Visibilities | None) -> tuple[IncidentLight, Any]:
+    def _reflected(
+        self, frame: Frame, lighting: Lighting, visible: Visibilities | None, shapes: PlacedShapes
+    ) -> tuple[IncidentLight, Any]:
         """(light that reaches a frame, reflected radiance (colour, N) towards the camera)."""
         light, colour = self.light, frame.surface.colour
+        if lighting.sliced is not None:
+            color, each = light.reflected_in_slices(frame, lighting, shapes)
+            return IncidentLight((), each, 0, ()), light.with_ambient(color, frame.surface)
         if colour is None:
             incident = light.incident_light(frame, lighting, visible)
             return incident, light.radiance(frame, lighting, incident)

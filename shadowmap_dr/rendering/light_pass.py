@@ -11,7 +11,8 @@ import drjit as dr
 import mitsuba as mi
 
 from ..errors import ShadowmapError
-from ..jit.types import Bool, Color3f, Float, Point3f
+from ..jit.checkpoint import Term, checkpointed_sum
+from ..jit.types import AnyArray, Bool, Color3f, Float, Point3f, PyTree
 from ..raster import RasterOutput
 from ..scene.geometry import Geometry
 from ..scene.lights.area import AreaLight
@@ -21,6 +22,7 @@ from ..scene.lights.read import Light
 from ..scene.lights.soft_outline import softened
 from ..scene.load import SceneData
 from ..scene.sensor import ImageSize, Sensor
+from ..scene.sums import attached_parameters
 from ..shadow import Frusta, ShadowMaps
 from .direct_light import ambient_light, background, direct_light, emission
 from .extended_lights import (
@@ -44,6 +46,7 @@ from .gbuffer.pixel_footprint import FootprintSamples, footprint_points
 from .gbuffer.surface import Surface
 from .light_colours import white_area_light, white_light
 from .light_loops import MANY_LIGHTS, many_lights
+from .light_slices import LightSlice, joined_fits, shining_objects
 from .settings import RenderSettings
 from .shadow_pass import MapPlan, fit_maps, light_visibility, make_maps
 
@@ -53,17 +56,47 @@ _AMBIENT_DIRECTIONS = 16
 
 @dataclass(frozen=True)
 class Lighting:
-    """The lights of one rendering and their shadow maps, or None without maps."""
+    """The lights of one rendering and their shadow maps, or None without maps.
+
+    ``sliced``: with lights in slices, their fits, and the function that makes the lighting of a slice; there are no maps then.
+    """
 
     lights: tuple[Light, ...]
     maps: ShadowMaps | None
     areas: tuple[AreaLight, ...]
     samples: tuple[LightSamples, ...]
     soft_maps: SoftMaps | None
+    sliced: SlicedLighting | None = None
+
+    @property
+    def fits(self) -> tuple[Frusta | None, SoftFrusta]:
+        """The fit of the maps."""
+        if self.sliced is not None:
+            return joined_fits(self.sliced.fits)
+        frusta = None if self.maps is None else self.maps.frusta
+        return frusta, (None, None) if self.soft_maps is None else self.soft_maps.frusta
 
     def for_points(self, count: int) -> Lighting:
         """The same maps, prepared for look-ups by this many points (:meth:`~shadowmap_dr.shadow.ShadowMaps.for_points`)."""
+        if self.sliced is not None:
+            return replace(self, sliced=replace(self.sliced, points=count))
         return self if self.maps is None else replace(self, maps=self.maps.for_points(count))
+
+
+@dataclass(frozen=True)
+class SlicedLighting:
+    """The lights of one rendering in slices.
+
+    Attributes:
+        fits: of the maps of each slice.
+        transparent, seen: as for :meth:`LightPass.lighting`.
+        points: number of points that look the maps up, see :meth:`Lighting.for_points`.
+    """
+
+    fits: list[tuple[Frusta | None, SoftFrusta]]
+    transparent: Callable[[RasterOutput], Bool] | None
+    seen: tuple[Point3f, Bool]
+    points: int = 1
 
 
 @dataclass(frozen=True)
@@ -106,6 +139,7 @@ class LightPass:
         plan: shadow maps of lights without extent.
         soft: samples of extended lights, and the shadow maps of the samples.
         outward: ``Bool`` (F,), faces that shadow maps show from the front only, or None.
+        slices: slices of the lights, whose maps are in memory one after the other; none if all fit together.
     """
 
     data: SceneData
@@ -113,6 +147,7 @@ class LightPass:
     plan: MapPlan
     soft: tuple[SoftPlan, ...]
     outward: Bool | None
+    slices: tuple[LightSlice, ...] = ()
 
     @property
     def needs_frames(self) -> bool:
@@ -141,6 +176,10 @@ class LightPass:
         if not settings.lit:
             return Lighting((), None, data.areas, (), None)
         lights, areas = self._replaced(data.lights, replacements), self._replaced(data.areas, replacements)
+        if self.slices:
+            points = seen()
+            made = [self._part(one, lights, areas).fit(shapes, points, one.fits(fits)) for one in self.slices]
+            return Lighting(lights, None, areas, (), None, SlicedLighting(made, transparent, points))
         samples = self._samples(areas, shapes.geometry)
         maps = soft_maps = None
         if settings.shadow.method != "none" and (lights or samples):
@@ -152,20 +191,52 @@ class LightPass:
                 soft_maps = make_soft_maps(self.soft, samples, self.plan, *common, shadow, fits[1], transparent, points)
         return Lighting(lights, maps, areas, samples, soft_maps)
 
-    def fit(self, shapes: PlacedShapes, seen: tuple[Point3f, Bool]) -> tuple[Frusta | None, SoftFrusta]:
-        """Fit the maps of all lights for the first time. Arguments as of :meth:`lighting`. Detached."""
+    def fit(
+        self, shapes: PlacedShapes, seen: tuple[Point3f, Bool], previous: tuple[Frusta | None, SoftFrusta] = (None, (None, None))
+    ) -> tuple[Frusta | None, SoftFrusta]:
+        """Fit the maps of all lights. ``previous``: an earlier fit; others as of :meth:`lighting`. Detached."""
         data, settings, geometry = self.data, self.settings, shapes.geometry
         if not settings.lit or settings.shadow.method == "none":
             return None, (None, None)
+        if self.slices:
+            parts = (self._part(one, data.lights, data.areas) for one in self.slices)
+            return joined_fits([part.fit(shapes, seen, one.fits(previous)) for part, one in zip(parts, self.slices, strict=True)])
         with dr.suspend_grad():
             samples = self._samples(data.areas, geometry)
             frusta: Frusta | None = None
             soft: SoftFrusta = (None, None)
             if data.lights:
-                frusta = fit_maps(self.plan, data.lights, geometry, settings.shadow, None, seen)
+                frusta = fit_maps(self.plan, data.lights, geometry, settings.shadow, previous[0], seen)
             if samples:
-                soft = fit_soft_maps(self.soft, samples, self.plan, geometry, settings.soft_shadow, soft, seen)
+                soft = fit_soft_maps(self.soft, samples, self.plan, geometry, settings.soft_shadow, previous[1], seen)
+            dr.eval(frusta, soft)
             return frusta, soft
+
+    def _part(self, chosen: LightSlice, lights: Sequence[Light], areas: Sequence[AreaLight]) -> LightPass:
+        """The light pass of a slice alone. ``lights``, ``areas``: current records of all lights."""
+        data, soft = chosen.data(self.data, lights, areas), chosen.soft_plans(self.soft)
+        return replace(self, data=data, plan=self.plan.part(*chosen.lights), soft=soft, slices=())
+
+    def reflected_in_slices(self, frame: Frame, lighting: Lighting, shapes: PlacedShapes) -> tuple[Color3f, list[Float]]:
+        """(:meth:`reflected` radiance (colour, N) of all lights; visibility (Float, N) of each light without extent), for lights
+        in slices. Attached to frame, lights, shapes, materials and emitters; derivatives make the maps again."""
+        sliced = lighting.sliced
+        assert sliced is not None, "asked for lights in slices only"
+
+        def term(number: int, tree: PyTree) -> Term:
+            frame, lights, areas, shapes = tree
+            part = self._part(self.slices[number], lights, areas)
+            lit = part.lighting(shapes, None, sliced.fits[number], sliced.transparent, lambda: sliced.seen)
+            lit = lit.for_points(sliced.points)
+            incident = part.incident_light(frame, lit)
+            value = mi.UnpolarizedSpectrum(part.reflected(frame, lit, incident))
+            visible: list[AnyArray] = [*incident.visible] if self.settings.aovs else []
+            return [value[k] for k in range(dr.size_v(mi.UnpolarizedSpectrum))], visible
+
+        nodes = [*self.data.materials(), *shining_objects(self.data)]
+        tree = frame, lighting.lights, lighting.areas, shapes
+        sums, visible = checkpointed_sum(term, len(self.slices), tree, attached_parameters(nodes))
+        return mi.UnpolarizedSpectrum(*sums), [mi.Float(one) for part in visible for one in part]
 
     def relit(self, maps: tuple[ShadowMaps | None, SoftMaps | None], geometry: Geometry) -> Lighting:
         """The scene's current lights with shadow maps of an earlier image, in which shapes and lights had the same places."""
@@ -209,7 +280,14 @@ class LightPass:
             return tuple(term[0] for term in terms)
 
     def radiance(self, frame: Frame, lighting: Lighting, incident: IncidentLight) -> Color3f:
-        """Reflected radiance (colour, N) towards the camera. ``incident``: light on these surfaces. Attached to all arguments."""
+        """Reflected radiance (colour, N) towards the camera, of ambient light, too. Arguments as of :meth:`reflected`."""
+        return self.with_ambient(self.reflected(frame, lighting, incident), frame.surface)
+
+    def reflected(self, frame: Frame, lighting: Lighting, incident: IncidentLight) -> Color3f:
+        """Radiance (colour, N) of all lights that surfaces reflect towards the camera. Attached to all arguments.
+
+        ``incident``: light on these surfaces.
+        """
         gate, seen = not self.settings.shadow.compat, frame.surface
         color = dr.zeros(mi.UnpolarizedSpectrum, dr.width(seen.shape))
         nodes = self.data.materials()
@@ -219,7 +297,7 @@ class LightPass:
         for plan, samples, parts in zip(soft, lighting.samples, incident.parts, strict=True):
             turns = _turns(samples, frame.view)
             color += soft_light(seen, plan, samples, lighting.soft_maps, nodes, gate=gate, visible=parts, turns=turns)
-        return incident.looped + self.with_ambient(color, seen)
+        return incident.looped + color
 
     def with_ambient(self, color: Color3f, seen: Surface) -> Color3f:
         """Radiance plus reflected ambient light, which nothing shadows."""

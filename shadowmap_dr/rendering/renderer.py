@@ -33,7 +33,8 @@ from .gbuffer.pixel_footprint import footprint_points
 from .gbuffer.shading_edges import ShadingEdges
 from .image_pass import ImagePass
 from .light_pass import Lighting, LightPass, plan_extended_lights
-from .pass_cache import PassCache
+from .light_slices import LightSlice, plan_slices
+from .pass_cache import CacheLevel, PassCache
 from .settings import RenderSettings
 from .shadow_pass import MapPlan, check_sizes, plan_maps
 
@@ -58,6 +59,7 @@ class Renderer:
         soft: samples of extended lights (area lights, environments), and the shadow maps of the samples.
         frusta: fit of the shadow maps in the last rendering, None before the first. ``soft_frusta``: for extended lights.
         untracked: parameters of the scene that recordings do not see, or None if the caller watches them.
+        slices: of the lights, whose shadow maps are in memory one slice after the other; none if all fit together.
     """
 
     data: SceneData
@@ -71,6 +73,7 @@ class Renderer:
     frusta: Frusta | None = None
     soft_frusta: SoftFrusta = (None, None)
     untracked: UntrackedState | None = None
+    slices: tuple[LightSlice, ...] = ()
 
     # All that Dr.Jit is to know of, instead of the fields: see ``frozen``.
     DRJIT_STRUCT: ClassVar[dict[str, type]] = {"recording_parts": tuple}
@@ -120,7 +123,8 @@ class Renderer:
             texels = settings.shadow.resolution * settings.shadow.supersampling
             check_sizes(plan.maps, texels, geometry, "lights", "lower shadow_map_resolution, or leave out lights")
         outward = mi.Bool(outward_faces(topology, positions.reshape(-1, 3))) if settings.shadow.cull_backfaces else None
-        renderer = cls(data, topology, plan, settings, flat_faces(geometry, topology), creases, outward, soft)
+        slices = plan_slices(data, plan, soft, settings)
+        renderer = cls(data, topology, plan, settings, flat_faces(geometry, topology), creases, outward, soft, slices=slices)
         renderer.untracked = UntrackedState((*data.scene.emitters(), *data.materials()))
         # The first fit is made here, so that a step which is recorded later always starts from one.
         if data.sensors:
@@ -137,7 +141,9 @@ class Renderer:
 
     def with_replanned_lights(self) -> Renderer:
         """The same renderer with area lights and environments divided, and their maps aimed, as its records are now."""
-        return replace(self, soft=plan_extended_lights(self.data, self.settings), soft_frusta=(None, None))
+        soft = plan_extended_lights(self.data, self.settings)
+        slices = plan_slices(self.data, self.plan, soft, self.settings)
+        return replace(self, soft=soft, soft_frusta=(None, None), slices=slices)
 
     @property
     def texels(self) -> int:
@@ -192,6 +198,8 @@ class Renderer:
         factor = sample_grid(spp, windows)
         margin = Margin.of(cameras, factor) if self.settings.antialias else Margin()
         cache = cache or PassCache()
+        if self.slices:
+            cache.keep(min(cache.level, CacheLevel.VIEW))  # maps of lights in slices are not kept
         images = ImagePass(self.camera_pass, self.light_pass)
         samples = max(window.width * window.height for window in windows) * factor**2
         views: Sequence[CameraView] = cache.views
@@ -251,7 +259,7 @@ class Renderer:
     @property
     def light_pass(self) -> LightPass:
         """The pass that renders shadow maps and light."""
-        return LightPass(self.data, self.settings, self.plan, self.soft, self.outward)
+        return LightPass(self.data, self.settings, self.plan, self.soft, self.outward, self.slices)
 
     def _lighting(self, views: Sequence[CameraView], shapes: PlacedShapes, replacements: Mapping[str, Any] | None) -> Lighting:
         """All lights and their shadow maps."""
@@ -259,10 +267,11 @@ class Renderer:
         transparent = cameras.transparent(shapes.geometry, views[0].sensor)
         seen = partial(cameras.seen, views, shapes.geometry)
         lighting = self.light_pass.lighting(shapes, replacements, fits, transparent, seen)
-        if lighting.maps is not None:
-            self.frusta = lighting.maps.frusta
-        if lighting.soft_maps is not None:
-            self.soft_frusta = lighting.soft_maps.frusta
+        frusta, soft_frusta = lighting.fits
+        if frusta is not None:
+            self.frusta = frusta
+        if soft_frusta != (None, None):
+            self.soft_frusta = soft_frusta
         return lighting
 
     def g_buffer(self, sensor: int = 0) -> GBuffer:

@@ -41,13 +41,16 @@ class RenderSettings:
         hide_emitters: the camera looks through area lights, and sees black instead of environments, which light the scene all
             the same.
         max_depth: 0 is black, 1 shows emitters only, 2 is direct light, as in Mitsuba; more, or -1, is the same as 2.
-        area_light_samples: points on each area light, each with a shadow map.
+        area_light_samples: points on each area light, each with a shadow map. With 64 samples per pixel or more, the samples of
+            a pixel take turns at the points if 4 (or 9, ...) divides their number.
         environment_light_samples: directions of an environment, each with a shadow map.
         soft_map_resolution: texels along each side of these maps.
         emitter_shadows: ``samples``, or ``single``: one map of ``shadow.resolution`` texels (a power of two) for each area light,
             from which penumbrae are estimated; fast, and right for simple occluders only.
         shadow_samples: look-ups along each side of a pixel's footprint (``samples ** 2`` in all), or 0 for 1 where the image is
             larger than the shadow map, else 2 to 4, one for every two texels of the map that a pixel of the image has.
+        light_memory: memory (GiB) for the shadow maps of lights, derivatives included. Maps of more lights are made one slice of
+            the lights after the other, and once more for derivatives.
         aovs: names of further channels, see :data:`shadowmap_dr.rendering.film.aovs.AOVS`.
     """
 
@@ -61,6 +64,7 @@ class RenderSettings:
     environment_light_samples: int = 64
     soft_map_resolution: int = 128
     emitter_shadows: str = "samples"
+    light_memory: float = 2.0
     aovs: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -88,6 +92,9 @@ class RenderSettings:
             _ = self.soft_shadow  # whether such maps can be
         if isinstance(self.ambient, bool) or not isinstance(self.ambient, Real) or not 0 <= self.ambient < float("inf"):
             raise ShadowmapError(f"ambient is {self.ambient!r}: give a finite radiance of at least 0.")
+        memory = self.light_memory
+        if isinstance(memory, bool) or not isinstance(memory, Real) or not 0 < memory < float("inf"):
+            raise ShadowmapError(f"light_memory is {memory!r}: give a positive number of GiB.")
 
     @classmethod
     def of(cls, **named: Any) -> RenderSettings:  # Any: checked by the records

@@ -59,13 +59,24 @@ class MapPlan:
     @property
     def maps(self) -> int:
         """Number of maps."""
-        return sum(6 if kind == "cube" else 1 for kind in self.kinds)
+        return sum(_maps_of(kind) for kind in self.kinds)
+
+    def part(self, first: int, last: int) -> MapPlan:
+        """The maps of the lights from number ``first`` to before number ``last``."""
+        return replace(self, kinds=self.kinds[first:last], first=_first_maps(self.kinds[first:last]))
+
+
+def _maps_of(kind: str) -> int:
+    return 6 if kind == "cube" else 1
+
+
+def _first_maps(kinds: Sequence[str]) -> tuple[int, ...]:
+    return tuple(int(n) for n in np.cumsum([0, *(_maps_of(kind) for kind in kinds)])[:-1])
 
 
 def plan_maps(lights: Sequence[Light], geometry: Geometry) -> MapPlan:
     """Choose the maps of the lights, and find planar shapes (on the host, once)."""
     kinds = tuple(light.map_kind() for light in lights)
-    sizes = [6 if kind == "cube" else 1 for kind in kinds]
     positions = dr.detach(geometry.positions).numpy().reshape(-1, 3)
     faces = geometry.faces.numpy().reshape(-1, 3)
     planes = np.array([info.face_start for info in geometry.shapes])
@@ -82,7 +93,7 @@ def plan_maps(lights: Sequence[Light], geometry: Geometry) -> MapPlan:
     center, radius = _sphere_around(positions)
     return MapPlan(
         kinds,
-        tuple(int(n) for n in np.cumsum([0, *sizes])[:-1]),
+        _first_maps(kinds),
         device_array(mi.UInt32, planes),
         device_array(mi.Bool, [info.planar for info in geometry.shapes]),
         center,

@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..jit.broadcast import LIKE_LANES
-from ..jit.pytree import attached_arrays, attached_places, tree_map, with_places
+from ..jit.pytree import attached_arrays, attached_of, attached_places, tree_map, with_places
 from ..jit.types import AnyArray, Bool, PyTree, UInt32
 from .mitsuba_objects import parameters
 
@@ -179,6 +179,7 @@ class _Sum(dr.CustomOp):
             # A value that all lanes share, such as the radiance of a constant sky, has one gradient: the sum over the lanes.
             if size >= self._lanes or self._shared_value:
                 self.set_grad_in("arrays", self._backward(tree, call.zero, gradient, call.active, self._lanes))
+                dr.eval([dr.grad(array) for array in call.implicit])
                 return
             dr.eval(tree[0], gradient, call.active)
             found, implicit = [], [_taken(call.implicit)]
@@ -255,18 +256,6 @@ class _Sum(dr.CustomOp):
 
     def name(self) -> str:
         return "sum of terms"
-
-
-def attached_of(tree: PyTree, places: tuple[int, ...]) -> list[AnyArray]:
-    """The arrays at some places of a tree, counted in the order of :func:`~shadowmap_dr.jit.pytree.tree_map`."""
-    found: list[AnyArray] = []
-
-    def collect(array: AnyArray) -> AnyArray:
-        found.append(array)
-        return array
-
-    tree_map(tree, collect)
-    return [found[place] for place in places]
 
 
 def _total(parts: Sequence[AnyArray]) -> AnyArray:

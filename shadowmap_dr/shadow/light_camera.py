@@ -87,6 +87,20 @@ class Frusta:
     first: Float
     last: Float
 
+    def part(self, first: int, count: int) -> Frusta:
+        """Those of ``count`` maps from number ``first`` on."""
+        index = dr.arange(backend(self.near).UInt32, count) + first
+        return Frusta(*(dr.gather(type(column), column, index) for column in self.columns()))
+
+    def columns(self) -> list[Float]:
+        """All numbers, (M,) each, in a fixed order."""
+        return [getattr(self, name) for name in self.__dataclass_fields__]
+
+    @classmethod
+    def joined(cls, parts: Sequence[Frusta]) -> Frusta:
+        """Those of the maps of all parts, one part after the other."""
+        return cls(*(dr.concat(list(columns)) for columns in zip(*(part.columns() for part in parts), strict=True)))
+
 
 ViewsOrFrusta = TypeVar("ViewsOrFrusta", Views, Frusta)
 

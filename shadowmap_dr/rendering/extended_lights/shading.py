@@ -85,7 +85,7 @@ def soft_light(
 
 
 def turns_of(samples: LightSamples, size: ImageSize, factor: int) -> Turns | None:
-    """How the samples of an image take turns at the points of an area light. Parts of the sky are all seen by all samples.
+    """Turns of an image's samples at the points of an area light. Parts of the sky are all seen by all samples.
 
     ``size``: samples of the image; ``factor``: samples along each side of a pixel.
     """

@@ -1,0 +1,167 @@
+"""Slices of a scene's lights, whose shadow maps fit into memory one slice after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import mitsuba as mi
+
+from ..errors import ShadowmapError
+from ..scene.geometry import Geometry
+from ..scene.load import SceneData
+from ..shadow import Frusta, ShadowSettings
+from .extended_lights import SoftFrusta, SoftPlan
+from .settings import RenderSettings
+from .shadow_pass import MapPlan
+
+# Bytes of a map, its derivatives included: for each texel (as it is rasterized), and in addition for each number that the texel
+# stores; for each vertex; for each triangle. Measured peaks, rounded up (docs/performance.md).
+_TEXEL, _NUMBER, _VERTEX, _TRIANGLE = 50, 20, 112, 56
+# Bytes of a stored number's gradient, of which each extended light has one for the maps of all of them.
+_GRADIENT = 4
+
+
+@dataclass(frozen=True)
+class LightSlice:
+    """Consecutive lights, and their maps: (first, last + 1) of each. Static.
+
+    Attributes:
+        lights, soft: lights without extent; extended lights, environments after area lights.
+        maps, sampled, single: maps of the lights without extent, of samples, and single ones.
+    """
+
+    lights: tuple[int, int]
+    soft: tuple[int, int]
+    maps: tuple[int, int]
+    sampled: tuple[int, int]
+    single: tuple[int, int]
+
+    def data(self, data: SceneData, lights: Sequence[Any], areas: Sequence[Any]) -> SceneData:
+        """The scene with the lights of the slice alone. ``lights``, ``areas``: current records of all lights."""
+        (a, b), (c, d), n = self.lights, self.soft, len(areas)
+        environments = data.environments[max(c - n, 0) : max(d - n, 0)]
+        return replace(data, lights=tuple(lights[a:b]), areas=tuple(areas[c : min(d, n)]), environments=environments)
+
+    def soft_plans(self, plans: Sequence[SoftPlan]) -> tuple[SoftPlan, ...]:
+        """The plans of the slice's extended lights, with the numbers that their maps have there."""
+        start = {True: self.single[0], False: self.sampled[0]}
+        return tuple(replace(plan, first=plan.first - start[plan.kind == "single"]) for plan in plans[slice(*self.soft)])
+
+    def fits(self, fits: tuple[Frusta | None, SoftFrusta]) -> tuple[Frusta | None, SoftFrusta]:
+        """The part of a fit of all maps that belongs to the slice."""
+        frusta, (sampled, single) = fits
+        return _part(frusta, self.maps), (_part(sampled, self.sampled), _part(single, self.single))
+
+
+def _part(frusta: Frusta | None, maps: tuple[int, int]) -> Frusta | None:
+    first, last = maps
+    return None if frusta is None or first == last else frusta.part(first, last - first)
+
+
+def joined_fits(fits: Sequence[tuple[Frusta | None, SoftFrusta]]) -> tuple[Frusta | None, SoftFrusta]:
+    """The fit of all maps from those of the slices."""
+    columns = [[fit for fit in column if fit is not None] for column in zip(*((f, *soft) for f, soft in fits), strict=True)]
+    frusta, sampled, single = (Frusta.joined(column) if column else None for column in columns)
+    return frusta, (sampled, single)
+
+
+def plan_slices(data: SceneData, plan: MapPlan, soft: Sequence[SoftPlan], settings: RenderSettings) -> tuple[LightSlice, ...]:
+    """Slices of the lights, as few and as equal as fit into ``settings.light_memory`` each; none if all lights fit together.
+
+    Raises:
+        ShadowmapError: the maps of a single light do not fit.
+    """
+    if settings.shadow.method == "none" or not settings.lit:
+        return ()
+    sizes = _Sizes.of(data, plan, soft, settings)
+    budget, every = int(settings.light_memory * 2**30), sizes.count
+    if sizes.bytes(0, every) <= budget:
+        return ()
+    largest = max(range(every), key=lambda k: sizes.bytes(k, k + 1))
+    if sizes.bytes(largest, largest + 1) > budget:
+        names = [light.name for light in (*data.lights, *data.areas, *data.environments)]
+        raise ShadowmapError(
+            f"The shadow maps of light '{names[largest]}' take {sizes.bytes(largest, largest + 1) / 2**30:.3g} GiB, more than "
+            f"light_memory ({settings.light_memory:g} GiB): raise it, or lower shadow_map_resolution, soft_map_resolution or the "
+            f"number of the light's samples."
+        )
+    own = [6 if kind == "cube" else 1 for kind in plan.kinds]
+    return tuple(_slice(first, last, own, soft) for first, last in _groups(sizes, budget))
+
+
+@dataclass(frozen=True)
+class _Sizes:
+    """Memory for the maps of lights; extended lights come last.
+
+    Attributes:
+        maps: bytes of each light's maps.
+        gradients: bytes of the gradient of each light's maps, 0 for lights without extent.
+    """
+
+    maps: list[int]
+    gradients: list[int]
+
+    @classmethod
+    def of(cls, data: SceneData, plan: MapPlan, soft: Sequence[SoftPlan], settings: RenderSettings) -> _Sizes:
+        sampled, single = settings.soft_shadow
+        kinds = [(6 if kind == "cube" else 1, settings.shadow) for kind in plan.kinds]
+        kinds += [(one.maps, single if one.kind == "single" else sampled) for one in soft]
+        maps = [count * map_bytes(setting, data.geometry) for count, setting in kinds]
+        gradients = [count * _GRADIENT * _numbers(setting) * setting.resolution**2 for count, setting in kinds]
+        return cls(maps, [0] * len(plan.kinds) + gradients[len(plan.kinds) :])
+
+    @property
+    def count(self) -> int:
+        return len(self.maps)
+
+    def bytes(self, first: int, last: int) -> int:
+        """Estimate of the memory for lights ``first`` to before ``last`` at once."""
+        gradients = [size for size in self.gradients[first:last] if size]
+        return sum(self.maps[first:last]) + len(gradients) * sum(gradients)
+
+
+def map_bytes(settings: ShadowSettings, geometry: Geometry) -> int:
+    """Estimate of the memory (bytes) for making, filtering and differentiating one map."""
+    texels = (settings.resolution * settings.supersampling) ** 2 * (_TEXEL + _NUMBER * _numbers(settings))
+    return texels + _VERTEX * geometry.vertex_count + _TRIANGLE * geometry.face_count
+
+
+def _numbers(settings: ShadowSettings) -> int:
+    """Most numbers that a texel stores."""
+    return max(4, 2 * settings.order if settings.method == "csm" else 4)
+
+
+def _groups(sizes: _Sizes, budget: int) -> list[tuple[int, int]]:
+    """(first, last + 1) of consecutive groups, each of at most ``budget``, and as equal as their least number allows."""
+    count = len(_filled(sizes, budget))
+    low, high = max(sizes.bytes(k, k + 1) for k in range(sizes.count)), budget
+    while high - low > max(budget // 256, 1):  # the least limit that needs no more groups: equal groups share their kernels
+        middle = (low + high) // 2
+        low, high = (low, middle) if len(_filled(sizes, middle)) <= count else (middle, high)
+    return _filled(sizes, high)
+
+
+def _filled(sizes: _Sizes, limit: int) -> list[tuple[int, int]]:
+    groups, first = [], 0
+    for k in range(1, sizes.count):
+        if sizes.bytes(first, k + 1) > limit:
+            groups.append((first, k))
+            first = k
+    return [*groups, (first, sizes.count)]
+
+
+def _slice(first: int, last: int, own: Sequence[int], soft: Sequence[SoftPlan]) -> LightSlice:
+    n = len(own)
+    a, b, c, d = min(first, n), min(last, n), max(first - n, 0), max(last - n, 0)
+    sampled = [0 if plan.kind == "single" else plan.maps for plan in soft]
+    single = [plan.maps if plan.kind == "single" else 0 for plan in soft]
+    ranges = [(sum(maps[:x]), sum(maps[:y])) for maps, x, y in ((own, a, b), (sampled, c, d), (single, c, d))]
+    return LightSlice((a, b), (c, d), *ranges)
+
+
+def shining_objects(data: SceneData) -> list[mi.Object]:
+    """Mitsuba's objects that the light of a scene calls: emitters and their textures."""
+    found = [value for light in data.lights for value in vars(light).values() if isinstance(value, mi.Object)]
+    return [*found, *(area.emitter for area in data.areas), *(node for sky in data.environments for node in sky.nodes)]

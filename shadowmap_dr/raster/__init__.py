@@ -5,7 +5,7 @@ from .antialiasing.creases import CoplanarCreases
 from .antialiasing.edge_crossings import DEPTH_GAP, Crossings, find_crossings
 from .closed_parts import drawing_order, outward_faces
 from .interpolate import interpolate
-from .rasterize import rasterize, visible_triangles
+from .rasterize import check_resolution, locate, rasterize, visible_triangles
 from .shape_seams import detach_moved_seams
 from .topology import NO_VERTEX, Topology, build_topology
 from .types import MAX_RESOLUTION, NO_TRIANGLE, RasterOutput
@@ -21,9 +21,11 @@ __all__ = [
     "Topology",
     "antialias",
     "build_topology",
+    "check_resolution",
     "drawing_order",
     "find_crossings",
     "interpolate",
+    "locate",
     "outward_faces",
     "detach_moved_seams",
     "rasterize",

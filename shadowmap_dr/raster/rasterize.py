@@ -65,8 +65,23 @@ def rasterize(
     """
     flat, face_indices, batch, _ = check_mesh(positions, faces, batch, check_indices)
     located = visible_triangles(flat, face_indices, resolution, batch=batch, transparent=transparent, layers=layers)
-    u, v, depth = pixel_barycentrics(located, flat, face_indices)
-    if dr.grad_enabled(flat):
+    return _with_barycentrics(located, flat, face_indices)
+
+
+def locate(raster: RasterOutput, positions: Float, faces: UInt32) -> RasterOutput:
+    """Barycentrics and depths of the triangles that pixels see, again, attached to ``positions``.
+
+    Args:
+        raster: from :func:`rasterize` or :func:`visible_triangles`. Only its triangles and their records are read.
+        positions, faces: flat, as rasterized.
+    """
+    size = raster.batch, dr.width(positions) // (4 * raster.batch), raster.height, raster.width
+    return _with_barycentrics(_locate(positions, faces, raster.triangle, raster.records, *size), positions, faces)
+
+
+def _with_barycentrics(located: RasterOutput, positions: Float, faces: UInt32) -> RasterOutput:
+    u, v, depth = pixel_barycentrics(located, positions, faces)
+    if dr.grad_enabled(positions):
         u, v, depth = (replace_grad(a, b) for a, b in ((u, located.u), (v, located.v), (depth, located.depth)))
     return replace(located, u=u, v=v, depth=depth)
 

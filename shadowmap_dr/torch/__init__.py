@@ -19,7 +19,9 @@ except ModuleNotFoundError as error:
         raise
     raise ImportError("shadowmap_dr.torch needs PyTorch: pip install 'shadowmap-dr[torch]'.", name="torch") from None
 
-from .raster import Raster, Topology, antialias, build_topology, interpolate, rasterize
+from .antialias import antialias, build_topology
+from .raster import interpolate, rasterize
+from .records import Raster, Topology
 from .render import Renderer
 from .shadow import DirectionalLight, Light, PointLight, ShadowMaps, SpotLight, filter_maps, render_maps, visibility
 

@@ -1,4 +1,4 @@
-"""The crossing between PyTorch's autograd and Dr.Jit's.
+"""Arrays and derivatives between PyTorch and Dr.Jit. :mod:`.crossing` makes them a part of PyTorch's graph.
 
 Dr.Jit's own ``drjit.wrap`` shares memory with both sides, and a backward pass frees its graph: an optimiser that changes
 parameters between the two passes, or a second backward pass, silently gets wrong gradients. Here no memory is shared, and each
@@ -11,50 +11,21 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import ModuleType
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 import drjit as dr
 import torch
 
 from ..jit.arrays import backend
-from ..jit.types import AnyArray, ArrayT, Float, TensorXf, UInt32, Vector3f
+from ..jit.types import AnyArray, ArrayT, Bool, Float, TensorXf, UInt32, Vector3f
 from .checks import backend_of
+from .transforms import outside
 
 #: Takes the place of an array in a record whose values a PyTorch tensor holds.
 IN_TENSOR: Any = None  # Any: arrays of several types
 
 # Held by the thread in which Dr.Jit works.
 _TURN = threading.RLock()
-
-
-class Operation(Protocol):
-    """A differentiable function of float tensors that Dr.Jit evaluates. An object serves one call."""
-
-    def forward(self, arrays: list[TensorXf], wanted: list[bool]) -> Sequence[TensorXf]:
-        """Results (Dr.Jit tensors) for Dr.Jit tensors. ``wanted``: whether each of these needs gradients; maybe none does."""
-
-    def backward(self, adjoints: Sequence[TensorXf | None]) -> Sequence[TensorXf]:
-        """Gradients to the arrays, arbitrary for arrays that need none. ``adjoints``: gradients to the results, None for zero."""
-
-
-class Repeated:
-    """A differentiable Dr.Jit function, which is evaluated once more for its derivatives.
-
-    No graph is kept in between: Dr.Jit 1.5 never frees a graph that is dropped or that must serve several backward passes.
-    """
-
-    def __init__(self, function: Callable[..., Sequence[TensorXf]]) -> None:
-        self.function = function
-
-    def forward(self, arrays: list[TensorXf], wanted: list[bool]) -> Sequence[TensorXf]:
-        self.arrays, self.wanted = arrays, wanted
-        with dr.suspend_grad():
-            return self.function(*arrays)
-
-    def backward(self, adjoints: Sequence[TensorXf | None]) -> Sequence[TensorXf]:
-        with dr.resume_grad():
-            arrays = attached(self.arrays, self.wanted)
-            return gradients(arrays, self.function(*arrays), adjoints)
 
 
 def attached(arrays: Sequence[ArrayT], wanted: Sequence[bool]) -> list[ArrayT]:
@@ -78,24 +49,31 @@ def gradients(arrays: Sequence[ArrayT], results: Sequence[TensorXf], adjoints: S
     return found
 
 
-def cross(operation: Operation, *tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    """Results of an operation as part of PyTorch's graph. ``tensors``: at least one; checked, float32, on one device."""
-    return _Crossing.apply(operation, torch.is_grad_enabled(), *tensors)
-
-
 def to_drjit(tensor: torch.Tensor) -> Any:  # Any: TensorXf or TensorXi, as the tensor's type
-    """A Dr.Jit tensor with memory of its own, float32 or int32."""
+    """A Dr.Jit tensor with memory of its own, float32 or int32. ``tensor``: not batched by ``torch.vmap``."""
     # The memory of PyTorch's copy is shared: nobody else has this copy.
-    copy = tensor.detach().clone(memory_format=torch.contiguous_format)
+    return outside(lambda numbers: borrowed(numbers.clone(memory_format=torch.contiguous_format)), tensor)
+
+
+def borrowed(tensor: torch.Tensor) -> Any:  # Any: TensorXf or TensorXi, as the tensor's type
+    """A Dr.Jit tensor in the memory of a contiguous tensor, float32 or int32, whose numbers nobody will change."""
     module = backend_of(tensor.device)
-    return (module.TensorXf if tensor.dtype == torch.float32 else module.TensorXi)(copy)
+    return (module.TensorXf if tensor.dtype == torch.float32 else module.TensorXi)(tensor.detach())
 
 
 def index_array(indices: torch.Tensor) -> UInt32:
-    """(Checked) indices as a flat ``UInt32`` array."""
+    """(Checked, plain) indices as a flat ``UInt32`` array."""
     with drjit_turn(indices.device) as module:
         array = to_drjit(indices.to(torch.int32)).array
         result = module.UInt32(array)
+        dr.eval(result)
+    return result
+
+
+def mask_array(mask: torch.Tensor) -> Bool:
+    """A (checked, plain) boolean tensor as a flat ``Bool`` array."""
+    with drjit_turn(mask.device):
+        result = index_array(mask) != 0
         dr.eval(result)
     return result
 
@@ -119,6 +97,20 @@ def _gathered(kind: type[ArrayT], flat: Float, index: UInt32 | int) -> ArrayT:
 def to_torch(array: AnyArray) -> torch.Tensor:
     """A PyTorch tensor with the values of a Dr.Jit tensor, in memory of its own. Call it in :func:`drjit_turn`: it waits."""
     return cast(torch.Tensor, dr.detach(array).torch()).clone()
+
+
+def forward_derivatives(
+    arrays: Sequence[ArrayT], results: Sequence[TensorXf], tangents: Sequence[TensorXf | None]
+) -> list[TensorXf]:
+    """Derivatives of results along the tangents (None for zero) of attached arrays. Frees the graph."""
+    for array, tangent in zip(arrays, tangents, strict=True):
+        if tangent is not None:
+            dr.set_grad(array, tangent)
+    dr.enqueue(dr.ADMode.Forward, [array for array, tangent in zip(arrays, tangents, strict=True) if tangent is not None])
+    dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearInterior | dr.ADFlag.ClearEdges)
+    found = [dr.grad(result) for result in results]
+    dr.eval(found)
+    return found
 
 
 def _copy(array: ArrayT) -> ArrayT:
@@ -147,36 +139,3 @@ def drjit_turn(device: torch.device) -> Iterator[ModuleType]:
         finally:
             dr.sync_thread()
             dr.detail.new_scope(dr.backend_v(module.Float))
-
-
-class _Crossing(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any,  # Any: PyTorch's stubs lack the attributes of a context
-        operation: Operation,
-        record: bool,
-        *tensors: torch.Tensor,
-    ) -> tuple[torch.Tensor, ...]:
-        wanted = [record and needed for needed in ctx.needs_input_grad[2:]]
-        with drjit_turn(tensors[0].device):
-            arrays = [to_drjit(tensor) for tensor in tensors]
-            results = operation.forward(arrays, wanted)
-            dr.eval(results)
-            found = tuple(to_torch(result) for result in results)
-        ctx.operation, ctx.wanted, ctx.device = operation, wanted, tensors[0].device
-        ctx.set_materialize_grads(False)
-        return found
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(
-        ctx: Any,  # Any: PyTorch's stubs lack the attributes of a context
-        *adjoints: torch.Tensor | None,
-    ) -> tuple[torch.Tensor | None, ...]:
-        with drjit_turn(ctx.device):
-            arrays = [None if adjoint is None else to_drjit(adjoint) for adjoint in adjoints]
-            found = ctx.operation.backward(arrays)
-            dr.eval(found)
-            wanted = zip(found, ctx.wanted, strict=True)
-            given = [to_torch(gradient) if want else None for gradient, want in wanted]
-        return None, None, *given

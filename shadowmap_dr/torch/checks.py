@@ -37,14 +37,29 @@ def check_floats(name: str, tensor: torch.Tensor, *shapes: tuple[int | str, ...]
 
 def check_indices(name: str, tensor: torch.Tensor, count: int, what: str = "vertices") -> None:
     """Raise ShadowmapError unless ``tensor`` is integer (F, 3), F > 0, with indices from 0 to ``count - 1``. Reads them all."""
-    _check_tensor(name, tensor)
-    if tensor.dtype not in _INTEGERS:
-        raise ShadowmapError(f"{name}: {tensor.dtype}, but must be integers; convert with .int().")
-    if tensor.ndim != 2 or tensor.shape[1] != 3 or len(tensor) == 0:
-        raise ShadowmapError(f"{name}: shape {tuple(tensor.shape)}, but must be (F, 3) with at least one triangle.")
+    check_face_shape(name, tensor)
     low, high = (int(value) for value in torch.aminmax(tensor))
     if low < 0 or high >= count:
         raise ShadowmapError(f"{name}: indices from {low} to {high}, but there are {count} {what}, counted from 0.")
+
+
+def check_face_shape(name: str, tensor: torch.Tensor, batched: bool = False) -> None:
+    """Raise ShadowmapError unless ``tensor`` is integer (F, 3), or, if ``batched``, (B, F, 3), with B, F > 0."""
+    _check_tensor(name, tensor)
+    if tensor.dtype not in _INTEGERS:
+        raise ShadowmapError(f"{name}: {tensor.dtype}, but must be integers; convert with .int().")
+    if tensor.ndim not in ((2, 3) if batched else (2,)) or tensor.shape[-1] != 3 or tensor.numel() == 0:
+        wanted = "(F, 3) or (B, F, 3)" if batched else "(F, 3)"
+        raise ShadowmapError(f"{name}: shape {tuple(tensor.shape)}, but must be {wanted} with at least one triangle.")
+
+
+def check_flags(name: str, tensor: torch.Tensor, shape: tuple[int, ...]) -> None:
+    """Raise ShadowmapError unless ``tensor`` is boolean, of the shape."""
+    _check_tensor(name, tensor)
+    if tensor.dtype != torch.bool:
+        raise ShadowmapError(f"{name}: {tensor.dtype}, but must be torch.bool; convert with .bool().")
+    if tuple(tensor.shape) != shape:
+        raise ShadowmapError(f"{name}: shape {tuple(tensor.shape)}, but must be {_written(shape)}.")
 
 
 def check_devices(**tensors: torch.Tensor) -> torch.device:

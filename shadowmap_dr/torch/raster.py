@@ -1,168 +1,192 @@
-"""Screen-space primitives on PyTorch tensors: rasterize, interpolate, antialias. Functions of :mod:`shadowmap_dr.raster`."""
+"""Visibility and vertex attributes on PyTorch tensors: rasterize, interpolate. Functions of :mod:`shadowmap_dr.raster`."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import TypeAlias
 
 import drjit as dr
 import torch
 
 from .. import raster as _raster
 from ..errors import ShadowmapError
-from ..jit.types import TensorXf
+from ..jit.arrays import backend
+from ..jit.types import Bool, Float, TensorXf
 from ..raster import RasterOutput
-from ..raster.rasterize import check_resolution
-from .bridge import IN_TENSOR, Repeated, cross, drjit_turn, index_array, to_torch
-from .checks import check_devices, check_floats, check_indices, check_kind, check_same
+from .bridge import IN_TENSOR, drjit_turn, index_array, mask_array, to_drjit, to_torch
+from .checks import check_devices, check_flags, check_floats, check_kind, check_same, number_of
+from .crossing import Repeated, cross, eager
+from .records import FaceSets, Raster, check_set_images, pieces, plain_faces
+from .transforms import plain
+
+#: First face and number of faces of each image.
+Ranges: TypeAlias = Sequence[tuple[int, int]] | torch.Tensor
+
+_BATCH = "give positions (B, V, 4), one set for each image"
 
 
-@dataclass(frozen=True)
-class Raster:
-    """Triangles that the pixels of B images see.
-
-    Attributes:
-        triangle: int32 (B, H, W), index of the visible triangle, -1 for none.
-        u, v: float32 (B, H, W), perspective-correct weights of the triangle's vertices 1 and 2 (vertex 0 has ``1 - u - v``).
-        depth: float32 (B, H, W), ``z / w`` in clip space, 1 (the far plane) where nothing is seen.
-
-    ``u``, ``v`` and ``depth`` are attached to the positions, for a fixed visible triangle; :func:`antialias` differentiates
-    changes of visibility. Read only: the other functions ignore a changed ``triangle``.
-    """
-
-    triangle: torch.Tensor
-    u: torch.Tensor
-    v: torch.Tensor
-    depth: torch.Tensor
-    _found: RasterOutput = field(repr=False)
-
-    @property
-    def covered(self) -> torch.Tensor:
-        """Bool (B, H, W): whether a pixel sees a triangle."""
-        return self.triangle >= 0
-
-
-@dataclass(frozen=True)
-class Topology:
-    """Edges of a mesh, from :func:`build_topology`. Valid as long as the faces stay the same.
-
-    Attributes:
-        faces: int32 (F, 3), vertex indices.
-        vertex_count: number of vertices V.
-    """
-
-    faces: torch.Tensor
-    vertex_count: int
-    _edges: _raster.Topology = field(repr=False)
-
-
-def rasterize(positions: torch.Tensor, faces: torch.Tensor, resolution: tuple[int, int]) -> Raster:
+@eager
+def rasterize(
+    positions: torch.Tensor,
+    faces: torch.Tensor,
+    resolution: tuple[int, int],
+    *,
+    ranges: Ranges | None = None,
+    transparent: Callable[[Raster], torch.Tensor] | None = None,
+    layers: int = 4,
+) -> Raster:
     """Find the nearest triangle at each pixel centre. See :func:`shadowmap_dr.raster.rasterize` for the rules.
 
     Args:
-        positions: float32 (V, 4) or (B, V, 4), clip-space vertices; visible where ``-w <= x, y, z <= w``.
-        faces: integers (F, 3), vertex indices, the same for all images.
+        positions: float32 (V, 4), the same for all images, or (B, V, 4), clip-space vertices; visible where
+            ``-w <= x, y, z <= w``.
+        faces: integers (F, 3), vertex indices, the same for all images, or (B, F, 3).
         resolution: (height, width) in pixels, each 1 to 4096.
+        ranges: (first face, number of faces) of each image, integers (B, 2): images show different parts of faces (F, 3).
+        transparent: alpha test. A function of a :class:`Raster` (detached) that returns a bool tensor (B, H, W), True for pixels
+            whose surface is transparent there; these see the surface behind it. No gradients. All images must show the same
+            faces.
+        layers: maximum number of surfaces tested for each pixel, front to back. The last surface counts as opaque.
 
     Returns:
-        :class:`Raster`, attached to ``positions``; B is 1 for positions (V, 4).
+        :class:`Raster`, attached to ``positions``; B is 1 if no argument has images.
     """
     check_floats("positions", positions, ("V", 4), ("B", "V", 4))
-    check_indices("faces", faces, positions.shape[-2])
-    device = check_devices(positions=positions, faces=faces)
+    indices = plain_faces(faces, positions.shape[-2])
+    device, sets = check_devices(positions=positions, faces=indices), FaceSets.of(faces, ranges)
+    batch = check_set_images(sets, len(positions) if positions.ndim == 3 else None)
     try:
-        size = check_resolution(resolution)
+        size = _raster.check_resolution(resolution)
     except (ValueError, TypeError) as error:
         raise ShadowmapError(str(error)) from None
-    indices = index_array(faces)
-    kept: list[RasterOutput] = []
+    _check_alpha_test(transparent, layers, sets)
+    own_faces = [index_array(part) for part in sets.split(indices)]
+    images = batch if sets.shared else 1
+    numbers = plain("positions", positions, _BATCH)
+
+    def test(output: RasterOutput) -> Bool:
+        assert transparent is not None, "called only where there is one"
+        return _alpha(transparent, output, sets)
+
+    with drjit_turn(device):
+        vertices, found = to_drjit(numbers).array, []
+        alpha = None if transparent is None else test
+        for part, own in zip(_of_sets(vertices, sets, positions.ndim), own_faces, strict=True):
+            one = dr.detach(_raster.visible_triangles(part, own, size, batch=images, transparent=alpha, layers=layers))
+            # Only the visible triangles: tensors hold the rest.
+            found.append(replace(one, u=IN_TENSOR, v=IN_TENSOR, depth=IN_TENSOR, w=IN_TENSOR))
+            dr.eval(found[-1].triangle, found[-1].records)
+        triangle = torch.cat([
+            _triangles(one, start) for one, start in zip(found, sets.starts(), strict=True)
+        ])  # fmt: skip
 
     def run(positions: TensorXf) -> tuple[TensorXf, ...]:
-        output = _raster.rasterize(positions, indices, size, check_indices=False)
-        kept.append(output)
-        shape = (output.batch, output.height, output.width)
-        return tuple(type(positions)(value, shape) for value in (output.u, output.v, output.depth))
+        parts = _of_sets(positions.array, sets, len(positions.shape))
+        seen = [_raster.locate(*each) for each in zip(found, parts, own_faces, strict=True)]
+        return tuple(
+            type(positions)(_joined([getattr(one, name) for one in seen]), (batch, *size)) for name in ("u", "v", "depth")
+        )
 
-    u, v, depth = cross(Repeated(run), positions)
-    with drjit_turn(device) as module:
-        # Only the visible triangles: tensors hold the rest.
-        found = dr.detach(replace(kept[0], u=IN_TENSOR, v=IN_TENSOR, depth=IN_TENSOR, w=IN_TENSOR))
-        triangle = to_torch(module.TensorXi(module.Int32(found.triangle), u.shape))
-    return Raster(triangle, u, v, depth, found)
+    u, v, depth = cross(Repeated("rasterize", run, _BATCH), positions)
+    return Raster(triangle, u, v, depth, tuple(found), sets)
 
 
+@eager
 def interpolate(attributes: torch.Tensor, raster: Raster, faces: torch.Tensor) -> torch.Tensor:
     """Interpolate vertex attributes over the visible triangles, perspective-correct.
 
     Args:
         attributes: float32 (V, C), the same for all images, or (B, V, C).
         raster: from :func:`rasterize`.
-        faces: integers (F, 3), indices into ``attributes``: the faces that were rasterized, or other indices for the same
-            triangles (such as those of texture coordinates).
+        faces: integers (F, 3) or (B, F, 3), indices into ``attributes``: the faces that were rasterized, or other indices for the
+            same triangles (such as those of texture coordinates).
 
     Returns:
         float32 (B, H, W, C), 0 where nothing is seen. Attached to ``attributes`` and, through ``raster.u`` and ``raster.v``, to
         the positions that were rasterized.
     """
     check_kind("raster", raster, Raster)
-    found = raster._found
-    shape = (found.batch, found.height, found.width)
-    check_floats("attributes", attributes, ("V", "C"), (found.batch, "V", "C"))
-    check_indices("faces", faces, attributes.shape[-2], "rows of attributes")
-    check_same("faces", len(faces), found.face_count, "give one row for each triangle that was rasterized")
-    check_floats("raster.u", raster.u, shape)
-    check_floats("raster.v", raster.v, shape)
-    check_devices(attributes=attributes, faces=faces, raster=raster.triangle, u=raster.u, v=raster.v)
-    indices = index_array(faces)
+    size, sets, found = raster._size, raster._sets, raster._found
+    check_floats("attributes", attributes, ("V", "C"), (size[0], "V", "C"))
+    indices = plain_faces(faces, attributes.shape[-2], "rows of attributes")
+    if tuple(faces.shape) != sets.shape:
+        if faces.ndim == len(sets.shape) == 2:
+            check_same("faces", len(faces), sets.shape[0], "give one row for each triangle that was rasterized")
+        check_same("shape of faces", tuple(faces.shape), sets.shape, "give one row for each triangle that was rasterized")
+    check_floats("raster.u", raster.u, size)
+    check_floats("raster.v", raster.v, size)
+    check_devices(attributes=attributes, faces=indices, raster=raster.triangle, u=raster.u, v=raster.v)
+    own_faces = [index_array(part) for part in sets.split(indices)]
 
     def run(attributes: TensorXf, u: TensorXf, v: TensorXf) -> tuple[TensorXf, ...]:
-        result = _raster.interpolate(attributes, replace(found, u=u.array, v=v.array), indices, check_indices=False)
-        return (type(result)(result.array, (*shape, result.shape[-1])),)
+        channels, shape = attributes.shape[-1], tuple(attributes.shape)
+        images = _of_pixels(found, u.array), _of_pixels(found, v.array)
+        values = [attributes]
+        if not sets.shared:
+            shape = shape[-2:]
+            values = [type(attributes)(part, shape) for part in _of_sets(attributes.array, sets, len(attributes.shape))]
+        results = []
+        for value, one, own, u_own, v_own in zip(values, found, own_faces, *images, strict=True):
+            result = _raster.interpolate(value, replace(one, u=u_own, v=v_own), own, check_indices=False)
+            results.append(result.array)
+        return (type(attributes)(_joined(results), (*size, channels)),)
 
-    return cross(Repeated(run), attributes, raster.u, raster.v)[0]
-
-
-def build_topology(faces: torch.Tensor, positions: torch.Tensor) -> Topology:
-    """Find the edges of a mesh (on the host, once).
-
-    Args:
-        faces: integers (F, 3), vertex indices.
-        positions: float32 (V, 3), vertices. Vertices at the same place count as one: seams of texture coordinates or normals
-            duplicate vertices, but are no boundaries of the surface.
-    """
-    check_floats("positions", positions, ("V", 3))
-    check_indices("faces", faces, len(positions))
-    with drjit_turn(check_devices(faces=faces, positions=positions)) as module:
-        edges = _raster.build_topology(faces.detach().cpu().numpy(), positions.detach().cpu().numpy(), module.UInt32)
-    if not edges.count:
-        raise ShadowmapError("faces: all triangles have two corners at the same place, so that the mesh has no edges.")
-    return Topology(faces.detach().to(torch.int32).clone(), len(positions), edges)
+    return cross(Repeated("interpolate", run), attributes, raster.u, raster.v)[0]
 
 
-def antialias(image: torch.Tensor, raster: Raster, positions: torch.Tensor, topology: Topology) -> torch.Tensor:
-    """Blend pixels along silhouettes by the share that each side covers, so that silhouettes are differentiable.
+def _check_alpha_test(transparent: object, layers: object, sets: FaceSets) -> None:
+    if number_of("layers", layers, int) < 1:
+        raise ShadowmapError(f"layers: {layers}; give 1 or more surfaces.")
+    if transparent is not None and not callable(transparent):
+        raise ShadowmapError(f"transparent: {type(transparent).__name__}, but must be a function of a Raster.")
+    if transparent is not None and not sets.shared:
+        raise ShadowmapError(f"transparent: given beside faces {sets}; rasterize the images one by one.")
 
-    See :func:`shadowmap_dr.raster.antialias`.
 
-    Args:
-        image: float32 (B, H, W, C).
-        raster: from :func:`rasterize`.
-        positions: the clip-space vertices that were rasterized, (V, 4) or (B, V, 4).
-        topology: of the mesh that was rasterized.
+def _alpha(transparent: Callable[[Raster], torch.Tensor], output: RasterOutput, sets: FaceSets) -> Bool:
+    """The caller's alpha test of the triangles that pixels see."""
+    shape = output.batch, output.height, output.width
+    module = backend(output.triangle)
+    u, v, depth = (to_torch(module.TensorXf(value, shape)) for value in (output.u, output.v, output.depth))
+    found = replace(dr.detach(output), u=IN_TENSOR, v=IN_TENSOR, depth=IN_TENSOR, w=IN_TENSOR)
+    with torch.no_grad():
+        mask = transparent(Raster(_triangles(found, 0), u, v, depth, (found,), sets))
+    check_flags("result of transparent", mask, shape)
+    check_devices(positions=u, **{"result of transparent": mask})
+    return mask_array(plain("result of transparent", mask, _BATCH))
 
-    Returns:
-        float32 (B, H, W, C), attached to ``image`` and, through the silhouettes, to ``positions``.
-    """
-    check_kind("raster", raster, Raster)
-    check_kind("topology", topology, Topology)
-    found = raster._found
-    count = topology.vertex_count
-    check_floats("image", image, (found.batch, found.height, found.width, "C"))
-    shapes = [(found.batch, count, 4), (count, 4)]
-    check_floats("positions", positions, *(shapes if found.batch == 1 else shapes[:1]))
-    check_same("faces of topology", len(topology.faces), found.face_count, "give that of the mesh that was rasterized")
-    check_devices(image=image, raster=raster.triangle, positions=positions, topology=topology.faces)
 
-    def run(image: TensorXf, positions: TensorXf) -> tuple[TensorXf, ...]:
-        return (_raster.antialias(image, found, positions, topology._edges),)
+def _triangles(found: RasterOutput, start: int) -> torch.Tensor:
+    """int32 (B, H, W), indices in all faces, of which ``start`` is the first of this set."""
+    module, shape = backend(found.triangle), (found.batch, found.height, found.width)
+    triangle = to_torch(module.TensorXi(module.Int32(found.triangle), shape))
+    return torch.where(triangle < 0, triangle, triangle + start) if start else triangle
 
-    return cross(Repeated(run), image, positions)[0]
+
+def _of_sets(flat: Float, sets: FaceSets, dimensions: int) -> list[Float]:
+    """Numbers of vertices, (V, N) or (B, V, N) as there are ``dimensions``, for each set. Attached."""
+    if sets.shared:
+        return [flat]
+    if dimensions == 2:
+        return [flat] * sets.count
+    return parts_of(flat, [1] * sets.count)
+
+
+def _of_pixels(found: Sequence[RasterOutput], flat: Float) -> list[Float]:
+    return parts_of(flat, [one.batch for one in found])
+
+
+def parts_of(flat: Float, images: Sequence[int]) -> list[Float]:
+    """The numbers of consecutive groups of images. Attached."""
+    if len(images) == 1:
+        return [flat]
+    module, length = backend(flat), dr.width(flat) // sum(images)
+    return [
+        dr.gather(type(flat), flat, dr.arange(module.UInt32, start, end), mode=dr.ReduceMode.NoConflicts)
+        for start, end in pieces(images, length)
+    ]
+
+
+def _joined(parts: list[Float]) -> Float:
+    return parts[0] if len(parts) == 1 else dr.concat(parts)

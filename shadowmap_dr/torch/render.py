@@ -19,8 +19,12 @@ from ..jit.types import TensorXf
 from ..rendering.extended_lights import SkyWatch, SoftFrusta, still_aimed
 from ..rendering.renderer import Renderer as _Renderer
 from ..shadow import Frusta
-from .bridge import attached, cross, drjit_turn, gradients, number, to_torch
+from .bridge import attached, drjit_turn, forward_derivatives, gradients, number, to_torch
 from .checks import check_devices, check_floats, check_kind, number_of
+from .crossing import cross, eager
+from .transforms import plain
+
+_LOOP = "render the images in a loop"
 
 
 class Renderer:
@@ -32,6 +36,7 @@ class Renderer:
     The backward pass reads the scene again: Mitsuba's own parameters must not change between the two passes.
     """
 
+    @eager
     def __init__(self, renderer: _Renderer, *, frozen: bool = False) -> None:
         """Wrap a :class:`shadowmap_dr.Renderer`.
 
@@ -51,6 +56,7 @@ class Renderer:
         self._frozen = (Frozen(_forward), Frozen(_backward)) if frozen else None
 
     @classmethod
+    @eager
     def from_scene(
         cls,
         scene: mi.Scene,
@@ -63,6 +69,7 @@ class Renderer:
             renderer = _Renderer.from_scene(scene, **settings)
         return cls(renderer, frozen=frozen)
 
+    @eager
     def vertices(self, name: str) -> torch.Tensor:
         """Positions of a shape when the scene was loaded: float32 (V, 3), world space, without gradients."""
         count = self._renderer.data.geometry.shape(name).vertex_count
@@ -70,6 +77,7 @@ class Renderer:
             flat = dr.ravel(dr.detach(self._renderer.data.geometry.shape_positions(name)))
             return to_torch(mi.TensorXf(flat, (count, 3)))
 
+    @eager
     def faces(self, name: str) -> torch.Tensor:
         """Triangles of a shape: int32 (F, 3), indices into its vertices."""
         info = self._renderer.data.geometry.shape(name)
@@ -78,6 +86,7 @@ class Renderer:
         own = torch.from_numpy(faces[info.face_start : info.face_start + info.face_count] - info.vertex_start)
         return own.to(self._device)
 
+    @eager
     def render(
         self,
         vertex_positions: Mapping[str, torch.Tensor] | None = None,
@@ -119,7 +128,7 @@ class Renderer:
         if given:
             return cross(operation, *given.values())[0]
         with drjit_turn(self._device):
-            (image,) = operation.forward([], [])
+            (image,) = operation.forward([])
             return to_torch(image)
 
     def _inputs(
@@ -143,8 +152,13 @@ class Renderer:
                 if key not in known:
                     raise ShadowmapError(f"Light '{name}' has no '{key}' that a tensor could replace: {', '.join(known)}.")
                 check_floats(f"lights['{name}']['{key}']", value, *_shapes_of(f"lights: '{key}'", getattr(record, key)))
-                if key == "direction" and not (bool(value.any()) and bool(value.isfinite().all())):
-                    raise ShadowmapError(f"lights['{name}']['direction']: {value.tolist()}; give a finite one other than zero.")
+                if key != "direction":
+                    pass
+                elif not (
+                    bool((numbers := plain(f"lights['{name}']['direction']", value, _LOOP)).any())
+                    and bool(numbers.isfinite().all())
+                ):
+                    raise ShadowmapError(f"lights['{name}']['direction']: {numbers.tolist()}; give a finite one other than zero.")
                 given[_Place("light", name, key)] = value
         if parameters:
             current = mi.traverse(self._renderer.data.scene)
@@ -176,7 +190,9 @@ class _Place:
 
 
 class _Rendering:
-    """One image as an operation of the bridge, rendered once more for its derivatives."""
+    """One image as an operation, rendered once more for its derivatives."""
+
+    name, unbatched = "Renderer.render", ""
 
     def __init__(self, owner: Renderer, places: tuple[_Place, ...], sensor: int, spp: int) -> None:
         self.owner, self.places, self.camera = owner, places, (sensor, spp)
@@ -186,12 +202,11 @@ class _Rendering:
         # Decisions of the forward pass that the backward pass repeats.
         self.fixed: dict[str, Any] = {}
 
-    def forward(self, arrays: list[TensorXf], wanted: list[bool]) -> Sequence[TensorXf]:
+    def forward(self, arrays: list[TensorXf]) -> Sequence[TensorXf]:
         with dr.suspend_grad(), self._scene(arrays) as renderer:
             image, fit = self.functions[0](self.places, *self.camera, arrays, renderer)
             # Evaluated while the scene has the parameters of this call.
             dr.eval(image, fit)
-        self.arrays, self.wanted = arrays, wanted
         self.fixed = {"soft": renderer.soft, "frusta": fit[0], "soft_frusta": fit[1]}
         # The owner changes only now that nothing can fail any more.
         self.owner._renderer.frusta = fit[0]
@@ -201,11 +216,21 @@ class _Rendering:
             self.owner._renderer.soft_frusta = fit[1]
         return (image,)
 
-    def backward(self, adjoints: Sequence[TensorXf | None]) -> Sequence[TensorXf]:
+    def backward(self, arrays: list[TensorXf], wanted: Sequence[bool], adjoints: Sequence[TensorXf | None]) -> Sequence[TensorXf]:
         with dr.resume_grad():
-            arrays = attached(self.arrays, self.wanted)  # before they enter the scene
+            arrays = attached(arrays, wanted)  # before they enter the scene
             with self._scene(arrays) as renderer:
-                return self.functions[1](self.places, *self.camera, self.wanted, arrays, adjoints[0], renderer)
+                return self.functions[1](self.places, *self.camera, list(wanted), arrays, adjoints[0], renderer)
+
+    def jvp(self, arrays: list[TensorXf], tangents: Sequence[TensorXf | None]) -> Sequence[TensorXf]:
+        with dr.resume_grad():
+            arrays = attached(arrays, [tangent is not None for tangent in tangents])
+            with self._scene(arrays) as renderer:
+                image, _ = _forward(self.places, *self.camera, arrays, renderer)
+                return forward_derivatives(arrays, (image,), tangents)
+
+    def again(self) -> _Rendering:
+        return _Rendering(self.owner, self.places, *self.camera)
 
     @contextmanager
     def _scene(self, arrays: list[TensorXf]) -> Iterator[_Renderer]:

@@ -15,9 +15,11 @@ from ..errors import ShadowmapError
 from ..jit.arrays import backend
 from ..jit.types import AnyArray, Float, TensorXf, UInt32, Vector3f
 from ..shadow import Frusta, LightView, ShadowSettings, Views
-from .bridge import IN_TENSOR, Repeated, cross, drjit_turn, index_array, vector
+from .bridge import IN_TENSOR, drjit_turn, index_array, vector
 from .checks import check_devices, check_floats, check_kind, check_same, number_of
-from .raster import Topology
+from .crossing import Repeated, cross, eager
+from .records import Topology
+from .transforms import plain
 
 _ArrayT = TypeVar("_ArrayT", bound="AnyArray")
 
@@ -25,6 +27,7 @@ _ArrayT = TypeVar("_ArrayT", bound="AnyArray")
 _WIDEST_SPOT = 60.0
 # Names of the vectors that a map's camera consists of, in the order of ShadowMaps.axes.
 _AXES = ("right", "up", "forward", "origin")
+_LOOP = "make maps for each of the batch in a loop"
 
 
 @dataclass(frozen=True)
@@ -73,6 +76,7 @@ class ShadowMaps:
     _channels: int = field(repr=False)
 
 
+@eager
 def render_maps(
     vertices: torch.Tensor,
     topology: Topology,
@@ -86,7 +90,7 @@ def render_maps(
 
     Args:
         vertices: float32 (V, 3), vertices of the casters, world space.
-        topology: of their mesh.
+        topology: of their mesh, with faces (F, 3).
         lights: one or several.
         settings: default ``ShadowSettings()``; ``compat`` and the method ``none`` have no maps of their own.
         previous: maps of the step before. Their frusta are kept while the casters stay inside and fill most of them, so that an
@@ -101,6 +105,7 @@ def render_maps(
     check_kind("settings", settings, ShadowSettings)
     if settings.method == "none" or settings.compat:
         raise ShadowmapError("settings: the method 'none' and compat are for the Renderer only; choose another method.")
+    edges = topology._single
     lights = list(lights) if isinstance(lights, Sequence) else [lights]
     if not lights:
         raise ShadowmapError("lights: an empty list; give at least one light.")
@@ -108,7 +113,7 @@ def render_maps(
     tensors = {f"lights[{k}].{name}": value for k, light in enumerate(lights) for name, value in _checked(light, k).items()}
     if seen is not None:
         check_floats("seen", seen, ("...", "N", 3), (3,))
-        tensors["seen"] = seen.reshape(-1, 3).detach()
+        tensors["seen"] = plain("seen", seen.reshape(-1, 3), _LOOP)
     check_devices(vertices=vertices, topology=topology.faces, **tensors)
     sizes = [6 if _has_cube(light) else 1 for light in lights]
     if previous is not None:
@@ -124,7 +129,7 @@ def render_maps(
         count = len(views)
         p_light, map_index, _ = _shadow.vertices_in_maps(stacked, vertices.array)
         frusta = _fit(stacked, p_light, map_index, settings, previous, given.get("seen"))
-        maps = _shadow.render_maps(p_light, map_index, indices, topology._edges, stacked, frusta, settings)
+        maps = _shadow.render_maps(p_light, map_index, indices, edges, stacked, frusta, settings)
         bare = replace(stacked, right=IN_TENSOR, up=IN_TENSOR, forward=IN_TENSOR, origin=IN_TENSOR)
         kept.append((dr.detach(bare), frusta))
         size = settings.resolution
@@ -132,7 +137,7 @@ def render_maps(
         tensor = type(vertices)
         return tensor(maps.values, (count, size, size, maps.channels)), tensor(axes, (len(_AXES), count, 3))
 
-    values, axes = cross(Repeated(run), vertices, *tensors.values())
+    values, axes = cross(Repeated("render_maps", run, _LOOP), vertices, *tensors.values())
     views, frusta = kept[0]
     with drjit_turn(vertices.device):
         dr.eval(views, frusta)
@@ -140,6 +145,7 @@ def render_maps(
     return ShadowMaps(values, axes, settings, first, views, frusta, values.shape[-1])
 
 
+@eager
 def filter_maps(maps: ShadowMaps) -> ShadowMaps:
     """Filter maps with the kernel of their settings. Maps of methods that compare depths in the look-up stay unfiltered."""
     _check_maps(maps)
@@ -148,9 +154,10 @@ def filter_maps(maps: ShadowMaps) -> ShadowMaps:
         flat = _shadow.ShadowMaps(values.array, maps._views, maps._frusta, maps.settings, values.shape[-1])
         return (type(values)(_shadow.filter_maps(flat).values, values.shape),)
 
-    return replace(maps, values=cross(Repeated(run), maps.values)[0])
+    return replace(maps, values=cross(Repeated("filter_maps", run), maps.values)[0])
 
 
+@eager
 def visibility(maps: ShadowMaps, points: torch.Tensor, light: int = 0) -> torch.Tensor:
     """Fraction of a light that reaches each point.
 
@@ -185,7 +192,7 @@ def visibility(maps: ShadowMaps, points: torch.Tensor, light: int = 0) -> torch.
         result = _shadow.visibility(flat, which, p_world)
         return (type(points)(_full(result, dr.width(p_world)), points.shape[:-1]),)
 
-    return cross(Repeated(run), points, maps.values, maps.axes)[0]
+    return cross(Repeated("visibility", run), points, maps.values, maps.axes)[0]
 
 
 def _checked(light: Light, number: int) -> dict[str, torch.Tensor]:
@@ -195,8 +202,9 @@ def _checked(light: Light, number: int) -> dict[str, torch.Tensor]:
     tensors = {name: value for name, value in vars(light).items() if name != "cutoff_angle"}
     for name, value in tensors.items():
         check_floats(f"lights[{number}].{name}", value, (3,))
-        if not bool(torch.isfinite(value).all()) or (name == "direction" and not bool(value.any())):
-            raise ShadowmapError(f"lights[{number}].{name}: {value.tolist()}; give three finite numbers that make sense.")
+        numbers = plain(f"lights[{number}].{name}", value, _LOOP)
+        if not bool(torch.isfinite(numbers).all()) or (name == "direction" and not bool(numbers.any())):
+            raise ShadowmapError(f"lights[{number}].{name}: {numbers.tolist()}; give three finite numbers that make sense.")
     if isinstance(light, SpotLight):
         number_of(f"lights[{number}].cutoff_angle", light.cutoff_angle, float)
     if isinstance(light, SpotLight) and not 0 < light.cutoff_angle <= 180:

@@ -202,7 +202,7 @@ def _cut(
 
     Their planes cross there, and each triangle is seen where it is the nearer one.
     """
-    Float = backend(raster.depth).Float
+    Float = backend(raster.records[0]).Float
     active &= ~touching(topology, here, there)
     planes = (raster.depth_plane(image, triangle, active) for triangle in (here, there))
     a, b, c = (u - v for u, v in zip(*planes, strict=True))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Any, ClassVar
@@ -16,12 +17,14 @@ from ..jit.call_data import rewrite_scalars
 from ..jit.frozen import take_apart
 from ..jit.gpu import keep_registers
 from ..jit.kernel_cache import note_size
+from ..jit.pytree import tree_map
 from ..jit.types import Bool, Float, TensorXf
 from ..raster import Topology, build_topology, outward_faces
 from ..scene.geometry import Geometry
 from ..scene.lights.area import AreaLight
 from ..scene.lights.read import Light
 from ..scene.load import SceneData, load, refresh
+from ..scene.origin import SceneOrigin
 from ..scene.sensor import Sensor
 from ..scene.untracked import UntrackedState
 from ..shadow import Frusta
@@ -60,6 +63,11 @@ class Renderer:
         frusta: fit of the shadow maps in the last rendering, None before the first. ``soft_frusta``: for extended lights.
         untracked: parameters of the scene that recordings do not see, or None if the caller watches them.
         slices: of the lights, whose shadow maps are in memory one slice after the other; none if all fit together.
+        origin: file or dictionary of the scene, None if the scene was given.
+
+    ``copy.deepcopy`` shares the scene, which Mitsuba cannot copy, and all records; the copy has a fit of its own. ``pickle``
+    works for renderers of :meth:`from_file` and :meth:`from_dict`: it stores the file's name or the dictionary, the settings and
+    the fit, and loads the scene again. Parameters that were changed since then are not stored.
     """
 
     data: SceneData
@@ -74,6 +82,7 @@ class Renderer:
     soft_frusta: SoftFrusta = (None, None)
     untracked: UntrackedState | None = None
     slices: tuple[LightSlice, ...] = ()
+    origin: SceneOrigin | None = None
 
     # All that Dr.Jit is to know of, instead of the fields: see ``frozen``.
     DRJIT_STRUCT: ClassVar[dict[str, type]] = {"recording_parts": tuple}
@@ -101,6 +110,49 @@ class Renderer:
         """
         chosen = RenderSettings.of(**settings)
         return cls.from_data(load(scene, tessellation=tessellation), chosen)
+
+    @classmethod
+    def from_file(
+        cls,
+        path: str | os.PathLike[str],
+        parameters: Mapping[str, str] | None = None,
+        *,
+        tessellation: int = 64,
+        **settings: object,
+    ) -> Renderer:
+        """Build a renderer for a scene file. Shapes keep their names (``optimize=False``).
+
+        Args:
+            path: the scene file.
+            parameters: values of ``$name`` in the file, by name.
+            tessellation, settings: as for :meth:`from_scene`.
+
+        Raises:
+            ShadowmapError: the file cannot be loaded; otherwise as :meth:`from_scene`.
+        """
+        return cls._of_origin(SceneOrigin(path, None, parameters, tessellation), settings)
+
+    @classmethod
+    def from_dict(cls, description: Mapping[str, Any], *, tessellation: int = 64, **settings: object) -> Renderer:
+        """Build a renderer for a dictionary that describes a scene (``mi.load_dict``). Otherwise as :meth:`from_file`."""
+        return cls._of_origin(SceneOrigin(None, description, None, tessellation), settings)
+
+    @classmethod
+    def _of_origin(cls, origin: SceneOrigin, settings: Mapping[str, object]) -> Renderer:
+        renderer = cls.from_scene(origin.load(), tessellation=origin.tessellation, **settings)
+        renderer.origin = origin
+        return renderer
+
+    def __deepcopy__(self, memo: dict[int, object]) -> Renderer:
+        fits = tree_map((self.frusta, self.soft_frusta), lambda array: type(array)(array))
+        return replace(self, frusta=fits[0], soft_frusta=fits[1])
+
+    def __reduce__(self) -> tuple[Callable[..., Renderer], tuple[object, ...]]:
+        if self.origin is None:
+            raise ShadowmapError(
+                "Renderer: Mitsuba's scenes cannot be pickled; make the renderer by Renderer.from_file or Renderer.from_dict."
+            )
+        return _loaded_again, (self.origin, self.settings, self.frusta, self.soft_frusta)
 
     @classmethod
     def from_data(cls, data: SceneData, settings: RenderSettings) -> Renderer:
@@ -293,6 +345,12 @@ class Renderer:
             points = footprint_points(windows[0], view.size, frame.depth, seen.p_world, seen.n_world, samples)
             crossings = cameras.crossings(view, frame.sharpness, shapes) if self.settings.antialias else None
             return GBuffer(windows[0], seen, points, crossings, cameras.seen([view], geometry))
+
+
+def _loaded_again(origin: SceneOrigin, settings: RenderSettings, frusta: Frusta | None, soft_frusta: SoftFrusta) -> Renderer:
+    """The renderer that was pickled."""
+    renderer = Renderer.from_data(load(origin.load(), tessellation=origin.tessellation, warn=False), settings)
+    return replace(renderer, origin=origin, frusta=frusta, soft_frusta=soft_frusta)
 
 
 def _warn_of_lost_vertices(geometry: Geometry, names: Iterable[str]) -> None:

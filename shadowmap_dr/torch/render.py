@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import math
-from collections.abc import Iterator, Mapping, Sequence
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -24,7 +26,7 @@ from .checks import check_devices, check_floats, check_kind, number_of
 from .crossing import cross, eager
 from .transforms import plain
 
-_LOOP = "render the images in a loop"
+_LOOP = "render the images of different directions in a loop"
 
 
 class Renderer:
@@ -34,6 +36,9 @@ class Renderer:
     tensors.
 
     The backward pass reads the scene again: Mitsuba's own parameters must not change between the two passes.
+
+    ``copy.deepcopy`` shares the scene; ``pickle`` works for renderers of :meth:`from_file` and :meth:`from_dict`. See
+    :class:`shadowmap_dr.Renderer`.
     """
 
     @eager
@@ -68,6 +73,46 @@ class Renderer:
         with drjit_turn(_device_of(mi.variant() or "")):
             renderer = _Renderer.from_scene(scene, **settings)
         return cls(renderer, frozen=frozen)
+
+    @classmethod
+    @eager
+    def from_file(
+        cls,
+        path: str | os.PathLike[str],
+        parameters: Mapping[str, str] | None = None,
+        *,
+        frozen: bool = False,
+        **settings: Any,  # Any: settings of several types
+    ) -> Renderer:
+        """Build a renderer for a scene file, see :meth:`shadowmap_dr.Renderer.from_file`."""
+        with drjit_turn(_device_of(mi.variant() or "")):
+            renderer = _Renderer.from_file(path, parameters, **settings)
+        return cls(renderer, frozen=frozen)
+
+    @classmethod
+    @eager
+    def from_dict(
+        cls,
+        description: Mapping[str, Any],
+        *,
+        frozen: bool = False,
+        **settings: Any,  # Any: settings of several types
+    ) -> Renderer:
+        """Build a renderer for a dictionary that describes a scene, see :meth:`shadowmap_dr.Renderer.from_dict`."""
+        with drjit_turn(_device_of(mi.variant() or "")):
+            renderer = _Renderer.from_dict(description, **settings)
+        return cls(renderer, frozen=frozen)
+
+    def __deepcopy__(self, memo: dict[int, object]) -> Renderer:
+        copied = Renderer(copy.deepcopy(self._renderer), frozen=self._frozen is not None)
+        copied._planned, copied._sky = dict(self._planned), self._sky
+        return copied
+
+    def __reduce__(self) -> tuple[Callable[..., Renderer], tuple[object, ...]]:
+        with drjit_turn(self._device):
+            # Raises its own error if the scene's origin is unknown.
+            make, state = self._renderer.__reduce__()
+        return _loaded_again, (make, state, self._frozen is not None)
 
     @eager
     def vertices(self, name: str) -> torch.Tensor:
@@ -152,13 +197,8 @@ class Renderer:
                 if key not in known:
                     raise ShadowmapError(f"Light '{name}' has no '{key}' that a tensor could replace: {', '.join(known)}.")
                 check_floats(f"lights['{name}']['{key}']", value, *_shapes_of(f"lights: '{key}'", getattr(record, key)))
-                if key != "direction":
-                    pass
-                elif not (
-                    bool((numbers := plain(f"lights['{name}']['direction']", value, _LOOP)).any())
-                    and bool(numbers.isfinite().all())
-                ):
-                    raise ShadowmapError(f"lights['{name}']['direction']: {numbers.tolist()}; give a finite one other than zero.")
+                if key == "direction":
+                    _check_direction(f"lights['{name}']['direction']", value)
                 given[_Place("light", name, key)] = value
         if parameters:
             current = mi.traverse(self._renderer.data.scene)
@@ -268,8 +308,21 @@ class _Rendering:
             return renderer.with_replanned_lights()
 
 
+def _loaded_again(make: Callable[..., _Renderer], state: tuple[object, ...], frozen: bool) -> Renderer:
+    """The renderer that was pickled."""
+    with drjit_turn(_device_of(mi.variant() or "")):
+        renderer = make(*state)
+    return Renderer(renderer, frozen=frozen)
+
+
 def _device_of(variant: str) -> torch.device:
     return torch.device("cuda" if variant.startswith("cuda") else "cpu")
+
+
+def _check_direction(name: str, value: torch.Tensor) -> None:
+    numbers = plain(name, value, _LOOP)
+    if not (bool(numbers.any()) and bool(numbers.isfinite().all())):
+        raise ShadowmapError(f"{name}: {numbers.tolist()}; give a finite one other than zero.")
 
 
 def _set(table: mi.SceneParameters, values: Mapping[str, Any]) -> None:

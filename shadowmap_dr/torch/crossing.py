@@ -119,7 +119,7 @@ class _Derivative:
 
     def at(self, k: int) -> _Derivative:
         """That for one of the batch."""
-        return _Derivative(self.call.parts[k], self.count, self.wanted) if self.call.parts else self
+        return _Derivative(self.call.parts[k], self.count, self.wanted)
 
 
 class _Node(torch.autograd.Function):
@@ -215,7 +215,9 @@ class _First(_Node):
     @classmethod
     def over_batch(cls, size: int, in_dims: tuple[Any, ...], given: _Derivative, tensors: tuple[Any, ...]) -> _Batched:
         """:meth:`looped` for the rule of ``torch.vmap``."""
-        return cls.looped([given.at(k) for k in range(size)], size, in_dims[1:], tensors)
+        # If only adjoints or tangents are batched, there was one call.
+        several = any(dim is not None for dim in in_dims[1 + given.count :])
+        return cls.looped([given.at(k) if several else given for k in range(size)], size, in_dims[1:], tensors)
 
 
 class _Adjoint(_First):

@@ -34,6 +34,8 @@ class SceneOrigin:
         parameters: Mapping[str, str] | None = None,
         tessellation: int = 64,
     ) -> None:
+        if file is None and not isinstance(description, Mapping):
+            raise ShadowmapError(f"description: {type(description).__name__}, but must be a dictionary for mi.load_dict.")
         self.file = None if file is None else os.path.abspath(file)
         self.description = None if description is None else dict(description)
         self.parameters = dict(parameters or {})

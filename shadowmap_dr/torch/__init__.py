@@ -2,8 +2,11 @@
 
 Tensors are float32, indices any integers, and all of one call lie on one device: the CPU, or the GPU that Dr.Jit uses. Any
 strides will do. Functions copy what they are given and share no memory with what they return, so tensors may be changed in
-place before and after the backward pass; that may run more than once (``retain_graph=True``), but not be differentiated itself.
-Bad input raises a one-line :class:`shadowmap_dr.ShadowmapError`.
+place before and after the backward pass; that may run more than once (``retain_graph=True``). There are first derivatives only,
+in reverse and forward. Bad input raises a one-line :class:`shadowmap_dr.ShadowmapError`.
+
+``torch.func`` works: ``grad``, ``vjp``, ``jvp``, ``jacrev``, ``jacfwd``, and ``vmap`` as a loop over images; it cannot batch
+:func:`rasterize` and :func:`render_maps`. Code compiled by ``torch.compile`` calls all functions as they are (graph breaks).
 
 Images are stored as in Mitsuba: row 0 of what is rasterized lies at y = -1 in clip space.
 

@@ -42,7 +42,7 @@ def test_intersections_have_the_area_and_the_derivative_of_the_formula(at: float
     height = torch.tensor(at, requires_grad=True)
     share = sheet_through_floor(height).mean()
     share.backward()
-    assert float(share) == pytest.approx((1 + at) / 2, abs=1e-4) and float(height.grad) == pytest.approx(0.5, abs=1e-3)
+    assert float(share.detach()) == pytest.approx((1 + at) / 2, abs=1e-4) and float(height.grad) == pytest.approx(0.5, abs=1e-3)
     _, rate = torch.func.jvp(lambda h: sheet_through_floor(h).mean(), (torch.tensor(at),), (torch.tensor(1.0),))
     assert float(rate) == pytest.approx(0.5, abs=1e-3)
 
@@ -55,11 +55,12 @@ def test_intersections_may_be_left_out() -> None:
 
 
 def face_colours(vertices: torch.Tensor, **options: Any) -> torch.Tensor:
-    """A box each of whose triangles has a colour of its own."""
+    """A box each of whose sides has a colour of its own."""
     positions = clip(vertices)
     found = sdr.rasterize(positions, FACES, (128, 128))
     own = torch.arange(3 * len(FACES)).reshape(-1, 3)
-    colours = (1 + torch.arange(len(FACES)) // 2).float().repeat_interleave(3)[:, None]
+    sides = torch.unique(normals().round(decimals=3), dim=0, return_inverse=True)[1]
+    colours = (1 + sides).float().repeat_interleave(3)[:, None]
     topology = sdr.build_topology(FACES, VERTICES)
     return sdr.antialias(sdr.interpolate(colours, found, own), found, positions, topology, **options)
 
@@ -78,7 +79,6 @@ def test_creases_agree_with_differences() -> None:
         image = face_colours(vertices, **options)
         return (smooth_weights(*image.shape) * image).double().sum()
 
-    expected = float(total(VERTICES + 0.02 * direction) - total(VERTICES - 0.02 * direction)) / 0.04
     rates = {}
     for name, options in {
         "none": {},
@@ -87,9 +87,12 @@ def test_creases_agree_with_differences() -> None:
     }.items():
         vertices = VERTICES.clone().requires_grad_()
         total(vertices, **options).backward()
-        rates[name] = float((vertices.grad * direction).sum())
-    assert rates["all"] == pytest.approx(expected, rel=0.05) and rates["bent"] == pytest.approx(expected, rel=0.05)
-    assert abs(rates["none"] - expected) > 0.2 * abs(expected)
+        found = float((vertices.grad * direction).sum())
+        ends = [float(total(VERTICES + sign * 0.05 * direction, **options)) for sign in (1, -1)]
+        rates[name] = found, (ends[0] - ends[1]) / 0.1
+    for name in ("all", "bent"):
+        assert rates[name][0] == pytest.approx(rates[name][1], rel=0.03), name
+    assert abs(rates["none"][0] - rates["none"][1]) > 0.2 * abs(rates["none"][1])
 
 
 @pytest.mark.parametrize("options", ["creases", "weights", "folds", "continued", "gap"])
@@ -133,7 +136,7 @@ def test_continued_colours_give_the_derivative_of_a_ramp() -> None:
 
     def total(edge: torch.Tensor, continued: bool) -> torch.Tensor:
         x = torch.stack([-ONE[0], edge, edge, -ONE[0]])
-        positions, faces = torch.stack([x, 0.77 * Y, 0 * X, ONE], 1), QUADS[:2]
+        positions, faces = torch.stack([x, 0.75 * Y, 0 * X, ONE], 1), QUADS[:2]
         found = sdr.rasterize(positions, faces, SIZE)
         image = ramp * found.covered[..., None]
         topology = sdr.build_topology(faces, positions[:, :3])
@@ -145,7 +148,7 @@ def test_continued_colours_give_the_derivative_of_a_ramp() -> None:
         edge = torch.tensor(at, requires_grad=True)
         total(edge, continued).backward()
         found[continued] = float(edge.grad)
-    exact = 2 * 0.77 * (1 + at)
+    exact = 2 * 0.75 * (1 + at)
     assert found[True] == pytest.approx(exact, rel=2e-3)
     assert abs(found[True] - exact) < abs(found[False] - exact)
 

@@ -46,14 +46,15 @@ def description(**more: Any) -> dict[str, Any]:
 
 
 def image(renderer: Any, **options: Any) -> Any:
-    return np.array(renderer.render(**options))
+    return renderer.render(**options).numpy()
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_pickles_of_dictionaries_render_the_same(kind: Any) -> None:
     renderer = kind.from_dict(description(), **OPTIONS)
     again = pickle.loads(pickle.dumps(renderer))
-    assert np.array_equal(image(again), image(renderer)) and image(renderer).std() > 0.1
+    np.testing.assert_allclose(image(again), image(renderer), atol=1e-6)
+    assert image(renderer).std() > 0.1
     assert pickle.loads(pickle.dumps(again)) is not again
 
 
@@ -104,12 +105,12 @@ def test_deep_copies_have_a_fit_of_their_own(kind: Any, known: bool) -> None:
     first = image(renderer)
     copied = copy.deepcopy({"renderer": renderer})["renderer"]
     core, own = (getattr(r, "_renderer", r) for r in (renderer, copied))
-    assert copied is not renderer and np.array_equal(image(copied), first)
+    assert copied is not renderer and np.allclose(image(copied), first, atol=1e-6)
     width = float(core.frusta.half_x[0])
     vertices = torch.tensor(np.array(core.data.geometry.shape_positions("ball"))).reshape(-1, 3) * 2 + torch.tensor([1.0, 1, 1])
     given = vertices if kind is sdr.Renderer else mi.TensorXf(vertices)
     copied.render({"ball": given})
-    assert float(core.frusta.half_x[0]) == width != float(own.frusta.half_x[0]) and np.array_equal(image(renderer), first)
+    assert float(core.frusta.half_x[0]) == width != float(own.frusta.half_x[0]) and np.allclose(image(renderer), first, atol=1e-6)
 
 
 def test_copies_have_gradients() -> None:
@@ -133,13 +134,12 @@ def test_what_cannot_be_pickled_is_said_in_a_line(kind: Any) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_scenes_that_cannot_be_loaded_are_named(kind: Any, tmp_path: Path) -> None:
-    refused_start = "cannot load "
     for call in (
         lambda: kind.from_file(tmp_path / "none.xml"),
         lambda: kind.from_dict({"type": "scene", "shape": {"type": "no such shape"}}),
         lambda: kind.from_dict({"type": "sphere"}),
-        lambda: kind.from_dict([]),
     ):
-        with pytest.raises(shadowmap_dr.ShadowmapError, match=refused_start) as caught:
+        with pytest.raises(shadowmap_dr.ShadowmapError, match="cannot load ") as caught:
             call()
         assert "\n" not in str(caught.value)
+    refused("description: list, but must be a dictionary for mi.load_dict.", lambda: kind.from_dict([]))

@@ -1,4 +1,4 @@
-"""Interactive modelling: somebody paints on the shadow of a mesh, and the mesh follows."""
+"""Interactive modelling: the user paints on the shadow of a mesh, and the mesh follows."""
 
 from .canvas import Canvas
 from .modeller import Modeller

@@ -1,8 +1,9 @@
-"""The image that is painted on: strokes and images, one over the other, each of which can be undone."""
+"""The image that is painted on. Strokes and images lie on top of each other, and each of them can be undone."""
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+import itertools
+from collections.abc import Hashable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -10,37 +11,60 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import ShadowmapError
+from . import brush
+from .brush import Box, Bytes
 
-#: So many of the latest edits can be undone.
+#: Number of the newest edits that can be undone.
 HISTORY = 50
 
 Mode = Literal["add", "erase"]
 Array = npt.NDArray[np.float32]
-Bytes = npt.NDArray[np.uint8]
+_ALL: Box = (slice(None), slice(None))
 
 
 @dataclass(frozen=True)
-class _Edit:
-    """Something painted: a tone from 0 (dark) to 255 (lit) where it covers the canvas, by 0..255."""
+class Change:
+    """An edit that has been undone or redone.
 
+    Attributes:
+        edit: number of the edit.
+        exact: the canvas looks as it did right before (undone) or right after (redone) the edit. False after an older stroke,
+            of somebody else, went on in the meantime.
+    """
+
+    edit: int
+    exact: bool
+
+
+@dataclass
+class _Edit:
+    """A painted tone, 0 (dark) to 255 (lit), mixed with the image below it by its coverage, 0 to 255."""
+
+    number: int
     key: Hashable
     tone: int | Bytes
-    cover: Bytes | None  # None: all of it
+    coverage: Bytes | None  # None: covers everything
+    below_changed: bool = False  # since the edit was made
 
-    def over(self, below: Bytes) -> Bytes:
-        if self.cover is None:
-            return np.array(np.broadcast_to(np.uint8(self.tone), below.shape))
-        change = np.subtract(self.tone, below, dtype=np.int32) * self.cover
+    def over(self, below: Bytes, box: Box) -> Bytes:
+        """The edit on top of a part of an image."""
+        tone = self.tone if isinstance(self.tone, int) else self.tone[box]
+        if self.coverage is None:
+            return np.array(np.broadcast_to(np.uint8(tone), below.shape))
+        change = np.subtract(tone, below, dtype=np.int32) * self.coverage[box]
         return (below + np.rint(change / 255).astype(np.int32)).astype(np.uint8)
 
 
 class Canvas:
     """A painted shadow. Several people may paint at once: undoing one stroke leaves the others as they are.
 
-    Not thread-safe; strokes take well under a millisecond at 256 x 256.
+    The canvas keeps the image after each edit. A stroke draws only the rectangle that it touches, and undoing an edit draws
+    nothing. This takes H W bytes for each edit, 3.3 MB for 50 edits of 256 x 256 pixels.
+
+    Not thread-safe.
 
     Args:
-        start: visibility (H, W), 0 (dark) to 1 (lit), top row first: what is painted on.
+        start: visibility (H, W), 0 (dark) to 1 (lit), top row first: the image before the first edit.
 
     Attributes:
         version: grows with every change.
@@ -50,8 +74,9 @@ class Canvas:
         self._start = _bytes(start)
         self._base = self._start
         self._edits: list[_Edit] = []
+        self._images: list[Bytes] = []  # after each edit
         self._undone: list[_Edit] = []
-        self._image = self._below = self._base
+        self._numbers = itertools.count(1)
         self.version = 0
 
     @property
@@ -68,101 +93,99 @@ class Canvas:
         return bool(self._undone)
 
     def pixels(self) -> Bytes:
-        """(H, W), 0 (dark) to 255 (lit). Do not write into it."""
-        return self._image
+        """(H, W), 0 (dark) to 255 (lit), not writable. The next stroke may change it: copy it to keep it."""
+        view = self._newest.view()
+        view.flags.writeable = False
+        return view
 
     def target(self) -> Array:
         """(H, W), visibility from 0 to 1, a copy."""
-        return np.divide(self._image, 255, dtype=np.float32)
+        return np.divide(self._newest, 255, dtype=np.float32)
 
-    def stroke(self, key: Hashable, mode: Mode, radius: float, points: npt.ArrayLike) -> None:
+    def stroke(self, key: Hashable, mode: Mode, radius: float, points: npt.ArrayLike) -> int | None:
         """Paint along a line, round, with an edge one pixel soft. A stroke does not get darker where it crosses itself.
 
         Args:
-            key: names the stroke: further calls with it go on with the same one, and are undone with it.
+            key: names the stroke. Further calls with the same key extend the stroke, and are undone with it.
             mode: ``add`` or ``erase`` shadow.
             radius: in pixels.
             points: (N, 2), x to the right and y down from the top left corner, in pixels.
+
+        Returns the number of the edit if the call has begun a new one, else None.
         """
         line = np.asarray(points, np.float64).reshape(-1, 2)
         if mode not in ("add", "erase"):
             raise ShadowmapError(f"a stroke to {mode!r}: choose add or erase.")
         if not (0 < radius < np.inf and len(line) and np.isfinite(line).all()):
             raise ShadowmapError(f"a stroke of {len(line)} points and radius {radius}: give finite ones, at least one point.")
-        known = ((k, edit.cover) for k, edit in enumerate(self._edits) if edit.key == key and edit.cover is not None)
-        index, cover = next(known, (None, None))
-        if index is None or cover is None:
-            cover = np.zeros(self.shape, np.uint8)
-            self._push(_Edit(key, 0 if mode == "add" else 255, cover))
+        known = ((k, edit.coverage) for k, edit in enumerate(self._edits) if edit.key == key and edit.coverage is not None)
+        index, coverage = next(known, (None, None))
+        begun = None
+        if index is None or coverage is None:
+            coverage = np.zeros(self.shape, np.uint8)
+            begun = next(self._numbers)
+            self._push(_Edit(begun, key, 0 if mode == "add" else 255, coverage), self._newest.copy())
             index = len(self._edits) - 1
-        _cover(cover, line, radius)
+        box = brush.cover(coverage, line, radius)
+        if box is not None:
+            self._draw(index, box)
         self._undone.clear()
-        self._changed(above=index)
-
-    def replace(self, image: npt.ArrayLike) -> None:
-        """Put an image (H, W) over all that has been painted; can be undone."""
-        self._push(_Edit(None, _bytes(image, self.shape), None))
-        self._undone.clear()
-        self._changed()
-
-    def clear(self) -> None:
-        """Back to the first image; can be undone."""
-        self.replace(self._start.astype(np.float32) / 255)
-
-    def undo(self) -> bool:
-        """Take away the newest edit; False if there is none that is remembered."""
-        if not self._edits:
-            return False
-        self._undone.append(self._edits.pop())
-        self._changed()
-        return True
-
-    def redo(self) -> bool:
-        """Put back what was undone last, unless something has been painted since."""
-        if not self._undone:
-            return False
-        self._edits.append(self._undone.pop())
-        self._changed()
-        return True
-
-    def _push(self, edit: _Edit) -> None:
-        self._edits.append(edit)
-        if len(self._edits) > HISTORY:
-            self._base = self._edits.pop(0).over(self._base)
-        self._below = _pile(self._base, self._edits[:-1])
-
-    def _changed(self, above: int = -1) -> None:
-        """The image anew. Mostly it is the topmost edit that has changed: what lies below it is kept."""
-        if above != len(self._edits) - 1:
-            self._below = _pile(self._base, self._edits[:-1])
-        self._image = _pile(self._below, self._edits[-1:])
         self.version += 1
+        return begun
 
+    def replace(self, image: npt.ArrayLike) -> int:
+        """Put an image (H, W) on top of everything. It can be undone. Returns the number of the edit."""
+        pixels = _bytes(image, self.shape)
+        number = next(self._numbers)
+        self._push(_Edit(number, None, pixels, None), pixels.copy())
+        self._undone.clear()
+        self.version += 1
+        return number
 
-def _pile(base: Bytes, edits: Sequence[_Edit]) -> Bytes:
-    for edit in edits:
-        base = edit.over(base)
-    return base
+    def clear(self) -> int:
+        """Put the first image on top of everything. It can be undone. Returns the number of the edit."""
+        return self.replace(self._start.astype(np.float32) / 255)
 
+    def undo(self) -> Change | None:
+        """Remove the newest edit. None if there is none left in the history."""
+        if not self._edits:
+            return None
+        edit = self._edits.pop()
+        self._images.pop()
+        self._undone.append(edit)
+        self.version += 1
+        return Change(edit.number, not edit.below_changed)
 
-def _cover(cover: Bytes, line: npt.NDArray[np.float64], radius: float) -> None:
-    """Adds a round-ended line (N, 2) to a coverage, in place."""
-    starts = line[:-1] if len(line) > 1 else line
-    ends = line[1:] if len(line) > 1 else line
-    for a, b in zip(starts, ends, strict=True):
-        (x0, y0), (x1, y1) = np.minimum(a, b) - radius - 1, np.maximum(a, b) + radius + 1
-        columns = slice(max(int(x0), 0), max(int(np.ceil(x1)), 0))
-        rows = slice(max(int(y0), 0), max(int(np.ceil(y1)), 0))
-        part = cover[rows, columns]
-        if not part.size:
-            continue
-        x = columns.start + np.arange(part.shape[1]) + 0.5 - a[0]
-        y = (rows.start + np.arange(part.shape[0]) + 0.5 - a[1])[:, None]
-        along = b - a
-        length = along @ along
-        t = np.clip((x * along[0] + y * along[1]) / length, 0, 1) if length > 0 else 0.0
-        distance = np.hypot(x - t * along[0], y - t * along[1])
-        np.maximum(part, np.rint(255 * np.clip(radius + 0.5 - distance, 0, 1)).astype(np.uint8), out=part)
+    def redo(self) -> Change | None:
+        """Put the edit back that was undone last. None if nothing was undone, or something has been painted since."""
+        if not self._undone:
+            return None
+        edit = self._undone.pop()
+        edit.below_changed = False
+        self._push(edit, edit.over(self._newest, _ALL))
+        self.version += 1
+        return Change(edit.number, True)
+
+    @property
+    def _newest(self) -> Bytes:
+        return self._images[-1] if self._images else self._base
+
+    def _push(self, edit: _Edit, image: Bytes) -> None:
+        """Add an edit and the image after it. The oldest edit becomes part of the base once there are more than `HISTORY`."""
+        self._edits.append(edit)
+        self._images.append(image)
+        if len(self._edits) > HISTORY:
+            self._edits.pop(0)
+            self._base = self._images.pop(0)
+
+    def _draw(self, index: int, box: Box) -> None:
+        """Draw a rectangle of an edit again, and of all edits on top of it."""
+        below = self._images[index - 1] if index else self._base
+        for k in range(index, len(self._edits)):
+            edit, image = self._edits[k], self._images[k]
+            image[box] = edit.over(below[box], box)
+            edit.below_changed |= k > index
+            below = image
 
 
 def _bytes(image: npt.ArrayLike, shape: tuple[int, int] | None = None) -> Bytes:

@@ -5,44 +5,33 @@ from __future__ import annotations
 import asyncio
 import itertools
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass, field
 
 import anyio
+import numpy.typing as npt
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from ..errors import ShadowmapError
 from ..inverse import ShadowView
-from . import messages
-from .canvas import Canvas
-from .session import Session, Status
+from . import brush, messages
+from .canvas import Canvas, Change
+from .client import Client, FrameCache
+from .session import Session
 
-#: Most pages at a time.
+#: Largest number of pages at a time.
 MOST_CLIENTS = 8
-# Frames that a page has been sent but has not shown; a page that shows none gets no more.
-_UNSEEN = 2
-# Seconds until a page that takes nothing off its connection is given up.
+# Seconds until a page that does not read its messages is given up.
 _PATIENCE = 20.0
-# What a connection ends with when the page has gone: closed, or asleep.
+# A connection ends with one of these when the page has gone, or is asleep.
 _GONE = (WebSocketDisconnect, TimeoutError, ConnectionError)
 
 
-@dataclass(eq=False)
-class _Client:
-    """A page."""
-
-    number: int
-    socket: WebSocket
-    wake: asyncio.Event = field(default_factory=asyncio.Event)
-    seq: int = 0
-    status: Status | None = None
-    target: tuple[int, int] | None = None
-    frame: int = 0
-    unseen: list[int] = field(default_factory=list)
-
-
 class Connections:
-    """State that pages share. Lives in the event loop's thread; all work on meshes is done in the session's.
+    """State that pages share. It lives in the event loop's thread; the session's thread does all work on meshes.
 
-    Each page has a task that sends whatever it lacks of the newest state. What a slow page misses is never queued.
+    Each page has a task that sends the newest state to it. Messages that a slow page misses are never queued. A page that sends
+    too much is read more slowly, and other pages get their turn between any two of its messages.
+
+    Undo restores the mesh of the moment before the edit: the session keeps a state of the mesh before and after each edit.
 
     Args:
         session: started.
@@ -55,44 +44,44 @@ class Connections:
         self.canvas = Canvas(session.snapshot.shadow / 255)
         self._hello = messages.hello(view, name)
         self._faces = messages.faces(session.faces)
-        self._clients: set[_Client] = set()
+        self._clients: set[Client] = set()
         self._numbers = itertools.count()
-        self._frame = (0, b"")
+        self._frames = FrameCache()
 
     def attach(self) -> None:
-        """To be called once in the event loop: from then on, the session wakes the pages."""
+        """Let the session wake the pages from now on. Call it once, in the event loop."""
         loop = asyncio.get_running_loop()
 
         def woken() -> None:
             try:
                 loop.call_soon_threadsafe(self.wake)
             except RuntimeError:
-                pass  # the loop has ended; so will the session
+                pass  # the event loop has ended, so the session ends soon
 
         self.session.on_change = woken
 
     def wake(self) -> None:
-        """Let all pages look for what is new."""
+        """Let all pages look for news."""
         for client in self._clients:
             client.wake.set()
 
-    def paint(self) -> None:
-        """Tell optimiser and pages that the canvas has changed."""
-        self.session.set_target(self.canvas.target(), self.canvas.version)
-        self.wake()
+    def replace(self, image: npt.ArrayLike) -> None:
+        """Put an image (H, W), 0 (dark) to 1 (lit), on top of everything that has been painted."""
+        self._begun(self.canvas.replace(image))
+        self._paint()
 
     async def serve(self, socket: WebSocket) -> None:
-        """A connection, from beginning to end."""
+        """Serve a connection from beginning to end."""
         await socket.accept()
         if len(self._clients) >= MOST_CLIENTS:
             await socket.close(1013, f"{MOST_CLIENTS} pages are open already: close one of them.")
             return
-        client = _Client(next(self._numbers), socket)
+        client = Client(next(self._numbers), socket)
         self._clients.add(client)
         try:
             async with anyio.create_task_group() as group:
 
-                async def run(half: Callable[[_Client], Awaitable[None]]) -> None:
+                async def run(half: Callable[[Client], Awaitable[None]]) -> None:
                     try:
                         await half(client)
                     except _GONE:
@@ -104,72 +93,77 @@ class Connections:
         finally:
             self._clients.discard(client)
 
-    async def _receive(self, client: _Client) -> None:
+    async def _receive(self, client: Client) -> None:
         while True:
             message = await client.socket.receive()
             if message["type"] == "websocket.disconnect":
                 return
             try:
                 if message.get("text") is None:
-                    raise messages.MessageError("a binary message.")
-                self._handle(client, messages.parse(message["text"], self.canvas.shape))
-            except messages.MessageError as error:
-                await client.socket.close(1008, str(error)[:120])
+                    raise messages.MessageError("a binary message: pages send texts only.")
+                await self._handle(client, messages.parse(message["text"], self.canvas.shape))
+            except ShadowmapError as error:
+                with anyio.fail_after(_PATIENCE):
+                    await client.socket.close(1008, str(error)[:120])
                 return
+            # A message that has arrived already is received without a pause: other pages would wait until none is left.
+            await client.slow_down()
 
-    def _handle(self, client: _Client, message: object) -> None:
+    async def _handle(self, client: Client, message: object) -> None:
         if isinstance(message, messages.Seen):
-            client.unseen = [number for number in client.unseen if number > message.frame]
-            client.wake.set()
-            return
-        if isinstance(message, messages.Stroke):
-            self.canvas.stroke((client.number, message.id), message.mode, message.radius, message.points)
-            client.seq = message.seq
+            client.shown(message.frame)
+        elif isinstance(message, messages.Stroke):
+            await self._stroke(client, message)
         elif message == "undo":
-            self.canvas.undo()
+            self._go_back(self.canvas.undo(), leaves="after", finds="before")
         elif message == "redo":
-            self.canvas.redo()
-        elif message in ("clear", "reset"):
-            self.canvas.clear()
-        if message == "restart":
+            self._go_back(self.canvas.redo(), leaves="before", finds="after")
+        elif message == "restart":
             self.session.restart()
-            return
-        if message == "reset":
-            self.session.reset()
-        self.paint()
+        else:
+            self._begun(self.canvas.clear())
+            if message == "reset":
+                self.session.reset()
+            self._paint()
 
-    async def _send(self, client: _Client) -> None:
+    async def _stroke(self, client: Client, stroke: messages.Stroke) -> None:
+        """Paint a part of a stroke. Other pages get their turn while a long one is drawn."""
+        lines = list(brush.parts(stroke.points, stroke.radius, self.canvas.shape))
+        for left, line in zip(reversed(range(len(lines))), lines, strict=True):
+            self._begun(self.canvas.stroke((client.number, stroke.id), stroke.mode, stroke.radius, line))
+            if left:
+                await asyncio.sleep(0)
+        client.seq = stroke.seq
+        self._paint()
+
+    def _begun(self, edit: int | None) -> None:
+        """Keep the mesh for undo, if an edit has begun."""
+        if edit is not None:
+            self.session.keep(("before", edit))
+
+    def _go_back(self, change: Change | None, leaves: str, finds: str) -> None:
+        """Show the canvas after undo or redo, with the mesh of that moment, and keep the mesh of this one."""
+        if change is None:
+            return
+        self.session.keep((leaves, change.edit))
+        self.session.set_target(self.canvas.target(), self.canvas.version, go_back=(finds, change.edit), exact=change.exact)
+        self.wake()
+
+    def _paint(self) -> None:
+        """Tell optimiser and pages that the canvas has changed."""
+        self.session.set_target(self.canvas.target(), self.canvas.version)
+        self.wake()
+
+    async def _send(self, client: Client) -> None:
         await client.socket.send_text(self._hello)
         await client.socket.send_bytes(self._faces)
         client.wake.set()
         while True:
             await client.wake.wait()
             client.wake.clear()
-            for content in self._news(client):
+            for content in client.news(self.session, self.canvas, self._frames):
                 with anyio.fail_after(_PATIENCE):
                     if isinstance(content, str):
                         await client.socket.send_text(content)
                     else:
                         await client.socket.send_bytes(content)
-
-    def _news(self, client: _Client) -> list[str | bytes]:
-        """Messages that the page has not had yet: of a movement before its first frame, of rest after the last one."""
-        # In this order, the status is not older than the snapshot.
-        snapshot, status = self.session.snapshot, self.session.status
-        target: list[str | bytes] = []
-        frame: list[str | bytes] = []
-        told: list[str | bytes] = []
-        if client.target != (self.canvas.version, client.seq):
-            client.target = (self.canvas.version, client.seq)
-            target.append(messages.target(self.canvas, client.seq))
-        if snapshot.number > client.frame and len(client.unseen) < _UNSEEN:
-            if self._frame[0] != snapshot.number:
-                self._frame = (snapshot.number, messages.frame(snapshot))
-            client.frame = snapshot.number
-            client.unseen.append(snapshot.number)
-            frame.append(self._frame[1])
-        rests = status.phase == "resting"
-        if client.status != status and not (rests and client.frame < self.session.snapshot.number):
-            client.status = status
-            told.append(messages.status(status))
-        return target + (frame + told if rests else told + frame)

@@ -1,4 +1,4 @@
-"""Meshes and shadows as files in memory, and images as targets, all of bounded size."""
+"""Meshes and shadows written to files or memory, and images read as targets. Images have a bounded size."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ if TYPE_CHECKING:
 
 #: Formats of meshes, with their media types.
 FORMATS = {"ply": "application/octet-stream", "obj": "text/plain; charset=utf-8", "glb": "model/gltf-binary"}
-#: Most bytes and pixels of an image.
+#: Largest numbers of bytes and pixels of an image.
 MOST_BYTES, MOST_PIXELS = 8_000_000, 16_000_000
-# Others, such as vector graphics and documents, have parsers that are none of a server's business.
+# Other formats, such as vector graphics and documents, have large parsers that a server should not expose.
 _IMAGES = ("PNG", "JPEG", "WEBP", "GIF", "BMP")
 
 Array = npt.NDArray[np.float32]
 
 
 def mesh_bytes(kind: str, vertices: Array, faces: npt.NDArray[np.uint32]) -> bytes:
-    """A mesh of (V, 3) vertices and (F, 3) faces as a file of one of `FORMATS`; GLB has colours."""
+    """A mesh of vertices (V, 3) and faces (F, 3) as a file of one of `FORMATS`. GLB files have vertex colours."""
     if kind not in FORMATS:
         raise ShadowmapError(f"no mesh format {kind!r}: choose from {', '.join(FORMATS)}.")
     import trimesh
@@ -39,14 +39,14 @@ def mesh_bytes(kind: str, vertices: Array, faces: npt.NDArray[np.uint32]) -> byt
 
 
 def write_mesh(path: Path, vertices: Array, faces: npt.NDArray[np.uint32]) -> None:
-    """Write a mesh as its suffix says. The file is complete at any time."""
+    """Write a mesh in the format of the path's suffix. Other programs never see half of the file."""
     content = mesh_bytes(path.suffix.lower().removeprefix("."), vertices, faces)
     with atomic(path) as temporary:
         temporary.write_bytes(content)
 
 
 def shadow_bytes(shadow: npt.NDArray[np.uint8]) -> bytes:
-    """A shadow (H, W) as a grey PNG file: a pixel's value is its visibility, as `read_shadow` and paint programs take it."""
+    """A shadow (H, W) as a grey PNG file. The value of a pixel is its visibility, as in `read_shadow`."""
     from PIL import Image
 
     buffer = io.BytesIO()
@@ -55,16 +55,16 @@ def shadow_bytes(shadow: npt.NDArray[np.uint8]) -> bytes:
 
 
 def write_shadow(path: Path, shadow: npt.NDArray[np.uint8]) -> None:
-    """Write `shadow_bytes`. The file is complete at any time."""
+    """Write a shadow (H, W) as `shadow_bytes`. Other programs never see half of the file."""
     content = shadow_bytes(shadow)
     with atomic(path) as temporary:
         temporary.write_bytes(content)
 
 
 def read_shadow(data: bytes, shape: tuple[int, int]) -> Array:
-    """A painted shadow: visibility (H, W) from an image of any size, grey values as they are; transparent is lit.
+    """Read a painted shadow: visibility (H, W) from the grey values of an image of any size. Transparent pixels are lit.
 
-    Raises ShadowmapError where the image is damaged (half of a file is), too large, or of another aspect ratio.
+    Raises ShadowmapError if the image is damaged or incomplete, too large, or of another aspect ratio.
     """
     image = _open(data)
     height, width = shape
@@ -79,13 +79,15 @@ def read_shadow(data: bytes, shape: tuple[int, int]) -> Array:
 
 
 def read_target(data: bytes, seen: npt.NDArray[np.bool_]) -> Array:
-    """A target (H, W) from any image: as `read_shadow` if it has the canvas' size; else the figure in it, as large as possible.
+    """Read a target (H, W) from any image.
+
+    An opaque image of the canvas' size is read by `read_shadow`. Of any other image, the figure is enlarged to fill the canvas.
 
     Args:
         data: PNG, JPEG, WebP, GIF or BMP.
-        seen: (H, W) of the view.
+        seen: (H, W), pixels in which the view's camera sees the receiver.
 
-    Raises ShadowmapError where it cannot be read, is too large, or shows no figure.
+    Raises ShadowmapError if the image cannot be read, is too large, or shows no figure.
     """
     height, width = seen.shape
     image = _open(data)
@@ -97,7 +99,7 @@ def read_target(data: bytes, seen: npt.NDArray[np.bool_]) -> Array:
 
 
 def _open(data: bytes) -> Image.Image:
-    """All of an image, decoded."""
+    """Decode an image completely."""
     from PIL import Image
 
     if len(data) > MOST_BYTES:
@@ -110,7 +112,7 @@ def _open(data: bytes) -> Image.Image:
         return target_images.scaled_to_bytes(image)
     except ShadowmapError:
         raise
-    except Exception as error:  # damaged files make decoders raise whatever they like
+    except Exception as error:  # decoders raise errors of many types for damaged files
         raise ShadowmapError(f"no image, or a damaged one: give {', '.join(_IMAGES)}.") from error
 
 

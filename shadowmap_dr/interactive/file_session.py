@@ -1,7 +1,8 @@
-"""Modelling with any paint program: a mesh follows an image file."""
+"""Modelling with any paint program: the mesh follows an image file."""
 
 from __future__ import annotations
 
+import atexit
 import logging
 import threading
 import time
@@ -21,7 +22,7 @@ from .watch import ImageWatch
 LOOK_INTERVAL, SAVE_INTERVAL = 0.1, 2.0
 log = logging.getLogger(__name__)
 
-# Seconds until a file that cannot be used is worth a word: most are complete long before.
+# Seconds until the user is told of a file that cannot be used. Most files are complete long before.
 _PATIENCE = 2.0
 
 
@@ -32,16 +33,16 @@ def follow(
     stop: Callable[[], bool],
     say: Callable[[str], None] = lambda text: None,
 ) -> None:
-    """Write the mesh's shadow into an image file and deform the mesh whenever the file is changed, until told to stop.
+    """Write the mesh's shadow into an image file, and deform the mesh whenever the file is changed, until `stop` returns True.
 
-    An image that exists already is not written over: the mesh follows it from the start.
+    An image that exists already is not overwritten: the mesh follows it from the start.
 
     Args:
         modeller: at rest.
         image: a .png file.
-        save: called with vertices (V, 3) now and then while the mesh moves, whenever it comes to rest, and at the end.
-        stop: asked between steps.
-        say: told in one line what happens.
+        save: called with vertices (V, 3) every two seconds while the mesh moves, when it comes to rest, and at the end.
+        stop: called between steps.
+        say: called with one line for the user at each event.
     """
     watch = ImageWatch(image, modeller.sculptor.views[0].shape)
     if image.exists():
@@ -83,7 +84,7 @@ def follow(
 
 @contextmanager
 def kept(session: Session, save: Callable[[np.ndarray], None]) -> Iterator[None]:
-    """Saves what has become of a session's mesh now and then, in a thread of its own, until the end of the context."""
+    """Save the mesh of a session every two seconds if it has moved, in another thread, until the context or the interpreter ends."""
     ending = threading.Event()
 
     def work() -> None:
@@ -94,13 +95,19 @@ def kept(session: Session, save: Callable[[np.ndarray], None]) -> Iterator[None]
                 saved = snapshot.number
                 try:
                     save(snapshot.vertices)
-                except ShadowmapError as error:  # there may be room again next time, or at the end
+                except ShadowmapError as error:  # for example, the disk is full: the next save may succeed
                     log.warning("%s", error)
 
     thread = threading.Thread(target=work, name="keeper", daemon=True)
+
+    def end() -> None:
+        ending.set()
+        thread.join()
+
     thread.start()
+    atexit.register(end)
     try:
         yield
     finally:
-        ending.set()
-        thread.join()
+        end()
+        atexit.unregister(end)

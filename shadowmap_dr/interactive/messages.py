@@ -1,19 +1,19 @@
 """Messages between server and page: JSON texts, and binary records for meshes and images.
 
-The page sends JSON objects of these types; anything else ends its connection:
+The page sends JSON objects of the types below. Any other message ends its connection, with the reason.
 
-- ``stroke``: id (an integer that the page chooses), seq (an integer, comes back in the next target), mode (``add`` or ``erase``),
-  radius, points ([x, y, x, y, ...] in pixels from the top left corner; further messages with the same id go on with the line).
-- ``undo``, ``redo``, ``clear`` (of the painting), ``reset`` (of painting and mesh), ``restart`` (after a failure).
-- ``seen``: frame, the number of a frame that has been shown; the server sends few that have not been.
+- ``stroke``: id (an integer that the page chooses), seq (an integer that comes back in the next target), mode (``add`` or
+  ``erase``), radius, points ([x, y, x, y, ...] in pixels from the top left corner). Messages with the same id extend the stroke.
+- ``undo``, ``redo``, ``clear`` (the painting), ``reset`` (painting and mesh), ``restart`` (after a failure).
+- ``seen``: frame (the number of a frame that the page has shown). The server sends few frames ahead of this number.
 
-The server sends the text messages ``hello`` and ``status``, and records of little-endian 32-bit words, each with its kind in the
-first:
+The server sends the text messages ``hello``, ``status`` and ``notice`` (a line for the user), and records of little-endian 32-bit
+words. The first word is the kind of the record:
 
 - faces (1): F, then 3 F unsigned integers.
 - frame (2): number, steps, version of the target, loss and steps per second (floats), V, then 3 V floats, then H W bytes of
   shadow.
-- target (3): version, seq of this page's last stroke, 1 if something can be undone, 1 if redone, then H W bytes.
+- target (3): version, seq of this page's last stroke, 1 if an edit can be undone, 1 if one can be redone, then H W bytes.
 """
 
 from __future__ import annotations
@@ -28,13 +28,14 @@ import numpy.typing as npt
 
 from ..errors import ShadowmapError
 from ..inverse import ShadowView
+from . import exports
 from .canvas import Canvas, Mode
 from .session import Snapshot, Status
 
-#: Longest text message from a page, and most points in one stroke message.
+#: Length of the longest text message from a page, and number of points in the longest stroke message.
 MOST_BYTES, MOST_POINTS = 16_384, 512
 _FACES, _FRAME, _TARGET = 1, 2, 3
-# Integers of pages stay exact in JavaScript, and in the words of records.
+# Larger integers would not fit into the words of records.
 _MOST_INTEGER = 2**31 - 1
 
 Command = Literal["undo", "redo", "clear", "reset", "restart"]
@@ -42,12 +43,12 @@ _COMMANDS = ("undo", "redo", "clear", "reset", "restart")
 
 
 class MessageError(ShadowmapError):
-    """A message from a page that makes no sense."""
+    """A message that no page should send."""
 
 
 @dataclass(frozen=True)
 class Stroke:
-    """A part of a stroke; see `Canvas.stroke`. Points: (N, 2)."""
+    """A part of a stroke, see `Canvas.stroke`. Points: (N, 2)."""
 
     id: int
     seq: int
@@ -58,26 +59,26 @@ class Stroke:
 
 @dataclass(frozen=True)
 class Seen:
-    """A frame has been shown."""
+    """The page has shown a frame."""
 
     frame: int
 
 
 def parse(text: str, shape: tuple[int, int]) -> Stroke | Seen | Command:
-    """A page's message.
+    """Read a page's message.
 
     Args:
         text: as received.
-        shape: (H, W) of the canvas; strokes may begin and end a little outside of it.
+        shape: (H, W) of the canvas. Strokes may begin and end a little outside of it.
 
-    Raises MessageError.
+    Raises MessageError for any message but those above.
     """
     if len(text) > MOST_BYTES:
         raise MessageError(f"a message of {len(text)} characters: {MOST_BYTES} are allowed.")
     try:
         value = json.loads(text)
     except (ValueError, RecursionError):
-        raise MessageError("a message that is no JSON.") from None
+        raise MessageError("a message that is not JSON.") from None
     kind = value.get("type") if isinstance(value, dict) else None
     if kind == "stroke":
         return _stroke(value, shape)
@@ -91,14 +92,14 @@ def parse(text: str, shape: tuple[int, int]) -> Stroke | Seen | Command:
 def _stroke(value: dict[str, Any], shape: tuple[int, int]) -> Stroke:
     height, width = shape
     if value.get("mode") not in ("add", "erase"):
-        raise MessageError("a stroke that neither adds nor erases.")
+        raise MessageError("a stroke that neither adds nor erases shadow.")
     radius, points = value.get("radius"), value.get("points")
     if not (isinstance(radius, int | float) and _number(radius) and 0.5 <= radius <= max(shape)):
-        raise MessageError(f"a stroke's radius that is no number from 0.5 to {max(shape)}.")
+        raise MessageError(f"a stroke whose radius is not a number from 0.5 to {max(shape)}.")
     if not (isinstance(points, list) and 2 <= len(points) <= 2 * MOST_POINTS and len(points) % 2 == 0):
-        raise MessageError(f"a stroke that has not 1 to {MOST_POINTS} points.")
+        raise MessageError(f"a stroke without points, or with more than {MOST_POINTS}.")
     if not all(_number(x) for x in points):
-        raise MessageError("a stroke with points that are no numbers.")
+        raise MessageError("a stroke whose points are not numbers.")
     line = np.array(points, np.float64).reshape(-1, 2)
     if (np.abs(line) > 2 * max(height, width)).any():
         raise MessageError("a stroke far outside of the canvas.")
@@ -106,22 +107,23 @@ def _stroke(value: dict[str, Any], shape: tuple[int, int]) -> Stroke:
 
 
 def _number(value: object) -> bool:
-    # A comparison also refuses NaN, and integers that no float can hold.
+    # The comparison also refuses NaN, and integers that are too large for a float.
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e9
 
 
 def _integer(value: dict[str, Any], name: str) -> int:
     number = value.get(name)
     if not isinstance(number, int) or isinstance(number, bool) or not 0 <= number <= _MOST_INTEGER:
-        raise MessageError(f"{name} is no number from 0 to {_MOST_INTEGER}.")
+        raise MessageError(f"{name} is not an integer from 0 to {_MOST_INTEGER}.")
     return number
 
 
 def hello(view: ShadowView, name: str) -> str:
-    """The first message: what the mesh is called, the canvas and the receiver. Vectors are in world space."""
+    """The first message: name of the mesh, canvas, receiver (vectors are in world space), and limits of the page's messages."""
     height, width = view.shape
     return json.dumps({
         "type": "hello", "name": name, "height": height, "width": width, "half": view.half, "points": MOST_POINTS,
+        "bytes": exports.MOST_BYTES,
         **{axis: getattr(view, axis).tolist() for axis in ("right", "up", "forward", "origin")},
     })  # fmt: skip
 
@@ -129,6 +131,11 @@ def hello(view: ShadowView, name: str) -> str:
 def status(state: Status) -> str:
     """Status of the optimiser."""
     return json.dumps({"type": "status", "phase": state.phase, "message": state.message})
+
+
+def notice(text: str) -> str:
+    """A line for the user."""
+    return json.dumps({"type": "notice", "message": text})
 
 
 def faces(corners: npt.NDArray[np.uint32]) -> bytes:
@@ -144,6 +151,6 @@ def frame(snapshot: Snapshot) -> bytes:
 
 
 def target(canvas: Canvas, seq: int) -> bytes:
-    """A record of what has been painted, for a page whose last stroke message had this number."""
+    """A record of the painting, for a page whose last stroke message had the number `seq`."""
     head = struct.pack("<5I", _TARGET, canvas.version & 0xFFFFFFFF, seq, canvas.can_undo, canvas.can_redo)
     return head + canvas.pixels().tobytes()

@@ -1,6 +1,10 @@
-"""A sculptor that stops when its shadow is as wanted, and wakes when something else is wanted."""
+"""A sculptor that stops once its shadow matches the target, and goes on when the target changes."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -9,19 +13,40 @@ from ..errors import ShadowmapError
 from ..inverse import Sculptor
 from ..jit.types import Float
 
-#: It rests once the loss has not fallen by this share, and by this much, for so many steps; and after so many steps at last. At
-#: 256 x 256 pixels, the second is a fifth of what one wrong pixel costs.
+#: The modeller rests once the loss has not fallen by the share IMPROVEMENT, and by the amount LEAST, for PATIENCE steps, and after
+#: MOST_STEPS steps at the latest. At 256 x 256 pixels, LEAST is a fifth of the loss of one wrong pixel.
 IMPROVEMENT, LEAST, PATIENCE, MOST_STEPS = 0.02, 3e-6, 60, 600
-# The loss is waited for only now and then.
+# Reading the loss waits for the device, so it is read only every few steps.
 _LOOK_EVERY = 5
 
 Array = npt.NDArray[np.float32]
 
 
-class Modeller:
-    """Lets a `Sculptor` of one view follow a target that changes at any time. To be used in one thread, like the sculptor.
+@dataclass(frozen=True)
+class ModellerState:
+    """The mesh, the optimiser, and the progress towards the target at one moment. The target itself is not part of it."""
 
-    It begins at rest: a mesh matches its own shadow.
+    sculptor: Mapping[str, npt.NDArray[Any]]  # see `Sculptor.state`
+    moving: bool
+    loss: float
+    steps: int
+    best_at: int
+    best: float
+
+    @property
+    def bytes(self) -> int:
+        """Bytes of all arrays."""
+        return sum(array.nbytes for array in self.sculptor.values())
+
+    @property
+    def finite(self) -> bool:
+        return all(bool(np.isfinite(array).all()) for array in self.sculptor.values())
+
+
+class Modeller:
+    """Lets a `Sculptor` of one view follow a target that may change at any time. Use it in one thread, like the sculptor.
+
+    It is at rest at first, since a mesh matches its own shadow.
 
     Args:
         sculptor: with one view.
@@ -29,36 +54,54 @@ class Modeller:
 
     def __init__(self, sculptor: Sculptor) -> None:
         if len(sculptor.views) != 1:
-            raise ShadowmapError(f"a sculptor of {len(sculptor.views)} views: one is needed to paint on.")
+            raise ShadowmapError(f"a sculptor of {len(sculptor.views)} views: painting needs exactly one.")
         self.sculptor = sculptor
         self.moving = False
         self.loss = 0.0
         self._steps = self._best_at = 0
         self._best = np.inf
 
-    def set_target(self, image: npt.ArrayLike) -> None:
-        """Another visibility image (H, W). Raises ShadowmapError, and goes on as before, where it cannot be used."""
+    def set_target(self, image: npt.ArrayLike, wake: bool = True) -> None:
+        """Replace the target by a visibility image (H, W).
+
+        Raises ShadowmapError, and keeps the old target, if the image cannot be used.
+
+        Args:
+            image: 0 (dark) to 1 (lit).
+            wake: follow the target from now on. False: for a target that the loaded state has followed already.
+        """
         self.sculptor.set_target(0, image)
-        self.wake()
+        if wake:
+            self.wake()
 
     def reset(self, vertices: npt.ArrayLike | None = None) -> None:
-        """Back to the first mesh, or to (V, 3) vertices; the target stays."""
+        """Go back to the first mesh, or to vertices (V, 3). The target stays."""
         self.sculptor.reset(vertices)
         self.wake()
 
     def wake(self) -> None:
-        """Go on, even though nothing has got better lately."""
+        """Follow the target, even if the loss has not fallen lately."""
         if not self.moving:
-            # What gradients used to be says nothing about those of the next change.
+            # Adam's moments are of an older target, and would make the first steps towards this one small.
             self.sculptor.calm()
         self.moving = True
         self._steps = self._best_at = 0
         self._best = np.inf
 
-    def step(self) -> bool:
-        """One step, unless it rests. Returns whether there was one.
+    def state(self) -> ModellerState:
+        """A copy of everything that `load_state` needs."""
+        return ModellerState(self.sculptor.state(), self.moving, self.loss, self._steps, self._best_at, self._best)
 
-        Raises ShadowmapError when the mesh has been lost to numbers that are not finite.
+    def load_state(self, state: ModellerState) -> None:
+        """Go back to a result of `state`: the same vertices, moving or at rest as then. The target stays as it is now."""
+        self.sculptor.load_state(state.sculptor)
+        self.moving, self.loss = state.moving, state.loss
+        self._steps, self._best_at, self._best = state.steps, state.best_at, state.best
+
+    def step(self) -> bool:
+        """Take one step, unless the mesh is at rest. Returns True if there was a step.
+
+        Raises ShadowmapError when vertices are not finite any more.
         """
         if not self.moving:
             return False
@@ -77,6 +120,7 @@ class Modeller:
         return self.sculptor.visibility()[0]
 
     def _judge(self, loss: Float) -> None:
+        """Rest if the loss does not fall any more."""
         self.loss = float(loss[0])
         if not np.isfinite(self.loss):
             raise ShadowmapError("the mesh has been lost: its vertices are not finite any more.")

@@ -1,4 +1,4 @@
-"""Options of modelling by painting."""
+"""Options of the command `model`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ..io.options import option
 from ..io.ranges import check_ranges
 from . import exports
 
-#: Light direction, and direction that is up in the shadow image.
+#: For each view, the light's direction, and the direction that is up in the shadow image.
 VIEWS = {"front": ((0, 0, -1), (0, 1, 0)), "side": ((-1, 0, 0), (0, 1, 0)), "top": ((0, -1, 0), (0, 0, -1))}
 
 

@@ -1,8 +1,8 @@
-"""Keeps strangers out of a server on the loopback interface: other sites' pages, and names that point to it.
+"""Refuses requests of other web sites to a server on the loopback interface.
 
-A browser on this machine will happily carry requests of any web site to a port of the machine. What tells them from those of our
-own page: the name that was asked for (a site can let its own name point to 127.0.0.1, but cannot change what the browser sends as
-Host), and the page that asks (Origin, Sec-Fetch-Site).
+A browser sends requests of any web site to a port of its own machine. Two headers tell them from requests of our own page. Host is
+the name in the address: a site can let its own name point to 127.0.0.1, but the browser then sends that name. Origin and
+Sec-Fetch-Site name the page that sends the request.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
 Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
 App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
-#: Names under which the loopback interface may be asked for.
+#: Host names that are accepted.
 NAMES = ("127.0.0.1", "localhost")
 
 _HEADERS = {
@@ -30,7 +30,7 @@ _HEADERS = {
 
 
 class Guard:
-    """ASGI middleware: answers 403 to what does not come from our own page, and adds headers that keep the page to itself."""
+    """ASGI middleware. It answers 403 to requests of other pages, and adds security headers to all other answers."""
 
     def __init__(self, app: App) -> None:
         self._app = app
@@ -53,7 +53,7 @@ class Guard:
 
 
 def refusal(scope: Scope) -> str | None:
-    """Why a request is not answered, None if it is."""
+    """Reason for refusing a request, None if it is allowed."""
     hosts, origins, sites = (_all(scope, name) for name in (b"host", b"origin", b"sec-fetch-site"))
     port = scope["server"][1]
     allowed = {f"{name}:{port}" for name in NAMES} | (set(NAMES) if port == 80 else set())
@@ -64,7 +64,7 @@ def refusal(scope: Scope) -> str | None:
         return "This server answers only its own page."
     if scope["type"] == "websocket" or scope["method"] not in ("GET", "HEAD"):
         return None if origins else "This server answers only its own page."
-    # Links from elsewhere may lead to the page, but nothing else may be fetched or embedded.
+    # Other sites may link to the page, but may not fetch or embed any other path.
     if scope["path"] != "/" and any(site not in ("same-origin", "none") for site in sites):
         return "This server answers only its own page."
     return None

@@ -1,4 +1,4 @@
-"""The web page's server: what it answers, and how it runs on the loopback interface."""
+"""The web page's server on the loopback interface."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from importlib import resources
 
+import anyio
 import uvicorn
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
@@ -17,12 +18,12 @@ from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route, WebSocketRoute
 
 from ..errors import ShadowmapError
-from . import exports, messages
+from . import exports
 from .connections import Connections
 from .request_guard import Guard
 
 ADDRESS = "127.0.0.1"
-#: The page's files: name -> media type. Nothing else is ever read for a browser.
+#: The page's files: name -> media type. The server sends no other files to a browser.
 PAGE = {
     "index.html": "text/html; charset=utf-8",
     "style.css": "text/css; charset=utf-8",
@@ -33,8 +34,18 @@ PAGE = {
     "three.module.min.js": "text/javascript; charset=utf-8",
     "three.LICENSE": "text/plain; charset=utf-8",
 }
-# Connections of all kinds at a time; more are answered "busy".
+# Connections of all kinds at a time. Further ones are answered 503.
 _MOST_CONNECTIONS = 64
+# Bytes of a request that are read at most. Those beyond the size of an image are thrown away: a client that is still sending when
+# its connection is closed would not see the answer.
+_MOST_READ = 64_000_000
+# Seconds for an image to arrive.
+_UPLOAD_SECONDS = 30.0
+# Bytes of a message on the live connection that are read at most. Longer ones than `messages.MOST_BYTES` are refused with a reason,
+# which gets lost if a message is not read to its end.
+_MOST_MESSAGE = 8_000_000
+# An answer to a request that has not been read to its end is the last one on its connection.
+_LAST = {"connection": "close"}
 
 
 def create_app(connections: Connections) -> Starlette:
@@ -43,15 +54,22 @@ def create_app(connections: Connections) -> Starlette:
 
     async def upload(request: Request) -> Response:
         try:
-            data = await _body(request)
+            with anyio.fail_after(_UPLOAD_SECONDS):
+                data = await _body(request)
+        except _Endless as error:
+            return PlainTextResponse(str(error), 422, headers=_LAST)
+        except ShadowmapError as error:
+            return PlainTextResponse(str(error), 422)
+        except TimeoutError:
+            return PlainTextResponse(f"the image has not arrived within {_UPLOAD_SECONDS:.0f} seconds.", 408, headers=_LAST)
+        except ClientDisconnect:
+            return Response(status_code=400)
+        try:
             async with decoding:
                 target = await run_in_threadpool(exports.read_target, data, connections.view.seen)
         except ShadowmapError as error:
             return PlainTextResponse(str(error), 422)
-        except ClientDisconnect:
-            return Response(status_code=400)
-        connections.canvas.replace(target)
-        connections.paint()
+        connections.replace(target)
         return Response(status_code=204)
 
     async def mesh(request: Request) -> Response:
@@ -85,7 +103,7 @@ def create_app(connections: Connections) -> Starlette:
 
 
 def listen(port: int = 0) -> socket.socket:
-    """A socket that waits for pages on 127.0.0.1, on any free port for 0. ShadowmapError where the port cannot be had."""
+    """Open a socket for pages on 127.0.0.1. Port 0 stands for any free one. Raises ShadowmapError if the port is not free."""
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -103,20 +121,20 @@ def serve(
     stop: Callable[[], bool],
     on_start: Callable[[str], None] = lambda url: None,
 ) -> None:
-    """Serve until told to stop. Signals are left to the caller.
+    """Serve until `stop` returns True. The caller handles signals.
 
     Args:
-        connections: its session is started, and stays open afterwards.
-        listener: from :func:`listen`; stays open, too.
-        stop: asked ten times a second.
-        on_start: called with the page's address once it can be opened.
+        connections: with a started session, which stays open afterwards.
+        listener: from :func:`listen`. It stays open, too.
+        stop: called ten times a second.
+        on_start: called with the page's address as soon as the page can be opened.
     """
     on_start(f"http://{ADDRESS}:{listener.getsockname()[1]}/")
     _Server(config(connections), stop).run(sockets=[listener])
 
 
 class _Server(uvicorn.Server):
-    """Asks whether to stop, where uvicorn's own has handlers for signals, which it raises again at the end."""
+    """Stops when a function says so. Uvicorn's own server handles signals, and raises them again at the end."""
 
     def __init__(self, settings: uvicorn.Config, stop: Callable[[], bool]) -> None:
         super().__init__(settings)
@@ -131,10 +149,10 @@ class _Server(uvicorn.Server):
 
 
 def config(connections: Connections) -> uvicorn.Config:
-    """Uvicorn's settings: small messages, few connections, nothing said about itself."""
+    """Uvicorn's settings: messages of bounded size, few connections, no header that names the server."""
     return uvicorn.Config(
         create_app(connections), log_level="warning", access_log=False, server_header=False, proxy_headers=False,
-        ws_max_size=messages.MOST_BYTES, ws_per_message_deflate=False, limit_concurrency=_MOST_CONNECTIONS,
+        ws_max_size=_MOST_MESSAGE, ws_per_message_deflate=False, limit_concurrency=_MOST_CONNECTIONS,
         timeout_graceful_shutdown=2,
     )  # fmt: skip
 
@@ -152,12 +170,22 @@ def _download(content: bytes, kind: str, name: str) -> Response:
     return Response(content, media_type=kind, headers={"content-disposition": f'attachment; filename="{name}"'})
 
 
+class _Endless(ShadowmapError):
+    """A request that is not read to its end."""
+
+
 async def _body(request: Request) -> bytes:
-    """All of a request's body, but never more than an image may have."""
-    parts, size = [], 0
+    """All of a request's body. Raises ShadowmapError for a body that is larger than images may be, after reading it."""
+    parts: list[bytes] = []
+    size = 0
     async for part in request.stream():
-        parts.append(part)
         size += len(part)
-        if size > exports.MOST_BYTES:
-            raise ShadowmapError(f"the image has more than {exports.MOST_BYTES} bytes.")
+        if size <= exports.MOST_BYTES:
+            parts.append(part)
+        elif size <= _MOST_READ:
+            parts.clear()
+        else:
+            raise _Endless(f"the image has more than {_MOST_READ} bytes: {exports.MOST_BYTES} are allowed.")
+    if size > exports.MOST_BYTES:
+        raise ShadowmapError(f"the image has {size} bytes: {exports.MOST_BYTES} are allowed.")
     return b"".join(parts)

@@ -1,12 +1,13 @@
-"""The optimiser's thread: it takes targets, leaves snapshots, and survives its own failures."""
+"""The optimiser's thread. It takes targets, publishes snapshots, and can be restarted after a failure."""
 
 from __future__ import annotations
 
+import atexit
 import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -14,12 +15,15 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import ShadowmapError
-from .modeller import Modeller
+from .mesh_history import KeptMesh, MeshHistory
+from .modeller import Modeller, ModellerState
 
-#: Least time between two snapshots, seconds.
+#: Shortest time between two snapshots, seconds.
 SNAPSHOT_INTERVAL = 0.05
 # Time over which the speed is averaged, seconds.
 _SPEED_WINDOW = 1.0
+# Commands that may wait for the thread, which takes none after a failure. The oldest ones are dropped beyond.
+_MOST_COMMANDS = 400
 
 Phase = Literal["starting", "moving", "resting", "failed", "closed"]
 Array = npt.NDArray[np.float32]
@@ -29,7 +33,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Status:
-    """Status of the optimiser; the message says why it has failed."""
+    """Status of the optimiser. The message is the reason of a failure."""
 
     phase: Phase
     message: str = ""
@@ -37,14 +41,14 @@ class Status:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """The mesh at a moment. Nobody writes into its arrays.
+    """The mesh at one moment. Do not write into its arrays.
 
     Attributes:
         number: counts snapshots from 1 on.
-        steps: steps so far.
-        target: the version of the target that the last step knew.
-        loss: before that step.
-        speed: steps per second lately, 0 at rest.
+        steps: number of steps so far.
+        target: version of the target of the last step.
+        loss: before the last step.
+        speed: steps per second during the last second, 0 at rest.
         vertices: (V, 3), world space.
         shadow: (H, W), visibility, 0 (dark) to 255 (lit).
     """
@@ -58,23 +62,45 @@ class Snapshot:
     shadow: npt.NDArray[np.uint8]
 
 
-class Session:
-    """Owns a thread in which a mesh follows its target. All methods may be called from any thread, and none waits for a step,
-    but `start`, `restart` (not at all) and `close` (for one step).
+@dataclass(frozen=True)
+class _Target:
+    """A target image (H, W). The mesh need not follow it if it has just gone back to a state that did."""
 
-    A new target replaces one that has not been looked at yet: only the newest counts. When a step fails, the thread waits for
-    `restart`, and builds everything anew: from the last good mesh, or from the first one if that has led to nothing.
+    image: Array
+    version: int
+    follow: bool
+
+
+@dataclass(frozen=True)
+class _Command:
+    """An order for the thread: keep the mesh under a name, go back to a name, or reset the mesh."""
+
+    kind: Literal["keep", "go back", "reset"]
+    name: Hashable = None
+    version: int = 0  # of the newest target when the order was given
+
+
+class Session:
+    """Owns a thread in which a mesh follows its target. All methods may be called from any thread.
+
+    Methods do not wait for a step, except `start`, and `close`, which waits for one step. A new target replaces a target that the
+    thread has not taken yet: only the newest one counts. When a step fails, the thread waits for `restart`, and builds a new
+    modeller. It starts from the last good mesh, or from the first mesh if the last start has led to nothing.
+
+    A session that is still open when the interpreter exits is closed then.
 
     Args:
-        build: makes the modeller; called in the thread, once for each start. All of Dr.Jit's work stays there.
-        on_change: called in the thread when there is a new snapshot or status. Must not wait.
+        build: makes the modeller. The thread calls it once for each start, and does all of Dr.Jit's work.
+        on_change: the thread calls it when there is a new snapshot or status. It must not wait.
     """
 
     def __init__(self, build: Callable[[], Modeller], on_change: Callable[[], None] = lambda: None) -> None:
         self._build, self.on_change = build, on_change
         self._condition = threading.Condition()
-        self._target: tuple[Array, int] | None = None
-        self._target_is_new = self._reset = self._restart = self._closing = False
+        self._target: _Target | None = None
+        self._target_is_new = self._restart = self._closing = False
+        self._commands: deque[_Command] = deque(maxlen=_MOST_COMMANDS)
+        self._history = MeshHistory()
         self._status = Status("starting")
         self._snapshot: Snapshot | None = None
         self._faces = np.zeros((0, 3), np.uint32)
@@ -89,18 +115,20 @@ class Session:
 
     @property
     def snapshot(self) -> Snapshot:
-        """The newest one. Only after `start`."""
+        """The newest snapshot. Only after `start`."""
         if self._snapshot is None:
-            raise RuntimeError("a session has no snapshot before it has been started")
+            raise RuntimeError("a session has no snapshot before it is started")
         return self._snapshot
 
     @property
     def faces(self) -> npt.NDArray[np.uint32]:
-        """(F, 3). Only after `start`; they never change."""
+        """Faces (F, 3). Only after `start`. They never change."""
         return self._faces
 
     def start(self) -> None:
-        """Start, and wait for the first snapshot. Raises what building the modeller raises."""
+        """Start the thread, and wait for the first snapshot. Raises the errors of building the modeller."""
+        # A daemon thread that runs Dr.Jit while the interpreter is taken down would end the process by a signal.
+        atexit.register(self.close)
         self._thread.start()
         with self._condition:
             self._condition.wait_for(lambda: self._status.phase != "starting")
@@ -109,32 +137,53 @@ class Session:
             self.close()
             raise failure
 
-    def set_target(self, image: npt.ArrayLike, version: int) -> None:
-        """Visibility (H, W) from 0 to 1; the version comes back in snapshots."""
-        pixels = np.array(image, np.float32)
+    def set_target(self, image: npt.ArrayLike, version: int, go_back: Hashable = None, exact: bool = False) -> None:
+        """Replace the target.
+
+        Args:
+            image: visibility (H, W) from 0 (dark) to 1 (lit).
+            version: snapshots of meshes that have followed the target have this number.
+            go_back: name of a mesh that `keep` has kept, to go back to before the mesh follows the target. A mesh that is not in the
+                history any more is ignored: the mesh then follows the target from where it is.
+            exact: the image is also the one of that moment, so a mesh that was at rest then stays at rest.
+        """
+        target = _Target(np.array(image, np.float32), version, follow=not exact)
         with self._condition:
-            self._target, self._target_is_new = (pixels, version), True
+            if go_back is not None:
+                self._commands.append(_Command("go back", go_back))
+            self._target, self._target_is_new = target, True
             self._condition.notify_all()
+
+    def keep(self, name: Hashable) -> None:
+        """Keep vertices and optimiser, as they are between this step and the next one, in a history of bounded size.
+
+        Call it before the target that changes the mesh is set.
+        """
+        self._order("keep", name)
 
     def reset(self) -> None:
-        """Back to the first mesh; the target stays."""
-        with self._condition:
-            self._reset = True
-            self._condition.notify_all()
+        """Go back to the first mesh. The target stays."""
+        self._order("reset")
 
     def restart(self) -> None:
-        """Go on after a failure; does nothing otherwise."""
+        """Go on after a failure. Does nothing otherwise."""
         with self._condition:
             self._restart = self._status.phase == "failed"
             self._condition.notify_all()
 
     def close(self) -> None:
-        """End the thread. The last snapshot stays, and is what the mesh was at its last step."""
+        """End the thread after its step. The last snapshot remains: the mesh after that step."""
         with self._condition:
             self._closing = True
             self._condition.notify_all()
         if self._thread.ident is not None:
             self._thread.join()
+        atexit.unregister(self.close)
+
+    def _order(self, kind: Literal["keep", "reset"], name: Hashable = None) -> None:
+        with self._condition:
+            self._commands.append(_Command(kind, name, self._target.version if self._target is not None else 0))
+            self._condition.notify_all()
 
     def _work(self) -> None:
         first = True
@@ -153,7 +202,7 @@ class Session:
         self._set_status("closed")
 
     def _follow(self, first: bool) -> None:
-        """Builds a modeller and works until the session is closed."""
+        """Build a modeller, and work until the session is closed."""
         if not first:
             self._set_status("starting")
         modeller = self._build()
@@ -165,18 +214,17 @@ class Session:
         while True:
             self._set_status("moving" if modeller.moving else "resting")
             with self._condition:
-                # At rest there is nothing to do but to wait.
-                self._condition.wait_for(lambda: self._closing or self._target_is_new or self._reset or modeller.moving)
-                closing, reset, self._reset = self._closing, self._reset, False
+                self._condition.wait_for(lambda: self._closing or self._target_is_new or self._commands or modeller.moving)
+                closing, commands = self._closing, list(self._commands)
+                self._commands.clear()
                 target, self._target_is_new = self._target if self._target_is_new else None, False
             if closing:
                 self._publish(modeller, known)
                 return
-            if reset:
-                modeller.reset()
-            if target is not None:
-                modeller.set_target(target[0])
-                known = target[1]
+            moved = self._obey(modeller, commands, target, known)
+            known = target.version if target is not None else known
+            if not (moved or target is not None or modeller.moving):
+                continue  # the mesh has only been kept
             if modeller.moving:
                 self._set_status("moving")  # before anybody sees a frame of it
             if modeller.step():
@@ -186,8 +234,39 @@ class Session:
                 last = time.monotonic()
                 self._publish(modeller, known)
 
+    def _obey(self, modeller: Modeller, commands: list[_Command], target: _Target | None, known: int) -> bool:
+        """Carry out commands, then take the target. Returns True if a command has changed the mesh.
+
+        Args:
+            modeller: follows the target of the version `known`.
+            commands: in the order in which they were given.
+            target: None if there is no new one.
+            known: see above.
+        """
+        moved = current = False
+        now: ModellerState | None = None
+        for command in commands:
+            if command.kind == "keep":
+                now = now or modeller.state()
+                if now.finite:
+                    self._history.put(command.name, KeptMesh(now, current=command.version == known))
+            elif command.kind == "reset":
+                modeller.reset()
+                moved, current, now = True, False, None
+            else:
+                mesh = self._history.get(command.name)
+                current = mesh is not None and mesh.current
+                if mesh is not None:
+                    modeller.load_state(mesh.state)
+                    moved, now = True, mesh.state
+        if target is not None:
+            modeller.set_target(target.image, wake=target.follow or not current)
+        elif moved:
+            modeller.wake()
+        return moved
+
     def _take_up(self, modeller: Modeller) -> int:
-        """After a failure: the last good mesh and the newest target. Returns the target's version."""
+        """Load the last good mesh and the newest target, after a failure. Returns the version of the target."""
         if self._snapshot is not None:
             if self._snapshot.number > self._first_number:
                 modeller.sculptor.reset(self._snapshot.vertices)
@@ -195,8 +274,8 @@ class Session:
             target, self._target_is_new = self._target, False
         if target is None:
             return 0
-        modeller.set_target(target[0])
-        return target[1]
+        modeller.set_target(target.image)
+        return target.version
 
     def _publish(self, modeller: Modeller, target: int) -> None:
         vertices, shadow = modeller.vertices(), modeller.shadow()

@@ -1,4 +1,4 @@
-"""Watching an image file that somebody edits in a paint program."""
+"""Watches an image file that the user edits in a paint program."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ _Stamp = tuple[int, int, int]
 class ImageWatch:
     """Reads an image file whenever it has changed and is complete.
 
-    Paint programs save in many ways: over the old file, piece by piece, or beside it and then in its place. So a file is only
-    read once it has stayed the same between two looks, and only taken when it decodes to its end and has not changed meanwhile.
-    Everything else is waited out.
+    Some paint programs overwrite the old file piece by piece, others write a new file and move it into place. So the file is read
+    only after it has stayed the same for two polls, and used only if it can be decoded to its end and has not changed meanwhile.
+    Otherwise the next polls try again.
 
     Args:
         path: the file.
-        size: (H, W) of the shadow; images of other sizes are scaled.
+        size: (H, W) of the shadow. Images of other sizes are scaled.
 
     Attributes:
-        problem: why the file cannot be used as it is now, None if it can.
+        problem: reason why the file cannot be used now, None if it can.
     """
 
     def __init__(self, path: Path, size: tuple[int, int]) -> None:
@@ -35,11 +35,11 @@ class ImageWatch:
         self.problem: str | None = None
 
     def ignore(self) -> None:
-        """The file as it is now is no news: we have written it ourselves."""
+        """Do not read the file until it changes again. Call it after writing the file."""
         self._taken = self._seen = self._stamp()
 
     def poll(self) -> npt.NDArray[np.float32] | None:
-        """Visibility (H, W), 0 (dark) to 1 (lit), if there is something new, else None. Nothing in the file raises an error."""
+        """Visibility (H, W), 0 (dark) to 1 (lit), of a changed file, else None. Files that cannot be used raise no error."""
         stamp = self._stamp()
         if stamp is None:
             self.problem = f"{self._path} is missing."

@@ -17,19 +17,19 @@ SIZE = 32
 class FakeSculptor:
     """Its shadow is the target, step by step; its vertices' first coordinates are the target's mean and the number of steps."""
 
-    def __init__(self, start: float = 0.75, most_loss: float = 1.0) -> None:
-        self.views = (shadow_view(size=SIZE),)
+    def __init__(self, start: float = 0.75, size: int = SIZE) -> None:
+        self.views = (shadow_view(size=size),)
         self.faces = np.array([[0, 1, 2], [0, 2, 3]], np.uint32)
         self._first = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
         self._now = self._first.copy()
-        self._target = np.full((SIZE, SIZE), start, np.float32)
+        self._target = np.full((size, size), start, np.float32)
         self.steps = self.calmed = 0
         self.failure: Exception | None = None
         self.hold: threading.Event | None = None
         self.seconds = 0.0  # that a step takes
 
     def set_target(self, view: int, image: Any) -> None:
-        assert view == 0 and image.shape == (SIZE, SIZE)
+        assert view == 0 and image.shape == self._target.shape
         self._target = np.array(image, np.float32)
 
     def step(self) -> np.ndarray:
@@ -55,11 +55,18 @@ class FakeSculptor:
     def calm(self) -> None:
         self.calmed += 1
 
+    def state(self) -> dict[str, np.ndarray]:
+        return {"u": self._now.copy(), "steps": np.array([self.steps])}
+
+    def load_state(self, state: Any) -> None:
+        self._now, self.steps = state["u"].copy(), int(state["steps"][0])
+
 
 class FakeSession:
     """A session, and the sculptors it has built so far."""
 
-    def __init__(self) -> None:
+    def __init__(self, size: int = SIZE) -> None:
+        self.size = size
         self.sculptors: list[FakeSculptor] = []
         self.session = Session(self._build)
 
@@ -68,7 +75,7 @@ class FakeSession:
         return self.sculptors[-1]
 
     def _build(self) -> Modeller:
-        self.sculptors.append(FakeSculptor())
+        self.sculptors.append(FakeSculptor(size=self.size))
         return Modeller(self.sculptor)
 
 

@@ -4,7 +4,7 @@ import { Painting } from "./painting.js";
 import { Stage } from "./stage.js";
 
 const FACES = 1, FRAME = 2, TARGET = 3;
-const RETRY_MS = 1000;
+const RETRY_MS = 1000, NOTICE_MS = 5000;
 const PHASES = {
   starting: "Preparing …", moving: "Following", resting: "At rest", failed: "Stopped", closed: "Closed", lost: "Connection lost",
 };
@@ -14,7 +14,8 @@ const painting = new Painting($("shadow"), $("brush"), sendStroke);
 let stage = null, socket = null, opened = null;
 let sequence = 0; // of the last stroke message
 let latest = null; // the newest frame, until it is shown
-let resting = false; // whether that is the last one before a rest
+let resting = false; // the newest frame is the last one before a rest
+let noticed = 0; // time until which a notice stays, ms
 let planned = false;
 
 try {
@@ -30,7 +31,7 @@ function connect() {
   socket.onclose = ({ code, reason }) => {
     setPhase("lost");
     opened = null;
-    // Told to go (1008: something was wrong with a message, 1013: too many pages); else it may come back.
+    // Codes of a server that has refused the page (1008: a message, 1013: too many pages). Otherwise the server may come back.
     if (code === 1008 || code === 1013) warn(`The server has closed the connection: ${reason}`);
     else setTimeout(connect, RETRY_MS);
   };
@@ -56,11 +57,14 @@ function onText(message) {
     $("name").textContent = message.name;
     $("alert").hidden = Boolean(stage);
   } else if (message.type === "status") {
-    // What is shown rests when its last frame is shown.
+    // The page shows a rest together with its last frame.
     resting = message.phase === "resting" && latest !== null;
     if (!resting) setPhase(message.phase);
     if (message.phase === "failed") warn(`The optimiser has stopped: ${message.message}`, true);
-    else if (stage) $("alert").hidden = true;
+    else if (stage && performance.now() > noticed) $("alert").hidden = true;
+  } else if (message.type === "notice") {
+    noticed = performance.now() + NOTICE_MS;
+    warn(message.message);
   }
 }
 
@@ -71,7 +75,7 @@ function onRecord(buffer) {
   if (kind === TARGET) {
     $("undo").disabled = !word(3);
     $("redo").disabled = !word(4);
-    // An image from before the last stroke would hide it for a moment.
+    // An older image would hide the last stroke for a moment.
     if (word(2) === sequence) painting.target = new Uint8Array(buffer, 20).slice();
     plan();
   }
@@ -126,6 +130,10 @@ function warn(reason, restart = false) {
 }
 
 async function load(file) {
+  if (opened && file.size > opened.bytes) {
+    warn(`The image cannot be used: it has ${file.size} bytes, ${opened.bytes} are allowed.`);
+    return;
+  }
   try {
     const answer = await fetch("image", { method: "POST", body: file, headers: { "content-type": "application/octet-stream" } });
     if (!answer.ok) warn(`The image cannot be used: ${await answer.text()}`);

@@ -1,4 +1,4 @@
-// The shadow, and what has been painted on it.
+// The canvas that shows the shadow and the painting.
 
 const PAPER = [246, 239, 223], INK = [58, 61, 92], MISSING = [224, 122, 95], EXCESS = [143, 184, 216];
 
@@ -56,7 +56,7 @@ export class Painting {
     this.#showBrush();
   }
 
-  // Sends what has been painted since the last call.
+  // Sends the part of the stroke that has been painted since the last call.
   flush() {
     const { stroke } = this;
     if (!stroke || !stroke.points.length) return;
@@ -110,7 +110,7 @@ export class Painting {
     this.stroke = { id: ++this.strokes, mode, radius: this.radius, points: [...point], last: null };
     this.#cover(point, point);
     this.#move(point);
-    this.flush(); // the first dot at once; what follows once a frame
+    this.flush(); // the first dot at once, the rest of the stroke once a frame
   }
 
   #move(point) {
@@ -134,7 +134,7 @@ export class Painting {
     this.stroke = null;
   }
 
-  // What the server will do to the target, so that nobody has to wait for it.
+  // Paints the target as the server will, so that the user need not wait for the answer.
   #cover([x0, y0], [x1, y1]) {
     const [width, height] = this.size, { radius, mode } = this.stroke;
     const dx = x1 - x0, dy = y1 - y0, length = dx * dx + dy * dy;

@@ -11,7 +11,7 @@ export class Stage {
     this.canvas = canvas;
     const software = isSoftware();
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: !software });
-    // Where the processor draws, it has better things to do.
+    // Drawing without a graphics card is slow.
     this.mostRatio = software ? 1 : 2;
     this.scene = new THREE.Scene();
     this.scene.background = new THREE.Color(GROUND);

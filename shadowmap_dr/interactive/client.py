@@ -10,7 +10,7 @@ from starlette.websockets import WebSocket
 from . import messages
 from .canvas import Canvas
 from .rate_limit import RateLimit
-from .session import Session, Status
+from .session import Session, Snapshot, Status
 
 #: Messages that a page may send in a second, and at once after a pause. A page that is drawn on sends about 80 a second.
 MOST_MESSAGES, BURST = 400, 200
@@ -26,8 +26,7 @@ class FrameCache:
     def __init__(self) -> None:
         self._number, self._record = 0, b""
 
-    def record(self, session: Session) -> bytes:
-        snapshot = session.snapshot
+    def record(self, snapshot: Snapshot) -> bytes:
         if self._number != snapshot.number:
             self._number, self._record = snapshot.number, messages.frame(snapshot)
         return self._record
@@ -80,18 +79,20 @@ class Client:
     def news(self, session: Session, canvas: Canvas, frames: FrameCache) -> list[str | bytes]:
         """Messages that the page has not had yet.
 
-        The status "moving" comes before the first frame of a movement, "resting" after the last one.
+        A painting comes before the frames of meshes that follow it. The status "moving" comes before the first frame of a movement,
+        "resting" after the last one.
         """
         # In this order, the status is not older than the snapshot.
         snapshot, status = session.snapshot, session.status
         first: list[str | bytes] = [messages.notice(text) for text in self._notices]
         self._notices.clear()
-        if self._takes_target(canvas):
+        has_frame = snapshot.number > self._frame and len(self._unseen) < _UNSEEN
+        if self._takes_target(canvas, at_once=has_frame):
             first.append(messages.target(canvas, self.seq))
         frame: list[str | bytes] = []
         told: list[str | bytes] = []
-        if snapshot.number > self._frame and len(self._unseen) < _UNSEEN:
-            frame.append(frames.record(session))
+        if has_frame:
+            frame.append(frames.record(snapshot))
             self._frame = snapshot.number
             self._unseen.append(snapshot.number)
         rests = status.phase == "resting"
@@ -100,14 +101,14 @@ class Client:
             told.append(messages.status(status))
         return first + (frame + told if rests else told + frame)
 
-    def _takes_target(self, canvas: Canvas) -> bool:
-        """True if the painting is new to the page, and the last one was sent long enough ago. Otherwise it is looked at again."""
+    def _takes_target(self, canvas: Canvas, at_once: bool) -> bool:
+        """True if the painting is new to the page, and is due. A new one that is not due yet wakes the page when it is."""
         newest = canvas.version, self.seq
         if self._target == newest:
             return False
         loop = asyncio.get_running_loop()
         now = loop.time()
-        if now < self._target_due:
+        if now < self._target_due and not at_once:
             loop.call_at(self._target_due, self.wake.set)
             return False
         self._target, self._target_due = newest, now + _TARGET_INTERVAL

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from shadowmap_dr.errors import ShadowmapError
-from shadowmap_dr.interactive import Canvas
-from shadowmap_dr.interactive.canvas import HISTORY
+from shadowmap_dr.interactive import Canvas, brush
+from shadowmap_dr.interactive import canvas as canvas_module
+from shadowmap_dr.interactive.canvas import HISTORY, Change
 
 H, W = 24, 32
 
@@ -106,3 +107,116 @@ def test_canvases_refuse_what_makes_no_sense():
         with pytest.raises(ShadowmapError):
             canvas.replace(image)
     assert canvas.version == 0 and not canvas.can_undo
+
+
+class DrawnAgain:
+    """A canvas that draws all strokes again after each change, from the formulas, over the whole image."""
+
+    def __init__(self, start):
+        self.start = np.rint(255 * start).astype(np.uint8)
+        self.edits, self.undone = [], []
+
+    def stroke(self, key, mode, radius, points):
+        same = [edit for edit in self.edits if edit[0] == key]
+        if not same:
+            self.edits.append((key, mode, []))
+            same = self.edits[-1:]
+        same[0][2].extend((a, b, radius) for a, b in zip(points, points[1:] or points, strict=False))
+        self.undone.clear()
+
+    def replace(self, image):
+        self.edits.append((None, np.rint(255 * image.astype(np.float32)).astype(np.uint8), None))
+        self.undone.clear()
+
+    def undo(self):
+        if self.edits:
+            self.undone.append(self.edits.pop())
+
+    def redo(self):
+        if self.undone:
+            self.edits.append(self.undone.pop())
+
+    def pixels(self):
+        image = self.start
+        for _, tone, segments in self.edits:
+            image = tone if segments is None else self.over(image, 0 if tone == "add" else 255, segments)
+        return image
+
+    @staticmethod
+    def over(image, tone, segments):
+        coverage = np.zeros(image.shape)
+        for a, b, radius in segments:
+            x, y = np.arange(W) + 0.5 - a[0], (np.arange(H) + 0.5 - a[1])[:, None]
+            along = np.subtract(b, a)
+            length = along @ along
+            t = np.clip((x * along[0] + y * along[1]) / length, 0, 1) if length > 0 else 0.0
+            distance = np.hypot(x - t * along[0], y - t * along[1])
+            coverage = np.maximum(coverage, np.rint(255 * np.clip(radius + 0.5 - distance, 0, 1)))
+        return (image + np.rint((tone - image.astype(float)) * coverage / 255)).astype(np.uint8)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_all_edits_in_any_order_look_as_if_drawn_again(seed):
+    random = np.random.default_rng(seed)
+    start = random.uniform(0, 1, (H, W)).astype(np.float32)
+    canvas, again = Canvas(start), DrawnAgain(start)
+    np.testing.assert_array_equal(canvas.pixels(), again.pixels())
+    shown = [canvas.pixels().copy()]
+    for _ in range(45):
+        kind = random.choice(["stroke", "stroke", "stroke", "undo", "redo", "replace"], p=[0.2, 0.2, 0.2, 0.2, 0.15, 0.05])
+        if kind == "stroke":
+            count = random.integers(1, 4)
+            points = [tuple(p) for p in random.uniform(-8, 40, (count, 2)).round(2)]
+            arguments = int(random.integers(6)), random.choice(["add", "erase"]), float(random.uniform(0.5, 9)), points
+            if any(edit[0] == arguments[0] and edit[1] != arguments[1] for edit in again.edits):
+                continue
+            for one in (canvas, again):
+                one.stroke(*arguments)
+        elif kind == "replace":
+            picture = random.uniform(0, 1, (H, W))
+            for one in (canvas, again):
+                one.replace(picture)
+        else:
+            for one in (canvas, again):
+                getattr(one, kind)()
+        np.testing.assert_array_equal(canvas.pixels(), again.pixels())
+        shown.append(canvas.pixels().copy())
+    assert len({image.tobytes() for image in shown}) > 10
+
+
+def test_strokes_draw_only_what_they_touch(monkeypatch):
+    canvas = Canvas(np.ones((256, 256)))
+    for k in range(HISTORY + 10):
+        canvas.stroke(k, "add", 5, [(100, 100), (150, 120)])
+    drawn = []
+    over = canvas_module._Edit.over
+    monkeypatch.setattr(canvas_module._Edit, "over", lambda self, below, box: (drawn.append(below.size), over(self, below, box))[1])
+    canvas.stroke("new", "erase", 3, [(50, 50), (55, 50)])
+    assert sum(drawn) < 200
+    canvas.undo()
+    assert sum(drawn) < 200
+
+
+def test_changes_tell_whether_the_canvas_is_as_it_was():
+    canvas = lit()
+    first, second = canvas.stroke("a", "add", 3, [(5, 5)]), canvas.stroke("b", "add", 3, [(25, 5)])
+    assert canvas.stroke("b", "add", 3, [(25, 8)]) is None and None is not first != second is not None
+    assert canvas.undo() == Change(second, True) and canvas.redo() == Change(second, True)
+    canvas.stroke("a", "add", 3, [(5, 8)])  # below the other one
+    assert canvas.undo() == Change(second, False) and canvas.redo() == Change(second, True)
+    assert canvas.undo() == Change(second, True) and canvas.undo() == Change(first, True) and canvas.undo() is None
+
+
+def test_parts_of_lines_are_small_and_cover_the_same():
+    random = np.random.default_rng(3)
+    line = random.uniform(-100, 356, (512, 2))
+    parts = list(brush.parts(line, 60.0, (256, 256)))
+    whole, pieces = np.zeros((2, 256, 256), np.uint8)
+    brush.cover(whole, line[:40], 60.0)
+    for part in brush.parts(line[:40], 60.0, (256, 256)):
+        brush.cover(pieces, part, 60.0)
+    np.testing.assert_array_equal(whole, pieces)
+    assert len(parts) > 20 and max(len(part) for part in parts) < 40
+    assert all((one[-1] == other[0]).all() for one, other in zip(parts, parts[1:], strict=False))
+    (one,) = brush.parts(np.zeros((1, 2)), 3.0, (256, 256))
+    assert one.shape == (1, 2)

@@ -79,8 +79,8 @@ class Client:
     def news(self, session: Session, canvas: Canvas, frames: FrameCache) -> list[str | bytes]:
         """Messages that the page has not had yet.
 
-        A painting comes before the frames of meshes that follow it. The status "moving" comes before the first frame of a movement,
-        "resting" after the last one.
+        A painting comes before the frames of meshes that follow it. The status "moving" comes before the first frame of a
+        movement, "resting" after the last one.
         """
         # In this order, the status is not older than the snapshot.
         snapshot, status = session.snapshot, session.status

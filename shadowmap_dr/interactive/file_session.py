@@ -84,7 +84,10 @@ def follow(
 
 @contextmanager
 def kept(session: Session, save: Callable[[np.ndarray], None]) -> Iterator[None]:
-    """Save the mesh of a session every two seconds if it has moved, in another thread, until the context or the interpreter ends."""
+    """Save the mesh of a session every two seconds if it has moved, until the context ends.
+
+    Another thread saves. It ends with the interpreter if the context is still open then.
+    """
     ending = threading.Event()
 
     def work() -> None:

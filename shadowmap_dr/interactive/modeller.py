@@ -13,8 +13,8 @@ from ..errors import ShadowmapError
 from ..inverse import Sculptor
 from ..jit.types import Float
 
-#: The modeller rests once the loss has not fallen by the share IMPROVEMENT, and by the amount LEAST, for PATIENCE steps, and after
-#: MOST_STEPS steps at the latest. At 256 x 256 pixels, LEAST is a fifth of the loss of one wrong pixel.
+#: The modeller rests once the loss has not fallen by the share IMPROVEMENT, and by the amount LEAST, for PATIENCE steps, and
+#: after MOST_STEPS steps at the latest. At 256 x 256 pixels, LEAST is a fifth of the loss of one wrong pixel.
 IMPROVEMENT, LEAST, PATIENCE, MOST_STEPS = 0.02, 3e-6, 60, 600
 # Reading the loss waits for the device, so it is read only every few steps.
 _LOOK_EVERY = 5

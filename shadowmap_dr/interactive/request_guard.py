@@ -1,8 +1,8 @@
 """Refuses requests of other web sites to a server on the loopback interface.
 
-A browser sends requests of any web site to a port of its own machine. Two headers tell them from requests of our own page. Host is
-the name in the address: a site can let its own name point to 127.0.0.1, but the browser then sends that name. Origin and
-Sec-Fetch-Site name the page that sends the request.
+A browser sends requests of any web site to a port of its own machine. The headers tell them from requests of our own page. Host
+is the name in the address: a site can let its own name point to 127.0.0.1, but the browser then sends that name. Origin and
+Sec-Fetch-Site tell from which page the request comes.
 """
 
 from __future__ import annotations

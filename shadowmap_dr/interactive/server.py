@@ -41,8 +41,8 @@ _MOST_CONNECTIONS = 64
 _MOST_READ = 64_000_000
 # Seconds for an image to arrive.
 _UPLOAD_SECONDS = 30.0
-# Bytes of a message on the live connection that are read at most. Longer ones than `messages.MOST_BYTES` are refused with a reason,
-# which gets lost if a message is not read to its end.
+# Bytes of a message on the live connection that are read at most. Messages longer than `messages.MOST_BYTES` are refused with a
+# reason, which gets lost if a message is not read to its end.
 _MOST_MESSAGE = 8_000_000
 # An answer to a request that has not been read to its end is the last one on its connection.
 _LAST = {"connection": "close"}

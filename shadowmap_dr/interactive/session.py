@@ -8,15 +8,15 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Hashable
-from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from ..errors import ShadowmapError
-from .mesh_history import KeptMesh, MeshHistory
-from .modeller import Modeller, ModellerState
+from .commands import Command, Kind, Target, obey
+from .mesh_history import MeshHistory
+from .modeller import Modeller
+from .snapshot import Phase, Snapshot, Status
 
 #: Shortest time between two snapshots, seconds.
 SNAPSHOT_INTERVAL = 0.05
@@ -25,59 +25,7 @@ _SPEED_WINDOW = 1.0
 # Commands that may wait for the thread, which takes none after a failure. The oldest ones are dropped beyond.
 _MOST_COMMANDS = 400
 
-Phase = Literal["starting", "moving", "resting", "failed", "closed"]
-Array = npt.NDArray[np.float32]
-
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Status:
-    """Status of the optimiser. The message is the reason of a failure."""
-
-    phase: Phase
-    message: str = ""
-
-
-@dataclass(frozen=True)
-class Snapshot:
-    """The mesh at one moment. Do not write into its arrays.
-
-    Attributes:
-        number: counts snapshots from 1 on.
-        steps: number of steps so far.
-        target: version of the target of the last step.
-        loss: before the last step.
-        speed: steps per second during the last second, 0 at rest.
-        vertices: (V, 3), world space.
-        shadow: (H, W), visibility, 0 (dark) to 255 (lit).
-    """
-
-    number: int
-    steps: int
-    target: int
-    loss: float
-    speed: float
-    vertices: Array
-    shadow: npt.NDArray[np.uint8]
-
-
-@dataclass(frozen=True)
-class _Target:
-    """A target image (H, W). The mesh need not follow it if it has just gone back to a state that did."""
-
-    image: Array
-    version: int
-    follow: bool
-
-
-@dataclass(frozen=True)
-class _Command:
-    """An order for the thread: keep the mesh under a name, go back to a name, or reset the mesh."""
-
-    kind: Literal["keep", "go back", "reset"]
-    name: Hashable = None
-    version: int = 0  # of the newest target when the order was given
 
 
 class Session:
@@ -97,9 +45,9 @@ class Session:
     def __init__(self, build: Callable[[], Modeller], on_change: Callable[[], None] = lambda: None) -> None:
         self._build, self.on_change = build, on_change
         self._condition = threading.Condition()
-        self._target: _Target | None = None
+        self._target: Target | None = None
         self._target_is_new = self._restart = self._closing = False
-        self._commands: deque[_Command] = deque(maxlen=_MOST_COMMANDS)
+        self._commands: deque[Command] = deque(maxlen=_MOST_COMMANDS)
         self._history = MeshHistory()
         self._status = Status("starting")
         self._snapshot: Snapshot | None = None
@@ -143,14 +91,14 @@ class Session:
         Args:
             image: visibility (H, W) from 0 (dark) to 1 (lit).
             version: snapshots of meshes that have followed the target have this number.
-            go_back: name of a mesh that `keep` has kept, to go back to before the mesh follows the target. A mesh that is not in the
-                history any more is ignored: the mesh then follows the target from where it is.
-            exact: the image is also the one of that moment, so a mesh that was at rest then stays at rest.
+            go_back: go back to the mesh that `keep` has kept under this name. If the history has dropped it, the mesh follows the
+                target from where it is.
+            exact: the image is the one of that moment, too. A mesh that was at rest then stays at rest.
         """
-        target = _Target(np.array(image, np.float32), version, follow=not exact)
+        target = Target(np.array(image, np.float32), version, follow=not exact)
         with self._condition:
             if go_back is not None:
-                self._commands.append(_Command("go back", go_back))
+                self._commands.append(Command("go back", go_back))
             self._target, self._target_is_new = target, True
             self._condition.notify_all()
 
@@ -180,9 +128,9 @@ class Session:
             self._thread.join()
         atexit.unregister(self.close)
 
-    def _order(self, kind: Literal["keep", "reset"], name: Hashable = None) -> None:
+    def _order(self, kind: Kind, name: Hashable = None) -> None:
         with self._condition:
-            self._commands.append(_Command(kind, name, self._target.version if self._target is not None else 0))
+            self._commands.append(Command(kind, name, self._target.version if self._target is not None else 0))
             self._condition.notify_all()
 
     def _work(self) -> None:
@@ -221,7 +169,7 @@ class Session:
             if closing:
                 self._publish(modeller, known)
                 return
-            moved = self._obey(modeller, commands, target, known)
+            moved = obey(modeller, self._history, commands, target, known)
             known = target.version if target is not None else known
             if not (moved or target is not None or modeller.moving):
                 continue  # the mesh has only been kept
@@ -233,37 +181,6 @@ class Session:
             if not modeller.moving or time.monotonic() - last >= SNAPSHOT_INTERVAL:
                 last = time.monotonic()
                 self._publish(modeller, known)
-
-    def _obey(self, modeller: Modeller, commands: list[_Command], target: _Target | None, known: int) -> bool:
-        """Carry out commands, then take the target. Returns True if a command has changed the mesh.
-
-        Args:
-            modeller: follows the target of the version `known`.
-            commands: in the order in which they were given.
-            target: None if there is no new one.
-            known: see above.
-        """
-        moved = current = False
-        now: ModellerState | None = None
-        for command in commands:
-            if command.kind == "keep":
-                now = now or modeller.state()
-                if now.finite:
-                    self._history.put(command.name, KeptMesh(now, current=command.version == known))
-            elif command.kind == "reset":
-                modeller.reset()
-                moved, current, now = True, False, None
-            else:
-                mesh = self._history.get(command.name)
-                current = mesh is not None and mesh.current
-                if mesh is not None:
-                    modeller.load_state(mesh.state)
-                    moved, now = True, mesh.state
-        if target is not None:
-            modeller.set_target(target.image, wake=target.follow or not current)
-        elif moved:
-            modeller.wake()
-        return moved
 
     def _take_up(self, modeller: Modeller) -> int:
         """Load the last good mesh and the newest target, after a failure. Returns the version of the target."""

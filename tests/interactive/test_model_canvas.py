@@ -190,7 +190,9 @@ def test_strokes_draw_only_what_they_touch(monkeypatch):
         canvas.stroke(k, "add", 5, [(100, 100), (150, 120)])
     drawn = []
     over = canvas_module._Edit.over
-    monkeypatch.setattr(canvas_module._Edit, "over", lambda self, below, box: (drawn.append(below.size), over(self, below, box))[1])
+    monkeypatch.setattr(
+        canvas_module._Edit, "over", lambda self, below, box: (drawn.append(below.size), over(self, below, box))[1]
+    )
     canvas.stroke("new", "erase", 3, [(50, 50), (55, 50)])
     assert sum(drawn) < 200
     canvas.undo()

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from model_fakes import FakeSession, eventually
 
-for package in ("starlette", "uvicorn", "websockets"):
-    pytest.importorskip(package, reason=f"{package} is not installed: pip install '.[interactive]'")
+pytest.importorskip("starlette", reason="Starlette is not installed: pip install '.[interactive]'")
+pytest.importorskip("uvicorn")
+pytest.importorskip("websockets")
 
 from live_server import LivePage, live, serving
 

@@ -146,7 +146,9 @@ def test_strokes_leave_no_scars(variant):
     from shadowmap_dr.interactive.messages import Stroke
 
     view = shadow_view(size=48)
-    session = Session(lambda: Modeller(Sculptor(*even_sphere(8, 0.9), [view], map_resolution=48, filter_size=3, consistency=0.02)))
+    session = Session(
+        lambda: Modeller(Sculptor(*even_sphere(8, 0.9), [view], map_resolution=48, filter_size=3, consistency=0.02))
+    )
     session.start()
     board = Connections(session, view, "ball")
     client = type("Page", (), {"number": 0, "seq": 0})()

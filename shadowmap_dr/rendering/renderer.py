@@ -143,6 +143,9 @@ class Renderer:
         renderer.origin = origin
         return renderer
 
+    def __copy__(self) -> Renderer:
+        return replace(self)
+
     def __deepcopy__(self, memo: dict[int, object]) -> Renderer:
         fits = tree_map((self.frusta, self.soft_frusta), lambda array: type(array)(array))
         return replace(self, frusta=fits[0], soft_frusta=fits[1])

@@ -1,4 +1,4 @@
-"""Where a scene came from: a file or a dictionary. Mitsuba's scenes cannot be copied, but they can be loaded again."""
+"""Origins of scenes: a file or a dictionary. Mitsuba's scenes cannot be copied, but they can be loaded again."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the raster functions return: visible triangles and edges, of images that show the same triangles or different ones."""
+"""Results of the raster functions: visible triangles and edges, of images that show the same triangles or different ones."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _SHARED = "give indices that are the same for all of the batch"
 
 @dataclass(frozen=True)
 class FaceSets:
-    """Which faces the images of a batch show.
+    """The faces that the images of a batch show.
 
     Attributes:
         shape: of the faces: (F, 3), or (B, F, 3) with faces for each image.

@@ -103,6 +103,9 @@ class Renderer:
             renderer = _Renderer.from_dict(description, **settings)
         return cls(renderer, frozen=frozen)
 
+    def __copy__(self) -> Renderer:
+        return copy.deepcopy(self)
+
     def __deepcopy__(self, memo: dict[int, object]) -> Renderer:
         copied = Renderer(copy.deepcopy(self._renderer), frozen=self._frozen is not None)
         copied._planned, copied._sky = dict(self._planned), self._sky

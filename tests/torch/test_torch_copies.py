@@ -143,3 +143,11 @@ def test_scenes_that_cannot_be_loaded_are_named(kind: Any, tmp_path: Path) -> No
             call()
         assert "\n" not in str(caught.value)
     refused("description: list, but must be a dictionary for mi.load_dict.", lambda: kind.from_dict([]))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_shallow_copies_need_no_origin(kind: Any) -> None:
+    renderer = kind.from_scene(mi.load_dict(description()), **OPTIONS)
+    copied = copy.copy(renderer)
+    assert copied is not renderer
+    np.testing.assert_array_equal(image(copied), image(renderer))

@@ -9,6 +9,7 @@ from typing import Any
 import mitsuba as mi
 
 from ..errors import ShadowmapError
+from ..jit.memory import physical_memory
 from ..scene.geometry import Geometry
 from ..scene.load import SceneData
 from ..shadow import Frusta, ShadowSettings
@@ -70,8 +71,10 @@ def joined_fits(fits: Sequence[tuple[Frusta | None, SoftFrusta]]) -> tuple[Frust
 def plan_slices(data: SceneData, plan: MapPlan, soft: Sequence[SoftPlan], settings: RenderSettings) -> tuple[LightSlice, ...]:
     """Slices of the lights, as few and as equal as fit into ``settings.light_memory`` each; none if all lights fit together.
 
+    A light whose maps take more is a slice of its own.
+
     Raises:
-        ShadowmapError: the maps of a single light do not fit.
+        ShadowmapError: the maps of a single light take more memory than that and than the machine has.
     """
     if settings.shadow.method == "none" or not settings.lit:
         return ()
@@ -80,12 +83,13 @@ def plan_slices(data: SceneData, plan: MapPlan, soft: Sequence[SoftPlan], settin
     if sizes.bytes(0, every) <= budget:
         return ()
     largest = max(range(every), key=lambda k: sizes.bytes(k, k + 1))
-    if sizes.bytes(largest, largest + 1) > budget:
+    least, memory = sizes.bytes(largest, largest + 1), physical_memory()
+    if least > max(budget, memory):
         names = [light.name for light in (*data.lights, *data.areas, *data.environments)]
         raise ShadowmapError(
-            f"The shadow maps of light '{names[largest]}' take {sizes.bytes(largest, largest + 1) / 2**30:.3g} GiB, more than "
-            f"light_memory ({settings.light_memory:g} GiB): raise it, or lower shadow_map_resolution, soft_map_resolution or the "
-            f"number of the light's samples."
+            f"The shadow maps of light '{names[largest]}' take {least / 2**30:.3g} GiB, more than light_memory "
+            f"({settings.light_memory:g} GiB) and this machine ({memory / 2**30:.3g} GiB): lower shadow_map_resolution, "
+            f"soft_map_resolution or the number of the light's samples."
         )
     own = [6 if kind == "cube" else 1 for kind in plan.kinds]
     return tuple(_slice(first, last, own, soft) for first, last in _groups(sizes, budget))
@@ -136,7 +140,7 @@ def _numbers(settings: ShadowSettings) -> int:
 def _groups(sizes: _Sizes, budget: int) -> list[tuple[int, int]]:
     """(first, last + 1) of consecutive groups, each of at most ``budget``, and as equal as their least number allows."""
     count = len(_filled(sizes, budget))
-    low, high = max(sizes.bytes(k, k + 1) for k in range(sizes.count)), budget
+    low, high = min(budget, max(sizes.bytes(k, k + 1) for k in range(sizes.count))), budget
     while high - low > max(budget // 256, 1):  # the least limit that needs no more groups: equal groups share their kernels
         middle = (low + high) // 2
         low, high = (low, middle) if len(_filled(sizes, middle)) <= count else (middle, high)

@@ -165,7 +165,7 @@ def test_only_one_thread_waits_for_drjit(variant: str, monkeypatch: pytest.Monke
     """Two that do both help it, and lose terms of each other's sums."""
     torch = pytest.importorskip("torch")
     from shadowmap_dr.torch import Renderer as TorchRenderer
-    from shadowmap_dr.torch import bridge, render
+    from shadowmap_dr.torch import bridge, crossing, render
 
     original, turns = bridge.to_torch, []
 
@@ -178,7 +178,7 @@ def test_only_one_thread_waits_for_drjit(variant: str, monkeypatch: pytest.Monke
         turns.append(not free())
         return original(array)
 
-    for module in (bridge, render):
+    for module in (crossing, render):
         monkeypatch.setattr(module, "to_torch", to_torch)
     renderer = TorchRenderer(renderer_of(), frozen=True)
     vertices = renderer.vertices("ball").requires_grad_()

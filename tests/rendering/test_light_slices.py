@@ -209,10 +209,16 @@ def test_equal_lights_make_equal_groups() -> None:
     assert len(groups) == 17 and lengths == {59}
 
 
-def test_a_light_that_does_not_fit_is_named(variant: str) -> None:
-    scene = small_scene(camera=camera(16), lamp=lamp(1))
-    with pytest.raises(ShadowmapError, match=r"light 'lamp' take [0-9.]+ GiB, more than light_memory \(0.001 GiB\): raise it"):
-        Renderer.from_scene(scene, light_memory=0.001, shadow_map_resolution=16)
+def test_a_light_that_does_not_fit(variant: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is a slice of its own if the machine has the memory, and named otherwise."""
+    scene = small_scene(camera=camera(16), lamp=lamp(1), second=lamp(-1))
+    renderer = Renderer.from_scene(scene, light_memory=1e-3, shadow_map_resolution=16)
+    assert len(renderer.slices) == 3
+    assert_close(np.array(renderer.render()), np.array(Renderer.from_scene(scene, shadow_map_resolution=16).render()))
+    monkeypatch.setattr("shadowmap_dr.rendering.light_slices.physical_memory", lambda: 2.0**20)
+    message = r"light 'lamp' take [0-9.]+ GiB, more than light_memory \(0.001 GiB\) and this machine \([0-9.]+ GiB\): lower"
+    with pytest.raises(ShadowmapError, match=message):
+        Renderer.from_scene(scene, light_memory=1e-3, shadow_map_resolution=16)
     for wrong in (0, -1.0, float("nan"), True, "2"):
         with pytest.raises(ShadowmapError, match="light_memory is .*: give a positive number of GiB"):
             Renderer.from_scene(scene, light_memory=wrong)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import json
-import os
 import sys
 from typing import Any
 
@@ -12,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ...io import records
+from ...jit.memory import physical_memory
 
 
 def main() -> None:
@@ -34,9 +34,9 @@ def _limit_memory() -> None:
     try:
         import resource
 
-        limit = int(0.75 * os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+        limit = int(0.75 * physical_memory())
         resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
-    except (ImportError, OSError, ValueError):
+    except (ImportError, OSError, OverflowError, ValueError):
         pass  # not on this system
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import os
 import statistics
 import time
 from collections.abc import Callable, Mapping
@@ -17,6 +16,7 @@ import numpy.typing as npt
 from ...errors import ShadowmapError
 from ...inverse import Method
 from ...io import assets, images
+from ...jit.memory import physical_memory
 from ..common.timing import Contender, alternate, compare, timed
 from ..pose.methods import BETAS, METHODS, STEP_SIZE, build_method
 from ..pose.record import seconds_to_pose
@@ -194,7 +194,7 @@ def _methods(problem: PoseProblem, reference: Image) -> tuple[dict[str, Any], st
     setting = fair_setting(problem.resolution)
     samples = max(setting.spp, setting.sppc, setting.sppp, setting.sppi) * problem.resolution**2
     names, left_out = list(METHODS), None
-    if hasattr(os, "sysconf") and samples * BYTES_PER_SAMPLE > os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2:
+    if samples * BYTES_PER_SAMPLE > physical_memory() / 2:
         names.remove("mitsuba")
         left_out = f"{samples / 1e6:.0f} million samples at once do not fit into the memory"
     return {name: build_method(name, problem, reference) for name in names}, left_out

@@ -71,7 +71,7 @@ def joined_fits(fits: Sequence[tuple[Frusta | None, SoftFrusta]]) -> tuple[Frust
 def plan_slices(data: SceneData, plan: MapPlan, soft: Sequence[SoftPlan], settings: RenderSettings) -> tuple[LightSlice, ...]:
     """Slices of the lights, as few and as equal as fit into ``settings.light_memory`` each; none if all lights fit together.
 
-    A light whose maps take more is a slice of its own.
+    A light whose maps take more is a slice of its own. A single slice would save nothing: then there are none.
 
     Raises:
         ShadowmapError: the maps of a single light take more memory than that and than the machine has.
@@ -92,7 +92,8 @@ def plan_slices(data: SceneData, plan: MapPlan, soft: Sequence[SoftPlan], settin
             f"soft_map_resolution or the number of the light's samples."
         )
     own = [6 if kind == "cube" else 1 for kind in plan.kinds]
-    return tuple(_slice(first, last, own, soft) for first, last in _groups(sizes, budget))
+    groups = _groups(sizes, budget)
+    return tuple(_slice(first, last, own, soft) for first, last in groups) if len(groups) > 1 else ()
 
 
 @dataclass(frozen=True)

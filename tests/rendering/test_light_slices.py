@@ -215,6 +215,8 @@ def test_a_light_that_does_not_fit(variant: str, monkeypatch: pytest.MonkeyPatch
     renderer = Renderer.from_scene(scene, light_memory=1e-3, shadow_map_resolution=16)
     assert len(renderer.slices) == 3
     assert_close(np.array(renderer.render()), np.array(Renderer.from_scene(scene, shadow_map_resolution=16).render()))
+    alone = small_scene(camera=camera(16), sun=None, lamp=lamp(1))
+    assert Renderer.from_scene(alone, light_memory=1e-3, shadow_map_resolution=16).slices == ()
     monkeypatch.setattr("shadowmap_dr.rendering.light_slices.physical_memory", lambda: 2.0**20)
     message = r"light 'lamp' take [0-9.]+ GiB, more than light_memory \(0.001 GiB\) and this machine \([0-9.]+ GiB\): lower"
     with pytest.raises(ShadowmapError, match=message):

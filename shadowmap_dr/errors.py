@@ -44,3 +44,9 @@ def warn(message: str) -> None:
     while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] in _CALLED:
         level, frame = level + 1, frame.f_back
     warnings.warn(message, stacklevel=level)
+
+
+def check_variant(current: str | None, made_for: str) -> None:
+    """Raise ShadowmapError unless the current variant is the one for which a renderer was made."""
+    if current != made_for:
+        raise ShadowmapError(f"The variant is {current}, but this renderer was made for {made_for}: set that one.")

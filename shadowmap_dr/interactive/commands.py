@@ -45,7 +45,7 @@ class Command:
     version: int = 0
 
 
-def obey(modeller: Modeller, history: MeshHistory, commands: Sequence[Command], target: Target | None, known: int) -> bool:
+def execute(modeller: Modeller, history: MeshHistory, commands: Sequence[Command], target: Target | None, known: int) -> bool:
     """Carry out commands, then take the target. Returns True if a command has changed the mesh.
 
     Args:

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import ShadowmapError
-from .commands import Command, Kind, Target, obey
+from .commands import Command, Kind, Target, execute
 from .mesh_history import MeshHistory
 from .modeller import Modeller
 from .snapshot import Phase, Snapshot, Status
@@ -169,7 +169,7 @@ class Session:
             if closing:
                 self._publish(modeller, known)
                 return
-            moved = obey(modeller, self._history, commands, target, known)
+            moved = execute(modeller, self._history, commands, target, known)
             known = target.version if target is not None else known
             if not (moved or target is not None or modeller.moving):
                 continue  # the mesh has only been kept

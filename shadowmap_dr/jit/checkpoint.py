@@ -7,7 +7,7 @@ from typing import Any
 
 import drjit as dr
 
-from .pytree import attached_of, attached_places, tree_map, with_places
+from .pytree import attached_copies, attached_places, tree_map, with_places
 from .types import AnyArray, PyTree
 
 #: A term of a sum: (arrays that are summed over all terms, arrays of this term's own).
@@ -50,6 +50,10 @@ class _Call:
     ) -> None:
         self.term, self.count, self.implicit, self.tree, self.places = term, count, implicit, tree, places
 
+    def leaves(self) -> list[AnyArray]:
+        """Attached copies of the tree's attached arrays."""
+        return attached_copies(self.tree, self.places)
+
     def at(self, number: int, leaves: list[AnyArray]) -> Term:
         """A term, with these arrays as the attached ones of the tree."""
         return self.term(number, with_places(self.tree, self.places, leaves))
@@ -67,7 +71,7 @@ class _Checkpointed(dr.CustomOp):
         dr.eval(tangents)
         for k in range(call.count):
             with dr.resume_grad():
-                leaves = self._leaves()
+                leaves = call.leaves()
                 for leaf, tangent in zip(leaves, tangents, strict=True):
                     dr.set_grad(leaf, tangent)
                 summed, alone = call.at(k, leaves)
@@ -85,7 +89,7 @@ class _Checkpointed(dr.CustomOp):
         dr.eval(of_sums, of_own)
         for k in range(call.count):
             with dr.resume_grad():
-                leaves = self._leaves()
+                leaves = call.leaves()
                 summed, alone = call.at(k, leaves)
                 outputs = [*summed, *alone]
                 for output, gradient in zip(outputs, [*of_sums, *of_own[k]], strict=True):
@@ -102,12 +106,6 @@ class _Checkpointed(dr.CustomOp):
         for array, total in zip(call.implicit, implicit or [], strict=True):
             dr.accum_grad(array, total)
         self.set_grad_in("arrays", gradients)
-
-    def _leaves(self) -> list[AnyArray]:
-        """Attached copies of the inputs."""
-        leaves = [type(array)(array) for array in attached_of(self._call.tree, self._call.places)]
-        dr.enable_grad(leaves)
-        return leaves
 
     def name(self) -> str:
         return "checkpointed sum"

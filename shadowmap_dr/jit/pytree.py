@@ -91,6 +91,13 @@ def attached_of(tree: PyTree, places: tuple[int, ...]) -> list[AnyArray]:
     return [found[place] for place in places]
 
 
+def attached_copies(tree: PyTree, places: tuple[int, ...]) -> list[AnyArray]:
+    """Copies of :func:`attached_of` that begin a graph of their own."""
+    copies = [type(array)(array) for array in attached_of(tree, places)]
+    dr.enable_grad(copies)
+    return copies
+
+
 def with_arrays(record: PyTree, arrays: list[AnyArray]) -> PyTree:
     """A copy of a tree with ``arrays`` in the place of its :func:`attached_arrays`."""
     position = iter(arrays)

@@ -33,14 +33,14 @@ from .extended_lights import (
     SoftPlan,
     check_soft_sizes,
     fit_soft_maps,
+    interleaving_of,
     make_soft_maps,
     plan_soft,
     sample_visibilities,
     samples_of,
     soft_light,
-    turns_of,
 )
-from .extended_lights.turns import Turns
+from .extended_lights.interleaving import Interleaving
 from .gbuffer.camera_view import CameraView, Frame, PlacedShapes
 from .gbuffer.pixel_footprint import FootprintSamples, footprint_points
 from .gbuffer.surface import Surface
@@ -261,7 +261,7 @@ class LightPass:
             lights = self.visibilities(frame, lighting, numbers, list(lighting.lights))
             pairs = zip(self.soft, lighting.samples, strict=True) if self.settings.lit else ()
             maps, seen = lighting.soft_maps, frame.surface
-            parts = (sample_visibilities(seen, plan, own, maps, _turns(own, frame.view)) for plan, own in pairs)
+            parts = (sample_visibilities(seen, plan, own, maps, _interleaving(own, frame.view)) for plan, own in pairs)
             return Visibilities(lights, tuple(parts))
 
     def white_terms(self, frame: Frame, lighting: Lighting, geometry: Geometry) -> tuple[Any, ...]:
@@ -276,7 +276,7 @@ class LightPass:
             reach = zip(self._outlined(frame, lights), visible, strict=True)
             extended, maps, nodes = zip(self.soft, samples, strict=True), lighting.soft_maps, self.data.materials()
             terms = [direct_light(seen, light, fraction) for light, fraction in reach]
-            terms += [soft_light(seen, plan, own, maps, nodes, turns=_turns(own, frame.view)) for plan, own in extended]
+            terms += [soft_light(seen, plan, own, maps, nodes, _interleaving(own, frame.view)) for plan, own in extended]
             return tuple(term[0] for term in terms)
 
     def radiance(self, frame: Frame, lighting: Lighting, incident: IncidentLight) -> Color3f:
@@ -295,8 +295,8 @@ class LightPass:
             color += direct_light(seen, light, fraction, nodes, gate=gate)
         soft = self.soft if self.settings.lit else ()
         for plan, samples, parts in zip(soft, lighting.samples, incident.parts, strict=True):
-            turns = _turns(samples, frame.view)
-            color += soft_light(seen, plan, samples, lighting.soft_maps, nodes, gate=gate, visible=parts, turns=turns)
+            interleaving = _interleaving(samples, frame.view)
+            color += soft_light(seen, plan, samples, lighting.soft_maps, nodes, interleaving, gate=gate, visible=parts)
         return incident.looped + color
 
     def with_ambient(self, color: Color3f, seen: Surface) -> Color3f:
@@ -375,5 +375,5 @@ def plan_extended_lights(data: SceneData, settings: RenderSettings) -> tuple[Sof
     return soft
 
 
-def _turns(samples: LightSamples, view: CameraView) -> Turns | None:
-    return turns_of(samples, view.size, view.factor)
+def _interleaving(samples: LightSamples, view: CameraView) -> Interleaving:
+    return interleaving_of(samples, view.size, view.factor)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import mitsuba as mi
 
 from ..errors import ShadowmapError
 from ..jit.memory import physical_memory
 from ..scene.geometry import Geometry
+from ..scene.lights.area import AreaLight
+from ..scene.lights.read import Light
 from ..scene.load import SceneData
 from ..shadow import Frusta, ShadowSettings
 from .extended_lights import SoftFrusta, SoftPlan
@@ -39,7 +40,7 @@ class LightSlice:
     sampled: tuple[int, int]
     single: tuple[int, int]
 
-    def data(self, data: SceneData, lights: Sequence[Any], areas: Sequence[Any]) -> SceneData:
+    def data(self, data: SceneData, lights: Sequence[Light], areas: Sequence[AreaLight]) -> SceneData:
         """The scene with the lights of the slice alone. ``lights``, ``areas``: current records of all lights."""
         (a, b), (c, d), n = self.lights, self.soft, len(areas)
         environments = data.environments[max(c - n, 0) : max(d - n, 0)]

@@ -41,8 +41,8 @@ class RenderSettings:
         hide_emitters: the camera looks through area lights, and sees black instead of environments, which light the scene all
             the same.
         max_depth: 0 is black, 1 shows emitters only, 2 is direct light, as in Mitsuba; more, or -1, is the same as 2.
-        area_light_samples: points on each area light, each with a shadow map. With 64 samples per pixel or more, the samples of
-            a pixel take turns at the points if 4 (or 9, ...) divides their number.
+        area_light_samples: points on each area light, each with a shadow map. With 64 samples per pixel or more, each
+            sample sees a fourth (ninth, ...) of them if that number divides theirs (interleaved sampling).
         environment_light_samples: directions of an environment, each with a shadow map.
         soft_map_resolution: texels along each side of these maps.
         emitter_shadows: ``samples``, or ``single``: one map of ``shadow.resolution`` texels (a power of two) for each area light,

@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import ShadowmapError, UnsupportedShape
+from ..errors import ShadowmapError, UnsupportedShape, check_variant
 from ..jit.arrays import device_array
 from ..jit.types import Float
 from .descriptions import Parts, describe_all
@@ -69,8 +69,7 @@ class SceneData:
         Raises:
             ShadowmapError: there is no such sensor; the variant is not the scene's.
         """
-        if mi.variant() != self.variant:
-            raise ShadowmapError(f"The variant is {mi.variant()}, but this renderer was made for {self.variant}: set that one.")
+        check_variant(mi.variant(), self.variant)
         if isinstance(sensor, Sensor):
             return (sensor,)
         if not isinstance(sensor, Integral):

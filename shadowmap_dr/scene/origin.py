@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import ShadowmapError
+from ..errors import ShadowmapError, check_variant
 
 #: A dictionary for ``mi.load_dict``: numbers, texts, arrays, transformations, dictionaries.
 Description: TypeAlias = Mapping[str, Any]
@@ -51,8 +51,7 @@ class SceneOrigin:
         Raises:
             ShadowmapError: another variant is set; there is no such file, or Mitsuba does not understand it.
         """
-        if mi.variant() != self.variant:
-            raise ShadowmapError(f"The variant is {mi.variant()}, but this renderer was made for {self.variant}: set that one.")
+        check_variant(mi.variant(), self.variant)
         what = self.file or "the dictionary"
         try:
             if self.file is None:

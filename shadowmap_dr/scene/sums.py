@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..jit.broadcast import LIKE_LANES
-from ..jit.pytree import attached_arrays, attached_of, attached_places, tree_map, with_places
+from ..jit.pytree import attached_arrays, attached_copies, attached_of, attached_places, tree_map, with_places
 from ..jit.types import AnyArray, Bool, PyTree, UInt32
 from .mitsuba_objects import parameters
 
@@ -150,8 +150,7 @@ class _Sum(dr.CustomOp):
 
     def forward(self) -> None:
         call, (tree, places) = self._call, self._trees
-        leaves = [type(array)(array) for array in attached_of(tree, places)]
-        dr.enable_grad(leaves)
+        leaves = attached_copies(tree, places)
         own, shared = with_places(tree, places, leaves)
         tangents: Any = self.grad_in("arrays")  # Any: Dr.Jit's stub says object
         dr.eval(tangents)

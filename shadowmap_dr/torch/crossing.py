@@ -1,7 +1,7 @@
 """Dr.Jit's functions as part of PyTorch's graph: ``backward``, ``torch.func`` (``grad``, ``jvp``, ``vmap``), ``torch.compile``.
 
 Each function has first derivatives, forward and in reverse. Second derivatives raise an error instead of being zero in silence:
-derivatives are themselves nodes of the graph (:class:`_Adjoint`, :class:`_Tangent`) that depend on all inputs.
+derivatives are themselves nodes of the graph (:class:`_First`) that depend on all inputs.
 """
 
 from __future__ import annotations
@@ -111,15 +111,26 @@ class _Call:
 
 @dataclass
 class _Derivative:
-    """A call to be differentiated: ``count`` adjoints or tangents come before its inputs. ``wanted``: inputs for gradients."""
+    """A call to be differentiated: ``count`` adjoints or tangents come before its inputs.
+
+    ``wanted``: the inputs for gradients; None for forward mode.
+    """
 
     call: _Call
     count: int
-    wanted: Sequence[bool] = ()
+    wanted: Sequence[bool] | None = None
 
     def at(self, k: int) -> _Derivative:
         """That for one of the batch."""
         return _Derivative(self.call.parts[k], self.count, self.wanted)
+
+    def evaluate(self, given: list[TensorXf | None], inputs: list[TensorXf]) -> list[TensorXf]:
+        """Gradients to the wanted inputs from adjoints, or derivatives of the results along tangents."""
+        operation = self.call.operation
+        if self.wanted is None:
+            return list(operation.jvp(inputs, given))
+        found = operation.backward(inputs, self.wanted, given)
+        return [gradient for gradient, want in zip(found, self.wanted, strict=True) if want]
 
 
 class _Node(torch.autograd.Function):
@@ -163,7 +174,7 @@ class _Crossing(_Node):
         wanted = ctx.needs_input_grad[1:]
         if all(adjoint is None for adjoint in adjoints):
             return None, *(None for _ in wanted)
-        given = iter(_Adjoint.apply(_Derivative(ctx.call, len(adjoints), wanted), *adjoints, *ctx.saved_tensors))
+        given = iter(_First.apply(_Derivative(ctx.call, len(adjoints), wanted), *adjoints, *ctx.saved_tensors))
         return None, *(next(given) if want else None for want in wanted)
 
     @staticmethod
@@ -171,7 +182,7 @@ class _Crossing(_Node):
         ctx: Any,  # Any: PyTorch's stubs lack the attributes of a context
         *tangents: torch.Tensor | None,
     ) -> tuple[torch.Tensor, ...]:
-        return _Tangent.apply(_Derivative(ctx.call, len(tangents) - 1), *tangents[1:], *ctx.saved_tensors)
+        return _First.apply(_Derivative(ctx.call, len(tangents) - 1), *tangents[1:], *ctx.saved_tensors)
 
     @staticmethod
     def vmap(
@@ -189,6 +200,13 @@ class _Crossing(_Node):
 
 class _First(_Node):
     """A first derivative, which has none itself."""
+
+    @staticmethod
+    def forward(given: _Derivative, *tensors: torch.Tensor | None) -> tuple[torch.Tensor, ...]:
+        with _arrays(given, tensors) as arrays:
+            found = given.evaluate(*arrays)
+            dr.eval(found)
+            return tuple(to_torch(derivative) for derivative in found)
 
     @staticmethod
     def setup_context(
@@ -212,52 +230,17 @@ class _First(_Node):
     ) -> NoReturn:
         raise _second(ctx.name)
 
-    @classmethod
-    def over_batch(cls, size: int, in_dims: tuple[Any, ...], given: _Derivative, tensors: tuple[Any, ...]) -> _Batched:
-        """:meth:`looped` for the rule of ``torch.vmap``."""
+    @staticmethod
+    def vmap(
+        info: Any,  # Any: a type that PyTorch does not show
+        in_dims: tuple[Any, ...],
+        given: _Derivative,
+        *tensors: torch.Tensor | None,
+    ) -> _Batched:
         # If only adjoints or tangents are batched, there was one call.
         several = any(dim is not None for dim in in_dims[1 + given.count :])
-        return cls.looped([given.at(k) if several else given for k in range(size)], size, in_dims[1:], tensors)
-
-
-class _Adjoint(_First):
-    """Gradients to the wanted inputs of a call, from adjoints and inputs."""
-
-    @staticmethod
-    def forward(given: _Derivative, *tensors: torch.Tensor | None) -> tuple[torch.Tensor, ...]:
-        with _arrays(given, tensors) as (adjoints, inputs):
-            found = given.call.operation.backward(inputs, given.wanted, adjoints)
-            dr.eval(found)
-            return tuple(to_torch(gradient) for gradient, want in zip(found, given.wanted, strict=True) if want)
-
-    @staticmethod
-    def vmap(
-        info: Any,  # Any: a type that PyTorch does not show
-        in_dims: tuple[Any, ...],
-        given: _Derivative,
-        *tensors: torch.Tensor | None,
-    ) -> _Batched:
-        return _Adjoint.over_batch(info.batch_size, in_dims, given, tensors)
-
-
-class _Tangent(_First):
-    """Derivatives of a call's results along tangents, from tangents and inputs."""
-
-    @staticmethod
-    def forward(given: _Derivative, *tensors: torch.Tensor | None) -> tuple[torch.Tensor, ...]:
-        with _arrays(given, tensors) as (tangents, inputs):
-            found = given.call.operation.jvp(inputs, tangents)
-            dr.eval(found)
-            return tuple(to_torch(derivative) for derivative in found)
-
-    @staticmethod
-    def vmap(
-        info: Any,  # Any: a type that PyTorch does not show
-        in_dims: tuple[Any, ...],
-        given: _Derivative,
-        *tensors: torch.Tensor | None,
-    ) -> _Batched:
-        return _Tangent.over_batch(info.batch_size, in_dims, given, tensors)
+        calls = [given.at(k) if several else given for k in range(info.batch_size)]
+        return _First.looped(calls, info.batch_size, in_dims[1:], tensors)
 
 
 @contextmanager

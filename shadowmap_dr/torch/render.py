@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import torch
 
-from ..errors import ShadowmapError
+from ..errors import ShadowmapError, check_variant
 from ..jit.frozen import Frozen
 from ..jit.pytree import tree_map
 from ..jit.types import TensorXf
@@ -186,8 +186,7 @@ class Renderer:
         parameters: Mapping[str, torch.Tensor] | None,
     ) -> dict[_Place, torch.Tensor]:
         """All tensors, checked, by their purpose."""
-        if mi.variant() != self._variant:
-            raise ShadowmapError(f"The variant is {mi.variant()}, but this renderer was made for {self._variant}: set that one.")
+        check_variant(mi.variant(), self._variant)
         given: dict[_Place, torch.Tensor] = {}
         for name, value in (vertex_positions or {}).items():
             count = self._renderer.data.geometry.shape(name).vertex_count

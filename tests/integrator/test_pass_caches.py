@@ -95,9 +95,8 @@ SCENES: dict[str, tuple[Callable[[], dict[str, Any]], dict[str, Any], int]] = {
         1,
     ),
     "unlit": (lambda: {"floor": floor(bsdf=grey()), "lamp": lamp()}, {"hide_emitters": True, "shadow_method": "none"}, 1),
-    # Samples of a pixel take turns at the points of the lamp.
-    "turns": (lambda: {"floor": floor(bsdf=grey()), "lamp": lamp()}, {"area_light_samples": 16}, 64),
-    "turns on gloss": (
+    "interleaved": (lambda: {"floor": floor(bsdf=grey()), "lamp": lamp()}, {"area_light_samples": 16}, 64),
+    "interleaved on gloss": (
         lambda: {"floor": floor(bsdf=grey()), "lamp": lamp(), "box": plate({"type": "roughplastic"})},
         {"area_light_samples": 16},
         64,

@@ -15,7 +15,7 @@ from contextlib import ExitStack
 
 import numpy as np
 import pytest
-from model_fakes import SIZE, FakeSession, eventually
+from model_fakes import SIZE, eventually
 from PIL import Image
 
 pytest.importorskip("starlette", reason="Starlette is not installed: pip install '.[interactive]'")
@@ -69,14 +69,6 @@ class Page:
 
     def paint(self, seq=1, points=(16, 16), **change):
         self.send(**{"type": "stroke", "id": 1, "seq": seq, "mode": "add", "radius": 6, "points": list(points), **change})
-
-
-@pytest.fixture
-def fake() -> Iterator[FakeSession]:
-    session = FakeSession()
-    session.session.start()
-    yield session
-    session.session.close()
 
 
 @pytest.fixture

@@ -3,24 +3,15 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from model_fakes import SIZE, FakeSession, eventually
+from model_fakes import SIZE, eventually
 
 from shadowmap_dr.interactive import Modeller, Session
 from shadowmap_dr.interactive.mesh_history import KeptMesh, MeshHistory
 from shadowmap_dr.interactive.modeller import ModellerState
 from shadowmap_dr.inverse import Sculptor, even_sphere, shadow_view
-
-
-@pytest.fixture
-def fake() -> Iterator[FakeSession]:
-    session = FakeSession()
-    session.session.start()
-    yield session
-    session.session.close()
 
 
 def image(value: float) -> np.ndarray:

@@ -13,7 +13,7 @@ from .sample_maps import (
     still_aimed,
 )
 from .samples import LightSamples
-from .shading import sample_visibilities, soft_light, turns_of
+from .shading import interleaving_of, sample_visibilities, soft_light
 from .sky_samples import SkyWatch
 
 __all__ = [
@@ -25,11 +25,11 @@ __all__ = [
     "SoftPlan",
     "check_soft_sizes",
     "fit_soft_maps",
+    "interleaving_of",
     "make_soft_maps",
     "plan_soft",
     "samples_of",
     "soft_light",
     "still_aimed",
     "sample_visibilities",
-    "turns_of",
 ]

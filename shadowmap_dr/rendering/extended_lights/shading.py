@@ -14,12 +14,12 @@ from ...scene.sums import attached_parameters, sum_over
 from ...shadow import visibility
 from ..direct_light import passes_gate
 from ..gbuffer.surface import Surface
+from .interleaving import Interleaving
 from .penumbra import penumbra_visibility
 from .sample_maps import SoftMaps, SoftPlan, map_of
 from .samples import LightSamples
 from .sky_light import reflects_only, sky_light
 from .sky_samples import SkySamples
-from .turns import Turns
 
 
 def soft_light(
@@ -28,16 +28,16 @@ def soft_light(
     samples: LightSamples,
     maps: SoftMaps | None,
     nodes: Sequence[Any],
+    interleaving: Interleaving,
     *,
     gate: bool = True,
     visible: Float | None = None,
-    turns: Turns | None = None,
 ) -> Color3f:
     """Radiance (colour, P) towards the camera of one extended light.
 
     ``maps`` None: unshadowed. ``nodes``: all BSDFs that ``seen`` may call, and shapes whose
     attributes these read. ``gate``: see :func:`shadowmap_dr.rendering.direct_light.direct_light`. ``visible``: from
-    :func:`sample_visibilities`, to be looked up instead of the maps. ``turns``: from :func:`turns_of`.
+    :func:`sample_visibilities`, to be looked up instead of the maps. ``interleaving``: from :func:`interleaving_of`.
     Gradients flow to all of surface, samples, maps and BSDFs.
     """
     if isinstance(samples, SkySamples) and reflects_only(nodes):
@@ -45,11 +45,9 @@ def soft_light(
     sampled = None if maps is None or plan.kind == "single" else maps.sampled
     transmits = not samples.distant and any(_transmits(node) for node in nodes)
 
-    turns = turns or Turns(samples.count)
-
     def one_sample(number: UInt32, own: PyTree, shared: PyTree) -> Color3f:
         (seen, lane, group), (table, maps, visible) = own, shared
-        index = turns.point(number, group)
+        index = interleaving.point(number, group)
         value, active = mi.UnpolarizedSpectrum(0), mi.Bool(False)
         for wo_world, weight, reached in table.illuminate(index, seen.p_world, sides(seen)):
             wo = seen.si.to_local(wo_world)
@@ -73,44 +71,43 @@ def soft_light(
     lanes = dr.width(seen.shape)
     start = dr.zeros(mi.UnpolarizedSpectrum, lanes)
     implicit = [] if seen.colour is not None else attached_parameters(nodes)
-    own = seen, None if visible is None else dr.arange(mi.UInt32, lanes), turns.group
+    own = seen, None if visible is None else dr.arange(mi.UInt32, lanes), interleaving.group
     shared = samples.table(), sampled, visible
-    light = sum_over(one_sample, turns.length, start, own, shared, implicit, seen.active)
-    if turns.groups > 1:
-        light *= turns.groups
+    light = sum_over(one_sample, interleaving.seen, start, own, shared, implicit, seen.active)
+    if interleaving.groups > 1:
+        light *= interleaving.groups
     if maps is None or maps.single is None or plan.kind != "single":
         return light
     radius = samples.radius_towards(seen.p_world)
     return light * penumbra_visibility(maps.single, mi.UInt32(plan.first), radius, seen.p_world, seen.n_world, seen.active)
 
 
-def turns_of(samples: LightSamples, size: ImageSize, factor: int) -> Turns | None:
-    """Turns of an image's samples at the points of an area light. Parts of the sky are all seen by all samples.
+def interleaving_of(samples: LightSamples, size: ImageSize, factor: int) -> Interleaving:
+    """Interleaving of an image's samples over the points of an area light. All samples see all parts of the sky.
 
     ``size``: samples of the image; ``factor``: samples along each side of a pixel.
     """
-    return None if samples.distant else Turns.of(samples.count, size, factor)
+    return Interleaving(samples.count) if samples.distant else Interleaving.of(samples.count, size, factor)
 
 
 def sample_visibilities(
-    seen: Surface, plan: SoftPlan, samples: LightSamples, maps: SoftMaps | None, turns: Turns | None = None
+    seen: Surface, plan: SoftPlan, samples: LightSamples, maps: SoftMaps | None, interleaving: Interleaving
 ) -> Float | None:
     """Visibility (Float, K P) of the K samples of an extended light, sample by sample, or None without maps of samples.
 
-    With ``turns``: of the points that each lane sees, turn by turn. Detached. For images that differ only in materials and in
+    With several groups of samples: of the points that each lane sees. Detached. For images that differ only in materials and in
     the colours of lights.
     """
     if maps is None or maps.sampled is None or plan.kind == "single":
         return None
     with dr.suspend_grad():
-        turns = turns or Turns(samples.count)
         count, table = dr.width(seen.shape), samples.table()
-        lane = dr.arange(mi.UInt32, turns.length * count)
+        lane = dr.arange(mi.UInt32, interleaving.seen * count)
         number = lane // count
-        dr.eval(seen.p_world, seen.active, turns.group)
+        dr.eval(seen.p_world, seen.active, interleaving.group)
         pixel = lane - number * count
-        group = None if turns.group is None else dr.gather(mi.UInt32, turns.group, pixel)
-        sample = turns.point(number, group)
+        group = None if interleaving.group is None else dr.gather(mi.UInt32, interleaving.group, pixel)
+        sample = interleaving.point(number, group)
         p_world, active = dr.gather(mi.Point3f, seen.p_world, pixel), dr.gather(mi.Bool, seen.active, pixel)
         found = visibility(maps.sampled, map_of(plan, table, sample, p_world), p_world, active)
         dr.eval(found)

@@ -1,4 +1,7 @@
-"""Turns: each of the many samples of a pixel sees some points of an area light, and all samples together see all of them."""
+"""Interleaved sampling: each of many samples of a pixel sees some points of an area light, all together see all of them.
+
+Source: Keller and Heidrich, "Interleaved Sampling", 2001.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,7 @@ _SAMPLES, _POINTS = 4, 4
 
 
 @dataclass(frozen=True)
-class Turns:
+class Interleaving:
     """Groups of samples that see the same points of a light of N points, as many points in each group.
 
     A sample of group g sees the points g, g + K, g + 2 K, ... for K groups. Neighbouring samples are in different groups, and
@@ -32,8 +35,8 @@ class Turns:
     group: UInt32 | None = None
 
     @classmethod
-    def of(cls, points: int, size: ImageSize, factor: int) -> Turns:
-        """Choose the turns. ``size``: samples of the image; ``factor``: samples along each side of a pixel."""
+    def of(cls, points: int, size: ImageSize, factor: int) -> Interleaving:
+        """Choose the groups. ``size``: samples of the image; ``factor``: samples along each side of a pixel."""
         sides = [n for n in range(1, factor // _SAMPLES + 1) if factor % n == points % (n * n) == 0 and points >= _POINTS * n * n]
         side = max(sides, default=1)
         if side == 1:
@@ -43,10 +46,10 @@ class Turns:
         return cls(points, side * side, lane % size.width % side + row % side * side)
 
     @property
-    def length(self) -> int:
+    def seen(self) -> int:
         """Number of points that a sample sees."""
         return self.points // self.groups
 
     def point(self, number: UInt32, group: UInt32 | None) -> UInt32:
-        """The point (UInt32) that samples of a group see in turn ``number`` (UInt32)."""
+        """The point (UInt32) that samples of a group see as number ``number`` (UInt32) of theirs."""
         return number if group is None else number * self.groups + group

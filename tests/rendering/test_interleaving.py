@@ -1,4 +1,4 @@
-"""Samples of a pixel that take turns at the points of an area light: images and derivatives as if each saw all points."""
+"""Interleaved sampling of the points of an area light: images and derivatives as if each saw all points."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from integrator_scenes import ball, camera, floor, shadowmap, small_scene
 
 from mitsuba_baselines import derivatives
-from shadowmap_dr.rendering.extended_lights.turns import Turns
+from shadowmap_dr.rendering.extended_lights.interleaving import Interleaving
 from shadowmap_dr.scene.sensor import ImageSize
 
 
@@ -34,13 +34,13 @@ from shadowmap_dr.scene.sensor import ImageSize
 def test_each_point_is_seen_equally_often(variant: str, points: int, factor: int, groups: int) -> None:
     """In each pixel, by samples that lie on a grid of their own: as many of them in all rows and columns."""
     size = ImageSize(3 * factor, 2 * factor)
-    turns = Turns.of(points, size, factor)
-    assert turns.groups == groups
-    group = np.zeros(size.width * size.height, np.uint32) if turns.group is None else turns.group.numpy()
+    interleaving = Interleaving.of(points, size, factor)
+    assert interleaving.groups == groups
+    group = np.zeros(size.width * size.height, np.uint32) if interleaving.group is None else interleaving.group.numpy()
     seen = np.zeros((points, size.height, size.width), np.int64)
     rows, columns = np.divmod(np.arange(len(group)), size.width)
-    for number in range(turns.length):
-        index = np.broadcast_to(turns.point(mi.UInt32(number), turns.group).numpy(), group.shape)
+    for number in range(interleaving.seen):
+        index = np.broadcast_to(interleaving.point(mi.UInt32(number), interleaving.group).numpy(), group.shape)
         np.add.at(seen, (index, rows, columns), 1)
     assert seen.max() == 1
     pixels = seen.reshape(points, 2, factor, 3, factor)
@@ -96,7 +96,7 @@ def test_images_are_those_of_all_points(
     radiance = painted() if emitter == "painted" else {"radiance": {"type": "rgb", "value": [6.0, 5.0, 4.0]}}
     parts = {"sun": None, "floor": floor(), "ball": ball(), "lamp": lamp(radiance)}
     image, derivative, ratio = image_and_derivatives(parts, points, move)
-    monkeypatch.setattr(Turns, "of", classmethod(lambda cls, points, size, factor: cls(points)))
+    monkeypatch.setattr(Interleaving, "of", classmethod(lambda cls, points, size, factor: cls(points)))
     expected, other, _ = image_and_derivatives(parts, points, move)
     assert np.any(image != expected)
     assert np.sqrt(((image - expected) ** 2).mean()) < 3e-3 * expected.mean()

@@ -13,34 +13,36 @@ LEAST = 2.0**-100
 
 def unit(vector: Vector3f) -> Vector3f:
     """Unit vector along a vector that is not 0, even where squares of its components overflow or underflow. Attached."""
-    scaled, _ = _near_one(vector)
+    scaled, _, _ = _near_one(vector)
     return dr.normalize(scaled)
 
 
 def normalize_or(vector: Vector3f, fallback: Vector3f) -> Vector3f:
-    """Unit vector, or ``fallback`` where the vector is zero. Neither value nor gradient is NaN there. Attached to both."""
-    direction, _, there = direction_and_length(vector)
-    return dr.select(there, direction, fallback)
+    """Unit vector, or ``fallback`` where no component reaches ``LEAST``. Neither value nor gradient is NaN. Attached to both."""
+    scaled, _, there = _near_one(vector)
+    return dr.select(there, scaled * dr.rsqrt(dr.select(there, dr.squared_norm(scaled), 1.0)), fallback)
 
 
 def direction_and_length(vector: Vector3f) -> tuple[Vector3f, Float, Bool]:
     """(unit vector, length, whether there is one), for vectors of any size. Attached.
 
-    Where no component reaches ``LEAST``, all three are zero. Without the scale, the derivative of a vector of length 1e-13
-    overflows: it holds the inverse of the length's third power.
+    Where no component reaches ``LEAST``, all three are zero.
     """
-    scaled, scale = _near_one(vector)
-    there = dr.max(dr.abs(dr.detach(vector))) > LEAST
+    scaled, scale, there = _near_one(vector)
     squared = dr.select(there, dr.squared_norm(scaled), 1.0)
     inverse = dr.rsqrt(squared)
     return dr.select(there, scaled * inverse, 0), dr.select(there, squared * inverse * dr.rcp(scale), 0), there
 
 
-def _near_one(vector: Vector3f) -> tuple[Vector3f, Float]:
-    """The vector times a power of two that brings its largest component near 1, and that power. It rounds nothing."""
+def _near_one(vector: Vector3f) -> tuple[Vector3f, Float, Bool]:
+    """(the vector times a power of two that brings its largest component near 1, that power, whether one reaches ``LEAST``).
+
+    The product rounds nothing. Without it, the derivative of the direction of a vector of length 1e-13 overflows: it holds the
+    inverse of the length's third power.
+    """
     largest = dr.max(dr.abs(dr.detach(vector)))
     module = backend(largest)
     # At most 1 / LEAST, so that derivatives do not overflow where vectors vanish.
     exponent = dr.clip(reinterpret(module.UInt32, largest) & 0x7F800000, (127 - 100) << 23, 0x7E800000)
     scale = reinterpret(module.Float, 0x7F000000 - exponent)
-    return vector * scale, scale
+    return vector * scale, scale, largest > LEAST

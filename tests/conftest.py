@@ -40,6 +40,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         items[place] = item
 
 
+def pytest_collection_finish() -> None:
+    # Modules stay: tests that collect garbage, by the hundred, need not look through them each time.
+    gc.collect()
+    gc.freeze()
+
+
 def _scene_of(item: pytest.Item) -> tuple[str, str, bool]:
     values = getattr(item, "callspec", None)
     values = values.params if values else {}

@@ -18,7 +18,6 @@ from ..rendering.renderer import Renderer
 from ..rendering.settings import RenderSettings
 from ..scene.changes import MirrorWatch, ParameterWatch
 from ..scene.geometry import NOT_READ
-from ..scene.lights.read import environments_of
 from ..scene.load import SceneData, load, refresh, with_positions
 from ..scene.mitsuba_objects import parameters
 from ..scene.sensor import lenses_of, sensors_of
@@ -127,7 +126,7 @@ class SceneCache:
         if dr.flag(dr.JitFlag.FreezingScope):
             return True  # nothing can be read back
         with dr.suspend_grad():
-            still = self.mirrors.same() and self.sky.same(environments_of(scene))
+            still = self.mirrors.same() and self.sky.same()
             return still and still_aimed(self.renderer.soft, lambda: with_positions(data))
 
     def data(self, scene: mi.Scene, sensor: mi.Sensor) -> SceneData:

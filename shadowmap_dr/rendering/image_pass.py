@@ -16,7 +16,7 @@ from ..scene.geometry import Geometry
 from .direct_light import shining_side
 from .film.aovs import collect_aovs
 from .film.film import film_channels, interleave
-from .gbuffer.camera_pass import least_gap
+from .gbuffer.camera_clip import least_gap
 from .gbuffer.camera_view import CameraPass, CameraView, Frame, PlacedShapes
 from .gbuffer.surface import coloured
 from .light_colours import colours_of

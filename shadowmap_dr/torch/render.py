@@ -304,7 +304,7 @@ class _Rendering:
         """The renderer, with extended lights divided anew if they have changed much since their last division."""
         data = renderer.data
         with dr.suspend_grad():
-            if self.sky.same(data.environments) and still_aimed(renderer.soft, lambda: data.geometry):
+            if self.sky.same() and still_aimed(renderer.soft, lambda: data.geometry):
                 return renderer
             self.sky = SkyWatch(data.environments)
             return renderer.with_replanned_lights()

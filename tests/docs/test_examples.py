@@ -30,14 +30,11 @@ def output_of(script: str, *options: object) -> str:
 
 def test_a_mesh_takes_the_shape_of_its_shadow(tmp_path: Path) -> None:
     pytest.importorskip("torch", reason="PyTorch is not installed: pip install '.[torch]'")
-    script = ROOT / "docs" / "examples" / "torch_mesh.py"
-    command = [sys.executable, script, "--steps", "40", "--size", "96", "--out", tmp_path / "out"]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=ROOT)
-    assert result.returncode == 0, result.stderr
-    before, after = map(float, re.search(r"loss ([0-9.]+) -> ([0-9.]+)", result.stdout).groups())
+    output = output_of("torch_mesh.py", "--steps", 40, "--size", 64, "--out", tmp_path / "out")
+    before, after = map(float, re.search(r"loss ([0-9.]+) -> ([0-9.]+)", output).groups())
     assert after < 0.2 * before
     shadows = np.asarray(Image.open(tmp_path / "out" / "shadows.png"), np.float32).mean(2)
-    start, end, wanted = (shadows[:, k * 96 : (k + 1) * 96] < 170 for k in range(3))
+    start, end, wanted = (shadows[:, k * 64 : (k + 1) * 64] < 170 for k in range(3))
     assert 0.05 < wanted.mean() < 0.6
     assert (end != wanted).mean() < 0.3 * (start != wanted).mean()
     views = [np.asarray(Image.open(tmp_path / "out" / f"{name}.png"), np.float32) for name in ("before", "after")]

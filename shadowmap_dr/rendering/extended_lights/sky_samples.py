@@ -129,17 +129,18 @@ class SkyWatch:
     """Watch over the distribution of a sky's light, which may have been turned since the sky was divided into parts.
 
     Args:
-        lights: current environments of a scene.
+        lights: environments of a scene.
     """
 
     def __init__(self, lights: Sequence[Environment]) -> None:
+        self._lights = tuple(lights)
         self._rows = [int(np.clip(light.rows, *_ROWS)) for light in lights]
         self._shares = [_shares(light, rows) for light, rows in zip(lights, self._rows, strict=True)]
         self._versions = [_version(light) for light in lights]
 
-    def same(self, lights: Sequence[Environment]) -> bool:
-        """True if ``lights``, the current environments, shine as before. Reads back only what has changed since the last call."""
-        for k, (light, rows) in enumerate(zip(lights, self._rows, strict=True)):
+    def same(self) -> bool:
+        """True if the environments shine as before. Reads back only the parameters changed since the last call."""
+        for k, (light, rows) in enumerate(zip(self._lights, self._rows, strict=True)):
             version = _version(light)
             if version == self._versions[k]:
                 continue

@@ -15,7 +15,7 @@ from ...raster.antialiasing.edge_crossings import find_crossings
 from ...scene.geometry import Geometry
 from ...scene.load import SceneData
 from ...scene.sensor import ImageSize, Sensor
-from .camera_pass import camera_clip, least_gap, seen_points, within_far_plane, without_shapes
+from .camera_clip import camera_clip, least_gap, seen_points, within_far_plane, without_shapes
 from .facet_normals import FlatFaces, facet_normals, mean_normals, prefilter_normals
 from .shading_edges import ShadingEdges
 from .surface import Surface, normals_at, opacity, surface, surface_at

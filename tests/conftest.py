@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -17,6 +18,10 @@ import quick_kernels  # selects the LLVM library before mitsuba is imported, and
 # isort: split
 import drjit as dr
 import mitsuba as mi
+
+from tests.slow import slow_tests
+
+TESTS = Path(__file__).parent
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -33,7 +38,12 @@ def pytest_runtest_makereport() -> Iterator[None]:
     report.sections = [(name, text) for name, text in written if text]
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    slow = slow_tests()
+    for item in items:
+        if f"{item.path.relative_to(TESTS).as_posix()}::{getattr(item, 'originalname', item.name)}" in slow:
+            item.add_marker(pytest.mark.slow)
     # Tests of one scene of the gradient suite after one another: they share derivative images, the first of them takes new ones.
     places = [place for place, item in enumerate(items) if item.path.name == "test_gradients.py"]
     for place, item in zip(places, sorted((items[place] for place in places), key=_scene_of), strict=True):

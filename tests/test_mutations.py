@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import pytest
 from mutations import MUTATIONS, check_all
 
 
-@pytest.mark.slow
 def test_each_mutation_makes_its_named_test_fail() -> None:
     verdicts = check_all()
     assert len(verdicts) == 1 + len(MUTATIONS)

@@ -50,7 +50,6 @@ def need(name: str) -> None:
         pytest.importorskip("cholespy", reason="pip install '.[test]'")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_notebook_runs_frozen(name: str) -> None:
     """From the first cell to the last, but for those that wait for Mitsuba's integrator; both loops end near the truth."""
@@ -190,7 +189,6 @@ def test_solved_means_ten_steps_in_a_row() -> None:
     assert compare.Trace(trace.seconds, trace.states, [{"off": 1.0}] * 13).record(bar)["seconds"] is None
 
 
-@pytest.mark.slow
 def test_race_of_frozen_and_drop_in_and_mitsuba(tmp_path: Path) -> None:
     """All three methods do step after step; with a bar this low each is done after ten."""
     import compare

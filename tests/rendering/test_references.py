@@ -80,7 +80,6 @@ def test_shadows_of_1024_texels(variant: str, name: str) -> None:
     assert error <= 0.015, f"mean absolute error {error:.2%} of the mean"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", cases.SCENES)
 def test_error_falls_with_resolution(variant: str, name: str) -> None:
     errors = [shadow_error(variant, name, resolution) for resolution in RESOLUTIONS]

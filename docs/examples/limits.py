@@ -1,4 +1,4 @@
-"""Errors of derivatives at the limits that README names: against central differences of images with 256 samples a pixel.
+"""Errors of derivatives at the limits of docs/limits.md: against central differences of images with 256 samples a pixel.
 
     python docs/examples/limits.py [--size 64] [--samples 1 16]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -39,6 +40,18 @@ def test_a_mesh_takes_the_shape_of_its_shadow(tmp_path: Path) -> None:
     assert (end != wanted).mean() < 0.3 * (start != wanted).mean()
     views = [np.asarray(Image.open(tmp_path / "out" / f"{name}.png"), np.float32) for name in ("before", "after")]
     assert views[0].shape == (384, 384, 3) and np.abs(views[0] - views[1]).mean() > 2
+
+
+def test_optimisations_are_drawn_with_their_seconds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["hero", "--out", str(tmp_path / "hero.png"), "--size", "40", "--resolution", "24"])
+    hero = runpy.run_path(str(ROOT / "docs" / "examples" / "hero.py"))
+    hero["SHOWN"].update(pose=(0, 3), shape=(0, 3))
+    hero["main"]()
+    pixels = np.asarray(Image.open(tmp_path / "hero.png"), np.float32)
+    assert pixels.shape == (2 * 44, 3 * 40 + 2, 3)
+    for row in (pixels[:40], pixels[44:84]):  # target, start, end
+        start, end = row[:, 41:81], row[:, 82:122]
+        assert start.std() > 20 and 0.2 < np.abs(start - end).mean() < 60
 
 
 def test_ways_to_render_are_timed_in_turns() -> None:

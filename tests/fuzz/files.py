@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import io
 import json
 from pathlib import Path
 
@@ -18,7 +17,7 @@ from shadowmap_dr.io.meshes import read_placed_mesh
 from . import mesh_files
 from .commands import run_command
 from .outcome import check
-from .values import chance, mutated, pick
+from .values import chance, changed_arrays, mutated, npz, pick
 
 
 def run(rng: np.random.Generator, folder: Path) -> str:
@@ -91,32 +90,9 @@ def _basel_arrays() -> dict[str, np.ndarray]:
     }  # fmt: skip
 
 
-def _npz(arrays: dict[str, np.ndarray]) -> bytes:
-    buffer = io.BytesIO()
-    np.savez(buffer, **arrays)
-    return buffer.getvalue()
-
-
-def _changed_arrays(rng: np.random.Generator, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Arrays of which one or two have other values, types or shapes, or other names."""
-    changed = dict(arrays)
-    for _ in range(int(rng.integers(1, 3))):
-        name = pick(rng, tuple(changed))
-        value = changed[name]
-        choices = (
-            value[:-1] if value.ndim else value, value.T, value.astype(str), value * np.nan if value.dtype.kind == "f" else value - 1,
-            value[:0] if value.ndim else value, np.array(3), value.astype(bool), value.astype(complex), value[None], value * 10**9,
-            np.array([]), value.astype(np.int8),
-        )  # fmt: skip
-        changed[name] = pick(rng, choices)
-        if chance(rng, 0.2):
-            changed[f"{name}x"] = changed.pop(name)
-    return changed
-
-
 def _basel(rng: np.random.Generator, folder: Path) -> str:
     path = folder / "model.npz"
-    data = _npz(_changed_arrays(rng, _basel_arrays()) if chance(rng, 0.8) else _basel_arrays())
+    data = npz(changed_arrays(rng, _basel_arrays()) if chance(rng, 0.8) else _basel_arrays())
     path.write_bytes(mutated(rng, data) if chance(rng, 0.2) else data)
     model = convert(path, ConvertOptions())
     check(np.isfinite(model.mean).all() and model.faces.max() < len(model.mean), "a model with bad vertices or faces")
@@ -143,14 +119,14 @@ def _model_arrays() -> dict[str, np.ndarray]:
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "basel.npz")
-        path.write_bytes(_npz(_basel_arrays()))
+        path.write_bytes(npz(_basel_arrays()))
         save_model(Path(folder, "model.npz"), convert(path, ConvertOptions()))
         return io_files.read_arrays(Path(folder, "model.npz"))
 
 
 def _model(rng: np.random.Generator, folder: Path) -> str:
     path = folder / "model.npz"
-    data = _npz(_changed_arrays(rng, _model_arrays()))
+    data = npz(changed_arrays(rng, _model_arrays()))
     path.write_bytes(mutated(rng, data) if chance(rng, 0.2) else data)
     model = load_model(path)
     vertices = model.vertices(np.ones(len(model.identity)))
@@ -160,7 +136,7 @@ def _model(rng: np.random.Generator, folder: Path) -> str:
 
 def _arrays(rng: np.random.Generator, folder: Path) -> str:
     path = folder / "arrays.npz"
-    path.write_bytes(mutated(rng, _npz({"a": np.arange(12.0).reshape(3, 4), "b": np.array("text"), "c": np.ones(0)})))
+    path.write_bytes(mutated(rng, npz({"a": np.arange(12.0).reshape(3, 4), "b": np.array("text"), "c": np.ones(0)})))
     arrays = io_files.read_arrays(path)
     check(all(isinstance(array, np.ndarray) for array in arrays.values()), "something else than arrays")
     return ", ".join(arrays)

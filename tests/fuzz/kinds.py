@@ -23,12 +23,14 @@ class Kind:
         seconds: time budget of a case.
         megabytes: memory budget of a case.
         needs: package without which the kind is left out.
+        slow: cases take seconds each: the test suite has none of them.
     """
 
     share: int
     seconds: float = 30.0
     megabytes: float = 2000.0
     needs: str = ""
+    slow: bool = False
 
 
 #: Kinds by the name of their module, which has a function ``run`` (see `Run`).
@@ -40,6 +42,7 @@ KINDS = {
     "scenes": Kind(8, seconds=60.0),
     "options": Kind(12, seconds=60.0),
     "records": Kind(12),
+    "runs": Kind(4, seconds=120.0, slow=True),
     "messages": Kind(10, needs="starlette"),
 }
 

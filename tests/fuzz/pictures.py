@@ -27,7 +27,7 @@ _MODES = ("1", "L", "LA", "P", "RGB", "RGBA", "I;16", "CMYK", "I", "F", "YCbCr")
 _FORMATS = {
     **{"1": ("PNG", "TIFF", "BMP"), "L": ("PNG", "JPEG", "TIFF", "GIF", "WEBP"), "LA": ("PNG", "TIFF"), "P": ("PNG", "GIF", "BMP")},
     **{"RGB": ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "PPM", "TGA"), "RGBA": ("PNG", "WEBP", "TIFF", "GIF"), "I;16": ("PNG", "TIFF")},
-    **{"CMYK": ("JPEG", "TIFF"), "I": ("TIFF", "PNG"), "F": ("TIFF",), "YCbCr": ("JPEG", "TIFF")},
+    **{"CMYK": ("JPEG", "TIFF"), "I": ("TIFF",), "F": ("TIFF",), "YCbCr": ("JPEG", "TIFF")},
 }
 _SIDES = (1, 1, 2, 3, 16, 17, 40, 64, 300)
 

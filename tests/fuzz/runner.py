@@ -51,7 +51,7 @@ def run_cases(
 
 def _run_batch(batch: Sequence[Case], said: IO[bytes], on_done: Report, on_wait: Callable[[], None]) -> int:
     """Try cases in one process, which writes its standard error into ``said``. Returns how many have ended."""
-    with _process(batch, said) as (process, lines):
+    with tempfile.TemporaryDirectory(prefix="fuzz-") as folder, _process(batch, said, folder) as (process, lines):
         done, begun, deadline, base = 0, False, time.monotonic() + _START, 0.0
         while True:
             on_wait()
@@ -90,10 +90,12 @@ def _run_batch(batch: Sequence[Case], said: IO[bytes], on_done: Report, on_wait:
 
 
 @contextmanager
-def _process(batch: Sequence[Case], said: IO[bytes]) -> Iterator[tuple[subprocess.Popen[bytes], queue.Queue[Any]]]:
-    """A process, and the lines that it writes; None after the last one."""
+def _process(
+    batch: Sequence[Case], said: IO[bytes], folder: str
+) -> Iterator[tuple[subprocess.Popen[bytes], queue.Queue[Any]]]:
+    """A process with its temporary files in a folder, and the lines that it writes; None after the last one."""
     code = [sys.executable, "-m", f"{__package__}.worker"]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": _python_path()}
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": _python_path(), "TMPDIR": folder}
     process = subprocess.Popen(
         code, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=said, cwd=_ROOT, env=environment, start_new_session=True
     )

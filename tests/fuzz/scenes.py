@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -37,15 +38,28 @@ def _file(rng: np.random.Generator, folder: Path) -> str:
     text = "\n".join(['<scene version="3.0.0">', *(_element(name, part) for name, part in plugins.items()), "</scene>\n"])
     sound = chance(rng, 0.4)
     path = folder / "scene.xml"
-    path.write_text(text if sound else mutated_text(rng, text), encoding="utf-8", errors="surrogateescape")
+    path.write_text(text if sound else _changed(rng, text), encoding="utf-8", errors="surrogateescape")
     options = ["--integrator", "scene"] if chance(rng, 0.8) else []
     if chance(rng, 0.15):
-        options += pick(rng, (["--size", "9x7"], ["--spp", "4"], ["--size", "0x1"], ["-D", "a=b"], ["--aovs", "depth"], ["--integrator", "path"]))
+        options += pick(rng, (["--size", "9x7"], ["--spp", "4"], ["--size", "0x1"], ["--aovs", "depth"], ["--integrator", "path"]))
     said = run_command(["render", str(path), "-o", "image.exr", *options])
     channels, _ = images.read_exr(folder / "image.exr")
     colours = [channels[name] for name in ("R", "G", "B", "Y", "A") if name in channels]
     check(colours and all(np.isfinite(plane).all() for plane in colours), "an image has no colours, or is not finite")
     return said.strip()
+
+
+def _changed(rng: np.random.Generator, text: str) -> str:
+    """XML with other numbers; one of three with any fault."""
+    if chance(rng, 0.2):
+        return mutated_text(rng, text)
+    for _ in range(int(rng.integers(1, 4))):
+        found = list(re.finditer(r'(?<=[" ])-?\d+(\.\d+)?(e-?\d+)?(?=[",])', text))
+        at = pick(rng, found)
+        numbers = (0, 1, -1, 2, 7, 40) if "." not in at[0] and chance(rng, 0.9) else (1e-3, 1e10, 1e38, -5.5, 300, 0, number(rng))
+        new = str(pick(rng, numbers))
+        text = text[: at.start()] + new + text[at.end() :]
+    return text
 
 
 def _dictionary(rng: np.random.Generator, folder: Path) -> str:
@@ -70,26 +84,26 @@ def _scene(rng: np.random.Generator, folder: Path) -> dict[str, Plugin]:
     }
     for k in range(int(rng.integers(0, 3))):
         plugins[f"shape{k}"] = _shape(rng, folder)
-    for k in range(int(rng.integers(0, 3))):
+    for k in range(int(pick(rng, (0, 1, 1, 1, 2)))):
         plugins[f"light{k}"] = _light(rng)
     if chance(rng, 0.1):
         del plugins[pick(rng, tuple(plugins))]
-    if chance(rng, 0.3):
+    if chance(rng, 0.12):
         _damage(rng, plugins)
     return plugins
 
 
 def _shape(rng: np.random.Generator, folder: Path) -> Plugin:
-    kind = pick(rng, ("cube", "sphere", "disk", "cylinder", "rectangle", "file", "file", "bsplinecurve", "sdfgrid", "shapegroup"))
+    kind = pick(rng, (*("cube", "sphere", "disk", "cylinder", "rectangle", "file", "file") * 2, "bsplinecurve", "linearcurve")) if chance(rng, 0.97) else "shapegroup"
     shape: Plugin = {"type": kind, "to_world": _transform(rng), "bsdf": _bsdf(rng)}
     if kind == "file":
-        suffix, data = mesh_files.files()[pick(rng, ("obj", "obj of quads", "ply", "ascii ply", "stl"))]
+        suffix, data = mesh_files.files()[pick(rng, ("obj", "obj of quads", "ply", "ascii ply"))]
         path = folder / f"mesh{int(rng.integers(1000))}{suffix}"
-        path.write_bytes(data if chance(rng, 0.7) else mutated(rng, data))
+        path.write_bytes(data if chance(rng, 0.8) else mutated(rng, data))
         shape.update(type=suffix[1:], filename=str(path))
-    elif kind == "bsplinecurve":
+    elif kind.endswith("curve"):
         path = folder / "curve.txt"
-        path.write_text("\n".join(f"{k} {k % 2} 1 {pick(rng, ('0.1', '0.1', '0', 'nan', ''))}" for k in range(int(rng.integers(1, 7)))))
+        path.write_text("\n".join(f"{k} {k % 2} 1 {pick(rng, ('0.1',) * 8 + ('0', 'nan', ''))}" for k in range(int(rng.integers(1, 7)))))
         shape["filename"] = str(path)
     if chance(rng, 0.15):
         shape["emitter"] = {"type": "area", "radiance": _colour(rng)}
@@ -97,7 +111,8 @@ def _shape(rng: np.random.Generator, folder: Path) -> Plugin:
 
 
 def _bsdf(rng: np.random.Generator) -> Plugin:
-    kind = pick(rng, ("diffuse", "diffuse", "twosided", "plastic", "roughplastic", "roughconductor", "dielectric", "principled", "null", "mask", "bumpmap", "measured"))
+    kinds = ("twosided", "plastic", "roughplastic", "roughconductor", "dielectric", "principled", "null", "mask", "conductor")
+    kind = pick(rng, ("diffuse",) * 6 + kinds) if chance(rng, 0.97) else pick(rng, ("bumpmap", "measured", "blendbsdf", ""))
     if kind in ("twosided", "mask", "bumpmap"):
         nested: Plugin = {"type": "diffuse", "reflectance": _colour(rng)}
         return {"type": kind, "nested": nested, **({"opacity": float(rng.uniform(0, 1))} if kind == "mask" else {})}
@@ -105,7 +120,8 @@ def _bsdf(rng: np.random.Generator) -> Plugin:
 
 
 def _light(rng: np.random.Generator) -> Plugin:
-    kind = pick(rng, ("point", "directional", "spot", "constant", "envmap", "projector", "directionalarea", "sunsky"))
+    kind = pick(rng, ("point", "directional", "spot", "constant", "envmap", "projector"))
+    kind = kind if chance(rng, 0.95) else pick(rng, ("directionalarea", "sunsky", "area", "timedsunsky", ""))
     light: Plugin = {"type": kind}
     if kind == "point":
         light |= {"position": _vector(rng), "intensity": _colour(rng)}
@@ -115,17 +131,21 @@ def _light(rng: np.random.Generator) -> Plugin:
         light |= {"to_world": _transform(rng), "intensity": _colour(rng), "cutoff_angle": float(rng.uniform(1, 80))}
     elif kind == "constant":
         light |= {"radiance": _colour(rng)}
+    elif kind in ("envmap", "projector"):
+        height = int(pick(rng, (1, 2, 5)))
+        images.write_exr(Path("light.exr"), {name: rng.uniform(0, 2, (height, 2 * height)).astype(np.float32) for name in "RGB"})
+        light |= {"filename": "light.exr"} if kind == "envmap" else {"irradiance": {"type": "bitmap", "filename": "light.exr"}, "fov": 40.0}
     return light
 
 
 def _camera(rng: np.random.Generator) -> Plugin:
-    kind = pick(rng, ("perspective", "perspective", "perspective", "orthographic", "thinlens", "batch", "distant"))
+    kind = pick(rng, (*("perspective",) * 8, "orthographic", "orthographic", "thinlens", "thinlens")) if chance(rng, 0.97) else pick(rng, ("batch", "distant", "irradiancemeter"))
     film: Plugin = {
-        "type": pick(rng, ("hdrfilm", "hdrfilm", "hdrfilm", "specfilm")), "width": SIZE, "height": int(pick(rng, (SIZE, SIZE, 5, 1))),
-        "pixel_format": pick(rng, ("rgb", "rgba", "luminance", "xyz")), "rfilter": {"type": pick(rng, ("box", "gaussian", "tent", "lanczos"))},
+        "type": pick(rng, ("hdrfilm",) * 20 + ("specfilm",)), "width": SIZE, "height": int(pick(rng, (SIZE, SIZE, 5, 1))),
+        "pixel_format": pick(rng, (*("rgb", "rgba", "luminance", "luminance_alpha") * 4, "xyz")), "rfilter": {"type": pick(rng, ("box", "gaussian", "tent", "lanczos"))},
     }  # fmt: skip
     if chance(rng, 0.2):
-        film |= {"crop_offset_x": 2, "crop_width": int(pick(rng, (3, 1, 20)))}
+        film |= {"crop_offset_x": 2, "crop_width": int(pick(rng, (3, 1, 5, 20)))}
     camera: Plugin = {"type": kind, "to_world": ("look_at", (2, -3, 4), (0, 0, 0.5), (0, 0, 1)), "film": film}
     if kind in ("perspective", "thinlens"):
         camera["fov"] = float(pick(rng, (45, 10, 120, 1e-3, 179)))
@@ -141,21 +161,23 @@ def _camera(rng: np.random.Generator) -> Plugin:
 def _options(rng: np.random.Generator) -> Plugin:
     """Parameters of the integrator."""
     choices: Plugin = {
-        "shadow_method": pick(rng, ("vsm", "esm", "evsm2", "msm", "csm", "pcf", "standard", "none", "x")),
-        "shadow_filter": pick(rng, ("box", "gaussian", "wendland", "none")), "shadow_filter_size": int(pick(rng, (1, 3, 5, 2, 27, 255))),
-        "antialias": chance(rng, 0.5), "hide_emitters": chance(rng, 0.5), "max_depth": int(pick(rng, (0, 1, 2, 5, -1, -2))),
-        "emitter_shadows": pick(rng, ("single", "samples", "x")), "compat": chance(rng, 0.3), "recorded": chance(rng, 0.3),
-        "shadow_supersampling": int(pick(rng, (2, 0, 9))), "shadow_cull_backfaces": True, "aovs": pick(rng, ("depth", "albedo,normal", "x", "a:depth,a:depth")),
-        "light_memory": float(pick(rng, (0, 1e-5, 1.0, -1))), "ambient": float(number(rng)), "rr_depth": 3, "unknown": 1,
+        "shadow_method": pick(rng, ("vsm", "esm", "evsm2", "msm", "csm", "pcf", "standard", "none")),
+        "shadow_filter": pick(rng, ("box", "gaussian", "wendland", "none")), "shadow_filter_size": int(pick(rng, (1, 3, 5, 5, 2, 27, 255))),
+        "antialias": chance(rng, 0.5), "hide_emitters": chance(rng, 0.5), "max_depth": int(pick(rng, (0, 1, 2, 2, 5, -1, -2))),
+        "emitter_shadows": pick(rng, ("single", "samples", "samples", "x")), "compat": chance(rng, 0.3), "recorded": chance(rng, 0.3),
+        "shadow_supersampling": int(pick(rng, (2, 2, 2, 9))), "shadow_cull_backfaces": True, "aovs": pick(rng, ("depth", "position,normal", "a:depth,b:visibility", "a:depth,a:depth")),
+        "light_memory": float(pick(rng, (1e-5, 1e-4, 1.0, -1))), "ambient": float(pick(rng, (0.1, 1.0, 1e10, -1.0))), "rr_depth": 3,
     }  # fmt: skip
-    names = rng.permutation(sorted(choices))[: int(rng.integers(0, 4))]
+    if chance(rng, 0.03):
+        return {"unknown": 1}
+    names = rng.permutation(sorted(choices))[: int(rng.integers(0, 3))]
     return {str(name): choices[str(name)] for name in names}
 
 
 def _colour(rng: np.random.Generator) -> Any:
     if chance(rng, 0.8):
         return tuple(float(x) for x in rng.uniform(0, 1, 3).round(3))
-    return pick(rng, (0.0, (0.0, 0.0, 0.0), (1e10, 1.0, 1.0), (-1.0, 0.0, 1.0), 1e-30))
+    return pick(rng, (0.5, (0.0, 0.0, 0.0), (1e10, 1.0, 1.0), (-1.0, 0.0, 1.0), 1e-30))
 
 
 def _vector(rng: np.random.Generator) -> tuple[str, tuple[float, ...]]:
@@ -181,7 +203,7 @@ def _damage(rng: np.random.Generator, plugins: dict[str, Plugin]) -> None:
 
 _TAGS = {
     **dict.fromkeys(("camera",), "sensor"), "film": "film", "rfilter": "rfilter", "sampler": "sampler", "integrator": "integrator",
-    "bsdf": "bsdf", "nested": "bsdf", "emitter": "emitter", "floor": "shape",
+    "irradiance": "texture", "bsdf": "bsdf", "nested": "bsdf", "emitter": "emitter", "floor": "shape",
 }  # fmt: skip
 
 
@@ -191,7 +213,8 @@ def _element(name: str, value: Any) -> str:
         tag = _TAGS.get(name, "emitter" if name.startswith("light") else "shape")
         kind = value.get("type", "")
         inner = "\n".join(_element(key, part) for key, part in value.items() if key != "type")
-        return f'<{tag} type="{kind}" id="{name}">\n{inner}\n</{tag}>' if tag in ("shape", "sensor") else f'<{tag} type="{kind}">\n{inner}\n</{tag}>'
+        mark = f' id="{name}"' if tag in ("shape", "sensor") else f' name="{name}"' if tag == "texture" else ""
+        return f'<{tag} type="{kind}"{mark}>\n{inner}\n</{tag}>'
     if isinstance(value, bool):
         return f'<boolean name="{name}" value="{str(value).lower()}"/>'
     if isinstance(value, int):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+import io
+import re
 from collections.abc import Sequence
 from typing import Any, TypeVar
 
@@ -49,6 +52,52 @@ def mutated_text(rng: np.random.Generator, text: str) -> str:
     return text
 
 
+def changed_json(rng: np.random.Generator, value: Any) -> Any:
+    """JSON with one to three entries replaced, removed or renamed, at any depth."""
+    value = copy.deepcopy(value)
+    for _ in range(int(rng.integers(1, 4))):
+        value = _changed_entry(rng, value)
+    return value
+
+
+def changed_arrays(rng: np.random.Generator, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Arrays of which one or two have other values, types or shapes, or other names."""
+    changed = dict(arrays)
+    for _ in range(int(rng.integers(1, 3))):
+        name = pick(rng, tuple(changed))
+        value = changed[name]
+        choices = (
+            value[:-1] if value.ndim else value, value.T, value.astype(str), value[:0] if value.ndim else value, np.array(3),
+            np.array([]), value[None], np.full(value.shape, pick(rng, (np.nan, np.inf, -1.0, 1e30, 1e300))), np.full(value.shape, -1),
+            np.ones(value.shape, bool), np.ones(value.shape, complex), np.full(value.shape, 10**9), np.full(value.shape, 200, np.uint8),
+        )  # fmt: skip
+        changed[name] = pick(rng, choices)
+        if chance(rng, 0.2):
+            changed[f"{name}x"] = changed.pop(name)
+    return changed
+
+
+def npz(arrays: dict[str, np.ndarray]) -> bytes:
+    """Content of an .npz file."""
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    return buffer.getvalue()
+
+
+def _changed_entry(rng: np.random.Generator, value: Any) -> Any:
+    """JSON with one entry changed, at a random depth."""
+    if isinstance(value, (dict, list)) and value and chance(rng, 0.85):
+        key: Any = pick(rng, tuple(value)) if isinstance(value, dict) else int(rng.integers(len(value)))
+        if chance(rng, 0.15):
+            entry = value.pop(key)
+            if isinstance(value, dict) and chance(rng, 0.3):
+                value[f"{key}x"] = entry
+        else:
+            value[key] = _changed_entry(rng, value[key])
+        return value
+    return pick(rng, (None, "", "x", 0, -1, 1.5, 10**30, True, [], {}, [None], {"a": 1}, float("nan"), 1e308, [[1, 2], [3]]))
+
+
 def _place(rng: np.random.Generator, data: bytes) -> int:
     # Headers more often than the rest.
     end = len(data) if chance(rng, 0.5) else min(len(data), 200)
@@ -89,8 +138,6 @@ def _repeat(rng: np.random.Generator, data: bytes) -> bytes:
 
 def _change_number(rng: np.random.Generator, data: bytes) -> bytes:
     """Another number in place of one of the text's."""
-    import re
-
     found = list(re.finditer(rb"-?\d+(\.\d+)?", data[:20_000]))
     if not found:
         return data
@@ -108,8 +155,6 @@ _FAULTS = (_flip, _flip, _truncate, _overwrite, _overwrite, _insert, _remove, _r
 
 def _word(rng: np.random.Generator, text: str) -> str:
     """Another word in place of one."""
-    import re
-
     found = list(re.finditer(r"[A-Za-z_]\w*", text))
     if len(found) < 2:
         return text

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from ..errors import ShadowmapError
 from ..jit.arrays import device_array
-from ..jit.frozen import recordings_of
+from ..jit.frozen import freeze, recordings_of
 from ..jit.types import Float, TensorXf
 
 
@@ -79,7 +79,7 @@ class PoseFit:
         self._step_size, self._betas, self._shift_z = step_size, betas, shift_z
         self._spp = {} if spp == 1 else {"spp": spp}  # left out by default: a renderer need not have this option
         self._settings = dict(settings or {})
-        self._step = dr.freeze(_pose_step)
+        self._step = freeze(_pose_step)
         self.reset(np.zeros(3))
 
     def reset(self, start: npt.ArrayLike) -> None:

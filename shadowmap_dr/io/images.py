@@ -34,6 +34,12 @@ def write_exr(path: str | os.PathLike[str], channels: Mapping[str, Array], metad
     header: dict[str, object] = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     header.update(metadata or {})
     arrays = {name: np.ascontiguousarray(array) for name, array in channels.items()}
+    shapes = sorted({array.shape for array in arrays.values()})
+    if len(shapes) != 1 or len(shapes[0]) != 2 or 0 in shapes[0]:
+        raise ShadowmapError(f"cannot write {path}: channels of the shapes {shapes}; give arrays (H, W) of one size, not empty.")
+    for name, array in arrays.items():
+        if array.dtype not in (np.float16, np.float32, np.uint32):
+            raise ShadowmapError(f"cannot write {path}: channel {name} is {array.dtype}; give float16, float32 or uint32.")
     with atomic(path) as temporary:
         try:
             with OpenEXR.File(header, arrays) as file:
@@ -97,8 +103,8 @@ def write_png(path: str | os.PathLike[str], image: Array) -> None:
     pixels = np.asarray(image, dtype=np.float32)
     if pixels.ndim == 3 and pixels.shape[2] == 1:
         pixels = pixels[..., 0]
-    if pixels.ndim not in (2, 3) or (pixels.ndim == 3 and pixels.shape[2] not in (3, 4)):
-        raise ShadowmapError(f"an image of shape {np.shape(image)} is no PNG: give (H, W), (H, W, 1), (H, W, 3 or 4).")
+    if pixels.ndim not in (2, 3) or not pixels.size or (pixels.ndim == 3 and pixels.shape[2] not in (3, 4)):
+        raise ShadowmapError(f"an image of shape {np.shape(image)} is no PNG: give (H, W), (H, W, 1), (H, W, 3 or 4), not empty.")
     encoded = to_srgb(pixels)
     if pixels.ndim == 3 and pixels.shape[2] == 4:
         encoded[..., 3] = np.clip(pixels[..., 3], 0, 1)
@@ -115,6 +121,10 @@ def write_image(path: str | os.PathLike[str], image: Array, metadata: Mapping[st
     elif suffix == ".exr":
         pixels = np.asarray(image, dtype=np.float32)
         pixels = pixels[..., None] if pixels.ndim == 2 else pixels
+        if pixels.ndim != 3 or not pixels.size:
+            raise ShadowmapError(
+                f"cannot write {path}: an image of shape {np.shape(image)}; give (H, W) or (H, W, C), not empty."
+            )
         write_exr(path, {name: pixels[..., i] for i, name in enumerate(colour_channels(pixels.shape[2]))}, metadata)
     else:
         raise OutputError(f"cannot write {path}: the suffix {suffix!r} is not one of {', '.join(SUFFIXES)}.")

@@ -40,8 +40,13 @@ def _mesh(rng: np.random.Generator, folder: Path) -> str:
 
 def _read(path: Path, sound: bool) -> str:
     vertices, faces, (middle, scale) = read_placed_mesh(path)
-    check(vertices.dtype == np.float32 and vertices.ndim == 2 and vertices.shape[1] == 3, f"vertices {vertices.dtype} {vertices.shape}")
-    check(faces.dtype == np.uint32 and faces.ndim == 2 and faces.shape[1] == 3 and len(faces), f"faces {faces.dtype} {faces.shape}")
+    check(
+        vertices.dtype == np.float32 and vertices.ndim == 2 and vertices.shape[1] == 3,
+        f"vertices {vertices.dtype} {vertices.shape}",
+    )
+    check(
+        faces.dtype == np.uint32 and faces.ndim == 2 and faces.shape[1] == 3 and len(faces), f"faces {faces.dtype} {faces.shape}"
+    )
     check(faces.max() < len(vertices), f"index {faces.max()} of {len(vertices)} vertices")
     check(np.isfinite(vertices).all() and np.isfinite([*middle, scale]).all(), "vertices are not finite")
     check(np.abs(vertices).max() <= 1 + 1e-5, f"coordinates up to {np.abs(vertices).max()}")
@@ -52,7 +57,20 @@ def _read(path: Path, sound: bool) -> str:
 
 def _headers(rng: np.random.Generator, folder: Path) -> str:
     """PLY files with headers made of random lines."""
-    types = ("float", "double", "uchar", "int", "uint", "short", "list", "list uchar int", "list int float", "list float int", "quad", "")
+    types = (
+        "float",
+        "double",
+        "uchar",
+        "int",
+        "uint",
+        "short",
+        "list",
+        "list uchar int",
+        "list int float",
+        "list float int",
+        "quad",
+        "",
+    )
     names = ("x", "y", "z", "vertex_indices", "vertex_index", "red", "", "nx")
     counts = ("8", "0", "-1", "3", "1000000000", "99999999999999999999", "x", "")
     form = pick(rng, ("ascii", "binary_little_endian", "binary_big_endian", "binary", ""))
@@ -64,7 +82,9 @@ def _headers(rng: np.random.Generator, folder: Path) -> str:
             lines += [f"property float {axis}" for axis in "xyz"]
         if element == "face" and chance(rng, 0.7):
             lines += ["property list uchar int vertex_indices"]
-    body = rng.bytes(int(rng.integers(400))) if form.startswith("binary") else " ".join(map(str, rng.integers(-1, 9, 100))).encode()
+    body = (
+        rng.bytes(int(rng.integers(400))) if form.startswith("binary") else " ".join(map(str, rng.integers(-1, 9, 100))).encode()
+    )
     path = folder / "mesh.ply"
     path.write_bytes("\n".join([*lines, "end_header", ""]).encode() + body)
     return _read(path, False)
@@ -76,7 +96,9 @@ def _mesh_command(rng: np.random.Generator, folder: Path) -> str:
     suffix, data = mesh_files.files()[name]
     path = folder / f"mesh{suffix}"
     path.write_bytes(mutated(rng, data))
-    return run_command(["art", "--target", "none.png", "--mesh", str(path), "--resolution", "16", "--iterations", "1", "--out", "out"])
+    return run_command(
+        ["art", "--target", "none.png", "--mesh", str(path), "--resolution", "16", "--iterations", "1", "--out", "out"]
+    )
 
 
 @functools.cache
@@ -98,7 +120,9 @@ def _basel(rng: np.random.Generator, folder: Path) -> str:
     check(np.isfinite(model.mean).all() and model.faces.max() < len(model.mean), "a model with bad vertices or faces")
     save_model(folder / "again.npz", model)
     again = load_model(folder / "again.npz")
-    check(np.array_equal(again.mean, model.mean) and np.array_equal(again.faces, model.faces), "another model was read than written")
+    check(
+        np.array_equal(again.mean, model.mean) and np.array_equal(again.faces, model.faces), "another model was read than written"
+    )
     return model.describe()
 
 

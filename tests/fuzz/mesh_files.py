@@ -33,7 +33,15 @@ def files() -> dict[str, tuple[str, bytes]]:
 
 
 def _obj() -> bytes:
-    lines = ["# caf\u00e9", "mtllib none.mtl", "o cube", *(f"v {x} {y} {z}" for x, y, z in CORNERS), "vn 0 0 1", "vt 0 0", "usemtl a"]
+    lines = [
+        "# caf\u00e9",
+        "mtllib none.mtl",
+        "o cube",
+        *(f"v {x} {y} {z}" for x, y, z in CORNERS),
+        "vn 0 0 1",
+        "vt 0 0",
+        "usemtl a",
+    ]
     lines += ["f " + " ".join(f"{i + 1}/1/1" for i in face) for face in QUADS[:3]]
     lines += ["f " + " ".join(f"{i - 8}//1" for i in face) for face in QUADS[3:]]
     return "\n".join(lines).encode() + b"\n"
@@ -43,7 +51,9 @@ def _ply(order: str) -> bytes:
     """Triangles and quads in one list, with further properties and a comment that is not UTF-8."""
     faces = [*QUADS[:3], *TRIANGLES[6:]]
     form = "binary_little_endian" if order == "<" else "binary_big_endian"
-    header = f"ply\nformat {form} 1.0\nelement vertex 8\nproperty double x\nproperty double y\nproperty double z\nproperty uchar red\n"
+    header = (
+        f"ply\nformat {form} 1.0\nelement vertex 8\nproperty double x\nproperty double y\nproperty double z\nproperty uchar red\n"
+    )
     header += f"element face {len(faces)}\nproperty list uchar int vertex_indices\nproperty list uchar float texcoord\n"
     data = b"".join(struct.pack(f"{order}3dB", *corner, 7) for corner in CORNERS)
     for face in faces:

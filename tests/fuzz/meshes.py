@@ -37,7 +37,11 @@ def _clip(rng: np.random.Generator, mesh: RandomMesh) -> Any:
 
 
 def _faces(mesh: RandomMesh) -> Any:
-    return mi.TensorXu(mesh.faces.astype(np.int64).astype(np.uint32)) if len(mesh.faces) else mi.TensorXu(dr.zeros(mi.UInt32, 0), (0, 3))
+    return (
+        mi.TensorXu(mesh.faces.astype(np.int64).astype(np.uint32))
+        if len(mesh.faces)
+        else mi.TensorXu(dr.zeros(mi.UInt32, 0), (0, 3))
+    )
 
 
 def _rasterize(rng: np.random.Generator, mesh: RandomMesh) -> str:
@@ -153,9 +157,19 @@ def _render(rng: np.random.Generator, mesh: RandomMesh) -> str:
     flat = mi.Float(vertices.ravel())
     forms: list[Any] = [flat, mi.TensorXf(vertices), mi.Point3f(vertices.T)]
     if chance(rng, 0.2):
-        forms = [mi.Float(vertices.ravel()[:-3]), mi.TensorXf(vertices.T.copy()), mi.Float(0), mi.TensorXf(vertices[None]), *OTHERS]
+        forms = [
+            mi.Float(vertices.ravel()[:-3]),
+            mi.TensorXf(vertices.T.copy()),
+            mi.Float(0),
+            mi.TensorXf(vertices[None]),
+            *OTHERS,
+        ]
     given: Any = {"ball" if chance(rng, 0.95) else pick(rng, ("none", "", "sun")): pick(rng, forms)}
-    options: dict[str, Any] = {"spp": int(pick(rng, (1, 4)))} if chance(rng, 0.8) else {pick(rng, ("spp", "sensor")): pick(rng, (0, -1, 10**9, "x", None, 1.5, 2))}
+    options: dict[str, Any] = (
+        {"spp": int(pick(rng, (1, 4)))}
+        if chance(rng, 0.8)
+        else {pick(rng, ("spp", "sensor")): pick(rng, (0, -1, 10**9, "x", None, 1.5, 2))}
+    )
     image = renderer.render(given, **options).numpy()
     check(image.shape == (16, 16, 3), f"an image of shape {image.shape}")
     check(np.isfinite(image).all(), "an image is not finite")

@@ -14,7 +14,6 @@ import numpy as np
 from model_fakes import SIZE, FakeSession
 from PIL import Image
 from starlette.testclient import TestClient
-from starlette.websockets import WebSocketDisconnect
 
 from shadowmap_dr.interactive import messages, server
 from shadowmap_dr.interactive.connections import Connections
@@ -39,7 +38,9 @@ def _client() -> TestClient:
     fake.session.start()
     atexit.register(fake.session.close)
     stack = ExitStack()
-    client = stack.enter_context(TestClient(server.create_app(Connections(fake.session, fake.sculptor.views[0], "ball")), base_url=_BASE))
+    client = stack.enter_context(
+        TestClient(server.create_app(Connections(fake.session, fake.sculptor.views[0], "ball")), base_url=_BASE)
+    )
     atexit.register(stack.close)
     return client
 
@@ -92,7 +93,9 @@ def _live(rng: np.random.Generator, folder: Path) -> str:
         for _ in range(2000):
             message = connection.receive()
             if message["type"] == "websocket.close":
-                check(message["code"] == 1008 and message.get("reason"), f"closed with {message['code']}, {message.get('reason')!r}")
+                check(
+                    message["code"] == 1008 and message.get("reason"), f"closed with {message['code']}, {message.get('reason')!r}"
+                )
                 raise Refused(message["reason"])
             data = message.get("bytes")
             if data and data[0] == 3 and int.from_bytes(data[8:12], "little") == 12345:
@@ -112,10 +115,24 @@ def _post(rng: np.random.Generator, folder: Path) -> str:
 
 def _get(rng: np.random.Generator, folder: Path) -> str:
     """Requests for files, and for others."""
-    names = ("/", "/page.js", "/mesh.ply", "/mesh.obj", "/mesh.glb", "/shadow.png", "/live", "/image", "/../server.py", "/mesh.exe", "/mesh.")
+    names = (
+        "/",
+        "/page.js",
+        "/mesh.ply",
+        "/mesh.obj",
+        "/mesh.glb",
+        "/shadow.png",
+        "/live",
+        "/image",
+        "/../server.py",
+        "/mesh.exe",
+        "/mesh.",
+    )
     path = pick(rng, names)
     if chance(rng, 0.4):
-        path = "/" + "".join(pick(rng, ("%2e", "..", "/", "%00", "a", "%ff", "mesh.", "é", "?x=1", "%")) for _ in range(int(rng.integers(6))))
+        path = "/" + "".join(
+            pick(rng, ("%2e", "..", "/", "%00", "a", "%ff", "mesh.", "é", "?x=1", "%")) for _ in range(int(rng.integers(6)))
+        )
     method = pick(rng, ("GET", "GET", "GET", "POST", "HEAD", "PUT", "OPTIONS", "DELETE"))
     return _answer(_client().request(method, _BASE + path, headers=_header(rng)))
 
@@ -124,7 +141,17 @@ def _header(rng: np.random.Generator) -> dict[str, str]:
     if chance(rng, 0.7):
         return {}
     names = ("host", "origin", "range", "content-length", "content-type", "sec-fetch-site", "x" * 50)
-    values = ("127.0.0.1:8711", "http://evil.example", "null", "bytes=0-1", "-1", "0", "", str(pick(rng, INTEGERS)), str(pick(rng, NUMBERS)))
+    values = (
+        "127.0.0.1:8711",
+        "http://evil.example",
+        "null",
+        "bytes=0-1",
+        "-1",
+        "0",
+        "",
+        str(pick(rng, INTEGERS)),
+        str(pick(rng, NUMBERS)),
+    )
     return {pick(rng, names): pick(rng, values)}
 
 

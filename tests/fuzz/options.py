@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import importlib
-import re
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -82,9 +81,36 @@ def random_option(rng: np.random.Generator, parameter: Any) -> list[str]:
     elif len(known) > 1 and chance(rng, 0.7):
         value = pick(rng, known)
     elif "Path" in kind and chance(rng, 0.8):
-        value = pick(rng, ("new", "folder", "mesh.ply", "none/deep/new", "picture.png", "", ".", "/dev/null", "/proc/none", "é", "x" * 300))
+        value = pick(
+            rng, ("new", "folder", "mesh.ply", "none/deep/new", "picture.png", "", ".", "/dev/null", "/proc/none", "é", "x" * 300)
+        )
     else:
-        value = pick(rng, ("", "x", "0", "-1", "1e9", "nan", "3/0", "1/2", "99999x2", "2x3", "heart", "mesh.ply", "a=b", "é\udcff", "\n", "llvm_ad_rgb", "scalar_rgb", "cuda_ad_rgb", "processes:0", "tcp://127.0.0.1:1", " "))
+        value = pick(
+            rng,
+            (
+                "",
+                "x",
+                "0",
+                "-1",
+                "1e9",
+                "nan",
+                "3/0",
+                "1/2",
+                "99999x2",
+                "2x3",
+                "heart",
+                "mesh.ply",
+                "a=b",
+                "é\udcff",
+                "\n",
+                "llvm_ad_rgb",
+                "scalar_rgb",
+                "cuda_ad_rgb",
+                "processes:0",
+                "tcp://127.0.0.1:1",
+                " ",
+            ),
+        )
     return [name, value]
 
 

@@ -25,8 +25,17 @@ from .values import NUMBERS, chance, mutated, mutated_text, pick
 _MODES = ("1", "L", "LA", "P", "RGB", "RGBA", "I;16", "CMYK", "I", "F", "YCbCr")
 # Mode of a Pillow image -> formats that hold it.
 _FORMATS = {
-    **{"1": ("PNG", "TIFF", "BMP"), "L": ("PNG", "JPEG", "TIFF", "GIF", "WEBP"), "LA": ("PNG", "TIFF"), "P": ("PNG", "GIF", "BMP")},
-    **{"RGB": ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "PPM", "TGA"), "RGBA": ("PNG", "WEBP", "TIFF", "GIF"), "I;16": ("PNG", "TIFF")},
+    **{
+        "1": ("PNG", "TIFF", "BMP"),
+        "L": ("PNG", "JPEG", "TIFF", "GIF", "WEBP"),
+        "LA": ("PNG", "TIFF"),
+        "P": ("PNG", "GIF", "BMP"),
+    },
+    **{
+        "RGB": ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "PPM", "TGA"),
+        "RGBA": ("PNG", "WEBP", "TIFF", "GIF"),
+        "I;16": ("PNG", "TIFF"),
+    },
     **{"CMYK": ("JPEG", "TIFF"), "I": ("TIFF",), "F": ("TIFF",), "YCbCr": ("JPEG", "TIFF")},
 }
 _SIDES = (1, 1, 2, 3, 16, 17, 40, 64, 300)
@@ -77,7 +86,9 @@ def _picture(rng: np.random.Generator, folder: Path) -> str:
     suffix, data, image = _encoded(rng)
     sound = chance(rng, 0.2)
     data = data if sound else mutated(rng, data)
-    return _read(rng, folder, suffix if chance(rng, 0.95) else pick(rng, (".exr", ".png", ".svg")), data, image.size if sound else None)
+    return _read(
+        rng, folder, suffix if chance(rng, 0.95) else pick(rng, (".exr", ".png", ".svg")), data, image.size if sound else None
+    )
 
 
 def _read(rng: np.random.Generator, folder: Path, suffix: str, data: bytes, size: tuple[int, int] | None) -> str:
@@ -128,12 +139,16 @@ def _declared(rng: np.random.Generator, folder: Path) -> str:
     elif form == "GIF":
         data = b"GIF89a" + struct.pack("<2H", width & 0xFFFF, height & 0xFFFF) + rng.bytes(50)
     elif form == "BMP":
-        header = struct.pack("<I2i2H6I", 40, width & 0x7FFFFFFF, height & 0x7FFFFFFF, 1, int(pick(rng, (1, 8, 24, 32))), 0, 0, 0, 0, 0, 0)
+        header = struct.pack(
+            "<I2i2H6I", 40, width & 0x7FFFFFFF, height & 0x7FFFFFFF, 1, int(pick(rng, (1, 8, 24, 32))), 0, 0, 0, 0, 0, 0
+        )
         data = b"BM" + struct.pack("<3I", 100, 0, 54) + header + bytes(100)
     elif form == "TIFF":
         buffer = io.BytesIO()
         Image.new("L", (5, 7)).save(buffer, format="TIFF")
-        data = buffer.getvalue().replace(struct.pack("<2HI", 256, 4, 1), b"").replace(b"\x05\x00\x00\x00", struct.pack("<I", width))
+        data = (
+            buffer.getvalue().replace(struct.pack("<2HI", 256, 4, 1), b"").replace(b"\x05\x00\x00\x00", struct.pack("<I", width))
+        )
         data = data.replace(b"\x07\x00\x00\x00", struct.pack("<I", height))
     else:
         images.write_exr(folder / "a.exr", {"Y": np.ones((7, 5), np.float32)})
@@ -144,7 +159,9 @@ def _declared(rng: np.random.Generator, folder: Path) -> str:
 
 
 def _exr(rng: np.random.Generator, folder: Path) -> str:
-    names = pick(rng, (("R", "G", "B"), ("Y",), ("R", "G", "B", "A"), ("R",), ("Z", "N.x"), ("Y", "A"), ("R", "G", "B", "A", "depth.Z")))
+    names = pick(
+        rng, (("R", "G", "B"), ("Y",), ("R", "G", "B", "A"), ("R",), ("Z", "N.x"), ("Y", "A"), ("R", "G", "B", "A", "depth.Z"))
+    )
     height, width = int(pick(rng, _SIDES)), int(pick(rng, _SIDES))
     kind: Any = pick(rng, (np.float16, np.float32, np.uint32))
     channels = {name: rng.uniform(0, 2, (height, width)).astype(kind) for name in names}

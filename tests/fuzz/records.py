@@ -27,11 +27,25 @@ from shadowmap_dr.io.files import read_arrays
 from .outcome import check
 from .values import chance, changed_arrays, changed_json, mutated, npz, pick
 
-_FOREIGN = (b"", b"{", b"[]", b"3", b'"text"', b"null", b'{"a": 1}', b'[{"a": []}]', b"\x00", b"[" * 50_000, b"\xff\xfe{", b"NaN", b"{}" * 9)
+_FOREIGN = (
+    b"",
+    b"{",
+    b"[]",
+    b"3",
+    b'"text"',
+    b"null",
+    b'{"a": 1}',
+    b'[{"a": []}]',
+    b"\x00",
+    b"[" * 50_000,
+    b"\xff\xfe{",
+    b"NaN",
+    b"{}" * 9,
+)
 
 _POSE: dict[str, Any] = {
     **{"object": "spot", "method": "shadows", "reference": "own", "resolution": 8, "run": 0, "seed": 0, "iterations": 2},
-    **{"settings": {}, "environment": {}, "start": [0, 0, 0, 0, 0, 0], "final": [0, None, 0, 0, 0, 0], "recovered": False},
+    **{"settings": {}, "environment": {}, "start": [0, 0, 0], "final": [0, None, 0], "recovered": False},
     **{"rotation_error_deg": 1.0, "translation_error_x100": 1.0, "seconds_per_iteration": None, "shadow_only": False},
     **{"seconds_to_pose": None, "seconds_total": 1.0, "loss_curve": [1, 1], "normals": "face"},
     **{"rotation_error_curve": [1, 1, 1], "translation_error_curve": [1, 1, 1]},
@@ -45,7 +59,9 @@ _LIGHTS: dict[str, Any] = {
 
 def run(rng: np.random.Generator, folder: Path) -> str:
     """Edit a record, and read it."""
-    return pick(rng, (_pose, _lights, _bench, _gallery, _plain, _table, _sweep, _sweep, _checkpoint, _checkpoint, _art_checkpoint))(rng, folder)
+    return pick(
+        rng, (_pose, _lights, _bench, _gallery, _plain, _table, _sweep, _sweep, _checkpoint, _checkpoint, _art_checkpoint)
+    )(rng, folder)
 
 
 def _write(rng: np.random.Generator, path: Path, value: Any) -> bool:
@@ -78,18 +94,25 @@ def _lights(rng: np.random.Generator, folder: Path) -> str:
 
 
 def _bench(rng: np.random.Generator, folder: Path) -> str:
-    unit = {"seconds": {"shadows": {"median": 1.0, "low": 1.0, "high": 1.0}}, "resolution": 128}
-    record = {"format": bench.FORMAT, "sections": {"steps": {"units": {"step-128": unit}, "settings": {}}}}
-    _write(rng, folder / "bench.json", record)
-    found = bench._stored(BenchOptions(out=folder / "bench.json", resume=chance(rng, 0.7)))
-    check(isinstance(found["sections"], dict), "a record without sections")
-    bench_report.markdown({**record, **found})
+    unit = {"seconds": {name: {"median": 1.0, "q1": 1.0, "q3": 1.0} for name in ("shadows", "rasterizer")}, "resolution": 128}
+    unit |= {"mitsuba": {"fair": True}, "ratio_of_medians": {"shadows / rasterizer": 1.0}}
+    options = BenchOptions(out=folder / "bench.json", resume=chance(rng, 0.7))
+    bench._write(options, {"format": bench.FORMAT, "sections": {"steps": {"units": {"step-128": unit}, "settings": {}}}})
+    written = json.loads(options.out.read_text())
+    if chance(rng, 0.5):
+        del written["checks"]
+    sound = _write(rng, options.out, written)
+    found = bench._stored(options)
+    made = bench_report.rows(found)
+    check(not sound or len(made) == 2, f"{len(made)} of 2 rows")
     return f"{len(found['sections'])} sections"
 
 
 def _gallery(rng: np.random.Generator, folder: Path) -> str:
     view = {"iou": 0.9}
-    _write(rng, folder / "art.json", {"settings": {}, "views": [view], "mesh": {"inverted_triangles": 0}, "iou_curve": [[0, [0.9]]]})
+    _write(
+        rng, folder / "art.json", {"settings": {}, "views": [view], "mesh": {"inverted_triangles": 0}, "iou_curve": [[0, [0.9]]]}
+    )
     return f"finished: {gallery._is_finished(folder / 'art.json')}"
 
 
@@ -134,7 +157,9 @@ def _sweep(rng: np.random.Generator, folder: Path) -> str:
                 value.pop("check")
             _write(rng, path, value)
     if chance(rng, 0.3):
-        (folder / "batches" / pick(rng, ("x.json", "bowls-.json", "bowls-0-1.json", "bowls.checkpoint.npz"))).write_bytes(pick(rng, _FOREIGN))
+        (folder / "batches" / pick(rng, ("x.json", "bowls-.json", "bowls-0-1.json", "bowls.checkpoint.npz"))).write_bytes(
+            pick(rng, _FOREIGN)
+        )
     again = run_sweep([problem], folder, variant=mi.variant(), resume=True, console=quiet)
     check(len(again["bowls"]) == len(first["bowls"]) == 3, f"{len(again['bowls'])} of 3 runs")
     return "3 runs"
@@ -192,6 +217,8 @@ def _art_checkpoint(rng: np.random.Generator, folder: Path) -> str:
     path.write_bytes(mutated(rng, path.read_bytes()) if chance(rng, 0.3) else npz(changed_arrays(rng, arrays)))
     found, state = art_run._load(path, "x")
     check(all(frame.vertices.ndim == 2 and frame.faces.ndim == 2 for frame in found.frames), "frames of other shapes")
-    check(all(frame.faces.size == 0 or frame.faces.max() < len(frame.vertices) for frame in found.frames), "faces without vertices")
+    check(
+        all(frame.faces.size == 0 or frame.faces.max() < len(frame.vertices) for frame in found.frames), "faces without vertices"
+    )
     check(len(found.loss) == len(found.seconds) == len(found.warm), "curves of different lengths")
     return f"{len(found.frames)} frames, {len(state)} arrays"

@@ -47,7 +47,9 @@ class Report:
         outcomes = (RESULT, REFUSED, FAULT)
         lines = ["| kind | cases | result | refused | fault | seconds |", "|---|---|---|---|---|---|"]
         for name in [*KINDS, "all"]:
-            of = [sum(n for (kind, o), n in self.counts.items() if o == outcome and name in (kind, "all")) for outcome in outcomes]
+            of = [
+                sum(n for (kind, o), n in self.counts.items() if o == outcome and name in (kind, "all")) for outcome in outcomes
+            ]
             seconds = sum(s for kind, s in self.seconds.items() if name in (kind, "all"))
             if sum(of):
                 lines.append(f"| {name} | {sum(of)} | {' | '.join(map(str, of))} | {seconds:.0f} |")

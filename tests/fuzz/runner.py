@@ -30,7 +30,10 @@ Report = Callable[[Case, Outcome], None]
 
 
 def run_cases(
-    cases: Sequence[Case], on_done: Report, on_wait: Callable[[], None] = lambda: None, on_end: Callable[[str], None] | None = None
+    cases: Sequence[Case],
+    on_done: Report,
+    on_wait: Callable[[], None] = lambda: None,
+    on_end: Callable[[str], None] | None = None,
 ) -> None:
     """Try all cases in order.
 
@@ -90,12 +93,16 @@ def _run_batch(batch: Sequence[Case], said: IO[bytes], on_done: Report, on_wait:
 
 
 @contextmanager
-def _process(
-    batch: Sequence[Case], said: IO[bytes], folder: str
-) -> Iterator[tuple[subprocess.Popen[bytes], queue.Queue[Any]]]:
+def _process(batch: Sequence[Case], said: IO[bytes], folder: str) -> Iterator[tuple[subprocess.Popen[bytes], queue.Queue[Any]]]:
     """A process with its temporary files in a folder, and the lines that it writes; None after the last one."""
     code = [sys.executable, "-m", f"{__package__}.worker"]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": _python_path(), "TMPDIR": folder}
+    environment = {
+        **os.environ,
+        "OMP_NUM_THREADS": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+        "PYTHONPATH": _python_path(),
+        "TMPDIR": folder,
+    }
     process = subprocess.Popen(
         code, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=said, cwd=_ROOT, env=environment, start_new_session=True
     )
@@ -153,10 +160,14 @@ def _status(code: int) -> str:
 
 
 def _stack(said: IO[bytes]) -> str:
-    """The innermost frames of this package that the process has written last."""
+    """The last words of a process that was ended: a failure of Dr.Jit, and the innermost frames of this package."""
     text = _text(said)
-    frames = re.findall(r'File ".*?(shadowmap_dr/[^"]*|tests/fuzz/[^"]*)", line (\d+)', text[text.rfind("most recent call first") :])
-    return ", ".join(f"{path}:{line}" for path, line in frames[:2]) or " ".join(text.split())[-200:] or "it has said nothing"
+    frames = re.findall(
+        r'File ".*?(shadowmap_dr/[^"]*|tests/fuzz/[^"]*)", line (\d+)', text[text.rfind("most recent call first") :]
+    )
+    failures = re.findall(r"^.*(?:[Ff]ailure|terminate called|what\(\):).*$", text[-20_000:], re.MULTILINE)
+    words = [line.strip() for line in failures[-1:]] + [f"{path}:{line}" for path, line in frames[:2]]
+    return ", ".join(words) or " ".join(text.split())[-200:] or "it has said nothing"
 
 
 def _text(said: IO[bytes]) -> str:

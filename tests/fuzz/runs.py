@@ -51,7 +51,7 @@ _RESUMED = [line for line in COMMANDS if line != "info"]
 def run(rng: np.random.Generator, folder: Path) -> str:
     """Run a command."""
     write_files(folder)
-    return _resumed(rng, folder) if chance(rng, 0.7) else _short(rng)
+    return _resumed(rng) if chance(rng, 0.7) else _short(rng)
 
 
 def _short(rng: np.random.Generator) -> str:
@@ -73,9 +73,9 @@ def _check_records(folder: Path) -> None:
 
 
 @functools.cache
-def _finished(line: str) -> Path:
-    """A folder in which the command has run, with checkpoints of its last steps as ``*.npz.kept``."""
-    folder = Path(tempfile.mkdtemp())
+def _finished(line: str) -> tuple[Path, Path]:
+    """A copy of a folder in which the command has run, and the folder. Checkpoints of its last steps are ``*.npz.kept``."""
+    copy, folder = Path(tempfile.mkdtemp()), Path(tempfile.mkdtemp())
     write_files(folder)
     here = os.getcwd()
     os.chdir(folder)
@@ -84,7 +84,8 @@ def _finished(line: str) -> Path:
             run_command(line.split())
     finally:
         os.chdir(here)
-    return folder
+    shutil.copytree(folder, copy, dirs_exist_ok=True)
+    return copy, folder
 
 
 @contextmanager
@@ -101,10 +102,16 @@ def _keeping_checkpoints() -> Iterator[None]:
         yield
 
 
-def _resumed(rng: np.random.Generator, folder: Path) -> str:
+def _resumed(rng: np.random.Generator) -> str:
     line = pick(rng, tuple(_RESUMED))
-    shutil.copytree(_finished(line), folder, dirs_exist_ok=True)
-    paths = sorted(path for path in folder.rglob("*") if path.suffix in (".json", ".exr", ".npz", ".md", ".ply") and path.name != "mesh.ply")
+    finished, folder = _finished(line)
+    # Records may name files by their places.
+    shutil.rmtree(folder)
+    shutil.copytree(finished, folder)
+    os.chdir(folder)
+    paths = sorted(
+        path for path in folder.rglob("*") if path.suffix in (".json", ".exr", ".npz", ".md", ".ply") and path.name != "mesh.ply"
+    )
     for path in folder.rglob("*.kept"):
         killed = path.with_suffix("")
         path.replace(killed)

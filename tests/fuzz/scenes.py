@@ -41,7 +41,9 @@ def _file(rng: np.random.Generator, folder: Path) -> str:
     path.write_text(text if sound else _changed(rng, text), encoding="utf-8", errors="surrogateescape")
     options = ["--integrator", "scene"] if chance(rng, 0.8) else []
     if chance(rng, 0.15):
-        options += pick(rng, (["--size", "9x7"], ["--spp", "4"], ["--size", "0x1"], ["--aovs", "depth"], ["--integrator", "path"]))
+        options += pick(
+            rng, (["--size", "9x7"], ["--spp", "4"], ["--size", "0x1"], ["--aovs", "depth"], ["--integrator", "path"])
+        )
     said = run_command(["render", str(path), "-o", "image.exr", *options])
     channels, _ = images.read_exr(folder / "image.exr")
     colours = [channels[name] for name in ("R", "G", "B", "Y", "A") if name in channels]
@@ -94,7 +96,11 @@ def _scene(rng: np.random.Generator, folder: Path) -> dict[str, Plugin]:
 
 
 def _shape(rng: np.random.Generator, folder: Path) -> Plugin:
-    kind = pick(rng, (*("cube", "sphere", "disk", "cylinder", "rectangle", "file", "file") * 2, "bsplinecurve", "linearcurve")) if chance(rng, 0.97) else "shapegroup"
+    kind = (
+        pick(rng, (*("cube", "sphere", "disk", "cylinder", "rectangle", "file", "file") * 2, "bsplinecurve", "linearcurve"))
+        if chance(rng, 0.97)
+        else "shapegroup"
+    )
     shape: Plugin = {"type": kind, "to_world": _transform(rng), "bsdf": _bsdf(rng)}
     if kind == "file":
         suffix, data = mesh_files.files()[pick(rng, ("obj", "obj of quads", "ply", "ascii ply"))]
@@ -103,7 +109,9 @@ def _shape(rng: np.random.Generator, folder: Path) -> Plugin:
         shape.update(type=suffix[1:], filename=str(path))
     elif kind.endswith("curve"):
         path = folder / "curve.txt"
-        path.write_text("\n".join(f"{k} {k % 2} 1 {pick(rng, ('0.1',) * 8 + ('0', 'nan', ''))}" for k in range(int(rng.integers(1, 7)))))
+        path.write_text(
+            "\n".join(f"{k} {k % 2} 1 {pick(rng, ('0.1',) * 8 + ('0', 'nan', ''))}" for k in range(int(rng.integers(1, 7))))
+        )
         shape["filename"] = str(path)
     if chance(rng, 0.15):
         shape["emitter"] = {"type": "area", "radiance": _colour(rng)}
@@ -134,12 +142,20 @@ def _light(rng: np.random.Generator) -> Plugin:
     elif kind in ("envmap", "projector"):
         height = int(pick(rng, (1, 2, 5)))
         images.write_exr(Path("light.exr"), {name: rng.uniform(0, 2, (height, 2 * height)).astype(np.float32) for name in "RGB"})
-        light |= {"filename": "light.exr"} if kind == "envmap" else {"irradiance": {"type": "bitmap", "filename": "light.exr"}, "fov": 40.0}
+        light |= (
+            {"filename": "light.exr"}
+            if kind == "envmap"
+            else {"irradiance": {"type": "bitmap", "filename": "light.exr"}, "fov": 40.0}
+        )
     return light
 
 
 def _camera(rng: np.random.Generator) -> Plugin:
-    kind = pick(rng, (*("perspective",) * 8, "orthographic", "orthographic", "thinlens", "thinlens")) if chance(rng, 0.97) else pick(rng, ("batch", "distant", "irradiancemeter"))
+    kind = (
+        pick(rng, (*("perspective",) * 8, "orthographic", "orthographic", "thinlens", "thinlens"))
+        if chance(rng, 0.97)
+        else pick(rng, ("batch", "distant", "irradiancemeter"))
+    )
     film: Plugin = {
         "type": pick(rng, ("hdrfilm",) * 20 + ("specfilm",)), "width": SIZE, "height": int(pick(rng, (SIZE, SIZE, 5, 1))),
         "pixel_format": pick(rng, (*("rgb", "rgba", "luminance", "luminance_alpha") * 4, "xyz")), "rfilter": {"type": pick(rng, ("box", "gaussian", "tent", "lanczos"))},
@@ -152,7 +168,10 @@ def _camera(rng: np.random.Generator) -> Plugin:
     if kind == "thinlens":
         camera |= {"aperture_radius": 0.1, "focus_distance": 4.0}
     if chance(rng, 0.3):
-        camera["sampler"] = {"type": pick(rng, ("independent", "multijitter", "stratified")), "sample_count": int(pick(rng, (1, 4, 9)))}
+        camera["sampler"] = {
+            "type": pick(rng, ("independent", "multijitter", "stratified")),
+            "sample_count": int(pick(rng, (1, 4, 9))),
+        }
     if chance(rng, 0.2):
         camera |= {"near_clip": float(pick(rng, (1e-3, 1.0, 10.0))), "far_clip": float(pick(rng, (5.0, 1e6)))}
     return camera
@@ -182,13 +201,26 @@ def _colour(rng: np.random.Generator) -> Any:
 
 def _vector(rng: np.random.Generator) -> tuple[str, tuple[float, ...]]:
     x, y = rng.normal(size=2).round(3)
-    return "vector", (float(x), float(y), float(pick(rng, (3.0, -1.0, 0.0)))) if chance(rng, 0.9) else (0.0, 0.0, float(pick(rng, (0.0, 1e20))))
+    return "vector", (float(x), float(y), float(pick(rng, (3.0, -1.0, 0.0)))) if chance(rng, 0.9) else (
+        0.0,
+        0.0,
+        float(pick(rng, (0.0, 1e20))),
+    )
 
 
 def _transform(rng: np.random.Generator) -> tuple[Any, ...]:
     if chance(rng, 0.7):
         return "translate", tuple(float(x) for x in rng.uniform(-1, 1, 3).round(3))
-    return pick(rng, (("scale", (1, 1, 0)), ("scale", (-1, 1, 1)), ("scale", (1e-8, 1e-8, 1e-8)), ("translate", (0, 0, 1e8)), ("scale", (0.5, 0.5, 0.5))))
+    return pick(
+        rng,
+        (
+            ("scale", (1, 1, 0)),
+            ("scale", (-1, 1, 1)),
+            ("scale", (1e-8, 1e-8, 1e-8)),
+            ("translate", (0, 0, 1e8)),
+            ("scale", (0.5, 0.5, 0.5)),
+        ),
+    )
 
 
 def _damage(rng: np.random.Generator, plugins: dict[str, Plugin]) -> None:
@@ -198,7 +230,20 @@ def _damage(rng: np.random.Generator, plugins: dict[str, Plugin]) -> None:
     if nested and chance(rng, 0.5):
         part = pick(rng, nested)
     key = pick(rng, tuple(part)) if chance(rng, 0.8) else pick(rng, ("unknown", "radius", "fov", "id", "center"))
-    part[key] = pick(rng, (number(rng), min(integer(rng), 40), "text", "", True, (0.0, 0.0, 0.0), ("scale", (0, 0, 0)), {"type": "diffuse"}, {"type": "none"}))
+    part[key] = pick(
+        rng,
+        (
+            number(rng),
+            min(integer(rng), 40),
+            "text",
+            "",
+            True,
+            (0.0, 0.0, 0.0),
+            ("scale", (0, 0, 0)),
+            {"type": "diffuse"},
+            {"type": "none"},
+        ),
+    )
 
 
 _TAGS = {

@@ -50,7 +50,9 @@ def _finite(tensor: torch.Tensor, name: str) -> None:
 def _rasterize(rng: np.random.Generator, mesh: RandomMesh) -> str:
     options: dict[str, Any] = {}
     if chance(rng, 0.2):
-        options["ranges"] = pick(rng, ([(0, 1)], [(0, 1), (0, 1)], [(0, 0)], [(-1, 2)], [(0, 10**9)], torch.zeros(1, 2), [], "x", [(0,)], None))
+        options["ranges"] = pick(
+            rng, ([(0, 1)], [(0, 1), (0, 1)], [(0, 0)], [(-1, 2)], [(0, 10**9)], torch.zeros(1, 2), [], "x", [(0,)], None)
+        )
     if chance(rng, 0.1):
         options["layers"] = pick(rng, (0, -1, 2, 1.5, None, True))
     size: Any = (8, 8) if chance(rng, 0.8) else pick(rng, ((7, 13), (0, 8), (integer(rng), 0), 8, (8.5, 8), None, "ab"))
@@ -79,9 +81,13 @@ def _antialias(rng: np.random.Generator, mesh: RandomMesh) -> str:
     if chance(rng, 0.3):
         options["gap"] = pick(rng, (0, 1e-3, -1.0, float("nan"), float("inf"), "x", None))
     if chance(rng, 0.3):
-        options["creases"] = pick(rng, (torch.ones(faces.shape, dtype=torch.bool), torch.ones(faces.shape), torch.ones(2, 2, dtype=torch.bool), 1))
+        options["creases"] = pick(
+            rng, (torch.ones(faces.shape, dtype=torch.bool), torch.ones(faces.shape), torch.ones(2, 2, dtype=torch.bool), 1)
+        )
     if chance(rng, 0.2):
-        options["face_normals"] = pick(rng, (torch.zeros(faces.shape), torch.full(faces.shape, float("nan")), torch.ones(1, 3), "x"))
+        options["face_normals"] = pick(
+            rng, (torch.zeros(faces.shape), torch.full(faces.shape, float("nan")), torch.ones(1, 3), "x")
+        )
     if chance(rng, 0.2):
         options["continued"] = pick(rng, (True, 1, None))
     blended = sdr.antialias(image if chance(rng, 0.9) else _tensor(rng, image.numpy()), found, positions, topology, **options)
@@ -96,21 +102,36 @@ def _antialias(rng: np.random.Generator, mesh: RandomMesh) -> str:
 def _vector(rng: np.random.Generator) -> Any:
     if chance(rng, 0.8):
         return torch.tensor(rng.normal(size=3), dtype=torch.float32)
-    return pick(rng, (torch.zeros(3), torch.full((3,), float("nan")), torch.tensor([number(rng), 0, 1]).float(), torch.ones(2), torch.ones(3).double(), None, [0, 0, 1]))
+    return pick(
+        rng,
+        (
+            torch.zeros(3),
+            torch.full((3,), float("nan")),
+            torch.tensor([number(rng), 0, 1]).float(),
+            torch.ones(2),
+            torch.ones(3).double(),
+            None,
+            [0, 0, 1],
+        ),
+    )
 
 
 def _shadows(rng: np.random.Generator, mesh: RandomMesh) -> str:
     makers = (
         lambda: sdr.DirectionalLight(_vector(rng)),
         lambda: sdr.PointLight(_vector(rng)),
-        lambda: sdr.SpotLight(_vector(rng), _vector(rng), 40.0 if chance(rng, 0.7) else pick(rng, (0, -1, 90, 180, float("nan"), "x", None, 75.0))),
+        lambda: sdr.SpotLight(
+            _vector(rng), _vector(rng), 40.0 if chance(rng, 0.7) else pick(rng, (0, -1, 90, 180, float("nan"), "x", None, 75.0))
+        ),
         lambda: pick(rng, OTHERS),
     )
     lights: Any = makers[int(pick(rng, (0, 0, 0, 1, 2, 2, 3)))]()
     settings = ShadowSettings(method=pick(rng, ("auto", "vsm", "msm", "pcf", "standard", "esm")), resolution=16, filter_size=3)
     faces = torch.from_numpy(mesh.faces.astype(np.int64))
     topology = sdr.build_topology(faces, torch.from_numpy(mesh.vertices))
-    maps = sdr.filter_maps(sdr.render_maps(_tensor(rng, mesh.vertices), topology, [lights] if chance(rng, 0.5) else lights, settings))
+    maps = sdr.filter_maps(
+        sdr.render_maps(_tensor(rng, mesh.vertices), topology, [lights] if chance(rng, 0.5) else lights, settings)
+    )
     points = torch.from_numpy(rng.uniform(-3, 3, (4, 5, 3)).astype(np.float32))
     number_of = 0 if chance(rng, 0.9) else pick(rng, (1, -1, "x", None, 0.5))
     seen = sdr.visibility(maps, points if chance(rng, 0.9) else _tensor(rng, points.numpy()), number_of)

@@ -12,10 +12,45 @@ import numpy as np
 
 _T = TypeVar("_T")
 
-NUMBERS = (0.0, -0.0, 1.0, -1.0, 0.5, 1e-3, 1e3, 1e-20, 1e-38, 1e-45, 1e20, 3e38, 1e300, -1e300, float("nan"), float("inf"), -float("inf"))
+NUMBERS = (
+    0.0,
+    -0.0,
+    1.0,
+    -1.0,
+    0.5,
+    1e-3,
+    1e3,
+    1e-20,
+    1e-38,
+    1e-45,
+    1e20,
+    3e38,
+    1e300,
+    -1e300,
+    float("nan"),
+    float("inf"),
+    -float("inf"),
+)
 INTEGERS = (0, 1, -1, 2, 3, 7, 16, 255, 256, 4095, 4096, 4097, 65535, 2**31 - 1, 2**31, 2**32, 2**63, 10**20, -(2**31), -(10**20))
 #: Values of types that nobody expects.
-OTHERS: tuple[Any, ...] = (None, "", "x", "7", True, [], {}, (), [1, 2], {"a": 1}, b"\xff", float("nan"), 1 + 2j, object, np.array(1), "é\n")
+OTHERS: tuple[Any, ...] = (
+    None,
+    "",
+    "x",
+    "7",
+    True,
+    [],
+    {},
+    (),
+    [1, 2],
+    {"a": 1},
+    b"\xff",
+    float("nan"),
+    1 + 2j,
+    object,
+    np.array(1),
+    "é\n",
+)
 
 
 def pick(rng: np.random.Generator, choices: Sequence[_T]) -> _T:
@@ -158,7 +193,10 @@ def _word(rng: np.random.Generator, text: str) -> str:
     found = list(re.finditer(r"[A-Za-z_]\w*", text))
     if len(found) < 2:
         return text
-    at, new = pick(rng, found), pick(rng, found)[0] if chance(rng, 0.7) else pick(rng, ("", "x", "é", "nan", "None", "\x00", "<", '"'))
+    at, new = (
+        pick(rng, found),
+        pick(rng, found)[0] if chance(rng, 0.7) else pick(rng, ("", "x", "é", "nan", "None", "\x00", "<", '"')),
+    )
     return text[: at.start()] + new + text[at.end() :]
 
 

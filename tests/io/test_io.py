@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -229,3 +230,21 @@ def test_plots_are_drawn_without_a_display(tmp_path: Path, monkeypatch: pytest.M
     plots.image_sheet(tmp_path / "b.png", {"x": {"start": np.ones((3, 4, 3)), "end": np.full((3, 4, 1), np.nan)}})
     assert Image.open(tmp_path / "a.png").size[0] > 100
     assert Image.open(tmp_path / "b.png").size[0] > 100
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.exr"])
+@pytest.mark.parametrize("shape", [(), (5,), (0, 5), (5, 0), (2, 3, 0), (2, 3, 1, 1)])
+def test_arrays_that_are_no_images(tmp_path: Path, name: str, shape: tuple[int, ...]) -> None:
+    with pytest.raises(ShadowmapError, match=r"an image of shape \(.*give \(H, W\)"):
+        images.write_image(tmp_path / name, np.ones(shape, np.float32))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "channels",
+    [{}, {"Y": np.ones(5, np.float32)}, {"Y": np.ones((0, 5), np.float32)}, {"Y": np.ones((4, 4))},
+     {"R": np.ones((4, 4), np.float32), "G": np.ones((4, 5), np.float32)}],
+)  # fmt: skip
+def test_channels_that_openexr_cannot_hold(tmp_path: Path, channels: dict[str, Any]) -> None:
+    with pytest.raises(ShadowmapError, match=r"cannot write .*a\.exr: channel.*; give "):
+        images.write_exr(tmp_path / "a.exr", channels)

@@ -121,6 +121,13 @@ def test_wrong_kinds_and_sizes(renderer: Renderer) -> None:
         ({"area_light_samples": "4"}, "area_light_samples is '4': give an integer"),
         ({"ambient": float("nan")}, "ambient is nan"),
         ({"aovs": ("albedo",)}, "no AOV 'albedo'"),
+        ({"aovs": 1.5}, "aovs is 1.5: give names in a tuple"),
+        ({"aovs": ([],)}, "no AOV '[]'"),
+        ({"shadow_method": []}, "shadow method [] is unknown"),
+        ({"antialias": "no"}, "antialias is 'no': give True or False"),
+        ({"shadow_antialias": 2}, "shadow map antialias is 2; give True or False"),
+        ({"compat": None}, "shadow map compat is None; give True or False"),
+        ({"shadow_bleeding": True}, "shadow map bleeding is True; give a finite number"),
         ({"tessellation": 1}, "tessellation is 1"),
     ],
 )

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from ...errors import ShadowmapError
 from ...jit.arrays import device_array
-from ...jit.frozen import recordings_of
+from ...jit.frozen import freeze, recordings_of
 from ...jit.types import Float
 from ...rendering.receivers.planar_receiver import ReceiverShadows
 from .blend_shapes import blend
@@ -75,7 +75,7 @@ class MorphFit:
         self._prior = dr.opaque(mi.Float, prior)
         self._rates = {"weights": step_size} | ({"translation": translation_step} if translate else {})
         self._settings = {**(settings or {}), "prior": float(prior), "translate": translate}
-        self._step = dr.freeze(_step)
+        self._step = freeze(_step)
         self.reset(np.zeros(len(directions)))
 
     def reset(self, start: npt.ArrayLike) -> None:

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from ...errors import ShadowmapError
 from ...jit.arrays import device_array
-from ...jit.frozen import recordings_of
+from ...jit.frozen import freeze, recordings_of
 from ...jit.types import Float, Vector3f
 from ...shadow import Frusta
 from .pixels import StillScene
@@ -83,7 +83,7 @@ class LightBatch:
     def __init__(self, scene: StillScene, *, betas: tuple[float, float] = (0.9, 0.999)) -> None:
         self.scene = scene
         self._betas = betas
-        self._step = dr.freeze(_step)
+        self._step = freeze(_step)
 
     @property
     def lights(self) -> int:

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from ...errors import ShadowmapError
 from ...jit.arrays import device_array
+from ...jit.frozen import freeze
 from ...jit.types import Float, Point3f
 from ...rendering.receivers.shadow_images import ShadowImages, image_loss, shadow_images
 from ...rendering.receivers.shadow_views import ShadowView
@@ -150,7 +151,7 @@ class Collection:
         apart = self._rest + np.arange(count, dtype=np.float32)[:, None, None] * np.float32(4)
         self._shadows = shadow_images(apart.reshape(-1, 3), self.faces, self.views, **self._shadow)
         self._points = mi.Point3f(*(device_array(mi.Float, np.tile(self._rest[:, c], count)) for c in range(3)))
-        self._gradient, self._look = dr.freeze(_gradient), dr.freeze(_look)
+        self._gradient, self._look = freeze(_gradient), freeze(_look)
 
     def _double(self) -> None:
         """Replace each copy by two smaller ones, side by side in the image and at different depths."""

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from ...errors import ShadowmapError
 from ...jit.arrays import device_array
-from ...jit.frozen import recordings_of
+from ...jit.frozen import freeze, recordings_of
 from ...jit.types import Float, UInt32
 from ...rendering.receivers.shadow_images import ShadowImages, image_loss, shadow_images
 from ...rendering.receivers.shadow_views import ShadowView
@@ -88,7 +88,7 @@ class Sculptor:
         # An array: a Python number would become a constant of the recorded step.
         self._consistency, self._smoothness = dr.opaque(mi.Float, consistency), smoothness
         self._solver = _large_steps(mi.Float(self._start.ravel()), self._shadows.faces, smoothness)
-        self._gradient, self._look = dr.freeze(_gradient), dr.freeze(_look)
+        self._gradient, self._look = freeze(_gradient), freeze(_look)
         self.reset()
         if targets is None:
             self._targets = [image.copy() for image in self.visibility()]

@@ -127,7 +127,7 @@ def check_mesh(
 ) -> tuple[Float, UInt32, int, int]:
     """Validate and flatten vertices and faces; returns (flat positions, flat faces, batch, vertices per image)."""
     for name, array in (("positions", positions), ("faces", faces)):
-        is_flat = dr.is_jit_v(array) and (dr.is_tensor_v(array) or dr.depth_v(array) == 1)
+        is_flat = array is not None and dr.is_jit_v(array) and (dr.is_tensor_v(array) or dr.depth_v(array) == 1)
         fits = is_flat and (dr.type_v(array) == dr.VarType.Float32 if name == "positions" else dr.is_integral_v(array))
         if not fits:
             wanted = "single-precision" if name == "positions" else "integer"

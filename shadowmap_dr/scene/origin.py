@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, TypeAlias
@@ -58,8 +59,8 @@ class SceneOrigin:
                 scene: object = mi.load_dict(self.description, optimize=False)
             else:
                 scene = mi.load_file(self.file, optimize=False, **self.parameters)
-        except (RuntimeError, TypeError) as error:
-            raise ShadowmapError(f"cannot load {what}: {' '.join(str(error).split())}") from error
+        except (RuntimeError, TypeError, UnicodeError) as error:
+            raise ShadowmapError(f"cannot load {what}: {mitsuba_message(error)}") from error
         if not isinstance(scene, mi.Scene):
             raise ShadowmapError(f"cannot load {what}: its root is a {type(scene).__name__}, not a scene.")
         return scene
@@ -79,6 +80,14 @@ class _Packed:
     values: npt.NDArray[Any]
     name: str = ""
     gamma: bool = False
+
+
+def mitsuba_message(error: BaseException) -> str:
+    """Message of an exception of Mitsuba's, in one line, without positions in its source."""
+    if isinstance(error, UnicodeError):  # Mitsuba quotes what it cannot read
+        return "a file that it names is damaged."
+    text = re.sub(r"\[\w+\.(?:cpp|h):\d+\] ?", "", " ".join(str(error).split()))
+    return "a parameter has a value of the wrong type." if text == "std::bad_cast" else text
 
 
 def _packed(value: object, place: str) -> Any:  # Any: a value of any type

@@ -2,8 +2,8 @@
 
     python -m tests.fuzz [--cases N] [--seed S] [--kind K] [--case N] [--out FILE.json]
 
-Each case must end in a right result or in one line that says what is wrong; none in a traceback, a signal, or beyond its budget of
-time and memory. Exit status 1 if one does.
+Each case must end in a right result or in one line that says what is wrong; none in a traceback, a signal, or beyond its
+budget of time and memory. Exit status 1 if one does.
 """
 
 from __future__ import annotations

@@ -107,9 +107,13 @@ def _basel_arrays() -> dict[str, np.ndarray]:
     rng = np.random.default_rng(0)
     mean = np.array(mesh_files.CORNERS, np.float32)
     return {
-        "shape_mean": mean.ravel(), "shape_basis": rng.normal(size=(24, 2)).astype(np.float32), "shape_std": np.ones(2, np.float32),
-        "triangles": np.array(mesh_files.TRIANGLES), "expression_basis": rng.normal(size=(24, 1)), "expression_variance": np.ones(1),
-    }  # fmt: skip
+        "shape_mean": mean.ravel(),
+        "shape_basis": rng.normal(size=(24, 2)).astype(np.float32),
+        "shape_std": np.ones(2, np.float32),
+        "triangles": np.array(mesh_files.TRIANGLES),
+        "expression_basis": rng.normal(size=(24, 1)),
+        "expression_variance": np.ones(1),
+    }
 
 
 def _basel(rng: np.random.Generator, folder: Path) -> str:

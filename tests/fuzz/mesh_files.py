@@ -6,6 +6,7 @@ import functools
 import struct
 
 import numpy as np
+import numpy.typing as npt
 import trimesh
 
 CORNERS = [(-1, -1, -1), (1, -1, -1), (1, 1, -1), (-1, 1, -1), (-1, -1, 1), (1, -1, 1), (1, 1, 1), (-1, 1, 1)]
@@ -61,7 +62,7 @@ def _ply(order: str) -> bytes:
     return header.encode() + b"comment caf\xe9\nend_header\n" + data
 
 
-def is_cube(vertices: object, faces: object) -> bool:
+def is_cube(vertices: npt.ArrayLike, faces: npt.ArrayLike) -> bool:
     """True if a mesh is the cube."""
     cube = trimesh.Trimesh(vertices, faces, process=False)
     return bool(len(cube.vertices) == 8 and abs(cube.volume - 8) < 1e-3 and np.allclose(np.abs(cube.vertices), 1, atol=1e-5))

@@ -81,14 +81,29 @@ def _wrong_arguments(rng: np.random.Generator, mesh: RandomMesh) -> str:
     """Arguments of other types and shapes."""
     positions = _clip(rng, mesh)
     choices: list[Any] = [
-        mi.TensorXf(positions[:, :3]), mi.TensorXf(positions.ravel()), mi.Float(positions.ravel()), mi.Float(positions.ravel()[:-1]),
-        mi.TensorXf(positions[None]), mi.TensorXf(positions[None, None]), mi.TensorXd(positions), positions, mi.TensorXu(positions),
-        mi.Point3f(0), mi.Float(), *OTHERS,
-    ]  # fmt: skip
+        mi.TensorXf(positions[:, :3]),
+        mi.TensorXf(positions.ravel()),
+        mi.Float(positions.ravel()),
+        mi.Float(positions.ravel()[:-1]),
+        mi.TensorXf(positions[None]),
+        mi.TensorXf(positions[None, None]),
+        mi.TensorXd(positions),
+        positions,
+        mi.TensorXu(positions),
+        mi.Point3f(0),
+        mi.Float(),
+        *OTHERS,
+    ]
     indices: list[Any] = [
-        _faces(mesh), mi.TensorXf(positions), mi.TensorXi(mesh.faces.astype(np.int32)) if len(mesh.faces) else mi.TensorXi(),
-        mi.UInt32(np.zeros(3, np.uint32)), mi.UInt32(np.zeros(4, np.uint32)), mi.UInt32(), mesh.faces, *OTHERS,
-    ]  # fmt: skip
+        _faces(mesh),
+        mi.TensorXf(positions),
+        mi.TensorXi(mesh.faces.astype(np.int32)) if len(mesh.faces) else mi.TensorXi(),
+        mi.UInt32(np.zeros(3, np.uint32)),
+        mi.UInt32(np.zeros(4, np.uint32)),
+        mi.UInt32(),
+        mesh.faces,
+        *OTHERS,
+    ]
     options: dict[str, Any] = {}
     if chance(rng, 0.3):
         options["batch"] = pick(rng, (1, 2, 0, -1, None, 3))
@@ -201,9 +216,12 @@ def _settings(rng: np.random.Generator, mesh: RandomMesh) -> str:
 
     names = [*SHADOW_NAMES, *(f.name for f in fields(RenderSettings)), "unknown", ""]
     values: list[Callable[[], Any]] = [
-        lambda: integer(rng), lambda: number(rng), lambda: pick(rng, OTHERS), lambda: pick(rng, ("vsm", "box", "none", "samples", "single")),
+        lambda: integer(rng),
+        lambda: number(rng),
+        lambda: pick(rng, OTHERS),
+        lambda: pick(rng, ("vsm", "box", "none", "samples", "single")),
         lambda: chance(rng, 0.5),
-    ]  # fmt: skip
+    ]
     given = {pick(rng, names): pick(rng, values)() for _ in range(int(rng.integers(1, 4)))}
     settings = RenderSettings.of(**given)
     hash(settings)

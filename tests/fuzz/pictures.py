@@ -188,12 +188,21 @@ def _drawing(rng: np.random.Generator, folder: Path) -> str:
     """SVG drawings."""
     side = pick(rng, ("100", "0", "-5", "1e9", "100%", "1e-9", "nan", "3mm", ""))
     shapes = "".join(
-        pick(rng, (
-            '<circle cx="50" cy="50" r="30"/>', '<rect width="1e30" height="5"/>', '<path d="M0 0 L100 100 Z"/>', '<g transform="scale(0)">x</g>',
-            '<text x="5" y="50">a</text>', '<image href="/etc/hostname" width="10" height="10"/>', '<use href="#a"/>', '<path d="M nan"/>',
-        ))
+        pick(
+            rng,
+            (
+                '<circle cx="50" cy="50" r="30"/>',
+                '<rect width="1e30" height="5"/>',
+                '<path d="M0 0 L100 100 Z"/>',
+                '<g transform="scale(0)">x</g>',
+                '<text x="5" y="50">a</text>',
+                '<image href="/etc/hostname" width="10" height="10"/>',
+                '<use href="#a"/>',
+                '<path d="M nan"/>',
+            ),
+        )
         for _ in range(int(rng.integers(4)))
-    )  # fmt: skip
+    )
     box = pick(rng, ('viewBox="0 0 100 100"', "", 'viewBox="0 0 0 0"', 'viewBox="0 0 1 100000"'))
     text = f'<svg xmlns="http://www.w3.org/2000/svg" width="{side}" height="100" {box}>\n{shapes}\n</svg>'
     if chance(rng, 0.4):

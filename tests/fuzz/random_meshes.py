@@ -119,6 +119,8 @@ def _fan(rng: np.random.Generator, vertices: Any, faces: Any) -> tuple[Any, Any]
 
 def _out_of_range(rng: np.random.Generator, vertices: Any, faces: Any) -> tuple[Any, Any]:
     changed = np.array(faces)
+    if not len(changed):
+        return vertices, changed
     changed[int(rng.integers(len(changed))), int(rng.integers(3))] = pick(rng, (-1, len(vertices), 2**31 - 1, 10**6, -(2**31)))
     return vertices, changed
 

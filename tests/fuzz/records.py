@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import mitsuba as mi
 import numpy as np
@@ -19,7 +19,7 @@ from shadowmap_dr.experiments.bench.common import BenchOptions
 from shadowmap_dr.experiments.lights import experiment as lights
 from shadowmap_dr.experiments.pose import table
 from shadowmap_dr.experiments.pose.record import stored_records
-from shadowmap_dr.inverse.runs.loop import optimize
+from shadowmap_dr.inverse.runs.loop import Method, optimize
 from shadowmap_dr.inverse.runs.sweep import run_sweep
 from shadowmap_dr.io import records
 from shadowmap_dr.io.files import read_arrays
@@ -190,13 +190,13 @@ class _Bowl:
 
 def _checkpoint(rng: np.random.Generator, folder: Path) -> str:
     path = folder / "a.checkpoint.npz"
-    optimize(_Bowl(), [0.0, 0.0], 10, checkpoint=path)
+    optimize(cast(Method, _Bowl()), [0.0, 0.0], 10, checkpoint=path)
     arrays = read_arrays(path)
     data = path.read_bytes()
     sound = chance(rng, 0.1)
     if not sound:
         path.write_bytes(mutated(rng, data) if chance(rng, 0.3) else npz(changed_arrays(rng, arrays)))
-    history = optimize(_Bowl(), [0.0, 0.0], 20, checkpoint=path)
+    history = optimize(cast(Method, _Bowl()), [0.0, 0.0], 20, checkpoint=path)
     check(history.parameters.shape == (21, 2) and history.loss.shape == (20,), f"{history.parameters.shape} parameters")
     check(history.seconds.shape == history.warm.shape == (20,), "times of other lengths")
     check(np.isfinite(history.final).all(), "final parameters are not finite")

@@ -38,12 +38,15 @@ COMMANDS = {
     "pose --object mesh.ply --method shadows --reference own --resolution 16 --runs 2 --iterations 2": (
         *("--seed", "--normals", "--shadow-only", "--resume", "--object"),
     ),
-    "soft --scene disk --samples 2/2 --resolution 16 --map-resolution 32 --spp 1 --reference-spp 16 --no-times": ("--resume", "--times"),
-    "gradients jacobian --motion x --map-resolution 32 --filter-size 3 --faces 200 --mitsuba-passes 0 --resolution 32 --spp 16": (),
+    "soft --scene disk --samples 2/2 --resolution 16 --map-resolution 32 --spp 1 --reference-spp 16 --no-times": (
+        "--resume",
+        "--times",
+    ),
+    "gradients jacobian --motion x --map-resolution 32 --filter-size 3 --faces 99 --mitsuba-passes 0 --resolution 32 --spp 4": (),
     "gradients convergence --occluder plane --camera orthographic --map-resolution 32 --filter-size 3 --displacement 0.1 "
     "--resolution 32 --iterations 2": ("--camera", "--occluder"),
     "info": (),
-}  # fmt: skip
+}
 # Commands that resume, with the record that the last run leaves; a folder's name is that of the command.
 _RESUMED = [line for line in COMMANDS if line != "info"]
 

@@ -21,9 +21,13 @@ from .values import chance, integer, mutated, mutated_text, number, pick
 SIZE = 12
 #: Settings that keep scenes small.
 _SMALL = {
-    "shadow_map_resolution": 32, "soft_map_resolution": 16, "area_light_samples": 4, "environment_light_samples": 4, "tessellation": 8,
+    "shadow_map_resolution": 32,
+    "soft_map_resolution": 16,
+    "area_light_samples": 4,
+    "environment_light_samples": 4,
+    "tessellation": 8,
     "shadow_samples": 1,
-}  # fmt: skip
+}
 
 Plugin = dict[str, Any]
 
@@ -37,8 +41,11 @@ def _file(rng: np.random.Generator, folder: Path) -> str:
     plugins = _scene(rng, folder)
     text = "\n".join(['<scene version="3.0.0">', *(_element(name, part) for name, part in plugins.items()), "</scene>\n"])
     sound = chance(rng, 0.4)
+    text = text if sound else _changed(rng, text)
+    # Mitsuba 3.9 ends the process if a sampler has no sample.
+    text = re.sub(r'(name="sample_count" value=")0"', r'\g<1>1"', text)
     path = folder / "scene.xml"
-    path.write_text(text if sound else _changed(rng, text), encoding="utf-8", errors="surrogateescape")
+    path.write_text(text, encoding="utf-8", errors="surrogateescape")
     options = ["--integrator", "scene"] if chance(rng, 0.8) else []
     if chance(rng, 0.15):
         options += pick(
@@ -120,7 +127,8 @@ def _shape(rng: np.random.Generator, folder: Path) -> Plugin:
 
 def _bsdf(rng: np.random.Generator) -> Plugin:
     kinds = ("twosided", "plastic", "roughplastic", "roughconductor", "dielectric", "principled", "null", "mask", "conductor")
-    kind = pick(rng, ("diffuse",) * 6 + kinds) if chance(rng, 0.97) else pick(rng, ("bumpmap", "measured", "blendbsdf", ""))
+    # Mitsuba 3.9 ends the process on a `blendbsdf` without two BSDFs in it.
+    kind = pick(rng, ("diffuse",) * 6 + kinds) if chance(rng, 0.97) else pick(rng, ("bumpmap", "measured", ""))
     if kind in ("twosided", "mask", "bumpmap"):
         nested: Plugin = {"type": "diffuse", "reflectance": _colour(rng)}
         return {"type": kind, "nested": nested, **({"opacity": float(rng.uniform(0, 1))} if kind == "mask" else {})}
@@ -157,9 +165,12 @@ def _camera(rng: np.random.Generator) -> Plugin:
         else pick(rng, ("batch", "distant", "irradiancemeter"))
     )
     film: Plugin = {
-        "type": pick(rng, ("hdrfilm",) * 20 + ("specfilm",)), "width": SIZE, "height": int(pick(rng, (SIZE, SIZE, 5, 1))),
-        "pixel_format": pick(rng, (*("rgb", "rgba", "luminance", "luminance_alpha") * 4, "xyz")), "rfilter": {"type": pick(rng, ("box", "gaussian", "tent", "lanczos"))},
-    }  # fmt: skip
+        "type": pick(rng, ("hdrfilm",) * 20 + ("specfilm",)),
+        "width": SIZE,
+        "height": int(pick(rng, (SIZE, SIZE, 5, 1))),
+        "pixel_format": pick(rng, (*("rgb", "rgba", "luminance", "luminance_alpha") * 4, "xyz")),
+        "rfilter": {"type": pick(rng, ("box", "gaussian", "tent", "lanczos"))},
+    }
     if chance(rng, 0.2):
         film |= {"crop_offset_x": 2, "crop_width": int(pick(rng, (3, 1, 5, 20)))}
     camera: Plugin = {"type": kind, "to_world": ("look_at", (2, -3, 4), (0, 0, 0.5), (0, 0, 1)), "film": film}
@@ -181,12 +192,21 @@ def _options(rng: np.random.Generator) -> Plugin:
     """Parameters of the integrator."""
     choices: Plugin = {
         "shadow_method": pick(rng, ("vsm", "esm", "evsm2", "msm", "csm", "pcf", "standard", "none")),
-        "shadow_filter": pick(rng, ("box", "gaussian", "wendland", "none")), "shadow_filter_size": int(pick(rng, (1, 3, 5, 5, 2, 27, 255))),
-        "antialias": chance(rng, 0.5), "hide_emitters": chance(rng, 0.5), "max_depth": int(pick(rng, (0, 1, 2, 2, 5, -1, -2))),
-        "emitter_shadows": pick(rng, ("single", "samples", "samples", "x")), "compat": chance(rng, 0.3), "recorded": chance(rng, 0.3),
-        "shadow_supersampling": int(pick(rng, (2, 2, 2, 9))), "shadow_cull_backfaces": True, "aovs": pick(rng, ("depth", "position,normal", "a:depth,b:visibility", "a:depth,a:depth")),
-        "light_memory": float(pick(rng, (1e-5, 1e-4, 1.0, -1))), "ambient": float(pick(rng, (0.1, 1.0, 1e10, -1.0))), "rr_depth": 3,
-    }  # fmt: skip
+        "shadow_filter": pick(rng, ("box", "gaussian", "wendland", "none")),
+        "shadow_filter_size": int(pick(rng, (1, 3, 5, 5, 2, 27, 255))),
+        "antialias": chance(rng, 0.5),
+        "hide_emitters": chance(rng, 0.5),
+        "max_depth": int(pick(rng, (0, 1, 2, 2, 5, -1, -2))),
+        "emitter_shadows": pick(rng, ("single", "samples", "samples", "x")),
+        "compat": chance(rng, 0.3),
+        "recorded": chance(rng, 0.3),
+        "shadow_supersampling": int(pick(rng, (2, 2, 2, 9))),
+        "shadow_cull_backfaces": True,
+        "aovs": pick(rng, ("depth", "position,normal", "a:depth,b:visibility", "a:depth,a:depth")),
+        "light_memory": float(pick(rng, (1e-5, 1e-4, 1.0, -1))),
+        "ambient": float(pick(rng, (0.1, 1.0, 1e10, -1.0))),
+        "rr_depth": 3,
+    }
     if chance(rng, 0.03):
         return {"unknown": 1}
     names = rng.permutation(sorted(choices))[: int(rng.integers(0, 3))]
@@ -204,7 +224,7 @@ def _vector(rng: np.random.Generator) -> tuple[str, tuple[float, ...]]:
     return "vector", (float(x), float(y), float(pick(rng, (3.0, -1.0, 0.0)))) if chance(rng, 0.9) else (
         0.0,
         0.0,
-        float(pick(rng, (0.0, 1e20))),
+        float(pick(rng, (0.0, 1e10))),
     )
 
 
@@ -247,9 +267,17 @@ def _damage(rng: np.random.Generator, plugins: dict[str, Plugin]) -> None:
 
 
 _TAGS = {
-    **dict.fromkeys(("camera",), "sensor"), "film": "film", "rfilter": "rfilter", "sampler": "sampler", "integrator": "integrator",
-    "irradiance": "texture", "bsdf": "bsdf", "nested": "bsdf", "emitter": "emitter", "floor": "shape",
-}  # fmt: skip
+    **dict.fromkeys(("camera",), "sensor"),
+    "film": "film",
+    "rfilter": "rfilter",
+    "sampler": "sampler",
+    "integrator": "integrator",
+    "irradiance": "texture",
+    "bsdf": "bsdf",
+    "nested": "bsdf",
+    "emitter": "emitter",
+    "floor": "shape",
+}
 
 
 def _element(name: str, value: Any) -> str:

@@ -28,10 +28,24 @@ def _tensor(rng: np.random.Generator, values: Any) -> Any:
     if chance(rng, 0.88):
         return tensor
     choices: list[Any] = [
-        tensor.double(), tensor.half(), tensor.int(), tensor.long(), tensor[:0], tensor[..., :1], tensor[None], tensor.reshape(-1),
-        tensor.T, tensor.to_sparse(), tensor.bool(), torch.tensor(1.0), np.asarray(values), tensor.to(torch.complex64),
-        tensor.to("meta"), tensor.float().requires_grad_(), *OTHERS,
-    ]  # fmt: skip
+        tensor.double(),
+        tensor.half(),
+        tensor.int(),
+        tensor.long(),
+        tensor[:0],
+        tensor[..., :1],
+        tensor[None],
+        tensor.reshape(-1),
+        tensor.T,
+        tensor.to_sparse(),
+        tensor.bool(),
+        torch.tensor(1.0),
+        np.asarray(values),
+        tensor.to(torch.complex64),
+        tensor.to("meta"),
+        tensor.float().requires_grad_(),
+        *OTHERS,
+    ]
     return pick(rng, choices)
 
 
@@ -116,11 +130,15 @@ def _vector(rng: np.random.Generator) -> Any:
     )
 
 
+def _spot(position: Any, direction: Any, angle: Any) -> Any:
+    return sdr.SpotLight(position, direction, angle)
+
+
 def _shadows(rng: np.random.Generator, mesh: RandomMesh) -> str:
     makers = (
         lambda: sdr.DirectionalLight(_vector(rng)),
         lambda: sdr.PointLight(_vector(rng)),
-        lambda: sdr.SpotLight(
+        lambda: _spot(
             _vector(rng), _vector(rng), 40.0 if chance(rng, 0.7) else pick(rng, (0, -1, 90, 180, float("nan"), "x", None, 75.0))
         ),
         lambda: pick(rng, OTHERS),
@@ -133,8 +151,8 @@ def _shadows(rng: np.random.Generator, mesh: RandomMesh) -> str:
         sdr.render_maps(_tensor(rng, mesh.vertices), topology, [lights] if chance(rng, 0.5) else lights, settings)
     )
     points = torch.from_numpy(rng.uniform(-3, 3, (4, 5, 3)).astype(np.float32))
-    number_of = 0 if chance(rng, 0.9) else pick(rng, (1, -1, "x", None, 0.5))
-    seen = sdr.visibility(maps, points if chance(rng, 0.9) else _tensor(rng, points.numpy()), number_of)
+    light: Any = 0 if chance(rng, 0.9) else pick(rng, (1, -1, "x", None, 0.5))
+    seen = sdr.visibility(maps, points if chance(rng, 0.9) else _tensor(rng, points.numpy()), light)
     _finite(seen, "visibilities are")
     low, high = float(seen.min()), float(seen.max())
     check(low >= -1e-4 and high <= 1 + 1e-4, f"visibilities from {low} to {high}")

@@ -48,7 +48,7 @@ def _tried(run: Callable[[], str]) -> tuple[str, str]:
         if isinstance(root, ShadowmapError) or (type(root) is ValueError and _is_raised_here(root)):
             return _refusal(str(root))
         print(traceback.format_exc(), file=sys.__stderr__, flush=True)
-        return FAULT, f"{type(error).__name__}: {' '.join(str(error).split())[:300]} ({_last_place(root)})"
+        return FAULT, f"{type(root).__name__}: {' '.join(str(root).split())[:300]} ({_last_place(root)})"
 
 
 def _refusal(message: str) -> tuple[str, str]:
@@ -58,7 +58,9 @@ def _refusal(message: str) -> tuple[str, str]:
 
 
 def _root(error: BaseException) -> BaseException:
-    """The exception of this package that Dr.Jit has wrapped."""
+    """The exception that a group of tasks or Dr.Jit has wrapped."""
+    while len(inner := getattr(error, "exceptions", ())) == 1:  # of a group of tasks
+        error = inner[0]
     while isinstance(error, RuntimeError) and (cause := error.__cause__ or error.__context__) is not None:
         error = cause
     return error

@@ -102,10 +102,20 @@ def changed_arrays(rng: np.random.Generator, arrays: dict[str, np.ndarray]) -> d
         name = pick(rng, tuple(changed))
         value = changed[name]
         choices = (
-            value[:-1] if value.ndim else value, value.T, value.astype(str), value[:0] if value.ndim else value, np.array(3),
-            np.array([]), value[None], np.full(value.shape, pick(rng, (np.nan, np.inf, -1.0, 1e30, 1e300))), np.full(value.shape, -1),
-            np.ones(value.shape, bool), np.ones(value.shape, complex), np.full(value.shape, 10**9), np.full(value.shape, 200, np.uint8),
-        )  # fmt: skip
+            value[:-1] if value.ndim else value,
+            value.T,
+            value.astype(str),
+            value[:0] if value.ndim else value,
+            np.array(3),
+            np.array([]),
+            value[None],
+            np.full(value.shape, pick(rng, (np.nan, np.inf, -1.0, 1e30, 1e300))),
+            np.full(value.shape, -1),
+            np.ones(value.shape, bool),
+            np.ones(value.shape, complex),
+            np.full(value.shape, 10**9),
+            np.full(value.shape, 200, np.uint8),
+        )
         changed[name] = pick(rng, choices)
         if chance(rng, 0.2):
             changed[f"{name}x"] = changed.pop(name)
@@ -115,7 +125,8 @@ def changed_arrays(rng: np.random.Generator, arrays: dict[str, np.ndarray]) -> d
 def npz(arrays: dict[str, np.ndarray]) -> bytes:
     """Content of an .npz file."""
     buffer = io.BytesIO()
-    np.savez(buffer, **arrays)
+    named: dict[str, Any] = {**arrays}  # NumPy's stubs take named arrays for its own option
+    np.savez(buffer, **named)
     return buffer.getvalue()
 
 

@@ -1,4 +1,4 @@
-"""The process that tries cases one after the other. It reads them from its input, and writes a line when it begins and ends one."""
+"""The process that tries cases one after the other. It reads them from its input, and writes a line when one begins or ends."""
 
 from __future__ import annotations
 

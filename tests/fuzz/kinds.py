@@ -40,6 +40,8 @@ KINDS = {
     "files": Kind(22),
     "pictures": Kind(18),
     "scenes": Kind(8, seconds=60.0),
+    "changes": Kind(8, seconds=60.0),
+    "sculpting": Kind(4, seconds=60.0, needs="cholespy"),
     "options": Kind(12, seconds=60.0),
     "records": Kind(12),
     "runs": Kind(4, seconds=120.0, slow=True),

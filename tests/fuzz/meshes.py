@@ -27,7 +27,9 @@ _SETTINGS = {"shadow_map_resolution": 32, "shadow_filter_size": 3, "tessellation
 def run(rng: np.random.Generator, folder: Path) -> str:
     """Give a mesh to one of the functions."""
     mesh = random_mesh(rng)
-    return pick(rng, (_rasterize, _rasterize, _wrong_arguments, _antialias, _shadow_maps, _render, _scene, _settings))(rng, mesh)
+    return pick(
+        rng, (_rasterize, _rasterize, _wrong_arguments, _wrong_values, _antialias, _shadow_maps, _render, _scene, _settings)
+    )(rng, mesh)
 
 
 def _clip(rng: np.random.Generator, mesh: RandomMesh) -> Any:
@@ -114,6 +116,45 @@ def _wrong_arguments(rng: np.random.Generator, mesh: RandomMesh) -> str:
     out = raster.rasterize(first, pick(rng, indices), size, **options)
     ids = out.triangle.numpy()
     return f"{int((ids != raster.NO_TRIANGLE).sum())} of {len(ids)} pixels"
+
+
+def _wrong_values(rng: np.random.Generator, mesh: RandomMesh) -> str:
+    """Arguments of other types and shapes for what follows a rasterization."""
+    if not mesh.usable:
+        return _rasterize(rng, mesh)
+    positions, faces = mi.TensorXf(_clip(rng, mesh)), _faces(mesh)
+    found = raster.rasterize(positions, faces, (8, 8))
+    others: list[Any] = [
+        *OTHERS,
+        mi.Float(),
+        mi.Float(0),
+        mi.TensorXf(),
+        mi.Point3f(0),
+        mi.Float64(0.5),
+        faces,
+        positions,
+        [mi.Float(1)] * 2,
+    ]
+    kind = int(rng.integers(3))
+    if kind == 0:
+        values = raster.interpolate(pick(rng, [positions, *others]), found, pick(rng, [faces, *others]))
+        check(values.shape[:2] == (8, 8), f"interpolated values of shape {values.shape}")
+        return f"{values.shape}"
+    rows: list[Any] = [
+        mesh.faces,
+        mesh.faces.astype(float),
+        mesh.faces.ravel(),
+        mesh.faces.T,
+        mesh.faces.astype(str),
+        [[0, 1], [2]],
+        *OTHERS,
+    ]
+    places: list[Any] = [mesh.vertices, mesh.vertices.astype(complex), mesh.vertices[:1], mesh.vertices.T, *OTHERS]
+    chosen = (mesh.faces, mesh.vertices) if kind == 1 else (pick(rng, rows), pick(rng, places))
+    topology = raster.build_topology(*chosen, mi.UInt32)
+    image = pick(rng, [mi.Float(np.ones(64)), [mi.Float(0.5)], mi.TensorXf(np.ones((8, 8, 2))), *others])
+    blended = raster.antialias(image, found, pick(rng, [positions, positions, positions, *others]), topology)
+    return f"{dr.width(blended.array if dr.is_tensor_v(blended) else blended)} values"
 
 
 def _antialias(rng: np.random.Generator, mesh: RandomMesh) -> str:

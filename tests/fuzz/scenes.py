@@ -20,7 +20,7 @@ from .values import chance, integer, mutated, mutated_text, number, pick
 
 SIZE = 12
 #: Settings that keep scenes small.
-_SMALL = {
+SMALL = {
     "shadow_map_resolution": 32,
     "soft_map_resolution": 16,
     "area_light_samples": 4,
@@ -38,7 +38,7 @@ def run(rng: np.random.Generator, folder: Path) -> str:
 
 
 def _file(rng: np.random.Generator, folder: Path) -> str:
-    plugins = _scene(rng, folder)
+    plugins = random_scene(rng, folder)
     text = "\n".join(['<scene version="3.0.0">', *(_element(name, part) for name, part in plugins.items()), "</scene>\n"])
     sound = chance(rng, 0.4)
     text = text if sound else _changed(rng, text)
@@ -72,10 +72,10 @@ def _changed(rng: np.random.Generator, text: str) -> str:
 
 
 def _dictionary(rng: np.random.Generator, folder: Path) -> str:
-    plugins = _scene(rng, folder)
+    plugins = random_scene(rng, folder)
     plugins.pop("integrator", None)
-    description = {"type": "scene", **{name: _entry(part) for name, part in plugins.items()}}
-    renderer = shadowmap_dr.Renderer.from_dict(description, **_SMALL)
+    description = {"type": "scene", **{name: scene_entry(part) for name, part in plugins.items()}}
+    renderer = shadowmap_dr.Renderer.from_dict(description, **SMALL)
     if not renderer.data.sensors:
         raise ShadowmapError("the scene has no sensor.")
     image = renderer.render().numpy()
@@ -84,20 +84,20 @@ def _dictionary(rng: np.random.Generator, folder: Path) -> str:
     return f"{image.shape}, mean {image.mean():.3f}"
 
 
-def _scene(rng: np.random.Generator, folder: Path) -> dict[str, Plugin]:
-    """Shapes, lights, a camera and an integrator by name. One of ten lacks one of them."""
+def random_scene(rng: np.random.Generator, folder: Path, damaged: bool = True) -> dict[str, Plugin]:
+    """Shapes, lights, a camera and an integrator by name. ``damaged``: one of ten lacks one of them, others have wrong values."""
     plugins: dict[str, Plugin] = {
         "floor": {"type": "rectangle", "to_world": ("scale", (3, 3, 3)), "bsdf": _bsdf(rng)},
         "camera": _camera(rng),
-        "integrator": {"type": "shadowmap", **_SMALL, **_options(rng)},
+        "integrator": {"type": "shadowmap", **SMALL, **_options(rng)},
     }
     for k in range(int(rng.integers(0, 3))):
         plugins[f"shape{k}"] = _shape(rng, folder)
     for k in range(int(pick(rng, (0, 1, 1, 1, 2)))):
         plugins[f"light{k}"] = _light(rng)
-    if chance(rng, 0.1):
+    if damaged and chance(rng, 0.1):
         del plugins[pick(rng, tuple(plugins))]
-    if chance(rng, 0.12):
+    if damaged and chance(rng, 0.12):
         _damage(rng, plugins)
     return plugins
 
@@ -306,10 +306,10 @@ def _element(name: str, value: Any) -> str:
     return f'<rgb name="{name}" value="{", ".join(map(str, value))}"/>'
 
 
-def _entry(value: Any) -> Any:
+def scene_entry(value: Any) -> Any:
     """A part or a value for ``mi.load_dict``."""
     if isinstance(value, dict):
-        return {key: _entry(part) for key, part in value.items()}
+        return {key: scene_entry(part) for key, part in value.items()}
     if not isinstance(value, tuple):
         return value
     if value[0] == "vector":

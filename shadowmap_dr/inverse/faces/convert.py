@@ -202,7 +202,8 @@ def _placed(
         low, high = mean[:, 1].min(), mean[:, 1].max()
         raise ShadowmapError(f"no vertex lies above {options.neck}: heights of this model go from {low:.4g} to {high:.4g}.")
     low, high = mean[mask].min(0), mean[mask].max(0)
-    extent = float((high - low).max())
+    with np.errstate(over="ignore", invalid="ignore"):
+        extent = float((high - low).max())
     if not (np.isfinite(extent) and extent > 0):
         raise ShadowmapError("the model's mean has no finite extent: check its vertices.")
     scale = 2 / extent

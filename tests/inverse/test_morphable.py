@@ -214,7 +214,7 @@ def test_basel_like_arrays(tmp_path: Path) -> None:
         ({"triangles": np.full((5, 3), 0.5)}, "no whole numbers"),
         ({"triangles": np.full((5, 3), np.nan)}, "no whole numbers"),
         ({"triangles": np.full((5, 3), 1e30)}, "no whole numbers up to"),
-        ({"shape_mean": np.full(42, np.inf)}, "no finite extent"),
+        ({"shape_mean": np.full(126, np.inf)}, "no finite extent"),
         ({"shape_variance": -np.ones(4)}, "deviations or variances of shape_basis are negative or not finite"),
         ({"shape_std": np.full(4, np.nan)}, "deviations or variances of shape_basis are negative or not finite"),
         ({"shape_mean": np.ones(42, complex)}, "shape_mean holds complex128"),

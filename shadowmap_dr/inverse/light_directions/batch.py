@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from ...errors import ShadowmapError
 from ...jit.arrays import device_array
+from ...jit.checks import real_array
 from ...jit.frozen import freeze, recordings_of
 from ...jit.types import Float, Vector3f
 from ...shadow import Frusta
@@ -180,7 +181,7 @@ class LightBatch:
         return recordings_of(self._step)
 
     def _vectors(self, directions: npt.ArrayLike) -> tuple[Vector3f, int]:
-        array = np.asarray(directions, np.float64)
+        array = real_array("directions", directions, np.float64)
         if array.ndim != 3 or array.shape[1:] != (self.lights, 3) or not len(array):
             raise ShadowmapError(f"directions of shape {array.shape}: give (R, {self.lights}, 3) for R runs.")
         length = np.linalg.norm(array, axis=-1, keepdims=True)
@@ -190,7 +191,7 @@ class LightBatch:
         return mi.Vector3f(*(device_array(mi.Float, unit[:, c]) for c in range(3))), len(array)
 
     def _targets(self, targets: npt.ArrayLike, runs: int) -> list[Float]:
-        pixels, array = self.scene.pixels, np.asarray(targets, np.float32)
+        pixels, array = self.scene.pixels, real_array("targets", targets)
         shape = (runs, pixels.height, pixels.width, pixels.channels)
         if array.shape != shape or not np.isfinite(array).all():
             raise ShadowmapError(f"targets of shape {array.shape}: give finite values in the shape {shape}.")

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from ...errors import ShadowmapError
 from ...io.checkpoints import read_checkpoint, unreadable, write_checkpoint
 from ...io.records import plain
+from ...jit.checks import real_array
 from ...jit.types import Float
 
 WARM_UP_STEPS = 5
@@ -117,7 +118,7 @@ def optimize(
     if iterations < 1:
         raise ShadowmapError(f"{iterations} iterations: at least one is needed.")
     fingerprint = json.dumps(plain(settings or {}), sort_keys=True)
-    history = History(np.empty(0), np.asarray(start, np.float64).reshape(1, -1), np.empty(0), np.empty(0, np.bool_))
+    history = History(np.empty(0), real_array("start", start, np.float64).reshape(1, -1), np.empty(0), np.empty(0, np.bool_))
     state = None
     if checkpoint is not None and checkpoint.exists():
         history, state = _load(checkpoint, fingerprint)

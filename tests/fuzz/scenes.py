@@ -224,7 +224,7 @@ def _vector(rng: np.random.Generator) -> tuple[str, tuple[float, ...]]:
     return "vector", (float(x), float(y), float(pick(rng, (3.0, -1.0, 0.0)))) if chance(rng, 0.9) else (
         0.0,
         0.0,
-        float(pick(rng, (0.0, 1e10))),
+        float(pick(rng, (0.0, 1e10, 1e20))),
     )
 
 

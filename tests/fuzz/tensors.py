@@ -154,6 +154,7 @@ def _shadows(rng: np.random.Generator, mesh: RandomMesh) -> str:
     light: Any = 0 if chance(rng, 0.9) else pick(rng, (1, -1, "x", None, 0.5))
     seen = sdr.visibility(maps, points if chance(rng, 0.9) else _tensor(rng, points.numpy()), light)
     _finite(seen, "visibilities are")
+    seen = seen.detach()
     low, high = float(seen.min()), float(seen.max())
     check(low >= -1e-4 and high <= 1 + 1e-4, f"visibilities from {low} to {high}")
     return f"mean {float(seen.mean()):.3f}"

@@ -248,3 +248,9 @@ def test_arrays_that_are_no_images(tmp_path: Path, name: str, shape: tuple[int, 
 def test_channels_that_openexr_cannot_hold(tmp_path: Path, channels: dict[str, Any]) -> None:
     with pytest.raises(ShadowmapError, match=r"cannot write .*a\.exr: channel.*; give "):
         images.write_exr(tmp_path / "a.exr", channels)
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_plots_of_the_largest_numbers(tmp_path: Path) -> None:
+    plots.plot_curves(tmp_path / "a.png", {"loss": {"a": [[1e-300, 1e308], [float("nan"), 1.0]]}})
+    assert Image.open(tmp_path / "a.png").width > 100

@@ -52,7 +52,7 @@ def run_bench(options: BenchOptions, *, console: Console | None = None) -> dict[
 
     Returns:
         Content of the JSON file: `sections` (by name, each with `command`, `settings`, `machine` and `units`),
-        `machine`, `load_before` and `load_after`, and `figures`, the rows of the table.
+        `machine`, `load_before` and `load_after`, `figures`, the rows of the table, and `checks`, digests of the sections.
     """
     console = console or Console(stderr=True)
     files.check_output(options.out, (".json",))
@@ -177,4 +177,5 @@ def _is_sound(name: str, section: Any) -> bool:  # Any: JSON
 
 
 def _write(options: BenchOptions, record: dict[str, Any]) -> None:
-    records.write_record(options.out, record, "sections")
+    record["checks"] = {"sections": {name: records.digest(section) for name, section in record["sections"].items()}}
+    records.write_json(options.out, record)

@@ -100,7 +100,7 @@ def write_png(path: str | os.PathLike[str], image: Array) -> None:
     """
     from PIL import Image
 
-    pixels = np.asarray(image, dtype=np.float32)
+    pixels = _single(image)
     if pixels.ndim == 3 and pixels.shape[2] == 1:
         pixels = pixels[..., 0]
     if pixels.ndim not in (2, 3) or not pixels.size or (pixels.ndim == 3 and pixels.shape[2] not in (3, 4)):
@@ -119,7 +119,7 @@ def write_image(path: str | os.PathLike[str], image: Array, metadata: Mapping[st
     if suffix == ".png":
         write_png(path, image)
     elif suffix == ".exr":
-        pixels = np.asarray(image, dtype=np.float32)
+        pixels = _single(image)
         pixels = pixels[..., None] if pixels.ndim == 2 else pixels
         if pixels.ndim != 3 or not pixels.size:
             raise ShadowmapError(
@@ -147,7 +147,13 @@ def colour_channels(count: int) -> tuple[str, ...]:
     return names
 
 
+def _single(image: Array) -> npt.NDArray[np.float32]:
+    """An image in single precision; numbers beyond its range become infinite."""
+    with np.errstate(over="ignore"):
+        return np.asarray(image, dtype=np.float32)
+
+
 def to_srgb(linear: Array) -> npt.NDArray[np.float32]:
     """sRGB transfer curve (IEC 61966-2-1) of linear values, clipped to [0, 1]."""
-    x = np.clip(np.asarray(linear, dtype=np.float32), 0, 1)
+    x = np.clip(_single(linear), 0, 1)
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(x, 1 / 2.4) - 0.055).astype(np.float32)

@@ -228,7 +228,7 @@ def _render(rng: np.random.Generator, mesh: RandomMesh) -> str:
     )
     image = renderer.render(given, **options).numpy()
     check(image.shape == (16, 16, 3), f"an image of shape {image.shape}")
-    check(np.isfinite(image).all(), "an image is not finite")
+    check(np.isfinite(image).all() or not mesh.moderate, "an image is not finite")
     return f"mean {image.mean():.3f}"
 
 
@@ -245,7 +245,7 @@ def _scene(rng: np.random.Generator, mesh: RandomMesh) -> str:
     image = shadowmap_dr.Renderer.from_scene(scene, **_SETTINGS).render().numpy()
     check(mesh.usable, "indices out of range were accepted")
     check(image.shape == (16, 16, 3), f"an image of shape {image.shape}")
-    check(np.isfinite(image).all(), "an image is not finite")
+    check(np.isfinite(image).all() or not mesh.moderate, "an image is not finite")
     return f"mean {image.mean():.3f}"
 
 

@@ -52,6 +52,11 @@ class RandomMesh:
         return bool(np.isfinite(self.vertices).all())
 
     @property
+    def moderate(self) -> bool:
+        """True if sums of a few coordinates are in the range of single precision, where they are finite at all."""
+        return not (np.abs(self.vertices[np.isfinite(self.vertices)]) > 1e37).any()
+
+    @property
     def sound(self) -> bool:
         return self.usable and self.finite and bool(np.abs(self.vertices).max() < 1e4)
 

@@ -73,7 +73,7 @@ def _rasterize(rng: np.random.Generator, mesh: RandomMesh) -> str:
     faces = _faces(rng, mesh)
     found = sdr.rasterize(_tensor(rng, _clip(mesh)), faces, size, **options)
     triangles = found.triangle
-    check(int(triangles.max()) < len(faces), f"triangle {int(triangles.max())} of {len(faces)}")
+    check(int(triangles.max()) < faces.shape[-2], f"triangle {int(triangles.max())} of {faces.shape[-2]}")
     if mesh.sound:
         for name in ("u", "v", "depth"):
             _finite(getattr(found, name), name)

@@ -254,3 +254,14 @@ def test_channels_that_openexr_cannot_hold(tmp_path: Path, channels: dict[str, A
 def test_plots_of_the_largest_numbers(tmp_path: Path) -> None:
     plots.plot_curves(tmp_path / "a.png", {"loss": {"a": [[1e-300, 1e308], [float("nan"), 1.0]]}})
     assert Image.open(tmp_path / "a.png").width > 100
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize("name", ["a.png", "a.exr"])
+def test_images_beyond_single_precision_are_white(tmp_path: Path, name: str) -> None:
+    images.write_image(tmp_path / name, np.full((4, 5, 3), 1e300))
+    assert (images.to_srgb(np.full((4, 5), 1e300)) > 0.999).all()
+    if name == "a.png":
+        assert (np.asarray(Image.open(tmp_path / name)) == 255).all()
+    else:
+        assert np.isinf(images.read_image(tmp_path / name)).all()

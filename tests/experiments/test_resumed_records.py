@@ -15,6 +15,8 @@ from shadowmap_dr.errors import ShadowmapError
 from shadowmap_dr.experiments.art import gallery
 from shadowmap_dr.experiments.bench import experiment as bench
 from shadowmap_dr.experiments.bench.common import BenchOptions
+from shadowmap_dr.experiments.gradients import convergence
+from shadowmap_dr.experiments.gradients.convergence import ConvergenceOptions
 from shadowmap_dr.experiments.lights import experiment as lights
 from shadowmap_dr.experiments.pose.record import stored_records
 from shadowmap_dr.inverse import run_sweep
@@ -110,3 +112,28 @@ def test_batches_without_a_digest_are_made_again(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="was edited or is damaged: its runs are made again"):
         again = run_sweep([problem], tmp_path, resume=True, **runs)
     assert [record.keys() for record in again["bowls"]] == [record.keys() for record in made["bowls"]]
+
+
+CONVERGENCE: dict[str, Any] = {
+    **{"occluder": "ring", "camera": "perspective", "filter": 3, "displacement": 0.1, "texel": 0.01, "error_texels": 0.1},
+    **{
+        "recovered": True,
+        "seconds_per_iteration": 0.1,
+        "error_curve_texels": [1.0, 0.1],
+        "loss_curve": [1.0],
+        "candidate": "msm",
+    },
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("candidate", 3), ("occluder", []), ("camera", []), ("displacement", "x"), ("error_curve_texels", [[1], 2])],
+)
+def test_edited_runs_of_occluders_are_made_again(tmp_path: Path, name: str, value: object) -> None:
+    options = ConvergenceOptions(out=tmp_path, resume=True)
+    path = tmp_path / "convergence.json"
+    settings = convergence._started(path, options)["settings"]
+    runs = {"good": CONVERGENCE, "edited": {**CONVERGENCE, name: value}}
+    found = _warned(path, json.dumps({"settings": settings, "runs": runs}), lambda: convergence._started(path, options))
+    assert found["runs"] == {"good": CONVERGENCE}

@@ -185,6 +185,19 @@ def test_records_of_earlier_versions_need_some_keys(tmp_path: Path) -> None:
         assert records.read_record(path, fresh, {"runs": ("n",)})["runs"] == {"x": {"n": 1}}
 
 
+def test_records_of_earlier_versions_that_no_report_can_be_made_of(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    entries = {"a": {"loss": 1.0}, "b": {"loss": "x"}, "c": {"loss": None}, "d": {"loss": []}}
+    path.write_text(json.dumps({"settings": {}, "runs": entries}))
+
+    def report(record: dict[str, Any]) -> str:
+        return ", ".join(f"{run['loss']:.2f} {int(run['loss'])}" for run in record["runs"].values())
+
+    with pytest.warns(UserWarning, match="3 of 4 entries of 'runs' were edited or are damaged"):
+        found = records.read_record(path, {"settings": {}, "runs": {}}, {"runs": ("loss",)}, report)
+    assert found["runs"] == {"a": {"loss": 1.0}}
+
+
 @pytest.mark.parametrize("content", [b"{", b"\xff\xfe", b"[" * 100_000, b"1" * 10_000, b""])
 def test_files_that_are_no_json_are_one_line(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "a.json").write_bytes(content)

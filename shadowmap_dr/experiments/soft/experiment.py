@@ -166,7 +166,12 @@ def _kept(path: Path, options: SoftOptions) -> dict[str, Any]:
     if not options.resume or not path.exists():
         return {}
     needed = ("about", "glossy", "counted", "reference_noise", "noise_of_one_sample", "errors")
-    scenes: dict[str, Any] = records.read_record(path, {"settings": options.settings, "scenes": {}}, {"scenes": needed})["scenes"]
+    scenes: dict[str, Any] = records.read_record(
+        path,
+        {"settings": options.settings, "scenes": {}},
+        {"scenes": needed},
+        lambda record: soft_report.reading(record) and soft_report.rows(record),
+    )["scenes"]
     return scenes
 
 

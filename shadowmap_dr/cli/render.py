@@ -11,9 +11,8 @@ import numpy as np
 import typer
 
 from .. import __version__
-from ..errors import ShadowmapError
+from ..errors import ShadowmapError, mitsuba_message
 from ..io import assets, files, images
-from ..scene.origin import mitsuba_message
 from ..variants import ANY, DEFAULT_VARIANT, set_variant
 from .options import Variant
 

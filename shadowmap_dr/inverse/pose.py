@@ -14,9 +14,9 @@ import numpy.typing as npt
 
 from ..errors import ShadowmapError
 from ..jit.arrays import device_array
-from ..jit.checks import real_array
 from ..jit.frozen import freeze, recordings_of
 from ..jit.types import Float, TensorXf
+from ..rendering.receivers.checks import real_array
 
 
 def apply_pose(p_rest: Float, pose: Float, shift_z: float = 0.0) -> Float:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import pickle
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, TypeAlias
@@ -13,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import ShadowmapError, check_variant
+from ..errors import ShadowmapError, check_variant, mitsuba_message
 
 #: A dictionary for ``mi.load_dict``: numbers, texts, arrays, transformations, dictionaries.
 Description: TypeAlias = Mapping[str, Any]
@@ -80,14 +79,6 @@ class _Packed:
     values: npt.NDArray[Any]
     name: str = ""
     gamma: bool = False
-
-
-def mitsuba_message(error: BaseException) -> str:
-    """Message of an exception of Mitsuba's, in one line, without positions in its source."""
-    if isinstance(error, UnicodeError):  # Mitsuba quotes what it cannot read
-        return "a file that it names is damaged."
-    text = re.sub(r"\[\w+\.(?:cpp|h):\d+\] ?", "", " ".join(str(error).split()))
-    return "a parameter has a value of the wrong type." if text == "std::bad_cast" else text
 
 
 def _packed(value: object, place: str) -> Any:  # Any: a value of any type

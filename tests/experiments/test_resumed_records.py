@@ -15,6 +15,9 @@ from shadowmap_dr.errors import ShadowmapError
 from shadowmap_dr.experiments.art import gallery
 from shadowmap_dr.experiments.bench import experiment as bench
 from shadowmap_dr.experiments.bench.common import BenchOptions
+from shadowmap_dr.experiments.faces import experiment as faces
+from shadowmap_dr.experiments.faces.experiment import FaceOptions
+from shadowmap_dr.experiments.faces.problem import default_model
 from shadowmap_dr.experiments.gradients import convergence
 from shadowmap_dr.experiments.gradients.convergence import ConvergenceOptions
 from shadowmap_dr.experiments.lights import experiment as lights
@@ -137,3 +140,11 @@ def test_edited_runs_of_occluders_are_made_again(tmp_path: Path, name: str, valu
     runs = {"good": CONVERGENCE, "edited": {**CONVERGENCE, name: value}}
     found = _warned(path, json.dumps({"settings": settings, "runs": runs}), lambda: convergence._started(path, options))
     assert found["runs"] == {"good": CONVERGENCE}
+
+
+def test_edited_runs_of_heads_are_made_again(tmp_path: Path) -> None:
+    names = ("mode", "lights", "seed", "distance", "start_distance", "image_error", "weight_error", "final", "true", "loss_curve")
+    options, model, path = FaceOptions(out=tmp_path, resume=True), default_model(None), tmp_path / "faces.json"
+    settings = faces._started(path, options, model)["settings"]
+    content = json.dumps({"settings": settings, "runs": {"edited": dict.fromkeys(names, {"a": 1})}})
+    assert _warned(path, content, lambda: faces._started(path, options, model))["runs"] == {}

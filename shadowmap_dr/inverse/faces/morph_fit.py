@@ -12,9 +12,9 @@ import numpy.typing as npt
 
 from ...errors import ShadowmapError
 from ...jit.arrays import device_array
-from ...jit.checks import is_real, real_array
 from ...jit.frozen import freeze, recordings_of
 from ...jit.types import Float
+from ...rendering.receivers.checks import is_real, real_array
 from ...rendering.receivers.planar_receiver import ReceiverShadows
 from .blend_shapes import blend
 

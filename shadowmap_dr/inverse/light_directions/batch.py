@@ -16,9 +16,9 @@ import numpy.typing as npt
 
 from ...errors import ShadowmapError
 from ...jit.arrays import device_array
-from ...jit.checks import real_array
 from ...jit.frozen import freeze, recordings_of
 from ...jit.types import Float, Vector3f
+from ...rendering.receivers.checks import real_array
 from ...shadow import Frusta
 from .pixels import StillScene
 from .shading import fit_maps, images, light_views, losses_and_gradients, render_lights, with_shadow

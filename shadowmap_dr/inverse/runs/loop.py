@@ -16,8 +16,8 @@ import numpy.typing as npt
 from ...errors import ShadowmapError
 from ...io.checkpoints import read_checkpoint, unreadable, write_checkpoint
 from ...io.records import plain
-from ...jit.checks import real_array
 from ...jit.types import Float
+from ...rendering.receivers.checks import real_array
 
 WARM_UP_STEPS = 5
 CHECKPOINT_INTERVAL = 10

@@ -12,9 +12,9 @@ import numpy.typing as npt
 
 from ...errors import ShadowmapError
 from ...jit.arrays import device_array
-from ...jit.checks import index_array, is_real, is_whole, real_array
 from ...jit.frozen import freeze
 from ...jit.types import Float, Point3f
+from ...rendering.receivers.checks import index_array, is_real, is_whole, real_array
 from ...rendering.receivers.shadow_images import ShadowImages, image_loss, shadow_images
 from ...rendering.receivers.shadow_views import ShadowView
 from .sculpt import checked_target

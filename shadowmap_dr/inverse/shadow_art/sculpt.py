@@ -12,9 +12,9 @@ import numpy.typing as npt
 
 from ...errors import ShadowmapError
 from ...jit.arrays import device_array
-from ...jit.checks import is_real, is_whole, real_array
 from ...jit.frozen import freeze, recordings_of
 from ...jit.types import Float, UInt32
+from ...rendering.receivers.checks import is_real, is_whole, real_array
 from ...rendering.receivers.shadow_images import ShadowImages, image_loss, shadow_images
 from ...rendering.receivers.shadow_views import ShadowView
 from .smoothness import normal_consistency

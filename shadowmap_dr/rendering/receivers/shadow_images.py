@@ -13,10 +13,10 @@ import numpy.typing as npt
 
 from ...errors import ShadowmapError
 from ...jit.arrays import device_array
-from ...jit.checks import index_array, real_array
 from ...jit.types import Float, Point3f, UInt32
 from ...raster import Topology, build_topology
 from ...shadow import Frusta, ShadowSettings, Views, filter_maps, render_maps, vertices_in_maps, visibility
+from .checks import index_array, real_array
 from .shadow_views import ShadowView
 
 # All casters lie before the receiver, by half of its half-side at least, and within twelve of these. Maps tell no depths apart

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...errors import ShadowmapError
-from ...jit.checks import is_real, is_whole, real_array
+from .checks import is_real, is_whole, real_array
 
 RECEIVERS = ("plane", "wavy")
 CAMERAS = ("orthographic", "perspective")

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import ShadowmapError
+from ...errors import ShadowmapError
 
 
 def real_array(name: str, values: npt.ArrayLike, kind: type[Any] = np.float32) -> npt.NDArray[Any]:

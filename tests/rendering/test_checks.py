@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from shadowmap_dr.errors import ShadowmapError
-from shadowmap_dr.jit.checks import index_array, is_real, is_whole, real_array
+from shadowmap_dr.rendering.receivers.checks import index_array, is_real, is_whole, real_array
 
 
 def test_numbers_of_all_kinds_become_arrays(variant: str) -> None:

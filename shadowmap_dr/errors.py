@@ -6,6 +6,7 @@ Every message is one line: what is wrong, the offending value, and what to do ab
 from __future__ import annotations
 
 import inspect
+import re
 import warnings
 
 
@@ -23,6 +24,14 @@ class LLVMError(ShadowmapError, ImportError):
 
 class OutputError(ShadowmapError, OSError):
     """A result could not be written (unwritable directory, full disk, unknown suffix)."""
+
+
+def mitsuba_message(error: BaseException) -> str:
+    """Message of an exception of Mitsuba's, in one line, without positions in its source."""
+    if isinstance(error, UnicodeError):  # Mitsuba quotes what it cannot read
+        return "a file that it names is damaged."
+    text = re.sub(r"\[\w+\.(?:cpp|h):\d+\] ?", "", " ".join(str(error).split()))
+    return "a parameter has a value of the wrong type." if text == "std::bad_cast" else text
 
 
 def is_interrupt(error: BaseException | None) -> bool:

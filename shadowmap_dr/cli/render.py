@@ -11,7 +11,7 @@ import numpy as np
 import typer
 
 from .. import __version__
-from ..errors import ShadowmapError
+from ..errors import ShadowmapError, mitsuba_message
 from ..io import assets, files, images
 from ..variants import ANY, DEFAULT_VARIANT, set_variant
 from .options import Variant
@@ -102,7 +102,7 @@ def _size(text: str) -> tuple[int, int]:
 def _load(path: Path, values: dict[str, str]) -> mi.Scene:
     try:
         loaded = mi.load_file(str(path), **values)
-    except RuntimeError as error:
+    except (RuntimeError, UnicodeError) as error:
         raise ShadowmapError(f"cannot load {path}: {_one_line(error)}") from error
     if not isinstance(loaded, mi.Scene):
         raise ShadowmapError(f"cannot load {path}: its root is a {type(loaded).__name__}, not a scene.")
@@ -167,4 +167,4 @@ def _one_line(error: BaseException) -> str:
     text = str(error)
     if "Traceback (most recent call last)" in text:  # raised by a Python plug-in: the message is the last line
         return re.sub(r"^[\w.]*(?:Error|Exception): ", "", text.strip().splitlines()[-1])
-    return re.sub(r"\[\w+\.(?:cpp|h):\d+\] ?", "", " ".join(text.split()))
+    return mitsuba_message(error)

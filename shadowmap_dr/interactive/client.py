@@ -42,6 +42,7 @@ class Client:
         wake: set when there may be something new to send.
         seq: number of the page's last stroke message.
         rate: of messages from the page.
+        refusal: reason why the connection ends, None while it goes on.
     """
 
     number: int
@@ -49,6 +50,7 @@ class Client:
     wake: asyncio.Event = field(default_factory=asyncio.Event)
     seq: int = 0
     rate: RateLimit = field(default_factory=lambda: RateLimit(MOST_MESSAGES, BURST))
+    refusal: str | None = None
     _status: Status | None = None
     _target: tuple[int, int] | None = None
     _target_due: float = 0.0

@@ -90,10 +90,16 @@ class Connections:
 
                 group.start_soon(run, self._send)
                 group.start_soon(run, self._receive)
+            if client.refusal is not None:  # nothing is sent any more
+                with anyio.fail_after(_PATIENCE):
+                    await socket.close(1008, client.refusal)
+        except _GONE:
+            pass
         finally:
             self._clients.discard(client)
 
     async def _receive(self, client: Client) -> None:
+        """Read messages until the page has gone, or has sent one that it may not send."""
         while True:
             message = await client.socket.receive()
             if message["type"] == "websocket.disconnect":
@@ -103,8 +109,7 @@ class Connections:
                     raise messages.MessageError("a binary message: pages send texts only.")
                 await self._handle(client, messages.parse(message["text"], self.canvas.shape))
             except ShadowmapError as error:
-                with anyio.fail_after(_PATIENCE):
-                    await client.socket.close(1008, str(error)[:120])
+                client.refusal = str(error)[:120]
                 return
             # A message that has arrived already is received without a pause: other pages would wait until none is left.
             await client.slow_down()

@@ -14,8 +14,9 @@ import numpy.typing as npt
 
 from ..errors import ShadowmapError
 from ..jit.arrays import device_array
-from ..jit.frozen import recordings_of
+from ..jit.frozen import freeze, recordings_of
 from ..jit.types import Float, TensorXf
+from ..rendering.receivers.checks import real_array
 
 
 def apply_pose(p_rest: Float, pose: Float, shift_z: float = 0.0) -> Float:
@@ -69,22 +70,22 @@ class PoseFit:
         spp: int = 1,
         settings: Mapping[str, Any] | None = None,
     ) -> None:
-        image = np.asarray(reference, np.float32)
+        image = real_array("reference", reference)
         if image.ndim != 3 or not np.isfinite(image).all():
             raise ShadowmapError(f"a reference of shape {image.shape}: give finite values in the shape (H, W, C).")
         self._initial_renderer = renderer
         self._shape = shape
-        self._p_rest = device_array(mi.Float, p_rest)
+        self._p_rest = device_array(mi.Float, real_array("p_rest", p_rest))
         self._reference = mi.TensorXf(device_array(mi.Float, image), image.shape)
         self._step_size, self._betas, self._shift_z = step_size, betas, shift_z
         self._spp = {} if spp == 1 else {"spp": spp}  # left out by default: a renderer need not have this option
         self._settings = dict(settings or {})
-        self._step = dr.freeze(_pose_step)
+        self._step = freeze(_pose_step)
         self.reset(np.zeros(3))
 
     def reset(self, start: npt.ArrayLike) -> None:
         """Start from (rotation in radians, x, y) with empty moments."""
-        self.load_state({"parameters": np.asarray(start), "m": np.zeros(3), "v": np.zeros(3), "t": np.zeros(1)})
+        self.load_state({"parameters": real_array("start", start), "m": np.zeros(3), "v": np.zeros(3), "t": np.zeros(1)})
 
     def step(self) -> Float:
         """Take one step. Returns the loss before the step, Float (1,), without waiting for the device."""

@@ -34,6 +34,12 @@ def write_exr(path: str | os.PathLike[str], channels: Mapping[str, Array], metad
     header: dict[str, object] = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     header.update(metadata or {})
     arrays = {name: np.ascontiguousarray(array) for name, array in channels.items()}
+    shapes = sorted({array.shape for array in arrays.values()})
+    if len(shapes) != 1 or len(shapes[0]) != 2 or 0 in shapes[0]:
+        raise ShadowmapError(f"cannot write {path}: channels of the shapes {shapes}; give arrays (H, W) of one size, not empty.")
+    for name, array in arrays.items():
+        if array.dtype not in (np.float16, np.float32, np.uint32):
+            raise ShadowmapError(f"cannot write {path}: channel {name} is {array.dtype}; give float16, float32 or uint32.")
     with atomic(path) as temporary:
         try:
             with OpenEXR.File(header, arrays) as file:
@@ -94,11 +100,11 @@ def write_png(path: str | os.PathLike[str], image: Array) -> None:
     """
     from PIL import Image
 
-    pixels = np.asarray(image, dtype=np.float32)
+    pixels = _single(image)
     if pixels.ndim == 3 and pixels.shape[2] == 1:
         pixels = pixels[..., 0]
-    if pixels.ndim not in (2, 3) or (pixels.ndim == 3 and pixels.shape[2] not in (3, 4)):
-        raise ShadowmapError(f"an image of shape {np.shape(image)} is no PNG: give (H, W), (H, W, 1), (H, W, 3 or 4).")
+    if pixels.ndim not in (2, 3) or not pixels.size or (pixels.ndim == 3 and pixels.shape[2] not in (3, 4)):
+        raise ShadowmapError(f"an image of shape {np.shape(image)} is no PNG: give (H, W), (H, W, 1), (H, W, 3 or 4), not empty.")
     encoded = to_srgb(pixels)
     if pixels.ndim == 3 and pixels.shape[2] == 4:
         encoded[..., 3] = np.clip(pixels[..., 3], 0, 1)
@@ -113,8 +119,12 @@ def write_image(path: str | os.PathLike[str], image: Array, metadata: Mapping[st
     if suffix == ".png":
         write_png(path, image)
     elif suffix == ".exr":
-        pixels = np.asarray(image, dtype=np.float32)
+        pixels = _single(image)
         pixels = pixels[..., None] if pixels.ndim == 2 else pixels
+        if pixels.ndim != 3 or not pixels.size:
+            raise ShadowmapError(
+                f"cannot write {path}: an image of shape {np.shape(image)}; give (H, W) or (H, W, C), not empty."
+            )
         write_exr(path, {name: pixels[..., i] for i, name in enumerate(colour_channels(pixels.shape[2]))}, metadata)
     else:
         raise OutputError(f"cannot write {path}: the suffix {suffix!r} is not one of {', '.join(SUFFIXES)}.")
@@ -137,7 +147,13 @@ def colour_channels(count: int) -> tuple[str, ...]:
     return names
 
 
+def _single(image: Array) -> npt.NDArray[np.float32]:
+    """An image in single precision; numbers beyond its range become infinite."""
+    with np.errstate(over="ignore"):
+        return np.asarray(image, dtype=np.float32)
+
+
 def to_srgb(linear: Array) -> npt.NDArray[np.float32]:
     """sRGB transfer curve (IEC 61966-2-1) of linear values, clipped to [0, 1]."""
-    x = np.clip(np.asarray(linear, dtype=np.float32), 0, 1)
+    x = np.clip(_single(linear), 0, 1)
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(x, 1 / 2.4) - 0.055).astype(np.float32)

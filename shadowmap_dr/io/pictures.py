@@ -85,7 +85,8 @@ def _linear_picture(path: str | os.PathLike[str]) -> npt.NDArray[np.float32]:
         raise ShadowmapError(f"cannot read {path}: its channels differ in size; give an image without subsampling.")
     alpha = np.clip(np.nan_to_num(np.asarray(channels.get("A", np.ones_like(planes[0])), np.float32)), 0, 1)
     # OpenEXR's colours are premultiplied.
-    colours = [to_srgb(plane / np.maximum(alpha, np.float32(1e-6))) for plane in planes]
+    with np.errstate(over="ignore"):  # white
+        colours = [to_srgb(plane / np.maximum(alpha, np.float32(1e-6))) for plane in planes]
     picture = np.stack([*colours, alpha], axis=-1)
     times = -(-max(alpha.shape) // LONGER_SIDE)
     return picture[::times, ::times] if times > 1 else picture

@@ -21,6 +21,7 @@ Image = npt.NDArray[np.floating[Any]]
 Rows = Mapping[str, Mapping[str, Image]]
 
 
+@np.errstate(over="ignore", invalid="ignore")  # the margins of axes for numbers near the largest ones
 def plot_curves(
     path: str | os.PathLike[str],
     panels: Mapping[str, Mapping[str, Sequence[Sequence[float]]]],

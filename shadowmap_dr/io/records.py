@@ -7,7 +7,7 @@ import itertools
 import json
 import math
 import os
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +45,12 @@ def write_record(path: str | os.PathLike[str], record: Mapping[str, Any], *parts
     write_json(path, {**record, "checks": checks})
 
 
-def read_record(path: str | os.PathLike[str], fresh: Mapping[str, Any], parts: Mapping[str, Collection[str]]) -> dict[str, Any]:
+def read_record(
+    path: str | os.PathLike[str],
+    fresh: Mapping[str, Any],
+    parts: Mapping[str, Collection[str]],
+    report: Callable[[dict[str, Any]], object] | None = None,
+) -> dict[str, Any]:
     """A record to go on with: ``fresh``, and the entries of an earlier call in the file.
 
     Entries that were edited or damaged are left out, to be made again, and a file that holds no record is set aside. A warning
@@ -55,6 +60,7 @@ def read_record(path: str | os.PathLike[str], fresh: Mapping[str, Any], parts: M
         path: the file.
         fresh: record without entries, with ``settings``.
         parts: names of the mappings of entries; keys that entries without digests need, which earlier versions wrote.
+        report: makes reports of a record. Entries without digests of which none can be made are damaged.
 
     Raises ShadowmapError if the file is a record of other settings.
     """
@@ -79,12 +85,28 @@ def read_record(path: str | os.PathLike[str], fresh: Mapping[str, Any], parts: M
         result[part] = {
             key: entry
             for key, entry in entries.items()
-            if (own.get(key) == digest(entry) if checks is not None else isinstance(entry, dict) and entry.keys() >= set(needed))
+            if (
+                own.get(key) == digest(entry)
+                if checks is not None
+                else isinstance(entry, dict)
+                and entry.keys() >= set(needed)
+                and _is_readable({**fresh, part: {key: entry}}, report)
+            )
         }
         lost = len(entries) - len(result[part])
         if lost:
             warn(f"{path}: {lost} of {len(entries)} entries of {part!r} were edited or are damaged: they are made again.")
     return result
+
+
+def _is_readable(record: dict[str, Any], report: Callable[[dict[str, Any]], object] | None) -> bool:
+    """True if a report can be made of a record."""
+    if report is not None:
+        try:
+            report(record)
+        except (KeyError, IndexError, TypeError, ValueError, AttributeError, ArithmeticError, ShadowmapError):
+            return False
+    return True
 
 
 def set_aside(path: str | os.PathLike[str]) -> None:

@@ -26,6 +26,22 @@ def recordings_of(function: Callable[..., Any]) -> int:
     return int(cast(Any, function).n_recordings)
 
 
+class freeze:
+    """As ``dr.freeze``, but Python's garbage is not collected during calls: see `gc_paused`."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._recorded = dr.freeze(function)
+
+    def __call__(self, *arguments: Any, **named: Any) -> Any:  # Any: those of the function
+        with gc_paused():
+            return self._recorded(*arguments, **named)
+
+    @property
+    def n_recordings(self) -> int:
+        """Number of recordings so far."""
+        return recordings_of(self._recorded)
+
+
 class Frozen:
     """A function of records, recorded once for all arguments that differ only in the contents of their arrays.
 

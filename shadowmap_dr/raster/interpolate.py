@@ -8,7 +8,7 @@ import drjit as dr
 
 from ..jit.arrays import backend, ravel
 from ..jit.types import TensorXf, TensorXu, UInt32
-from .types import RasterOutput, check_range, pixel_coordinates
+from .types import RasterOutput, check_array, check_range, pixel_coordinates
 
 
 def interpolate(attributes: TensorXf, raster: RasterOutput, faces: TensorXu | UInt32, *, check_indices: bool = True) -> TensorXf:
@@ -29,6 +29,10 @@ def interpolate(attributes: TensorXf, raster: RasterOutput, faces: TensorXu | UI
     Raises:
         ValueError: attributes or faces do not fit the images or each other; an index is out of range.
     """
+    check_array("attributes", attributes)
+    check_array("faces", faces, integer=True)
+    if not dr.is_tensor_v(attributes):
+        raise ValueError(f"attributes are of type {type(attributes).__name__}; expected a tensor (V, C) or (B, V, C)")
     shape = tuple(attributes.shape)
     if len(shape) not in (2, 3) or 0 in shape:
         raise ValueError(f"attributes have shape {shape}; expected (V, C) or (B, V, C), not empty")

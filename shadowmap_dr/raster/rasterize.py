@@ -16,7 +16,7 @@ from .barycentrics import pixel_barycentrics
 from .small_triangles import EMPTY, draw
 from .tile_lists import STRIP, Strips, TileGrid, TileLists, build_tile_lists, nearest_covers, strips
 from .triangle_setup import Line, centred, covers, edge_lines, fragment_key, gather_triangle, set_up
-from .types import MAX_RESOLUTION, NO_TRIANGLE, RasterOutput, Records, by_image, check_range, pixel_coordinates
+from .types import MAX_RESOLUTION, NO_TRIANGLE, RasterOutput, Records, by_image, check_array, check_range, pixel_coordinates
 
 #: A triangle that covers more pixels than this, and is not thin, goes through the lists of tiles.
 _LARGE = 512
@@ -126,12 +126,8 @@ def check_mesh(
     positions: TensorXf | Float, faces: TensorXu | UInt32, batch: int | None, check_indices: bool
 ) -> tuple[Float, UInt32, int, int]:
     """Validate and flatten vertices and faces; returns (flat positions, flat faces, batch, vertices per image)."""
-    for name, array in (("positions", positions), ("faces", faces)):
-        is_flat = dr.is_jit_v(array) and (dr.is_tensor_v(array) or dr.depth_v(array) == 1)
-        fits = is_flat and (dr.type_v(array) == dr.VarType.Float32 if name == "positions" else dr.is_integral_v(array))
-        if not fits:
-            wanted = "single-precision" if name == "positions" else "integer"
-            raise ValueError(f"{name} are of type {type(array).__name__}; expected a Dr.Jit tensor or flat array, {wanted}")
+    check_array("positions", positions)
+    check_array("faces", faces, integer=True)
     if dr.is_tensor_v(positions):
         shape = tuple(positions.shape)
         if len(shape) not in (2, 3) or shape[-1] != 4:

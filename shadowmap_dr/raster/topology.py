@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import drjit as dr
 import numpy as np
+import numpy.typing as npt
 
 from ..jit.arrays import device_array
 from ..jit.types import Bool, UInt32
@@ -99,8 +100,9 @@ def build_topology(
     Raises:
         ValueError: arrays of other shapes, no faces, an index out of range.
     """
-    faces = _in_threes("faces", "F", np.asarray(faces))
-    positions = np.ascontiguousarray(_in_threes("positions", "V", np.asarray(positions, np.float32))) + np.float32(0)  # -0 -> 0
+    faces = _in_threes("faces", "F", faces, "iu")
+    with np.errstate(over="ignore"):
+        positions = _in_threes("positions", "V", positions, "fiu").astype(np.float32) + np.float32(0)  # -0 -> 0
     if faces.size == 0:
         raise ValueError("faces are empty; a topology needs at least one triangle")
     low, high = int(faces.min()), int(faces.max())
@@ -165,7 +167,14 @@ def _by_place(halves: Index, corners: np.ndarray, positions: np.ndarray) -> Inde
     return halves[np.argsort(edge_keys(rank, corners, halves), kind="stable")]
 
 
-def _in_threes(name: str, count: str, values: np.ndarray) -> np.ndarray:
+def _in_threes(name: str, count: str, given: npt.ArrayLike, kinds: str) -> np.ndarray:
+    """Rows of three numbers of the kinds ``kinds`` (``np.dtype.kind``)."""
+    try:
+        values = np.asarray(given)
+    except ValueError:
+        raise ValueError(f"{name} are no array; expected ({count}, 3)") from None
+    if values.size and values.dtype.kind not in kinds:
+        raise ValueError(f"{name} hold {values.dtype}; expected {'integers' if kinds == 'iu' else 'numbers'} ({count}, 3)")
     if (values.ndim == 2 and values.shape[1] == 3) or (values.ndim == 1 and values.size % 3 == 0):
         return values.reshape(-1, 3)
     raise ValueError(f"{name} have shape {values.shape}; expected ({count}, 3)")

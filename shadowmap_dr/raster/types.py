@@ -84,6 +84,14 @@ def precise_rcp(x: Float64) -> Float64:
         return dr.rcp(x)
 
 
+def check_array(name: str, array: object, *, integer: bool = False) -> None:
+    """Raise ValueError unless an array is a tensor or a flat array of Dr.Jit's, of integers or in single precision."""
+    is_flat = array is not None and dr.is_jit_v(array) and (dr.is_tensor_v(array) or dr.depth_v(array) == 1)
+    if not (is_flat and (dr.is_integral_v(array) if integer else dr.type_v(array) == dr.VarType.Float32)):
+        wanted = "integer" if integer else "single-precision"
+        raise ValueError(f"{name} are of type {type(array).__name__}; expected a Dr.Jit tensor or flat array, {wanted}")
+
+
 def check_range(faces: UInt32, count: int, what: str) -> None:
     """Raise ValueError if an index in ``faces`` is ``count`` or more; ``what`` names the indexed thing. Reads back one number."""
     largest = int(np.max(dr.max(faces).numpy()))

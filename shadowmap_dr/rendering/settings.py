@@ -70,9 +70,15 @@ class RenderSettings:
     def __post_init__(self) -> None:
         if isinstance(self.aovs, str):
             raise ShadowmapError(f"aovs is {self.aovs!r}: give names in a tuple, as in ('{self.aovs}',).")
+        if not isinstance(self.aovs, tuple | list):
+            raise ShadowmapError(f"aovs is {self.aovs!r}: give names in a tuple, as in ('depth',).")
+        object.__setattr__(self, "aovs", tuple(self.aovs))
         for name in self.aovs:
-            if name not in AOVS:
+            if not isinstance(name, str) or name not in AOVS:
                 raise ShadowmapError(f"There is no AOV '{name}': choose from {', '.join(AOVS)}.")
+        for name in ("antialias", "hide_emitters"):
+            if not isinstance(getattr(self, name), bool):
+                raise ShadowmapError(f"{name} is {getattr(self, name)!r}: give True or False.")
         for name in ("shadow_samples", "area_light_samples", "environment_light_samples", "max_depth"):
             if isinstance(getattr(self, name), bool) or not isinstance(getattr(self, name), Integral):
                 raise ShadowmapError(f"{name} is {getattr(self, name)!r}: give an integer.")

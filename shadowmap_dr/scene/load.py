@@ -23,7 +23,7 @@ from .descriptions import Parts, describe_all
 from .geometry import NOT_READ, Geometry, ShapeInfo, pack_face_info, stand_ins
 from .lights.area import AreaLight
 from .lights.environment import Environment
-from .lights.read import Light, area_lights_of, environments_of, lights_of
+from .lights.read import Light, area_lights_of, check_directions, environments_of, lights_of
 from .mitsuba_objects import children, held_arrays, is_cosine, is_plain
 from .sensor import Sensor, sensors_of
 from .shapes.sources import CurveSource, ShapeSource, source_of
@@ -181,6 +181,7 @@ def load(scene: mi.Scene, *, tessellation: int = 64, warn: bool = True) -> Scene
         only_cosines=all(is_cosine(bsdf) for bsdf in different),
         soup=soup if len(sources) >= _MANY_SHAPES else None,
     )
+    check_directions(scene)
     data = refresh(data)
     if warn:
         shapes = [(info.name, source.shape) for info, source in zip(infos, sources, strict=True)]

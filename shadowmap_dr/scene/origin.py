@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import ShadowmapError, check_variant
+from ..errors import ShadowmapError, check_variant, mitsuba_message
 
 #: A dictionary for ``mi.load_dict``: numbers, texts, arrays, transformations, dictionaries.
 Description: TypeAlias = Mapping[str, Any]
@@ -58,8 +58,8 @@ class SceneOrigin:
                 scene: object = mi.load_dict(self.description, optimize=False)
             else:
                 scene = mi.load_file(self.file, optimize=False, **self.parameters)
-        except (RuntimeError, TypeError) as error:
-            raise ShadowmapError(f"cannot load {what}: {' '.join(str(error).split())}") from error
+        except (RuntimeError, TypeError, UnicodeError) as error:
+            raise ShadowmapError(f"cannot load {what}: {mitsuba_message(error)}") from error
         if not isinstance(scene, mi.Scene):
             raise ShadowmapError(f"cannot load {what}: its root is a {type(scene).__name__}, not a scene.")
         return scene

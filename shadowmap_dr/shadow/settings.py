@@ -62,15 +62,18 @@ class ShadowSettings:
                 object.__setattr__(self, name, index(getattr(self, name)))
             except TypeError:
                 raise ValueError(f"shadow map {name} is {getattr(self, name)!r}; give a whole number") from None
+        for name in ("antialias", "compat", "receiver_range", "cull_backfaces"):
+            if not isinstance(getattr(self, name), bool):
+                raise ValueError(f"shadow map {name} is {getattr(self, name)!r}; give True or False")
         for name in ("bias", "bleeding"):
             value = getattr(self, name)
-            if not isinstance(value, int | float) or not math.isfinite(value):
+            if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
                 raise ValueError(f"shadow map {name} is {value!r}; give a finite number")
         if self.method == "auto":
             object.__setattr__(self, "method", "vsm" if self.compat else DEFAULT)
-        if self.method not in METHODS:
+        if not isinstance(self.method, str) or self.method not in METHODS:
             raise ValueError(f"shadow method {self.method!r} is unknown; choose one of auto, {', '.join(METHODS)}")
-        if self.filter not in FILTERS:
+        if not isinstance(self.filter, str) or self.filter not in FILTERS:
             raise ValueError(f"shadow filter {self.filter!r} is unknown; choose one of {', '.join(FILTERS)}")
         if self.compat and self.method not in ("vsm", "standard", "none"):
             raise ValueError(f"shadow method {self.method!r} has no compatible variant; use vsm with compat")

@@ -169,3 +169,39 @@ def test_unusable_folders(tmp_path: Path, content: str) -> None:
     (tmp_path / "pose.json").write_text(content)
     with pytest.raises(ShadowmapError, match="pose.json"):
         pose_table.read([tmp_path])
+
+
+@pytest.mark.parametrize("as_table", [False, True])
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("method", "x"),
+        ("object", 3),
+        ("resolution", None),
+        ("shadow_only", None),
+        ("settings", []),
+        ("environment", "x"),
+        ("seed", []),
+    ]
+    + [
+        ("recovered", 2),
+        ("normals", "x"),
+        ("rotation_error_deg", [1, 2]),
+        ("translation_error_x100", "x"),
+        ("rotation_error_curve", 1),
+    ],
+)
+def test_edited_records_are_refused(tmp_path: Path, name: str, value: object, as_table: bool) -> None:
+    path = tmp_path / "pose.json"
+    records = [record("shadows", 0, 0.1), record("shadows", 1, 0.2)]
+    content: Any = {"rows": [row.plain() for row in pose_table.rows(records)]} if as_table else records
+    path.write_text(json.dumps(content))
+    assert len(pose_table.read([path])) == 2
+    edited = content["rows"][0] if as_table else content[0]
+    if as_table and name in edited["runs"]:
+        edited["runs"][name] = [value, value]
+    else:
+        edited[name] = value
+    path.write_text(json.dumps(content))
+    with pytest.raises(ShadowmapError, match=r"pose\.json is no (table|list of records) of the pose experiment"):
+        pose_table.read([path])

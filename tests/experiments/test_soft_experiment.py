@@ -120,3 +120,11 @@ def test_samples_of_equal_error() -> None:
     assert soft.equal_error_samples(0.0, 0.5, 96 * 96) == soft.equal_error_samples(0.005, 0.5, 96 * 96) == 10_000
     assert soft.equal_error_samples(0.5, 0.1, 96 * 96) == 1
     assert soft.equal_error_samples(0.0, 1e6, 512 * 512) * 512 * 512 < 2**32
+
+
+def test_images_without_pixels_to_count_are_refused(variant: str, tmp_path: Path) -> None:
+    chosen = {"samples": ((1, 1),), "map_resolution": 32, "spp": 1, "reference_spp": 16, "timed": False, "out": tmp_path}
+    with pytest.raises(
+        ShadowmapError, match="scene 'desk' has no lit pixel away from silhouettes in 8 x 8 pixels: give a larger"
+    ):
+        run_soft(SoftOptions(scenes=("desk",), resolution=8, **chosen))

@@ -401,3 +401,41 @@ def test_ports_that_are_taken_are_an_error():
         port = other.getsockname()[1]
         with pytest.raises(ShadowmapError, match=f"cannot serve on port {port}"):
             server.listen(port)
+
+
+class ClosingSocket:
+    """A connection whose page sends a message that is refused. Like Starlette's, it sends nothing after it has been closed."""
+
+    def __init__(self, board: Connections) -> None:
+        self.board, self.closed = board, None
+
+    async def accept(self) -> None:
+        pass
+
+    async def receive(self) -> dict[str, str]:
+        await asyncio.sleep(0.02)
+        return {"type": "websocket.receive", "text": "nonsense"}
+
+    async def send_text(self, text: str) -> None:
+        await self.send_bytes(b"")
+
+    async def send_bytes(self, data: bytes) -> None:
+        if self.closed is not None:
+            raise RuntimeError('Cannot call "send" once a close message has been sent.')
+        await asyncio.sleep(0)
+
+    async def close(self, code: int, reason: str) -> None:
+        self.closed = code, reason
+        self.board.replace(np.full((SIZE, SIZE), 0.5))  # news for the page
+        await asyncio.sleep(0.1)
+
+
+def test_nothing_is_sent_to_a_page_that_is_being_refused(board):
+    socket = ClosingSocket(board)
+
+    async def serve() -> None:
+        board.attach()
+        await board.serve(socket)
+
+    asyncio.run(serve())
+    assert socket.closed == (1008, "a message that is not JSON.")

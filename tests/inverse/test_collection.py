@@ -112,11 +112,30 @@ def test_recorded_state_goes_on_exactly_with_all_copies(variant):
 
 
 def test_collections_refuse_what_they_cannot_use(variant):
-    for options in ({"interval": 0}, {"most": 0}, {"step_size": 0}, {"seed": -1}):
+    for options in (
+        {"interval": 0},
+        {"most": 0},
+        {"step_size": 0},
+        {"seed": -1},
+        {"most": "x"},
+        {"step_size": None},
+        {"interval": 1.5},
+    ):
         with pytest.raises(ShadowmapError):
             balls(**options)
     with pytest.raises(ShadowmapError, match="targets"):
         Collection(*BOX, [shadow_view(size=SIZE)], [])
+    vertices, faces = BOX
+    for mesh in (
+        (vertices[:, :2], faces),
+        (vertices, faces.ravel()),
+        (vertices, faces + 8),
+        (vertices, None),
+        ("box", faces),
+        (3, 4),
+    ):
+        with pytest.raises(ShadowmapError):
+            Collection(*mesh, [shadow_view(size=SIZE)], [bar()])
     collection = balls()
     with pytest.raises(ShadowmapError, match="a state of 3"):
         collection.load_state({name: np.zeros(3) for name in ("numbers", "m", "v", "t", "steps")})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -212,6 +213,10 @@ def test_basel_like_arrays(tmp_path: Path) -> None:
         ({"triangles": np.zeros((5, 4), int)}, r"triangles of shape \(5, 4\)"),
         ({"triangles": np.full((5, 3), 0.5)}, "no whole numbers"),
         ({"triangles": np.full((5, 3), np.nan)}, "no whole numbers"),
+        ({"triangles": np.full((5, 3), 1e30)}, "no whole numbers up to"),
+        ({"shape_mean": np.full(126, np.inf)}, "no finite extent"),
+        ({"shape_variance": -np.ones(4)}, "deviations or variances of shape_basis are negative or not finite"),
+        ({"shape_std": np.full(4, np.nan)}, "deviations or variances of shape_basis are negative or not finite"),
         ({"shape_mean": np.ones(42, complex)}, "shape_mean holds complex128"),
         ({"shape_std": np.array(["a"] * 4)}, "shape_std holds <U1"),
     ],
@@ -220,5 +225,6 @@ def test_bad_arrays(changes: dict[str, Any], message: str, tmp_path: Path) -> No
     model = egg(1)
     arrays = {"shape_mean": model.mean.ravel(), "shape_basis": model.identity.reshape(4, -1).T, "triangles": model.faces}
     np.savez(tmp_path / "basel.npz", **(arrays | changes))
-    with pytest.raises(ShadowmapError, match=message):
+    with warnings.catch_warnings(), pytest.raises(ShadowmapError, match=message):
+        warnings.simplefilter("error")
         convert(tmp_path / "basel.npz", ConvertOptions())

@@ -91,6 +91,14 @@ def test_views_refuse_what_makes_no_sense():
         {"direction": (0, 2, 0)},
         {"direction": (0, 0, 0)},
         {"up": (np.nan, 0, 0)},
+        {"up": "up"},
+        {"direction": None},
+        {"direction": [(1, 2), 3]},
+        {"size": "large"},
+        {"size": 32.5},
+        {"half": None},
+        {"receiver": []},
+        {"camera": {}},
     ):
         with pytest.raises(ShadowmapError):
             shadow_view(**arguments)
@@ -277,14 +285,35 @@ def test_sculptors_refuse_what_they_cannot_use(variant):
         (vertices[:, :2], faces, views),
         (vertices * np.nan, faces, views),
         (vertices, faces + 100, views),
+        (vertices, faces.astype(np.int64) - 1, views),
+        (vertices, faces.astype(float), views),
+        (vertices.astype(complex), faces, views),
+        ("sphere", faces, views),
+        (vertices, None, views),
+        (vertices, faces, views, [lit.astype(complex)]),
+        (vertices, faces, views, ["lit"]),
     ):
         with pytest.raises(ShadowmapError):
             Sculptor(*arguments, map_resolution=SIZE)
-    for options in ({"step_size": 0}, {"smoothness": -1}, {"consistency": np.nan}, {"map_resolution": 0}, {"method": "magic"}):
+    for options in (
+        {"step_size": 0},
+        {"smoothness": -1},
+        {"consistency": np.nan},
+        {"map_resolution": 0},
+        {"method": "magic"},
+        {"step_size": "x"},
+        {"smoothness": None},
+        {"consistency": True},
+    ):
         with pytest.raises(ShadowmapError):
             Sculptor(vertices, faces, views, **options)
     sculptor = Sculptor(vertices, faces, views, [lit], map_resolution=SIZE)
-    for change, *arguments in ((sculptor.set_target, 1, lit), (sculptor.set_target, 0, lit[1:]), (sculptor.reset, vertices[1:])):
+    for change, *arguments in (
+        (sculptor.set_target, 1, lit),
+        (sculptor.set_target, "a", lit),
+        (sculptor.set_target, 0, lit[1:]),
+        (sculptor.reset, vertices[1:]),
+    ):
         with pytest.raises(ShadowmapError):
             change(*arguments)
     np.testing.assert_array_equal(sculptor.target(0), lit)

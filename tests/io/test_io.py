@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -184,6 +185,19 @@ def test_records_of_earlier_versions_need_some_keys(tmp_path: Path) -> None:
         assert records.read_record(path, fresh, {"runs": ("n",)})["runs"] == {"x": {"n": 1}}
 
 
+def test_records_of_earlier_versions_that_no_report_can_be_made_of(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    entries = {"a": {"loss": 1.0}, "b": {"loss": "x"}, "c": {"loss": None}, "d": {"loss": []}}
+    path.write_text(json.dumps({"settings": {}, "runs": entries}))
+
+    def report(record: dict[str, Any]) -> str:
+        return ", ".join(f"{run['loss']:.2f} {int(run['loss'])}" for run in record["runs"].values())
+
+    with pytest.warns(UserWarning, match="3 of 4 entries of 'runs' were edited or are damaged"):
+        found = records.read_record(path, {"settings": {}, "runs": {}}, {"runs": ("loss",)}, report)
+    assert found["runs"] == {"a": {"loss": 1.0}}
+
+
 @pytest.mark.parametrize("content", [b"{", b"\xff\xfe", b"[" * 100_000, b"1" * 10_000, b""])
 def test_files_that_are_no_json_are_one_line(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "a.json").write_bytes(content)
@@ -229,3 +243,38 @@ def test_plots_are_drawn_without_a_display(tmp_path: Path, monkeypatch: pytest.M
     plots.image_sheet(tmp_path / "b.png", {"x": {"start": np.ones((3, 4, 3)), "end": np.full((3, 4, 1), np.nan)}})
     assert Image.open(tmp_path / "a.png").size[0] > 100
     assert Image.open(tmp_path / "b.png").size[0] > 100
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.exr"])
+@pytest.mark.parametrize("shape", [(), (5,), (0, 5), (5, 0), (2, 3, 0), (2, 3, 1, 1)])
+def test_arrays_that_are_no_images(tmp_path: Path, name: str, shape: tuple[int, ...]) -> None:
+    with pytest.raises(ShadowmapError, match=r"an image of shape \(.*give \(H, W\)"):
+        images.write_image(tmp_path / name, np.ones(shape, np.float32))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "channels",
+    [{}, {"Y": np.ones(5, np.float32)}, {"Y": np.ones((0, 5), np.float32)}, {"Y": np.ones((4, 4))},
+     {"R": np.ones((4, 4), np.float32), "G": np.ones((4, 5), np.float32)}],
+)  # fmt: skip
+def test_channels_that_openexr_cannot_hold(tmp_path: Path, channels: dict[str, Any]) -> None:
+    with pytest.raises(ShadowmapError, match=r"cannot write .*a\.exr: channel.*; give "):
+        images.write_exr(tmp_path / "a.exr", channels)
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_plots_of_the_largest_numbers(tmp_path: Path) -> None:
+    plots.plot_curves(tmp_path / "a.png", {"loss": {"a": [[1e-300, 1e308], [float("nan"), 1.0]]}})
+    assert Image.open(tmp_path / "a.png").width > 100
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize("name", ["a.png", "a.exr"])
+def test_images_beyond_single_precision_are_white(tmp_path: Path, name: str) -> None:
+    images.write_image(tmp_path / name, np.full((4, 5, 3), 1e300))
+    assert (images.to_srgb(np.full((4, 5), 1e300)) > 0.999).all()
+    if name == "a.png":
+        assert (np.asarray(Image.open(tmp_path / name)) == 255).all()
+    else:
+        assert np.isinf(images.read_image(tmp_path / name)).all()

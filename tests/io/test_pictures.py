@@ -8,6 +8,7 @@ import resource
 import struct
 import subprocess
 import sys
+import warnings
 import zipfile
 import zlib
 from pathlib import Path
@@ -153,3 +154,19 @@ def test_texts_of_drawings_are_bounded(tmp_path: Path, monkeypatch: pytest.Monke
         file.write(b" " * 100_000 + b"<svg/>")
     with pytest.raises(ShadowmapError, match=r"a\.svgz: the drawing has more than 10000 bytes"):
         read_figure(tmp_path / "a.svgz")
+
+
+def test_bright_premultiplied_colours_are_white(tmp_path: Path) -> None:
+    plane = np.full((4, 5), 3e38, np.float32)
+    images.write_exr(tmp_path / "a.exr", {**dict.fromkeys("RGB", plane), "A": np.full((4, 5), 1e-3, np.float32)})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        picture = read_picture(tmp_path / "a.exr")
+    assert picture[..., :3].min() > 0.999
+
+
+@pytest.mark.parametrize("box", ["0 0 0 0", "0 0 100 0", "0 0 -1 5", "0 0 nan 5"])
+def test_drawings_with_empty_boxes_are_refused(tmp_path: Path, box: str) -> None:
+    path = _drawing(tmp_path / "a.svg", f'viewBox="{box}" width="100"', '<circle r="5"/>')
+    with pytest.raises(ShadowmapError, match=r"a\.svg: it is no drawing"):
+        read_figure(path)

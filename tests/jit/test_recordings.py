@@ -5,6 +5,7 @@ What once ended the process runs in one of its own.
 
 from __future__ import annotations
 
+import gc
 import os
 import subprocess
 import sys
@@ -21,7 +22,7 @@ import recording_stress
 from renderer_scenes import renderer_of
 
 from shadowmap_dr import Renderer
-from shadowmap_dr.jit.frozen import Frozen
+from shadowmap_dr.jit.frozen import Frozen, freeze
 
 TESTS = Path(__file__).parents[1]
 
@@ -104,6 +105,25 @@ from recording_stress import stress
 steps, recordings, wrong = stress(60, seed=3, seconds=25, few=True)
 assert steps > recordings and not wrong, (steps, recordings, wrong)
 """)
+
+
+def test_garbage_waits_while_a_function_is_recorded(variant: str) -> None:
+    seen = []
+
+    def double(x: mi.Float) -> mi.Float:
+        seen.append(gc.isenabled())
+        return 2 * x
+
+    call = freeze(double)
+    gc.enable()
+    assert call(mi.Float(1, 2)).numpy().tolist() == [2, 4] and call(x=mi.Float(3, 4)).numpy().tolist() == [6, 8]
+    assert not any(seen) and gc.isenabled() and call.n_recordings == len(seen)
+
+
+def test_all_recordings_of_the_package_are_such() -> None:
+    package = TESTS.parent / "shadowmap_dr"
+    texts = {path: path.read_text() for path in package.rglob("*.py") if path != package / "jit" / "frozen.py"}
+    assert [str(path) for path, text in texts.items() if "dr.freeze(" in text.replace("`dr.freeze(", "")] == []
 
 
 def test_what_follows_the_renderer_is_noticed(renderer: Renderer) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import brute_force
 import drjit as dr
 import mitsuba as mi
@@ -346,3 +348,29 @@ def test_derivatives_of_claimed_pixels_match_differences(variant: str) -> None:
             ends.append(float(total(mi.Float(moved))[0]))
         want = (ends[0] - ends[1]) / (2 * step)
         assert abs(got[i] - want) < 2e-3 + 0.02 * abs(want), (i, got[i], want)
+
+
+@pytest.mark.parametrize("other", [None, "x", [], 3, np.ones(16), [1.0]])
+def test_arguments_that_are_no_arrays_are_named(variant: str, other: object) -> None:
+    positions = mi.TensorXf(np.array([[-1, -1, 0, 1], [3, -1, 0, 1], [-1, 3, 0, 1]], np.float32))
+    faces = mi.TensorXu(np.array([[0, 1, 2]], np.uint32))
+    found = rasterize(positions, faces, (4, 4))
+    topology = build_topology(np.array([[0, 1, 2]]), np.eye(3), mi.UInt32)
+    wrong: Any = other
+    for name, call in {
+        "attributes": lambda: interpolate(wrong, found, faces),
+        "faces": lambda: interpolate(positions, found, wrong),
+        "values|channels": lambda: antialias(wrong, found, positions, topology),
+        "positions": lambda: antialias(mi.Float(0.5) + dr.zeros(mi.Float, 16), found, wrong, topology),
+    }.items():
+        with pytest.raises(ValueError, match=f"^({name}) (are of type|hold)") as caught:
+            call()
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("faces", [None, "x", [[0.5, 1, 2]], [[0, 1], [2]], {}])
+def test_topologies_need_indices(faces: Any) -> None:
+    with pytest.raises(ValueError, match="^faces (hold|are no array|have shape).*expected"):
+        build_topology(faces, np.eye(3), mi.UInt32)
+    with pytest.raises(ValueError, match="^positions (hold|are no array|have shape).*expected"):
+        build_topology(np.array([[0, 1, 2]]), faces if faces is None or isinstance(faces, str | dict) else "x", mi.UInt32)

@@ -182,6 +182,8 @@ def test_bad_input_is_named(variant: str) -> None:
         ((pos, f, (4, 4)), "positions are of type ndarray"),
         ((mi.TensorXd(pos), f, (4, 4)), "positions are of type TensorXf64"),
         ((p, face, (4, 4)), "faces are of type ndarray"),
+        ((None, f, (4, 4)), "positions are of type NoneType"),
+        ((p, None, (4, 4)), "faces are of type NoneType"),
         ((p, mi.TensorXf(face.astype(np.float32)), (4, 4)), "faces are of type TensorXf; expected .* integer"),
         ((p, f, (8.7, 4)), "whole pixels"),
         ((p, f, 4), "whole pixels"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
@@ -61,6 +62,15 @@ def test_scenes_and_settings_that_are_none(variant: str) -> None:
         Renderer.from_scene(None)
     with pytest.raises(ShadowmapError, match="There is no setting 'shadow_bias': there are .*shadow_bleeding"):
         Renderer.from_scene(build(), shadow_bias=1)
+
+
+def test_damaged_files_of_scenes_are_named(variant: str, tmp_path: Path) -> None:
+    (tmp_path / "a.obj").write_bytes(b"v 0 0 \xff\nf 1 1 1\n")
+    shape = {"type": "obj", "filename": str(tmp_path / "a.obj")}
+    with pytest.raises(ShadowmapError, match=r"cannot load the dictionary: a file that it names is damaged\.$"):
+        Renderer.from_dict({"type": "scene", "shape": shape})
+    with pytest.raises(ShadowmapError, match="cannot load the dictionary: At dictionary node"):  # no position in Mitsuba's source
+        Renderer.from_dict({"type": "scene", "shape": {"type": "no such shape"}})
 
 
 @pytest.mark.parametrize("length", [1e-25, 1e-3, 1e25, 3e38])
@@ -121,6 +131,13 @@ def test_wrong_kinds_and_sizes(renderer: Renderer) -> None:
         ({"area_light_samples": "4"}, "area_light_samples is '4': give an integer"),
         ({"ambient": float("nan")}, "ambient is nan"),
         ({"aovs": ("albedo",)}, "no AOV 'albedo'"),
+        ({"aovs": 1.5}, "aovs is 1.5: give names in a tuple"),
+        ({"aovs": ([],)}, "no AOV '[]'"),
+        ({"shadow_method": []}, "shadow method [] is unknown"),
+        ({"antialias": "no"}, "antialias is 'no': give True or False"),
+        ({"shadow_antialias": 2}, "shadow map antialias is 2; give True or False"),
+        ({"compat": None}, "shadow map compat is None; give True or False"),
+        ({"shadow_bleeding": True}, "shadow map bleeding is True; give a finite number"),
         ({"tessellation": 1}, "tessellation is 1"),
     ],
 )

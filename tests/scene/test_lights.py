@@ -244,3 +244,15 @@ def test_maps_look_where_lights_shine(variant: str) -> None:
         if kind == "spot":
             half_angle = np.degrees(np.arctan(float(views[0].spread[0])))
             assert half_angle >= float(getattr(light, "cutoff_angle", mi.Float(0))[0]) - 1e-3
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [*(("direction", value) for value in ([0, 0, 0], [0, 0, float("nan")], [0, 1e20, 1e20]))]
+    + [*(("scale", value) for value in (1e-30, 1e30, [1, 1, 0]))],
+)
+def test_directional_lights_without_a_direction_are_named(variant: str, key: str, value: Any) -> None:
+    place = {"to_world": mi.ScalarTransform4f().scale(value)} if key == "scale" else {key: value}
+    scene = mi.load_dict({"type": "scene", "sun": {"type": "directional", **place}, "floor": {"type": "rectangle"}})
+    with pytest.raises(ShadowmapError, match="light 'sun' has no direction: its direction or to_world is zero.* give three"):
+        load(scene)

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from ...errors import ShadowmapError
 from ...inverse.runs.loop import WARM_UP_STEPS
-from ...io.files import atomic, read_arrays
+from ...io.checkpoints import read_checkpoint, unreadable, write_checkpoint
 from ...jit.types import Float
 from ...rendering.receivers.shadow_views import ShadowView
 
@@ -136,7 +136,10 @@ def make(
     trace, wanted = Trace(), frame_steps(iterations)
     if checkpoint is not None and checkpoint.exists():
         trace, state = _load(checkpoint, fingerprint)
-        maker.load_state(state)
+        try:
+            maker.load_state(state)
+        except KeyError as error:
+            raise unreadable(checkpoint) from error
     if not trace.frames:
         trace.frames.append(Frame(0, maker.vertices(), maker.faces))
     last_change = first = trace.iterations
@@ -176,14 +179,12 @@ def _save(path: Path, fingerprint: str, trace: Trace, state: Mapping[str, npt.ND
         arrays[f"frame/{k}/step"], arrays[f"frame/{k}/vertices"] = np.array(frame.step), frame.vertices
         if previous is None or not np.array_equal(frame.faces, previous):
             arrays[f"frame/{k}/faces"] = previous = frame.faces
-    with atomic(path) as temporary, temporary.open("wb") as file:
-        np.savez(file, fingerprint=np.array(fingerprint), **arrays)
+    write_checkpoint(path, fingerprint, arrays)
 
 
 def _load(path: Path, fingerprint: str) -> tuple[Trace, dict[str, npt.NDArray[Any]]]:
+    arrays = read_checkpoint(path, fingerprint)
     try:
-        arrays = read_arrays(path)
-        found = str(arrays.pop("fingerprint"))
         trace = Trace(*(arrays[f"trace/{name}"].tolist() for name in ("loss", "seconds", "warm")))
         trace.looks = list(zip(arrays["looks/step"].tolist(), arrays["looks/iou"].tolist(), strict=True))
         faces: npt.NDArray[np.uint32] | None = None
@@ -192,8 +193,6 @@ def _load(path: Path, fingerprint: str) -> tuple[Trace, dict[str, npt.NDArray[An
             if faces is None:
                 raise KeyError("faces")
             trace.frames.append(Frame(int(arrays[f"frame/{k}/step"]), arrays[f"frame/{k}/vertices"], faces))
-    except (ShadowmapError, ValueError, KeyError, TypeError) as error:
-        raise ShadowmapError(f"cannot read the checkpoint {path}: delete it to start this run anew.") from error
-    if found != fingerprint:
-        raise ShadowmapError(f"the checkpoint {path} belongs to a run with other settings: delete it or choose another folder.")
+    except (ValueError, KeyError) as error:
+        raise unreadable(path) from error
     return trace, {name.removeprefix("state/"): array for name, array in arrays.items() if name.startswith("state/")}

@@ -52,7 +52,7 @@ def run_bench(options: BenchOptions, *, console: Console | None = None) -> dict[
 
     Returns:
         Content of the JSON file: `sections` (by name, each with `command`, `settings`, `machine` and `units`),
-        `machine`, `load_before` and `load_after`, and `figures`, the rows of the table.
+        `machine`, `load_before` and `load_after`, `figures`, the rows of the table, and `checks`, digests of the sections.
     """
     console = console or Console(stderr=True)
     files.check_output(options.out, (".json",))
@@ -151,17 +151,31 @@ def _stored(options: BenchOptions) -> dict[str, Any]:
             raise ShadowmapError(f"{options.out} is no record of a benchmark, or is damaged: choose another file.")
         records.set_aside(options.out)
         return {"sections": {}}
-    sound = {name: section for name, section in record["sections"].items() if _is_sound(section)}
+    checks = record.get("checks")
+    own = checks.get("sections") if isinstance(checks, dict) else None
+    own = own if isinstance(own, dict) else {}
+    sound = {
+        name: section
+        for name, section in record["sections"].items()
+        if (own.get(name) == records.digest(section) if checks is not None else _is_sound(name, section))
+    }
     if len(sound) < len(record["sections"]):
         records.set_aside(options.out)
     return {**record, "sections": sound}
 
 
-def _is_sound(section: Any) -> bool:  # Any: JSON
-    """True if a section has the structure that reports read."""
+def _is_sound(name: str, section: Any) -> bool:  # Any: JSON
+    """True if reports can be made of a section."""
     units = section.get("units") if isinstance(section, dict) else None
-    return isinstance(units, dict) and all(isinstance(unit, dict) for unit in units.values())
+    if not isinstance(units, dict) or not all(isinstance(unit, dict) for unit in units.values()):
+        return False
+    try:
+        rows = [row.cells() for row in bench_report.rows({"sections": {name: section}})]
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError, ZeroDivisionError):
+        return False
+    return all(isinstance(cell, str) for cells in rows for cell in cells)
 
 
 def _write(options: BenchOptions, record: dict[str, Any]) -> None:
+    record["checks"] = {"sections": {name: records.digest(section) for name, section in record["sections"].items()}}
     records.write_json(options.out, record)

@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...jit.frozen import recordings_of
+from ...jit.frozen import freeze, recordings_of
 from ...jit.types import Float, Matrix4f, UInt32
 from ...raster import Topology, antialias, build_topology, interpolate, rasterize
 from ...scene.load import load
@@ -147,7 +147,7 @@ def measure_raster(options: BenchOptions, kind: str, resolution: int, done: Mapp
         return {"mesh": kind, "resolution": resolution, "skipped": f"predicted to take {predicted:.0f} s a call"}
     update(0, 1, "mesh")
     data = raster_scene(options, kind, resolution)
-    ours = dr.freeze(_visible)
+    ours = freeze(_visible)
     params, ray, moves = mi.traverse(data.scene), camera_rays(data.scene, resolution), offsets()
 
     def rasterize_moved() -> tuple[UInt32, Float, Float, Float]:
@@ -215,9 +215,9 @@ def measure_full(options: BenchOptions, kind: str, resolution: int, done: Mappin
     target = mi.Float(_forward(*common, mi.Float([0.2]), size=resolution))
     dr.make_opaque(target, topology)
     steps: dict[str, tuple[Callable[..., object], tuple[object, ...]]] = {
-        "rasterize": (dr.freeze(_visible), ()),
-        "rasterize and interpolate": (dr.freeze(_forward), ()),
-        "forward and backward": (dr.freeze(_forward_backward), (topology, target)),
+        "rasterize": (freeze(_visible), ()),
+        "rasterize and interpolate": (freeze(_forward), ()),
+        "forward and backward": (freeze(_forward_backward), (topology, target)),
     }
 
     def call(name: str) -> object:

@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...inverse import PoseFit
+from ...jit.frozen import freeze
 from ...jit.types import AnyArray, Float
 from ...rendering.renderer import Renderer
 from ..common import meshes as bench_meshes
@@ -174,7 +175,7 @@ def measure_batch(options: BenchOptions, done: Mapping[str, Any], update: Update
     dr.make_opaque(topology)
     calls: dict[str, Contender] = {}
     for count in what.batch:
-        step = dr.freeze(_forward_backward)
+        step = freeze(_forward_backward)
         target = dr.zeros(mi.Float, 3 * count * size * size)
         dr.make_opaque(target)
         common = (data.p_rest, data.moving, data.matrix, data.faces)

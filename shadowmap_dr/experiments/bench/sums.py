@@ -18,6 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...errors import ShadowmapError
+from ...jit.frozen import freeze
 from ...jit.types import Float, TensorXf
 from ...rendering.renderer import Renderer
 from ...scene.mitsuba_meshes import make_mesh
@@ -149,7 +150,7 @@ def _of_renderer(case: Sum, size: int, spp: int, frozen: bool) -> float:
         dr.backward(dr.sum((image * weights).array))
         return dr.grad(change)
 
-    call = dr.freeze(step) if frozen else step
+    call = freeze(step) if frozen else step
     for _ in range(3 if frozen else 1):
         result = call(dr.opaque(mi.Float, 0), weights, renderer)
     return float(result[0])

@@ -252,8 +252,16 @@ def _started(path: Path, options: FaceOptions, model: MorphableModel) -> dict[st
             "true",
             "loss_curve",
         )
-        return records.read_record(path, record, {"runs": needed})
+        return records.read_record(path, record, {"runs": needed}, _report)
     return record
+
+
+def _report(record: dict[str, Any]) -> None:
+    """Make what is written of the runs, for its errors."""
+    faces_report.reading(record)
+    faces_report.tables(record)
+    for run in record["runs"].values():
+        np.asarray(run["loss_curve"], np.float64)
 
 
 def _show(progress: Progress, task: TaskID, done: int) -> None:

@@ -158,10 +158,22 @@ def _started(path: Path, options: ConvergenceOptions) -> dict[str, Any]:
     }
     record: dict[str, Any] = {"settings": identity, "machine": machine(), "runs": {}}
     if options.resume and path.exists():
-        record = records.read_record(path, record, {"runs": _NEEDED})
-        for run in record["runs"].values():
-            run.setdefault("candidate", "default")  # records of earlier versions have this one only
+        record = _with_candidates(records.read_record(path, record, {"runs": _NEEDED}, _report))
     return record
+
+
+def _with_candidates(record: dict[str, Any]) -> dict[str, Any]:
+    """A record with a candidate for each run: records of earlier versions have the default only."""
+    return {**record, "runs": {key: {"candidate": "default", **run} for key, run in record["runs"].items()}}
+
+
+def _report(record: dict[str, Any]) -> None:
+    """Make what is written of the runs, for its errors."""
+    complete = _with_candidates(record)
+    read_convergence(complete)
+    for panel in _curves(complete).values():
+        for curves in panel.values():
+            np.array(curves, np.float64)
 
 
 def _key(label: str, name: str, camera: str, taps: int, displacement: float) -> str:

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from ...errors import ShadowmapError
 from ...jit.arrays import device_array
+from ...jit.frozen import freeze
 from ...jit.types import Float, TensorXf
 from ...rendering.renderer import Renderer
 from .images import SHAPE
@@ -57,7 +58,7 @@ class ShadowFit:
         self._basis = [device_array(mi.Float, direction) for direction in directions]
         self._reference = mi.TensorXf(device_array(mi.Float, image), image.shape)
         self._step_size, self._decay, self._settings = step_size, decay, dict(settings or {})
-        self._step = dr.freeze(_step)
+        self._step = freeze(_step)
         self._values: list[Float]
         self._m: list[Float]
         self._v: list[Float]

@@ -21,6 +21,7 @@ from ...inverse.light_directions.pixels import mixed_pixels
 from ...io.options import option
 from ...io.ranges import check_ranges
 from ...jit.arrays import device_array
+from ...jit.frozen import freeze
 from ...jit.types import Float, Vector3f
 from ...rendering.renderer import Renderer
 from ...rendering.shadow_pass import light_visibility, make_maps
@@ -119,7 +120,7 @@ def _single(image: Callable[..., Float], scene: tuple[Any, ...], start: np.ndarr
         dr.traverse(dr.ADMode.Backward)
         return dr.mean(square), [dr.grad(vector) for vector in vectors]
 
-    frozen = dr.freeze(step)
+    frozen = freeze(step)
     copies = [mi.Vector3f(*(v[c] + dr.opaque(mi.Float, 0) for c in range(3))) for v in vectors]
     dr.eval(copies)
     return lambda: frozen(scene, [mi.Vector3f(v) for v in copies], wanted)

@@ -22,6 +22,7 @@ from ...io import console as io_console
 from ...io import files, plots, records
 from ...io.options import option, setting
 from ...io.ranges import FILTER_SIDE, MAP_SIDE, SAMPLES, check_ranges
+from ...jit.frozen import freeze
 from ...jit.types import Float
 from ...rendering.renderer import Renderer
 from ...shadow import ShadowSettings, directional_view
@@ -209,7 +210,7 @@ def _add_times(entries: dict[str, dict[str, Any]], scene: mi.Scene, options: Map
 
     def contender(settings: dict[str, Any]) -> Contender:
         renderer = Renderer.from_scene(scene, **settings)
-        render = dr.freeze(lambda renderer: renderer.render().array)
+        render = freeze(lambda renderer: renderer.render().array)
         return Contender(lambda: dr.eval(render(renderer)), options.rounds)
 
     calls = {label: contender(_settings(label, options)) for label in entries}

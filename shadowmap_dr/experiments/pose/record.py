@@ -85,13 +85,13 @@ def is_complete(record: dict[str, Any]) -> bool:
         **{"start": len(start_pose(0, 0)), "final": len(start_pose(0, 0)), "loss_curve": steps},
         **{"rotation_error_curve": steps + 1, "translation_error_curve": steps + 1},
     }
-    return all(name in record and _is_number(record[name]) for name in numbers) and all(
-        isinstance(record.get(name), list) and len(record[name]) == length and all(map(_is_number, record[name]))
+    return all(name in record and is_number(record[name]) for name in numbers) and all(
+        isinstance(record.get(name), list) and len(record[name]) == length and all(map(is_number, record[name]))
         for name, length in lengths.items()
     )
 
 
-def _is_number(value: Any) -> bool:  # Any: JSON
+def is_number(value: Any) -> bool:  # Any: JSON
     """True for numbers, and for None, which stands for numbers that are not finite."""
     return value is None or (isinstance(value, int | float) and not isinstance(value, bool))
 

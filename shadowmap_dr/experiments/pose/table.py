@@ -22,7 +22,7 @@ from ...io import files
 from ...io import records as io_records
 from ...io.console import markdown
 from .plot import plot_convergence
-from .record import essence
+from .record import essence, is_number
 
 #: Largest excess of a median of ours over Mitsuba's: degrees, and 100 x offset.
 ALLOWED_DEG, ALLOWED_X100 = 0.05, 0.05
@@ -293,15 +293,38 @@ def read(folders: Iterable[str | Path]) -> list[dict[str, Any]]:
         records = io_records.read_json(path)
         if isinstance(records, dict) and "rows" in records:
             try:
-                result += [record for row in records["rows"] for record in _records(row)]
-            except (KeyError, TypeError, ValueError) as error:
+                found = [record for row in records["rows"] for record in _records(row)]
+            except (KeyError, TypeError, ValueError, AttributeError) as error:
                 raise ShadowmapError(f"{path} is no table of the pose experiment ({error!r}).") from error
+            if not all(_is_sound(record) for record in found):
+                raise ShadowmapError(f"{path} is no table of the pose experiment: it was edited, or is damaged; make it again.")
+            result += found
             continue
-        needed = {"object", "resolution", "method", "environment", *_PER_RUN, *_SETTINGS}
-        if not isinstance(records, list) or not all(isinstance(entry, dict) and needed <= entry.keys() for entry in records):
+        if not isinstance(records, list) or not all(isinstance(entry, dict) and _is_sound(entry) for entry in records):
             raise ShadowmapError(f"{path} is no list of records of the pose experiment.")
         result += records
     return result
+
+
+def _is_sound(record: dict[str, Any]) -> bool:
+    """True if the entries that tables are made of have the right types."""
+    types: dict[type, tuple[str, ...]] = {
+        str: ("object", "method", "reference"),
+        int: ("resolution", "seed", "run", "iterations"),
+        bool: ("recovered", "shadow_only"),
+        dict: ("settings", "environment"),
+        list: ("start", "final"),
+    }
+    if not all(type(record.get(name)) is kind for kind, names in types.items() for name in names):
+        return False
+    curve, errors = record.get(_CURVE), [record.get(name, "") for name in _ERRORS]
+    times = [record.get(name) for name in ("seconds_per_iteration", "seconds_per_step")]
+    return (
+        record["method"] in METHODS
+        and record.get("normals", "face") in ("face", "vertex")
+        and all(map(is_number, [*errors, *times]))
+        and (curve is None or (isinstance(curve, list) and all(map(is_number, curve))))
+    )
 
 
 def write(out: Path, records: Sequence[Mapping[str, Any]], timed: Sequence[Mapping[str, Any]] = ()) -> list[Row]:

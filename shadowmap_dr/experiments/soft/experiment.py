@@ -20,6 +20,7 @@ from ...io import console as io_console
 from ...io import files, records
 from ...io.options import option
 from ...io.ranges import MAP_SIDE, SAMPLES, check_range, check_ranges
+from ...jit.frozen import freeze
 from ...jit.types import UInt32
 from ...rendering.renderer import Renderer
 from ...rendering.settings import MOST_SAMPLES
@@ -165,7 +166,12 @@ def _kept(path: Path, options: SoftOptions) -> dict[str, Any]:
     if not options.resume or not path.exists():
         return {}
     needed = ("about", "glossy", "counted", "reference_noise", "noise_of_one_sample", "errors")
-    scenes: dict[str, Any] = records.read_record(path, {"settings": options.settings, "scenes": {}}, {"scenes": needed})["scenes"]
+    scenes: dict[str, Any] = records.read_record(
+        path,
+        {"settings": options.settings, "scenes": {}},
+        {"scenes": needed},
+        lambda record: soft_report.reading(record) and soft_report.rows(record),
+    )["scenes"]
     return scenes
 
 
@@ -174,6 +180,11 @@ def measure(name: str, options: SoftOptions, step: Callable[..., None]) -> tuple
     scene = soft_scenes.build(name, options.resolution)
     step("reference", done=0)
     traced = path_traced_twice(scene, options.reference_spp)
+    if not traced.mask.any() or not traced.level > 0:
+        side = options.resolution
+        raise ShadowmapError(
+            f"scene {name!r} has no lit pixel away from silhouettes in {side} x {side} pixels: give a larger --resolution."
+        )
     step("reference")
     entry: dict[str, Any] = {
         "about": soft_scenes.SCENES[name].about,
@@ -264,7 +275,7 @@ def _times(scene: mi.Scene, errors: list[dict[str, Any]], noise: float, options:
     width, height = (int(side) for side in scene.sensors()[0].film().crop_size())
     spp = equal_error_samples(best["error"], noise, width * height)
     renderer = make_renderer(scene, tuple(best["samples"]), options.map_resolution)
-    render = dr.freeze(lambda spp, renderer: renderer.render(spp=spp).array)
+    render = freeze(lambda spp, renderer: renderer.render(spp=spp).array)
     plugin = mi.load_dict({"type": "direct"})
     limits: dict[str, Any] = {"rounds": _TIMED_ROUNDS, "warm_up": 2, "settle": 0, "burst": 1, "seconds": _TIMED_SECONDS}
     contenders = {

@@ -166,7 +166,10 @@ def _components(path: Path, arrays: dict[str, Array], kind: str, vertices: int) 
         raise ShadowmapError(f"{path}: {kind}_basis of shape {basis.shape} for {vertices} vertices: give ({3 * vertices}, K).")
     deviation = arrays.get(f"{kind}_std")
     if deviation is None and f"{kind}_variance" in arrays:
-        deviation = np.sqrt(arrays[f"{kind}_variance"])
+        variance = arrays[f"{kind}_variance"]
+        deviation = np.sqrt(np.where(variance < 0, np.nan, variance))
+    if deviation is not None and not (np.isfinite(deviation) & (np.asarray(deviation) >= 0)).all():
+        raise ShadowmapError(f"{path}: deviations or variances of {kind}_basis are negative or not finite: repair them.")
     deviation = np.ones(basis.shape[1]) if deviation is None else np.asarray(deviation, np.float64).reshape(-1)
     if len(deviation) != basis.shape[1]:
         raise ShadowmapError(f"{path}: {kind}_basis has {basis.shape[1]} components, but there are {len(deviation)} deviations.")
@@ -176,8 +179,10 @@ def _components(path: Path, arrays: dict[str, Array], kind: str, vertices: int) 
 def _triangles(path: Path, triangles: Array, vertices: int) -> Array:
     if triangles.ndim != 2 or 3 not in triangles.shape or triangles.dtype.kind not in "iuf":
         raise ShadowmapError(f"{path}: triangles of shape {triangles.shape}: give (F, 3) or (3, F).")
-    if not (np.isfinite(triangles) & (triangles == np.floor(triangles))).all():
-        raise ShadowmapError(f"{path}: triangles have corners that are no whole numbers: give indices of vertices.")
+    if not (np.isfinite(triangles) & (triangles == np.floor(triangles)) & (triangles >= -1) & (triangles <= vertices)).all():
+        raise ShadowmapError(
+            f"{path}: triangles have corners that are no whole numbers up to {vertices}: give indices of vertices."
+        )
     faces = (triangles if triangles.shape[1] == 3 else triangles.T).astype(np.int64)
     # Some of these models count from 1.
     return faces - 1 if faces.size and faces.min() == 1 and faces.max() == vertices else faces
@@ -197,7 +202,8 @@ def _placed(
         low, high = mean[:, 1].min(), mean[:, 1].max()
         raise ShadowmapError(f"no vertex lies above {options.neck}: heights of this model go from {low:.4g} to {high:.4g}.")
     low, high = mean[mask].min(0), mean[mask].max(0)
-    extent = float((high - low).max())
+    with np.errstate(over="ignore", invalid="ignore"):
+        extent = float((high - low).max())
     if not (np.isfinite(extent) and extent > 0):
         raise ShadowmapError("the model's mean has no finite extent: check its vertices.")
     scale = 2 / extent

@@ -12,8 +12,9 @@ import numpy.typing as npt
 
 from ...errors import ShadowmapError
 from ...jit.arrays import device_array
-from ...jit.frozen import recordings_of
+from ...jit.frozen import freeze, recordings_of
 from ...jit.types import Float
+from ...rendering.receivers.checks import is_real, real_array
 from ...rendering.receivers.planar_receiver import ReceiverShadows
 from .blend_shapes import blend
 
@@ -56,12 +57,13 @@ class MorphFit:
         translation_step: float = 0.01,
         settings: Mapping[str, Any] | None = None,
     ) -> None:
-        positions, directions, image = (np.asarray(a, np.float32) for a in (rest, basis, reference))
+        given = {"rest": rest, "basis": basis, "reference": reference}
+        positions, directions, image = (real_array(name, values) for name, values in given.items())
         if directions.ndim != 3 or directions.shape[1:] != positions.shape or not len(directions):
             raise ShadowmapError(f"a basis of shape {directions.shape} for vertices of shape {positions.shape}: give (N, V, 3).")
         if image.shape != shadows.shape or not np.isfinite(image).all():
             raise ShadowmapError(f"a reference of shape {image.shape}: give finite values in the shape {shadows.shape}.")
-        if not (np.isfinite(prior) and prior >= 0):
+        if not is_real(prior) or prior < 0:
             raise ShadowmapError(f"a prior of {prior}: give a finite number, 0 or more.")
         self.count, self.translate = len(directions), translate
         if translate:  # vertices depend linearly on the translation, too: two more columns of the basis
@@ -75,7 +77,7 @@ class MorphFit:
         self._prior = dr.opaque(mi.Float, prior)
         self._rates = {"weights": step_size} | ({"translation": translation_step} if translate else {})
         self._settings = {**(settings or {}), "prior": float(prior), "translate": translate}
-        self._step = dr.freeze(_step)
+        self._step = freeze(_step)
         self.reset(np.zeros(len(directions)))
 
     def reset(self, start: npt.ArrayLike) -> None:
@@ -158,7 +160,7 @@ class MorphFit:
         return {"weights": self.count} | ({"translation": 2} if self.translate else {})
 
     def _checked(self, parameters: npt.ArrayLike) -> Float:
-        values = np.asarray(parameters, np.float32).reshape(-1)
+        values = real_array("parameters", parameters).reshape(-1)
         total = sum(self._sizes().values())
         if len(values) != total:
             raise ShadowmapError(f"{len(values)} parameters: give {total}.")

@@ -16,8 +16,9 @@ import numpy.typing as npt
 
 from ...errors import ShadowmapError
 from ...jit.arrays import device_array
-from ...jit.frozen import recordings_of
+from ...jit.frozen import freeze, recordings_of
 from ...jit.types import Float, Vector3f
+from ...rendering.receivers.checks import real_array
 from ...shadow import Frusta
 from .pixels import StillScene
 from .shading import fit_maps, images, light_views, losses_and_gradients, render_lights, with_shadow
@@ -83,7 +84,7 @@ class LightBatch:
     def __init__(self, scene: StillScene, *, betas: tuple[float, float] = (0.9, 0.999)) -> None:
         self.scene = scene
         self._betas = betas
-        self._step = dr.freeze(_step)
+        self._step = freeze(_step)
 
     @property
     def lights(self) -> int:
@@ -180,7 +181,7 @@ class LightBatch:
         return recordings_of(self._step)
 
     def _vectors(self, directions: npt.ArrayLike) -> tuple[Vector3f, int]:
-        array = np.asarray(directions, np.float64)
+        array = real_array("directions", directions, np.float64)
         if array.ndim != 3 or array.shape[1:] != (self.lights, 3) or not len(array):
             raise ShadowmapError(f"directions of shape {array.shape}: give (R, {self.lights}, 3) for R runs.")
         length = np.linalg.norm(array, axis=-1, keepdims=True)
@@ -190,7 +191,7 @@ class LightBatch:
         return mi.Vector3f(*(device_array(mi.Float, unit[:, c]) for c in range(3))), len(array)
 
     def _targets(self, targets: npt.ArrayLike, runs: int) -> list[Float]:
-        pixels, array = self.scene.pixels, np.asarray(targets, np.float32)
+        pixels, array = self.scene.pixels, real_array("targets", targets)
         shape = (runs, pixels.height, pixels.width, pixels.channels)
         if array.shape != shape or not np.isfinite(array).all():
             raise ShadowmapError(f"targets of shape {array.shape}: give finite values in the shape {shape}.")

@@ -14,9 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from ...errors import ShadowmapError
-from ...io.files import atomic, read_arrays
+from ...io.checkpoints import read_checkpoint, unreadable, write_checkpoint
 from ...io.records import plain
 from ...jit.types import Float
+from ...rendering.receivers.checks import real_array
 
 WARM_UP_STEPS = 5
 CHECKPOINT_INTERVAL = 10
@@ -117,7 +118,7 @@ def optimize(
     if iterations < 1:
         raise ShadowmapError(f"{iterations} iterations: at least one is needed.")
     fingerprint = json.dumps(plain(settings or {}), sort_keys=True)
-    history = History(np.empty(0), np.asarray(start, np.float64).reshape(1, -1), np.empty(0), np.empty(0, np.bool_))
+    history = History(np.empty(0), real_array("start", start, np.float64).reshape(1, -1), np.empty(0), np.empty(0, np.bool_))
     state = None
     if checkpoint is not None and checkpoint.exists():
         history, state = _load(checkpoint, fingerprint)
@@ -166,19 +167,14 @@ def optimize(
 
 
 def _save(path: Path, fingerprint: str, history: History, state: Mapping[str, npt.NDArray[Any]]) -> None:
-    arrays: dict[str, Any] = {f"state/{name}": np.asarray(array) for name, array in state.items()}
-    arrays |= {f"history/{name}": array for name, array in vars(history).items()}
-    with atomic(path) as temporary, temporary.open("wb") as file:
-        np.savez(file, fingerprint=np.array(fingerprint), **arrays)
+    arrays = {f"state/{name}": np.asarray(array) for name, array in state.items()}
+    write_checkpoint(path, fingerprint, arrays | {f"history/{name}": array for name, array in vars(history).items()})
 
 
 def _load(path: Path, fingerprint: str) -> tuple[History, dict[str, npt.NDArray[Any]]]:
+    arrays = read_checkpoint(path, fingerprint)
     try:
-        arrays = read_arrays(path)
-        found = str(arrays.pop("fingerprint"))
         history = History(**{k.removeprefix("history/"): v for k, v in arrays.items() if k.startswith("history/")})
-    except (ShadowmapError, ValueError, KeyError, TypeError) as error:
-        raise ShadowmapError(f"cannot read the checkpoint {path}: delete it to start this run anew.") from error
-    if found != fingerprint:
-        raise ShadowmapError(f"the checkpoint {path} belongs to a run with other settings: delete it or choose another folder.")
+    except TypeError as error:
+        raise unreadable(path) from error
     return history, {k.removeprefix("state/"): v for k, v in arrays.items() if k.startswith("state/")}

@@ -12,7 +12,9 @@ import numpy.typing as npt
 
 from ...errors import ShadowmapError
 from ...jit.arrays import device_array
+from ...jit.frozen import freeze
 from ...jit.types import Float, Point3f
+from ...rendering.receivers.checks import index_array, is_real, is_whole, real_array
 from ...rendering.receivers.shadow_images import ShadowImages, image_loss, shadow_images
 from ...rendering.receivers.shadow_views import ShadowView
 from .sculpt import checked_target
@@ -63,14 +65,20 @@ class Collection:
         method: str = "esm",
         settings: Mapping[str, Any] | None = None,
     ) -> None:
-        if interval < 1 or most < 1 or not 0 < step_size < np.inf or seed < 0:
+        counts = all(map(is_whole, (interval, most, seed)))
+        if not counts or interval < 1 or most < 1 or seed < 0 or not is_real(step_size) or not step_size > 0:
             raise ShadowmapError("a collection's interval, largest number and step size must be positive, its seed at least 0.")
         if len(targets) != len(views):
             raise ShadowmapError(f"{len(targets)} targets for {len(views)} views: give one for each.")
         self.views = tuple(views)
         self._targets = [checked_target(image, view) for image, view in zip(targets, self.views, strict=True)]
         self._wanted = device_array(mi.Float, np.concatenate([image.ravel() for image in self._targets]))
-        self._rest, self._rest_faces = np.array(vertices, np.float32), np.array(faces, np.uint32)
+        self._rest = real_array("vertices", vertices)
+        if self._rest.ndim != 2 or self._rest.shape[1] != 3:
+            raise ShadowmapError(f"vertices of shape {self._rest.shape}: give (V, 3).")
+        self._rest_faces = index_array("faces", faces, len(self._rest))
+        if self._rest_faces.ndim != 2 or self._rest_faces.shape[1] != 3:
+            raise ShadowmapError(f"faces of shape {self._rest_faces.shape}: give (F, 3).")
         self._shadow: dict[str, Any] = {"map_resolution": map_resolution, "filter_size": filter_size, "method": method}
         self._interval, self._most, self._seed = interval, most, seed
         self._step_size, self._settings = step_size, dict(settings or {})
@@ -150,7 +158,7 @@ class Collection:
         apart = self._rest + np.arange(count, dtype=np.float32)[:, None, None] * np.float32(4)
         self._shadows = shadow_images(apart.reshape(-1, 3), self.faces, self.views, **self._shadow)
         self._points = mi.Point3f(*(device_array(mi.Float, np.tile(self._rest[:, c], count)) for c in range(3)))
-        self._gradient, self._look = dr.freeze(_gradient), dr.freeze(_look)
+        self._gradient, self._look = freeze(_gradient), freeze(_look)
 
     def _double(self) -> None:
         """Replace each copy by two smaller ones, side by side in the image and at different depths."""

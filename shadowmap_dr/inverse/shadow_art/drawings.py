@@ -93,6 +93,8 @@ def _size(text: bytes) -> tuple[float, float]:
         raise ValueError("no element svg")
     box = [float(number) for number in re.split(r"[\s,]+", root.get("viewBox", "").strip()) if number]
     box = box[2:] if len(box) == 4 else []
+    if box and not min(box) > 0:
+        raise ValueError("no extent")
     given = [_length(root.get(name, ""), whole) for name, whole in zip(("width", "height"), box or (100.0, 100.0), strict=True)]
     if box:
         # If one length is missing, it follows from the other and the proportions of the box.

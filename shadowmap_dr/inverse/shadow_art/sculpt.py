@@ -12,8 +12,9 @@ import numpy.typing as npt
 
 from ...errors import ShadowmapError
 from ...jit.arrays import device_array
-from ...jit.frozen import recordings_of
+from ...jit.frozen import freeze, recordings_of
 from ...jit.types import Float, UInt32
+from ...rendering.receivers.checks import is_real, is_whole, real_array
 from ...rendering.receivers.shadow_images import ShadowImages, image_loss, shadow_images
 from ...rendering.receivers.shadow_views import ShadowView
 from .smoothness import normal_consistency
@@ -74,9 +75,9 @@ class Sculptor:
         settings: Mapping[str, Any] | None = None,
     ) -> None:
         for name, value in (("step size", step_size), ("smoothness", smoothness)):
-            if not 0 < value < np.inf:
+            if not is_real(value) or not value > 0:
                 raise ShadowmapError(f"a {name} of {value}: give a positive number.")
-        if not 0 <= consistency < np.inf:
+        if not is_real(consistency) or consistency < 0:
             raise ShadowmapError(f"a weight of {consistency} for normal consistency: give a number from 0 on.")
         self.views = tuple(views)
         self._shadows = shadow_images(
@@ -88,7 +89,7 @@ class Sculptor:
         # An array: a Python number would become a constant of the recorded step.
         self._consistency, self._smoothness = dr.opaque(mi.Float, consistency), smoothness
         self._solver = _large_steps(mi.Float(self._start.ravel()), self._shadows.faces, smoothness)
-        self._gradient, self._look = dr.freeze(_gradient), dr.freeze(_look)
+        self._gradient, self._look = freeze(_gradient), freeze(_look)
         self.reset()
         if targets is None:
             self._targets = [image.copy() for image in self.visibility()]
@@ -113,7 +114,7 @@ class Sculptor:
 
         Raises ShadowmapError, and keeps the old target, if there is no such view or the image cannot be used.
         """
-        if not 0 <= view < len(self.views):
+        if not is_whole(view) or not 0 <= view < len(self.views):
             raise ShadowmapError(f"no view {view}: there are {len(self.views)}, counted from 0.")
         self._targets[view] = checked_target(image, self.views[view])
         self._wanted = None
@@ -145,7 +146,7 @@ class Sculptor:
 
     def reset(self, vertices: npt.ArrayLike | None = None) -> None:
         """Restart from the first mesh or from other vertices (V, 3), with empty moments."""
-        start = self._start if vertices is None else np.asarray(vertices, np.float32)
+        start = self._start if vertices is None else real_array("vertices", vertices)
         if start.shape != self._start.shape or not np.isfinite(start).all():
             raise ShadowmapError(f"vertices of shape {start.shape}: give {self._start.shape} finite numbers.")
         u = np.array(self._solver.to_differential(mi.Float(start.ravel())))
@@ -208,7 +209,7 @@ def _large_steps(vertices: Float, faces: UInt32, smoothness: float) -> mi.ad.Lar
 
 def checked_target(image: npt.ArrayLike, view: ShadowView) -> Array:
     """A copy of a view's target (H, W). Raises ShadowmapError for another shape, or values outside of 0..1."""
-    pixels = np.array(image, np.float32)
+    pixels = real_array("target", image)
     if pixels.shape != view.shape:
         raise ShadowmapError(f"a target of shape {pixels.shape} for images of shape {view.shape}.")
     if not (np.isfinite(pixels).all() and pixels.min() >= 0 and pixels.max() <= 1):

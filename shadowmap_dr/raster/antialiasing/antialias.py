@@ -8,7 +8,7 @@ import drjit as dr
 
 from ...jit.types import Bool, Float, TensorXf
 from ..topology import Topology
-from ..types import RasterOutput
+from ..types import RasterOutput, check_array
 from .blend import blend
 from .colour_jumps import Surroundings
 from .creases import CoplanarCreases
@@ -94,6 +94,9 @@ def antialias(
     Source: the idea of blending along the axis that crosses the edge is that of Laine et al., "Modular Primitives for
     High-Performance Differentiable Rendering", 2020, section 3.6; the search for edges and the weights are different.
     """
+    check_array("positions", positions)
+    for array in values if isinstance(values, list | tuple) else [values]:
+        check_array("values", array)
     tensor = cast("TensorXf", values) if dr.is_tensor_v(values) else None
     flat = _checked_values(values, raster)
     positions, vertex_count = _flat_positions(positions, raster, topology)

@@ -16,6 +16,7 @@ from ...jit.arrays import device_array
 from ...jit.types import Float, Point3f, UInt32
 from ...raster import Topology, build_topology
 from ...shadow import Frusta, ShadowSettings, Views, filter_maps, render_maps, vertices_in_maps, visibility
+from .checks import index_array, real_array
 from .shadow_views import ShadowView
 
 # All casters lie before the receiver, by half of its half-side at least, and within twelve of these. Maps tell no depths apart
@@ -91,7 +92,8 @@ def shadow_images(
 
     Raises ShadowmapError for a mesh or settings that cannot be used.
     """
-    positions, corners = np.asarray(vertices, np.float32), np.asarray(faces)
+    positions = real_array("vertices", vertices)
+    corners = index_array("faces", faces, len(positions) if positions.ndim else 0)
     if positions.ndim != 2 or positions.shape[1:] != (3,) or corners.ndim != 2 or corners.shape[1:] != (3,):
         raise ShadowmapError(f"vertices of shape {positions.shape}, faces of shape {corners.shape}: give (V, 3) and (F, 3).")
     if not np.isfinite(positions).all():

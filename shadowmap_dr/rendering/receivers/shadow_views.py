@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...errors import ShadowmapError
+from .checks import is_real, is_whole, real_array
 
 RECEIVERS = ("plane", "wavy")
 CAMERAS = ("orthographic", "perspective")
@@ -83,13 +84,13 @@ def shadow_view(
 
     Raises ShadowmapError for names that do not exist, and numbers that make no sense.
     """
-    if receiver not in RECEIVERS:
+    if not isinstance(receiver, str) or receiver not in RECEIVERS:
         raise ShadowmapError(f"no receiver {receiver!r}: choose from {', '.join(RECEIVERS)}.")
-    if camera not in CAMERAS:
+    if not isinstance(camera, str) or camera not in CAMERAS:
         raise ShadowmapError(f"no camera {camera!r}: choose from {', '.join(CAMERAS)}.")
-    if not 16 <= size <= 2048:
+    if not is_whole(size) or not 16 <= size <= 2048:
         raise ShadowmapError(f"images of {size} x {size} pixels: choose from 16 to 2048.")
-    if not 0 < half < np.inf:
+    if not is_real(half) or not half > 0:
         raise ShadowmapError(f"a receiver of half-side {half}: give a positive number.")
     axes = _axes(direction, up)
     local, seen = (_orthographic if camera == "orthographic" else _perspective)(receiver, size, half)
@@ -109,7 +110,7 @@ def height(receiver: str, x: npt.NDArray[np.float64], half: float) -> npt.NDArra
 
 
 def _axes(direction: npt.ArrayLike, up: npt.ArrayLike) -> tuple[npt.NDArray[np.float64], ...]:
-    forward, upward = (np.asarray(v, np.float64).reshape(-1) for v in (direction, up))
+    forward, upward = (real_array(name, v, np.float64).reshape(-1) for name, v in (("direction", direction), ("up", up)))
     right = np.cross(forward, upward) if forward.shape == upward.shape == (3,) else np.zeros(3)
     length = float(np.linalg.norm(right))
     if not (np.isfinite(length) and length > 1e-6 * np.linalg.norm(forward) * np.linalg.norm(upward)):

@@ -10,7 +10,9 @@ from collections.abc import Sequence
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+from ...errors import ShadowmapError
 from ...jit.types import Color3f
 from ..mitsuba_objects import children, parameters, varies
 from ..transforms import axis
@@ -54,6 +56,20 @@ def lights_of(scene: mi.Scene) -> tuple[Light, ...]:
         for name, emitter in named_emitters(scene)
         if emitter.class_name() in (*_LIGHTS, "DirectionalArea", SUNSKY) and unsupported_reason(emitter) is None
     )
+
+
+def check_directions(scene: mi.Scene) -> None:
+    """ShadowmapError for a directional light without a direction. Mitsuba makes NaN of a direction of (0, 0, 0)."""
+    for name, emitter in named_emitters(scene):
+        if emitter.class_name() == "DirectionalEmitter":
+            direction = dr.detach(axis(parameters(emitter)["to_world"], 2)).numpy()
+            with np.errstate(over="ignore"):
+                square = float(np.square(direction, dtype=np.float32).sum())
+            if not 0 < square < np.inf:
+                raise ShadowmapError(
+                    f"light '{name}' has no direction: its direction or to_world is zero, too small, too large or not "
+                    "finite; give three numbers, not all of them zero."
+                )
 
 
 def area_lights_of(scene: mi.Scene, shapes: Sequence[mi.Shape]) -> tuple[AreaLight, ...]:

@@ -175,7 +175,7 @@ def run_art(options: ArtOptions, *, console: Console | None = None) -> dict[str,
         io_images.write_png(options.out / f"target-{k + 1}.png", maker.target(k))
     settings = {"targets": [_name(target) for target in options.targets], "iterations": steps, **maker.describe()}
     with io_console.progress(console) as progress:
-        task = progress.add_task("steps", total=steps, note="")
+        task = progress.add_task("steps", total=steps, note="kernels are compiled")
         trace = make(
             maker, steps, checkpoint=checkpoint, fingerprint=_fingerprint(settings, maker),
             on_step=lambda done, note: progress.update(task, completed=done, note=note),

@@ -162,11 +162,14 @@ def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Co
         for folder, (_, problem) in problems.items():
             search = searches[folder]
             make = searching(search, options.iterations) if build is build_method else build
-            task = progress.add_task(f"{problem.folder} reference and methods", total=None, note="")
-            reference = _reference(problem, options, make)
+            kind = "path-traced reference" if options.reference == "mitsuba" else "reference"
+            with io_console.task(progress, f"{problem.folder} {kind}"):
+                reference = _reference(problem, options, make)
             # Built once for all runs: compiled kernels are reused, and a method that cannot be built fails at once.
-            methods = {name: make(name, problem, reference) for name in options.methods}
-            progress.remove_task(task)
+            methods = {}
+            for name in options.methods:
+                with io_console.task(progress, f"{problem.folder} {name}: scene and kernels"):
+                    methods[name] = make(name, problem, reference)
             for method in methods.values():
                 if fairness(method, problem).get("fair") is False:
                     note = "sample counts found with another object or resolution; that they converge here has not been shown"
@@ -175,7 +178,7 @@ def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Co
             for run in range(options.runs):
                 for name in options.methods:
                     title = f"{problem.folder} {name} run {run}"
-                    task = progress.add_task(title, total=options.iterations, note="")
+                    task = progress.add_task(title, total=options.iterations, note="kernels are compiled")
                     step = functools.partial(_show, progress, task)
                     record = _run_one(problem, name, run, options, methods[name], reference, stored, step)
                     record = {**record, "search": _search_record(search, options)}
@@ -257,7 +260,8 @@ def _sweep(
     for folder, (object_, problem) in problems.items():
         build = searching(searches[folder], options.iterations)
         # For the workers; those that do not see this folder make the reference again.
-        reference = _reference(problem, options, build)
+        with io_console.progress(console) as progress, io_console.task(progress, f"{folder} reference"):
+            reference = _reference(problem, options, build)
         for name in options.methods:
             method = build(name, problem, reference)
             wanted = [_identity(problem, name, run, options, method) for run in range(options.runs)]

@@ -32,14 +32,14 @@ SETTINGS = ("1", "4", "16", "auto")
 _STEPS = 150
 
 
-def measure(file: Path, setting: str, *, runs: int, resolution: int, work: Path) -> dict[str, Any]:
-    """Runs of the method `shadows` for a mesh file from the first starts: settings, ends, and seconds of each run."""
+def measure(file: Path, setting: str, numbers: range, *, resolution: int, work: Path) -> dict[str, Any]:
+    """Runs of the method `shadows` for a mesh file, by their numbers: settings, ends, and seconds of each run."""
     problem = make_problem(str(file), resolution, work=work / "objects")
     reference = path_traced_reference(problem, work / problem.folder / "reference.exr")
     search = choose(problem, str(file), None, None, None) if setting == "auto" else Search(int(setting))
     method = searching(search, _STEPS)("shadows", problem, reference)
     results = []
-    for run in range(runs):
+    for run in numbers:
         wanted = identity(problem, "shadows", run, method, seed=0, iterations=_STEPS, reference="mitsuba")
         record = make_record(method, reference, wanted, None, lambda *_: None)
         names = ("start", "final", "rotation_error_deg", "translation_error_x100", "found", "unexplained", "seconds_total")
@@ -106,9 +106,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for name in options.mesh or MAKERS:
             file = write(name, options.out / "meshes") if name in MAKERS else Path(name).resolve()
             entry = found.setdefault(file.stem, {})
-            if len(entry.get(setting, {}).get("runs", ())) == options.runs:
+            kept = entry.get(setting, {}).get("runs", [])
+            missing = range(len(kept), options.runs)
+            if not missing:
                 continue
-            entry[setting] = measure(file, setting, runs=options.runs, resolution=options.resolution, work=options.out)
+            entry[setting] = measure(file, setting, missing, resolution=options.resolution, work=options.out)
+            entry[setting]["runs"] = kept + entry[setting]["runs"]
             records.write_json(path, found)
             with atomic(options.out / "foreign.md") as temporary:
                 temporary.write_text("\n".join(table(found)) + "\n", encoding="utf-8")

@@ -494,11 +494,11 @@ def antenna() -> Mesh:
 
 
 def dense_scan() -> Mesh:
-    """A blob of 327,680 triangles with the noise of a scanner."""
+    """A blob of 81,920 triangles with the noise of a scanner."""
     import trimesh
 
     rng = np.random.default_rng(13)
-    ball = trimesh.creation.icosphere(subdivisions=7)
+    ball = trimesh.creation.icosphere(subdivisions=6)
     points = np.asarray(ball.vertices)
     bumps = sum(np.sin(points @ rng.normal(scale=2.5, size=3) + rng.uniform(0, 6)) for _ in range(6)) / 6
     return points * (1 + 0.5 * bumps + 0.003 * rng.normal(size=len(points)))[:, None] * [1, 0.7, 0.8], np.asarray(ball.faces)

@@ -25,10 +25,13 @@ def blurred(values: Float, shape: tuple[int, ...], width: Float, most: float) ->
     """
     height, columns, channels = shape
     spread = max(1, int(most) // _TAPS_PER_WIDTH)
+    # Squares of widths add up.
+    narrow = dr.minimum(width, 0.75 * spread)
+    wide = dr.safe_sqrt(dr.square(width) - dr.square(narrow)) if spread > 1 else width
     for stride, count in ((channels, columns), (channels * columns, height)):
         if spread > 1:
-            values = _convolved(values, stride, count, dr.minimum(width, 0.5 * spread), 1, _REACH * spread // 2)
-        values = _convolved(values, stride, count, width, spread, int(_REACH * most / spread) + 1)
+            values = _convolved(values, stride, count, narrow, 1, _REACH * spread)
+        values = _convolved(values, stride, count, wide, spread, int(_REACH * most / spread) + 1)
     return values
 
 

@@ -29,18 +29,17 @@ from .scene import make_problem, path_traced_reference
 from .search import Search, choose, facet_widths, narrow_width
 
 SETTINGS = ("1", "4", "16", "auto")
-_STEPS = 150
 
 
-def measure(file: Path, setting: str, numbers: range, *, resolution: int, work: Path) -> dict[str, Any]:
+def measure(file: Path, setting: str, numbers: range, *, resolution: int, iterations: int, work: Path) -> dict[str, Any]:
     """Runs of the method `shadows` for a mesh file, by their numbers: settings, ends, and seconds of each run."""
     problem = make_problem(str(file), resolution, work=work / "objects")
     reference = path_traced_reference(problem, work / problem.folder / "reference.exr")
     search = choose(problem, str(file), None, None, None) if setting == "auto" else Search(int(setting))
-    method = searching(search, _STEPS)("shadows", problem, reference)
+    method = searching(search, iterations)("shadows", problem, reference)
     results = []
     for run in numbers:
-        wanted = identity(problem, "shadows", run, method, seed=0, iterations=_STEPS, reference="mitsuba")
+        wanted = identity(problem, "shadows", run, method, seed=0, iterations=iterations, reference="mitsuba")
         record = make_record(method, reference, wanted, None, lambda *_: None)
         names = ("start", "final", "rotation_error_deg", "translation_error_x100", "found", "unexplained", "seconds_total")
         results.append({**{name: record[name] for name in names}, "tries": len(record["tries"])})
@@ -93,6 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=Path("foreign"), help="folder of meshes, references and results")
     parser.add_argument("--runs", type=int, default=10, help="starts")
     parser.add_argument("--resolution", type=int, default=128, help="image width and height in pixels")
+    parser.add_argument("--iterations", type=int, default=150, help="steps of a descent")
     parser.add_argument("--mesh", action="append", metavar="NAME|FILE", help=f"mesh file, or one of {', '.join(MAKERS)}")
     parser.add_argument("--setting", action="append", choices=SETTINGS, help="settings of the search [all]")
     parser.add_argument("--threads", type=int, default=0, help="threads, 0 for one for each core")
@@ -110,7 +110,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             missing = range(len(kept), options.runs)
             if not missing:
                 continue
-            entry[setting] = measure(file, setting, missing, resolution=options.resolution, work=options.out)
+            sizes = {"resolution": options.resolution, "iterations": options.iterations}
+            entry[setting] = measure(file, setting, missing, **sizes, work=options.out)
             entry[setting]["runs"] = kept + entry[setting]["runs"]
             records.write_json(path, found)
             with atomic(options.out / "foreign.md") as temporary:

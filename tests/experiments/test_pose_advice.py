@@ -36,7 +36,7 @@ def unfound(**changes: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("changes", "words", "remedy"),
     [
-        ({}, "60 % of the image's differences are left", "--tries 5"),
+        ({}, "60 % as much as without the object", "--tries 5"),
         ({"tries": [{}, {}]}, "60 %", "more --tries"),
         ({"settings": {}}, "facets below 0.44 pixels", "--samples 4"),
         ({"settings": {"samples_per_pixel": 4}}, "facets below", "--samples 16"),

@@ -33,8 +33,15 @@ def reasons(record: dict[str, Any], problem: PoseProblem) -> list[str]:
         return ["the object is out of view and this method has no shadows; try --method shadows"]
     left = record["unexplained"]
     rotation, offset = pose_errors(record["final"])
-    if 0.01 * offset > 2 * _HALF_SIDE and left is not None and left > EXPLAINED:
+    far = left is not None and left > EXPLAINED
+    if far and 0.01 * offset > 2 * _HALF_SIDE:
         result.append("the object left the view; try more --samples, or a --blur of a sixteenth of the image")
+    elif far and record["method"] != "mitsuba":
+        tries = "more --tries" if len(record["tries"]) > 1 else "--tries 5"
+        result.append(
+            f"the image differs by {100 * left:.0f} % as much as without the object: another pose with a similar shadow was found; "
+            f"try {tries}, a larger --blur, or another --seed"
+        )
     if record["method"] == "mitsuba":
         if record["settings"].get("fair") is False:
             result.append("sample counts that converge here are not known; see docs/pose.md")
@@ -48,15 +55,9 @@ def reasons(record: dict[str, Any], problem: PoseProblem) -> list[str]:
             result.append("this method has no shadows; try --method shadows")
     if _is_falling(record["loss_curve"]):
         result.append(f"the loss was still falling; try --iterations {2 * record['iterations']}")
-    if left is not None and left > EXPLAINED and not result:
-        more_tries = "more --tries" if len(record["tries"]) > 1 else "--tries 5"
-        result.append(
-            f"{100 * left:.0f} % of the image's differences are left, so the search ended at another pose with a similar shadow; "
-            f"try {more_tries}, a larger --blur, or another --seed"
-        )
-    if left is not None and left <= EXPLAINED and rotation > _OTHER_POSE_DEG:
+    if not far and rotation > _OTHER_POSE_DEG:
         result.append("another pose gives nearly the same image, as of a symmetric object; try another camera or object")
-    elif left is not None and left <= EXPLAINED and not result:
+    elif not far and not result:
         result.append("the pose is nearly found, and trembles with the step size; try more --samples or a larger --resolution")
     return result
 

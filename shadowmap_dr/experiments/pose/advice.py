@@ -39,7 +39,7 @@ def reasons(record: dict[str, Any], problem: PoseProblem) -> list[str]:
     elif far and record["method"] != "mitsuba":
         tries = "more --tries" if len(record["tries"]) > 1 else "--tries 5"
         result.append(
-            f"the image differs by {100 * left:.0f} % as much as without the object: another pose with a similar shadow was found; "
+            f"the image differs by {100 * left:.0f} % as much as without the object: another pose with a similar shadow; "
             f"try {tries}, a larger --blur, or another --seed"
         )
     if record["method"] == "mitsuba":

@@ -8,6 +8,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
+from PIL import Image
 
 from shadowmap_dr.experiments.pose import foreign
 from shadowmap_dr.experiments.pose.foreign_meshes import MAKERS, UNWELDED, write
@@ -60,6 +61,7 @@ def test_runs_are_counted_kept_and_added(tmp_path: Path, capsys: pytest.CaptureF
     assert [len(found[setting]["runs"]) for setting in ("1", "auto")] == [2, 2]
     assert found["1"]["search"] == {"samples": 1, "blur": 0.0, "tries": 1}
     assert found["auto"]["search"]["samples"] == 16 and found["auto"]["search"]["blur"] == 1
+    assert Image.open(tmp_path / "foreign.png").size == (6 * 16, 16)
     lines = (tmp_path / "foreign.md").read_text().splitlines()
     assert lines[0] == "| mesh | faces | narrow [px] | 1 sample: found, s | default: found, s | samples | tries |"
     assert lines[2].startswith("| letters | 564 | ") and lines[3].startswith("| all 1 |")

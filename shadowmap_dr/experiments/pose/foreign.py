@@ -2,9 +2,9 @@
 
     python -m shadowmap_dr.experiments.pose.foreign --out foreign [--runs 10] [--mesh NAME|FILE ...] [--setting auto|1|4|16 ...]
 
-Makes the meshes of `foreign_meshes`, finds each from ten starts at 128 x 128, and writes OUT/foreign.json and OUT/foreign.md.
-Settings: ``1``, ``4`` and ``16`` samples per pixel without blur and with one try, and ``auto``, the defaults for files. Runs of
-an earlier call are kept.
+Makes the meshes of `foreign_meshes`, finds each from ten starts at 128 x 128, and writes OUT/foreign.json, OUT/foreign.md and a
+picture of all. Settings: ``1``, ``4`` and ``16`` samples per pixel without blur and with one try, and ``auto``, the defaults for
+files. Runs of an earlier call are kept.
 """
 
 from __future__ import annotations
@@ -19,8 +19,9 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import numpy.typing as npt
 
-from ...io import console, records
+from ...io import console, images, records
 from ...io.files import atomic
 from .foreign_meshes import MAKERS, write
 from .methods import searching
@@ -76,6 +77,13 @@ def table(found: dict[str, dict[str, Any]]) -> list[str]:
     return console.markdown(columns, rows)
 
 
+def sheet(folders: Sequence[Path], columns: int = 6) -> npt.NDArray[np.float32]:
+    """The reference images in some folders, side by side in rows, linear colours."""
+    tiles = [images.read_image(folder / "reference.exr") for folder in folders]
+    tiles += [np.ones_like(tiles[0])] * (-len(tiles) % columns)
+    return np.concatenate([np.concatenate(tiles[k : k + columns], 1) for k in range(0, len(tiles), columns)])
+
+
 def _cell(entries: Sequence[dict[str, Any]]) -> str:
     """Runs found of runs made, and the median of their seconds."""
     runs = [run for entry in entries for run in entry["runs"]]
@@ -113,10 +121,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
             sizes = {"resolution": options.resolution, "iterations": options.iterations}
             entry[setting] = measure(file, setting, missing, **sizes, work=options.out)
             entry[setting]["runs"] = kept + entry[setting]["runs"]
+            found = dict(sorted(found.items()))
             records.write_json(path, found)
             with atomic(options.out / "foreign.md") as temporary:
                 temporary.write_text("\n".join(table(found)) + "\n", encoding="utf-8")
             print(f"{file.stem}, {setting}: {_cell([entry[setting]])} s a run", flush=True)
+    folders = [options.out / f"{name}-{options.resolution}" for name in found]
+    images.write_png(options.out / "foreign.png", sheet([folder for folder in folders if folder.is_dir()]))
     print("\n".join(table(found)))
 
 

@@ -60,6 +60,11 @@ def test_found_poses_need_no_reason(problem: PoseProblem) -> None:
     assert reasons(unfound(recovered=True), problem) == []
 
 
+def test_records_of_earlier_versions_have_reasons_too(problem: PoseProblem) -> None:
+    older = {name: value for name, value in unfound().items() if name not in ("unexplained", "without_object", "tries")}
+    assert "another pose" in "; ".join(reasons(older, problem))
+
+
 def test_the_terminal_says_what_was_not_found_and_why(tmp_path: Path) -> None:
     mi.set_variant("llvm_ad_rgb")
     written = io.StringIO()

@@ -26,14 +26,15 @@ def reasons(record: dict[str, Any], problem: PoseProblem) -> list[str]:
         return []
     if None in record["final"] or record["rotation_error_deg"] is None:
         return ["the loss or the pose was not finite; report this with the object"]
-    if record["without_object"] < _NO_EFFECT:
+    # Records of earlier versions do not say how much of an image is explained.
+    if record.get("without_object", 1.0) < _NO_EFFECT:
         return ["neither the object nor its shadow is in view, so that nothing in the image tells the pose"]
     result = []
     if record["method"] == "rasterizer" and record["shadow_only"]:
         return ["the object is out of view and this method has no shadows; try --method shadows"]
-    left = record["unexplained"]
+    left: float = np.nan if record.get("unexplained") is None else record["unexplained"]
     rotation, offset = pose_errors(record["final"])
-    far = left is not None and left > EXPLAINED
+    far, near = left > EXPLAINED, left <= EXPLAINED  # neither for NaN
     if far and 0.01 * offset > 2 * _HALF_SIDE:
         result.append("the object left the view; try more --samples, or a --blur of a sixteenth of the image")
     elif far and record["method"] != "mitsuba":
@@ -55,11 +56,11 @@ def reasons(record: dict[str, Any], problem: PoseProblem) -> list[str]:
             result.append("this method has no shadows; try --method shadows")
     if _is_falling(record["loss_curve"]):
         result.append(f"the loss was still falling; try --iterations {2 * record['iterations']}")
-    if not far and rotation > _OTHER_POSE_DEG:
+    if near and rotation > _OTHER_POSE_DEG:
         result.append("another pose gives nearly the same image, as of a symmetric object; try another camera or object")
-    elif not far and not result:
+    elif near and not result:
         result.append("the pose is nearly found, and trembles with the step size; try more --samples or a larger --resolution")
-    return result
+    return result or ["the search ended at another pose; try more --iterations, or another --seed"]
 
 
 def _is_falling(curve: list[float | None]) -> bool:

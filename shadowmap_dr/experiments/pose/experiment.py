@@ -181,7 +181,7 @@ def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Co
                     task = progress.add_task(title, total=options.iterations, note="kernels are compiled")
                     step = functools.partial(_show, progress, task)
                     record = _run_one(problem, name, run, options, methods[name], reference, stored, step)
-                    record = {**record, "search": _search_record(search, options)}
+                    record = {**record, "found": record["recovered"], "search": _search_record(search, options)}
                     record["reasons"] = reasons(record, problem)
                     final = record["final"] if None not in record["final"] else start_pose(options.seed, run)
                     pictures = _pictures(methods[name], record["start"], final, reference)

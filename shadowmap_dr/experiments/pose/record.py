@@ -116,7 +116,7 @@ def make_record(
     """Make the run with the identity ``wanted``. Returns its record.
 
     The run descends from its start, and from other rotations while its images differ from the reference by more than `EXPLAINED`
-    allows. The record has the results of the best descent, and all descents in ``tries``.
+    allows and steps change the pose. The record has the results of the best descent, and all descents in ``tries``.
 
     Args:
         on_step: called with the numbers of finished descents and of finished steps of the next one.
@@ -129,7 +129,7 @@ def make_record(
         step = functools.partial(on_step, number)
         histories.append(optimize(method, start, wanted["iterations"], checkpoint=path, settings=essence(wanted), on_step=step))
         left.append(_left(histories[-1], without))
-        if left[-1] <= EXPLAINED:
+        if left[-1] <= EXPLAINED or np.array_equal(histories[-1].final, histories[-1].parameters[0]):
             break
     best = int(np.argmin(left))
     results = _results(histories[best])

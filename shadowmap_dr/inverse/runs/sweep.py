@@ -19,8 +19,8 @@ from .worker import Batch, stem
 
 #: Default limit of a batch's memory, in bytes.
 MEMORY = 1 << 31
-#: Ends of the names of checkpoints, of batches and of single runs of a batch.
-_CHECKPOINT = r"\.checkpoint(-[0-9a-f]{8})?(-run\d+)?\.npz"
+#: Ends of the names of checkpoints, of batches, of single runs of a batch, and of further descents of a run.
+_CHECKPOINT = r"\.checkpoint(-[0-9a-f]{8})?(-run\d+)?(-try\d+)?\.npz"
 
 
 def run_sweep(

@@ -21,7 +21,7 @@ from ...scene.mitsuba_meshes import mesh_buffers
 from .scene import PoseProblem
 
 #: Differences between images by the share of those without the object. A search that ends above has found another pose.
-EXPLAINED = 0.1
+EXPLAINED = 0.05
 #: Rotation between the starts of a run's tries, in degrees.
 TURN_DEG = 25.0
 # Sides of grids of samples, and distances of samples that the narrowest tenth of an object's area has to be wide.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import drjit as dr
 import mitsuba as mi
 
@@ -24,20 +26,28 @@ def blurred(values: Float, shape: tuple[int, ...], width: Float, most: float) ->
     Returns Float (H W C). No gradients: the blur is its own adjoint, up to the image's border.
     """
     height, columns, channels = shape
+    # Colours are gathered together.
+    together = 3 if channels == 3 else 1
+    step = channels // together
     spread = max(1, int(most) // _TAPS_PER_WIDTH)
     # Squares of widths add up.
     narrow = dr.minimum(width, 0.75 * spread)
     wide = dr.safe_sqrt(dr.square(width) - dr.square(narrow)) if spread > 1 else width
-    for stride, count in ((channels, columns), (channels * columns, height)):
+    for stride, count in ((step, columns), (step * columns, height)):
         if spread > 1:
-            values = _convolved(values, stride, count, narrow, 1, _REACH * spread)
-        values = _convolved(values, stride, count, wide, spread, int(_REACH * most / spread) + 1)
+            values = _convolved(values, together, stride, count, narrow, 1, _REACH * spread)
+        values = _convolved(values, together, stride, count, wide, spread, int(_REACH * most / spread) + 1)
     return values
 
 
-def _convolved(values: Float, stride: int, count: int, width: Float, spread: int, taps: int) -> Float:
-    """An image convolved along one axis, with ``taps`` samples on both sides that are ``spread`` pixels apart."""
-    index = dr.arange(mi.Int32, dr.width(values))
+def _convolved(values: Float, together: int, stride: int, count: int, width: Float, spread: int, taps: int) -> Float:
+    """An image convolved along one axis, with at most ``taps`` samples on both sides that are ``spread`` pixels apart.
+
+    ``together``: neighbouring values with the same neighbours, 1 or 3. ``stride``, ``count``: of the axis, in groups of them.
+    """
+    kind = cast(type[Float], mi.Vector3f if together == 3 else mi.Float)
+    size = dr.width(values) // together
+    index = dr.arange(mi.Int32, size)
     place = index // stride % count
     exponent = -0.5 / dr.square(dr.maximum(width, 1e-3))
 
@@ -45,11 +55,13 @@ def _convolved(values: Float, stride: int, count: int, width: Float, spread: int
         offset = k * spread
         weight = dr.exp(dr.square(mi.Float(offset)) * exponent)
         inside = (place + offset >= 0) & (place + offset < count)
-        value = dr.gather(mi.Float, values, mi.UInt32(index + offset * stride), inside)
+        value = dr.gather(kind, values, mi.UInt32(index + offset * stride), inside)
         return k + 1, total + weight * value, weights + weight
 
-    begin = mi.Int32(-taps), dr.zeros(mi.Float, dr.width(values)), mi.Float(0)
-    _, total, weights = dr.while_loop(begin, lambda k, *_: k <= taps, add)
-    result = total / weights
+    # As many as the present width needs: none beside the pixel without blur.
+    last = mi.Int32(dr.minimum(float(taps), dr.ceil(_REACH * width / spread)))
+    begin = -last, dr.zeros(kind, size), mi.Float(0)
+    _, total, weights = dr.while_loop(begin, lambda k, *_: k <= last, add)
+    result = dr.ravel(total / weights)
     dr.eval(result)
-    return result
+    return cast(Float, result)

@@ -17,6 +17,7 @@ from ..jit.arrays import device_array
 from ..jit.frozen import freeze, recordings_of
 from ..jit.types import Float, TensorXf
 from ..rendering.receivers.checks import real_array
+from .image_blur import blurred
 
 
 def apply_pose(p_rest: Float, pose: Float, shift_z: float = 0.0) -> Float:
@@ -40,6 +41,9 @@ def apply_pose(p_rest: Float, pose: Float, shift_z: float = 0.0) -> Float:
 class PoseFit:
     """Fit of a pose to a reference image by gradient descent (Adam) on the mean squared difference of linear colours.
 
+    With ``blur``, gradients are those of blurred differences at first, whose width shrinks evenly to zero: shadows of thin parts
+    then attract each other from farther away than they are wide. The loss is that of unblurred images at all steps.
+
     A `Method` of the optimisation loop. A step - vertices, rendering, loss, backward pass, Adam - is recorded once with
     `dr.freeze` and replayed from then on, without a read-back. Mitsuba's meshes stay as they are, and no rays are traced.
 
@@ -52,6 +56,8 @@ class PoseFit:
         step_size, betas: parameters of Adam.
         shift_z: see `apply_pose`.
         spp: samples per pixel that the renderer is asked for.
+        blur: standard deviation of the first step's blur, in pixels.
+        blur_steps: number of steps after which no blur is left.
         settings: further entries for `describe`.
 
     Raises ShadowmapError for a reference that is no image or not finite.
@@ -68,6 +74,8 @@ class PoseFit:
         betas: tuple[float, float] = (0.9, 0.999),
         shift_z: float = 0.0,
         spp: int = 1,
+        blur: float = 0.0,
+        blur_steps: int = 0,
         settings: Mapping[str, Any] | None = None,
     ) -> None:
         image = real_array("reference", reference)
@@ -79,6 +87,7 @@ class PoseFit:
         self._reference = mi.TensorXf(device_array(mi.Float, image), image.shape)
         self._step_size, self._betas, self._shift_z = step_size, betas, shift_z
         self._spp = {} if spp == 1 else {"spp": spp}  # left out by default: a renderer need not have this option
+        self._blur = (blur, blur_steps) if blur_steps else (0.0, 0)
         self._settings = dict(settings or {})
         self._step = freeze(_pose_step)
         self.reset(np.zeros(3))
@@ -89,7 +98,7 @@ class PoseFit:
 
     def step(self) -> Float:
         """Take one step. Returns the loss before the step, Float (1,), without waiting for the device."""
-        constants: dict[str, Any] = {"shape": self._shape, "shift_z": self._shift_z, "spp": self._spp}
+        constants: dict[str, Any] = {"shape": self._shape, "shift_z": self._shift_z, "spp": self._spp, "blur": self._blur}
         return self._step(self._renderer, self._optimizer, self._p_rest, self._reference, **constants)
 
     def parameters(self) -> Float:
@@ -154,13 +163,20 @@ def _gradient(
     shape: str,
     shift_z: float,
     spp: dict[str, int],
+    blur: float = 0.0,
+    width: Float | None = None,
 ) -> Float:
-    """Add the derivative of the loss to the gradient of ``pose``. Returns the loss (mean squared difference), Float (1,)."""
+    """Add the derivative of the loss to the gradient of ``pose``. Returns the loss (mean squared difference), Float (1,).
+
+    ``width``: Float (1,), standard deviation of the blur of differences, at most ``blur``.
+    """
     image = renderer.render(vertex_positions={shape: apply_pose(p_rest, pose, shift_z)}, **spp)
     # Derived by hand: one kernel then reads the image for both the loss and its derivative.
     difference = dr.detach(image.array) - reference.array
     square, slope = dr.square(difference), difference * (2 / dr.width(difference))
     dr.eval(square, slope)
+    if width is not None:
+        slope = blurred(slope, image.shape, width, blur)
     dr.set_grad(image, type(image)(slope, shape=image.shape))
     dr.enqueue(dr.ADMode.Backward, image)
     dr.traverse(dr.ADMode.Backward)
@@ -176,7 +192,13 @@ def _pose_step(
     shape: str,
     shift_z: float,
     spp: dict[str, int],
+    blur: tuple[float, int] = (0.0, 0),
 ) -> Float:
-    loss = _gradient(renderer, optimizer["pose"], p_rest, reference, shape, shift_z, spp)
+    (most, steps), width = blur, None
+    if most:
+        # From Adam's count of steps, an array: the recording holds for all of them.
+        width = most * dr.maximum(1 - mi.Float(optimizer.state["pose"][3][0]) / steps, 0)
+        dr.eval(width)
+    loss = _gradient(renderer, optimizer["pose"], p_rest, reference, shape, shift_z, spp, most, width)
     optimizer.step()
     return loss

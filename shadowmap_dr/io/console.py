@@ -3,11 +3,22 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from time import monotonic
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    Task,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.table import Table
 
 # Seconds between lines of progress where there is no terminal to draw a bar on.
@@ -27,7 +38,8 @@ def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> 
 def progress(console: Console) -> Progress:
     """A progress display. Add one task for each part of the work, with a text in its field `note`.
 
-    Without a terminal (in a pipe, in a file) it writes a line every ten seconds.
+    Without a terminal (in a pipe, in a file) it writes a line every ten seconds. On a terminal, a step that takes longer
+    than that has a line of its own.
     """
     return _ProgressOrLines(
         TextColumn("{task.description}"),
@@ -40,15 +52,27 @@ def progress(console: Console) -> Progress:
     )
 
 
+@contextmanager
+def task(display: Progress, description: str) -> Iterator[None]:
+    """A task without steps, shown while a block runs."""
+    number = display.add_task(description, total=None, note="")
+    try:
+        yield
+    finally:
+        display.remove_task(number)
+
+
 class _ProgressOrLines(Progress):
-    """A bar on terminals, lines elsewhere."""
+    """A bar on terminals, lines elsewhere. Steps that take long are named on both."""
 
     def start(self) -> None:
         super().start()
         self._stopped = threading.Event()
+        # Time of the last change of each task, and the changes that a terminal has been told of.
+        self._changes: dict[TaskID, tuple[float, float]] = {}
+        self._told: set[tuple[TaskID, float]] = set()
         self._lines = threading.Thread(target=self._write_lines, daemon=True)
-        if not self.console.is_terminal:
-            self._lines.start()
+        self._lines.start()
 
     def stop(self) -> None:
         self._stopped.set()
@@ -59,12 +83,60 @@ class _ProgressOrLines(Progress):
     def _write_lines(self) -> None:
         while not self._stopped.wait(_LINE_SECONDS):
             for task in self.tasks:
-                if not task.finished:
-                    total = "" if task.total is None else f"/{task.total:.0f}"
-                    seconds = int(task.elapsed or 0)
-                    note = f" {task.fields['note']}" if task.fields.get("note") else ""
-                    time = f"{seconds // 60}:{seconds % 60:02d}"
-                    self.console.print(f"{task.description} {task.completed:.0f}{total}{note}, {time}", soft_wrap=True)
+                if not task.finished and task.visible:
+                    self._write_line(task)
+
+    def _write_line(self, task: Task) -> None:
+        waited = self._waited(task)
+        if self.console.is_terminal:
+            change = (task.id, task.completed)
+            if waited is None or change in self._told:
+                return
+            self._told.add(change)
+        note = f" {task.fields['note']}" if task.fields.get("note") else ""
+        if task.total is None:
+            progress = f"{note}, for {waited or 0:.0f} s"
+        else:
+            step = f", at step {task.completed + 1:.0f} for {waited:.0f} s" if waited is not None else ""
+            progress = f" {task.completed:.0f}/{task.total:.0f}{note}{step}, {_minutes(task.elapsed or 0)}"
+        self.console.print(task.description + progress, soft_wrap=True, highlight=False)
+
+    def _waited(self, task: Task) -> float | None:
+        """Seconds for which a task has not gone on, None if it has since the last line."""
+        now = monotonic()
+        begun = now if task.completed else now - (task.elapsed or 0)
+        completed, since = self._changes.get(task.id, (task.completed, begun))
+        if completed != task.completed:
+            since = now
+        self._changes[task.id] = (task.completed, since)
+        return now - since if now - since >= _LINE_SECONDS else None
+
+
+@contextmanager
+def waiting(say: Callable[[str], None], text: Callable[[float], str | None]) -> Iterator[None]:
+    """Say every ten seconds, while a block runs, what it waits for.
+
+    ``text`` gets the seconds since the block began, in another thread. It returns a line, or None for nothing to say.
+    """
+    began, ended = monotonic(), threading.Event()
+
+    def write() -> None:
+        while not ended.wait(_LINE_SECONDS):
+            line = text(monotonic() - began)
+            if line is not None:
+                say(line)
+
+    thread = threading.Thread(target=write, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+def _minutes(seconds: float) -> str:
+    return f"{int(seconds) // 60}:{int(seconds) % 60:02d}"
 
 
 def markdown(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -247,3 +250,25 @@ def test_recorded_gallery_shows_pieces_and_their_numbers(variant, tmp_path, monk
     assert art_gallery.run_gallery(["heart", "two"], *folders, resume=True) == record
     with pytest.raises(SystemExit, match="no piece 'nothing'"):
         art_gallery.main(["nothing"])
+
+
+def test_one_thread_gives_the_same_bits_in_every_process(tmp_path):
+    # As a script, with the kernels of tests, in two processes. The sphere is the usual one.
+    program = "import quick_kernels; from shadowmap_dr.cli.main import main; main()"
+    support = Path(__file__).parents[1] / "support"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(support), os.environ.get("PYTHONPATH", "")])}
+    options = ["--target", "heart", "--target", "duck", "--iterations", "12", "--resolution", "64", "--animate", "none"]
+    for name in ("a", "b"):
+        command = [sys.executable, "-c", program, "art", *options, "--threads", "1", "--out", str(tmp_path / name)]
+        result = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=300)
+        assert result.returncode == 0, result.stderr
+    one, other = (json.loads((tmp_path / name / "art.json").read_text()) for name in ("a", "b"))
+    assert one["loss_curve"] == other["loss_curve"] and one["views"] == other["views"]
+    for file in ("mesh.ply", "mesh.obj", "mesh.glb", "shadow-1.png", "shadow-2.png", "picture.png"):
+        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes(), file
+
+
+@pytest.mark.parametrize("threads", [-1, 5000])
+def test_impossible_numbers_of_threads_are_refused(threads):
+    with pytest.raises(ShadowmapError, match=f"{threads} threads"):
+        art.ArtOptions(targets=("heart",), threads=threads)

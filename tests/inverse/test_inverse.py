@@ -14,6 +14,7 @@ from fakes import POINTS, BlobRenderer
 
 from shadowmap_dr.errors import ShadowmapError
 from shadowmap_dr.inverse import PoseFit, apply_pose, optimize
+from shadowmap_dr.inverse.image_blur import blurred
 
 START = [0.3, 0.15, -0.1]
 
@@ -53,6 +54,57 @@ def test_fit_recovers_the_pose(variant: str) -> None:
     np.testing.assert_allclose(history.parameters[0], START)
     assert history.loss[-1] < 1e-3 * history.loss[0]
     assert method.render(history.final).shape == (16, 16, 1)
+
+
+def test_blurred_gradients_against_differences_of_blurred_images(variant: str) -> None:
+    width, size = 2.0, 16
+    method = fit(blur=width, blur_steps=10)
+    method.reset(START)
+    method.step()
+    # Adam's first moment is a tenth of the first gradient.
+    gradient = method.state()["m"] / 0.1
+    target = fit().render(np.zeros(3))[..., 0].astype(np.float64)
+    place = np.arange(size)
+    kernel = np.exp(-0.5 * ((place[:, None] - place) / width) ** 2) / np.exp(-0.5 * (np.arange(-9, 10) / width) ** 2).sum()
+
+    def loss(pose: Any) -> float:
+        difference = method.render(pose)[..., 0] - target
+        return float((difference * (kernel @ difference @ kernel.T)).mean())
+
+    expected = [(loss(START + step) - loss(START - step)) / 2e-2 for step in np.eye(3) * 1e-2]
+    np.testing.assert_allclose(gradient, expected, rtol=0.02, atol=1e-4)
+    optimize(method, START, 20)
+    assert method.recordings() <= 2
+
+
+def test_losses_are_those_of_images_without_blur(variant: str) -> None:
+    losses = [optimize(method, START, 1).loss for method in (fit(), fit(blur=3.0, blur_steps=10))]
+    np.testing.assert_allclose(*losses, rtol=1e-5)
+
+
+def test_after_the_blur_steps_are_as_without(variant: str) -> None:
+    ends = []
+    for options in ({}, {"blur": 3.0, "blur_steps": 10}):
+        method = fit(**options)
+        method.load_state({**method.state(), "parameters": np.array(START), "t": np.full(1, 10.0)})
+        method.step()
+        ends.append(np.array(method.parameters()))
+    np.testing.assert_allclose(*ends, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("width", "most"), [(0.0, 8.0), (2.5, 8.0), (8.0, 8.0), (30.0, 32.0), (3.0, 32.0)])
+def test_blur_against_a_dense_gaussian(variant: str, width: float, most: float) -> None:
+    rng = np.random.default_rng(0)
+    image = rng.random((90, 120, 3)).astype(np.float32)
+    found = np.array(blurred(mi.Float(image.ravel()), image.shape, mi.Float(width), most)).reshape(image.shape)
+    expected = image.astype(np.float64)
+    for axis in (0, 1):
+        place = np.arange(image.shape[axis])
+        kernel = np.exp(-0.5 * ((place[:, None] - place) / max(width, 1e-3)) ** 2)
+        whole = np.exp(-0.5 * (np.arange(-400, 401) / max(width, 1e-3)) ** 2).sum()
+        expected = np.moveaxis(np.tensordot(kernel / whole, expected, (1, axis)), 0, axis)
+    # Wide Gaussians are sampled, and lose a little more at the border.
+    assert np.abs(found - expected).max() < (2e-3 if most < 16 else 0.02)
 
 
 def test_step_is_recorded_at_most_twice_and_compiles_nothing_afterwards(variant: str) -> None:

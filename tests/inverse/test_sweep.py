@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -19,10 +21,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from fake_problems import BlobPoses, Bowls
+from rich.console import Console
 
 from shadowmap_dr.errors import OutputError, ShadowmapError
 from shadowmap_dr.inverse import run_sweep
 from shadowmap_dr.inverse.runs.worker import stem
+from shadowmap_dr.io import console as io_console
 
 SUPPORT = Path(__file__).parents[1] / "support"
 
@@ -301,6 +305,27 @@ def test_a_scheduler_that_dies_is_named(tmp_path: Path) -> None:
         cluster.close()
         with pytest.raises(ShadowmapError, match="scheduler at tcp://.* is gone"):
             sweep.result(60)
+
+
+def test_a_scheduler_without_workers_is_waited_for_with_a_word(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    distributed = pytest.importorskip("distributed")
+    monkeypatch.setattr(io_console, "_LINE_SECONDS", 0.2)
+    written = io.StringIO()
+    with (
+        distributed.LocalCluster(n_workers=0, threads_per_worker=1, dashboard_address=None, memory_limit=0) as cluster,
+        ThreadPoolExecutor(1) as pool,
+    ):
+        address = cluster.scheduler_address
+        line = f"waiting for a worker of {address}: none has joined for "
+        console = Console(file=written, width=40)  # lines are not broken
+        sweep = pool.submit(run_sweep, [Bowls(2)], tmp_path, scheduler=address, console=console)
+        for _ in range(600):
+            if written.getvalue().count(line) > 1:
+                break
+            time.sleep(0.1)
+        cluster.scale(1)
+        assert len(sweep.result(120)["bowls"]) == 2
+    assert re.search(re.escape(line) + rf"\d+ s \(start one with `dask worker {re.escape(address)}`\)\n", written.getvalue())
 
 
 def test_bad_input_is_named(tmp_path: Path) -> None:

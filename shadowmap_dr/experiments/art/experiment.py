@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import numpy as np
 import numpy.typing as npt
 from rich.console import Console
@@ -21,6 +22,7 @@ from rich.table import Table
 from ... import __version__
 from ...errors import ShadowmapError
 from ...inverse import Collection, RemeshingSculptor, Sculptor, even_sphere, shadow_view
+from ...inverse.runs.schedulers import check_threads
 from ...inverse.shadow_art import exports, target_images
 from ...io import assets, files, meshes, records
 from ...io import console as io_console
@@ -81,6 +83,7 @@ class ArtOptions:
     printable: bool = option(False, help="Also write an STL file, and report on the mesh.")
     out: Path = option(Path("art"), help="Folder for the results.")
     resume: bool = option(False, help="Resume a killed run with the same settings.")
+    threads: int = option(0, help="Threads, 0 for one for each core; with one, repeated runs give the same bits.")
     step_size: float = setting(0.2, allowed=(1e-06, 100.0), help="Step size of the `Sculptor`; a `Collection` has its own.")
     consistency: float = setting(0.2, allowed=(0.0, 1e6), help="Weight of normal consistency of the `Sculptor`.")
     interval: int = setting(150, allowed=STEPS, help="Steps between two doublings of the copies, see `Collection`.")
@@ -92,6 +95,7 @@ class ArtOptions:
 
     def __post_init__(self) -> None:
         check_ranges(self)
+        check_threads(self.threads)
         if not 1 <= len(self.targets) <= len(DIRECTIONS):
             raise ShadowmapError(f"{len(self.targets)} targets: give one, or two for two views.")
         if self.receiver not in RECEIVERS:
@@ -159,6 +163,8 @@ def run_art(options: ArtOptions, *, console: Console | None = None) -> dict[str,
     """Make one piece, write all files into ``options.out``, and return the record of `art.json`."""
     assert options.iterations is not None  # `ArtOptions` replaces None
     steps = options.iterations
+    if options.threads:
+        dr.set_thread_count(options.threads)
     console = console or Console(stderr=True)
     path = files.check_output(options.out / "art.json", (".json",))
     checkpoint = options.out / "checkpoint.npz"
@@ -169,7 +175,7 @@ def run_art(options: ArtOptions, *, console: Console | None = None) -> dict[str,
         io_images.write_png(options.out / f"target-{k + 1}.png", maker.target(k))
     settings = {"targets": [_name(target) for target in options.targets], "iterations": steps, **maker.describe()}
     with io_console.progress(console) as progress:
-        task = progress.add_task("steps", total=steps, note="")
+        task = progress.add_task("steps", total=steps, note="kernels are compiled")
         trace = make(
             maker, steps, checkpoint=checkpoint, fingerprint=_fingerprint(settings, maker),
             on_step=lambda done, note: progress.update(task, completed=done, note=note),

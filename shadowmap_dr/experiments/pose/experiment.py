@@ -7,7 +7,9 @@ projective integrator, with an area light in place of the directional one and th
 
 from __future__ import annotations
 
+import dataclasses
 import functools
+import glob
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,10 +33,26 @@ from ...io import records as io_records
 from ...io.options import option
 from ...io.ranges import RUNS, SEED, STEPS, check_ranges
 from ..common.options import scheduler_option, threads_option
-from .methods import METHODS, Builder, Image, build_method, fairness
+from .advice import reasons
+from .methods import METHODS, Builder, Image, build_method, fairness, searching
 from .record import identity, is_of, make_record, stored_records
 from .scene import NormalKind, PoseProblem, ReferenceKind, make_problem, start_pose
+from .search import Search, choose, number_or_auto
 from .sweep import PoseRuns, make_reference
+
+# Choices of `search.choose`, for the help.
+_AUTO = (
+    "auto: 1 for objects of this package; 1, 4 or 16 for files, by the width of facets",
+    "auto: 0 for objects of this package; a sixteenth of the image for files",
+    "auto: 1 for objects of this package; 5 for files",
+)
+
+
+def _number(name: str) -> Callable[[str], float | None]:
+    def parse(text: str) -> float | None:
+        return number_or_auto(f"{name} (--{name})", text)
+
+    return parse
 
 
 @dataclass(frozen=True)
@@ -60,7 +78,22 @@ class PoseOptions:
     reference: ReferenceKind = option("mitsuba", help="Reference image: path-traced, or rendered by this library.")
     shadow_only: bool = option(False, help="The camera sees the shadow but not the object.")
     normals: NormalKind = option("face", help="Shading of the object: flat, or smooth.")
-    samples: int = option(1, allowed=(1, 4096), help="Samples per pixel of our own methods.")
+    samples: int | None = option(
+        None,
+        metavar="N|auto",
+        shown=_AUTO[0],
+        parse=_number("samples"),
+        allowed=(1, 4096),
+        help="Samples per pixel of our methods.",
+    )
+    blur: float | None = option(
+        None, metavar="PIXELS|auto", shown=_AUTO[1], parse=_number("blur"), allowed=(0.0, 512.0),
+        help="Blur of the first step's differences, which shrinks to zero.",
+    )  # fmt: skip
+    tries: int | None = option(
+        None, metavar="N|auto", shown=_AUTO[2], parse=_number("tries"), allowed=(1, 13),
+        help="Most descents of a run, from other rotations while the image is not explained.",
+    )  # fmt: skip
     out: Path = option(Path("pose"), help="Folder for the results.")
     resume: bool = option(False, help="Keep finished runs, resume killed ones.")
     scheduler: str = scheduler_option()
@@ -98,8 +131,6 @@ def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Co
     Runs that share a machine take longer than runs alone.
     """
     console = console or Console(stderr=True)
-    if build is build_method:
-        build = functools.partial(build_method, samples=options.samples)
     out = options.out
     files.check_output(out / "pose.json", (".json",))
     stored: list[dict[str, Any]] = []
@@ -114,22 +145,31 @@ def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Co
             make_problem(name, resolution, shadow_only=options.shadow_only, normals=options.normals, work=out / "objects")
         ]
     }
+    searches = {
+        folder: choose(problem, name, options.samples, options.blur, options.tries)
+        for folder, (name, problem) in problems.items()
+    }
     if len(problems) != len(options.objects) * len(options.resolutions):
         raise ShadowmapError(f"two of the objects {', '.join(options.objects)} have the same name: rename one file.")
     if options.scheduler == "local":
         if options.threads:
             dr.set_thread_count(options.threads)
     else:
-        stored += _sweep(problems, options, stored, console)
+        stored += _sweep(problems, searches, options, stored, console)
 
     result: list[dict[str, Any]] = []
     with io_console.progress(console) as progress:
-        for _, problem in problems.values():
-            task = progress.add_task(f"{problem.folder} reference and methods", total=None, note="")
-            reference = _reference(problem, options, build)
+        for folder, (_, problem) in problems.items():
+            search = searches[folder]
+            make = searching(search, options.iterations) if build is build_method else build
+            kind = "path-traced reference" if options.reference == "mitsuba" else "reference"
+            with io_console.task(progress, f"{problem.folder} {kind}"):
+                reference = _reference(problem, options, make)
             # Built once for all runs: compiled kernels are reused, and a method that cannot be built fails at once.
-            methods = {name: build(name, problem, reference) for name in options.methods}
-            progress.remove_task(task)
+            methods = {}
+            for name in options.methods:
+                with io_console.task(progress, f"{problem.folder} {name}: scene and kernels"):
+                    methods[name] = make(name, problem, reference)
             for method in methods.values():
                 if fairness(method, problem).get("fair") is False:
                     note = "sample counts found with another object or resolution; that they converge here has not been shown"
@@ -138,9 +178,11 @@ def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Co
             for run in range(options.runs):
                 for name in options.methods:
                     title = f"{problem.folder} {name} run {run}"
-                    task = progress.add_task(title, total=options.iterations, note="")
+                    task = progress.add_task(title, total=options.iterations, note="kernels are compiled")
                     step = functools.partial(_show, progress, task)
-                    record = _run_one(problem, name, run, options, methods[name], stored, step)
+                    record = _run_one(problem, name, run, options, methods[name], reference, stored, step)
+                    record = {**record, "found": record["recovered"], "search": _search_record(search, options)}
+                    record["reasons"] = reasons(record, problem)
                     final = record["final"] if None not in record["final"] else start_pose(options.seed, run)
                     pictures = _pictures(methods[name], record["start"], final, reference)
                     for picture, image in pictures.items():
@@ -150,9 +192,9 @@ def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Co
                     records.append(record)
                     stored = [*(other for other in stored if _key(other) != _key(record)), record]
                     io_records.write_json(out / "pose.json", stored)
-                    _checkpoint(problem, name, run, options).unlink(missing_ok=True)
+                    _remove_checkpoints(problem, name, run, options)
                     progress.remove_task(task)
-                    progress.console.print(f"{title}: {_outcome(record)}", highlight=False)
+                    progress.console.print(f"{title}: {_outcome(record)}", highlight=False, soft_wrap=True)
             _plots(problem, options, records, images, reference)
             result += records
     return result
@@ -192,29 +234,34 @@ def _run_one(
     run: int,
     options: PoseOptions,
     method: Method,
+    reference: Image,
     stored: Sequence[dict[str, Any]],
-    on_step: Callable[[int], None],
+    on_step: Callable[[int, int], None],
 ) -> dict[str, Any]:
     """The record of a run: the stored record with exactly these settings if there is one, else that of a new run."""
     wanted = _identity(problem, name, run, options, method)
     for record in stored:
         if is_of(record, wanted):
             return record
-    path = _checkpoint(problem, name, run, options)
     if not options.resume:
-        path.unlink(missing_ok=True)
-    return make_record(method, wanted, path, on_step)
+        _remove_checkpoints(problem, name, run, options)
+    return make_record(method, reference, wanted, _checkpoint(problem, name, run, options), on_step)
 
 
 def _sweep(
-    problems: Mapping[str, tuple[str, PoseProblem]], options: PoseOptions, stored: Sequence[dict[str, Any]], console: Console
+    problems: Mapping[str, tuple[str, PoseProblem]],
+    searches: Mapping[str, Search],
+    options: PoseOptions,
+    stored: Sequence[dict[str, Any]],
+    console: Console,
 ) -> list[dict[str, Any]]:
     """Make the runs without stored records with the workers of a scheduler. Returns their records."""
-    build = functools.partial(build_method, samples=options.samples)
     missing = []
     for folder, (object_, problem) in problems.items():
+        build = searching(searches[folder], options.iterations)
         # For the workers; those that do not see this folder make the reference again.
-        reference = _reference(problem, options, build)
+        with io_console.progress(console) as progress, io_console.task(progress, f"{folder} reference"):
+            reference = _reference(problem, options, build)
         for name in options.methods:
             method = build(name, problem, reference)
             wanted = [_identity(problem, name, run, options, method) for run in range(options.runs)]
@@ -231,7 +278,7 @@ def _sweep(
                     reference=options.reference,
                     shadow_only=options.shadow_only,
                     normals=options.normals,
-                    samples=options.samples,
+                    search=searches[folder],
                     out=str(options.out.resolve()),
                 )
             )
@@ -247,8 +294,14 @@ def _sweep(
     return [record for records in found.values() for record in records]
 
 
-def _show(progress: Progress, task: TaskID, done: int) -> None:
-    progress.update(task, completed=done, note="")
+def _show(progress: Progress, task: TaskID, finished: int, done: int) -> None:
+    progress.update(task, completed=done, note=f"try {finished + 1}" if finished else "")
+
+
+def _search_record(search: Search, options: PoseOptions) -> dict[str, Any]:
+    """Settings of a search for the record, and the names of those that the user left to us."""
+    chosen = [name for name in ("samples", "blur", "tries") if getattr(options, name) is None]
+    return {**dataclasses.asdict(search), "chosen": chosen}
 
 
 def _reference(problem: PoseProblem, options: PoseOptions, build: Builder) -> Image:
@@ -288,12 +341,19 @@ def _checkpoint(problem: PoseProblem, name: str, run: int, options: PoseOptions)
     return options.out / problem.folder / f"{name}-run{run}-seed{options.seed}.checkpoint.npz"
 
 
+def _remove_checkpoints(problem: PoseProblem, name: str, run: int, options: PoseOptions) -> None:
+    path = _checkpoint(problem, name, run, options)
+    for one in path.parent.glob(f"{glob.escape(path.stem)}*{path.suffix}"):
+        one.unlink(missing_ok=True)
+
+
 def _key(record: dict[str, Any]) -> tuple[Any, ...]:
     """Identity of a record's run: a newer record with the same key replaces it."""
     names = ("object", "resolution", "method", "run", "seed", "iterations", "reference", "shadow_only")
-    samples = record.get("settings", {}).get("samples_per_pixel", 1)
+    settings = record.get("settings", {})
+    search = (settings.get("samples_per_pixel", 1), settings.get("blur", 0), settings.get("tries", 1))
     variant = record.get("variant", record.get("environment", {}).get("variant"))
-    return (*(record.get(name) for name in names), samples, _normals(record), variant)
+    return (*(record.get(name) for name in names), search, _normals(record), variant)
 
 
 def _normals(record: dict[str, Any]) -> str:
@@ -317,4 +377,5 @@ def _mean(group: Sequence[dict[str, Any]], key: str, form: str) -> str:
 def _outcome(record: dict[str, Any]) -> str:
     values = (_mean([record], key, "{:.3f}") for key in ("rotation_error_deg", "translation_error_x100"))
     time = _mean([record], "seconds_per_iteration", "{:.4f}")
-    return "rotation {} deg, offset x 100 {}, {} s per iteration".format(*values, time)
+    text = "rotation {} deg, offset x 100 {}, {} s per iteration".format(*values, time)
+    return text if record["recovered"] else f"{text}; not found: {'; '.join(record['reasons'])}"

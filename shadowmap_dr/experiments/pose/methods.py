@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,7 @@ import numpy.typing as npt
 from ...inverse import Method, PoseFit
 from ...io import assets
 from .scene import PoseProblem
+from .search import Search
 
 if TYPE_CHECKING:
     from mitsuba_baselines.pose import ProjectiveSetting
@@ -34,13 +36,23 @@ def usual_methods(shadow_only: bool = False, normals: str = "face") -> tuple[str
 
 
 def build_method(
-    name: str, problem: PoseProblem, reference: Image, samples: int = 1, setting: ProjectiveSetting | None = None
+    name: str,
+    problem: PoseProblem,
+    reference: Image,
+    samples: int = 1,
+    setting: ProjectiveSetting | None = None,
+    *,
+    blur: float = 0.0,
+    blur_steps: int = 0,
+    tries: int = 1,
 ) -> Method:
     """One of the three methods for a problem and its reference image.
 
     Args:
         samples: samples per pixel of our own methods.
         setting: sample counts of Mitsuba's; None: the result of `fair_setting`.
+        blur, blur_steps: see `PoseFit`; of our own methods.
+        tries: most descents of a run with our own methods, for its record.
     """
     if name == "mitsuba":
         from mitsuba_baselines.fair_settings import fair_setting
@@ -66,6 +78,10 @@ def build_method(
     renderer = Renderer.from_scene(problem.scene, **settings)
     if samples != 1:
         settings["samples_per_pixel"] = samples
+    if blur:
+        settings |= {"blur": blur, "blur_steps": blur_steps}
+    if tries != 1:
+        settings["tries"] = tries
     return PoseFit(
         renderer,
         "object",
@@ -75,7 +91,20 @@ def build_method(
         betas=BETAS,
         shift_z=problem.shift_z,
         spp=samples,
+        blur=blur,
+        blur_steps=blur_steps,
         settings=settings,
+    )
+
+
+def searching(search: Search, iterations: int) -> Builder:
+    """`build_method` with the settings of a search."""
+    return functools.partial(
+        build_method,
+        samples=search.samples,
+        blur=search.blur,
+        blur_steps=search.blur_steps(iterations),
+        tries=search.tries,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -17,11 +18,16 @@ from ...errors import ShadowmapError, warn
 from ...inverse import History, Method, optimize
 from ...io import records
 from ..common.timing import DRJIT_VERSION
-from .methods import fairness
+from .methods import Image, fairness
 from .scene import PoseProblem, ReferenceKind, pose_errors, start_pose
+from .search import EXPLAINED, TURN_DEG
 
 RECOVERED_DEG, RECOVERED_X100 = 0.2, 0.3
 TIME_TO_POSE_DEG = 0.1
+#: A pose in which neither an object in [-1, 1]^3 nor its shadow is near anything.
+AWAY = np.array([0.0, 50.0, 0.0])
+# Steps whose mean loss stands for the end of a descent.
+_LAST = 5
 
 
 def identity(
@@ -105,22 +111,71 @@ def essence(value: Any) -> Any:  # Any: JSON
 
 
 def make_record(
-    method: Method, wanted: dict[str, Any], checkpoint: Path | None, on_step: Callable[[int], None]
+    method: Method, reference: Image, wanted: dict[str, Any], checkpoint: Path | None, on_step: Callable[[int, int], None]
 ) -> dict[str, Any]:
-    """Make the run with the identity ``wanted``. Returns its record."""
-    iterations, start = wanted["iterations"], wanted["start"]
-    history = optimize(method, start, iterations, checkpoint=checkpoint, settings=essence(wanted), on_step=on_step)
-    return {**wanted, **_results(history), "environment": _environment()}
+    """Make the run with the identity ``wanted``. Returns its record.
+
+    The run descends from its start, and from other rotations while its images differ from the reference by more than `EXPLAINED`
+    allows and steps change the pose. The record has the results of the best descent, and all descents in ``tries``.
+
+    Args:
+        on_step: called with the numbers of finished descents and of finished steps of the next one.
+    """
+    without = _mean_square(method.render(AWAY), reference)
+    histories: list[History] = []
+    left: list[float] = []
+    for number, start in enumerate(starts_of(wanted)):
+        path = checkpoint if checkpoint is None or not number else checkpoint.with_stem(f"{checkpoint.stem}-try{number}")
+        step = functools.partial(on_step, number)
+        histories.append(optimize(method, start, wanted["iterations"], checkpoint=path, settings=essence(wanted), on_step=step))
+        left.append(_left(histories[-1], without))
+        if left[-1] <= EXPLAINED or np.array_equal(histories[-1].final, histories[-1].parameters[0]):
+            break
+    best = int(np.argmin(left))
+    results = _results(histories[best])
+    results["seconds_total"] = sum(history.seconds_total for history in histories)
+    results["seconds_to_pose"] = _later(results["seconds_to_pose"], sum(history.seconds_total for history in histories[:best]))
+    tries = [
+        {"start": history.parameters[0], "final": history.final, "unexplained": rest}
+        for history, rest in zip(histories, left, strict=True)
+    ]
+    results |= records.plain({"unexplained": left[best], "without_object": without, "tries": tries})
+    return {**wanted, **results, "environment": _environment()}
+
+
+def starts_of(wanted: dict[str, Any]) -> list[npt.NDArray[np.float64]]:
+    """Starts (3,) of the descents of a run with the identity ``wanted``, the run's own first."""
+    # To both sides in turn, a turn farther after two.
+    turns = [TURN_DEG * ((k + 1) // 2) * (1 if k % 2 else -1) for k in range(wanted["settings"].get("tries", 1))]
+    return [np.asarray(wanted["start"], np.float64) + [np.radians(turn), 0, 0] for turn in turns]
+
+
+def _left(history: History, without: float) -> float:
+    """Share of the loss without the object that the last steps have left; infinite if the descent failed."""
+    last = float(history.loss[-_LAST:].mean())
+    if not (np.isfinite(last) and np.isfinite(history.final).all()):
+        return float("inf")
+    return last / without if without > 0 else 1.0
+
+
+def _mean_square(image: Image, reference: Image) -> float:
+    return float(np.mean(np.square(image - reference, dtype=np.float64)))
+
+
+def _later(seconds: float | None, before: float) -> float | None:
+    return None if seconds is None else seconds + before
 
 
 def _results(history: History) -> dict[str, Any]:
     rotation, translation = pose_errors(history.parameters)
+    found = bool(rotation[-1] < RECOVERED_DEG and translation[-1] < RECOVERED_X100)
     return records.plain(
         {
             "final": history.final,
             "rotation_error_deg": rotation[-1],
             "translation_error_x100": translation[-1],
-            "recovered": bool(rotation[-1] < RECOVERED_DEG and translation[-1] < RECOVERED_X100),
+            "recovered": found,
+            "found": found,
             "seconds_per_iteration": history.seconds_per_iteration,
             "seconds_total": history.seconds_total,
             "seconds_to_pose": seconds_to_pose(rotation, history.seconds),

@@ -12,9 +12,10 @@ import numpy as np
 
 from ...inverse import Method, Problem
 from ...io import images
-from .methods import Builder, Image, build_method
+from .methods import Builder, Image, searching
 from .record import identity, make_record
 from .scene import NormalKind, PoseProblem, ReferenceKind, make_problem, path_traced_reference
+from .search import Search
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,8 @@ class PoseRuns(Problem):
         method: one of METHODS.
         numbers: numbers of the runs, which determine their starts.
         out: folder with reference images; workers that do not see it make their own.
-        resolution, iterations, seed, reference, shadow_only, normals, samples: as in `PoseOptions`.
+        resolution, iterations, seed, reference, shadow_only, normals: as in `PoseOptions`.
+        search: samples, blur and tries.
     """
 
     object: str
@@ -40,7 +42,7 @@ class PoseRuns(Problem):
     reference: ReferenceKind
     shadow_only: bool
     normals: NormalKind
-    samples: int
+    search: Search
     out: str
 
     @property
@@ -62,27 +64,31 @@ class PoseRuns(Problem):
     def run_numbers(self) -> tuple[int, ...]:
         return self.numbers
 
-    def build(self) -> tuple[PoseProblem, Method]:
+    def build(self) -> tuple[PoseProblem, Method, Image]:
         out = Path(self.out)
         problem = make_problem(
             self.object, self.resolution, shadow_only=self.shadow_only, normals=self.normals, work=out / "objects"
         )
         image = make_reference(problem, self.reference, out / self.folder, self._build)
-        return problem, self._build(self.method, problem, image)
+        return problem, self._build(self.method, problem, image), image
 
     def _build(self, name: str, problem: PoseProblem, reference: Image) -> Method:
-        return build_method(name, problem, reference, samples=self.samples)
+        return searching(self.search, self.iterations)(name, problem, reference)
 
     def run_batch(
-        self, built: tuple[PoseProblem, Method], runs: Sequence[int], checkpoint: Path | None, on_step: Callable[[int], None]
+        self,
+        built: tuple[PoseProblem, Method, Image],
+        runs: Sequence[int],
+        checkpoint: Path | None,
+        on_step: Callable[[int], None],
     ) -> list[dict[str, Any]]:
-        problem, method = built
+        problem, method, reference = built
         records = []
         for run in runs:
             wanted = identity(
                 problem, self.method, run, method, seed=self.seed, iterations=self.iterations, reference=self.reference
             )
-            records.append(make_record(method, wanted, checkpoint, on_step))
+            records.append(make_record(method, reference, wanted, checkpoint, lambda _, done: on_step(done)))
         return records
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ...errors import OutputError, ShadowmapError, is_interrupt
+from ...io.console import waiting
 from .worker import Batch, Worker
 
 if TYPE_CHECKING:
@@ -22,6 +23,7 @@ SCHEDULERS = "local, processes:N or tcp://HOST:PORT"
 
 MOST_THREADS = 1024
 
+Say = Callable[[str], None]
 Report = Callable[[Batch, dict[str, Any]], None]
 
 
@@ -55,13 +57,19 @@ def do_batches(
     folder: Path,
     on_done: Report,
     on_step: Callable[[Batch, int], None] = lambda batch, done: None,
+    say: Say = lambda line: None,
 ) -> None:
     """Do all batches; ``on_done`` gets the result of each as soon as it ends.
+
+    ``say`` gets a line every ten seconds while a scheduler does not answer or has no worker.
 
     If a worker dies, another worker repeats its batch. Only the scheduler ``local`` calls ``on_step``. Errors of batches are
     raised after all other batches are done.
     """
-    failed = (_do_here if scheduler == "local" else _do_elsewhere)(batches, scheduler, threads, folder, on_done, on_step)
+    if scheduler == "local":
+        failed = _do_here(batches, threads, folder, on_done, on_step)
+    else:
+        failed = _do_elsewhere(batches, scheduler, threads, folder, on_done, say)
     if failed:
         error = failed[0]
         if scheduler == "local":
@@ -73,7 +81,7 @@ def do_batches(
 
 
 def _do_here(
-    batches: Sequence[Batch], _: str, threads: int, folder: Path, on_done: Report, on_step: Callable[[Batch, int], None]
+    batches: Sequence[Batch], threads: int, folder: Path, on_done: Report, on_step: Callable[[Batch, int], None]
 ) -> list[Exception]:
     failed: list[Exception] = []
     worker = Worker(threads)
@@ -92,12 +100,12 @@ def _do_here(
 
 
 def _do_elsewhere(
-    batches: Sequence[Batch], scheduler: str, threads: int, folder: Path, on_done: Report, _: Callable[[Batch, int], None]
+    batches: Sequence[Batch], scheduler: str, threads: int, folder: Path, on_done: Report, say: Say
 ) -> list[Exception]:
     from distributed import as_completed
 
     failed: list[Exception] = []
-    with _client(scheduler) as client:
+    with _client(scheduler, say) as client, waiting(say, _Workers(client, scheduler).missing):
         # Other sweeps on the same cluster may have batches of the same name with other results.
         sweep = uuid.uuid4().hex
         futures = {
@@ -117,23 +125,43 @@ def _do_elsewhere(
     return failed
 
 
+class _Workers:
+    """Watch of a cluster's workers."""
+
+    def __init__(self, client: Client, scheduler: str) -> None:
+        self._client, self._scheduler, self._last = client, scheduler, 0.0
+
+    def missing(self, seconds: float) -> str | None:
+        """A line if the cluster has no worker now. ``seconds``: since the work began."""
+        try:
+            workers = self._client.nthreads()
+        except Exception:  # of many kinds: the scheduler is gone, which the wait for results notices
+            return None
+        if workers:
+            self._last = seconds
+            return None
+        since = "none has joined" if not self._last else "none is left"
+        start = "" if self._scheduler.startswith("processes:") else f" (start one with `dask worker {self._scheduler}`)"
+        return f"waiting for a worker of {self._scheduler}: {since} for {seconds - self._last:.0f} s{start}"
+
+
 @contextmanager
-def _client(scheduler: str) -> Iterator[Client]:
+def _client(scheduler: str, say: Say) -> Iterator[Client]:
     from distributed import Client, LocalCluster
 
     if scheduler.startswith("processes:"):
         count = int(scheduler.partition(":")[2])
         # One Python thread each; Dr.Jit has its own threads. Dask restarts workers that die.
-        with (
-            LocalCluster(
-                n_workers=count, threads_per_worker=1, processes=True, dashboard_address=None, memory_limit=0
-            ) as cluster,
-            Client(cluster) as client,
-        ):
+        with waiting(say, lambda seconds: f"waiting for {count} processes to start, for {seconds:.0f} s"):
+            cluster = LocalCluster(n_workers=count, threads_per_worker=1, processes=True, dashboard_address=None, memory_limit=0)
+        with cluster, Client(cluster) as client:
             yield client
         return
     client = None
-    with suppress(OSError, ValueError, TypeError):  # the last two: invalid ports and missing certificates
+    with (
+        waiting(say, lambda seconds: f"waiting for a Dask scheduler at {scheduler} to answer, for {seconds:.0f} s"),
+        suppress(OSError, ValueError, TypeError),  # the last two: invalid ports and missing certificates
+    ):
         client = Client(scheduler, timeout=20)
     if client is None:
         # Collect the failed client here: its destructor waits for a lock, forever in the thread that starts the next client.

@@ -19,8 +19,8 @@ from .worker import Batch, stem
 
 #: Default limit of a batch's memory, in bytes.
 MEMORY = 1 << 31
-#: Ends of the names of checkpoints, of batches and of single runs of a batch.
-_CHECKPOINT = r"\.checkpoint(-[0-9a-f]{8})?(-run\d+)?\.npz"
+#: Ends of the names of checkpoints, of batches, of single runs of a batch, and of further descents of a run.
+_CHECKPOINT = r"\.checkpoint(-[0-9a-f]{8})?(-run\d+)?(-try\d+)?\.npz"
 
 
 def run_sweep(
@@ -92,7 +92,10 @@ def run_sweep(
             done[batch.problem.name] |= dict(zip(result["runs"], result["records"], strict=True))
             progress.update(total, advance=1)
 
-        do_batches(batches, scheduler, threads=threads, folder=folder.resolve(), on_done=on_done, on_step=on_step)
+        def say(line: str) -> None:
+            progress.console.print(line, soft_wrap=True, highlight=False)
+
+        do_batches(batches, scheduler, threads=threads, folder=folder.resolve(), on_done=on_done, on_step=on_step, say=say)
     for problem in problems:  # checkpoints of killed batches of another size
         for path in _files(problem, folder, variant, _CHECKPOINT):
             path.unlink(missing_ok=True)

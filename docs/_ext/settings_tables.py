@@ -35,9 +35,7 @@ def settings() -> str:
         if option.name not in texts:
             raise ExtensionError(f"the docstring of Options does not describe '{option.name}'.")
         rows.append((code(option.name), type(option.default).__name__, code(_shown(option.default)), _accepted(option)))
-    return table(
-        ("Parameter", "Type", "Default", "Values", "Meaning"), [(*row, texts[row[0].strip("`")]) for row in rows]
-    )
+    return table(("Parameter", "Type", "Default", "Values", "Meaning"), [(*row, texts[row[0].strip("`")]) for row in rows])
 
 
 def channels() -> str:

@@ -28,8 +28,9 @@ extensions = [
 ]
 exclude_patterns = ["_ext", "_build"]
 default_role = "py:obj"
+# Dashes only: quotation marks stay as they are.
+smartquotes_action = "D"
 
-myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3
 # Headings of pages that are included, such as the README's, begin where they like.
 suppress_warnings = ["myst.header"]
@@ -43,6 +44,7 @@ python_use_unqualified_type_names = True
 maximum_signature_line_length = 80
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
+napoleon_attr_annotations = False
 
 html_theme = "furo"
 html_title = f"shadowmap_dr {release}"

@@ -50,7 +50,7 @@ def _option(option: Any) -> tuple[str, str, str, str]:  # Any: as above
     names = " ".join(code(name) for name in (*option.opts, *option.secondary_opts))
     text, default = _DEFAULT.sub("", option.help or ""), _DEFAULT.search(option.help or "")
     shown = default[1] if default else "" if option.default in (None, False) or callable(option.default) else str(option.default)
-    kind = "switch" if option.is_flag else " ".join(code(word) for word in (option.metavar or _type(option)).split("|"))
+    kind = "switch" if option.is_flag else ", ".join(code(word) for word in (option.metavar or _type(option)).split("|"))
     return (
         names,
         kind + ("; repeatable" if option.multiple else ""),
@@ -63,11 +63,13 @@ def _type(option: Any) -> str:  # Any: as above
     """The word for an option's type, with its range."""
     # Typer's own options know a Python type, those of Click a named one.
     word = option.bare_type() if hasattr(option, "bare_type") else option.type.name
+    word = re.sub(r"^list\[(.*)\]$", r"\1", word)  # of options that can be repeated
     least, most = (getattr(option, name, None) for name in ("min", "max"))
     limits = [f"{least} or more"] if most is None else [f"{least} to {most}"]
     return " ".join([word.lower(), *(limits if least is not None else [])])
 
 
 def _text(text: str) -> str:
-    """A help text as a paragraph."""
-    return re.sub(r"\s+", " ", text.replace("\b", "")).strip()
+    """A help text as a paragraph, with names of options as code."""
+    paragraph = re.sub(r"\s+", " ", text.replace("\b", "")).strip()
+    return re.sub(r"(?<![`\w-])--[a-z][a-z-]*", lambda name: code(name[0]), paragraph)

@@ -25,6 +25,14 @@ def literal_blocks(lines: list[str]) -> list[str]:
     return result
 
 
+def signature(
+    app: Sphinx, what: str, name: str, thing: object, options: dict[str, object], arguments: str | None, result: str | None
+) -> tuple[str, str | None] | None:
+    """No arguments for classes that functions make: those documented with ``:exclude-members: __init__``."""
+    hidden = what == "class" and "__init__" in (options.get("exclude-members") or ())
+    return ("", result) if hidden else None
+
+
 def definitions(lines: list[str]) -> list[str]:
     """Lines with items of aligned lists as items of definition lists."""
     result: list[str] = []
@@ -44,4 +52,5 @@ def definitions(lines: list[str]) -> list[str]:
 
 def setup(app: Sphinx) -> dict[str, bool]:
     app.connect("autodoc-process-docstring", process, priority=400)  # before those of sphinx.ext.napoleon
+    app.connect("autodoc-process-signature", signature)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -28,9 +28,13 @@ def literal_blocks(lines: list[str]) -> list[str]:
 def signature(
     app: Sphinx, what: str, name: str, thing: object, options: dict[str, object], arguments: str | None, result: str | None
 ) -> tuple[str, str | None] | None:
-    """No arguments for classes that functions make: those documented with ``:exclude-members: __init__``."""
-    hidden = what == "class" and "__init__" in (options.get("exclude-members") or ())
-    return ("", result) if hidden else None
+    """No arguments for classes that functions make: those documented with ``:exclude-members: __init__``.
+
+    Defaults that a dataclass makes anew each time are written ``...``; Sphinx cannot read the text that Python has for them.
+    """
+    if what == "class" and "__init__" in (options.get("exclude-members") or ()):
+        return "", result
+    return (arguments.replace("<factory>", "..."), result) if arguments else None
 
 
 def definitions(lines: list[str]) -> list[str]:

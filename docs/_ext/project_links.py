@@ -14,7 +14,7 @@ _LINK = re.compile(r"\]\((?P<path>[^)#\s:]+)(?P<anchor>#[^)\s]*)?\)")
 
 
 def read_source(app: Sphinx, page: str, source: list[str]) -> None:
-    """Let links to the files of `PAGES` lead to their pages, and links to folders and to code lead to names in the text."""
+    """Let links to the files of `PAGES` lead to their pages."""
     folder = (Path(app.srcdir) / page).parent
     source[0] = _LINK.sub(lambda link: _led(link, folder, Path(app.srcdir)), source[0])
 
@@ -22,7 +22,11 @@ def read_source(app: Sphinx, page: str, source: list[str]) -> None:
 def _led(link: re.Match[str], folder: Path, docs: Path) -> str:
     target = (folder / link["path"]).resolve()
     if target.parent == docs.parent and target.name in PAGES:
-        return f"](/{PAGES[target.name]}{link['anchor'] or ''})"
+        anchor = link["anchor"] or ""
+        # A heading that is gone is no reason to lose the link.
+        known = re.findall(r"^#+ (.+)$", target.read_text(encoding="utf-8"), re.MULTILINE)
+        there = anchor.lstrip("#") in {heading.lower().replace(" ", "-") for heading in known}
+        return f"](/{PAGES[target.name]}{anchor if there else ''})"
     return link[0]
 
 

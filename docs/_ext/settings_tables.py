@@ -21,7 +21,7 @@ CHANNELS = {
     "normal": ("shading normal, world space, unit length", "0"),
     "shape_index": ("number of the shape, counted from 0", "-1"),
     "prim_index": ("number of the triangle in its shape, counted from 0", "-1"),
-    "visibility": ("fraction of each light that arrives; one channel for each light, named after it", "1"),
+    "visibility": ("fraction of the light that arrives; a channel for each light but area lights and skies, named after it", "1"),
 }
 #: Largest number that is tried.
 _MOST = 1 << 24

@@ -21,7 +21,7 @@ from .records import FaceSets, Raster, check_set_images, pieces, plain_faces
 from .transforms import plain
 
 #: First face and number of faces of each image.
-Ranges: TypeAlias = Sequence[tuple[int, int]] | torch.Tensor
+Ranges: TypeAlias = "Sequence[tuple[int, int]] | torch.Tensor"
 
 _BATCH = "give positions (B, V, 4), one set for each image"
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 import sys
 from pathlib import Path
 
@@ -32,13 +33,16 @@ default_role = "py:obj"
 smartquotes_action = "D"
 
 myst_heading_anchors = 3
-# Headings of pages that are included, such as the README's, begin where they like.
-suppress_warnings = ["myst.header"]
+# Included pages may begin with any heading. Dr.Jit and PyTorch have records of the same names, such as Topology.
+suppress_warnings = ["myst.header", "ref.python"]
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
 autodoc_preserve_defaults = True
+# Names of arrays: at run time all of them are Any.
+_TYPES = (HERE.parent / "shadowmap_dr" / "jit" / "types.py").read_text(encoding="utf-8")
+autodoc_type_aliases = {name: name for name in re.findall(r"^    (\w+): TypeAlias", _TYPES, re.MULTILINE)}
 autodoc_mock_imports = [] if importlib.util.find_spec("torch") else ["torch"]
 python_use_unqualified_type_names = True
 maximum_signature_line_length = 80

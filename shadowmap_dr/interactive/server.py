@@ -67,19 +67,18 @@ def create_app(connections: Connections) -> Starlette:
         try:
             async with decoding:
                 target = await run_in_threadpool(exports.read_target, data, connections.view.seen)
+            connections.replace(target)
         except ShadowmapError as error:
             return PlainTextResponse(str(error), 422)
-        connections.replace(target)
         return Response(status_code=204)
 
     async def mesh(request: Request) -> Response:
         kind = request.path_params["kind"]
         if kind not in exports.FORMATS:
             return PlainTextResponse("There is no such format.", 404)
+        snapshot = connections.session.snapshot
         async with decoding:
-            content = await run_in_threadpool(
-                exports.mesh_bytes, kind, connections.session.snapshot.vertices, connections.session.faces
-            )
+            content = await run_in_threadpool(exports.mesh_bytes, kind, snapshot.vertices, snapshot.faces)
         return _download(content, exports.FORMATS[kind], f"mesh.{kind}")
 
     async def shadow(request: Request) -> Response:

@@ -110,6 +110,7 @@ class Client:
         self._notices.clear()
         if self.mesh != mesh.number:
             self.mesh, self._target = mesh.number, None
+            self._unseen.clear()  # the page shows no more frames of the last mesh
             first += [messages.mesh(mesh.name, mesh.number), mesh.faces]
         has_frame = snapshot.number > self._frame and len(self._unseen) < _UNSEEN
         if self._takes_target(canvas, at_once=has_frame):

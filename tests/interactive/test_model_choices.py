@@ -211,6 +211,9 @@ def test_pages_are_told_of_another_mesh_before_its_frames(board, fake):
         return client.news(fake.session, connections.canvas, connections._mesh, FrameCache())
 
     asyncio.run(news())
+    fake.session.set_target(np.full((SIZE, SIZE), 0.5, np.float32), 1)
+    eventually(lambda: fake.session.snapshot.target == 1 and fake.session.status.phase == "resting")
+    asyncio.run(news())  # the page has two frames, and shows none of them
     board.do(messages.Choice("mesh", "spot"))
     eventually(lambda: fake.session.snapshot.start is not fake.library.first and fake.session.status.phase == "resting")
     assert asyncio.run(early()) == []  # the canvas is that of the last mesh still

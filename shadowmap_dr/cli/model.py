@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Annotated, Any
 
 import numpy as np
@@ -14,22 +15,25 @@ import typer
 from ..errors import ShadowmapError
 from ..interactive import exports
 from ..interactive.file_session import follow, kept
+from ..interactive.library import SPHERE, MeshLibrary, read_start
 from ..interactive.modeller import Modeller
 from ..interactive.options import VIEWS, ModelOptions
-from ..inverse import Sculptor, ShadowView, even_sphere, shadow_view
+from ..interactive.snapshot import Snapshot
+from ..interactive.start_mesh import StartMesh
+from ..inverse import Sculptor, ShadowView, shadow_view
 from ..io import assets, files
-from ..io.meshes import read_placed_mesh
 from ..variants import DEFAULT_VARIANT, set_variant
 from .options import Variant, from_record
 
-_SPHERE = "sphere"
 #: Weight of normal consistency: weak, so that parts without changes keep their details.
 CONSISTENCY = 0.001
+
+Vertices = npt.NDArray[np.float32]
 
 
 @from_record()
 def model(
-    mesh: Annotated[str, typer.Argument(metavar="NAME|FILE", help=f"Mesh to deform: a file, a name, or '{_SPHERE}'.")],
+    mesh: Annotated[str, typer.Argument(metavar="NAME|FILE", help=f"Mesh to deform: a file, a name, or '{SPHERE}'.")],
     options: ModelOptions,
     variant: Variant = DEFAULT_VARIANT,
 ) -> None:
@@ -41,34 +45,35 @@ def model(
     files.check_output(options.output, tuple(f".{kind}" for kind in exports.FORMATS))
     if not options.serve:
         files.check_output(options.image, (".png",))
-    path = None if mesh == _SPHERE else assets.mesh(mesh)
+    path = None if mesh == SPHERE else assets.mesh(mesh)
     set_variant(variant)
-    vertices, faces, (middle, scale) = (*even_sphere(), ((0, 0, 0), 1.0)) if path is None else read_placed_mesh(path)
+    first = read_start(path)
     shadow = shadow_view(*VIEWS[options.view], size=options.resolution)
 
-    def build() -> Modeller:
+    def build(start: StartMesh) -> Modeller:
         settings: dict[str, Any] = {
             "step_size": options.step_size,
             "smoothness": options.smoothness,
             "consistency": CONSISTENCY,
             "map_resolution": options.resolution,
         }
-        return Modeller(Sculptor(vertices, faces, [shadow], **settings))
+        return Modeller(Sculptor(start.vertices, start.faces, [shadow], **settings), start)
 
-    def save(moved: np.ndarray) -> None:
-        placed: npt.NDArray[Any] = moved * scale + middle
-        exports.write_mesh(options.output, placed, faces)
+    def save(start: StartMesh, vertices: Vertices) -> None:
+        exports.write_mesh(options.output, start.placed(vertices), start.faces)
 
     if options.serve:
-        _serve(build, shadow, _SPHERE if path is None else path.stem, options.port, save)
+        _serve(MeshLibrary(first, build), shadow, options.port, save)
     else:
         typer.echo("Preparing ...", err=True)
         with _interrupts() as stopped:
-            follow(build(), options.image, save, lambda: bool(stopped), lambda text: typer.echo(text, err=True))
+            say = partial(typer.echo, err=True)
+            follow(build(first), options.image, partial(save, first), lambda: bool(stopped), say)
     typer.echo(f"Mesh: {options.output}")
 
 
-def _serve(build: Callable[[], Modeller], shadow: ShadowView, name: str, port: int, save: Callable[[np.ndarray], None]) -> None:
+def _serve(library: MeshLibrary, shadow: ShadowView, port: int, save: Callable[[StartMesh, Vertices], None]) -> None:
+    """Serve the page until a signal comes. The mesh that is saved is the one that pages have chosen last."""
     try:
         from ..interactive.connections import Connections
         from ..interactive.server import listen, serve
@@ -76,16 +81,19 @@ def _serve(build: Callable[[], Modeller], shadow: ShadowView, name: str, port: i
         raise ShadowmapError(f"--serve needs the package {error.name}: pip install 'shadowmap-dr[interactive]'.") from error
     from ..interactive.session import Session
 
+    def save_snapshot(snapshot: Snapshot) -> None:
+        save(snapshot.start or library.first, snapshot.vertices)
+
     with listen(port) as listener, _interrupts() as stopped:
-        session = Session(build)
+        session = Session(lambda: library.build(library.first))
         session.start()
         try:
-            with kept(session, save):
-                connections = Connections(session, shadow, name)
+            with kept(session, save_snapshot):
+                connections = Connections(session, shadow, library.first.name, library)
                 serve(connections, listener, lambda: bool(stopped), lambda url: typer.echo(f"Open {url} (Ctrl-C ends)"))
         finally:
             session.close()
-            save(session.snapshot.vertices)
+            save_snapshot(session.snapshot)
 
 
 @contextmanager

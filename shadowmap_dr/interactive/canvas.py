@@ -65,19 +65,20 @@ class Canvas:
 
     Args:
         start: visibility (H, W), 0 (dark) to 1 (lit), top row first: the image before the first edit.
+        version: number of that image.
 
     Attributes:
         version: grows with every change.
     """
 
-    def __init__(self, start: npt.ArrayLike) -> None:
+    def __init__(self, start: npt.ArrayLike, version: int = 0) -> None:
         self._start = _bytes(start)
         self._base = self._start
         self._edits: list[_Edit] = []
         self._images: list[Bytes] = []  # after each edit
         self._undone: list[_Edit] = []
         self._numbers = itertools.count(1)
-        self.version = 0
+        self.version = version
 
     @property
     def shape(self) -> tuple[int, int]:

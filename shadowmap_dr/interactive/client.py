@@ -11,6 +11,7 @@ from . import messages
 from .canvas import Canvas
 from .rate_limit import RateLimit
 from .session import Session, Snapshot, Status
+from .start_mesh import StartMesh
 
 #: Messages that a page may send in a second, and at once after a pause. A page that is drawn on sends about 80 a second.
 MOST_MESSAGES, BURST = 400, 200
@@ -32,6 +33,23 @@ class FrameCache:
         return self._record
 
 
+@dataclass(frozen=True, eq=False)
+class ShownMesh:
+    """The mesh that pages work on.
+
+    Attributes:
+        number: grows with each mesh.
+        name: of the mesh.
+        start: of the session's snapshots of this mesh.
+        faces: their record.
+    """
+
+    number: int
+    name: str
+    start: StartMesh | None
+    faces: bytes
+
+
 @dataclass(eq=False)
 class Client:
     """A page.
@@ -41,6 +59,7 @@ class Client:
         socket: the connection.
         wake: set when there may be something new to send.
         seq: number of the page's last stroke message.
+        mesh: number of the mesh that the page knows.
         rate: of messages from the page.
         refusal: reason why the connection ends, None while it goes on.
     """
@@ -49,6 +68,7 @@ class Client:
     socket: WebSocket
     wake: asyncio.Event = field(default_factory=asyncio.Event)
     seq: int = 0
+    mesh: int = 0
     rate: RateLimit = field(default_factory=lambda: RateLimit(MOST_MESSAGES, BURST))
     refusal: str | None = None
     _status: Status | None = None
@@ -78,16 +98,22 @@ class Client:
             self.wake.set()
         await asyncio.sleep(delay)
 
-    def news(self, session: Session, canvas: Canvas, frames: FrameCache) -> list[str | bytes]:
+    def news(self, session: Session, canvas: Canvas, mesh: ShownMesh, frames: FrameCache) -> list[str | bytes]:
         """Messages that the page has not had yet.
 
-        A painting comes before the frames of meshes that follow it. The status "moving" comes before the first frame of a
-        movement, "resting" after the last one.
+        Another mesh comes before its painting and its frames. A painting comes before the frames of meshes that follow it. The
+        status "moving" comes before the first frame of a movement, "resting" after the last one.
         """
         # In this order, the status is not older than the snapshot.
         snapshot, status = session.snapshot, session.status
+        if snapshot.start is not mesh.start:
+            return []  # the canvas is still that of the last mesh; the session wakes the pages
         first: list[str | bytes] = [messages.notice(text) for text in self._notices]
         self._notices.clear()
+        if self.mesh != mesh.number:
+            self.mesh, self._target = mesh.number, None
+            self._unseen.clear()  # the page shows no more frames of the last mesh
+            first += [messages.mesh(mesh.name, mesh.number), mesh.faces]
         has_frame = snapshot.number > self._frame and len(self._unseen) < _UNSEEN
         if self._takes_target(canvas, at_once=has_frame):
             first.append(messages.target(canvas, self.seq))

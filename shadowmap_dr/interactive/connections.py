@@ -8,14 +8,17 @@ from collections.abc import Awaitable, Callable
 
 import anyio
 import numpy.typing as npt
+from starlette.concurrency import run_in_threadpool
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from ..errors import ShadowmapError
 from ..inverse import ShadowView
 from . import brush, messages
 from .canvas import Canvas, Change
-from .client import Client, FrameCache
+from .client import Client, FrameCache, ShownMesh
+from .library import MeshLibrary, read_named_target, target_names
 from .session import Session
+from .start_mesh import StartMesh
 
 #: Largest number of pages at a time.
 MOST_CLIENTS = 8
@@ -33,17 +36,24 @@ class Connections:
 
     Undo restores the mesh of the moment before the edit: the session keeps a state of the mesh before and after each edit.
 
+    When a page chooses another mesh, all pages get it, with a new canvas. Until the session has prepared it, edits are dropped.
+
     Args:
         session: started.
         view: of the session's sculptor.
         name: of the mesh.
+        library: meshes that pages may choose. None: no other mesh.
+
+    Attributes:
+        canvas: of the mesh that pages see. Another mesh has another canvas.
     """
 
-    def __init__(self, session: Session, view: ShadowView, name: str) -> None:
-        self.session, self.view = session, view
-        self.canvas = Canvas(session.snapshot.shadow / 255)
-        self._hello = messages.hello(view, name)
-        self._faces = messages.faces(session.faces)
+    def __init__(self, session: Session, view: ShadowView, name: str, library: MeshLibrary | None = None) -> None:
+        self.session, self.view, self._library = session, view, library
+        snapshot = session.snapshot
+        self.canvas = Canvas(snapshot.shadow / 255)
+        self._mesh = ShownMesh(0, name, snapshot.start, messages.faces(snapshot.faces))
+        self._coming: StartMesh | None = None  # a mesh that the session prepares
         self._clients: set[Client] = set()
         self._numbers = itertools.count()
         self._frames = FrameCache()
@@ -66,7 +76,13 @@ class Connections:
             client.wake.set()
 
     def replace(self, image: npt.ArrayLike) -> None:
-        """Put an image (H, W), 0 (dark) to 1 (lit), on top of everything that has been painted."""
+        """Put an image (H, W), 0 (dark) to 1 (lit), on top of everything that has been painted.
+
+        Raises ShadowmapError while another mesh is prepared.
+        """
+        self._take_mesh()
+        if self._coming is not None:
+            raise ShadowmapError("another mesh is being prepared: send the image again.")
         self._begun(self.canvas.replace(image))
         self._paint()
 
@@ -115,16 +131,21 @@ class Connections:
             await client.slow_down()
 
     async def _handle(self, client: Client, message: object) -> None:
+        self._take_mesh()
         if isinstance(message, messages.Seen):
             client.shown(message.frame)
+        elif isinstance(message, messages.Choice):
+            await self._choose(message)
+        elif message == "restart":
+            self.session.restart()
+        elif self._coming is not None and not isinstance(message, messages.Stroke):
+            pass  # the edit is of a mesh that goes
         elif isinstance(message, messages.Stroke):
             await self._stroke(client, message)
         elif message == "undo":
             self._go_back(self.canvas.undo(), leaves="after", finds="before")
         elif message == "redo":
             self._go_back(self.canvas.redo(), leaves="before", finds="after")
-        elif message == "restart":
-            self.session.restart()
         else:
             self._begun(self.canvas.clear())
             if message == "reset":
@@ -133,13 +154,47 @@ class Connections:
 
     async def _stroke(self, client: Client, stroke: messages.Stroke) -> None:
         """Paint a part of a stroke. Other pages get their turn while a long one is drawn."""
+        mesh = self._mesh
         lines = list(brush.parts(stroke.points, stroke.radius, self.canvas.shape))
         for left, line in zip(reversed(range(len(lines))), lines, strict=True):
+            if self._coming is not None or self._mesh is not mesh or stroke.mesh not in (None, mesh.number):
+                client.seq = stroke.seq
+                self.wake()  # the page takes back what it has drawn
+                return
             self._begun(self.canvas.stroke((client.number, stroke.id), stroke.mode, stroke.radius, line))
             if left:
                 await asyncio.sleep(0)
         client.seq = stroke.seq
         self._paint()
+
+    async def _choose(self, choice: messages.Choice) -> None:
+        """Begin with another mesh, or put a target on top of everything. Raises MessageError for unknown names."""
+        if choice.kind == "target":
+            if choice.name not in target_names():
+                raise messages.MessageError("a target that does not exist.")
+            mesh = self._mesh
+            image = await run_in_threadpool(read_named_target, choice.name, self.view.seen)
+            self._take_mesh()
+            if self._coming is None and self._mesh is mesh:
+                self.replace(image)
+            return
+        library = self._library
+        if library is None or choice.name not in library.names:
+            raise messages.MessageError("a mesh that does not exist.")
+        start = await run_in_threadpool(library.load, choice.name)
+        self._coming = start
+        self.session.begin(lambda: library.build(start), self.canvas.version + 1)
+        self.wake()
+
+    def _take_mesh(self) -> None:
+        """Show the session's mesh, if it is another one. Its canvas is its shadow."""
+        snapshot = self.session.snapshot
+        if snapshot.start is None or snapshot.start is self._mesh.start:
+            return
+        self.canvas = Canvas(snapshot.shadow / 255, snapshot.target)
+        self._mesh = ShownMesh(self._mesh.number + 1, snapshot.start.name, snapshot.start, messages.faces(snapshot.faces))
+        if snapshot.start is self._coming:
+            self._coming = None
 
     def _begun(self, edit: int | None) -> None:
         """Keep the mesh for undo, if an edit has begun."""
@@ -160,13 +215,18 @@ class Connections:
         self.wake()
 
     async def _send(self, client: Client) -> None:
-        await client.socket.send_text(self._hello)
-        await client.socket.send_bytes(self._faces)
+        self._take_mesh()
+        mesh = self._mesh
+        client.mesh = mesh.number
+        meshes = self._library.names if self._library is not None else ()
+        await client.socket.send_text(messages.hello(self.view, mesh.name, mesh.number, meshes, target_names()))
+        await client.socket.send_bytes(mesh.faces)
         client.wake.set()
         while True:
             await client.wake.wait()
             client.wake.clear()
-            for content in client.news(self.session, self.canvas, self._frames):
+            self._take_mesh()
+            for content in client.news(self.session, self.canvas, self._mesh, self._frames):
                 with anyio.fail_after(_PATIENCE):
                     if isinstance(content, str):
                         await client.socket.send_text(content)

@@ -25,20 +25,21 @@ MOST_BYTES, MOST_PIXELS = 8_000_000, 16_000_000
 _IMAGES = ("PNG", "JPEG", "WEBP", "GIF", "BMP")
 
 Array = npt.NDArray[np.float32]
+Vertices = Array | npt.NDArray[np.float64]
 
 
-def mesh_bytes(kind: str, vertices: Array, faces: npt.NDArray[np.uint32]) -> bytes:
+def mesh_bytes(kind: str, vertices: Vertices, faces: npt.NDArray[np.uint32]) -> bytes:
     """A mesh of vertices (V, 3) and faces (F, 3) as a file of one of `FORMATS`. GLB files have vertex colours."""
     if kind not in FORMATS:
         raise ShadowmapError(f"no mesh format {kind!r}: choose from {', '.join(FORMATS)}.")
     import trimesh
 
-    colours = vertex_colours(vertices) if kind == "glb" else None
+    colours = vertex_colours(np.asarray(vertices, np.float32)) if kind == "glb" else None
     content = trimesh.Trimesh(vertices, faces, process=False, vertex_colors=colours).export(file_type=kind)
     return content.encode() if isinstance(content, str) else bytes(content)
 
 
-def write_mesh(path: Path, vertices: Array, faces: npt.NDArray[np.uint32]) -> None:
+def write_mesh(path: Path, vertices: Vertices, faces: npt.NDArray[np.uint32]) -> None:
     """Write a mesh in the format of the path's suffix. Other programs never see half of the file."""
     content = mesh_bytes(path.suffix.lower().removeprefix("."), vertices, faces)
     with atomic(path) as temporary:

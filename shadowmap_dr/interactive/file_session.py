@@ -16,6 +16,7 @@ from ..errors import ShadowmapError
 from . import exports
 from .modeller import Modeller
 from .session import Session
+from .snapshot import Snapshot
 from .watch import ImageWatch
 
 #: Seconds between two looks at the file, and between two saves of a mesh that moves.
@@ -83,7 +84,7 @@ def follow(
 
 
 @contextmanager
-def kept(session: Session, save: Callable[[np.ndarray], None]) -> Iterator[None]:
+def kept(session: Session, save: Callable[[Snapshot], None]) -> Iterator[None]:
     """Save the mesh of a session every two seconds if it has moved, until the context ends.
 
     Another thread saves. It ends with the interpreter if the context is still open then.
@@ -97,7 +98,7 @@ def kept(session: Session, save: Callable[[np.ndarray], None]) -> Iterator[None]
             if snapshot.number != saved:
                 saved = snapshot.number
                 try:
-                    save(snapshot.vertices)
+                    save(snapshot)
                 except ShadowmapError as error:  # for example, the disk is full: the next save may succeed
                     log.warning("%s", error)
 

@@ -3,12 +3,15 @@
 The page sends JSON objects of the types below. Any other message ends its connection, with the reason.
 
 - ``stroke``: id (an integer that the page chooses), seq (an integer that comes back in the next target), mode (``add`` or
-  ``erase``), radius, points ([x, y, x, y, ...] in pixels from the top left corner). Messages with the same id extend the stroke.
+  ``erase``), radius, points ([x, y, x, y, ...] in pixels from the top left corner), and mesh (the number of the mesh that is
+  painted on; optional). Messages with the same id extend the stroke. Strokes on a mesh that has been replaced are dropped.
 - ``undo``, ``redo``, ``clear`` (the painting), ``reset`` (painting and mesh), ``restart`` (after a failure).
+- ``mesh``: name (of the mesh to begin with, for all pages), ``target``: name (of a figure, or ``blank``). The first message lists
+  the names.
 - ``seen``: frame (the number of a frame that the page has shown). The server sends few frames ahead of this number.
 
-The server sends the text messages ``hello``, ``status`` and ``notice`` (a line for the user), and records of little-endian 32-bit
-words. The first word is the kind of the record:
+The server sends the text messages ``hello``, ``mesh`` (name and number of another mesh; its faces follow), ``status`` and
+``notice`` (a line for the user), and records of little-endian 32-bit words. The first word is the kind of the record:
 
 - faces (1): F, then 3 F unsigned integers.
 - frame (2): number, steps, version of the target, loss and steps per second (floats), V, then 3 V floats, then H W bytes of
@@ -20,6 +23,7 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -35,6 +39,8 @@ from .session import Snapshot, Status
 #: Length of the longest text message from a page, and number of points in the longest stroke message.
 MOST_BYTES, MOST_POINTS = 16_384, 512
 _FACES, _FRAME, _TARGET = 1, 2, 3
+# Length of the longest name of a mesh or target.
+_MOST_NAME = 200
 # Larger integers would not fit into the words of records.
 _MOST_INTEGER = 2**31 - 1
 
@@ -48,13 +54,14 @@ class MessageError(ShadowmapError):
 
 @dataclass(frozen=True)
 class Stroke:
-    """A part of a stroke, see `Canvas.stroke`. Points: (N, 2)."""
+    """A part of a stroke, see `Canvas.stroke`. Points: (N, 2). Mesh: number of the mesh, None for any."""
 
     id: int
     seq: int
     mode: Mode
     radius: float
     points: npt.NDArray[np.float64]
+    mesh: int | None = None
 
 
 @dataclass(frozen=True)
@@ -64,7 +71,15 @@ class Seen:
     frame: int
 
 
-def parse(text: str, shape: tuple[int, int]) -> Stroke | Seen | Command:
+@dataclass(frozen=True)
+class Choice:
+    """A mesh or a target by its name."""
+
+    kind: Literal["mesh", "target"]
+    name: str
+
+
+def parse(text: str, shape: tuple[int, int]) -> Stroke | Seen | Choice | Command:
     """Read a page's message.
 
     Args:
@@ -84,6 +99,11 @@ def parse(text: str, shape: tuple[int, int]) -> Stroke | Seen | Command:
         return _stroke(value, shape)
     if kind == "seen":
         return Seen(_integer(value, "frame"))
+    if kind in ("mesh", "target"):
+        name = value.get("name")
+        if not isinstance(name, str) or len(name) > _MOST_NAME:
+            raise MessageError(f"a {kind} without a name.")
+        return Choice(kind, name)
     if kind in _COMMANDS:
         return kind
     raise MessageError("a message of an unknown type.")
@@ -103,7 +123,8 @@ def _stroke(value: dict[str, Any], shape: tuple[int, int]) -> Stroke:
     line = np.array(points, np.float64).reshape(-1, 2)
     if (np.abs(line) > 2 * max(height, width)).any():
         raise MessageError("a stroke far outside of the canvas.")
-    return Stroke(_integer(value, "id"), _integer(value, "seq"), value["mode"], float(radius), line)
+    mesh = _integer(value, "mesh") if "mesh" in value else None
+    return Stroke(_integer(value, "id"), _integer(value, "seq"), value["mode"], float(radius), line, mesh)
 
 
 def _number(value: object) -> bool:
@@ -118,14 +139,25 @@ def _integer(value: dict[str, Any], name: str) -> int:
     return number
 
 
-def hello(view: ShadowView, name: str) -> str:
-    """The first message: name of the mesh, canvas, receiver (vectors are in world space), and limits of the page's messages."""
+def hello(view: ShadowView, name: str, mesh: int = 0, meshes: Sequence[str] = (), targets: Sequence[str] = ()) -> str:
+    """The first message: canvas, receiver (vectors are in world space), and limits of the page's messages.
+
+    Args:
+        view: of the session.
+        name, mesh: name and number of the mesh.
+        meshes, targets: names that the page may choose.
+    """
     height, width = view.shape
     return json.dumps({
-        "type": "hello", "name": name, "height": height, "width": width, "half": view.half, "points": MOST_POINTS,
-        "bytes": exports.MOST_BYTES,
+        "type": "hello", "name": name, "mesh": mesh, "meshes": list(meshes), "targets": list(targets),
+        "height": height, "width": width, "half": view.half, "points": MOST_POINTS, "bytes": exports.MOST_BYTES,
         **{axis: getattr(view, axis).tolist() for axis in ("right", "up", "forward", "origin")},
     })  # fmt: skip
+
+
+def mesh(name: str, number: int) -> str:
+    """Name and number of another mesh. Its faces, its painting and its frames follow."""
+    return json.dumps({"type": "mesh", "name": name, "mesh": number})
 
 
 def status(state: Status) -> str:

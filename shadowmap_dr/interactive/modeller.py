@@ -12,10 +12,13 @@ import numpy.typing as npt
 from ..errors import ShadowmapError
 from ..inverse import Sculptor
 from ..jit.types import Float
+from .start_mesh import StartMesh
 
 #: The modeller rests once the loss has not fallen by the share IMPROVEMENT, and by the amount LEAST, for PATIENCE steps, and
 #: after MOST_STEPS steps at the latest. At 256 x 256 pixels, LEAST is a fifth of the loss of one wrong pixel.
 IMPROVEMENT, LEAST, PATIENCE, MOST_STEPS = 0.02, 3e-6, 60, 600
+# A target whose darkest pixel is lighter has no shadow. A mesh that followed it would shrink to nothing.
+_LIT = 0.998
 # Reading the loss waits for the device, so it is read only every few steps.
 _LOOK_EVERY = 5
 
@@ -46,16 +49,18 @@ class ModellerState:
 class Modeller:
     """Lets a `Sculptor` of one view follow a target that may change at any time. Use it in one thread, like the sculptor.
 
-    It is at rest at first, since a mesh matches its own shadow.
+    It is at rest at first, since a mesh matches its own shadow. It also rests while the target has no shadow at all.
 
     Args:
         sculptor: with one view.
+        start: mesh that the sculptor begins with, for those who watch.
     """
 
-    def __init__(self, sculptor: Sculptor) -> None:
+    def __init__(self, sculptor: Sculptor, start: StartMesh | None = None) -> None:
         if len(sculptor.views) != 1:
             raise ShadowmapError(f"a sculptor of {len(sculptor.views)} views: painting needs exactly one.")
-        self.sculptor = sculptor
+        self.sculptor, self.start = sculptor, start
+        self._blank = False
         self.moving = False
         self.loss = 0.0
         self._steps = self._best_at = 0
@@ -71,7 +76,10 @@ class Modeller:
             wake: follow the target from now on. False: for a target that the loaded state has followed already.
         """
         self.sculptor.set_target(0, image)
-        if wake:
+        self._blank = bool(np.min(image) > _LIT)
+        if self._blank:
+            self.moving = False
+        elif wake:
             self.wake()
 
     def reset(self, vertices: npt.ArrayLike | None = None) -> None:
@@ -80,7 +88,10 @@ class Modeller:
         self.wake()
 
     def wake(self) -> None:
-        """Follow the target, even if the loss has not fallen lately."""
+        """Follow the target, even if the loss has not fallen lately. A target without any shadow is not followed."""
+        if self._blank:
+            self.moving = False
+            return
         if not self.moving:
             # Adam's moments are of an older target, and would make the first steps towards this one small.
             self.sculptor.calm()
@@ -95,7 +106,7 @@ class Modeller:
     def load_state(self, state: ModellerState) -> None:
         """Go back to a result of `state`: the same vertices, moving or at rest as then. The target stays as it is now."""
         self.sculptor.load_state(state.sculptor)
-        self.moving, self.loss = state.moving, state.loss
+        self.moving, self.loss = state.moving and not self._blank, state.loss
         self._steps, self._best_at, self._best = state.steps, state.best_at, state.best
 
     def step(self) -> bool:

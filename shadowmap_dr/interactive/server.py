@@ -29,7 +29,10 @@ PAGE = {
     "style.css": "text/css; charset=utf-8",
     "page.js": "text/javascript; charset=utf-8",
     "painting.js": "text/javascript; charset=utf-8",
+    "pinch.js": "text/javascript; charset=utf-8",
     "stage.js": "text/javascript; charset=utf-8",
+    "theme.js": "text/javascript; charset=utf-8",
+    "zoom.js": "text/javascript; charset=utf-8",
     "three.core.min.js": "text/javascript; charset=utf-8",
     "three.module.min.js": "text/javascript; charset=utf-8",
     "three.LICENSE": "text/plain; charset=utf-8",
@@ -67,19 +70,18 @@ def create_app(connections: Connections) -> Starlette:
         try:
             async with decoding:
                 target = await run_in_threadpool(exports.read_target, data, connections.view.seen)
+            connections.replace(target)
         except ShadowmapError as error:
             return PlainTextResponse(str(error), 422)
-        connections.replace(target)
         return Response(status_code=204)
 
     async def mesh(request: Request) -> Response:
         kind = request.path_params["kind"]
         if kind not in exports.FORMATS:
             return PlainTextResponse("There is no such format.", 404)
+        snapshot = connections.session.snapshot
         async with decoding:
-            content = await run_in_threadpool(
-                exports.mesh_bytes, kind, connections.session.snapshot.vertices, connections.session.faces
-            )
+            content = await run_in_threadpool(exports.mesh_bytes, kind, snapshot.vertices, snapshot.faces)
         return _download(content, exports.FORMATS[kind], f"mesh.{kind}")
 
     async def shadow(request: Request) -> Response:

@@ -35,6 +35,9 @@ class Session:
     thread has not taken yet: only the newest one counts. When a step fails, the thread waits for `restart`, and builds a new
     modeller. It starts from the last good mesh, or from the first mesh if the last start has led to nothing.
 
+    `begin` replaces the mesh by another one: the thread builds another modeller, and forgets targets and kept meshes of the last
+    one.
+
     A session that is still open when the interpreter exits is closed then.
 
     Args:
@@ -46,7 +49,8 @@ class Session:
         self._build, self.on_change = build, on_change
         self._condition = threading.Condition()
         self._target: Target | None = None
-        self._target_is_new = self._restart = self._closing = False
+        self._target_is_new = self._restart = self._closing = self._beginning = False
+        self._version = 0  # of the first image of the mesh, before there is a target
         self._commands: deque[Command] = deque(maxlen=_MOST_COMMANDS)
         self._history = MeshHistory()
         self._status = Status("starting")
@@ -70,8 +74,8 @@ class Session:
 
     @property
     def faces(self) -> npt.NDArray[np.uint32]:
-        """Faces (F, 3). Only after `start`. They never change."""
-        return self._faces
+        """Faces (F, 3) of the newest snapshot. Only after `start`. They change with `begin` only."""
+        return self.snapshot.faces
 
     def start(self) -> None:
         """Start the thread, and wait for the first snapshot. Raises the errors of building the modeller."""
@@ -84,6 +88,22 @@ class Session:
             failure = self._failure
             self.close()
             raise failure
+
+    def begin(self, build: Callable[[], Modeller], version: int) -> None:
+        """Replace the mesh. Targets and kept meshes of the last one are forgotten.
+
+        If building fails, `restart` tries again. Until there is a new snapshot, the last one stays.
+
+        Args:
+            build: makes the modeller, from now on.
+            version: snapshots have this number until there is a target.
+        """
+        with self._condition:
+            self._build, self._version = build, version
+            self._beginning = True
+            self._target, self._target_is_new = None, False
+            self._commands.clear()
+            self._condition.notify_all()
 
     def set_target(self, image: npt.ArrayLike, version: int, go_back: Hashable = None, exact: bool = False) -> None:
         """Replace the target.
@@ -130,7 +150,7 @@ class Session:
 
     def _order(self, kind: Kind, name: Hashable = None) -> None:
         with self._condition:
-            self._commands.append(Command(kind, name, self._target.version if self._target is not None else 0))
+            self._commands.append(Command(kind, name, self._target.version if self._target is not None else self._version))
             self._condition.notify_all()
 
     def _work(self) -> None:
@@ -144,16 +164,21 @@ class Session:
                 message = str(error) if isinstance(error, ShadowmapError) else f"{type(error).__name__}: {error}"
                 self._set_status("failed", " ".join(message.split())[:500])
                 with self._condition:
-                    self._condition.wait_for(lambda: self._closing or self._restart)
+                    self._condition.wait_for(lambda: self._closing or self._restart or self._beginning)
                     self._restart = False
             first = False
         self._set_status("closed")
 
     def _follow(self, first: bool) -> None:
-        """Build a modeller, and work until the session is closed."""
+        """Build a modeller, and work until the session is closed or begins with another mesh."""
         if not first:
             self._set_status("starting")
-        modeller = self._build()
+        with self._condition:
+            build = self._build
+            if self._beginning:
+                self._history = MeshHistory()
+            self._beginning = False
+        modeller = build()
         self._faces = modeller.sculptor.faces
         known = self._take_up(modeller)
         self._publish(modeller, known)
@@ -162,7 +187,9 @@ class Session:
         while True:
             self._set_status("moving" if modeller.moving else "resting")
             with self._condition:
-                self._condition.wait_for(lambda: self._closing or self._target_is_new or self._commands or modeller.moving)
+                self._condition.wait_for(self._is_wanted(modeller))
+                if self._beginning and not self._closing:
+                    return
                 closing, commands = self._closing, list(self._commands)
                 self._commands.clear()
                 target, self._target_is_new = self._target if self._target_is_new else None, False
@@ -182,15 +209,19 @@ class Session:
                 last = time.monotonic()
                 self._publish(modeller, known)
 
+    def _is_wanted(self, modeller: Modeller) -> Callable[[], bool]:
+        """A function that returns True if there is something to do."""
+        return lambda: self._closing or self._beginning or self._target_is_new or bool(self._commands) or modeller.moving
+
     def _take_up(self, modeller: Modeller) -> int:
         """Load the last good mesh and the newest target, after a failure. Returns the version of the target."""
-        if self._snapshot is not None:
-            if self._snapshot.number > self._first_number:
-                modeller.sculptor.reset(self._snapshot.vertices)
+        last = self._snapshot
+        if last is not None and last.start is modeller.start and last.number > self._first_number:
+            modeller.sculptor.reset(last.vertices)
         with self._condition:
             target, self._target_is_new = self._target, False
         if target is None:
-            return 0
+            return self._version
         modeller.set_target(target.image)
         return target.version
 
@@ -201,7 +232,9 @@ class Session:
         number = self._snapshot.number + 1 if self._snapshot is not None else 1
         pixels = np.rint(255 * shadow.clip(0, 1)).astype(np.uint8)
         speed = self._speed() if modeller.moving else 0.0
-        self._snapshot = Snapshot(number, self._steps, target, modeller.loss, speed, vertices, pixels)
+        self._snapshot = Snapshot(
+            number, self._steps, target, modeller.loss, speed, vertices, pixels, self._faces, modeller.start
+        )
         self.on_change()
 
     def _speed(self) -> float:

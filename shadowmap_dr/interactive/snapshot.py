@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
+
+from .start_mesh import StartMesh
 
 Phase = Literal["starting", "moving", "resting", "failed", "closed"]
 Array = npt.NDArray[np.float32]
@@ -32,6 +34,8 @@ class Snapshot:
         speed: steps per second during the last second, 0 at rest.
         vertices: (V, 3), world space.
         shadow: (H, W), visibility, 0 (dark) to 255 (lit).
+        faces: (F, 3).
+        start: mesh that the modelling has begun with, None if the modeller does not know it.
     """
 
     number: int
@@ -41,3 +45,5 @@ class Snapshot:
     speed: float
     vertices: Array
     shadow: npt.NDArray[np.uint8]
+    faces: npt.NDArray[np.uint32] = field(default_factory=lambda: np.zeros((0, 3), np.uint32))
+    start: StartMesh | None = None

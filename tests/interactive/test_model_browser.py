@@ -14,6 +14,8 @@ from model_fakes import eventually
 from PIL import Image
 
 from shadowmap_dr.interactive import Modeller, Session
+from shadowmap_dr.interactive.library import MeshLibrary, read_named_target
+from shadowmap_dr.interactive.start_mesh import StartMesh
 from shadowmap_dr.inverse import Sculptor, even_sphere, shadow_view
 
 for package in ("playwright", "starlette", "uvicorn", "websockets", "trimesh"):
@@ -34,13 +36,15 @@ EXPECTED = ("422 (Unprocessable", "ERR_CONNECTION_REFUSED")
 class Place:
     """A server with a sculptor that can be made to fail."""
 
-    def __init__(self) -> None:
+    def __init__(self, size: int = SIZE) -> None:
         from shadowmap_dr.interactive.connections import Connections
 
         self.failure: Exception | None = None
-        self.session = Session(self._build)
+        self.view = shadow_view(size=size)
+        library = MeshLibrary(StartMesh("ball", *even_sphere(10)), self._build)
+        self.session = Session(lambda: self._build(library.first))
         self.session.start()
-        self.studio = Connections(self.session, shadow_view(size=SIZE), "sphere")
+        self.studio = Connections(self.session, self.view, "ball", library)
         self.serve(0)
 
     def serve(self, port: int) -> None:
@@ -69,8 +73,8 @@ class Place:
         self.stop()
         self.session.close()
 
-    def _build(self) -> Modeller:
-        sculptor = Sculptor(*even_sphere(10), [shadow_view(size=SIZE)], map_resolution=SIZE, filter_size=3, consistency=0.02)
+    def _build(self, start: StartMesh) -> Modeller:
+        sculptor = Sculptor(start.vertices, start.faces, [self.view], map_resolution=SIZE, filter_size=3, consistency=0.02)
         step = sculptor.step
 
         def sometimes() -> Any:
@@ -80,7 +84,7 @@ class Place:
             return step()
 
         sculptor.step = sometimes
-        return Modeller(sculptor)
+        return Modeller(sculptor, start)
 
 
 @pytest.fixture(scope="module")
@@ -105,12 +109,13 @@ def page(instance: Any, place: Place) -> Iterator[Any]:
 class opened:
     """A page that is ready, and whose errors are errors of the test."""
 
-    def __init__(self, instance: Any, place: Place) -> None:
+    def __init__(self, instance: Any, place: Place, **settings: Any) -> None:
         self._instance, self._place = instance, place
+        self._settings = {"viewport": {"width": 900, "height": 640}, "accept_downloads": True, **settings}
         self.errors: list[str] = []
 
     def __enter__(self) -> Any:
-        self._context = self._instance.new_context(viewport={"width": 900, "height": 640}, accept_downloads=True)
+        self._context = self._instance.new_context(**self._settings)
         page = self._context.new_page()
         page.on("pageerror", lambda error: self.errors.append(str(error)))
         page.on("console", self._console)
@@ -299,3 +304,232 @@ def test_pages_find_a_server_again(page, place):
     phase(page, "resting")
     paint(page, NOSE, SIZE)
     assert shown(page, 1)["vertices"][:, 0].max() > 1.5
+
+
+def test_a_list_of_shortcuts_opens_and_closes(page, place):
+    for opens in (lambda: page.keyboard.press("?"), lambda: page.click("#help-open")):
+        assert page.is_hidden("#help")
+        opens()
+        assert page.is_visible("#help") and page.locator("#help kbd").count() > 10
+        page.keyboard.press("e")  # no shortcut acts meanwhile
+        assert page.get_attribute("#erase", "aria-pressed") == "false"
+        page.keyboard.press("Escape")
+    page.keyboard.press("?")
+    page.keyboard.press("?")
+    assert page.is_hidden("#help")
+    page.keyboard.press("e")
+    assert page.get_attribute("#erase", "aria-pressed") == "true"
+
+
+def scale(page: Any) -> float:
+    """Width of the canvas in widths of the board."""
+    return page.evaluate("() => shadow.getBoundingClientRect().width / easel.clientWidth")
+
+
+def test_strokes_land_where_they_are_painted_while_zoomed(page, place):
+    page.fill("#radius-number", "2")
+    box = page.locator("#easel").bounding_box()
+    x, y = box["x"] + 0.8 * box["width"], box["y"] + 0.25 * box["height"]
+    page.mouse.move(x, y)
+    for _ in range(6):
+        page.mouse.wheel(0, -100)
+    page.wait_for_timeout(100)
+    assert scale(page) > 3
+    canvas = page.locator("#shadow").bounding_box()
+    # The pixel under the pointer has stayed there.
+    assert (x - canvas["x"]) / canvas["width"] == pytest.approx(0.8, abs=0.01)
+    assert (y - canvas["y"]) / canvas["height"] == pytest.approx(0.25, abs=0.01)
+    before = place.studio.canvas.pixels().copy()
+    paint(page, [(50.5, 16.5), (53.5, 16.5)], SIZE)
+    eventually(lambda: place.studio.canvas.version >= 1 and place.studio.canvas.pixels()[16, 54] == 0)
+    rows, columns = np.nonzero((place.studio.canvas.pixels() < before) & (place.studio.canvas.pixels() < 100))
+    assert (rows.min(), rows.max(), columns.min(), columns.max()) == (15, 17, 49, 54)
+    ring = page.locator("#brush").bounding_box()
+    assert ring["width"] == pytest.approx(2 * 2 * canvas["width"] / SIZE, abs=1)
+    # The middle button moves the view, and paints nothing.
+    version = place.studio.canvas.version
+    page.mouse.down(button="middle")
+    page.mouse.move(x - 60, y + 40, steps=3)
+    page.mouse.up(button="middle")
+    assert page.locator("#shadow").bounding_box()["x"] < canvas["x"] - 20 and place.studio.canvas.version == version
+
+
+def test_keys_and_buttons_zoom(page):
+    for larger, smaller, whole in (("+", "-", "0"), ("#zoom-in", "#zoom-out", "#zoom-reset")):
+
+        def press(key: str) -> None:
+            page.click(key) if key.startswith("#") else page.keyboard.press(key)
+
+        press(larger)
+        press(larger)
+        two = scale(page)
+        assert two > 1.4 and page.inner_text("#zoom-reset") == f"{100 * two:.0f} %"
+        press(smaller)
+        assert 1 < scale(page) < two
+        press(whole)
+        assert scale(page) == pytest.approx(1, abs=0.01)
+        press(smaller)  # no smaller than the board
+        assert scale(page) == pytest.approx(1, abs=0.01)
+    # The object has keys of its own.
+    page.focus("#object")
+    page.keyboard.press("+")
+    assert scale(page) == pytest.approx(1, abs=0.01)
+    # The brush of the keyboard stays in sight.
+    page.focus("#shadow")
+    for key in ("+", "+", "+", "+", *["ArrowRight"] * 6):
+        page.keyboard.press(key)
+    board, brush = page.locator("#easel").bounding_box(), page.locator("#brush").bounding_box()
+    assert board["x"] < brush["x"] + brush["width"] / 2 < board["x"] + board["width"]
+
+
+def test_two_fingers_zoom_and_one_paints(instance, place):
+    with opened(instance, place, viewport={"width": 390, "height": 844}, has_touch=True) as page:
+        session = page.context.new_cdp_session(page)
+
+        def touch(kind: str, *points: tuple[float, float]) -> None:
+            touches = [{"x": x, "y": y, "id": k} for k, (x, y) in enumerate(points)]
+            session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": touches})
+
+        box = page.locator("#easel").bounding_box()
+        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+        touch("touchStart", (x - 40, y))
+        touch("touchStart", (x - 40, y), (x + 40, y))
+        for reach in (60, 80, 100, 120):
+            touch("touchMove", (x - reach, y), (x + reach, y))
+        touch("touchEnd")
+        page.wait_for_timeout(200)
+        assert scale(page) == pytest.approx(3, rel=0.05) and place.studio.canvas.version == 0
+        page.click("#zoom-reset")
+        touch("touchStart", (box["x"] + 0.8 * box["width"], y))
+        touch("touchMove", (box["x"] + 0.9 * box["width"], y))
+        touch("touchEnd")
+        eventually(lambda: place.studio.canvas.version > 0 and place.studio.canvas.pixels()[SIZE // 2, int(0.9 * SIZE)] == 0)
+
+
+def test_the_size_of_the_brush_is_a_number(page, place):
+    assert page.input_value("#radius-number") == page.input_value("#radius") == "12"
+    assert page.inner_text("abbr") == "px" and "pixels" in page.get_attribute("abbr", "title")
+    page.fill("#radius-number", "5")
+    assert page.input_value("#radius") == "5"
+    page.press("#radius-number", "e")
+    assert page.get_attribute("#erase", "aria-pressed") == "false"  # no shortcut where one writes
+    page.fill("#radius", "7")
+    assert page.input_value("#radius-number") == "7"
+    page.fill("#radius-number", "1000")
+    page.press("#radius-number", "Enter")
+    assert page.input_value("#radius-number") == page.input_value("#radius") == "60"
+
+
+def test_brushes_are_no_larger_than_small_shadows(instance, variant):
+    place = Place(size=32)
+    try:
+        with opened(instance, place) as page:
+            page.fill("#radius", "32")
+            assert page.get_attribute("#radius", "max") == page.get_attribute("#radius-number", "max") == "32"
+            paint(page, [(2, 2), (3, 3)], 32)
+            eventually(lambda: place.studio.canvas.version > 0)
+            assert page.is_hidden("#alert")  # the server has not closed the connection
+    finally:
+        place.close()
+
+
+def test_meshes_are_chosen_on_the_page(page, place, instance):
+    names = page.locator("#mesh option").all_inner_texts()
+    assert names[:2] == ["ball", "sphere"] and "spot" in names and page.input_value("#mesh") == "ball"
+    first = len(shown(page, 0)["vertices"])
+    with opened(instance, place) as other:
+        page.select_option("#mesh", "spot")
+        version = place.studio.canvas.version + 1
+        spot = shown(page, version)["vertices"]
+        assert len(spot) == len(shown(other, version)["vertices"]) > first
+        assert page.input_value("#mesh") == other.input_value("#mesh") == "spot"
+        np.testing.assert_allclose(spot, place.session.snapshot.vertices, atol=1e-6)
+    assert clay(picture(page, "#object")).sum() > 2000
+    paint(page, NOSE, SIZE)
+    version = place.studio.canvas.version
+    shown(page, version)
+    # Somebody has painted: the page asks first.
+    page.select_option("#mesh", "ball")
+    assert page.is_visible("#replace") and "ball" in page.inner_text("#replace")
+    page.click("#replace button:not([value=yes])")
+    assert page.input_value("#mesh") == "spot" and len(place.session.snapshot.vertices) == len(spot)
+    page.select_option("#mesh", "ball")
+    page.click("#replace button[value=yes]")
+    state = shown(page, version + 1)
+    assert len(state["vertices"]) == first and state["match"] > 0.99 and page.is_disabled("#undo")
+    paint(page, NOSE, SIZE)
+    assert shown(page, version + 2)["vertices"][:, 0].max() > 1.5
+
+
+def test_targets_are_chosen_on_the_page(page, place):
+    page.select_option("#target", "heart")
+    state = shown(page, 1)
+    assert page.input_value("#target") == "" and state["match"] > 0.85
+    np.testing.assert_allclose(place.studio.canvas.target(), read_named_target("heart", place.view.seen), atol=0.01)
+    page.select_option("#target", "blank")
+    vertices = shown(page, 2)["vertices"]
+    assert (place.studio.canvas.pixels() == 255).all()
+    np.testing.assert_allclose(vertices, state["vertices"])  # it waits for something to be painted
+    page.select_option("#target", "own")
+    assert shown(page, 3)["match"] > 0.95
+
+
+SIZES = [(1366, 768), (1920, 1080), (390, 844), (844, 390)]
+
+
+@pytest.mark.parametrize("size", SIZES, ids=lambda size: f"{size[0]}x{size[1]}")
+def test_shadow_and_object_fill_the_window_without_scrolling(instance, place, size):
+    width, height = size
+    with opened(instance, place, viewport={"width": width, "height": height}) as page:
+        assert page.evaluate("() => [document.documentElement.scrollWidth, document.documentElement.scrollHeight]") == [*size]
+        boxes = [page.locator(name).bounding_box() for name in ("#shadow", "#object", "#add", "#radius-number", "#undo", "#mesh")]
+        for box in boxes:
+            assert box["x"] >= 0 and box["x"] + box["width"] <= width and box["y"] >= 0 and box["y"] + box["height"] <= height
+        shadow, object_ = boxes[:2]
+        assert shadow["width"] == pytest.approx(shadow["height"], abs=1.5)
+        areas = [box["width"] * box["height"] for box in (shadow, object_)]
+        assert sum(areas) > 0.55 * width * height and min(areas) > 0.2 * width * height
+        # Some tools lie behind a button where there is no room.
+        small = min(width, height) < 500
+        assert page.is_visible("#reset") != small and page.is_visible("#more") == small
+        if small:
+            page.click("#more")
+            panel = page.locator("#extra").bounding_box()
+            assert panel["x"] >= 0 and panel["y"] >= 0 and panel["x"] + panel["width"] <= width
+            for name in ("#target", "#load", "#reset", "text=GLB"):
+                box = page.locator(name).bounding_box()
+                assert panel["x"] <= box["x"] and box["x"] + box["width"] <= panel["x"] + panel["width"]
+            page.keyboard.press("Escape")
+            assert page.is_hidden("#reset")
+
+
+def light_share(page: Any) -> float:
+    """Share of pixels that are light."""
+    import io
+
+    image = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("L"))
+    return float((image > 128).mean())
+
+
+def test_dark_pages_are_dark_throughout(instance, place):
+    with opened(instance, place, color_scheme="dark") as page:
+        assert light_share(page) < 0.03
+        shadow, object_ = picture(page, "#shadow"), picture(page, "#object")
+        middle = shadow.shape[0] // 2
+        assert shadow[middle, middle].mean() + 50 < shadow[10, 10].mean() < 110  # a shadow is darker than its ground
+        assert np.median(object_) < 60 and clay(object_).sum() > 2000
+        page.keyboard.press("?")
+        assert light_share(page) < 0.03
+        page.keyboard.press("Escape")
+        page.click("#theme")
+        page.wait_for_timeout(300)
+        assert light_share(page) > 0.6 and page.get_attribute("#theme", "aria-pressed") == "false"
+        page.reload()  # the choice is kept
+        shown(page, 0)
+        assert light_share(page) > 0.6
+        page.click("#theme")
+        page.wait_for_timeout(300)
+        assert light_share(page) < 0.03
+        page.emulate_media(color_scheme="light")  # without a choice, the page follows the system
+        page.wait_for_timeout(300)
+        assert light_share(page) > 0.6

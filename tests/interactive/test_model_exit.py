@@ -29,7 +29,7 @@ while session.snapshot.steps < 10:
 KEEPER = """
 from shadowmap_dr.interactive import file_session
 file_session.SAVE_INTERVAL = 0.001
-keeping = kept(session, lambda vertices: vertices.copy())
+keeping = kept(session, lambda snapshot: snapshot.vertices.copy())
 keeping.__enter__()
 """
 ENDS = {

@@ -22,12 +22,23 @@ def test_strokes_are_understood():
         assert messages.parse(json.dumps({"type": command}), (20, 30)) == command
 
 
+def test_choices_are_understood():
+    for kind in ("mesh", "target"):
+        choice = messages.parse(json.dumps({"type": kind, "name": "spot"}), (20, 30))
+        assert (choice.kind, choice.name) == (kind, "spot")
+        for name in (None, 3, ["spot"], "x" * 201):
+            with pytest.raises(messages.MessageError, match="without a name"):
+                messages.parse(json.dumps({"type": kind, "name": name}), (20, 30))
+    assert messages.parse(json.dumps(STROKE), (20, 30)).mesh is None
+    assert messages.parse(json.dumps({**STROKE, "mesh": 2}), (20, 30)).mesh == 2
+
+
 @pytest.mark.parametrize("change", [
     {"type": "open"}, {"type": None}, {"type": ["undo"]}, {"mode": "smear"}, {"mode": ["add"]}, {"radius": 0}, {"radius": 31},
     {"radius": "4"}, {"radius": True}, {"radius": None}, {"radius": float("nan")}, {"points": []}, {"points": [1, 2, 3]},
     {"points": {"0": 1}}, {"points": [1, "2"]}, {"points": [1, None]}, {"points": [1, float("inf")]}, {"points": [1, 1e9]},
     {"points": [1, 10**400]}, {"points": [0] * 1026}, {"points": [[1, 2]]}, {"id": -1}, {"id": 1.5}, {"id": "x"}, {"id": 2**31},
-    {"seq": None}, {"seq": True},
+    {"seq": None}, {"seq": True}, {"mesh": -1}, {"mesh": "spot"}, {"mesh": None},
 ])  # fmt: skip
 def test_other_strokes_are_refused(change):
     with pytest.raises(messages.MessageError):

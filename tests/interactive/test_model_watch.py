@@ -176,8 +176,8 @@ def test_a_sessions_mesh_is_saved_while_it_moves(monkeypatch):
     monkeypatch.setattr("shadowmap_dr.interactive.file_session.SAVE_INTERVAL", 0.01)
     fake, saved = FakeSession(), []
 
-    def save(vertices):
-        saved.append(vertices[0, 0])
+    def save(snapshot):
+        saved.append(snapshot.vertices[0, 0])
         if len(saved) == 1:
             raise ShadowmapError("the disk is full")
 

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 
 from shadowmap_dr.interactive import Modeller, Session
+from shadowmap_dr.interactive.library import MeshLibrary
+from shadowmap_dr.interactive.start_mesh import StartMesh
 from shadowmap_dr.inverse import shadow_view
 
 SIZE = 32
@@ -27,6 +29,11 @@ class FakeSculptor:
         self.failure: Exception | None = None
         self.hold: threading.Event | None = None
         self.seconds = 0.0  # that a step takes
+
+    def begin_with(self, vertices: np.ndarray, faces: np.ndarray) -> None:
+        """Take another mesh, whose shadow is half as bright."""
+        self.faces, self._first, self._now = faces, vertices, vertices.copy()
+        self._target = 0.5 * self._target
 
     def set_target(self, view: int, image: Any) -> None:
         assert view == 0 and image.shape == self._target.shape
@@ -63,20 +70,25 @@ class FakeSculptor:
 
 
 class FakeSession:
-    """A session, and the sculptors it has built so far."""
+    """A session, and the sculptors it has built so far. The mesh is a square with the name ``ball``."""
 
     def __init__(self, size: int = SIZE) -> None:
         self.size = size
         self.sculptors: list[FakeSculptor] = []
-        self.session = Session(self._build)
+        square = FakeSculptor(size=size)
+        self.library = MeshLibrary(StartMesh("ball", square.vertices(), square.faces), self._build)
+        self.session = Session(lambda: self._build(self.library.first))
 
     @property
     def sculptor(self) -> FakeSculptor:
         return self.sculptors[-1]
 
-    def _build(self) -> Modeller:
-        self.sculptors.append(FakeSculptor(size=self.size))
-        return Modeller(self.sculptor)
+    def _build(self, start: StartMesh) -> Modeller:
+        sculptor = FakeSculptor(size=self.size)
+        if start.name != "ball":
+            sculptor.begin_with(start.vertices, start.faces)
+        self.sculptors.append(sculptor)
+        return Modeller(self.sculptor, start)
 
 
 def eventually(condition: Any, seconds: float = 10.0) -> None:

@@ -1,18 +1,26 @@
 // The canvas that shows the shadow and the painting.
 
-const PAPER = [246, 239, 223], INK = [58, 61, 92], MISSING = [224, 122, 95], EXCESS = [143, 184, 216];
+import { Pinch } from "./pinch.js";
+
+// A finger paints once it has moved so far, in pixels of the window, or stayed so long. A second finger may come until then.
+const HELD_PIXELS = 6, HELD_MS = 90;
 
 export class Painting {
   // onStroke(id, mode, radius, points): a part of a stroke, [x, y, x, y, ...] in pixels of the shadow.
-  constructor(canvas, brush, onStroke) {
+  constructor(canvas, brush, zoom, onStroke) {
     this.canvas = canvas;
     this.brush = brush;
+    this.zoom = zoom;
     this.onStroke = onStroke;
     this.mode = "add";
     this.radius = 12;
     this.size = [0, 0];
     this.cursor = null; // [x, y], pixels
-    this.stroke = null; // {id, mode, points: not sent yet}
+    this.stroke = null; // {id, mode, pointer, points: not sent yet}
+    this.held = null; // a finger that does not paint yet: {event, mode, timer}
+    this.pinch = new Pinch();
+    this.pinching = false; // until all fingers are up
+    this.panning = false;
     this.strokes = 0;
     this.mostPoints = 2;
     this.#listen();
@@ -27,18 +35,29 @@ export class Painting {
     this.target = this.shadow.slice();
     this.context = this.canvas.getContext("2d");
     this.image = this.context.createImageData(width, height);
+    this.drop();
+  }
+
+  // Paper, ink, missing and excess: [red, green, blue] each.
+  setColours(colours) {
+    this.colours = colours;
+  }
+
+  // Ends the stroke without sending the rest of it.
+  drop() {
     this.stroke = null;
+    this.#release();
   }
 
   // Paints all pixels, and returns how well they match: intersection over union of the two shadows.
   draw() {
-    const { shadow, target, image: { data } } = this;
+    const { shadow, target, image: { data }, colours: { paper, ink, missing: lacking, excess: surplus } } = this;
     let both = 0, either = 0;
     for (let i = 0, o = 0; i < shadow.length; i++, o += 4) {
       const dark = 255 - shadow[i], wanted = 255 - target[i];
       const common = Math.min(dark, wanted) / 255, missing = Math.max(wanted - dark, 0) / 255, excess = Math.max(dark - wanted, 0) / 255;
       const light = 1 - common - missing - excess;
-      for (let c = 0; c < 3; c++) data[o + c] = light * PAPER[c] + common * INK[c] + missing * MISSING[c] + excess * EXCESS[c];
+      for (let c = 0; c < 3; c++) data[o + c] = light * paper[c] + common * ink[c] + missing * lacking[c] + excess * surplus[c];
       data[o + 3] = 255;
       both += dark > 127 && wanted > 127;
       either += dark > 127 || wanted > 127;
@@ -71,17 +90,11 @@ export class Painting {
 
   #listen() {
     const { canvas } = this;
-    canvas.addEventListener("pointerdown", (event) => {
-      if (event.button > 0 && event.button !== 5) return;
-      canvas.setPointerCapture(event.pointerId);
-      const erase = event.shiftKey || event.button === 5; // 5: a pen's eraser
-      this.#begin(this.#place(event), erase ? "erase" : this.mode);
-    });
-    canvas.addEventListener("pointermove", (event) => {
-      const events = event.getCoalescedEvents?.() ?? [];
-      for (const part of events.length ? events : [event]) this.#move(this.#place(part));
-    });
-    for (const type of ["pointerup", "pointercancel"]) canvas.addEventListener(type, () => this.#end());
+    canvas.addEventListener("pointerdown", (event) => this.#down(event));
+    canvas.addEventListener("pointermove", (event) => this.#drag(event));
+    for (const type of ["pointerup", "pointercancel"]) canvas.addEventListener(type, (event) => this.#up(event));
+    // Otherwise the middle button scrolls.
+    canvas.addEventListener("mousedown", (event) => event.button === 1 && event.preventDefault());
     canvas.addEventListener("pointerleave", () => {
       if (!this.stroke) this.brush.hidden = true;
     });
@@ -91,6 +104,7 @@ export class Painting {
         const [x, y] = this.cursor ?? this.size.map((s) => s / 2);
         const clip = (v, most) => Math.min(Math.max(v, 0), most);
         this.#move([clip(x + step[0], this.size[0]), clip(y + step[1], this.size[1])]);
+        this.zoom.reveal(this.cursor.map((v, axis) => v / this.size[axis]));
       } else if (event.key === " ") {
         if (!this.stroke) this.#begin(this.cursor ?? this.size.map((s) => s / 2), event.shiftKey ? "erase" : this.mode);
       } else return;
@@ -105,9 +119,81 @@ export class Painting {
     return [((event.clientX - box.left) / box.width) * this.size[0], ((event.clientY - box.top) / box.height) * this.size[1]];
   }
 
-  #begin(point, mode) {
+  #down(event) {
+    const { canvas, pinch } = this;
+    const erase = event.shiftKey || event.button === 5; // 5: a pen's eraser
+    const mode = erase ? "erase" : this.mode;
+    if (event.button > 1 && event.button !== 5) return;
+    canvas.setPointerCapture(event.pointerId);
+    if (event.button === 1) {
+      this.panning = true;
+    } else if (event.pointerType === "touch") {
+      pinch.down(event);
+      if (pinch.fingers === 1) {
+        this.held = { event, mode, timer: setTimeout(() => this.#take(), HELD_MS) };
+      } else {
+        // Two fingers move the view. A stroke that has been seen stays.
+        this.pinching = true;
+        this.#release();
+        this.#end();
+        this.brush.hidden = true;
+      }
+    } else {
+      this.#begin(this.#place(event), mode, event.pointerId);
+    }
+  }
+
+  #drag(event) {
+    if (this.panning) {
+      this.zoom.move(event.movementX, event.movementY);
+      return;
+    }
+    const change = this.pinch.move(event);
+    if (this.pinching) {
+      if (!change) return;
+      this.zoom.by(change.factor, change.x, change.y);
+      this.zoom.move(change.dx, change.dy);
+      return;
+    }
+    if (this.held) {
+      const { clientX, clientY } = this.held.event;
+      if (Math.hypot(event.clientX - clientX, event.clientY - clientY) < HELD_PIXELS) return;
+      this.#take();
+    }
+    // Another pointer does not continue a stroke.
+    if (this.stroke && this.stroke.pointer !== event.pointerId) return;
+    const events = event.getCoalescedEvents?.() ?? [];
+    for (const part of events.length ? events : [event]) this.#move(this.#place(part));
+  }
+
+  #up(event) {
+    this.pinch.up(event);
+    if (this.pinching) {
+      this.pinching = this.pinch.fingers > 0;
+    } else if (this.panning) {
+      this.panning = false;
+    } else {
+      if (event.type === "pointerup") this.#take();
+      this.#release();
+      this.#end();
+    }
+  }
+
+  // Lets the finger that was held begin its stroke.
+  #take() {
+    const { held } = this;
+    this.#release();
+    if (held) this.#begin(this.#place(held.event), held.mode, held.event.pointerId);
+  }
+
+  #release() {
+    clearTimeout(this.held?.timer);
+    this.held = null;
+  }
+
+  #begin(point, mode, pointer = null) {
     this.#end();
-    this.stroke = { id: ++this.strokes, mode, radius: this.radius, points: [...point], last: null };
+    this.stroke = { id: ++this.strokes, mode, pointer, radius: this.radius, points: [...point], last: null };
     this.#cover(point, point);
     this.#move(point);
     this.flush(); // the first dot at once, the rest of the stroke once a frame

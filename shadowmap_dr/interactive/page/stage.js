@@ -1,9 +1,9 @@
 // The object in front of the wall with its shadow. Draws only when something has changed.
 
+import { Pinch } from "./pinch.js";
 import * as THREE from "./three.module.min.js";
 
-const CLAY = 0xd98a6a, GROUND = 0xe9e1d2;
-const PAPER = [246, 239, 223], INK = [58, 61, 92];
+const FIELD = Math.tan((16 * Math.PI) / 180); // half of the image, at distance 1, along its shorter side
 const START = { turn: 0.62, rise: 0.24, distance: 11.5 };
 
 export class Stage {
@@ -14,16 +14,24 @@ export class Stage {
     // Drawing without a graphics card is slow.
     this.mostRatio = software ? 1 : 2;
     this.scene = new THREE.Scene();
-    this.scene.background = new THREE.Color(GROUND);
     this.camera = new THREE.PerspectiveCamera(32, 1, 0.1, 100);
     this.view = { ...START };
     this.planned = false;
-    this.tones = new Uint32Array(256).map((_, tone) => {
-      const [r, g, b] = PAPER.map((light, c) => Math.round(INK[c] + ((light - INK[c]) * tone) / 255));
-      return ((255 << 24) | (b << 16) | (g << 8) | r) >>> 0;
-    });
     new ResizeObserver(() => this.plan()).observe(canvas);
     this.#listen();
+  }
+
+  // Paper, ink, stage and clay: [red, green, blue] each.
+  setColours({ paper, ink, stage, clay }) {
+    this.scene.background = colour(stage);
+    this.clay = colour(clay);
+    this.mesh?.material.color.copy(this.clay);
+    this.tones = new Uint32Array(256).map((_, tone) => {
+      const [r, g, b] = paper.map((light, c) => Math.round(ink[c] + ((light - ink[c]) * tone) / 255));
+      return ((255 << 24) | (b << 16) | (g << 8) | r) >>> 0;
+    });
+    if (this.texture) this.#project();
+    this.plan();
   }
 
   // The hello message: the receiver's place, and the size of its image.
@@ -44,24 +52,26 @@ export class Stage {
     const light = new THREE.DirectionalLight(0xfff2df, 2.4);
     light.position.copy(z).multiplyScalar(-5).addScaledVector(y, 2).addScaledVector(x, 1.5);
     this.scene.add(receiver, light, new THREE.HemisphereLight(0xffffff, 0x8a7f99, 1.3));
-    this.mesh = null;
+    this.mesh = this.shadow = null;
   }
 
+  // Faces of another mesh.
   setFaces(faces) {
     this.faces = faces;
+    this.mesh?.geometry.dispose();
+    this.mesh?.removeFromParent();
+    this.mesh = null;
   }
 
   // Positions: Float32Array (3V); shadow: Uint8Array.
   update(positions, shadow) {
-    if (!this.mesh || this.mesh.geometry.attributes.position.array.length !== positions.length) {
-      this.mesh?.geometry.dispose();
-      this.mesh?.removeFromParent();
+    if (!this.mesh) {
       const geometry = new THREE.BufferGeometry();
       geometry.setIndex(new THREE.BufferAttribute(this.faces, 1));
       for (const name of ["position", "normal"]) {
         geometry.setAttribute(name, new THREE.BufferAttribute(new Float32Array(positions.length), 3).setUsage(THREE.DynamicDrawUsage));
       }
-      this.mesh = new THREE.Mesh(geometry, new THREE.MeshLambertMaterial({ color: CLAY, side: THREE.DoubleSide }));
+      this.mesh = new THREE.Mesh(geometry, new THREE.MeshLambertMaterial({ color: this.clay, side: THREE.DoubleSide }));
       this.mesh.frustumCulled = false;
       this.scene.add(this.mesh);
     }
@@ -69,8 +79,14 @@ export class Stage {
     position.array.set(positions);
     setNormals(position.array, this.faces, normal.array);
     position.needsUpdate = normal.needsUpdate = true;
+    this.shadow = shadow;
+    this.#project();
+  }
+
+  // Draws the shadow onto the wall.
+  #project() {
     const pixels = new Uint32Array(this.texture.image.data.buffer);
-    for (let i = 0; i < pixels.length; i++) pixels[i] = this.tones[shadow[i]];
+    for (let i = 0; i < pixels.length; i++) pixels[i] = this.tones[this.shadow?.[i] ?? 255];
     this.texture.needsUpdate = true;
   }
 
@@ -95,6 +111,7 @@ export class Stage {
     this.camera.up.copy(y);
     this.camera.lookAt(this.middle);
     this.camera.aspect = width / Math.max(height, 1);
+    this.camera.fov = (360 / Math.PI) * Math.atan(FIELD / Math.min(this.camera.aspect || 1, 1));
     this.camera.updateProjectionMatrix();
     this.renderer.render(this.scene, this.camera);
   }
@@ -108,26 +125,38 @@ export class Stage {
   }
 
   #listen() {
-    const { canvas } = this;
-    canvas.addEventListener("pointerdown", (event) => canvas.setPointerCapture(event.pointerId));
-    canvas.addEventListener("pointermove", (event) => {
-      if (event.buttons) this.turn(event.movementX * 0.01, event.movementY * 0.01);
+    const { canvas } = this, pinch = new Pinch();
+    canvas.addEventListener("pointerdown", (event) => {
+      canvas.setPointerCapture(event.pointerId);
+      pinch.down(event);
     });
+    canvas.addEventListener("pointermove", (event) => {
+      const change = pinch.move(event);
+      if (change) this.turn(change.dx * 0.01, change.dy * 0.01, 1 / change.factor);
+      else if (event.buttons) this.turn(event.movementX * 0.01, event.movementY * 0.01);
+    });
+    for (const type of ["pointerup", "pointercancel"]) canvas.addEventListener(type, (event) => pinch.up(event));
     canvas.addEventListener("wheel", (event) => {
       event.preventDefault();
       this.turn(0, 0, Math.exp(Math.sign(event.deltaY) * 0.1));
     }, { passive: false });
-    canvas.addEventListener("dblclick", () => {
+    const restore = () => {
       this.view = { ...START };
       this.plan();
-    });
+    };
+    canvas.addEventListener("dblclick", restore);
     canvas.addEventListener("keydown", (event) => {
       const move = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, -0.1], ArrowDown: [0, 0.1], "+": [0, 0, 0.9], "-": [0, 0, 1.1] };
-      if (!(event.key in move)) return;
+      if (event.ctrlKey || event.metaKey || (event.key !== "0" && !(event.key in move))) return;
       event.preventDefault();
-      this.turn(...move[event.key]);
+      if (event.key === "0") restore();
+      else this.turn(...move[event.key]);
     });
   }
+}
+
+function colour([r, g, b]) {
+  return new THREE.Color().setRGB(r / 255, g / 255, b / 255, THREE.SRGBColorSpace);
 }
 
 // Smooth normals, weighted by area.

@@ -1,4 +1,4 @@
-"""Links from pages to files of the project, as they work in a checkout, made links between pages of the documentation."""
+"""Links of files of the project, as they work in a checkout, made links of the documentation."""
 
 from __future__ import annotations
 
@@ -8,26 +8,45 @@ from pathlib import Path
 from pygments.lexers.special import TextLexer
 from sphinx.application import Sphinx
 
+DOCS = Path(__file__).resolve().parents[1]
 #: Files beside docs/ that are pages of the documentation, too: their place there.
-PAGES = {"CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md"}
-_LINK = re.compile(r"\]\((?P<path>[^)#\s:]+)(?P<anchor>#[^)\s]*)?\)")
+PAGES = {"README.md": "readme.md", "CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md"}
+_LINK = re.compile(r"(?P<text>\[[^\]]*\])\((?P<path>[^)#\s:]+)(?P<anchor>#[^)\s]*)?\)")
+
+
+def file(name: str) -> str:
+    """Markdown of a file beside docs/, for a page in docs/."""
+    return with_links((DOCS.parent / name).read_text(encoding="utf-8"), DOCS.parent, DOCS)
 
 
 def read_source(app: Sphinx, page: str, source: list[str]) -> None:
-    """Let links to the files of `PAGES` lead to their pages."""
-    folder = (Path(app.srcdir) / page).parent
-    source[0] = _LINK.sub(lambda link: _led(link, folder, Path(app.srcdir)), source[0])
+    """Make the links of a page those of the documentation."""
+    folder = (DOCS / page).parent
+    source[0] = with_links(source[0], folder, folder)
 
 
-def _led(link: re.Match[str], folder: Path, docs: Path) -> str:
-    target = (folder / link["path"]).resolve()
-    if target.parent == docs.parent and target.name in PAGES:
-        anchor = link["anchor"] or ""
+def with_links(text: str, folder: Path, new_folder: Path) -> str:
+    """Markdown from one folder for a page in another one.
+
+    Links to `PAGES` lead to their pages, links to folders and to files that are gone become text.
+    """
+    return _LINK.sub(lambda link: _link(link, folder, new_folder), text)
+
+
+def _link(link: re.Match[str], folder: Path, new_folder: Path) -> str:
+    target, anchor = (folder / link["path"]).resolve(), link["anchor"] or ""
+    if target.parent == DOCS.parent and target.name in PAGES:
         # A heading that is gone is no reason to lose the link.
-        known = re.findall(r"^#+ (.+)$", target.read_text(encoding="utf-8"), re.MULTILINE)
-        there = anchor.lstrip("#") in {heading.lower().replace(" ", "-") for heading in known}
-        return f"](/{PAGES[target.name]}{anchor if there else ''})"
-    return link[0]
+        headings = re.findall(r"^#+ (.+)$", target.read_text(encoding="utf-8"), re.MULTILINE)
+        there = anchor.lstrip("#") in {heading.lower().replace(" ", "-") for heading in headings}
+        return f"{link['text']}(/{PAGES[target.name]}{anchor if there else ''})"
+    if folder == new_folder:
+        return link[0]
+    if not target.is_file():
+        return link["text"][1:-1]
+    up = [".."] * len(new_folder.relative_to(DOCS).parts)
+    place = target.relative_to(DOCS) if target.is_relative_to(DOCS) else Path("..") / target.relative_to(DOCS.parent)
+    return f"{link['text']}({'/'.join([*up, place.as_posix()])}{anchor})"
 
 
 def setup(app: Sphinx) -> dict[str, bool]:

@@ -116,7 +116,7 @@ def extensions(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     pytest.importorskip("sphinx", reason="Sphinx is not installed: pip install '.[docs]'")
     monkeypatch.syspath_prepend(DOCS / "_ext")
     yield
-    for name in ("commands", "docstrings", "settings_tables", "tables"):
+    for name in ("commands", "docstrings", "project_links", "settings_tables", "tables"):
         sys.modules.pop(name, None)
 
 
@@ -128,6 +128,15 @@ def test_aligned_lists_and_examples_in_docstrings(extensions: None) -> None:
         *("Title.", "", "", "``width``", "    Float, metres", "    and more", "", "``a``, ``b``", "    Int", ""),
         *("Use::", "", "    run()", ""),
     ]
+
+
+def test_links_of_files_beside_the_pages(extensions: None, tmp_path: Path) -> None:
+    import project_links
+
+    text = "[a](docs/pose.md#results) [b](CONTRIBUTING.md) [c](README.md#gone) [d](scenes) [e](LICENSE) [f](https://x.y/z)"
+    assert project_links.with_links(f"{text} ![g](docs/model.png)", ROOT, DOCS) == (
+        "[a](pose.md#results) [b](/contributing.md) [c](/readme.md) d [e](../LICENSE) [f](https://x.y/z) ![g](model.png)"
+    )
 
 
 def test_ranges_are_those_that_the_records_accept(extensions: None) -> None:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import builtins
+import json
 import signal
 import socket
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from shadowmap_dr.cli import model
 from shadowmap_dr.errors import ShadowmapError
+from shadowmap_dr.io import assets
 
 
 @pytest.mark.parametrize("arguments, reason", [
@@ -86,3 +89,28 @@ def test_a_served_mesh_is_saved_when_the_program_is_told_to_end(tmp_path, number
     assert process.returncode == 0, err
     assert out == "Mesh: m.ply\n" and "Traceback" not in err
     assert (tmp_path / "m.ply").read_bytes().startswith(b"ply")
+
+
+def test_the_mesh_that_a_page_has_chosen_is_saved(tmp_path):
+    client = pytest.importorskip("websockets.sync.client")
+    trimesh = pytest.importorskip("trimesh")
+    command = [sys.executable, "-c", "from shadowmap_dr.cli.main import main; main()"]
+    options = ["model", "sphere", "--serve", "--port", "0", "--resolution", "32", "-o", "m.ply"]
+    process = subprocess.Popen([*command, *options], cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        address = process.stdout.readline().split()[1].rstrip("/")
+        with client.connect(f"ws{address[4:]}/live", origin=address, proxy=None, max_size=None) as page:
+            assert "spot" in json.loads(page.recv(timeout=30))["meshes"]
+            page.send(json.dumps({"type": "mesh", "name": "spot"}))
+            while not (isinstance(text := page.recv(timeout=60), str) and json.loads(text)["type"] == "mesh"):
+                pass
+            assert json.loads(text) == {"type": "mesh", "name": "spot", "mesh": 1}
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 0, err
+    saved = trimesh.load_mesh(tmp_path / "m.ply", process=False)
+    file = trimesh.load_mesh(assets.mesh("spot"), process=False)
+    assert len(saved.faces) == len(file.faces)
+    np.testing.assert_allclose(saved.bounds, file.bounds, atol=1e-4)  # in the place and size of its file

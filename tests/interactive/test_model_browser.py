@@ -446,8 +446,7 @@ def test_meshes_are_chosen_on_the_page(page, place, instance):
         np.testing.assert_allclose(spot, place.session.snapshot.vertices, atol=1e-6)
     assert clay(picture(page, "#object")).sum() > 2000
     paint(page, NOSE, SIZE)
-    version = place.studio.canvas.version
-    shown(page, version)
+    shown(page, version + 1)
     # Somebody has painted: the page asks first.
     page.select_option("#mesh", "ball")
     assert page.is_visible("#replace") and "ball" in page.inner_text("#replace")
@@ -455,10 +454,12 @@ def test_meshes_are_chosen_on_the_page(page, place, instance):
     assert page.input_value("#mesh") == "spot" and len(place.session.snapshot.vertices) == len(spot)
     page.select_option("#mesh", "ball")
     page.click("#replace button[value=yes]")
-    state = shown(page, version + 1)
+    eventually(lambda: place.session.snapshot.start.name == "ball", 60)
+    version = place.session.snapshot.target
+    state = shown(page, version)
     assert len(state["vertices"]) == first and state["match"] > 0.99 and page.is_disabled("#undo")
     paint(page, NOSE, SIZE)
-    assert shown(page, version + 2)["vertices"][:, 0].max() > 1.5
+    assert shown(page, version + 1)["vertices"][:, 0].max() > 1.5
 
 
 def test_targets_are_chosen_on_the_page(page, place):

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import typer
 
-from ..errors import ShadowmapError
+from ..errors import ShadowmapError, install_hint
 from ..interactive import exports
 from ..interactive.file_session import follow, kept
 from ..interactive.modeller import Modeller
@@ -73,7 +73,7 @@ def _serve(build: Callable[[], Modeller], shadow: ShadowView, name: str, port: i
         from ..interactive.connections import Connections
         from ..interactive.server import listen, serve
     except ModuleNotFoundError as error:
-        raise ShadowmapError(f"--serve needs the package {error.name}: pip install 'shadowmap-dr[interactive]'.") from error
+        raise ShadowmapError(f"--serve needs the package {error.name}: {install_hint('interactive')}.") from error
     from ..interactive.session import Session
 
     with listen(port) as listener, _interrupts() as stopped:

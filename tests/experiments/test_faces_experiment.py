@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from face_models import egg
 from PIL import Image
 
 from shadowmap_dr.cli import main
-from shadowmap_dr.errors import ShadowmapError
+from shadowmap_dr.errors import ShadowmapError, install_hint
 from shadowmap_dr.experiments.faces.experiment import FaceOptions, run_faces
 from shadowmap_dr.experiments.faces.information import contrasts, image_derivatives, posterior_covariance
 from shadowmap_dr.experiments.faces.metrics import distances, surface_distance
@@ -190,7 +191,7 @@ def test_exr_files_are_silhouettes_too(tmp_path: Path) -> None:
 
 def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(ShadowmapError, match=r"needs scipy: pip install 'shadowmap-dr\[faces\]'"):
+    with pytest.raises(ShadowmapError, match=re.escape(f"needs scipy: {install_hint('faces')}.")):
         run_faces(FaceOptions(out=tmp_path))
 
 

@@ -218,7 +218,8 @@ def test_no_mitsuba(place: str) -> None:
 
 def test_the_program_imports_no_command() -> None:
     """``shadowmap-dr --help`` is quick: commands are imported when they are called."""
-    assert [short(other) for other in imports("shadowmap_dr.cli.main")] == ["errors"]
+    assert [short(other) for other in imports("shadowmap_dr.cli.main")] == ["", "errors", "cli.usage"]
+    assert [short(other) for other in imports("shadowmap_dr.cli.usage")] == ["errors"]
 
 
 def test_nothing_lies_flat() -> None:

@@ -129,9 +129,13 @@ class Options:
         labels = [label for label, _ in pairs]
         for label in labels:
             if label in COLOURS:
-                raise ShadowmapError(f"aovs is {','.join(self.aovs)!r}: '{label}' is a channel of the image itself, label it otherwise.")
+                raise ShadowmapError(
+                    f"aovs is {','.join(self.aovs)!r}: '{label}' is a channel of the image itself, label it otherwise."
+                )
             if labels.count(label) > 1:
-                raise ShadowmapError(f"aovs is {','.join(self.aovs)!r}: '{label}' is there twice; label one of them, as in a:depth.")
+                raise ShadowmapError(
+                    f"aovs is {','.join(self.aovs)!r}: '{label}' is there twice; label one of them, as in a:depth."
+                )
         return tuple(pairs)
 
     def render_settings(self) -> RenderSettings:

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,9 @@ import pytest
 from PIL import Image
 from pose_runs import build
 
+from shadowmap_dr import __version__
 from shadowmap_dr.cli import gradients, main
+from shadowmap_dr.errors import ShadowmapError
 from shadowmap_dr.experiments.pose import experiment
 from shadowmap_dr.io import images
 
@@ -59,6 +62,105 @@ def test_help_names_the_commands(run: Any) -> None:
     for command in ("info", "render", "pose", "bench", "soft", "art"):
         assert command in result.out
     assert run().status == 2
+
+
+def test_commands_come_in_the_order_of_their_use(run: Any) -> None:
+    listed = [line.split()[0] for line in run("-h").out.partition("Commands:")[2].splitlines() if line.strip()]
+    assert listed == "render pose lights art face model soft maps gradients bench lights-times info".split()
+    assert list(main.COMMANDS) == listed
+
+
+@pytest.mark.parametrize(
+    "arguments", [(), ("pose",), ("render",), ("gradients",), ("gradients", "jacobian"), ("face", "convert")]
+)
+def test_short_help(run: Any, arguments: tuple[str, ...]) -> None:
+    short, long = run(*arguments, "-h"), run(*arguments, "--help")
+    assert short.status == 0 and short.out == long.out and "-h, --help" in short.out and "--quiet" in short.out
+    assert "<list[" not in short.out
+
+
+def test_version(run: Any) -> None:
+    result = run("--version")
+    assert result.status == 0 and result.out == f"shadowmap-dr {__version__}\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "command"),
+    [
+        (["poes"], "No such command 'poes'. Did you mean 'pose'?", "shadowmap-dr"),
+        (["grad"], "No such command 'grad'. Did you mean 'gradients'?", "shadowmap-dr"),
+        (["zzz"], "No such command 'zzz'.", "shadowmap-dr"),
+        (["gradients", "jacobain"], "No such command 'jacobain'. Did you mean 'jacobian'?", "shadowmap-dr gradients"),
+        (["pose", "--resolutoin", "3"], "No such option '--resolutoin'. Did you mean '--resolution'?", "shadowmap-dr pose"),
+        (["--verison"], "No such option '--verison'. Did you mean '--version'?", "shadowmap-dr"),
+    ],
+)
+def test_wrong_usage_names_the_nearest_word(run: Any, arguments: list[str], error: str, command: str) -> None:
+    result = run(*arguments)
+    assert result.status == 2
+    usage, message, hint = result.err.splitlines()
+    assert usage.startswith(f"Usage: {command} [OPTIONS]")
+    assert message == f"error: {error}" and hint == f"Try '{command} --help' for help."
+
+
+@pytest.mark.parametrize(
+    ("arguments", "found"),
+    [
+        (["soft", "--scene", "dsk"], "dusk"),
+        (["pose", "--method", "shadow"], "shadows"),
+        (["pose", "--object", "spt"], "spot"),
+        (["pose", "--variant", "llvm_ad_rbg"], "llvm_ad_rgb"),
+        (["maps", "--method", "vms"], "vsm"),
+        (["bench", "--only", "step"], "steps"),
+        (["art", "--target", "hart"], "heart"),
+        (["art", "--text", "A", "--camera", "ortho"], "orthographic"),
+        (["face", "--mode", "ident"], "identity"),
+        (["gradients", "convergence", "--occluder", "rings"], "ring"),
+        (["model", "sphere", "--view", "frnt"], "front"),
+        (["render", "psoe", "-o", "a.png"], "pose"),
+        (["render", "pose", "-o", "a.exr", "--aovs", "dept"], "depth"),
+    ],
+)
+def test_values_out_of_a_list_name_the_nearest(run: Any, arguments: list[str], found: str) -> None:
+    result = run(*arguments)
+    assert result.status == 1 and result.err.count("\n") == 1 and f"Did you mean '{found}'?" in result.err, result.err
+
+
+def test_without_words_the_help_is_shown(run: Any) -> None:
+    for arguments in ((), ("gradients",)):
+        result = run(*arguments)
+        assert result.status == 2 and result.err.startswith("Usage: shadowmap-dr") and "error:" not in result.err
+        assert "Commands:" in result.err
+
+
+def warns(*_: Any, **__: Any) -> None:
+    warnings.warn("the film is small", stacklevel=1)
+    mi.Log(mi.LogLevel.Warn, "the sampler is slow")
+    raise ShadowmapError("no film.")
+
+
+@pytest.mark.parametrize("place", ["before", "after"])
+@pytest.mark.parametrize("level", ["--quiet", "", "--verbose"])
+def test_amounts_of_text(run: Any, monkeypatch: pytest.MonkeyPatch, level: str, place: str) -> None:
+    """Warnings are lines without files of libraries; --verbose adds versions, origins and a traceback, --quiet leaves errors."""
+    monkeypatch.setattr(experiment, "run_pose", warns)
+    words = [level] if level else []
+    result = run(*words, "pose") if place == "before" else run("pose", *words)
+    lines = result.err.splitlines()
+    assert result.status == 1 and result.out == "" and lines[-1] == "error: no film."
+    if level == "--quiet":
+        assert len(lines) == 1
+    elif not level:
+        assert lines == ["warning: the film is small", "warning: Mitsuba: warns(): the sampler is slow", lines[-1]]
+    else:
+        assert lines[0].startswith(f"shadowmap-dr {__version__}, mitsuba {mi.__version__}, drjit ")
+        assert lines[1].startswith("warning: the film is small (UserWarning, ") and "test_cli.py" in lines[1]
+        assert "Traceback (most recent call last):" in lines
+
+
+def test_verbose_commands_tell_their_time(run: Any) -> None:
+    assert run("info", "-v").err.splitlines()[-1].endswith(" seconds")
+    assert run("info").err == run("info", "-q").err == ""
 
 
 def test_render_exr_equals_mitsuba(run: Any, tmp_path: Path) -> None:
@@ -187,6 +289,9 @@ def test_bad_input_is_one_clear_line(run: Any, tmp_path: Path, arguments: list[s
     result = run(*arguments)
     assert result.status in (1, 2)
     lines = result.err.strip().splitlines()
+    if result.status == 2:  # wrong usage: the error stands between the usage and the way to the help
+        assert len(lines) == 3 and lines[0].startswith("Usage: shadowmap-dr ") and lines[2].startswith("Try 'shadowmap-dr ")
+        lines = lines[1:2]
     assert len(lines) == 1 and lines[0].startswith("error: ") and message in lines[0]
     assert not (tmp_path / "a.exr").exists()
 

@@ -176,6 +176,7 @@ def test_parameters_are_the_settings_of_the_renderer() -> None:
     assert {setting.name for setting in fields(ShadowSettings)} == {*SHADOW_NAMES.values(), "bias"}
     assert RenderSettings.of(**options) == RenderSettings()
 
+
 @pytest.mark.parametrize("aovs", ["depth, visibility", ("depth", "visibility"), ["depth", "visibility"]])
 def test_names_of_channels_as_text_or_sequence(aovs: Any) -> None:
     """The plug-in and the renderer keep the same tuple."""

@@ -19,7 +19,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from ... import __version__
-from ...errors import ShadowmapError
+from ...errors import ShadowmapError, did_you_mean
 from ...inverse import Collection, RemeshingSculptor, Sculptor, even_sphere, shadow_view
 from ...inverse.shadow_art import exports, target_images
 from ...io import assets, files, meshes, records
@@ -95,9 +95,13 @@ class ArtOptions:
         if not 1 <= len(self.targets) <= len(DIRECTIONS):
             raise ShadowmapError(f"{len(self.targets)} targets: give one, or two for two views.")
         if self.receiver not in RECEIVERS:
-            raise ShadowmapError(f"no receiver {self.receiver!r}: choose from {', '.join(RECEIVERS)}.")
+            raise ShadowmapError(
+                f"no receiver {self.receiver!r}: choose from {', '.join(RECEIVERS)}.{did_you_mean(self.receiver, RECEIVERS)}"
+            )
         if self.camera not in CAMERAS:
-            raise ShadowmapError(f"no camera {self.camera!r}: choose from {', '.join(CAMERAS)}.")
+            raise ShadowmapError(
+                f"no camera {self.camera!r}: choose from {', '.join(CAMERAS)}.{did_you_mean(self.camera, CAMERAS)}"
+            )
         if self.mesh is not None and self.collection is not None:
             raise ShadowmapError("a mesh to deform and a collection: choose one of the two.")
         if self.remesh is not None and self.collection is not None:

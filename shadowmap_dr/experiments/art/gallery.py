@@ -20,7 +20,7 @@ import mitsuba as mi
 import numpy as np
 from rich.console import Console
 
-from ...errors import ShadowmapError
+from ...errors import ShadowmapError, did_you_mean
 from ...io import files
 from ...io import records as io_records
 from ...io.console import markdown
@@ -232,7 +232,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         unknown = sorted(set(options.names) - set(names))
         if unknown:
-            raise ShadowmapError(f"no piece {unknown[0]!r}: choose from {', '.join(names)}.")
+            raise ShadowmapError(f"no piece {unknown[0]!r}: choose from {', '.join(names)}.{did_you_mean(unknown[0], names)}")
         mi.set_variant(DEFAULT_VARIANT)
         record = run_gallery(options.names or names, options.work, options.out, options.results, resume=options.resume)
     except ShadowmapError as error:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from rich.console import Console
 from rich.progress import Progress, TaskID
 
-from ...errors import ShadowmapError
+from ...errors import ShadowmapError, did_you_mean
 from ...inverse import History, optimize
 from ...inverse.faces.morph_fit import MorphFit
 from ...inverse.faces.morphable import MorphableModel
@@ -82,7 +82,9 @@ class FaceOptions:
                 raise ShadowmapError(f"no {name} given: name at least one.")
             for value in values:
                 if known is not None and value not in known:
-                    raise ShadowmapError(f"no {name} {value!r}: choose from {', '.join(map(str, known))}.")
+                    raise ShadowmapError(
+                        f"no {name} {value!r}: choose from {', '.join(map(str, known))}.{did_you_mean(value, known)}"
+                    )
                 if values.count(value) > 1:
                     raise ShadowmapError(f"the {name} {value} is given twice: name each once.")
         if self.reference not in ("own", "mitsuba"):

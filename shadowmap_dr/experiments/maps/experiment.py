@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from ...errors import ShadowmapError
+from ...errors import ShadowmapError, did_you_mean
 from ...io import console as io_console
 from ...io import files, plots, records
 from ...io.options import option, setting
@@ -74,7 +74,9 @@ class MapsOptions:
                 raise ShadowmapError(f"no {kind} given: name at least one.")
             for name in names:
                 if name not in known:
-                    raise ShadowmapError(f"no {kind} {name!r}: choose from {', '.join(map(repr, known))}.")
+                    raise ShadowmapError(
+                        f"no {kind} {name!r}: choose from {', '.join(map(repr, known))}.{did_you_mean(name, known)}"
+                    )
         try:
             ShadowSettings(resolution=self.map_resolution, filter_size=self.filter_size)
         except ValueError as error:

@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.progress import Progress, TaskID
 from rich.table import Table
 
-from ...errors import ShadowmapError
+from ...errors import ShadowmapError, did_you_mean
 from ...inverse import Method, run_sweep
 from ...inverse.runs.schedulers import check_scheduler, check_threads
 from ...io import console as io_console
@@ -75,7 +75,7 @@ class PoseOptions:
                 raise ShadowmapError(f"one {name} is given twice in {', '.join(map(str, values))}: name each once.")
         for method in self.methods:
             if method not in METHODS:
-                raise ShadowmapError(f"no method {method!r}: choose from {', '.join(METHODS)}.")
+                raise ShadowmapError(f"no method {method!r}: choose from {', '.join(METHODS)}.{did_you_mean(method, METHODS)}")
         check_threads(self.threads)
         if self.reference not in ("mitsuba", "own"):
             raise ShadowmapError(f"no reference {self.reference!r}: choose mitsuba or own.")

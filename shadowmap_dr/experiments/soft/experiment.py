@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from rich.console import Console
 
-from ...errors import ShadowmapError
+from ...errors import ShadowmapError, did_you_mean
 from ...io import console as io_console
 from ...io import files, records
 from ...io.options import option
@@ -79,7 +79,9 @@ class SoftOptions:
             raise ShadowmapError("no scene or no number of samples given: name at least one.")
         for name in self.scenes:
             if name not in soft_scenes.SCENES:
-                raise ShadowmapError(f"no scene {name!r}: choose from {', '.join(soft_scenes.SCENES)}.")
+                raise ShadowmapError(
+                    f"no scene {name!r}: choose from {', '.join(soft_scenes.SCENES)}.{did_you_mean(name, soft_scenes.SCENES)}"
+                )
         for pair in self.samples:
             for name, value in zip(("area", "sky"), pair, strict=True):
                 check_range(f"number of {name} samples (--samples)", value, (1, MOST_SAMPLES))

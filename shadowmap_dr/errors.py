@@ -29,17 +29,17 @@ class OutputError(ShadowmapError, OSError):
     """A result could not be written (unwritable directory, full disk, unknown suffix)."""
 
 
-def nearest(word: str, known: Iterable[str]) -> str | None:
+def nearest(word: object, known: Iterable[object]) -> str | None:
     """The known word that a mistyped one most resembles, or the only one that it begins; None if none is near."""
     from difflib import get_close_matches  # only mistyped words need it
 
-    known = [str(one) for one in known]
-    begun = [one for one in known if word and one.startswith(word)]
-    close = get_close_matches(word, known, 1)
+    typed, words = str(word), [str(one) for one in known]
+    begun = [one for one in words if typed and one.startswith(typed)]
+    close = get_close_matches(typed, words, 1)
     return begun[0] if len(begun) == 1 else close[0] if close else None
 
 
-def did_you_mean(word: str, known: Iterable[str]) -> str:
+def did_you_mean(word: object, known: Iterable[object]) -> str:
     """A question with the nearest of the known words, to be put behind a sentence; empty if none is near."""
     found = nearest(word, known)
     return "" if found is None else f" Did you mean {found!r}?"

@@ -21,7 +21,7 @@ MAY_IMPORT = {
     "_llvm": ("errors",),
     "variants": ("errors",),
     "jit": (),
-    "io": ("errors",),
+    "io": ("", "_llvm", "errors"),
     "raster": ("jit",),
     "shadow": ("jit", "raster"),
     "scene": ("errors", "jit"),

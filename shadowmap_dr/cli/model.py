@@ -17,7 +17,7 @@ from ..interactive.file_session import follow, kept
 from ..interactive.modeller import Modeller
 from ..interactive.options import VIEWS, ModelOptions
 from ..inverse import Sculptor, ShadowView, even_sphere, shadow_view
-from ..io import assets, files
+from ..io import assets, console, files
 from ..io.meshes import read_placed_mesh
 from ..variants import DEFAULT_VARIANT, set_variant
 from .options import Variant, from_record
@@ -62,9 +62,9 @@ def model(
     if options.serve:
         _serve(build, shadow, _SPHERE if path is None else path.stem, options.port, save)
     else:
-        typer.echo("Preparing ...", err=True)
+        console.note("Preparing ...")
         with _interrupts() as stopped:
-            follow(build(), options.image, save, lambda: bool(stopped), lambda text: typer.echo(text, err=True))
+            follow(build(), options.image, save, lambda: bool(stopped), console.note)
     typer.echo(f"Mesh: {options.output}")
 
 

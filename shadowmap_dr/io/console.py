@@ -4,21 +4,52 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
+from rich.measure import Measurement
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
+from ..errors import Verbosity, verbosity
+
 # Seconds between lines of progress where there is no terminal to draw a bar on.
 _LINE_SECONDS = 10.0
+# Width of the widest table in a pipe.
+_WIDEST = 1000
+
+
+def notes() -> Console:
+    """Console for progress and notes, on standard error; it prints nothing with ``--quiet``."""
+    return Console(stderr=True, quiet=verbosity() is Verbosity.QUIET)
+
+
+def note(text: str) -> None:
+    """Print a line beside the results, on standard error, unless commands are quiet."""
+    notes().print(text, soft_wrap=True, highlight=False, markup=False)
+
+
+def show(result: Table) -> None:
+    """Print a table of results, in a pipe as wide as it is: no cell is wrapped there."""
+    console = Console()
+    if not console.is_terminal:
+        console.width = max(console.width, Measurement.get(console, console.options.update(max_width=_WIDEST), result).maximum)
+    console.print(result)
+
+
+def result(picture: Path | None = None, record: Path | None = None) -> None:
+    """Print the last line of a command: the picture to look at, and the record."""
+    named = {"picture": picture, "record": record}
+    line = ", ".join(f"{name}: {path}" for name, path in named.items() if path is not None)
+    print(line[0].upper() + line[1:])
 
 
 def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
-    """A table for the terminal: the first column left-aligned, all others right-aligned."""
+    """A table for the terminal: the first column left-aligned, all others right-aligned. Only the first one may be wrapped."""
     result = Table(title=title, title_justify="left", box=SIMPLE_HEAD)  # narrow enough for 80 columns
     for i, column in enumerate(columns):
-        result.add_column(column, justify="left" if i == 0 else "right")
+        result.add_column(column, justify="left" if i == 0 else "right", no_wrap=i > 0)
     for row in rows:
         result.add_row(*row)
     return result

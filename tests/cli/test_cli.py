@@ -17,7 +17,7 @@ from PIL import Image
 from pose_runs import build
 
 from shadowmap_dr import __version__
-from shadowmap_dr.cli import gradients, main
+from shadowmap_dr.cli import gradients, lights, main, maps, soft
 from shadowmap_dr.errors import ShadowmapError
 from shadowmap_dr.experiments.pose import experiment
 from shadowmap_dr.io import images
@@ -349,7 +349,9 @@ def test_pose_prints_a_table_and_writes_records(run: Any, monkeypatch: pytest.Mo
     result = run(*arguments)
     assert result.status == 0, result.err
     assert "spot" in result.out and "shadows" in result.out
-    assert len(json.loads(Path("o/pose.json").read_text())) == 1
+    assert len(json.loads(Path("o/pose.json").read_text())["runs"]) == 1
+    assert result.out.splitlines()[-1] == "Picture: o/spot-8/images.png, record: o/pose.json"
+    assert Path("o/spot-8/images.png").is_file()
 
 
 def test_bench_prints_a_table_and_writes_a_record(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -360,7 +362,7 @@ def test_bench_prints_a_table_and_writes_a_record(run: Any, monkeypatch: pytest.
     monkeypatch.setattr(bench_common, "QUICK", TINY)
     result = run("bench", "--quick", "--only", "breakdown", "--out", "o/b.json")
     assert result.status == 0, result.err
-    assert "frozen" in result.out and "o/b.png" in result.out
+    assert "frozen" in result.out and result.out.splitlines()[-1] == "Picture: o/b.png, record: o/b.json"
     assert list(json.loads(Path("o/b.json").read_text())["sections"]) == ["breakdown"]
     assert Path("o/b.png").exists()
 
@@ -397,3 +399,21 @@ def test_gradients(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     assert plane.iterations == 7
     result = run("gradients", "convergence", "--occluder", "moon")
     assert result.status == 1 and "moon" in result.err
+
+
+def test_times_of_lights_are_a_record(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    times = {"seconds": {"batch of 2": {"median": 0.5}}, "ratio_of_medians": {}}
+    monkeypatch.setattr(lights.lights_speed, "measure", lambda problem, sizes: times)
+    result = run("lights-times", "--batch", "2", "--out", "t")
+    assert result.status == 0 and result.out.splitlines()[-1] == "Record: t/times.json", result.err
+    record = json.loads(Path("t/times.json").read_text())
+    assert record.keys() == {"shadowmap_dr", "machine", "settings", "steps"} and record["steps"] == times
+
+
+def test_the_last_line_names_what_to_look_at(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(maps.maps_experiment, "run_maps", lambda options: {"scenes": {}})
+    assert run("maps", "--out", "m").out.splitlines()[-1] == "Picture: m/maps.png, record: m/maps.json"
+    monkeypatch.setattr(soft.soft_experiment, "run_soft", lambda options: {"scenes": {}, "settings": {"samples": []}})
+    assert run("soft", "--out", "s").out.splitlines()[-1] == "Picture: s/soft.png, record: s/soft.json"
+    monkeypatch.setattr(lights.lights_experiment, "run_lights", lambda options, variant: [])
+    assert run("lights", "--out", "l").out.splitlines()[-1] == "Picture: l/lights.png, record: l/lights.json"

@@ -290,6 +290,7 @@ def test_commands_from_a_folder_to_a_head(run: Any, tmp_path: Path) -> None:
     status, text = run(*arguments)
     assert status == 0 and "Identity: distances" in text
     record = json.loads((out / "faces.json").read_text())
+    assert {"shadowmap_dr", "machine", "settings"} <= record.keys()
     assert set(record["runs"]) == {f"{mode} | {lights} | 5" for mode in ("identity", "expression") for lights in (1, 3)}
     for entry in record["runs"].values():
         assert entry["distance"]["mean"] < 0.7 * entry["start_distance"]["mean"]
@@ -310,6 +311,7 @@ def test_commands_from_a_folder_to_a_head(run: Any, tmp_path: Path) -> None:
     arguments = ["face", "--model", converted, "--image", picture, "--iterations", "60", "--height", "64", "--out", str(out)]
     assert run(*arguments)[0] == 0
     record = json.loads((out / "image-face.json").read_text())
+    assert {"shadowmap_dr", "machine", "settings"} <= record.keys()
     assert record["settings"]["placement"]["mirrored"]
     assert record["image_error"] < 0.7 * record["image_error_start"]
 

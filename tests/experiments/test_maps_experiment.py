@@ -111,6 +111,7 @@ def test_small_run(variant: str, tmp_path: Path) -> None:
     )
     record = run_maps(options)
     stored = json.loads((tmp_path / "m" / "maps.json").read_text())
+    assert {"shadowmap_dr", "machine", "settings"} <= stored.keys()
     assert stored["scenes"].keys() == {"overlap"} and (tmp_path / "m" / "maps.png").stat().st_size > 1000
     vsm, evsm = (record["scenes"]["overlap"][label] for label in ("plain vsm", "evsm4"))
     assert vsm["seconds_over_plain_vsm"] == 1 and np.isfinite(evsm["seconds"])

@@ -15,11 +15,11 @@ from ...inverse import optimize
 from ...io import console as io_console
 from ...io import files, plots, records
 from ...io.console import markdown
+from ...io.machine import header
 from ...io.options import option, setting
 from ...io.ranges import FILTER_SIDE, MAP_SIDE, SAMPLES, SIDE, STEPS, check_ranges
 from ...rendering.renderer import Renderer
 from ..common.options import cameras_option
-from ..common.timing import machine
 from . import scenes as gradients_scenes
 from .fit import ShadowFit
 from .images import Image, check_chosen, check_maps
@@ -53,7 +53,7 @@ def run_plane(options: PlaneOptions, *, console: Console | None = None) -> dict[
     """Run all; write `minimal-plane.json`, `minimal-plane.md`, a plot and pictures into `options.out`. Returns the record."""
     from mitsuba_baselines.reference import path_traced
 
-    console = console or Console(stderr=True)
+    console = console or io_console.notes()
     path = files.check_output(options.out / "minimal-plane.json", (".json",))
     mesh = gradients_scenes.plane(HALF, Z)
     basis = np.zeros((2, *mesh.vertices.shape))
@@ -68,7 +68,7 @@ def run_plane(options: PlaneOptions, *, console: Console | None = None) -> dict[
         "step_size": STEP_SIZE,
         "start": start,
     }
-    record: dict[str, Any] = {"settings": settings, "machine": machine(), "runs": []}
+    record: dict[str, Any] = {**header(settings), "runs": []}
     sheet: dict[str, dict[str, Image]] = {}
     with io_console.progress(console) as progress:
         task = progress.add_task("steps", total=len(options.cameras) * len(CASES) * options.iterations, note="")

@@ -20,12 +20,13 @@ from rich.table import Table
 from ...errors import ShadowmapError, did_you_mean
 from ...io import console as io_console
 from ...io import files, plots, records
+from ...io.machine import header
 from ...io.options import option, setting
 from ...io.ranges import FILTER_SIDE, MAP_SIDE, SAMPLES, check_ranges
 from ...jit.types import Float
 from ...rendering.renderer import Renderer
 from ...shadow import ShadowSettings, directional_view
-from ..common.timing import Contender, alternate, machine
+from ..common.timing import Contender, alternate
 from . import pose as maps_pose
 from . import scenes as maps_scenes
 from .metrics import Image, Texel, metrics, texel_in_pixels
@@ -85,9 +86,9 @@ class MapsOptions:
 
 def run_maps(options: MapsOptions, *, console: Console | None = None) -> dict[str, Any]:
     """Measure all candidates on all scenes, write `maps.json` and `maps.png` into `options.out`, and return the record."""
-    console = console or Console(stderr=True)
+    console = console or io_console.notes()
     files.check_output(options.out / "maps.json", (".json",))
-    record: dict[str, Any] = {"settings": asdict(options), "machine": machine(), "candidates": CANDIDATES, "scenes": {}}
+    record: dict[str, Any] = {**header(asdict(options)), "candidates": CANDIDATES, "scenes": {}}
     sheet: dict[str, dict[str, Image]] = {}
     with io_console.progress(console) as progress:
         for name in options.scenes:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +24,11 @@ from rich.table import Table
 from ...errors import ShadowmapError, did_you_mean
 from ...inverse import Method, run_sweep
 from ...inverse.runs.schedulers import check_scheduler, check_threads
+from ...io import assets, files, plots
 from ...io import console as io_console
-from ...io import files, plots
 from ...io import images as io_images
 from ...io import records as io_records
+from ...io.machine import header
 from ...io.options import option
 from ...io.ranges import RUNS, SEED, STEPS, check_ranges
 from ..common.options import scheduler_option, threads_option
@@ -83,11 +84,17 @@ class PoseOptions:
             raise ShadowmapError(f"no normals {self.normals!r}: choose face or vertex.")
         check_scheduler(self.scheduler)
 
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Settings that the results depend on."""
+        left_out = ("out", "resume", "scheduler", "threads")
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in left_out}
+
 
 def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Console | None = None) -> list[dict[str, Any]]:
     """Run the experiment and write its results below `options.out`.
 
-    Files: `pose.json` (a list with one record for each object, resolution, method and run), and for each object and
+    Files: `pose.json` (`runs` has one record for each object, resolution, method and run), and for each object and
     resolution a folder with the reference, the images at start and end and their difference from the reference, a plot
     of the convergence (`convergence.png`) and a sheet with the images of the first run (`images.png`).
 
@@ -97,7 +104,7 @@ def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Co
     With a scheduler (see :func:`shadowmap_dr.inverse.run_sweep`) its workers make the runs, with methods of :func:`build_method`.
     Runs that share a machine take longer than runs alone.
     """
-    console = console or Console(stderr=True)
+    console = console or io_console.notes()
     if build is build_method:
         build = functools.partial(build_method, samples=options.samples)
     out = options.out
@@ -149,13 +156,21 @@ def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Co
                         images[name] = pictures
                     records.append(record)
                     stored = [*(other for other in stored if _key(other) != _key(record)), record]
-                    io_records.write_json(out / "pose.json", stored)
+                    io_records.write_json(out / "pose.json", {**header(options.settings), "runs": stored})
                     _checkpoint(problem, name, run, options).unlink(missing_ok=True)
                     progress.remove_task(task)
                     progress.console.print(f"{title}: {_outcome(record)}", highlight=False)
             _plots(problem, options, records, images, reference)
             result += records
     return result
+
+
+def pictures_of(options: PoseOptions) -> list[Path]:
+    """Sheets of images that `run_pose` writes, one for each object and resolution."""
+    smooth = "-vertex-normals" if options.normals == "vertex" else ""
+    ending = ("-shadow-only" if options.shadow_only else "") + smooth
+    objects = [name if name in assets.mesh_names() else Path(name).stem for name in options.objects]
+    return [options.out / f"{name}-{size}{ending}" / "images.png" for name in objects for size in options.resolutions]
 
 
 def table(records: Sequence[dict[str, Any]]) -> Table:

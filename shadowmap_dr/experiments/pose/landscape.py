@@ -23,6 +23,7 @@ from ...io import records as io_records
 from ...io.files import atomic
 from ...variants import DEFAULT_VARIANT
 from .methods import METHODS, build_method
+from .record import runs_in
 from .scene import make_problem
 
 Render = Callable[[npt.NDArray[np.float64]], npt.NDArray[Any]]
@@ -132,8 +133,8 @@ def landscape(
     `renderer`: method that renders the images, by default the run's own (Mitsuba's is slow and noisy).
     Returns angles in degrees and the slices. Raises ShadowmapError if there is no such record or no reference image.
     """
-    records = io_records.read_json(folder / "pose.json")
-    if not isinstance(records, list) or not all(isinstance(entry, dict) for entry in records):
+    records = runs_in(io_records.read_json(folder / "pose.json"))
+    if records is None:
         raise ShadowmapError(f"{folder / 'pose.json'} is no list of records: give a folder of the pose experiment.")
     record = next((entry for entry in records if all(entry.get(key) == value for key, value in wanted.items())), None)
     if record is None:

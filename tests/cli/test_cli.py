@@ -404,7 +404,7 @@ def test_gradients(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_times_of_lights_are_a_record(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     times = {"seconds": {"batch of 2": {"median": 0.5}}, "ratio_of_medians": {}}
     monkeypatch.setattr(lights.lights_speed, "measure", lambda problem, sizes: times)
-    result = run("lights-times", "--batch", "2", "--out", "t")
+    result = run("lights-times", "--batch", "2", "--no-workers", "--out", "t")
     assert result.status == 0 and result.out.splitlines()[-1] == "Record: t/times.json", result.err
     record = json.loads(Path("t/times.json").read_text())
     assert record.keys() == {"shadowmap_dr", "machine", "settings", "steps"} and record["steps"] == times

@@ -151,5 +151,6 @@ def write(out: Path, record: Mapping[str, Any]) -> None:
         temporary.write_text("\n".join(reading(record)) + "\n", encoding="utf-8")
     curves: dict[str, list[Any]] = {}
     for run in record["runs"].values():
-        curves.setdefault(f"{run['mode']}, {run['lights']}", []).append(run["loss_curve"])
-    plots.plot_curves(out / "convergence.png", {"loss": curves})
+        curves.setdefault(f"{run['mode']}, {run['lights']} shadow{'s' * (run['lights'] > 1)}", []).append(run["loss_curve"])
+    note = "Curves of one colour are different heads."
+    plots.plot_curves(out / "convergence.png", {"loss (difference of the shadows and prior)": curves}, caption=note)

@@ -134,7 +134,8 @@ def run_convergence(options: ConvergenceOptions, *, console: Console | None = No
     record = records.plain(record)
     records.write_record(path, record, "runs")
     plots.image_sheet(options.out / "convergence-images.png", sheet)
-    plots.plot_curves(options.out / "convergence.png", _curves(record), columns=2)
+    note = "Curves of one colour are runs with different displacements at the start."
+    plots.plot_curves(options.out / "convergence.png", _curves(record), columns=2, caption=note)
     with files.atomic(options.out / "convergence.md") as temporary:
         temporary.write_text(read_convergence(record), encoding="utf-8")
     return record
@@ -207,7 +208,7 @@ def _curves(record: Mapping[str, Any]) -> dict[str, dict[str, list[list[float]]]
     panels: dict[str, dict[str, list[list[float]]]] = {}
     for run in record["runs"].values():
         label = ", ".join([f"filter {run['filter']}" if run["filter"] > 1 else "no filter", *_unless_default(run["candidate"])])
-        panel = panels.setdefault(f"error [texels]: {run['occluder']}, {run['camera']}", {})
+        panel = panels.setdefault(f"{run['occluder']}, {run['camera']}:\nerror [texels]", {})
         panel.setdefault(label, []).append(run["error_curve_texels"])
     return panels
 

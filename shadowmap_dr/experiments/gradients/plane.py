@@ -108,9 +108,9 @@ def run_plane(options: PlaneOptions, *, console: Console | None = None) -> dict[
     record = records.plain(record)
     records.write_json(path, record)
     plots.image_sheet(options.out / "minimal-plane-images.png", sheet)
-    curves = {
-        key: {f"{run['camera']}, {_label(run)}": [run[f"{key}_curve"]] for run in record["runs"]} for key in ("error", "loss")
-    }
+    labels = {"error": "distance of the vertex from its place [units]", "loss": "loss (mean squared difference)"}
+    runs = {f"{run['camera']},\n{_label(run)}": run for run in record["runs"]}
+    curves = {label: {name: [run[f"{key}_curve"]] for name, run in runs.items()} for key, label in labels.items()}
     plots.plot_curves(options.out / "minimal-plane.png", curves)
     with files.atomic(options.out / "minimal-plane.md") as temporary:
         temporary.write_text(read_plane(record), encoding="utf-8")

@@ -288,13 +288,14 @@ def _plots(
     panels = {
         "rotation error [degrees]": "rotation_error_curve",
         "offset error x 100": "translation_error_curve",
-        "loss": "loss_curve",
+        "loss (mean squared difference)": "loss_curve",
     }
     curves = {
         label: {name: [record[key] for record in records if record["method"] == name] for name in options.methods}
         for label, key in panels.items()
     }
-    plots.plot_curves(options.out / problem.folder / "convergence.png", curves)
+    note = "Curves of one colour are runs from different starts."
+    plots.plot_curves(options.out / problem.folder / "convergence.png", curves, caption=note)
     rows = {name: {"reference": reference, **pictures} for name, pictures in images.items()}
     plots.image_sheet(options.out / problem.folder / "images.png", rows)
 

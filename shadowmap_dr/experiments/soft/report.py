@@ -14,10 +14,6 @@ from ...io import console, files, images, plots
 
 Image = npt.NDArray[np.floating[Any]]
 
-# Differences are shown multiplied by this, around a medium grey.
-_ENLARGED = 4.0
-_GREY = 0.2
-
 
 def rows(record: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
     """Column titles, and a row for each scene."""
@@ -79,9 +75,8 @@ def write(record: Mapping[str, Any], out: Path) -> None:
     for name in record["scenes"]:
         pictures = load_pictures(out / "pictures" / f"{name}.exr")
         if pictures:
-            difference = _GREY + _ENLARGED * (pictures["ours"] - pictures["path traced"]) * _exposure(pictures["path traced"])
             shown = {title: image * _exposure(pictures["path traced"]) for title, image in pictures.items()}
-            sheet[name] = {**shown, f"difference x {_ENLARGED:g}": difference}
+            sheet[name] = {**shown, "difference": shown["ours"] - shown["path traced"]}
     if sheet:
         plots.image_sheet(out / "soft.png", _paired(sheet))
 

@@ -19,6 +19,8 @@ def soft(options: soft_experiment.SoftOptions, variant: Variant = DEFAULT_VARIAN
     """
     set_variant(variant, COLOURED)
     record = soft_experiment.run_soft(options)
-    console.show(soft_report.table(record))
+    for table in (soft_report.table(record), soft_report.times_table(record)):
+        if table is not None:
+            console.show(table)
     typer.echo("\n".join(soft_report.reading(record)))
     console.result(options.out / "soft.png", options.out / "soft.json")

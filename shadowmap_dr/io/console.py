@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
+from typing import Literal
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -45,11 +46,16 @@ def result(picture: Path | None = None, record: Path | None = None) -> None:
     print(line[0].upper() + line[1:])
 
 
-def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
-    """A table for the terminal: the first column left-aligned, all others right-aligned. Only the first one may be wrapped."""
-    result = Table(title=title, title_justify="left", box=SIMPLE_HEAD)  # narrow enough for 80 columns
+def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], wrapped: Collection[int] = (0,)) -> Table:
+    """A table for the terminal: the first column left-aligned, all others right-aligned.
+
+    Columns of the numbers ``wrapped`` are wrapped between words where the terminal is narrow.
+    """
+    result = Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False, show_edge=False)
     for i, column in enumerate(columns):
-        result.add_column(column, justify="left" if i == 0 else "right", no_wrap=i > 0)
+        longest = max((len(word) for row in (columns, *rows) for word in row[i].split()), default=0)
+        justify: Literal["left", "right"] = "left" if i == 0 else "right"
+        result.add_column(column, justify=justify, no_wrap=i not in wrapped, min_width=longest if i in wrapped else None)
     for row in rows:
         result.add_row(*row)
     return result

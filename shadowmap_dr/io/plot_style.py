@@ -64,8 +64,24 @@ def drawn(path: str | os.PathLike[str], width: float, height: float, dpi: int = 
     with rc_context(style):
         figure = Figure(figsize=(width, height), layout="constrained")
         yield figure
+        _write_out_numbers(figure)
         with atomic(path) as temporary:
             figure.savefig(temporary, dpi=dpi)
+
+
+def _write_out_numbers(figure: Figure) -> None:
+    """Label logarithmic axes with 30 and 0.3, instead of powers of ten and products with them."""
+    from matplotlib.ticker import LogFormatter
+
+    class Plain(LogFormatter):
+        def __call__(self, x: float, pos: int | None = None) -> str:
+            return f"{x:g}" if super().__call__(x, pos) else ""
+
+    for axes in figure.axes:
+        for axis in (axes.xaxis, axes.yaxis):
+            if isinstance(axis.get_major_formatter(), LogFormatter):  # others have labels of their own
+                axis.set_major_formatter(Plain())
+                axis.set_minor_formatter(Plain(labelOnlyBase=False, minor_thresholds=(1.2, 0.5)))
 
 
 def label_ends(axes: Axes, ends: Sequence[tuple[float, str, str]]) -> None:

@@ -81,7 +81,7 @@ def image_sheet(path: str | os.PathLike[str], rows: Rows, size: float = 2.2) -> 
                 pixels = to_srgb(np.nan_to_num(image))
                 axes.imshow(np.repeat(pixels, 3, axis=2) if pixels.shape[2] == 1 else pixels[..., :3])
         if differences:
-            label = "difference (mean over channels)" if signed else "absolute difference (mean over channels)"
+            label = "difference" if signed else "absolute difference"
             plot_style.colour_bar(figure, [axes for _, axes in grid], name, low, limit, label)
 
 

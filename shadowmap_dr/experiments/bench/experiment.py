@@ -86,7 +86,7 @@ def run_bench(options: BenchOptions, *, console: Console | None = None) -> dict[
                 progress.remove_task(inner)
                 _write(options, record)
                 line = f"{name} {unit.name}: {bench_report.outcome(done[unit.name])}"
-                progress.console.print(line, highlight=False, markup=False)
+                progress.console.print(line, highlight=False, markup=False, soft_wrap=True)
                 # Memory that a unit leaves allocated would count as memory of the next.
                 dr.flush_malloc_cache()
             progress.remove_task(task)

@@ -43,7 +43,6 @@ def plot(path: str | os.PathLike[str], record: dict[str, Any]) -> None:
     with plot_style.drawn(path, 5.2 * columns, 3.4 * rows if panels else 1.0, dpi=110) as figure:
         for k, (draw, data) in enumerate(panels):
             draw(figure.add_subplot(rows, columns, k + 1), data)
-        figure.align_ylabels()
         measured = "Points: medians. Bars: from the lower to the upper quartile."
         plot_style.caption(figure, measured if panels else f"The sections measured have tables only: {', '.join(sections)}.")
 

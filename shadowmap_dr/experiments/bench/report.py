@@ -84,7 +84,7 @@ def rows(record: dict[str, Any]) -> list[Row]:
 
 def table(record: dict[str, Any]) -> Table:
     """The table for the terminal."""
-    result = console.table("Medians; ratios are those of medians", COLUMNS, [])
+    result = console.table("Medians; ratios are those of medians", COLUMNS, [], wrapped=range(5))
     kind = None
     for row in rows(record):
         if kind is not None and row.what.split()[0] != kind:

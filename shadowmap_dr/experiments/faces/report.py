@@ -57,9 +57,9 @@ def rows(record: Mapping[str, Any], mode: str) -> tuple[list[str], list[list[str
     the results with 1 and with 3 shadows; milliseconds of a step.
     """
     means = summary(record, mode)
-    columns = ["head", "start mean", "start max"]
+    columns = ["head", "start: mean", "max"]
     for lights in means:
-        columns += [f"{lights}: mean", f"{lights}: max", f"{lights}: ms"]
+        columns += [f"{lights} shadow{'s' * (lights > 1)}: mean", "max", "ms"]
     body = []
     for seed in sorted({run["seed"] for run in runs_of(record, mode)}):
         runs = {run["lights"]: run for run in runs_of(record, mode) if run["seed"] == seed}

@@ -137,7 +137,7 @@ def plane_rows(record: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
 
 def plane_table(record: Mapping[str, Any]) -> Table:
     """The table for the terminal."""
-    return io_console.table("A vertex recovered from the shadow (distance from its place, world units)", *plane_rows(record))
+    return io_console.table("A vertex recovered from the shadow: distance from its place [units]", *plane_rows(record))
 
 
 def read_plane(record: Mapping[str, Any]) -> str:

@@ -66,13 +66,14 @@ def jacobian_rows(record: Mapping[str, Any]) -> tuple[list[str], list[list[str]]
         groups.setdefault((entry["candidate"], entry["map"], entry["filter"]), []).append(entry)
     rows = []
     order = list(dict.fromkeys(label for label, _, _ in groups))
+    named = order != ["default"]
     for (label, size, taps), entries in sorted(groups.items(), key=lambda item: (order.index(item[0][0]), *item[0][1:])):
         cells = []
         for kind in _KINDS:
             farthest = max((e[kind]["scale"] for e in entries), key=lambda scale: abs(scale - 1))
             cells += [f"{min(e[kind]['cosine'] for e in entries):.3f}", f"{farthest:.3f}"]
         reverse = max(e["reverse_error"] for e in entries)
-        rows.append([f"{label}, {size}, {taps if taps > 1 else 'none'}", *cells, f"{reverse:.0e}"])
+        rows.append([f"{f'{label}, ' * named}{size}, {taps if taps > 1 else 'none'}", *cells, f"{reverse:.0e}"])
     return columns, rows
 
 

@@ -68,11 +68,11 @@ def plot(path: Path, summaries: Sequence[dict[str, Any]]) -> None:
                 x, mean, std = (np.array(entry[key]) for key in ("curve_iterations", "curve_mean", "curve_std"))
                 low, middle, high = _angles(mean, std)
                 axes.plot(x, middle, color=plot_style.colour(k), linestyle=plot_style.dash(k))
-                ends.append((float(middle[-1]), label_of(entry).replace(", ", ",\n"), plot_style.colour(k)))
+                ends.append((float(middle[-1]), _short(entry), plot_style.colour(k)))
                 if len(own) <= 3 or k == 0:
                     axes.fill_between(x, low, high, color=plot_style.colour(k), alpha=0.15, linewidth=0)
             axes.set(title=f"{lights} light{'s' * (lights > 1)}", xlabel="iteration", ylabel="angle to the true light [degrees]")
-            axes.set_yscale("log")
+            _scaled(axes, [np.array(entry["curve_mean"]) for entry in own])
             plot_style.label_ends(axes, ends)
         _plot_sizes(panels[len(numbers)], [entry for entry in summaries if _is_plain(entry)])
         for axes in panels[len(numbers) + 1 :]:
@@ -90,15 +90,30 @@ def _plot_sizes(axes: Axes, summaries: Sequence[dict[str, Any]]) -> None:
     ends, sizes = [], sorted({entry["filter_size"] for entry in summaries})
     for k, ((lights, filter), own) in enumerate(series.items()):
         low, middle, high = _angles(*(np.array([entry[f"alignment_{key}"] for entry in own]) for key in ("mean", "std")))
-        positions = np.array([entry["filter_size"] for entry in own]) + 0.15 * k  # side by side
+        positions = np.array([sizes.index(entry["filter_size"]) for entry in own]) + 0.06 * k  # side by side
         tint = plot_style.colour(k)
-        axes.errorbar(positions, middle, yerr=[middle - low, high - middle], marker=plot_style.marker(k), capsize=2, color=tint)
+        bars = [middle - low, high - middle] if len(series) <= 2 else None
+        axes.errorbar(positions, middle, yerr=bars, marker=plot_style.marker(k), capsize=2, color=tint)
         label = f"{lights} light{'s' * (lights > 1)}" + ("" if filter == "gaussian" else f",\n{filter}")
         ends.append((float(middle[-1]), label, tint))
     axes.set(xlabel="texels of the filter", ylabel="angle at the end [degrees]", title="all filters")
-    axes.set_xticks(sizes, [{0: "no\nshadows", 1: "1 (none)"}.get(size, str(size)) for size in sizes])
-    axes.set_yscale("log")
+    axes.set_xticks(range(len(sizes)), [{0: "no shadows", 1: "1 (none)"}.get(size, str(size)) for size in sizes])
+    _scaled(axes, [np.array([entry["alignment_mean"] for entry in summaries])])
     plot_style.label_ends(axes, ends)
+
+
+def _short(entry: dict[str, Any]) -> str:
+    """Label of a line."""
+    text = label_of(entry)
+    return "no shadows" if text == "none" else text.replace("path-traced targets", "path-traced")
+
+
+def _scaled(axes: Axes, alignments: Sequence[npt.NDArray[np.float64]]) -> None:
+    """Scale the vertical axis to lines of alignments: bands reach to angles of zero, which no logarithm has."""
+    axes.set_yscale("log")
+    drawn = [_angles(values, np.zeros_like(values))[1] for values in alignments if values.size]
+    if drawn:
+        axes.set_ylim(min(float(values.min()) for values in drawn) / 2, 2 * max(float(values.max()) for values in drawn))
 
 
 def _angles(mean: npt.NDArray[np.float64], std: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.float64], ...]:

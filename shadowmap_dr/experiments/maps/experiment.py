@@ -228,7 +228,7 @@ def _add_times(entries: dict[str, dict[str, Any]], scene: mi.Scene, options: Map
 
 def table(record: dict[str, Any]) -> Table:
     """Table with a row for each scene and method."""
-    columns = ["scene, method", "RMSE", "shadowed", "bleeding", "acne", "shift", "cosine", "scale", "time"]
+    columns = ["scene, method", "RMSE", "shade", "bleed", "acne", "shift", "cos", "scale", "time"]
     rows: list[Sequence[str]] = []
     for scene, entries in record["scenes"].items():
         for label, e in entries.items():
@@ -236,8 +236,8 @@ def table(record: dict[str, Any]) -> Table:
             rows.append(
                 [
                     f"{scene}, {label}",
-                    *(f"{e[key]:.3f}" for key in ("rmse", "rmse_shadowed", "bleeding", "acne", "contour_shift_texels")),
-                    *(f"{e[key]:.3f}" for key in ("derivative_cosine", "derivative_scale")),
+                    *(_number(e[key]) for key in ("rmse", "rmse_shadowed", "bleeding", "acne", "contour_shift_texels")),
+                    *(_number(e[key]) for key in ("derivative_cosine", "derivative_scale")),
                     f"{ratio:.2f}x" if ratio is not None else f"{1e3 * e['seconds']:.2f} ms",
                 ]
             )
@@ -245,3 +245,8 @@ def table(record: dict[str, Any]) -> Table:
         errors = f"{e['median_rotation_deg']:.3f} deg, {e['median_offset_x100']:.3f}"
         rows.append([f"poses, {label}", f"{e['found']} of {e['runs']}", errors, *[""] * (len(columns) - 3)])
     return io_console.table("Shadow maps against path tracing (shift in texels, time over plain vsm)", columns, rows)
+
+
+def _number(value: float | None) -> str:
+    """A cell; records have None where a quantity is not defined, for instance a shift where there is no outline."""
+    return "-" if value is None else f"{value:.3f}"

@@ -140,7 +140,8 @@ def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Co
             for method in methods.values():
                 if fairness(method, problem).get("fair") is False:
                     note = "sample counts found with another object or resolution; that they converge here has not been shown"
-                    progress.console.print(f"{problem.folder} mitsuba: {note}: {getattr(method, 'setting', '')}", highlight=False)
+                    line = f"{problem.folder} mitsuba: {note}: {getattr(method, 'setting', '')}"
+                    progress.console.print(line, highlight=False, soft_wrap=True)
             records, images = [], {}
             for run in range(options.runs):
                 for name in options.methods:
@@ -159,7 +160,7 @@ def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Co
                     io_records.write_json(out / "pose.json", {**header(options.settings), "runs": stored})
                     _checkpoint(problem, name, run, options).unlink(missing_ok=True)
                     progress.remove_task(task)
-                    progress.console.print(f"{title}: {_outcome(record)}", highlight=False)
+                    progress.console.print(f"{title}: {_outcome(record)}", highlight=False, soft_wrap=True)
             _plots(problem, options, records, images, reference)
             result += records
     return result
@@ -287,7 +288,7 @@ def _plots(
 ) -> None:
     panels = {
         "rotation error [degrees]": "rotation_error_curve",
-        "offset error x 100": "translation_error_curve",
+        "offset error [units / 100]": "translation_error_curve",
         "loss (mean squared difference)": "loss_curve",
     }
     curves = {

@@ -15,5 +15,8 @@ def maps(options: maps_experiment.MapsOptions, variant: Variant = DEFAULT_VARIAN
     Writes OUT/maps.json and a sheet of pictures, OUT/maps.png.
     """
     set_variant(variant, COLOURED)
-    console.show(maps_experiment.table(maps_experiment.run_maps(options)))
+    record = maps_experiment.run_maps(options)
+    for table in (maps_experiment.table(record), maps_experiment.poses_table(record)):
+        if table is not None:
+            console.show(table)
     console.result(options.out / "maps.png", options.out / "maps.json")

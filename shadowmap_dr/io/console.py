@@ -17,6 +17,8 @@ from ..errors import Verbosity, verbosity
 
 # Seconds between lines of progress where there is no terminal to draw a bar on.
 _LINE_SECONDS = 10.0
+# Columns between two columns of a table.
+_GAP = 2
 # Width of the widest table in a pipe.
 _WIDEST = 1000
 
@@ -36,7 +38,26 @@ def show(result: Table) -> None:
     console = Console()
     if not console.is_terminal:
         console.width = max(console.width, Measurement.get(console, console.options.update(max_width=_WIDEST), result).maximum)
+    fit(result, console.width)
     console.print(result)
+
+
+def fit(result: Table, width: int) -> None:
+    """Share the room of a terminal among the wrapped columns of a table, so that no column loses a word if that is possible.
+
+    Rich itself narrows columns below their longest words, and cuts the last ones off.
+    """
+    natural = [
+        max(len(line) for cell in (*column.cells, column.header) for line in str(cell).split("\n")) for column in result.columns
+    ]
+    needed = [
+        whole if column.no_wrap else column.min_width or whole for whole, column in zip(natural, result.columns, strict=True)
+    ]
+    room = width - _GAP * (len(natural) - 1) - sum(needed)
+    wanted = sum(natural) - sum(needed)
+    if 0 <= room < wanted:
+        for whole, least, column in zip(natural, needed, result.columns, strict=True):
+            column.width = least + (whole - least) * room // wanted
 
 
 def result(picture: Path | None = None, record: Path | None = None) -> None:

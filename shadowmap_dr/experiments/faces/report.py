@@ -59,7 +59,7 @@ def rows(record: Mapping[str, Any], mode: str) -> tuple[list[str], list[list[str
     means = summary(record, mode)
     columns = ["head", "start: mean", "max"]
     for lights in means:
-        columns += [f"{lights} shadow{'s' * (lights > 1)}: mean", "max", "ms"]
+        columns += [f"{lights}: mean", "max", "ms"]
     body = []
     for seed in sorted({run["seed"] for run in runs_of(record, mode)}):
         runs = {run["lights"]: run for run in runs_of(record, mode) if run["seed"] == seed}
@@ -94,7 +94,7 @@ def rows(record: Mapping[str, Any], mode: str) -> tuple[list[str], list[list[str
 def tables(record: Mapping[str, Any]) -> list[Table]:
     """Tables for the terminal, one for each mode."""
     modes = [mode for mode in _TITLES if runs_of(record, mode)]
-    return [console.table(f"{_TITLES[mode]}: distances, ms a step", *rows(record, mode)) for mode in modes]
+    return [console.table(f"{_TITLES[mode]}: distances from 1 or 3 shadows, ms a step", *rows(record, mode)) for mode in modes]
 
 
 def seen_expressions(record: Mapping[str, Any], lights: int) -> list[dict[str, Any]]:

@@ -36,7 +36,7 @@ def table(summaries: Sequence[dict[str, Any]]) -> Table:
         for entry in summaries
     ]
     columns = ["lights", "shadows", "runs", "alignment", "deviation", "least", "% >= 0.995"]
-    return console.table("Alignment of estimated with true light directions", columns, rows)
+    return console.table("Alignment of estimated with true light directions", columns, rows, wrapped=(0, 1))
 
 
 def label_of(entry: dict[str, Any]) -> str:

@@ -241,10 +241,17 @@ def table(record: dict[str, Any]) -> Table:
                     f"{ratio:.2f}x" if ratio is not None else f"{1e3 * e['seconds']:.2f} ms",
                 ]
             )
-    for label, e in record.get("poses", {}).items():
-        errors = f"{e['median_rotation_deg']:.3f} deg, {e['median_offset_x100']:.3f}"
-        rows.append([f"poses, {label}", f"{e['found']} of {e['runs']}", errors, *[""] * (len(columns) - 3)])
     return io_console.table("Shadow maps against path tracing (shift in texels, time over plain vsm)", columns, rows)
+
+
+def poses_table(record: dict[str, Any]) -> Table | None:
+    """Table of the poses found with each method; None if none were looked for."""
+    rows = [
+        [label, f"{e['found']} of {e['runs']}", f"{e['median_rotation_deg']:.3f}", f"{e['median_offset_x100']:.3f}"]
+        for label, e in record.get("poses", {}).items()
+    ]
+    columns = ["method", "found", "degrees", "offset x 100"]
+    return io_console.table("Poses found with the shadow maps, medians of the errors", columns, rows) if rows else None
 
 
 def _number(value: float | None) -> str:

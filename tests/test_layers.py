@@ -48,7 +48,7 @@ MAY_IMPORT = {
             "variants",
         ),
     ),
-    "cli": ("", "_llvm", "errors", "experiments", "interactive", "inverse", "io", "variants"),
+    "cli": ("", "_llvm", "errors", "experiments", "interactive", "inverse", "io", "rendering.film.aovs", "variants"),
     "": ("_llvm", "errors", "integrator", "rendering", "shadow", "variants"),
 }
 

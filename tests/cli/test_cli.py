@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 import warnings
@@ -21,6 +22,7 @@ from shadowmap_dr.cli import gradients, lights, main, maps, soft
 from shadowmap_dr.errors import ShadowmapError
 from shadowmap_dr.experiments.pose import experiment
 from shadowmap_dr.io import images
+from shadowmap_dr.rendering.film.aovs import AOVS
 
 
 class Result:
@@ -161,6 +163,33 @@ def test_amounts_of_text(run: Any, monkeypatch: pytest.MonkeyPatch, level: str, 
 def test_verbose_commands_tell_their_time(run: Any) -> None:
     assert run("info", "-v").err.splitlines()[-1].endswith(" seconds")
     assert run("info").err == run("info", "-q").err == ""
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("cow.ply", "cow.ply is a mesh, and has no light and no camera: .*shadowmap-dr render pose -D object=cow.ply"),
+        ("cow.obj", 'cow.obj is a mesh, .*put <shape type="obj"><string name="filename" value="cow.obj"/></shape> into a scene'),
+        ("cow.glb", "cow.glb is a mesh, .*converted to .ply or .obj, into a scene"),
+        ("cow.png", "cow.png is a picture: give a Mitsuba scene"),
+        ("notes.txt", "notes.txt is no XML: give a Mitsuba scene"),
+        ("folder", "no scene 'folder': it is a folder; give a file in it .room.xml."),
+        ("folder/rom.xml", "no scene 'folder/rom.xml': there is no such file. Did you mean 'folder/room.xml'?"),
+        ("zzz.xml", "no scene 'zzz.xml': give a file that exists, or one of gallery"),
+    ],
+)
+def test_what_is_no_scene(run: Any, tmp_path: Path, name: str, message: str) -> None:
+    (tmp_path / "folder").mkdir()
+    for written in ("cow.ply", "cow.obj", "cow.glb", "cow.png", "notes.txt", "folder/room.xml"):
+        (tmp_path / written).write_text("what it is")
+    result = run("render", name, "-o", "a.png")
+    assert result.status == 1 and result.err.count("\n") == 1 and re.search(message, result.err), result.err
+    assert not (tmp_path / "a.png").exists()
+
+
+def test_channels_are_listed_in_the_help(run: Any) -> None:
+    words = " ".join(run("render", "--help").out.split())
+    assert ", ".join(AOVS) in words and "d:depth,n:sh_normal" in words
 
 
 def test_render_exr_equals_mitsuba(run: Any, tmp_path: Path) -> None:

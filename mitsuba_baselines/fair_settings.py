@@ -20,9 +20,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from shadowmap_dr import __version__
 from shadowmap_dr.errors import ShadowmapError
 from shadowmap_dr.io import assets
 from shadowmap_dr.io.files import atomic
+from shadowmap_dr.io.machine import machine
 
 from .pose import MitsubaPose, ProjectiveSetting, load_scene, pose_start
 from .proxy import calibrate
@@ -153,6 +155,8 @@ def find_fair_setting(
         "measurements": list(earlier.get("measurements", [])),
         "untried": dict(earlier.get("untried", {})),
         "proxy": proxy.record(),
+        "shadowmap_dr": __version__,
+        "machine": machine(),
         "mitsuba": mi.__version__,
         "variant": mi.variant(),
         "threads": dr.thread_count(),

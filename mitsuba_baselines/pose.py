@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from shadowmap_dr.errors import ShadowmapError
+from shadowmap_dr.errors import ShadowmapError, did_you_mean
 from shadowmap_dr.inverse.pose import apply_pose
 from shadowmap_dr.scene.mitsuba_meshes import positions_in, set_positions
 
@@ -46,7 +46,9 @@ class ProjectiveSetting:
 
     def __post_init__(self) -> None:
         if self.guiding not in GUIDINGS:
-            raise ShadowmapError(f"guiding {self.guiding!r}: choose from {', '.join(GUIDINGS)}.")
+            raise ShadowmapError(
+                f"guiding {self.guiding!r}: choose from {', '.join(GUIDINGS)}.{did_you_mean(self.guiding, GUIDINGS)}"
+            )
         if min(self.sppc, self.sppp, self.sppi, self.spp) < 1:
             raise ShadowmapError(f"sample counts {self.sppc}/{self.sppp}/{self.sppi}: each must be at least 1.")
 

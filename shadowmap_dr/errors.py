@@ -5,9 +5,12 @@ Every message is one line: what is wrong, the offending value, and what to do ab
 
 from __future__ import annotations
 
+import enum
 import inspect
 import re
 import warnings
+from collections.abc import Iterable
+from pathlib import Path
 
 
 class ShadowmapError(ValueError):
@@ -32,6 +35,83 @@ def mitsuba_message(error: BaseException) -> str:
         return "a file that it names is damaged."
     text = re.sub(r"\[\w+\.(?:cpp|h):\d+\] ?", "", " ".join(str(error).split()))
     return "a parameter has a value of the wrong type." if text == "std::bad_cast" else text
+
+
+def nearest(word: object, known: Iterable[object]) -> str | None:
+    """The known word that a mistyped one most resembles, or the only one that it begins; None if none is near."""
+    from difflib import get_close_matches  # only mistyped words need it
+
+    typed, words = str(word), [str(one) for one in known]
+    begun = [one for one in words if typed and one.startswith(typed)]
+    close = get_close_matches(typed, words, 1)
+    return begun[0] if len(begun) == 1 else close[0] if close else None
+
+
+def did_you_mean(word: object, known: Iterable[object]) -> str:
+    """A question with the nearest of the known words, to be put behind a sentence; empty if none is near."""
+    found = nearest(word, known)
+    return "" if found is None else f" Did you mean {found!r}?"
+
+
+#: Folder of the package: in a checkout, `pyproject.toml` lies beside it.
+_PACKAGE = Path(__file__).resolve().parent
+
+
+def install_hint(extra: str) -> str:
+    """Command that installs the packages of an extra, in the way in which this package was installed.
+
+    In a checkout: ``pip install '.[extra]'`` and the folder, with ``-e`` for an editable installation. Elsewhere: names of the
+    missing packages, as this package may be on no index.
+    """
+    import importlib.metadata as metadata
+
+    try:
+        own = metadata.distribution("shadowmap-dr")
+        needs, origin = own.requires or [], own.read_text("direct_url.json") or ""
+    except metadata.PackageNotFoundError:
+        needs, origin = [], ""
+    folder = _PACKAGE.parent
+    if (folder / "pyproject.toml").is_file():
+        return f"pip install {'-e ' if re.search(r'.editable.: *true', origin) else ''}'.[{extra}]' in {folder}"
+    marked = re.compile(rf"(?P<needed>(?P<name>[\w.-]+)[^;]*?) *;.*\bextra *== *['\"]{re.escape(extra)}['\"]")
+    found = [match for match in map(marked.fullmatch, needs) if match]
+    missing = [match for match in found if not _is_installed(match["name"])]
+    words = [repr(match["needed"]) for match in missing or found]
+    return f"pip install {' '.join(words)}" if words else f"install the packages of the extra {extra!r}"
+
+
+def _is_installed(package: str) -> bool:
+    import importlib.metadata as metadata
+
+    try:
+        metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return False
+    return True
+
+
+class Verbosity(enum.IntEnum):
+    """Amount of text that commands print beside their results."""
+
+    #: Errors only.
+    QUIET = 0
+    #: Progress, notes and warnings, too.
+    USUAL = 1
+    #: Versions, times, origins of warnings and tracebacks, too.
+    VERBOSE = 2
+
+
+_VERBOSITY = [Verbosity.USUAL]
+
+
+def verbosity() -> Verbosity:
+    """The verbosity of this process."""
+    return _VERBOSITY[0]
+
+
+def set_verbosity(level: Verbosity) -> None:
+    """Set the verbosity of this process. Commands do it, by their options ``--quiet`` and ``--verbose``."""
+    _VERBOSITY[0] = level
 
 
 def is_interrupt(error: BaseException | None) -> bool:

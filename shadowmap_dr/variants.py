@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .errors import ShadowmapError, warn
+from .errors import ShadowmapError, did_you_mean, warn
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
 #: Endings of variant names: of those that rendering with shadow maps supports, of those with colours, of all.
@@ -31,7 +31,9 @@ def set_variant(name: str, endings: tuple[str, ...] = SUPPORTED) -> None:
     """
     fitting = [variant for variant in mi.variants() if variant.endswith(endings)]
     if name not in mi.variants():
-        raise ShadowmapError(f"no variant {name!r} in this Mitsuba: choose one of {', '.join(fitting)}.")
+        raise ShadowmapError(
+            f"no variant {name!r} in this Mitsuba: choose one of {', '.join(fitting)}.{did_you_mean(name, fitting)}"
+        )
     if name not in fitting:
         raise ShadowmapError(f"this command does not work in the variant {name}: choose one of {', '.join(fitting)}.")
     if name.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):

@@ -21,7 +21,7 @@ MAY_IMPORT = {
     "_llvm": ("errors",),
     "variants": ("errors",),
     "jit": (),
-    "io": ("errors",),
+    "io": ("", "_llvm", "errors"),
     "raster": ("jit",),
     "shadow": ("jit", "raster"),
     "scene": ("errors", "jit"),
@@ -48,7 +48,7 @@ MAY_IMPORT = {
             "variants",
         ),
     ),
-    "cli": ("", "_llvm", "errors", "experiments", "interactive", "inverse", "io", "variants"),
+    "cli": ("", "_llvm", "errors", "experiments", "interactive", "inverse", "io", "rendering.film.aovs", "variants"),
     "": ("_llvm", "errors", "integrator", "rendering", "shadow", "variants"),
 }
 
@@ -218,7 +218,8 @@ def test_no_mitsuba(place: str) -> None:
 
 def test_the_program_imports_no_command() -> None:
     """``shadowmap-dr --help`` is quick: commands are imported when they are called."""
-    assert [short(other) for other in imports("shadowmap_dr.cli.main")] == ["errors"]
+    assert [short(other) for other in imports("shadowmap_dr.cli.main")] == ["", "errors", "cli.usage"]
+    assert [short(other) for other in imports("shadowmap_dr.cli.usage")] == ["errors"]
 
 
 def test_nothing_lies_flat() -> None:

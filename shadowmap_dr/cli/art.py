@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from ..experiments.art import experiment as art_experiment
+from ..io import console
 from ..variants import COLOURED, DEFAULT_VARIANT, set_variant
 from .options import After, Given, Variant, from_record
 
@@ -32,8 +32,8 @@ def art(
     options = given.make(targets=(*given.chosen.get("targets", ()), *letters))
     set_variant(variant, COLOURED)
     record = art_experiment.run_art(options)
-    Console().print(art_experiment.table(record))
+    console.show(art_experiment.table(record))
     typer.echo(art_experiment.summary(record))
     for message in record["warnings"]:
-        typer.echo(f"warning: {message}", err=True)
-    typer.echo(f"Meshes, pictures and record: {options.out}")
+        console.note(f"warning: {message}")
+    console.result(options.out / "picture.png", options.out / "art.json")

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import typer
-from rich.console import Console
-
 from ..errors import ShadowmapError
 from ..experiments.bench import common as bench_common
 from ..experiments.bench import experiment as bench_experiment
 from ..experiments.bench import report as bench_report
+from ..io import console
 from ..variants import COLOURED, DEFAULT_VARIANT, set_variant
 from .options import Variant, from_record
 
@@ -24,8 +22,8 @@ def bench(options: bench_common.BenchOptions, variant: Variant = DEFAULT_VARIANT
     options = replace(options, only=tuple(dict.fromkeys(options.only)))
     set_variant(variant, COLOURED)
     record = bench_experiment.run_bench(options)
-    Console().print(bench_report.table(record))
-    typer.echo(f"Record: {options.out}, plot: {options.out.with_suffix('.png')}")
+    console.show(bench_report.table(record))
+    console.result(options.out.with_suffix(".png"), options.out)
     failed = bench_experiment.failures(record, options.only)
     if failed:
         raise ShadowmapError(f"{len(failed)} part(s) could not be measured; the first: {failed[0]}")

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from ..errors import ShadowmapError
 from ..experiments.faces import experiment as faces_experiment
@@ -16,7 +15,7 @@ from ..experiments.faces import problem as faces_problem
 from ..experiments.faces import report as faces_report
 from ..inverse.faces import convert as convert_model
 from ..inverse.faces.morphable import save_model
-from ..io import files
+from ..io import console, files
 from ..variants import COLOURED, DEFAULT_VARIANT, set_variant
 from .options import After, Given, Variant, from_record
 
@@ -49,8 +48,8 @@ def face(
     set_variant(variant, COLOURED)
     record = faces_experiment.run_faces(options)
     for table in faces_report.tables(record):
-        Console().print(table)
-    typer.echo(f"Record, tables, pictures and heads: {options.out}")
+        console.show(table)
+    console.result(options.out / f"{options.modes[0]}-errors.png", options.out / "faces.json")
 
 
 def _image_options(given: Given[faces_experiment.FaceOptions], image: Path) -> faces_image.ImageOptions:
@@ -77,8 +76,9 @@ def _fit_image(options: faces_image.ImageOptions, variant: str) -> None:
     )
     typer.echo(f"share of heads whose weights are as far from the mean head's: {record['chance_of_weights']:.2g}")
     for message in faces_image.doubts(record):
-        typer.echo(f"warning: {message}", err=True)
-    typer.echo(f"Record, pictures and head: {options.out}")
+        console.note(f"warning: {message}")
+    name = options.image.stem
+    console.result(options.out / f"{name}-shadows.png", options.out / f"{name}-face.json")
 
 
 @app.command("convert")

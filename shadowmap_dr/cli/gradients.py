@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import typer
-from rich.console import Console
 from rich.table import Table
 
 from ..experiments.gradients import convergence as convergence_experiment
 from ..experiments.gradients import jacobian as jacobian_experiment
 from ..experiments.gradients import plane as plane_experiment
 from ..experiments.gradients import report as gradients_report
+from ..io import console
 from ..variants import DEFAULT_VARIANT, set_variant
 from .options import Variant, from_record
 
@@ -55,8 +55,8 @@ def minimal_plane(options: plane_experiment.PlaneOptions, variant: Variant = DEF
 
 
 def _show(table: Table, out: Path, name: str) -> None:
-    Console().print(table)
+    console.show(table)
     # The sentences of the summary only: the table has just been printed.
     text = (out / f"{name}.md").read_text(encoding="utf-8")
     typer.echo("\n".join(line for line in text.splitlines() if line and not line.startswith(("|", "#"))))
-    typer.echo(f"Record, pictures and plots: {out}")
+    console.result(out / f"{name}.png", out / f"{name}.json")

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 
 from ..errors import ShadowmapError
 from ..experiments.lights import experiment as lights_experiment
@@ -14,6 +13,7 @@ from ..experiments.lights import speed as lights_speed
 from ..experiments.lights.problem import LightProblem, check_problem
 from ..inverse.runs.schedulers import check_scheduler
 from ..io import console, files, records
+from ..io.machine import header
 from ..io.ranges import FILTER_SIDE, check_range
 from ..variants import DEFAULT_VARIANT, set_variant
 from .options import After, Given, Variant, from_record
@@ -36,8 +36,8 @@ def lights(
     options = given.make(filter_sizes=_filter_sizes(given, shadows))
     set_variant(variant)
     summaries = lights_experiment.run_lights(options, variant=variant)
-    Console().print(lights_report.table(summaries))
-    typer.echo(f"Record, plot and pictures: {options.out}")
+    console.show(lights_report.table(summaries))
+    console.result(options.out / "lights.png", options.out / "lights.json")
 
 
 def _filter_sizes(given: Given[lights_experiment.LightOptions], shadows: bool | None) -> tuple[int, ...]:
@@ -73,8 +73,9 @@ def lights_times(options: lights_speed.TimesOptions, variant: Variant = DEFAULT_
         [name, f"{1e3 * entry['median']:.2f}", f"{ratios.get(f'{name} / batch of {max(sizes)}', 1):.2f}"]
         for name, entry in times.items()
     ]
-    Console().print(console.table("A step of a run", ["way", "ms", "/ largest batch"], rows))
-    record: dict[str, Any] = {"steps": steps}
+    console.show(console.table("A step of a run", ["way", "ms", "/ largest batch"], rows))
+    settings = {"object": options.object, "lights": options.lights, "batches": sizes}
+    record: dict[str, Any] = {**header(settings), "steps": steps}
     records.write_json(path, record)
     if options.workers:
         problem = LightProblem(options.object, options.lights, 32, iterations=60)
@@ -82,3 +83,4 @@ def lights_times(options: lights_speed.TimesOptions, variant: Variant = DEFAULT_
         speed_up = record["workers"]["speed_up"]["2"]
         records.write_json(path, record)
         typer.echo(f"Two workers with a thread each do {speed_up:.2f} times the work of one.")
+    console.result(record=path)

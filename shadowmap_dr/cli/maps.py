@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import typer
-from rich.console import Console
-
 from ..experiments.maps import experiment as maps_experiment
+from ..io import console
 from ..variants import COLOURED, DEFAULT_VARIANT, set_variant
 from .options import Variant, from_record
 
@@ -17,5 +15,8 @@ def maps(options: maps_experiment.MapsOptions, variant: Variant = DEFAULT_VARIAN
     Writes OUT/maps.json and a sheet of pictures, OUT/maps.png.
     """
     set_variant(variant, COLOURED)
-    Console().print(maps_experiment.table(maps_experiment.run_maps(options)))
-    typer.echo(f"Record and pictures: {options.out}")
+    record = maps_experiment.run_maps(options)
+    for table in (maps_experiment.table(record), maps_experiment.poses_table(record)):
+        if table is not None:
+            console.show(table)
+    console.result(options.out / "maps.png", options.out / "maps.json")

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import typer
 
-from ..errors import ShadowmapError
+from ..errors import ShadowmapError, install_hint
 from ..interactive import exports
 from ..interactive.file_session import follow, kept
 from ..interactive.library import SPHERE, MeshLibrary, read_start
@@ -21,7 +21,7 @@ from ..interactive.options import VIEWS, ModelOptions
 from ..interactive.snapshot import Snapshot
 from ..interactive.start_mesh import StartMesh
 from ..inverse import Sculptor, ShadowView, shadow_view
-from ..io import assets, files
+from ..io import assets, console, files
 from ..variants import DEFAULT_VARIANT, set_variant
 from .options import Variant, from_record
 
@@ -65,10 +65,9 @@ def model(
     if options.serve:
         _serve(MeshLibrary(first, build), shadow, options.port, save)
     else:
-        typer.echo("Preparing ...", err=True)
+        console.note("Preparing ...")
         with _interrupts() as stopped:
-            say = partial(typer.echo, err=True)
-            follow(build(first), options.image, partial(save, first), lambda: bool(stopped), say)
+            follow(build(first), options.image, partial(save, first), lambda: bool(stopped), console.note)
     typer.echo(f"Mesh: {options.output}")
 
 
@@ -78,7 +77,7 @@ def _serve(library: MeshLibrary, shadow: ShadowView, port: int, save: Callable[[
         from ..interactive.connections import Connections
         from ..interactive.server import listen, serve
     except ModuleNotFoundError as error:
-        raise ShadowmapError(f"--serve needs the package {error.name}: pip install 'shadowmap-dr[interactive]'.") from error
+        raise ShadowmapError(f"--serve needs the package {error.name}: {install_hint('interactive')}.") from error
     from ..interactive.session import Session
 
     def save_snapshot(snapshot: Snapshot) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, is_dataclass
+from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Generic, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -12,11 +13,14 @@ import typer
 
 from ..io.options import Option, described
 
-Variant = Annotated[str, typer.Option(help="Mitsuba variant; the cuda ones need an NVIDIA GPU.")]
+Variant = Annotated[str, typer.Option(metavar="NAME", help="Mitsuba variant; the cuda ones need an NVIDIA GPU.")]
 
 # Any: these make types of parameters from those of fields; type checkers want types in annotations to be spelled out.
 _ANNOTATED: Any = Annotated
 _LIST: Any = list
+
+# Words for values in the help, by type. Typer's own depend on its version, and name Python's types.
+_METAVARS: dict[Any, str] = {int: "INTEGER", float: "NUMBER", str: "TEXT", Path: "PATH"}
 
 R = TypeVar("R")
 Command = Callable[..., None]
@@ -135,6 +139,7 @@ def _parameter(field: Field[Any], option: Option, kind: object) -> inspect.Param
         single = type(get_args(single)[0])
     if option.parse is not None:
         single = next(kind for name, kind in get_type_hints(option.parse).items() if name != "return")
+    metavar = metavar or _METAVARS.get(single)
     info = typer.Option(*names, help=_help(field, option, names), metavar=metavar, show_default=False)
     annotation = _ANNOTATED[(_LIST[single] if repeated else single) | None, info]
     return inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import typer
-from rich.console import Console
-
 from ..experiments.pose import experiment as pose_experiment
 from ..experiments.pose.methods import usual_methods
+from ..io import console
 from ..variants import DEFAULT_VARIANT, set_variant
 from .options import Given, Variant, from_record
 
@@ -21,5 +19,5 @@ def pose(given: Given[pose_experiment.PoseOptions], variant: Variant = DEFAULT_V
     methods = given["methods"] if "methods" in given else usual_methods(given["shadow_only"], given["normals"])
     options = given.make(methods=methods)
     records = pose_experiment.run_pose(options)
-    Console().print(pose_experiment.table(records))
-    typer.echo(f"Records, images and plots: {options.out}")
+    console.show(pose_experiment.table(records))
+    console.result(pose_experiment.pictures_of(options)[0], options.out / "pose.json")

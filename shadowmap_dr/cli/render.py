@@ -11,25 +11,40 @@ import numpy as np
 import typer
 
 from .. import __version__
-from ..errors import ShadowmapError, mitsuba_message
+from ..errors import ShadowmapError, mitsuba_message, nearest
 from ..io import assets, files, images
+from ..io.pictures import SUFFIXES
+from ..rendering.film.aovs import AOVS
 from ..variants import ANY, DEFAULT_VARIANT, set_variant
 from .options import Variant
 
+# Mitsuba's plug-ins for suffixes of meshes; none for those that have to be converted.
+_MESHES = {".ply": "ply", ".obj": "obj", ".serialized": "serialized", ".stl": "", ".glb": "", ".gltf": "", ".off": "", ".fbx": ""}
+
 
 def render(
-    scene: Annotated[str, typer.Argument(help="Mitsuba XML file, or the name of a scene of this package.")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Image to write: .exr (all channels) or .png (sRGB).")],
+    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Mitsuba XML file, or the name of a scene of this package.")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="IMAGE", help="Image to write: .exr (all channels) or .png (sRGB).")
+    ],
     define: Annotated[
         list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="Value of the parameter $NAME of the scene; repeatable.")
     ] = None,
-    integrator: Annotated[str, typer.Option(help="Integrator plug-in, or 'scene' for the scene's own.")] = "shadowmap",
+    integrator: Annotated[
+        str, typer.Option(metavar="NAME", help="Integrator plug-in, or 'scene' for the scene's own.")
+    ] = "shadowmap",
     size: Annotated[str | None, typer.Option(metavar="WxH", help="Image size in pixels.")] = None,
-    spp: Annotated[int | None, typer.Option(min=1, max=1 << 24, help="Samples per pixel [default: the integrator's].")] = None,
-    seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Seed of the sampler.")] = 0,
+    spp: Annotated[
+        int | None, typer.Option(metavar="INTEGER", min=1, max=1 << 24, help="Samples per pixel [default: the integrator's].")
+    ] = None,
+    seed: Annotated[int, typer.Option(metavar="INTEGER", min=0, max=2**32 - 1, help="Seed of the sampler.")] = 0,
     aovs: Annotated[
         str | None,
-        typer.Option(help="Further channels, separated by commas: the integrator's names, or those of Mitsuba's aov."),
+        typer.Option(
+            metavar="NAMES",
+            help=f"Further channels of an .exr file, separated by commas: {', '.join(AOVS)}; or LABEL:NAME. With other "
+            "integrators the pairs of Mitsuba's aov, for instance d:depth,n:sh_normal.",
+        ),
     ] = None,
     variant: Variant = DEFAULT_VARIANT,
 ) -> None:
@@ -38,8 +53,9 @@ def render(
     if aovs is not None and output.suffix.lower() != ".exr":
         raise ShadowmapError(f"--aovs {aovs}: {output.suffix} files hold colours only, choose an .exr file.")
     values = _definitions(define or [])
+    path = _scene_file(scene)
     set_variant(variant, ANY)
-    loaded = _load(assets.scene(scene), values)
+    loaded = _load(path, values)
     if size is not None:
         loaded = _resized(loaded, *_size(size))
     width, height = loaded.sensors()[0].film().crop_size()
@@ -71,6 +87,34 @@ def render(
         pixels = np.asarray(image, dtype=np.float32)
         images.write_exr(output, {name: pixels[..., i] for i, name in enumerate(names)}, metadata)
     typer.echo(f"{output}: {width} x {height}, {', '.join(names)}")
+
+
+def _scene_file(name: str) -> Path:
+    """Path of a scene by name or file. ShadowmapError, with what to do, for a folder, a mesh, a picture, and what is no XML."""
+    files.check_name(name)
+    given = Path(name)
+    if name in assets.scene_names() or not given.exists():
+        beside = [path.name for path in given.parent.glob("*.xml")] if given.parent.is_dir() else []
+        if name not in assets.scene_names() and beside and (near := nearest(given.name, beside)):
+            raise ShadowmapError(f"no scene {name!r}: there is no such file. Did you mean {str(given.with_name(near))!r}?")
+        return assets.scene(name)
+    suffix = given.suffix.lower()
+    if given.is_dir():
+        scenes = sorted(path.name for path in given.glob("*.xml"))
+        raise ShadowmapError(
+            f"no scene {name!r}: it is a folder; give a file in it ({', '.join(scenes[:5]) or 'it has no .xml'})."
+        )
+    if suffix in _MESHES:
+        shape = f'<shape type="{_MESHES[suffix]}"><string name="filename" value="{name}"/></shape>'
+        how = f", or render it in ours: shadowmap-dr render pose -D object={name} -o image.png" if suffix == ".ply" else ""
+        plural = shape if _MESHES[suffix] else "its mesh, converted to .ply or .obj,"
+        raise ShadowmapError(f"{name} is a mesh, and has no light and no camera: put {plural} into a scene (.xml){how}.")
+    if suffix in SUFFIXES:
+        raise ShadowmapError(f"{name} is a picture: give a Mitsuba scene (.xml), or one of {', '.join(assets.scene_names())}.")
+    with given.open("rb") as file:
+        if not file.read(1024).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<"):
+            raise ShadowmapError(f"{name} is no XML: give a Mitsuba scene (.xml), or one of {', '.join(assets.scene_names())}.")
+    return given.resolve()
 
 
 def _definitions(entries: list[str]) -> dict[str, str]:

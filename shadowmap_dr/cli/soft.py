@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import typer
-from rich.console import Console
 
 from ..experiments.soft import experiment as soft_experiment
 from ..experiments.soft import report as soft_report
+from ..io import console
 from ..variants import COLOURED, DEFAULT_VARIANT, set_variant
 from .options import Variant, from_record
 
@@ -19,6 +19,8 @@ def soft(options: soft_experiment.SoftOptions, variant: Variant = DEFAULT_VARIAN
     """
     set_variant(variant, COLOURED)
     record = soft_experiment.run_soft(options)
-    Console().print(soft_report.table(record))
+    for table in (soft_report.table(record), soft_report.times_table(record)):
+        if table is not None:
+            console.show(table)
     typer.echo("\n".join(soft_report.reading(record)))
-    typer.echo(f"Record and pictures: {options.out}")
+    console.result(options.out / "soft.png", options.out / "soft.json")

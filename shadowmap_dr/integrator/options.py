@@ -8,6 +8,7 @@ from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, Any
 
 from ..errors import ShadowmapError, warn
+from ..rendering.film.aovs import split_aovs
 from ..rendering.settings import DIRECT, RenderSettings
 from ..shadow import ShadowSettings
 from .name import PLUGIN
@@ -55,7 +56,7 @@ class Options:
     hide_emitters          the camera looks through area lights, and sees black instead of environments; both light the scene
     max_depth              as in Mitsuba: 0 is black, 1 shows emitters only, 2 is direct light; more, or -1, is rendered as 2
     aovs                   further channels, separated by commas: names of ``shadowmap_dr.rendering.film.aovs.AOVS``, or
-                           ``label:name`` to call the channel ``label``
+                           ``label:name`` to call the channel ``label``. Python may give a sequence of them to this record
     tessellation           triangles around spheres, disks and cylinders, at least 3; curves have half as many around them, and
                            B-splines an eighth of it along each segment
     recorded               ``mi.render`` and its backward pass are recorded with ``dr.freeze`` and replayed while only numbers
@@ -84,10 +85,13 @@ class Options:
     ambient: float = RenderSettings.ambient
     hide_emitters: bool = RenderSettings.hide_emitters
     max_depth: int = RenderSettings.max_depth
-    aovs: str = ""
+    aovs: tuple[str, ...] = RenderSettings.aovs
     tessellation: int = 64
     recorded: bool = False
     compat: bool = ShadowSettings.compat
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "aovs", split_aovs(self.aovs))
 
     @classmethod
     def from_properties(cls, props: mi.Properties) -> Options:
@@ -97,7 +101,8 @@ class Options:
         foreign = []
         for name in props.keys():  # noqa: SIM118  (Properties is no dictionary)
             if name in defaults:
-                values[name] = _typed(name, props[name], type(defaults[name]))
+                # Properties hold no sequences: names of channels are text there.
+                values[name] = _typed(name, props[name], str if name == "aovs" else type(defaults[name]))
             elif any(fnmatchcase(name, pattern) for pattern in _FOREIGN):
                 _ = props[name]  # otherwise Mitsuba would report an unqueried parameter
                 foreign.append(name)
@@ -117,16 +122,20 @@ class Options:
     def labelled_aovs(self) -> tuple[tuple[str, str], ...]:
         """(label, name) of each further channel."""
         pairs = []
-        for entry in filter(None, (part.strip() for part in self.aovs.split(","))):
+        for entry in self.aovs:
             label, _, name = entry.rpartition(":")
             name = name.strip()
             pairs.append((label.strip() or name, _SYNONYMS.get(name, name)))
         labels = [label for label, _ in pairs]
         for label in labels:
             if label in COLOURS:
-                raise ShadowmapError(f"aovs is {self.aovs!r}: '{label}' is a channel of the image itself, label it otherwise.")
+                raise ShadowmapError(
+                    f"aovs is {','.join(self.aovs)!r}: '{label}' is a channel of the image itself, label it otherwise."
+                )
             if labels.count(label) > 1:
-                raise ShadowmapError(f"aovs is {self.aovs!r}: '{label}' is there twice; label one of them, as in a:depth.")
+                raise ShadowmapError(
+                    f"aovs is {','.join(self.aovs)!r}: '{label}' is there twice; label one of them, as in a:depth."
+                )
         return tuple(pairs)
 
     def render_settings(self) -> RenderSettings:

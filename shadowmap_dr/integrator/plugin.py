@@ -213,7 +213,8 @@ def make_class() -> type:
                 )
             if self.shell.options.aovs:
                 raise ShadowmapError(
-                    f"'{PLUGIN}' has channels of its own (aovs is {self.shell.options.aovs!r}), which aov cannot pass on: "
+                    f"'{PLUGIN}' has channels of its own (aovs is {','.join(self.shell.options.aovs)!r}), "
+                    "which aov cannot pass on: "
                     "leave them out, or render it by itself."
                 )
             return mi.Spectrum(0), mi.Bool(False), [], None

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import ShadowmapError
+from ..errors import ShadowmapError, did_you_mean
 from ..inverse.shadow_art import target_images
 from ..inverse.shadow_art.exports import vertex_colours
 from ..io.files import atomic
@@ -31,7 +31,7 @@ Vertices = Array | npt.NDArray[np.float64]
 def mesh_bytes(kind: str, vertices: Vertices, faces: npt.NDArray[np.uint32]) -> bytes:
     """A mesh of vertices (V, 3) and faces (F, 3) as a file of one of `FORMATS`. GLB files have vertex colours."""
     if kind not in FORMATS:
-        raise ShadowmapError(f"no mesh format {kind!r}: choose from {', '.join(FORMATS)}.")
+        raise ShadowmapError(f"no mesh format {kind!r}: choose from {', '.join(FORMATS)}.{did_you_mean(kind, FORMATS)}")
     import trimesh
 
     colours = vertex_colours(np.asarray(vertices, np.float32)) if kind == "glb" else None

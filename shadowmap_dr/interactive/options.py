@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..errors import ShadowmapError
+from ..errors import ShadowmapError, did_you_mean
 from ..io.options import option
 from ..io.ranges import check_ranges
 from . import exports
@@ -30,4 +30,4 @@ class ModelOptions:
     def __post_init__(self) -> None:
         check_ranges(self)
         if self.view not in VIEWS:
-            raise ShadowmapError(f"no view {self.view!r}: choose from {', '.join(VIEWS)}.")
+            raise ShadowmapError(f"no view {self.view!r}: choose from {', '.join(VIEWS)}.{did_you_mean(self.view, VIEWS)}")

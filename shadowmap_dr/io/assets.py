@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..errors import ShadowmapError
+from ..errors import ShadowmapError, did_you_mean
 from .files import check_name
 
 
@@ -54,4 +54,4 @@ def _find(name: str, suffix: str, folder: Path, known: list[str], kind: str) -> 
     path = Path(name)
     if path.is_file():
         return path.resolve()
-    raise ShadowmapError(f"no {kind} {name!r}: give a file that exists, or one of {', '.join(known)}.")
+    raise ShadowmapError(f"no {kind} {name!r}: give a file that exists, or one of {', '.join(known)}.{did_you_mean(name, known)}")

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from .files import atomic
+from . import plot_style
 from .images import to_srgb
 
 if TYPE_CHECKING:
@@ -19,6 +19,10 @@ if TYPE_CHECKING:
 Image = npt.NDArray[np.floating[Any]]
 #: Title of a row -> title of a column -> image.
 Rows = Mapping[str, Mapping[str, Image]]
+#: Columns whose titles begin with this are differences: numbers, which are drawn in colours with a bar.
+DIFFERENCE = "difference"
+# Share of pixels below the end of a colour bar, in percent.
+_MOST = 99.7
 
 
 @np.errstate(over="ignore", invalid="ignore")  # the margins of axes for numbers near the largest ones
@@ -27,6 +31,7 @@ def plot_curves(
     panels: Mapping[str, Mapping[str, Sequence[Sequence[float]]]],
     x_label: str = "iteration",
     columns: int | None = None,
+    caption: str = "Curves of one colour are runs with the same settings.",
 ) -> None:
     """Plot curves over their index, one panel beside the other, with logarithmic vertical axes.
 
@@ -35,71 +40,98 @@ def plot_curves(
         panels: vertical axis label -> legend entry -> curves (several curves of one entry, e.g. runs, share a colour).
         x_label: label of the horizontal axes.
         columns: panels in a row, or None for all.
+        caption: line below the panels, if some entry has several curves.
     """
-    from matplotlib.figure import Figure  # unlike pyplot it has no global state and needs no display
-
     across = max(1, min(columns or len(panels), len(panels)))
-    down = math.ceil(len(panels) / across)
-    figure = Figure(figsize=(5 * across, 4 * down), layout="constrained")
-    for i, (y_label, entries) in enumerate(panels.items()):
-        axes = figure.add_subplot(down, across, i + 1)
-        for colour, (label, curves) in enumerate(entries.items()):
-            for k, curve in enumerate(curves):
-                axes.plot(curve, color=f"C{colour}", alpha=0.8, linewidth=1.2, label=label if k == 0 else None)
-        if any(_positive(curve) for curves in entries.values() for curve in curves):
-            axes.set_yscale("log")
-        axes.set_xlabel(x_label)
-        axes.set_ylabel(y_label)
-        axes.grid(True, alpha=0.3)
-        if i == 0 and entries:
-            axes.legend()
-    with atomic(path) as temporary:
-        figure.savefig(temporary, dpi=150)
+    down = max(1, math.ceil(len(panels) / across))
+    with plot_style.drawn(path, 4.6 * across, 3.2 * down) as figure:
+        for i, (y_label, entries) in enumerate(panels.items()):
+            axes = figure.add_subplot(down, across, i + 1)
+            ends = []
+            for k, (label, curves) in enumerate(entries.items()):
+                for curve in curves:
+                    axes.plot(curve, color=plot_style.colour(k), linestyle=plot_style.dash(k), alpha=0.85)
+                last = [value for curve in curves for value in list(curve)[-1:] if value is not None]
+                ends.append((float(np.median(last)) if last else math.nan, label, plot_style.colour(k)))
+            if any(_positive(curve) for curves in entries.values() for curve in curves):
+                axes.set_yscale("log")
+            axes.set_xlabel(x_label)
+            axes.set_ylabel(y_label)
+            axes.set_xmargin(0.02)
+            plot_style.label_ends(axes, ends)
+        if any(len(curves) > 1 for entries in panels.values() for curves in entries.values()):
+            plot_style.caption(figure, caption)
 
 
 def image_sheet(path: str | os.PathLike[str], rows: Rows, size: float = 2.2) -> None:
-    """Draw images in a grid: row title -> column title -> linear (H, W, 3) or (H, W, 1) image."""
+    """Draw images in a grid: row title -> column title -> linear (H, W, 3) or (H, W, 1) image.
 
-    def draw(axes: Axes, image: Image, _: Mapping[str, Image]) -> None:
-        pixels = to_srgb(np.nan_to_num(image))
-        pixels = np.repeat(pixels, 3, axis=2) if pixels.shape[2] == 1 else pixels[..., :3]
-        axes.imshow(pixels, interpolation="nearest")
+    Columns whose titles begin with `DIFFERENCE` are drawn as numbers, the mean over the channels, with one scale for the sheet
+    and a colour bar; negative numbers make it signed.
+    """
+    differences = [_mean(image) for row in rows.values() for title, image in row.items() if title.startswith(DIFFERENCE)]
+    limit = max((_limit(values) for values in differences), default=1.0)
+    signed = any(float(np.nanmin(values)) < 0 for values in differences)
+    low, name = (-limit, plot_style.SIGNED) if signed else (0.0, plot_style.SEQUENTIAL)
+    with plot_style.drawn(path, *_sheet_size(rows, size, bar=bool(differences)), dpi=120) as figure:
+        grid = _grid(figure, rows)
+        for (_, title, image), axes in grid:
+            if title.startswith(DIFFERENCE):
+                axes.imshow(np.nan_to_num(_mean(image)), cmap=name, vmin=low, vmax=limit)
+            else:
+                pixels = to_srgb(np.nan_to_num(image))
+                axes.imshow(np.repeat(pixels, 3, axis=2) if pixels.shape[2] == 1 else pixels[..., :3])
+        if differences:
+            label = "difference" if signed else "absolute difference"
+            plot_style.colour_bar(figure, [axes for _, axes in grid], name, low, limit, label)
 
-    _grid(path, rows, size, draw)
+
+def signed_sheet(path: str | os.PathLike[str], rows: Rows, size: float = 2.0, label: str = "value") -> None:
+    """Draw signed images (H, W) in a grid, blue below zero and red above, with one scale and a colour bar for each row."""
+    with plot_style.drawn(path, *_sheet_size(rows, size, bar=True), dpi=120) as figure:
+        grid = _grid(figure, rows)
+        for row_title, row in rows.items():
+            limit = max(_limit(image) for image in row.values())
+            own = [(image, axes) for (title, _, image), axes in grid if title == row_title]
+            for image, axes in own:
+                axes.imshow(np.nan_to_num(image), cmap=plot_style.SIGNED, vmin=-limit, vmax=limit, interpolation="antialiased")
+            plot_style.colour_bar(figure, [axes for _, axes in own], plot_style.SIGNED, -limit, limit, label)
 
 
-def signed_sheet(path: str | os.PathLike[str], rows: Rows, size: float = 2.0) -> None:
-    """Draw signed images (H, W) in a grid, blue below zero and red above, with one scale for each row."""
-
-    def draw(axes: Axes, image: Image, row: Mapping[str, Image]) -> None:
-        limit = max(float(np.percentile(np.abs(other), 99.7)) for other in row.values()) or 1.0
-        axes.imshow(np.nan_to_num(image), cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="antialiased")
-
-    _grid(path, rows, size, draw)
-
-
-def _grid(
-    path: str | os.PathLike[str], rows: Rows, size: float, draw: Callable[[Axes, Image, Mapping[str, Image]], None]
-) -> None:
-    """Write a grid of images with titles; ``draw(axes, image, row)`` draws one image."""
-    from matplotlib.figure import Figure  # unlike pyplot it has no global state and needs no display
-
+def _grid(figure: Any, rows: Rows) -> list[tuple[tuple[str, str, Image], Axes]]:  # Any: Figure
+    """Empty plots with titles for all images: (title of the row, title of the column, image) and axes."""
     columns = max(len(row) for row in rows.values())
-    aspect = max(image.shape[0] / image.shape[1] for row in rows.values() for image in row.values())
-    figure = Figure(figsize=(size * columns, size * aspect * len(rows) + 0.3), layout="constrained")
+    grid = []
     for i, (row_title, row) in enumerate(rows.items()):
         for j, (column_title, image) in enumerate(row.items()):
             axes = figure.add_subplot(len(rows), columns, i * columns + j + 1)
-            draw(axes, image, row)
-            axes.set_xticks([])
-            axes.set_yticks([])
-            if i == 0:
+            axes.set(xticks=[], yticks=[])
+            axes.grid(False)
+            axes.spines[:].set_visible(False)
+            if i == 0 or list(row) != list(next(iter(rows.values()))):
                 axes.set_title(column_title, fontsize=9)
             if j == 0:
                 axes.set_ylabel(row_title, fontsize=9)
-    with atomic(path) as temporary:
-        figure.savefig(temporary, dpi=120)
+            grid.append(((row_title, column_title, image), axes))
+    return grid
+
+
+def _sheet_size(rows: Rows, size: float, *, bar: bool) -> tuple[float, float]:
+    """Width and height of a sheet in inches; ``size`` is the width of an image."""
+    columns = max(len(row) for row in rows.values())
+    aspect = max(image.shape[0] / image.shape[1] for row in rows.values() for image in row.values())
+    return size * columns + (1.0 if bar else 0.0) + 0.3, (size * aspect + 0.15) * len(rows) + 0.3
+
+
+def _mean(image: Image) -> Image:
+    return image.mean(axis=2) if image.ndim == 3 else image
+
+
+def _limit(values: Image) -> float:
+    """End of a scale: nearly all magnitudes lie below it."""
+    found = float(np.percentile(np.abs(np.nan_to_num(values)), _MOST))
+    return found or float(np.abs(np.nan_to_num(values)).max()) or 1.0
 
 
 def _positive(curve: Sequence[float]) -> bool:
-    return any(value > 0 and math.isfinite(value) for value in curve)
+    return any(value is not None and value > 0 and math.isfinite(value) for value in curve)

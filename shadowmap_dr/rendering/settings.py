@@ -7,9 +7,9 @@ from difflib import get_close_matches
 from numbers import Integral, Real
 from typing import Any
 
-from ..errors import ShadowmapError
+from ..errors import ShadowmapError, did_you_mean
 from ..shadow import ShadowSettings
-from .film.aovs import AOVS
+from .film.aovs import AOVS, split_aovs
 
 #: Most samples of one extended light.
 MOST_SAMPLES = 4096
@@ -51,7 +51,8 @@ class RenderSettings:
             larger than the shadow map, else 2 to 4, one for every two texels of the map that a pixel of the image has.
         light_memory: memory (GiB) for the shadow maps of lights, derivatives included. Maps of more lights are made one slice of
             the lights after the other, and once more for derivatives.
-        aovs: names of further channels, see :data:`shadowmap_dr.rendering.film.aovs.AOVS`.
+        aovs: names of further channels, see :data:`shadowmap_dr.rendering.film.aovs.AOVS`. Text with commas is split into a
+            tuple, as in the plug-in.
     """
 
     shadow: ShadowSettings = field(default_factory=ShadowSettings)
@@ -68,14 +69,13 @@ class RenderSettings:
     aovs: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        if isinstance(self.aovs, str):
-            raise ShadowmapError(f"aovs is {self.aovs!r}: give names in a tuple, as in ('{self.aovs}',).")
-        if not isinstance(self.aovs, tuple | list):
-            raise ShadowmapError(f"aovs is {self.aovs!r}: give names in a tuple, as in ('depth',).")
-        object.__setattr__(self, "aovs", tuple(self.aovs))
+        try:
+            object.__setattr__(self, "aovs", split_aovs(self.aovs))
+        except (TypeError, AttributeError):
+            raise ShadowmapError(f"aovs is {self.aovs!r}: give names, as in 'depth,normal' or ('depth', 'normal').") from None
         for name in self.aovs:
-            if not isinstance(name, str) or name not in AOVS:
-                raise ShadowmapError(f"There is no AOV '{name}': choose from {', '.join(AOVS)}.")
+            if name not in AOVS:
+                raise ShadowmapError(f"There is no AOV '{name}': choose from {', '.join(AOVS)}.{did_you_mean(name, AOVS)}")
         for name in ("antialias", "hide_emitters"):
             if not isinstance(getattr(self, name), bool):
                 raise ShadowmapError(f"{name} is {getattr(self, name)!r}: give True or False.")

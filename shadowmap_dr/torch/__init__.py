@@ -10,7 +10,7 @@ in reverse and forward. Bad input raises a one-line :class:`shadowmap_dr.Shadowm
 
 Images are stored as in Mitsuba: row 0 of what is rasterized lies at y = -1 in clip space.
 
-Importing this module needs PyTorch: ``pip install 'shadowmap-dr[torch]'``.
+Importing this module needs PyTorch: in a checkout ``pip install '.[torch]'``, elsewhere ``pip install torch``.
 """
 
 from __future__ import annotations
@@ -20,7 +20,9 @@ try:
 except ModuleNotFoundError as error:
     if error.name != "torch":
         raise
-    raise ImportError("shadowmap_dr.torch needs PyTorch: pip install 'shadowmap-dr[torch]'.", name="torch") from None
+    from ..errors import install_hint
+
+    raise ImportError(f"shadowmap_dr.torch needs PyTorch: {install_hint('torch')}.", name="torch") from None
 
 from .antialias import antialias, build_topology
 from .raster import interpolate, rasterize

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +17,12 @@ import pytest
 from PIL import Image
 from pose_runs import build
 
-from shadowmap_dr.cli import gradients, main
+from shadowmap_dr import __version__
+from shadowmap_dr.cli import gradients, lights, main, maps, soft
+from shadowmap_dr.errors import ShadowmapError
 from shadowmap_dr.experiments.pose import experiment
 from shadowmap_dr.io import images
+from shadowmap_dr.rendering.film.aovs import AOVS
 
 
 class Result:
@@ -59,6 +64,132 @@ def test_help_names_the_commands(run: Any) -> None:
     for command in ("info", "render", "pose", "bench", "soft", "art"):
         assert command in result.out
     assert run().status == 2
+
+
+def test_commands_come_in_the_order_of_their_use(run: Any) -> None:
+    listed = [line.split()[0] for line in run("-h").out.partition("Commands:")[2].splitlines() if line.strip()]
+    assert listed == "render pose lights art face model soft maps gradients bench lights-times info".split()
+    assert list(main.COMMANDS) == listed
+
+
+@pytest.mark.parametrize(
+    "arguments", [(), ("pose",), ("render",), ("gradients",), ("gradients", "jacobian"), ("face", "convert")]
+)
+def test_short_help(run: Any, arguments: tuple[str, ...]) -> None:
+    short, long = run(*arguments, "-h"), run(*arguments, "--help")
+    assert short.status == 0 and short.out == long.out and "-h, --help" in short.out and "--quiet" in short.out
+    assert "<list[" not in short.out
+
+
+def test_version(run: Any) -> None:
+    result = run("--version")
+    assert result.status == 0 and result.out == f"shadowmap-dr {__version__}\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "command"),
+    [
+        (["poes"], "No such command 'poes'. Did you mean 'pose'?", "shadowmap-dr"),
+        (["grad"], "No such command 'grad'. Did you mean 'gradients'?", "shadowmap-dr"),
+        (["zzz"], "No such command 'zzz'.", "shadowmap-dr"),
+        (["gradients", "jacobain"], "No such command 'jacobain'. Did you mean 'jacobian'?", "shadowmap-dr gradients"),
+        (["pose", "--resolutoin", "3"], "No such option '--resolutoin'. Did you mean '--resolution'?", "shadowmap-dr pose"),
+        (["--verison"], "No such option '--verison'. Did you mean '--version'?", "shadowmap-dr"),
+    ],
+)
+def test_wrong_usage_names_the_nearest_word(run: Any, arguments: list[str], error: str, command: str) -> None:
+    result = run(*arguments)
+    assert result.status == 2
+    usage, message, hint = result.err.splitlines()
+    assert usage.startswith(f"Usage: {command} [OPTIONS]")
+    assert message == f"error: {error}" and hint == f"Try '{command} --help' for help."
+
+
+@pytest.mark.parametrize(
+    ("arguments", "found"),
+    [
+        (["soft", "--scene", "dsk"], "dusk"),
+        (["pose", "--method", "shadow"], "shadows"),
+        (["pose", "--object", "spt"], "spot"),
+        (["pose", "--variant", "llvm_ad_rbg"], "llvm_ad_rgb"),
+        (["maps", "--method", "vms"], "vsm"),
+        (["bench", "--only", "step"], "steps"),
+        (["art", "--target", "hart"], "heart"),
+        (["art", "--text", "A", "--camera", "ortho"], "orthographic"),
+        (["face", "--mode", "ident"], "identity"),
+        (["gradients", "convergence", "--occluder", "rings"], "ring"),
+        (["model", "sphere", "--view", "frnt"], "front"),
+        (["render", "psoe", "-o", "a.png"], "pose"),
+        (["render", "pose", "-o", "a.exr", "--aovs", "dept"], "depth"),
+    ],
+)
+def test_values_out_of_a_list_name_the_nearest(run: Any, arguments: list[str], found: str) -> None:
+    result = run(*arguments)
+    assert result.status == 1 and result.err.count("\n") == 1 and f"Did you mean '{found}'?" in result.err, result.err
+
+
+def test_without_words_the_help_is_shown(run: Any) -> None:
+    for arguments in ((), ("gradients",)):
+        result = run(*arguments)
+        assert result.status == 2 and result.err.startswith("Usage: shadowmap-dr") and "error:" not in result.err
+        assert "Commands:" in result.err
+
+
+def warns(*_: Any, **__: Any) -> None:
+    warnings.warn("the film is small", stacklevel=1)
+    mi.Log(mi.LogLevel.Warn, "the sampler is slow")
+    raise ShadowmapError("no film.")
+
+
+@pytest.mark.parametrize("place", ["before", "after"])
+@pytest.mark.parametrize("level", ["--quiet", "", "--verbose"])
+def test_amounts_of_text(run: Any, monkeypatch: pytest.MonkeyPatch, level: str, place: str) -> None:
+    """Warnings are lines without files of libraries; --verbose adds versions, origins and a traceback, --quiet leaves errors."""
+    monkeypatch.setattr(experiment, "run_pose", warns)
+    words = [level] if level else []
+    result = run(*words, "pose") if place == "before" else run("pose", *words)
+    lines = result.err.splitlines()
+    assert result.status == 1 and result.out == "" and lines[-1] == "error: no film."
+    if level == "--quiet":
+        assert len(lines) == 1
+    elif not level:
+        assert lines == ["warning: the film is small", "warning: Mitsuba: warns(): the sampler is slow", lines[-1]]
+    else:
+        assert lines[0].startswith(f"shadowmap-dr {__version__}, mitsuba {mi.__version__}, drjit ")
+        assert lines[1].startswith("warning: the film is small (UserWarning, ") and "test_cli.py" in lines[1]
+        assert "Traceback (most recent call last):" in lines
+
+
+def test_verbose_commands_tell_their_time(run: Any) -> None:
+    assert run("info", "-v").err.splitlines()[-1].endswith(" seconds")
+    assert run("info").err == run("info", "-q").err == ""
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("cow.ply", "cow.ply is a mesh, and has no light and no camera: .*shadowmap-dr render pose -D object=cow.ply"),
+        ("cow.obj", 'cow.obj is a mesh, .*put <shape type="obj"><string name="filename" value="cow.obj"/></shape> into a scene'),
+        ("cow.glb", "cow.glb is a mesh, .*converted to .ply or .obj, into a scene"),
+        ("cow.png", "cow.png is a picture: give a Mitsuba scene"),
+        ("notes.txt", "notes.txt is no XML: give a Mitsuba scene"),
+        ("folder", "no scene 'folder': it is a folder; give a file in it .room.xml."),
+        ("folder/rom.xml", "no scene 'folder/rom.xml': there is no such file. Did you mean 'folder/room.xml'?"),
+        ("zzz.xml", "no scene 'zzz.xml': give a file that exists, or one of gallery"),
+    ],
+)
+def test_what_is_no_scene(run: Any, tmp_path: Path, name: str, message: str) -> None:
+    (tmp_path / "folder").mkdir()
+    for written in ("cow.ply", "cow.obj", "cow.glb", "cow.png", "notes.txt", "folder/room.xml"):
+        (tmp_path / written).write_text("what it is")
+    result = run("render", name, "-o", "a.png")
+    assert result.status == 1 and result.err.count("\n") == 1 and re.search(message, result.err), result.err
+    assert not (tmp_path / "a.png").exists()
+
+
+def test_channels_are_listed_in_the_help(run: Any) -> None:
+    words = " ".join(run("render", "--help").out.split())
+    assert ", ".join(AOVS) in words and "d:depth,n:sh_normal" in words
 
 
 def test_render_exr_equals_mitsuba(run: Any, tmp_path: Path) -> None:
@@ -187,6 +318,9 @@ def test_bad_input_is_one_clear_line(run: Any, tmp_path: Path, arguments: list[s
     result = run(*arguments)
     assert result.status in (1, 2)
     lines = result.err.strip().splitlines()
+    if result.status == 2:  # wrong usage: the error stands between the usage and the way to the help
+        assert len(lines) == 3 and lines[0].startswith("Usage: shadowmap-dr ") and lines[2].startswith("Try 'shadowmap-dr ")
+        lines = lines[1:2]
     assert len(lines) == 1 and lines[0].startswith("error: ") and message in lines[0]
     assert not (tmp_path / "a.exr").exists()
 
@@ -244,7 +378,9 @@ def test_pose_prints_a_table_and_writes_records(run: Any, monkeypatch: pytest.Mo
     result = run(*arguments)
     assert result.status == 0, result.err
     assert "spot" in result.out and "shadows" in result.out
-    assert len(json.loads(Path("o/pose.json").read_text())) == 1
+    assert len(json.loads(Path("o/pose.json").read_text())["runs"]) == 1
+    assert result.out.splitlines()[-1] == "Picture: o/spot-8/images.png, record: o/pose.json"
+    assert Path("o/spot-8/images.png").is_file()
 
 
 def test_bench_prints_a_table_and_writes_a_record(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -255,7 +391,7 @@ def test_bench_prints_a_table_and_writes_a_record(run: Any, monkeypatch: pytest.
     monkeypatch.setattr(bench_common, "QUICK", TINY)
     result = run("bench", "--quick", "--only", "breakdown", "--out", "o/b.json")
     assert result.status == 0, result.err
-    assert "frozen" in result.out and "o/b.png" in result.out
+    assert "frozen" in result.out and result.out.splitlines()[-1] == "Picture: o/b.png, record: o/b.json"
     assert list(json.loads(Path("o/b.json").read_text())["sections"]) == ["breakdown"]
     assert Path("o/b.png").exists()
 
@@ -292,3 +428,21 @@ def test_gradients(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     assert plane.iterations == 7
     result = run("gradients", "convergence", "--occluder", "moon")
     assert result.status == 1 and "moon" in result.err
+
+
+def test_times_of_lights_are_a_record(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    times = {"seconds": {"batch of 2": {"median": 0.5}}, "ratio_of_medians": {}}
+    monkeypatch.setattr(lights.lights_speed, "measure", lambda problem, sizes: times)
+    result = run("lights-times", "--batch", "2", "--no-workers", "--out", "t")
+    assert result.status == 0 and result.out.splitlines()[-1] == "Record: t/times.json", result.err
+    record = json.loads(Path("t/times.json").read_text())
+    assert record.keys() == {"shadowmap_dr", "machine", "settings", "steps"} and record["steps"] == times
+
+
+def test_the_last_line_names_what_to_look_at(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(maps.maps_experiment, "run_maps", lambda options: {"scenes": {}})
+    assert run("maps", "--out", "m").out.splitlines()[-1] == "Picture: m/maps.png, record: m/maps.json"
+    monkeypatch.setattr(soft.soft_experiment, "run_soft", lambda options: {"scenes": {}, "settings": {"samples": []}})
+    assert run("soft", "--out", "s").out.splitlines()[-1] == "Picture: s/soft.png, record: s/soft.json"
+    monkeypatch.setattr(lights.lights_experiment, "run_lights", lambda options, variant: [])
+    assert run("lights", "--out", "l").out.splitlines()[-1] == "Picture: l/lights.png, record: l/lights.json"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import builtins
 import json
+import re
 import signal
 import socket
 import subprocess
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 
 from shadowmap_dr.cli import model
-from shadowmap_dr.errors import ShadowmapError
+from shadowmap_dr.errors import ShadowmapError, install_hint
 from shadowmap_dr.io import assets
 
 
@@ -48,7 +49,7 @@ def test_missing_packages_are_named(variant, tmp_path, monkeypatch, package, ext
 
     monkeypatch.setattr(builtins, "__import__", without)
     monkeypatch.delitem(__import__("sys").modules, "shadowmap_dr.interactive.server", raising=False)
-    with pytest.raises(ShadowmapError, match=rf"{package}.*pip install 'shadowmap-dr\[{extra}\]'"):
+    with pytest.raises(ShadowmapError, match=re.escape(f"{package}: {install_hint(extra)}.")):
         model.model("sphere", serve=True, port=0)
     assert not Path("model.ply").exists()
 

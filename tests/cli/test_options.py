@@ -74,6 +74,8 @@ def test_each_option_is_a_field() -> None:
     assert set(found) == {*RECORDS, *ALONE}
     for name, (record, own) in RECORDS.items():
         parameters = [parameter for parameter in found[name].params if parameter.name != "help"]
+        assert [parameter.name for parameter in parameters[-2:]] == ["quiet", "verbose"], name
+        parameters = parameters[:-2]
         assert {parameter.name for parameter in parameters} == {*described(record), *own}, name
         assert all(parameter.help for parameter in parameters), name
 

@@ -94,6 +94,7 @@ def test_a_piece_has_all_its_files(variant, tmp_path):
     )
     record = art.run_art(options)
     assert json.loads((tmp_path / "out" / "art.json").read_text()) == record
+    assert {"shadowmap_dr", "machine", "settings"} <= record.keys()
     assert str(tmp_path) not in json.dumps(record)
     assert {path.name for path in (tmp_path / "out").iterdir()} == {*record["files"], "art.json"}
     for view in record["views"]:
@@ -239,6 +240,7 @@ def test_recorded_gallery_shows_pieces_and_their_numbers(variant, tmp_path, monk
     folders = (tmp_path / "work", tmp_path / "out", tmp_path / "results" / "art.json")
     record = art_gallery.run_gallery(["heart", "two"], *folders)
     assert json.loads(folders[2].read_text()) == json.loads(json.dumps(record))
+    assert {"shadowmap_dr", "machine", "settings"} <= record.keys()
     assert record["summary"]["one_view_mean"] == record["pieces"]["heart"]["views"][0]["iou"]
     assert record["summary"]["two_views_least"] == min(view["iou"] for view in record["pieces"]["two"]["views"])
     page, tables = (tmp_path / "out" / "gallery.md").read_text(), folders[2].with_suffix(".md").read_text()

@@ -18,6 +18,7 @@ import pytest
 from bench_sizes import TINY
 from rich.console import Console
 
+from shadowmap_dr import __version__
 from shadowmap_dr.errors import ShadowmapError
 from shadowmap_dr.experiments.bench import breakdown as bench_breakdown
 from shadowmap_dr.experiments.bench import common as bench_common
@@ -50,6 +51,7 @@ def run(chosen: BenchOptions) -> dict[str, Any]:
     assert chosen.out.with_suffix(".png").stat().st_size > 1000
     assert not [name for name in os.listdir(chosen.out.parent) if name.startswith(".")]
     assert {"processor", "threads", "mitsuba", "drjit", "variant"} <= record["machine"].keys()
+    assert record["shadowmap_dr"] == __version__ and record["settings"]["quick"] == chosen.quick
     assert bench_report.table(record).row_count == len(record["figures"]) > 0
     text = bench_report.markdown(record)
     assert text.count("\n| ") >= len(record["figures"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from face_models import egg
 from PIL import Image
 
 from shadowmap_dr.cli import main
-from shadowmap_dr.errors import ShadowmapError
+from shadowmap_dr.errors import ShadowmapError, install_hint
 from shadowmap_dr.experiments.faces.experiment import FaceOptions, run_faces
 from shadowmap_dr.experiments.faces.information import contrasts, image_derivatives, posterior_covariance
 from shadowmap_dr.experiments.faces.metrics import distances, surface_distance
@@ -190,7 +191,7 @@ def test_exr_files_are_silhouettes_too(tmp_path: Path) -> None:
 
 def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(ShadowmapError, match=r"needs scipy: pip install 'shadowmap-dr\[faces\]'"):
+    with pytest.raises(ShadowmapError, match=re.escape(f"needs scipy: {install_hint('faces')}.")):
         run_faces(FaceOptions(out=tmp_path))
 
 
@@ -289,6 +290,7 @@ def test_commands_from_a_folder_to_a_head(run: Any, tmp_path: Path) -> None:
     status, text = run(*arguments)
     assert status == 0 and "Identity: distances" in text
     record = json.loads((out / "faces.json").read_text())
+    assert {"shadowmap_dr", "machine", "settings"} <= record.keys()
     assert set(record["runs"]) == {f"{mode} | {lights} | 5" for mode in ("identity", "expression") for lights in (1, 3)}
     for entry in record["runs"].values():
         assert entry["distance"]["mean"] < 0.7 * entry["start_distance"]["mean"]
@@ -309,6 +311,7 @@ def test_commands_from_a_folder_to_a_head(run: Any, tmp_path: Path) -> None:
     arguments = ["face", "--model", converted, "--image", picture, "--iterations", "60", "--height", "64", "--out", str(out)]
     assert run(*arguments)[0] == 0
     record = json.loads((out / "image-face.json").read_text())
+    assert {"shadowmap_dr", "machine", "settings"} <= record.keys()
     assert record["settings"]["placement"]["mirrored"]
     assert record["image_error"] < 0.7 * record["image_error_start"]
 

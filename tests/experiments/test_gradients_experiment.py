@@ -206,6 +206,7 @@ def test_small_jacobian(variant: str, tmp_path: Path, monkeypatch: pytest.Monkey
     wider = JacobianOptions(**SMALL, filter_sizes=(1, 3), candidates=("default", "no anti-aliasing"), out=tmp_path, resume=True)
     second = run_jacobian(wider)
     assert ("default", "x", 64, 3) not in measured and ("default", "x", 64, 1) in measured
+    assert {"shadowmap_dr", "machine", "settings"} <= second.keys()
     assert second["entries"]["default | x | 64 | 3"] == json.loads(json.dumps(entry))
     assert second["entries"]["no anti-aliasing | x | 64 | 3"]["own"]["cosine"] < 0.8
     with pytest.raises(ShadowmapError, match="leave out --resume"):
@@ -272,6 +273,7 @@ def test_small_convergence(variant: str, tmp_path: Path, monkeypatch: pytest.Mon
 
     # A record from before there were candidates.
     old = json.loads((tmp_path / "convergence.json").read_text())
+    assert {"shadowmap_dr", "machine", "settings"} <= old.keys()
     del old["checks"]
     for run in old["runs"].values():
         del run["candidate"]
@@ -318,6 +320,7 @@ def test_small_minimal_plane(variant: str, tmp_path: Path) -> None:
     reading = (tmp_path / "minimal-plane.md").read_text()
     assert "With anti-aliased moments 2 of 2" in reading and "there is no gradient" in reading
     assert json.loads((tmp_path / "minimal-plane.json").read_text()) == record
+    assert {"shadowmap_dr", "machine", "settings"} <= record.keys()
     assert gradients_plane.plane_table(record).row_count == 4 and (tmp_path / "minimal-plane-images.png").exists()
 
 

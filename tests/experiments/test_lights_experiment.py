@@ -70,6 +70,7 @@ def test_targets_and_starts_come_from_the_run_alone() -> None:
 def test_records_files_and_resuming(tmp_path: Path) -> None:
     summaries = run_lights(options(tmp_path, lights=(1, 2), filter_sizes=(3, 0)))
     stored = json.loads((tmp_path / "lights.json").read_text())
+    assert stored.keys() == {"shadowmap_dr", "machine", "settings", "summaries"} and stored["settings"]["runs"]
     assert stored["summaries"] == summaries and len(summaries) == 4
     for entry in summaries:
         assert entry["alignment_mean"] == pytest.approx(entry["curve_mean"][-1], abs=1e-5)

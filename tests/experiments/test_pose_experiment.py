@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import signal
@@ -23,7 +24,7 @@ from shadowmap_dr.errors import ShadowmapError
 from shadowmap_dr.experiments.pose import experiment as pose
 from shadowmap_dr.experiments.pose import record as pose_record
 from shadowmap_dr.experiments.pose import scene as pose_scene
-from shadowmap_dr.experiments.pose.experiment import PoseOptions, run_pose
+from shadowmap_dr.experiments.pose.experiment import PoseOptions, pictures_of, run_pose
 from shadowmap_dr.inverse import Method, PoseFit, optimize
 from shadowmap_dr.io import assets
 
@@ -40,6 +41,13 @@ def options(out: Path, **changes: Any) -> PoseOptions:
     return PoseOptions(**{**defaults, "out": out, **changes})
 
 
+def runs_of(folder: Path) -> Any:
+    """The records of runs in a folder."""
+    record = json.loads((folder / "pose.json").read_text())
+    assert record.keys() == {"shadowmap_dr", "machine", "settings", "runs"}
+    return record["runs"]
+
+
 @pytest.fixture(autouse=True)
 def _variant() -> None:
     mi.set_variant("llvm_ad_rgb")
@@ -47,7 +55,7 @@ def _variant() -> None:
 
 def test_records_and_files(tmp_path: Path) -> None:
     records = run_pose(options(tmp_path), build=build)
-    stored = json.loads((tmp_path / "pose.json").read_text())
+    stored = runs_of(tmp_path)
     assert stored == records and len(records) == 4
     for record in records:
         assert REQUIRED <= record.keys()
@@ -99,9 +107,9 @@ def test_killed_process_resumes_from_its_checkpoint(tmp_path: Path) -> None:
         time.sleep(0.005)
     process.send_signal(signal.SIGKILL)
     process.wait()
-    assert len(json.loads((killed / "pose.json").read_text())) == 1
+    assert len(runs_of(killed)) == 1
 
-    first = json.loads((killed / "pose.json").read_text())[0]
+    first = runs_of(killed)[0]
     resumed = run_pose(options(killed, runs=1, iterations=60, resume=True), build=build)
     assert resumed[0] == first
     for record, reference in zip(resumed, whole, strict=True):
@@ -113,25 +121,25 @@ def test_killed_process_resumes_from_its_checkpoint(tmp_path: Path) -> None:
 
 def test_resume_keeps_finished_runs_and_adds_new_ones(tmp_path: Path) -> None:
     run_pose(options(tmp_path, methods=("shadows",), runs=1), build=build)
-    before = json.loads((tmp_path / "pose.json").read_text())
+    before = runs_of(tmp_path)
     run_pose(options(tmp_path, runs=2, resume=True), build=build)
-    after = json.loads((tmp_path / "pose.json").read_text())
+    after = runs_of(tmp_path)
     assert before[0] in after and len(after) == 4
     longer = run_pose(options(tmp_path, methods=("shadows",), runs=1, iterations=30, resume=True), build=build)
-    assert json.loads((tmp_path / "pose.json").read_text()) == [*after, *longer]  # others' runs stay
+    assert runs_of(tmp_path) == [*after, *longer]  # others' runs stay
     run_pose(options(tmp_path, methods=("shadows",), runs=1, iterations=3), build=build)
-    assert [record["iterations"] for record in json.loads((tmp_path / "pose.json").read_text())] == [3]
+    assert [record["iterations"] for record in runs_of(tmp_path)] == [3]
 
 
 @pytest.mark.parametrize("lost", ["final", "rotation_error_curve"])
 def test_records_that_are_cut_short_are_made_again(tmp_path: Path, lost: str) -> None:
     (whole,) = run_pose(options(tmp_path, methods=("shadows",), runs=1, iterations=3), build=build)
     stored = tmp_path / "pose.json"
-    records = json.loads(stored.read_text())
-    del records[0][lost]
-    stored.write_text(json.dumps(records))
+    record = json.loads(stored.read_text())
+    del record["runs"][0][lost]
+    stored.write_text(json.dumps(record))
     (again,) = run_pose(options(tmp_path, methods=("shadows",), runs=1, iterations=3, resume=True), build=build)
-    assert again["final"] == pytest.approx(whole["final"]) and json.loads(stored.read_text()) == [again]
+    assert again["final"] == pytest.approx(whole["final"]) and runs_of(tmp_path) == [again]
 
 
 def test_runs_with_other_samples_are_others(tmp_path: Path) -> None:
@@ -147,7 +155,7 @@ def test_runs_with_other_samples_are_others(tmp_path: Path) -> None:
     small = {"methods": ("shadows",), "runs": 1, "iterations": 3, "resume": True}
     for samples in (1, 4):
         run_pose(options(tmp_path, **small), build=sampled(samples))
-    stored = json.loads((tmp_path / "pose.json").read_text())
+    stored = runs_of(tmp_path)
     assert [record["settings"].get("samples_per_pixel") for record in stored] == [None, 4]
 
 
@@ -183,8 +191,17 @@ def test_workers_make_the_same_runs(tmp_path: Path) -> None:
         assert (one["method"], one["run"], one["settings"]) == (other["method"], other["run"], other["settings"])
         np.testing.assert_allclose(one["final"], other["final"], atol=1e-4)
         assert other["environment"]["threads"] == 1
-    assert json.loads((tmp_path / "there" / "pose.json").read_text()) == more
+    assert runs_of(tmp_path / "there") == more
     assert (tmp_path / "there" / "spot-24" / "images.png").stat().st_size
+
+
+def test_lists_of_runs_of_earlier_versions_are_gone_on_with(tmp_path: Path) -> None:
+    small = options(tmp_path, methods=("shadows",), runs=1, iterations=3)
+    (whole,) = run_pose(small, build=build)
+    (tmp_path / "pose.json").write_text(json.dumps([whole]))
+    (again,) = run_pose(dataclasses.replace(small, resume=True), build=build)
+    assert again == whole and runs_of(tmp_path) == [whole]
+    assert pictures_of(small) == [tmp_path / "spot-12" / "images.png"] and pictures_of(small)[0].is_file()
 
 
 def test_which_record_is_of_a_run() -> None:
@@ -286,7 +303,7 @@ def test_normals_are_those_of_faces_or_of_vertices(tmp_path: Path) -> None:
 def test_runs_with_other_normals_are_not_taken_for_finished(tmp_path: Path) -> None:
     def run(**changes: Any) -> list[dict[str, Any]]:
         run_pose(options(tmp_path, methods=("shadows",), runs=1, iterations=2, **changes), build=build)
-        return sorted(json.loads((tmp_path / "pose.json").read_text()), key=lambda record: record["normals"])
+        return sorted(runs_of(tmp_path), key=lambda record: record["normals"])
 
     flat = run()
     both = run(normals="vertex", resume=True)

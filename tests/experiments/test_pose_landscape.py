@@ -68,7 +68,7 @@ def test_program_draws_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(sys, "argv", ["pose_landscape", str(tmp_path / "nothing")])
     with pytest.raises(SystemExit, match="no file"):
         pose_landscape.main()
-    assert len(records.read_json(tmp_path / "pose.json")) == 1
+    assert len(records.read_json(tmp_path / "pose.json")["runs"]) == 1
 
 
 def test_meshes_of_users_are_those_of_their_runs(tmp_path: Path) -> None:

@@ -88,6 +88,7 @@ def test_small_run(variant: str, tmp_path: Path) -> None:
     )
     record = run_soft(options)
     stored = json.loads((tmp_path / "s" / "soft.json").read_text())
+    assert {"shadowmap_dr", "machine", "settings"} <= stored.keys()
     assert stored["scenes"]["desk"]["errors"] == record["scenes"]["desk"]["errors"]
     coarse, fine = (entry["error"] for entry in record["scenes"]["desk"]["errors"])
     assert fine < 0.05 and fine < coarse

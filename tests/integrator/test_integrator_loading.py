@@ -167,11 +167,18 @@ def test_order_of_imports(late: bool) -> None:
 
 
 def test_parameters_are_the_settings_of_the_renderer() -> None:
-    """Names and defaults, but for those that mean nothing to it or have another form."""
-    own = {"aovs", "tessellation", "recorded"}
+    """Names and defaults, but for those that mean nothing to it."""
+    own = {"tessellation", "recorded"}
     options = {option.name: option.default for option in fields(Options) if option.name not in own}
-    settings = {setting.name: setting.default for setting in fields(RenderSettings) if setting.name not in ("shadow", "aovs")}
+    settings = {setting.name: setting.default for setting in fields(RenderSettings) if setting.name != "shadow"}
     shadow = {name: getattr(ShadowSettings, SHADOW_NAMES[name]) for name in SHADOW_NAMES}
     assert options == {**settings, **shadow}
     assert {setting.name for setting in fields(ShadowSettings)} == {*SHADOW_NAMES.values(), "bias"}
     assert RenderSettings.of(**options) == RenderSettings()
+
+
+@pytest.mark.parametrize("aovs", ["depth, visibility", ("depth", "visibility"), ["depth", "visibility"]])
+def test_names_of_channels_as_text_or_sequence(aovs: Any) -> None:
+    """The plug-in and the renderer keep the same tuple."""
+    assert Options(aovs=aovs).aovs == RenderSettings(aovs=aovs).aovs == ("depth", "visibility")
+    assert Options(aovs=aovs).render_settings() == RenderSettings.of(aovs=aovs)

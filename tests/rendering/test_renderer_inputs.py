@@ -30,8 +30,10 @@ def test_unknown_names(renderer: Renderer) -> None:
         renderer.render(sensor=1)
     with pytest.raises(ShadowmapError, match="give its number in the scene"):
         renderer.render(sensor=mi.load_dict({"type": "perspective"}))
-    with pytest.raises(ShadowmapError, match=r"give names in a tuple, as in \('depth',\)"):
-        Renderer.from_scene(renderer.data.scene, aovs="depth")
+    with pytest.raises(ShadowmapError, match=r"aovs is 3: give names, as in 'depth,normal' or \('depth', 'normal'\)"):
+        Renderer.from_scene(renderer.data.scene, aovs=3)
+    with pytest.raises(ShadowmapError, match="There is no AOV 'dept': .* Did you mean 'depth'?"):
+        Renderer.from_scene(renderer.data.scene, aovs="normal,dept")
     with pytest.raises(ShadowmapError, match="There is no sensor -1"):
         renderer.render(sensor=-1)
 

@@ -19,18 +19,17 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from ... import __version__
-from ...errors import ShadowmapError
+from ...errors import ShadowmapError, did_you_mean
 from ...inverse import Collection, RemeshingSculptor, Sculptor, even_sphere, shadow_view
 from ...inverse.runs.schedulers import check_threads
 from ...inverse.shadow_art import exports, target_images
 from ...io import assets, files, meshes, records
 from ...io import console as io_console
 from ...io import images as io_images
+from ...io.machine import header
 from ...io.options import option, setting
 from ...io.ranges import MAP_SIDE, SEED, STEPS, check_ranges
 from ...rendering.receivers.shadow_views import CAMERAS, RECEIVERS, ShadowView
-from ..common.timing import machine
 from . import pictures as art_pictures
 from .advice import warnings_of
 from .run import Frame, Maker, Trace, intersection_over_union, make
@@ -99,9 +98,13 @@ class ArtOptions:
         if not 1 <= len(self.targets) <= len(DIRECTIONS):
             raise ShadowmapError(f"{len(self.targets)} targets: give one, or two for two views.")
         if self.receiver not in RECEIVERS:
-            raise ShadowmapError(f"no receiver {self.receiver!r}: choose from {', '.join(RECEIVERS)}.")
+            raise ShadowmapError(
+                f"no receiver {self.receiver!r}: choose from {', '.join(RECEIVERS)}.{did_you_mean(self.receiver, RECEIVERS)}"
+            )
         if self.camera not in CAMERAS:
-            raise ShadowmapError(f"no camera {self.camera!r}: choose from {', '.join(CAMERAS)}.")
+            raise ShadowmapError(
+                f"no camera {self.camera!r}: choose from {', '.join(CAMERAS)}.{did_you_mean(self.camera, CAMERAS)}"
+            )
         if self.mesh is not None and self.collection is not None:
             raise ShadowmapError("a mesh to deform and a collection: choose one of the two.")
         if self.remesh is not None and self.collection is not None:
@@ -165,7 +168,7 @@ def run_art(options: ArtOptions, *, console: Console | None = None) -> dict[str,
     steps = options.iterations
     if options.threads:
         dr.set_thread_count(options.threads)
-    console = console or Console(stderr=True)
+    console = console or io_console.notes()
     path = files.check_output(options.out / "art.json", (".json",))
     checkpoint = options.out / "checkpoint.npz"
     if not options.resume:
@@ -180,9 +183,7 @@ def run_art(options: ArtOptions, *, console: Console | None = None) -> dict[str,
             maker, steps, checkpoint=checkpoint, fingerprint=_fingerprint(settings, maker),
             on_step=lambda done, note: progress.update(task, completed=done, note=note),
         )  # fmt: skip
-        record = records.plain(
-            {"settings": settings, "machine": machine(), "shadowmap_dr": __version__, **_results(maker, trace)}
-        )
+        record = records.plain({**header(settings), **_results(maker, trace)})
         written = _write(options, maker, trace, progress)
     record["files"] = written
     targets = [np.asarray(maker.target(k), np.float32) for k in range(len(maker.views))]

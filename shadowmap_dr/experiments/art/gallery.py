@@ -20,12 +20,12 @@ import mitsuba as mi
 import numpy as np
 from rich.console import Console
 
-from ...errors import ShadowmapError
+from ...errors import ShadowmapError, did_you_mean
 from ...io import files
 from ...io import records as io_records
-from ...io.console import markdown
+from ...io.console import markdown, notes
+from ...io.machine import header
 from ...variants import DEFAULT_VARIANT
-from ..common.timing import machine
 from .experiment import ArtOptions, run_art
 
 #: Targets without holes, except the thin-legged horse, and targets with holes.
@@ -96,7 +96,7 @@ def run_gallery(
         results: JSON file for the numbers; a file of tables (.md) is written beside it.
         resume: keep finished pieces.
     """
-    console = console or Console(stderr=True)
+    console = console or notes()
     files.check_output(results, (".json",))
     chosen = [piece for piece in PIECES if piece.name in set(names)]
     records: dict[str, Any] = {}
@@ -115,7 +115,7 @@ def run_gallery(
             for name in (*_SHOWN, *_shadow_images(piece)):
                 with files.atomic(out / f"{piece.name}-{name}") as temporary:
                     shutil.copyfile(work / piece.name / name, temporary)
-    record = {"machine": io_records.plain(machine()), "pieces": records, "summary": summary(records)}
+    record = {**header({"pieces": [piece.name for piece in chosen]}), "pieces": records, "summary": summary(records)}
     io_records.write_json(results, record)
     with files.atomic(results.with_suffix(".md")) as temporary:
         temporary.write_text("\n".join(document(record)) + "\n", encoding="utf-8")
@@ -232,7 +232,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         unknown = sorted(set(options.names) - set(names))
         if unknown:
-            raise ShadowmapError(f"no piece {unknown[0]!r}: choose from {', '.join(names)}.")
+            raise ShadowmapError(f"no piece {unknown[0]!r}: choose from {', '.join(names)}.{did_you_mean(unknown[0], names)}")
         mi.set_variant(DEFAULT_VARIANT)
         record = run_gallery(options.names or names, options.work, options.out, options.results, resume=options.resume)
     except ShadowmapError as error:

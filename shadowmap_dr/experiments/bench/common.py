@@ -14,7 +14,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ...errors import ShadowmapError
+from ...errors import ShadowmapError, did_you_mean
 from ...io.options import option, setting
 
 SECTIONS = ("steps", "raster", "scaling", "breakdown", "sums", "loops", "first")
@@ -135,7 +135,7 @@ class BenchOptions:
     def __post_init__(self) -> None:
         for name in self.only:
             if name not in SECTIONS:
-                raise ShadowmapError(f"no section {name!r}: choose from {', '.join(SECTIONS)}.")
+                raise ShadowmapError(f"no section {name!r}: choose from {', '.join(SECTIONS)}.{did_you_mean(name, SECTIONS)}")
         if not self.only:
             raise ShadowmapError(f"no section given: choose from {', '.join(SECTIONS)}.")
         if not 0 < self.mitsuba_seconds < float("inf"):

@@ -21,7 +21,8 @@ from ... import __version__
 from ...errors import ShadowmapError
 from ...io import console as io_console
 from ...io import files, records
-from ..common.timing import DRJIT_VERSION, OtherWork, load, machine
+from ...io.machine import DRJIT_VERSION, header, machine
+from ..common.timing import OtherWork, load
 from . import breakdown as bench_breakdown
 from . import first as bench_first
 from . import loops as bench_loops
@@ -54,12 +55,12 @@ def run_bench(options: BenchOptions, *, console: Console | None = None) -> dict[
         Content of the JSON file: `sections` (by name, each with `command`, `settings`, `machine` and `units`),
         `machine`, `load_before` and `load_after`, `figures`, the rows of the table, and `checks`, digests of the sections.
     """
-    console = console or Console(stderr=True)
+    console = console or io_console.notes()
     files.check_output(options.out, (".json",))
     record = _stored(options)
     command = shlex.join(["shadowmap-dr", *sys.argv[1:]])
-    record |= {"format": FORMAT, "machine": machine(), "load_before": load()}
     settings = _settings(options)
+    record |= {"format": FORMAT, **header(settings), "load_before": load()}
     plan = {name: UNITS[name](options) for name in UNITS if name in options.only}
     for name in plan:
         section = record["sections"].get(name, {})
@@ -85,7 +86,7 @@ def run_bench(options: BenchOptions, *, console: Console | None = None) -> dict[
                 progress.remove_task(inner)
                 _write(options, record)
                 line = f"{name} {unit.name}: {bench_report.outcome(done[unit.name])}"
-                progress.console.print(line, highlight=False, markup=False)
+                progress.console.print(line, highlight=False, markup=False, soft_wrap=True)
                 # Memory that a unit leaves allocated would count as memory of the next.
                 dr.flush_malloc_cache()
             progress.remove_task(task)

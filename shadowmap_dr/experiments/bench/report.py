@@ -84,13 +84,10 @@ def rows(record: dict[str, Any]) -> list[Row]:
 
 def table(record: dict[str, Any]) -> Table:
     """The table for the terminal."""
-    result = console.table("Medians; ratios are those of medians", COLUMNS, [])
-    kind = None
-    for row in rows(record):
-        if kind is not None and row.what.split()[0] != kind:
-            result.add_section()
-        kind = row.what.split()[0]
-        result.add_row(*row.cells())
+    lines = rows(record)
+    result = console.table("Medians; ratios are those of medians", COLUMNS, [row.cells() for row in lines], wrapped=range(5))
+    for row, following, line in zip(lines, lines[1:], result.rows, strict=False):
+        line.end_section = row.what.split()[0] != following.what.split()[0]
     return result
 
 

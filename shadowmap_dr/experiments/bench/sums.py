@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...errors import ShadowmapError
+from ...errors import ShadowmapError, did_you_mean
 from ...jit.frozen import freeze
 from ...jit.types import Float, TensorXf
 from ...rendering.renderer import Renderer
@@ -113,7 +113,7 @@ def _reverse(case: Sum, size: int, spp: int, mode: str) -> float:
     if mode in ("renderer", "frozen"):
         return _of_renderer(case, size, spp, mode == "frozen")
     if mode not in MODES:
-        raise ShadowmapError(f"no mode {mode!r}: choose from {', '.join(MODES)}.")
+        raise ShadowmapError(f"no mode {mode!r}: choose from {', '.join(MODES)}.{did_you_mean(mode, MODES)}")
     scene, change = _changed(case, size)
     integrator = mi.load_dict({"type": "shadowmap", "recorded": mode == "recorded"})
     mi.render(scene, integrator=integrator, spp=spp)

@@ -12,15 +12,15 @@ import numpy.typing as npt
 from rich.console import Console
 from rich.progress import Progress, TaskID
 
-from ...errors import ShadowmapError
+from ...errors import ShadowmapError, did_you_mean
 from ...inverse import History, optimize
 from ...inverse.faces.morph_fit import MorphFit
 from ...inverse.faces.morphable import MorphableModel
 from ...io import console as io_console
 from ...io import files, records
+from ...io.machine import header
 from ...io.options import option, setting
 from ...io.ranges import FILTER_SIDE, MAP_SIDE, SAMPLES, SEED, SIDE, STEPS, check_ranges
-from ..common.timing import machine
 from . import pictures as faces_pictures
 from . import report as faces_report
 from .information import image_derivatives, posterior_covariance, recovery
@@ -82,7 +82,9 @@ class FaceOptions:
                 raise ShadowmapError(f"no {name} given: name at least one.")
             for value in values:
                 if known is not None and value not in known:
-                    raise ShadowmapError(f"no {name} {value!r}: choose from {', '.join(map(str, known))}.")
+                    raise ShadowmapError(
+                        f"no {name} {value!r}: choose from {', '.join(map(str, known))}.{did_you_mean(value, known)}"
+                    )
                 if values.count(value) > 1:
                     raise ShadowmapError(f"the {name} {value} is given twice: name each once.")
         if self.reference not in ("own", "mitsuba"):
@@ -119,7 +121,7 @@ def run_faces(options: FaceOptions, *, console: Console | None = None) -> dict[s
     `-3.png` (shadows), `MODE-errors.png` (distances drawn on the heads), `convergence.png`, heads as `.ply`. Returns the record.
     """
     check_libraries()
-    console = console or Console(stderr=True)
+    console = console or io_console.notes()
     path = files.check_output(options.out / "faces.json", (".json",))
     model = default_model(options.model)
     scenes = {
@@ -238,7 +240,7 @@ def _started(path: Path, options: FaceOptions, model: MorphableModel) -> dict[st
             "translation_step": TRANSLATION_STEP,
         }
     )
-    record: dict[str, Any] = {"settings": settings, "machine": machine(), "runs": {}}
+    record: dict[str, Any] = {**header(settings), "runs": {}}
     if options.resume and path.exists():
         needed = (
             "mode",

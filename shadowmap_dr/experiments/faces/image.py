@@ -16,9 +16,9 @@ from rich.progress import Progress, TaskID
 from ...inverse import optimize
 from ...io import console as io_console
 from ...io import files, plots, records
+from ...io.machine import header
 from ...io.options import setting
 from ...io.ranges import FILTER_SIDE, MAP_SIDE, SIDE, STEPS, check_ranges
-from ..common.timing import machine
 from . import pictures as faces_pictures
 from . import report as faces_report
 from .experiment import STEP_SIZE, TRANSLATION_STEP, FaceOptions
@@ -90,7 +90,7 @@ def run_image(options: ImageOptions, *, console: Console | None = None) -> dict[
     Writes into `options.out`, with the image's name as prefix: `-face.json`, `-shadows.png` (the silhouette, aligned with the
     shadow of the mean head; that shadow; the result), `-heads.png`, `-face.ply`.
     """
-    console = console or Console(stderr=True)
+    console = console or io_console.notes()
     name = options.image.stem
     path = files.check_output(options.out / f"{name}-face.json", (".json",))
     silhouette = read_silhouette(options.image)
@@ -126,8 +126,7 @@ def run_image(options: ImageOptions, *, console: Console | None = None) -> dict[
     images["difference"] = np.abs(images["result"] - images["target"])
     record = records.plain(
         {
-            "settings": settings,
-            "machine": machine(),
+            **header(settings),
             "image_error": float(np.sqrt(np.mean(images["difference"] ** 2))),
             "image_error_start": float(np.sqrt(np.mean(np.square(images["mean head"] - images["target"])))),
             "weights": history.final[: fit.count],

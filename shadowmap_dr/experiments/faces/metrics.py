@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...errors import ShadowmapError
+from ...errors import ShadowmapError, install_hint
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -40,7 +40,7 @@ class SurfaceDistance:
 def check_libraries() -> None:
     """ShadowmapError if SciPy, which measures distances, is not installed."""
     if importlib.util.find_spec("scipy") is None:
-        raise ShadowmapError("measuring faces needs scipy: pip install 'shadowmap-dr[faces]'.")
+        raise ShadowmapError(f"measuring faces needs scipy: {install_hint('faces')}.")
 
 
 def surface_distance(

@@ -11,8 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...inverse.faces.morphable import MorphableModel
-from ...io import meshes, plots
-from ...io.files import atomic
+from ...io import meshes, plot_style, plots
 from ...io.images import to_srgb
 from ...scene.mitsuba_meshes import make_mesh
 from .metrics import distances
@@ -85,7 +84,7 @@ def picture(
     if error is None:
         colours = np.full((len(p), 3), _GREY)
     else:
-        encoded = colormaps["viridis"](np.clip(np.asarray(error) / COLOUR_END, 0, 1))[:, :3]
+        encoded = colormaps[plot_style.SEQUENTIAL](np.clip(np.asarray(error) / COLOUR_END, 0, 1))[:, :3]
         colours = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
     mesh = _mesh(p, f)
     mesh.add_attribute("vertex_paint", 3, np.ascontiguousarray(colours, np.float32).ravel())
@@ -120,26 +119,21 @@ def picture(
 
 def error_sheet(path: str | os.PathLike[str], rows: dict[str, dict[str, npt.NDArray[np.float32]]]) -> None:
     """Draw a grid of pictures with the colour bar beside it."""
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
-    from matplotlib.figure import Figure  # without pyplot there is no global state and no display is needed
-
     columns = max(len(row) for row in rows.values())
-    figure = Figure(figsize=(2.2 * columns + 0.8, 2.2 * len(rows) + 0.3), layout="constrained")
-    grid = np.atleast_2d(figure.subplots(len(rows), columns, squeeze=False))
-    for i, (row_title, row) in enumerate(rows.items()):
-        for j, (title, image) in enumerate(row.items()):
-            axes = grid[i, j]
-            axes.imshow(to_srgb(image), interpolation="nearest")
-            axes.set_title(title if i == 0 else "", fontsize=9)
-            axes.set_ylabel(row_title if j == 0 else "", fontsize=9)
-        for axes in grid[i]:
-            axes.set_xticks([])
-            axes.set_yticks([])
-    scale = ScalarMappable(Normalize(0, COLOUR_END), "viridis")
-    figure.colorbar(scale, ax=list(grid[:, -1]), label="distance from the head", extend="max", shrink=0.8)
-    with atomic(path) as temporary:
-        figure.savefig(temporary, dpi=120)
+    with plot_style.drawn(path, 2.2 * columns + 0.8, 2.2 * len(rows) + 0.3, dpi=120) as figure:
+        grid = np.atleast_2d(figure.subplots(len(rows), columns, squeeze=False))
+        for i, (row_title, row) in enumerate(rows.items()):
+            for j, (title, image) in enumerate(row.items()):
+                axes = grid[i, j]
+                axes.imshow(to_srgb(image))
+                axes.set_title(title if i == 0 else "", fontsize=9)
+                axes.set_ylabel(row_title if j == 0 else "", fontsize=9)
+            for axes in grid[i]:
+                axes.set(xticks=[], yticks=[])
+                axes.spines[:].set_visible(False)
+                axes.grid(False)
+        label = "distance from the true head [its half size]"
+        plot_style.colour_bar(figure, list(grid.flat), plot_style.SEQUENTIAL, 0.0, COLOUR_END, label)
 
 
 def write_ply(path: str | os.PathLike[str], vertices: npt.ArrayLike, faces: npt.ArrayLike) -> None:

@@ -57,9 +57,9 @@ def rows(record: Mapping[str, Any], mode: str) -> tuple[list[str], list[list[str
     the results with 1 and with 3 shadows; milliseconds of a step.
     """
     means = summary(record, mode)
-    columns = ["head", "start mean", "start max"]
+    columns = ["head", "start: mean", "max"]
     for lights in means:
-        columns += [f"{lights}: mean", f"{lights}: max", f"{lights}: ms"]
+        columns += [f"{lights}: mean", "max", "ms"]
     body = []
     for seed in sorted({run["seed"] for run in runs_of(record, mode)}):
         runs = {run["lights"]: run for run in runs_of(record, mode) if run["seed"] == seed}
@@ -94,7 +94,7 @@ def rows(record: Mapping[str, Any], mode: str) -> tuple[list[str], list[list[str
 def tables(record: Mapping[str, Any]) -> list[Table]:
     """Tables for the terminal, one for each mode."""
     modes = [mode for mode in _TITLES if runs_of(record, mode)]
-    return [console.table(f"{_TITLES[mode]}: distances, ms a step", *rows(record, mode)) for mode in modes]
+    return [console.table(f"{_TITLES[mode]}: distances from 1 or 3 shadows, ms a step", *rows(record, mode)) for mode in modes]
 
 
 def seen_expressions(record: Mapping[str, Any], lights: int) -> list[dict[str, Any]]:
@@ -151,5 +151,6 @@ def write(out: Path, record: Mapping[str, Any]) -> None:
         temporary.write_text("\n".join(reading(record)) + "\n", encoding="utf-8")
     curves: dict[str, list[Any]] = {}
     for run in record["runs"].values():
-        curves.setdefault(f"{run['mode']}, {run['lights']}", []).append(run["loss_curve"])
-    plots.plot_curves(out / "convergence.png", {"loss": curves})
+        curves.setdefault(f"{run['mode']}, {run['lights']} shadow{'s' * (run['lights'] > 1)}", []).append(run["loss_curve"])
+    note = "Curves of one colour are different heads."
+    plots.plot_curves(out / "convergence.png", {"loss (difference of the shadows and prior)": curves}, caption=note)

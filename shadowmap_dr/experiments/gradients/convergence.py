@@ -16,12 +16,12 @@ from ...inverse import optimize
 from ...io import console as io_console
 from ...io import files, plots, records
 from ...io.console import markdown
+from ...io.machine import header
 from ...io.options import option, setting
 from ...io.ranges import FILTER_SIDE, MAP_SIDE, SAMPLES, SIDE, STEPS, check_ranges
 from ...rendering.renderer import Renderer
 from ..common.meshes import Mesh
 from ..common.options import cameras_option
-from ..common.timing import machine
 from . import scenes as gradients_scenes
 from .fit import ShadowFit
 from .images import CANDIDATES, Image, check_chosen, check_maps
@@ -90,7 +90,7 @@ class ConvergenceOptions:
 
 def run_convergence(options: ConvergenceOptions, *, console: Console | None = None) -> dict[str, Any]:
     """Run all; write `convergence.json`, `convergence.md`, a plot and pictures into `options.out`. Returns the record."""
-    console = console or Console(stderr=True)
+    console = console or io_console.notes()
     path = files.check_output(options.out / "convergence.json", (".json",))
     record = _started(path, options)
     groups = list(itertools.product(options.candidates, options.occluders, options.cameras, options.filter_sizes))
@@ -134,7 +134,8 @@ def run_convergence(options: ConvergenceOptions, *, console: Console | None = No
     record = records.plain(record)
     records.write_record(path, record, "runs")
     plots.image_sheet(options.out / "convergence-images.png", sheet)
-    plots.plot_curves(options.out / "convergence.png", _curves(record), columns=2)
+    note = "Curves of one colour are runs with different displacements at the start."
+    plots.plot_curves(options.out / "convergence.png", _curves(record), columns=2, caption=note)
     with files.atomic(options.out / "convergence.md") as temporary:
         temporary.write_text(read_convergence(record), encoding="utf-8")
     return record
@@ -156,7 +157,7 @@ def _started(path: Path, options: ConvergenceOptions) -> dict[str, Any]:
         "step_size": STEP_SIZE,
         "decay": _DECAY,
     }
-    record: dict[str, Any] = {"settings": identity, "machine": machine(), "runs": {}}
+    record: dict[str, Any] = {**header(identity), "runs": {}}
     if options.resume and path.exists():
         record = _with_candidates(records.read_record(path, record, {"runs": _NEEDED}, _report))
     return record
@@ -219,7 +220,7 @@ def _curves(record: Mapping[str, Any]) -> dict[str, dict[str, list[list[float]]]
     panels: dict[str, dict[str, list[list[float]]]] = {}
     for run in record["runs"].values():
         label = ", ".join([f"filter {run['filter']}" if run["filter"] > 1 else "no filter", *_unless_default(run["candidate"])])
-        panel = panels.setdefault(f"error [texels]: {run['occluder']}, {run['camera']}", {})
+        panel = panels.setdefault(f"{run['occluder']}, {run['camera']}:\nerror [texels]", {})
         panel.setdefault(label, []).append(run["error_curve_texels"])
     return panels
 

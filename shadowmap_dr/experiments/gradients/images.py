@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from ...errors import ShadowmapError
+from ...errors import ShadowmapError, did_you_mean
 from ...jit.types import Float
 from ...rendering.renderer import Renderer
 from ...shadow import ShadowSettings, directional_view
@@ -47,7 +47,9 @@ def check_chosen(chosen: Mapping[str, tuple[Collection[Any], Collection[str] | N
             raise ShadowmapError(f"no {kind} given: name at least one.")
         for value in values:
             if known is not None and value not in known:
-                raise ShadowmapError(f"no {kind} {value!r}: choose from {', '.join(map(repr, known))}.")
+                raise ShadowmapError(
+                    f"no {kind} {value!r}: choose from {', '.join(map(repr, known))}.{did_you_mean(value, known)}"
+                )
 
 
 def check_maps(resolutions: Iterable[int], filter_sizes: Iterable[int]) -> None:

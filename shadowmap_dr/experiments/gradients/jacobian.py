@@ -15,11 +15,11 @@ from rich.console import Console
 from ...errors import ShadowmapError
 from ...io import console as io_console
 from ...io import files, plots, records
+from ...io.machine import header
 from ...io.options import option
 from ...io.ranges import FILTER_SIDE, MAP_SIDE, SIDE, check_ranges
 from ...rendering.renderer import Renderer
 from ..common.meshes import Mesh
-from ..common.timing import machine
 from . import report as gradients_report
 from . import scenes as gradients_scenes
 from .images import (
@@ -95,7 +95,7 @@ PARTS: dict[str, tuple[str, ...]] = {
 
 def run_jacobian(options: JacobianOptions, *, console: Console | None = None) -> dict[str, Any]:
     """Run all; write `jacobian.json`, `jacobian.md`, pictures and a plot into `options.out`. Returns the record."""
-    console = console or Console(stderr=True)
+    console = console or io_console.notes()
     path = files.check_output(options.out / "jacobian.json", (".json",))
     record = _started(path, options)
     mesh = gradients_scenes.ring(options.faces)
@@ -134,7 +134,7 @@ def run_jacobian(options: JacobianOptions, *, console: Console | None = None) ->
             record["tessellation"][name] = _tessellation(name, options)
         records.write_record(path, record, *PARTS)
         pictures = {name: _pictures(mesh, name, traced, mitsuba, options) for name in track("pictures", list(options.motions))}
-    plots.signed_sheet(options.out / "jacobian.png", pictures)
+    plots.signed_sheet(options.out / "jacobian.png", pictures, label="derivative of radiance")
     gradients_report.plot_agreement(options.out / "jacobian-agreement.png", record)
     with files.atomic(options.out / "jacobian.md") as temporary:
         temporary.write_text(gradients_report.read_jacobian(record), encoding="utf-8")
@@ -144,7 +144,7 @@ def run_jacobian(options: JacobianOptions, *, console: Console | None = None) ->
 def _started(path: Path, options: JacobianOptions) -> dict[str, Any]:
     """The stored record if the run is resumed, else a new one."""
     identity = {"resolution": options.resolution, "requested_faces": options.faces, "spp": options.spp}
-    empty: dict[str, Any] = {"settings": identity, "machine": machine(), "candidates": CANDIDATES, **{part: {} for part in PARTS}}
+    empty: dict[str, Any] = {**header(identity), "candidates": CANDIDATES, **{part: {} for part in PARTS}}
     if options.resume and path.exists():
         return records.read_record(path, empty, PARTS)
     return empty

@@ -15,11 +15,11 @@ from ...inverse import optimize
 from ...io import console as io_console
 from ...io import files, plots, records
 from ...io.console import markdown
+from ...io.machine import header
 from ...io.options import option, setting
 from ...io.ranges import FILTER_SIDE, MAP_SIDE, SAMPLES, SIDE, STEPS, check_ranges
 from ...rendering.renderer import Renderer
 from ..common.options import cameras_option
-from ..common.timing import machine
 from . import scenes as gradients_scenes
 from .fit import ShadowFit
 from .images import Image, check_chosen, check_maps
@@ -53,7 +53,7 @@ def run_plane(options: PlaneOptions, *, console: Console | None = None) -> dict[
     """Run all; write `minimal-plane.json`, `minimal-plane.md`, a plot and pictures into `options.out`. Returns the record."""
     from mitsuba_baselines.reference import path_traced
 
-    console = console or Console(stderr=True)
+    console = console or io_console.notes()
     path = files.check_output(options.out / "minimal-plane.json", (".json",))
     mesh = gradients_scenes.plane(HALF, Z)
     basis = np.zeros((2, *mesh.vertices.shape))
@@ -68,7 +68,7 @@ def run_plane(options: PlaneOptions, *, console: Console | None = None) -> dict[
         "step_size": STEP_SIZE,
         "start": start,
     }
-    record: dict[str, Any] = {"settings": settings, "machine": machine(), "runs": []}
+    record: dict[str, Any] = {**header(settings), "runs": []}
     sheet: dict[str, dict[str, Image]] = {}
     with io_console.progress(console) as progress:
         task = progress.add_task("steps", total=len(options.cameras) * len(CASES) * options.iterations, note="")
@@ -108,9 +108,9 @@ def run_plane(options: PlaneOptions, *, console: Console | None = None) -> dict[
     record = records.plain(record)
     records.write_json(path, record)
     plots.image_sheet(options.out / "minimal-plane-images.png", sheet)
-    curves = {
-        key: {f"{run['camera']}, {_label(run)}": [run[f"{key}_curve"]] for run in record["runs"]} for key in ("error", "loss")
-    }
+    labels = {"error": "distance of the vertex from its place [units]", "loss": "loss (mean squared difference)"}
+    runs = {f"{run['camera']},\n{_label(run)}": run for run in record["runs"]}
+    curves = {label: {name: [run[f"{key}_curve"]] for name, run in runs.items()} for key, label in labels.items()}
     plots.plot_curves(options.out / "minimal-plane.png", curves)
     with files.atomic(options.out / "minimal-plane.md") as temporary:
         temporary.write_text(read_plane(record), encoding="utf-8")
@@ -137,7 +137,7 @@ def plane_rows(record: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
 
 def plane_table(record: Mapping[str, Any]) -> Table:
     """The table for the terminal."""
-    return io_console.table("A vertex recovered from the shadow (distance from its place, world units)", *plane_rows(record))
+    return io_console.table("A vertex recovered from the shadow: distance from its place [units]", *plane_rows(record))
 
 
 def read_plane(record: Mapping[str, Any]) -> str:

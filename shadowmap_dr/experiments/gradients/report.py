@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from ...io import console
+from ...io import console, plot_style
 from ...io.console import markdown
-from ...io.files import atomic
 
 #: Aims for derivative images: least cosine, and bounds of the scale.
 OWN, TRACED = (0.98, 0.97, 1.03), (0.95, 0.95, 1.05)
@@ -25,32 +24,29 @@ _KINDS = {
 
 def plot_agreement(path: str | os.PathLike[str], record: Mapping[str, Any]) -> None:
     """Plot scale and 1 - cosine over map sizes: a line for each filter, a column for each reference; means over motions."""
-    from matplotlib.figure import Figure
-
     entries = [e for e in _compared(record) if e["candidate"] == _first_candidate(record)]
-    figure = Figure(figsize=(13, 6.5), layout="constrained")
-    for j, (kind, (title, (least, low, high))) in enumerate(_KINDS.items()):
-        for i, (quantity, label) in enumerate((("scale", "scale"), ("cosine", "1 - cosine"))):
-            axes = figure.add_subplot(2, 3, 1 + j + 3 * i)
-            for colour, taps in enumerate(sorted({e["filter"] for e in entries})):
-                sizes = sorted({e["map"] for e in entries if e["filter"] == taps})
-                means = [np.mean([e[kind][quantity] for e in entries if (e["filter"], e["map"]) == (taps, n)]) for n in sizes]
-                values = means if quantity == "scale" else [1 - m for m in means]
-                axes.plot(sizes, values, f"C{colour}o-", label=f"filter {taps}" if taps > 1 else "no filter")
-            for bound in (low, high) if quantity == "scale" else (1 - least,):
-                axes.axhline(bound, color="0.5", linestyle=":")
-            axes.set_xscale("log", base=2)
-            if quantity == "cosine":
-                axes.set_yscale("log")
-            axes.set_xlabel("texels along each side of the map")
-            axes.set_ylabel(label)
-            axes.grid(True, alpha=0.3)
-            if i == 0:
-                axes.set_title(title, fontsize=10)
-            if i == 0 and j == 0 and entries:
-                axes.legend(fontsize=8)
-    with atomic(path) as temporary:
-        figure.savefig(temporary, dpi=110)
+    with plot_style.drawn(path, 13, 6.8, dpi=110) as figure:
+        for j, (kind, (title, (least, low, high))) in enumerate(_KINDS.items()):
+            for i, (quantity, label) in enumerate((("scale", "scale s (1: exact)"), ("cosine", "1 - cosine c (0: exact)"))):
+                axes, ends = figure.add_subplot(2, 3, 1 + j + 3 * i), []
+                every: set[int] = set()
+                for k, taps in enumerate(sorted({e["filter"] for e in entries})):
+                    sizes = sorted({e["map"] for e in entries if e["filter"] == taps})
+                    means = [np.mean([e[kind][quantity] for e in entries if (e["filter"], e["map"]) == (taps, n)]) for n in sizes]
+                    values = means if quantity == "scale" else [1 - m for m in means]
+                    axes.plot(sizes, values, color=plot_style.colour(k), marker=plot_style.marker(k))
+                    ends.append((float(values[-1]), f"filter {taps}" if taps > 1 else "no filter", plot_style.colour(k)))
+                    every.update(sizes)
+                for bound in (low, high) if quantity == "scale" else (1 - least,):
+                    axes.axhline(bound, color=plot_style.GREY, linestyle=":")
+                axes.set_xscale("log", base=2)
+                axes.set_xticks(sorted(every), [str(size) for size in sorted(every)])
+                if quantity == "cosine":
+                    axes.set_yscale("log")
+                axes.set(xlabel="texels along each side of the map", ylabel=label, title=title if i == 0 else "")
+                if j == len(_KINDS) - 1:
+                    plot_style.label_ends(axes, ends)
+        plot_style.caption(figure, "Points: means over the motions across the light. Dotted: aims.")
 
 
 def _compared(record: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -70,13 +66,14 @@ def jacobian_rows(record: Mapping[str, Any]) -> tuple[list[str], list[list[str]]
         groups.setdefault((entry["candidate"], entry["map"], entry["filter"]), []).append(entry)
     rows = []
     order = list(dict.fromkeys(label for label, _, _ in groups))
+    named = order != ["default"]
     for (label, size, taps), entries in sorted(groups.items(), key=lambda item: (order.index(item[0][0]), *item[0][1:])):
         cells = []
         for kind in _KINDS:
             farthest = max((e[kind]["scale"] for e in entries), key=lambda scale: abs(scale - 1))
             cells += [f"{min(e[kind]['cosine'] for e in entries):.3f}", f"{farthest:.3f}"]
         reverse = max(e["reverse_error"] for e in entries)
-        rows.append([f"{label}, {size}, {taps if taps > 1 else 'none'}", *cells, f"{reverse:.0e}"])
+        rows.append([f"{f'{label}, ' * named}{size}, {taps if taps > 1 else 'none'}", *cells, f"{reverse:.0e}"])
     return columns, rows
 
 

@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from ...errors import ShadowmapError
+from ...errors import ShadowmapError, did_you_mean
 from ..common.meshes import Mesh, subdivided, torus
 from ..common.objects import occluder
 
@@ -38,7 +38,7 @@ def build(mesh: Mesh, resolution: int, camera: str = "orthographic") -> mi.Scene
         camera: see `CAMERAS`.
     """
     if camera not in CAMERAS:
-        raise ShadowmapError(f"no camera {camera!r}: choose from {', '.join(CAMERAS)}.")
+        raise ShadowmapError(f"no camera {camera!r}: choose from {', '.join(CAMERAS)}.{did_you_mean(camera, CAMERAS)}")
     t = mi.ScalarTransform4f
     film: dict[str, Any] = {
         "type": "hdrfilm",

@@ -22,13 +22,16 @@ from ...inverse.runs.schedulers import check_threads
 from ...inverse.runs.sweep import MEMORY, stored_records
 from ...io import assets, files
 from ...io import records as io_records
+from ...io.machine import header
 from ...io.options import option
 from ...io.ranges import RUNS, check_ranges
-from ..common import timing
 from ..common.options import scheduler_option, threads_option
 from .problem import LightProblem, LightSetting, check_problem, curve_iterations
 from .report import pictures, plot
 from .scene import OBJECTS
+
+# Fields that say how runs are made, not which.
+_HOW = ("memory", "scheduler", "threads", "out", "resume")
 
 
 def _mebibytes(count: int) -> int:
@@ -79,6 +82,11 @@ class LightOptions(LightSetting):
         for problem in self.problems():
             check_problem(problem)
 
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Settings that the results depend on."""
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _HOW}
+
     def problems(self) -> list[LightProblem]:
         """A problem for each object of each setting."""
         common = {f.name: getattr(self, f.name) for f in fields(LightSetting)}
@@ -124,7 +132,7 @@ def run_lights(options: LightOptions, *, variant: str = "llvm_ad_rgb", console: 
         summaries.append(summary(*(wider or (group, [found[problem.name] for problem in group]))))
     new = [entry["setting"] for entry in summaries]
     summaries = [entry for entry in stored if entry["setting"] not in new] + summaries
-    io_records.write_json(path, {"summaries": summaries, "machine": timing.machine()})
+    io_records.write_json(path, {**header(options.settings), "summaries": summaries})
     plot(options.out / "lights.png", summaries)
     shown = next(iter(groups.values()))
     pictures(options.out / "pictures.png", shown, [found[problem.name] for problem in shown])

@@ -7,14 +7,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 from rich.table import Table
 
-from ...io import console, plots
-from ...io.files import atomic
+from ...io import console, plot_style, plots
 from .problem import LightProblem
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+
+# Least angle of plots, degrees: alignments are rounded to about its cosine.
+_LEAST_DEG = 0.02
 
 
 def table(summaries: Sequence[dict[str, Any]]) -> Table:
@@ -32,7 +36,7 @@ def table(summaries: Sequence[dict[str, Any]]) -> Table:
         for entry in summaries
     ]
     columns = ["lights", "shadows", "runs", "alignment", "deviation", "least", "% >= 0.995"]
-    return console.table("Alignment of estimated with true light directions", columns, rows)
+    return console.table("Alignment of estimated with true light directions", columns, rows, wrapped=(0, 1))
 
 
 def label_of(entry: dict[str, Any]) -> str:
@@ -47,50 +51,75 @@ def label_of(entry: dict[str, Any]) -> str:
 
 
 def plot(path: Path, summaries: Sequence[dict[str, Any]]) -> None:
-    """Plot the alignment over iterations for each number of lights, and the final alignment over the filter size.
+    """Plot the angle over iterations for each number of lights, and the final angle over the filter size.
 
-    Bands and bars are standard deviations. With more than three curves in a panel, only the first has a band.
+    Angles are those of the mean alignment and of a standard deviation to both sides of it. With more than three curves in a
+    panel, only the first has a band.
     """
-    from matplotlib.figure import Figure
-
     numbers = sorted({entry["lights"] for entry in summaries})
     columns = min(3, len(numbers) + 1)
     rows = -(-(len(numbers) + 1) // columns)
-    figure = Figure(figsize=(5 * columns, 3.8 * rows), layout="constrained")
-    panels = list(figure.subplots(rows, columns, squeeze=False).flat)
-    for axes, lights in zip(panels, numbers, strict=False):
-        own = sorted((entry for entry in summaries if entry["lights"] == lights), key=lambda entry: entry["filter_size"])
-        for k, entry in enumerate(own):
-            x, mean, std = (np.array(entry[key]) for key in ("curve_iterations", "curve_mean", "curve_std"))
-            axes.plot(x, mean, color=f"C{k % 10}", label=label_of(entry))
-            if len(own) <= 3 or k == 0:
-                axes.fill_between(x, mean - std, np.minimum(mean + std, 1), color=f"C{k % 10}", alpha=0.12, linewidth=0)
-        axes.set(title=f"n = {lights}", xlabel="iteration", ylabel="alignment")
-        axes.legend(fontsize=7, loc="lower right")
-    _plot_sizes(panels[len(numbers)], [entry for entry in summaries if _is_plain(entry)])
-    for axes in panels[len(numbers) + 1 :]:
-        axes.set_axis_off()
-    for axes in panels[: len(numbers) + 1]:
-        axes.grid(True, alpha=0.3)
-    with atomic(path) as temporary:
-        figure.savefig(temporary, dpi=100)
+    with plot_style.drawn(path, 5.2 * columns, 3.6 * rows, dpi=110) as figure:
+        panels = list(figure.subplots(rows, columns, squeeze=False).flat)
+        for axes, lights in zip(panels, numbers, strict=False):
+            own = sorted((entry for entry in summaries if entry["lights"] == lights), key=lambda entry: entry["filter_size"])
+            ends = []
+            for k, entry in enumerate(own):
+                x, mean, std = (np.array(entry[key]) for key in ("curve_iterations", "curve_mean", "curve_std"))
+                low, middle, high = _angles(mean, std)
+                axes.plot(x, middle, color=plot_style.colour(k), linestyle=plot_style.dash(k))
+                ends.append((float(middle[-1]), _short(entry), plot_style.colour(k)))
+                if len(own) <= 3 or k == 0:
+                    axes.fill_between(x, low, high, color=plot_style.colour(k), alpha=0.15, linewidth=0)
+            axes.set(title=f"{lights} light{'s' * (lights > 1)}", xlabel="iteration", ylabel="angle to the true light [degrees]")
+            _scaled(axes, [np.array(entry["curve_mean"]) for entry in own])
+            plot_style.label_ends(axes, ends)
+        _plot_sizes(panels[len(numbers)], [entry for entry in summaries if _is_plain(entry)])
+        for axes in panels[len(numbers) + 1 :]:
+            axes.set_axis_off()
+        plot_style.caption(
+            figure, "Lines: angle of the mean alignment of the runs. Bands and bars: one standard deviation of it."
+        )
 
 
 def _plot_sizes(axes: Axes, summaries: Sequence[dict[str, Any]]) -> None:
-    """Plot the final alignment over the filter size, a line for each number of lights and type of filter."""
+    """Plot the final angle over the filter size, a line for each number of lights and type of filter."""
     series: dict[tuple[int, str], list[dict[str, Any]]] = {}
     for entry in sorted(summaries, key=lambda entry: (entry["lights"], entry["filter_size"])):
         series.setdefault((entry["lights"], entry["filter"]), []).append(entry)
+    ends, sizes = [], sorted({entry["filter_size"] for entry in summaries})
     for k, ((lights, filter), own) in enumerate(series.items()):
-        mean, std = (np.array([entry[f"alignment_{key}"] for entry in own]) for key in ("mean", "std"))
-        positions = np.array([entry["filter_size"] for entry in own]) + 0.15 * k  # side by side
-        label = f"n = {lights}" + ("" if filter == "gaussian" else f", {filter}")
-        bars = [std, np.minimum(std, 1 - mean)]
-        axes.errorbar(positions, mean, yerr=bars, marker="o", ms=4, capsize=2, color=f"C{k}", label=label)
-    axes.set(xlabel="texels of the filter (0: no shadows, 1: no filter)", ylabel="alignment at the end")
-    axes.ticklabel_format(axis="y", useOffset=False)
-    if series:
-        axes.legend(fontsize=7, loc="lower right")
+        low, middle, high = _angles(*(np.array([entry[f"alignment_{key}"] for entry in own]) for key in ("mean", "std")))
+        positions = np.array([sizes.index(entry["filter_size"]) for entry in own]) + 0.06 * k  # side by side
+        tint = plot_style.colour(k)
+        bars = [middle - low, high - middle] if len(series) <= 2 else None
+        axes.errorbar(positions, middle, yerr=bars, marker=plot_style.marker(k), capsize=2, color=tint)
+        label = f"{lights} light{'s' * (lights > 1)}" + ("" if filter == "gaussian" else f",\n{filter}")
+        ends.append((float(middle[-1]), label, tint))
+    axes.set(xlabel="texels of the filter", ylabel="angle at the end [degrees]", title="all filters")
+    axes.set_xticks(range(len(sizes)), [{0: "no shadows", 1: "1 (none)"}.get(size, str(size)) for size in sizes])
+    _scaled(axes, [np.array([entry["alignment_mean"] for entry in summaries])])
+    plot_style.label_ends(axes, ends)
+
+
+def _short(entry: dict[str, Any]) -> str:
+    """Label of a line."""
+    text = label_of(entry)
+    return "no shadows" if text == "none" else text.replace("path-traced targets", "path-traced")
+
+
+def _scaled(axes: Axes, alignments: Sequence[npt.NDArray[np.float64]]) -> None:
+    """Scale the vertical axis to lines of alignments: bands reach to angles of zero, which no logarithm has."""
+    axes.set_yscale("log")
+    drawn = [_angles(values, np.zeros_like(values))[1] for values in alignments if values.size]
+    if drawn:
+        axes.set_ylim(min(float(values.min()) for values in drawn) / 2, 2 * max(float(values.max()) for values in drawn))
+
+
+def _angles(mean: npt.NDArray[np.float64], std: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.float64], ...]:
+    """Angles (degrees) of an alignment, one standard deviation better, as it is, and one worse. None is below `_LEAST_DEG`."""
+    better, worse = np.minimum(mean + std, 1), np.maximum(mean - std, -1)
+    return tuple(np.maximum(np.degrees(np.arccos(np.clip(value, -1, 1))), _LEAST_DEG) for value in (better, mean, worse))
 
 
 def pictures(path: Path, problems: Sequence[LightProblem], records: Sequence[Sequence[dict[str, Any]]]) -> None:

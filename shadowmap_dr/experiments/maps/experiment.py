@@ -17,16 +17,17 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from ...errors import ShadowmapError
+from ...errors import ShadowmapError, did_you_mean
 from ...io import console as io_console
 from ...io import files, plots, records
+from ...io.machine import header
 from ...io.options import option, setting
 from ...io.ranges import FILTER_SIDE, MAP_SIDE, SAMPLES, check_ranges
 from ...jit.frozen import freeze
 from ...jit.types import Float
 from ...rendering.renderer import Renderer
 from ...shadow import ShadowSettings, directional_view
-from ..common.timing import Contender, alternate, machine
+from ..common.timing import Contender, alternate
 from . import pose as maps_pose
 from . import scenes as maps_scenes
 from .metrics import Image, Texel, metrics, texel_in_pixels
@@ -75,7 +76,9 @@ class MapsOptions:
                 raise ShadowmapError(f"no {kind} given: name at least one.")
             for name in names:
                 if name not in known:
-                    raise ShadowmapError(f"no {kind} {name!r}: choose from {', '.join(map(repr, known))}.")
+                    raise ShadowmapError(
+                        f"no {kind} {name!r}: choose from {', '.join(map(repr, known))}.{did_you_mean(name, known)}"
+                    )
         try:
             ShadowSettings(resolution=self.map_resolution, filter_size=self.filter_size)
         except ValueError as error:
@@ -84,9 +87,9 @@ class MapsOptions:
 
 def run_maps(options: MapsOptions, *, console: Console | None = None) -> dict[str, Any]:
     """Measure all candidates on all scenes, write `maps.json` and `maps.png` into `options.out`, and return the record."""
-    console = console or Console(stderr=True)
+    console = console or io_console.notes()
     files.check_output(options.out / "maps.json", (".json",))
-    record: dict[str, Any] = {"settings": asdict(options), "machine": machine(), "candidates": CANDIDATES, "scenes": {}}
+    record: dict[str, Any] = {**header(asdict(options)), "candidates": CANDIDATES, "scenes": {}}
     sheet: dict[str, dict[str, Image]] = {}
     with io_console.progress(console) as progress:
         for name in options.scenes:
@@ -226,7 +229,7 @@ def _add_times(entries: dict[str, dict[str, Any]], scene: mi.Scene, options: Map
 
 def table(record: dict[str, Any]) -> Table:
     """Table with a row for each scene and method."""
-    columns = ["scene, method", "RMSE", "shadowed", "bleeding", "acne", "shift", "cosine", "scale", "time"]
+    columns = ["scene, method", "RMSE", "shade", "bleed", "acne", "shift", "cos", "scale", "time"]
     rows: list[Sequence[str]] = []
     for scene, entries in record["scenes"].items():
         for label, e in entries.items():
@@ -234,12 +237,24 @@ def table(record: dict[str, Any]) -> Table:
             rows.append(
                 [
                     f"{scene}, {label}",
-                    *(f"{e[key]:.3f}" for key in ("rmse", "rmse_shadowed", "bleeding", "acne", "contour_shift_texels")),
-                    *(f"{e[key]:.3f}" for key in ("derivative_cosine", "derivative_scale")),
+                    *(_number(e[key]) for key in ("rmse", "rmse_shadowed", "bleeding", "acne", "contour_shift_texels")),
+                    *(_number(e[key]) for key in ("derivative_cosine", "derivative_scale")),
                     f"{ratio:.2f}x" if ratio is not None else f"{1e3 * e['seconds']:.2f} ms",
                 ]
             )
-    for label, e in record.get("poses", {}).items():
-        errors = f"{e['median_rotation_deg']:.3f} deg, {e['median_offset_x100']:.3f}"
-        rows.append([f"poses, {label}", f"{e['found']} of {e['runs']}", errors, *[""] * (len(columns) - 3)])
     return io_console.table("Shadow maps against path tracing (shift in texels, time over plain vsm)", columns, rows)
+
+
+def poses_table(record: dict[str, Any]) -> Table | None:
+    """Table of the poses found with each method; None if none were looked for."""
+    rows = [
+        [label, f"{e['found']} of {e['runs']}", f"{e['median_rotation_deg']:.3f}", f"{e['median_offset_x100']:.3f}"]
+        for label, e in record.get("poses", {}).items()
+    ]
+    columns = ["method", "found", "degrees", "offset x 100"]
+    return io_console.table("Poses found with the shadow maps, medians of the errors", columns, rows) if rows else None
+
+
+def _number(value: float | None) -> str:
+    """A cell; records have None where a quantity is not defined, for instance a shift where there is no outline."""
+    return "-" if value is None else f"{value:.3f}"

@@ -11,7 +11,7 @@ import dataclasses
 import functools
 import glob
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -23,13 +23,14 @@ from rich.console import Console
 from rich.progress import Progress, TaskID
 from rich.table import Table
 
-from ...errors import ShadowmapError
+from ...errors import ShadowmapError, did_you_mean
 from ...inverse import Method, run_sweep
 from ...inverse.runs.schedulers import check_scheduler, check_threads
+from ...io import assets, files, plots
 from ...io import console as io_console
-from ...io import files, plots
 from ...io import images as io_images
 from ...io import records as io_records
+from ...io.machine import header
 from ...io.options import option
 from ...io.ranges import RUNS, SEED, STEPS, check_ranges
 from ..common.options import scheduler_option, threads_option
@@ -108,7 +109,7 @@ class PoseOptions:
                 raise ShadowmapError(f"one {name} is given twice in {', '.join(map(str, values))}: name each once.")
         for method in self.methods:
             if method not in METHODS:
-                raise ShadowmapError(f"no method {method!r}: choose from {', '.join(METHODS)}.")
+                raise ShadowmapError(f"no method {method!r}: choose from {', '.join(METHODS)}.{did_you_mean(method, METHODS)}")
         check_threads(self.threads)
         if self.reference not in ("mitsuba", "own"):
             raise ShadowmapError(f"no reference {self.reference!r}: choose mitsuba or own.")
@@ -116,11 +117,17 @@ class PoseOptions:
             raise ShadowmapError(f"no normals {self.normals!r}: choose face or vertex.")
         check_scheduler(self.scheduler)
 
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Settings that the results depend on."""
+        left_out = ("out", "resume", "scheduler", "threads")
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in left_out}
+
 
 def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Console | None = None) -> list[dict[str, Any]]:
     """Run the experiment and write its results below `options.out`.
 
-    Files: `pose.json` (a list with one record for each object, resolution, method and run), and for each object and
+    Files: `pose.json` (`runs` has one record for each object, resolution, method and run), and for each object and
     resolution a folder with the reference, the images at start and end and their difference from the reference, a plot
     of the convergence (`convergence.png`) and a sheet with the images of the first run (`images.png`).
 
@@ -130,7 +137,7 @@ def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Co
     With a scheduler (see :func:`shadowmap_dr.inverse.run_sweep`) its workers make the runs, with methods of :func:`build_method`.
     Runs that share a machine take longer than runs alone.
     """
-    console = console or Console(stderr=True)
+    console = console or io_console.notes()
     out = options.out
     files.check_output(out / "pose.json", (".json",))
     stored: list[dict[str, Any]] = []
@@ -173,7 +180,8 @@ def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Co
             for method in methods.values():
                 if fairness(method, problem).get("fair") is False:
                     note = "sample counts found with another object or resolution; that they converge here has not been shown"
-                    progress.console.print(f"{problem.folder} mitsuba: {note}: {getattr(method, 'setting', '')}", highlight=False)
+                    line = f"{problem.folder} mitsuba: {note}: {getattr(method, 'setting', '')}"
+                    progress.console.print(line, highlight=False, soft_wrap=True)
             records, images = [], {}
             for run in range(options.runs):
                 for name in options.methods:
@@ -191,13 +199,21 @@ def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Co
                         images[name] = pictures
                     records.append(record)
                     stored = [*(other for other in stored if _key(other) != _key(record)), record]
-                    io_records.write_json(out / "pose.json", stored)
+                    io_records.write_json(out / "pose.json", {**header(options.settings), "runs": stored})
                     _remove_checkpoints(problem, name, run, options)
                     progress.remove_task(task)
                     progress.console.print(f"{title}: {_outcome(record)}", highlight=False, soft_wrap=True)
             _plots(problem, options, records, images, reference)
             result += records
     return result
+
+
+def pictures_of(options: PoseOptions) -> list[Path]:
+    """Sheets of images that `run_pose` writes, one for each object and resolution."""
+    smooth = "-vertex-normals" if options.normals == "vertex" else ""
+    ending = ("-shadow-only" if options.shadow_only else "") + smooth
+    objects = [name if name in assets.mesh_names() else Path(name).stem for name in options.objects]
+    return [options.out / f"{name}-{size}{ending}" / "images.png" for name in objects for size in options.resolutions]
 
 
 def table(records: Sequence[dict[str, Any]]) -> Table:
@@ -325,14 +341,15 @@ def _plots(
 ) -> None:
     panels = {
         "rotation error [degrees]": "rotation_error_curve",
-        "offset error x 100": "translation_error_curve",
-        "loss": "loss_curve",
+        "offset error [units / 100]": "translation_error_curve",
+        "loss (mean squared difference)": "loss_curve",
     }
     curves = {
         label: {name: [record[key] for record in records if record["method"] == name] for name in options.methods}
         for label, key in panels.items()
     }
-    plots.plot_curves(options.out / problem.folder / "convergence.png", curves)
+    note = "Curves of one colour are runs from different starts."
+    plots.plot_curves(options.out / problem.folder / "convergence.png", curves, caption=note)
     rows = {name: {"reference": reference, **pictures} for name, pictures in images.items()}
     plots.image_sheet(options.out / problem.folder / "images.png", rows)
 

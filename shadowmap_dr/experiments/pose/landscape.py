@@ -18,11 +18,11 @@ import numpy as np
 import numpy.typing as npt
 
 from ...errors import ShadowmapError
-from ...io import images
+from ...io import images, plot_style
 from ...io import records as io_records
-from ...io.files import atomic
 from ...variants import DEFAULT_VARIANT
 from .methods import METHODS, build_method
+from .record import runs_in
 from .scene import make_problem
 
 Render = Callable[[npt.NDArray[np.float64]], npt.NDArray[Any]]
@@ -97,31 +97,26 @@ def plot_slices(
     path: str | os.PathLike[str], title: str, angles: npt.ArrayLike, lines: Mapping[str, npt.ArrayLike], record: Mapping[str, Any]
 ) -> None:
     """Draw the slices with the path of a run, and the run's errors over its steps."""
-    from matplotlib.figure import Figure  # without pyplot there is no global state and no display is needed
-
-    figure = Figure(figsize=(11, 4), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    labels = {"target": "offset zero", "end": "offset where the run ended", "best": "best offset"}
-    for colour, (name, label) in enumerate(labels.items()):
-        left.plot(np.degrees(angles), lines[name], f"C{colour}", linewidth=1.3, label=label)
+    labels = {"target": "offset zero", "end": "offset at the end of the run", "best": "best offset"}
     rotation, losses = np.asarray(record["rotation_error_curve"], np.float64), np.asarray(record["loss_curve"], np.float64)
     side = np.sign(record["start"][0])
-    left.plot(side * rotation[: len(losses)], losses, "k.", markersize=3, label="the run (on the side where it started)")
-    left.plot(np.degrees(record["final"][0]), losses[-1], "kx", markersize=8, label="its end")
-    left.set_xlabel("rotation [degrees]")
-    left.set_ylabel("loss")
-    left.set_yscale("log")
-    left.set_title(title, fontsize=10)
-    left.grid(True, alpha=0.3)
-    left.legend(fontsize=8, loc="lower right")
-    right.plot(rotation, "k", linewidth=1.2, label="rotation error [degrees]")
-    right.plot(np.asarray(record["translation_error_curve"], np.float64), "C3", linewidth=1.2, label="offset error x 100")
-    right.set_xlabel("step")
-    right.set_yscale("log")
-    right.grid(True, alpha=0.3)
-    right.legend(fontsize=8)
-    with atomic(path) as temporary:
-        figure.savefig(temporary, dpi=110)
+    with plot_style.drawn(path, 11, 4.2, dpi=110) as figure:
+        left, right = figure.subplots(1, 2)
+        for k, (name, label) in enumerate(labels.items()):
+            left.plot(np.degrees(angles), lines[name], color=plot_style.colour(k), linestyle=("-", "--", "-.")[k], label=label)
+        run, end = side * rotation[: len(losses)], np.degrees(record["final"][0])
+        left.plot(run, losses, "k.", markersize=3, label="steps of the run, on the side of its start")
+        left.plot(end, losses[-1], "kx", markersize=8, label="end of the run")
+        left.set(xlabel="rotation [degrees]", ylabel="loss (mean squared difference)", yscale="log", title=title)
+        left.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2)
+        offset = np.asarray(record["translation_error_curve"], np.float64)
+        curves = {"rotation error [degrees]": rotation, "offset error [units / 100]": offset}
+        ends = []
+        for k, (label, curve) in enumerate(curves.items()):
+            right.plot(curve, color=plot_style.COLOURS[3 + k])
+            ends.append((float(curve[-1]), label.replace(" [", "\n["), plot_style.COLOURS[3 + k]))
+        right.set(xlabel="step", ylabel="error", yscale="log", title="errors of the run")
+        plot_style.label_ends(right, ends)
 
 
 def landscape(
@@ -132,8 +127,8 @@ def landscape(
     `renderer`: method that renders the images, by default the run's own (Mitsuba's is slow and noisy).
     Returns angles in degrees and the slices. Raises ShadowmapError if there is no such record or no reference image.
     """
-    records = io_records.read_json(folder / "pose.json")
-    if not isinstance(records, list) or not all(isinstance(entry, dict) for entry in records):
+    records = runs_in(io_records.read_json(folder / "pose.json"))
+    if records is None:
         raise ShadowmapError(f"{folder / 'pose.json'} is no list of records: give a folder of the pose experiment.")
     record = next((entry for entry in records if all(entry.get(key) == value for key, value in wanted.items())), None)
     if record is None:

@@ -8,9 +8,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ...io.files import atomic
+from ...io import plot_style
 
-COLOURS = {"shadows": "C0", "rasterizer": "C1", "mitsuba": "C2"}
+COLOURS = {name: plot_style.colour(k) for k, name in enumerate(("shadows", "rasterizer", "mitsuba"))}
 _LIMIT_DEG = 0.2
 
 
@@ -23,29 +23,29 @@ def plot_convergence(
         path: file to write (.png, .pdf, .svg).
         curves: (object, resolution) -> method -> a curve (degrees) for each run. Objects become rows, resolutions columns.
     """
-    from matplotlib.figure import Figure  # without pyplot there is no global state and no display is needed
-
     objects, resolutions = sorted({name for name, _ in curves}), sorted({resolution for _, resolution in curves})
-    figure = Figure(figsize=(1.2 + 3.4 * len(resolutions), 0.6 + 2.2 * len(objects)), layout="constrained")
-    grid = figure.subplots(len(objects), len(resolutions), sharex=True, sharey=True, squeeze=False)
-    handles = {}
-    for i, name in enumerate(objects):
-        for j, resolution in enumerate(resolutions):
-            axes = grid[i, j]
-            for method, runs in curves.get((name, resolution), {}).items():
-                errors = np.array(runs, np.float64)  # None, of a run that failed, becomes NaN
-                with warnings.catch_warnings():  # a step that no run reached leaves a gap in the plot
-                    warnings.simplefilter("ignore", RuntimeWarning)
-                    low, middle, high = np.nanpercentile(errors, (25, 50, 75), axis=0)
-                (line,) = axes.plot(middle, COLOURS.get(method, "0.3"), linewidth=1.4, label=method)
-                axes.fill_between(np.arange(len(middle)), low, high, color=line.get_color(), alpha=0.25, linewidth=0)
-                handles[method] = line
-            axes.axhline(_LIMIT_DEG, color="0.5", linestyle=":", linewidth=1)
-            axes.set_yscale("log")
-            axes.grid(True, alpha=0.3)
-            axes.set_title(f"{name}, {resolution} x {resolution}", fontsize=9)
-    figure.supxlabel("step", fontsize=10)
-    figure.supylabel("rotation error [degrees]", fontsize=10)
-    figure.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=len(handles), fontsize=9, frameon=False)
-    with atomic(path) as temporary:
-        figure.savefig(temporary, dpi=110)
+    with plot_style.drawn(path, 1.8 + 3.2 * len(resolutions), 0.7 + 2.2 * len(objects), dpi=110) as figure:
+        grid = figure.subplots(len(objects), len(resolutions), sharex=True, sharey=True, squeeze=False)
+        for i, name in enumerate(objects):
+            for j, resolution in enumerate(resolutions):
+                axes, ends = grid[i, j], []
+                for method, runs in curves.get((name, resolution), {}).items():
+                    errors = np.array(runs, np.float64)  # None, of a run that failed, becomes NaN
+                    with warnings.catch_warnings():  # a step that no run reached leaves a gap in the plot
+                        warnings.simplefilter("ignore", RuntimeWarning)
+                        low, middle, high = np.nanpercentile(errors, (25, 50, 75), axis=0)
+                    tint = COLOURS.get(method, plot_style.GREY)
+                    axes.plot(middle, color=tint)
+                    axes.fill_between(np.arange(len(middle)), low, high, color=tint, alpha=0.25, linewidth=0)
+                    ends.append((float(middle[-1]), method, tint))
+                axes.axhline(_LIMIT_DEG, color=plot_style.GREY, linestyle=":", linewidth=1)
+                axes.set_yscale("log")
+                axes.set_title(f"{name}, {resolution} x {resolution} pixels")
+                if j == 0:
+                    axes.set_ylabel("rotation error [degrees]")
+                if i == len(objects) - 1:
+                    axes.set_xlabel("step")
+                if j == len(resolutions) - 1:
+                    plot_style.label_ends(axes, ends)
+        bands = "Lines: medians of the runs. Bands: from the lower to the upper quartile."
+        plot_style.caption(figure, f"{bands} Dotted: {_LIMIT_DEG} degrees, the limit.")

@@ -17,7 +17,7 @@ from ... import __version__
 from ...errors import ShadowmapError, warn
 from ...inverse import History, Method, optimize
 from ...io import records
-from ..common.timing import DRJIT_VERSION
+from ...io.machine import DRJIT_VERSION
 from .methods import Image, fairness
 from .scene import PoseProblem, ReferenceKind, pose_errors, start_pose
 from .search import EXPLAINED, TURN_DEG
@@ -64,16 +64,22 @@ def is_of(record: dict[str, Any], wanted: dict[str, Any]) -> bool:
 def stored_records(path: Path) -> list[dict[str, Any]]:
     """Complete records in a file of an earlier call; a warning tells of others. A file without records is set aside."""
     try:
-        found = records.read_json(path)
+        found = runs_in(records.read_json(path))
     except ShadowmapError:
         found = None
-    if not isinstance(found, list) or not all(isinstance(record, dict) for record in found):
+    if found is None:
         records.set_aside(path)
         return []
     kept = [record for record in found if is_complete(record)]
     if len(kept) < len(found):
         warn(f"{path}: {len(found) - len(kept)} of {len(found)} records were edited or are damaged: their runs are made again.")
     return kept
+
+
+def runs_in(content: Any) -> list[dict[str, Any]] | None:  # Any: JSON
+    """The runs in the content of a `pose.json`, which is a list of them in earlier versions; None if it is something else."""
+    runs = content.get("runs") if isinstance(content, dict) else content
+    return runs if isinstance(runs, list) and all(isinstance(run, dict) for run in runs) else None
 
 
 def is_complete(record: dict[str, Any]) -> bool:

@@ -22,7 +22,7 @@ from ...io import files
 from ...io import records as io_records
 from ...io.console import markdown
 from .plot import plot_convergence
-from .record import essence, is_number
+from .record import essence, is_number, runs_in
 
 #: Largest excess of a median of ours over Mitsuba's: degrees, and 100 x offset.
 ALLOWED_DEG, ALLOWED_X100 = 0.05, 0.05
@@ -300,7 +300,8 @@ def read(folders: Iterable[str | Path]) -> list[dict[str, Any]]:
                 raise ShadowmapError(f"{path} is no table of the pose experiment: it was edited, or is damaged; make it again.")
             result += found
             continue
-        if not isinstance(records, list) or not all(isinstance(entry, dict) and _is_sound(entry) for entry in records):
+        records = runs_in(records)
+        if records is None or not all(isinstance(entry, dict) and _is_sound(entry) for entry in records):
             raise ShadowmapError(f"{path} is no list of records of the pose experiment.")
         result += records
     return result

@@ -15,16 +15,17 @@ import numpy as np
 import numpy.typing as npt
 from rich.console import Console
 
-from ...errors import ShadowmapError
+from ...errors import ShadowmapError, did_you_mean
 from ...io import console as io_console
 from ...io import files, records
+from ...io.machine import header
 from ...io.options import option
 from ...io.ranges import MAP_SIDE, SAMPLES, check_range, check_ranges
 from ...jit.frozen import freeze
 from ...jit.types import UInt32
 from ...rendering.renderer import Renderer
 from ...rendering.settings import MOST_SAMPLES
-from ..common.timing import Contender, alternate, machine
+from ..common.timing import Contender, alternate
 from . import report as soft_report
 from . import scenes as soft_scenes
 
@@ -80,7 +81,9 @@ class SoftOptions:
             raise ShadowmapError("no scene or no number of samples given: name at least one.")
         for name in self.scenes:
             if name not in soft_scenes.SCENES:
-                raise ShadowmapError(f"no scene {name!r}: choose from {', '.join(soft_scenes.SCENES)}.")
+                raise ShadowmapError(
+                    f"no scene {name!r}: choose from {', '.join(soft_scenes.SCENES)}.{did_you_mean(name, soft_scenes.SCENES)}"
+                )
         for pair in self.samples:
             for name, value in zip(("area", "sky"), pair, strict=True):
                 check_range(f"number of {name} samples (--samples)", value, (1, MOST_SAMPLES))
@@ -141,8 +144,8 @@ def run_soft(options: SoftOptions, *, console: Console | None = None) -> dict[st
     """Measure all scenes, write `soft.json`, `soft.md` and `soft.png` into `options.out`, and return the record."""
     path = options.out / "soft.json"
     files.check_output(path, (".json",))
-    record: dict[str, Any] = {"settings": options.settings, "machine": machine(), "scenes": _kept(path, options)}
-    with io_console.progress(console or Console(stderr=True)) as progress:
+    record: dict[str, Any] = {**header(options.settings), "scenes": _kept(path, options)}
+    with io_console.progress(console or io_console.notes()) as progress:
         task = progress.add_task("scenes", total=len(options.scenes) * (2 + len(options.samples)), note="")
         for name in options.scenes:
             if name in record["scenes"]:

@@ -14,10 +14,6 @@ from ...io import console, files, images, plots
 
 Image = npt.NDArray[np.floating[Any]]
 
-# Differences are shown multiplied by this, around a medium grey.
-_ENLARGED = 4.0
-_GREY = 0.2
-
 
 def rows(record: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
     """Column titles, and a row for each scene."""
@@ -41,11 +37,21 @@ def rows(record: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
 
 
 def table(record: Mapping[str, Any]) -> Table:
-    """Table for the terminal."""
+    """Table of errors for the terminal, without the units of the cells."""
     columns, lines = rows(record)
-    keep = [k for k in range(len(columns)) if k != 1]
-    title = "Relative error by samples (area light / sky), and time at equal error (samples per pixel)"
-    return console.table(title, [columns[k] for k in keep], [[line[k] for k in keep] for line in lines])
+    keep = [0, *range(2, len(columns) - 3)]
+    cells = [[line[k].removesuffix(" %") for k in keep] for line in lines]
+    return console.table(
+        "Relative error [%] by samples (area light / sky)", [columns[k].replace(" / ", "/") for k in keep], cells
+    )
+
+
+def times_table(record: Mapping[str, Any]) -> Table | None:
+    """Table of times for the terminal; None if none were measured."""
+    columns, lines = rows(record)
+    cells = [[line[0], *line[-3:]] for line in lines if line[-1] != "-"]
+    names = ["scene", "ours", "path traced (samples per pixel)", "ratio"]
+    return console.table("Time of an image at equal error", names, cells) if cells else None
 
 
 def reading(record: Mapping[str, Any], bar: float = 0.02) -> list[str]:
@@ -79,9 +85,8 @@ def write(record: Mapping[str, Any], out: Path) -> None:
     for name in record["scenes"]:
         pictures = load_pictures(out / "pictures" / f"{name}.exr")
         if pictures:
-            difference = _GREY + _ENLARGED * (pictures["ours"] - pictures["path traced"]) * _exposure(pictures["path traced"])
             shown = {title: image * _exposure(pictures["path traced"]) for title, image in pictures.items()}
-            sheet[name] = {**shown, f"difference x {_ENLARGED:g}": difference}
+            sheet[name] = {**shown, "difference": shown["ours"] - shown["path traced"]}
     if sheet:
         plots.image_sheet(out / "soft.png", _paired(sheet))
 

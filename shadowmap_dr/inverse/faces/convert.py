@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...errors import ShadowmapError
+from ...errors import ShadowmapError, did_you_mean
 from ...io.files import read_arrays
 from ...io.options import option
 from ...io.ranges import check_ranges
@@ -46,7 +46,9 @@ class ConvertOptions:
 
     def __post_init__(self) -> None:
         if self.facing not in FACING:
-            raise ShadowmapError(f"a head facing {self.facing!r}: choose from {', '.join(FACING)}.")
+            raise ShadowmapError(
+                f"a head facing {self.facing!r}: choose from {', '.join(FACING)}.{did_you_mean(self.facing, FACING)}"
+            )
         check_ranges(self)
         if not (np.isfinite(self.expression_scale) and self.expression_scale > 0):
             raise ShadowmapError(f"an expression scale of {self.expression_scale}: give a positive number.")

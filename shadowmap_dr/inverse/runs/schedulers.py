@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ...errors import OutputError, ShadowmapError, is_interrupt
+from ...errors import OutputError, ShadowmapError, install_hint, is_interrupt
 from ...io.console import waiting
 from .worker import Batch, Worker
 
@@ -40,7 +40,7 @@ def check_scheduler(name: str) -> None:
     try:
         import distributed  # noqa: F401
     except ImportError as error:
-        raise ShadowmapError(f"scheduler {name!r} needs Dask: pip install 'shadowmap-dr[distributed]'.") from error
+        raise ShadowmapError(f"scheduler {name!r} needs Dask: {install_hint('distributed')}.") from error
 
 
 def check_threads(threads: int) -> None:

@@ -78,7 +78,7 @@ def run_sweep(
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"cannot write {folder}: {error.strerror or error}.") from error
-    with io_console.progress(console or Console(stderr=True)) as progress:
+    with io_console.progress(console or io_console.notes()) as progress:
         total = progress.add_task("batches", total=len(batches), note="")
         task = progress.add_task("", total=None, note="", visible=False)
 

@@ -14,7 +14,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from ...errors import ShadowmapError
+from ...errors import ShadowmapError, install_hint
 
 # Pixels along the longer side of rasterized drawings, and their largest aspect ratio.
 _SIDE, _MOST_SIDES_DIFFER = 1024, 64
@@ -48,7 +48,7 @@ def rasterized(path: Path) -> bytes:
     try:
         import resvg_py  # noqa: F401
     except ModuleNotFoundError as error:
-        raise ShadowmapError(f"{path}: drawings need the package resvg-py: pip install 'shadowmap-dr[art]'.") from error
+        raise ShadowmapError(f"{path}: drawings need the package resvg-py: {install_hint('art')}.") from error
     try:
         text = _text(path)
         width, height = _size(text)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...errors import ShadowmapError
+from ...errors import ShadowmapError, install_hint
 from ...jit.types import Float
 from ...rendering.receivers.shadow_views import ShadowView
 from .sculpt import Sculptor
@@ -128,5 +128,5 @@ def _remesher() -> Callable[..., Any]:
     try:
         from gpytoolbox import remesh_botsch
     except ModuleNotFoundError as error:
-        raise ShadowmapError("remeshing needs the package gpytoolbox: pip install 'shadowmap-dr[remesh]'.") from error
+        raise ShadowmapError(f"remeshing needs the package gpytoolbox: {install_hint('remesh')}.") from error
     return remesh_botsch

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from ...errors import ShadowmapError
+from ...errors import ShadowmapError, install_hint
 from ...jit.arrays import device_array
 from ...jit.frozen import freeze, recordings_of
 from ...jit.types import Float, UInt32
@@ -202,7 +202,7 @@ def _large_steps(vertices: Float, faces: UInt32, smoothness: float) -> mi.ad.Lar
     try:
         return mi.ad.LargeSteps(vertices, faces, lambda_=smoothness)
     except ModuleNotFoundError as error:
-        raise ShadowmapError("deforming meshes needs the package cholespy: pip install 'shadowmap-dr[art]'.") from error
+        raise ShadowmapError(f"deforming meshes needs the package cholespy: {install_hint('art')}.") from error
     except ValueError as error:
         raise ShadowmapError(f"a smoothness of {smoothness:g} is too large for this mesh: use a smaller one.") from error
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import drjit as dr
 import mitsuba as mi
 
@@ -19,6 +21,12 @@ AOVS: dict[str, tuple[str, ...]] = {
     "prim_index": ("",),
     "visibility": (),
 }
+
+
+def split_aovs(aovs: str | Iterable[str]) -> tuple[str, ...]:
+    """Entries of further channels, from text with commas or from a sequence of names; without blanks and empty entries."""
+    parts = aovs.split(",") if isinstance(aovs, str) else aovs
+    return tuple(filter(None, (part.strip() for part in parts)))
 
 
 def aov_names(aovs: tuple[str, ...], light_names: list[str]) -> list[str]:

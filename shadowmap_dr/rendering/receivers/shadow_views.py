@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...errors import ShadowmapError
+from ...errors import ShadowmapError, did_you_mean
 from .checks import is_real, is_whole, real_array
 
 RECEIVERS = ("plane", "wavy")
@@ -85,9 +85,9 @@ def shadow_view(
     Raises ShadowmapError for names that do not exist, and numbers that make no sense.
     """
     if not isinstance(receiver, str) or receiver not in RECEIVERS:
-        raise ShadowmapError(f"no receiver {receiver!r}: choose from {', '.join(RECEIVERS)}.")
+        raise ShadowmapError(f"no receiver {receiver!r}: choose from {', '.join(RECEIVERS)}.{did_you_mean(receiver, RECEIVERS)}")
     if not isinstance(camera, str) or camera not in CAMERAS:
-        raise ShadowmapError(f"no camera {camera!r}: choose from {', '.join(CAMERAS)}.")
+        raise ShadowmapError(f"no camera {camera!r}: choose from {', '.join(CAMERAS)}.{did_you_mean(camera, CAMERAS)}")
     if not is_whole(size) or not 16 <= size <= 2048:
         raise ShadowmapError(f"images of {size} x {size} pixels: choose from 16 to 2048.")
     if not is_real(half) or not half > 0:

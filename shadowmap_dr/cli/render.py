@@ -42,8 +42,8 @@ def render(
         str | None,
         typer.Option(
             metavar="NAMES",
-            help=f"Further channels of an .exr file, separated by commas: {', '.join(AOVS)}; or LABEL:NAME. With other integrators "
-            "the pairs of Mitsuba's aov, for instance d:depth,n:sh_normal.",
+            help=f"Further channels of an .exr file, separated by commas: {', '.join(AOVS)}; or LABEL:NAME. "
+            "With other integrators the pairs of Mitsuba's aov, for instance d:depth,n:sh_normal.",
         ),
     ] = None,
     variant: Variant = DEFAULT_VARIANT,

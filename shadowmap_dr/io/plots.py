@@ -42,6 +42,8 @@ def plot_curves(
         columns: panels in a row, or None for all.
         caption: line below the panels, if some entry has several curves.
     """
+    from matplotlib.ticker import MaxNLocator
+
     across = max(1, min(columns or len(panels), len(panels)))
     down = max(1, math.ceil(len(panels) / across))
     with plot_style.drawn(path, 4.6 * across, 3.2 * down) as figure:
@@ -58,6 +60,7 @@ def plot_curves(
             axes.set_xlabel(x_label)
             axes.set_ylabel(y_label)
             axes.set_xmargin(0.02)
+            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
             plot_style.label_ends(axes, ends)
         if any(len(curves) > 1 for entries in panels.values() for curves in entries.values()):
             plot_style.caption(figure, caption)
@@ -107,7 +110,7 @@ def _grid(figure: Any, rows: Rows) -> list[tuple[tuple[str, str, Image], Axes]]:
             axes = figure.add_subplot(len(rows), columns, i * columns + j + 1)
             axes.set(xticks=[], yticks=[])
             axes.grid(False)
-            axes.spines[:].set_visible(False)
+            axes.spines[:].set(visible=True, color="0.8", linewidth=0.5)
             if i == 0 or list(row) != list(next(iter(rows.values()))):
                 axes.set_title(column_title, fontsize=9)
             if j == 0:

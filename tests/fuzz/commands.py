@@ -29,7 +29,7 @@ def run_command(arguments: Sequence[str]) -> str:
         return out.getvalue()
     errors = [line for line in said.splitlines() if line.startswith("error:")]
     check(len(errors) == 1, f"exit status {status} with {len(errors)} lines of errors: {said[-500:]!r}")
-    last = said.strip().splitlines()[-1]
+    *_, last = (line for line in said.splitlines() if line and not re.match(r"Try 'shadowmap-dr .*--help' for help\.$", line))
     check(last == errors[0], f"lines after the error: {said[-500:]!r}")
     raise Refused(re.sub(r"^error: ", "", errors[0]))
 

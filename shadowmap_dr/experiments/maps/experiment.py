@@ -257,4 +257,4 @@ def poses_table(record: dict[str, Any]) -> Table | None:
 
 def _number(value: float | None) -> str:
     """A cell; records have None where a quantity is not defined, for instance a shift where there is no outline."""
-    return "-" if value is None else f"{value:.3f}"
+    return "-" if value is None or not np.isfinite(value) else f"{value:.3f}"

@@ -156,4 +156,4 @@ def test_every_command_is_described(extensions: None) -> None:
 
     text = commands.commands()
     assert all(re.search(rf"^## {name}\b", text, re.MULTILINE) for name in COMMANDS)
-    assert "| `-o` `--output` | `path` | required |" in text
+    assert "| `-o` `--output` | `IMAGE` | required |" in text

@@ -22,7 +22,7 @@ FEW = {
     "soft_map_resolution": 32,
 }
 FLOOR, BALL, SUN = "floor.bsdf.reflectance.value", "ball.vertex_positions", "sun.irradiance.value"
-COMMON, FIRST = (FLOOR, BALL, SUN, "camera.to_world"), ("colours", "gloss")
+COMMON, FIRST = (FLOOR, BALL, SUN), ("colours", "gloss")
 
 
 def lamp(**emitter: Any) -> dict[str, Any]:

@@ -24,7 +24,9 @@ def run_command(arguments: Sequence[str]) -> str:
         else:
             raise Wrong("the program has not ended itself")
     said = error.getvalue()
-    check("Traceback" not in said and "RuntimeWarning" not in said, f"on standard error: {said[-500:]!r}")
+    asked = bool({"--verbose", "-v"} & set(arguments))  # for tracebacks of errors of one line, too
+    traced = re.search(r"Traceback(?![^$]*\nshadowmap_dr\.errors\.\w+: )" if asked else "Traceback", said)
+    check(traced is None and "RuntimeWarning" not in said, f"on standard error: {said[-500:]!r}")
     if status in (0, None):
         return out.getvalue()
     errors = [line for line in said.splitlines() if line.startswith("error:")]

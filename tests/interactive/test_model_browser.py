@@ -451,7 +451,9 @@ def test_meshes_are_chosen_on_the_page(page, place, instance):
     page.select_option("#mesh", "ball")
     assert page.is_visible("#replace") and "ball" in page.inner_text("#replace")
     page.click("#replace button:not([value=yes])")
-    assert page.input_value("#mesh") == "spot" and len(place.session.snapshot.vertices) == len(spot)
+    # Browsers tell later that a dialog has closed.
+    eventually(lambda: page.input_value("#mesh") == "spot", 10)
+    assert len(place.session.snapshot.vertices) == len(spot)
     page.select_option("#mesh", "ball")
     page.click("#replace button[value=yes]")
     eventually(lambda: place.session.snapshot.start.name == "ball", 60)

@@ -30,6 +30,7 @@ MAY_IMPORT = {
     "integrator": ("errors", "jit", "rendering", "scene", "shadow"),
     "torch": ("errors", "jit", "raster", "rendering", "shadow"),
     "inverse": ("errors", "io", "jit", "raster", "rendering", "scene.lights", "shadow"),
+    "cameras": ("errors", "scene.pixel_filter", "scene.sensor"),
     "interactive": ("errors", "inverse", "io", "jit.types"),
     "mitsuba_baselines": ("", "errors", "inverse", "io", "scene.mitsuba_meshes"),
     "experiments": (

@@ -27,7 +27,7 @@ OTHERS = {
     ("docs/reference/results.md", "| Entry | Content"): "entries of records",
     ("docs/tutorials/index.md", "| problem | bar"): "docs/tutorials/compare.py has it from its record",
 }
-#: Pages whose tables name the pages that have the numbers, in a column `Source` or in the text: test_sources_of_numbers.py.
+#: Pages whose tables name the pages that have the numbers, in a column `Source` or in the text: test_numbers.py.
 SUMMARIES = {"docs/how-it-works.md", "docs/limits.md"}
 
 

@@ -66,14 +66,14 @@ def plot_curves(
             plot_style.caption(figure, caption)
 
 
-def image_sheet(path: str | os.PathLike[str], rows: Rows, size: float = 2.2) -> None:
+def image_sheet(path: str | os.PathLike[str], rows: Rows, size: float = 2.2, most: float | None = None) -> None:
     """Draw images in a grid: row title -> column title -> linear (H, W, 3) or (H, W, 1) image.
 
     Columns whose titles begin with `DIFFERENCE` are drawn as numbers, the mean over the channels, with one scale for the sheet
-    and a colour bar; negative numbers make it signed.
+    and a colour bar; negative numbers make it signed. The scale ends at ``most``, or so that nearly all pixels lie within.
     """
     differences = [_mean(image) for row in rows.values() for title, image in row.items() if title.startswith(DIFFERENCE)]
-    limit = max((_limit(values) for values in differences), default=1.0)
+    limit = most or max((_limit(values) for values in differences), default=1.0)
     signed = any(float(np.nanmin(values)) < 0 for values in differences)
     low, name = (-limit, plot_style.SIGNED) if signed else (0.0, plot_style.SEQUENTIAL)
     with plot_style.drawn(path, *_sheet_size(rows, size, bar=bool(differences)), dpi=120) as figure:

@@ -56,6 +56,8 @@ def test_differences_are_numbers_with_a_bar(tmp_path: Path, figures: list[Figure
     np.testing.assert_allclose(pictures[2].images[0].get_array(), rows["a"]["difference"].mean(2))
     plots.image_sheet(tmp_path / "plain.png", {"a": images("target", "result")})
     assert len(figures[1].axes) == 2  # no bar
+    plots.image_sheet(tmp_path / "most.png", rows, most=0.1)
+    assert figures[2].axes[2].images[0].get_clim() == (0, 0.1)
 
 
 def test_signed_differences_have_a_scale_about_zero(tmp_path: Path, figures: list[Figure]) -> None:

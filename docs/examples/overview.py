@@ -1,6 +1,6 @@
 """The picture of docs/how-it-works.md: two scenes of the package, and a pose at the start, as found, and its path-traced image.
 
-    python docs/examples/overview.py [--out docs/overview.png] [--size 256] [--steps 150]
+python docs/examples/overview.py [--out docs/overview.png] [--size 256] [--steps 150]
 """
 
 from __future__ import annotations

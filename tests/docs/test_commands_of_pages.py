@@ -235,6 +235,7 @@ SMALL = {
     "shadowmap-dr render pose -D resolution=256 -o docs/first-picture.png": "--size 16x16 -o picture.png",
     "shadowmap-dr pose --runs 10 --method shadows": "--runs 1 --resolution 16 --iterations 2 --reference own --quiet",
     "shadowmap-dr lights": "--runs 2 --object spot --resolution 16 --iterations 2 --shadows --quiet",
+    "shadowmap-dr maps": "--scene overlap --method vsm --resolution 32 --spp 4 --pose-runs 0 --quiet",
 }
 
 

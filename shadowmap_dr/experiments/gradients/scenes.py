@@ -142,7 +142,7 @@ class Motion:
     @property
     def unit(self) -> str:
         """Unit of t in words."""
-        return "radian" if any(self.spin) else "factor" if self.growth else "unit of length"
+        return "radian" if any(self.spin) else "relative size" if self.growth else "unit of length"
 
     @property
     def along_light(self) -> bool:

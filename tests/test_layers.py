@@ -1,6 +1,6 @@
 """Layers of the package: which packages may import which others. Read from the sources; nothing is imported.
 
-``python tests/test_layers.py`` prints the picture in docs/architecture.md.
+``python tests/test_layers.py`` draws the picture in docs/architecture.md.
 """
 
 from __future__ import annotations
@@ -9,11 +9,13 @@ import ast
 import functools
 from collections.abc import Iterator
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("shadowmap_dr", "mitsuba_baselines")
+PICTURE = ROOT / "docs" / "architecture.svg"
 
 #: Package -> what it may import of the others: packages, or modules of theirs. "" is the package itself, for its version.
 MAY_IMPORT = {
@@ -128,8 +130,8 @@ def within(module: str, places: tuple[str, ...]) -> bool:
     return any(name == place or (place and name.startswith(place + ".")) for place in places)
 
 
-def picture() -> str:
-    """A Mermaid diagram: packages, with arrows to those that they import. What an imported package imports has no arrow."""
+def arrows() -> dict[str, tuple[str, ...]]:
+    """Packages, and those that they import. What an imported package imports is left out."""
     below: dict[str, set[str]] = {}
     for module in modules():
         package = package_of(module)
@@ -141,16 +143,70 @@ def picture() -> str:
     def reached(package: str) -> frozenset[str]:
         return frozenset().union(*({other} | reached(other) for other in below[package]))
 
-    lines = ["```mermaid", "flowchart TD"]
-    for package in sorted(below):
-        direct = sorted(other for other in below[package] if not any(other in reached(between) for between in below[package]))
-        lines += [f"    {package} --> {other}" for other in direct] or [f"    {package}"]
-    return "\n".join([*lines, "```"])
+    def direct(package: str) -> Iterator[str]:
+        return (other for other in sorted(below[package]) if not any(other in reached(between) for between in below[package]))
+
+    return {package: tuple(direct(package)) for package in sorted(below)}
+
+
+def picture() -> str:
+    """A drawing (SVG): packages in rows by their layer, with arrows to those that they import."""
+    below = arrows()
+
+    @functools.cache
+    def layer(package: str) -> int:
+        return 1 + max(map(layer, below[package]), default=-1)
+
+    places: dict[str, tuple[float, float]] = {}
+    top = max(map(layer, below))
+    for number in range(top + 1):
+        row = [package for package in below if layer(package) == number]
+        # Each as far as possible above those that it imports.
+        middles = {package: sum(places[other][0] for other in below[package]) / max(1, len(below[package])) for package in row}
+        row.sort(key=middles.__getitem__)
+        for k, package in enumerate(row):
+            x = middles[package] if len(row) == 1 else _WIDTH * (k + 1) / (len(row) + 1)
+            places[package] = (x, _ROW * (top - number + 0.5))
+    height, half = _ROW * (top + 1), _BOX[1] / 2
+    lines = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_WIDTH} {height}" width="{_WIDTH}" height="{height}">',
+        "<title>Packages, with arrows to those that they import</title>",
+        '<defs><marker id="tip" viewBox="0 0 8 8" refX="8" refY="4" markerWidth="8" markerHeight="8" orient="auto">'
+        '<path d="M0 0L8 4L0 8z" fill="#4d4d4d"/></marker></defs>',
+        f'<rect width="{_WIDTH}" height="{height}" fill="#fff"/>',
+    ]
+    for package, others in below.items():
+        for other in others:
+            (x, y), (to_x, to_y) = places[package], places[other]
+            ends = f'x1="{x:.0f}" y1="{y + half:.0f}" x2="{to_x:.0f}" y2="{to_y - half:.0f}"'
+            lines.append(f'<line {ends} stroke="#4d4d4d" marker-end="url(#tip)"/>')
+    for package, (x, y) in places.items():
+        corner = f'x="{x - _BOX[0] / 2:.0f}" y="{y - half:.0f}" width="{_BOX[0]}" height="{_BOX[1]}"'
+        lines.append(f'<rect {corner} rx="4" fill="#e6f1f8" stroke="#0072b2"/>')
+        lines.append(
+            f'<text x="{x:.0f}" y="{y + 5:.0f}" text-anchor="middle" font-family="sans-serif" font-size="14">{package}</text>'
+        )
+    return "\n".join([*lines, "</svg>", ""])
+
+
+# Sizes in pixels: of the drawing, from row to row, and of a box.
+_WIDTH, _ROW, _BOX = 640, 62, (150, 30)
 
 
 def test_the_picture_shows_the_imports() -> None:
-    page = (ROOT / "docs" / "architecture.md").read_text()
-    assert picture() in page, f"docs/architecture.md: its picture should be\n{picture()}"
+    assert PICTURE.read_text(encoding="utf-8") == picture(), "run python tests/test_layers.py"
+    assert f"]({PICTURE.name})" in (PICTURE.parent / "architecture.md").read_text(encoding="utf-8")
+
+
+def test_the_picture_has_all_packages_above_what_they_import() -> None:
+    drawn = ElementTree.fromstring(picture())
+    texts = {text.text: (float(text.get("x", "")), float(text.get("y", ""))) for text in drawn.iter(f"{_SVG}text")}
+    assert texts.keys() == {package_of(module) for module in modules()} - {"", *_EVERYWHERE}
+    assert all(texts[package][1] < texts[other][1] for package, others in arrows().items() for other in others)
+    assert len(list(drawn.iter(f"{_SVG}line"))) == sum(map(len, arrows().values()))
+
+
+_SVG = "{http://www.w3.org/2000/svg}"
 
 
 def test_packages_import_what_they_may() -> None:
@@ -237,4 +293,4 @@ def test_the_package_shows_its_public_names_only() -> None:
 
 
 if __name__ == "__main__":
-    print(picture())
+    PICTURE.write_text(picture(), encoding="utf-8")

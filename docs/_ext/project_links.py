@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from pygments.lexers.special import TextLexer
 from sphinx.application import Sphinx
 
 DOCS = Path(__file__).resolve().parents[1]
@@ -51,6 +50,4 @@ def _link(link: re.Match[str], folder: Path, new_folder: Path) -> str:
 
 def setup(app: Sphinx) -> dict[str, bool]:
     app.connect("source-read", read_source)
-    # Diagrams are shown as they are written; drawing them needs a program or the network.
-    app.add_lexer("mermaid", TextLexer)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

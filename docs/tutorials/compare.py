@@ -25,8 +25,8 @@ from rich.console import Console
 
 from shadowmap_dr.errors import ShadowmapError
 from shadowmap_dr.experiments.common import timing
+from shadowmap_dr.io import plot_style
 from shadowmap_dr.io.console import progress, table
-from shadowmap_dr.io.files import atomic
 from shadowmap_dr.io.records import read_json, write_json
 from shadowmap_dr.jit import gc
 
@@ -235,27 +235,23 @@ def race(
 
 def plot(path: Path, records: Mapping[str, Any]) -> None:
     """Error over seconds, a panel for each problem that was measured."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
     shown = {name: record["race"] for name, record in records.items() if "race" in record}
-    figure, axes = pyplot.subplots(1, len(shown), figsize=(4 * len(shown), 3.5), squeeze=False)
-    colours = {method: f"C{k}" for k, method in enumerate((*METHODS, *ONE_CALL))}
-    handles: dict[str, Any] = {}
-    for axis, (name, result) in zip(axes[0], shown.items(), strict=True):
-        measure, bar = next(iter(result["bar"].items()))
-        for method, entry in result["methods"].items():
-            seconds, errors = np.cumsum(entry["seconds_of_steps"]), [e[measure] for e in entry["errors"]]
-            handles[method] = axis.loglog(seconds, errors, color=colours[method])[0]
-        axis.axhline(bar, color="gray", linewidth=0.8, linestyle=":")
-        axis.set(title=name, xlabel="seconds", ylabel=measure)
-    figure.tight_layout(rect=(0, 0.1, 1, 1))
-    figure.legend(handles.values(), handles.keys(), loc="lower center", ncols=len(handles), fontsize="small", frameon=False)
-    with atomic(path) as temporary:
-        figure.savefig(temporary, dpi=90)
-    pyplot.close(figure)
+    colours = {method: plot_style.colour(k) for k, method in enumerate((*METHODS, *ONE_CALL))}
+    with plot_style.drawn(path, 5.4 * len(shown), 3.6, dpi=100) as figure:
+        for axes, (name, result) in zip(figure.subplots(1, len(shown), squeeze=False)[0], shown.items(), strict=True):
+            measure, bar = next(iter(result["bar"].items()))
+            ends = []
+            for method, entry in result["methods"].items():
+                seconds, errors = np.cumsum(entry["seconds_of_steps"]), [e[measure] for e in entry["errors"]]
+                axes.loglog(seconds, errors, color=colours[method])
+                axes.plot(seconds[-1], errors[-1], color=colours[method], marker="o")
+                ends.append((seconds[-1], errors[-1], method, colours[method]))
+            axes.axhline(bar, color=plot_style.GREY, linewidth=1, linestyle=":")
+            axes.set(title=name, xlabel="time [s]", ylabel=f"error [{measure.removeprefix('RMSE in ')}]")
+            # In the order of the ends of the lines, the slowest method uppermost.
+            top = axes.get_ylim()[1]
+            plot_style.label_ends(axes, [(top, method, tint) for _, _, method, tint in sorted(ends)])
+        plot_style.caption(figure, "Dotted: the bar. Dots: ends of the runs; labels in their order, the first one lowest.")
 
 
 def _errors(trace: Trace) -> str:

@@ -6,6 +6,7 @@ Colours are those of M. Okabe and K. Ito, "Color Universal Design", 2008, withou
 from __future__ import annotations
 
 import os
+import textwrap
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -34,6 +35,8 @@ _STYLE: dict[str, Any] = {
 }
 # Distance of labels at the ends of lines, in points.
 _LABEL_HEIGHT = 11.0
+# Mean width of a letter of captions, in inches.
+_LETTER_WIDTH = 0.066
 
 
 def colour(number: int) -> str:
@@ -70,12 +73,13 @@ def drawn(path: str | os.PathLike[str], width: float, height: float, dpi: int = 
 
 
 def _write_out_numbers(figure: Figure) -> None:
-    """Label logarithmic axes with 30 and 0.3, instead of powers of ten and products with them."""
+    """Label logarithmic axes with 30, 0.3 and 1,000,000, instead of powers of ten and products with them."""
     from matplotlib.ticker import LogFormatter
 
     class Plain(LogFormatter):
         def __call__(self, x: float, pos: int | None = None) -> str:
-            return f"{x:g}" if super().__call__(x, pos) else ""
+            text = f"{x:g}" if abs(x) < 1e5 else f"{x:,.0f}"
+            return text if super().__call__(x, pos) else ""
 
     for axes in figure.axes:
         for axis in (axes.xaxis, axes.yaxis):
@@ -122,8 +126,9 @@ def _apart(heights: Sequence[float], gap: float, top: float) -> list[float]:
 
 
 def caption(figure: Figure, text: str) -> None:
-    """Write a line below all plots, for instance the meaning of bands and bars."""
-    figure.supxlabel(text, fontsize=8.5, color="0.3")
+    """Write a text below all plots, for instance the meaning of bands and bars. It takes as many lines as it needs."""
+    letters = max(20, int(figure.get_size_inches()[0] / _LETTER_WIDTH))
+    figure.supxlabel(textwrap.fill(text, letters), fontsize=8.5, color="0.3")
 
 
 def colour_bar(figure: Figure, axes: Sequence[Axes], name: str, low: float, high: float, label: str) -> None:

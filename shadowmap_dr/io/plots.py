@@ -66,14 +66,14 @@ def plot_curves(
             plot_style.caption(figure, caption)
 
 
-def image_sheet(path: str | os.PathLike[str], rows: Rows, size: float = 2.2) -> None:
+def image_sheet(path: str | os.PathLike[str], rows: Rows, size: float = 2.2, most: float | None = None) -> None:
     """Draw images in a grid: row title -> column title -> linear (H, W, 3) or (H, W, 1) image.
 
     Columns whose titles begin with `DIFFERENCE` are drawn as numbers, the mean over the channels, with one scale for the sheet
-    and a colour bar; negative numbers make it signed.
+    and a colour bar; negative numbers make it signed. The scale ends at ``most``, or so that nearly all pixels lie within.
     """
     differences = [_mean(image) for row in rows.values() for title, image in row.items() if title.startswith(DIFFERENCE)]
-    limit = max((_limit(values) for values in differences), default=1.0)
+    limit = most or max((_limit(values) for values in differences), default=1.0)
     signed = any(float(np.nanmin(values)) < 0 for values in differences)
     low, name = (-limit, plot_style.SIGNED) if signed else (0.0, plot_style.SEQUENTIAL)
     with plot_style.drawn(path, *_sheet_size(rows, size, bar=bool(differences)), dpi=120) as figure:
@@ -89,8 +89,11 @@ def image_sheet(path: str | os.PathLike[str], rows: Rows, size: float = 2.2) -> 
             plot_style.colour_bar(figure, [axes for _, axes in grid], name, low, limit, label)
 
 
-def signed_sheet(path: str | os.PathLike[str], rows: Rows, size: float = 2.0, label: str = "value") -> None:
-    """Draw signed images (H, W) in a grid, blue below zero and red above, with one scale and a colour bar for each row."""
+def signed_sheet(path: str | os.PathLike[str], rows: Rows, size: float = 2.0, label: str | Mapping[str, str] = "value") -> None:
+    """Draw signed images (H, W) in a grid, blue below zero and red above, with one scale and a colour bar for each row.
+
+    ``label``, with the unit, is that of all bars, or each row's.
+    """
     with plot_style.drawn(path, *_sheet_size(rows, size, bar=True), dpi=120) as figure:
         grid = _grid(figure, rows)
         for row_title, row in rows.items():
@@ -98,7 +101,8 @@ def signed_sheet(path: str | os.PathLike[str], rows: Rows, size: float = 2.0, la
             own = [(image, axes) for (title, _, image), axes in grid if title == row_title]
             for image, axes in own:
                 axes.imshow(np.nan_to_num(image), cmap=plot_style.SIGNED, vmin=-limit, vmax=limit, interpolation="antialiased")
-            plot_style.colour_bar(figure, [axes for _, axes in own], plot_style.SIGNED, -limit, limit, label)
+            shown = label if isinstance(label, str) else label[row_title]
+            plot_style.colour_bar(figure, [axes for _, axes in own], plot_style.SIGNED, -limit, limit, shown)
 
 
 def _grid(figure: Any, rows: Rows) -> list[tuple[tuple[str, str, Image], Axes]]:  # Any: Figure

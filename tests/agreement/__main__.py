@@ -1,18 +1,22 @@
 """Prints how far the plug-in is from Mitsuba, as a table: ``python -m tests.agreement [NAME ...]`` in the repository's folder.
 
-``--references`` renders the stored references anew instead (about a minute each on two cores), ``--defaults`` measures with the
-plug-in's default options.
+``--json FILE`` writes a record of it. ``--references`` renders the stored references anew instead (about a minute each on two
+cores), ``--defaults`` measures with the plug-in's default options.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
+from pathlib import Path
 
 import mitsuba as mi
 
+from shadowmap_dr.io import machine, records
+
 mi.set_variant("llvm_ad_rgb")
 
-from . import measure, references  # noqa: E402
+from . import measure, references, report  # noqa: E402
 from .cases import BY_NAME, CASES  # noqa: E402
 
 
@@ -22,6 +26,7 @@ def main() -> None:
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(BY_NAME))
     parser.add_argument("--references", action="store_true", help="render the references")
     parser.add_argument("--defaults", action="store_true", help="measure with default options")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="record to write")
     arguments = parser.parse_args()
     unknown = [name for name in arguments.names if name not in BY_NAME]
     if unknown:
@@ -33,20 +38,15 @@ def main() -> None:
             made.save(references.path_of(case))
             print(f"{case.name}: slope {made.slope:.6g}, standard error {made.noise:.2g}", flush=True)
         return
-    print("| case | primal | largest | forward | largest | reverse |\n| --- | --- | --- | --- | --- | --- |", flush=True)
-    within = 0
+    print(f"| {' | '.join(report.COLUMNS)} |\n|{'---|' * len(report.COLUMNS)}", flush=True)
+    found: dict[str, dict[str, dict[str, float]]] = {}
     for case in chosen:
         errors = {mode: measure.error(case, mode, {} if arguments.defaults else None) for mode in measure.MODES}
-        passes = {mode: found.mean <= measure.TOLERANCES[mode] for mode, found in errors.items()}
-        within += sum(passes.values())
-        cells = []
-        for mode, found in errors.items():
-            text = f"{100 * found.mean:.2f} %"
-            cells.append(text if passes[mode] else f"**{text}**")
-            if mode != "reverse":
-                cells.append(f"{100 * found.largest:.0f} %")
-        print(f"| {case.name} | {' | '.join(cells)} |", flush=True)
-    print(f"\n{within} of {len(chosen) * len(measure.MODES)} within the tolerances.")
+        found[case.name] = {mode: dataclasses.asdict(error) for mode, error in errors.items()}
+        print(f"| {' | '.join(report.cells(case.name, found[case.name]))} |", flush=True)
+    print(f"\n{report.summary(found)}")
+    if arguments.json:
+        records.write_json(arguments.json, {**machine.header({"defaults": arguments.defaults}), "cases": found})
 
 
 if __name__ == "__main__":

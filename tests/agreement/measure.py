@@ -14,10 +14,9 @@ import shadowmap_dr  # noqa: F401  (registers the integrator)
 
 from . import references
 from .cases import OPTIONS, Case, Changing
+from .report import TOLERANCES
 
-MODES = ("primal", "forward", "reverse")
-#: Largest mean errors that count as agreement.
-TOLERANCES = {"primal": 0.02, "forward": 0.05, "reverse": 0.01}
+MODES = tuple(TOLERANCES)
 # Values below these are divided by them instead of by themselves, as in Mitsuba's tests.
 _LEAST = {"primal": 2e-2, "forward": 2e-1}
 

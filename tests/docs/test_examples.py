@@ -54,6 +54,16 @@ def test_optimisations_are_drawn_with_their_seconds(tmp_path: Path, monkeypatch:
         assert start.std() > 20 and 0.2 < np.abs(start - end).mean() < 60
 
 
+def test_the_overview_has_a_pose(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    command = ["overview", "--out", str(tmp_path / "overview.png"), "--size", "24", "--steps", "2"]
+    monkeypatch.setattr(sys, "argv", command)
+    overview = runpy.run_path(str(ROOT / "docs" / "examples" / "overview.py"))
+    overview["SCENES"].clear()  # which are rendered by other tests
+    overview["main"]()
+    with Image.open(tmp_path / "overview.png") as picture:
+        assert picture.width > 2 * picture.height and np.asarray(picture.convert("L")).std() > 30
+
+
 def test_ways_to_render_are_timed_in_turns() -> None:
     output = output_of("plugin_speed.py", "--resolution", "16", "--rounds", "2")
     steps = dict(re.findall(r"^(.+): ([0-9.]+) ms a step", output, re.MULTILINE))

@@ -262,7 +262,7 @@ def test_small_convergence(variant: str, tmp_path: Path, monkeypatch: pytest.Mon
     assert run["recovered"] and run["error_texels"] < 0.3
     assert run["error_curve_texels"][0] == pytest.approx(0.1 / run["texel"], rel=1e-4) and len(run["loss_curve"]) == 120
     assert "1 of 1 runs recover" in (tmp_path / "convergence.md").read_text()
-    assert (tmp_path / "convergence.png").exists() and (tmp_path / "convergence-images.png").exists()
+    assert all((tmp_path / f"{name}.png").exists() for name in ("convergence", "convergence-errors", "convergence-images"))
 
     starts = []
     monkeypatch.setattr(gradients_convergence, "optimize", lambda m, s, n: starts.append(s) or optimize(m, s, n))

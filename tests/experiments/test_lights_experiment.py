@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import itertools
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
+from rich.console import Console
 from typer.testing import CliRunner
 
 from shadowmap_dr.cli.main import app
 from shadowmap_dr.errors import ShadowmapError
+from shadowmap_dr.experiments.lights import speed
 from shadowmap_dr.experiments.lights.experiment import LightOptions, run_lights, summary
 from shadowmap_dr.experiments.lights.problem import LightProblem, curve_iterations
 from shadowmap_dr.experiments.lights.scene import alignment, random_directions, target_and_starts
@@ -206,3 +211,29 @@ def test_command_line(tmp_path: Path) -> None:
         result = runner.invoke(app, ["lights", *small, *extra, "--out", str(out)])
         assert result.exit_code == 0, result.output
         assert [e["shadows"] for e in json.loads((out / "lights.json").read_text())["summaries"]] == shadows
+
+
+def test_times_show_how_far_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    def alternate(contenders: Any, on_call: Any) -> dict[str, list[float]]:
+        on_call(1, 2, "reverse")
+        return {name: [1.0] for name in contenders}
+
+    monkeypatch.setattr(speed.timing, "alternate", alternate)
+    console = Console(file=io.StringIO(), force_terminal=True, width=90)
+    problem = LightProblem("spot", 1, 2, resolution=16, map_resolution=16)
+    times = speed.measure(problem, (1,), console=console)
+    assert times["seconds"].keys() == {"batch of 1", "reverse", "renderer"}
+    shown = console.file.getvalue()
+    assert "1/2" in shown and "reverse" in shown
+
+
+def test_sweeps_of_workers_show_how_far_they_are(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed", reason="distributed is not installed: pip install '.[distributed]'")
+    cluster = contextlib.nullcontext(SimpleNamespace(scheduler_address="tcp://nowhere:1"))
+    monkeypatch.setattr(distributed, "LocalCluster", lambda **settings: cluster)
+    monkeypatch.setattr(speed, "run_sweep", lambda *arguments, **settings: None)
+    console = Console(file=io.StringIO(), force_terminal=True, width=90)
+    found = speed.measure_workers(LightProblem("spot", 1, 2, resolution=16, map_resolution=16), (1, 2), tmp_path, console=console)
+    assert found["speed_up"].keys() == {"1", "2"} and found["runs"] == 2
+    shown = console.file.getvalue()
+    assert "4/4" in shown and "2 workers, timed" in shown

@@ -56,6 +56,8 @@ def test_differences_are_numbers_with_a_bar(tmp_path: Path, figures: list[Figure
     np.testing.assert_allclose(pictures[2].images[0].get_array(), rows["a"]["difference"].mean(2))
     plots.image_sheet(tmp_path / "plain.png", {"a": images("target", "result")})
     assert len(figures[1].axes) == 2  # no bar
+    plots.image_sheet(tmp_path / "most.png", rows, most=0.1)
+    assert figures[2].axes[2].images[0].get_clim() == (0, 0.1)
 
 
 def test_signed_differences_have_a_scale_about_zero(tmp_path: Path, figures: list[Figure]) -> None:
@@ -66,6 +68,19 @@ def test_signed_differences_have_a_scale_about_zero(tmp_path: Path, figures: lis
         tmp_path / "b.png", {k: {"x": s * RNG.normal(size=(6, 8))} for k, s in (("a", 1.0), ("b", 9.0))}, label="slope"
     )
     assert [axes.get_ylabel() for axes in figures[1].axes if axes.get_ylabel() == "slope"] == ["slope"] * 2  # a bar for each row
+    plots.signed_sheet(
+        tmp_path / "c.png", {k: {"x": RNG.normal(size=(6, 8))} for k in "ab"}, label={"a": "per metre", "b": "per radian"}
+    )
+    assert {axes.get_ylabel() for axes in figures[2].axes} >= {"per metre", "per radian"}
+
+
+def test_captions_take_lines(tmp_path: Path, figures: list[Figure]) -> None:
+    for width, lines in ((10.0, 1), (3.0, 3)):
+        with plot_style.drawn(tmp_path / "a.png", width, 2.0) as figure:
+            plot_style.caption(
+                figure, "Lines: medians of the runs. Bands: from the lower to the upper quartile. Dotted: the limit."
+            )
+        assert figure._supxlabel.get_text().count("\n") == lines - 1
 
 
 def test_lines_have_labels_and_axes_plain_numbers(tmp_path: Path, figures: list[Figure]) -> None:

@@ -132,7 +132,7 @@ def error_sheet(path: str | os.PathLike[str], rows: dict[str, dict[str, npt.NDAr
                 axes.set(xticks=[], yticks=[])
                 axes.spines[:].set_visible(False)
                 axes.grid(False)
-        label = "distance from the head"
+        label = "distance from the head [units of the model]"
         plot_style.colour_bar(figure, list(grid.flat), plot_style.SEQUENTIAL, 0.0, COLOUR_END, label)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,7 @@ from rich.table import Table
 
 from ...inverse import optimize
 from ...io import console as io_console
-from ...io import files, plots, records
+from ...io import files, plot_style, plots, records
 from ...io.console import markdown
 from ...io.machine import header
 from ...io.options import option, setting
@@ -36,6 +37,8 @@ _PLANE, _RING = 0.25, 0.3
 _TURN_DEG = 10.0
 MAX_DISPLACEMENT = 0.7
 STEP_SIZE, _DECAY = 0.02, 0.005
+# The least error of plots, texels.
+_LEAST_SHOWN = 1e-4
 
 
 @dataclass(frozen=True)
@@ -136,6 +139,7 @@ def run_convergence(options: ConvergenceOptions, *, console: Console | None = No
     plots.image_sheet(options.out / "convergence-images.png", sheet)
     note = "Curves of one colour are runs with different displacements at the start."
     plots.plot_curves(options.out / "convergence.png", _curves(record), columns=2, caption=note)
+    plot_errors(options.out / "convergence-errors.png", record)
     with files.atomic(options.out / "convergence.md") as temporary:
         temporary.write_text(read_convergence(record), encoding="utf-8")
     return record
@@ -219,10 +223,53 @@ def _curves(record: Mapping[str, Any]) -> dict[str, dict[str, list[list[float]]]
     """Curves of the error over iterations: a panel for each occluder and camera, a colour for each filter."""
     panels: dict[str, dict[str, list[list[float]]]] = {}
     for run in record["runs"].values():
-        label = ", ".join([f"filter {run['filter']}" if run["filter"] > 1 else "no filter", *_unless_default(run["candidate"])])
         panel = panels.setdefault(f"{run['occluder']}, {run['camera']}:\nerror [texels]", {})
-        panel.setdefault(label, []).append(run["error_curve_texels"])
+        panel.setdefault(_label(run), []).append(run["error_curve_texels"])
     return panels
+
+
+def plot_errors(path: str | os.PathLike[str], record: Mapping[str, Any]) -> None:
+    """Plot the error at the end over the displacement: a panel for each occluder and camera, a line for each filter."""
+    panels: dict[tuple[str, str], dict[str, dict[float, float]]] = {}
+    for run in record["runs"].values():
+        own = panels.setdefault((run["occluder"], run["camera"]), {}).setdefault(_label(run), {})
+        own[run["displacement"]] = run["error_texels"]
+    columns = min(2, len(panels))
+    rows = -(-len(panels) // columns)
+    with plot_style.drawn(path, 5.2 * columns, 0.4 + 2.9 * rows, dpi=110) as figure:
+        grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+        labels: list[tuple[Any, list[tuple[float, str, str]]]] = []  # Any: Axes
+        for k, ((occluder, camera), series) in enumerate(panels.items()):
+            axes: Any = grid.flat[k]  # Any: Axes
+            ends: list[tuple[float, str, str]] = []
+            for number, (label, errors) in enumerate(series.items()):
+                tint = plot_style.colour(number)
+                # A displacement that left nothing to find has an error of zero, which no logarithm has.
+                points = [(x, max(y, _LEAST_SHOWN)) for x, y in sorted(errors.items())]
+                axes.plot(
+                    *zip(*points, strict=True), color=tint, marker=plot_style.marker(number), linestyle=plot_style.dash(number)
+                )
+                ends.append((points[-1][1], label, tint))
+            axes.axhline(RECOVERED, color=plot_style.GREY, linestyle=":", linewidth=1)
+            axes.set_yscale("log")
+            axes.set(title=f"{occluder}, {camera} camera")
+            if k % columns == 0:
+                axes.set_ylabel("error at the end [texels]")
+            if k >= len(panels) - columns:
+                axes.set_xlabel("displacement at the start [units]")
+            labels.append((axes, ends))
+        for labelled in labels:  # only now, since the limits are those of all panels
+            plot_style.label_ends(*labelled)
+        for empty in list(grid.flat)[len(panels) :]:
+            empty.set_axis_off()
+        plot_style.caption(
+            figure,
+            f"Points: runs. Dotted: a texel, below which an occluder is recovered. Errors below {_LEAST_SHOWN} are drawn there.",
+        )
+
+
+def _label(run: Mapping[str, Any]) -> str:
+    return ", ".join([f"filter {run['filter']}" if run["filter"] > 1 else "no filter", *_unless_default(run["candidate"])])
 
 
 def convergence_rows(record: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:

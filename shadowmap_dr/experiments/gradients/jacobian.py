@@ -134,7 +134,8 @@ def run_jacobian(options: JacobianOptions, *, console: Console | None = None) ->
             record["tessellation"][name] = _tessellation(name, options)
         records.write_record(path, record, *PARTS)
         pictures = {name: _pictures(mesh, name, traced, mitsuba, options) for name in track("pictures", list(options.motions))}
-    plots.signed_sheet(options.out / "jacobian.png", pictures, label="derivative of radiance")
+    labels = {name: f"radiance per {MOTIONS[name].unit}" for name in pictures}
+    plots.signed_sheet(options.out / "jacobian.png", pictures, label=labels)
     gradients_report.plot_agreement(options.out / "jacobian-agreement.png", record)
     with files.atomic(options.out / "jacobian.md") as temporary:
         temporary.write_text(gradients_report.read_jacobian(record), encoding="utf-8")

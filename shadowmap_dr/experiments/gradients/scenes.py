@@ -140,6 +140,11 @@ class Motion:
         return 0.5 * pixels * 2 * RECEIVER_HALF / resolution / speed
 
     @property
+    def unit(self) -> str:
+        """Unit of t in words."""
+        return "radian" if any(self.spin) else "relative size" if self.growth else "unit of length"
+
+    @property
     def along_light(self) -> bool:
         """True if all points move along the light, so that the shadow does not change."""
         return self.growth == 0 and not any(self.spin) and not any(self.velocity[:2])

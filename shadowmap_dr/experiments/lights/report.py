@@ -68,7 +68,8 @@ def plot(path: Path, summaries: Sequence[dict[str, Any]]) -> None:
                 x, mean, std = (np.array(entry[key]) for key in ("curve_iterations", "curve_mean", "curve_std"))
                 low, middle, high = _angles(mean, std)
                 axes.plot(x, middle, color=plot_style.colour(k), linestyle=plot_style.dash(k))
-                ends.append((float(middle[-1]), _short(entry), plot_style.colour(k)))
+                dashed = " (dashed)" * (plot_style.dash(k) != plot_style.dash(0))
+                ends.append((float(middle[-1]), _short(entry) + dashed, plot_style.colour(k)))
                 if len(own) <= 3 or k == 0:
                     axes.fill_between(x, low, high, color=plot_style.colour(k), alpha=0.15, linewidth=0)
             axes.set(title=f"{lights} light{'s' * (lights > 1)}", xlabel="iteration", ylabel="angle to the true light [degrees]")
@@ -78,7 +79,8 @@ def plot(path: Path, summaries: Sequence[dict[str, Any]]) -> None:
         for axes in panels[len(numbers) + 1 :]:
             axes.set_axis_off()
         plot_style.caption(
-            figure, "Lines: angle of the mean alignment of the runs. Bands and bars: one standard deviation of it."
+            figure,
+            "Lines and marks: angle of the mean alignment of the runs. Bands and bars: one standard deviation on each side.",
         )
 
 
@@ -94,10 +96,10 @@ def _plot_sizes(axes: Axes, summaries: Sequence[dict[str, Any]]) -> None:
         tint = plot_style.colour(k)
         bars = [middle - low, high - middle] if len(series) <= 2 else None
         axes.errorbar(positions, middle, yerr=bars, marker=plot_style.marker(k), capsize=2, color=tint)
-        label = f"{lights} light{'s' * (lights > 1)}" + ("" if filter == "gaussian" else f",\n{filter}")
+        label = f"{lights} light{'s' * (lights > 1)}" + ("" if filter == "gaussian" else f", {filter}")
         ends.append((float(middle[-1]), label, tint))
     axes.set(xlabel="texels of the filter", ylabel="angle at the end [degrees]", title="all filters")
-    axes.set_xticks(range(len(sizes)), [{0: "no shadows", 1: "1 (none)"}.get(size, str(size)) for size in sizes])
+    axes.set_xticks(range(len(sizes)), [{0: "no\nshadows", 1: "1\n(none)"}.get(size, str(size)) for size in sizes])
     _scaled(axes, [np.array([entry["alignment_mean"] for entry in summaries])])
     plot_style.label_ends(axes, ends)
 

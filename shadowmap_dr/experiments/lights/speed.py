@@ -18,6 +18,7 @@ from rich.console import Console
 from ...inverse import LightBatch, StillScene, run_sweep
 from ...inverse.light_directions.batch import batch_bytes
 from ...inverse.light_directions.pixels import mixed_pixels
+from ...io import console as io_console
 from ...io.options import option
 from ...io.ranges import check_ranges
 from ...jit.arrays import device_array
@@ -45,7 +46,7 @@ class TimesOptions:
         check_ranges(self)
 
 
-def measure_workers(problem: LightProblem, counts: Sequence[int], out: Path) -> dict[str, Any]:
+def measure_workers(problem: LightProblem, counts: Sequence[int], out: Path, *, console: Console | None = None) -> dict[str, Any]:
     """Seconds of a warm sweep for each number of Dask workers on this machine, with one Dr.Jit thread each.
 
     All sweeps do the same batches, several for each worker. A first sweep, which compiles, is not timed.
@@ -53,21 +54,26 @@ def measure_workers(problem: LightProblem, counts: Sequence[int], out: Path) -> 
     from distributed import LocalCluster
 
     seconds: dict[int, float] = {}
-    for count in counts:
-        with LocalCluster(n_workers=count, threads_per_worker=1, dashboard_address=None, memory_limit=0) as cluster:
-            for name in ("warm-up", "timed"):
-                began = time.perf_counter()
-                memory = problem.runs * batch_bytes(problem.lights, problem.resolution**2, 3, problem.map_resolution)
-                run_sweep(
-                    [problem],
-                    out / f"{name}-{count}",
-                    scheduler=cluster.scheduler_address,
-                    variant=mi.variant(),
-                    threads=1,
-                    memory=memory // (4 * max(counts)),
-                    console=Console(quiet=True),
-                )
-                seconds[count] = time.perf_counter() - began
+    memory = problem.runs * batch_bytes(problem.lights, problem.resolution**2, 3, problem.map_resolution)
+    with io_console.progress(console or io_console.notes()) as progress:
+        task = progress.add_task("sweeps", total=2 * len(counts), note="")
+        for count in counts:
+            progress.update(task, note=f"starting {count} worker{'s' * (count > 1)}")
+            with LocalCluster(n_workers=count, threads_per_worker=1, dashboard_address=None, memory_limit=0) as cluster:
+                for name in ("warm-up", "timed"):
+                    progress.update(task, note=f"{count} worker{'s' * (count > 1)}, {name}")
+                    began = time.perf_counter()
+                    run_sweep(
+                        [problem],
+                        out / f"{name}-{count}",
+                        scheduler=cluster.scheduler_address,
+                        variant=mi.variant(),
+                        threads=1,
+                        memory=memory // (4 * max(counts)),
+                        console=Console(quiet=True),
+                    )
+                    seconds[count] = time.perf_counter() - began
+                    progress.advance(task)
     first = counts[0]
     return {
         "seconds": {str(count): value for count, value in seconds.items()},
@@ -77,27 +83,34 @@ def measure_workers(problem: LightProblem, counts: Sequence[int], out: Path) -> 
     }
 
 
-def measure(problem: LightProblem, batches: Sequence[int], seconds: float = 6.0) -> dict[str, Any]:
+def measure(
+    problem: LightProblem, batches: Sequence[int], seconds: float = 6.0, *, console: Console | None = None
+) -> dict[str, Any]:
     """Seconds of a step for each run.
 
     Contenders take turns: batches of several sizes; ``reverse``, a single run whose frozen step differentiates ordinary shadow
     maps in reverse mode, but also reuses the G-buffer; ``renderer``, the frozen step of a user who calls ``render``. All do the
     same step; the last two leave out Adam, whose time is negligible.
     """
-    renderer = Renderer.from_scene(make_scene(problem.object, problem.lights, problem.resolution), **problem.renderer_settings())
-    still = StillScene.of(renderer)
-    batch = LightBatch(still)
-    targets, starts = problem.directions(range(max(batches)))
-    images = batch.render(targets)
-    contenders: dict[str, Callable[[], object]] = {
-        f"batch of {size}": batch.stepper(starts[:size, 0], images[:size]) for size in batches
-    }
-    contenders["reverse"] = _single(_reverse_image, (renderer, still), starts[0, 0], images[0])
-    contenders["renderer"] = _single(_rendered_image, (renderer,), starts[0, 0], images[0])
-    sizes = [*batches, 1, 1]
-    samples = timing.alternate(
-        {name: timing.Contender(call, rounds=40, burst=4, seconds=seconds) for name, call in contenders.items()}
-    )
+    with io_console.progress(console or io_console.notes()) as progress:
+        task = progress.add_task("steps", total=1, note="scene, targets, recordings")
+        renderer = Renderer.from_scene(
+            make_scene(problem.object, problem.lights, problem.resolution), **problem.renderer_settings()
+        )
+        still = StillScene.of(renderer)
+        batch = LightBatch(still)
+        targets, starts = problem.directions(range(max(batches)))
+        images = batch.render(targets)
+        contenders: dict[str, Callable[[], object]] = {
+            f"batch of {size}": batch.stepper(starts[:size, 0], images[:size]) for size in batches
+        }
+        contenders["reverse"] = _single(_reverse_image, (renderer, still), starts[0, 0], images[0])
+        contenders["renderer"] = _single(_rendered_image, (renderer,), starts[0, 0], images[0])
+        sizes = [*batches, 1, 1]
+        samples = timing.alternate(
+            {name: timing.Contender(call, rounds=40, burst=4, seconds=seconds) for name, call in contenders.items()},
+            lambda done, total, name: progress.update(task, completed=done, total=total, note=name),
+        )
     per_run = {name: [s / size for s in samples[name]] for name, size in zip(contenders, sizes, strict=True)}
     largest = f"batch of {max(batches)}"
     ratios = [(name, largest) for name in contenders if name != largest]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -26,6 +27,7 @@ def plot_convergence(
     objects, resolutions = sorted({name for name, _ in curves}), sorted({resolution for _, resolution in curves})
     with plot_style.drawn(path, 1.8 + 3.2 * len(resolutions), 0.7 + 2.2 * len(objects), dpi=110) as figure:
         grid = figure.subplots(len(objects), len(resolutions), sharex=True, sharey=True, squeeze=False)
+        labels: list[tuple[Any, list[tuple[float, str, str]]]] = []  # Any: Axes
         for i, name in enumerate(objects):
             for j, resolution in enumerate(resolutions):
                 axes, ends = grid[i, j], []
@@ -46,6 +48,8 @@ def plot_convergence(
                 if i == len(objects) - 1:
                     axes.set_xlabel("step")
                 if j == len(resolutions) - 1:
-                    plot_style.label_ends(axes, ends)
+                    labels.append((axes, ends))
+        for labelled in labels:  # only now, since the limits are those of all panels
+            plot_style.label_ends(*labelled)
         bands = "Lines: medians of the runs. Bands: from the lower to the upper quartile."
         plot_style.caption(figure, f"{bands} Dotted: {_LIMIT_DEG} degrees, the limit.")

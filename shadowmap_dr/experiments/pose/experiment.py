@@ -379,10 +379,11 @@ def _picture(
         for name, shown in images.items()
     }
     seen = "its shadow" if problem.shadow_only else "it and its shadow"
-    heading = f"The pose of {problem.name.capitalize()}, found from one image of {seen}"
+    heading = f"{problem.name[:1].upper()}{problem.name[1:]}: its pose, found from one image of {seen}"
     shading = "Smooth shading" if problem.normals == "vertex" else "Flat shading"
     steps = f"All methods take {options.iterations} steps of Adam with the same step size; none is cut short"
-    notes = [f"{shading}, {dr.thread_count()} threads. {steps}. Dots: from here on the run stays at the pose."]
+    dots = "" if options.runs > 1 else " Dots: from here on the run stays at the pose."
+    notes = [f"{shading}, {dr.thread_count()} threads. {steps}.{dots}"]
     if "mitsuba" in courses and hasattr(methods["mitsuba"], "setting"):
         notes.append(f"Mitsuba: {setting_text(methods['mitsuba'], problem)}.")
     path = options.out / problem.folder / _PICTURE

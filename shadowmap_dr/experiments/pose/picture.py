@@ -37,13 +37,13 @@ _ERRORS = (
 # Sizes in inches: width of an image, height of texts above it, height of a plot, of the heading and of a line of notes.
 _TILE, _ABOVE, _PLOT, _HEADING, _LINE = 2.35, 0.85, 2.75, 0.6, 0.19
 # Letters of notes to an inch.
-_LETTERS = 13.5
+_LETTERS = 15
 _INK, _PALE = "0.15", "0.4"
 
 
 @dataclass
 class Course:
-    """What the picture shows of a method: images of its first run, and records of all its runs so far."""
+    """A method in the picture: images of its first run, and records of all its runs so far."""
 
     start: Image
     result: Image
@@ -61,9 +61,9 @@ def draw(
         courses: by the name of the method, in the order of the columns; at least one.
         notes: lines below the plots.
     """
-    columns = 2 + len(courses)
+    columns = max(2 + len(courses), 4)  # places for images, the last of which may be empty
     rows = [_ABOVE + _TILE * reference.shape[0] / reference.shape[1], _PLOT]
-    width = max(columns, 4) * _TILE
+    width = columns * _TILE
     lines = [line for note in notes for line in textwrap.wrap(note, int(_LETTERS * width))]
     below = 0.1 + _LINE * len(lines)
     height = _HEADING + sum(rows) + below
@@ -74,7 +74,7 @@ def draw(
         figure.text(0.012, 0.07 / height, "\n".join(lines), size=8.5, va="bottom", color=_PALE, linespacing=1.5)
         grid = figure.add_gridspec(2, 1, height_ratios=rows)
         upper, lower = grid[0].subgridspec(1, columns), grid[1].subgridspec(1, len(_ERRORS))
-        _images([figure.add_subplot(upper[k]) for k in range(columns)], reference, courses)
+        _images([figure.add_subplot(upper[k]) for k in range(2 + len(courses))], reference, courses)
         _curves([figure.add_subplot(lower[k]) for k in range(len(_ERRORS))], courses)
 
 

@@ -60,28 +60,38 @@ def poses_compared(normals: str) -> Lines:
     return pose._compared([entry for entry in entries if pose.CASES[entry["case"]]["normals"] == normals])
 
 
-def poses_of_spot() -> Lines:
-    """Spot at 128 x 128: the short table."""
-    labels = {
+#: Labels of Spot's rows by normals, case and method.
+_SPOT = {
+    "vertex": {
+        ("vertex-normals", "shadows"): "with shadows",
+        ("vertex-normals", "rasterizer"): "without shadows",
+        ("vertex-normals", "mitsuba"): "Mitsuba's projective integrator",
+    },
+    "face": {
         ("seen", "shadows"): "with shadows",
         ("seen", "rasterizer"): "without shadows",
         ("seen", "mitsuba"): "Mitsuba's projective integrator",
         ("shadow-only", "shadows"): "with shadows, object out of view",
         ("shadow-only", "rasterizer"): "without shadows, object out of view",
-    }
+    },
+}
+
+
+def poses_of_spot(normals: str) -> Lines:
+    """Spot at 128 x 128 with smooth (`vertex`) or flat (`face`) shading: the short table."""
     rows = []
-    for (case, method), label in labels.items():
+    for (case, method), label in _SPOT[normals].items():
         row = _pose_row(case, method)
         found = f"{row.recovered()} of {len(row.runs)}"
         if label == "without shadows, object out of view":
             found += " (gradient exactly zero)"
-        (turned, turned_median), (offset, offset_median) = (
-            (np.mean(values), np.median(values)) for values in map(row.errors, pose._ERRORS)
-        )
-        medians = (f" (median {turned_median:.3f})", f" ({offset_median:.3f})") if method == "mitsuba" else ("", "")
-        command = f"shadowmap-dr pose --runs {len(row.runs)} --method {method}{' --shadow-only' * (case == 'shadow-only')}"
-        rows.append([label, found, f"{turned:.3f} deg{medians[0]}", f"{offset:.3f}{medians[1]}", f"`{command}`"])
-    return markdown(["", "recovered", "rotation", "100 x offset", "command"], rows)
+        turned, offset = (f"{np.mean(values):.3f}{{}} ({np.median(values):.3f})" for values in map(row.errors, pose._ERRORS))
+        flat = " --normals face" * (normals == "face")
+        command = f"shadowmap-dr pose{flat} --runs {len(row.runs)} --method {method}{' --shadow-only' * (case == 'shadow-only')}"
+        rows.append([label, found, turned.format(" deg"), offset.format(""), f"`{command}`"])
+    return markdown(
+        [{"vertex": "smooth shading", "face": "flat shading"}[normals], "recovered", "rotation", "100 x offset", "command"], rows
+    )
 
 
 def _pose_row(case: str, method: str) -> pose.Row:
@@ -89,6 +99,24 @@ def _pose_row(case: str, method: str) -> pose.Row:
     table = pose.rows(pose.read([RESULTS / "pose.json"]))
     (row,) = (row for row in table if (row.case, row.object, row.resolution, row.method) == (case, "spot", 128, method))
     return row
+
+
+def default_shading() -> Lines:
+    """Mitsuba's counts of samples and results with smooth and flat shading, beside ours."""
+    rows = []
+    for normals, case in (("vertex", "vertex-normals"), ("face", "seen")):
+        both = [_pose_row(case, method) for method in ("mitsuba", "shadows")]
+        (stored,) = (
+            row
+            for row in record("pose")["rows"]
+            if (row["case"], row["object"], row["resolution"], row["method"]) == (case, "spot", 128, "mitsuba")
+        )
+        counts = "/".join(str(stored["settings"][key]) for key in ("sppc", "sppp", "sppi"))
+        turned = ", ".join(f"{np.median(row.errors(pose._ERRORS[0])):.3f}" for row in both)
+        rows.append([f"`--normals {normals}`", counts, ", ".join(str(row.recovered()) for row in both), turned])
+    return markdown(
+        ["Spot, 128 x 128, ten starts", "Mitsuba's samples", "found: Mitsuba, ours", "median rotation [deg]: Mitsuba, ours"], rows
+    )
 
 
 def foreign_meshes() -> Lines:
@@ -136,9 +164,14 @@ def speed() -> Lines:
     )
 
 
+def _readme_poses(label: str, case: str, command: str) -> list[str]:
+    ours, theirs = _pose_row(case, "shadows"), _pose_row(case, "mitsuba")
+    turned, other = (float(np.median(row.errors(pose._ERRORS[0]))) for row in (ours, theirs))
+    return [label, f"{ours.recovered()} found, {turned:.3f} degrees", f"{theirs.recovered()} found, {other:.3f}", command]
+
+
 def readme() -> Lines:
     """Results in the README. Bounds of images and derivatives are those of the tests that the rows name."""
-    ours, theirs = _pose_row("seen", "shadows"), _pose_row("seen", "mitsuba")
     units = record("bench")["sections"]["steps"]["units"]
     steps = " / ".join(_two_digits(1e3 * units[f"step-{size}"]["seconds"]["shadows"]["median"]) for size in (128, 512, 1024))
     ratios = loop_ratios()
@@ -146,13 +179,9 @@ def readme() -> Lines:
     return markdown(
         ["", "shadowmap_dr", "Mitsuba", "command"],
         [
-            [
-                "Spot's pose, 128 x 128, ten starts",
-                f"{ours.recovered()} found, {np.mean(ours.errors(pose._ERRORS[0])):.3f} degrees",
-                f"{theirs.recovered()} found",
-                "`shadowmap-dr pose --runs 10`",
-            ],
-            ["a step, 128 / 512 / 1024 pixels", f"{steps} ms", f"{mitsuba} at 128", "`shadowmap-dr bench`"],
+            _readme_poses("Spot's pose, 128 x 128, ten starts", "vertex-normals", "`shadowmap-dr pose --runs 10`"),
+            _readme_poses("the same, flat shading", "seen", "`shadowmap-dr pose --normals face --runs 10`"),
+            ["a step, 128 / 512 / 1024 pixels, flat shading", f"{steps} ms", f"{mitsuba} at 128", "`shadowmap-dr bench`"],
             [
                 "images with shadows beside path tracing",
                 "within 1.5 % of the mean",
@@ -549,9 +578,11 @@ def _two_digits(value: float) -> str:
 TABLES: dict[str, Callable[[], Lines]] = {
     "readme": readme,
     "poses": poses,
-    "poses of Spot": poses_of_spot,
+    "poses of Spot, smooth": lambda: poses_of_spot("vertex"),
+    "poses of Spot, flat": lambda: poses_of_spot("face"),
     "poses beside Mitsuba's, flat": lambda: poses_compared("face"),
     "poses beside Mitsuba's, smooth": lambda: poses_compared("vertex"),
+    "default shading": default_shading,
     "poses of users' meshes": foreign_meshes,
     "speed": speed,
     "figures": figures,

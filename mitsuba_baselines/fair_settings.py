@@ -98,6 +98,16 @@ def is_searched(normals: str = "face") -> bool:
     return any(entry["setting"] and entry.get("normals", "face") == normals for entry in _stored().values())
 
 
+def seconds_of_step(setting: ProjectiveSetting, resolution: int, normals: str = "face") -> tuple[float, int] | None:
+    """Median seconds of a step in the runs of a stored search with a setting, and their number of threads; None without runs."""
+    for entry in _stored().values():
+        if entry["resolution"] == resolution and entry.get("normals", "face") == normals:
+            for measured in entry.get("measurements", []):
+                if measured["setting"] == asdict(setting) and measured["runs"]:
+                    return float(np.median([run["seconds_per_iteration"] for run in measured["runs"]])), int(entry["threads"])
+    return None
+
+
 def find_fair_setting(
     resolution: int,
     *,

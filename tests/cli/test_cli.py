@@ -379,8 +379,8 @@ def test_pose_prints_a_table_and_writes_records(run: Any, monkeypatch: pytest.Mo
     assert result.status == 0, result.err
     assert "spot" in result.out and "shadows" in result.out
     assert len(json.loads(Path("o/pose.json").read_text())["runs"]) == 1
-    assert result.out.splitlines()[-1] == "Picture: o/spot-8/images.png, record: o/pose.json"
-    assert Path("o/spot-8/images.png").is_file()
+    assert result.out.splitlines()[-1] == "Picture: o/spot-8-vertex-normals/pose.png, record: o/pose.json"
+    assert Path("o/spot-8-vertex-normals/pose.png").is_file()
 
 
 def test_bench_prints_a_table_and_writes_a_record(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -20,3 +21,12 @@ def quick_figures(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
     monkeypatch.setattr(Figure, "savefig", savefig)
     yield
+
+
+@pytest.fixture
+def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The pose experiment without its plots, which take longer than small runs."""
+    from shadowmap_dr.experiments.pose import experiment
+
+    monkeypatch.setattr(experiment, "_plots", lambda *_: None)
+    monkeypatch.setattr(experiment, "draw", lambda path, *_: Path(path).touch())

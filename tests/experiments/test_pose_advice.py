@@ -65,6 +65,7 @@ def test_records_of_earlier_versions_have_reasons_too(problem: PoseProblem) -> N
     assert "another pose" in "; ".join(reasons(older, problem))
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_the_terminal_says_what_was_not_found_and_why(tmp_path: Path) -> None:
     mi.set_variant("llvm_ad_rgb")
     written = io.StringIO()

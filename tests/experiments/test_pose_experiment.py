@@ -36,7 +36,8 @@ REQUIRED = {
 
 def options(out: Path, **changes: Any) -> PoseOptions:
     defaults: dict[str, Any] = {
-        "resolutions": (12,), "methods": ("shadows", "rasterizer"), "runs": 2, "iterations": 24, "reference": "own"
+        "resolutions": (12,), "methods": ("shadows", "rasterizer"), "runs": 2, "iterations": 24, "reference": "own",
+        "normals": "face",
     }  # fmt: skip
     return PoseOptions(**{**defaults, "out": out, **changes})
 
@@ -66,10 +67,11 @@ def test_records_and_files(tmp_path: Path) -> None:
         for title in ("start", "result", "difference"):
             assert (tmp_path / "spot-12" / f"{record['method']}-run{record['run']}-{title}.png").stat().st_size
     names = set(os.listdir(tmp_path / "spot-12"))
-    assert {"reference.png", "convergence.png", "images.png"} <= names
+    assert {"reference.png", "convergence.png", "images.png", "pose.png"} <= names
     assert not [name for name in names if "checkpoint" in name or name.startswith(".")]
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_both_methods_start_from_the_protocols_poses(tmp_path: Path) -> None:
     records = run_pose(options(tmp_path, seed=5, iterations=1), build=build)
     for record in records:
@@ -95,6 +97,7 @@ t.run_pose(t.options(Path(sys.argv[2]), runs=1, iterations=60), build=lambda *a:
 """
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_killed_process_resumes_from_its_checkpoint(tmp_path: Path) -> None:
     whole = run_pose(options(tmp_path / "whole", runs=1, iterations=60), build=build)
 
@@ -119,6 +122,7 @@ def test_killed_process_resumes_from_its_checkpoint(tmp_path: Path) -> None:
     assert not checkpoint.exists()
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_resume_keeps_finished_runs_and_adds_new_ones(tmp_path: Path) -> None:
     run_pose(options(tmp_path, methods=("shadows",), runs=1), build=build)
     before = runs_of(tmp_path)
@@ -131,6 +135,7 @@ def test_resume_keeps_finished_runs_and_adds_new_ones(tmp_path: Path) -> None:
     assert [record["iterations"] for record in runs_of(tmp_path)] == [3]
 
 
+@pytest.mark.usefixtures("no_pictures")
 @pytest.mark.parametrize("lost", ["final", "rotation_error_curve"])
 def test_records_that_are_cut_short_are_made_again(tmp_path: Path, lost: str) -> None:
     (whole,) = run_pose(options(tmp_path, methods=("shadows",), runs=1, iterations=3), build=build)
@@ -142,6 +147,7 @@ def test_records_that_are_cut_short_are_made_again(tmp_path: Path, lost: str) ->
     assert again["final"] == pytest.approx(whole["final"]) and runs_of(tmp_path) == [again]
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_runs_with_other_samples_are_others(tmp_path: Path) -> None:
     def sampled(samples: int) -> Any:
         def build_sampled(name: str, problem: Any, reference: Any) -> Method:
@@ -159,6 +165,7 @@ def test_runs_with_other_samples_are_others(tmp_path: Path) -> None:
     assert [record["settings"].get("samples_per_pixel") for record in stored] == [None, 4]
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_threads_are_those_asked_for(tmp_path: Path) -> None:
     before = dr.thread_count()
     try:
@@ -168,6 +175,7 @@ def test_threads_are_those_asked_for(tmp_path: Path) -> None:
         dr.set_thread_count(before)
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_a_killed_sweep_goes_on_with_more_runs(tmp_path: Path) -> None:
     pytest.importorskip("distributed")
     small = {"resolutions": (24,), "iterations": 6, "methods": ("shadows",), "scheduler": "processes:1", "threads": 1}
@@ -201,7 +209,7 @@ def test_lists_of_runs_of_earlier_versions_are_gone_on_with(tmp_path: Path) -> N
     (tmp_path / "pose.json").write_text(json.dumps([whole]))
     (again,) = run_pose(dataclasses.replace(small, resume=True), build=build)
     assert again == whole and runs_of(tmp_path) == [whole]
-    assert pictures_of(small) == [tmp_path / "spot-12" / "images.png"] and pictures_of(small)[0].is_file()
+    assert pictures_of(small) == [tmp_path / "spot-12" / "pose.png"] and pictures_of(small)[0].is_file()
 
 
 def test_which_record_is_of_a_run() -> None:
@@ -238,6 +246,7 @@ def test_time_to_pose_counts_until_the_error_stays_small() -> None:
     assert pose_record.seconds_to_pose(np.array([1, 1, 0, 0, np.nan]), seconds) is None
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_table_has_a_row_for_each_object_resolution_and_method(tmp_path: Path) -> None:
     records = run_pose(options(tmp_path, resolutions=(8, 12), iterations=2), build=build)
     assert pose.table(records).row_count == 4
@@ -300,6 +309,7 @@ def test_normals_are_those_of_faces_or_of_vertices(tmp_path: Path) -> None:
             assert 0.8 < share < 1.2, share
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_runs_with_other_normals_are_not_taken_for_finished(tmp_path: Path) -> None:
     def run(**changes: Any) -> list[dict[str, Any]]:
         run_pose(options(tmp_path, methods=("shadows",), runs=1, iterations=2, **changes), build=build)
@@ -426,6 +436,6 @@ def test_samples_make_the_image_of_a_fit_smoother(spot: Any) -> None:
 
 
 def test_own_reference_is_the_renderers_image_of_the_target(spot: Any, tmp_path: Path) -> None:
-    options_ = PoseOptions(resolutions=(16,), methods=("shadows",), iterations=1, reference="own", out=tmp_path)
+    options_ = PoseOptions(resolutions=(16,), methods=("shadows",), iterations=1, reference="own", normals="face", out=tmp_path)
     assert run_pose(options_)[0]["reference"] == "own"
     assert (tmp_path / "spot-16" / "reference-own.exr").exists()

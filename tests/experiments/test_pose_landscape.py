@@ -47,6 +47,7 @@ def test_best_offset_is_found_at_each_angle() -> None:
     assert (lines["best"][[0, 4]] < 0.8 * lines["target"][[0, 4]]).all()
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_program_draws_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from typer.testing import CliRunner
 
@@ -71,6 +72,7 @@ def test_program_draws_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert len(records.read_json(tmp_path / "pose.json")["runs"]) == 1
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_meshes_of_users_are_those_of_their_runs(tmp_path: Path) -> None:
     path = tmp_path / "brick.ply"
     trimesh.creation.box((1, 2, 3)).export(path)

@@ -76,6 +76,7 @@ def test_files_are_searched_for_by_their_facets_and_own_objects_as_in_the_paper(
         assert choose(make_problem(name, 128, work=tmp_path), name, None, None, None) == Search()
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_a_thin_bar_is_found_from_afar_with_the_defaults_for_files(tmp_path: Path) -> None:
     # An L of bars a pixel wide; without blur, 1 sample: the bars miss each other.
     path = tmp_path / "ell.obj"

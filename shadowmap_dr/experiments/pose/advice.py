@@ -37,7 +37,7 @@ def reasons(record: dict[str, Any], problem: PoseProblem) -> list[str]:
     far, near = left > EXPLAINED, left <= EXPLAINED  # neither for NaN
     if far and 0.01 * offset > 2 * _HALF_SIDE:
         result.append("the object left the view; try more --samples, or a --blur of a sixteenth of the image")
-    elif far and record["method"] != "mitsuba":
+    elif far and record["method"] == "shadows":  # the others' images lack the shadows, or are noisy
         tries = "more --tries" if len(record["tries"]) > 1 else "--tries 5"
         result.append(
             f"the image differs by {100 * left:.0f} % as much as without the object: another pose with a similar shadow; "
@@ -46,14 +46,14 @@ def reasons(record: dict[str, Any], problem: PoseProblem) -> list[str]:
     if record["method"] == "mitsuba":
         if record["settings"].get("fair") is False:
             result.append("sample counts that converge here are not known; see docs/pose.md")
+    elif record["method"] == "rasterizer":
+        result.append("this method has no shadows; try --method shadows")
     else:
         samples = record["settings"].get("samples_per_pixel", 1)
         width = narrow_width(facet_widths(problem))
         more = next((count for count in _SAMPLE_GRIDS if count > samples), None)
         if width * np.sqrt(samples) < 1 and more is not None:
             result.append(f"a tenth of the object's area lies in facets below {width:.2g} pixels; try --samples {more}")
-        if record["method"] == "rasterizer":
-            result.append("this method has no shadows; try --method shadows")
     if _is_falling(record["loss_curve"]):
         result.append(f"the loss was still falling; try --iterations {2 * record['iterations']}")
     if near and rotation > _OTHER_POSE_DEG:

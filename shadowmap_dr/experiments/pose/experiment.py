@@ -20,7 +20,6 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 from rich.console import Console
-from rich.progress import Progress, TaskID
 from rich.table import Table
 
 from ...errors import ShadowmapError, did_you_mean
@@ -35,12 +34,16 @@ from ...io.options import option
 from ...io.ranges import RUNS, SEED, STEPS, check_ranges
 from ..common.options import scheduler_option, threads_option
 from .advice import reasons
-from .methods import METHODS, Builder, Image, build_method, fairness, searching
+from .methods import METHODS, Builder, Image, build_method, described, fairness, searching, setting_text, usual_normals
+from .picture import Course, draw
 from .record import identity, is_of, make_record, stored_records
-from .scene import NormalKind, PoseProblem, ReferenceKind, make_problem, start_pose
+from .run_steps import RunSteps
+from .scene import NormalKind, PoseProblem, ReferenceKind, folder_name, make_problem, pose_errors, start_pose
 from .search import Search, choose, number_or_auto
 from .sweep import PoseRuns, make_reference
 
+# File of the picture of a problem, in its folder.
+_PICTURE = "pose.png"
 # Choices of `search.choose`, for the help.
 _AUTO = (
     "auto: 1 for objects of this package; 1, 4 or 16 for files, by the width of facets",
@@ -70,7 +73,7 @@ class PoseOptions:
         METHODS,
         names=("--method",),
         choices=METHODS,
-        shown="all; the first two with --shadow-only or --normals vertex",
+        shown="all; the first two with --shadow-only",
         help="Method; repeatable.",
     )
     runs: int = option(1, allowed=RUNS, help="Number of runs, each with its own start.")
@@ -78,7 +81,12 @@ class PoseOptions:
     iterations: int = option(150, allowed=STEPS, help="Steps of the optimiser.")
     reference: ReferenceKind = option("mitsuba", help="Reference image: path-traced, or rendered by this library.")
     shadow_only: bool = option(False, help="The camera sees the shadow but not the object.")
-    normals: NormalKind = option("face", help="Shading of the object: flat, or smooth.")
+    normals: NormalKind | None = option(
+        None,
+        metavar="face|vertex",
+        shown="vertex for objects of this package, face for files",
+        help="Shading of the object: flat, or smooth.",
+    )
     samples: int | None = option(
         None,
         metavar="N|auto",
@@ -113,9 +121,13 @@ class PoseOptions:
         check_threads(self.threads)
         if self.reference not in ("mitsuba", "own"):
             raise ShadowmapError(f"no reference {self.reference!r}: choose mitsuba or own.")
-        if self.normals not in ("face", "vertex"):
+        if self.normals not in (None, "face", "vertex"):
             raise ShadowmapError(f"no normals {self.normals!r}: choose face or vertex.")
         check_scheduler(self.scheduler)
+
+    def normals_of(self, name: str) -> NormalKind:
+        """Shading of an object."""
+        return usual_normals(name) if self.normals is None else self.normals
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -128,8 +140,9 @@ def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Co
     """Run the experiment and write its results below `options.out`.
 
     Files: `pose.json` (`runs` has one record for each object, resolution, method and run), and for each object and
-    resolution a folder with the reference, the images at start and end and their difference from the reference, a plot
-    of the convergence (`convergence.png`) and a sheet with the images of the first run (`images.png`).
+    resolution a folder with a picture of all methods, their results and errors over time (`pose.png`), the reference, the images
+    at start and end and their difference from the reference, a plot of the convergence (`convergence.png`) and a sheet with the
+    images of the first run (`images.png`). Reference, start and the picture so far are written before Mitsuba's method begins.
 
     Complete records are kept if `options.resume` is set, and a killed run continues from its last checkpoint, at most ten
     iterations back. Returns the records of this call's runs, in the order of the file.
@@ -147,9 +160,12 @@ def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Co
     problems = {
         problem.folder: (name, problem)
         for name in options.objects
+        for normals in [options.normals_of(name)]
         for resolution in options.resolutions
         for problem in [
-            make_problem(name, resolution, shadow_only=options.shadow_only, normals=options.normals, work=out / "objects")
+            make_problem(
+                name, resolution, shadow_only=options.shadow_only, normals=options.normals_of(name), work=out / "objects"
+            )
         ]
     }
     searches = {
@@ -170,31 +186,40 @@ def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Co
             search = searches[folder]
             make = searching(search, options.iterations) if build is build_method else build
             kind = "path-traced reference" if options.reference == "mitsuba" else "reference"
+            say = functools.partial(progress.console.print, highlight=False, soft_wrap=True, markup=False)
             with io_console.task(progress, f"{problem.folder} {kind}"):
                 reference = _reference(problem, options, make)
+            say(f"{problem.folder} {kind}: {out / problem.folder / 'reference.png'}")
             # Built once for all runs: compiled kernels are reused, and a method that cannot be built fails at once.
-            methods = {}
+            methods: dict[str, Method] = {}
             for name in options.methods:
                 with io_console.task(progress, f"{problem.folder} {name}: scene and kernels"):
                     methods[name] = make(name, problem, reference)
+                    if len(methods) == 1:
+                        say(_start(problem, name, methods[name], options))
             for method in methods.values():
                 if fairness(method, problem).get("fair") is False:
                     note = "sample counts found with another object or resolution; that they converge here has not been shown"
-                    line = f"{problem.folder} mitsuba: {note}: {getattr(method, 'setting', '')}"
-                    progress.console.print(line, highlight=False, soft_wrap=True)
-            records, images = [], {}
+                    say(f"{problem.folder} mitsuba: {note}: {getattr(method, 'setting', '')}")
+            records: list[dict[str, Any]] = []
+            images: dict[str, dict[str, Image]] = {}
             for run in range(options.runs):
                 for name in options.methods:
                     title = f"{problem.folder} {name} run {run}"
+                    if run == 0 and (about := described(methods[name], problem, options.iterations)):
+                        if images:
+                            picture = _picture(problem, options, records, images, reference, methods)
+                            say(f"{problem.folder} picture so far: {picture}")
+                        say(f"{title} begins: {about}")
                     task = progress.add_task(title, total=options.iterations, note="kernels are compiled")
-                    step = functools.partial(_show, progress, task)
+                    step = RunSteps(progress, task, title, options.iterations, say)
                     record = _run_one(problem, name, run, options, methods[name], reference, stored, step)
                     record = {**record, "found": record["recovered"], "search": _search_record(search, options)}
                     record["reasons"] = reasons(record, problem)
                     final = record["final"] if None not in record["final"] else start_pose(options.seed, run)
                     pictures = _pictures(methods[name], record["start"], final, reference)
-                    for picture, image in pictures.items():
-                        io_images.write_png(out / problem.folder / f"{name}-run{run}-{picture}.png", image)
+                    for title_, image in pictures.items():
+                        io_images.write_png(out / problem.folder / f"{name}-run{run}-{title_}.png", image)
                     if run == 0:
                         images[name] = pictures
                     records.append(record)
@@ -202,18 +227,22 @@ def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Co
                     io_records.write_json(out / "pose.json", {**header(options.settings), "runs": stored})
                     _remove_checkpoints(problem, name, run, options)
                     progress.remove_task(task)
-                    progress.console.print(f"{title}: {_outcome(record)}", highlight=False, soft_wrap=True)
-            _plots(problem, options, records, images, reference)
+                    say(f"{title}: {_outcome(record)}")
+            with io_console.task(progress, f"{problem.folder} pictures"):
+                _plots(problem, options, records, images, reference)
+                _picture(problem, options, records, images, reference, methods)
             result += records
     return result
 
 
 def pictures_of(options: PoseOptions) -> list[Path]:
-    """Sheets of images that `run_pose` writes, one for each object and resolution."""
-    smooth = "-vertex-normals" if options.normals == "vertex" else ""
-    ending = ("-shadow-only" if options.shadow_only else "") + smooth
-    objects = [name if name in assets.mesh_names() else Path(name).stem for name in options.objects]
-    return [options.out / f"{name}-{size}{ending}" / "images.png" for name in objects for size in options.resolutions]
+    """Pictures of all methods that `run_pose` writes, one for each object and resolution."""
+    objects = [(name if name in assets.mesh_names() else Path(name).stem, options.normals_of(name)) for name in options.objects]
+    return [
+        options.out / folder_name(name, size, options.shadow_only, normals) / _PICTURE
+        for name, normals in objects
+        for size in options.resolutions
+    ]
 
 
 def table(records: Sequence[dict[str, Any]]) -> Table:
@@ -293,7 +322,7 @@ def _sweep(
                     seed=options.seed,
                     reference=options.reference,
                     shadow_only=options.shadow_only,
-                    normals=options.normals,
+                    normals=problem.normals,
                     search=searches[folder],
                     out=str(options.out.resolve()),
                 )
@@ -308,10 +337,6 @@ def _sweep(
         console=console,
     )
     return [record for records in found.values() for record in records]
-
-
-def _show(progress: Progress, task: TaskID, finished: int, done: int) -> None:
-    progress.update(task, completed=done, note=f"try {finished + 1}" if finished else "")
 
 
 def _search_record(search: Search, options: PoseOptions) -> dict[str, Any]:
@@ -330,6 +355,40 @@ def _reference(problem: PoseProblem, options: PoseOptions, build: Builder) -> Im
 def _pictures(method: Method, start: npt.ArrayLike, final: npt.ArrayLike, reference: Image) -> dict[str, Image]:
     result = method.render(final)
     return {"start": method.render(start), "result": result, "difference": np.abs(result - reference)}
+
+
+def _start(problem: PoseProblem, name: str, method: Method, options: PoseOptions) -> str:
+    """Write the picture of the first run's start. Returns a line about it."""
+    start, path = start_pose(options.seed, 0), options.out / problem.folder / f"{name}-run0-start.png"
+    io_images.write_png(path, method.render(start))
+    rotation, offset = pose_errors(start)
+    return f"{problem.folder} start, {rotation:.1f} degrees and {offset / 100:.2f} units off: {path}"
+
+
+def _picture(
+    problem: PoseProblem,
+    options: PoseOptions,
+    records: Sequence[dict[str, Any]],
+    images: Mapping[str, Mapping[str, Image]],
+    reference: Image,
+    methods: Mapping[str, Method],
+) -> Path:
+    """Write the picture of a problem, of the methods that have made a run. Returns its path."""
+    courses = {
+        name: Course(shown["start"], shown["result"], [record for record in records if record["method"] == name])
+        for name, shown in images.items()
+    }
+    seen = "its shadow" if problem.shadow_only else "it and its shadow"
+    heading = f"{problem.name[:1].upper()}{problem.name[1:]}: its pose, found from one image of {seen}"
+    shading = "Smooth shading" if problem.normals == "vertex" else "Flat shading"
+    steps = f"All methods take {options.iterations} steps of Adam with the same step size; none is cut short"
+    dots = "" if options.runs > 1 else " Dots: from here on the run stays at the pose."
+    notes = [f"{shading}, {dr.thread_count()} threads. {steps}.{dots}"]
+    if "mitsuba" in courses and hasattr(methods["mitsuba"], "setting"):
+        notes.append(f"Mitsuba: {setting_text(methods['mitsuba'], problem)}.")
+    path = options.out / problem.folder / _PICTURE
+    draw(path, heading, reference, courses, notes)
+    return path
 
 
 def _plots(
@@ -394,5 +453,6 @@ def _mean(group: Sequence[dict[str, Any]], key: str, form: str) -> str:
 def _outcome(record: dict[str, Any]) -> str:
     values = (_mean([record], key, "{:.3f}") for key in ("rotation_error_deg", "translation_error_x100"))
     time = _mean([record], "seconds_per_iteration", "{:.4f}")
-    text = "rotation {} deg, offset x 100 {}, {} s per iteration".format(*values, time)
+    total = _mean([record], "seconds_total", "{:.1f}")
+    text = "rotation {} deg, offset x 100 {}, {} s per iteration, {} s in all".format(*values, time, total)
     return text if record["recovered"] else f"{text}; not found: {'; '.join(record['reasons'])}"

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from ...inverse import Method, PoseFit
 from ...io import assets
-from .scene import PoseProblem
+from .scene import NormalKind, PoseProblem
 from .search import Search
 
 if TYPE_CHECKING:
@@ -23,6 +23,15 @@ BETAS = (0.9, 0.999)
 
 Image = npt.NDArray[np.float32]
 Builder = Callable[[str, PoseProblem, Image], Method]
+
+
+def usual_normals(file: str) -> NormalKind:
+    """The default shading of an object that the user calls ``file``.
+
+    Meshes of this package are shaded smoothly: Mitsuba's integrator then needs a third of the time and finds more poses. Files
+    keep flat shading, with which the defaults of their search were measured (`search.choose`).
+    """
+    return "vertex" if file in assets.mesh_names() else "face"
 
 
 def usual_methods(shadow_only: bool = False, normals: str = "face") -> tuple[str, ...]:
@@ -113,6 +122,36 @@ def shadow_settings(method: str) -> dict[str, Any]:
     if method == "rasterizer":
         return {"shadow_method": "none"}
     return {"shadow_method": "vsm", "shadow_map_resolution": 256, "shadow_filter": "gaussian", "shadow_filter_size": 3}
+
+
+def described(method: Method, problem: PoseProblem, iterations: int) -> str:
+    """The setting of Mitsuba's method for readers, and an estimate of its seconds; "" for other methods."""
+    setting = getattr(method, "setting", None)
+    if setting is None:
+        return ""
+    from mitsuba_baselines.fair_settings import seconds_of_step
+
+    known = seconds_of_step(setting, problem.resolution, problem.normals)
+    if known is None:
+        return f"{setting_text(method, problem)}; its time is not known, and is estimated after a few steps"
+    seconds, threads = known
+    return (
+        f"{setting_text(method, problem)}; {iterations} steps take about {seconds * iterations:.0f} s, if one takes "
+        f"{seconds:.2g} s, as when it was measured with {threads} threads"
+    )
+
+
+def setting_text(method: Method, problem: PoseProblem) -> str:
+    """Integrator and samples of Mitsuba's method, and whether a search found them."""
+    setting: ProjectiveSetting = getattr(method, "setting")  # noqa: B009
+    counts = f"{setting.sppc}/{setting.sppp}/{setting.sppi}"
+    guiding = "no guiding" if setting.guiding == "none" else f"guiding {setting.guiding}"
+    found = (
+        "the cheapest setting that a search found to converge"
+        if fairness(method, problem)["fair"]
+        else "not shown to converge here"
+    )
+    return f"direct_projective, sppc/sppp/sppi {counts}, {setting.spp} samples for the loss, {guiding}: {found}"
 
 
 def fairness(method: Method, problem: PoseProblem) -> dict[str, bool]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -93,7 +93,10 @@ def is_complete(record: dict[str, Any]) -> bool:
     if not all(isinstance(record.get(name), int) for name in known) or not isinstance(record.get("recovered"), bool):
         return False
     steps = record["iterations"]
+    # Records of earlier versions lack the curve of the seconds.
+    timed = {"seconds_curve": steps} if "seconds_curve" in record else {}
     lengths = {
+        **timed,
         **{"start": len(start_pose(0, 0)), "final": len(start_pose(0, 0)), "loss_curve": steps},
         **{"rotation_error_curve": steps + 1, "translation_error_curve": steps + 1},
     }
@@ -140,7 +143,9 @@ def make_record(
     best = int(np.argmin(left))
     results = _results(histories[best])
     results["seconds_total"] = sum(history.seconds_total for history in histories)
-    results["seconds_to_pose"] = _later(results["seconds_to_pose"], sum(history.seconds_total for history in histories[:best]))
+    before = sum(history.seconds_total for history in histories[:best])
+    results["seconds_to_pose"] = _later(results["seconds_to_pose"], before)
+    results["seconds_curve"] = records.plain(before + np.cumsum(histories[best].seconds))
     tries = [
         {"start": history.parameters[0], "final": history.final, "unexplained": rest}
         for history, rest in zip(histories, left, strict=True)
@@ -197,6 +202,17 @@ def seconds_to_pose(rotation_deg: npt.NDArray[np.float64], seconds: npt.NDArray[
     outside = np.flatnonzero(~(rotation_deg <= TIME_TO_POSE_DEG))
     first = int(outside[-1]) + 1 if len(outside) else 0
     return float(seconds[:first].sum()) if first < len(rotation_deg) else None
+
+
+def seconds_to_stay(record: Mapping[str, Any], times: npt.NDArray[np.float64]) -> tuple[float, int] | None:
+    """Seconds and step from which on a run with a record is at the pose, within the bounds of a recovered one, to its end.
+
+    ``times``: (N + 1,) seconds of the poses of its curves. None if the run does not end there.
+    """
+    rotation, offset = (np.array(record[name], np.float64) for name in ("rotation_error_curve", "translation_error_curve"))
+    outside = np.flatnonzero(~((rotation < RECOVERED_DEG) & (offset < RECOVERED_X100)))
+    first = int(outside[-1]) + 1 if len(outside) else 0
+    return (float(times[first]), first) if first < len(rotation) else None
 
 
 def _environment() -> dict[str, Any]:

@@ -66,8 +66,13 @@ class PoseProblem:
     @property
     def folder(self) -> str:
         """Name of the folder for this problem's results."""
-        smooth = "-vertex-normals" if self.normals == "vertex" else ""
-        return f"{self.name}-{self.resolution}" + ("-shadow-only" if self.shadow_only else "") + smooth
+        return folder_name(self.name, self.resolution, self.shadow_only, self.normals)
+
+
+def folder_name(name: str, resolution: int, shadow_only: bool, normals: NormalKind) -> str:
+    """Name of the folder for the results of a problem."""
+    smooth = "-vertex-normals" if normals == "vertex" else ""
+    return f"{name}-{resolution}" + ("-shadow-only" if shadow_only else "") + smooth
 
 
 def make_problem(

@@ -32,6 +32,7 @@ MAY_IMPORT = {
     "integrator": ("errors", "jit", "rendering", "scene", "shadow"),
     "torch": ("errors", "jit", "raster", "rendering", "shadow"),
     "inverse": ("errors", "io", "jit", "raster", "rendering", "scene.lights", "shadow"),
+    "importing": ("errors", "io"),
     "cameras": ("errors", "scene.pixel_filter", "scene.sensor"),
     "interactive": ("errors", "inverse", "io", "jit.types"),
     "mitsuba_baselines": ("", "errors", "inverse", "io", "scene.mitsuba_meshes"),
@@ -51,7 +52,7 @@ MAY_IMPORT = {
             "variants",
         ),
     ),
-    "cli": ("", "_llvm", "errors", "experiments", "interactive", "inverse", "io", "rendering.film.aovs", "variants"),
+    "cli": ("", "_llvm", "errors", "experiments", "importing", "interactive", "inverse", "io", "rendering.film.aovs", "variants"),
     "": ("_llvm", "errors", "integrator", "rendering", "shadow", "variants"),
 }
 

@@ -33,6 +33,9 @@ class Command:
 #: Commands by name, in the order of the help: pictures first, then applications, then measurements.
 COMMANDS = {
     "render": Command("render", "render", "Render a Mitsuba scene."),
+    "import": Command(
+        "import_model", "import_command", "Make a Mitsuba scene of a model: meshes, materials, textures, cameras and lights."
+    ),
     "pose": Command(
         "pose", "pose", "Find an object's pose from an image of the object and its shadow, with three methods side by side."
     ),

@@ -12,14 +12,15 @@ import typer
 
 from .. import __version__
 from ..errors import ShadowmapError, mitsuba_message, nearest
+from ..importing.reader import SUFFIXES as IMPORTED
 from ..io import assets, files, images
 from ..io.pictures import SUFFIXES
 from ..rendering.film.aovs import AOVS
 from ..variants import ANY, DEFAULT_VARIANT, set_variant
 from .options import Variant
 
-# Mitsuba's plug-ins for suffixes of meshes; none for those that have to be converted.
-_MESHES = {".ply": "ply", ".obj": "obj", ".serialized": "serialized", ".stl": "", ".glb": "", ".gltf": "", ".off": "", ".fbx": ""}
+# Suffixes of models; those of `IMPORTED` become scenes by `shadowmap-dr import`.
+_MODELS = (*IMPORTED, ".serialized", ".fbx", ".blend", ".dae", ".usd", ".usdz", ".3ds")
 
 
 def render(
@@ -104,11 +105,10 @@ def _scene_file(name: str) -> Path:
         raise ShadowmapError(
             f"no scene {name!r}: it is a folder; give a file in it ({', '.join(scenes[:5]) or 'it has no .xml'})."
         )
-    if suffix in _MESHES:
-        shape = f'<shape type="{_MESHES[suffix]}"><string name="filename" value="{name}"/></shape>'
-        how = f", or render it in ours: shadowmap-dr render pose -D object={name} -o image.png" if suffix == ".ply" else ""
-        plural = shape if _MESHES[suffix] else "its mesh, converted to .ply or .obj,"
-        raise ShadowmapError(f"{name} is a mesh, and has no light and no camera: put {plural} into a scene (.xml){how}.")
+    if suffix in _MODELS:
+        made = given.with_suffix(".xml").name
+        how = f"shadowmap-dr import {name} -o {made}" if suffix in IMPORTED else "convert it to .glb or .ply"
+        raise ShadowmapError(f"{name} is a model, and no scene of Mitsuba's: make one of it first: {how}.")
     if suffix in SUFFIXES:
         raise ShadowmapError(f"{name} is a picture: give a Mitsuba scene (.xml), or one of {', '.join(assets.scene_names())}.")
     with given.open("rb") as file:

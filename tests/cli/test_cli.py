@@ -68,7 +68,7 @@ def test_help_names_the_commands(run: Any) -> None:
 
 def test_commands_come_in_the_order_of_their_use(run: Any) -> None:
     listed = [line.split()[0] for line in run("-h").out.partition("Commands:")[2].splitlines() if line.strip()]
-    assert listed == "render pose lights art face model soft maps gradients bench lights-times info".split()
+    assert listed == "render import pose lights art face model soft maps gradients bench lights-times info".split()
     assert list(main.COMMANDS) == listed
 
 
@@ -168,9 +168,10 @@ def test_verbose_commands_tell_their_time(run: Any) -> None:
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("cow.ply", "cow.ply is a mesh, and has no light and no camera: .*shadowmap-dr render pose -D object=cow.ply"),
-        ("cow.obj", 'cow.obj is a mesh, .*put <shape type="obj"><string name="filename" value="cow.obj"/></shape> into a scene'),
-        ("cow.glb", "cow.glb is a mesh, .*converted to .ply or .obj, into a scene"),
+        ("cow.ply", "cow.ply is a model, and no scene of Mitsuba's: .*: shadowmap-dr import cow.ply -o cow.xml"),
+        ("cow.obj", "cow.obj is a model, .*: shadowmap-dr import cow.obj -o cow.xml"),
+        ("cow.glb", "cow.glb is a model, .*: shadowmap-dr import cow.glb -o cow.xml"),
+        ("cow.fbx", "cow.fbx is a model, .*: convert it to .glb or .ply"),
         ("cow.png", "cow.png is a picture: give a Mitsuba scene"),
         ("notes.txt", "notes.txt is no XML: give a Mitsuba scene"),
         ("folder", "no scene 'folder': it is a folder; give a file in it .room.xml."),
@@ -180,7 +181,7 @@ def test_verbose_commands_tell_their_time(run: Any) -> None:
 )
 def test_what_is_no_scene(run: Any, tmp_path: Path, name: str, message: str) -> None:
     (tmp_path / "folder").mkdir()
-    for written in ("cow.ply", "cow.obj", "cow.glb", "cow.png", "notes.txt", "folder/room.xml"):
+    for written in ("cow.ply", "cow.obj", "cow.glb", "cow.fbx", "cow.png", "notes.txt", "folder/room.xml"):
         (tmp_path / written).write_text("what it is")
     result = run("render", name, "-o", "a.png")
     assert result.status == 1 and result.err.count("\n") == 1 and re.search(message, result.err), result.err

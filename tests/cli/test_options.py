@@ -48,7 +48,7 @@ RECORDS: dict[str, tuple[type[Any], set[str]]] = {
     "face convert": (ConvertOptions, {"source", "output"}),
 }
 # Commands whose options stand in their functions.
-ALONE = {"info", "render"}
+ALONE = {"import", "info", "render"}
 
 
 def commands() -> Iterator[tuple[str, Any]]:  # Any: Click's Command, by the version of Typer

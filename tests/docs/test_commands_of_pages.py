@@ -145,7 +145,9 @@ def of(kind: str) -> dict[str, str]:
 
 def test_commands_are_found() -> None:
     assert len(of(PROGRAM)) > 50 and len(of("python -m")) > 15 and len(of("python docs/")) > 8 and len(of("pip")) > 5
-    assert "shadowmap-dr pose --normals face --runs 10 --method shadows --shadow-only" in FOUND and not FOREIGN.keys() - FOUND.keys()
+    assert (
+        "shadowmap-dr pose --normals face --runs 10 --method shadows --shadow-only" in FOUND and not FOREIGN.keys() - FOUND.keys()
+    )
     assert list(
         commands(
             "    shadowmap-dr soft \\\n        --full   # an hour\n\nor `python -m\nx --y`\n\n```python\n    python a.py\n```\n"

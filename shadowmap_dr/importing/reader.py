@@ -1,0 +1,220 @@
+"""Model files, read with trimesh into records."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..errors import ShadowmapError
+from ..io.files import check_readable
+from ..io.meshes import MOST_BYTES, MOST_TRIANGLES, read_placed_mesh
+from . import gltf
+from .model import Array, Material, Model, Part, Picture, PlacedCamera, PlacedLight
+
+if TYPE_CHECKING:
+    import PIL.Image
+    import trimesh
+
+#: Suffixes of files that can be imported.
+SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off")
+# Formats whose files are one mesh without materials.
+_PLAIN = (".stl", ".off")
+
+
+def read_model(path: Path) -> Model:
+    """All meshes, materials, cameras and lights of a file. Raises ShadowmapError if it cannot be read or has no triangles."""
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise ShadowmapError(f"cannot import {path}: the suffix {suffix!r} is not one of {', '.join(SUFFIXES)}.")
+    check_readable(path)
+    if path.stat().st_size > MOST_BYTES:
+        raise ShadowmapError(f"cannot import {path}: it has more than {MOST_BYTES / 1e6:.0f} MB; decimate its meshes.")
+    cameras, lights, notes = list[PlacedCamera](), list[PlacedLight](), list[str]()
+    if suffix in (".glb", ".gltf"):
+        document = _document(path)
+        try:
+            cameras, lights = gltf.cameras_and_lights(document)
+        except (KeyError, IndexError, TypeError, ValueError) as error:
+            raise ShadowmapError(f"cannot import {path}: its cameras or lights are damaged ({error}).") from error
+        notes = gltf.notes(document)
+    parts = _parts(path, suffix)
+    kinds = {light.kind for light in lights}
+    lights = [light for light in lights if light.kind in ("directional", "point", "spot")]
+    notes += [f"lights of the kind {kind!r} are left out" for kind in sorted(kinds - {light.kind for light in lights})]
+    return Model(tuple(parts), tuple(cameras), tuple(lights), tuple(notes))
+
+
+def _document(path: Path) -> gltf.Json:
+    try:
+        document = gltf.document(path.read_bytes())
+    except Exception as error:
+        raise ShadowmapError(f"cannot import {path}: it is no glTF file, or it is damaged.") from error
+    for extension, reason in gltf.UNREADABLE.items():
+        if extension in document.get("extensionsRequired", ()):
+            raise ShadowmapError(f"cannot import {path}: it is {reason}.")
+    for accessor in document.get("accessors", ()):
+        count = accessor.get("count", 0)
+        if not isinstance(count, int) or not 0 <= count <= MOST_BYTES:
+            raise ShadowmapError(f"cannot import {path}: it announces {count} values; it is damaged.")
+    return document
+
+
+def _parts(path: Path, suffix: str) -> list[Part]:
+    if suffix in _PLAIN:
+        return [_plain(path)]
+    try:
+        scene = _loaded(path, suffix)
+        instances = [scene.graph[node] for node in scene.graph.nodes_geometry]
+        count = sum(len(getattr(scene.geometry[name], "faces", ())) for _, name in instances)
+        if count > MOST_TRIANGLES:
+            raise ShadowmapError(f"cannot import {path}: its {count} triangles are more than {MOST_TRIANGLES}; decimate them.")
+        materials: dict[int, Material | None] = {}
+        found = list(_placed(scene, path.stem, materials))
+    except ShadowmapError:
+        raise
+    except MemoryError:
+        raise ShadowmapError(f"cannot import {path}: its content does not fit into memory; it may be damaged.") from None
+    except Exception as error:  # loaders of these formats raise errors of many kinds
+        if suffix == ".ply":
+            return [_plain(path)]  # of what trimesh refuses, some can be read
+        raise ShadowmapError(
+            f"cannot import {path}: it is no model, or it is damaged, or a file that it names is missing."
+        ) from error
+    if not found:
+        raise ShadowmapError(f"{path} has no triangles: give a triangle mesh, no points and no curves.")
+    for part in found:
+        if not np.isfinite(part.vertices).all():
+            raise ShadowmapError(f"{path}: mesh {part.name!r} has vertices that are not finite (NaN or inf): repair the file.")
+    return found
+
+
+def _plain(path: Path) -> Part:
+    vertices, faces, (middle, scale) = read_placed_mesh(path)
+    return Part(path.stem, vertices.astype(np.float64) * scale + middle, faces.astype(np.int64))
+
+
+def _loaded(path: Path, suffix: str) -> trimesh.Scene:
+    import trimesh
+
+    options: dict[str, Any] = {"split_objects": True, "group_material": True} if suffix == ".obj" else {}
+    # glTF's nodes are kept apart: their names are those of the scene.
+    return trimesh.load_scene(
+        io.BytesIO(path.read_bytes()), file_type=suffix[1:], resolver=_resolver(path), process=False, **options
+    )
+
+
+def _resolver(path: Path) -> Any:  # Any: trimesh's resolver
+    from trimesh.resolvers import FilePathResolver
+
+    return FilePathResolver(str(path))
+
+
+def _placed(scene: trimesh.Scene, stem: str, materials: dict[int, Material | None]) -> Iterator[Part]:
+    for node in scene.graph.nodes_geometry:
+        matrix, name = scene.graph[node]
+        mesh = scene.geometry[name]
+        faces = np.asarray(getattr(mesh, "faces", np.empty((0, 3))), np.int64).reshape(-1, 3)
+        if not len(faces):
+            continue  # points and lines
+        label = str(node) if len(scene.geometry) > 1 or "." not in str(node) else stem
+        yield _part(mesh, label, np.asarray(matrix, np.float64), faces, materials)
+
+
+def _part(
+    mesh: trimesh.Trimesh, name: str, matrix: Array, faces: Any, materials: dict[int, Material | None]
+) -> Part:  # Any: indices
+    linear = matrix[:3, :3]
+    vertices = np.asarray(mesh.vertices, np.float64) @ linear.T + matrix[:3, 3]
+    normals = None
+    if "vertex_normals" in mesh._cache:  # those of the file; trimesh would make others
+        normals = np.asarray(mesh.vertex_normals, np.float64) @ np.linalg.inv(linear)
+        length = np.linalg.norm(normals, axis=1, keepdims=True)
+        normals = normals / np.where(length > 0, length, 1) if (length > 0).all() and np.isfinite(normals).all() else None
+    if np.linalg.det(linear) < 0:
+        faces = faces[:, ::-1]
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise ShadowmapError(f"mesh {name!r} has {len(vertices)} vertices, but its triangles go to {faces.max()}.")
+    material, colours, texcoords = _look(mesh, materials)
+    return Part(name, vertices, faces, normals, texcoords, colours, material)
+
+
+def _look(mesh: trimesh.Trimesh, materials: dict[int, Material | None]) -> tuple[Material | None, Array | None, Array | None]:
+    """(material, colours of the vertices, texture coordinates) of a mesh."""
+    visual: Any = mesh.visual  # Any: one of trimesh's classes, told apart by their kind
+    if visual.kind == "texture" and getattr(visual, "material", None) is not None:
+        made = materials.setdefault(id(visual.material), None) or _material(visual.material)
+        materials[id(visual.material)] = made
+        uv = visual.uv
+        texcoords = None if uv is None or np.shape(uv) != (len(mesh.vertices), 2) else np.array(uv, np.float64) * [1, -1] + [0, 1]
+        colours = visual.vertex_attributes.get("color") if made.picture is None else None
+        return made, None if colours is None else _linear_bytes(colours), texcoords
+    if visual.kind == "vertex":
+        return None, _linear_bytes(visual.vertex_colors), None
+    return None, None, None
+
+
+def _linear_bytes(colours: Any) -> Array:  # Any: (V, 3 or 4) bytes or numbers
+    """Colours (V, 3), linear, of sRGB bytes; floating-point ones are linear already."""
+    values = np.asarray(colours)[:, :3]
+    return to_linear(values / 255.0) if values.dtype.kind in "ui" else values.astype(np.float64)
+
+
+def _material(source: Any) -> Material:  # Any: a material of trimesh
+    from trimesh.visual.material import PBRMaterial
+
+    pbr = source if isinstance(source, PBRMaterial) else source.to_pbr()
+    factor = _factor(pbr.baseColorFactor, 4, np.ones(4))
+    picture = _picture(pbr.baseColorTexture, "RGBA")
+    emission = _factor(pbr.emissiveFactor, 3, np.zeros(3))
+    glow = _picture(pbr.emissiveTexture, "RGB")
+    rough = _picture(pbr.metallicRoughnessTexture, "RGB")
+    metallic, roughness = (1.0 if value is None else float(value) for value in (pbr.metallicFactor, pbr.roughnessFactor))
+    if not isinstance(source, PBRMaterial):
+        metallic = 0.0  # other formats know no metal
+    opacity: Picture | float = 1.0
+    mode = pbr.alphaMode or "OPAQUE"
+    if mode != "OPAQUE":
+        opacity = float(factor[3])
+        if picture is not None and picture[..., 3].min() < 255:
+            opacity = np.clip(np.rint(picture[..., 3] * factor[3]), 0, 255).astype(np.uint8)
+    cutoff = float(0.5 if pbr.alphaCutoff is None else pbr.alphaCutoff) if mode == "MASK" else None
+    return Material(
+        name=str(pbr.name or "material"),
+        colour=factor[:3],
+        picture=None if picture is None else picture[..., :3],
+        opacity=opacity,
+        cutoff=cutoff,
+        roughness=roughness if rough is None else _scaled(rough[..., 1], roughness),
+        metallic=metallic if rough is None else _scaled(rough[..., 2], metallic),
+        normals=_picture(pbr.normalTexture, "RGB"),
+        emission=emission,
+        emission_picture=glow if emission.any() else None,
+    )
+
+
+def _factor(values: Any, count: int, default: Array) -> Array:  # Any: a sequence, bytes or None
+    """A colour of 0 to 1, linear; trimesh has bytes where files of other formats have them."""
+    if values is None:
+        return default
+    array = np.asarray(values)
+    numbers = array.astype(np.float64).ravel() / (255.0 if array.dtype.kind in "ui" else 1.0)
+    return np.concatenate([numbers, default])[:count] if len(numbers) < count else numbers[:count]
+
+
+def _picture(image: PIL.Image.Image | None, mode: str) -> Picture | None:
+    return None if image is None else np.asarray(image.convert(mode), np.uint8)
+
+
+def _scaled(channel: Picture, factor: float) -> Picture | float:
+    """Bytes times a factor; a number where all are equal."""
+    values = np.clip(np.rint(channel * factor), 0, 255).astype(np.uint8)
+    return float(values.flat[0]) / 255 if values.min() == values.max() else values
+
+
+def to_linear(srgb: Array) -> Array:
+    """Linear values of sRGB ones (IEC 61966-2-1)."""
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)

@@ -55,7 +55,7 @@ def _size(source: Path, values: Mapping[str, Any], name: str, width: int | None,
     if width and height:
         return width, height
     if "w" in values and "h" in values:
-        return int(_number(values, "w")), int(_number(values, "h"))
+        return int(_positive(values, "w")), int(_positive(values, "h"))
     from PIL import Image
 
     for file in (source.parent / name, *(source.parent / f"{name}{suffix}" for suffix in (".png", ".jpg", ".jpeg"))):
@@ -73,14 +73,16 @@ def _camera(values: Mapping[str, Any], name: str, size: tuple[int, int]) -> Came
     if model not in _PLAIN + _FISHEYE:
         raise ShadowmapError(f"the camera model {model!r} is not supported: undistort the pictures first.")
     # A file that names another size than the pictures have, for smaller copies of them.
-    scale_x = width / _number(values, "w") if "w" in values else 1.0
-    scale_y = height / _number(values, "h") if "h" in values else 1.0
+    scale_x = width / _positive(values, "w") if "w" in values else 1.0
+    scale_y = height / _positive(values, "h") if "h" in values else 1.0
     fx, fy = (_focal(values, axis, side) for axis, side in (("x", width / scale_x), ("y", height / scale_y)))
-    if fx is None and fy is None:
+    fx, fy = (fy if fx is None else fx), (fx if fy is None else fy)
+    if fx is None or fy is None:
         raise ShadowmapError("it has no focal length (fl_x) and no angle (camera_angle_x).")
-    fx, fy = fx or fy, fy or fx
-    assert fx is not None and fy is not None
-    matrix = np.array(values.get("transform_matrix", ()), np.float64)
+    try:
+        matrix = np.array(values.get("transform_matrix", ()), np.float64)
+    except (TypeError, ValueError):
+        matrix = np.zeros(0)
     if matrix.shape not in ((4, 4), (3, 4)) or not np.isfinite(matrix).all():
         raise ShadowmapError("its transform_matrix has not 4 x 4 numbers.")
     linear = matrix[:3, :3]
@@ -105,10 +107,17 @@ def _camera(values: Mapping[str, Any], name: str, size: tuple[int, int]) -> Came
 
 def _focal(values: Mapping[str, Any], axis: str, side: float) -> float | None:
     if f"fl_{axis}" in values:
-        return _number(values, f"fl_{axis}")
+        return _positive(values, f"fl_{axis}")
     if f"camera_angle_{axis}" in values:
-        return 0.5 * side / math.tan(0.5 * _number(values, f"camera_angle_{axis}"))
+        return 0.5 * side / math.tan(0.5 * _positive(values, f"camera_angle_{axis}"))
     return None
+
+
+def _positive(values: Mapping[str, Any], key: str) -> float:
+    number = _number(values, key)
+    if number <= 0:
+        raise ShadowmapError(f"{key} is {number:g}: a positive number is needed.")
+    return number
 
 
 def _number(values: Mapping[str, Any], key: str) -> float:

@@ -112,10 +112,14 @@ def _camera(camera: Json, name: str, matrix: Array) -> PlacedCamera:
     to_world = _rigid(matrix) @ _TO_MITSUBA
     label = name or str(camera.get("name") or "camera")
     if camera.get("type") == "orthographic":
-        across, up = (float(camera["orthographic"][key]) for key in ("xmag", "ymag"))
-        return PlacedCamera(label, to_world, None, across / up, 2 * up)
-    lens = camera["perspective"]
-    return PlacedCamera(label, to_world, math.degrees(float(lens["yfov"])), float(lens.get("aspectRatio", 4 / 3)))
+        across, up = (abs(float(camera["orthographic"][key])) for key in ("xmag", "ymag"))
+        found = PlacedCamera(label, to_world, None, across / up, 2 * up)
+    else:
+        lens = camera["perspective"]
+        found = PlacedCamera(label, to_world, math.degrees(float(lens["yfov"])), float(lens.get("aspectRatio", 4 / 3)))
+    if not 1e-3 <= found.aspect <= 1e3 or not 0 < (90.0 if found.fov is None else found.fov) < 179:
+        raise ValueError(f"camera {label!r} has an angle of view or an aspect that none has")
+    return found
 
 
 def _light(light: Json, name: str, matrix: Array) -> PlacedLight:

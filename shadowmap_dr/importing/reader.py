@@ -11,6 +11,7 @@ import numpy as np
 
 from ..errors import ShadowmapError
 from ..io.files import check_readable
+from ..io.images import check_size
 from ..io.meshes import MOST_BYTES, MOST_TRIANGLES, read_placed_mesh
 from . import gltf
 from .model import Array, Material, Model, Part, Picture, PlacedCamera, PlacedLight
@@ -38,9 +39,9 @@ def read_model(path: Path) -> Model:
         document = _document(path)
         try:
             cameras, lights = gltf.cameras_and_lights(document)
-        except (KeyError, IndexError, TypeError, ValueError) as error:
-            raise ShadowmapError(f"cannot import {path}: its cameras or lights are damaged ({error}).") from error
-        notes = gltf.notes(document)
+            notes = gltf.notes(document)
+        except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
+            raise ShadowmapError(f"cannot import {path}: its nodes, cameras or lights are damaged ({error}).") from error
     parts = _parts(path, suffix)
     kinds = {light.kind for light in lights}
     lights = [light for light in lights if light.kind in ("directional", "point", "spot")]
@@ -56,11 +57,25 @@ def _document(path: Path) -> gltf.Json:
     for extension, reason in gltf.UNREADABLE.items():
         if extension in document.get("extensionsRequired", ()):
             raise ShadowmapError(f"cannot import {path}: it is {reason}.")
+    try:
+        _check_counts(path, document)
+    except ShadowmapError:
+        raise
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise ShadowmapError(f"cannot import {path}: its accessors or buffers are damaged.") from error
+    return document
+
+
+def _check_counts(path: Path, document: gltf.Json) -> None:
+    """ShadowmapError if the file announces more values than its buffers hold: the loader would make room for them."""
+    beside = [str(buffer.get("uri", "")) for buffer in document.get("buffers", ())]
+    held = path.stat().st_size + sum(
+        file.stat().st_size for uri in beside if uri and not uri.startswith("data:") and (file := path.parent / uri).is_file()
+    )
     for accessor in document.get("accessors", ()):
         count = accessor.get("count", 0)
-        if not isinstance(count, int) or not 0 <= count <= MOST_BYTES:
-            raise ShadowmapError(f"cannot import {path}: it announces {count} values; it is damaged.")
-    return document
+        if isinstance(count, bool) or not isinstance(count, (int, float)) or not 0 <= count <= held:
+            raise ShadowmapError(f"cannot import {path}: it announces {count} values, but its buffers have {held} bytes.")
 
 
 def _parts(path: Path, suffix: str) -> list[Part]:
@@ -206,7 +221,10 @@ def _factor(values: Any, count: int, default: Array) -> Array:  # Any: a sequenc
 
 
 def _picture(image: PIL.Image.Image | None, mode: str) -> Picture | None:
-    return None if image is None else np.asarray(image.convert(mode), np.uint8)
+    if image is None:
+        return None
+    check_size("a texture of the model", image.width, image.height, 4)
+    return np.asarray(image.convert(mode), np.uint8)
 
 
 def _scaled(channel: Picture, factor: float) -> Picture | float:

@@ -245,7 +245,8 @@ def test_files_of_nerf(tmp_path: Path) -> None:
         ({"fl_x": "ten", "w": 10, "h": 10}, "fl_x is 'ten'"),
         ({"fl_x": 10, "w": 10, "h": 10, "camera_model": "EQUIRECTANGULAR"}, "undistort the pictures first"),
         ({"fl_x": 10, "w": 10, "h": 10, "frames": [{"transform_matrix": [1]}]}, "has not 4 x 4 numbers"),
-        ({"fl_x": -10, "w": 10, "h": 10}, "give a positive number of pixels"),
+        ({"fl_x": -10, "w": 10, "h": 10}, "fl_x is -10: a positive number"),
+        ({"fl_x": 10, "w": 0, "h": 10}, "w is 0: a positive number"),
     ],
 )
 def test_files_of_nerf_that_lack_something(tmp_path: Path, values: dict[str, Any], message: str) -> None:

@@ -38,6 +38,7 @@ KINDS = {
     "meshes": Kind(16),
     "tensors": Kind(12, needs="torch"),
     "files": Kind(22),
+    "models": Kind(14),
     "pictures": Kind(18),
     "scenes": Kind(8, seconds=60.0),
     "changes": Kind(8, seconds=60.0),

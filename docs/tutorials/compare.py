@@ -52,11 +52,13 @@ class Problem:
     bar         largest errors, as the notebook's `error` names them
     steps       after which a method has failed
     candidates  of Mitsuba's settings, the cheapest step first
+    parameters  of the notebook that differ from its own
     """
 
     bar: Mapping[str, float]
     steps: int
     candidates: tuple[Counts, ...]
+    parameters: Mapping[str, Any] = field(default_factory=dict)
 
 
 PROBLEMS = {
@@ -69,6 +71,8 @@ PROBLEMS = {
         {"100 x Chamfer": 5.0},
         200,
         ((1, 1, 0, 1), (1, 1, 0, 4), (1, 1, 1, 4), (2, 2, 0, 16), (4, 4, 0, 16), (4, 4, 4, 16), (16, 16, 16, 64)),
+        # Small pictures and steps: a search takes Mitsuba's integrator long enough.
+        {"resolution": 96, "rate": 0.02},
     ),
     "curve": Problem(
         {"RMSE in %": 3.0},
@@ -153,7 +157,7 @@ def search(
     for counts in problem.candidates:
         known = {entry["seed"]: entry["solved"] for entry in tried if tuple(entry["counts"]) == counts}
         if all(known.values()) and len(known) < seeds:
-            names = load(name, counts[3])
+            names = load(name, counts[3], **problem.parameters)
             for seed in range(seeds):
                 if seed in known:
                     continue
@@ -194,7 +198,7 @@ def race(
     name: str, problem: Problem, fair: Counts, on_step: Callable[[str], None] = lambda note: None, **parameters: Any
 ) -> dict[str, Any]:
     """All methods in turns, from the same start until each has solved the problem or has used up its steps."""
-    names = load(name, fair[3], **parameters)
+    names = load(name, fair[3], **{**problem.parameters, **parameters})
     ours, theirs = names["integrator"], projective(fair)
     methods = (*(ONE_CALL if "together" in names else ()), *METHODS)
 

@@ -19,12 +19,21 @@ from shadowmap_dr.io import assets
 from shadowmap_dr.io.records import read_json
 
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "tutorials"
-NAMES = ("pose", "shape", "curve")
-PARAMETERS = {
-    "pose": {"resolution": 64, "steps": 40, "reference_samples": 256},
-    "shape": {"resolution": 48, "steps": 24, "reference_samples": 64, "subdivisions": 3},
-    "curve": {"resolution": 48, "steps": 30, "reference_samples": 128, "check_samples": 32},
-}
+# With a loop for any integrator and a recorded one, then those with a loop of their own.
+RACED = ("pose", "shape", "curve")
+OTHERS = ("torch", "sun", "art")
+FEW = {"type": "shadowmap", "area_light_samples": 4, "environment_light_samples": 8, "soft_map_resolution": 64}
+PARAMETERS: dict[str, dict[str, Any]] = {
+    "pose": {"resolution": 64, "steps": 36, "reference_samples": 256, "integrator": FEW},
+    "shape": {
+        "resolution": 32, "steps": 9, "fine_steps": 4, "reference_samples": 32, "subdivisions": 3, "picture_size": 32,
+        "distance_samples": 2000, "integrator": FEW,
+    },
+    "curve": {"resolution": 48, "steps": 30, "reference_samples": 128, "check_samples": 32, "integrator": FEW},
+    "torch": {"resolution": 32, "steps": 8, "batch": 2, "subdivisions": 3, "reference_samples": 8, "picture_size": 32},
+    "sun": {"resolution": 32, "steps": 8, "texels": 20, "reference_samples": 32},
+    "art": {"resolution": 64, "rings": 12, "steps": 80, "picture_size": 32, "picture_samples": 2},
+}  # fmt: skip
 # Share of the start's errors that may be left.
 LEFT = {"pose": (0.1, 0.15), "shape": (0.75, 0.95), "curve": (0.6,)}
 
@@ -46,31 +55,68 @@ def modules(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 def need(name: str) -> None:
-    if name == "shape":
+    if name in ("shape", "art"):
         pytest.importorskip("cholespy", reason="pip install '.[test]'")
+    if name == "torch":
+        pytest.importorskip("torch", reason="pip install '.[torch]'")
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_notebook_runs_frozen(name: str) -> None:
-    """From the first cell to the last, but for those that wait for Mitsuba's integrator; both loops end near the truth."""
+def run_small(name: str) -> tuple[dict[str, Any], list[str]]:
+    """A notebook's namespace and the lines that it prints, with small numbers, without those that wait for Mitsuba's."""
     need(name)
     import notebooks
 
     printed: list[str] = []
-    path, parameters = FOLDER / f"{name}.ipynb", PARAMETERS[name]
-    names = notebooks.run(path, skip={"mitsuba"}, on_cell=lambda cell, text: printed.append(text), **parameters)
+    path = FOLDER / f"{name}.ipynb"
+    names = notebooks.run(path, skip={"mitsuba"}, on_cell=lambda cell, text: printed.append(text), **PARAMETERS[name])
+    return names, "".join(printed).splitlines()
+
+
+@pytest.mark.parametrize("name", RACED)
+def test_notebook_runs_frozen(name: str) -> None:
+    """From the first cell to the last, but for those that wait for Mitsuba's integrator; all loops end near the truth."""
+    names, lines = run_small(name)
     before = names["error"](np.array(names["start"]))
-    lines = "".join(printed).splitlines()
-    # Through `mi.render`, with several views in one call as well, and frozen.
-    assert len(lines) == 2 + ("together" in names)
-    for line in lines:
+    results = [line for line in lines if line.startswith(next(iter(before)))]
+    # Through `mi.render`, with several views in one call as well, frozen, and with a finer mesh.
+    assert len(results) == (4 if name == "shape" else 2)
+    for line in results:
         after = {key: float(value) for key, value in (part.split(": ") for part in line.split(", "))}
         for (key, start), share in zip(before.items(), LEFT[name], strict=True):
             assert after[key] < share * start, (key, start, after[key])
 
 
+def test_network_is_trained_frozen() -> None:
+    """Shadows come to overlap with those of pictures and with others; the shape comes nearer."""
+    names, lines = run_small("torch")
+    overlaps = [line.partition(": ")[2].split(", ") for line in lines if line.startswith("suns")]
+    assert len(overlaps) == 2 and all(float(after) > float(before) + 5 for before, after in overlaps), overlaps
+    assert names["chamfer"](names["found"]) < 0.9 * names["chamfer"](names["points"])
+
+
+def test_sun_and_texture_are_recovered() -> None:
+    """The suns come nearer; a factor of all light changes the picture of the known paint only."""
+    names, _ = run_small("sun")
+    suns, guess = names["SUNS"], names["GUESS"]
+    off, before = (
+        sum(names["angle"](k, found) for k in range(len(suns)))
+        for found in (names["three"], {f"angles{k}": mi.Point2f(angles) for k, angles in enumerate(guess)})
+    )
+    assert off < 0.9 * before, (off, before)
+    assert names["losses_of_three"][-1] < 0.5 * names["losses_of_three"][0]
+    (quilt, statue), (scaled_quilt, scaled_statue) = names["errors"]
+    assert scaled_quilt < 1.1 * quilt and scaled_statue > 1.4 * statue
+
+
+def test_art_takes_both_shadows_frozen() -> None:
+    names, _ = run_small("art")
+    first, last = (names["kept"][step] for step in (0, names["steps"]))
+    for start, end in zip(names["overlap"](first[1]), names["overlap"](last[1]), strict=True):
+        assert end > 75 > start
+
+
 def test_notebooks_are_whole_and_small() -> None:
-    for name in NAMES:
+    for name in (*RACED, *OTHERS):
         path = FOLDER / f"{name}.ipynb"
         notebook = json.loads(path.read_text())
         assert (notebook["nbformat"], notebook["nbformat_minor"]) == (4, 5)
@@ -194,7 +240,7 @@ def test_race_of_frozen_and_drop_in_and_mitsuba(tmp_path: Path) -> None:
     import compare
 
     problem = compare.Problem({"degrees": 100.0, "100 x offset": 100.0}, 30, ())
-    result = compare.race("pose", problem, (1, 1, 1, 4), resolution=32, reference_samples=16)
+    result = compare.race("pose", problem, (1, 1, 1, 4), resolution=32, reference_samples=16, integrator=FEW)
     assert list(result["methods"]) == list(compare.METHODS)
     for entry in result["methods"].values():
         assert entry["solved"] and entry["steps"] == compare.WINDOW

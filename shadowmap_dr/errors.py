@@ -38,11 +38,15 @@ def mitsuba_message(error: BaseException) -> str:
 
 
 def nearest(word: object, known: Iterable[object]) -> str | None:
-    """The known word that a mistyped one most resembles, or the only one that it begins; None if none is near."""
+    """The known word that a mistyped one most resembles, or the only one that it begins, or the first that it ends; None if none
+    is near."""
     from difflib import get_close_matches  # only mistyped words need it
 
     typed, words = str(word), [str(one) for one in known]
     begun = [one for one in words if typed and one.startswith(typed)]
+    ended = [one for one in words if typed and one.endswith(f"_{typed}")]
+    if ended:
+        return ended[0]
     close = get_close_matches(typed, words, 1)
     return begun[0] if len(begun) == 1 else close[0] if close else None
 

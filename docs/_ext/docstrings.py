@@ -9,10 +9,18 @@ from sphinx.application import Sphinx
 # A name, or several, two or more spaces, and a description; other lines of the description are indented.
 _ITEM = re.compile(r"(?P<names>[A-Za-z_][\w.]*(?:, [A-Za-z_][\w.]*)*) {2,}(?P<text>\S.*)")
 
+# An entry of a section for several names.
+_NAMES = re.compile(r"^ +[A-Za-z_]\w*(?:, [A-Za-z_]\w*)+(?=: )")
+
 
 def process(app: Sphinx, what: str, name: str, thing: object, options: object, lines: list[str]) -> None:
     """Rewrite the lines of a docstring in place."""
-    lines[:] = definitions(literal_blocks(lines))
+    lines[:] = definitions(literal_blocks(joined_names(lines)))
+
+
+def joined_names(lines: list[str]) -> list[str]:
+    """Lines in which several names of one entry (``width, height: ...``) have no spaces: Sphinx takes the first for a type."""
+    return [_NAMES.sub(lambda match: match[0].replace(", ", ",\u00a0"), line) for line in lines]
 
 
 def literal_blocks(lines: list[str]) -> list[str]:

@@ -33,5 +33,5 @@ def import_command(
         (found.shapes, "shape"), (found.triangles, "triangle"), (found.cameras, "camera"), (found.lights, "light"),
     )  # fmt: skip
     listed = ", ".join(f"{count:,} {word}{'s' * (count != 1)}" for count, word in counts)
-    typer.echo(f"{found.scene}: {listed}")
+    typer.echo(f"{found.scene}: {listed} in the file")
     typer.echo(f"Render it: shadowmap-dr render {found.scene} -o {found.scene.with_suffix('.png').name}")

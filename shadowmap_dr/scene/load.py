@@ -73,7 +73,8 @@ class SceneData:
         if isinstance(sensor, Sensor):
             return (sensor,)
         if not isinstance(sensor, Integral):
-            raise ShadowmapError(f"the sensor is a {type(sensor).__name__}: give its number in the scene, or a Sensor record.")
+            how = "give camera.record()" if hasattr(sensor, "record") else "give its number in the scene, or a Sensor record"
+            raise ShadowmapError(f"the sensor is a {type(sensor).__name__}: {how}.")
         if not 0 <= sensor < len(self.sensors):
             raise ShadowmapError(f"There is no sensor {sensor}: the scene has {len(self.sensors)}, counted from 0.")
         return self.sensors[sensor]

@@ -20,6 +20,7 @@ from ..jit.pytree import tree_map
 from ..jit.types import TensorXf
 from ..rendering.extended_lights import SkyWatch, SoftFrusta, still_aimed
 from ..rendering.renderer import Renderer as _Renderer
+from ..scene.sensor import Sensor
 from ..shadow import Frusta
 from .bridge import attached, drjit_turn, forward_derivatives, gradients, number, to_torch
 from .checks import check_devices, check_floats, check_kind, number_of
@@ -140,7 +141,7 @@ class Renderer:
         vertex_positions: Mapping[str, torch.Tensor] | None = None,
         lights: Mapping[str, Mapping[str, torch.Tensor]] | None = None,
         parameters: Mapping[str, torch.Tensor] | None = None,
-        sensor: int = 0,
+        sensor: int | Sensor = 0,
         spp: int = 1,
     ) -> torch.Tensor:
         """Render an image.
@@ -153,7 +154,7 @@ class Renderer:
             parameters: by Mitsuba's names (``mi.traverse(scene)``), new values of anything else: textures (H, W, C) in linear
                 colour, colours, ``to_world`` (4, 4) of cameras. They are set in the scene during the call only. Such a call reads
                 all other parameters from the scene, too, and loads textures anew.
-            sensor: number of the scene's sensor.
+            sensor: number of the scene's sensor, or a record (``cameras.Camera.record()``), to which no gradients flow.
             spp: samples per pixel, see :meth:`shadowmap_dr.Renderer.render`.
 
         Returns:
@@ -166,10 +167,13 @@ class Renderer:
             check_kind(name, {} if value is None else value, Mapping)
         for name, value in (lights or {}).items():
             check_kind(f"lights['{name}']", value, Mapping)
-        sensor, samples = number_of("sensor", sensor, int), number_of("spp", spp, float)
+        samples = number_of("spp", spp, float)
+        if hasattr(sensor, "record"):
+            raise ShadowmapError(f"the sensor is a {type(sensor).__name__}: give camera.record().")
+        sensor = sensor if isinstance(sensor, Sensor) else number_of("sensor", sensor, int)
         given = self._inputs(vertex_positions, lights, parameters)
-        if not 0 <= sensor < len(self._renderer.data.sensors) or not 1 <= samples < math.inf:
-            count = len(self._renderer.data.sensors)
+        count = len(self._renderer.data.sensors)
+        if not (isinstance(sensor, Sensor) or 0 <= sensor < count) or not 1 <= samples < math.inf:
             why = f"there are {count} sensors, counted from 0; spp is 1 or more"
             raise ShadowmapError(f"sensor {sensor}, spp {samples:g}: {why}.")
         operation = _Rendering(self, tuple(given), sensor, math.ceil(samples))
@@ -236,7 +240,7 @@ class _Rendering:
 
     name, unbatched = "Renderer.render", ""
 
-    def __init__(self, owner: Renderer, places: tuple[_Place, ...], sensor: int, spp: int) -> None:
+    def __init__(self, owner: Renderer, places: tuple[_Place, ...], sensor: int | Sensor, spp: int) -> None:
         self.owner, self.places, self.camera = owner, places, (sensor, spp)
         self.changes_scene = any(place.kind == "parameter" for place in places)
         self.functions = (_forward, _backward) if self.changes_scene or owner._frozen is None else owner._frozen
@@ -334,7 +338,7 @@ def _set(table: mi.SceneParameters, values: Mapping[str, Any]) -> None:
 
 
 def _forward(
-    places: tuple[_Place, ...], sensor: int, spp: int, arrays: list[TensorXf], renderer: _Renderer
+    places: tuple[_Place, ...], sensor: int | Sensor, spp: int, arrays: list[TensorXf], renderer: _Renderer
 ) -> tuple[TensorXf, tuple[Frusta | None, SoftFrusta]]:
     """Image and (frusta of the shadow maps, frusta of extended lights' maps)."""
     given = list(zip(places, arrays, strict=True))
@@ -350,7 +354,7 @@ def _forward(
 
 def _backward(
     places: tuple[_Place, ...],
-    sensor: int,
+    sensor: int | Sensor,
     spp: int,
     wanted: list[bool],
     arrays: list[TensorXf],

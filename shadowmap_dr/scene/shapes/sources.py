@@ -6,6 +6,7 @@ an analytic shape, control points of a curve. Gradients flow to all of these.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...errors import ShadowmapError, UnsupportedShape
+from ...errors import ShadowmapError, UnsupportedShape, warn
 from ...jit.arrays import device_array, ravel
 from ...jit.types import Float, UInt32, Vector3f
 from ..mitsuba_meshes import mesh_buffers
@@ -82,12 +83,23 @@ class ShapeSource:
         return own if self.instance is None else _placed(own, Parameter(self.instance, "to_world").now())
 
 
+@functools.cache
+def _warn_of_normals(name: str) -> None:
+    """Warn once for each shape: `params.update()` makes the normals anew, attached to the vertices."""
+    warn(
+        f"Derivatives by the vertices of shape '{name}' leave out its vertex normals, as with Mitsuba's integrators: "
+        "call params.update() after dr.enable_grad."
+    )
+
+
 @dataclass(frozen=True)
 class MeshSource(ShapeSource):
     """The buffers of a ``mi.Mesh``."""
 
     def rest(self) -> Buffers:
         _, positions, normals, texcoords = mesh_buffers(self.shape)
+        if len(normals) and dr.grad_enabled(positions) and not dr.grad_enabled(normals):
+            _warn_of_normals(self.shape.id())
         return Buffers(positions, normals if len(normals) else None, texcoords if len(texcoords) else None)
 
     def read(self) -> tuple[Float, ...]:

@@ -63,14 +63,15 @@ def test_extras_of_hints_exist() -> None:
     extras = set(re.findall(r"^(\w+) = ", declared[1], re.MULTILINE))
     sources = "\n".join(path.read_text() for path in (ROOT / "shadowmap_dr").rglob("*.py"))
     named = set(re.findall(r"install_hint\(['\"](\w+)['\"]\)", sources))
-    assert named == {"art", "distributed", "faces", "interactive", "remesh", "torch"} and named <= extras
+    assert named == {"art", "distributed", "faces", "interactive", "photos", "remesh", "torch"} and named <= extras
     assert "shadowmap-dr[" not in sources, "the package is on no index"
 
 
 @pytest.mark.parametrize(
-    ("word", "found"), [("poes", "pose"), ("grad", "gradients"), ("Art", "art"), ("zebra", None), ("", None)]
+    ("word", "found"),
+    [("poes", "pose"), ("grad", "gradients"), ("Art", "art"), ("zebra", None), ("", None), ("size", "map_size")],
 )
 def test_nearest_words(word: str, found: Any) -> None:
-    known = ["pose", "gradients", "art", "maps"]
+    known = ["pose", "gradients", "art", "maps", "map_size", "soft_map_size"]
     assert errors.nearest(word, known) == found
     assert errors.did_you_mean(word, known) == (f" Did you mean {found!r}?" if found else "")

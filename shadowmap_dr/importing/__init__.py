@@ -1,5 +1,6 @@
 """Models of other programs (glTF, OBJ, PLY, STL, OFF) as Mitsuba scenes."""
 
 from .importer import Imported, import_model
+from .options import ImportOptions
 
-__all__ = ["Imported", "import_model"]
+__all__ = ["ImportOptions", "Imported", "import_model"]

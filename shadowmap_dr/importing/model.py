@@ -48,10 +48,11 @@ class Part:
         name: of the node or object.
         vertices: (V, 3).
         faces: (F, 3) indices.
-        normals: (V, 3) unit normals of the vertices, or None where facets are flat.
+        normals: (V, 3) unit normals of the vertices, or None.
         texcoords: (V, 2), v downwards from the top of pictures, or None.
         colours: (V, 3) linear colours of the vertices, which replace the material's, or None.
         material: its material, or None.
+        smooth: whether Mitsuba is to compute normals of the vertices where there are none; otherwise facets are flat.
     """
 
     name: str
@@ -61,6 +62,7 @@ class Part:
     texcoords: Array | None = None
     colours: Array | None = None
     material: Material | None = None
+    smooth: bool = False
 
 
 @dataclass(frozen=True)

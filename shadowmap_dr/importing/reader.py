@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,8 +27,11 @@ SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off")
 _PLAIN = (".stl", ".off")
 
 
-def read_model(path: Path) -> Model:
-    """All meshes, materials, cameras and lights of a file. Raises ShadowmapError if it cannot be read or has no triangles."""
+def read_model(path: Path, normals: str = "auto") -> Model:
+    """All meshes, materials, cameras and lights of a file.
+
+    ``normals`` is that of `ImportOptions`. Raises ShadowmapError if the file cannot be read or has no triangles.
+    """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise ShadowmapError(f"cannot import {path}: the suffix {suffix!r} is not one of {', '.join(SUFFIXES)}.")
@@ -42,7 +46,8 @@ def read_model(path: Path) -> Model:
             notes = gltf.notes(document)
         except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
             raise ShadowmapError(f"cannot import {path}: its nodes, cameras or lights are damaged ({error}).") from error
-    parts = _parts(path, suffix)
+    smooth = normals == "smooth" or (normals == "auto" and suffix not in (".glb", ".gltf", ".stl"))
+    parts = [replace(part, smooth=smooth) for part in _parts(path, suffix)]
     kinds = {light.kind for light in lights}
     lights = [light for light in lights if light.kind in ("directional", "point", "spot")]
     notes += [f"lights of the kind {kind!r} are left out" for kind in sorted(kinds - {light.kind for light in lights})]

@@ -14,9 +14,8 @@ import numpy as np
 
 from ..io.files import atomic, make_folder
 from .model import Array, Material, Model, Part, Picture, PlacedCamera, PlacedLight
+from .options import ImportOptions
 
-#: Pixels along the longer side of pictures.
-LONGER_SIDE = 512
 # Angle of view of the camera that a model without one gets, degrees.
 _FOV = 35.0
 # Direction from which that camera looks, for each axis that points upwards.
@@ -35,25 +34,23 @@ class Written:
     notes: list[str] = field(default_factory=list)
 
 
-def write_scene(model: Model, path: Path, up: str = "y", longer_side: int = LONGER_SIDE, daylight: bool = True) -> Written:
+def write_scene(model: Model, path: Path, options: ImportOptions) -> Written:
     """Write a scene that Mitsuba loads.
 
     Args:
         model: all that the scene has. Without a camera it gets one that sees all.
         path: of the XML file. Meshes and pictures go into the folder ``<its name>_files`` beside it.
-        up: axis that points upwards, for the camera and the sun of models without: ``y`` or ``z``.
-        longer_side: pixels along the longer side of pictures.
-        daylight: whether a model without lights gets a sun and a dim sky. Surfaces that glow do not count as lights.
+        options: additions, and the size of pictures.
 
     Raises:
         OutputError: A file could not be written.
     """
-    return _Writer(path, up, longer_side, daylight).write(model)
+    return _Writer(path, options).write(model)
 
 
 class _Writer:
-    def __init__(self, path: Path, up: str, longer_side: int, daylight: bool) -> None:
-        self.path, self.up, self.longer_side, self.daylight = path, up, longer_side, daylight
+    def __init__(self, path: Path, options: ImportOptions) -> None:
+        self.path, self.options, self.up, self.longer_side = path, options, options.up, options.size
         self.folder = path.with_name(f"{path.stem}_files")
         self.written, self.ids, self.named = Written(), set[str](), dict[int, str]()
         self.renamed: list[tuple[str, str]] = []
@@ -67,12 +64,14 @@ class _Writer:
             root.append(self._sensor(camera, model))
         for light in model.lights:
             root.append(self._emitter(light))
-        if self.daylight and not model.lights:
+        if self.options.daylight and not model.lights:
             self._daylight(root)
         for part in model.parts:
             if part.material is not None and part.colours is None and id(part.material) not in self.named:
                 root.append(self._bsdf(part.material))
             root.append(self._shape(part))
+        if self.options.floor:
+            root.append(self._floor(model))
         if self.renamed:
             first = ", ".join(f"{old!r} is {new!r}" for old, new in self.renamed[:3])
             more = f", and {len(self.renamed) - 3} more" if len(self.renamed) > 3 else ""
@@ -138,6 +137,22 @@ class _Writer:
         root.append(_element("emitter", "constant", self._id("sky"), {"radiance": np.full(3, _SKYLIGHT)}))
         self.written.notes.append("the file has no light: a sun and a dim sky were added")
 
+    def _floor(self, model: Model) -> Xml.Element:
+        """A square below the model, three times as wide as it is."""
+        low, high = model.bounds
+        axis = 1 if self.up == "y" else 2
+        middle, half = 0.5 * (low + high), 1.5 * float(np.linalg.norm(high - low))
+        middle[axis] = low[axis]
+        matrix = np.eye(4)
+        # A rectangle faces +z.
+        matrix[:3, :3] = half * (np.eye(3) if axis == 2 else np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]))
+        matrix[:3, 3] = middle
+        floor = _element("shape", "rectangle", self._id("floor"), {})
+        floor.append(_transform(matrix))
+        floor.append(_two_sided(_element("bsdf", "diffuse", None, {"reflectance": np.full(3, 0.5)})))
+        self.written.notes.append("a floor was added")
+        return floor
+
     # ------------------------------------------------------------------------------------------------------ meshes, materials
 
     def _shape(self, part: Part) -> Xml.Element:
@@ -148,7 +163,7 @@ class _Writer:
         write_mesh(file, part)
         self.written.files.append(file)
         shape = _element("shape", "ply", name, {"filename": f"{self.folder.name}/{file.name}"})
-        if part.normals is None:
+        if part.normals is None and not part.smooth:
             shape.append(_value("face_normals", True))
         if part.colours is not None:
             shape.append(

@@ -26,6 +26,7 @@ from shadowmap_dr.experiments.lights.speed import TimesOptions
 from shadowmap_dr.experiments.maps.experiment import MapsOptions
 from shadowmap_dr.experiments.pose.experiment import PoseOptions
 from shadowmap_dr.experiments.soft.experiment import SoftOptions
+from shadowmap_dr.importing import ImportOptions
 from shadowmap_dr.interactive.options import ModelOptions
 from shadowmap_dr.inverse.faces.convert import ConvertOptions
 from shadowmap_dr.io.options import described, description, option, setting
@@ -33,6 +34,7 @@ from shadowmap_dr.io.ranges import check_ranges
 
 # Records of the commands, and the parameters that are no fields of them.
 RECORDS: dict[str, tuple[type[Any], set[str]]] = {
+    "import": (ImportOptions, {"model", "output"}),
     "soft": (SoftOptions, {"full", "variant"}),
     "lights": (LightOptions, {"shadows", "full", "variant"}),
     "lights-times": (TimesOptions, {"variant"}),
@@ -48,7 +50,7 @@ RECORDS: dict[str, tuple[type[Any], set[str]]] = {
     "face convert": (ConvertOptions, {"source", "output"}),
 }
 # Commands whose options stand in their functions.
-ALONE = {"import", "info", "render"}
+ALONE = {"info", "render"}
 
 
 def commands() -> Iterator[tuple[str, Any]]:  # Any: Click's Command, by the version of Typer

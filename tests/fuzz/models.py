@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from shadowmap_dr import cameras
-from shadowmap_dr.importing import import_model
+from shadowmap_dr.importing import ImportOptions, import_model
 from tests.importing.gltf_files import GltfFile
 
 from . import mesh_files
@@ -78,7 +78,7 @@ def _materials(rng: np.random.Generator, folder: Path) -> str:
 
 
 def _imported(path: Path, folder: Path, triangles: int | None = None) -> str:
-    found = import_model(path, folder / "scene.xml", size=16)
+    found = import_model(path, folder / "scene.xml", ImportOptions(size=16))
     check(all(file.is_file() for file in found.files), "a file that was written is not there")
     check(triangles in (None, found.triangles), f"{found.triangles} triangles instead of {triangles}")
     if sum(file.stat().st_size for file in found.files) < _MOST_BYTES:

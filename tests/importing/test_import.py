@@ -12,7 +12,7 @@ import pytest
 import trimesh
 
 from shadowmap_dr import ShadowmapError
-from shadowmap_dr.importing import Imported, import_model
+from shadowmap_dr.importing import Imported, ImportOptions, import_model
 from tests.importing.gltf_files import GltfFile
 
 FRONT = {"intensity": math.pi, "node": {"translation": [0, 0, 5]}}
@@ -24,7 +24,7 @@ def rendered(found: Imported, integrator: str = "direct", **options: Any) -> np.
 
 
 def scene_of(file: GltfFile, folder: Path, **options: Any) -> Imported:
-    return import_model(file.write(folder / "model.gltf"), folder / "scene.xml", size=64, **options)
+    return import_model(file.write(folder / "model.gltf"), folder / "scene.xml", ImportOptions(size=64, **options))
 
 
 def matt(**values: Any) -> dict[str, Any]:
@@ -216,11 +216,34 @@ def test_names_are_kept_where_mitsuba_takes_them(tmp_path: Path) -> None:
 def test_models_without_camera_and_light_are_seen_and_lit(variant: str, tmp_path: Path, up: str) -> None:
     path = tmp_path / "box.ply"
     trimesh.creation.box((3, 1, 1)).export(path)
-    found = import_model(path, tmp_path / "box.xml", up, 64)
+    found = import_model(path, tmp_path / "box.xml", ImportOptions(up=up, size=64))
     assert [note.split(":")[0] for note in found.notes] == ["the file has no camera", "the file has no light"]
     scene = mi.load_file(str(found.scene))
     depth = np.array(mi.render(scene, integrator=mi.load_dict({"type": "aov", "aovs": "d:depth"}), spp=4))[..., 0] > 0
     assert 0.15 < depth.mean() < 0.8 and not depth[0].any() and not depth[-1].any() and not depth[:, 0].any()
+
+
+@pytest.mark.parametrize("up", ["y", "z"])
+def test_floors_catch_shadows(variant: str, tmp_path: Path, up: str) -> None:
+    path = tmp_path / "box.ply"
+    trimesh.creation.box((1, 1, 1)).export(path)
+    found = import_model(path, tmp_path / "box.xml", ImportOptions(up=up, size=64, floor=True))
+    scene = mi.load_file(str(found.scene), optimize=False)
+    floor = next(shape for shape in scene.shapes() if shape.id() == "floor")
+    axis = "yz".index(up) + 1
+    assert floor.bbox().max[axis] == pytest.approx(-0.5, abs=1e-5) and floor.bbox().max[0] > 2
+    image = rendered(found).mean(-1)
+    assert image[image > 0].min() < 0.5 * np.median(image[image > 0])
+
+
+@pytest.mark.parametrize(("suffix", "normals", "smooth"), [
+    ("ply", "auto", True), ("stl", "auto", False), ("glb", "auto", False), ("ply", "flat", False), ("stl", "smooth", True),
+])  # fmt: skip
+def test_shading_of_meshes_without_normals(tmp_path: Path, suffix: str, normals: Any, smooth: bool) -> None:
+    path = tmp_path / f"box.{suffix}"
+    trimesh.creation.box((1, 1, 1)).export(path)
+    found = import_model(path, tmp_path / "box.xml", ImportOptions(normals=normals))
+    assert mi.load_file(str(found.scene), optimize=False).shapes()[0].has_vertex_normals() == smooth
 
 
 def test_objects_of_obj_files_have_their_materials(variant: str, tmp_path: Path) -> None:
@@ -229,7 +252,7 @@ def test_objects_of_obj_files_have_their_materials(variant: str, tmp_path: Path)
         "mtllib two.mtl\nv -1 -1 0\nv 0 -1 0\nv 0 1 0\nv -1 1 0\nv 1 -1 0\nv 1 1 0\n"
         "o left\nusemtl red\nf 1 2 3 4\no right\nusemtl green\nf 2 5 6 3\n"
     )
-    found = import_model(tmp_path / "two.obj", tmp_path / "two.xml", size=64)
+    found = import_model(tmp_path / "two.obj", tmp_path / "two.xml", ImportOptions(size=64))
     assert (found.shapes, found.triangles) == (2, 4)
     image = rendered(found)
     colourful = image[np.ptp(image, axis=-1) > 0.05]
@@ -282,9 +305,9 @@ def test_files_that_cannot_be_imported(tmp_path: Path, name: str, content: bytes
 def test_wrong_options(tmp_path: Path) -> None:
     path = tmp_path / "ball.ply"
     trimesh.creation.icosphere(1).export(path)
-    for options, message in (({"up": "x"}, "give y or z"), ({"size": 0}, "give pixels")):
+    for options, message in (({"up": "x"}, "give one of y, z"), ({"size": 0}, "size"), ({"normals": "no"}, "auto, smooth, flat")):
         with pytest.raises(ShadowmapError, match=message):
-            import_model(path, tmp_path / "scene.xml", **options)
+            import_model(path, tmp_path / "scene.xml", ImportOptions(**options))
     with pytest.raises(ShadowmapError, match="the suffix '.json' is not one of .xml"):
         import_model(path, tmp_path / "scene.json")
     with pytest.raises(ShadowmapError, match="none.ply"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import traceback
+import warnings
 
 import drjit as dr
 import mitsuba as mi
@@ -22,6 +23,7 @@ from integrator_scenes import (
 )
 
 from shadowmap_dr.scene.load import load
+from shadowmap_dr.scene.shapes import sources
 
 
 def test_image_agrees_with_path_tracing(variant: str) -> None:
@@ -210,3 +212,25 @@ def test_vertices_that_become_nan_are_named(variant: str, recorded: bool) -> Non
         with pytest.raises(RuntimeError) as error:
             mi.render(scene, params, integrator=integrator)
         assert f"Vertex {where} of shape 'ball' is [" in "".join(traceback.format_exception(error.value))
+
+
+def test_vertex_normals_that_stay_behind_are_named(variant: str) -> None:
+    """Attached vertices alone leave their normals constant, in Mitsuba's integrators too; updated ones follow."""
+    scene = small_scene()
+    params = mi.traverse(scene)
+    slopes = []
+    for update in (False, True):
+        dr.enable_grad(params["ball.vertex_positions"])
+        if update:
+            params.update()
+        image = mi.render(scene, params, integrator=shadowmap(), spp=4)
+        sources._warn_of_normals.cache_clear()
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            dr.backward(dr.mean(image))
+        said = [str(warning.message) for warning in caught if "leave out its vertex normals" in str(warning.message)]
+        assert len(said) == (not update) and all("'ball'" in text and "params.update()" in text for text in said)
+        slopes.append(np.array(dr.grad(params["ball.vertex_positions"])))
+        params["ball.vertex_positions"] = dr.detach(params["ball.vertex_positions"])
+        params.update()
+    assert np.abs(slopes[0] - slopes[1]).max() > 0.05 * np.abs(slopes[1]).max()

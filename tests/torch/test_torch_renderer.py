@@ -356,3 +356,28 @@ def test_wrong_variant_is_refused(renderer: sdr.Renderer) -> None:
     renderer._variant = "cuda_ad_rgb"  # as if there were a GPU
     with pytest.raises(ShadowmapError, match="The variant is llvm_ad_rgb, but this renderer was made for cuda_ad_rgb"):
         renderer.render({"ball": renderer.vertices("ball")})
+
+
+def test_records_of_cameras(renderer: sdr.Renderer) -> None:
+    """Images and gradients are those of Dr.Jit through the same record, whose pixels are not square."""
+    from shadowmap_dr import cameras
+
+    views = [
+        replace(cameras.look_at((2, -3, 4), (0.1 * k, 0, 0), (0, 0, 1), fov=45, width=SIZE, height=72), fx=110.0, fy=90.0)
+        for k in range(3)
+    ]
+    plain = shadowmap_dr.Renderer.from_scene(build(), **OPTIONS)
+    weight = torch.rand((72, SIZE, 3), generator=torch.Generator().manual_seed(0))
+    for view in views:
+        vertices = renderer.vertices("ball").clone().requires_grad_()
+        image = renderer.render({"ball": vertices}, sensor=view.record())
+        (weight * image).sum().backward()
+        positions = mi.TensorXf(vertices.detach().clone())
+        dr.enable_grad(positions)
+        expected = plain.render({"ball": positions.array}, sensor=view.record())
+        dr.backward(dr.sum(expected * mi.TensorXf(weight), axis=None))
+        np.testing.assert_allclose(image.detach(), expected, atol=1e-5)
+        gradient = np.array(dr.grad(positions))
+        np.testing.assert_allclose(vertices.grad, gradient, atol=1e-4 * np.abs(gradient).max())
+    with pytest.raises(ShadowmapError, match=r"the sensor is a Camera: give camera.record\(\)"):
+        renderer.render(sensor=views[0])

@@ -18,7 +18,7 @@ from ..jit.frozen import take_apart
 from ..jit.gpu import keep_registers
 from ..jit.kernel_cache import note_size
 from ..jit.pytree import tree_map
-from ..jit.types import Bool, Float, TensorXf
+from ..jit.types import Bool, Float, Point3f, TensorXf
 from ..raster import Topology, build_topology, outward_faces
 from ..scene.geometry import Geometry
 from ..scene.lights.area import AreaLight
@@ -289,6 +289,14 @@ class Renderer:
     def light(self, name: str) -> Light | AreaLight:
         """Record of a light of the scene."""
         return self.data.light(name)
+
+    def vertices(self, name: str) -> Point3f:
+        """World-space vertices of a shape, Point3f (Vs,), detached: as the scene has them, or had them at the last ``refresh``.
+
+        Raises:
+            ShadowmapError: The scene has no such shape.
+        """
+        return mi.Point3f(dr.detach(self.data.geometry.shape_positions(name)))
 
     def curve_vertices(self, name: str, control_points: Float) -> Float:
         """World-space vertices of a `bsplinecurve` or `linearcurve` for ``vertex_positions`` of :meth:`render`.

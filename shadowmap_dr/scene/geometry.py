@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import ShadowmapError
-from ..jit.arrays import backend, ravel, replace_grad
+from ..jit.arrays import backend, device_array, ravel, replace_grad
 from ..jit.broadcast import copy_of_lane, in_copies
 from ..jit.types import AnyArray, Bool, Float, Point3f, UInt32, Vector3u
 from ..jit.vectors import normalize_or
@@ -29,6 +29,8 @@ NOT_READ: Any = None  # Any: stands for buffers of several types, until ``load.r
 
 # Shape indices are compared with each index of a list up to this length. Longer lists cost more than they save.
 _MANY_SHAPES = 8
+# Numbers of vertices, the largest, to which recordings hold new positions.
+_MOST_LANES = 64
 
 HAS_NORMALS = 1
 HAS_TEXCOORDS = 2
@@ -107,6 +109,8 @@ class Geometry:
                    those without faces, take the position of another vertex of their shape and so stretch no bounds (``settled``)
     packets        Float (4V,), positions padded to four numbers, through which derivatives flow back (``in_packets``)
     copies         number of copies of packets, normals and texture coordinates in their buffers, one for each block of lanes
+    lanes          UInt32 (Vs,) or (3Vs,) each, zeros: two arrays for each number of vertices that shapes have. Recordings hold
+                   new positions against them (``bound``)
     """
 
     positions: Float
@@ -124,6 +128,7 @@ class Geometry:
     stand_ins: UInt32 | None = None
     packets: Float | None = None
     copies: int = 1
+    lanes: tuple[UInt32, ...] = ()
 
     @property
     def vertex_count(self) -> int:
@@ -231,7 +236,7 @@ class Geometry:
         merged = self.positions
         for name, value in positions.items():
             info = self.shape(name)
-            checked = _checked_positions(name, value, info.vertex_count)
+            checked = self.bound(_checked_positions(name, value, info.vertex_count))
             merged = _write_vertices(merged, checked, info.vertex_start, info.vertex_count, self.vertex_count)
         normals = self.normals
         for name in positions:
@@ -242,6 +247,17 @@ class Geometry:
                 outward = dr.gather(mi.Normal3f, smooth, own) * (-1 if info.against_winding else 1)
                 normals = _write_vertices(normals, outward, info.vertex_start, info.vertex_count, self.vertex_count)
         return replace(self, positions=self.settled(merged), normals=normals, changed=changed, packets=None)
+
+    def bound(self, value: Float | Point3f) -> Float | Point3f:
+        """New positions of a shape, in a recording held to their number: a replay with another number is an error of Dr.Jit's.
+
+        Sizes are checked while a function is recorded, not while it is replayed. A replay with more vertices would write behind
+        the end of an array.
+        """
+        if not dr.flag(dr.JitFlag.FreezingScope):
+            return value
+        held = next((lane for lane in self.lanes if dr.width(lane) == dr.width(value)), None)
+        return value if held is None else value + mi.Float(held)
 
     def settled(self, positions: Float) -> Float:
         """Positions (Float, 3V) in which each vertex without faces has moved to its stand-in."""
@@ -308,6 +324,13 @@ def stand_ins(
         return None
     visible = faces[[info.face_start for info in shapes], 0]
     return np.where(used, np.arange(len(used)), visible[vertex_shape]).astype(np.uint32)
+
+
+def lanes_of(shapes: tuple[ShapeInfo, ...]) -> tuple[UInt32, ...]:
+    """``Geometry.lanes``; of many numbers of vertices only the largest."""
+    counts = sorted({info.vertex_count for info in shapes})[-_MOST_LANES:]
+    widths = sorted({width for count in counts for width in (count, 3 * count)})
+    return tuple(device_array(mi.UInt32, np.zeros(width, np.uint32)) for width in widths)
 
 
 def pack_face_info(shapes: tuple[ShapeInfo, ...]) -> np.ndarray:

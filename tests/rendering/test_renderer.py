@@ -365,3 +365,35 @@ def test_renderings_that_are_dropped_leave_no_graph(variant: str) -> None:
         dr.eval(renderer.render(vertex_positions={"ball": moved * 1.0}))
         del moved
     assert attached() == before
+
+
+@pytest.mark.parametrize("flat", [False, True], ids=["points", "numbers"])
+@pytest.mark.parametrize("factor", [0.3, 2.0])
+def test_recorded_steps_with_another_number_of_vertices_are_refused(variant: str, factor: float, flat: bool) -> None:
+    """They would write behind the end of an array, and end the process."""
+    renderer, name = renderer_of(), "ball"
+    rest = np.array(renderer.vertices(name))
+
+    @dr.freeze
+    def step(rest: Any, offset: Any, renderer: Any) -> Any:
+        dr.enable_grad(offset)
+        moved = rest + (offset.x if flat else offset)
+        image = renderer.render(vertex_positions={name: moved})
+        dr.backward(dr.mean(image, axis=None))
+        return dr.grad(offset)
+
+    def run(x: float, count: int = rest.shape[1]) -> Any:
+        values = np.resize(rest, (3, count)) if count != rest.shape[1] else rest
+        # Memory of Dr.Jit's own: it borrows NumPy's.
+        points = (mi.Float(values.T.ravel()) if flat else mi.Point3f(values)) * dr.opaque(mi.Float, 1)
+        offset = mi.Vector3f(x)
+        dr.make_opaque(points, offset)
+        return step(points, offset, renderer)
+
+    for x in (0.0, 0.01, 0.02, 0.03):
+        run(x)
+    assert step.n_recordings <= 2
+    with pytest.raises(RuntimeError) as error:
+        run(0.04, int(factor * rest.shape[1]))
+    assert "vertices" in str(error.value.__cause__)
+    assert np.isfinite(run(0.05)).all()

@@ -116,7 +116,8 @@ def _verdict(records: Sequence[dict[str, Any]]) -> str:
         return "failed"
     error = f"{_short(first['rotation_error_deg'])}°"
     offset = first["translation_error_x100"] / 100
-    end = f"{'found' if first['recovered'] else 'not found'}: {error}, {offset:.{3 if offset > 0.01 else 4 if offset >= 5e-5 else 5}f} units off"
+    digits = 3 if offset > 0.01 else 4 if offset >= 5e-5 else 5
+    end = f"{'found' if first['recovered'] else 'not found'}: {error}, {offset:.{digits}f} units off"
     if len(records) > 1:
         end = f"found {found} of {len(records)}; here {error} off"
     curve = first.get("seconds_curve")

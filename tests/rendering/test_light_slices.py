@@ -127,7 +127,7 @@ def assert_close(found: np.ndarray, expected: np.ndarray, tolerance: float = 2e-
 @pytest.mark.parametrize("name", SCENES)
 def test_slices_do_not_show(variant: str, name: str, options: dict[str, Any]) -> None:
     whole, sliced = Case(name, **options), Case(name, light_memory=LITTLE, **options)
-    for spp in (1, 1, 4):  # the second image finds results of the first
+    for spp in (1, 1) if options else (1, 1, 4):  # the second image finds results of the first
         (image, gradients), (other, others) = whole.reverse(spp), sliced.reverse(spp)
         assert_close(other, image)
         for key, gradient in gradients.items():

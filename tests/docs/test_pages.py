@@ -36,6 +36,7 @@ PROMISES = {
     "how-to/cameras.md": [("optimiser['camera.x_fov'] - true_fov", 1.0), ("shift", 0.05)],
     "how-to/scene-and-photo.md": [("direction - mi.Vector3f(-0.25, 0.5, -0.83)", 0.03)],
     "how-to/sweeps.md": [("np.array(records[0]['final']) - [1, -0.5]", 0.1)],
+    "reference/inverse.md": [("history.final - [0.2, 0.1, -0.1]", 0.05)],
     "how-to/visibility.md": [("np.array(sorted(names)) != ['depth', 'visibility.bulb', 'visibility.sun']", 0)],
 }
 
@@ -56,13 +57,25 @@ def names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str,
 
 @pytest.mark.parametrize("page", PAGES)
 def test_code_runs(page: str, names: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
-    """All blocks of a page, one after the other. Blocks that need PyTorch are left out without it."""
-    with_torch = importlib.util.find_spec("torch") is not None
+    """All blocks of a page, one after the other. Blocks that need PyTorch or OpenCV are left out without it."""
+    with_torch, with_opencv = (importlib.util.find_spec(name) is not None for name in ("torch", "cv2"))
     for number, block in enumerate(PAGES[page]):
-        if with_torch or not ("torch" in block or "sdr." in block):
+        if (with_torch or not ("torch" in block or "sdr." in block)) and (with_opencv or "cameras.undistort" not in block):
             exec(compile(block, f"docs/{page}, block {number}", "exec", dont_inherit=True), names)
     for expression, bound in PROMISES.get(page, []):
         assert np.all(np.abs(np.array(eval(expression, {"np": np, "mi": mi, **names}), np.float64)) <= bound), expression
+
+
+def test_all_public_names_have_an_example() -> None:
+    """On the page of the reference that describes them."""
+    count, without = 0, []
+    for path in sorted((DOCS / "reference").glob("*.md")):
+        text = path.read_text(encoding="utf-8")
+        code = "\n".join(BLOCK.findall(text))
+        for name in re.findall(r"^\.\. auto(?:function|class|exception):: ([\w.]+)", text, re.MULTILINE):
+            count += 1
+            without += [] if re.search(rf"\b{name.rpartition('.')[2]}\b", code) else [f"{path.name}: {name}"]
+    assert count > 70 and not without
 
 
 def test_promises_are_of_pages_that_exist() -> None:

@@ -1,7 +1,7 @@
 """The slow tests, which ``pytest -m "not slow"`` leaves out, from a measurement.
 
     python -m pytest -n 2 --dist loadfile --junitxml=times.xml tests
-    python -m tests.slow times.xml [--above 0.3]
+    python -m tests.slow times.xml [--above 0.15]
 
 writes ``slow.txt``: each test function whose cases take longer than so many seconds on average, and all tests of modules in which
 the first case makes the results of the others.
@@ -16,7 +16,7 @@ from collections import defaultdict
 from pathlib import Path
 
 LIST = Path(__file__).with_name("slow.txt")
-_ABOVE = 0.3
+_ABOVE = 0.15
 # Modules whose cases share results.
 _SHARED = ("integrator/test_broken_scenes.py", "integrator/test_gradients.py")
 

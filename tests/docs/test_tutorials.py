@@ -29,7 +29,7 @@ PARAMETERS: dict[str, dict[str, Any]] = {
         "resolution": 32, "steps": 9, "fine_steps": 4, "reference_samples": 32, "subdivisions": 3, "picture_size": 32,
         "distance_samples": 2000, "integrator": FEW,
     },
-    "curve": {"resolution": 48, "steps": 30, "reference_samples": 128, "check_samples": 32, "integrator": FEW},
+    "curve": {"resolution": 48, "steps": 40, "reference_samples": 128, "check_samples": 32, "integrator": FEW},
     "torch": {"resolution": 32, "steps": 8, "batch": 2, "subdivisions": 3, "reference_samples": 8, "picture_size": 32},
     "sun": {"resolution": 32, "steps": 8, "texels": 20, "reference_samples": 32},
     "art": {"resolution": 64, "rings": 12, "steps": 80, "picture_size": 32, "picture_samples": 2},

@@ -334,34 +334,26 @@ def from_sensor(sensor: Any) -> Camera:  # Any: a sensor of any variant, or a re
 
 def rotation_from_vector(vector: npt.ArrayLike) -> Array:
     """The rotation (3, 3) about a vector (3,) by its length in radians (Rodrigues' formula; ``cv2.Rodrigues``)."""
+    from trimesh.transformations import rotation_matrix
+
     axis = _array(vector, (3,), "A rotation vector")
     angle = float(np.linalg.norm(axis))
-    if angle == 0:
-        return np.eye(3)
-    x, y, z = axis / angle
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+    return np.eye(3) if angle == 0 else np.array(rotation_matrix(angle, axis)[:3, :3])
 
 
 def rotation_from_quaternion(quaternion: npt.ArrayLike) -> Array:
     """The rotation (3, 3) of a quaternion (w, x, y, z) of any length but 0."""
+    from trimesh.transformations import quaternion_matrix
+
     values = _array(quaternion, (4,), "A quaternion")
-    length = float(np.linalg.norm(values))
-    if not length:
+    if not values.any():
         raise ShadowmapError("A quaternion is zero, which is no rotation.")
-    w, x, y, z = values / length
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return np.array(quaternion_matrix(values / np.linalg.norm(values))[:3, :3])
 
 
-def _number(value: object, who: str, what: str) -> float:
+def _number(value: Any, who: str, what: str) -> float:  # Any: a number of any library, or none
     try:
-        number = float(value)  # type: ignore[arg-type]
+        number = float(value)
     except (TypeError, ValueError):
         raise ShadowmapError(f"{who}: {what} is {value!r}: give a number.") from None
     if not math.isfinite(number):

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..errors import ShadowmapError
 from ..io.files import check_readable
-from ..io.images import check_size
+from ..io.images import check_size, to_linear
 from ..io.meshes import MOST_BYTES, MOST_TRIANGLES, read_placed_mesh
 from . import gltf
 from .model import Array, Material, Model, Part, Picture, PlacedCamera, PlacedLight
@@ -236,8 +236,3 @@ def _scaled(channel: Picture, factor: float) -> Picture | float:
     """Bytes times a factor; a number where all are equal."""
     values = np.clip(np.rint(channel * factor), 0, 255).astype(np.uint8)
     return float(values.flat[0]) / 255 if values.min() == values.max() else values
-
-
-def to_linear(srgb: Array) -> Array:
-    """Linear values of sRGB ones (IEC 61966-2-1)."""
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)

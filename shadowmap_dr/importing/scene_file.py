@@ -13,6 +13,7 @@ from xml.etree import ElementTree as Xml
 import numpy as np
 
 from ..io.files import atomic, make_folder
+from ..io.images import to_linear, to_srgb
 from .model import Array, Material, Model, Part, Picture, PlacedCamera, PlacedLight
 from .options import ImportOptions
 
@@ -326,7 +327,4 @@ def _multiplied(picture: Picture, factor: Array) -> Picture:
     """An sRGB picture times a linear colour."""
     if np.allclose(factor, 1):
         return picture
-    from ..io.images import to_srgb
-    from .reader import to_linear
-
     return np.rint(255 * to_srgb(to_linear(picture / 255.0) * factor)).astype(np.uint8)

@@ -153,6 +153,12 @@ def _single(image: Array) -> npt.NDArray[np.float32]:
         return np.asarray(image, dtype=np.float32)
 
 
+def to_linear(srgb: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """Linear values of sRGB values in [0, 1] (IEC 61966-2-1)."""
+    x = np.asarray(srgb, np.float64)
+    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
+
+
 def to_srgb(linear: Array) -> npt.NDArray[np.float32]:
     """sRGB transfer curve (IEC 61966-2-1) of linear values, clipped to [0, 1]."""
     x = np.clip(_single(linear), 0, 1)

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from ...inverse.faces.morphable import MorphableModel
 from ...io import meshes, plot_style, plots
-from ...io.images import to_srgb
+from ...io.images import to_linear, to_srgb
 from ...scene.mitsuba_meshes import make_mesh
 from .metrics import distances
 
@@ -84,8 +84,7 @@ def picture(
     if error is None:
         colours = np.full((len(p), 3), _GREY)
     else:
-        encoded = colormaps[plot_style.SEQUENTIAL](np.clip(np.asarray(error) / COLOUR_END, 0, 1))[:, :3]
-        colours = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+        colours = to_linear(colormaps[plot_style.SEQUENTIAL](np.clip(np.asarray(error) / COLOUR_END, 0, 1))[:, :3])
     mesh = _mesh(p, f)
     mesh.add_attribute("vertex_paint", 3, np.ascontiguousarray(colours, np.float32).ravel())
     mesh.set_bsdf(

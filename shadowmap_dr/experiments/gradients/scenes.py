@@ -12,6 +12,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
+from trimesh.transformations import rotation_matrix
 
 from ...errors import ShadowmapError, did_you_mean
 from ..common.meshes import Mesh, subdivided, torus
@@ -171,11 +172,6 @@ def _turned(points: npt.NDArray[Any], vector_deg: tuple[float, float, float]) ->
 
 
 def _rotation(vector: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    """(3, 3) matrix of a rotation vector (Rodrigues)."""
-    v = np.asarray(vector, np.float64)
-    angle = float(np.linalg.norm(v))
-    if angle == 0:
-        return np.eye(3)
-    x, y, z = v / angle
-    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
+    """(3, 3) matrix of a rotation vector, radians."""
+    angle = float(np.linalg.norm(vector))
+    return np.array(rotation_matrix(angle, vector)[:3, :3]) if angle else np.eye(3)

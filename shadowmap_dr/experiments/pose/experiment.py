@@ -160,7 +160,6 @@ def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Co
     problems = {
         problem.folder: (name, problem)
         for name in options.objects
-        for normals in [options.normals_of(name)]
         for resolution in options.resolutions
         for problem in [
             make_problem(
@@ -218,8 +217,8 @@ def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Co
                     record["reasons"] = reasons(record, problem)
                     final = record["final"] if None not in record["final"] else start_pose(options.seed, run)
                     pictures = _pictures(methods[name], record["start"], final, reference)
-                    for title_, image in pictures.items():
-                        io_images.write_png(out / problem.folder / f"{name}-run{run}-{title_}.png", image)
+                    for part, image in pictures.items():
+                        io_images.write_png(out / problem.folder / f"{name}-run{run}-{part}.png", image)
                     if run == 0:
                         images[name] = pictures
                     records.append(record)

@@ -147,7 +147,7 @@ def setting_text(method: Method, problem: PoseProblem) -> str:
     counts = f"{setting.sppc}/{setting.sppp}/{setting.sppi}"
     guiding = "no guiding" if setting.guiding == "none" else f"guiding {setting.guiding}"
     found = (
-        "the cheapest setting that a search found to converge"
+        "the cheapest setting with which a search found three of three starts"
         if fairness(method, problem)["fair"]
         else "not shown to converge here"
     )

@@ -30,7 +30,7 @@ NOT_READ: Any = None  # Any: stands for buffers of several types, until ``load.r
 # Shape indices are compared with each index of a list up to this length. Longer lists cost more than they save.
 _MANY_SHAPES = 8
 # Numbers of vertices, the largest, to which recordings hold new positions.
-_MOST_LANES = 64
+_MOST_GUARDS = 64
 
 HAS_NORMALS = 1
 HAS_TEXCOORDS = 2
@@ -109,8 +109,8 @@ class Geometry:
                    those without faces, take the position of another vertex of their shape and so stretch no bounds (``settled``)
     packets        Float (4V,), positions padded to four numbers, through which derivatives flow back (``in_packets``)
     copies         number of copies of packets, normals and texture coordinates in their buffers, one for each block of lanes
-    lanes          UInt32 (Vs,) or (3Vs,) each, zeros: two arrays for each number of vertices that shapes have. Recordings hold
-                   new positions against them (``bound``)
+    size_guards    UInt32 (Vs,) or (3Vs,) each, zeros: two arrays for each number of vertices that shapes have. Recordings add
+                   them to new positions (``bound``)
     """
 
     positions: Float
@@ -128,7 +128,7 @@ class Geometry:
     stand_ins: UInt32 | None = None
     packets: Float | None = None
     copies: int = 1
-    lanes: tuple[UInt32, ...] = ()
+    size_guards: tuple[UInt32, ...] = ()
 
     @property
     def vertex_count(self) -> int:
@@ -256,8 +256,8 @@ class Geometry:
         """
         if not dr.flag(dr.JitFlag.FreezingScope):
             return value
-        held = next((lane for lane in self.lanes if dr.width(lane) == dr.width(value)), None)
-        return value if held is None else value + mi.Float(held)
+        guard = next((zeros for zeros in self.size_guards if dr.width(zeros) == dr.width(value)), None)
+        return value if guard is None else value + mi.Float(guard)
 
     def settled(self, positions: Float) -> Float:
         """Positions (Float, 3V) in which each vertex without faces has moved to its stand-in."""
@@ -326,9 +326,9 @@ def stand_ins(
     return np.where(used, np.arange(len(used)), visible[vertex_shape]).astype(np.uint32)
 
 
-def lanes_of(shapes: tuple[ShapeInfo, ...]) -> tuple[UInt32, ...]:
-    """``Geometry.lanes``; of many numbers of vertices only the largest."""
-    counts = sorted({info.vertex_count for info in shapes})[-_MOST_LANES:]
+def size_guards_of(shapes: tuple[ShapeInfo, ...]) -> tuple[UInt32, ...]:
+    """``Geometry.size_guards``; of many numbers of vertices only the largest."""
+    counts = sorted({info.vertex_count for info in shapes})[-_MOST_GUARDS:]
     widths = sorted({width for count in counts for width in (count, 3 * count)})
     return tuple(device_array(mi.UInt32, np.zeros(width, np.uint32)) for width in widths)
 
@@ -377,9 +377,12 @@ def _write_vertices(target: Float, value: Float | Point3f, start: int, count: in
     if start == 0 and count == total:
         return ravel(value) if points and dr.width(value) == count else _fill(value, count)
     result = type(target)(target)
-    index = dr.arange(mi.UInt32, count if points else 3 * count) + (start if points else 3 * start)
+    each = 1 if points else 3
+    index = dr.arange(mi.UInt32, each * count) + each * start
+    # Not all shapes have a size guard: a replay with more vertices must not write behind those of its shape.
+    within = index < each * (start + count) if dr.flag(dr.JitFlag.FreezingScope) else True
     # Not ``Permute``: that promises that all of the target is written, and its gradient would be dropped.
-    dr.scatter(result, value, index, mode=dr.ReduceMode.NoConflicts)
+    dr.scatter(result, value, index, within, mode=dr.ReduceMode.NoConflicts)
     return result
 
 

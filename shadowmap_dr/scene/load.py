@@ -20,7 +20,7 @@ from ..errors import ShadowmapError, UnsupportedShape, check_variant
 from ..jit.arrays import device_array
 from ..jit.types import Float
 from .descriptions import Parts, describe_all
-from .geometry import NOT_READ, Geometry, ShapeInfo, lanes_of, pack_face_info, stand_ins
+from .geometry import NOT_READ, Geometry, ShapeInfo, pack_face_info, size_guards_of, stand_ins
 from .lights.area import AreaLight
 from .lights.environment import Environment
 from .lights.read import Light, area_lights_of, check_directions, environments_of, lights_of
@@ -164,7 +164,7 @@ def load(scene: mi.Scene, *, tessellation: int = 64, warn: bool = True) -> Scene
         shape_face_start=device_array(mi.UInt32, [i.face_start for i in infos]),
         shapes=infos,
         stand_ins=None if settled is None else device_array(mi.UInt32, settled),
-        lanes=lanes_of(infos),
+        size_guards=size_guards_of(infos),
     )
     bsdfs = [source.shape.bsdf() for source in sources]
     different = list(dict.fromkeys(bsdfs))

@@ -397,3 +397,24 @@ def test_recorded_steps_with_another_number_of_vertices_are_refused(variant: str
         run(0.04, int(factor * rest.shape[1]))
     assert "vertices" in str(error.value.__cause__)
     assert np.isfinite(run(0.05)).all()
+
+
+def test_recorded_steps_of_shapes_without_size_guards_stay_within_their_shape(variant: str) -> None:
+    """Scenes of very many sizes guard the largest shapes only: more vertices than recorded change no other memory."""
+    renderer, name = renderer_of(), "ball"
+    renderer.data = replace(renderer.data, geometry=replace(renderer.data.geometry, size_guards=()))
+    rest = np.array(renderer.vertices(name))
+
+    @dr.freeze
+    def image(points: Any, renderer: Any) -> Any:
+        return renderer.render(vertex_positions={name: points + 0.01})
+
+    def run(count: int) -> Any:
+        points = mi.Point3f(np.resize(rest, (3, count)) if count != rest.shape[1] else rest) * dr.opaque(mi.Float, 1)
+        dr.make_opaque(points)
+        return np.array(image(points, renderer))
+
+    count = rest.shape[1]
+    expected = [run(count) for _ in range(3)][-1]
+    run(100 * count)
+    np.testing.assert_array_equal(run(count), expected)

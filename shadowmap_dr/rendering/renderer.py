@@ -231,8 +231,8 @@ class Renderer:
             vertex_positions: new world-space vertices by the name of their shape: ``Float`` (3V,), tensor (V, 3) or ``Point3f``.
             lights: new records by the name of the light (start from ``renderer.light(name)`` and ``dataclasses.replace``).
             sensor: number of the scene's sensor, or a camera record.
-            spp: samples per pixel, a grid of ``ceil(sqrt(spp)) ** 2``, at most 16 x 16 and
-                4096 along the longer side of the image. Each is anti-aliased.
+            spp: samples per pixel, rounded up to a square grid: 5 are 3 x 3. More than 16 x 16, or than 4096 along the longer
+                side of the image, are lowered to these. Each sample is anti-aliased.
             cache: results of earlier passes that still hold, with the same ``spp``, for the scene as it is. The image leaves its
                 own there. Only without ``vertex_positions`` and ``lights``, and not in recordings.
 

@@ -60,7 +60,7 @@ def test_code_runs(page: str, names: dict[str, Any], capsys: pytest.CaptureFixtu
     """All blocks of a page, one after the other. Blocks that need PyTorch or OpenCV are left out without it."""
     with_torch, with_opencv = (importlib.util.find_spec(name) is not None for name in ("torch", "cv2"))
     for number, block in enumerate(PAGES[page]):
-        if (with_torch or not ("torch" in block or "sdr." in block)) and (with_opencv or "cameras.undistort" not in block):
+        if (with_torch or not re.search(r"\b(torch|sdr)\b", block)) and (with_opencv or "cameras.undistort" not in block):
             exec(compile(block, f"docs/{page}, block {number}", "exec", dont_inherit=True), names)
     for expression, bound in PROMISES.get(page, []):
         assert np.all(np.abs(np.array(eval(expression, {"np": np, "mi": mi, **names}), np.float64)) <= bound), expression

@@ -224,6 +224,7 @@ class Renderer:
         sensor: int | Sensor = 0,
         spp: int = 1,
         cache: PassCache | None = None,
+        transforms: Mapping[str, Any] | None = None,
     ) -> TensorXf:
         """Render an image.
 
@@ -234,7 +235,10 @@ class Renderer:
             spp: samples per pixel, rounded up to a square grid: 5 are 3 x 3. More than 16 x 16, or than 4096 along the longer
                 side of the image, are lowered to these. Each sample is anti-aliased.
             cache: results of earlier passes that still hold, with the same ``spp``, for the scene as it is. The image leaves its
-                own there. Only without ``vertex_positions`` and ``lights``, and not in recordings.
+                own there. Only without ``vertex_positions``, ``transforms`` and ``lights``, and not in recordings.
+            transforms: affine maps of world space by the name of the shape that they move: ``Transform4f`` or ``Matrix4f``. Vertex
+                normals move along, whereas those of ``vertex_positions`` are computed from the new vertices. Of shapes that have
+                both, the new vertices are moved.
 
         Returns:
             ``mi.TensorXf`` (H, W, C): linear colour (1 or 3 channels, as the film), then alpha if the film has it, then the AOVs.
@@ -249,6 +253,8 @@ class Renderer:
         if vertex_positions is not None:
             geometry = geometry.with_positions(vertex_positions)
             _warn_of_lost_vertices(geometry, vertex_positions)
+        if transforms is not None:
+            geometry = geometry.with_transforms(transforms)
         windows = sample_windows(cameras)
         factor = sample_grid(spp, windows)
         margin = Margin.of(cameras, factor) if self.settings.antialias else Margin()

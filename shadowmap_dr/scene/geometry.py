@@ -19,7 +19,7 @@ import numpy.typing as npt
 from ..errors import ShadowmapError
 from ..jit.arrays import backend, device_array, ravel, replace_grad
 from ..jit.broadcast import copy_of_lane, in_copies
-from ..jit.types import AnyArray, Bool, Float, Point3f, UInt32, Vector3u
+from ..jit.types import AnyArray, Bool, Float, Matrix4f, Point3f, UInt32, Vector3f, Vector3u
 from ..jit.vectors import normalize_or
 
 NO_TRIANGLE = 0xFFFFFFFF
@@ -248,6 +248,37 @@ class Geometry:
                 normals = _write_vertices(normals, outward, info.vertex_start, info.vertex_count, self.vertex_count)
         return replace(self, positions=self.settled(merged), normals=normals, changed=changed, packets=None)
 
+    def with_transforms(self, transforms: Mapping[str, Matrix4f | mi.Transform4f]) -> Geometry:
+        """A new Geometry in which some shapes have moved as a whole.
+
+        Args:
+            transforms: by the name of the shape, an affine map (Matrix4f of width 1, or Transform4f) of world space, applied to the
+                current vertices. Vertex normals move along instead of being computed anew. Attached.
+
+        Raises:
+            ShadowmapError: a name that is not the scene's; a value that is no transformation.
+        """
+        if not isinstance(transforms, Mapping):
+            raise ShadowmapError(f"transforms is a {type(transforms).__name__}: give a dictionary of the shapes' names.")
+        if not transforms:
+            return self
+        positions, normals, changed = self.positions, self.normals, self.changed
+        if changed is None and not dr.grad_enabled(positions, normals):
+            changed = ()
+        if changed is not None:
+            changed = tuple(sorted({*changed, *transforms}))
+        for name, value in transforms.items():
+            info, matrix = self.shape(name), _checked_matrix(name, value)
+            where = info.vertex_start, info.vertex_count, self.vertex_count
+            own = dr.arange(mi.UInt32, info.vertex_count) + info.vertex_start
+            # Twelve numbers that all vertices share: evaluated once.
+            dr.eval(matrix)
+            positions = _write_vertices(positions, _moved(matrix, dr.gather(mi.Point3f, positions, own)), *where)
+            if info.has_normals:
+                turned = _turned(matrix, dr.gather(mi.Vector3f, normals, own))
+                normals = _write_vertices(normals, mi.Point3f(turned), *where)
+        return replace(self, positions=self.settled(positions), normals=normals, changed=changed, packets=None)
+
     def bound(self, value: Float | Point3f) -> Float | Point3f:
         """New positions of a shape, in a recording held to their number: a replay with another number is an error of Dr.Jit's.
 
@@ -369,6 +400,33 @@ def _checked_positions(name: str, value: AnyArray | npt.ArrayLike, count: int) -
             f"Positions of shape '{name}' are an array of {dr.width(array)} numbers, but {count} vertices need {3 * count}."
         )
     return mi.Float(array)
+
+
+def _checked_matrix(name: str, value: Matrix4f | mi.Transform4f | npt.ArrayLike) -> Matrix4f:
+    """The map of a shape as Matrix4f."""
+    value = getattr(value, "matrix", value)
+    try:
+        matrix = mi.Matrix4f(value if dr.is_array_v(value) else mi.ScalarMatrix4f(np.asarray(value, np.float64).tolist()))
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ShadowmapError(f"transforms['{name}'] is a {type(value).__name__}: give a Transform4f or a 4 x 4 matrix.") from error
+    if dr.width(matrix) != 1:
+        raise ShadowmapError(f"transforms['{name}'] holds {dr.width(matrix)} transformations: give one.")
+    return matrix
+
+
+def _moved(matrix: Matrix4f, p: Point3f) -> Point3f:
+    """Points after an affine map."""
+    x, y, z = (
+        dr.fma(matrix[row, 0], p.x, dr.fma(matrix[row, 1], p.y, dr.fma(matrix[row, 2], p.z, matrix[row, 3]))) for row in range(3)
+    )
+    return mi.Point3f(x, y, z)
+
+
+def _turned(matrix: Matrix4f, n: Vector3f) -> Vector3f:
+    """Unit normals after an affine map. Where the map mirrors faces, it mirrors normals, too."""
+    a, b, c = (mi.Vector3f(matrix[0, k], matrix[1, k], matrix[2, k]) for k in range(3))
+    turned = n.x * dr.cross(b, c) + n.y * dr.cross(c, a) + n.z * dr.cross(a, b)  # by the cofactors
+    return normalize_or(turned, mi.Vector3f(1.0, 0.0, 0.0))
 
 
 def _write_vertices(target: Float, value: Float | Point3f, start: int, count: int, total: int) -> Float:

@@ -1,0 +1,103 @@
+"""Minimisation by Levenberg and Marquardt's method, for few numbers and many residuals.
+
+Source: Nocedal and Wright, "Numerical Optimization", 2006, section 10.3; Marquardt's scaling by the diagonal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+# Damping: at first, after success and failure, least and most.
+_DAMPING, _BETTER, _WORSE, _LEAST, _MOST = 1e-3, 0.2, 5.0, 1e-9, 1e4
+
+
+class Residuals(Protocol):
+    """A point of an objective. ``x`` (n,); ``cost``: the loss."""
+
+    x: Array
+    cost: float
+
+    def system(self) -> tuple[Array, Array]:
+        """(matrix (n, n), right side (n,)) of the normal equations."""
+
+
+P = TypeVar("P", bound=Residuals)
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Limits of a minimisation.
+
+    Attributes:
+        low, high: bounds (n,) of the numbers.
+        longest: largest change of a number in a step.
+        steps: most steps.
+        improvement: share of the cost; a step that improves less is the last.
+        shortest: steps in which no number changes more are the last.
+    """
+
+    low: Array
+    high: Array
+    longest: float = 0.3
+    steps: int = 10
+    improvement: float = 1e-4
+    shortest: float = 1e-5
+
+
+def minimise(
+    at: Callable[[Array], P], start: P, limits: Limits, accepted: Callable[[P], None] = lambda point: None
+) -> tuple[P, bool]:
+    """Minimise a loss from a point on.
+
+    Args:
+        at: the point at given numbers.
+        start: the first point.
+        limits: bounds and ends.
+        accepted: called with each better point.
+
+    Returns:
+        (best point, True if the steps had become small).
+    """
+    point, damping = start, _DAMPING
+    for _ in range(limits.steps):
+        matrix, right = point.system()
+        while True:
+            step = _step(matrix, right, damping, point.x, limits)
+            if np.abs(step).max(initial=0) < limits.shortest:
+                return point, True
+            candidate = at(point.x + step)
+            if candidate.cost < point.cost:
+                break
+            if candidate.cost < point.cost * (1 + limits.improvement):
+                return point, True  # the differences are those of rounding, and of shadow maps that were fitted anew
+            damping *= _WORSE
+            if damping > _MOST:
+                return point, True
+        damping = max(damping * _BETTER, _LEAST)
+        gained = (point.cost - candidate.cost) / max(point.cost, 1e-300)
+        point = candidate
+        accepted(point)
+        if gained < limits.improvement:
+            return point, True
+    return point, False
+
+
+def _step(matrix: Array, right: Array, damping: float, x: Array, limits: Limits) -> Array:
+    """A damped step within the bounds. Numbers at a bound that the loss pushes outwards stay."""
+    free = ~(((x <= limits.low) & (right > 0)) | ((x >= limits.high) & (right < 0)))
+    diagonal = np.diag(matrix).copy()
+    # Numbers that move nothing get no step, and make no matrix singular.
+    diagonal = np.maximum(diagonal, 1e-9 * max(diagonal.max(initial=0), 1e-30))
+    step = np.zeros_like(x)
+    if free.any():
+        damped = matrix[np.ix_(free, free)] + np.diag(damping * diagonal[free] + 1e-12 * diagonal[free])
+        step[free] = -np.linalg.solve(damped, right[free])
+    step *= min(1.0, limits.longest / max(np.abs(step).max(initial=0), 1e-300))
+    return np.clip(x + step, limits.low, limits.high) - x

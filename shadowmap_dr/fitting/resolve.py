@@ -1,0 +1,244 @@
+"""Parameters of a scene by the names that users write."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import ShadowmapError, did_you_mean
+from ..rendering.renderer import Renderer
+from .motions import tangents
+from .parameters import CameraMotion, FieldOfView, LightMotion, Parameter, ShapeMotion, Value
+from .vary import Vary
+
+Array = npt.NDArray[np.float64]
+
+_AXES = "xyz"
+# Fields of lights' records by the ends of Mitsuba's names.
+_FIELDS = {
+    "irradiance.value": "irradiance",
+    "intensity.value": "intensity",
+    "cutoff_angle": "cutoff_angle",
+    "beam_width": "beam_width",
+}
+# Values between zero and one, by words of their names; other values that are positive stay positive.
+_SHARES = (
+    *("reflectance", "base_color", "albedo", "metallic", "specular_tint", "clearcoat", "sheen", "spec_tint", "flatness"),
+    *("opacity", "weight", "spec_trans", "transmittance", "specular"),
+)
+_ROUGHNESS = ("alpha", "roughness")
+# Most numbers of one value that are fitted by their full matrix of derivatives.
+_MOST = 16
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An object or value of a scene that can vary: its name, its kinds, and its present value in words."""
+
+    name: str
+    kinds: tuple[str, ...]
+    value: str
+
+
+class Resolver:
+    """The objects and values of one scene by name.
+
+    Args:
+        renderer: the renderer of the scene.
+    """
+
+    def __init__(self, renderer: Renderer) -> None:
+        self.renderer = renderer
+        self.shapes = [info.name for info in renderer.data.geometry.shapes]
+        self.lights = [light.name for light in renderer.data.lights]
+        self.emitting = {self.shapes[area.shape]: area for area in renderer.data.areas}
+        self.skies = {sky.name: sky for sky in renderer.data.environments}
+        self.sensors = {cameras[0].name: k for k, cameras in enumerate(renderer.data.sensors) if len(cameras) == 1}
+        self.table = mi.traverse(renderer.data.scene)
+        # Names alone: to list a table loads values, which may be large.
+        self.keys = list(self.table.properties)
+        with dr.suspend_grad():
+            points = np.array(dr.detach(renderer.data.geometry.positions)).reshape(-1, 3).astype(np.float64)
+        self._points = points
+        self.middle, self.diameter = _bounds(points)
+
+    def parameter(self, vary: Vary) -> Parameter:
+        """The parameter of an entry.
+
+        Raises:
+            ShadowmapError: The scene has no such object or value, or it has no such kind; with the nearest known name.
+        """
+        name = vary.name
+        matched = [shape for shape in self.shapes if shape == name or fnmatchcase(shape, name)]
+        if vary.kind in ("value", "brightness", "sky") or not (matched or name in self.lights or name in self.sensors):
+            return self._value(vary)
+        if matched:
+            return self._shape(vary, matched)
+        return self._light(vary) if name in self.lights else self._sensor(vary)
+
+    def candidates(self) -> list[Candidate]:
+        """All that can vary."""
+        found = [Candidate(name, ("pose", "rotation", "translation", "scale", "vertices"), "shape") for name in self.shapes]
+        for light in self.renderer.data.lights:
+            kinds = tuple(self._light_kinds(light))
+            if kinds:
+                found.append(Candidate(light.name, kinds, type(light).__name__))
+        found += [Candidate(name, ("pose", "rotation", "translation", "fov"), "camera") for name in self.sensors]
+        for key in self.keys:
+            array = self._numbers(key)
+            if array is not None:
+                kind = ("value", "brightness") if len(array) == 3 else ("value",)
+                found.append(Candidate(key, kind if len(array) <= _MOST else ("texture",), _shown(array)))
+        return found
+
+    # ------------------------------------------------------------------------------------------------------ shapes
+
+    def _shape(self, vary: Vary, shapes: Sequence[str]) -> Parameter:
+        kind = vary.kind or "pose"
+        axes = vary.axes or _AXES
+        parts = {
+            "pose": ("rx", "ry", "rz", "tx", "ty", "tz"),
+            "rotation": tuple(f"r{axis}" for axis in axes),
+            "translation": tuple(f"t{axis}" for axis in axes),
+            "position": tuple(f"t{axis}" for axis in axes),
+            "scale": ("s",),
+        }.get(kind)
+        if parts is None:
+            raise _no_kind(vary, "a shape", ("pose", "rotation", "translation", "scale", "vertices"))
+        infos = [self.renderer.data.geometry.shape(shape) for shape in shapes]
+        points = np.concatenate([self._points[info.vertex_start : info.vertex_start + info.vertex_count] for info in infos])
+        middle, diameter = _bounds(points)
+        return ShapeMotion(vary, tuple(shapes), middle, diameter or self.diameter, parts)
+
+    # ------------------------------------------------------------------------------------------------------ lights, sensors
+
+    def _light_kinds(self, light: Any) -> list[str]:  # Any: one of several records
+        placed = hasattr(light, "to_world")
+        return [
+            *(["pose", "rotation"] if placed else []),
+            *(["direction"] if hasattr(light, "direction") else []),
+            *(["position"] if placed or hasattr(light, "position") else []),
+        ]
+
+    def _light(self, vary: Vary) -> Parameter:
+        light: Any = self.renderer.light(vary.name)
+        kinds = self._light_kinds(light)
+        kind = {"translation": "position"}.get(vary.kind, vary.kind) or (kinds[0] if len(kinds) == 1 else "")
+        if not kind and kinds:
+            kind = "direction" if kinds == ["direction"] else "pose"
+        if kind not in kinds:
+            raise _no_kind(vary, f"a {type(light).__name__}", (*kinds, "brightness"))
+        axes = vary.axes or _AXES
+        parts = {
+            "pose": ("rx", "ry", "rz", "tx", "ty", "tz"),
+            "rotation": tuple(f"r{axis}" for axis in axes),
+            "direction": ("a", "b"),
+            "position": tuple(f"t{axis}" for axis in axes),
+        }[kind]
+        direction = (
+            np.array(dr.detach(light.direction), np.float64).ravel() if hasattr(light, "direction") else np.array([0, 0, 1.0])
+        )
+        extent = self.diameter
+        if hasattr(light, "position"):
+            extent = float(np.linalg.norm(np.array(dr.detach(light.position), np.float64).ravel() - self.middle)) or self.diameter
+        return LightMotion(vary, vary.name, extent, parts, tangents(direction))
+
+    def _sensor(self, vary: Vary) -> Parameter:
+        number, kind = self.sensors[vary.name], vary.kind or "pose"
+        record = self.renderer.data.cameras(number)[0]
+        if kind == "fov":
+            if record.kind != "perspective":
+                raise ShadowmapError(f"vary {vary.label}: the sensor is orthographic and has no angle of view.")
+            return FieldOfView(vary, number, float(dr.detach(record.x_fov)[0]))
+        axes = vary.axes or _AXES
+        parts = {
+            "pose": ("rx", "ry", "rz", "tx", "ty", "tz"),
+            "rotation": tuple(f"r{axis}" for axis in axes),
+            "translation": tuple(f"t{axis}" for axis in axes),
+            "position": tuple(f"t{axis}" for axis in axes),
+        }.get(kind)
+        if parts is None:
+            raise _no_kind(vary, "a camera", ("pose", "rotation", "translation", "fov"))
+        place = np.array(dr.detach(record.origin), np.float64).ravel()
+        return CameraMotion(vary, number, float(np.linalg.norm(place - self.middle)) or self.diameter, parts)
+
+    # ------------------------------------------------------------------------------------------------------ values
+
+    def _value(self, vary: Vary) -> Parameter:
+        key = self._key(vary)
+        array = self._numbers(key)
+        if array is None:
+            raise ShadowmapError(f"vary {vary.label}: {key} is a {type(self.table[key]).__name__}, to which no derivatives flow.")
+        common = vary.kind in ("brightness", "sky")
+        if vary.kind not in ("", "value", "brightness", "sky"):
+            raise _no_kind(vary, "a value", ("value", "brightness"))
+        if len(array) > _MOST:
+            raise ShadowmapError(f"vary {vary.label}: {key} has {len(array)} values; give the kind texture.")
+        owner, _, end = key.partition(".")
+        light = owner if owner in self.lights and end in _FIELDS else ""
+        last = next((part for part in reversed(key.split(".")) if part not in ("value", "data")), key)
+        natural = (0.0, np.inf)
+        if end in ("cutoff_angle", "beam_width"):
+            natural = (0.1, 179.0)
+        elif any(word in last for word in _ROUGHNESS):
+            natural = (1e-3, 1.0)
+        elif any(word in last for word in _SHARES):
+            natural = (0.0, 1.0)
+        elif not (array > 0).all():
+            natural = (-np.inf, np.inf)
+        if common and not (array.max() > 0):
+            raise ShadowmapError(
+                f"vary {vary.label}: {key} is {_shown(array)}; a factor of zero changes nothing: give the kind value."
+            )
+        logarithmic = not common and natural == (0.0, np.inf) or natural == (0.1, 179.0)
+        bounds = (0.0, np.inf) if common else natural
+        unit = "deg" if end in ("cutoff_angle", "beam_width") else ""
+        return Value(vary, key, array, bounds, logarithmic, light, _FIELDS[end] if light else "", common, unit=unit)
+
+    def _key(self, vary: Vary) -> str:
+        """Mitsuba's name of the value of an entry."""
+        name = vary.name
+        tried = [name, f"{name}.value"]
+        if vary.kind in ("brightness", "sky", "value"):
+            tried += [f"{name}.{end}" for end in ("irradiance.value", "intensity.value", "radiance.value", "scale")]
+            tried += [f"{name}.emitter.radiance.value", f"{name}.bsdf.reflectance.value"]
+        for key in tried:
+            if key in self.keys:
+                return key
+        known = [*self.shapes, *self.lights, *self.sensors, *(key.removesuffix(".value") for key in self.keys)]
+        near = did_you_mean(name, known)
+        raise ShadowmapError(f"vary {vary.label}: the scene has no object or value {name!r}; --list lists all.{near}")
+
+    def _numbers(self, key: str) -> Array | None:
+        """The values (n,) of a parameter of Mitsuba's, None if no derivatives flow to it, or if it is a part of a mesh or a film."""
+        if key.endswith((".faces", ".vertex_positions", ".vertex_normals", ".vertex_texcoords", ".to_world", ".to_uv", ".x_fov")):
+            return None
+        if any(key.startswith(f"{name}.") for name in self.sensors):
+            return None
+        value = self.table[key]
+        if not (dr.is_array_v(value) and dr.is_float_v(value) and dr.is_diff_v(value)):  # transformations are no arrays
+            return None
+        return np.array(dr.detach(value), np.float64).ravel()
+
+
+def _bounds(points: Array) -> tuple[Array, float]:
+    """(middle, diagonal) of the bounding box of points (N, 3)."""
+    finite = points[np.isfinite(points).all(1)]
+    low, high = finite.min(0), finite.max(0)
+    return 0.5 * (low + high), float(np.linalg.norm(high - low))
+
+
+def _no_kind(vary: Vary, what: str, kinds: Sequence[str]) -> ShadowmapError:
+    return ShadowmapError(f"vary {vary.label}: '{vary.name}' is {what} and has the kinds {', '.join(kinds)}.")
+
+
+def _shown(values: Array) -> str:
+    text = ", ".join(f"{value:.4g}" for value in values[:4])
+    return text if len(values) <= 4 else f"{len(values):,} values"

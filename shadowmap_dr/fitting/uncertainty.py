@@ -1,0 +1,115 @@
+"""Intervals and correlations of fitted numbers, and the numbers that pictures do not determine.
+
+Residuals of a fit are no noise: most of them are errors of the model, alike at neighbouring pixels. Their covariance is estimated
+from sums over blocks of pixels (a "sandwich"; Liang and Zeger, "Longitudinal data analysis using generalized linear models", 1986),
+and errors that all of a picture shares are added: a displacement, a wrong brightness, missing light.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from .objective import Objective, Point
+
+Array = npt.NDArray[np.float64]
+
+# Pixels along each side of a block of residuals that may be alike.
+_BLOCK = 16
+#: Errors that a whole picture shares: displacement of its edges in pixels of the fit; shares of its brightness: factor, and offset.
+DISPLACEMENT, FACTOR, OFFSET = 0.15, 0.004, 0.002
+#: Factor of the blocks' covariance.
+INFLATION = 2.0
+# Quantile of 95 % intervals, both sides.
+_NORMAL = 1.96
+# Numbers with a wider interval, in the fit's own numbers, are not determined; correlations from which two are not told apart.
+_WIDEST, _ALIKE = 1.0, 0.98
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """Covariance (n, n) of the fit's numbers, and the numbers that move nothing.
+
+    Attributes:
+        covariance: of all numbers; rows of numbers that move nothing are zero.
+        idle: (n,) True for numbers that move nothing in the pictures.
+    """
+
+    covariance: Array
+    idle: npt.NDArray[np.bool_]
+
+    @property
+    def half_widths(self) -> Array:
+        """Halves (n,) of 95 % intervals in the fit's numbers, infinite where the pictures do not determine a number."""
+        half = _NORMAL * np.sqrt(np.maximum(np.diag(self.covariance), 0))
+        return np.where(self.idle | (half > _WIDEST) | ~np.isfinite(half), np.inf, half)
+
+    @property
+    def correlations(self) -> Array:
+        """Correlations (n, n), zero for numbers that move nothing."""
+        deviations = np.sqrt(np.maximum(np.diag(self.covariance), 1e-300))
+        found = self.covariance / np.outer(deviations, deviations)
+        found[self.idle] = found[:, self.idle] = 0
+        np.fill_diagonal(found, 1)
+        return np.clip(found, -1, 1)
+
+
+def uncertainty(point: Point, objective: Objective) -> Uncertainty:
+    """The uncertainty of a fit that ended at a point."""
+    matrix, _ = point.system()
+    total = 3 * objective.pixels
+    moved = np.sqrt(np.maximum(np.diag(matrix - np.diag(objective.precision)), 0))
+    # Shares of the brightness that a change of a number by one makes.
+    idle = moved < 1e-6
+    inverse = _inverse(matrix * total, idle)
+    scores = _scores(point, objective)
+    covariance = INFLATION * inverse @ scores @ inverse
+    for error in _shared_errors(point, objective):
+        shift = inverse @ error
+        covariance += np.outer(shift, shift)
+    return Uncertainty(covariance, idle)
+
+
+def not_told_apart(found: Uncertainty) -> list[tuple[int, int]]:
+    """Pairs of numbers that have nearly the same effect, or the opposite one, on the pictures."""
+    high = np.argwhere(np.triu(np.abs(found.correlations), 1) > _ALIKE)
+    return [(int(a), int(b)) for a, b in high]
+
+
+def _inverse(matrix: Array, idle: npt.NDArray[np.bool_]) -> Array:
+    """Inverse of the matrix of all numbers but idle ones; directions that nothing determines become very wide."""
+    keep = ~idle
+    result = np.zeros_like(matrix)
+    if keep.any():
+        own = matrix[np.ix_(keep, keep)]
+        scale = np.sqrt(np.maximum(np.diag(own), 1e-300))
+        values, vectors = np.linalg.eigh(own / np.outer(scale, scale))
+        values = np.maximum(values, 1e-9)
+        result[np.ix_(keep, keep)] = (vectors / values) @ vectors.T / np.outer(scale, scale)
+    return result
+
+
+def _scores(point: Point, objective: Objective) -> Array:
+    """Sum over blocks of the outer products of the blocks' sums of weighted residuals times derivatives."""
+    total = np.zeros((objective.count, objective.count))
+    for columns, weight, residual in zip(point.columns(), point.weights(), point.residuals, strict=True):
+        rows, width, _ = residual.shape
+        product = (columns * (weight * residual.reshape(-1))).reshape(objective.count, rows, width, 3).sum(3, dtype=np.float64)
+        blocks = np.add.reduceat(np.add.reduceat(product, range(0, rows, _BLOCK), 1), range(0, width, _BLOCK), 2)
+        flat = blocks.reshape(objective.count, -1)
+        total += flat @ flat.T
+    return total
+
+
+def _shared_errors(point: Point, objective: Objective) -> list[Array]:
+    """Right sides (n,) of errors that all of a picture shares."""
+    found = []
+    each = zip(point.columns(), point.weights(), point.recorded, objective.brightness, strict=True)
+    for columns, weight, image, scale in each:
+        shown = image.astype(np.float64) / scale
+        down, right = np.gradient(shown, axis=(0, 1)) if min(shown.shape[:2]) > 1 else (0 * shown, 0 * shown)
+        for error in (DISPLACEMENT * down, DISPLACEMENT * right, FACTOR * shown, np.full_like(shown, OFFSET)):
+            found.append((columns * weight).astype(np.float64) @ error.reshape(-1))
+    return found

@@ -1,0 +1,128 @@
+"""Statements of the things that a fit varies: names, kinds, bounds, priors and ranges of starts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+from ..errors import ShadowmapError, did_you_mean
+
+#: Kinds of variation -> what varies.
+KINDS = {
+    "pose": "rotation and translation of a shape, a light or a camera",
+    "rotation": "rotation about axes of the world through the middle of a shape; cameras and lights turn about their own axes",
+    "translation": "offset along axes of the world",
+    "scale": "size of a shape, about its middle",
+    "direction": "direction of a directional light or a spot light",
+    "position": "place of a light or a shape: the same as translation",
+    "value": "colour or number of a material or a light",
+    "brightness": "common factor of a light's or a material's colour",
+    "fov": "angle of view of a camera",
+    "sky": "brightness of an environment",
+    "texture": "all values of a texture or another array",
+    "vertices": "all vertices of a mesh",
+}
+_WITH_AXES = ("rotation", "translation", "position")
+_OPTIONS = {"min": "low", "max": "high", "prior": "prior", "spread": "spread"}
+
+
+@dataclass(frozen=True)
+class Vary:
+    """One entry of the list of things that vary.
+
+    Attributes:
+        name: id of a shape, a light or a sensor, a pattern of ids (``car_*``) of shapes that move together, or a name of
+            ``mi.traverse(scene)``, whose last part ``.value`` may be left out.
+        kind: one of :data:`KINDS`, or "" for the usual one of the object.
+        axes: axes of a rotation or a translation; all three if empty.
+        low, high: bounds of the fitted values, in the units of the report (degrees, scene units, the value's own).
+        prior: standard deviation of a Gaussian prior about the scene's value, same units; None for none.
+        spread: half of the range of starts about the scene's value, same units (a factor where values are logarithmic).
+    """
+
+    name: str
+    kind: str = ""
+    axes: str = ""
+    low: float | None = None
+    high: float | None = None
+    prior: float | None = None
+    spread: float | None = None
+
+    def __post_init__(self) -> None:
+        if not self.name:
+            raise ShadowmapError(f"vary {self.label!r}: the name is missing; write NAME:KIND, for instance bunny:pose.")
+        if self.kind and self.kind not in KINDS:
+            known = ", ".join(KINDS)
+            raise ShadowmapError(
+                f"vary {self.label}: there is no kind {self.kind!r}: choose from {known}.{did_you_mean(self.kind, KINDS)}"
+            )
+        if self.axes and self.kind not in _WITH_AXES:
+            raise ShadowmapError(f"vary {self.label}: only {', '.join(_WITH_AXES)} have axes.")
+        if set(self.axes) - set("xyz") or len(set(self.axes)) != len(self.axes):
+            raise ShadowmapError(f"vary {self.label}: axes are letters out of xyz, for instance x or xz.")
+        for name in ("low", "high", "prior", "spread"):
+            value = getattr(self, name)
+            if value is not None and (isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value)):
+                raise ShadowmapError(f"vary {self.label}: {name} is {value!r}; give a finite number.")
+        for name in ("prior", "spread"):
+            value = getattr(self, name)
+            if value is not None and value <= 0:
+                raise ShadowmapError(f"vary {self.label}: {name} is {value:g}; give a positive number.")
+        if self.low is not None and self.high is not None and self.low >= self.high:
+            raise ShadowmapError(f"vary {self.label}: min is {self.low:g} and max is {self.high:g}; give min below max.")
+
+    @property
+    def label(self) -> str:
+        """The entry as users write it, without options."""
+        return ":".join(part for part in (self.name, self.kind, self.axes) if part)
+
+    @classmethod
+    def parse(cls, text: str) -> Vary:
+        """Parse ``NAME[:KIND[:AXES]][,min=NUMBER][,max=NUMBER][,prior=NUMBER][,spread=NUMBER]``.
+
+        Raises:
+            ShadowmapError: The text has another form, with the part that was not understood.
+        """
+        head, *options = text.split(",")
+        name, _, rest = head.strip().partition(":")
+        kind, _, axes = rest.partition(":")
+        values: dict[str, Any] = {}
+        for option in options:
+            key, equals, value = option.strip().partition("=")
+            if key not in _OPTIONS or not equals:
+                raise ShadowmapError(
+                    f"vary {text}: {option.strip()!r} is not understood: write {', '.join(_OPTIONS)} = a number."
+                )
+            try:
+                values[_OPTIONS[key]] = float(value)
+            except ValueError:
+                raise ShadowmapError(f"vary {text}: {key} is {value!r}; give a number.") from None
+        return cls(name, kind, axes, **values)
+
+    @classmethod
+    def of(cls, entry: str | Mapping[str, Any] | Vary) -> Vary:
+        """An entry given as text, as a mapping of the fields (``min`` and ``max`` for ``low`` and ``high``), or as a record."""
+        if isinstance(entry, Vary):
+            return entry
+        if isinstance(entry, str):
+            return cls.parse(entry)
+        if not isinstance(entry, Mapping):
+            raise ShadowmapError(
+                f"vary: {entry!r:.60} is a {type(entry).__name__}; give text such as 'bunny:pose', or a mapping."
+            )
+        known = [field.name for field in fields(cls)]
+        values = {_OPTIONS.get(key, key): value for key, value in entry.items()}
+        for key in values:
+            if key not in known:
+                raise ShadowmapError(f"vary: there is no key {key!r}: there are name, kind, axes, {', '.join(_OPTIONS)}.")
+        for key in ("name", "kind", "axes"):
+            if not isinstance(values.get(key, ""), str):
+                raise ShadowmapError(f"vary: {key} is {values[key]!r}; give text.")
+        return cls(**{"name": "", **values})
+
+    def plain(self) -> dict[str, Any]:
+        """The fields that are set, with the names of files: ``min`` and ``max``."""
+        names = {field: key for key, field in _OPTIONS.items()}
+        return {names.get(f.name, f.name): getattr(self, f.name) for f in fields(self) if getattr(self, f.name) not in (None, "")}

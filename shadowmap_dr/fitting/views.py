@@ -1,0 +1,180 @@
+"""Images of a scene by the numbers of a fit, and their derivatives, from recordings."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
+
+from ..jit.frozen import freeze
+from ..jit.types import Float, TensorXf
+from ..rendering.renderer import Renderer
+from ..scene.pixel_filter import Filter
+from ..scene.sensor import ImageSize, Sensor
+from .parameters import Parameter, SceneChange
+
+Array = npt.NDArray[np.float64]
+Image = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Settings of the images of a stage.
+
+    Attributes:
+        side: pixels along the longer side.
+        spp: samples per pixel.
+        texels: texels along each side of a shadow map: fewer texels make wider filters.
+    """
+
+    side: int
+    spp: int
+    texels: int
+
+
+class View:
+    """Images of one camera at one quality.
+
+    Args:
+        renderer: the renderer of the scene as it was given. It is not changed.
+        parameters: all that varies, in the order of the fit's numbers.
+        sensor: number of the scene's sensor.
+        size: of the images.
+        quality: samples and texels.
+    """
+
+    def __init__(
+        self, renderer: Renderer, parameters: Sequence[Parameter], sensor: int, size: ImageSize, quality: Quality
+    ) -> None:
+        self._parameters, self._sensor, self._size, self._spp = tuple(parameters), sensor, size, quality.spp
+        self._renderer = _with_texels(renderer, quality.texels)
+        counts = [len(parameter.labels) for parameter in parameters]
+        self._starts = np.cumsum([0, *counts]).tolist()
+        # One recording for each entry: a pass computes the derivative of a combination of its numbers.
+        self._passes = [freeze(self._recorded(k)) for k in range(len(parameters))]
+
+    @property
+    def count(self) -> int:
+        """Number of the scene's numbers."""
+        return int(self._starts[-1])
+
+    def image(self, x: Array) -> Image:
+        """Linear image (H, W, 3) at the numbers x (n,)."""
+        if not self._passes:
+            with dr.suspend_grad():
+                return self._shaped(self._render(self._renderer, [])[0])
+        return self._pass(0, x, np.zeros(self._starts[1]))[0]
+
+    def derivative(self, x: Array, number: int) -> tuple[Image, Image]:
+        """Image, and its derivative (H, W, 3) by one of the numbers."""
+        entry = int(np.searchsorted(self._starts, number, side="right")) - 1
+        tangent = np.zeros(self._starts[entry + 1] - self._starts[entry])
+        tangent[number - self._starts[entry]] = 1
+        return self._pass(entry, x, tangent)
+
+    def change(self, x: Array) -> SceneChange:
+        """The change of the scene at the numbers x (n,), detached."""
+        change = SceneChange(self._renderer)
+        with dr.suspend_grad():
+            for k, parameter in enumerate(self._parameters):
+                parameter.put([mi.Float(v) for v in x[self._starts[k] : self._starts[k + 1]]], change)
+        return change
+
+    def _pass(self, entry: int, x: Array, tangent: Array) -> tuple[Image, Image]:
+        numbers, step = mi.Float(x[: self.count].astype(np.float32)), mi.Float(tangent.astype(np.float32))
+        image, derivative = self._passes[entry](numbers, step, self._renderer)
+        return self._shaped(image), self._shaped(derivative)
+
+    def _shaped(self, image: Float) -> Image:
+        pixels = image.numpy().reshape(self._size.height, self._size.width, -1)
+        channels = self._camera(self._renderer.data.cameras(self._sensor)[0]).channels
+        return pixels[..., :3] if channels == 3 else np.repeat(pixels[..., :1], 3, 2)
+
+    def _camera(self, record: Sensor) -> Sensor:
+        """A sensor whose picture, its crop window alone, has the size of this view and a box filter."""
+        film, crop, (left, top) = record.film_size, record.crop_size, record.crop_offset
+        columns, rows = film.width / crop.width, film.height / crop.height
+        # The window as a film of its own: a narrower angle of view, and another principal point.
+        point = mi.Point2f(
+            0.5 - 0.5 * columns * (1 - 2 * record.principal_point.x - 2 * left / film.width),
+            0.5 - 0.5 * rows * (1 - 2 * record.principal_point.y - 2 * top / film.height),
+        )
+        half = dr.atan(dr.tan(record.x_fov * (0.5 * math.pi / 180)) / columns)
+        aspect = record.pixel_aspect * (crop.width * self._size.height) / (crop.height * self._size.width)
+        return replace(
+            record,
+            x_fov=half * (2 * 180 / math.pi),
+            principal_point=point,
+            film_size=self._size,
+            crop_size=self._size,
+            crop_offset=(0, 0),
+            filter=Filter("BoxFilter", 0.5, 0),
+            sample_border=False,
+            film_column=0,
+            pixel_aspect=aspect,
+        )
+
+    def _recorded(self, entry: int) -> Any:  # Any: a function for dr.freeze
+        """The pass of one entry: image, and its derivative along a tangent of the entry's numbers."""
+
+        def derivative(x: Float, tangent: Float, renderer: Renderer) -> tuple[Float, Float]:
+            every: list[list[Float]] = []
+            for k in range(len(self._parameters)):
+                own = [dr.gather(mi.Float, x, mi.UInt32(j)) for j in range(self._starts[k], self._starts[k + 1])]
+                if k == entry:
+                    for j, number in enumerate(own):
+                        dr.enable_grad(number)
+                        dr.set_grad(number, dr.gather(mi.Float, tangent, mi.UInt32(j)))
+                every.append(own)
+            image, restore = self._render(renderer, every)
+            dr.forward_to(image, flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad)
+            change = dr.grad(image)
+            dr.eval(image, change)
+            restore()
+            return dr.detach(image), change
+
+        return derivative
+
+    def _render(self, renderer: Renderer, numbers: Sequence[Sequence[Float]]) -> tuple[Float, Any]:
+        """(flat image, attached; function that gives the scene its values back)."""
+        change = SceneChange(renderer)
+        for parameter, own in zip(self._parameters, numbers, strict=False):
+            parameter.put(own, change)
+        restore = _set_values(renderer, change.values)
+        camera = self._camera(change.camera(self._sensor))
+        image: TensorXf = renderer.render(
+            transforms=change.placements or None, lights=change.lights or None, sensor=camera, spp=self._spp
+        )
+        return image.array, restore
+
+
+def _set_values(renderer: Renderer, values: dict[str, Any]) -> Any:  # Any: values of all kinds
+    """Give parameters of the scene new values; returns a function that gives them the old ones."""
+    if not values:
+        return lambda: None
+    table = mi.traverse(renderer.data.scene)
+    before = {key: type(table[key])(dr.detach(table[key])) for key in values}
+    for key, parts in values.items():
+        table[key] = type(before[key])(*parts)
+    table.update()
+
+    def restore() -> None:
+        for key, value in before.items():
+            table[key] = value
+        table.update()
+
+    return restore
+
+
+def _with_texels(renderer: Renderer, texels: int) -> Renderer:
+    """A copy of a renderer whose shadow maps have another resolution, with a fit of its own."""
+    settings = renderer.settings
+    changed = replace(settings, shadow=replace(settings.shadow, resolution=min(texels, settings.shadow.resolution)))
+    return copy.deepcopy(replace(renderer, settings=changed))

@@ -34,6 +34,7 @@ MAY_IMPORT = {
     "inverse": ("errors", "io", "jit", "raster", "rendering", "scene.lights", "shadow"),
     "importing": ("errors", "io"),
     "cameras": ("errors", "scene.pixel_filter", "scene.sensor"),
+    "fitting": ("errors", "inverse", "io", "jit", "raster", "rendering", "scene", "shadow"),
     "interactive": ("errors", "inverse", "io", "jit.types"),
     "mitsuba_baselines": ("", "errors", "inverse", "io", "scene.mitsuba_meshes"),
     "experiments": (

@@ -1,0 +1,1 @@
+"""Fits of scenes to photographs: poses, lights, materials, cameras, textures and vertices."""

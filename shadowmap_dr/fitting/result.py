@@ -122,10 +122,11 @@ def brightness(image: Image, weight: Image) -> float:
 
 def relative_error(image: Image, target: Image, weight: Image) -> float:
     """Weighted RMS difference of two images (H, W, C), as a fraction of the target's RMS; inf for a black target."""
-    difference, reference = brightness(image - target, weight), brightness(target, weight)
+    difference = np.nan_to_num(image).astype(np.float64) - np.nan_to_num(target)
+    error, reference = brightness(difference, weight), brightness(target, weight)
     if reference == 0:
-        return float("inf") if difference > 0 else 0.0
-    return difference / reference
+        return float("inf") if error > 0 else 0.0
+    return error / reference
 
 
 @dataclass(eq=False)

@@ -32,6 +32,7 @@ MAY_IMPORT = {
     "integrator": ("errors", "jit", "rendering", "scene", "shadow"),
     "torch": ("errors", "jit", "raster", "rendering", "scene.sensor", "shadow"),
     "inverse": ("errors", "io", "jit", "raster", "rendering", "scene.lights", "shadow"),
+    "fitting": ("errors", "inverse", "io", "jit", "raster", "rendering", "scene", "shadow"),
     "importing": ("errors", "io"),
     "cameras": ("errors", "scene.pixel_filter", "scene.sensor"),
     "fitting": ("errors", "inverse", "io", "jit", "raster", "rendering", "scene", "shadow"),

@@ -23,7 +23,7 @@ from ...errors import ShadowmapError, did_you_mean
 from ...inverse import Collection, RemeshingSculptor, Sculptor, even_sphere, shadow_view
 from ...inverse.runs.schedulers import check_threads
 from ...inverse.shadow_art import exports, target_images
-from ...io import assets, files, meshes, records
+from ...io import animations, assets, files, meshes, records
 from ...io import console as io_console
 from ...io import images as io_images
 from ...io.machine import header
@@ -112,8 +112,8 @@ class ArtOptions:
         default = 400 if self.collection is None else 1100
         steps = default if self.iterations is None else self.iterations
         object.__setattr__(self, "iterations", steps)
-        if self.animate is not None and self.animate not in art_pictures.ANIMATIONS:
-            raise ShadowmapError(f"no animation {self.animate!r}: choose from {', '.join(art_pictures.ANIMATIONS)}.")
+        if self.animate is not None and self.animate not in animations.SUFFIXES:
+            raise ShadowmapError(f"no animation {self.animate!r}: choose from {', '.join(animations.SUFFIXES)}.")
 
 
 def read_target(target: str) -> Array:
@@ -245,10 +245,10 @@ def _write(options: ArtOptions, maker: Maker, trace: Trace, progress: Progress) 
         task = progress.add_task("pictures", total=options.turns + len(trace.frames), note="")
         pictures = art_pictures.turntable(last, maker.views, size, options.turns, lambda: progress.advance(task))
         names.append("turntable" + options.animate)
-        art_pictures.write_animation(out / names[-1], pictures)
+        animations.write_animation(out / names[-1], pictures)
         pictures = art_pictures.history(trace.frames, maker.views, size, lambda: progress.advance(task))
         names.append("steps" + options.animate)
-        art_pictures.write_animation(out / names[-1], pictures, art_pictures.LAST_MS)
+        animations.write_animation(out / names[-1], pictures, last_ms=art_pictures.LAST_MS)
     return names
 
 

@@ -11,17 +11,16 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from ...errors import ShadowmapError
 from ...io import files
 from ...io import images as io_images
+from ...io.animations import Pixels
 from ...rendering.receivers.shadow_views import DISTANCE, HALF, ShadowView, height
 from ...rendering.renderer import Renderer
 from ..common.objects import occluder
 from .run import Frame
 
-ANIMATIONS = (".webp", ".gif")
-#: Duration of a frame of an animation, and of the last frame of a history, in milliseconds.
-FRAME_MS, LAST_MS = 70, 1500
+#: Duration of the last frame of a history, in milliseconds.
+LAST_MS = 1500
 
 # Linear colours.
 _OBJECT, _WALLS, _AMBIENT = (0.72, 0.36, 0.26), ((0.8, 0.78, 0.74), (0.55, 0.62, 0.68)), 0.22
@@ -30,8 +29,6 @@ _PLACES = {1: ((-7.4, 1.9, 5.0), (-0.3, -0.2, -1.9), 40.0), 2: ((8.0, 3.6, 8.0),
 # Extent of walls, beyond the picture, in multiples of the receiver's half-side. Two walls end at each other.
 _WALL_REACH = 9.0
 _MAP_RESOLUTION = 1024
-
-Pixels = npt.NDArray[np.uint8]
 
 
 class Stage:
@@ -96,21 +93,6 @@ def history(frames: Sequence[Frame], views: Sequence[ShadowView], size: int,
         pictures.append(stage.picture(frame.vertices))
         on_frame()
     return pictures
-
-
-def write_animation(path: Path, pictures: Sequence[Pixels], last_ms: int = FRAME_MS) -> None:
-    """Write an animated image, .webp or .gif, in an endless loop. Raises ShadowmapError for another suffix."""
-    from PIL import Image
-
-    if path.suffix.lower() not in ANIMATIONS:
-        raise ShadowmapError(f"no animation {path}: the suffix is not one of {', '.join(ANIMATIONS)}.")
-    images = [Image.fromarray(picture) for picture in pictures]
-    options: dict[str, Any] = {"quality": 70, "method": 4} if path.suffix.lower() == ".webp" else {"optimize": True}
-    if path.suffix.lower() == ".gif":
-        images = [image.quantize(128, dither=Image.Dither.NONE) for image in images]
-    duration = [FRAME_MS] * (len(images) - 1) + [last_ms]
-    with files.atomic(path) as temporary:
-        images[0].save(temporary, save_all=True, append_images=images[1:], duration=duration, loop=0, **options)
 
 
 def write_picture(path: Path, picture: Pixels) -> None:

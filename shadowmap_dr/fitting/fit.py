@@ -25,7 +25,7 @@ from .parameters import Parameter, SceneChange
 from .resolve import Resolver
 from .result import Estimate, FitResult, Picture, Step
 from .stages import Stage, make_stages, qualities
-from .starts import draw, going_on, half_ranges, with_gains
+from .starts import chosen, draw, going_on, half_ranges, with_gains
 from .targets import Target
 from .uncertainty import Uncertainty, uncertainty
 
@@ -102,14 +102,15 @@ class Fit:
         """Take the steps, one after the other, and yield the error after each."""
         scene = self.stages[0].objective.views[0].count
         ranges = half_ranges(self.parameters)
-        starts = draw(ranges, self._low[:scene], self._high[:scene], self.options.starts, self.options.seed)
-        self._runs = [_Run(k, with_gains(x, self.stages[0].objective), trail=[]) for k, x in enumerate(starts)]
+        drawn = draw(ranges, self._low[:scene], self._high[:scene], self.options.starts, self.options.seed)
+        starts = chosen(drawn, self.stages[0].objective, self.options.starts)
+        self._runs = [_Run(k, x, trail=[]) for k, x in enumerate(starts)]
         going = list(self._runs)
         for number, stage in enumerate(self.stages):
             for run in going:
                 yield from self._descend(run, number, stage)
             if number < len(self.stages) - 1:
-                going = [going[k] for k in going_on([run.cost for run in going], number)]
+                going = [going[k] for k in going_on([run.cost for run in going], len(self.stages) - 2 - number)]
         self._runs = sorted(going, key=lambda run: run.cost)
 
     def _descend(self, run: _Run, number: int, stage: Stage) -> Iterator[Step]:

@@ -238,12 +238,17 @@ class LightMotion:
 
 @dataclass(frozen=True)
 class CameraMotion:
-    """Motion of a sensor: turning about its own axes (x to the left, y up, z forwards), and translation in world space."""
+    """Motion of a sensor: turning about its own axes (x to the left, y up, z forwards), and translation in world space.
+
+    ``distance``: of the point about which it turns, straight ahead. Zero: about its own place. A camera that goes around what it
+    sees keeps it in view.
+    """
 
     vary: Vary
     sensor: int
     extent: float
     parts: tuple[str, ...]
+    distance: float = 0.0
     natural: tuple[float, float] = (-np.inf, np.inf)
 
     @property
@@ -264,12 +269,14 @@ class CameraMotion:
 
     @property
     def usual(self) -> Array:
-        return _ranges(self.parts, 0.1, 0.1)
+        return _ranges(self.parts, 0.25 if self.distance else 0.1, 0.1)
 
     def put(self, numbers: Sequence[Float], change: SceneChange) -> None:
         given, record = dict(zip(self.parts, numbers, strict=True)), change.camera(self.sensor)
+        ahead = translation(mi.Vector3f(0, 0, self.distance))
+        back = translation(mi.Vector3f(0, 0, -self.distance))
         move = translation(_vector(given, "t") * self.extent)
-        matrix = move @ mi.Matrix4f(record.to_world.matrix) @ rotation(_vector(given, "r"))
+        matrix = move @ mi.Matrix4f(record.to_world.matrix) @ ahead @ rotation(_vector(given, "r")) @ back
         change.cameras[self.sensor] = replace(record, to_world=mi.Transform4f(matrix))
 
     def arrays(self, renderer: Renderer, change: SceneChange) -> dict[str, Array]:

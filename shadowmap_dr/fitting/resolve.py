@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from ..errors import ShadowmapError, did_you_mean
 from ..rendering.renderer import Renderer
-from .motions import tangents
+from .motions import host_matrix, tangents
 from .parameters import CameraMotion, FieldOfView, LightMotion, Parameter, ShapeMotion, Value
 from .vary import Vary
 
@@ -166,8 +166,12 @@ class Resolver:
         }.get(kind)
         if parts is None:
             raise _no_kind(vary, "a camera", ("pose", "rotation", "translation", "fov"))
-        place = np.array(dr.detach(record.origin), np.float64).ravel()
-        return CameraMotion(vary, number, float(np.linalg.norm(place - self.middle)) or self.diameter, parts)
+        place, towards = (np.array(dr.detach(v), np.float64).ravel() for v in (record.origin, record.direction))
+        away = float(np.linalg.norm(place - self.middle)) or self.diameter
+        ahead = max(float(towards @ (self.middle - place)), 0.1 * away) if kind == "pose" else 0.0
+        # The distance is one of the camera's own space, which may be scaled.
+        scale = float(np.linalg.norm(host_matrix(record.to_world)[:3, 2]))
+        return CameraMotion(vary, number, away, parts, ahead / scale)
 
     # ------------------------------------------------------------------------------------------------------ values
 

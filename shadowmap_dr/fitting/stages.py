@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -19,10 +20,8 @@ from .views import Quality, View
 
 Array = npt.NDArray[np.float64]
 
-# Sizes of the first stage: pixels along the longer side, and texels of a map.
-_COARSEST, _FEWEST_TEXELS = 24, 64
-# Stages at most, each with half of the next one's pixels along a side.
-_STAGES = 4
+# Sizes of the first stage: pixels along the longer side, samples along it, and texels of a map.
+_COARSEST, _FEWEST_SAMPLES, _FEWEST_TEXELS = 12, 64, 64
 
 
 @dataclass(frozen=True)
@@ -40,9 +39,22 @@ class Stage:
 def qualities(side: int, spp: int, texels: int) -> list[Quality]:
     """Qualities of the stages, coarse first; the last one is as given."""
     sides = [side]
-    while len(sides) < _STAGES and sides[0] / 2 >= _COARSEST:
+    while sides[0] / 2 >= _COARSEST:
         sides.insert(0, sides[0] // 2)
-    return [Quality(own, spp, max(min(texels, _FEWEST_TEXELS), round(texels * own / side))) for own in sides]
+    return [
+        Quality(
+            own,
+            max(spp, math.ceil(_FEWEST_SAMPLES / own) ** 2),
+            max(min(texels, _FEWEST_TEXELS), round(texels * own / side)),
+            *_light_quality(side / own),
+        )
+        for own in sides
+    ]
+
+
+def _light_quality(coarseness: float) -> tuple[int, int]:
+    """(samples of an area light, texels of their maps) of a stage with so many times fewer pixels along a side."""
+    return (32, 128) if coarseness < 1.5 else (16, 64) if coarseness < 3 else (8, 64) if coarseness < 6 else (4, 32)
 
 
 def make_stages(

@@ -12,8 +12,10 @@ from .parameters import Parameter
 
 Array = npt.NDArray[np.float64]
 
-# Starts that go on after the first, second, ... stage: shares of all, and fewest.
-_SHARES, _FEWEST = (0.5, 0.25), (4, 2)
+# Candidates for each start.
+_TRIED = 8
+# Starts that go on: to stages of half of the last one's pixels along a side, of a quarter, ...
+_GOING_ON = (1, 2, 4, 8, 16)
 
 
 def half_ranges(parameters: Sequence[Parameter]) -> Array:
@@ -31,11 +33,18 @@ def half_ranges(parameters: Sequence[Parameter]) -> Array:
 
 
 def draw(ranges: Array, low: Array, high: Array, count: int, seed: int) -> list[Array]:
-    """Starts (n,) of the scene's numbers: the scene as it is, and others uniform in the ranges and within the bounds."""
+    """Candidates (n,) of the scene's numbers: the scene as it is, and ``_TRIED`` others for each further start, uniform in the
+    ranges and within the bounds."""
     generator = np.random.default_rng(seed)
-    first = np.zeros(len(ranges))
-    others = [np.clip(generator.uniform(-ranges, ranges), low, high) for _ in range(count - 1)] if len(ranges) else []
-    return [np.clip(first, low, high), *others]
+    others = (count - 1) * _TRIED if len(ranges) else 0
+    return [np.clip(x, low, high) for x in (np.zeros(len(ranges)), *(generator.uniform(-ranges, ranges) for _ in range(others)))]
+
+
+def chosen(candidates: Sequence[Array], objective: Objective, count: int) -> list[Array]:
+    """The first of some candidates and the best others, ``count`` in all, with gains."""
+    full = [with_gains(x, objective) for x in candidates]
+    costs = [objective.at(x).cost for x in full[1:]]
+    return [full[0], *(full[1 + int(k)] for k in np.argsort(costs, kind="stable")[: count - 1])]
 
 
 def with_gains(x: Array, objective: Objective) -> Array:
@@ -54,8 +63,7 @@ def with_gains(x: Array, objective: Objective) -> Array:
     return full
 
 
-def going_on(costs: Sequence[float], stage: int) -> list[int]:
-    """Indices of the starts, best first, that go on after a stage (from 0)."""
-    order = np.argsort(costs, kind="stable").tolist()
-    share, fewest = _SHARES[min(stage, len(_SHARES) - 1)], _FEWEST[min(stage, len(_FEWEST) - 1)]
-    return order[: max(fewest, round(share * len(order)))]
+def going_on(costs: Sequence[float], left: int) -> list[int]:
+    """Indices of the starts, best first, that go on to a stage which ``left`` others follow."""
+    order: list[int] = np.argsort(costs, kind="stable").tolist()
+    return order[: _GOING_ON[min(left, len(_GOING_ON) - 1)]]

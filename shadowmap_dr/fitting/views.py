@@ -32,11 +32,15 @@ class Quality:
         side: pixels along the longer side.
         spp: samples per pixel.
         texels: texels along each side of a shadow map: fewer texels make wider filters.
+        light_samples: samples of an area light at most, and half of those of an environment.
+        soft_texels: texels along each side of their maps at most.
     """
 
     side: int
     spp: int
     texels: int
+    light_samples: int
+    soft_texels: int
 
 
 class View:
@@ -54,7 +58,7 @@ class View:
         self, renderer: Renderer, parameters: Sequence[Parameter], sensor: int, size: ImageSize, quality: Quality
     ) -> None:
         self._parameters, self._sensor, self._size, self._spp = tuple(parameters), sensor, size, quality.spp
-        self._renderer = _with_texels(renderer, quality.texels)
+        self._renderer = _at(renderer, quality)
         counts = [len(parameter.labels) for parameter in parameters]
         self._starts = np.cumsum([0, *counts]).tolist()
         # One recording for each entry: a pass computes the derivative of a combination of its numbers.
@@ -173,8 +177,15 @@ def _set_values(renderer: Renderer, values: dict[str, Any]) -> Any:  # Any: valu
     return restore
 
 
-def _with_texels(renderer: Renderer, texels: int) -> Renderer:
-    """A copy of a renderer whose shadow maps have another resolution, with a fit of its own."""
+def _at(renderer: Renderer, quality: Quality) -> Renderer:
+    """A copy of a renderer at a quality, with a fit of the shadow maps of its own."""
     settings = renderer.settings
-    changed = replace(settings, shadow=replace(settings.shadow, resolution=min(texels, settings.shadow.resolution)))
-    return copy.deepcopy(replace(renderer, settings=changed))
+    changed = replace(
+        settings,
+        shadow=replace(settings.shadow, resolution=min(quality.texels, settings.shadow.resolution)),
+        area_light_samples=max(1, min(settings.area_light_samples, quality.light_samples)),
+        environment_light_samples=max(1, min(settings.environment_light_samples, 2 * quality.light_samples)),
+        soft_map_resolution=min(settings.soft_map_resolution, quality.soft_texels),
+    )
+    copied = copy.deepcopy(replace(renderer, settings=changed))
+    return copied.with_replanned_lights() if copied.soft else copied

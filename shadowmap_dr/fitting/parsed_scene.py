@@ -1,0 +1,182 @@
+"""A scene file as Mitsuba parses it: which element of which file each parameter comes from."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+
+from ..errors import ShadowmapError, mitsuba_message
+from .xml_text import Element, XmlText
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a parameter comes from.
+
+    ``element`` describes the object that has it, or the nearest object around that the file describes; ``path`` leads on from
+    there: names of children, and of the parameter.
+    """
+
+    text: XmlText
+    element: Element
+    path: tuple[str, ...]
+
+
+class ParsedScene:
+    """A scene file, loaded, with the texts of all its files.
+
+    Args:
+        file: scene file.
+        parameters: values of ``$name`` in it.
+
+    Raises:
+        ShadowmapError: Mitsuba does not understand the file, or it is no scene.
+    """
+
+    def __init__(self, file: Path, parameters: Mapping[str, str]) -> None:
+        self.file, self.folder = file, file.parent
+        config = mi.parser.ParserConfig(mi.variant())
+        config.merge_equivalent = config.merge_meshes = False
+        try:
+            state = mi.parser.parse_file(config, str(file), **parameters)
+        except (RuntimeError, TypeError, UnicodeError) as error:
+            raise ShadowmapError(f"cannot load {file}: {mitsuba_message(error)}") from error
+        self.texts = [XmlText(Path(str(path))) for path in state.files]
+        self.defaults = {
+            element.get("name"): element.get("value")
+            for text in reversed(self.texts)
+            for element in text.root.walk()
+            if element.tag == "default"
+        }
+        self.constants = {**self.defaults, **parameters}
+        self._found: dict[str, tuple[XmlText, Element]] = {}
+        counts: dict[str, int] = {}
+        # Mitsuba names children of the scene by their ids, and those without by their place in memory.
+        for node in state.nodes:
+            kind = node.type.name.lower()
+            counts[kind] = counts.get(kind, 0) + 1
+            name = node.props.id() or f"{_UNNAMED}{kind}-{counts[kind]}"
+            text = self.texts[node.file_index]
+            element = text.at(node.offset)
+            if element is not None:
+                self._found[name] = text, element
+            node.props.set_id(name)
+        root = state.root.props
+        roots = {
+            key: state.nodes[root[key].index()].props.id()
+            for key in root.keys()
+            if root.type(key) == mi.Properties.Type.ResolvedReference
+        }
+        with self._resolving():
+            try:
+                mi.parser.transform_all(config, state)
+                scene: Any = mi.parser.instantiate(config, state)
+            except (RuntimeError, TypeError, UnicodeError) as error:
+                raise ShadowmapError(f"cannot load {file}: {mitsuba_message(error)}") from error
+        scene = scene[0] if isinstance(scene, list) and len(scene) == 1 else scene
+        if not isinstance(scene, mi.Scene):
+            raise ShadowmapError(f"cannot load {file}: its root is no scene.")
+        self.scene = scene
+        self.parameters = self._stable(mi.traverse(scene), state.root.props, roots)
+        self.shapes = {
+            shape.id() if not shape.id().startswith(_UNNAMED) else f"shape_{k}": shape for k, shape in enumerate(scene.shapes())
+        }
+
+    def place(self, name: str) -> Place | None:
+        """The place of a parameter in the files; None if none is found."""
+        parts = name.split(".")
+        owner: Any = self.parameters.properties[name][2]
+        while owner is not None:
+            parent, depth = self.parameters.hierarchy[owner]
+            known = owner.id() if owner.id() in self._found else parts[0] if depth == 1 else ""
+            if known in self._found and depth:
+                text, element = self._found[known]
+                return self._descended(text, element, tuple(parts[depth:]))
+            owner = parent
+        return None
+
+    def shape_element(self, shape: mi.Shape) -> tuple[XmlText, Element] | None:
+        """The element of a shape of the scene."""
+        return self._found.get(shape.id())
+
+    def substituted(self, text: str) -> str:
+        """A text with the values of ``$name`` in it."""
+        longest = sorted(self.constants, key=len, reverse=True)
+        pattern = "|".join(re.escape("$" + name) for name in longest)
+        return re.sub(pattern, lambda found: self.constants[found[0][1:]], text) if longest else text
+
+    def resolved(self, name: str) -> Path | None:
+        """The file that a name in the scene means; None if there is none."""
+        for folder in self._folders():
+            if name and (folder / name).is_file():
+                return folder / name
+        found = Path(str(mi.file_resolver().resolve(name))) if name else Path()
+        return found.absolute() if found.is_file() else None
+
+    def _stable(self, table: mi.SceneParameters, root: mi.Properties, roots: Mapping[str, str]) -> mi.SceneParameters:
+        """Parameters under names that do not depend on memory: some plug-ins become others, which know no id.
+
+        ``roots``: names of the scene's children by the keys of its properties.
+        """
+        names = {root[key]: name for key, name in roots.items() if isinstance(root[key], mi.Object)}
+        found = {}
+        for key, entry in table.properties.items():
+            child = entry[2]
+            while table.hierarchy[child][1] > 1:
+                child = table.hierarchy[child][0]
+            first, dot, rest = key.partition(".")
+            found[names.get(child, first) + dot + rest if table.hierarchy[child][1] else key] = entry
+        return type(table)(found, table.hierarchy)
+
+    def _descended(self, text: XmlText, element: Element, path: tuple[str, ...]) -> Place:
+        """The place within nested elements, as far as they are written out: some plug-ins become others, which know no id."""
+        while len(path) > 1:
+            child = element.named(path[0])
+            if child is None:
+                free = [one for one in element.children if one.tag in ("texture", "volume") and not one.get("name")]
+                child = free[0] if path[0] in ("nested_texture", "texture") and len(free) == 1 else None
+            if child is not None and child.tag == "ref":
+                referred = self._found.get(self.substituted(child.get("id")))
+                if referred is None:
+                    break
+                text, element, path = *referred, path[1:]
+                continue
+            if child is None or child.tag not in _PLUGINS or not child.get("type"):
+                break
+            element, path = child, path[1:]
+        return Place(text, element, path)
+
+    def _folders(self) -> list[Path]:
+        """Folders in which Mitsuba looks for files."""
+        found = []
+        for text in self.texts:
+            for element in text.root.walk():
+                if element.tag == "path":
+                    found.append(self.folder / self.substituted(element.get("value")))
+        return [*reversed(found), self.folder]
+
+    @contextlib.contextmanager
+    def _resolving(self) -> Iterator[None]:
+        """Let Mitsuba find the scene's files."""
+        before = mi.file_resolver()
+        resolver = mi.FileResolver(before)
+        for folder in reversed(self._folders()):
+            resolver.prepend(os.fspath(folder))
+        mi.set_file_resolver(resolver)
+        try:
+            yield
+        finally:
+            mi.set_file_resolver(before)
+
+
+# Begin of the names of objects that have none.
+_UNNAMED = "unnamed-"
+# Elements of objects that have parameters.
+_PLUGINS = ("bsdf", "emitter", "film", "medium", "phase", "sensor", "shape", "texture", "volume")

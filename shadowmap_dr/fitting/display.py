@@ -44,7 +44,8 @@ def difference(image: Image, target: Image, weight: Image) -> npt.NDArray[np.flo
     scale = brightness(target, weight)
     scale = scale if math.isfinite(scale) and scale > 0 else 1.0
     with np.errstate(over="ignore", invalid="ignore"):
-        return np.nan_to_num((image[..., :3].astype(np.float64) - target[..., :3]).mean(axis=2) / scale)
+        sums = (image[..., :3] - target[..., :3]) @ np.full(3, 1 / (3 * scale))
+    return np.nan_to_num(sums)
 
 
 def limit(values: npt.NDArray[np.float64], weight: Image) -> float:
@@ -104,7 +105,11 @@ def resized(pixels: Pixels, height: int, width: int) -> Pixels:
 
 
 def percent(fraction: float) -> str:
-    """A fraction with two significant digits: "12 %", "0.34 %"."""
+    """A fraction with two significant digits, which no line break parts from its sign: "12 %", "0.34 %"."""
+    return _percent(fraction).replace(" %", "\u00a0%")
+
+
+def _percent(fraction: float) -> str:
     if not math.isfinite(fraction):
         return "unknown" if math.isnan(fraction) else "more than 1000 %"
     number = 100 * fraction

@@ -116,8 +116,9 @@ def brightness(image: Image, weight: Image) -> float:
     total = float(np.sum(weight, dtype=np.float64))
     if not total > 0:
         return float("nan")
-    squares = np.mean(np.square(np.nan_to_num(image), dtype=np.float64), axis=2)
-    return float(np.sqrt(np.sum(weight * squares) / total))
+    finite = np.nan_to_num(image).astype(np.float64, copy=False)
+    squares = np.einsum("ijk,ijk,ij->", finite, finite, weight)
+    return float(np.sqrt(squares / total / image.shape[2]))
 
 
 def relative_error(image: Image, target: Image, weight: Image) -> float:

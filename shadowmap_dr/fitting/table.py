@@ -42,12 +42,13 @@ def rows(estimate: Estimate) -> list[Row]:
 
 
 def table(result: FitResult) -> Table:
-    """Table for the terminal. The name of an estimate stands in its first row only."""
+    """Table for the terminal. The name of an estimate stands in its first row only; intervals belong to fits that were found."""
     cells = []
     for estimate in result.estimates:
         for k, row in enumerate(rows(estimate)):
-            cells.append([row.name if k == 0 else "", *row[1:]])
-    title = "Estimates with 95 % intervals" if result.found else "No fit was found; the best estimates"
+            shown = row if result.found else row._replace(half_width="")
+            cells.append([row.name if k == 0 else "", *shown[1:]])
+    title = "Estimates with 95 % intervals" if result.found else "No fit was found: numbers of the best attempt"
     made = console.table(title, COLUMNS, cells, wrapped=(0, 1))
     for column in (1, len(COLUMNS) - 1):
         made.columns[column].justify = "left"

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 # Width and height in inches, and most points of a curve.
 _SIZE, _MOST_POINTS = (6.4, 3.1), 300
+# Errors below this are not drawn: no rounding reaches them.
+_LEAST = 1e-9
 # Least distance of names of stages, as a share of the axis.
 _APART = 0.09
 
@@ -47,43 +49,47 @@ def draw_curves(path: str | os.PathLike[str], history: Sequence[Step], *, dark: 
         axes = figure.add_subplot()
         axes.set_xlabel("seconds")
         axes.set_ylabel("error [% of the target's brightness]")
+        if any(_is_drawn(step) for step in history):
+            axes.set_yscale("log")
+        axes.set_xmargin(0.02)
         ends = []
         for start in others:
             seconds, errors = _curve(history, start)
             axes.plot(seconds, errors, color=plot_style.GREY, linewidth=0.9, alpha=0.7)
-            ends.append(errors[-1] if len(errors) else math.nan)
+            ends += errors[-1:]
+        names = []
         if best is not None:
             seconds, errors = _curve(history, best)
             axes.plot(seconds, errors, color=tint, linewidth=2.2, zorder=5)
-        if any(0 < step["error"] < math.inf for step in history):
-            axes.set_yscale("log")
-        axes.set_xmargin(0.02)
-        if best is not None:
-            _mark_stages(axes, [step for step in history if step["start"] == best])
-        # Names stand at the ends of lines, where the limits of the axes are known.
-        names = [(float(errors[-1]), f"start {best},\nthe best" if others else f"start {best}", tint)] if best is not None else []
+            if errors:
+                _mark_stages(axes, [step for step in history if step["start"] == best])
+            names.append((errors[-1] if errors else math.nan, f"start {best}" + (",\nthe best" if others else ""), tint))
         if others:
-            grey = "#a7b0bb" if dark else "#5f5f5f"
-            names.append((float(np.median(ends)), "1 other\nstart" if len(others) == 1 else f"{len(others)} other\nstarts", grey))
+            count = "1 other\nstart" if len(others) == 1 else f"{len(others)} other\nstarts"
+            names.append((float(np.median(ends)) if ends else math.nan, count, "#a7b0bb" if dark else "#5f5f5f"))
         plot_style.label_ends(axes, names)
 
 
 def _curve(history: Sequence[Step], start: int) -> tuple[list[float], list[float]]:
-    """Seconds and errors, in percent, of a start; errors that no logarithmic axis has are left out."""
-    steps = [step for step in history if step["start"] == start and 0 < step["error"] < math.inf]
+    """Seconds and errors, in percent, of a start."""
+    steps = [step for step in history if step["start"] == start and _is_drawn(step)]
     kept = sorted(set(np.linspace(0, len(steps) - 1, min(len(steps), _MOST_POINTS)).round().astype(int).tolist()))
     return [steps[k]["seconds"] for k in kept], [100 * steps[k]["error"] for k in kept]
+
+
+def _is_drawn(step: Step) -> bool:
+    """True unless a logarithmic axis has no place for a step's error."""
+    return math.isfinite(step["seconds"]) and _LEAST < step["error"] < math.inf
 
 
 def _mark_stages(axes: Axes, steps: Sequence[Step]) -> None:
     """A dotted line at the begin of each stage, with the stage's name where there is room."""
     low, high = axes.get_xlim()
     free = -math.inf
-    stages = [step for k, step in enumerate(steps) if k == 0 or step["stage"] != steps[k - 1]["stage"]]
-    for step in stages:
-        place = (step["seconds"] - low) / (high - low)
-        if not math.isfinite(place):
+    for k, step in enumerate(steps):
+        if (k and step["stage"] == steps[k - 1]["stage"]) or not math.isfinite(step["seconds"]):
             continue
+        place = (step["seconds"] - low) / (high - low)
         axes.axvline(step["seconds"], color=plot_style.GREY, linewidth=0.7, linestyle=":")
         name = step["stage"].replace("$", r"\$")
         if place > free:

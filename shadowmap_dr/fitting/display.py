@@ -124,8 +124,6 @@ def _percent(fraction: float) -> str:
 
 def error_words(error: float) -> str:
     """An error as words: "differs from the target by 12 % of its brightness"."""
-    if math.isnan(error):
-        return "no pixel counts"
     return f"differs from the target by {percent(error)} of its brightness"
 
 

@@ -91,8 +91,11 @@ def _verdict(result: FitResult) -> tuple[str, str]:
 def _errors(pictures: Sequence[Picture]) -> str:
     errors = [picture.error for picture in pictures]
     if len(errors) == 1:
-        return f"The fit {display.error_words(errors[0])}.".replace("The fit no pixel counts", "No pixel of the target counts")
-    low, high = (display.percent(float(value)) for value in (np.nanmin(errors), np.nanmax(errors)))
+        return "No pixel of the target counts." if np.isnan(errors[0]) else f"The fit {display.error_words(errors[0])}."
+    known = [error for error in errors if not np.isnan(error)]
+    if not known:
+        return "No pixel of the targets counts."
+    low, high = display.percent(min(known)), display.percent(max(known))
     return f"The fit differs from the targets by {low if low == high else f'{low} to {high}'} of their brightness."
 
 
@@ -220,7 +223,7 @@ def _curves(result: FitResult) -> str:
         if best is not None
         else "No start has an error that is a number."
     )
-    text = "Dotted lines: stages of the best start, from coarse to fine images. Errors of different stages do not compare."
+    text = "Dotted lines: stages of the best start, from coarse to fine images. Errors of different stages cannot be compared."
     return (
         f"<h2>Course</h2><p>{escape(summary)}{f' The best of {starts} starts is the wide line.' if starts > 1 else ''}</p>"
         f'<figure class="curves"><picture><source media="(prefers-color-scheme: dark)" srcset="{dark}">'

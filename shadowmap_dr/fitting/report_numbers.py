@@ -35,8 +35,8 @@ def estimates(result: FitResult) -> str:
     )
     details = f"<details><summary>Matrices and vectors in full</summary><pre>{escape(arrays)}</pre></details>" if arrays else ""
     return (
-        f'<table class="estimates"><caption>{caption}</caption>'
-        f'<thead><tr>{head}<th scope="col" class="unit">unit</th></tr></thead>{groups}</table>{details}'
+        f'<div class="wide"><table class="estimates"><caption>{caption}</caption>'
+        f'<thead><tr>{head}<th scope="col" class="unit">unit</th></tr></thead>{groups}</table></div>{details}'
     )
 
 

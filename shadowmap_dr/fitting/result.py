@@ -44,8 +44,7 @@ class Estimate:
 
     Attributes:
         name: "bunny:pose", "wall.bsdf.reflectance.value", "exposure of photo.png".
-        kind: pose, rotation, translation, scale, direction, position, value, texture, vertices, fov, exposure, white balance or
-            vignetting.
+        kind: of the variation (pose, direction, value, texture, vertices, ...), or exposure, white balance or vignetting.
         labels: a name for each number ("rotation x"); none for large arrays.
         units: of each number: "deg", "stops", "" for units of the scene and plain numbers.
         values: (n,), in these units.

@@ -16,6 +16,8 @@ from .result import Image, Picture, brightness
 _MOST = 99.0
 # Brightness of nearly all pixels of targets that are displayed as they are.
 _DARK, _BRIGHT = 0.2, 1.6
+# Round numbers for the ends of scales, from 1 to 10.
+_ENDS = (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10)
 # Greys of the stripes of pixels that do not count, and the stripes' width in pixels.
 _STRIPES, _STRIPE = ((148, 148, 148), (120, 120, 120)), 4
 
@@ -49,14 +51,14 @@ def difference(image: Image, target: Image, weight: Image) -> npt.NDArray[np.flo
 
 
 def limit(values: npt.NDArray[np.float64], weight: Image) -> float:
-    """End of the scale of a difference: nearly all counted magnitudes lie below it. It has one significant digit, rounded up."""
+    """End of the scale of a difference: nearly all counted magnitudes lie below it. A round number."""
     counted = np.abs(values[weight > 0])
     found = float(np.percentile(counted, _MOST)) if counted.size else 0.0
     found = found or float(counted.max(initial=0.0))
     if not 1e-6 < found:
         return 1e-6 if found else 0.01
     unit = 10.0 ** math.floor(math.log10(found))
-    return math.ceil(found / unit - 1e-9) * unit
+    return next(end for end in _ENDS if found / unit <= end + 1e-9) * unit
 
 
 def difference_colours(values: npt.NDArray[np.float64], weight: Image, end: float, size: tuple[int, int] | None = None) -> Pixels:

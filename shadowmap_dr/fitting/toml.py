@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
-from ..io.records import plain
+import numpy as np
 
 _BARE = frozenset("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_-")
 
@@ -17,11 +17,11 @@ def to_toml(settings: Mapping[str, Any]) -> str:
 
     Mappings in the settings become tables at the end.
     """
-    finite = {key: value if isinstance(value, float) else plain(value) for key, value in settings.items()}
-    lines = [f"{_key(key)} = {_value(value)}" for key, value in finite.items() if not isinstance(value, (dict, type(None)))]
-    for name, table in finite.items():
-        if isinstance(table, dict):
-            lines += ["", f"[{_key(name)}]"] if lines else [f"[{_key(name)}]"]
+    single = {key: value for key, value in settings.items() if value is not None and not isinstance(value, Mapping)}
+    lines = [f"{_key(key)} = {_value(value)}" for key, value in single.items()]
+    for name, table in settings.items():
+        if isinstance(table, Mapping):
+            lines += [*([""] if lines else []), f"[{_key(name)}]"]
             lines += [f"{_key(key)} = {_value(value)}" for key, value in table.items() if value is not None]
     return "\n".join([*lines, ""]) if lines else ""
 
@@ -30,19 +30,21 @@ def _key(name: str) -> str:
     return name if name and _BARE.issuperset(name) else _text(name)
 
 
-def _value(value: Any) -> str:  # Any: JSON
+def _value(value: Any) -> str:  # Any: values of settings
+    if isinstance(value, (np.ndarray, np.generic)):
+        value = value.tolist()
     if isinstance(value, bool):
         return str(value).lower()
-    if isinstance(value, str):
-        return _text(value)
-    if isinstance(value, float) and not math.isfinite(value):
-        return "nan" if math.isnan(value) else f"{'-' if value < 0 else ''}inf"
-    if isinstance(value, list):
+    if isinstance(value, (str, Path)):
+        return _text(str(value))
+    if isinstance(value, (list, tuple)):
         return f"[{', '.join(_value(entry) for entry in value if entry is not None)}]"
-    if isinstance(value, dict):
+    if isinstance(value, Mapping):
         inner = ", ".join(f"{_key(key)} = {_value(entry)}" for key, entry in value.items() if entry is not None)
         return f"{{ {inner} }}" if inner else "{}"
-    return repr(value)
+    if isinstance(value, (int, float)):
+        return repr(value)  # "inf" and "nan" are TOML's words as well
+    raise TypeError(f"{type(value).__name__} is no value of TOML")
 
 
 def _text(text: str) -> str:

@@ -24,7 +24,9 @@ def test_differences_are_blue_where_darker_and_red_where_brighter() -> None:
     assert display.difference_colours(values, weight, end, (3, 8)).shape == (3, 8, 3)
 
 
-@pytest.mark.parametrize(("most", "end"), [(0.0, 0.01), (0.0123, 0.015), (1.05, 1.2), (9.5, 10.0), (0.4, 0.4), (7.1, 8.0), (1e-9, 1e-6)])
+@pytest.mark.parametrize(
+    ("most", "end"), [(0.0, 0.01), (0.0123, 0.015), (1.05, 1.2), (9.5, 10.0), (0.4, 0.4), (7.1, 8.0), (1e-9, 1e-6)]
+)
 def test_scales_end_at_round_numbers(most: float, end: float) -> None:
     assert display.limit(np.full((4, 4), -most), np.ones((4, 4))) == pytest.approx(end)
 

@@ -74,8 +74,8 @@ def rounded(value: float, half_width: float | None = None) -> tuple[str, str]:
     exponent = math.floor(math.log10(largest))
     places = _MOST_DIGITS - 1 - exponent
     places = min(places, _places(width)) if width else places
-    if value and not _SMALL <= largest < _LARGE:
-        text = _short_power(f"{value:.{max(0, exponent + places)}e}")
+    if not _SMALL <= largest < _LARGE:
+        text = _short_power(f"{value:.{max(0, exponent + places)}e}") if value else "0"
     else:
         text = f"{round(value, places) + 0.0:.{max(0, places)}f}"
     if not width and "." in text and "e" not in text:  # an exact number

@@ -16,6 +16,8 @@ from .result import Image, Picture, brightness
 _MOST = 99.0
 # Brightness of nearly all pixels of targets that are displayed as they are.
 _DARK, _BRIGHT = 0.2, 1.6
+# Round numbers for the ends of scales, from 1 to 10.
+_ENDS = (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10)
 # Greys of the stripes of pixels that do not count, and the stripes' width in pixels.
 _STRIPES, _STRIPE = ((148, 148, 148), (120, 120, 120)), 4
 
@@ -44,18 +46,19 @@ def difference(image: Image, target: Image, weight: Image) -> npt.NDArray[np.flo
     scale = brightness(target, weight)
     scale = scale if math.isfinite(scale) and scale > 0 else 1.0
     with np.errstate(over="ignore", invalid="ignore"):
-        return np.nan_to_num((image[..., :3].astype(np.float64) - target[..., :3]).mean(axis=2) / scale)
+        sums = (image[..., :3] - target[..., :3]) @ np.full(3, 1 / (3 * scale))
+    return np.nan_to_num(sums)
 
 
 def limit(values: npt.NDArray[np.float64], weight: Image) -> float:
-    """End of the scale of a difference: nearly all counted magnitudes lie below it. It has one significant digit, rounded up."""
+    """End of the scale of a difference: nearly all counted magnitudes lie below it. A round number."""
     counted = np.abs(values[weight > 0])
     found = float(np.percentile(counted, _MOST)) if counted.size else 0.0
     found = found or float(counted.max(initial=0.0))
     if not 1e-6 < found:
         return 1e-6 if found else 0.01
     unit = 10.0 ** math.floor(math.log10(found))
-    return math.ceil(found / unit - 1e-9) * unit
+    return next(end for end in _ENDS if found / unit <= end + 1e-9) * unit
 
 
 def difference_colours(values: npt.NDArray[np.float64], weight: Image, end: float, size: tuple[int, int] | None = None) -> Pixels:
@@ -104,7 +107,11 @@ def resized(pixels: Pixels, height: int, width: int) -> Pixels:
 
 
 def percent(fraction: float) -> str:
-    """A fraction with two significant digits: "12 %", "0.34 %"."""
+    """A fraction with two significant digits, which no line break parts from its sign: "12 %", "0.34 %"."""
+    return _percent(fraction).replace(" %", "\u00a0%")
+
+
+def _percent(fraction: float) -> str:
     if not math.isfinite(fraction):
         return "unknown" if math.isnan(fraction) else "more than 1000 %"
     number = 100 * fraction
@@ -119,8 +126,6 @@ def percent(fraction: float) -> str:
 
 def error_words(error: float) -> str:
     """An error as words: "differs from the target by 12 % of its brightness"."""
-    if math.isnan(error):
-        return "no pixel counts"
     return f"differs from the target by {percent(error)} of its brightness"
 
 

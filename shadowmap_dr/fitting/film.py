@@ -29,7 +29,7 @@ _COLUMNS = ("target", "fit", "difference")
 # Longer side of an image in pixels, WebP's quality, and most frames: the first are tried first, until the file is small enough.
 _ATTEMPTS = ((256, 75, MOST_FRAMES), (256, 50, MOST_FRAMES), (208, 40, 40), (160, 30, 24), (112, 25, 16))
 # Lengths in pixels: the space between images, the height of a line of text, the size of letters.
-_GAP, _LINE, _LETTERS = 8, 26, 17
+_GAP, _LINE, _LETTERS = 8, 32, 22
 _BACKGROUND, _INK, _PALE = (24, 27, 33), (240, 240, 240), (186, 192, 202)
 
 
@@ -83,10 +83,16 @@ class _Strip:
         self._target = display.resized(display.colours(picture.target, self.gain), *self.size)
         values = display.difference(picture.start, picture.target, picture.weight)
         self.end = display.limit(values, picture.weight)
+        self._drawn: dict[int, tuple[str, list[Pixels]]] = {}
 
     def at(self, time: float) -> tuple[str, list[Pixels]]:
         """Caption and images at a time of 0 to 1."""
-        text, image = self.moments[round(time * (len(self.moments) - 1))]
+        number = round(time * (len(self.moments) - 1))
+        if number not in self._drawn:
+            self._drawn[number] = self._draw(*self.moments[number])
+        return self._drawn[number]
+
+    def _draw(self, text: str, image: Image) -> tuple[str, list[Pixels]]:
         height, width = image.shape[:2]
         target, weight = self.picture.target, self.picture.weight
         if (height, width) != target.shape[:2]:
@@ -94,7 +100,7 @@ class _Strip:
             # Pixels that are half masked count half.
             weight = display.averaged(weight, height, width)
         values = display.difference(image, target, weight)
-        caption = f"{text}: {display.error_words(relative_error(image, target, weight))}"
+        caption = f"{text}: error {display.percent(relative_error(image, target, weight))}"
         shown = display.resized(display.colours(image, self.gain), *self.size)
         return caption, [self._target, shown, display.difference_colours(values, weight, self.end, self.size)]
 
@@ -109,7 +115,7 @@ def _frame(strips: Sequence[_Strip], time: float, side: int) -> Pixels:
     canvas = pillow.new("RGB", (width, _LINE + _GAP + sum(heights)), _BACKGROUND)
     draw = ImageDraw.Draw(canvas)
     for k, title in enumerate(_COLUMNS):
-        limits = f", ± {display.percent(strips[0].end)}" if k == 2 and len(strips) == 1 and side > 200 else ""
+        limits = f", ± {display.percent(strips[0].end)}" if k == 2 and len(strips) == 1 and side >= 256 else ""
         draw.text((_GAP + k * (side + _GAP), _GAP), title + limits, fill=_PALE, font=_font())
     top = _LINE + _GAP
     for strip, height in zip(strips, heights, strict=True):

@@ -44,8 +44,7 @@ class Estimate:
 
     Attributes:
         name: "bunny:pose", "wall.bsdf.reflectance.value", "exposure of photo.png".
-        kind: pose, rotation, translation, scale, direction, position, value, texture, vertices, fov, exposure, white balance or
-            vignetting.
+        kind: of the variation (pose, direction, value, texture, vertices, ...), or exposure, white balance or vignetting.
         labels: a name for each number ("rotation x"); none for large arrays.
         units: of each number: "deg", "stops", "" for units of the scene and plain numbers.
         values: (n,), in these units.
@@ -116,8 +115,9 @@ def brightness(image: Image, weight: Image) -> float:
     total = float(np.sum(weight, dtype=np.float64))
     if not total > 0:
         return float("nan")
-    squares = np.mean(np.square(np.nan_to_num(image), dtype=np.float64), axis=2)
-    return float(np.sqrt(np.sum(weight * squares) / total))
+    finite = np.nan_to_num(image).astype(np.float64, copy=False)
+    squares = np.einsum("ijk,ijk,ij->", finite, finite, weight)
+    return float(np.sqrt(squares / total / image.shape[2]))
 
 
 def relative_error(image: Image, target: Image, weight: Image) -> float:

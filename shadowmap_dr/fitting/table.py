@@ -42,12 +42,13 @@ def rows(estimate: Estimate) -> list[Row]:
 
 
 def table(result: FitResult) -> Table:
-    """Table for the terminal. The name of an estimate stands in its first row only."""
+    """Table for the terminal. The name of an estimate stands in its first row only; intervals belong to fits that were found."""
     cells = []
     for estimate in result.estimates:
         for k, row in enumerate(rows(estimate)):
-            cells.append([row.name if k == 0 else "", *row[1:]])
-    title = "Estimates with 95 % intervals" if result.found else "No fit was found; the best estimates"
+            shown = row if result.found else row._replace(half_width="")
+            cells.append([row.name if k == 0 else "", *shown[1:]])
+    title = "Estimates with 95 % intervals" if result.found else "No fit was found: numbers of the best attempt"
     made = console.table(title, COLUMNS, cells, wrapped=(0, 1))
     for column in (1, len(COLUMNS) - 1):
         made.columns[column].justify = "left"
@@ -73,8 +74,8 @@ def rounded(value: float, half_width: float | None = None) -> tuple[str, str]:
     exponent = math.floor(math.log10(largest))
     places = _MOST_DIGITS - 1 - exponent
     places = min(places, _places(width)) if width else places
-    if value and not _SMALL <= largest < _LARGE:
-        text = _short_power(f"{value:.{max(0, exponent + places)}e}")
+    if not _SMALL <= largest < _LARGE:
+        text = _short_power(f"{value:.{max(0, exponent + places)}e}") if value else "0"
     else:
         text = f"{round(value, places) + 0.0:.{max(0, places)}f}"
     if not width and "." in text and "e" not in text:  # an exact number

@@ -33,6 +33,14 @@ _STYLE: dict[str, Any] = {
     **{"axes.spines.top": False, "axes.spines.right": False, "axes.grid": True, "grid.alpha": 0.3, "grid.linewidth": 0.6},
     **{"axes.formatter.useoffset": False, "axes.axisbelow": True, "image.interpolation": "nearest"},
 }
+# Changes for pages with a dark background, which shows through.
+_DARK: dict[str, Any] = {
+    **dict.fromkeys(
+        ("text.color", "axes.labelcolor", "axes.titlecolor", "xtick.color", "ytick.color", "axes.edgecolor"), "#e9ecef"
+    ),
+    **dict.fromkeys(("figure.facecolor", "axes.facecolor"), "none"),
+    **{"grid.color": "#8a939e"},
+}
 # Distance of labels at the ends of lines, in points.
 _LABEL_HEIGHT = 11.0
 # Mean width of a letter of captions, in inches.
@@ -55,15 +63,15 @@ def marker(number: int) -> str:
 
 
 @contextmanager
-def drawn(path: str | os.PathLike[str], width: float, height: float, dpi: int = 130) -> Iterator[Figure]:
+def drawn(path: str | os.PathLike[str], width: float, height: float, dpi: int = 130, *, dark: bool = False) -> Iterator[Figure]:
     """A figure in this style, to be drawn on in the block, which is written into a file (.png, .pdf, .svg) at its end.
 
-    ``width`` and ``height`` are in inches.
+    ``width`` and ``height`` are in inches. With ``dark`` it is transparent, and its letters are light.
     """
     from matplotlib import rc_context
     from matplotlib.figure import Figure  # without pyplot there is no global state and no display is needed
 
-    style: Any = _STYLE  # Any: Matplotlib's own names of settings
+    style: Any = {**_STYLE, **(_DARK if dark else {})}  # Any: Matplotlib's own names of settings
     with rc_context(style):
         figure = Figure(figsize=(width, height), layout="constrained")
         yield figure

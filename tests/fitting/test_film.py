@@ -36,13 +36,14 @@ def test_coarse_frames_are_squares() -> None:
     assert len(np.unique(tile)) == 2
 
 
-def test_long_and_noisy_films_stay_small(tmp_path: Path) -> None:
+def test_long_and_noisy_films_stay_small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(1)
-    frames = [(f"step {k}", rng.random((96, 128, 3)).astype(np.float32)) for k in range(150)]
-    made = picture(96, 128, frames=frames)
+    made = picture(48, 64, frames=[(f"step {k}", rng.random((48, 64, 3)).astype(np.float32)) for k in range(150)])
+    assert len(film._frames([made], 32, MOST_FRAMES)) == MOST_FRAMES <= 60 and MOST_BYTES <= 2_000_000
+    monkeypatch.setattr(film, "MOST_BYTES", 100_000)
+    monkeypatch.setattr(film, "_ATTEMPTS", [attempt for attempt in film._ATTEMPTS if attempt[0] < 200])
     write_film([made], tmp_path / "film.webp")
-    assert (tmp_path / "film.webp").stat().st_size <= MOST_BYTES
-    assert len(film._frames([made], 64, MOST_FRAMES)) == MOST_FRAMES
+    assert (tmp_path / "film.webp").stat().st_size <= 100_000
 
 
 def test_all_targets_are_shown_up_to_four() -> None:

@@ -36,6 +36,7 @@ COMMANDS = {
     "import": Command(
         "import_model", "import_command", "Make a Mitsuba scene of a model: meshes, materials, textures, cameras and lights."
     ),
+    "fit": Command("fit", "fit", "Find poses, lights, materials and cameras of a scene from pictures of it."),
     "pose": Command(
         "pose", "pose", "Find an object's pose from an image of the object and its shadow, with three methods side by side."
     ),

@@ -11,16 +11,12 @@ import numpy as np
 import typer
 
 from .. import __version__
-from ..errors import ShadowmapError, mitsuba_message, nearest
-from ..importing.reader import SUFFIXES as IMPORTED
-from ..io import assets, files, images
-from ..io.pictures import SUFFIXES
+from ..errors import ShadowmapError
+from ..io import files, images
 from ..rendering.film.aovs import AOVS
 from ..variants import ANY, DEFAULT_VARIANT, set_variant
 from .options import Variant
-
-# Suffixes of models; those of `IMPORTED` become scenes by `shadowmap-dr import`.
-_MODELS = (*IMPORTED, ".serialized", ".fbx", ".blend", ".dae", ".usd", ".usdz", ".3ds")
+from .scene_argument import definitions, load, one_line, scene_file
 
 
 def render(
@@ -53,10 +49,10 @@ def render(
     files.check_output(output)
     if aovs is not None and output.suffix.lower() != ".exr":
         raise ShadowmapError(f"--aovs {aovs}: {output.suffix} files hold colours only, choose an .exr file.")
-    values = _definitions(define or [])
-    path = _scene_file(scene)
+    values = definitions(define or [])
+    path = scene_file(scene)
     set_variant(variant, ANY)
-    loaded = _load(path, values)
+    loaded = load(path, values)
     if size is not None:
         loaded = _resized(loaded, *_size(size))
     width, height = loaded.sensors()[0].film().crop_size()
@@ -67,7 +63,7 @@ def render(
     try:
         image = np.array(mi.render(loaded, integrator=method, spp=spp or 0, seed=seed))
     except RuntimeError as error:
-        raise ShadowmapError(f"cannot render {scene}: {_one_line(_root(error))}") from error
+        raise ShadowmapError(f"cannot render {scene}: {one_line(_root(error))}") from error
     names = _channel_names(method, image.shape[2])
     bad = int(np.count_nonzero(~np.isfinite(image[..., : _colours(names)]).all(axis=-1)))
     if bad:
@@ -90,49 +86,6 @@ def render(
     typer.echo(f"{output}: {width} x {height}, {', '.join(names)}")
 
 
-def _scene_file(name: str) -> Path:
-    """Path of a scene by name or file. ShadowmapError, with what to do, for a folder, a mesh, a picture, and what is no XML."""
-    files.check_name(name)
-    given = Path(name)
-    if name in assets.scene_names() or not given.exists():
-        beside = [path.name for path in given.parent.glob("*.xml")] if given.parent.is_dir() else []
-        if name not in assets.scene_names() and beside and (near := nearest(given.name, beside)):
-            raise ShadowmapError(f"no scene {name!r}: there is no such file. Did you mean {str(given.with_name(near))!r}?")
-        return assets.scene(name)
-    suffix = given.suffix.lower()
-    if given.is_dir():
-        scenes = sorted(path.name for path in given.glob("*.xml"))
-        raise ShadowmapError(
-            f"no scene {name!r}: it is a folder; give a file in it ({', '.join(scenes[:5]) or 'it has no .xml'})."
-        )
-    if suffix in _MODELS:
-        made = given.with_suffix(".xml").name
-        how = f"shadowmap-dr import {name} -o {made}" if suffix in IMPORTED else "convert it to .glb or .ply"
-        raise ShadowmapError(f"{name} is a model, and no scene of Mitsuba's: make one of it first: {how}.")
-    if suffix in SUFFIXES:
-        raise ShadowmapError(f"{name} is a picture: give a Mitsuba scene (.xml), or one of {', '.join(assets.scene_names())}.")
-    with given.open("rb") as file:
-        if not file.read(1024).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<"):
-            raise ShadowmapError(f"{name} is no XML: give a Mitsuba scene (.xml), or one of {', '.join(assets.scene_names())}.")
-    return given.resolve()
-
-
-def _definitions(entries: list[str]) -> dict[str, str]:
-    values: dict[str, str] = {}
-    for entry in entries:
-        match = re.fullmatch(r"([A-Za-z_]\w*)=(.*)", entry)
-        if match is None:
-            raise ShadowmapError(f"-D {entry}: write it as NAME=VALUE, for instance -D resolution=256.")
-        name, value = match.groups()
-        files.check_name(value)
-        if name in values:
-            raise ShadowmapError(f"-D {entry}: {name} has a value already, {values[name]!r}.")
-        if value.strip().lower() in ("nan", "-nan", "inf", "-inf", "+inf", "infinity", "-infinity"):
-            raise ShadowmapError(f"-D {entry}: {value} is no finite number.")
-        values[name] = value
-    return values
-
-
 def _size(text: str) -> tuple[int, int]:
     match = re.fullmatch(r"(\d+)[xX](\d+)", text)
     if match is None:
@@ -141,18 +94,6 @@ def _size(text: str) -> tuple[int, int]:
     if not (1 <= width <= 16384 and 1 <= height <= 16384):
         raise ShadowmapError(f"--size {text}: both sides must lie between 1 and 16384 pixels.")
     return width, height
-
-
-def _load(path: Path, values: dict[str, str]) -> mi.Scene:
-    try:
-        loaded = mi.load_file(str(path), **values)
-    except (RuntimeError, UnicodeError) as error:
-        raise ShadowmapError(f"cannot load {path}: {_one_line(error)}") from error
-    if not isinstance(loaded, mi.Scene):
-        raise ShadowmapError(f"cannot load {path}: its root is a {type(loaded).__name__}, not a scene.")
-    if not loaded.sensors():
-        raise ShadowmapError(f"cannot render {path}: the scene has no sensor.")
-    return loaded
 
 
 def _resized(scene: mi.Scene, width: int, height: int) -> mi.Scene:
@@ -184,7 +125,7 @@ def _integrator(scene: mi.Scene, name: str, aovs: str | None) -> mi.Integrator:
             return mi.load_dict({"type": name, "aovs": aovs})
         return mi.load_dict({"type": "aov", "aovs": aovs, "img": {"type": name}})
     except RuntimeError as error:
-        raise ShadowmapError(f"--integrator {name}: {_one_line(error)}") from error
+        raise ShadowmapError(f"--integrator {name}: {one_line(error)}") from error
 
 
 def _channel_names(integrator: mi.Integrator, count: int) -> list[str]:
@@ -204,11 +145,3 @@ def _root(error: BaseException) -> BaseException:
     while (cause := error.__cause__ or error.__context__) is not None:
         error = cause
     return error
-
-
-def _one_line(error: BaseException) -> str:
-    """Message of a Mitsuba exception, without line breaks and positions in Mitsuba's source."""
-    text = str(error)
-    if "Traceback (most recent call last)" in text:  # raised by a Python plug-in: the message is the last line
-        return re.sub(r"^[\w.]*(?:Error|Exception): ", "", text.strip().splitlines()[-1])
-    return mitsuba_message(error)

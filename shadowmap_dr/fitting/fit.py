@@ -2,51 +2,44 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from pathlib import Path
 
-import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
 from ..errors import ShadowmapError
+from ..io import records
+from ..jit.arrays import device_array
 from ..rendering.renderer import Renderer
+from .arrays import ArrayParameter
 from .changes import Changes
+from .estimates import array_estimates, changes_of, estimates_of, gain_estimates
 from .gains import Gain
 from .judgement import judge
 from .levenberg_marquardt import Limits, minimise
 from .losses import Loss
-from .motions import host_matrix
 from .objective import Point
 from .options import FitOptions
 from .parameters import Parameter, SceneChange
 from .resolve import Resolver
-from .result import Estimate, FitResult, Picture, Step
+from .result import FitResult, Picture, Step
 from .stages import Stage, make_stages, qualities
-from .starts import chosen, draw, going_on, half_ranges, with_gains
+from .starts import chosen, draw, half_ranges, with_gains
+from .state import Run, State
 from .targets import Target
-from .uncertainty import Uncertainty, uncertainty
+from .uncertainty import uncertainty
 
 Array = npt.NDArray[np.float64]
 
 # Most steps of each start in a stage, and the longest step, in the fit's own numbers.
-_STEPS, _LONGEST = 10, 0.3
-_LAST_STEPS = 20
-# Units of logarithms of gains: stops.
-_STOP = math.log(2)
-
-
-@dataclass
-class _Run:
-    """One start on its way: its number, current numbers x, cost and error, and the x of all steps by stage."""
-
-    number: int
-    x: Array
-    cost: float = math.inf
-    error: float = math.inf
-    trail: list[tuple[int, Array, float]] | None = None
+_STEPS, _LAST_STEPS, _LONGEST = 8, 15, 0.3
+# Improvement of the loss, as a share, below which a step is the last of its stage.
+_ENOUGH = 1e-3
+# Textures and vertices: stages in which they are fitted, the last ones; rounds of a stage, in turns with the numbers; share of the
+# last step's size.
+_ARRAY_STAGES, _ROUNDS, _LAST_SHARE = 3, 3, 0.1
 
 
 class Fit:
@@ -57,7 +50,7 @@ class Fit:
     Args:
         renderer: the renderer of the scene as it was given. It is not changed.
         targets: pictures, one or several, of one or several sensors.
-        options: what varies, and settings of the search.
+        options: things that vary, and settings of the search.
         known: known exposures of the pictures, factors; 1 where not given.
 
     Raises:
@@ -71,26 +64,26 @@ class Fit:
         if not targets:
             raise ShadowmapError("there is no picture to fit to: give one by --target.")
         resolver = Resolver(renderer)
-        self.parameters: list[Parameter] = [resolver.parameter(vary) for vary in options.vary]
+        found = [resolver.parameter(vary) for vary in options.vary]
+        self.parameters: list[Parameter] = [one for one in found if not hasattr(one, "descent")]  # type: ignore[misc]
+        self.arrays: list[ArrayParameter] = [one for one in found if hasattr(one, "descent")]
         colours = 3 if options.white_balance else 1 if options.exposure else 0
-        exposures = known or [1.0] * len(targets)
-        self.gains = [Gain(colours, options.vignetting, exposure) for exposure in exposures]
-        if not self.parameters and not any(gain.count for gain in self.gains):
+        self.gains = [Gain(colours, options.vignetting, exposure) for exposure in known or [1.0] * len(targets)]
+        if not found and not any(gain.count for gain in self.gains):
             raise ShadowmapError("nothing varies: name something by --vary; --list lists all that can vary.")
         _check_sizes(renderer, self.targets)
-        self._low, self._high, prior = self._bounds()
+        self._low, self._high, prior = _bounds(self.parameters, self.gains)
         side = min(options.resolution, max(max(target.width, target.height) for target in targets))
         levels = qualities(side, options.spp, renderer.settings.shadow.resolution)
-        loss = Loss(options.loss, options.delta)
-        self.stages: list[Stage] = make_stages(renderer, self.parameters, targets, self.gains, prior, loss, levels)
-        self._runs: list[_Run] = []
+        pictures = self.parameters, self.arrays, targets, self.gains
+        self.stages: list[Stage] = make_stages(renderer, *pictures, prior, Loss(options.loss, options.delta), levels)
         self._began = time.perf_counter()
-        self.history: list[Step] = []
+        self._state = State([], [], 0, [array.start for array in self.arrays])
 
     @property
-    def count(self) -> int:
-        """Number of all fitted numbers."""
-        return self.stages[0].objective.count
+    def history(self) -> list[Step]:
+        """Errors after all steps of all starts."""
+        return self._state.history
 
     def run(self) -> FitResult:
         """Take all steps, and return the result."""
@@ -98,203 +91,182 @@ class Fit:
             pass
         return self.result()
 
-    def steps(self) -> Iterator[Step]:
-        """Take the steps, one after the other, and yield the error after each."""
-        scene = self.stages[0].objective.views[0].count
-        ranges = half_ranges(self.parameters)
-        drawn = draw(ranges, self._low[:scene], self._high[:scene], self.options.starts, self.options.seed)
-        starts = chosen(drawn, self.stages[0].objective, self.options.starts)
-        self._runs = [_Run(k, x, trail=[]) for k, x in enumerate(starts)]
-        going = list(self._runs)
-        for number, stage in enumerate(self.stages):
-            for run in going:
-                yield from self._descend(run, number, stage)
-            if number < len(self.stages) - 1:
-                going = [going[k] for k in going_on([run.cost for run in going], len(self.stages) - 2 - number)]
-        self._runs = sorted(going, key=lambda run: run.cost)
+    def steps(self, state: Path | None = None, *, resume: bool = False) -> Iterator[Step]:
+        """Take the steps, one after the other, and yield the error after each.
 
-    def _descend(self, run: _Run, number: int, stage: Stage) -> Iterator[Step]:
+        Args:
+            state: file for the state after each start and stage; None for none.
+            resume: go on from the file, if there is one.
+
+        Raises:
+            ShadowmapError: The file is damaged, or of another fit.
+        """
+        fingerprint = self._fingerprint()
+        if state is not None and resume and state.exists():
+            self._state = State.read(state, fingerprint)
+            self._began = time.perf_counter() - max((step["seconds"] for step in self.history), default=0.0)
+        if not self._state.runs:
+            self._state.runs = self._starts()
+        for number, stage in enumerate(self.stages):
+            for run in self._state.going(number):
+                yield from self._descend(run, number, stage, _LAST_STEPS if number == len(self.stages) - 1 else _STEPS)
+                run.stage = number
+                if state is not None:
+                    self._state.write(state, fingerprint)
+            self._state.choose(number, len(self.stages) - 2 - number)
+            if self.arrays and number >= len(self.stages) - _ARRAY_STAGES and number >= self._state.array_stage:
+                yield from self._fit_arrays(self.best_run, number, stage)
+                self._state.array_stage = number + 1
+                if state is not None:
+                    self._state.write(state, fingerprint)
+
+    def _starts(self) -> list[Run]:
+        """The starts: the best of many candidates."""
+        first = self.stages[0].objective
+        scene = first.views[0].count
+        options, ranges = self.options, half_ranges(self.parameters)
+        drawn = draw(ranges, self._low[:scene], self._high[:scene], options.starts, options.seed)
+        return [Run(k, x) for k, x in enumerate(chosen(drawn, first, options.starts))]
+
+    def _descend(self, run: Run, number: int, stage: Stage, steps: int) -> Iterator[Step]:
         """Steps of a start in a stage."""
         found: list[Point] = []
-        last = number == len(self.stages) - 1
-        limits = Limits(self._low, self._high, _LONGEST, _LAST_STEPS if last else _STEPS)
+        limits = Limits(self._low, self._high, _LONGEST, steps, _ENOUGH)
         point = stage.objective.at(run.x)
-        best, _ = minimise(stage.objective.at, point, limits, found.append)
-        run.x, run.cost, run.error = best.x, best.cost, best.error
-        for count, each in enumerate([point, *found]):
-            assert run.trail is not None, "made with the run"
-            run.trail.append((number, each.x, each.error))
-            step: Step = {
-                "start": run.number,
-                "stage": stage.name,
-                "step": count,
-                "error": each.error,
-                "seconds": time.perf_counter() - self._began,
-            }
-            self.history.append(step)
-            yield step
+        best, _ = minimise(stage.objective.at, point, limits, found.append) if len(run.x) else (point, True)
+        run.x, run.cost = best.x, best.cost
+        for each in (point, *found):
+            yield self._note(run, number, each)
+
+    def _fit_arrays(self, run: Run, number: int, stage: Stage) -> Iterator[Step]:
+        """Steps of the textures and vertices in a stage, in turns with steps of the numbers."""
+        begin = len(self.stages) - min(_ARRAY_STAGES, len(self.stages))
+        each = max(1, self.options.steps // (len(self.stages) - begin) // _ROUNDS)
+        total = each * _ROUNDS * (len(self.stages) - begin)
+        done = each * _ROUNDS * (number - begin)
+        descents = [array.descent(own) for array, own in zip(self.arrays, self._state.values, strict=True)]
+        values = [device_array(type(g), own) for g, own in zip(stage.objective.views[0].values, self._state.values, strict=True)]
+        for _ in range(_ROUNDS):
+            for _ in range(each):
+                share = 1 - (1 - _LAST_SHARE) * done / total
+                gradients = stage.objective.gradient(run.x)
+                values = [descent.step(one, share) for descent, one in zip(descents, gradients, strict=True)]
+                stage.objective.set_values(values)
+                done += 1
+            yield from self._descend(run, number, stage, 3)
+        self._state.values = [np.array(one, np.float32) for one in values]
+        for other in self.stages:
+            other.objective.set_values(values)
+
+    def _note(self, run: Run, number: int, point: Point) -> Step:
+        """Write a step down."""
+        stage = self.stages[number].name
+        count = sum(step["start"] == run.number and step["stage"] == stage for step in self.history)
+        seconds = time.perf_counter() - self._began
+        step: Step = {"start": run.number, "stage": stage, "step": count, "error": point.error, "seconds": seconds}
+        self.history.append(step)
+        run.trail.append((number, point.x))
+        return step
+
+    def _fingerprint(self) -> str:
+        """Text that identifies the fit."""
+        sums = [[float(t.image.sum(dtype=np.float64)), float(t.weight.sum(dtype=np.float64)), t.sensor] for t in self.targets]
+        entries = {"options": repr(self.options), "pictures": sums, "numbers": len(self._low)}
+        return records.digest(entries)
 
     # ------------------------------------------------------------------------------------------------------ results
 
     @property
+    def best_run(self) -> Run:
+        """The start with the smallest loss of those that came farthest."""
+        if not self._state.runs or self._state.runs[0].stage < 0:
+            raise ShadowmapError("the fit has taken no steps yet: call run(), or iterate over steps().")
+        return self._state.best
+
+    @property
     def best(self) -> Array:
         """The numbers (n,) with the smallest loss."""
-        if not self._runs:
-            raise ShadowmapError("the fit has taken no steps yet: call run(), or iterate over steps().")
-        return self._runs[0].x
+        return self.best_run.x
 
     def change(self, x: Array) -> SceneChange:
         """The change of the scene at the numbers x."""
         return self.stages[-1].objective.views[0].change(x)
 
-    def changes(self, x: Array) -> Changes:
-        """The change of the scene for files, by the names of the scene's parameters."""
-        change = self.change(x)
-        values: dict[str, npt.NDArray[np.float64]] = {}
-        for key, parts in change.values.items():
-            values[key] = np.array([float(dr.detach(part)[0]) for part in parts])
-        for name, light in change.lights.items():
-            values |= _light_values(name, self.renderer.light(name), light)
-        for number, camera in change.cameras.items():
-            old = self.renderer.data.cameras(number)[0]
-            if camera.to_world is not old.to_world:
-                values[f"{old.name}.to_world"] = host_matrix(camera.to_world)
-            if camera.x_fov is not old.x_fov:
-                values[f"{old.name}.x_fov"] = np.array(dr.detach(camera.x_fov), np.float64)
-        transforms = {name: host_matrix(matrix) for name, matrix in change.placements.items()}
-        return Changes(values=values, transforms=transforms, vertices={})
+    def changes(self) -> Changes:
+        """The fitted values for files, by the names of the scene's parameters."""
+        return changes_of(self.change(self.best), self.renderer)
 
     def result(self, command: str = "") -> FitResult:
         """The result of the steps taken so far."""
-        stage, x = self.stages[-1], self.best
-        point = stage.objective.at(x)
-        spread = uncertainty(point, stage.objective)
-        estimates, names = self._estimates(x, spread)
-        found, words = judge(point, stage.objective, spread, names, [run.x for run in self._runs], [run.cost for run in self._runs])
-        first = stage.objective.at(with_gains(np.zeros(stage.objective.views[0].count), stage.objective))
-        pictures = [
+        objective, x = self.stages[-1].objective, self.best
+        point = objective.at(x)
+        spread = uncertainty(point, objective)
+        estimates, names = estimates_of(x, self.parameters, self.renderer, self.change(x), spread)
+        of_gains, names_of_gains = gain_estimates(x, self.targets, self.gains, objective.gains, spread)
+        names += names_of_gains
+        ends = [run for run in self._state.runs if run.stage >= self.best_run.stage - 1]
+        found, words = judge(point, objective, spread, names, [run.x for run in ends], [run.cost for run in ends])
+        seconds = time.perf_counter() - self._began
+        return FitResult(
+            found=found,
+            words=words,
+            estimates=[*estimates, *array_estimates(self.arrays, self._state.values), *of_gains],
+            correlations=spread.correlations,
+            names=names,
+            pictures=self._pictures(point),
+            history=self.history,
+            seconds=seconds,
+            command=command,
+            settings={"vary": [vary.plain() for vary in self.options.vary]},
+        )
+
+    def _pictures(self, point: Point) -> list[Picture]:
+        """Pictures of the scene as it was given, and as it is at a point."""
+        objective, values = self.stages[-1].objective, self.stages[-1].objective.views[0].values
+        objective.set_values([device_array(type(one), array.start) for one, array in zip(values, self.arrays, strict=True)])
+        start = objective.at(with_gains(np.zeros(objective.views[0].count), objective))
+        objective.set_values(values)
+        return [
             Picture(
                 target=seen.image,
-                start=first.recorded[k],
+                start=start.recorded[k],
                 fit=point.recorded[k],
                 weight=seen.weight,
                 frames=self._frames(k),
                 name=self.targets[k].name,
-                exposure=float(np.mean(seen.gain.colour_factors(x[stage.objective.gains[k]]))),
+                exposure=float(np.mean(seen.gain.colour_factors(point.x[objective.gains[k]]))),
             )
-            for k, seen in enumerate(stage.objective.observations)
+            for k, seen in enumerate(objective.observations)
         ]
-        settings = {"vary": [vary.plain() for vary in self.options.vary], "starts": self.options.starts, "seed": self.options.seed}
-        return FitResult(
-            found=found,
-            words=words,
-            estimates=estimates,
-            correlations=spread.correlations,
-            names=names,
-            pictures=pictures,
-            history=self.history,
-            seconds=time.perf_counter() - self._began,
-            command=command,
-            settings=settings,
-        )
 
     def _frames(self, number: int) -> list[tuple[str, npt.NDArray[np.float32]]]:
         """Images of the best start's steps."""
         frames = []
-        for stage, x, error in self._runs[0].trail or []:
+        for count, (stage, x) in enumerate(self.best_run.trail):
             objective = self.stages[stage].objective
             image = objective.recorded(number, objective.views[number].image(x).copy(), x)
-            frames.append((f"{self.stages[stage].name}, off by {100 * error:.1f} % of the brightness", image))
+            frames.append((f"{self.stages[stage].name}, step {count}", image))
         return frames
 
-    def _estimates(self, x: Array, spread: Uncertainty) -> tuple[list[Estimate], list[str]]:
-        """(estimates of all parameters and gains, names of all numbers)."""
-        estimates: list[Estimate] = []
-        names: list[str] = []
-        half, at, change = spread.half_widths, 0, self.change(x)
-        for parameter in self.parameters:
-            count, scale = len(parameter.labels), parameter.scale
-            own = slice(at, at + count)
-            at += count
-            with np.errstate(invalid="ignore"):
-                widths = scale.widths(x[own], half[own])
-            label = parameter.vary.label
-            estimates.append(
-                Estimate(
-                    name=label,
-                    kind=parameter.kind,
-                    labels=parameter.labels,
-                    units=parameter.units,
-                    values=scale.shown(x[own]),
-                    start=scale.shown(np.zeros(count)),
-                    half_width=np.where(np.isfinite(half[own]), widths, np.inf),
-                    arrays=parameter.arrays(self.renderer, change),
-                )
-            )
-            names += [label if count == 1 else f"{label} {one}" for one in parameter.labels]
-        for target, gain, own in zip(self.targets, self.gains, self.stages[-1].objective.gains, strict=True):
-            shown = target.name or "the picture"
-            if gain.colours:
-                one = slice(own.start, own.start + gain.colours)
-                kind = "exposure" if gain.colours == 1 else "white balance"
-                labels = ("exposure",) if gain.colours == 1 else ("red", "green", "blue")
-                stops, widths = x[one] / _STOP, half[one] / _STOP
-                zero = np.zeros(gain.colours)
-                estimates.append(Estimate(f"{kind} of {shown}", kind, labels, ("stops",) * gain.colours, stops, zero, widths))
-                names += [f"{kind} of {shown}" if gain.colours == 1 else f"{kind} of {shown}, {one}" for one in labels]
-            if gain.vignetting:
-                last = slice(own.stop - 1, own.stop)
-                values = x[last], np.zeros(1), half[last]
-                estimates.append(Estimate(f"vignetting of {shown}", "vignetting", ("in the corners",), ("",), *values))
-                names.append(f"vignetting of {shown}")
-        return estimates, names
 
-    def _bounds(self) -> tuple[Array, Array, Array]:
-        """(lower bounds, upper bounds, standard deviations of priors), all (n,), in the fit's own numbers."""
-        low, high, prior = [], [], []
-        for parameter in self.parameters:
-            vary, scale, count = parameter.vary, parameter.scale, len(parameter.labels)
-            least = parameter.natural[0] if vary.low is None else vary.low
-            most = parameter.natural[1] if vary.high is None else vary.high
-            low.append(np.broadcast_to(scale.number(least) if np.isfinite(least) else -np.inf, count))
-            high.append(np.broadcast_to(scale.number(most) if np.isfinite(most) else np.inf, count))
-            deviation = np.full(count, np.inf)
-            if vary.prior is not None:
-                unit = scale.shown(np.zeros(count)) if scale.logarithmic else scale.factor
-                deviation = vary.prior / np.abs(unit)
-            prior.append(deviation)
-        for gain in self.gains:
-            low.append(np.array([-8.0] * gain.colours + [-0.95] * gain.vignetting))
-            high.append(np.array([8.0] * gain.colours + [1.0] * gain.vignetting))
-            prior.append(np.full(gain.count, np.inf))
-        return tuple(np.concatenate([np.zeros(0), *parts]) for parts in (low, high, prior))  # type: ignore[return-value]
-
-
-def _light_values(name: str, old: object, new: object) -> dict[str, npt.NDArray[np.float64]]:
-    """Values of a changed light by the names of Mitsuba's parameters."""
-    values: dict[str, npt.NDArray[np.float64]] = {}
-    for field, key in (("irradiance", "irradiance.value"), ("intensity", "intensity.value"), ("position", "position")):
-        if getattr(new, field, None) is not getattr(old, field, None) and not (field == "position" and hasattr(new, "to_world")):
-            values[f"{name}.{key}"] = np.array(dr.detach(getattr(new, field)), np.float64).ravel()
-    for field in ("cutoff_angle", "beam_width"):
-        if getattr(new, field, None) is not getattr(old, field, None):
-            values[f"{name}.{field}"] = np.array(dr.detach(getattr(new, field)), np.float64).ravel()
-    if getattr(new, "to_world", None) is not getattr(old, "to_world", None):
-        values[f"{name}.to_world"] = host_matrix(new.to_world)  # type: ignore[attr-defined]
-    elif not hasattr(new, "to_world") and getattr(new, "direction", None) is not getattr(old, "direction", None):
-        direction = np.array(dr.detach(new.direction), np.float64).ravel()  # type: ignore[attr-defined]
-        values[f"{name}.to_world"] = _frame(direction)
-    return values
-
-
-def _frame(direction: Array) -> Array:
-    """A rotation (4, 4) that takes the z axis to a direction."""
-    forward = direction / np.linalg.norm(direction)
-    side = np.cross(forward, np.eye(3)[np.abs(forward).argmin()])
-    side /= np.linalg.norm(side)
-    matrix = np.eye(4)
-    matrix[:3, :3] = np.stack([side, np.cross(forward, side), forward], axis=1)
-    return matrix
+def _bounds(parameters: Sequence[Parameter], gains: Sequence[Gain]) -> tuple[Array, Array, Array]:
+    """(lower bounds, upper bounds, standard deviations of priors), all (n,), in the fit's own numbers."""
+    low, high, prior = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)]
+    for parameter in parameters:
+        vary, scale, count = parameter.vary, parameter.scale, len(parameter.labels)
+        least = parameter.natural[0] if vary.low is None else vary.low
+        most = parameter.natural[1] if vary.high is None else vary.high
+        if vary.low is not None and vary.high is None and least >= most or vary.high is not None and most <= least:
+            raise ShadowmapError(f"vary {vary.label}: the bounds leave nothing between {least:g} and {most:g}.")
+        low.append(np.broadcast_to(scale.number(least) if np.isfinite(least) else -np.inf, count))
+        high.append(np.broadcast_to(scale.number(most) if np.isfinite(most) else np.inf, count))
+        unit = np.abs(scale.shown(np.zeros(count)) if scale.logarithmic else scale.factor)
+        prior.append(np.full(count, np.inf) if vary.prior is None else vary.prior / unit)
+    for gain in gains:
+        low.append(np.array([-8.0] * gain.colours + [-0.95] * gain.vignetting))
+        high.append(np.array([8.0] * gain.colours + [1.0] * gain.vignetting))
+        prior.append(np.full(gain.count, np.inf))
+    return np.concatenate(low), np.concatenate(high), np.concatenate(prior)
 
 
 def _check_sizes(renderer: Renderer, targets: Sequence[Target]) -> None:

@@ -32,7 +32,7 @@ class Gain:
 
     def apply(self, image: Image, g: Array) -> Image:
         """Image (H, W, 3) times the factors."""
-        return np.asarray(image * self._factors(image, g), np.float32)
+        return np.asarray(image * self.factors(image, g), np.float32)
 
     def derivatives(self, recorded: Image, g: Array) -> list[Image]:
         """Derivatives of :meth:`apply`'s result ``recorded`` by each number."""
@@ -51,7 +51,8 @@ class Gain:
         exposure = np.exp(g[: self.colours]) if self.colours else np.ones(1)
         return self.known * np.broadcast_to(exposure, 3).astype(np.float64)
 
-    def _factors(self, image: Image, g: Array) -> Image:
+    def factors(self, image: Image, g: Array) -> Image:
+        """Factors of an image (H, W, 3), which broadcast to it."""
         factors = self.colour_factors(g)
         if not self.vignetting:
             return factors.astype(np.float32)

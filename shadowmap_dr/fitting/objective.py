@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from ..jit.types import Float
 from .gains import Gain
 from .losses import Loss
 from .views import View
@@ -62,6 +63,22 @@ class Objective:
     def at(self, x: Array) -> Point:
         """The residuals at x (n,)."""
         return Point(self, np.asarray(x, np.float64))
+
+    def set_values(self, values: Sequence[Float]) -> None:
+        """Set the values of the parameters with many values."""
+        for view in self.views:
+            view.values = list(values)
+
+    def gradient(self, x: Array) -> list[Float]:
+        """Derivatives of the mean loss by the values of the parameters with many values, Float each."""
+        total: list[Float] = []
+        for number, (view, seen) in enumerate(zip(self.views, self.observations, strict=True)):
+            scale, shape = self.brightness[number], np.zeros((*seen.weight.shape, 3), np.float32)
+            factors = seen.gain.factors(shape, x[self.gains[number]]) / scale
+            weight = seen.weight[..., None] / (3 * self.pixels)
+            found = view.gradient(x, seen.image / scale, weight, factors, self.loss.limit)
+            total = [a + b for a, b in zip(total, found, strict=True)] if total else found
+        return total
 
     def recorded(self, number: int, image: Image, x: Array) -> Image:
         """The image of a view as its picture's camera records it."""

@@ -38,7 +38,9 @@ class FitOptions:
     vignetting: bool = option(False, help="Fit the darkening of each picture towards its corners.")
     starts: int = option(8, allowed=(1, 1024), help="Starts; the first is the scene as it is.")
     seed: int = option(0, allowed=(0, 2**32 - 1), help="Seed of the other starts.")
-    resolution: int = option(256, allowed=(8, 2048), help="Pixels along the longer side of the last images, at most the picture's.")
+    resolution: int = option(
+        256, allowed=(8, 2048), help="Pixels along the longer side of the last images, at most the picture's."
+    )
     spp: int = option(4, allowed=(1, 64), help="Samples per pixel.")
     loss: LossKind = option("huber", help="Loss of the differences.")
     delta: float = option(0.1, help="Difference, as a share of the picture's brightness, above which huber grows slower.")

@@ -35,14 +35,18 @@ class SceneChange:
         placements: affine maps of shapes, in the order of their application.
         lights: changed records of lights.
         cameras: changed records of sensors, by number.
-        values: values of Mitsuba's parameters by their names in ``mi.traverse``.
+        values: numbers of Mitsuba's parameters by their names in ``mi.traverse``.
+        arrays: (values, shape) of Mitsuba's arrays by their names.
+        vertices: world-space vertices of meshes, before they are moved.
     """
 
     renderer: Renderer
     placements: dict[str, Matrix4f] = field(default_factory=dict)
     lights: dict[str, Light] = field(default_factory=dict)
     cameras: dict[int, Sensor] = field(default_factory=dict)
-    values: dict[str, Any] = field(default_factory=dict)  # Any: parameters have values of all kinds
+    values: dict[str, list[Float]] = field(default_factory=dict)
+    arrays: dict[str, tuple[Float, tuple[int, ...]]] = field(default_factory=dict)
+    vertices: dict[str, Float] = field(default_factory=dict)
 
     def light(self, name: str) -> Any:  # Any: one of several records
         """The current record of a light."""
@@ -372,7 +376,7 @@ class Value:
 
     def arrays(self, renderer: Renderer, change: SceneChange) -> dict[str, Array]:
         value = getattr(change.light(self.light), self.field) if self.light else change.values[self.key]
-        if isinstance(value, list):
+        if not self.light:
             return {"value": np.array([float(dr.detach(one)[0]) for one in value])}
         return {"value": np.array(dr.detach(value), np.float64).ravel()}
 

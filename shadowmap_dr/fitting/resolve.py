@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from ..errors import ShadowmapError, did_you_mean
 from ..rendering.renderer import Renderer
+from .arrays import ArrayParameter, mesh_vertices, texture_values
 from .motions import host_matrix, tangents
 from .parameters import CameraMotion, FieldOfView, LightMotion, Parameter, ShapeMotion, Value
 from .vary import Vary
@@ -69,7 +70,7 @@ class Resolver:
         self._points = points
         self.middle, self.diameter = _bounds(points)
 
-    def parameter(self, vary: Vary) -> Parameter:
+    def parameter(self, vary: Vary) -> Parameter | ArrayParameter:
         """The parameter of an entry.
 
         Raises:
@@ -77,6 +78,12 @@ class Resolver:
         """
         name = vary.name
         matched = [shape for shape in self.shapes if shape == name or fnmatchcase(shape, name)]
+        if vary.kind == "vertices":
+            if len(matched) != 1:
+                raise ShadowmapError(f"vary {vary.label}: {len(matched)} shapes are called {name!r}; name one mesh.")
+            return mesh_vertices(self.renderer, vary, matched[0])
+        if vary.kind == "texture":
+            return texture_values(self.renderer, vary, self._texture_key(vary))
         if vary.kind in ("value", "brightness", "sky") or not (matched or name in self.lights or name in self.sensors):
             return self._value(vary)
         if matched:
@@ -219,6 +226,18 @@ class Resolver:
         known = [*self.shapes, *self.lights, *self.sensors, *(key.removesuffix(".value") for key in self.keys)]
         near = did_you_mean(name, known)
         raise ShadowmapError(f"vary {vary.label}: the scene has no object or value {name!r}; --list lists all.{near}")
+
+    def _texture_key(self, vary: Vary) -> str:
+        """Mitsuba's name of the array of an entry: itself, or the only one of a material or light."""
+        own = [key for key in self.keys if key == vary.name or key.startswith(f"{vary.name}.")]
+        arrays = [key for key in own if (array := self._numbers(key)) is not None and len(array) > _MOST]
+        if len(arrays) == 1:
+            return arrays[0]
+        if arrays:
+            raise ShadowmapError(f"vary {vary.label}: there are several, {', '.join(arrays)}; name one.")
+        known = [key for key in self.keys if key.endswith(".data")]
+        near = did_you_mean(vary.name, known)
+        raise ShadowmapError(f"vary {vary.label}: '{vary.name}' has no texture; textures: {', '.join(known) or 'none'}.{near}")
 
     def _numbers(self, key: str) -> Array | None:
         """The values (n,) of a parameter of Mitsuba's, None if no derivatives flow to it, or if it is a part of a mesh or a film."""

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from ..rendering.renderer import Renderer
 from ..scene.sensor import ImageSize
+from .arrays import ArrayParameter
 from .gains import Gain
 from .losses import Loss
 from .objective import Objective, Observation
@@ -54,12 +55,13 @@ def qualities(side: int, spp: int, texels: int) -> list[Quality]:
 
 def _light_quality(coarseness: float) -> tuple[int, int]:
     """(samples of an area light, texels of their maps) of a stage with so many times fewer pixels along a side."""
-    return (32, 128) if coarseness < 1.5 else (16, 64) if coarseness < 3 else (8, 64) if coarseness < 6 else (4, 32)
+    return (16, 64) if coarseness < 3 else (8, 64) if coarseness < 6 else (4, 32)
 
 
 def make_stages(
     renderer: Renderer,
     parameters: Sequence[Parameter],
+    arrays: Sequence[ArrayParameter],
     targets: Sequence[Target],
     gains: Sequence[Gain],
     prior: Array,
@@ -72,7 +74,7 @@ def make_stages(
         views, observations = [], []
         for target, gain in zip(targets, gains, strict=True):
             size = size_of(target, quality.side)
-            views.append(View(renderer, parameters, target.sensor, size, quality))
+            views.append(View(renderer, parameters, arrays, target.sensor, size, quality))
             small = target.resized(size.width, size.height)
             observations.append(Observation(small.image, small.weight, gain))
         stages.append(Stage(quality, Objective(views, observations, prior, loss)))

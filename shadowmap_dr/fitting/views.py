@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,11 +13,13 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
+from ..jit.arrays import device_array
 from ..jit.frozen import freeze
 from ..jit.types import Float, TensorXf
 from ..rendering.renderer import Renderer
 from ..scene.pixel_filter import Filter
 from ..scene.sensor import ImageSize, Sensor
+from .arrays import ArrayParameter
 from .parameters import Parameter, SceneChange
 
 Array = npt.NDArray[np.float64]
@@ -48,21 +50,34 @@ class View:
 
     Args:
         renderer: the renderer of the scene as it was given. It is not changed.
-        parameters: all that varies, in the order of the fit's numbers.
+        parameters: all that few numbers describe, in the order of the fit's numbers.
+        arrays: parameters with many values.
         sensor: number of the scene's sensor.
         size: of the images.
         quality: samples and texels.
+
+    Attributes:
+        values: current values of the parameters with many values, a Float each.
     """
 
     def __init__(
-        self, renderer: Renderer, parameters: Sequence[Parameter], sensor: int, size: ImageSize, quality: Quality
+        self,
+        renderer: Renderer,
+        parameters: Sequence[Parameter],
+        arrays: Sequence[ArrayParameter],
+        sensor: int,
+        size: ImageSize,
+        quality: Quality,
     ) -> None:
-        self._parameters, self._sensor, self._size, self._spp = tuple(parameters), sensor, size, quality.spp
+        self._parameters, self._arrays, self._sensor = tuple(parameters), tuple(arrays), sensor
+        self._size, self._spp = size, quality.spp
+        self.values = [device_array(mi.Float, array.start) for array in arrays]
         self._renderer = _at(renderer, quality)
         counts = [len(parameter.labels) for parameter in parameters]
         self._starts = np.cumsum([0, *counts]).tolist()
         # One recording for each entry: a pass computes the derivative of a combination of its numbers.
         self._passes = [freeze(self._recorded(k)) for k in range(len(parameters))]
+        self._image, self._gradient = freeze(self._recorded(-1)), freeze(self._recorded_gradient())
 
     @property
     def count(self) -> int:
@@ -71,10 +86,7 @@ class View:
 
     def image(self, x: Array) -> Image:
         """Linear image (H, W, 3) at the numbers x (n,)."""
-        if not self._passes:
-            with dr.suspend_grad():
-                return self._shaped(self._render(self._renderer, [])[0])
-        return self._pass(0, x, np.zeros(self._starts[1]))[0]
+        return self._pass(0 if self._passes else -1, x, np.zeros(self._starts[1] if self._passes else 0))[0]
 
     def derivative(self, x: Array, number: int) -> tuple[Image, Image]:
         """Image, and its derivative (H, W, 3) by one of the numbers."""
@@ -83,23 +95,44 @@ class View:
         tangent[number - self._starts[entry]] = 1
         return self._pass(entry, x, tangent)
 
+    def gradient(self, x: Array, target: Image, weight: Image, factors: Image, limit: float) -> list[Float]:
+        """Derivatives of a loss by all ``values``, Float each.
+
+        The loss is the sum over pixels of ``weight`` (H, W, 1) times the Huber loss (``limit``) of factors image - target (both
+        (H, W, 3)).
+        """
+        pixels = [device_array(mi.Float, self._planes(plane).astype(np.float32)) for plane in (target, weight, factors)]
+        numbers = mi.Float(x[: self.count].astype(np.float32))
+        return list(self._gradient(numbers, self.values, pixels, device_array(mi.Float, np.float32([limit])), self._renderer))
+
     def change(self, x: Array) -> SceneChange:
         """The change of the scene at the numbers x (n,), detached."""
         change = SceneChange(self._renderer)
         with dr.suspend_grad():
             for k, parameter in enumerate(self._parameters):
                 parameter.put([mi.Float(v) for v in x[self._starts[k] : self._starts[k + 1]]], change)
+            for array, values in zip(self._arrays, self.values, strict=True):
+                array.put(values, change)
         return change
 
     def _pass(self, entry: int, x: Array, tangent: Array) -> tuple[Image, Image]:
         numbers, step = mi.Float(x[: self.count].astype(np.float32)), mi.Float(tangent.astype(np.float32))
-        image, derivative = self._passes[entry](numbers, step, self._renderer)
+        recorded = self._passes[entry] if entry >= 0 else self._image
+        image, derivative = recorded(numbers, step, self.values, self._renderer)
         return self._shaped(image), self._shaped(derivative)
 
     def _shaped(self, image: Float) -> Image:
         pixels = image.numpy().reshape(self._size.height, self._size.width, -1)
-        channels = self._camera(self._renderer.data.cameras(self._sensor)[0]).channels
-        return pixels[..., :3] if channels == 3 else np.repeat(pixels[..., :1], 3, 2)
+        return pixels if self._channels == 3 else np.repeat(pixels, 3, 2)
+
+    def _planes(self, image: Image) -> Image:
+        """Pixels (H W C,) in as many channels as the film has, of an image (H, W, 1 or 3)."""
+        wide = np.broadcast_to(image, (self._size.height, self._size.width, 3))
+        return np.ravel(wide if self._channels == 3 else wide.mean(2))
+
+    @property
+    def _channels(self) -> int:
+        return self._renderer.data.cameras(self._sensor)[0].channels
 
     def _camera(self, record: Sensor) -> Sensor:
         """A sensor whose picture, its crop window alone, has the size of this view and a box filter."""
@@ -122,13 +155,14 @@ class View:
             filter=Filter("BoxFilter", 0.5, 0),
             sample_border=False,
             film_column=0,
+            alpha=False,
             pixel_aspect=aspect,
         )
 
     def _recorded(self, entry: int) -> Any:  # Any: a function for dr.freeze
-        """The pass of one entry: image, and its derivative along a tangent of the entry's numbers."""
+        """The pass of one entry: image, and its derivative along a tangent of the entry's numbers. -1: of none."""
 
-        def derivative(x: Float, tangent: Float, renderer: Renderer) -> tuple[Float, Float]:
+        def derivative(x: Float, tangent: Float, values: list[Float], renderer: Renderer) -> tuple[Float, Float]:
             every: list[list[Float]] = []
             for k in range(len(self._parameters)):
                 own = [dr.gather(mi.Float, x, mi.UInt32(j)) for j in range(self._starts[k], self._starts[k + 1])]
@@ -137,7 +171,13 @@ class View:
                         dr.enable_grad(number)
                         dr.set_grad(number, dr.gather(mi.Float, tangent, mi.UInt32(j)))
                 every.append(own)
-            image, restore = self._render(renderer, every)
+            if entry < 0:
+                with dr.suspend_grad():
+                    image, restore = self._render(renderer, every, values)
+                    dr.eval(image)
+                    restore()
+                return image, mi.Float(image)
+            image, restore = self._render(renderer, every, values)
             dr.forward_to(image, flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad)
             change = dr.grad(image)
             dr.eval(image, change)
@@ -146,27 +186,61 @@ class View:
 
         return derivative
 
-    def _render(self, renderer: Renderer, numbers: Sequence[Sequence[Float]]) -> tuple[Float, Any]:
+    def _recorded_gradient(self) -> Any:  # Any: a function for dr.freeze
+        """The pass of :meth:`gradient`."""
+
+        def gradient(x: Float, values: list[Float], pixels: list[Float], limit: Float, renderer: Renderer) -> list[Float]:
+            numbers = [
+                [dr.gather(mi.Float, x, mi.UInt32(j)) for j in range(self._starts[k], self._starts[k + 1])]
+                for k in range(len(self._parameters))
+            ]
+            own = [mi.Float(dr.detach(one)) for one in values]
+            dr.enable_grad(own)
+            image, restore = self._render(renderer, numbers, own)
+            target, weight, factors = pixels
+            difference = factors * dr.detach(image) - target
+            slope = weight * factors * dr.clip(difference, -limit, limit)
+            dr.set_grad(image, slope)
+            dr.enqueue(dr.ADMode.Backward, image)
+            dr.traverse(dr.ADMode.Backward)
+            gradients = [dr.grad(one) for one in own]
+            dr.eval(gradients)
+            restore()
+            return gradients
+
+        return gradient
+
+    def _render(
+        self, renderer: Renderer, numbers: Sequence[Sequence[Float]], values: Sequence[Float]
+    ) -> tuple[Float, Callable[[], None]]:
         """(flat image, attached; function that gives the scene its values back)."""
         change = SceneChange(renderer)
-        for parameter, own in zip(self._parameters, numbers, strict=False):
+        for parameter, own in zip(self._parameters, numbers, strict=True):
             parameter.put(own, change)
-        restore = _set_values(renderer, change.values)
-        camera = self._camera(change.camera(self._sensor))
+        for array, one in zip(self._arrays, values, strict=True):
+            array.put(one, change)
+        restore = set_values(renderer.data.scene, change)
         image: TensorXf = renderer.render(
-            transforms=change.placements or None, lights=change.lights or None, sensor=camera, spp=self._spp
+            vertex_positions=change.vertices or None,
+            transforms=change.placements or None,
+            lights=change.lights or None,
+            sensor=self._camera(change.camera(self._sensor)),
+            spp=self._spp,
         )
         return image.array, restore
 
 
-def _set_values(renderer: Renderer, values: dict[str, Any]) -> Any:  # Any: values of all kinds
-    """Give parameters of the scene new values; returns a function that gives them the old ones."""
-    if not values:
+def set_values(scene: mi.Scene, change: SceneChange) -> Callable[[], None]:
+    """Give parameters of Mitsuba's objects new values; returns a function that gives them the old ones back."""
+    if not change.values and not change.arrays:
         return lambda: None
-    table = mi.traverse(renderer.data.scene)
-    before = {key: type(table[key])(dr.detach(table[key])) for key in values}
-    for key, parts in values.items():
+    table = mi.traverse(scene)
+    before = {key: type(table[key])(dr.detach(table[key])) for key in (*change.values, *change.arrays)}
+    for key, parts in change.values.items():
         table[key] = type(before[key])(*parts)
+    for key, (values, shape) in change.arrays.items():
+        kind = type(before[key])
+        table[key] = kind(values, shape) if dr.is_tensor_v(kind) else kind(values)
     table.update()
 
     def restore() -> None:

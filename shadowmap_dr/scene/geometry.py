@@ -408,7 +408,9 @@ def _checked_matrix(name: str, value: Matrix4f | mi.Transform4f | npt.ArrayLike)
     try:
         matrix = mi.Matrix4f(value if dr.is_array_v(value) else mi.ScalarMatrix4f(np.asarray(value, np.float64).tolist()))
     except (TypeError, ValueError, RuntimeError) as error:
-        raise ShadowmapError(f"transforms['{name}'] is a {type(value).__name__}: give a Transform4f or a 4 x 4 matrix.") from error
+        raise ShadowmapError(
+            f"transforms['{name}'] is a {type(value).__name__}: give a Transform4f or a 4 x 4 matrix."
+        ) from error
     if dr.width(matrix) != 1:
         raise ShadowmapError(f"transforms['{name}'] holds {dr.width(matrix)} transformations: give one.")
     return matrix

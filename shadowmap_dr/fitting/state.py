@@ -1,0 +1,106 @@
+"""State of a fit: its starts on their way, and its file, from which a fit that was killed goes on."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from ..io.checkpoints import read_checkpoint, unreadable, write_checkpoint
+from .result import Step
+from .starts import going_on
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass
+class Run:
+    """A start on its way.
+
+    Attributes:
+        number: of the start.
+        x: current numbers (n,).
+        cost: loss in the last stage.
+        stage: last stage that is done, -1 for none.
+        last: last stage that it is to take part in.
+        trail: (stage, numbers) of all steps.
+    """
+
+    number: int
+    x: Array
+    cost: float = math.inf
+    stage: int = -1
+    last: int = 1 << 30
+    trail: list[tuple[int, Array]] = field(default_factory=list)
+
+
+@dataclass
+class State:
+    """The starts; the errors of all steps; the first stage in which textures and vertices are not yet fitted, and their values."""
+
+    runs: list[Run]
+    history: list[Step]
+    array_stage: int
+    values: list[npt.NDArray[np.float32]]
+
+    @property
+    def best(self) -> Run:
+        """The start with the smallest loss of those that came farthest."""
+        return min(self.runs, key=lambda run: (-run.stage, run.cost))
+
+    def going(self, stage: int) -> list[Run]:
+        """Starts that have a stage before them."""
+        return [run for run in self.runs if run.stage < stage <= run.last]
+
+    def choose(self, stage: int, left: int) -> None:
+        """Choose the starts that go on after a stage which ``left`` others but the next one follow."""
+        if left < 0:
+            return
+        done = [run for run in self.runs if run.stage == stage]
+        on = {done[k].number for k in going_on([run.cost for run in done], left)}
+        for run in done:
+            run.last = 1 << 30 if run.number in on else stage
+
+    def write(self, path: Path, fingerprint: str) -> None:
+        """Write the state. ``fingerprint``: text that identifies the fit."""
+        trail = [(run.number, stage, x) for run in self.runs for stage, x in run.trail]
+        count = len(self.runs[0].x)
+        write_checkpoint(
+            path,
+            fingerprint,
+            {
+                "numbers": [[run.number, run.stage, run.last] for run in self.runs],
+                "costs": [run.cost for run in self.runs],
+                "x": np.array([run.x for run in self.runs]).reshape(len(self.runs), count),
+                "trail": np.array([entry[:2] for entry in trail], np.int64).reshape(-1, 2),
+                "trail_x": np.array([entry[2] for entry in trail]).reshape(len(trail), count),
+                "history": np.array(json.dumps(self.history)),
+                "array_stage": self.array_stage,
+                **{f"values{k}": own for k, own in enumerate(self.values)},
+            },
+        )
+
+    @classmethod
+    def read(cls, path: Path, fingerprint: str) -> State:
+        """Read a state.
+
+        Raises:
+            ShadowmapError: The file is damaged, or of another fit.
+        """
+        arrays = read_checkpoint(path, fingerprint)
+        try:
+            runs = [
+                Run(int(number), x, float(cost), int(stage), int(last))
+                for (number, stage, last), cost, x in zip(arrays["numbers"], arrays["costs"], arrays["x"], strict=True)
+            ]
+            by_number = {run.number: run for run in runs}
+            for (number, stage), x in zip(arrays["trail"], arrays["trail_x"], strict=True):
+                by_number[int(number)].trail.append((int(stage), x))
+            values = [arrays[f"values{k}"] for k in range(sum(name.startswith("values") for name in arrays))]
+            return cls(runs, json.loads(str(arrays["history"])), int(arrays["array_stage"]), values)
+        except (KeyError, ValueError, TypeError) as error:
+            raise unreadable(path) from error

@@ -346,7 +346,8 @@ class _Writer:
                 raise OutputError(f"cannot write {copy}: {error.strerror or error}.") from error
             return f"{FILES_FOLDER}/{copy.name}"
         try:
-            return Path(os.path.relpath(path.resolve(), self.target.parent.resolve())).as_posix()
+            # A link keeps its own name, which may have the suffix that tells its format.
+            return Path(os.path.relpath(path.parent.resolve() / path.name, self.target.parent.resolve())).as_posix()
         except ValueError:  # of another drive
             return path.as_posix()
 

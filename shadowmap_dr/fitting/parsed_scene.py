@@ -103,6 +103,11 @@ class ParsedScene:
             owner = parent
         return None
 
+    def value(self, name: str) -> Any:  # Any: parameters have values of all kinds
+        """The value of a parameter; None if there is none of this name, or if it has none, as some of hair have."""
+        value, kind, owner, _ = self.parameters.properties.get(name, (None, None, None, 0))
+        return value if kind is None else mi.get_property(value, kind, owner)
+
     def shape_element(self, shape: mi.Shape) -> tuple[XmlText, Element] | None:
         """The element of a shape of the scene."""
         return self._found.get(shape.id())

@@ -200,7 +200,7 @@ class ValueStep(Step):
             self._default_bsdf(scene, text, element, path[1:])
         elif path[-1] == "data":
             self._data(scene, text, element, path)
-        elif len(path) == 2 and path[1] == "value":
+        elif path[1:] in (("value",), ("value", "value")):  # the latter of media, in volumes that are the same everywhere
             self._colour(scene, text, element, path[0])
         elif len(path) == 1:
             self._number(text, element, path[0])
@@ -420,6 +420,8 @@ class ValueStep(Step):
                 found = found[:3, 2] / np.linalg.norm(found[:3, 2])
         else:
             found, wanted = np.array(value, np.float64).ravel(), np.asarray(wanted, np.float64).ravel()
+        if self.key.endswith("direction"):  # Mitsuba keeps unit vectors
+            found, wanted = (vector / np.linalg.norm(vector) for vector in (found, wanted))
         if found.size != wanted.size and 1 in (found.size, wanted.size):
             found, wanted = np.broadcast_arrays(found, wanted)
         return "" if is_close(found, wanted) else f"it is {_text(found.ravel()[:4], ', ')} there"

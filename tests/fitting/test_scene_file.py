@@ -90,6 +90,8 @@ def check_all(file: Path, folder: Path, given: Mapping[str, str] | None = None) 
         elif old.endswith("to_world") and "<vector" in file.read_text(encoding="utf-8") and old.startswith(("sun", "sky")):
             forward = expected[:3, 2] / np.linalg.norm(expected[:3, 2])
             np.testing.assert_allclose(numbers(found)[:3, 2], forward, atol=1e-5, err_msg=old)
+        elif old.endswith("sun_direction"):
+            np.testing.assert_allclose(numbers(found).ravel(), expected.ravel() / np.linalg.norm(expected), atol=1e-5)
         else:
             found, expected = np.broadcast_arrays(numbers(found).ravel(), expected.ravel())
             np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4, err_msg=old)
@@ -108,6 +110,13 @@ def test_all_parameters_of_our_scenes(tmp_path: Path, variant: str, name: str) -
 
 
 BODIES = {
+    "medium": """<medium type="homogeneous" id="m"><rgb name="albedo" value="0.9, 0.8, 0.7"/>
+    <float name="sigma_t" value="2"/></medium>
+    <shape type="cube" id="a"><ref name="interior" id="m"/></shape>""",
+    "sky": """<emitter type="sunsky" id="a"><float name="turbidity" value="4"/><rgb name="albedo" value="0.3"/>
+    <vector name="sun_direction" x="0.2" y="0.5" z="1"/></emitter>""",
+    "batch": f"""<sensor type="batch" id="a"><sensor type="perspective"><float name="fov" value="30"/>{FILM}</sensor>
+    <sensor type="perspective">{FILM}</sensor>{FILM}</sensor>""",
     "forms": """<shape type="cube" id="a"><bsdf type="diffuse"><rgb name="reflectance" value="0.5, 0.4, 0.3"/></bsdf></shape>
     <shape type="cube" id="b"><bsdf type="diffuse"><spectrum name="reflectance" value="0.5"/></bsdf></shape>
     <shape type="cube" id="c"><bsdf type="diffuse"><rgb name="reflectance" value="0.5"/></bsdf></shape>
@@ -185,6 +194,26 @@ def test_all_parameters(tmp_path: Path, variant: str, name: str) -> None:
 def test_scenes_with_our_integrator(tmp_path: Path, variant: str) -> None:
     body = '<integrator type="shadowmap"><integer name="shadow_map_resolution" value="64"/></integrator>' + BODIES["defaults"]
     assert not check_all(scene(tmp_path, body), tmp_path).notes
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        *("diffuse", "conductor", "roughconductor", "dielectric", "roughdielectric", "thindielectric", "plastic", "roughplastic"),
+        *("principled", "principledthin", "null", "bumpmap", "normalmap"),
+    ],
+)
+def test_materials_of_all_kinds(tmp_path: Path, variant: str, kind: str) -> None:
+    texture = '<texture type="checkerboard" name="normalmap"/>' if kind == "normalmap" else '<texture type="checkerboard"/>'
+    inner = f'{texture}<bsdf type="diffuse"/>' if kind in ("bumpmap", "normalmap") else ""
+    file = scene(tmp_path, f'<shape type="cube" id="a"><bsdf type="{kind}">{inner}</bsdf></shape>')
+    assert not check_all(file, tmp_path).notes
+
+
+def test_parameters_without_a_value(tmp_path: Path, variant: str) -> None:
+    body = '<shape type="cube" id="a"><bsdf type="hair"/></shape><shape type="cube" id="b"><bsdf type="diffuse"/></shape>'
+    written = write(scene(tmp_path, body), tmp_path, values={"b.bsdf.reflectance.value": np.array([0.1, 0.2, 0.3])})
+    assert not written.notes
 
 
 def test_spectra_in_files(tmp_path: Path, variant: str) -> None:

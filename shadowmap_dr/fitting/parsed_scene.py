@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -45,7 +45,8 @@ class ParsedScene:
         config = mi.parser.ParserConfig(mi.variant())
         config.merge_equivalent = config.merge_meshes = False
         try:
-            state = mi.parser.parse_file(config, str(file), **parameters)
+            with _resolving([self.folder]):
+                state = mi.parser.parse_file(config, str(file), **parameters)
         except (RuntimeError, TypeError, UnicodeError) as error:
             raise ShadowmapError(f"cannot load {file}: {mitsuba_message(error)}") from error
         self.texts = [XmlText(Path(str(path))) for path in state.files]
@@ -74,7 +75,7 @@ class ParsedScene:
             for key in root.keys()
             if root.type(key) == mi.Properties.Type.ResolvedReference
         }
-        with self._resolving():
+        with _resolving(self._folders()):
             try:
                 mi.parser.transform_all(config, state)
                 scene: Any = mi.parser.instantiate(config, state)
@@ -101,6 +102,11 @@ class ParsedScene:
                 return self._descended(text, element, tuple(parts[depth:]))
             owner = parent
         return None
+
+    def value(self, name: str) -> Any:  # Any: parameters have values of all kinds
+        """The value of a parameter; None if there is none of this name, or if it has none, as some of hair have."""
+        value, kind, owner, _ = self.parameters.properties.get(name, (None, None, None, 0))
+        return value if kind is None else mi.get_property(value, kind, owner)
 
     def shape_element(self, shape: mi.Shape) -> tuple[XmlText, Element] | None:
         """The element of a shape of the scene."""
@@ -162,18 +168,19 @@ class ParsedScene:
                     found.append(self.folder / self.substituted(element.get("value")))
         return [*reversed(found), self.folder]
 
-    @contextlib.contextmanager
-    def _resolving(self) -> Iterator[None]:
-        """Let Mitsuba find the scene's files."""
-        before = mi.file_resolver()
-        resolver = mi.FileResolver(before)
-        for folder in reversed(self._folders()):
-            resolver.prepend(os.fspath(folder))
-        mi.set_file_resolver(resolver)
-        try:
-            yield
-        finally:
-            mi.set_file_resolver(before)
+
+@contextlib.contextmanager
+def _resolving(folders: Sequence[Path]) -> Iterator[None]:
+    """Let Mitsuba look for files in folders, the first first."""
+    before = mi.file_resolver()
+    resolver = mi.FileResolver(before)
+    for folder in reversed(folders):
+        resolver.prepend(os.fspath(folder))
+    mi.set_file_resolver(resolver)
+    try:
+        yield
+    finally:
+        mi.set_file_resolver(before)
 
 
 # Begin of the names of objects that have none.

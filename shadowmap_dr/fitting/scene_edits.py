@@ -85,6 +85,8 @@ class TransformStep(Step):
         tables = [mi.traverse(shape) for shape in (old, new)]
         if "to_world" in tables[0]:
             own, moved = (_matrix(table["to_world"]) for table in tables)
+            if _is_stretched(old, self.matrix @ own):
+                return f"Mitsuba draws a {old.class_name()} only round"
             return "" if is_close(moved, self.matrix @ own) else "its to_world is another one there"
         if "control_points" in tables[0]:
             points, found = (np.array(table["control_points"]).reshape(-1, 4)[:, :3] for table in tables)
@@ -117,7 +119,7 @@ class MeshStep(Step):
         self._write(path, vertices)
         text.set(element, type="ply")
         for child in element.children:
-            if child.tag in _VALUES and child.get("name") not in ("face_normals", "flip_normals"):
+            if child.tag in _VALUES and child.get("name") not in _OF_ALL_MESHES:
                 text.replace(child, None)
         text.append(element, tag("string", {"name": "filename", "value": f"{FILES_FOLDER}/{path.name}"}))
         if self.normals is None and element.named("face_normals") is None:
@@ -185,7 +187,7 @@ class ValueStep(Step):
 
     def __post_init__(self) -> None:
         self.owner = self.key
-        self.is_texture = self.value.ndim == 3 and self.value.shape[-1] in (1, 3, 4) and self.value.size > 16
+        self.is_texture = self.value.ndim == 3 and self.key.endswith((".value", ".data"))
 
     def apply(self, scene: EditedScene) -> None:
         place = self.parsed.place(self.key)
@@ -198,7 +200,7 @@ class ValueStep(Step):
             self._default_bsdf(scene, text, element, path[1:])
         elif path[-1] == "data":
             self._data(scene, text, element, path)
-        elif len(path) == 2 and path[1] == "value":
+        elif path[1:] in (("value",), ("value", "value")):  # the latter of media, in volumes that are the same everywhere
             self._colour(scene, text, element, path[0])
         elif len(path) == 1:
             self._number(text, element, path[0])
@@ -303,22 +305,21 @@ class ValueStep(Step):
 
     def _number(self, text: XmlText, element: Element, name: str) -> None:
         """Parameters of the object itself: numbers, points, transformations."""
-        special: Callable[[XmlText, Element], None] | None = {
+        special: dict[str, Callable[[XmlText, Element], None]] = {
             "to_world": self._to_world,
+            "to_uv": lambda text, element: self._replace_transform(text, element, "to_uv"),
             "position": self._position,
             "x_fov": self._fov,
-            "eta": self._eta,
-        }.get(name)
-        if special is not None:
-            special(text, element)
-            return
-        if name == "to_uv":
-            self._replace_transform(text, element, "to_uv")
+        }
+        if element.named("eta") is None and not element.get("type").startswith("principled"):
+            special["eta"] = self._eta
+        if name in special:
+            special[name](text, element)
             return
         numbers = self.value.ravel()
         child = element.named(name)
         if len(numbers) == 1:
-            kind = child.tag if child is not None and child.tag in ("float", "spectrum", "integer") else "float"
+            kind = child.tag if child is not None and child.tag == "spectrum" else "float"
         elif len(numbers) == 3:
             kind = child.tag if child is not None and child.tag in ("vector", "point", "rgb") else "vector"
         else:
@@ -419,6 +420,8 @@ class ValueStep(Step):
                 found = found[:3, 2] / np.linalg.norm(found[:3, 2])
         else:
             found, wanted = np.array(value, np.float64).ravel(), np.asarray(wanted, np.float64).ravel()
+        if self.key.endswith("direction"):  # Mitsuba keeps unit vectors
+            found, wanted = (vector / np.linalg.norm(vector) for vector in (found, wanted))
         if found.size != wanted.size and 1 in (found.size, wanted.size):
             found, wanted = np.broadcast_arrays(found, wanted)
         return "" if is_close(found, wanted) else f"it is {_text(found.ravel()[:4], ', ')} there"
@@ -431,7 +434,8 @@ class ValueStep(Step):
 
 # -------------------------------------------------------------------------------------------------------------------- helpers
 
-# Elements of values; names of those that place a shape, by its plug-in.
+# Elements of values; names of those that meshes of all files have; names of those that place a shape, by its plug-in.
+_OF_ALL_MESHES = ("face_normals", "flip_normals", "silhouette_sampling_weight")
 _VALUES = ("boolean", "float", "integer", "matrix", "point", "string", "transform", "vector")
 _PLACES = {"sphere": ("center", "radius"), "cylinder": ("p0", "p1", "radius")}
 
@@ -455,6 +459,15 @@ def _matrix(value: Any) -> Array:  # Any: a transformation of Mitsuba's, or an a
     if matrix.shape not in ((4, 4), (3, 3)):
         raise Unwritable(f"its shape {matrix.shape} is not (4, 4)")
     return matrix
+
+
+def _is_stretched(shape: mi.Shape, to_world: Array) -> bool:
+    """True if a sphere or cylinder, which Mitsuba only warns of, is none any more."""
+    round_axes = {"Sphere": 3, "Cylinder": 2}.get(shape.class_name(), 0)
+    products = to_world[:3, :3].T @ to_world[:3, :3]
+    expected = np.diag(np.diagonal(products))
+    expected[range(round_axes), range(round_axes)] = products[0, 0]
+    return bool(round_axes) and not is_close(products, expected, 1e-3)
 
 
 def is_transform(value: Any) -> bool:  # Any: parameters have values of all kinds

@@ -114,7 +114,7 @@ class _Writer:
             if not differing:
                 break
             for name, reason in differing.items():
-                value = numbers_of(self.parsed.parameters[name]) if name in self.parsed.parameters else None
+                value = numbers_of(self.parsed.value(name))
                 if name in steps:
                     notes[name] = reason
                     del steps[name]
@@ -230,7 +230,7 @@ class _Writer:
         moved = {step.owner for step in steps.values()}
         for key in self.parsed.parameters.keys():
             if key in written.parameters and not any(key == one or key.startswith(f"{one}.") for one in moved):
-                before, after = (numbers_of(one.parameters[key]) for one in (self.parsed, written))
+                before, after = (numbers_of(one.value(key)) for one in (self.parsed, written))
                 if before is not None and after is not None and not is_close(after, before):
                     found.setdefault(key, "it is another value there, though the fit has not changed it")
         return found
@@ -346,7 +346,8 @@ class _Writer:
                 raise OutputError(f"cannot write {copy}: {error.strerror or error}.") from error
             return f"{FILES_FOLDER}/{copy.name}"
         try:
-            return Path(os.path.relpath(path.resolve(), self.target.parent.resolve())).as_posix()
+            # A link keeps its own name, which may have the suffix that tells its format.
+            return Path(os.path.relpath(path.parent.resolve() / path.name, self.target.parent.resolve())).as_posix()
         except ValueError:  # of another drive
             return path.as_posix()
 

@@ -28,8 +28,8 @@ LONGER_SIDE = 4096
 
 # Pillow's other formats need programs (EPS), or are no pictures.
 _FORMATS = ("PNG", "JPEG", "WEBP", "GIF", "BMP", "TIFF", "PPM", "TGA")
-# Pillow keeps pixels of several channels in four bytes.
-_PIXEL_BYTES = {"1": 1, "L": 1, "P": 1, "I;16": 2, "I;16B": 2, "I;16L": 2}
+# Pillow keeps pixels of several channels in four bytes; numbers of one channel are repeated here.
+_PIXEL_BYTES = {"1": 1, "L": 1, "P": 1, "I;16": 8, "I;16B": 8, "I;16L": 8, "I": 8, "F": 16}
 # Layouts of 16-bit colours in files, in Pillow's words, with the order of their bytes.
 _DEEP = re.compile(r"(RGB|RGBX|RGBA|RGBa|LA);16[BLN]")
 _NATIVE = "L" if sys.byteorder == "little" else "B"
@@ -167,7 +167,8 @@ def _deep_tiff(file: str | os.PathLike[str] | io.BytesIO, high: str, low: str) -
         with Image.open(file, formats=_FORMATS) as image:
             tiles: Any = image.tile  # of several types in Pillow's versions
             premultiplied = tiles[0][3][0].startswith("RGBa")
-            image.tile = [type(tile)(tile[0], tile[1], tile[2], (name, *tile[3][1:])) for tile in tiles]
+            make = getattr(type(tiles[0]), "_make", tuple)
+            image.tile = [make((tile[0], tile[1], tile[2], (name, *tile[3][1:]))) for tile in tiles]
             values = values + np.asarray(image).astype(np.uint16) * np.uint16(factor)
     if values.shape[2] == 3:
         return np.concatenate([values, np.full_like(values[..., :1], 65535)], axis=-1)

@@ -90,6 +90,8 @@ def check_all(file: Path, folder: Path, given: Mapping[str, str] | None = None) 
         elif old.endswith("to_world") and "<vector" in file.read_text(encoding="utf-8") and old.startswith(("sun", "sky")):
             forward = expected[:3, 2] / np.linalg.norm(expected[:3, 2])
             np.testing.assert_allclose(numbers(found)[:3, 2], forward, atol=1e-5, err_msg=old)
+        elif old.endswith("sun_direction"):
+            np.testing.assert_allclose(numbers(found).ravel(), expected.ravel() / np.linalg.norm(expected), atol=1e-5)
         else:
             found, expected = np.broadcast_arrays(numbers(found).ravel(), expected.ravel())
             np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4, err_msg=old)
@@ -108,6 +110,13 @@ def test_all_parameters_of_our_scenes(tmp_path: Path, variant: str, name: str) -
 
 
 BODIES = {
+    "medium": """<medium type="homogeneous" id="m"><rgb name="albedo" value="0.9, 0.8, 0.7"/>
+    <float name="sigma_t" value="2"/></medium>
+    <shape type="cube" id="a"><ref name="interior" id="m"/></shape>""",
+    "sky": """<emitter type="sunsky" id="a"><float name="turbidity" value="4"/><rgb name="albedo" value="0.3"/>
+    <vector name="sun_direction" x="0.2" y="0.5" z="1"/></emitter>""",
+    "batch": f"""<sensor type="batch" id="a"><sensor type="perspective"><float name="fov" value="30"/>{FILM}</sensor>
+    <sensor type="perspective">{FILM}</sensor>{FILM}</sensor>""",
     "forms": """<shape type="cube" id="a"><bsdf type="diffuse"><rgb name="reflectance" value="0.5, 0.4, 0.3"/></bsdf></shape>
     <shape type="cube" id="b"><bsdf type="diffuse"><spectrum name="reflectance" value="0.5"/></bsdf></shape>
     <shape type="cube" id="c"><bsdf type="diffuse"><rgb name="reflectance" value="0.5"/></bsdf></shape>
@@ -182,6 +191,63 @@ def test_all_parameters(tmp_path: Path, variant: str, name: str) -> None:
     assert "<!-- kept -->" in written.files[0].read_text(encoding="utf-8")
 
 
+def test_scenes_with_our_integrator(tmp_path: Path, variant: str) -> None:
+    body = '<integrator type="shadowmap"><integer name="shadow_map_resolution" value="64"/></integrator>' + BODIES["defaults"]
+    assert not check_all(scene(tmp_path, body), tmp_path).notes
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        *("diffuse", "conductor", "roughconductor", "dielectric", "roughdielectric", "thindielectric", "plastic", "roughplastic"),
+        *("principled", "principledthin", "null", "bumpmap", "normalmap"),
+    ],
+)
+def test_materials_of_all_kinds(tmp_path: Path, variant: str, kind: str) -> None:
+    texture = '<texture type="checkerboard" name="normalmap"/>' if kind == "normalmap" else '<texture type="checkerboard"/>'
+    inner = f'{texture}<bsdf type="diffuse"/>' if kind in ("bumpmap", "normalmap") else ""
+    file = scene(tmp_path, f'<shape type="cube" id="a"><bsdf type="{kind}">{inner}</bsdf></shape>')
+    assert not check_all(file, tmp_path).notes
+
+
+def test_parameters_without_a_value(tmp_path: Path, variant: str) -> None:
+    body = '<shape type="cube" id="a"><bsdf type="hair"/></shape><shape type="cube" id="b"><bsdf type="diffuse"/></shape>'
+    written = write(scene(tmp_path, body), tmp_path, values={"b.bsdf.reflectance.value": np.array([0.1, 0.2, 0.3])})
+    assert not written.notes
+
+
+def test_spectra_in_files(tmp_path: Path, variant: str) -> None:
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "a.spd").write_text("400 0.2\n550 0.5\n700 0.7\n")
+    body = '<shape type="cube" id="{}"><bsdf type="diffuse"><spectrum name="reflectance" filename="a.spd"/></bsdf></shape>'
+    file = scene(tmp_path / "in", body.format("a") + body.format("b"))
+    written = write(file, tmp_path, values={"b.bsdf.reflectance.value": np.array([0.1, 0.2, 0.3])})
+    assert not written.notes and 'filename="../in/a.spd"' in written.files[0].read_text()
+    np.testing.assert_allclose(np.array(read(written)["b.bsdf.reflectance.value"]).ravel(), [0.1, 0.2, 0.3], rtol=1e-6)
+
+
+def test_refraction_of_principled_materials(tmp_path: Path, variant: str) -> None:
+    body = '<shape type="cube" id="a"><bsdf type="principled"><float name="eta" value="1.5"/></bsdf></shape>'
+    written = write(scene(tmp_path, body), tmp_path, values={"a.bsdf.eta": np.array([1.3])})
+    assert not written.notes and '<float name="eta" value="1.3"/>' in written.files[0].read_text()
+
+
+_KINDS = ("sphere", "cube", "cylinder")
+
+
+def test_maps_that_a_shape_does_not_take(tmp_path: Path, variant: str) -> None:
+    file = scene(tmp_path, "".join(f'<shape type="{kind}" id="{name}"/>' for name, kind in zip("abc", _KINDS, strict=True)))
+    matrix = np.diag([1.0, 2.0, 3.0, 1.0])
+    written = write(file, tmp_path, transforms={"a": matrix, "b": matrix, "c": matrix})
+    assert written.notes == [
+        "a:pose could not be written into the scene file: Mitsuba draws a Sphere only round.",
+        "c:pose could not be written into the scene file: Mitsuba draws a Cylinder only round.",
+    ]
+    assert "<matrix" in written.files[0].read_text()
+    points = np.array(read(written)["b.vertex_positions"]).reshape(-1, 3)
+    np.testing.assert_allclose(np.abs(points).max(0), [1, 2, 3])
+
+
 def test_only_changed_lines_are_others(tmp_path: Path, variant: str) -> None:
     file = SCENES / "gallery.xml"
     written = write(file, tmp_path, values={"wall.bsdf.reflectance.value": np.array([0.1, 0.2, 0.3])})
@@ -235,7 +301,7 @@ SHAPES = {
     "ply": PLY.format(""),
     "obj": '<shape type="obj" id="a"><string name="filename" value="a.obj"/>'
            '<transform name="to_world"><scale value="2"/></transform></shape>',
-    "faces": PLY.format('<boolean name="face_normals" value="true"/>'),
+    "faces": PLY.format('<boolean name="face_normals" value="true"/><float name="silhouette_sampling_weight" value="0.5"/>'),
     "flipped": PLY.format('<boolean name="flip_normals" value="true"/>'),
     "cube": '<shape type="cube" id="a"/>',
     "flipped cube": '<shape type="cube" id="a"><boolean name="flip_normals" value="true"/></shape>',
@@ -301,6 +367,8 @@ def test_vertices(tmp_path: Path, variant: str, name: str) -> None:
     written = write(file, tmp_path, vertices={"a": new})
     assert not written.notes
     after = mi.load_file(str(written.files[0]), optimize=False)
+    weights = [float(mi.traverse(one)["a.silhouette_sampling_weight"]) for one in (loaded, after)]
+    assert weights[0] == weights[1]
     assert [one.id() for one in after.shapes()] == ["a"] and written.files[1].name == "a.ply"
     np.testing.assert_allclose(np.array(after.shapes()[0].vertex_positions_buffer()).reshape(-1, 3), new, atol=1e-6)
     table = mi.traverse(loaded)
@@ -407,13 +475,14 @@ def test_textures(tmp_path: Path, variant: str, body: str, key: str | None, most
     "material",
     ["", '<bsdf type="diffuse"/>', '<bsdf type="diffuse"><rgb name="reflectance" value="0.2"/></bsdf>'],
 )
-def test_colours_become_textures(tmp_path: Path, variant: str, key: str, material: str) -> None:
+@pytest.mark.parametrize("size", [(5, 7, 3), (2, 2, 3)])
+def test_colours_become_textures(tmp_path: Path, variant: str, key: str, material: str, size: tuple[int, ...]) -> None:
     body = f'<shape type="rectangle" id="a">{material}</shape>'
-    new = np.random.default_rng(1).uniform(0, 1, (5, 7, 3)).astype(np.float32)
+    new = np.random.default_rng(1).uniform(0, 1, size).astype(np.float32)
     written = write(scene(tmp_path, body), tmp_path, values={key: new})
     assert not written.notes
     np.testing.assert_allclose(np.array(read(written)["a.bsdf.reflectance.data"]), new, atol=1e-4)
-    assert np.asarray(Image.open(written.files[1])).shape == (5, 7, 3), "others read it, too"
+    assert np.asarray(Image.open(written.files[1])).shape == size, "others read it, too"
 
 
 # --------------------------------------------------------------------------------------------------------------------- files

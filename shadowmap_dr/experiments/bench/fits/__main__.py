@@ -24,11 +24,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Write problems for the fit as folders.")
     parser.add_argument("out", type=Path)
     parser.add_argument("--only", action="append", default=[], help="name of a problem")
+    parser.add_argument("--calibration", action="store_true", help="the problems for tuning instead of those that are scored")
     parser.add_argument("--start", type=int, default=0, help="number of the start values")
     parser.add_argument("--sheet", action="store_true", help="draw start and photograph of all problems side by side")
     arguments = parser.parse_args()
     mi.set_variant("llvm_ad_rgb")
-    problems = catalogue.named(arguments.only) if arguments.only else list(catalogue.scored())
+    every = catalogue.calibration() if arguments.calibration else catalogue.scored()
+    problems = catalogue.named(arguments.only) if arguments.only else list(every)
     for problem in problems:
         folder = arguments.out / problem.name
         write_problem(problem, arguments.start, folder, arguments.out / "pictures")

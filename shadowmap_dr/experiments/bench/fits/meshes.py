@@ -228,10 +228,23 @@ def _hill() -> Part:
     return _grid(np.stack([x, height, z], -1)[:, ::-1], closed=(False, False))
 
 
-def _sheet() -> Part:
-    """A flat square of many triangles, facing +z."""
-    x, y = np.meshgrid(np.linspace(-1, 1, 33), np.linspace(-1, 1, 33), indexing="ij")
-    return _grid(np.stack([x, y, 0 * x], -1), closed=(False, False))
+def _crank() -> Part:
+    path = np.array([(-1.2, 0, 0), (-0.5, 0, 0), (-0.5, 0.7, 0), (0.2, 0.7, 0), (0.2, 0, 0), (0.8, 0, 0), (0.8, 0, 0.5)], float)
+    bars = []
+    for a, b in zip(path[:-1], path[1:], strict=True):
+        low, high = np.minimum(a, b) - 0.11, np.maximum(a, b) + 0.11
+        bars.append(_box(low.tolist(), high.tolist()))
+    return _joined([*bars, _ball((-1.25, 0, 0), (0.25, 0.25, 0.25), 12)])
+
+
+def _tower() -> Part:
+    """Boxes on each other, each turned and shifted."""
+    boxes = []
+    for k, (width, depth, turn) in enumerate(((1.0, 0.8, 0.1), (0.7, 0.75, 0.5), (0.8, 0.4, 1.1), (0.35, 0.5, 0.3))):
+        corners, faces = _box((-width / 2, 0.5 * k, -depth / 2), (width / 2, 0.5 * k + 0.5, depth / 2))
+        c, s = np.cos(turn), np.sin(turn)
+        boxes.append((corners @ np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]]) + [0.1 * (k % 2), 0, 0.05 * k], faces))
+    return _joined(boxes)
 
 
 def _globe() -> Part:
@@ -245,6 +258,7 @@ MADE: dict[str, tuple[Callable[[], Part], bool]] = {
     "cactus": (_cactus, True),
     "cam": (_cam, False),
     "chair": (_chair, False),
+    "crank": (_crank, False),
     "glider": (_glider, False),
     "globe": (_globe, True),
     "hill": (_hill, True),
@@ -252,9 +266,9 @@ MADE: dict[str, tuple[Callable[[], Part], bool]] = {
     "knot": (_knot, True),
     "mug": (_mug, False),
     "rock": (_rock, True),
-    "sheet": (_sheet, True),
     "spring": (_spring, True),
     "stairs": (_stairs, False),
+    "tower": (_tower, False),
 }
 # Meshes of this package that have edges.
 _FACETED = ("teapot",)

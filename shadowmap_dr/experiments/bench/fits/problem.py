@@ -6,9 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from .photographs import Photograph
 from .scenes import Body, Scene
-from .variations import Variation, start_scene, value
+from .variations import Variation, start_scene, value, with_value
+
+#: Start values of light from everywhere that stands for light which bounces.
+AMBIENT = (0.04, 0.12)
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +44,12 @@ class FitProblem:
 
     def start(self, number: int) -> Scene:
         """The scene with the start values of a run, the first is 0."""
-        return start_scene(self.truth, self.varied, 1000 * self.seed + number)
+        scene = start_scene(self.truth, self.varied, 1000 * self.seed + number)
+        random = np.random.default_rng(1000 * self.seed + number + 500)
+        for one in self.varied:
+            if one.name in self.ambient:
+                scene = with_value(scene, one, np.full(3, random.uniform(*AMBIENT)))
+        return scene
 
     @property
     def scored(self) -> tuple[Variation, ...]:
@@ -86,9 +96,8 @@ class FitProblem:
                 result += [flag, file if len(files) == 1 else f"{k}={file}"]
         for one in self.varied:
             result += ["--vary", one.name]
-        result.append("--exposure")
-        if any(photo.white != (1, 1) for photo in self.photographs):
-            result.append("--white-balance")
+        # White balance has an exposure of each colour.
+        result.append("--white-balance" if any(photo.white != (1, 1) for photo in self.photographs) else "--exposure")
         if any(photo.vignetting for photo in self.photographs):
             result.append("--vignetting")
         return result

@@ -6,11 +6,13 @@ Lengths are such that a stage is about 4 wide; y is up.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
+from ....io.images import to_linear, to_srgb
 from . import space
 from .scenes import Body, Camera, Lamp, Material, Scene
 from .variations import is_above
@@ -31,7 +33,15 @@ _WALLS = ((0.62, 0.6, 0.55), (0.5, 0.54, 0.58), (0.58, 0.5, 0.44), (0.44, 0.5, 0
 _TURN = np.deg2rad
 
 
-def scene(stage: str, things: Sequence[str], lights: Sequence[str], views: int, size: tuple[int, int], seed: int) -> Scene:
+def scene(
+    stage: str,
+    things: Sequence[str],
+    lights: Sequence[str],
+    views: int,
+    size: tuple[int, int],
+    seed: int,
+    files: Mapping[str, Path] | None = None,
+) -> Scene:
     """A scene.
 
     Args:
@@ -41,13 +51,14 @@ def scene(stage: str, things: Sequence[str], lights: Sequence[str], views: int, 
         views: number of cameras.
         size: width and height of pictures in pixels.
         seed: of all that is not named.
+        files: meshes by name, beside those of this package.
     """
     random = np.random.default_rng(seed)
     backdrops = _backdrops(stage, random)
     bodies: list[Body] = []
     order = random.permutation(len(_PALETTE))
     for k, thing in enumerate(things):
-        bodies.append(_thing(stage, thing, k, len(things), backdrops, _PALETTE[order[k]], random))
+        bodies.append(_thing(stage, thing, k, len(things), backdrops, _PALETTE[order[k]], random, files or {}))
     azimuth = float(random.uniform(-24, 24))
     lamps, shining = _lights(lights, stage, azimuth, random)
     height = float(np.mean([body.centre()[1] for body in bodies])) - (0.05 if stage == "floor" else 0.0)
@@ -88,6 +99,7 @@ def _thing(
     backdrops: Sequence[Body],
     colour: Sequence[float],
     random: np.random.Generator,
+    files: Mapping[str, Path],
 ) -> Body:
     """A thing at its place: on the floor, leaning a little, or in the air, turned in any way."""
     name, _, kind = words.rstrip("^").partition("/")
@@ -96,7 +108,12 @@ def _thing(
     size = _SIZES[count] * random.uniform(0.93, 1.07)
     lean = space.rotation(_TURN(random.uniform(6, 25) if in_air else random.uniform(0, 7)) * space.random_direction(random))
     turn = lean @ space.rotation((0, _TURN(random.uniform(-55, 55)), 0))
-    body = Body(name, name, space.moved(turn * size), _material(kind, np.array(colour) * random.uniform(0.85, 1.15), random))
+    body = Body(
+        name,
+        str(files.get(name, name)),
+        space.moved(turn * size),
+        _material(kind, np.array(colour) * random.uniform(0.85, 1.15), random),
+    )
     low = body.world().min(0)[1]
     height = 0.9 + random.uniform(-0.1, 0.1) if stage == "wall" else -low + (random.uniform(0.12, 0.35) if in_air else 0.0)
     z = z - 0.1 if stage == "wall" else z
@@ -144,17 +161,18 @@ def _lights(
             place = space.look_at(where, aim)
             lamps.append(Lamp(name, "spot", place, {"intensity": _numbers(24 * strength * tint)}, settings))
         elif name == "panel":
-            place = space.look_at(where * 0.92, aim) @ space.moved(np.diag([0.42, 0.27, 1.0]))
+            where = aim - 3.1 * space.from_elevation(azimuth + side * random.uniform(50, 70), random.uniform(52, 62))
+            place = space.look_at(where, aim) @ space.moved(np.diag([0.42, 0.27, 1.0]))
             black = Material("diffuse", {"reflectance": (0.05, 0.05, 0.05)})
             bodies.append(Body(name, "rectangle", place, black, radiance=_numbers(44 * strength * tint)))
         elif name == "sky":
             lamps.append(Lamp(name, "constant", np.eye(4), {"radiance": _numbers((0.8 * strength if alone else 0.16) * tint)}))
         elif name == "dome":
-            image = _dome(-space.from_elevation(beside, elevation), random) * strength
+            image = _dome(-space.from_elevation(beside, elevation), random) * 0.55 * strength
             lamps.append(Lamp(name, "envmap", np.eye(4), {"scale": (round(float(random.uniform(0.8, 1.2)), 4),)}, image=image))
         elif name == "sunsky":
             settings = {"turbidity": (round(float(random.uniform(2.5, 5)), 3),)}
-            lamps.append(Lamp(name, "sunsky", sun, {"sun_scale": (0.05,), "sky_scale": (0.05,)}, settings))
+            lamps.append(Lamp(name, "sunsky", sun, {"sun_scale": (0.6,), "sky_scale": (0.6,)}, settings))
         else:
             raise KeyError(name)
     return tuple(lamps), tuple(bodies)
@@ -189,3 +207,45 @@ def _cameras(
         name = "camera" if views == 1 else f"camera{k}"
         result.append(Camera(name, space.look_at(origin, target), fov, *size))
     return tuple(result)
+
+
+def without_sky(scene: Scene) -> Scene:
+    """The scene with a sky that is nearly black, as pictures with light that bounces need none."""
+    sky = scene.lamp("sky")
+    return scene.replaced(dataclasses.replace(sky, values={"radiance": (0.01, 0.01, 0.01)}))
+
+
+def with_picture(scene: Scene, name: str, random: np.random.Generator) -> Scene:
+    """The scene with a picture of soft discs and stripes, 32 texels wide, on a body."""
+    body, size = scene.body(name), 32
+    y, x = (np.mgrid[:size, :size] + 0.5) / size
+    image = np.broadcast_to(random.uniform(0.3, 0.5, 3), (size, size, 3)).copy()
+    image += 0.1 * np.sin(2 * np.pi * (3 * x + 1.5 * y))[..., None] * random.uniform(0.5, 1, 3)
+    for _ in range(6):
+        a, b, radius = random.uniform(0.15, 0.85), random.uniform(0.2, 0.8), random.uniform(0.08, 0.2)
+        inside = 1 / (1 + np.exp((np.hypot(x - a, y - b) - radius) * 60))
+        image += inside[..., None] * (random.uniform(0.1, 0.8, 3) - image)
+    image = to_linear(np.round(to_srgb(np.clip(image, 0.05, 0.85)) * 255) / 255)  # as the file has it
+    material = Material(body.material.kind, {}, {"reflectance": image})
+    return scene.replaced(dataclasses.replace(body, material=material))
+
+
+def deformed(scene: Scene, name: str, random: np.random.Generator) -> Scene:
+    """The scene with a landscape of which one part has risen and another has moved sideways."""
+    body = scene.body(name)
+    body = dataclasses.replace(body, place=body.place @ np.diag([1.7, 1.7, 1.7, 1.0]))
+    vertices = body.local().copy()
+    for sign in (1, -1):
+        middle = np.array([0.4 * sign, 0, 0.3 * sign]) + random.uniform(-0.1, 0.1, 3)
+        near = np.exp(-np.sum((vertices - middle)[:, [0, 2]] ** 2, 1) / (2 * 0.3**2))[:, None]
+        vertices += near * np.array([0.06 * sign, 0.26 if sign > 0 else -0.1, 0.08]) * random.uniform(0.85, 1.15)
+    body = dataclasses.replace(body, vertices=vertices)
+    low = min(body.world().min(0)[1], dataclasses.replace(body, vertices=None).world().min(0)[1])
+    return scene.replaced(dataclasses.replace(body, place=space.moved(np.eye(3), (0, 0.06 - low, 0)) @ body.place))
+
+
+def intruder(scene: Scene, random: np.random.Generator) -> Body:
+    """A ball on the floor at the side, in the way of no thing."""
+    x = 1.15 * random.choice([-1, 1])
+    material = Material("diffuse", {"reflectance": (0.2, 0.5, 0.25)})
+    return Body("ball", "globe", space.moved(0.24 * np.eye(3), (x, 0.24, 0.75)), material)

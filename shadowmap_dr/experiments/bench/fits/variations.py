@@ -75,7 +75,7 @@ def parse(name: str) -> Variation:
     if not kind:
         return Variation(name, part, "value", inside.removesuffix(".value"))
     kind, _, detail = kind.partition(":")
-    return Variation(name, part, kind, inside.removeprefix("bsdf.") or "reflectance" if kind == "texture" else detail)
+    return Variation(name, part, kind, (inside.partition(".")[2] or "reflectance") if kind == "texture" else detail)
 
 
 def value(scene: Scene, variation: Variation) -> Array:
@@ -174,7 +174,7 @@ def start_scene(truth: Scene, variations: tuple[Variation, ...], seed: int) -> S
     for variation in variations:
         for attempt in range(_ATTEMPTS):
             drawn = _wrong(truth, scene, variation, diameter, random)
-            if is_plausible(drawn, variation.part):
+            if variation.kind == "vertices" or is_plausible(drawn, variation.part):
                 break
             if attempt == _ATTEMPTS - 1:
                 raise ValueError(f"no plausible start of {variation.name}")

@@ -35,18 +35,19 @@ def standard_deviations(problem: FitProblem) -> dict[str, float]:
     """Standard deviations by the names of the numbers, as shares of their bars."""
     scene = _smaller(problem.truth)
     middle = _pictures(scene)
+    sizes = [np.sqrt(np.mean(picture**2)) for picture in middle]
     names, columns = [], []
     for variation in problem.varied:
         bars = _bars(scene, variation)
         for number, bar in enumerate(bars):
             step = np.eye(len(bars))[number] * bar * _STEP
             ahead, behind = (_pictures(nudged(scene, variation, sign * step)) for sign in (1, -1))
-            columns.append(np.concatenate([(a - b) / (2 * _STEP) for a, b in zip(ahead, behind, strict=True)]))
+            columns.append(np.concatenate([(a - b) / (2 * _STEP * s) for a, b, s in zip(ahead, behind, sizes, strict=True)]))
             names.append(f"{variation.name} {number}")
     count = len(columns)
     if not problem.common_factor:
         for k in range(len(middle)):  # the exposures, which are not printed
-            columns.append(np.concatenate([picture * (j == k) for j, picture in enumerate(middle)]))
+            columns.append(np.concatenate([picture / sizes[k] * (j == k) for j, picture in enumerate(middle)]))
     matrix = np.array(columns)
     # Pixels that are alike in their errors: a block of four counts once.
     covariance = np.linalg.pinv(matrix @ matrix.T / 4, rcond=1e-12)
@@ -74,15 +75,12 @@ def _smaller(scene: Scene) -> Scene:
 
 
 def _pictures(scene: Scene) -> list[Array]:
-    """Pictures of all cameras, flat, as shares of their brightness."""
+    """Pictures of all cameras, flat."""
     with tempfile.TemporaryDirectory() as folder:
         loaded = mi.load_file(str(write_scene(scene, Path(folder))))
     method = mi.load_dict({"type": "shadowmap"})
-    found = []
-    for sensor in range(len(scene.cameras)):
-        image = np.array(mi.render(loaded, sensor=sensor, integrator=method, spp=4), float)[..., :3].ravel()
-        found.append(image / np.sqrt(np.mean(image**2)))
-    return found
+    images = [mi.render(loaded, sensor=sensor, integrator=method, spp=4) for sensor in range(len(scene.cameras))]
+    return [np.array(image, float)[..., :3].ravel() for image in images]
 
 
 def main() -> None:

@@ -11,7 +11,7 @@ from xml.etree import ElementTree
 import numpy as np
 import numpy.typing as npt
 
-from ....io.images import to_srgb, write_exr
+from ....io.images import write_exr, write_image
 from ....io.meshes import write_ply
 from ....scene.mitsuba_meshes import make_mesh
 from . import space
@@ -60,6 +60,11 @@ class Body:
     def world(self) -> Array:
         """(V, 3) vertices."""
         return space.applied(self.place, self.local())
+
+    def middle(self) -> Array:
+        """The middle (3,) of its box before `place`."""
+        local = self.local()
+        return (local.min(0) + local.max(0)) / 2
 
     def centre(self) -> Array:
         """The middle (3,) of its box in the world."""
@@ -148,8 +153,11 @@ class Scene:
         return float(np.linalg.norm(points.max(0) - points.min(0)))
 
 
-def write_scene(scene: Scene, folder: Path) -> Path:
-    """Write ``scene.xml`` into a folder, with the meshes and pictures that it names. Returns its path."""
+def write_scene(scene: Scene, folder: Path, suffix: str = ".png") -> Path:
+    """Write ``scene.xml`` into a folder, with the meshes and pictures that it names. Returns its path.
+
+    ``suffix``: of textures. Mitsuba keeps those of ``.png`` as bytes, to which no derivatives flow; ``.exr`` become floats.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     root = ElementTree.Element("scene", version="3.0.0")
     ElementTree.SubElement(root, "integrator", type="direct")
@@ -158,16 +166,11 @@ def write_scene(scene: Scene, folder: Path) -> Path:
     for lamp in scene.lamps:
         _lamp(root, lamp, folder)
     for body in scene.bodies:
-        _body(root, body, folder)
+        _body(root, body, folder, suffix)
     ElementTree.indent(root, "    ")
     path = folder / "scene.xml"
     path.write_text('<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n", encoding="utf-8")
     return path
-
-
-def scene_text(scene: Scene, folder: Path) -> str:
-    """The XML of `write_scene`."""
-    return write_scene(scene, folder).read_text(encoding="utf-8")
 
 
 def _camera(root: ElementTree.Element, camera: Camera) -> None:
@@ -201,7 +204,7 @@ def _lamp(root: ElementTree.Element, lamp: Lamp, folder: Path) -> None:
         _value(element, name, value)
 
 
-def _body(root: ElementTree.Element, body: Body, folder: Path) -> None:
+def _body(root: ElementTree.Element, body: Body, folder: Path, suffix: str) -> None:
     kind = "rectangle" if body.mesh == "rectangle" else "ply"
     element = ElementTree.SubElement(root, "shape", type=kind, id=body.id)
     if kind == "ply":
@@ -217,19 +220,13 @@ def _body(root: ElementTree.Element, body: Body, folder: Path) -> None:
     for name, value in body.material.values.items():
         _value(bsdf, name, value)
     for name, image in body.material.textures.items():
-        file = f"{body.id}.png"
-        _write_texture(folder / file, image)
+        file = f"{body.id}{suffix}"
+        write_image(folder / file, image)
         texture = ElementTree.SubElement(bsdf, "texture", type="bitmap", name=name)
         ElementTree.SubElement(texture, "string", name="filename", value=file)
     if body.radiance is not None:
         emitter = ElementTree.SubElement(element, "emitter", type="area")
         _value(emitter, "radiance", body.radiance)
-
-
-def _write_texture(path: Path, image: Array) -> None:
-    from PIL import Image
-
-    Image.fromarray(np.round(to_srgb(image) * 255).astype(np.uint8)).save(path)
 
 
 def _value(parent: ElementTree.Element, name: str, value: tuple[float, ...]) -> None:

@@ -18,12 +18,13 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
+from ....io.images import to_linear
 from ....scene.mitsuba_meshes import mesh_buffers
 from . import space
 from .meshes import mesh
 from .problem import FitProblem
 from .scenes import Scene, write_scene
-from .variations import Variation, parse, pivot, texture, value
+from .variations import Variation, parse, texture, value
 
 Array = npt.NDArray[np.float64]
 Record = Mapping[str, Any]  # fit.json
@@ -126,7 +127,7 @@ def deviations(problem: FitProblem, variation: Variation, start: Scene, record: 
         return found
     old = getattr(start, holder)(part).place
     place = _map(record, part) @ old
-    middle = _local_middle(truth, part)
+    middle = truth.body(part).middle() if holder == "body" else np.zeros(3)
     found = []
     if kind in ("pose", "rotation"):
         turn = space.nearest_rotation(place[:3, :3]) @ space.nearest_rotation(own[:3, :3]).T
@@ -180,8 +181,8 @@ def _motion(truth: Scene, start: Scene, part: str) -> dict[str, float]:
     """True numbers of all motions of a part, by label."""
     holder = truth.holds(part)
     old, new = (getattr(scene, holder)(part).place for scene in (start, truth))
-    about = pivot(start, part)
     if holder == "body":
+        about = start.body(part).centre()
         matrix = new @ np.linalg.inv(old)
         shift = space.applied(matrix, about) - about
         size = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
@@ -251,14 +252,6 @@ def _position(start: Scene, part: str, estimate: Record) -> Array:
     return space.applied(np.array(estimate["matrix"], float), start.lamp(part).position)
 
 
-def _local_middle(scene: Scene, part: str) -> Array:
-    """The point (3,) before a part's place whose position counts."""
-    if scene.holds(part) != "body":
-        return np.zeros(3)
-    local = scene.body(part).local()
-    return (local.min(0) + local.max(0)) / 2
-
-
 def _value_error(problem: FitProblem, variation: Variation, estimate: Record, record: Record) -> float:
     """The largest relative error of a colour's channels, or that of a number."""
     new, true = _numbers(estimate, "value", "values"), value(problem.truth, variation)
@@ -279,7 +272,10 @@ def _fitted(folder: Path) -> mi.Scene:
 def _texture_error(problem: FitProblem, variation: Variation, folder: Path) -> float:
     """RMSE of the texels that are seen, lit, in the pictures."""
     key = f"{variation.part}.bsdf.{variation.detail}.data"
-    new = np.array(mi.traverse(_fitted(folder))[key], float)[..., :3]
+    data = mi.traverse(_fitted(folder))[key]
+    new = np.array(data)[..., :3]
+    if not dr.is_float_v(data):  # bytes, sRGB
+        new = to_linear(new / 255)
     seen = seen_texels(problem, variation, folder)
     difference = (new - texture(problem.truth, variation))[seen]
     return float(np.sqrt(np.mean(difference**2)))
@@ -290,16 +286,17 @@ def seen_texels(problem: FitProblem, variation: Variation, folder: Path) -> npt.
 
     The true scene is written into a folder ``truth`` beside that of the command's output.
     """
-    scene = mi.load_file(str(write_scene(problem.truth, folder.parent / "truth")))
+    scene = mi.load_file(str(write_scene(problem.truth, folder.parent / "truth", ".exr")))
     key = f"{variation.part}.bsdf.{variation.detail}.data"
     params = mi.traverse(scene)
-    params.keep([key])
-    dr.enable_grad(params[key])
+    data = mi.TensorXf(params[key])
+    dr.enable_grad(data)
+    params[key] = data
     params.update()
     for sensor in range(len(scene.sensors())):
         image = mi.render(scene, params, sensor=sensor, integrator=mi.load_dict({"type": "direct"}), spp=32)
         dr.backward(dr.sum(image, axis=None))
-    sums = np.array(dr.grad(params[key]), float).sum(-1)
+    sums = np.array(dr.grad(data), float).sum(-1)
     return sums > _SEEN * np.median(sums[sums > 0])
 
 

@@ -38,6 +38,8 @@ VERTICES = 0.004
 _RADIOMETRIC = ("irradiance", "intensity", "radiance")
 _ROUGH = ("alpha", "roughness")
 _AXES = {"x": np.array([1.0, 0, 0]), "y": np.array([0, 1.0, 0]), "z": np.array([0, 0, 1.0])}
+#: Most by which a start's spot may miss the middle of the things that it lights.
+_AIMED_DEG = 26.0
 _ATTEMPTS = 500
 
 
@@ -111,9 +113,10 @@ def moved_part(scene: Scene, part: str, matrix: Array) -> Scene:
 
 
 def pivot(scene: Scene, part: str) -> Array:
-    """The point (3,) about which a part turns: the middle of a shape's box, the place of a light or camera."""
+    """The point (3,) of a part whose position counts: the middle of a mesh's own box, the place of a light or camera."""
     kind = scene.holds(part)
-    return scene.body(part).centre() if kind == "body" else getattr(scene, kind)(part).place[:3, 3]
+    found: Body | Lamp | Camera = getattr(scene, kind)(part)
+    return space.applied(found.place, found.middle() if isinstance(found, Body) else np.zeros(3))
 
 
 def freedoms(scene: Scene, variation: Variation) -> int:
@@ -191,7 +194,9 @@ def is_plausible(scene: Scene, part: str) -> bool:
         lamp = scene.lamp(part)
         if lamp.kind in ("directional", "sunsky"):
             return lamp.direction[1] < -0.25
-        return lamp.kind in ("constant", "envmap") or lamp.position[1] > 1.0
+        things = np.mean([body.centre() for body in scene.bodies if not body.backdrop], axis=0)
+        aimed = lamp.kind != "spot" or space.angle_deg(lamp.direction, things - lamp.position) < _AIMED_DEG
+        return lamp.kind in ("constant", "envmap") or (bool(lamp.position[1] > 1.0) and aimed)
     body = scene.body(part)
     return body.radiance is not None or body.backdrop or (_is_seen(scene, body, 0.95) and is_above(scene, body))
 
@@ -230,6 +235,9 @@ def _wrong(truth: Scene, scene: Scene, variation: Variation, diameter: float, ra
         return float(random.uniform(*limits) ** random.choice([-1, 1]))
 
     def pose() -> Scene:
+        if _is_round(scene, part):
+            map_ = space.moved(np.eye(3), shift())
+            return moved_part(direction(), part, map_)
         small = scene.holds(part) == "camera"
         turn = np.radians(random.uniform(*(CAMERA_DEG if small else ROTATION_DEG))) * space.random_direction(random)
         map_ = space.moved(space.rotation(turn), shift(CAMERA_TRANSLATION if small else TRANSLATION), about)

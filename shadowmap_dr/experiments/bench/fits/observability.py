@@ -94,7 +94,9 @@ def main() -> None:
         note = f"; up to a factor: {', '.join(problem.common_factor)}" if problem.common_factor else ""
         print(f"{problem.name}{note}", flush=True)
         for name, deviation in found.items():
-            print(f"    {name:40} {deviation:8.3f}{'  NOT SEEN' if deviation > WORST else ''}", flush=True)
+            scored = any(name.startswith(f"{one.name} ") for one in problem.scored)
+            note = "  NOT SEEN" if scored and deviation > WORST else ""
+            print(f"    {name:40} {deviation:8.3f}{note}", flush=True)
 
 
 if __name__ == "__main__":

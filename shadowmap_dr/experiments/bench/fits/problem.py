@@ -103,7 +103,7 @@ class FitProblem:
         return result
 
     def described(self) -> Mapping[str, Any]:
-        """What was true, for developers; the command never sees it."""
+        """The truth, for developers. The command never sees it."""
         scene = self.truth
         parts = {part.id: part.place.tolist() for part in scene.parts()}
         values = {one.name: value(scene, one).tolist() for one in self.varied if one.kind == "value"}

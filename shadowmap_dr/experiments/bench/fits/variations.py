@@ -120,7 +120,7 @@ def pivot(scene: Scene, part: str) -> Array:
 
 
 def freedoms(scene: Scene, variation: Variation) -> int:
-    """How many numbers vary; those of textures and vertices are not counted."""
+    """Number of numbers that vary; textures and vertices have none."""
     fixed = {"pose": 6, "rotation": 1, "scale": 1, "direction": 2, "position": 3, "fov": 1, "texture": 0, "vertices": 0}
     if variation.kind == "translation":
         return len(variation.detail)

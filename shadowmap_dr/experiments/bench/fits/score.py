@@ -154,10 +154,10 @@ def intervals(problem: FitProblem, start: Scene, record: Record) -> list[Interva
                 label = f"{variation.name} {estimate['labels'][number]}"
                 found.append(_interval(label, estimate, number, truth))
     if not problem.common_factor and problem.integrator == "direct":
-        for photo, name in zip(problem.photographs, problem.targets(), strict=True):
-            estimate = next((one for one in record["estimates"] if one["name"] == f"exposure of {name}"), None)
-            if estimate is not None and estimate["half_width"] is not None:
-                found.append(_interval(f"exposure of {name}", estimate, 0, float(np.log2(photo.exposure))))
+        exposures = [one for one in record["estimates"] if one["kind"] == "exposure"]
+        for photo, estimate in zip(problem.photographs, exposures, strict=False):  # none with white balance
+            if estimate["half_width"] is not None:
+                found.append(_interval(estimate["name"], estimate, 0, float(np.log2(photo.exposure))))
     return found
 
 
@@ -257,10 +257,8 @@ def _value_error(problem: FitProblem, variation: Variation, estimate: Record, re
     new, true = _numbers(estimate, "value", "values"), value(problem.truth, variation)
     if variation.name not in problem.common_factor:
         return float(np.max(np.abs(new / true - 1)))
-    errors = []
-    for photo, file in zip(problem.photographs, problem.targets(), strict=True):
-        factor = next((one["exposure"] for one in record["pictures"] if one["name"] == file), float("nan"))
-        errors.append(np.max(np.abs(new * factor / (true * photo.exposure) - 1)))
+    pairs = zip(problem.photographs, record["pictures"], strict=True)
+    errors = [np.max(np.abs(new * found["exposure"] / (true * photo.exposure) - 1)) for photo, found in pairs]
     return float(np.max(errors))
 
 

@@ -16,7 +16,7 @@ from PIL import Image
 from shadowmap_dr.errors import ShadowmapError
 from shadowmap_dr.experiments.bench import report as bench_report
 from shadowmap_dr.experiments.bench.common import QUICK, BenchOptions, Sizes
-from shadowmap_dr.experiments.bench.fits import catalogue, meshes, score, section, space, stages, targets, variations
+from shadowmap_dr.experiments.bench.fits import catalogue, meshes, score, section, space, stages, targets, trial, variations
 from shadowmap_dr.experiments.bench.fits.photographs import Photograph, falloff
 from shadowmap_dr.experiments.bench.fits.problem import FitProblem
 from shadowmap_dr.experiments.bench.fits.scenes import Scene, write_scene
@@ -444,6 +444,9 @@ def test_the_section_runs_the_command(tmp_path: Path, monkeypatch: pytest.Monkey
     result = section.measure(options(tmp_path), problem, {}, lambda *_: None)
     assert [one["solved"] for one in result["starts"]] == [True, False]
     assert result["seconds"]["fit"]["count"] == 2 and result["vary"] == ["bunny:pose"]
+    first, second = (trial.line(one) for one in result["starts"])
+    assert ", solved, called found; bunny:pose rotation " in first
+    assert ("failed: status 1: Error: this went wrong." if failing == 1 else "NOT SOLVED, called found") in second
     if failing == 1:
         assert "this went wrong" in result["starts"][1]["failed"]
     rows = bench_report.rows({"sections": {"fits": {"units": {"bunny-pose": result}}}})

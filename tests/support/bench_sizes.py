@@ -26,4 +26,6 @@ TINY = Sizes(
     crowds=({"instances": 4, "groups": 2, "shapes": 4, "lights": 3},),
     loop_size=8,
     loop_steps=0,
+    fits=("bunny-pose",),
+    fit_starts=1,
 )

@@ -17,7 +17,7 @@ import mitsuba as mi
 from ...errors import ShadowmapError, did_you_mean
 from ...io.options import option, setting
 
-SECTIONS = ("steps", "raster", "scaling", "breakdown", "sums", "loops", "first")
+SECTIONS = ("steps", "raster", "scaling", "breakdown", "sums", "loops", "first", "fits")
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,7 @@ class Sizes:
         loop_size: pixels along each side of images in the loops of `bench.loops`.
         loop_steps: steps over which their memory is measured, 0 for none.
         crowds: scenes of many shapes; see `bench.first.Crowd`.
+        fits: problems for the command `fit`; None: all that are scored. `fit_starts`: starts of each.
     """
 
     resolutions: tuple[int, ...] = (128, 512, 1024)
@@ -83,6 +84,8 @@ class Sizes:
         {"shapes": 5000},
         {"shapes": 200, "lights": 40},
     )
+    fits: tuple[str, ...] | None = None
+    fit_starts: int = 4
 
 
 FULL = Sizes()
@@ -113,6 +116,8 @@ QUICK = Sizes(
     loop_size=64,
     loop_steps=0,
     crowds=({"instances": 30, "groups": 6}, {"shapes": 50, "lights": 6}),
+    fits=("bunny-pose", "house-pose-sun", "teapot-colours", "spot-aim", "panel-place", "camera-pose"),
+    fit_starts=1,
 )
 
 
@@ -130,6 +135,7 @@ class BenchOptions:
     mitsuba_seconds: float = option(
         900.0, help="Time limit of each part that runs Mitsuba's integrator; the record names parts that it cut off."
     )
+    meshes: Path | None = option(None, metavar="FOLDER", help="Folder of meshes, for further problems of the section fits.")
     sizes: Sizes | None = setting(None, help="Sizes of the measurements; None: those for `quick`.")
 
     def __post_init__(self) -> None:
@@ -138,6 +144,8 @@ class BenchOptions:
                 raise ShadowmapError(f"no section {name!r}: choose from {', '.join(SECTIONS)}.{did_you_mean(name, SECTIONS)}")
         if not self.only:
             raise ShadowmapError(f"no section given: choose from {', '.join(SECTIONS)}.")
+        if self.meshes is not None and not self.meshes.is_dir():
+            raise ShadowmapError(f"--meshes {self.meshes}: there is no such folder.")
         if not 0 < self.mitsuba_seconds < float("inf"):
             raise ShadowmapError(f"--mitsuba-seconds {self.mitsuba_seconds}: give a positive number of seconds.")
 

@@ -32,6 +32,7 @@ from . import scaling as bench_scaling
 from . import steps as bench_steps
 from . import sums as bench_sums
 from .common import BenchOptions, Unit
+from .fits import section as bench_fits
 
 FORMAT = "shadowmap-dr bench 1"
 
@@ -43,6 +44,7 @@ UNITS: dict[str, Callable[[BenchOptions], list[Unit]]] = {
     "sums": bench_sums.units,
     "loops": bench_loops.units,
     "first": bench_first.units,
+    "fits": bench_fits.units,
 }
 
 
@@ -129,6 +131,7 @@ def _settings(options: BenchOptions) -> dict[str, Any]:
         {
             "quick": options.quick,
             "mitsuba_seconds": options.mitsuba_seconds,
+            "meshes": options.meshes,
             "sizes": vars(options.what),
             "variant": mi.variant(),
             "threads": dr.thread_count(),

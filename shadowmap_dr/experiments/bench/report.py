@@ -17,6 +17,7 @@ from ...errors import ShadowmapError
 from ...io import console, records
 from . import plot as bench_plot
 from . import sums as bench_sums
+from .fits.score import summary as score_summary
 
 plot = bench_plot.plot
 
@@ -34,6 +35,9 @@ LARGE_MS, LARGE_GIB = 250.0, 3.0
 BUSY = 0.3
 #: A first picture may take this multiple of Mitsuba's `direct` and these seconds more; a first backward pass, these seconds.
 FIRST_OVER_DIRECT, FIRST_SECONDS, BACKWARD_SECONDS = 2.0, 0.5, 5.0
+#: Percentage of starts from which the command `fit` solves its problems, its seconds, percentage of intervals that hold true
+#: values, and how much wider than the error they may be.
+FITS_SOLVED, FIT_SECONDS, FITS_COVERAGE, FITS_WIDTH = 90.0, 60.0, (85.0, 99.0), 4.0
 EIGHT_LIGHTS, BATCH, OUTSIDE_KERNELS = 4.5, 1.2, 0.10
 
 
@@ -70,6 +74,7 @@ def rows(record: dict[str, Any]) -> list[Row]:
         "sums": _sum_rows,
         "loops": _loop_rows,
         "first": _first_rows,
+        "fits": _fit_rows,
     }
     result: list[Row] = []
     for name, make in makers.items():
@@ -79,6 +84,8 @@ def rows(record: dict[str, Any]) -> list[Row]:
                 result.append(Row(f"{name} {key}", "", "failed"))
             else:
                 result += make(key, unit)
+        if name == "fits" and units:
+            result += _fit_summary_rows(units)
     return result
 
 
@@ -300,6 +307,35 @@ def _first_rows(key: str, unit: dict[str, Any]) -> Iterator[Row]:
     aims = _aim(seconds["backward"], BACKWARD_SECONDS, "<= {:g} s", least=False)
     other = f"uncompiled {_time(unit['uncompiled']['backward'])}"
     yield Row("first derivative", key, _time(seconds["backward"]), other, "", *aims)
+
+
+def _fit_rows(key: str, unit: dict[str, Any]) -> Iterator[Row]:
+    solved, count = sum(one["solved"] for one in unit["starts"]), len(unit["starts"])
+    yield Row(
+        f"fit: {key}", f"{count} starts", _time(unit["seconds"]["fit"]["median"]), ", ".join(unit["vary"]), f"{solved} solved"
+    )
+
+
+def _fit_summary_rows(units: dict[str, dict[str, Any]]) -> Iterator[Row]:
+    runs = [one for unit in units.values() for one in unit.get("starts", [])]
+    if not runs:
+        return
+    total = score_summary(runs)
+    size, seconds = f"{total['starts']} starts", total["seconds"]
+    share = 100 * total["solved"] / total["starts"]
+    yield Row("fits: solved", size, f"{share:.0f} %", "", "", *_aim(share, FITS_SOLVED, ">= {:g} %", least=True))
+    longest = seconds["max"]
+    aims = _aim(longest, FIT_SECONDS, "<= {:g} s", least=False)
+    yield Row("fits: longest", size, _time(longest), f"median {_time(seconds['median'])}", "", *aims)
+    wrong, other = total["false_found"], f"solved, but called not found {total['missed']}"
+    yield Row("fits: called found, but not solved", size, f"{wrong}", other, "", *_aim(wrong, 0, "<= {:g}", least=False))
+    if total["coverage"] is None:
+        return
+    (low, high), share, ratio = FITS_COVERAGE, 100 * total["coverage"], total["ratio"]
+    size, aim = f"{total['intervals']} numbers", f"{low:g} to {high:g} %"
+    yield Row("fits: intervals that hold the truth", size, f"{share:.0f} %", "", "", aim, low <= share <= high)
+    aims = _aim(ratio, FITS_WIDTH, "<= {:g}", least=False)
+    yield Row("fits: half-width over error", size, f"{ratio:.2g}", "", "", *aims)
 
 
 def _aim(value: float, aim: float | None, form: str, *, least: bool) -> tuple[str, bool | None]:

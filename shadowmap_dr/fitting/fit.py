@@ -37,8 +37,8 @@ Array = npt.NDArray[np.float64]
 _STEPS, _LAST_STEPS, _LONGEST = 8, 15, 0.3
 # Improvement of the loss, as a share, below which a step is the last of its stage.
 _ENOUGH = 1e-3
-# Textures and vertices: stages in which they are fitted, the last ones; rounds of a stage, in turns with the numbers; share of the
-# last step's size.
+# Textures and vertices: stages in which they are fitted, the last ones; rounds of a stage, in turns with the numbers; the last step's
+# size as a share of the first one's.
 _ARRAY_STAGES, _ROUNDS, _LAST_SHARE = 3, 3, 0.1
 
 
@@ -282,6 +282,6 @@ def _check_sizes(renderer: Renderer, targets: Sequence[Target]) -> None:
         width, height = cameras[0].width, cameras[0].height
         if abs(width / height * target.height / target.width - 1) > 0.01 + 1 / min(target.width, target.height):
             raise ShadowmapError(
-                f"{name} has {target.width} x {target.height} pixels, sensor {target.sensor} has {width} x {height}: these are of "
-                "different shapes; crop the picture, or change the film's width and height in the scene."
+                f"{name} has {target.width} x {target.height} pixels, sensor {target.sensor} has {width} x {height}, of "
+                "another shape: crop the picture, or change the film's width and height in the scene."
             )

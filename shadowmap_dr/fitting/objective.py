@@ -16,7 +16,7 @@ from .views import View
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
 
-# Differences that remain in good fits, as shares of a picture's brightness, and pixels that err alike: priors are weighed by these.
+# Differences that remain in good fits, as shares of a picture's brightness, and pixels that err alike: they weigh priors.
 _USUAL, _ALIKE = 0.02, 64
 
 

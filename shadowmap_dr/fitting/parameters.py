@@ -1,6 +1,7 @@
 """Parameters of a scene that few numbers describe: placements, directions, angles of view, colours.
 
-A fit's numbers are zero in the scene as it was given, and about one where much has changed: radians, shares of an extent, logarithms.
+A fit's numbers are zero in the scene as it was given, and about one where much has changed: radians, shares of an extent,
+logarithms.
 """
 
 from __future__ import annotations
@@ -95,8 +96,8 @@ class Scale:
 class Parameter(Protocol):
     """One entry of the list of things that vary, with n numbers.
 
-    ``labels``, ``units``: of each number, for reports; ``scale``: units of the numbers; ``natural``: bounds (low, high) in units, from
-    the meaning of the values; ``usual``: half ranges (n,) of starts, in the fit's own numbers.
+    ``labels``, ``units``: of each number, for reports; ``scale``: units of the numbers; ``natural``: bounds (low, high) in units,
+    from the meaning of the values; ``usual``: half ranges (n,) of starts, in the fit's own numbers.
     """
 
     vary: Vary

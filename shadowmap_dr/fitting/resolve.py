@@ -240,7 +240,7 @@ class Resolver:
         raise ShadowmapError(f"vary {vary.label}: '{vary.name}' has no texture; textures: {', '.join(known) or 'none'}.{near}")
 
     def _numbers(self, key: str) -> Array | None:
-        """The values (n,) of a parameter of Mitsuba's, None if no derivatives flow to it, or if it is a part of a mesh or a film."""
+        """The values (n,) of a parameter of Mitsuba's; None if no derivatives flow to it, and for parts of meshes and films."""
         if key.endswith((".faces", ".vertex_positions", ".vertex_normals", ".vertex_texcoords", ".to_world", ".to_uv", ".x_fov")):
             return None
         if any(key.startswith(f"{name}.") for name in self.sensors):

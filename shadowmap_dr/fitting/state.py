@@ -40,7 +40,7 @@ class Run:
 
 @dataclass
 class State:
-    """The starts; the errors of all steps; the first stage in which textures and vertices are not yet fitted, and their values."""
+    """The starts; the errors of all steps; values of textures and vertices, and the first stage in which they are not fitted."""
 
     runs: list[Run]
     history: list[Step]

@@ -1,8 +1,8 @@
 """Intervals and correlations of fitted numbers, and the numbers that pictures do not determine.
 
 Residuals of a fit are no noise: most of them are errors of the model, alike at neighbouring pixels. Their covariance is estimated
-from sums over blocks of pixels (a "sandwich"; Liang and Zeger, "Longitudinal data analysis using generalized linear models", 1986),
-and errors that all of a picture shares are added: a displacement, a wrong brightness, missing light.
+from sums over blocks of pixels: a "sandwich" (Liang and Zeger, "Longitudinal data analysis using generalized linear models", 1986).
+Errors that all of a picture shares are added: a displacement, a wrong brightness, missing light.
 """
 
 from __future__ import annotations
@@ -18,14 +18,16 @@ Array = npt.NDArray[np.float64]
 
 # Pixels along each side of a block of residuals that may be alike.
 _BLOCK = 16
-#: Errors that a whole picture shares: displacement of its edges in pixels of the fit; shares of its brightness: factor, and offset.
+#: Errors that a whole picture shares: displacement of edges in pixels of the fit; factor and offset as shares of its brightness.
 DISPLACEMENT, FACTOR, OFFSET = 0.15, 0.004, 0.002
 #: Factor of the blocks' covariance.
 INFLATION = 2.0
 # Quantile of 95 % intervals, both sides.
 _NORMAL = 1.96
-# Numbers with a wider interval, in the fit's own numbers, are not determined; correlations from which two are not told apart.
-_WIDEST, _ALIKE = 1.0, 0.98
+# Numbers with a wider interval, in the fit's own numbers, are not determined.
+_WIDEST = 1.0
+# Two numbers are not told apart if their intervals are wider than the first number, and their correlation is above the second.
+_WIDE, _ALIKE = 0.1, 0.97
 
 
 @dataclass(frozen=True)
@@ -74,7 +76,8 @@ def uncertainty(point: Point, objective: Objective) -> Uncertainty:
 
 def not_told_apart(found: Uncertainty) -> list[tuple[int, int]]:
     """Pairs of numbers that have nearly the same effect, or the opposite one, on the pictures."""
-    high = np.argwhere(np.triu(np.abs(found.correlations), 1) > _ALIKE)
+    wide = found.half_widths > _WIDE
+    high = np.argwhere(np.triu(np.abs(found.correlations), 1) * np.outer(wide, wide) > _ALIKE)
     return [(int(a), int(b)) for a, b in high]
 
 

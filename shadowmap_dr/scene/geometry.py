@@ -252,8 +252,8 @@ class Geometry:
         """A new Geometry in which some shapes have moved as a whole.
 
         Args:
-            transforms: by the name of the shape, an affine map (Matrix4f of width 1, or Transform4f) of world space, applied to the
-                current vertices. Vertex normals move along instead of being computed anew. Attached.
+            transforms: by the name of the shape, an affine map of world space (Matrix4f of width 1, or Transform4f), applied to
+                the current vertices. Vertex normals move along instead of being computed anew. Attached.
 
         Raises:
             ShadowmapError: a name that is not the scene's; a value that is no transformation.

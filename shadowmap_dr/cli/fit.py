@@ -36,7 +36,7 @@ def fit(
         list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="Value of the parameter $NAME of the scene; repeatable.")
     ] = None,
     listing: Annotated[bool, typer.Option("--list", help="List all that can vary, and by how much it moves the image.")] = False,
-    out: Annotated[Path, typer.Option(metavar="PATH", help="Folder for the results.  [default: fit]")] = Path("fit"),
+    out: Annotated[Path, typer.Option(metavar="PATH", help="Folder for the results.")] = Path("fit"),
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a fit that did not end.")] = False,
     variant: Variant = DEFAULT_VARIANT,
 ) -> None:

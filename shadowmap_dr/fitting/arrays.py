@@ -31,9 +31,14 @@ class ArrayParameter(Protocol):
     ``start`` (n,): the values of the scene.
     """
 
-    vary: Vary
-    kind: str
-    start: Array
+    @property
+    def vary(self) -> Vary: ...
+
+    @property
+    def kind(self) -> str: ...
+
+    @property
+    def start(self) -> Array: ...
 
     def put(self, values: Float, change: SceneChange) -> None:
         """Write values (Float, n; attached) into a change."""

@@ -13,7 +13,6 @@ from ..errors import ShadowmapError
 from ..io import records
 from ..jit.arrays import device_array
 from ..rendering.renderer import Renderer
-from .arrays import ArrayParameter
 from .changes import Changes
 from .estimates import array_estimates, changes_of, estimates_of, gain_estimates
 from .gains import Gain
@@ -37,8 +36,8 @@ Array = npt.NDArray[np.float64]
 _STEPS, _LAST_STEPS, _LONGEST = 8, 15, 0.3
 # Improvement of the loss, as a share, below which a step is the last of its stage.
 _ENOUGH = 1e-3
-# Textures and vertices: stages in which they are fitted, the last ones; rounds of a stage, in turns with the numbers; the last step's
-# size as a share of the first one's.
+# Textures and vertices: stages in which they are fitted, the last ones; rounds of a stage, in turns with the numbers; size of the
+# last step as a share of the first one's.
 _ARRAY_STAGES, _ROUNDS, _LAST_SHARE = 3, 3, 0.1
 
 
@@ -64,12 +63,10 @@ class Fit:
         if not targets:
             raise ShadowmapError("there is no picture to fit to: give one by --target.")
         resolver = Resolver(renderer)
-        found = [resolver.parameter(vary) for vary in options.vary]
-        self.parameters: list[Parameter] = [one for one in found if not hasattr(one, "descent")]  # type: ignore[misc]
-        self.arrays: list[ArrayParameter] = [one for one in found if hasattr(one, "descent")]
+        self.parameters, self.arrays = resolver.parameters(options.vary)
         colours = 3 if options.white_balance else 1 if options.exposure else 0
         self.gains = [Gain(colours, options.vignetting, exposure) for exposure in known or [1.0] * len(targets)]
-        if not found and not any(gain.count for gain in self.gains):
+        if not options.vary and not any(gain.count for gain in self.gains):
             raise ShadowmapError("nothing varies: name something by --vary; --list lists all that can vary.")
         _check_sizes(renderer, self.targets)
         self._low, self._high, prior = _bounds(self.parameters, self.gains)

@@ -32,8 +32,8 @@ def judge(
     found = point.error <= EXPLAINED
     if not found:
         words.append(
-            f"Not found: the images differ by {100 * point.error:.0f} % of the picture's brightness. Try more starts, a scene that "
-            "is nearer to the picture, or let more vary; mask what the scene does not have."
+            f"Not found: the images differ by {100 * point.error:.0f} % of the picture's brightness. Try more starts, a "
+            "scene that is nearer to the picture, or let more vary; mask what the scene does not have."
         )
     idle = [name for name, none in zip(names, spread.idle, strict=True) if none]
     words += [f"{name} moves nothing in the pictures." for name in idle]

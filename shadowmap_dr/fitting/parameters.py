@@ -100,8 +100,11 @@ class Parameter(Protocol):
     from the meaning of the values; ``usual``: half ranges (n,) of starts, in the fit's own numbers.
     """
 
-    vary: Vary
-    natural: tuple[float, float]
+    @property
+    def vary(self) -> Vary: ...
+
+    @property
+    def natural(self) -> tuple[float, float]: ...
 
     @property
     def kind(self) -> str: ...
@@ -215,7 +218,10 @@ class LightMotion:
     def put(self, numbers: Sequence[Float], change: SceneChange) -> None:
         given, record = dict(zip(self.parts, numbers, strict=True)), change.light(self.light)
         move = _vector(given, "t") * self.extent
-        turn = sum(mi.Vector3f(*axis.tolist()) * given[p] for p, axis in zip("ab", self.turns, strict=True) if p in given)
+        turn = mi.Vector3f(0)
+        for part, axis in zip("ab", self.turns, strict=True):
+            if part in given:
+                turn += mi.Vector3f(*axis.tolist()) * given[part]
         if hasattr(record, "to_world"):
             own = mi.Matrix4f(record.to_world.matrix)
             place = mi.Vector3f(own[0, 3], own[1, 3], own[2, 3])
@@ -231,7 +237,8 @@ class LightMotion:
         change.lights[self.light] = new
 
     def arrays(self, renderer: Renderer, change: SceneChange) -> dict[str, Array]:
-        old, new, found = renderer.light(self.light), change.light(self.light), {}
+        old: Any = renderer.light(self.light)  # Any: one of several records
+        new, found = change.light(self.light), dict[str, Array]()
         for name in ("direction", "position"):
             if hasattr(new, name):
                 found[name] = np.array(dr.detach(getattr(new, name)), np.float64).ravel()[:3]
@@ -363,14 +370,13 @@ class Value:
         return np.full(len(self.labels), 0.5 if self.scale.logarithmic else 0.25)
 
     def put(self, numbers: Sequence[Float], change: SceneChange) -> None:
-        old = getattr(change.light(self.light), self.field) if self.light else None
         scale, each = self.scale, (numbers[0],) * len(self.start) if self.common else numbers
         if self.common or self.logarithmic:
             parts = [float(start) * dr.exp(x) for start, x in zip(self.start, each, strict=True)]
         else:
             parts = [float(start) + float(factor) * x for start, factor, x in zip(self.start, scale.factor, each, strict=True)]
         if self.light:
-            value = type(old)(*parts)
+            value = type(getattr(change.light(self.light), self.field))(*parts)
             change.lights[self.light] = replace(change.light(self.light), **{self.field: value})
         else:
             change.values[self.key] = parts

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from ..errors import ShadowmapError, did_you_mean
 from ..rendering.renderer import Renderer
-from .arrays import ArrayParameter, mesh_vertices, texture_values
+from .arrays import ArrayParameter, MeshVertices, TextureValues, mesh_vertices, texture_values
 from .motions import host_matrix, tangents
 from .parameters import CameraMotion, FieldOfView, LightMotion, Parameter, ShapeMotion, Value
 from .vary import Vary
@@ -70,7 +70,7 @@ class Resolver:
         self._points = points
         self.middle, self.diameter = _bounds(points)
 
-    def parameter(self, vary: Vary) -> Parameter | ArrayParameter:
+    def parameter(self, vary: Vary) -> Parameter | MeshVertices | TextureValues:
         """The parameter of an entry.
 
         Raises:
@@ -89,6 +89,18 @@ class Resolver:
         if matched:
             return self._shape(vary, matched)
         return self._light(vary) if name in self.lights else self._sensor(vary)
+
+    def parameters(self, entries: Sequence[Vary]) -> tuple[list[Parameter], list[ArrayParameter]]:
+        """The parameters of entries: those that few numbers describe, and those with many values."""
+        few: list[Parameter] = []
+        many: list[ArrayParameter] = []
+        for vary in entries:
+            found = self.parameter(vary)
+            if isinstance(found, (MeshVertices, TextureValues)):
+                many.append(found)
+            else:
+                few.append(found)
+        return few, many
 
     def candidates(self) -> list[Candidate]:
         """All that can vary."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, replace
@@ -76,10 +77,7 @@ def read_task(path: Path) -> FitTask:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeError) as error:
         raise ShadowmapError(f"cannot read {path}: {getattr(error, 'strerror', None) or 'it is no text'}.") from error
-    if sys.version_info >= (3, 11):
-        import tomllib
-    else:
-        import tomli as tomllib
+    tomllib = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
     try:
         content = tomllib.loads(text)
     except (tomllib.TOMLDecodeError, RecursionError) as error:

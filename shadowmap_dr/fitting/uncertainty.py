@@ -1,8 +1,8 @@
 """Intervals and correlations of fitted numbers, and the numbers that pictures do not determine.
 
 Residuals of a fit are no noise: most of them are errors of the model, alike at neighbouring pixels. Their covariance is estimated
-from sums over blocks of pixels: a "sandwich" (Liang and Zeger, "Longitudinal data analysis using generalized linear models", 1986).
-Errors that all of a picture shares are added: a displacement, a wrong brightness, missing light.
+from sums over blocks of pixels, a "sandwich" (Liang and Zeger, "Longitudinal data analysis using generalized linear models",
+1986). Errors that all of a picture shares are added: a displacement, a wrong brightness, missing light.
 """
 
 from __future__ import annotations

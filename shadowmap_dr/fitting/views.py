@@ -102,8 +102,8 @@ class View:
         (H, W, 3)).
         """
         pixels = [device_array(mi.Float, self._planes(plane).astype(np.float32)) for plane in (target, weight, factors)]
-        numbers = mi.Float(x[: self.count].astype(np.float32))
-        return list(self._gradient(numbers, self.values, pixels, device_array(mi.Float, np.float32([limit])), self._renderer))
+        numbers, bound = mi.Float(x[: self.count].astype(np.float32)), device_array(mi.Float, np.array([limit], np.float32))
+        return list(self._gradient(numbers, self.values, pixels, bound, self._renderer))
 
     def change(self, x: Array) -> SceneChange:
         """The change of the scene at the numbers x (n,), detached."""

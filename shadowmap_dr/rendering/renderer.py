@@ -237,8 +237,8 @@ class Renderer:
             cache: results of earlier passes that still hold, with the same ``spp``, for the scene as it is. The image leaves its
                 own there. Only without ``vertex_positions``, ``transforms`` and ``lights``, and not in recordings.
             transforms: affine maps of world space, ``Transform4f`` or ``Matrix4f``, by the name of the shape that they move.
-                Vertex normals move along, whereas those of ``vertex_positions`` are computed from the new vertices. Of shapes that
-                have both, the new vertices are moved.
+                Vertex normals move along, whereas those of ``vertex_positions`` are computed from the new vertices. New vertices
+                of shapes that have both are moved.
 
         Returns:
             ``mi.TensorXf`` (H, W, C): linear colour (1 or 3 channels, as the film), then alpha if the film has it, then the AOVs.

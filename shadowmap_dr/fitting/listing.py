@@ -1,0 +1,56 @@
+"""The list of all that can vary in a scene, with the effect of each on the image."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+from rich.table import Table
+
+from ..errors import ShadowmapError
+from ..io import console
+from ..rendering.renderer import Renderer
+from ..scene.sensor import ImageSize
+from .arrays import MeshVertices, TextureValues
+from .resolve import Candidate, Resolver
+from .stages import qualities
+from .vary import Vary
+from .views import View
+
+# Pixels along the longer side of the images whose derivatives tell what moves them.
+_SIDE = 96
+
+
+def listed(scene: mi.Scene) -> Table:
+    """A table of the objects and values of a scene: names for ``--vary``, kinds, present values, effect on the image.
+
+    The effect is the change of the first sensor's image by a change of a degree, a hundredth of the extent, or one per cent, as a
+    share of the image's brightness.
+    """
+    renderer = Renderer.from_scene(scene)
+    resolver = Resolver(renderer)
+    rows = [[one.name, ", ".join(one.kinds), one.value, _effect(renderer, resolver, one)] for one in resolver.candidates()]
+    columns = ["name", "kinds", "now", "moves the image by"]
+    return console.table("What can vary: --vary NAME:KIND", columns, rows, wrapped=(0, 1))
+
+
+def _effect(renderer: Renderer, resolver: Resolver, candidate: Candidate) -> str:
+    """The effect of an object's or value's first kind in words."""
+    kind = candidate.kinds[0]
+    if kind == "texture":
+        return ""
+    try:
+        parameter = resolver.parameter(Vary(candidate.name, kind))
+    except ShadowmapError:
+        return ""
+    if isinstance(parameter, (MeshVertices, TextureValues)):
+        return ""
+    record = renderer.data.cameras(0)[0]
+    share = _SIDE / max(record.width, record.height)
+    size = ImageSize(max(1, round(record.width * share)), max(1, round(record.height * share)))
+    view = View(renderer, [parameter], [], 0, size, qualities(_SIDE, 1, renderer.settings.shadow.resolution)[-1])
+    zero = np.zeros(view.count)
+    brightness = float(np.sqrt(np.mean(np.square(view.image(zero), dtype=np.float64)))) or 1.0
+    strongest = max(float(np.sqrt(np.mean(np.square(view.derivative(zero, k)[1], dtype=np.float64)))) for k in range(view.count))
+    step = np.pi / 180 if kind in ("direction", "rotation") else 0.01
+    effect = 100 * strongest * step / brightness
+    return "nothing" if effect < 1e-4 else f"{effect:.2g} %"

@@ -12,6 +12,7 @@ from . import integrator, variants  # noqa: E402
 from .errors import ShadowmapError  # noqa: E402
 
 if TYPE_CHECKING:
+    from .fitting import Fit, fit
     from .rendering import Renderer, RenderSettings
     from .shadow import ShadowSettings
 
@@ -20,11 +21,16 @@ __version__ = "0.1.0"
 variants.warn_if_untried(mi.__version__)
 integrator.install()  # the plug-in `shadowmap`, in this variant and all that will be set
 
-__all__ = ["RenderSettings", "Renderer", "ShadowSettings", "ShadowmapError", "__version__"]
+__all__ = ["Fit", "RenderSettings", "Renderer", "ShadowSettings", "ShadowmapError", "__version__", "fit"]
 
 
 def __getattr__(name: str) -> Any:  # Any: one of several classes
     """Classes that are imported when they are first used: the command line's help needs none of them."""
+    if name in ("Fit", "fit"):
+        from . import fitting
+
+        globals().update(Fit=fitting.Fit, fit=fitting.fit)
+        return globals()[name]
     if name not in ("RenderSettings", "Renderer", "ShadowSettings"):
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from . import rendering, shadow

@@ -32,10 +32,9 @@ MAY_IMPORT = {
     "integrator": ("errors", "jit", "rendering", "scene", "shadow"),
     "torch": ("errors", "jit", "raster", "rendering", "scene.sensor", "shadow"),
     "inverse": ("errors", "io", "jit", "raster", "rendering", "scene.lights", "shadow"),
-    "fitting": ("errors", "inverse", "io", "jit", "raster", "rendering", "scene", "shadow"),
+    "fitting": ("errors", "io", "jit", "raster", "rendering", "scene", "shadow"),
     "importing": ("errors", "io"),
     "cameras": ("errors", "scene.pixel_filter", "scene.sensor"),
-    "fitting": ("errors", "inverse", "io", "jit", "raster", "rendering", "scene", "shadow"),
     "interactive": ("errors", "inverse", "io", "jit.types"),
     "mitsuba_baselines": ("", "errors", "inverse", "io", "scene.mitsuba_meshes"),
     "experiments": (
@@ -54,8 +53,20 @@ MAY_IMPORT = {
             "variants",
         ),
     ),
-    "cli": ("", "_llvm", "errors", "experiments", "importing", "interactive", "inverse", "io", "rendering.film.aovs", "variants"),
-    "": ("_llvm", "errors", "integrator", "rendering", "shadow", "variants"),
+    "cli": (
+        "",
+        "_llvm",
+        "errors",
+        "experiments",
+        "fitting",
+        "importing",
+        "interactive",
+        "inverse",
+        "io",
+        "rendering.film.aovs",
+        "variants",
+    ),
+    "": ("_llvm", "errors", "fitting", "integrator", "rendering", "shadow", "variants"),
 }
 
 #: Packages within packages: what they may import of the one around them.

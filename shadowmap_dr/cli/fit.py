@@ -62,8 +62,6 @@ def fit(
         typer.echo(words)
     typer.echo(f"{'Found' if result.found else 'Not found'}, in {result.seconds:.0f} s.")
     console.result(out / "report.html", out / RESULT)
-    if not result.found:
-        raise typer.Exit(1)
 
 
 def _task(scene: str, given: Given[FitOptions], targets: list[str], masks: list[str], parameters: dict[str, str]) -> FitTask:

@@ -1,1 +1,22 @@
 """Fits of scenes to photographs: poses, lights, materials, cameras, textures and vertices."""
+
+from .api import fit, prepared
+from .options import FitOptions
+from .result import Estimate, FitResult, read_fit
+from .search import Fit
+from .targets import Target, make_target, read_target
+from .vary import Vary
+
+__all__ = [
+    "Estimate",
+    "Fit",
+    "FitOptions",
+    "FitResult",
+    "Target",
+    "Vary",
+    "fit",
+    "make_target",
+    "prepared",
+    "read_fit",
+    "read_target",
+]

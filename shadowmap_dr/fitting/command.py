@@ -15,11 +15,11 @@ from ..io import console as io_console
 from ..io import files
 from ..rendering.renderer import Renderer
 from .film import write_film
-from .fit import Fit
 from .glb import write_glb
 from .report import write_report
 from .result import FitResult, Step
 from .scene_file import write_fitted_scene
+from .search import Fit
 from .task import FitTask
 from .toml import to_toml
 

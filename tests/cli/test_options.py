@@ -26,6 +26,7 @@ from shadowmap_dr.experiments.lights.speed import TimesOptions
 from shadowmap_dr.experiments.maps.experiment import MapsOptions
 from shadowmap_dr.experiments.pose.experiment import PoseOptions
 from shadowmap_dr.experiments.soft.experiment import SoftOptions
+from shadowmap_dr.fitting.options import FitOptions
 from shadowmap_dr.importing import ImportOptions
 from shadowmap_dr.interactive.options import ModelOptions
 from shadowmap_dr.inverse.faces.convert import ConvertOptions
@@ -35,6 +36,7 @@ from shadowmap_dr.io.ranges import check_ranges
 # Records of the commands, and the parameters that are no fields of them.
 RECORDS: dict[str, tuple[type[Any], set[str]]] = {
     "import": (ImportOptions, {"model", "output"}),
+    "fit": (FitOptions, {"scene", "target", "mask", "define", "listing", "out", "resume", "variant"}),
     "soft": (SoftOptions, {"full", "variant"}),
     "lights": (LightOptions, {"shadows", "full", "variant"}),
     "lights-times": (TimesOptions, {"variant"}),

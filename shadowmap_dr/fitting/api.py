@@ -1,0 +1,89 @@
+"""Fits from Python in one call."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, replace
+from typing import Any
+
+import mitsuba as mi
+
+from ..errors import ShadowmapError
+from ..rendering.renderer import Renderer
+from .options import FitOptions
+from .result import FitResult
+from .search import Fit
+from .targets import Target, make_target, read_target
+from .vary import Vary
+
+#: A picture: a file, an array (H, W), (H, W, 3) or (H, W, 4) of linear colours, or a record with a mask.
+Picture = Any  # Any: arrays of NumPy, Dr.Jit and PyTorch, names of files, Target
+
+
+def fit(
+    scene: mi.Scene | Renderer | str | os.PathLike[str],
+    targets: Picture | Sequence[Picture] | Mapping[int, Picture],
+    vary: Sequence[str | Vary | Mapping[str, Any]],
+    **options: Any,  # Any: fields of FitOptions
+) -> FitResult:
+    """Fit a scene to pictures: find poses, lights, materials, cameras, textures or vertices.
+
+    Args:
+        scene: a scene, loaded with ``optimize=False`` so that shapes keep their names; a renderer of it; or a scene file.
+        targets: a picture of the scene's first sensor, several of the first, second, ... sensor, or a mapping from numbers of
+            sensors. A picture is a file (sRGB, or OpenEXR: linear), an array of linear colours (H, W, 3), or a
+            :class:`~shadowmap_dr.fitting.targets.Target`, which has a mask.
+        vary: things that vary, as for ``shadowmap-dr fit --vary``: ``"bunny:pose"``, ``"sun:direction"``,
+            ``"wall.bsdf.reflectance,max=0.8"``, or mappings ``{"name": "sun", "kind": "direction", "spread": 60}``.
+        options: fields of :class:`~shadowmap_dr.fitting.options.FitOptions` by name: ``exposure=True``, ``starts=16``, ...
+
+    Returns:
+        The result: ``found``, ``estimates`` with 95 % intervals, ``words``, ``pictures``.
+
+    Raises:
+        ShadowmapError: names that the scene does not have, pictures of another shape, unknown options.
+    """
+    return prepared(scene, targets, vary, **options).run()
+
+
+def prepared(
+    scene: mi.Scene | Renderer | str | os.PathLike[str],
+    targets: Picture | Sequence[Picture] | Mapping[int, Picture],
+    vary: Sequence[str | Vary | Mapping[str, Any]],
+    **options: Any,  # Any: fields of FitOptions
+) -> Fit:
+    """The fit that :func:`fit` runs, to take its steps one by one. Arguments as there."""
+    entries = [vary] if isinstance(vary, (str, Vary)) else vary
+    try:
+        chosen = FitOptions(vary=tuple(Vary.of(entry) for entry in entries), **options)
+    except TypeError as error:
+        known = ", ".join(one.name for one in fields(FitOptions) if one.name != "vary")
+        raise ShadowmapError(f"fit: {str(error).partition('() ')[2] or error}; the options are {known}.") from error
+    if isinstance(scene, Renderer):
+        renderer = scene
+    elif isinstance(scene, mi.Scene):
+        renderer = Renderer.from_scene(scene)
+    else:
+        renderer = Renderer.from_file(scene)
+    return Fit(renderer, _targets(targets), chosen)
+
+
+def _targets(given: Any) -> list[Target]:  # Any: see `fit`
+    """Records of pictures."""
+    if isinstance(given, Mapping):
+        return [replace(_target(picture), sensor=number) for number, picture in given.items()]
+    if isinstance(given, (list, tuple)):
+        return [_of_place(picture, number) for number, picture in enumerate(given)]
+    return [_target(given)]
+
+
+def _of_place(picture: Picture, number: int) -> Target:
+    """A picture of the sensor of its place in a list; records have their own."""
+    return picture if isinstance(picture, Target) else replace(_target(picture), sensor=number)
+
+
+def _target(picture: Picture) -> Target:
+    if isinstance(picture, Target):
+        return picture
+    return read_target(picture) if isinstance(picture, (str, os.PathLike)) else make_target(picture)

@@ -137,9 +137,10 @@ class Point:
         owner, view = self._owner, self._owner.views[number]
         scale, gain, own = owner.brightness[number], owner.observations[number].gain, owner.gains[number]
         columns = np.zeros((owner.count, self.residuals[number].size), np.float32)
-        for k in range(view.count):
-            _, derivative = view.derivative(self.x, k)
-            columns[k] = (gain.apply(derivative, self.x[own]) / scale).reshape(-1)
+        with view.scene_at(self.x):
+            for k in range(view.count):
+                _, derivative = view.derivative(self.x, k)
+                columns[k] = (gain.apply(derivative, self.x[own]) / scale).reshape(-1)
         for k, derivative in enumerate(gain.derivatives(self.recorded[number], self.x[own])):
             columns[own.start + k] = (derivative / scale).reshape(-1)
         columns[~np.isfinite(columns)] = 0

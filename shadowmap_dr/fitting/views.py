@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,7 +21,7 @@ from ..rendering.renderer import Renderer
 from ..scene.pixel_filter import Filter
 from ..scene.sensor import ImageSize, Sensor
 from .arrays import ArrayParameter
-from .parameters import Parameter, SceneChange
+from .parameters import Parameter, SceneChange, Value
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
@@ -76,8 +77,10 @@ class View:
         counts = [len(parameter.labels) for parameter in parameters]
         self._starts = np.cumsum([0, *counts]).tolist()
         # One recording for each entry: a pass computes the derivative of a combination of its numbers.
-        self._passes = [freeze(self._recorded(k)) for k in range(len(parameters))]
-        self._image, self._gradient = freeze(self._recorded(-1)), freeze(self._recorded_gradient())
+        self._passes = [_Pass(self._recorded(k)) for k in range(len(parameters))]
+        self._image, self._gradient = _Pass(self._recorded(-1)), _Pass(self._recorded_gradient())
+        self._has_values = any(isinstance(parameter, Value) and not parameter.light for parameter in parameters) or bool(arrays)
+        self._held = 0
 
     @property
     def count(self) -> int:
@@ -103,7 +106,23 @@ class View:
         """
         pixels = [device_array(mi.Float, self._planes(plane).astype(np.float32)) for plane in (target, weight, factors)]
         numbers, bound = mi.Float(x[: self.count].astype(np.float32)), device_array(mi.Float, np.array([limit], np.float32))
-        return list(self._gradient(numbers, self.values, pixels, bound, self._renderer))
+        with self.scene_at(x):
+            return list(self._gradient(numbers, self.values, pixels, bound, self._renderer))
+
+    @contextmanager
+    def scene_at(self, x: Array) -> Iterator[None]:
+        """Context in which Mitsuba's objects have the values of the numbers x (n,). Passes at x are faster within one."""
+        if not self._has_values or self._held:
+            yield
+            return
+        change = self.change(x)
+        restore = set_values(self._renderer.data.scene, change)
+        self._held += 1
+        try:
+            yield
+        finally:
+            self._held -= 1
+            restore()
 
     def change(self, x: Array) -> SceneChange:
         """The change of the scene at the numbers x (n,), detached."""
@@ -118,8 +137,9 @@ class View:
     def _pass(self, entry: int, x: Array, tangent: Array) -> tuple[Image, Image]:
         numbers, step = mi.Float(x[: self.count].astype(np.float32)), mi.Float(tangent.astype(np.float32))
         recorded = self._passes[entry] if entry >= 0 else self._image
-        image, derivative = recorded(numbers, step, self.values, self._renderer)
-        return self._shaped(image), self._shaped(derivative)
+        with self.scene_at(x):
+            image, derivative = recorded(numbers, step, self.values, self._renderer)
+            return self._shaped(image), self._shaped(derivative)
 
     def _shaped(self, image: Float) -> Image:
         pixels = image.numpy().reshape(self._size.height, self._size.width, -1)
@@ -171,17 +191,13 @@ class View:
                         dr.enable_grad(number)
                         dr.set_grad(number, dr.gather(mi.Float, tangent, mi.UInt32(j)))
                 every.append(own)
-            if entry < 0:
-                with dr.suspend_grad():
-                    image, restore = self._render(renderer, every, values)
-                    dr.eval(image)
-                    restore()
-                return image, mi.Float(image)
-            image, restore = self._render(renderer, every, values)
-            dr.forward_to(image, flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad)
-            change = dr.grad(image)
-            dr.eval(image, change)
-            restore()
+            with dr.suspend_grad(when=entry < 0):
+                image = self._render(renderer, every, values, entry, arrays=False)
+                if entry < 0:
+                    return image, mi.Float(image)
+                dr.forward_to(image, flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad)
+                change = dr.grad(image)
+                dr.eval(image, change)
             return dr.detach(image), change
 
         return derivative
@@ -196,7 +212,7 @@ class View:
             ]
             own = [mi.Float(dr.detach(one)) for one in values]
             dr.enable_grad(own)
-            image, restore = self._render(renderer, numbers, own)
+            image = self._render(renderer, numbers, own, -1, arrays=True)
             target, weight, factors = pixels
             difference = factors * dr.detach(image) - target
             slope = weight * factors * dr.clip(difference, -limit, limit)
@@ -205,29 +221,55 @@ class View:
             dr.traverse(dr.ADMode.Backward)
             gradients = [dr.grad(one) for one in own]
             dr.eval(gradients)
-            restore()
             return gradients
 
         return gradient
 
     def _render(
-        self, renderer: Renderer, numbers: Sequence[Sequence[Float]], values: Sequence[Float]
-    ) -> tuple[Float, Callable[[], None]]:
-        """(flat image, attached; function that gives the scene its values back)."""
+        self, renderer: Renderer, numbers: Sequence[Sequence[Float]], values: Sequence[Float], entry: int, *, arrays: bool
+    ) -> Float:
+        """Flat image, attached. Mitsuba's objects have all values already; those of ``entry`` and of the arrays are attached here."""
         change = SceneChange(renderer)
         for parameter, own in zip(self._parameters, numbers, strict=True):
             parameter.put(own, change)
         for array, one in zip(self._arrays, values, strict=True):
             array.put(one, change)
-        restore = set_values(renderer.data.scene, change)
-        image: TensorXf = renderer.render(
-            vertex_positions=change.vertices or None,
-            transforms=change.placements or None,
-            lights=change.lights or None,
-            sensor=self._camera(change.camera(self._sensor)),
-            spp=self._spp,
+        mine = self._parameters[entry] if entry >= 0 else None
+        attached = replace(
+            change,
+            values={key: parts for key, parts in change.values.items() if isinstance(mine, Value) and key == mine.key},
+            arrays=change.arrays if arrays else {},
         )
-        return image.array, restore
+        restore = set_values(renderer.data.scene, attached)
+        try:
+            image: TensorXf = renderer.render(
+                vertex_positions=change.vertices or None,
+                transforms=change.placements or None,
+                lights=change.lights or None,
+                sensor=self._camera(change.camera(self._sensor)),
+                spp=self._spp,
+            )
+        finally:
+            restore()
+        return image.array
+
+
+class _Pass:
+    """A pass that is recorded, or, where Mitsuba's objects read their parameters back when these change, called as it is."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:  # Any: a tuple of arrays
+        self._function, self._recorded = function, freeze(function)
+        self._plain = False
+
+    def __call__(self, *arguments: Any) -> Any:  # Any: those of the function
+        if not self._plain:
+            try:
+                return self._recorded(*arguments)
+            except RuntimeError as error:
+                if "recording" not in str(error):
+                    raise
+                self._plain = True
+        return self._function(*arguments)
 
 
 def set_values(scene: mi.Scene, change: SceneChange) -> Callable[[], None]:
@@ -236,18 +278,22 @@ def set_values(scene: mi.Scene, change: SceneChange) -> Callable[[], None]:
         return lambda: None
     table = mi.traverse(scene)
     before = {key: type(table[key])(dr.detach(table[key])) for key in (*change.values, *change.arrays)}
-    for key, parts in change.values.items():
-        table[key] = type(before[key])(*parts)
-    for key, (values, shape) in change.arrays.items():
-        kind = type(before[key])
-        table[key] = kind(values, shape) if dr.is_tensor_v(kind) else kind(values)
-    table.update()
 
     def restore() -> None:
         for key, value in before.items():
             table[key] = value
         table.update()
 
+    try:
+        for key, parts in change.values.items():
+            table[key] = type(before[key])(*parts)
+        for key, (values, shape) in change.arrays.items():
+            kind = type(before[key])
+            table[key] = kind(values, shape) if dr.is_tensor_v(kind) else kind(values)
+        table.update()
+    except RuntimeError:
+        restore()
+        raise
     return restore
 
 

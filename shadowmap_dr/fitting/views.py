@@ -26,6 +26,14 @@ from .parameters import Parameter, SceneChange, Value
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
 
+# Classes of Mitsuba's whose parameters may change in recordings.
+_RECORDABLE = (
+    *("SRGBReflectanceSpectrum", "SRGBEmitterSpectrum", "UniformSpectrum", "BitmapTexture", "SmoothDiffuse", "TwoSidedBRDF"),
+    *("AreaLight", "ConstantBackgroundEmitter", "EnvironmentMapEmitter"),
+)
+# Step of differences of images, in the fit's own numbers.
+_DIFFERENCE = 0.01
+
 
 @dataclass(frozen=True)
 class Quality:
@@ -77,9 +85,14 @@ class View:
         counts = [len(parameter.labels) for parameter in parameters]
         self._starts = np.cumsum([0, *counts]).tolist()
         # One recording for each entry: a pass computes the derivative of a combination of its numbers.
-        self._passes = [_Pass(self._recorded(k)) for k in range(len(parameters))]
-        self._image, self._gradient = _Pass(self._recorded(-1)), _Pass(self._recorded_gradient())
-        self._has_values = any(isinstance(parameter, Value) and not parameter.light for parameter in parameters) or bool(arrays)
+        self._passes = [freeze(self._recorded(k)) for k in range(len(parameters))]
+        self._image, self._gradient = freeze(self._recorded(-1)), freeze(self._recorded_gradient())
+        # Values of Mitsuba's objects, and entries whose derivatives are differences of images.
+        self._values = [isinstance(parameter, Value) and not parameter.light for parameter in parameters]
+        self._differences = [
+            isinstance(one, Value) and own and not is_recordable(renderer.data.scene, one.key)
+            for own, one in zip(self._values, parameters, strict=True)
+        ]
         self._held = 0
 
     @property
@@ -89,14 +102,33 @@ class View:
 
     def image(self, x: Array) -> Image:
         """Linear image (H, W, 3) at the numbers x (n,)."""
-        return self._pass(0 if self._passes else -1, x, np.zeros(self._starts[1] if self._passes else 0))[0]
+        return self._pass(-1, x, np.zeros(1))[0]
 
     def derivative(self, x: Array, number: int) -> tuple[Image, Image]:
         """Image, and its derivative (H, W, 3) by one of the numbers."""
         entry = int(np.searchsorted(self._starts, number, side="right")) - 1
         tangent = np.zeros(self._starts[entry + 1] - self._starts[entry])
         tangent[number - self._starts[entry]] = 1
-        return self._pass(entry, x, tangent)
+        if not self._differences[entry]:
+            return self._pass(entry, x, tangent)
+        return self.image(x), self._difference(x, number, self._parameters[entry])
+
+    def _difference(self, x: Array, number: int, parameter: Parameter) -> Image:
+        """The derivative (H, W, 3) by a value, from two images."""
+        low, high = (parameter.scale.number(bound) if np.isfinite(bound) else bound for bound in parameter.natural)
+        ends = [x.copy(), x.copy()]
+        for end, step in zip(ends, (-_DIFFERENCE, _DIFFERENCE), strict=True):
+            end[number] = np.clip(x[number] + step, np.min(low), np.max(high))
+        below, above = (self._elsewhere(end) for end in ends)
+        return np.asarray((above - below) / max(ends[1][number] - ends[0][number], 1e-12), np.float32)
+
+    def _elsewhere(self, x: Array) -> Image:
+        """Image at other numbers than those that Mitsuba's objects have now."""
+        held, self._held = self._held, 0
+        try:
+            return self.image(x).copy()
+        finally:
+            self._held = held
 
     def gradient(self, x: Array, target: Image, weight: Image, factors: Image, limit: float) -> list[Float]:
         """Derivatives of a loss by all ``values``, Float each.
@@ -105,14 +137,14 @@ class View:
         (H, W, 3)).
         """
         pixels = [device_array(mi.Float, self._planes(plane).astype(np.float32)) for plane in (target, weight, factors)]
-        numbers, bound = mi.Float(x[: self.count].astype(np.float32)), device_array(mi.Float, np.array([limit], np.float32))
+        numbers, bound = self._numbers(x), device_array(mi.Float, np.array([limit], np.float32))
         with self.scene_at(x):
             return list(self._gradient(numbers, self.values, pixels, bound, self._renderer))
 
     @contextmanager
     def scene_at(self, x: Array) -> Iterator[None]:
         """Context in which Mitsuba's objects have the values of the numbers x (n,). Passes at x are faster within one."""
-        if not self._has_values or self._held:
+        if self._held or not (any(self._values) or self._arrays):
             yield
             return
         change = self.change(x)
@@ -135,11 +167,15 @@ class View:
         return change
 
     def _pass(self, entry: int, x: Array, tangent: Array) -> tuple[Image, Image]:
-        numbers, step = mi.Float(x[: self.count].astype(np.float32)), mi.Float(tangent.astype(np.float32))
+        numbers, step = self._numbers(x), mi.Float(tangent.astype(np.float32))
         recorded = self._passes[entry] if entry >= 0 else self._image
         with self.scene_at(x):
             image, derivative = recorded(numbers, step, self.values, self._renderer)
             return self._shaped(image), self._shaped(derivative)
+
+    def _numbers(self, x: Array) -> Float:
+        """The scene's numbers as an input of recordings, which takes no empty arrays."""
+        return mi.Float(x[: self.count].astype(np.float32)) if self.count else mi.Float(0)
 
     def _shaped(self, image: Float) -> Image:
         pixels = image.numpy().reshape(self._size.height, self._size.width, -1)
@@ -228,7 +264,7 @@ class View:
     def _render(
         self, renderer: Renderer, numbers: Sequence[Sequence[Float]], values: Sequence[Float], entry: int, *, arrays: bool
     ) -> Float:
-        """Flat image, attached. Mitsuba's objects have all values already; those of ``entry`` and of the arrays are attached here."""
+        """Flat image, attached. Mitsuba's objects have their values already; those of ``entry`` and of arrays are attached."""
         change = SceneChange(renderer)
         for parameter, own in zip(self._parameters, numbers, strict=True):
             parameter.put(own, change)
@@ -254,22 +290,19 @@ class View:
         return image.array
 
 
-class _Pass:
-    """A pass that is recorded, or, where Mitsuba's objects read their parameters back when these change, called as it is."""
+def is_recordable(scene: mi.Scene, key: str) -> bool:
+    """True if a recording may give the parameter of Mitsuba's called ``key`` another value, and its derivative is right.
 
-    def __init__(self, function: Callable[..., Any]) -> None:  # Any: a tuple of arrays
-        self._function, self._recorded = function, freeze(function)
-        self._plain = False
-
-    def __call__(self, *arguments: Any) -> Any:  # Any: those of the function
-        if not self._plain:
-            try:
-                return self._recorded(*arguments)
-            except RuntimeError as error:
-                if "recording" not in str(error):
-                    raise
-                self._plain = True
-        return self._function(*arguments)
+    Other objects read their parameters back when these change, on which recordings fail; or their derivatives in forward mode are
+    wrong (docs/limits.md).
+    """
+    table = mi.traverse(scene)
+    node = table.properties[key][2]
+    while node is not None:
+        if node.class_name() not in _RECORDABLE and not isinstance(node, (mi.Shape, mi.Scene)):
+            return False
+        node = table.hierarchy[node][0] if node in table.hierarchy else None
+    return True
 
 
 def set_values(scene: mi.Scene, change: SceneChange) -> Callable[[], None]:

@@ -86,7 +86,7 @@ SCORED = (
     Row("sun-and-sky", "corner", "chair", "sun sky", "sun:direction sun.irradiance", "noise jpeg"),
     Row("both-lights", "corner", "suzanne^", "sun sky", "suzanne:pose sun.irradiance sky.radiance"),
     # Materials.
-    Row("plastic", "corner", "teapot/plastic", "spot sky", "teapot.bsdf.alpha teapot.bsdf.diffuse_reflectance"),
+    Row("plastic", "corner", "vase/plastic", "point sky", "vase.bsdf.alpha vase.bsdf.diffuse_reflectance"),
     Row("metal", "corner", "bunny/metal", "panel sky", "bunny.bsdf.alpha bunny:pose", "noise"),
     Row(
         "white-balance",
@@ -133,7 +133,7 @@ CALIBRATION = (
     Row("drape-panel", "corner", "drape^", "panel", "drape:pose", "noise"),
     Row("hand-dome", "corner", "hand", "dome", "hand:pose"),
     Row("cactus-sunsky", "floor", "cactus", "sunsky", "cactus:pose cactus.bsdf.reflectance", "noise"),
-    Row("mug-plastic", "corner", "mug/plastic", "point sky", "mug.bsdf.alpha mug.bsdf.diffuse_reflectance", "noise"),
+    Row("drape-plastic", "floor", "drape/plastic^", "point sky", "drape.bsdf.alpha drape.bsdf.diffuse_reflectance", "noise"),
     Row("crank-camera", "niche", "crank", "sun sky", "camera:pose camera:fov", "jpeg"),
     Row("bounces-bracket", "niche", "bracket", "sun sky", "bracket:pose sky.radiance", "noise", "path"),
     Row("bounces-tower", "niche", "tower", "point sky", "point:position sky.radiance", "", "path"),

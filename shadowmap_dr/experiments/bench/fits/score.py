@@ -3,7 +3,8 @@
 A problem is solved if all rotations and directions are within 0.5 degrees, positions within 0.5 % of the scene's diameter,
 colours, intensities and roughnesses within 3 %, textures within an RMSE of 0.02, and vertices within a Chamfer distance of 1 % of
 the shape's diameter. Angles of view count as rotations, scales by how far they move the shape's surface. Values that exposures
-scale as well are compared after multiplication with the exposures.
+scale as well are compared after multiplication with the exposures. Of spots and area lamps the direction counts, not their turn
+about it, which pictures do not show.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from . import space
 from .meshes import mesh
 from .problem import FitProblem
 from .scenes import Scene, write_scene
-from .variations import Variation, parse, texture, value
+from .variations import Variation, is_round, parse, texture, value
 
 Array = npt.NDArray[np.float64]
 Record = Mapping[str, Any]  # fit.json
@@ -130,8 +131,11 @@ def deviations(problem: FitProblem, variation: Variation, start: Scene, record: 
     middle = truth.body(part).middle() if holder == "body" else np.zeros(3)
     found = []
     if kind in ("pose", "rotation"):
-        turn = space.nearest_rotation(place[:3, :3]) @ space.nearest_rotation(own[:3, :3]).T
-        found.append(one("rotation", np.degrees(np.linalg.norm(space.rotation_vector(turn))), ANGLE_DEG, "deg"))
+        if is_round(truth, part):
+            found.append(one("direction", space.angle_deg(place[:3, 2], own[:3, 2]), ANGLE_DEG, "deg"))
+        else:
+            turn = space.nearest_rotation(place[:3, :3]) @ space.nearest_rotation(own[:3, :3]).T
+            found.append(one("rotation", np.degrees(np.linalg.norm(space.rotation_vector(turn))), ANGLE_DEG, "deg"))
     if kind in ("pose", "translation", "position"):
         distance = float(np.linalg.norm(space.applied(place, middle) - space.applied(own, middle)))
         found.append(one("position", distance / diameter, POSITION, "of the diameter"))
@@ -162,7 +166,7 @@ def intervals(problem: FitProblem, start: Scene, record: Record) -> list[Interva
 
 
 def true_numbers(truth: Scene, start: Scene, variation: Variation, labels: Sequence[str]) -> list[float | None]:
-    """True values of an estimate's numbers, in its units; None for numbers that have none, as a spot's turn about its axis.
+    """True values of an estimate's numbers, in its units; None for those that pictures do not show.
 
     The command counts motions from the place in the scene file. Shapes turn about the middle of their box and the axes of the
     world, lights and cameras about their own axes, directions about two axes that are perpendicular to them.
@@ -197,6 +201,8 @@ def _motion(truth: Scene, start: Scene, part: str) -> dict[str, float]:
         numbers |= {"turn 1": float(about_axis @ first), "turn 2": float(about_axis @ second)}
         own = old[:3, :3].T @ about_axis
         return numbers | {"rotation x": float(own[0]), "rotation y": float(own[1])}
+    if is_round(truth, part):
+        return numbers
     names = ("tilt", "pan", "roll") if holder == "camera" else ("rotation x", "rotation y", "rotation z")
     return numbers | {name: float(turn[k]) for k, name in enumerate(names)} | {"scale": size}
 

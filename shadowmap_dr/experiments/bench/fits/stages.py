@@ -128,7 +128,7 @@ def _thing(
 def _material(kind: str, colour: Array, random: np.random.Generator) -> Material:
     roughness = (round(float(random.uniform(0.22, 0.38)), 4),)
     if kind == "plastic":
-        return Material("roughplastic", {"diffuse_reflectance": _numbers(colour), "alpha": roughness})
+        return Material("roughplastic", {"diffuse_reflectance": _numbers(colour * 0.6), "alpha": roughness})
     if kind == "metal":
         return Material("roughconductor", {"alpha": roughness, "specular_reflectance": _numbers(np.clip(colour * 1.3, 0, 0.95))})
     if kind == "principled":

@@ -11,14 +11,16 @@ from .objective import Objective, Point
 from .uncertainty import Uncertainty, not_told_apart
 
 Array = npt.NDArray[np.float64]
+Image = npt.NDArray[np.float32]
 
-#: Largest error, as a share of the brightness, with which a fit counts as found.
-EXPLAINED = 0.12
+#: Largest share of unexplained edges with which a fit counts as found.
+EXPLAINED = 0.25
+# Pixels matter where a change of a number by this moves them by more than the other number, a share of the brightness, or where the
+# residual is larger than that.
+_CHANGE, _VISIBLE = 0.05, 0.03
 
 
-def judge(
-    point: Point, objective: Objective, spread: Uncertainty, names: Sequence[str], ends: Sequence[Array], costs: Sequence[float]
-) -> tuple[bool, list[str]]:
+def judge(point: Point, objective: Objective, spread: Uncertainty, names: Sequence[str]) -> tuple[bool, list[str]]:
     """(True if the scene explains the pictures, sentences).
 
     Args:
@@ -26,14 +28,15 @@ def judge(
         objective: of the last stage.
         spread: its uncertainty.
         names: of all numbers.
-        ends: numbers at which the starts of the last stage ended, best first, with their ``costs``.
     """
     words: list[str] = []
-    found = point.error <= EXPLAINED
+    share = unexplained(point, objective)
+    found = share <= EXPLAINED
     if not found:
         words.append(
-            f"Not found: the images differ by {100 * point.error:.0f} % of the picture's brightness. Try more starts, a "
-            "scene that is nearer to the picture, or let more vary; mask what the scene does not have."
+            f"Not found: {100 * share:.0f} % of the edges that matter in the picture are not where the scene has them, and the images "
+            f"differ by {100 * point.error:.0f} % of the brightness. Try more starts, a scene that is nearer to the picture, or let "
+            "more vary; mask what the scene does not have."
         )
     idle = [name for name, none in zip(names, spread.idle, strict=True) if none]
     words += [f"{name} moves nothing in the pictures." for name in idle]
@@ -42,3 +45,26 @@ def judge(
     loose = [n for n, half, none in zip(names, spread.half_widths, spread.idle, strict=True) if np.isinf(half) and not none]
     words += [f"{name} is not determined by the pictures." for name in loose]
     return found, words
+
+
+def unexplained(point: Point, objective: Objective) -> float:
+    """Share of the edges in the pictures that the images do not have, or have elsewhere: 0 for equal images, 1 for unrelated ones.
+
+    Edges count where the fitted numbers, or errors, change the images. Smooth differences, such as light that bounces, hardly
+    count.
+    """
+    missing = total = 0.0
+    each = zip(point.columns(), point.recorded, point.residuals, objective.observations, objective.brightness, strict=True)
+    for columns, image, residual, seen, scale in each:
+        moved = np.abs(columns).reshape(len(columns), *residual.shape).max(0, initial=0) * _CHANGE
+        matters = (np.maximum(moved, np.abs(residual)).max(2) > _VISIBLE) * seen.weight
+        for axis in (0, 1):
+            weight = np.minimum(np.take(matters, range(1, matters.shape[axis]), axis), _without_last(matters, axis))
+            of_image, of_picture = (np.diff(picture / scale, axis=axis) for picture in (image, seen.image))
+            missing += float((weight[..., None] * (of_image - of_picture) ** 2).sum(dtype=np.float64))
+            total += float((weight[..., None] * (of_image**2 + of_picture**2)).sum(dtype=np.float64))
+    return missing / total if total > 0 else 0.0
+
+
+def _without_last(array: Image, axis: int) -> Image:
+    return np.take(array, range(array.shape[axis] - 1), axis)

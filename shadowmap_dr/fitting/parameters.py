@@ -178,7 +178,7 @@ class ShapeMotion:
 
     def arrays(self, renderer: Renderer, change: SceneChange) -> dict[str, Array]:
         matrix = host_matrix(change.placements[self.shapes[0]])
-        return {"matrix": matrix, "position": (matrix @ [*self.pivot, 1])[:3]}
+        return {"matrix": matrix, "position": (matrix @ [*self.pivot, 1])[:3], "pivot": self.pivot, "axes": np.eye(3)}
 
 
 @dataclass(frozen=True)
@@ -244,7 +244,8 @@ class LightMotion:
                 found[name] = np.array(dr.detach(getattr(new, name)), np.float64).ravel()[:3]
         if hasattr(new, "to_world"):
             found["to_world"] = host_matrix(new.to_world)
-            found["matrix"] = found["to_world"] @ np.linalg.inv(host_matrix(old.to_world))
+            before = host_matrix(old.to_world)
+            found |= {"matrix": found["to_world"] @ np.linalg.inv(before), "pivot": before[:3, 3], "axes": before[:3, :3]}
         return found
 
 
@@ -295,7 +296,9 @@ class CameraMotion:
         old, new = (
             host_matrix(camera.to_world) for camera in (renderer.data.cameras(self.sensor)[0], change.camera(self.sensor))
         )
-        return {"to_world": new, "matrix": new @ np.linalg.inv(old), "position": new[:3, 3]}
+        pivot = old[:3, 3] + self.distance * old[:3, 2]
+        turns = {"pivot": pivot, "axes": old[:3, :3] / np.linalg.norm(old[:3, :3], axis=0)}
+        return {"to_world": new, "matrix": new @ np.linalg.inv(old), "position": new[:3, 3], **turns}
 
 
 @dataclass(frozen=True)
@@ -399,8 +402,8 @@ _CAMERA = {"rx": "tilt", "ry": "pan", "rz": "roll"}
 
 
 def _kind(parts: Sequence[str]) -> str:
-    turns, moves = any(p[0] == "r" for p in parts), any(p[0] == "t" for p in parts)
-    if "a" in parts:
+    turns, moves = any(p[0] in "rab" for p in parts), any(p[0] == "t" for p in parts)
+    if parts == ("a", "b"):
         return "direction"
     return "scale" if "s" in parts else "pose" if turns and moves else "rotation" if turns else "translation"
 

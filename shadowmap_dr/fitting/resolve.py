@@ -155,8 +155,10 @@ class Resolver:
         if kind not in kinds:
             raise _no_kind(vary, f"a {type(light).__name__}", (*kinds, "brightness"))
         axes = vary.axes or _AXES
+        # The turn of a spot light without picture about its own axis changes nothing.
+        is_round = hasattr(light, "cutoff_angle") and light.texture is None
         parts = {
-            "pose": ("rx", "ry", "rz", "tx", "ty", "tz"),
+            "pose": (*(("a", "b") if is_round else ("rx", "ry", "rz")), "tx", "ty", "tz"),
             "rotation": tuple(f"r{axis}" for axis in axes),
             "direction": ("a", "b"),
             "position": tuple(f"t{axis}" for axis in axes),

@@ -17,7 +17,7 @@ from ..io.records import plain, read_json, write_json
 #: First entry of fit.json. The number grows when a reader of an earlier version could misread the file.
 FORMAT = "shadowmap-dr fit 1"
 #: Arrays of estimates that fit.json holds. Others (vertices, textures) have files of their own.
-SMALL_ARRAYS = ("matrix", "direction", "position", "value")
+SMALL_ARRAYS = ("matrix", "pivot", "axes", "direction", "position", "value")
 
 Numbers = npt.NDArray[np.float64]
 #: Linear colours (H, W, 3), or numbers (H, W).
@@ -50,8 +50,9 @@ class Estimate:
         values: (n,), in these units.
         start: (n,), from where the fit began.
         half_width: (n,), half of the 95 % interval; inf: the pictures do not determine the number. None: not estimated.
-        arrays: "matrix" (4, 4): affine map, in world space, from the place in the scene file to the fitted one; "direction" (3,),
-            "position" (3,), "value" (n,), "vertices" (V, 3), "texture" (H, W, C).
+        arrays: "matrix" (4, 4): affine map, in world space, from the place in the scene file to the fitted one; "pivot" (3,) and
+            "axes" (3, 3), columns: point and axes of rotations in the scene file; "direction" (3,), "position" (3,), "value"
+            (n,), "vertices" (V, 3), "texture" (H, W, C).
 
     Raises ShadowmapError for arrays of different lengths.
     """

@@ -195,14 +195,16 @@ class Fit:
 
     def result(self, command: str = "") -> FitResult:
         """The result of the steps taken so far."""
-        objective, x = self.stages[-1].objective, self.best
-        point = objective.at(x)
+        objective = self.stages[-1].objective
+        point = objective.at(self.best)
         spread = uncertainty(point, objective)
+        # Numbers that move nothing, which starts have left anywhere, are those of the scene.
+        x = np.where(spread.idle, np.clip(0, self._low, self._high), point.x)
+        self.best_run.x = x
         estimates, names = estimates_of(x, self.parameters, self.renderer, self.change(x), spread)
         of_gains, names_of_gains = gain_estimates(x, self.targets, self.gains, objective.gains, spread)
         names += names_of_gains
-        ends = [run for run in self._state.runs if run.stage >= self.best_run.stage - 1]
-        found, words = judge(point, objective, spread, names, [run.x for run in ends], [run.cost for run in ends])
+        found, words = judge(point, objective, spread, names)
         seconds = time.perf_counter() - self._began
         return FitResult(
             found=found,

@@ -153,7 +153,7 @@ def intervals(problem: FitProblem, start: Scene, record: Record) -> list[Interva
         estimate = _estimate(record, variation)
         if estimate is None or estimate["half_width"] is None or variation.name in problem.common_factor:
             continue
-        for number, truth in enumerate(true_numbers(problem.truth, start, variation, estimate["labels"])):
+        for number, truth in enumerate(true_numbers(problem.truth, start, variation, estimate)):
             if truth is not None:
                 label = f"{variation.name} {estimate['labels'][number]}"
                 found.append(_interval(label, estimate, number, truth))
@@ -165,42 +165,37 @@ def intervals(problem: FitProblem, start: Scene, record: Record) -> list[Interva
     return found
 
 
-def true_numbers(truth: Scene, start: Scene, variation: Variation, labels: Sequence[str]) -> list[float | None]:
+def true_numbers(truth: Scene, start: Scene, variation: Variation, estimate: Record) -> list[float | None]:
     """True values of an estimate's numbers, in its units; None for those that pictures do not show.
 
-    The command counts motions from the place in the scene file. Shapes turn about the middle of their box and the axes of the
-    world, lights and cameras about their own axes, directions about two axes that are perpendicular to them.
+    The command counts motions from the place in the scene file, and tells the point and the axes of rotations. Directions turn
+    about two axes that are perpendicular to them.
     """
     if variation.kind == "value":
         return [float(number) for number in value(truth, variation)]
     if variation.kind == "fov":
         return [truth.camera(variation.part).fov]
-    if not labels or variation.kind in ("texture", "vertices"):
+    if not estimate["labels"] or variation.kind in ("texture", "vertices"):
         return []
-    numbers = _motion(truth, start, variation.part)
-    return [numbers.get(label) for label in labels]
+    numbers = _motion(truth, start, variation.part, estimate)
+    return [numbers.get(label) for label in estimate["labels"]]
 
 
-def _motion(truth: Scene, start: Scene, part: str) -> dict[str, float]:
+def _motion(truth: Scene, start: Scene, part: str, estimate: Record) -> dict[str, float]:
     """True numbers of all motions of a part, by label."""
     holder = truth.holds(part)
     old, new = (getattr(scene, holder)(part).place for scene in (start, truth))
-    if holder == "body":
-        about = start.body(part).centre()
-        matrix = new @ np.linalg.inv(old)
-        shift = space.applied(matrix, about) - about
-        size = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
-        turn = np.degrees(space.rotation_vector(space.nearest_rotation(matrix[:3, :3])))
-    else:
-        shift, size = new[:3, 3] - old[:3, 3], 1.0
-        turn = np.degrees(space.rotation_vector(old[:3, :3].T @ new[:3, :3]))
+    matrix = new @ np.linalg.inv(old)
+    pivot = np.array(estimate["pivot"], float) if estimate.get("pivot") is not None else old[:3, 3]
+    axes = np.array(estimate["axes"], float) if estimate.get("axes") is not None else np.eye(3)
+    shift = space.applied(matrix, pivot) - pivot
+    size = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+    turn = np.degrees(space.rotation_vector(axes.T @ space.nearest_rotation(matrix[:3, :3]) @ axes))
     numbers = {f"translation {axis}": float(shift[k]) for k, axis in enumerate("xyz")}
     if holder == "lamp":
         about_axis = _shortest_turn(old[:3, 2], new[:3, 2])
         first, second = tangents(old[:3, 2])
-        numbers |= {"turn 1": float(about_axis @ first), "turn 2": float(about_axis @ second)}
-        own = old[:3, :3].T @ about_axis
-        return numbers | {"rotation x": float(own[0]), "rotation y": float(own[1])}
+        return numbers | {"turn 1": float(about_axis @ first), "turn 2": float(about_axis @ second)}
     if is_round(truth, part):
         return numbers
     names = ("tilt", "pan", "roll") if holder == "camera" else ("rotation x", "rotation y", "rotation z")

@@ -42,6 +42,7 @@ MAY_IMPORT = {
             "",
             "_llvm",
             "errors",
+            "fitting",
             "inverse",
             "io",
             "jit",

@@ -15,8 +15,8 @@ Image = npt.NDArray[np.float32]
 
 #: Largest share of unexplained edges with which a fit counts as found.
 EXPLAINED = 0.25
-# Pixels matter where a change of a number by this moves them by more than the other number, a share of the brightness, or where the
-# residual is larger than that.
+# Pixels matter where a change of a number by the first moves them by more than the second, a share of the brightness; and
+# where the residual is larger.
 _CHANGE, _VISIBLE = 0.05, 0.03
 
 
@@ -34,9 +34,9 @@ def judge(point: Point, objective: Objective, spread: Uncertainty, names: Sequen
     found = share <= EXPLAINED
     if not found:
         words.append(
-            f"Not found: {100 * share:.0f} % of the edges that matter in the picture are not where the scene has them, and the images "
-            f"differ by {100 * point.error:.0f} % of the brightness. Try more starts, a scene that is nearer to the picture, or let "
-            "more vary; mask what the scene does not have."
+            f"Not found: {100 * share:.0f} % of the edges that matter in the picture are not where the scene has them, and the "
+            f"images differ by {100 * point.error:.0f} % of the brightness. Try more starts, a scene that is nearer to the "
+            "picture, or let more vary; mask what the scene does not have."
         )
     idle = [name for name, none in zip(names, spread.idle, strict=True) if none]
     words += [f"{name} moves nothing in the pictures." for name in idle]
@@ -48,7 +48,7 @@ def judge(point: Point, objective: Objective, spread: Uncertainty, names: Sequen
 
 
 def unexplained(point: Point, objective: Objective) -> float:
-    """Share of the edges in the pictures that the images do not have, or have elsewhere: 0 for equal images, 1 for unrelated ones.
+    """Share of the pictures' edges that the images do not have, or have elsewhere: 0 for equal images, 1 for unrelated ones.
 
     Edges count where the fitted numbers, or errors, change the images. Smooth differences, such as light that bounces, hardly
     count.

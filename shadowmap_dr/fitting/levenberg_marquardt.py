@@ -5,7 +5,7 @@ Source: Nocedal and Wright, "Numerical Optimization", 2006, section 10.3; Marqua
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
@@ -51,19 +51,16 @@ class Limits:
     shortest: float = 1e-5
 
 
-def minimise(
-    at: Callable[[Array], P], start: P, limits: Limits, accepted: Callable[[P], None] = lambda point: None
-) -> tuple[P, bool]:
+def minimise(at: Callable[[Array], P], start: P, limits: Limits) -> Iterator[P]:
     """Minimise a loss from a point on.
 
     Args:
         at: the point at given numbers.
         start: the first point.
         limits: bounds and ends.
-        accepted: called with each better point.
 
-    Returns:
-        (best point, True if the steps had become small).
+    Yields:
+        Better and better points, one after each step. It ends when steps or improvements have become small.
     """
     point, damping = start, _DAMPING
     for _ in range(limits.steps):
@@ -71,22 +68,21 @@ def minimise(
         while True:
             step = _step(matrix, right, damping, point.x, limits)
             if np.abs(step).max(initial=0) < limits.shortest:
-                return point, True
+                return
             candidate = at(point.x + step)
             if candidate.cost < point.cost:
                 break
             if candidate.cost < point.cost * (1 + limits.improvement):
-                return point, True  # the differences are those of rounding, and of shadow maps that were fitted anew
+                return  # the differences are those of rounding, and of shadow maps that were fitted anew
             damping *= _WORSE
             if damping > _MOST:
-                return point, True
+                return
         damping = max(damping * _BETTER, _LEAST)
         gained = (point.cost - candidate.cost) / max(point.cost, 1e-300)
         point = candidate
-        accepted(point)
+        yield point
         if gained < limits.improvement:
-            return point, True
-    return point, False
+            return
 
 
 def _step(matrix: Array, right: Array, damping: float, x: Array, limits: Limits) -> Array:

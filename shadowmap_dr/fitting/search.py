@@ -127,13 +127,13 @@ class Fit:
 
     def _descend(self, run: Run, number: int, stage: Stage, steps: int) -> Iterator[Step]:
         """Steps of a start in a stage."""
-        found: list[Point] = []
         limits = Limits(self._low, self._high, _LONGEST, steps, _ENOUGH)
         point = stage.objective.at(run.x)
-        best, _ = minimise(stage.objective.at, point, limits, found.append) if len(run.x) else (point, True)
-        run.x, run.cost = best.x, best.cost
-        for each in (point, *found):
-            yield self._note(run, number, each)
+        run.cost = point.cost
+        yield self._note(run, number, point)
+        for better in minimise(stage.objective.at, point, limits) if len(run.x) else ():
+            run.x, run.cost = better.x, better.cost
+            yield self._note(run, number, better)
 
     def _fit_arrays(self, run: Run, number: int, stage: Stage) -> Iterator[Step]:
         """Steps of the textures and vertices in a stage, in turns with steps of the numbers."""

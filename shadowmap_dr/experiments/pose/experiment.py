@@ -13,7 +13,7 @@ import glob
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import drjit as dr
 import mitsuba as mi
@@ -103,6 +103,9 @@ class PoseOptions:
         None, metavar="N|auto", shown=_AUTO[2], parse=_number("tries"), allowed=(1, 13),
         help="Most descents of a run, from other rotations while the image is not explained.",
     )  # fmt: skip
+    optimiser: Literal["adam", "lm"] = option(
+        "adam", help="Optimiser of our methods: Adam, or Levenberg and Marquardt's method from coarse images to fine ones."
+    )
     out: Path = option(Path("pose"), help="Folder for the results.")
     resume: bool = option(False, help="Keep finished runs, resume killed ones.")
     scheduler: str = scheduler_option()
@@ -121,6 +124,8 @@ class PoseOptions:
         check_threads(self.threads)
         if self.reference not in ("mitsuba", "own"):
             raise ShadowmapError(f"no reference {self.reference!r}: choose mitsuba or own.")
+        if self.optimiser not in ("adam", "lm"):
+            raise ShadowmapError(f"no optimiser {self.optimiser!r}: choose adam or lm.")
         if self.normals not in (None, "face", "vertex"):
             raise ShadowmapError(f"no normals {self.normals!r}: choose face or vertex.")
         check_scheduler(self.scheduler)
@@ -168,7 +173,7 @@ def run_pose(options: PoseOptions, *, build: Builder = build_method, console: Co
         ]
     }
     searches = {
-        folder: choose(problem, name, options.samples, options.blur, options.tries)
+        folder: choose(problem, name, options.samples, options.blur, options.tries, options.optimiser)
         for folder, (name, problem) in problems.items()
     }
     if len(problems) != len(options.objects) * len(options.resolutions):

@@ -54,6 +54,7 @@ def build_method(
     blur: float = 0.0,
     blur_steps: int = 0,
     tries: int = 1,
+    optimiser: str = "adam",
 ) -> Method:
     """One of the three methods for a problem and its reference image.
 
@@ -62,6 +63,7 @@ def build_method(
         setting: sample counts of Mitsuba's; None: the result of `fair_setting`.
         blur, blur_steps: see `PoseFit`; of our own methods.
         tries: most descents of a run with our own methods, for its record.
+        optimiser: ``adam``, or ``lm`` for Levenberg and Marquardt's method; of our own methods.
     """
     if name == "mitsuba":
         from mitsuba_baselines.fair_settings import fair_setting
@@ -91,6 +93,12 @@ def build_method(
         settings |= {"blur": blur, "blur_steps": blur_steps}
     if tries != 1:
         settings["tries"] = tries
+    if optimiser == "lm":
+        from .gauss_newton import GaussNewtonPose
+
+        for name in ("blur", "blur_steps"):
+            settings.pop(name, None)
+        return GaussNewtonPose(renderer, "object", reference, spp=samples, settings=settings)
     return PoseFit(
         renderer,
         "object",
@@ -114,6 +122,7 @@ def searching(search: Search, iterations: int) -> Builder:
         blur=search.blur,
         blur_steps=search.blur_steps(iterations),
         tries=search.tries,
+        optimiser=search.optimiser,
     )
 
 

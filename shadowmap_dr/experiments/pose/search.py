@@ -38,18 +38,22 @@ class Search:
         samples: samples per pixel.
         blur: standard deviation of the blur of the first step, in pixels, see `PoseFit`.
         tries: most descents of a run. Another one follows, from another rotation, while the differences are above `EXPLAINED`.
+        optimiser: ``adam`` or ``lm``.
     """
 
     samples: int = 1
     blur: float = 0.0
     tries: int = 1
+    optimiser: str = "adam"
 
     def blur_steps(self, iterations: int) -> int:
         """Number of steps with blur."""
         return round(_BLUR_STEPS * iterations) if self.blur else 0
 
 
-def choose(problem: PoseProblem, file: str, samples: int | None, blur: float | None, tries: int | None) -> Search:
+def choose(
+    problem: PoseProblem, file: str, samples: int | None, blur: float | None, tries: int | None, optimiser: str = "adam"
+) -> Search:
     """Settings for a problem whose object is called ``file`` by the user; None stands for a choice."""
     known = file in assets.mesh_names()
     chosen = Search() if known else Search(samples_for(facet_widths(problem)), _BLUR * problem.resolution, _TRIES)
@@ -57,6 +61,7 @@ def choose(problem: PoseProblem, file: str, samples: int | None, blur: float | N
         chosen.samples if samples is None else samples,
         chosen.blur if blur is None else blur,
         chosen.tries if tries is None else tries,
+        optimiser,
     )
 
 

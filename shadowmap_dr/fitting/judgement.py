@@ -14,7 +14,9 @@ Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
 
 #: Largest share of unexplained edges with which a fit counts as found.
-EXPLAINED = 0.25
+EXPLAINED = 0.12
+# Pixels along the longer side of the images whose edges are compared: noise and blurred outlines count little there.
+_SIDE = 64
 # Pixels matter where a change of a number by the first moves them by more than the second, a share of the brightness; and
 # where the residual is larger.
 _CHANGE, _VISIBLE = 0.05, 0.03
@@ -58,12 +60,21 @@ def unexplained(point: Point, objective: Objective) -> float:
     for columns, image, residual, seen, scale in each:
         moved = np.abs(columns).reshape(len(columns), *residual.shape).max(0, initial=0) * _CHANGE
         matters = (np.maximum(moved, np.abs(residual)).max(2) > _VISIBLE) * seen.weight
+        times = max(1, round(max(matters.shape) / _SIDE))
+        weight, ours, theirs = (_reduced(one, times) for one in (matters, image / scale, seen.image / scale))
         for axis in (0, 1):
-            weight = np.minimum(np.take(matters, range(1, matters.shape[axis]), axis), _without_last(matters, axis))
-            of_image, of_picture = (np.diff(picture / scale, axis=axis) for picture in (image, seen.image))
-            missing += float((weight[..., None] * (of_image - of_picture) ** 2).sum(dtype=np.float64))
-            total += float((weight[..., None] * (of_image**2 + of_picture**2)).sum(dtype=np.float64))
+            both = np.minimum(np.take(weight, range(1, weight.shape[axis]), axis), _without_last(weight, axis))[..., None]
+            of_image, of_picture = np.diff(ours, axis=axis), np.diff(theirs, axis=axis)
+            missing += float((both * (of_image - of_picture) ** 2).sum(dtype=np.float64))
+            total += float((both * (of_image**2 + of_picture**2)).sum(dtype=np.float64))
     return missing / total if total > 0 else 0.0
+
+
+def _reduced(image: Image, times: int) -> Image:
+    """Means of blocks of pixels; a rest at the border is left out."""
+    rows, columns = image.shape[0] // times, image.shape[1] // times
+    blocks = image[: rows * times, : columns * times].reshape(rows, times, columns, times, *image.shape[2:])
+    return np.asarray(blocks.mean((1, 3)), np.float32)
 
 
 def _without_last(array: Image, axis: int) -> Image:

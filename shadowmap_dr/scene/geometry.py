@@ -411,7 +411,7 @@ def _checked_matrix(name: str, value: Matrix4f | mi.Transform4f | npt.ArrayLike)
             if numbers.shape != (4, 4):  # a matrix of a number is a multiple of the identity
                 raise ValueError("no matrix")
             given = mi.ScalarMatrix4f(numbers.tolist())
-        elif not dr.is_matrix_v(given):
+        elif not dr.is_matrix_v(given) or dr.size_v(given) != 4:
             raise TypeError("no matrix")
         matrix = mi.Matrix4f(given)
     except (TypeError, ValueError, RuntimeError) as error:

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from fitting_scenes import OPTIONS, varied_scene
+from fitting_scenes import OPTIONS, box, camera, renderer_of, varied_scene
 from hypothesis import example, given
 from hypothesis import strategies as st
 
@@ -339,10 +339,10 @@ def test_motions_of_numbers_are_those_that_are_shown(resolver: Resolver) -> None
 def test_motions_of_one_shape_follow_one_another(resolver: Resolver) -> None:
     """A turn after a move is one about the moved middle."""
     change = SceneChange(resolver.renderer)
-    move, turn = (resolver.parameter(Vary.parse(f"car_wheel:{kind}:z")) for kind in ("translation", "rotation"))
+    move, turn = (resolver.parameter(Vary.parse(f"car_wheel:{text}")) for text in ("translation:x", "rotation:z"))
     move.put([mi.Float(2 / move.extent)], change)  # type: ignore[union-attr, arg-type]
     turn.put([mi.Float(math.pi)], change)  # type: ignore[union-attr, arg-type]
-    np.testing.assert_allclose(host_matrix(change.placements["car_wheel"]) @ [1.5, 0, 0.5, 1], [0.5, 0, 2.5, 1], atol=1e-5)
+    np.testing.assert_allclose(host_matrix(change.placements["car_wheel"]) @ [1.5, 0, 0.5, 1], [2.5, 0, 0.5, 1], atol=1e-5)
 
 
 def test_directions_turn_by_the_angle_that_is_shown(resolver: Resolver) -> None:
@@ -371,6 +371,28 @@ def test_cameras_go_around_what_they_see(resolver: Resolver) -> None:
     fov = resolver.parameter(Vary("camera", "fov"))
     fov.put([mi.Float(float(fov.scale.number(60.0)[0]))], change)  # type: ignore[union-attr, arg-type]
     assert float(dr.detach(change.camera(0).x_fov)[0]) == pytest.approx(60, rel=1e-5)
+
+
+def test_the_space_of_a_camera_may_be_scaled() -> None:
+    """Without an effect on what it sees, nor on how it goes around it."""
+    found = []
+    for scale in (1, 4):
+        to_world = camera()["to_world"] @ mi.ScalarTransform4f().scale(scale)
+        own = Resolver(renderer_of(camera=camera(to_world=to_world)))
+        change = SceneChange(own.renderer)
+        own.parameter(Vary("camera")).put([mi.Float(v) for v in (0.2, -0.3, 0.1, 0, 0, 0)], change)  # type: ignore[union-attr, misc]
+        found.append(host_matrix(change.camera(0).to_world)[:3, 3])
+    np.testing.assert_allclose(found[0], found[1], atol=1e-4)
+
+
+def test_one_of_several_textures_is_to_be_named() -> None:
+    texture = {"type": "bitmap", "bitmap": mi.Bitmap(np.full((4, 8, 3), 0.5, np.float32)), "raw": True}
+    both = {"type": "roughplastic", "diffuse_reflectance": texture, "specular_reflectance": texture}
+    own = Resolver(renderer_of(box={**box(0), "bsdf": both}))
+    keys = [f"box.bsdf.{name}_reflectance.data" for name in ("diffuse", "specular")]
+    with pytest.raises(ShadowmapError, match=f"vary box:texture: there are several, {', '.join(keys)}; name one"):
+        own.parameter(Vary("box", "texture"))
+    assert own.parameter(Vary(keys[1], "texture")).key == keys[1]  # type: ignore[union-attr]
 
 
 def test_ranges_of_starts_are_in_units_of_the_report(resolver: Resolver) -> None:

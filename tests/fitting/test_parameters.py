@@ -373,12 +373,12 @@ def test_cameras_go_around_what_they_see(resolver: Resolver) -> None:
     assert float(dr.detach(change.camera(0).x_fov)[0]) == pytest.approx(60, rel=1e-5)
 
 
-def test_the_space_of_a_camera_may_be_scaled() -> None:
-    """Without an effect on what it sees, nor on how it goes around it."""
+def test_the_space_of_an_orthographic_camera_is_scaled() -> None:
+    """Without an effect on how it goes around what it sees."""
     found = []
     for scale in (1, 4):
         to_world = camera()["to_world"] @ mi.ScalarTransform4f().scale(scale)
-        own = Resolver(renderer_of(camera=camera(to_world=to_world)))
+        own = Resolver(renderer_of(camera={"type": "orthographic", "to_world": to_world, "film": camera()["film"]}))
         change = SceneChange(own.renderer)
         own.parameter(Vary("camera")).put([mi.Float(v) for v in (0.2, -0.3, 0.1, 0, 0, 0)], change)  # type: ignore[union-attr, misc]
         found.append(host_matrix(change.camera(0).to_world)[:3, 3])

@@ -102,7 +102,7 @@ class View:
         (H, W, 3)).
         """
         pixels = [device_array(mi.Float, self._planes(plane).astype(np.float32)) for plane in (target, weight, factors)]
-        numbers, bound = mi.Float(x[: self.count].astype(np.float32)), device_array(mi.Float, np.array([limit], np.float32))
+        numbers, bound = _input(x[: self.count]), device_array(mi.Float, np.array([limit], np.float32))
         return list(self._gradient(numbers, self.values, pixels, bound, self._renderer))
 
     def change(self, x: Array) -> SceneChange:
@@ -116,7 +116,7 @@ class View:
         return change
 
     def _pass(self, entry: int, x: Array, tangent: Array) -> tuple[Image, Image]:
-        numbers, step = mi.Float(x[: self.count].astype(np.float32)), mi.Float(tangent.astype(np.float32))
+        numbers, step = _input(x[: self.count]), _input(tangent)
         recorded = self._passes[entry] if entry >= 0 else self._image
         image, derivative = recorded(numbers, step, self.values, self._renderer)
         return self._shaped(image), self._shaped(derivative)
@@ -228,6 +228,11 @@ class View:
             spp=self._spp,
         )
         return image.array, restore
+
+
+def _input(numbers: Array) -> Float:
+    """Numbers as an input of a recording. Dr.Jit 1.5 aborts the process at arrays without entries."""
+    return mi.Float(numbers.astype(np.float32) if len(numbers) else np.zeros(1, np.float32))
 
 
 def set_values(scene: mi.Scene, change: SceneChange) -> Callable[[], None]:

@@ -159,13 +159,13 @@ def test_image_is_the_average_of_that_of_the_sensor(film: dict[str, Any]) -> Non
     mi.set_variant("llvm_ad_rgb")
     scene = scene_of(camera=camera(film={**WINDOW, **film}, **SHIFTED))
     renderer = Renderer.from_scene(scene, **OPTIONS)
-    size = ImageSize(20, 15)
-    found = view_of(renderer, "sun:direction", size=size).image(np.zeros(2))
-    assert found.shape == (15, 20, 3)
     box_film = camera(film={**WINDOW, **film, "rfilter": {"type": "box"}}, **SHIFTED)
     own = Renderer.from_scene(scene_of(camera=box_film), **OPTIONS).render(spp=16)
-    difference = np.abs(found - averaged(own, size))
-    assert difference.max() < 0.03 and difference.mean() < 1e-3, (difference.max(), difference.mean())
+    for size in (ImageSize(20, 15), ImageSize(20, 10)):  # pixels that are no squares, too: sides of pictures are rounded
+        found = view_of(renderer, "sun:direction", size=size).image(np.zeros(2))
+        assert found.shape == (size.height, 20, 3)
+        difference = np.abs(found - averaged(own, size))
+        assert difference.max() < 0.03 and difference.mean() < 1e-3, (difference.max(), difference.mean())
 
 
 def test_image_is_that_of_mitsuba(renderers: dict[str, Renderer]) -> None:

@@ -66,10 +66,10 @@ def minimise(at: Callable[[Array], P], start: P, limits: Limits) -> Iterator[P]:
     for _ in range(limits.steps):
         matrix, right = point.system()
         while True:
-            step = _step(matrix, right, damping, point.x, limits)
-            if np.abs(step).max(initial=0) < limits.shortest:
+            x = _after_step(matrix, right, damping, point.x, limits)
+            if np.abs(x - point.x).max(initial=0) < limits.shortest:
                 return
-            candidate = at(point.x + step)
+            candidate = at(x)
             if candidate.cost < point.cost:
                 break
             if candidate.cost < point.cost * (1 + limits.improvement):
@@ -85,8 +85,11 @@ def minimise(at: Callable[[Array], P], start: P, limits: Limits) -> Iterator[P]:
             return
 
 
-def _step(matrix: Array, right: Array, damping: float, x: Array, limits: Limits) -> Array:
-    """A damped step within the bounds. Numbers at a bound that the loss pushes outwards stay."""
+def _after_step(matrix: Array, right: Array, damping: float, x: Array, limits: Limits) -> Array:
+    """Numbers after a damped step within the bounds. Those at a bound that the loss pushes outwards stay.
+
+    Numbers that reach a bound are equal to it, not up to rounding: the next step looks for them.
+    """
     free = ~(((x <= limits.low) & (right > 0)) | ((x >= limits.high) & (right < 0)))
     diagonal = np.diag(matrix).copy()
     # Numbers that move nothing get no step, and make no matrix singular.
@@ -96,4 +99,4 @@ def _step(matrix: Array, right: Array, damping: float, x: Array, limits: Limits)
         damped = matrix[np.ix_(free, free)] + np.diag(damping * diagonal[free] + 1e-12 * diagonal[free])
         step[free] = -np.linalg.solve(damped, right[free])
     step *= min(1.0, limits.longest / max(np.abs(step).max(initial=0), 1e-300))
-    return np.clip(x + step, limits.low, limits.high) - x
+    return np.clip(x + step, limits.low, limits.high)

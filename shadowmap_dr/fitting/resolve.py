@@ -109,7 +109,7 @@ class Resolver:
             kinds = tuple(self._light_kinds(light))
             if kinds:
                 found.append(Candidate(light.name, kinds, type(light).__name__))
-        found += [Candidate(name, ("pose", "rotation", "translation", "fov"), "camera") for name in self.sensors]
+        found += [Candidate(name, self._sensor_kinds(number), "camera") for name, number in self.sensors.items()]
         for key in self.keys:
             array = self._numbers(key)
             if array is not None:
@@ -171,6 +171,10 @@ class Resolver:
             extent = float(np.linalg.norm(np.array(dr.detach(light.position), np.float64).ravel() - self.middle)) or self.diameter
         return LightMotion(vary, vary.name, extent, parts, tangents(direction))
 
+    def _sensor_kinds(self, number: int) -> tuple[str, ...]:
+        perspective = self.renderer.data.cameras(number)[0].kind == "perspective"
+        return ("pose", "rotation", "translation", *(["fov"] if perspective else []))
+
     def _sensor(self, vary: Vary) -> Parameter:
         number, kind = self.sensors[vary.name], vary.kind or "pose"
         record = self.renderer.data.cameras(number)[0]
@@ -186,7 +190,7 @@ class Resolver:
             "position": tuple(f"t{axis}" for axis in axes),
         }.get(kind)
         if parts is None:
-            raise _no_kind(vary, "a camera", ("pose", "rotation", "translation", "fov"))
+            raise _no_kind(vary, "a camera", self._sensor_kinds(number))
         place, towards = (np.array(dr.detach(v), np.float64).ravel() for v in (record.origin, record.direction))
         away = float(np.linalg.norm(place - self.middle)) or self.diameter
         ahead = max(float(towards @ (self.middle - place)), 0.1 * away) if kind == "pose" else 0.0

@@ -28,6 +28,14 @@ _WITH_AXES = ("rotation", "translation", "position")
 _OPTIONS = {"min": "low", "max": "high", "prior": "prior", "spread": "spread"}
 
 
+def _is_finite(value: object) -> bool:
+    """True for finite numbers; False for integers beyond the largest float, too."""
+    try:
+        return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    except OverflowError:
+        return False
+
+
 @dataclass(frozen=True)
 class Vary:
     """One entry of the list of things that vary.
@@ -64,7 +72,7 @@ class Vary:
             raise ShadowmapError(f"vary {self.label}: axes are letters out of xyz, for instance x or xz.")
         for name in ("low", "high", "prior", "spread"):
             value = getattr(self, name)
-            if value is not None and (isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value)):
+            if value is not None and not _is_finite(value):
                 raise ShadowmapError(f"vary {self.label}: {name} is {value!r}; give a finite number.")
         for name in ("prior", "spread"):
             value = getattr(self, name)

@@ -137,7 +137,7 @@ class View:
         (H, W, 3)).
         """
         pixels = [device_array(mi.Float, self._planes(plane).astype(np.float32)) for plane in (target, weight, factors)]
-        numbers, bound = self._numbers(x), device_array(mi.Float, np.array([limit], np.float32))
+        numbers, bound = _input(x[: self.count]), device_array(mi.Float, np.array([limit], np.float32))
         with self.scene_at(x):
             return list(self._gradient(numbers, self.values, pixels, bound, self._renderer))
 
@@ -167,15 +167,11 @@ class View:
         return change
 
     def _pass(self, entry: int, x: Array, tangent: Array) -> tuple[Image, Image]:
-        numbers, step = self._numbers(x), mi.Float(tangent.astype(np.float32))
+        numbers, step = _input(x[: self.count]), _input(tangent)
         recorded = self._passes[entry] if entry >= 0 else self._image
         with self.scene_at(x):
             image, derivative = recorded(numbers, step, self.values, self._renderer)
             return self._shaped(image), self._shaped(derivative)
-
-    def _numbers(self, x: Array) -> Float:
-        """The scene's numbers as an input of recordings, which takes no empty arrays."""
-        return mi.Float(x[: self.count].astype(np.float32)) if self.count else mi.Float(0)
 
     def _shaped(self, image: Float) -> Image:
         pixels = image.numpy().reshape(self._size.height, self._size.width, -1)
@@ -303,6 +299,11 @@ def is_recordable(scene: mi.Scene, key: str) -> bool:
             return False
         node = table.hierarchy[node][0] if node in table.hierarchy else None
     return True
+
+
+def _input(numbers: Array) -> Float:
+    """Numbers as an input of a recording. Dr.Jit 1.5 aborts the process at arrays without entries."""
+    return mi.Float(numbers.astype(np.float32) if len(numbers) else np.zeros(1, np.float32))
 
 
 def set_values(scene: mi.Scene, change: SceneChange) -> Callable[[], None]:

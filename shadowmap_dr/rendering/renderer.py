@@ -238,7 +238,7 @@ class Renderer:
                 own there. Only without ``vertex_positions``, ``transforms`` and ``lights``, and not in recordings.
             transforms: affine maps of world space, ``Transform4f`` or ``Matrix4f``, by the name of the shape that they move.
                 Vertex normals move along, whereas those of ``vertex_positions`` are computed from the new vertices. New vertices
-                of shapes that have both are moved.
+                of shapes that have both are moved. A map that mirrors turns a shape inside out, as mirrored vertices do.
 
         Returns:
             ``mi.TensorXf`` (H, W, C): linear colour (1 or 3 channels, as the film), then alpha if the film has it, then the AOVs.

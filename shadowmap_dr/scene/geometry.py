@@ -404,9 +404,16 @@ def _checked_positions(name: str, value: AnyArray | npt.ArrayLike, count: int) -
 
 def _checked_matrix(name: str, value: Matrix4f | mi.Transform4f | npt.ArrayLike) -> Matrix4f:
     """The map of a shape as Matrix4f."""
-    value = getattr(value, "matrix", value)
+    given: Any = value.matrix if isinstance(value, (mi.Transform4f, mi.ScalarTransform4f)) else value  # Any: no stub narrows it
     try:
-        matrix = mi.Matrix4f(value if dr.is_array_v(value) else mi.ScalarMatrix4f(np.asarray(value, np.float64).tolist()))
+        if not dr.is_array_v(given) or dr.is_tensor_v(given):
+            numbers = np.asarray(given, np.float64)
+            if numbers.shape != (4, 4):  # a matrix of a number is a multiple of the identity
+                raise ValueError("no matrix")
+            given = mi.ScalarMatrix4f(numbers.tolist())
+        elif not dr.is_matrix_v(given) or dr.size_v(given) != 4:
+            raise TypeError("no matrix")
+        matrix = mi.Matrix4f(given)
     except (TypeError, ValueError, RuntimeError) as error:
         raise ShadowmapError(
             f"transforms['{name}'] is a {type(value).__name__}: give a Transform4f or a 4 x 4 matrix."

@@ -11,6 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
+from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 import numpy as np
 import numpy.typing as npt
@@ -183,6 +184,37 @@ class Camera:
             "to_world": mi.ScalarTransform4f(self.to_world),
             "film": {"type": "hdrfilm", "width": self.width, "height": self.height, "rfilter": {"type": "box"}} | film,
         }
+
+    def xml(self, id: str = "camera", near: float = 1e-2, far: float = 1e4) -> str:
+        """The same sensor as text, an element ``<sensor>`` for a scene file of Mitsuba.
+
+        Args:
+            id: name of the sensor in the scene.
+            near, far: clip distances, world units.
+
+        Raises:
+            ShadowmapError: as :meth:`sensor`, but for the variant.
+        """
+        self._check_square()
+        sensor = Element("sensor", type="perspective", id=id)
+        SubElement(sensor, "string", name="fov_axis", value="x")
+        numbers = {
+            "fov": math.degrees(2 * math.atan(0.5 * self.width / self.fx)),
+            "principal_point_offset_x": 0.5 - self.cx / self.width,
+            "principal_point_offset_y": 0.5 - self.cy / self.height,
+            "near_clip": near,
+            "far_clip": far,
+        }
+        for name, number in numbers.items():
+            SubElement(sensor, "float", name=name, value=f"{number:.9g}")
+        matrix = " ".join(f"{number:.9g}" for number in self.to_world.ravel().tolist())
+        SubElement(SubElement(sensor, "transform", name="to_world"), "matrix", value=matrix)
+        film = SubElement(sensor, "film", type="hdrfilm")
+        for name, size in (("width", self.width), ("height", self.height)):
+            SubElement(film, "integer", name=name, value=str(size))
+        SubElement(film, "rfilter", type="box")
+        indent(sensor, "    ")
+        return tostring(sensor, encoding="unicode")
 
     def record(self, near: float = 1e-2, far: float = 1e4) -> Sensor:
         """A camera for ``Renderer.render(sensor=...)``, with a box filter. Keeps fx and fy: pixels need not be square.

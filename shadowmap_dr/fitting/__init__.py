@@ -2,6 +2,7 @@
 
 from .api import fit, prepared
 from .options import FitOptions
+from .report import write_report
 from .result import Estimate, FitResult, read_fit
 from .search import Fit
 from .targets import Target, make_target, read_target
@@ -19,4 +20,5 @@ __all__ = [
     "prepared",
     "read_fit",
     "read_target",
+    "write_report",
 ]

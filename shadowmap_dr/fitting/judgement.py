@@ -42,10 +42,11 @@ def judge(point: Point, objective: Objective, spread: Uncertainty, names: Sequen
         )
     idle = [name for name, none in zip(names, spread.idle, strict=True) if none]
     words += [f"{name} moves nothing in the pictures." for name in idle]
-    for a, b in not_told_apart(spread):
-        words.append(f"{names[a]} and {names[b]} cannot be told apart by the pictures.")
-    loose = [n for n, half, none in zip(names, spread.half_widths, spread.idle, strict=True) if np.isinf(half) and not none]
-    words += [f"{name} is not determined by the pictures." for name in loose]
+    pairs = not_told_apart(spread)
+    words += [f"{names[a]} and {names[b]} cannot be told apart by the pictures." for a, b in pairs]
+    loose = np.isinf(spread.half_widths) & ~spread.idle
+    loose[[number for pair in pairs for number in pair]] = False  # the sentence above says it
+    words += [f"{name} is not determined by the pictures." for name, it_is in zip(names, loose, strict=True) if it_is]
     return found, words
 
 

@@ -18,6 +18,8 @@ Image = npt.NDArray[np.float32]
 
 # Differences that remain in good fits, as shares of a picture's brightness, and pixels that err alike: they weigh priors.
 _USUAL, _ALIKE = 0.02, 64
+#: Weight of a prior's squares beside those of residuals.
+PRIOR_WEIGHT = _USUAL**2 * _ALIKE
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,7 @@ class Objective:
         self.views, self.observations, self.loss = tuple(views), tuple(observations), loss
         self.brightness = [observation.brightness for observation in observations]
         self.pixels = float(sum(observation.weight.sum(dtype=np.float64) for observation in observations))
-        self.precision = _USUAL**2 * _ALIKE / (3 * self.pixels) / np.square(prior)
+        self.precision = PRIOR_WEIGHT / (3 * self.pixels) / np.square(prior)
         self._scene = views[0].count
         ends = np.cumsum([self._scene, *(observation.gain.count for observation in observations)])
         self.gains = [slice(int(a), int(b)) for a, b in zip(ends[:-1], ends[1:], strict=True)]

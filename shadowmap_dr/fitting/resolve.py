@@ -86,9 +86,14 @@ class Resolver:
             return texture_values(self.renderer, vary, self._texture_key(vary))
         if vary.kind in ("value", "brightness", "sky") or not (matched or name in self.lights or name in self.sensors):
             return self._value(vary)
-        if matched:
-            return self._shape(vary, matched)
-        return self._light(vary) if name in self.lights else self._sensor(vary)
+        found = self._shape(vary, matched) if matched else self._light(vary) if name in self.lights else self._sensor(vary)
+        given = [name for name in ("min", "max", "prior", "spread") if name in vary.plain()]
+        if found.kind == "pose" and given:
+            raise ShadowmapError(
+                f"vary {vary.label}: {given[0]} is one number, but a pose has degrees and scene units: give {name}:rotation and "
+                f"{name}:translation, each with its own."
+            )
+        return found
 
     def parameters(self, entries: Sequence[Vary]) -> tuple[list[Parameter], list[ArrayParameter]]:
         """The parameters of entries: those that few numbers describe, and those with many values."""

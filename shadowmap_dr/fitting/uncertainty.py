@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from .objective import Objective, Point
+from .objective import PRIOR_WEIGHT, Objective, Point
 
 Array = npt.NDArray[np.float64]
 
@@ -20,8 +20,14 @@ Array = npt.NDArray[np.float64]
 _BLOCK = 16
 #: Errors that a whole picture shares: displacement of edges in pixels of the fit; factor and offset as shares of its brightness.
 DISPLACEMENT, FACTOR, OFFSET = 0.15, 0.004, 0.002
+#: Errors of single pixels, as shares of the brightness, that are there even if the residuals do not show them: steps of 8 bits,
+#: edges.
+PIXEL = 0.005
 #: Factor of the blocks' covariance.
 INFLATION = 2.0
+# Directions in which numbers move the images by less than this square share of their single effects are not determined. Residuals
+# say nothing of them: no change of the images can leave any. Their largest number gets this deviation.
+_LEAST, _FREE = 1e-6, 10.0
 # Quantile of 95 % intervals, both sides.
 _NORMAL = 1.96
 # Numbers with a wider interval, in the fit's own numbers, are not determined.
@@ -65,9 +71,10 @@ def uncertainty(point: Point, objective: Objective) -> Uncertainty:
     moved = np.sqrt(np.maximum(np.diag(matrix - np.diag(objective.precision)), 0))
     # Shares of the brightness that a change of a number by one makes.
     idle = moved < 1e-6
-    inverse = _inverse(matrix * total, idle)
-    scores = _scores(point, objective)
-    covariance = INFLATION * inverse @ scores @ inverse
+    inverse, free = _inverse(matrix * total, idle)
+    # Where a prior alone determines a number, its interval is the prior's.
+    scores = INFLATION * _scores(point, objective) + PRIOR_WEIGHT * np.diag(objective.precision * total)
+    covariance = inverse @ scores @ inverse + PIXEL**2 * inverse + free @ free.T
     for error in _shared_errors(point, objective):
         shift = inverse @ error
         covariance += np.outer(shift, shift)
@@ -81,17 +88,21 @@ def not_told_apart(found: Uncertainty) -> list[tuple[int, int]]:
     return [(int(a), int(b)) for a, b in high]
 
 
-def _inverse(matrix: Array, idle: npt.NDArray[np.bool_]) -> Array:
-    """Inverse of the matrix of all numbers but idle ones; directions that nothing determines become very wide."""
-    keep = ~idle
-    result = np.zeros_like(matrix)
-    if keep.any():
-        own = matrix[np.ix_(keep, keep)]
-        scale = np.sqrt(np.maximum(np.diag(own), 1e-300))
-        values, vectors = np.linalg.eigh(own / np.outer(scale, scale))
-        values = np.maximum(values, 1e-9)
-        result[np.ix_(keep, keep)] = (vectors / values) @ vectors.T / np.outer(scale, scale)
-    return result
+def _inverse(matrix: Array, idle: npt.NDArray[np.bool_]) -> tuple[Array, Array]:
+    """(inverse (n, n) of the matrix in directions that it determines, deviations (n, k) along the k others).
+
+    Rows of idle numbers are zero.
+    """
+    keep = np.flatnonzero(~idle)
+    own = matrix[np.ix_(keep, keep)]
+    scale = np.sqrt(np.maximum(np.diag(own), 1e-300))
+    values, vectors = np.linalg.eigh(own / np.outer(scale, scale))
+    vectors /= scale[:, None]
+    known = values > _LEAST
+    inverse, free = np.zeros_like(matrix), np.zeros((len(matrix), int((~known).sum())))
+    inverse[np.ix_(keep, keep)] = (vectors[:, known] / values[known]) @ vectors[:, known].T
+    free[keep] = _FREE * vectors[:, ~known] / np.abs(vectors[:, ~known]).max(0, initial=1e-300)
+    return inverse, free
 
 
 def _scores(point: Point, objective: Objective) -> Array:

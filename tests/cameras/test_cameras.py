@@ -54,6 +54,19 @@ def test_projections_are_those_of_opencv(coefficients: tuple[float, ...], fishey
     np.testing.assert_array_equal(camera.K, K)
 
 
+def test_text_for_scene_files_is_the_same_sensor(variant: str, tmp_path: Path) -> None:
+    camera = placed(fx=140.0, fy=140.0, cx=70.5, cy=41.5)
+    file = tmp_path / "scene.xml"
+    file.write_text(f'<scene version="3.0.0">{camera.xml("view", near=0.1)}</scene>')
+    read = mi.load_file(str(file)).sensors()[0]
+    same = cameras.from_sensor(read)
+    assert read.id() == "view" and read.near_clip() == pytest.approx(0.1) and (same.width, same.height) == (128, 96)
+    np.testing.assert_allclose(same.K, camera.K, rtol=1e-6)
+    np.testing.assert_allclose(same.to_world, camera.to_world, atol=1e-6)
+    with pytest.raises(ShadowmapError, match=r"take camera.undistorted\(\)"):
+        placed(fx=100.0, fy=120.0).xml()
+
+
 def test_rotation_vectors_are_those_of_opencv() -> None:
     for vector in (np.zeros(3), *np.random.default_rng(0).normal(size=(10, 3)), np.array([math.pi, 0, 0])):
         np.testing.assert_allclose(cameras.camera.rotation_from_vector(vector), cv2.Rodrigues(vector)[0], atol=1e-12)

@@ -5,7 +5,7 @@ Source: Nocedal and Wright, "Numerical Optimization", 2006, section 10.3; Marqua
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
@@ -51,7 +51,7 @@ class Limits:
     shortest: float = 1e-5
 
 
-def minimise(at: Callable[[Array], P], start: P, limits: Limits) -> Iterator[P]:
+def minimise(at: Callable[[Array], P], start: P, limits: Limits) -> Generator[P, None, bool]:
     """Minimise a loss from a point on.
 
     Args:
@@ -60,7 +60,10 @@ def minimise(at: Callable[[Array], P], start: P, limits: Limits) -> Iterator[P]:
         limits: bounds and ends.
 
     Yields:
-        Better and better points, one after each step. It ends when steps or improvements have become small.
+        Better and better points, one after each step.
+
+    Returns:
+        True if steps or improvements had become small, False after the last step of the limits.
     """
     point, damping = start, _DAMPING
     for _ in range(limits.steps):
@@ -68,21 +71,22 @@ def minimise(at: Callable[[Array], P], start: P, limits: Limits) -> Iterator[P]:
         while True:
             x = _after_step(matrix, right, damping, point.x, limits)
             if np.abs(x - point.x).max(initial=0) < limits.shortest:
-                return
+                return True
             candidate = at(x)
             if candidate.cost < point.cost:
                 break
             if candidate.cost < point.cost * (1 + limits.improvement):
-                return  # the differences are those of rounding, and of shadow maps that were fitted anew
+                return True  # the differences are those of rounding, and of shadow maps that were fitted anew
             damping *= _WORSE
             if damping > _MOST:
-                return
+                return True
         damping = max(damping * _BETTER, _LEAST)
         gained = (point.cost - candidate.cost) / max(point.cost, 1e-300)
         point = candidate
         yield point
         if gained < limits.improvement:
-            return
+            return True
+    return False
 
 
 def _after_step(matrix: Array, right: Array, damping: float, x: Array, limits: Limits) -> Array:

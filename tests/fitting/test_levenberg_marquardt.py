@@ -12,7 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shadowmap_dr.fitting.levenberg_marquardt import Limits, minimise
+from shadowmap_dr.fitting.levenberg_marquardt import Limits
+from shadowmap_dr.fitting.levenberg_marquardt import minimise as steps_of
 
 Array = npt.NDArray[np.float64]
 
@@ -42,6 +43,19 @@ class Problem:
     def at(self, x: Array) -> Point:
         self.asked.append(np.array(x))
         return Point(np.array(x), np.asarray(self._residuals(x), float), np.asarray(self._derivatives(x), float))
+
+
+def minimise(
+    at: Callable[[Array], Any], start: Any, limits: Limits, accepted: Callable[[Any], None] = lambda point: None
+) -> tuple[Any, bool]:
+    """(best point, True if steps had become small). ``accepted`` is called with each better point."""
+    steps, best = steps_of(at, start, limits), start
+    while True:
+        try:
+            best = next(steps)
+        except StopIteration as end:
+            return best, end.value
+        accepted(best)
 
 
 def rosenbrock() -> Problem:

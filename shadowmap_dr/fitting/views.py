@@ -223,8 +223,7 @@ class View:
                         dr.enable_grad(number)
                         dr.set_grad(number, dr.gather(mi.Float, tangent, mi.UInt32(j)))
                 every.append(own)
-            with dr.suspend_grad(when=entry < 0):
-                image = self._render(renderer, every, values, entry, arrays=False)
+            with dr.suspend_grad(when=entry < 0), self._rendered(renderer, every, values, entry, arrays=False) as image:
                 if entry < 0:
                     return image, mi.Float(image)
                 dr.forward_to(image, flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad)
@@ -244,23 +243,27 @@ class View:
             ]
             own = [mi.Float(dr.detach(one)) for one in values]
             dr.enable_grad(own)
-            image = self._render(renderer, numbers, own, -1, arrays=True)
             target, weight, factors = pixels
-            difference = factors * dr.detach(image) - target
-            slope = weight * factors * dr.clip(difference, -limit, limit)
-            dr.set_grad(image, slope)
-            dr.enqueue(dr.ADMode.Backward, image)
-            dr.traverse(dr.ADMode.Backward)
-            gradients = [dr.grad(one) for one in own]
-            dr.eval(gradients)
+            with self._rendered(renderer, numbers, own, -1, arrays=True) as image:
+                difference = factors * dr.detach(image) - target
+                dr.set_grad(image, weight * factors * dr.clip(difference, -limit, limit))
+                dr.enqueue(dr.ADMode.Backward, image)
+                dr.traverse(dr.ADMode.Backward)
+                gradients = [dr.grad(one) for one in own]
+                dr.eval(gradients)
             return gradients
 
         return gradient
 
-    def _render(
+    @contextmanager
+    def _rendered(
         self, renderer: Renderer, numbers: Sequence[Sequence[Float]], values: Sequence[Float], entry: int, *, arrays: bool
-    ) -> Float:
-        """Flat image, attached. Mitsuba's objects have their values already; those of ``entry`` and of arrays are attached."""
+    ) -> Iterator[Float]:
+        """Context of a flat image, attached.
+
+        Mitsuba's objects have their values already. Those of ``entry``, and of the arrays if asked for, are attached until the
+        context ends: derivatives look materials up once more.
+        """
         change = SceneChange(renderer)
         for parameter, own in zip(self._parameters, numbers, strict=True):
             parameter.put(own, change)
@@ -281,9 +284,9 @@ class View:
                 sensor=self._camera(change.camera(self._sensor)),
                 spp=self._spp,
             )
+            yield image.array
         finally:
             restore()
-        return image.array
 
 
 def is_recordable(scene: mi.Scene, key: str) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import Any
 
 import mitsuba as mi
@@ -100,6 +101,9 @@ class FakeView:
         generator = np.random.default_rng(seed)
         self.count, self.values = count, []
         self._base, self._slopes = generator.uniform(0.2, 1, shape), generator.normal(size=(count, *shape))
+
+    def scene_at(self, x: Array) -> contextlib.AbstractContextManager[None]:
+        return contextlib.nullcontext()
 
     def image(self, x: Array) -> npt.NDArray[np.float32]:
         return np.asarray(self._base * np.exp(np.tensordot(x[: self.count], self._slopes, 1)), np.float32)

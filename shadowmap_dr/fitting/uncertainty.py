@@ -26,6 +26,9 @@ INFLATION = 2.0
 _NORMAL = 1.96
 # Numbers with a wider interval, in the fit's own numbers, are not determined.
 _WIDEST = 1.0
+# Combinations of numbers whose effect, squared, is a smaller share of that of the numbers: rounding errors of derivatives. The
+# width that they are given, in the fit's own numbers.
+_NONE, _UNKNOWN = 1e-8, 10.0
 # Two numbers are not told apart if their intervals are wider than the first number, and their correlation is above the second.
 _WIDE, _ALIKE = 0.1, 0.97
 
@@ -65,13 +68,14 @@ def uncertainty(point: Point, objective: Objective) -> Uncertainty:
     moved = np.sqrt(np.maximum(np.diag(matrix - np.diag(objective.precision)), 0))
     # Shares of the brightness that a change of a number by one makes.
     idle = moved < 1e-6
-    inverse = _inverse(matrix * total, idle)
+    inverse, lost = _inverse(matrix * total, idle)
     scores = _scores(point, objective)
-    covariance = INFLATION * inverse @ scores @ inverse
+    # Residuals say nothing of directions that move nothing: these are given a width.
+    covariance = INFLATION * inverse @ scores @ inverse + _UNKNOWN**2 * lost.T @ lost
     for error in _shared_errors(point, objective):
         shift = inverse @ error
         covariance += np.outer(shift, shift)
-    return Uncertainty(covariance, idle)
+    return Uncertainty(0.5 * (covariance + covariance.T), idle)
 
 
 def not_told_apart(found: Uncertainty) -> list[tuple[int, int]]:
@@ -81,17 +85,24 @@ def not_told_apart(found: Uncertainty) -> list[tuple[int, int]]:
     return [(int(a), int(b)) for a, b in high]
 
 
-def _inverse(matrix: Array, idle: npt.NDArray[np.bool_]) -> Array:
-    """Inverse of the matrix of all numbers but idle ones; directions that nothing determines become very wide."""
+def _inverse(matrix: Array, idle: npt.NDArray[np.bool_]) -> tuple[Array, Array]:
+    """(inverse (n, n) of the matrix of all numbers but idle ones, unit directions (k, n) that nothing determines).
+
+    The inverse is zero along these directions.
+    """
     keep = ~idle
-    result = np.zeros_like(matrix)
+    result, lost = np.zeros_like(matrix), np.zeros((0, len(matrix)))
     if keep.any():
         own = matrix[np.ix_(keep, keep)]
         scale = np.sqrt(np.maximum(np.diag(own), 1e-300))
         values, vectors = np.linalg.eigh(own / np.outer(scale, scale))
-        values = np.maximum(values, 1e-9)
-        result[np.ix_(keep, keep)] = (vectors / values) @ vectors.T / np.outer(scale, scale)
-    return result
+        none = values < _NONE
+        inverse = np.where(none, 0, 1 / np.where(none, 1, values))
+        result[np.ix_(keep, keep)] = (vectors * inverse) @ vectors.T / np.outer(scale, scale)
+        lost = np.zeros((int(none.sum()), len(matrix)))
+        lost[:, keep] = (vectors[:, none] / scale[:, None]).T
+        lost /= np.linalg.norm(lost, axis=1, keepdims=True)
+    return result, lost
 
 
 def _scores(point: Point, objective: Objective) -> Array:

@@ -112,7 +112,7 @@ def _scores(point: Point, objective: Objective) -> Array:
         rows, width, _ = residual.shape
         product = (columns * (weight * residual.reshape(-1))).reshape(objective.count, rows, width, 3).sum(3, dtype=np.float64)
         blocks = np.add.reduceat(np.add.reduceat(product, range(0, rows, _BLOCK), 1), range(0, width, _BLOCK), 2)
-        flat = blocks.reshape(objective.count, -1)
+        flat = blocks.reshape(objective.count, blocks.shape[1] * blocks.shape[2])
         total += flat @ flat.T
     return total
 

@@ -57,8 +57,8 @@ class State:
         return [run for run in self.runs if run.stage < stage <= run.last]
 
     def choose(self, stage: int, left: int) -> None:
-        """Choose the starts that go on after a stage which ``left`` others but the next one follow."""
-        if left < 0:
+        """Choose the starts that go on after a stage which ``left`` others but the next one follow; once."""
+        if left < 0 or any(run.stage > stage for run in self.runs):  # those of a file were chosen
             return
         done = [run for run in self.runs if run.stage == stage]
         on = {done[k].number for k in going_on([run.cost for run in done], left)}

@@ -197,7 +197,7 @@ class Fit:
         """The result of the steps taken so far."""
         objective, x = self.stages[-1].objective, self.best
         point = objective.at(x)
-        spread = uncertainty(point, objective)
+        spread = uncertainty(point, objective, self._low, self._high)
         estimates, names = estimates_of(x, self.parameters, self.renderer, self.change(x), spread)
         of_gains, names_of_gains = gain_estimates(x, self.targets, self.gains, objective.gains, spread)
         names += names_of_gains

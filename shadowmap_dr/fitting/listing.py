@@ -30,7 +30,10 @@ def listed(scene: mi.Scene) -> Table:
     resolver = Resolver(renderer)
     rows = [[one.name, ", ".join(one.kinds), one.value, _effect(renderer, resolver, one)] for one in resolver.candidates()]
     columns = ["name", "kinds", "now", "moves the image by"]
-    return console.table("What can vary: --vary NAME:KIND", columns, rows, wrapped=(0, 1))
+    table = console.table("What can vary: --vary NAME:KIND", columns, rows, wrapped=(0, 1))
+    table.caption = "Changes of a degree, of a hundredth of the size, or of one per cent, as shares of the image's brightness."
+    table.caption_justify = "left"
+    return table
 
 
 def _effect(renderer: Renderer, resolver: Resolver, candidate: Candidate) -> str:

@@ -23,7 +23,7 @@ def estimates(result: FitResult) -> str:
     head = "".join(f'<th scope="col">{title}</th>' for title in ("", "start", "fit", "± 95 %"))
     groups = "".join(_group(result))
     caption = (
-        "± is half of the 95 % interval. It holds if the scene differs from the pictures by noise only."
+        "± is half of the 95 % interval. Light that bounces, or a wrong shape, can shift a number by more."
         if result.found
         else "No fit was found: these are the numbers of the best attempt, and no estimates."
     )

@@ -15,8 +15,8 @@ Image = npt.NDArray[np.float32]
 
 #: Largest share of unexplained edges with which a fit counts as found.
 EXPLAINED = 0.12
-# Pixels along the longer side of the images whose edges are compared: noise and blurred outlines count little there.
-_SIDE = 64
+# Pixels along the longer side of the images whose edges are compared, at most: noise and blurred outlines count little there.
+_SIDE = 56
 # Pixels matter where a change of a number by the first moves them by more than the second, a share of the brightness; and
 # where the residual is larger.
 _CHANGE, _VISIBLE = 0.05, 0.03
@@ -50,6 +50,11 @@ def judge(point: Point, objective: Objective, spread: Uncertainty, names: Sequen
     return found, words
 
 
+def is_explained(point: Point, objective: Objective) -> bool:
+    """True if the scene explains the pictures. Arguments as of :func:`judge`."""
+    return unexplained(point, objective) <= EXPLAINED
+
+
 def unexplained(point: Point, objective: Objective) -> float:
     """Share of the pictures' edges that the images do not have, or have elsewhere: 0 for equal images, 1 for unrelated ones.
 
@@ -60,9 +65,12 @@ def unexplained(point: Point, objective: Objective) -> float:
     each = zip(point.columns(), point.recorded, point.residuals, objective.observations, objective.brightness, strict=True)
     for columns, image, residual, seen, scale in each:
         moved = np.abs(columns).reshape(len(columns), *residual.shape).max(0, initial=0) * _CHANGE
-        matters = (np.maximum(moved, np.abs(residual)).max(2) > _VISIBLE) * seen.weight
-        times = max(1, round(max(matters.shape) / _SIDE))
-        weight, ours, theirs = (_reduced(one, times) for one in (matters, image / scale, seen.image / scale))
+        matters = np.asarray(np.maximum(moved, np.abs(residual)).max(2) > _VISIBLE, np.float32)
+        times = max(2, round(max(matters.shape) / _SIDE))
+        # Pixels that do not count are black: blocks with one count for nothing.
+        whole = _reduced(np.asarray(seen.weight > 0, np.float32), times) == 1
+        weight, ours, theirs = (_reduced(one, times) for one in (matters * seen.weight, image / scale, seen.image / scale))
+        weight = weight * whole
         for axis in (0, 1):
             both = np.minimum(np.take(weight, range(1, weight.shape[axis]), axis), _without_last(weight, axis))[..., None]
             of_image, of_picture = np.diff(ours, axis=axis), np.diff(theirs, axis=axis)

@@ -19,6 +19,7 @@ class FitOptions:
         vary: entries of the list of things that vary.
         exposure, white_balance, vignetting: factors of each picture that are fitted.
         starts: number of starts; the first is the scene as it is.
+        tries: most rounds of starts; another one follows, from wider ranges, while the scene does not explain the pictures.
         seed: of the other starts.
         resolution: pixels along the longer side of the last stage, at most the picture's.
         spp: samples per pixel.
@@ -37,6 +38,7 @@ class FitOptions:
     white_balance: bool = option(False, help="Fit an exposure of each colour, of each picture.")
     vignetting: bool = option(False, help="Fit the darkening of each picture towards its corners.")
     starts: int = option(8, allowed=(1, 1024), help="Starts; the first is the scene as it is.")
+    tries: int = option(3, allowed=(1, 100), help="Most rounds of starts; another one follows while nothing is found.")
     seed: int = option(0, allowed=(0, 2**32 - 1), help="Seed of the other starts.")
     resolution: int = option(
         256, allowed=(8, 2048), help="Pixels along the longer side of the last images, at most the picture's."

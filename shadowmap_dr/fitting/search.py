@@ -16,7 +16,7 @@ from ..rendering.renderer import Renderer
 from .changes import Changes
 from .estimates import array_estimates, changes_of, estimates_of, gain_estimates
 from .gains import Gain
-from .judgement import judge
+from .judgement import is_explained, judge
 from .levenberg_marquardt import Limits, minimise
 from .losses import Loss
 from .objective import Point
@@ -36,6 +36,8 @@ Array = npt.NDArray[np.float64]
 _STEPS, _LAST_STEPS, _LONGEST = 8, 15, 0.3
 # Improvement of the loss, as a share, below which a step is the last of its stage.
 _ENOUGH = 1e-3
+# Growth of the ranges of starts from one try to the next.
+_GROWTH = 0.5
 # Textures and vertices: stages in which they are fitted, the last ones; rounds of a stage, in turns with the numbers; size of the
 # last step as a share of the first one's.
 _ARRAY_STAGES, _ROUNDS, _LAST_SHARE = 3, 3, 0.1
@@ -102,28 +104,39 @@ class Fit:
         if state is not None and resume and state.exists():
             self._state = State.read(state, fingerprint)
             self._began = time.perf_counter() - max((step["seconds"] for step in self.history), default=0.0)
-        if not self._state.runs:
-            self._state.runs = self._starts()
-        for number, stage in enumerate(self.stages):
-            for run in self._state.going(number):
-                yield from self._descend(run, number, stage, _LAST_STEPS if number == len(self.stages) - 1 else _STEPS)
-                run.stage = number
-                if state is not None:
-                    self._state.write(state, fingerprint)
-            self._state.choose(number, len(self.stages) - 2 - number)
-            if self.arrays and number >= len(self.stages) - _ARRAY_STAGES and number >= self._state.array_stage:
-                yield from self._fit_arrays(self.best_run, number, stage)
+        tries = self.options.tries if self.parameters and not self.arrays else 1
+        for attempt in range(tries):
+            first = attempt * self.options.starts
+            if len(self._state.runs) <= first:
+                self._state.runs += self._starts(attempt)
+            for number, stage in enumerate(self.stages):
+                for run in self._state.going(number):
+                    yield from self._descend(run, number, stage, _LAST_STEPS if number == len(self.stages) - 1 else _STEPS)
+                    run.stage = number
+                    if state is not None:
+                        self._state.write(state, fingerprint)
+                self._state.choose(number, len(self.stages) - 2 - number, first)
+            if attempt < tries - 1 and self._is_explained():
+                break
+        for number in range(self._state.array_stage, len(self.stages) if self.arrays else 0):
+            if number >= len(self.stages) - _ARRAY_STAGES:
+                yield from self._fit_arrays(self.best_run, number, self.stages[number])
                 self._state.array_stage = number + 1
                 if state is not None:
                     self._state.write(state, fingerprint)
 
-    def _starts(self) -> list[Run]:
-        """The starts: the best of many candidates."""
+    def _starts(self, attempt: int) -> list[Run]:
+        """The starts of a try: the best of many candidates. Their ranges grow from try to try."""
         first = self.stages[0].objective
-        scene = first.views[0].count
-        options, ranges = self.options, half_ranges(self.parameters)
-        drawn = draw(ranges, self._low[:scene], self._high[:scene], options.starts, options.seed)
-        return [Run(k, x) for k, x in enumerate(chosen(drawn, first, options.starts))]
+        scene, options = first.views[0].count, self.options
+        ranges = half_ranges(self.parameters) * (1 + attempt * _GROWTH)
+        drawn = draw(ranges, self._low[:scene], self._high[:scene], options.starts, (options.seed, attempt), scene=attempt == 0)
+        return [Run(attempt * options.starts + k, x) for k, x in enumerate(chosen(drawn, first, options.starts))]
+
+    def _is_explained(self) -> bool:
+        """True if the scene explains the pictures."""
+        objective = self.stages[-1].objective
+        return is_explained(objective.at(self.best), objective)
 
     def _descend(self, run: Run, number: int, stage: Stage, steps: int) -> Iterator[Step]:
         """Steps of a start in a stage."""

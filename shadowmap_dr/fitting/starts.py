@@ -32,12 +32,18 @@ def half_ranges(parameters: Sequence[Parameter]) -> Array:
     return np.concatenate([np.zeros(0), *found])
 
 
-def draw(ranges: Array, low: Array, high: Array, count: int, seed: int) -> list[Array]:
-    """Candidates (n,) of the scene's numbers: the scene as it is, and ``_TRIED`` others for each further start, uniform in the
-    ranges and within the bounds."""
+def draw(ranges: Array, low: Array, high: Array, count: int, seed: int | tuple[int, int], *, scene: bool = True) -> list[Array]:
+    """Candidates (n,) of the scene's numbers: ``_TRIED`` for each of ``count`` starts, uniform in the ranges, within the bounds.
+
+    The first is the scene as it is, if ``scene``.
+    """
     generator = np.random.default_rng(seed)
-    others = (count - 1) * _TRIED if len(ranges) else 0
-    return [np.clip(x, low, high) for x in (np.zeros(len(ranges)), *(generator.uniform(-ranges, ranges) for _ in range(others)))]
+    if not len(ranges):
+        return [np.zeros(0)]
+    others = [generator.uniform(-ranges, ranges) for _ in range(1 + (count - 1) * _TRIED)]
+    if scene:
+        others[0] = np.zeros(len(ranges))
+    return [np.clip(x, low, high) for x in others]
 
 
 def chosen(candidates: Sequence[Array], objective: Objective, count: int) -> list[Array]:

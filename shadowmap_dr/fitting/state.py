@@ -56,11 +56,13 @@ class State:
         """Starts that have a stage before them."""
         return [run for run in self.runs if run.stage < stage <= run.last]
 
-    def choose(self, stage: int, left: int) -> None:
-        """Choose the starts that go on after a stage which ``left`` others but the next one follow; once."""
-        if left < 0 or any(run.stage > stage for run in self.runs):  # those of a file were chosen
+    def choose(self, stage: int, left: int, first: int = 0) -> None:
+        """Choose the starts that go on, of those from number ``first`` on, after a stage which ``left`` others but the next one
+        follow; once."""
+        own = [run for run in self.runs if run.number >= first]
+        if left < 0 or any(run.stage > stage for run in own):  # those of a file were chosen
             return
-        done = [run for run in self.runs if run.stage == stage]
+        done = [run for run in own if run.stage == stage]
         on = {done[k].number for k in going_on([run.cost for run in done], left)}
         for run in done:
             run.last = 1 << 30 if run.number in on else stage

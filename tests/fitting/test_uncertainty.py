@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -12,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shadowmap_dr.fitting import uncertainty as module
-from shadowmap_dr.fitting.objective import Objective, Point
+from shadowmap_dr.fitting.objective import PRIOR_WEIGHT, Objective, Point
 from shadowmap_dr.fitting.uncertainty import Uncertainty, not_told_apart, uncertainty
 
 Array = npt.NDArray[np.float64]
@@ -33,6 +34,14 @@ class Linear:
         self.count = len(self.derivatives[0])
         self.pixels = float(sum(residual[..., 0].size for residual in self.residuals))
         self.brightness = [1.0] * len(self.residuals)
+
+    @property
+    def x(self) -> Array:
+        return np.zeros(self.count)
+
+    def at(self, x: Array) -> Any:
+        moved = [(r.ravel() + x @ own).reshape(r.shape) for r, own in zip(self.residuals, self.derivatives, strict=True)]
+        return SimpleNamespace(residuals=moved)
 
     def columns(self) -> list[Any]:
         return [own.astype(np.float32) for own in self.derivatives]
@@ -69,7 +78,7 @@ def found(problem: Linear) -> Uncertainty:
 @pytest.fixture
 def plain(monkeypatch: pytest.MonkeyPatch) -> None:
     """Neither errors that a whole picture shares, nor a factor for what blocks do not tell."""
-    for name in ("DISPLACEMENT", "FACTOR", "OFFSET"):
+    for name in ("DISPLACEMENT", "FACTOR", "OFFSET", "PIXEL"):
         monkeypatch.setattr(module, name, 0.0)
     monkeypatch.setattr(module, "INFLATION", 1.0)
 
@@ -133,18 +142,19 @@ def test_pictures_add_up() -> None:
 
 
 def test_inflation_is_a_factor_of_the_covariance(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("DISPLACEMENT", "FACTOR", "OFFSET"):
+    for name in ("DISPLACEMENT", "FACTOR", "OFFSET", "PIXEL"):
         monkeypatch.setattr(module, name, 0.0)
     problem = made(smooth_derivatives(), np.random.default_rng(0).normal(scale=NOISE, size=SHAPE))
-    inflated = found(problem).half_widths
+    inflated, factor = found(problem).half_widths, module.INFLATION
     monkeypatch.setattr(module, "INFLATION", 1.0)
-    np.testing.assert_allclose(inflated, np.sqrt(2) * found(problem).half_widths, rtol=1e-6)
+    np.testing.assert_allclose(inflated, np.sqrt(factor) * found(problem).half_widths, rtol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["DISPLACEMENT", "FACTOR", "OFFSET"])
 def test_errors_that_a_picture_shares_shift_the_numbers(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     """By what least squares make of them. There is no noise."""
     monkeypatch.setattr(module, "INFLATION", 0.0)
+    monkeypatch.setattr(module, "PIXEL", 0.0)
     for other in {"DISPLACEMENT", "FACTOR", "OFFSET"} - {name}:
         monkeypatch.setattr(module, other, 0.0)
     jacobian, image = smooth_derivatives(), smooth_derivatives(7)[6].reshape(SHAPE)
@@ -164,7 +174,8 @@ def test_priors_narrow_the_intervals() -> None:
     jacobian = smooth_derivatives()
     residual = np.random.default_rng(0).normal(scale=NOISE, size=SHAPE)
     free = found(made(jacobian, residual)).half_widths
-    precision = np.array([100 * np.mean(jacobian[0] ** 2), 0, 0, 0])
+    # The prior's deviation is a hundredth of the interval's without it.
+    precision = np.array([PRIOR_WEIGHT / residual.size / (0.01 * free[0] / 1.96) ** 2, 0, 0, 0])
     held = found(made(jacobian, residual, precision=precision)).half_widths
     assert held[0] < 0.05 * free[0] and (held[1:] > 0.3 * free[1:]).all()
 

@@ -6,12 +6,14 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
 from ..errors import ShadowmapError
 from ..io import records
 from ..jit.arrays import device_array
+from ..jit.types import Float
 from ..rendering.renderer import Renderer
 from .changes import Changes
 from .estimates import array_estimates, changes_of, estimates_of, gain_estimates
@@ -102,6 +104,7 @@ class Fit:
         if state is not None and resume and state.exists():
             self._state = State.read(state, fingerprint)
             self._began = time.perf_counter() - max((step["seconds"] for step in self.history), default=0.0)
+            self._set_values([mi.Float(own) for own in self._state.values])
         if not self._state.runs:
             self._state.runs = self._starts()
         for number, stage in enumerate(self.stages):
@@ -152,8 +155,12 @@ class Fit:
                 done += 1
             yield from self._descend(run, number, stage, 3)
         self._state.values = [np.array(one, np.float32) for one in values]
-        for other in self.stages:
-            other.objective.set_values(values)
+        self._set_values(values)
+
+    def _set_values(self, values: Sequence[Float]) -> None:
+        """Set the values of textures and vertices in all stages."""
+        for stage in self.stages:
+            stage.objective.set_values(values)
 
     def _note(self, run: Run, number: int, point: Point) -> Step:
         """Write a step down."""

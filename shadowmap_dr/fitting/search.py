@@ -91,7 +91,7 @@ class Fit:
         return self.result()
 
     def steps(self, state: Path | None = None, *, resume: bool = False) -> Iterator[Step]:
-        """Take the steps, one after the other, and yield the error after each.
+        """Take the steps, one after the other, and yield the error after each. The file is read before the first one.
 
         Args:
             state: file for the state after each start and stage; None for none.
@@ -105,6 +105,9 @@ class Fit:
             self._state = State.read(state, fingerprint)
             self._began = time.perf_counter() - max((step["seconds"] for step in self.history), default=0.0)
             self._set_values([mi.Float(own) for own in self._state.values])
+        return self._all_steps(state, fingerprint)
+
+    def _all_steps(self, state: Path | None, fingerprint: str) -> Iterator[Step]:
         if not self._state.runs:
             self._state.runs = self._starts()
         for number, stage in enumerate(self.stages):

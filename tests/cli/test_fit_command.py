@@ -117,12 +117,20 @@ def test_options_come_before_those_of_a_file(run: Any, tmp_path: Path) -> None:
 
 
 def test_the_list_names_all_that_can_vary(run: Any, tmp_path: Path) -> None:
+    """Also shapes of one material, which Mitsuba would merge."""
+    posts = "".join(
+        f'<shape type="cube" id="{name}"><ref id="stone"/><transform name="to_world"><scale value="0.2"/>'
+        f'<translate x="{x}" y="1" z="0.2"/></transform></shape>'
+        for name, x in (("left_post", -1), ("right_post", 1))
+    )
+    more = f'<bsdf type="diffuse" id="stone"/>{posts}</scene>'
+    (tmp_path / "room.xml").write_text(ROOM.replace("X", "0").replace("</scene>", more))
     result = run("fit", "room.xml", "--list")
     assert result.status == 0, result.err
     words = " ".join(result.out.split())
-    for name in ("box", "floor", "sun", "camera", "sun.irradiance.value", "box.bsdf.reflectance.value"):
-        assert name in words
-    assert "pose, rotation, translation, scale, vertices" in words and "direction" in words and "%" in words
+    names = ("box", "floor", "left_post", "right_post", "sun", "camera", "sun.irradiance.value", "box.bsdf.reflectance.value")
+    for name in (*names, "pose, rotation, translation, scale, vertices", "direction", "%"):
+        assert name in words, name
     assert not (tmp_path / "fit").exists()
 
 

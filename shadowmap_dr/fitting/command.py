@@ -53,13 +53,14 @@ def run_fit(
         OutputError: A file cannot be written.
     """
     console = console or io_console.notes()
-    files.make_folder(out)
     renderer = Renderer.from_scene(scene)
     fit = Fit(renderer, [picture.read() for picture in task.pictures], task.options, [p.exposure for p in task.pictures])
+    steps = fit.steps(out / STATE, resume=resume)
+    files.make_folder(out)
     (out / TASK).write_text(to_toml(_beside(task, out)), encoding="utf-8")
     with io_console.progress(console) as progress:
         number = progress.add_task("fit", total=None, note="recording the first images")
-        for step in fit.steps(out / STATE, resume=resume):
+        for step in steps:
             progress.update(number, note=_words(step, fit))
     result = fit.result(shlex.join(["shadowmap-dr", *sys.argv[1:]]))
     result.settings = task.plain()

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import ShadowmapError
+from ..errors import ShadowmapError, did_you_mean
 
 Image = npt.NDArray[np.float32]
 LossKind = Literal["huber", "l2", "l1"]
+_KINDS = get_args(LossKind)
 
 # Residuals below this share of the picture's brightness count as squares in the loss l1, which has no second derivative.
 _SMALL = 0.005
@@ -30,8 +31,8 @@ class Loss:
     delta: float = 0.1
 
     def __post_init__(self) -> None:
-        if self.kind not in ("huber", "l2", "l1"):
-            raise ShadowmapError(f"loss is {self.kind!r}: choose huber, l2 or l1.")
+        if self.kind not in _KINDS:
+            raise ShadowmapError(f"loss is {self.kind!r}: choose huber, l2 or l1.{did_you_mean(self.kind, _KINDS)}")
         if not 0 < self.delta < np.inf:
             raise ShadowmapError(f"delta of the loss is {self.delta!r}: give a positive number.")
 

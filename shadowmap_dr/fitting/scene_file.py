@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import shutil
@@ -127,6 +128,8 @@ class _Writer:
             notes = self._differences(steps, notes) | notes
         for path in self.all_files - set(self.files):
             path.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # it has files
+            (self.target.parent / FILES_FOLDER).rmdir()
         listed = [f"{name} could not be written into the scene file: {reason}." for name, reason in notes.items()]
         return Written([self.target, *self.files], listed)
 

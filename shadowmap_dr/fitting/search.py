@@ -6,12 +6,14 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
 from ..errors import ShadowmapError
 from ..io import records
 from ..jit.arrays import device_array
+from ..jit.types import Float
 from ..rendering.renderer import Renderer
 from .changes import Changes
 from .estimates import array_estimates, changes_of, estimates_of, gain_estimates
@@ -91,7 +93,7 @@ class Fit:
         return self.result()
 
     def steps(self, state: Path | None = None, *, resume: bool = False) -> Iterator[Step]:
-        """Take the steps, one after the other, and yield the error after each.
+        """Take the steps, one after the other, and yield the error after each. The file is read before the first one.
 
         Args:
             state: file for the state after each start and stage; None for none.
@@ -104,6 +106,10 @@ class Fit:
         if state is not None and resume and state.exists():
             self._state = State.read(state, fingerprint)
             self._began = time.perf_counter() - max((step["seconds"] for step in self.history), default=0.0)
+            self._set_values([mi.Float(own) for own in self._state.values])
+        return self._all_steps(state, fingerprint)
+
+    def _all_steps(self, state: Path | None, fingerprint: str) -> Iterator[Step]:
         tries = self.options.tries if self.parameters and not self.arrays else 1
         for attempt in range(tries):
             first = attempt * self.options.starts
@@ -165,8 +171,12 @@ class Fit:
                 done += 1
             yield from self._descend(run, number, stage, 3)
         self._state.values = [np.array(one, np.float32) for one in values]
-        for other in self.stages:
-            other.objective.set_values(values)
+        self._set_values(values)
+
+    def _set_values(self, values: Sequence[Float]) -> None:
+        """Set the values of textures and vertices in all stages."""
+        for stage in self.stages:
+            stage.objective.set_values(values)
 
     def _note(self, run: Run, number: int, point: Point) -> Step:
         """Write a step down."""

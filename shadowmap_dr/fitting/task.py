@@ -80,9 +80,17 @@ def read_task(path: Path) -> FitTask:
     tomllib = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
     try:
         content = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # also integers of thousands of digits
         raise ShadowmapError(f"cannot read {path}: {' '.join(str(error).split())}.") from error
     return _Reader(path).task(content)
+
+
+def _as_float(value: int) -> float:
+    """An integer as a float; infinite beyond the largest one."""
+    try:
+        return float(value)
+    except OverflowError:
+        return float("inf") if value > 0 else float("-inf")
 
 
 class _Reader:
@@ -145,7 +153,7 @@ class _Reader:
             return value
         fits = isinstance(value, type(like)) and isinstance(value, bool) == isinstance(like, bool)
         if isinstance(like, float) and isinstance(value, int) and not isinstance(value, bool):
-            return float(value)
+            return _as_float(value)
         if not fits:
             raise ShadowmapError(f"{self.path}: {name} is {value!r}; give a value like {like!r}.")
         return value

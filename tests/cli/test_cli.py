@@ -25,27 +25,6 @@ from shadowmap_dr.io import images
 from shadowmap_dr.rendering.film.aovs import AOVS
 
 
-class Result:
-    def __init__(self, status: int, out: str, err: str) -> None:
-        self.status, self.out, self.err = status, out, err
-
-
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Any:
-    """Runs the program in this process, in an empty folder."""
-    monkeypatch.chdir(tmp_path)
-
-    def call(*arguments: str) -> Result:
-        monkeypatch.setattr(sys, "argv", ["shadowmap-dr", *arguments])
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as exit_:
-            main.main()
-        out, err = capsys.readouterr()
-        return Result(int(exit_.value.code or 0), out, err)
-
-    return call
-
-
 def program(*arguments: str, **options: Any) -> subprocess.CompletedProcess[str]:
     code = "from shadowmap_dr.cli.main import main; main()"
     return subprocess.run([sys.executable, "-c", code, *arguments], stderr=subprocess.PIPE, text=True, **options)
@@ -68,7 +47,7 @@ def test_help_names_the_commands(run: Any) -> None:
 
 def test_commands_come_in_the_order_of_their_use(run: Any) -> None:
     listed = [line.split()[0] for line in run("-h").out.partition("Commands:")[2].splitlines() if line.strip()]
-    assert listed == "render import pose lights art face model soft maps gradients bench lights-times info".split()
+    assert listed == "render import fit pose lights art face model soft maps gradients bench lights-times info".split()
     assert list(main.COMMANDS) == listed
 
 

@@ -320,26 +320,56 @@ def test_damaged_states_are_refused(picture: Image, tmp_path: Path, damage: str)
 # ------------------------------------------------------------------------------------------------------- textures, vertices
 
 
-def test_a_texture_is_found() -> None:
-    """Of 16 x 16 texels, together with the sun's brightness; from grey."""
-    generator = np.random.default_rng(4)
-    true = generator.uniform(0.15, 0.85, (4, 4, 3)).repeat(4, 0).repeat(4, 1).astype(np.float32)
+def painted(texels: Any) -> dict[str, Any]:
+    """A floor with a texture, and a box that hides a corner."""
+    bitmap = {"type": "bitmap", "bitmap": mi.Bitmap(np.asarray(texels, np.float32)), "raw": True, "filter_type": "nearest"}
+    ground = {**floor(), "to_world": mi.ScalarTransform4f().scale(1.6), "bsdf": {"type": "diffuse", "reflectance": bitmap}}
+    return {"floor": ground, "box": box(0.9, 0.9)}
 
-    def parts(texels: Any) -> dict[str, Any]:
-        bitmap = {"type": "bitmap", "bitmap": mi.Bitmap(texels), "raw": True, "filter_type": "nearest"}
-        ground = {**floor(), "to_world": mi.ScalarTransform4f().scale(1.6), "bsdf": {"type": "diffuse", "reflectance": bitmap}}
-        return {"floor": ground, "box": box(0.9, 0.9)}
 
-    seen = photograph(scene(**parts(true)))
-    result = fit(renderer(**parts(np.full((16, 16, 3), 0.5, np.float32))), seen, ["floor:texture"], starts=1, steps=120)
-    found = estimate(result, "floor:texture")
-    texels = found.arrays["texture"]
+TEXELS = np.random.default_rng(4).uniform(0.15, 0.85, (4, 4, 3)).repeat(4, 0).repeat(4, 1)
+GREY = np.full((16, 16, 3), 0.5)
+
+
+@pytest.fixture(scope="module")
+def painting() -> Image:
+    mi.set_variant("llvm_ad_rgb")
+    return photograph(scene(**painted(TEXELS)))
+
+
+def test_a_texture_is_found(painting: Image) -> None:
+    """Of 16 x 16 texels, from grey."""
+    result = fit(renderer(**painted(GREY)), painting, ["floor:texture"], starts=1, steps=120)
+    texels = estimate(result, "floor:texture").arrays["texture"]
     assert result.found and texels.shape == (16, 16, 3)
     assert ((texels >= 0) & (texels <= 1)).all()
     # Texels that the box hides, or its shadow, are not known: most others are.
-    error = np.abs(texels - true).mean(2)
-    assert np.median(error) < 0.03 < 0.15 < np.median(np.abs(0.5 - true).mean(2))
+    error = np.abs(texels - TEXELS).mean(2)
+    assert np.median(error) < 0.03 < 0.15 < np.median(np.abs(0.5 - TEXELS).mean(2))
     assert result.pictures[0].error < 0.06
+    # The picture of the start is that of the scene as it was given.
+    assert np.abs(result.pictures[0].start - result.pictures[0].target).mean() > 0.02
+
+
+@pytest.mark.parametrize("stop", [14, 10**6])
+def test_a_fit_of_a_texture_that_was_killed_goes_on(painting: Image, tmp_path: Path, stop: int) -> None:
+    """Together with the sun's brightness; in a stage, and after all of them."""
+
+    def begun() -> Fit:
+        entries = ["floor:texture", "sun:brightness,prior=0.01"]
+        return prepared(renderer(**painted(GREY)), painting, entries, starts=1, steps=60, resolution=24, spp=1)
+
+    straight = begun().run()
+    first, state = begun(), tmp_path / "fit.npz"
+    for count, _ in enumerate(first.steps(state), 1):
+        if count == stop:
+            break
+    second = begun()
+    assert len(list(second.steps(state, resume=True))) < len(straight.history)
+    result = second.result()
+    assert result.pictures[0].error == pytest.approx(straight.pictures[0].error, rel=0.02)
+    for ours, theirs in zip(result.estimates, straight.estimates, strict=True):
+        assert np.abs(ours.values - theirs.values).mean() < 2e-3
 
 
 def test_vertices_are_found() -> None:

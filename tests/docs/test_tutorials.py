@@ -21,7 +21,7 @@ from shadowmap_dr.io.records import read_json
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "tutorials"
 # With a loop for any integrator and a recorded one, then those with a loop of their own.
 RACED = ("pose", "shape", "curve")
-OTHERS = ("torch", "sun", "art")
+OTHERS = ("torch", "sun", "art", "photo", "certainty")
 FEW = {"type": "shadowmap", "area_light_samples": 4, "environment_light_samples": 8, "soft_map_resolution": 64}
 PARAMETERS: dict[str, dict[str, Any]] = {
     "pose": {"resolution": 64, "steps": 36, "reference_samples": 256, "integrator": FEW},
@@ -32,6 +32,8 @@ PARAMETERS: dict[str, dict[str, Any]] = {
     "curve": {"resolution": 48, "steps": 40, "reference_samples": 128, "check_samples": 32, "integrator": FEW},
     "torch": {"resolution": 32, "steps": 8, "batch": 2, "subdivisions": 3, "reference_samples": 8, "picture_size": 32},
     "sun": {"resolution": 32, "steps": 8, "texels": 20, "reference_samples": 32},
+    "photo": {"width": 64, "height": 48, "starts": 6, "reference_samples": 64},
+    "certainty": {"resolution": 64, "starts": 2, "reference_samples": 64},
     "art": {"resolution": 64, "rings": 12, "steps": 80, "picture_size": 32, "picture_samples": 2},
 }  # fmt: skip
 # Share of the start's errors that may be left.
@@ -61,14 +63,17 @@ def need(name: str) -> None:
         pytest.importorskip("torch", reason="pip install '.[torch]'")
 
 
-def run_small(name: str) -> tuple[dict[str, Any], list[str]]:
-    """A notebook's namespace and the lines that it prints, with small numbers, without those that wait for Mitsuba's."""
+def run_small(name: str, *skip: str) -> tuple[dict[str, Any], list[str]]:
+    """A notebook's namespace and the lines that it prints, with small numbers, without cells that wait for Mitsuba's.
+
+    ``skip``: tags of further cells that are left out.
+    """
     need(name)
     import notebooks
 
     printed: list[str] = []
     path = FOLDER / f"{name}.ipynb"
-    names = notebooks.run(path, skip={"mitsuba"}, on_cell=lambda cell, text: printed.append(text), **PARAMETERS[name])
+    names = notebooks.run(path, skip={"mitsuba", *skip}, on_cell=lambda cell, text: printed.append(text), **PARAMETERS[name])
     return names, "".join(printed).splitlines()
 
 
@@ -113,6 +118,25 @@ def test_art_takes_both_shadows_frozen() -> None:
     first, last = (names["kept"][step] for step in (0, names["steps"]))
     for start, end in zip(names["overlap"](first[1]), names["overlap"](last[1]), strict=True):
         assert end > 75 > start
+
+
+def test_a_photo_becomes_a_scene() -> None:
+    names, _ = run_small("photo", "run")
+    turn, place, sun, exposure = names["errors"](names["result"])
+    assert names["result"].found and turn < 1 and place < 0.03 and sun < 1.5 and abs(exposure) < 0.1
+    assert (names["folder"] / "report.html").is_file()
+
+
+def test_certainty_is_that_of_the_photos() -> None:
+    """The text of the notebook says all of this."""
+    names, _ = run_small("certainty")
+    assert np.isinf(names["turned"].estimates[0].half_width).tolist() == [False, False, True, False, False, False]
+    pair = "sun:brightness and exposure of the target cannot be told apart by the pictures."
+    assert pair in names["alone"].words and not names["lit"].words
+    alone, shadow, two = (result.estimates[0] for result in names["results"].values())
+    assert np.isinf(alone.half_width[1]) and two.half_width[1] < shadow.half_width[1] < 0.1
+    for found in (shadow, two):
+        assert abs(found.values[1] - 0.2) < found.half_width[1]
 
 
 def test_notebooks_are_whole_and_small() -> None:

@@ -26,6 +26,7 @@ from .options import FitOptions
 from .parameters import Parameter, SceneChange
 from .resolve import Resolver
 from .result import FitResult, Picture, Step
+from .shadow_pictures import lit_share
 from .stages import Stage, make_stages, qualities
 from .starts import chosen, draw, half_ranges, with_gains
 from .state import Run, State
@@ -254,6 +255,7 @@ class Fit:
                 start=start.recorded[k],
                 fit=point.recorded[k],
                 weight=seen.weight,
+                shadows=lit_share(objective.views[k], point.x),
                 frames=self._frames(k),
                 name=self.targets[k].name,
                 exposure=float(np.mean(seen.gain.colour_factors(point.x[objective.gains[k]]))),

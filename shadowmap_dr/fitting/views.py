@@ -95,6 +95,15 @@ class View:
         ]
         self._held = 0
 
+    def without_shadows(self) -> View:
+        """The same view of the scene without shadows."""
+        other = copy.copy(self)
+        settings = self._renderer.settings
+        unshadowed = replace(settings, shadow=replace(settings.shadow, method="none"))
+        other._renderer = replace(copy.deepcopy(self._renderer), settings=unshadowed)
+        other._image = freeze(other._recorded(-1))
+        return other
+
     @property
     def count(self) -> int:
         """Number of the scene's numbers."""

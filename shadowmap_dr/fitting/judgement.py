@@ -65,12 +65,12 @@ def unexplained(point: Point, objective: Objective) -> float:
     each = zip(point.columns(), point.recorded, point.residuals, objective.observations, objective.brightness, strict=True)
     for columns, image, residual, seen, scale in each:
         moved = np.abs(columns).reshape(len(columns), *residual.shape).max(0, initial=0) * _CHANGE
-        matters = np.asarray(np.maximum(moved, np.abs(residual)).max(2) > _VISIBLE, np.float32)
-        times = max(2, round(max(matters.shape) / _SIDE))
+        times = max(2, round(max(seen.weight.shape) / _SIDE))
+        ours, theirs, weight = (_reduced(one, times) for one in (image / scale, seen.image / scale, seen.weight))
+        matters = np.maximum(_reduced(moved.max(2), times), np.abs(_reduced(residual, times)).mean(2)) > _VISIBLE
         # Pixels that do not count are black: blocks with one count for nothing.
         whole = _reduced(np.asarray(seen.weight > 0, np.float32), times) == 1
-        weight, ours, theirs = (_reduced(one, times) for one in (matters * seen.weight, image / scale, seen.image / scale))
-        weight = weight * whole
+        weight = np.asarray(weight * whole * matters, np.float32)
         for axis in (0, 1):
             both = np.minimum(np.take(weight, range(1, weight.shape[axis]), axis), _without_last(weight, axis))[..., None]
             of_image, of_picture = np.diff(ours, axis=axis), np.diff(theirs, axis=axis)

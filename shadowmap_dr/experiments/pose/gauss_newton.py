@@ -37,6 +37,7 @@ class GaussNewtonPose:
         shape: name of the object.
         reference: (H, W, 3) linear image.
         spp: samples per pixel of the last stage.
+        shift_z: offset in z that the object has in the scene; the axis of rotation has it, too.
         settings: further entries for `describe`.
     """
 
@@ -47,13 +48,14 @@ class GaussNewtonPose:
         reference: npt.ArrayLike,
         *,
         spp: int = 1,
+        shift_z: float = 0.0,
         settings: Mapping[str, Any] | None = None,
     ) -> None:
         image = real_array("reference", reference)
         if image.ndim != 3 or not np.isfinite(image).all():
             raise ShadowmapError(f"a reference of shape {image.shape}: give finite values in the shape (H, W, C).")
         entry = Vary(shape, "pose")
-        motion = ShapeMotion(entry, (shape,), np.zeros(3), 1.0, ("ry", "tx", "ty"))
+        motion = ShapeMotion(entry, (shape,), np.array([0, 0, shift_z]), 1.0, ("ry", "tx", "ty"))
         levels = qualities(max(image.shape[:2]), spp, renderer.settings.shadow.resolution)
         free, target = np.full(3, np.inf), make_target(np.maximum(image, 0))
         self._stages = make_stages(renderer, [motion], [], [target], [Gain()], free, Loss("l2"), levels)

@@ -98,7 +98,7 @@ def build_method(
 
         for name in ("blur", "blur_steps"):
             settings.pop(name, None)
-        return GaussNewtonPose(renderer, "object", reference, spp=samples, settings=settings)
+        return GaussNewtonPose(renderer, "object", reference, spp=samples, shift_z=problem.shift_z, settings=settings)
     return PoseFit(
         renderer,
         "object",

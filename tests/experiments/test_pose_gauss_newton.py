@@ -1,0 +1,67 @@
+"""Poses by Levenberg and Marquardt's method, against path-traced references and `PoseFit`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from shadowmap_dr.errors import ShadowmapError
+from shadowmap_dr.experiments.pose.gauss_newton import GaussNewtonPose
+from shadowmap_dr.experiments.pose.methods import build_method
+from shadowmap_dr.experiments.pose.scene import PoseProblem, make_problem, pose_errors
+from shadowmap_dr.inverse import PoseFit, optimize
+
+START = np.array([np.radians(20), 0.15, -0.1])
+
+
+@pytest.fixture(scope="module", params=[False, True], ids=["seen", "shadow only"])
+def problem(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> PoseProblem:
+    mi.set_variant("llvm_ad_rgb")
+    return make_problem("spot", 64, shadow_only=request.param, work=tmp_path_factory.mktemp("spot"))
+
+
+@pytest.fixture(scope="module")
+def reference(problem: PoseProblem) -> np.ndarray:
+    return np.array(mi.render(problem.scene, integrator=mi.load_dict({"type": "direct"}), spp=64))
+
+
+@pytest.fixture(scope="module")
+def method(problem: PoseProblem, reference: np.ndarray) -> GaussNewtonPose:
+    built = build_method("shadows", problem, reference, optimiser="lm")
+    assert isinstance(built, GaussNewtonPose)
+    return built
+
+
+def test_a_pose_is_found_in_few_steps(method: GaussNewtonPose) -> None:
+    history = optimize(method, START, 40)
+    degrees, offset = pose_errors(history.final)
+    assert degrees < 0.3 and offset < 0.5
+    # Steps after the last stage change nothing, and cost nothing.
+    np.testing.assert_array_equal(history.parameters[-1], history.parameters[-5])
+
+
+def test_images_are_those_of_adams_method(problem: PoseProblem, reference: np.ndarray, method: GaussNewtonPose) -> None:
+    """Both turn and shift the object alike."""
+    other = build_method("shadows", problem, reference)
+    assert isinstance(other, PoseFit)
+    for pose in (np.zeros(3), START):
+        ours, theirs = method.render(pose), other.render(pose)
+        assert np.abs(ours - theirs).mean() < 0.02 * theirs.mean()
+
+
+def test_a_stopped_run_goes_on_from_its_stage(method: GaussNewtonPose, tmp_path: Path) -> None:
+    whole = optimize(method, START, 30)
+    optimize(method, START, 20, checkpoint=tmp_path / "run.npz")
+    resumed = optimize(method, START, 30, checkpoint=tmp_path / "run.npz")
+    np.testing.assert_allclose(resumed.final, whole.final, atol=2e-3)
+    assert method.describe()["optimizer"] == "Levenberg-Marquardt"
+
+
+def test_other_numbers_and_images_are_refused(problem: PoseProblem, method: GaussNewtonPose) -> None:
+    with pytest.raises(ShadowmapError, match="a pose of 2 numbers"):
+        method.reset(np.zeros(2))
+    with pytest.raises(ShadowmapError, match="give finite values"):
+        build_method("shadows", problem, np.full((64, 64, 3), np.nan, np.float32), optimiser="lm")

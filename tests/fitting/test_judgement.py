@@ -1,0 +1,57 @@
+"""Whether a scene explains pictures: edges at their places, elsewhere, blurred, noisy, masked."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from shadowmap_dr.fitting.judgement import EXPLAINED, is_explained, unexplained
+
+SIDE = 128
+
+
+def disc(x: float, y: float, softness: float = 1.0) -> np.ndarray:
+    """A dark disc on bright ground, (SIDE, SIDE, 3)."""
+    rows, columns = np.mgrid[:SIDE, :SIDE]
+    inside = 0.5 - 0.5 * np.tanh((np.hypot(columns - x, rows - y) - 25) / softness)
+    return np.repeat((1 - 0.8 * inside)[..., None], 3, 2).astype(np.float32)
+
+
+def judged(image: np.ndarray, picture: np.ndarray, weight: np.ndarray | None = None) -> float:
+    """The share for one number that moves the image sideways."""
+    weight = np.ones((SIDE, SIDE), np.float32) if weight is None else weight
+    slope = np.gradient(image, axis=1).reshape(1, -1)
+    point: Any = SimpleNamespace(columns=lambda: [slope], recorded=[image], residuals=[image - picture])
+    objective: Any = SimpleNamespace(observations=[SimpleNamespace(image=picture, weight=weight)], brightness=[1.0])
+    assert is_explained(point, objective) == (unexplained(point, objective) <= EXPLAINED)
+    return unexplained(point, objective)
+
+
+def test_equal_images_are_explained() -> None:
+    assert judged(disc(60, 60), disc(60, 60)) == 0
+
+
+def test_edges_elsewhere_are_not_explained() -> None:
+    assert judged(disc(60, 60), disc(63, 60)) > EXPLAINED
+    assert judged(disc(40, 60), disc(95, 60)) == pytest.approx(1, abs=0.15)
+    assert judged(np.ones((SIDE, SIDE, 3), np.float32), disc(60, 60)) == pytest.approx(1, abs=0.05)
+
+
+def test_noise_blur_and_smooth_light_are_no_matter() -> None:
+    noise = np.random.default_rng(0).normal(0, 0.05, (SIDE, SIDE, 3)).astype(np.float32)
+    ramp = np.linspace(0, 0.2, SIDE, dtype=np.float32)[None, :, None]
+    for picture in (disc(60, 60) + noise, disc(60, 60, softness=2), disc(60, 60) + ramp, disc(60.3, 60)):
+        assert judged(disc(60, 60), picture) < 0.6 * EXPLAINED
+
+
+def test_masked_parts_count_for_nothing() -> None:
+    """Where a picture is masked it is black."""
+    weight = np.ones((SIDE, SIDE), np.float32)
+    weight[:, 90:] = 0
+    picture = disc(60, 60) * weight[..., None]
+    assert judged(disc(60, 60), picture) > EXPLAINED
+    assert judged(disc(60, 60), picture, weight) == 0
+    assert judged(disc(60, 60), np.zeros((SIDE, SIDE, 3), np.float32), 0 * weight) == 0

@@ -310,7 +310,7 @@ def test_zero_is_no_positive_value() -> None:
 
 @pytest.mark.parametrize("text", ["sun.irradiance", "ball.bsdf.alpha", "ball.bsdf.diffuse_reflectance", "spot.cutoff_angle"])
 def test_values_of_numbers_are_those_that_are_shown(resolver: Resolver, text: str) -> None:
-    """What is written into the scene is what reports show."""
+    """Reports show the values that are written into the scene."""
     parameter = resolver.parameter(Vary.parse(text))
     assert not isinstance(parameter, (MeshVertices, TextureValues))
     x = np.linspace(-0.1, 0.2, len(parameter.labels))

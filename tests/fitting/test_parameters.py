@@ -212,6 +212,7 @@ def test_patterns_move_shapes_together(resolver: Resolver) -> None:
         ("panel.bsdf.reflectance:brightness", "a factor of zero changes nothing: give the kind value."),
         ("sun.sampling_weight", "to which no derivatives flow."),
         ("camera.x_fov", "to which no derivatives flow."),
+        ("lamp.position", "the position of a light is a kind of it: give lamp:position."),
         ("ball:texture", "'ball' has no texture; textures: floor.bsdf.reflectance.data."),
         ("nothing:vertices", "0 shapes are called 'nothing'; name one mesh."),
     ],
@@ -250,7 +251,7 @@ def test_the_list_names_what_can_vary(resolver: Resolver) -> None:
     listed = {one.name: one.kinds for one in resolver.candidates()}
     assert {"ball", "car_body", "sun", "lamp", "spot", "camera", "flat", "sky.radiance.value"} <= listed.keys()
     assert "fov" in listed["camera"] and "fov" not in listed["flat"]
-    assert not any("sampling_weight" in name or name.startswith("camera.") for name in listed)
+    assert not any("sampling_weight" in name or name.endswith(".position") or name.startswith("camera.") for name in listed)
     for name, kinds in listed.items():
         for kind in kinds:
             resolver.parameter(Vary(name, kind))

@@ -207,6 +207,9 @@ class Resolver:
 
     def _value(self, vary: Vary) -> Parameter:
         key = self._key(vary)
+        light, _, field = key.partition(".")
+        if field == "position" and light in self.lights:
+            raise ShadowmapError(f"vary {vary.label}: the position of a light is a kind of it: give {light}:position.")
         array = self._numbers(key)
         if array is None:
             raise ShadowmapError(f"vary {vary.label}: {key} is a {type(self.table[key]).__name__}, to which no derivatives flow.")
@@ -266,7 +269,7 @@ class Resolver:
         """The values (n,) of a parameter of Mitsuba's; None if no derivatives flow to it, and for parts of meshes and films."""
         if key.endswith((".faces", ".vertex_positions", ".vertex_normals", ".vertex_texcoords", ".to_world", ".to_uv", ".x_fov")):
             return None
-        if any(key.startswith(f"{name}.") for name in self.sensors):
+        if any(key.startswith(f"{name}.") for name in self.sensors) or key in [f"{light}.position" for light in self.lights]:
             return None
         value = self.table[key]
         if not (dr.is_array_v(value) and dr.is_float_v(value) and dr.is_diff_v(value)):  # transformations are no arrays

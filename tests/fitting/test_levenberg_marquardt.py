@@ -166,7 +166,7 @@ def test_numbers_of_very_unequal_effect() -> None:
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_candidates_without_a_cost_are_refused(bad: float) -> None:
-    """Where the first step would lead, images are not finite; shorter steps find the minimum."""
+    """Images are not finite where the first step would lead; shorter steps find the minimum."""
     limits = free(1)
     problem = Problem(lambda x: [bad if x[0] > 1.5 else np.arctan(x[0] - 1)], lambda x: [[1 / (1 + (x[0] - 1) ** 2)]])
     best, _ = minimise(problem.at, problem.at(np.array([-1.5])), limits)

@@ -212,6 +212,7 @@ def test_patterns_move_shapes_together(resolver: Resolver) -> None:
         ("panel.bsdf.reflectance:brightness", "a factor of zero changes nothing: give the kind value."),
         ("sun.sampling_weight", "to which no derivatives flow."),
         ("camera.x_fov", "to which no derivatives flow."),
+        ("lamp.position", "the position of a light is a kind of it: give lamp:position."),
         ("ball:texture", "'ball' has no texture; textures: floor.bsdf.reflectance.data."),
         ("nothing:vertices", "0 shapes are called 'nothing'; name one mesh."),
     ],
@@ -250,7 +251,7 @@ def test_the_list_names_what_can_vary(resolver: Resolver) -> None:
     listed = {one.name: one.kinds for one in resolver.candidates()}
     assert {"ball", "car_body", "sun", "lamp", "spot", "camera", "flat", "sky.radiance.value"} <= listed.keys()
     assert "fov" in listed["camera"] and "fov" not in listed["flat"]
-    assert not any("sampling_weight" in name or name.startswith("camera.") for name in listed)
+    assert not any("sampling_weight" in name or name.endswith(".position") or name.startswith("camera.") for name in listed)
     for name, kinds in listed.items():
         for kind in kinds:
             resolver.parameter(Vary(name, kind))
@@ -310,7 +311,7 @@ def test_zero_is_no_positive_value() -> None:
 
 @pytest.mark.parametrize("text", ["sun.irradiance", "ball.bsdf.alpha", "ball.bsdf.diffuse_reflectance", "spot.cutoff_angle"])
 def test_values_of_numbers_are_those_that_are_shown(resolver: Resolver, text: str) -> None:
-    """What is written into the scene is what reports show."""
+    """Reports show the values that are written into the scene."""
     parameter = resolver.parameter(Vary.parse(text))
     assert not isinstance(parameter, (MeshVertices, TextureValues))
     x = np.linspace(-0.1, 0.2, len(parameter.labels))

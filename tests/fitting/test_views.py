@@ -177,7 +177,7 @@ def test_image_is_that_of_mitsuba(renderers: dict[str, Renderer]) -> None:
 
 
 def test_image_of_no_numbers(renderers: dict[str, Renderer]) -> None:
-    """Where exposure alone is fitted."""
+    """As for a fit of the exposure alone."""
     with_numbers = view_of(renderers["sun"], "sun:direction").image(np.zeros(2))
     np.testing.assert_allclose(view_of(renderers["sun"]).image(np.zeros(0)), with_numbers, atol=1e-6)
 

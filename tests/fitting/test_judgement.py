@@ -21,9 +21,9 @@ def disc(x: float, y: float, softness: float = 1.0) -> np.ndarray:
 
 
 def judged(image: np.ndarray, picture: np.ndarray, weight: np.ndarray | None = None) -> float:
-    """The share for one number that moves the image sideways."""
+    """The share for one number that moves the image sideways, by 20 pixels for a change by one."""
     weight = np.ones((SIDE, SIDE), np.float32) if weight is None else weight
-    slope = np.gradient(image, axis=1).reshape(1, -1)
+    slope = 20 * np.gradient(image, axis=1).reshape(1, -1)
     point: Any = SimpleNamespace(columns=lambda: [slope], recorded=[image], residuals=[image - picture])
     objective: Any = SimpleNamespace(observations=[SimpleNamespace(image=picture, weight=weight)], brightness=[1.0])
     assert is_explained(point, objective) == (unexplained(point, objective) <= EXPLAINED)

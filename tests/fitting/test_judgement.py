@@ -50,7 +50,7 @@ def test_noise_blur_and_smooth_light_are_no_matter() -> None:
 def test_masked_parts_count_for_nothing() -> None:
     """Where a picture is masked it is black."""
     weight = np.ones((SIDE, SIDE), np.float32)
-    weight[:, 90:] = 0
+    weight[:, 70:] = 0
     picture = disc(60, 60) * weight[..., None]
     assert judged(disc(60, 60), picture) > EXPLAINED
     assert judged(disc(60, 60), picture, weight) == 0

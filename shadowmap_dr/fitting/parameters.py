@@ -132,6 +132,8 @@ class Parameter(Protocol):
 class ShapeMotion:
     """Motion of shapes as one body about their common middle ``pivot`` (3,); ``extent``: length that a number of one moves them.
 
+    ``room``: half range of starts of a translation, as a share of the extent.
+
     ``parts``: the numbers' meanings: rx, ry, rz, tx, ty, tz, s.
     """
 
@@ -140,6 +142,7 @@ class ShapeMotion:
     pivot: Array
     extent: float
     parts: tuple[str, ...]
+    room: float = 0.2
     natural: tuple[float, float] = (-np.inf, np.inf)
 
     @property
@@ -162,7 +165,7 @@ class ShapeMotion:
 
     @property
     def usual(self) -> Array:
-        return _ranges(self.parts, 0.35, 0.1)
+        return _ranges(self.parts, 0.35, self.room)
 
     def put(self, numbers: Sequence[Float], change: SceneChange) -> None:
         change.move(self.shapes, self._matrix(numbers, change.placements.get(self.shapes[0])))
@@ -282,7 +285,7 @@ class CameraMotion:
 
     @property
     def usual(self) -> Array:
-        return _ranges(self.parts, 0.25 if self.distance else 0.1, 0.1)
+        return _ranges(self.parts, 0.3 if self.distance else 0.15, 0.15)
 
     def put(self, numbers: Sequence[Float], change: SceneChange) -> None:
         given, record = dict(zip(self.parts, numbers, strict=True)), change.camera(self.sensor)

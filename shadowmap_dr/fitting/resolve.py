@@ -35,6 +35,8 @@ _SHARES = (
     *("opacity", "weight", "spec_trans", "transmittance", "specular"),
 )
 _ROUGHNESS = ("alpha", "roughness")
+# Half range of starts of a translation: as a share of the scene's diameter; least and most as shares of the shape's.
+_ROOM, _LEAST_MOST = 0.08, (0.15, 0.5)
 # Most numbers of one value that are fitted by their full matrix of derivatives.
 _MOST = 16
 
@@ -139,7 +141,9 @@ class Resolver:
         infos = [self.renderer.data.geometry.shape(shape) for shape in shapes]
         points = np.concatenate([self._points[info.vertex_start : info.vertex_start + info.vertex_count] for info in infos])
         middle, diameter = _bounds(points)
-        return ShapeMotion(vary, tuple(shapes), middle, diameter or self.diameter, parts)
+        extent = diameter or self.diameter
+        room = float(np.clip(_ROOM * self.diameter / extent, *_LEAST_MOST))
+        return ShapeMotion(vary, tuple(shapes), middle, extent, parts, room)
 
     # ------------------------------------------------------------------------------------------------------ lights, sensors
 

@@ -123,7 +123,7 @@ def _visual(material: _Material, info: ShapeInfo, shape: mi.Shape, texcoords: Ar
 
 
 def _material(shape: mi.Shape) -> _Material:
-    bsdf: Any = shape.bsdf()
+    bsdf: Any = shape.bsdf()  # Any: of several classes
     around = []
     while bsdf is not None and bsdf.class_name() in _AROUND:
         if bsdf.class_name() != "TwoSidedBRDF":
@@ -156,7 +156,9 @@ def _material(shape: mi.Shape) -> _Material:
     return found
 
 
-def _read_colour(found: _Material, name: str, texture: Any, values: dict[str, Any]) -> None:
+def _read_colour(
+    found: _Material, name: str, texture: Any, values: dict[str, Any]
+) -> None:  # Any: mi.Texture, and values of all kinds
     if f"{name}.data" in values:
         data = np.array(values[f"{name}.data"])
         matrix = np.array(values[f"{name}.to_uv"].matrix, np.float64) if f"{name}.to_uv" in values else np.eye(3)
@@ -179,7 +181,7 @@ def _read_colour(found: _Material, name: str, texture: Any, values: dict[str, An
         found.note = f"its {name} is a {texture.class_name()}; it is grey"
 
 
-def _attribute_name(texture: Any) -> str:
+def _attribute_name(texture: Any) -> str:  # Any: a mi.Texture or None
     """The name of the mesh's attribute that a texture reads."""
     for line in str(texture).splitlines():
         key, _, value = line.partition("=")

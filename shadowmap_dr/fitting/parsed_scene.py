@@ -78,7 +78,7 @@ class ParsedScene:
         with _resolving(self._folders()):
             try:
                 mi.parser.transform_all(config, state)
-                scene: Any = mi.parser.instantiate(config, state)
+                scene: Any = mi.parser.instantiate(config, state)  # Any: no stub says it is a scene
             except (RuntimeError, TypeError, UnicodeError) as error:
                 raise ShadowmapError(f"cannot load {file}: {mitsuba_message(error)}") from error
         scene = scene[0] if isinstance(scene, list) and len(scene) == 1 else scene
@@ -93,7 +93,7 @@ class ParsedScene:
     def place(self, name: str) -> Place | None:
         """The place of a parameter in the files; None if none is found."""
         parts = name.split(".")
-        owner: Any = self.parameters.properties[name][2]
+        owner: Any = self.parameters.properties[name][2]  # Any: an object of Mitsuba
         while owner is not None:
             parent, depth = self.parameters.hierarchy[owner]
             known = owner.id() if owner.id() in self._found else parts[0] if depth == 1 else ""

@@ -156,7 +156,7 @@ class Resolver:
         ]
 
     def _light(self, vary: Vary) -> Parameter:
-        light: Any = self.renderer.light(vary.name)
+        light: Any = self.renderer.light(vary.name)  # Any: one of several records
         kinds = self._light_kinds(light)
         kind = {"translation": "position"}.get(vary.kind, vary.kind) or (kinds[0] if len(kinds) == 1 else "")
         if not kind and kinds:

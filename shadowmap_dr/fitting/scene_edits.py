@@ -447,7 +447,7 @@ def _element_of(parsed: ParsedScene, shape: mi.Shape) -> tuple[XmlText, Element]
     return found
 
 
-def _text(values: Any, between: str = " ") -> str:
+def _text(values: Any, between: str = " ") -> str:  # Any: numbers, nested or not
     """Numbers as text, in single precision."""
     return between.join(f"{float(value):.9g}" for value in np.ravel(values))
 

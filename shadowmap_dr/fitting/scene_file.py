@@ -304,7 +304,7 @@ class _Writer:
                 if attribute:
                     self._relocate_file(text, element, attribute)
 
-    def _relocate_includes(self, text: XmlText, order: Any) -> None:
+    def _relocate_includes(self, text: XmlText, order: Any) -> None:  # Any: elements of a parser without stubs
         for element in text.root.walk():
             if element.tag == "include":
                 inner = next(order, None)

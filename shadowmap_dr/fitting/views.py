@@ -20,7 +20,7 @@ from ..jit.types import Float, TensorXf
 from ..rendering.renderer import Renderer
 from ..scene.pixel_filter import Filter
 from ..scene.sensor import ImageSize, Sensor
-from .arrays import ArrayParameter
+from .arrays import ArrayParameter, TextureValues
 from .parameters import Parameter, SceneChange, Value
 
 Array = npt.NDArray[np.float64]
@@ -86,7 +86,10 @@ class View:
         self._starts = np.cumsum([0, *counts]).tolist()
         # One recording for each entry: a pass computes the derivative of a combination of its numbers.
         self._passes = [freeze(self._recorded(k)) for k in range(len(parameters))]
-        self._image, self._gradient = freeze(self._recorded(-1)), freeze(self._recorded_gradient())
+        gradient = self._recorded_gradient()
+        keys = [array.key for array in arrays if isinstance(array, TextureValues)]
+        recordable = all(is_recordable(renderer.data.scene, key) for key in keys)
+        self._image, self._gradient = freeze(self._recorded(-1)), freeze(gradient) if recordable else gradient
         # Values of Mitsuba's objects, and entries whose derivatives are differences of images.
         self._values = [isinstance(parameter, Value) and not parameter.light for parameter in parameters]
         self._differences = [

@@ -129,7 +129,7 @@ def _raw_modes(image: PIL.ImageFile.ImageFile) -> tuple[str, str] | None:
     """
     if not image.tile:
         return None
-    options: Any = image.tile[0][3]
+    options: Any = image.tile[0][3]  # Any: of several types in Pillow
     name = options if isinstance(options, str) else str(options[0] if options else "")
     found = _DEEP.fullmatch(name)
     if found is None and not (name == "I;16B" and "transparency" in image.info and image.format == "PNG"):
@@ -165,7 +165,7 @@ def _deep_tiff(file: str | os.PathLike[str] | io.BytesIO, high: str, low: str) -
     premultiplied = False
     for name, factor in ((high, 256), (low, 1)):
         with Image.open(file, formats=_FORMATS) as image:
-            tiles: Any = image.tile  # of several types in Pillow's versions
+            tiles: Any = image.tile  # Any: of several types in Pillow's versions
             premultiplied = tiles[0][3][0].startswith("RGBa")
             make = getattr(type(tiles[0]), "_make", tuple)
             image.tile = [make((tile[0], tile[1], tile[2], (name, *tile[3][1:]))) for tile in tiles]

@@ -156,9 +156,7 @@ def _material(shape: mi.Shape) -> _Material:
     return found
 
 
-def _read_colour(
-    found: _Material, name: str, texture: Any, values: dict[str, Any]
-) -> None:  # Any: mi.Texture, and values of all kinds
+def _read_colour(found: _Material, name: str, texture: Any, values: dict[str, Any]) -> None:  # Any: no stub says
     if f"{name}.data" in values:
         data = np.array(values[f"{name}.data"])
         matrix = np.array(values[f"{name}.to_uv"].matrix, np.float64) if f"{name}.to_uv" in values else np.eye(3)

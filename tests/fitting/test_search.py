@@ -417,3 +417,26 @@ def test_vertices_are_found() -> None:
     rise = found[:, 2] - 0.6
     assert last < 0.4 * first, (first, last)
     assert np.corrcoef(rise, height.ravel())[0, 1] > 0.6 and 0.12 < rise.max() < 0.4
+
+
+@pytest.mark.parametrize(
+    ("material", "names"),
+    [
+        ({"type": "principled", "roughness": 0.4}, {"base_color": [0.7, 0.3, 0.2], "roughness": [0.6]}),
+        ({"type": "roughplastic", "alpha": 0.2}, {"diffuse_reflectance": [0.6, 0.4, 0.2]}),
+    ],
+    ids=["principled", "roughplastic"],
+)
+def test_materials_that_recordings_cannot_change(material: dict[str, Any], names: dict[str, list[float]]) -> None:
+    """They read parameters back when these change, or tables are made of them."""
+    true = {name: value[0] if len(value) == 1 else {"type": "rgb", "value": value} for name, value in names.items()}
+    seen = photograph(scene(box={**box(0), "bsdf": {**material, **true}}))
+    grey = {name: {"type": "rgb", "value": [0.5] * 3} for name, value in names.items() if len(value) == 3}
+    start = renderer(box={**box(0), "bsdf": {**material, **grey}})
+    result = fit(start, seen, [f"box.bsdf.{name}" for name in names], starts=2, tries=1)
+    for name, value in names.items():
+        np.testing.assert_allclose(estimate(result, f"box.bsdf.{name}").arrays["value"], value, rtol=0.1, atol=0.02)
+    # The scene has its values back.
+    table = mi.traverse(start.data.scene)
+    for name in grey:
+        np.testing.assert_allclose(np.array(table[f"box.bsdf.{name}.value"]).ravel(), 0.5)

@@ -2,6 +2,8 @@
 
 from .api import fit, prepared
 from .options import FitOptions
+from .own import Own
+from .parameters import SceneChange
 from .report import write_report
 from .result import Estimate, FitResult, read_fit
 from .search import Fit
@@ -13,6 +15,8 @@ __all__ = [
     "Fit",
     "FitOptions",
     "FitResult",
+    "Own",
+    "SceneChange",
     "Target",
     "Vary",
     "fit",

@@ -12,6 +12,7 @@ import mitsuba as mi
 from ..errors import ShadowmapError
 from ..rendering.renderer import Renderer
 from .options import FitOptions
+from .own import Own
 from .result import FitResult
 from .search import Fit
 from .targets import Target, make_target, read_target
@@ -24,7 +25,7 @@ Picture = Any  # Any: arrays of NumPy, Dr.Jit and PyTorch, names of files, Targe
 def fit(
     scene: mi.Scene | Renderer | str | os.PathLike[str],
     targets: Picture | Sequence[Picture] | Mapping[int, Picture],
-    vary: Sequence[str | Vary | Mapping[str, Any]],
+    vary: Sequence[str | Vary | Own | Mapping[str, Any]],
     **options: Any,  # Any: fields of FitOptions
 ) -> FitResult:
     """Fit a scene to pictures: find poses, lights, materials, cameras, textures or vertices.
@@ -35,7 +36,8 @@ def fit(
             sensors. A picture is a file (sRGB, or OpenEXR: linear), an array of linear colours (H, W, 3), or a
             :class:`~shadowmap_dr.fitting.targets.Target`, which has a mask.
         vary: things that vary, as for ``shadowmap-dr fit --vary``: ``"bunny:pose"``, ``"sun:direction"``,
-            ``"wall.bsdf.reflectance,max=0.8"``, or mappings ``{"name": "sun", "kind": "direction", "spread": 60}``.
+            ``"wall.bsdf.reflectance,max=0.8"``, mappings ``{"name": "sun", "kind": "direction", "spread": 60}``, or
+            parametrisations of your own (:class:`~shadowmap_dr.fitting.own.Own`).
         options: fields of :class:`~shadowmap_dr.fitting.options.FitOptions` by name: ``exposure=True``, ``starts=16``, ...
 
     Returns:
@@ -50,13 +52,13 @@ def fit(
 def prepared(
     scene: mi.Scene | Renderer | str | os.PathLike[str],
     targets: Picture | Sequence[Picture] | Mapping[int, Picture],
-    vary: Sequence[str | Vary | Mapping[str, Any]],
+    vary: Sequence[str | Vary | Own | Mapping[str, Any]],
     **options: Any,  # Any: fields of FitOptions
 ) -> Fit:
     """The fit that :func:`fit` runs, to take its steps one by one. Arguments as there."""
-    entries = [vary] if isinstance(vary, (str, Vary)) else vary
+    entries = [vary] if isinstance(vary, (str, Vary, Own)) else vary
     try:
-        chosen = FitOptions(vary=tuple(Vary.of(entry) for entry in entries), **options)
+        chosen = FitOptions(vary=tuple(entry if isinstance(entry, Own) else Vary.of(entry) for entry in entries), **options)
     except TypeError as error:
         known = ", ".join(one.name for one in fields(FitOptions) if one.name != "vary")
         raise ShadowmapError(f"fit: {str(error).partition('() ')[2] or error}; the options are {known}.") from error

@@ -8,6 +8,7 @@ from ..errors import ShadowmapError
 from ..io.options import option
 from ..io.ranges import check_ranges
 from .losses import Loss, LossKind
+from .own import Own
 from .vary import Vary
 
 
@@ -27,7 +28,7 @@ class FitOptions:
         steps: steps of Adam for vertices and textures.
     """
 
-    vary: tuple[Vary, ...] = option(
+    vary: tuple[Vary | Own, ...] = option(
         (),
         metavar="NAME[:KIND]",
         parse=Vary.parse,

@@ -16,6 +16,7 @@ from ..errors import ShadowmapError, did_you_mean
 from ..rendering.renderer import Renderer
 from .arrays import ArrayParameter, MeshVertices, TextureValues, mesh_vertices, texture_values
 from .motions import host_matrix, tangents
+from .own import Own
 from .parameters import CameraMotion, FieldOfView, LightMotion, Parameter, ShapeMotion, Value
 from .vary import Vary
 
@@ -97,12 +98,12 @@ class Resolver:
             )
         return found
 
-    def parameters(self, entries: Sequence[Vary]) -> tuple[list[Parameter], list[ArrayParameter]]:
+    def parameters(self, entries: Sequence[Vary | Own]) -> tuple[list[Parameter], list[ArrayParameter]]:
         """The parameters of entries: those that few numbers describe, and those with many values."""
         few: list[Parameter] = []
         many: list[ArrayParameter] = []
         for vary in entries:
-            found = self.parameter(vary)
+            found = vary if isinstance(vary, Own) else self.parameter(vary)
             if isinstance(found, (MeshVertices, TextureValues)):
                 many.append(found)
             else:

@@ -21,7 +21,7 @@ from ..rendering.renderer import Renderer
 from ..scene.pixel_filter import Filter
 from ..scene.sensor import ImageSize, Sensor
 from .arrays import ArrayParameter, TextureValues
-from .parameters import Parameter, SceneChange, Value
+from .parameters import Parameter, SceneChange
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
@@ -90,12 +90,9 @@ class View:
         keys = [array.key for array in arrays if isinstance(array, TextureValues)]
         recordable = all(is_recordable(renderer.data.scene, key) for key in keys)
         self._image, self._gradient = freeze(self._recorded(-1)), freeze(gradient) if recordable else gradient
-        # Values of Mitsuba's objects, and entries whose derivatives are differences of images.
-        self._values = [isinstance(parameter, Value) and not parameter.light for parameter in parameters]
-        self._differences = [
-            isinstance(one, Value) and own and not is_recordable(renderer.data.scene, one.key)
-            for own, one in zip(self._values, parameters, strict=True)
-        ]
+        # Names of Mitsuba's values that each entry changes, and entries whose derivatives are differences of images.
+        self._keys = self._keys_of_entries()
+        self._differences = [not all(is_recordable(renderer.data.scene, key) for key in own) for own in self._keys]
         self._held = 0
 
     def without_shadows(self) -> View:
@@ -156,7 +153,7 @@ class View:
     @contextmanager
     def scene_at(self, x: Array) -> Iterator[None]:
         """Context in which Mitsuba's objects have the values of the numbers x (n,). Passes at x are faster within one."""
-        if self._held or not (any(self._values) or self._arrays):
+        if self._held or not (any(self._keys) or self._arrays):
             yield
             return
         change = self.change(x)
@@ -167,6 +164,16 @@ class View:
         finally:
             self._held -= 1
             restore()
+
+    def _keys_of_entries(self) -> list[tuple[str, ...]]:
+        """Names of Mitsuba's values that each entry changes."""
+        change, found = SceneChange(self._renderer), list[tuple[str, ...]]()
+        with dr.suspend_grad():
+            for parameter in self._parameters:
+                before = set(change.values)
+                parameter.put([mi.Float(0)] * len(parameter.labels), change)
+                found.append(tuple(key for key in change.values if key not in before))
+        return found
 
     def change(self, x: Array) -> SceneChange:
         """The change of the scene at the numbers x (n,), detached."""
@@ -281,10 +288,10 @@ class View:
             parameter.put(own, change)
         for array, one in zip(self._arrays, values, strict=True):
             array.put(one, change)
-        mine = self._parameters[entry] if entry >= 0 else None
+        mine = self._keys[entry] if entry >= 0 else ()
         attached = replace(
             change,
-            values={key: parts for key, parts in change.values.items() if isinstance(mine, Value) and key == mine.key},
+            values={key: parts for key, parts in change.values.items() if key in mine},
             arrays=change.arrays if arrays else {},
         )
         restore = set_values(renderer.data.scene, attached)

@@ -27,7 +27,7 @@ _GREY = np.full(3, 0.5)
 
 @dataclass
 class _Material:
-    """What glTF can say of a material: linear colour, or picture of 8 bits with the map to its coordinates, roughness, metal."""
+    """A material of glTF: linear colour, or picture of 8 bits with the map to its coordinates, roughness, metal."""
 
     colour: Array = field(default_factory=lambda: _GREY)
     picture: Array | None = None

@@ -18,7 +18,7 @@ from .xml_text import Element, XmlText
 
 @dataclass(frozen=True)
 class Place:
-    """Where a parameter comes from.
+    """Origin of a parameter.
 
     ``element`` describes the object that has it, or the nearest object around that the file describes; ``path`` leads on from
     there: names of children, and of the parameter.

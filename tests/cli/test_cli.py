@@ -68,7 +68,7 @@ def test_help_names_the_commands(run: Any) -> None:
 
 def test_commands_come_in_the_order_of_their_use(run: Any) -> None:
     listed = [line.split()[0] for line in run("-h").out.partition("Commands:")[2].splitlines() if line.strip()]
-    assert listed == "render import pose lights art face model soft maps gradients bench lights-times info".split()
+    assert listed == "render import fit pose lights art face model soft maps gradients bench lights-times info".split()
     assert list(main.COMMANDS) == listed
 
 

@@ -20,6 +20,7 @@ from docs import tables  # noqa: E402
 MEASURED = re.compile(r"\d\.\d|\d ?(%|ms|s|x|GiB|MiB)\b|\d %")
 #: Tables of other things, by page and the beginning of their first line.
 OTHERS = {
+    ("docs/commands.md", "| key | default"): "values of options",
     ("docs/conventions.md", "| | here and in Mitsuba"): "positions of pixels",
     ("docs/how-to/shadow-methods.md", "| If | then"): "values of options",
     ("docs/performance.md", "| section | what is timed"): "descriptions",

@@ -29,6 +29,9 @@ INFLATION = 10.0
 # A number with a smaller effect than the first, a share of the brightness for a change by one, is idle if a change by the second
 # makes no larger difference than the third: derivatives of outlines are not exact.
 _WEAK, _FAR, _SAME = 0.3, 0.3, 0.005
+# Numbers may depend on each other where an eigenvalue of the matrix, with a diagonal of one, is smaller: images tell how much.
+# Those with a smaller share of the eigenvector have no part in it.
+_DEPENDENT, _SHARE = 0.05, 0.02
 # Directions in which numbers move the images by less than this square share of their single effects are not determined. Residuals
 # say nothing of them: no change of the images can leave any. Their largest number gets this deviation.
 _LEAST, _FREE = 1e-6, 10.0
@@ -76,7 +79,7 @@ def uncertainty(point: Point, objective: Objective, low: Array | float = -np.inf
     # Shares of the brightness that a change of a number by one makes.
     idle = moved < 1e-6
     for k in np.flatnonzero(~idle & (moved < _WEAK)):
-        idle[k] = _change(int(k), point, objective, low, high) < _SAME
+        idle[k] = 2 * _FAR * np.sqrt(_change(np.eye(objective.count)[k], point, objective, low, high)) < _SAME
     inverse, free = _inverse(matrix * total, idle)
     # Where a prior alone determines a number, its interval is the prior's.
     scores = INFLATION * _scores(point, objective) + PRIOR_WEIGHT * np.diag(objective.precision * total)
@@ -84,18 +87,52 @@ def uncertainty(point: Point, objective: Objective, low: Array | float = -np.inf
     for error in _shared_errors(point, objective):
         shift = inverse @ error
         covariance += np.outer(shift, shift)
-    return Uncertainty(covariance, idle)
+    return Uncertainty(covariance + _dependence(matrix, covariance, idle, point, objective, low, high), idle)
 
 
-def _change(number: int, point: Point, objective: Objective, low: Array | float, high: Array | float) -> float:
-    """Difference of the images, as a share of the brightness, between a smaller and a larger value of a number."""
-    step = np.zeros(objective.count)
-    step[number] = _FAR
-    above, below = (objective.at(np.clip(point.x + sign * step, low, high)) for sign in (1, -1))
+def _dependence(
+    matrix: Array,
+    covariance: Array,
+    idle: npt.NDArray[np.bool_],
+    point: Point,
+    objective: Objective,
+    low: Array | float,
+    high: Array | float,
+) -> Array:
+    """Further covariance (n, n) of numbers that can make up for each other, such as the size of a shape and its distance.
+
+    Derivatives of outlines are not exact, and hide it: the effect of such numbers together is smaller in images at a distance.
+    """
+    keep, result = np.flatnonzero(~idle), np.zeros_like(matrix)
+    scale = np.sqrt(np.diag(matrix)[keep])
+    values, vectors = np.linalg.eigh(matrix[np.ix_(keep, keep)] / np.outer(scale, scale))
+    for k in np.flatnonzero((values > _LEAST) & (values < _DEPENDENT)):
+        vector = np.where(np.abs(vectors[:, k]) < _SHARE, 0, vectors[:, k])
+        if objective.precision[keep][vector != 0].any():
+            continue  # a prior holds them
+        direction = np.zeros(objective.count)
+        direction[keep] = vectors[:, k] / scale
+        direction /= np.abs(direction).max()
+        stated = float(direction @ matrix @ direction)
+        ratio = max(min(1.0, _change(direction, point, objective, low, high) / stated), 1e-6)
+        along = np.zeros(objective.count)
+        along[keep] = vectors[:, k] * scale
+        variance = float(along @ covariance @ along) * (ratio**-2 - 1)
+        spread = np.zeros(objective.count)
+        spread[keep] = vector / scale
+        result += min(variance, (_FREE / np.abs(spread).max()) ** 2) * np.outer(spread, spread)
+    return result
+
+
+def _change(direction: Array, point: Point, objective: Objective, low: Array | float, high: Array | float) -> float:
+    """Square of the change of the images along a direction, a share of the brightness for a step of one, from two images."""
+    ends = [np.clip(point.x + sign * _FAR * direction, low, high) for sign in (1, -1)]
+    above, below = (objective.at(end) for end in ends)
     square = 0.0
     for one, other, weight in zip(above.residuals, below.residuals, point.weights(), strict=True):
         square += float((weight * np.square(one - other, dtype=np.float64).reshape(-1)).sum())
-    return float(np.sqrt(square / (3 * objective.pixels)))
+    step = float(np.linalg.norm(ends[0] - ends[1]) / np.linalg.norm(direction))
+    return square / (3 * objective.pixels) / step**2 if step > 0 else np.inf
 
 
 def not_told_apart(found: Uncertainty) -> list[tuple[int, int]]:

@@ -46,5 +46,5 @@ def test_all_keys_and_kinds_are_in_the_tables() -> None:
 
 
 def test_numbers_of_the_text_are_those_of_the_program() -> None:
-    assert f"at most {100 * EXPLAINED:g} % of the pictures' brightness" in TEXT
+    assert f"at most {100 * EXPLAINED:g} % of the edges that matter" in TEXT
     assert f"displaced by {DISPLACEMENT:g} pixels, a brightness that is wrong by {100 * FACTOR:g} %" in TEXT

@@ -247,3 +247,18 @@ def test_correlations_are_those_of_a_covariance(seed: int, near: float, count: i
     np.testing.assert_array_equal(np.diag(correlations), 1)
     assert (result.half_widths >= 0).all() and not np.isnan(result.half_widths).any()
     assert all(a < b for a, b in not_told_apart(result))
+
+
+@pytest.mark.usefixtures("plain")
+def test_dependent_numbers_are_measured_by_images() -> None:
+    """Derivatives with errors tell two numbers apart whose sum alone changes the images."""
+    true = smooth_derivatives(3)
+    true[1] = true[0]
+    noisy = true + np.random.default_rng(1).normal(scale=0.02, size=true.shape)
+    residual = np.random.default_rng(0).normal(scale=NOISE, size=SHAPE)
+    stated, measured = made(noisy, residual), made(noisy, residual)
+    measured.at = lambda x: SimpleNamespace(residuals=[residual + (x @ true).reshape(SHAPE)])  # type: ignore[method-assign]
+    assert found(stated).half_widths[0] < 0.1 and not not_told_apart(found(stated))
+    result = found(measured)
+    assert (result.half_widths[:2] > 10 * found(stated).half_widths[:2]).all() and not_told_apart(result) == [(0, 1)]
+    np.testing.assert_allclose(result.half_widths[2], found(stated).half_widths[2], rtol=0.05)

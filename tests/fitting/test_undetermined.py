@@ -20,13 +20,15 @@ def of(columns: np.ndarray, noise: float = 0.01, prior: np.ndarray | None = None
     flat = columns.reshape(count, -1)
     residual = np.random.default_rng(1).normal(0, noise, (SIZE, SIZE, 3))
     precision = PRIOR_WEIGHT / (3 * pixels) / np.square(np.full(count, np.inf) if prior is None else prior)
-    objective = SimpleNamespace(pixels=pixels, precision=precision, count=count, brightness=[1.0])
+    at = lambda x: SimpleNamespace(residuals=[residual + (x @ flat).reshape(residual.shape)])  # noqa: E731
+    objective = SimpleNamespace(pixels=pixels, precision=precision, count=count, brightness=[1.0], at=at)
     point = SimpleNamespace(
         system=lambda: (flat @ flat.T / (3 * pixels) + np.diag(precision), None),
         columns=lambda: [flat],
         weights=lambda: [np.ones(flat.shape[1])],
         residuals=[residual],
         recorded=[np.zeros((SIZE, SIZE, 3))],
+        x=np.zeros(count),
     )
     found: Any = uncertainty(point, objective)  # type: ignore[arg-type]
     return found

@@ -14,7 +14,7 @@ Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
 
 #: Largest share of unexplained edges with which a fit counts as found.
-EXPLAINED = 0.12
+EXPLAINED = 0.16
 # Pixels along the longer side of the images whose edges are compared, at most: noise and blurred outlines count little there.
 _SIDE = 56
 # Pixels matter where a change of a number by the first moves them by more than the second, a share of the brightness; and

@@ -40,7 +40,7 @@ _NORMAL = 1.96
 # Numbers with a wider interval, in the fit's own numbers, are not determined.
 _WIDEST = 1.0
 # Two numbers are not told apart if their intervals are wider than the first number, and their correlation is above the second.
-_WIDE, _ALIKE = 0.1, 0.97
+_WIDE, _ALIKE = 0.25, 0.97
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,7 @@ def _scores(point: Point, objective: Objective) -> Array:
         rows, width, _ = residual.shape
         product = (columns * (weight * residual.reshape(-1))).reshape(objective.count, rows, width, 3).sum(3, dtype=np.float64)
         blocks = np.add.reduceat(np.add.reduceat(product, range(0, rows, _BLOCK), 1), range(0, width, _BLOCK), 2)
-        flat = blocks.reshape(objective.count, -1)
+        flat = blocks.reshape(objective.count, blocks[0].size if len(blocks) else 0)
         total += flat @ flat.T
     return total
 

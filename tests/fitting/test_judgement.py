@@ -1,4 +1,4 @@
-"""Whether a scene explains pictures: edges at their places, elsewhere, blurred, noisy, masked."""
+"""Verdicts on edges at their places, elsewhere, blurred, noisy, masked."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_noise_blur_and_smooth_light_are_no_matter() -> None:
 
 
 def test_masked_parts_count_for_nothing() -> None:
-    """Where a picture is masked it is black."""
+    """A masked picture is black."""
     weight = np.ones((SIDE, SIDE), np.float32)
     weight[:, 70:] = 0
     picture = disc(60, 60) * weight[..., None]

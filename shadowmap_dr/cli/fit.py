@@ -47,7 +47,9 @@ def fit(
     task = _task(scene, given, target or [], mask or [], definitions(define or []))
     path = scene_file(task.scene)
     set_variant(variant)
-    loaded = load(path, dict(task.parameters), optimize=False)
+    from ..fitting.scene_loading import load_scene
+
+    loaded = load(path, dict(task.parameters), load_scene)
     if listing:
         from ..fitting.listing import listed
 

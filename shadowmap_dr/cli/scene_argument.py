@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import mitsuba as mi
@@ -59,9 +60,12 @@ def definitions(entries: list[str]) -> dict[str, str]:
     return values
 
 
-def load(path: Path, values: dict[str, str], *, optimize: bool = True) -> mi.Scene:
+def load(path: Path, values: dict[str, str], loader: Callable[[str, dict[str, str]], object] | None = None) -> mi.Scene:
+    """Load a scene file. ``loader``: instead of ``mi.load_file``."""
     try:
-        loaded = mi.load_file(str(path), optimize=optimize, **values)
+        loaded = mi.load_file(str(path), **values) if loader is None else loader(str(path), values)
+    except ShadowmapError:
+        raise
     except (RuntimeError, UnicodeError) as error:
         raise ShadowmapError(f"cannot load {path}: {one_line(error)}") from error
     if not isinstance(loaded, mi.Scene):

@@ -14,6 +14,7 @@ from ..rendering.renderer import Renderer
 from .options import FitOptions
 from .own import Own
 from .result import FitResult
+from .scene_loading import load_scene
 from .search import Fit
 from .targets import Target, make_target, read_target
 from .vary import Vary
@@ -67,7 +68,7 @@ def prepared(
     elif isinstance(scene, mi.Scene):
         renderer = Renderer.from_scene(scene)
     else:
-        renderer = Renderer.from_file(scene)
+        renderer = Renderer.from_scene(load_scene(scene))
     return Fit(renderer, _targets(targets), chosen)
 
 

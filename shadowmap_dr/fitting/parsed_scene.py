@@ -45,7 +45,7 @@ class ParsedScene:
         config = mi.parser.ParserConfig(mi.variant())
         config.merge_equivalent = config.merge_meshes = False
         try:
-            with _resolving([self.folder]):
+            with resolving([self.folder]):
                 state = mi.parser.parse_file(config, str(file), **parameters)
         except (RuntimeError, TypeError, UnicodeError) as error:
             raise ShadowmapError(f"cannot load {file}: {mitsuba_message(error)}") from error
@@ -75,7 +75,7 @@ class ParsedScene:
             for key in root.keys()
             if root.type(key) == mi.Properties.Type.ResolvedReference
         }
-        with _resolving(self._folders()):
+        with resolving(self._folders()):
             try:
                 mi.parser.transform_all(config, state)
                 scene: Any = mi.parser.instantiate(config, state)  # Any: no stub says it is a scene
@@ -170,7 +170,7 @@ class ParsedScene:
 
 
 @contextlib.contextmanager
-def _resolving(folders: Sequence[Path]) -> Iterator[None]:
+def resolving(folders: Sequence[Path]) -> Iterator[None]:
     """Let Mitsuba look for files in folders, the first first."""
     before = mi.file_resolver()
     resolver = mi.FileResolver(before)

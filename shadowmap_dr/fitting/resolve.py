@@ -266,6 +266,12 @@ class Resolver:
             return arrays[0]
         if arrays:
             raise ShadowmapError(f"vary {vary.label}: there are several, {', '.join(arrays)}; name one.")
+        coarse = [key for key in own if key.endswith(".data") and not dr.is_float_v(self.table[key])]
+        if coarse:
+            raise ShadowmapError(
+                f"vary {vary.label}: {coarse[0]} holds whole numbers, to which no derivatives flow: give the scene's file "
+                "instead of the scene, or the texture 'format': 'variant'."
+            )
         known = [key for key in self.keys if key.endswith(".data")]
         near = did_you_mean(vary.name, known)
         raise ShadowmapError(f"vary {vary.label}: '{vary.name}' has no texture; textures: {', '.join(known) or 'none'}.{near}")

@@ -59,7 +59,7 @@ def test_runs_are_counted_kept_and_added(tmp_path: Path, capsys: pytest.CaptureF
     found = json.loads((tmp_path / "foreign.json").read_text())["letters"]
     assert found["1"]["runs"][0] == first["letters"]["1"]["runs"][0]
     assert [len(found[setting]["runs"]) for setting in ("1", "auto")] == [2, 2]
-    assert found["1"]["search"] == {"samples": 1, "blur": 0.0, "tries": 1}
+    assert found["1"]["search"] == {"samples": 1, "blur": 0.0, "tries": 1, "optimiser": "adam"}
     assert found["auto"]["search"]["samples"] == 16 and found["auto"]["search"]["blur"] == 1
     assert Image.open(tmp_path / "foreign.png").size == (6 * 16, 16)
     lines = (tmp_path / "foreign.md").read_text().splitlines()

@@ -93,7 +93,8 @@ def test_a_thin_bar_is_found_from_afar_with_the_defaults_for_files(tmp_path: Pat
     path.write_text("\n".join(lines + faces) + "\n")
     common: dict[str, Any] = {"objects": (str(path),), "resolutions": (48,), "methods": ("shadows",), "reference": "own"}
     records = run_pose(PoseOptions(**common, iterations=120, out=tmp_path / "auto"), console=Console(file=io.StringIO()))
-    assert records[0]["search"] == {"samples": 16, "blur": 3.0, "tries": 5, "chosen": ["samples", "blur", "tries"]}
+    chosen = {"samples": 16, "blur": 3.0, "tries": 5, "optimiser": "adam", "chosen": ["samples", "blur", "tries"]}
+    assert records[0]["search"] == chosen
     assert records[0]["settings"]["samples_per_pixel"] == 16 and records[0]["settings"]["blur"] == 3.0
     assert records[0]["rotation_error_deg"] < 1 and records[0]["translation_error_x100"] < 1
     assert records[0]["unexplained"] < 0.05 and records[0]["found"] == records[0]["recovered"]

@@ -1,0 +1,78 @@
+"""Scene files with pictures of 8 bits, whose values are to vary."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from PIL import Image
+
+from shadowmap_dr import Renderer
+from shadowmap_dr.errors import ShadowmapError
+from shadowmap_dr.fitting import Vary, prepared
+from shadowmap_dr.fitting.resolve import Resolver
+from shadowmap_dr.fitting.scene_loading import load_scene
+from shadowmap_dr.io import assets
+
+KEY = "wall.bsdf.reflectance.data"
+SCENE = """<scene version="3.0.0">
+    <default name="fov" value="40"/>
+    <sensor type="perspective" id="camera"><float name="fov" value="$fov"/>
+        <transform name="to_world"><lookat origin="0, 0, 3" target="0, 0, 0" up="0, 1, 0"/></transform>
+        <film type="hdrfilm"><integer name="width" value="32"/><integer name="height" value="32"/><rfilter type="box"/></film>
+    </sensor>
+    <emitter type="directional" id="sun"><vector name="direction" x="0" y="0" z="-1"/></emitter>
+    <shape type="rectangle" id="wall"><bsdf type="diffuse"><texture type="bitmap" name="reflectance">
+        <string name="filename" value="wall.png"/><string name="filter_type" value="nearest"/></texture></bsdf></shape>
+</scene>"""
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    mi.set_variant("llvm_ad_rgb")
+    pixels = np.random.default_rng(0).integers(60, 200, (8, 8, 3), np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "wall.png")
+    (tmp_path / "scene.xml").write_text(SCENE)
+    return tmp_path / "scene.xml"
+
+
+def test_textures_have_numbers_with_derivatives(file: Path) -> None:
+    usual, loaded = mi.load_file(str(file), optimize=False), load_scene(file, {"fov": "41"})
+    table = mi.traverse(loaded)
+    assert not dr.is_float_v(mi.traverse(usual)[KEY]) and dr.is_diff_v(table[KEY]) and dr.is_float_v(table[KEY])
+    assert list(table.keys()) == list(mi.traverse(usual).keys())
+    assert table["camera.x_fov"][0] == pytest.approx(41)
+    images = [mi.render(one, spp=16, integrator=mi.load_dict({"type": "direct"})) for one in (load_scene(file), usual)]
+    np.testing.assert_allclose(*map(np.array, images), atol=1e-3)
+
+
+def test_all_scenes_of_the_package_load_alike() -> None:
+    mi.set_variant("llvm_ad_rgb")
+    for name in assets.scene_names():
+        path = assets.scene(name)
+        assert list(mi.traverse(load_scene(path)).keys()) == list(mi.traverse(mi.load_file(str(path), optimize=False)).keys())
+
+
+def test_a_texture_in_a_file_is_fitted(file: Path) -> None:
+    seen = np.array(mi.render(mi.load_file(str(file)), spp=64, integrator=mi.load_dict({"type": "direct"})))[..., :3]
+    Image.fromarray(np.full((8, 8, 3), 128, np.uint8)).save(file.parent / "wall.png")
+    fit = prepared(file, seen, ["wall.bsdf:texture"], steps=120)
+    (found,) = fit.run().estimates
+    (picture,) = fit.result().pictures
+    first, last = (np.abs(image - picture.target).mean() for image in (picture.start, picture.fit))
+    assert first > 0.02 and last < first / 3
+    assert found.arrays["texture"].shape == (8, 8, 3)
+
+
+def test_whole_numbers_and_bad_files_are_refused_in_a_line(file: Path, tmp_path: Path) -> None:
+    scene = mi.load_file(str(file), optimize=False)
+    with pytest.raises(ShadowmapError, match=f"{KEY} holds whole numbers"):
+        Resolver(Renderer.from_scene(scene)).parameters([Vary("wall.bsdf", "texture")])
+    with pytest.raises(ShadowmapError, match="the file does not exist"):
+        load_scene(tmp_path / "none.xml")
+    (tmp_path / "bad.xml").write_text("<scene version='3.0.0'><shape type='nothing'/></scene>")
+    with pytest.raises(ShadowmapError, match=r"cannot load .*bad\.xml"):
+        load_scene(tmp_path / "bad.xml")

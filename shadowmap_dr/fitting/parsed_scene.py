@@ -42,13 +42,7 @@ class ParsedScene:
 
     def __init__(self, file: Path, parameters: Mapping[str, str]) -> None:
         self.file, self.folder = file, file.parent
-        config = mi.parser.ParserConfig(mi.variant())
-        config.merge_equivalent = config.merge_meshes = False
-        try:
-            with resolving([self.folder]):
-                state = mi.parser.parse_file(config, str(file), **parameters)
-        except (RuntimeError, TypeError, UnicodeError) as error:
-            raise ShadowmapError(f"cannot load {file}: {mitsuba_message(error)}") from error
+        config, state = parsed(file, parameters)
         self.texts = [XmlText(Path(str(path))) for path in state.files]
         self.defaults = {
             element.get("name"): element.get("value")
@@ -76,14 +70,7 @@ class ParsedScene:
             if root.type(key) == mi.Properties.Type.ResolvedReference
         }
         with resolving(self._folders()):
-            try:
-                mi.parser.transform_all(config, state)
-                scene: Any = mi.parser.instantiate(config, state)  # Any: no stub says it is a scene
-            except (RuntimeError, TypeError, UnicodeError) as error:
-                raise ShadowmapError(f"cannot load {file}: {mitsuba_message(error)}") from error
-        scene = scene[0] if isinstance(scene, list) and len(scene) == 1 else scene
-        if not isinstance(scene, mi.Scene):
-            raise ShadowmapError(f"cannot load {file}: its root is no scene.")
+            scene = instantiated(config, state, file)
         self.scene = scene
         self.parameters = self._stable(mi.traverse(scene), state.root.props, roots)
         self.shapes = {
@@ -167,6 +154,30 @@ class ParsedScene:
                 if element.tag == "path":
                     found.append(self.folder / self.substituted(element.get("value")))
         return [*reversed(found), self.folder]
+
+
+def parsed(file: Path, parameters: Mapping[str, str]) -> tuple[mi.parser.ParserConfig, mi.parser.ParserState]:
+    """(configuration, state) of a scene file that Mitsuba has parsed; shapes stay as they are. ShadowmapError if it cannot be."""
+    config = mi.parser.ParserConfig(mi.variant())
+    config.merge_equivalent = config.merge_meshes = False
+    try:
+        with resolving([file.parent]):
+            return config, mi.parser.parse_file(config, str(file), **parameters)
+    except (RuntimeError, TypeError, UnicodeError) as error:
+        raise ShadowmapError(f"cannot load {file}: {mitsuba_message(error)}") from error
+
+
+def instantiated(config: mi.parser.ParserConfig, state: mi.parser.ParserState, file: Path) -> mi.Scene:
+    """The scene of a parsed file. ShadowmapError if it cannot be made, or is none."""
+    try:
+        mi.parser.transform_all(config, state)
+        scene: Any = mi.parser.instantiate(config, state)  # Any: no stub says it is a scene
+    except (RuntimeError, TypeError, UnicodeError) as error:
+        raise ShadowmapError(f"cannot load {file}: {mitsuba_message(error)}") from error
+    scene = scene[0] if isinstance(scene, list) and len(scene) == 1 else scene
+    if not isinstance(scene, mi.Scene):
+        raise ShadowmapError(f"cannot load {file}: its root is no scene.")
+    return scene
 
 
 @contextlib.contextmanager

@@ -19,18 +19,9 @@ from ..errors import OutputError, ShadowmapError, mitsuba_message
 from ..io.files import atomic, make_folder
 from .changes import Changes
 from .parsed_scene import ParsedScene
-from .scene_edits import (
-    FILES_FOLDER,
-    MeshStep,
-    Step,
-    TransformStep,
-    Unwritable,
-    ValueStep,
-    is_close,
-    mapped,
-    numbers_of,
-    vertices_of,
-)
+from .scene_edits import FILES_FOLDER, Step, Unwritable, is_close, numbers_of
+from .shape_edits import MeshStep, TransformStep, mapped, vertices_of
+from .value_edits import ValueStep
 from .xml_text import Element, XmlText, tag
 
 

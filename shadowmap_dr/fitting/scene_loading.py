@@ -5,12 +5,11 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 
-from ..errors import ShadowmapError, mitsuba_message
-from .parsed_scene import resolving
+from ..errors import ShadowmapError
+from .parsed_scene import instantiated, parsed, resolving
 
 
 def load_scene(file: str | os.PathLike[str], parameters: Mapping[str, str] | None = None) -> mi.Scene:
@@ -28,19 +27,9 @@ def load_scene(file: str | os.PathLike[str], parameters: Mapping[str, str] | Non
     path = Path(file).absolute()
     if not path.is_file():
         raise ShadowmapError(f"no scene {str(file)!r}: the file does not exist.")
-    config = mi.parser.ParserConfig(mi.variant())
-    config.merge_equivalent = config.merge_meshes = False
+    config, state = parsed(path, parameters or {})
+    for node in state.nodes:
+        if node.props.plugin_name() == "bitmap" and "format" not in node.props:
+            node.props["format"] = "variant"
     with resolving([path.parent]):
-        try:
-            state = mi.parser.parse_file(config, str(path), **(parameters or {}))
-            for node in state.nodes:
-                if node.props.plugin_name() == "bitmap" and "format" not in node.props:
-                    node.props["format"] = "variant"
-            mi.parser.transform_all(config, state)
-            scene: Any = mi.parser.instantiate(config, state)  # Any: no stub says it is a scene
-        except (RuntimeError, TypeError, UnicodeError) as error:
-            raise ShadowmapError(f"cannot load {file}: {mitsuba_message(error)}") from error
-    scene = scene[0] if isinstance(scene, list) and len(scene) == 1 else scene
-    if not isinstance(scene, mi.Scene):
-        raise ShadowmapError(f"cannot load {file}: its root is a {type(scene).__name__}, not a scene.")
-    return scene
+        return instantiated(config, state, path)

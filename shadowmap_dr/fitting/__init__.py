@@ -3,9 +3,9 @@
 from .api import fit, prepared
 from .options import FitOptions
 from .own import Own
-from .parameters import SceneChange
 from .report import write_report
 from .result import Estimate, FitResult, read_fit
+from .scene_change import SceneChange
 from .search import Fit
 from .targets import Target, make_target, read_target
 from .vary import Vary

@@ -14,7 +14,7 @@ from ..errors import ShadowmapError, install_hint
 from ..jit.arrays import device_array
 from ..jit.types import Float
 from ..rendering.renderer import Renderer
-from .parameters import SceneChange
+from .scene_change import SceneChange
 from .vary import Vary
 
 Array = npt.NDArray[np.float32]

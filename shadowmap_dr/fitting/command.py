@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import mitsuba as mi
 from rich.console import Console
+from rich.progress import Progress
 
 from ..errors import ShadowmapError, warn
 from ..io import console as io_console
@@ -65,7 +65,7 @@ def run_fit(
     result = fit.result(shlex.join(["shadowmap-dr", *sys.argv[1:]]))
     result.settings = task.plain()
     with io_console.progress(console) as progress:
-        _write(result, fit, task, scene_file, out, lambda text: progress.add_task(text, total=None, note=""))
+        _write(result, fit, task, scene_file, out, progress)
     (out / STATE).unlink(missing_ok=True)
     return result
 
@@ -79,14 +79,19 @@ def _words(step: Step, fit: Fit) -> str:
     )
 
 
-def _write(result: FitResult, fit: Fit, task: FitTask, scene_file: Path, out: Path, say: Callable[[str], object]) -> None:
+def _write(result: FitResult, fit: Fit, task: FitTask, scene_file: Path, out: Path, progress: Progress) -> None:
     """Write the results; problems of single files become warnings, so that nothing is lost."""
     result.write_json(out / RESULT)
-    say("report and film")
-    write_report(result, out / REPORT)
-    if any(picture.frames for picture in result.pictures):
-        write_film(result.pictures, out / FILM)
-    say("scene")
+    with io_console.task(progress, "report and film"):
+        write_report(result, out / REPORT)
+        if any(picture.frames for picture in result.pictures):
+            write_film(result.pictures, out / FILM)
+    with io_console.task(progress, "fitted scene"):
+        _write_scene(fit, task, scene_file, out)
+
+
+def _write_scene(fit: Fit, task: FitTask, scene_file: Path, out: Path) -> None:
+    """Write the fitted scene, as XML and as glTF."""
     names = [key for key in mi.traverse(fit.renderer.data.scene).keys()]  # noqa: SIM118, C416
     try:
         written = write_fitted_scene(scene_file, dict(task.parameters), fit.changes(), out, names=names, copy_files=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -13,9 +14,10 @@ from ..rendering.renderer import Renderer
 from .arrays import ArrayParameter
 from .changes import Changes
 from .gains import Gain
-from .motions import host_matrix
-from .parameters import Parameter, SceneChange
+from .motions import host_matrix, tangents
+from .parameters import Parameter
 from .result import Estimate
+from .scene_change import SceneChange
 from .targets import Target
 from .uncertainty import Uncertainty
 
@@ -23,6 +25,14 @@ Array = npt.NDArray[np.float64]
 
 # Gains are logarithms; a stop is a factor of two.
 _STOP = math.log(2)
+# Names of Mitsuba's parameters by fields of lights' records.
+_LIGHT_KEYS = {
+    "irradiance": "irradiance.value",
+    "intensity": "intensity.value",
+    "position": "position",
+    "cutoff_angle": "cutoff_angle",
+    "beam_width": "beam_width",
+}
 
 
 def estimates_of(
@@ -107,28 +117,19 @@ def changes_of(change: SceneChange, renderer: Renderer) -> Changes:
     return Changes(values=values, transforms=transforms, vertices=vertices)
 
 
-def _light_values(name: str, old: object, new: object) -> dict[str, npt.NDArray[np.float64]]:
+def _light_values(name: str, old: Any, new: Any) -> dict[str, npt.NDArray[np.float64]]:  # Any: one of several records
     """Values of a changed light by the names of Mitsuba's parameters."""
+    changed = {field for field in vars(new) if getattr(new, field) is not getattr(old, field)}
     values: dict[str, npt.NDArray[np.float64]] = {}
-    for field, key in (("irradiance", "irradiance.value"), ("intensity", "intensity.value"), ("position", "position")):
-        if getattr(new, field, None) is not getattr(old, field, None) and not (field == "position" and hasattr(new, "to_world")):
+    for field, key in _LIGHT_KEYS.items():
+        if field in changed:
             values[f"{name}.{key}"] = np.array(dr.detach(getattr(new, field)), np.float64).ravel()
-    for field in ("cutoff_angle", "beam_width"):
-        if getattr(new, field, None) is not getattr(old, field, None):
-            values[f"{name}.{field}"] = np.array(dr.detach(getattr(new, field)), np.float64).ravel()
-    if getattr(new, "to_world", None) is not getattr(old, "to_world", None):
-        values[f"{name}.to_world"] = host_matrix(new.to_world)  # type: ignore[attr-defined]
-    elif not hasattr(new, "to_world") and getattr(new, "direction", None) is not getattr(old, "direction", None):
-        direction = np.array(dr.detach(new.direction), np.float64).ravel()  # type: ignore[attr-defined]
-        values[f"{name}.to_world"] = _frame(direction)
+    if "to_world" in changed:
+        values[f"{name}.to_world"] = host_matrix(new.to_world)
+    if "direction" in changed:
+        forward = np.array(dr.detach(new.direction), np.float64).ravel()
+        side, up = tangents(forward)
+        matrix = np.eye(4)
+        matrix[:3, :3] = np.stack([side, up, forward / np.linalg.norm(forward)], axis=1)
+        values[f"{name}.to_world"] = matrix
     return values
-
-
-def _frame(direction: Array) -> Array:
-    """A rotation (4, 4) that takes the z axis to a direction."""
-    forward = direction / np.linalg.norm(direction)
-    side = np.cross(forward, np.eye(3)[np.abs(forward).argmin()])
-    side /= np.linalg.norm(side)
-    matrix = np.eye(4)
-    matrix[:3, :3] = np.stack([side, np.cross(forward, side), forward], axis=1)
-    return matrix

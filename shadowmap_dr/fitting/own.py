@@ -12,7 +12,8 @@ import numpy.typing as npt
 from ..errors import ShadowmapError
 from ..jit.types import Float
 from ..rendering.renderer import Renderer
-from .parameters import Scale, SceneChange
+from .parameters import Scale
+from .scene_change import SceneChange
 from .vary import Vary
 
 Array = npt.NDArray[np.float64]
@@ -25,7 +26,7 @@ class Own:
     Attributes:
         name: for reports.
         function: gets the numbers (a list of Float of width 1, attached) and a
-            :class:`~shadowmap_dr.fitting.parameters.SceneChange`. It moves shapes (``change.move(["lid"], matrix)``), replaces
+            :class:`~shadowmap_dr.fitting.SceneChange`. It moves shapes (``change.move(["lid"], matrix)``), replaces
             records (``change.lights[name] = dataclasses.replace(change.light(name), ...)``, ``change.cameras``) or sets numbers
             of Mitsuba's parameters (``change.values[key] = [number, ...]``). It is recorded: it may use Dr.Jit's functions and
             constants, no arrays of its own.

@@ -1,4 +1,4 @@
-"""Parameters of a scene that few numbers describe: placements, directions, angles of view, colours.
+"""Parameters of a scene that few numbers describe: their protocol, and colours, numbers and angles of view.
 
 A fit's numbers are zero in the scene as it was given, and about one where much has changed: radians, shares of an extent,
 logarithms.
@@ -7,60 +7,19 @@ logarithms.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from dataclasses import dataclass, replace
+from typing import Protocol
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from ..jit.types import Float, Matrix4f
+from ..jit.types import Float
 from ..rendering.renderer import Renderer
-from ..scene.lights.read import Light
-from ..scene.sensor import Sensor
-from .motions import host_matrix, rotation, scaling, translation
+from .scene_change import SceneChange
 from .vary import Vary
 
 Array = npt.NDArray[np.float64]
-
-_DEGREES = 180 / np.pi
-
-
-@dataclass
-class SceneChange:
-    """The changes that the numbers of a fit make to a scene, before an image is rendered.
-
-    Attributes:
-        renderer: the renderer of the scene as it was given.
-        placements: affine maps of shapes, in the order of their application.
-        lights: changed records of lights.
-        cameras: changed records of sensors, by number.
-        values: numbers of Mitsuba's parameters by their names in ``mi.traverse``.
-        arrays: (values, shape) of Mitsuba's arrays by their names.
-        vertices: world-space vertices of meshes, before they are moved.
-    """
-
-    renderer: Renderer
-    placements: dict[str, Matrix4f] = field(default_factory=dict)
-    lights: dict[str, Light] = field(default_factory=dict)
-    cameras: dict[int, Sensor] = field(default_factory=dict)
-    values: dict[str, list[Float]] = field(default_factory=dict)
-    arrays: dict[str, tuple[Float, tuple[int, ...]]] = field(default_factory=dict)
-    vertices: dict[str, Float] = field(default_factory=dict)
-
-    def light(self, name: str) -> Any:  # Any: one of several records
-        """The current record of a light."""
-        return self.lights.get(name, self.renderer.light(name))
-
-    def camera(self, number: int) -> Sensor:
-        """The current record of a sensor."""
-        return self.cameras.get(number, self.renderer.data.cameras(number)[0])
-
-    def move(self, shapes: Sequence[str], matrix: Matrix4f) -> None:
-        """Move shapes by an affine map, after the maps that they have."""
-        for name in shapes:
-            self.placements[name] = matrix @ self.placements[name] if name in self.placements else matrix
 
 
 @dataclass(frozen=True)
@@ -126,182 +85,6 @@ class Parameter(Protocol):
 
     def arrays(self, renderer: Renderer, change: SceneChange) -> dict[str, Array]:
         """Values for records and files, detached."""
-
-
-@dataclass(frozen=True)
-class ShapeMotion:
-    """Motion of shapes as one body about their common middle ``pivot`` (3,); ``extent``: length that a number of one moves them.
-
-    ``room``: half range of starts of a translation, as a share of the extent.
-
-    ``parts``: the numbers' meanings: rx, ry, rz, tx, ty, tz, s.
-    """
-
-    vary: Vary
-    shapes: tuple[str, ...]
-    pivot: Array
-    extent: float
-    parts: tuple[str, ...]
-    room: float = 0.2
-    natural: tuple[float, float] = (-np.inf, np.inf)
-
-    @property
-    def kind(self) -> str:
-        return _kind(self.parts)
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        return tuple(_MOTIONS[part] for part in self.parts)
-
-    @property
-    def units(self) -> tuple[str, ...]:
-        return tuple({"r": "deg", "t": "units", "s": "times"}[part[0]] for part in self.parts)
-
-    @property
-    def scale(self) -> Scale:
-        if self.parts == ("s",):
-            return Scale(np.ones(1), np.ones(1), logarithmic=True)
-        return Scale(np.zeros(len(self.parts)), np.array([_DEGREES if p[0] == "r" else self.extent for p in self.parts]))
-
-    @property
-    def usual(self) -> Array:
-        return _ranges(self.parts, 0.35, self.room)
-
-    def put(self, numbers: Sequence[Float], change: SceneChange) -> None:
-        change.move(self.shapes, self._matrix(numbers, change.placements.get(self.shapes[0])))
-
-    def _matrix(self, numbers: Sequence[Float], before: Matrix4f | None) -> Matrix4f:
-        given = dict(zip(self.parts, numbers, strict=True))
-        pivot = mi.Vector3f(*self.pivot.tolist())
-        if before is not None:  # the pivot moves along
-            moved = before @ mi.Vector4f(pivot.x, pivot.y, pivot.z, 1)
-            pivot = mi.Vector3f(moved.x, moved.y, moved.z)
-        linear = rotation(_vector(given, "r")) if self.parts[0][0] != "s" else scaling(dr.exp(given["s"]))
-        return translation(pivot + _vector(given, "t") * self.extent) @ linear @ translation(-pivot)
-
-    def arrays(self, renderer: Renderer, change: SceneChange) -> dict[str, Array]:
-        matrix = host_matrix(change.placements[self.shapes[0]])
-        return {"matrix": matrix, "position": (matrix @ [*self.pivot, 1])[:3], "pivot": self.pivot, "axes": np.eye(3)}
-
-
-@dataclass(frozen=True)
-class LightMotion:
-    """Motion of a light, named ``light``: turning about its own place, and translation in world space.
-
-    ``parts``: a, b (turns of its direction about two axes perpendicular to it), rx, ry, rz (about its own axes), tx, ty, tz.
-    """
-
-    vary: Vary
-    light: str
-    extent: float
-    parts: tuple[str, ...]
-    turns: tuple[Array, Array]
-    natural: tuple[float, float] = (-np.inf, np.inf)
-
-    @property
-    def kind(self) -> str:
-        return _kind(self.parts)
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        return tuple(_MOTIONS[part] for part in self.parts)
-
-    @property
-    def units(self) -> tuple[str, ...]:
-        return tuple("units" if part[0] == "t" else "deg" for part in self.parts)
-
-    @property
-    def scale(self) -> Scale:
-        return Scale(np.zeros(len(self.parts)), np.array([self.extent if p[0] == "t" else _DEGREES for p in self.parts]))
-
-    @property
-    def usual(self) -> Array:
-        return _ranges(self.parts, 0.4, 0.2)
-
-    def put(self, numbers: Sequence[Float], change: SceneChange) -> None:
-        given, record = dict(zip(self.parts, numbers, strict=True)), change.light(self.light)
-        move = _vector(given, "t") * self.extent
-        turn = mi.Vector3f(0)
-        for part, axis in zip("ab", self.turns, strict=True):
-            if part in given:
-                turn += mi.Vector3f(*axis.tolist()) * given[part]
-        if hasattr(record, "to_world"):
-            own = mi.Matrix4f(record.to_world.matrix)
-            place = mi.Vector3f(own[0, 3], own[1, 3], own[2, 3])
-            turned = own @ rotation(_vector(given, "r"))
-            if "a" in given:
-                turned = translation(place) @ rotation(turn) @ translation(-place) @ turned
-            new = replace(record, to_world=mi.Transform4f(translation(move) @ turned))
-        elif "a" in given:
-            linear = mi.Matrix3f(rotation(turn))
-            new = replace(record, direction=linear @ mi.Vector3f(record.direction))
-        else:
-            new = replace(record, position=mi.Point3f(record.position + move))
-        change.lights[self.light] = new
-
-    def arrays(self, renderer: Renderer, change: SceneChange) -> dict[str, Array]:
-        old: Any = renderer.light(self.light)  # Any: one of several records
-        new, found = change.light(self.light), dict[str, Array]()
-        for name in ("direction", "position"):
-            if hasattr(new, name):
-                found[name] = np.array(dr.detach(getattr(new, name)), np.float64).ravel()[:3]
-        if hasattr(new, "to_world"):
-            found["to_world"] = host_matrix(new.to_world)
-            before = host_matrix(old.to_world)
-            found |= {"matrix": found["to_world"] @ np.linalg.inv(before), "pivot": before[:3, 3], "axes": before[:3, :3]}
-        return found
-
-
-@dataclass(frozen=True)
-class CameraMotion:
-    """Motion of a sensor: turning about its own axes (x to the left, y up, z forwards), and translation in world space.
-
-    ``distance``: of the point about which it turns, straight ahead. Zero: about its own place. A camera that goes around what it
-    sees keeps it in view.
-    """
-
-    vary: Vary
-    sensor: int
-    extent: float
-    parts: tuple[str, ...]
-    distance: float = 0.0
-    natural: tuple[float, float] = (-np.inf, np.inf)
-
-    @property
-    def kind(self) -> str:
-        return _kind(self.parts)
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        return tuple(_CAMERA.get(part, _MOTIONS[part]) for part in self.parts)
-
-    @property
-    def units(self) -> tuple[str, ...]:
-        return tuple("units" if part[0] == "t" else "deg" for part in self.parts)
-
-    @property
-    def scale(self) -> Scale:
-        return Scale(np.zeros(len(self.parts)), np.array([self.extent if p[0] == "t" else _DEGREES for p in self.parts]))
-
-    @property
-    def usual(self) -> Array:
-        return _ranges(self.parts, 0.3 if self.distance else 0.15, 0.15)
-
-    def put(self, numbers: Sequence[Float], change: SceneChange) -> None:
-        given, record = dict(zip(self.parts, numbers, strict=True)), change.camera(self.sensor)
-        ahead = translation(mi.Vector3f(0, 0, self.distance))
-        back = translation(mi.Vector3f(0, 0, -self.distance))
-        move = translation(_vector(given, "t") * self.extent)
-        matrix = move @ mi.Matrix4f(record.to_world.matrix) @ ahead @ rotation(_vector(given, "r")) @ back
-        change.cameras[self.sensor] = replace(record, to_world=mi.Transform4f(matrix))
-
-    def arrays(self, renderer: Renderer, change: SceneChange) -> dict[str, Array]:
-        old, new = (
-            host_matrix(camera.to_world) for camera in (renderer.data.cameras(self.sensor)[0], change.camera(self.sensor))
-        )
-        pivot = old[:3, 3] + self.distance * old[:3, 2]
-        turns = {"pivot": pivot, "axes": old[:3, :3] / np.linalg.norm(old[:3, :3], axis=0)}
-        return {"to_world": new, "matrix": new @ np.linalg.inv(old), "position": new[:3, 3], **turns}
 
 
 @dataclass(frozen=True)
@@ -394,31 +177,5 @@ class Value:
         return {"value": np.array(dr.detach(value), np.float64).ravel()}
 
 
-_MOTIONS = {
-    **{f"r{axis}": f"rotation {axis}" for axis in "xyz"},
-    **{f"t{axis}": f"translation {axis}" for axis in "xyz"},
-    "s": "scale",
-    "a": "turn 1",
-    "b": "turn 2",
-}
-_CAMERA = {"rx": "tilt", "ry": "pan", "rz": "roll"}
-
-
-def _kind(parts: Sequence[str]) -> str:
-    turns, moves = any(p[0] in "rab" for p in parts), any(p[0] == "t" for p in parts)
-    if parts == ("a", "b"):
-        return "direction"
-    return "scale" if "s" in parts else "pose" if turns and moves else "rotation" if turns else "translation"
-
-
-def _ranges(parts: Sequence[str], turn: float, move: float) -> Array:
-    """Half ranges of turns and scales, and of translations."""
-    return np.array([move if part[0] == "t" else turn for part in parts])
-
-
 def _numbered(values: Array) -> tuple[str, ...]:
     return tuple(f"value {k}" for k in range(len(values)))
-
-
-def _vector(given: dict[str, Float], kind: str) -> Any:  # Any: mi.Vector3f
-    return mi.Vector3f(*(given.get(f"{kind}{axis}", mi.Float(0)) for axis in "xyz"))

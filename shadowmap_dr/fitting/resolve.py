@@ -15,14 +15,14 @@ import numpy.typing as npt
 from ..errors import ShadowmapError, did_you_mean
 from ..rendering.renderer import Renderer
 from .arrays import ArrayParameter, MeshVertices, TextureValues, mesh_vertices, texture_values
+from .motion_parameters import CameraMotion, LightMotion, ShapeMotion
 from .motions import host_matrix, tangents
 from .own import Own
-from .parameters import CameraMotion, FieldOfView, LightMotion, Parameter, ShapeMotion, Value
+from .parameters import FieldOfView, Parameter, Value
 from .vary import Vary
 
 Array = npt.NDArray[np.float64]
 
-_AXES = "xyz"
 # Fields of lights' records by the ends of Mitsuba's names.
 _FIELDS = {
     "irradiance.value": "irradiance",
@@ -62,8 +62,6 @@ class Resolver:
         self.renderer = renderer
         self.shapes = [info.name for info in renderer.data.geometry.shapes]
         self.lights = [light.name for light in renderer.data.lights]
-        self.emitting = {self.shapes[area.shape]: area for area in renderer.data.areas}
-        self.skies = {sky.name: sky for sky in renderer.data.environments}
         self.sensors = {cameras[0].name: k for k, cameras in enumerate(renderer.data.sensors) if len(cameras) == 1}
         self.table = mi.traverse(renderer.data.scene)
         # Names alone: to list a table loads values, which may be large.
@@ -128,15 +126,7 @@ class Resolver:
     # ------------------------------------------------------------------------------------------------------ shapes
 
     def _shape(self, vary: Vary, shapes: Sequence[str]) -> Parameter:
-        kind = vary.kind or "pose"
-        axes = vary.axes or _AXES
-        parts = {
-            "pose": ("rx", "ry", "rz", "tx", "ty", "tz"),
-            "rotation": tuple(f"r{axis}" for axis in axes),
-            "translation": tuple(f"t{axis}" for axis in axes),
-            "position": tuple(f"t{axis}" for axis in axes),
-            "scale": ("s",),
-        }.get(kind)
+        parts = {**_rigid_parts(vary.axes), "scale": ("s",)}.get(vary.kind or "pose")
         if parts is None:
             raise _no_kind(vary, "a shape", ("pose", "rotation", "translation", "scale", "vertices"))
         infos = [self.renderer.data.geometry.shape(shape) for shape in shapes]
@@ -144,7 +134,7 @@ class Resolver:
         middle, diameter = _bounds(points)
         extent = diameter or self.diameter
         room = float(np.clip(_ROOM * self.diameter / extent, *_LEAST_MOST))
-        return ShapeMotion(vary, tuple(shapes), middle, extent, parts, room)
+        return ShapeMotion(vary, extent, parts, tuple(shapes), middle, room)
 
     # ------------------------------------------------------------------------------------------------------ lights, sensors
 
@@ -164,22 +154,18 @@ class Resolver:
             kind = "direction" if kinds == ["direction"] else "pose"
         if kind not in kinds:
             raise _no_kind(vary, f"a {type(light).__name__}", (*kinds, "brightness"))
-        axes = vary.axes or _AXES
         # The turn of a spot light without picture about its own axis changes nothing.
         is_round = hasattr(light, "cutoff_angle") and light.texture is None
-        parts = {
-            "pose": (*(("a", "b") if is_round else ("rx", "ry", "rz")), "tx", "ty", "tz"),
-            "rotation": tuple(f"r{axis}" for axis in axes),
-            "direction": ("a", "b"),
-            "position": tuple(f"t{axis}" for axis in axes),
-        }[kind]
+        parts = {**_rigid_parts(vary.axes), "direction": ("a", "b")}[kind]
+        if kind == "pose" and is_round:
+            parts = ("a", "b", "tx", "ty", "tz")
         direction = (
             np.array(dr.detach(light.direction), np.float64).ravel() if hasattr(light, "direction") else np.array([0, 0, 1.0])
         )
         extent = self.diameter
         if hasattr(light, "position"):
             extent = float(np.linalg.norm(np.array(dr.detach(light.position), np.float64).ravel() - self.middle)) or self.diameter
-        return LightMotion(vary, vary.name, extent, parts, tangents(direction))
+        return LightMotion(vary, extent, parts, vary.name, tangents(direction))
 
     def _sensor_kinds(self, number: int) -> tuple[str, ...]:
         perspective = self.renderer.data.cameras(number)[0].kind == "perspective"
@@ -192,13 +178,7 @@ class Resolver:
             if record.kind != "perspective":
                 raise ShadowmapError(f"vary {vary.label}: the sensor is orthographic and has no angle of view.")
             return FieldOfView(vary, number, float(dr.detach(record.x_fov)[0]))
-        axes = vary.axes or _AXES
-        parts = {
-            "pose": ("rx", "ry", "rz", "tx", "ty", "tz"),
-            "rotation": tuple(f"r{axis}" for axis in axes),
-            "translation": tuple(f"t{axis}" for axis in axes),
-            "position": tuple(f"t{axis}" for axis in axes),
-        }.get(kind)
+        parts = _rigid_parts(vary.axes).get(kind)
         if parts is None:
             raise _no_kind(vary, "a camera", self._sensor_kinds(number))
         place, towards = (np.array(dr.detach(v), np.float64).ravel() for v in (record.origin, record.direction))
@@ -206,7 +186,7 @@ class Resolver:
         ahead = max(float(towards @ (self.middle - place)), 0.1 * away) if kind == "pose" else 0.0
         # The distance is one of the camera's own space, which may be scaled.
         scale = float(np.linalg.norm(host_matrix(record.to_world)[:3, 2]))
-        return CameraMotion(vary, number, away, parts, ahead / scale)
+        return CameraMotion(vary, away, parts, number, ahead / scale)
 
     # ------------------------------------------------------------------------------------------------------ values
 
@@ -286,6 +266,12 @@ class Resolver:
         if not (dr.is_array_v(value) and dr.is_float_v(value) and dr.is_diff_v(value)):  # transformations are no arrays
             return None
         return np.array(dr.detach(value), np.float64).ravel()
+
+
+def _rigid_parts(axes: str) -> dict[str, tuple[str, ...]]:
+    """Parts of rotations and translations, by kind. ``axes``: of those that have some; all if empty."""
+    turns, moves = (tuple(f"{letter}{axis}" for axis in axes or "xyz") for letter in "rt")
+    return {"pose": ("rx", "ry", "rz", "tx", "ty", "tz"), "rotation": turns, "translation": moves, "position": moves}
 
 
 def _bounds(points: Array) -> tuple[Array, float]:

@@ -23,9 +23,10 @@ from .levenberg_marquardt import Limits, minimise
 from .losses import Loss
 from .objective import Point
 from .options import FitOptions
-from .parameters import Parameter, SceneChange
+from .parameters import Parameter
 from .resolve import Resolver
 from .result import FitResult, Picture, Step
+from .scene_change import SceneChange
 from .shadow_pictures import lit_share
 from .stages import Stage, make_stages, qualities
 from .starts import chosen, draw, half_ranges, with_gains

@@ -21,7 +21,8 @@ from ..rendering.renderer import Renderer
 from ..scene.pixel_filter import Filter
 from ..scene.sensor import ImageSize, Sensor
 from .arrays import ArrayParameter, TextureValues
-from .parameters import Parameter, SceneChange
+from .parameters import Parameter
+from .scene_change import SceneChange
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
@@ -43,7 +44,7 @@ class Quality:
         side: pixels along the longer side.
         spp: samples per pixel.
         texels: texels along each side of a shadow map: fewer texels make wider filters.
-        light_samples: samples of an area light at most, and half of those of an environment.
+        light_samples: samples of an area light at most; an environment has twice as many.
         soft_texels: texels along each side of their maps at most.
     """
 

@@ -17,8 +17,9 @@ from shadowmap_dr import Renderer
 from shadowmap_dr.errors import ShadowmapError
 from shadowmap_dr.fitting.arrays import MeshVertices, TextureValues
 from shadowmap_dr.fitting.motions import host_matrix
-from shadowmap_dr.fitting.parameters import Scale, SceneChange
+from shadowmap_dr.fitting.parameters import Scale
 from shadowmap_dr.fitting.resolve import Resolver
+from shadowmap_dr.fitting.scene_change import SceneChange
 from shadowmap_dr.fitting.starts import half_ranges
 from shadowmap_dr.fitting.vary import KINDS, Vary
 
@@ -226,7 +227,17 @@ def test_what_a_scene_does_not_have(resolver: Resolver, text: str, words: str) -
 
 def test_every_name_with_every_kind(resolver: Resolver) -> None:
     """Numbers, labels, units and ranges are as many as one another; all else is one line."""
-    names = [*resolver.shapes, *resolver.lights, *resolver.sensors, *resolver.skies, *resolver.keys, "car_*", "*", "x", "ball."]
+    names = [
+        *resolver.shapes,
+        *resolver.lights,
+        *resolver.sensors,
+        *(sky.name for sky in resolver.renderer.data.environments),
+        *resolver.keys,
+        "car_*",
+        "*",
+        "x",
+        "ball.",
+    ]
     count = 0
     for name in names:
         for kind in ("", *KINDS):

@@ -12,8 +12,8 @@ from ...errors import ShadowmapError
 from ...fitting.gains import Gain
 from ...fitting.levenberg_marquardt import Limits, minimise
 from ...fitting.losses import Loss
+from ...fitting.motion_parameters import ShapeMotion
 from ...fitting.objective import Point
-from ...fitting.parameters import ShapeMotion
 from ...fitting.stages import make_stages, qualities
 from ...fitting.targets import make_target
 from ...fitting.vary import Vary
@@ -55,7 +55,7 @@ class GaussNewtonPose:
         if image.ndim != 3 or not np.isfinite(image).all():
             raise ShadowmapError(f"a reference of shape {image.shape}: give finite values in the shape (H, W, C).")
         entry = Vary(shape, "pose")
-        motion = ShapeMotion(entry, (shape,), np.array([0, 0, shift_z]), 1.0, ("ry", "tx", "ty"))
+        motion = ShapeMotion(entry, 1.0, ("ry", "tx", "ty"), (shape,), np.array([0, 0, shift_z]))
         levels = qualities(max(image.shape[:2]), spp, renderer.settings.shadow.resolution)
         free, target = np.full(3, np.inf), make_target(np.maximum(image, 0))
         self._stages = make_stages(renderer, [motion], [], [target], [Gain()], free, Loss("l2"), levels)

@@ -21,8 +21,8 @@ from .views import Quality, View
 
 Array = npt.NDArray[np.float64]
 
-# Sizes of the first stage: pixels along the longer side, samples along it, and texels of a map.
-_COARSEST, _FEWEST_SAMPLES, _FEWEST_TEXELS = 12, 64, 64
+# Sizes of the first stage: pixels along the longer side, and texels of a map.
+_COARSEST, _FEWEST_TEXELS = 12, 64
 
 
 @dataclass(frozen=True)
@@ -37,15 +37,15 @@ class Stage:
         return f"{self.quality.side} px"
 
 
-def qualities(side: int, spp: int, texels: int) -> list[Quality]:
-    """Qualities of the stages, coarse first; the last one is as given."""
+def qualities(side: int, spp: int, texels: int, samples: int = 64) -> list[Quality]:
+    """Qualities of the stages, coarse first; the last one is as given. ``samples``: at least so many along the longer side."""
     sides = [side]
     while sides[0] / 2 >= _COARSEST:
         sides.insert(0, sides[0] // 2)
     return [
         Quality(
             own,
-            max(spp, math.ceil(_FEWEST_SAMPLES / own) ** 2),
+            max(spp, math.ceil(samples / own) ** 2),
             max(min(texels, _FEWEST_TEXELS), round(texels * own / side)),
             *_light_quality(side / own),
         )

@@ -24,6 +24,8 @@ Array = npt.NDArray[np.float64]
 
 # Longest change of a number in a step: radians, or scene units. Most steps of a stage.
 _LONGEST, _STEPS = 0.3, 6
+# Samples along a side of coarse images: with fewer, they miss parts of thin objects, and starts end elsewhere.
+_SAMPLES = 128
 
 
 class GaussNewtonPose:
@@ -56,7 +58,7 @@ class GaussNewtonPose:
             raise ShadowmapError(f"a reference of shape {image.shape}: give finite values in the shape (H, W, C).")
         entry = Vary(shape, "pose")
         motion = ShapeMotion(entry, 1.0, ("ry", "tx", "ty"), (shape,), np.array([0, 0, shift_z]))
-        levels = qualities(max(image.shape[:2]), spp, renderer.settings.shadow.resolution)
+        levels = qualities(max(image.shape[:2]), spp, renderer.settings.shadow.resolution, _SAMPLES)
         free, target = np.full(3, np.inf), make_target(np.maximum(image, 0))
         self._stages = make_stages(renderer, [motion], [], [target], [Gain()], free, Loss("l2"), levels)
         self._limits = Limits(-free, free, _LONGEST, _STEPS, improvement=1e-2, shortest=1e-4)

@@ -24,7 +24,7 @@ DISPLACEMENT, FACTOR, OFFSET = 0.02, 0.004, 0.001
 #: edges.
 PIXEL = 0.005
 #: Factor of the blocks' covariance: errors of the model are alike over more than a block. Found, as the numbers above, on the
-#: calibration problems of `shadowmap-dr bench --only fits`, of which 96 % of the intervals then hold the true value.
+#: calibration problems of `shadowmap-dr bench --only fits`, where 99 % of 97 intervals then hold the true value.
 INFLATION = 10.0
 # A number with a smaller effect than the first, a share of the brightness for a change by one, is idle if a change by the second
 # makes no larger difference than the third: derivatives of outlines are not exact.

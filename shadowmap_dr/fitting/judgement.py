@@ -1,4 +1,4 @@
-"""Judgement of a fit: whether the scene explains the pictures, and in words what they do not determine."""
+"""Judgement of a fit: whether the scene explains the pictures, and in words the numbers that they do not determine."""
 
 from __future__ import annotations
 
@@ -22,22 +22,20 @@ _SIDE = 56
 _CHANGE, _VISIBLE = 0.05, 0.03
 
 
-def judge(point: Point, objective: Objective, spread: Uncertainty, names: Sequence[str]) -> tuple[bool, list[str]]:
-    """(True if the scene explains the pictures, sentences).
+def sentences(share: float, error: float, spread: Uncertainty, names: Sequence[str]) -> list[str]:
+    """Sentences about a fit: whether the scene explains the pictures, and the numbers that they do not determine.
 
     Args:
-        point: the best point.
-        objective: of the last stage.
+        share: of unexplained edges.
+        error: of the best point.
         spread: its uncertainty.
         names: of all numbers.
     """
     words: list[str] = []
-    share = unexplained(point, objective)
-    found = share <= EXPLAINED
-    if not found:
+    if share > EXPLAINED:
         words.append(
             f"Not found: {100 * share:.0f} % of the edges that matter in the picture are not where the scene has them, and the "
-            f"images differ by {100 * point.error:.0f} % of the brightness. Try more starts, a scene that is nearer to the "
+            f"images differ by {100 * error:.0f} % of the brightness. Try more starts, a scene that is nearer to the "
             "picture, or let more vary; mask what the scene does not have."
         )
     idle = [name for name, none in zip(names, spread.idle, strict=True) if none]
@@ -47,12 +45,7 @@ def judge(point: Point, objective: Objective, spread: Uncertainty, names: Sequen
     loose = np.isinf(spread.half_widths) & ~spread.idle
     loose[[number for pair in pairs for number in pair]] = False  # the sentence above says it
     words += [f"{name} is not determined by the pictures." for name, it_is in zip(names, loose, strict=True) if it_is]
-    return found, words
-
-
-def is_explained(point: Point, objective: Objective) -> bool:
-    """True if the scene explains the pictures. Arguments as of :func:`judge`."""
-    return unexplained(point, objective) <= EXPLAINED
+    return words
 
 
 def unexplained(point: Point, objective: Objective) -> float:

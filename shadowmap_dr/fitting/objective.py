@@ -50,6 +50,7 @@ class Objective:
     Attributes:
         gains: the numbers of each picture's gain.
         count: number of all numbers.
+        corrections: of each view's image, (H, W, 3), added to it; None for none.
     """
 
     def __init__(self, views: Sequence[View], observations: Sequence[Observation], prior: Array, loss: Loss) -> None:
@@ -61,6 +62,7 @@ class Objective:
         ends = np.cumsum([self._scene, *(observation.gain.count for observation in observations)])
         self.gains = [slice(int(a), int(b)) for a, b in zip(ends[:-1], ends[1:], strict=True)]
         self.count = int(ends[-1])
+        self.corrections: list[Image | None] = [None] * len(self.views)
 
     def at(self, x: Array) -> Point:
         """The residuals at x (n,)."""
@@ -78,13 +80,15 @@ class Objective:
             scale, shape = self.brightness[number], np.zeros((*seen.weight.shape, 3), np.float32)
             factors = seen.gain.factors(shape, x[self.gains[number]]) / scale
             weight = seen.weight[..., None] / (3 * self.pixels)
-            found = view.gradient(x, seen.image / scale, weight, factors, self.loss.limit)
+            correction = self.corrections[number]
+            target = seen.image / scale if correction is None else seen.image / scale - factors * correction
+            found = view.gradient(x, target, weight, factors, self.loss.limit)
             total = [a + b for a, b in zip(total, found, strict=True)] if total else found
         return total
 
-    def recorded(self, number: int, image: Image, x: Array) -> Image:
+    def recorded(self, number: int, image: Image, x: Array, correction: Image | None = None) -> Image:
         """The image of a view as its picture's camera records it."""
-        return self.observations[number].gain.apply(image, x[self.gains[number]])
+        return self.observations[number].gain.apply(image if correction is None else image + correction, x[self.gains[number]])
 
 
 class Point:
@@ -98,7 +102,7 @@ class Point:
     def __init__(self, owner: Objective, x: Array) -> None:
         self.x, self._owner = x, owner
         self.images = [view.image(x).copy() for view in owner.views]
-        self.recorded = [owner.recorded(k, image, x) for k, image in enumerate(self.images)]
+        self.recorded = [owner.recorded(k, image, x, owner.corrections[k]) for k, image in enumerate(self.images)]
         pairs = zip(self.recorded, owner.observations, owner.brightness, strict=True)
         self.residuals = [np.asarray((image - seen.image) / scale, np.float32) for image, seen, scale in pairs]
         cost = square = 0.0
@@ -143,7 +147,10 @@ class Point:
             for k in range(view.count):
                 _, derivative = view.derivative(self.x, k)
                 columns[k] = (gain.apply(derivative, self.x[own]) / scale).reshape(-1)
-        for k, derivative in enumerate(gain.derivatives(self.recorded[number], self.x[own])):
+        # Of the image without its correction, to which the scene's own numbers do not contribute either: the exposure and the
+        # strength of all lights have the same derivatives.
+        plain = owner.recorded(number, self.images[number], self.x)
+        for k, derivative in enumerate(gain.derivatives(plain, self.x[own])):
             columns[own.start + k] = (derivative / scale).reshape(-1)
         columns[~np.isfinite(columns)] = 0
         return columns

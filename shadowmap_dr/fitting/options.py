@@ -26,6 +26,8 @@ class FitOptions:
         spp: samples per pixel.
         loss, delta: see :class:`~shadowmap_dr.fitting.losses.Loss`.
         steps: steps of Adam for vertices and textures.
+        correct: correct the last images by images of the scene's own integrator, Mitsuba's: for light that bounces, and all else
+            that shadow maps only approximate.
     """
 
     vary: tuple[Vary | Own, ...] = option(
@@ -48,6 +50,7 @@ class FitOptions:
     loss: LossKind = option("huber", help="Loss of the differences.")
     delta: float = option(0.1, help="Difference, as a share of the picture's brightness, above which huber grows slower.")
     steps: int = option(200, allowed=(1, 100_000), help="Steps for vertices and textures.")
+    correct: bool = option(True, help="Correct the last images by those of the scene's own integrator.")
 
     def __post_init__(self) -> None:
         check_ranges(self)

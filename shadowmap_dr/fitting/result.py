@@ -137,6 +137,7 @@ class FitResult:
     Attributes:
         found: True if the scene explains the pictures.
         words: plain sentences: numbers that are not determined, what went wrong, what to try.
+        unexplained: share of the pictures' edges that the scene does not explain.
         estimates: in the order of the command line.
         correlations: (n, n) over all labelled numbers, in order.
         names: of these n numbers.
@@ -150,6 +151,7 @@ class FitResult:
 
     found: bool
     words: list[str]
+    unexplained: float
     estimates: list[Estimate]
     correlations: Numbers
     names: list[str]
@@ -168,6 +170,7 @@ class FitResult:
             **self.made,
             "found": bool(self.found),
             "words": list(self.words),
+            "unexplained": plain(self.unexplained),
             "estimates": [_estimate_json(estimate) for estimate in self.estimates],
             "correlations": plain(self.correlations),
             "names": list(self.names),
@@ -215,6 +218,7 @@ def _result(record: Mapping[str, Any]) -> FitResult:
     return FitResult(
         found=_checked(record["found"], bool, "found"),
         words=list(_texts(record["words"])),
+        unexplained=_number(record["unexplained"]),
         estimates=[_estimate(entry) for entry in record["estimates"]],
         correlations=correlations,
         names=list(names),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import mitsuba as mi
@@ -16,9 +17,10 @@ from ..jit.arrays import device_array
 from ..jit.types import Float
 from ..rendering.renderer import Renderer
 from .changes import Changes
+from .corrections import Corrections
 from .estimates import array_estimates, changes_of, estimates_of, gain_estimates
 from .gains import Gain
-from .judgement import is_explained, judge
+from .judgement import EXPLAINED, sentences, unexplained
 from .levenberg_marquardt import Limits, minimise
 from .losses import Loss
 from .objective import Point
@@ -40,6 +42,9 @@ Array = npt.NDArray[np.float64]
 _STEPS, _LAST_STEPS, _LONGEST = 8, 15, 0.3
 # Improvement of the loss, as a share, below which a step is the last of its stage.
 _ENOUGH = 1e-3
+# Corrections of the images at most, steps after each, and the improvement and the length below which steps are the last. Images
+# that explain less than the last share are too far from the pictures to be worth it.
+_CORRECTIONS, _CORRECTED_STEPS, _LITTLE, _SHORT, _FAR = 4, 4, 1e-4, 3e-4, 0.5
 # Growth of the ranges of starts from one try to the next.
 _GROWTH = 0.5
 # Textures and vertices: stages in which they are fitted, the last ones; rounds of a stage, in turns with the numbers; size of the
@@ -80,6 +85,8 @@ class Fit:
         levels = qualities(side, options.spp, renderer.settings.shadow.resolution)
         pictures = self.parameters, self.arrays, targets, self.gains
         self.stages: list[Stage] = make_stages(renderer, *pictures, prior, Loss(options.loss, options.delta), levels)
+        windows = [(target.width, target.height) for target in targets]
+        self._corrections = Corrections(renderer, self.stages[-1].objective, windows) if options.correct else None
         self._began = time.perf_counter()
         self._state = State([], [], 0, [array.start for array in self.arrays])
 
@@ -115,16 +122,19 @@ class Fit:
         tries = self.options.tries if self.parameters and not self.arrays else 1
         for attempt in range(tries):
             first = attempt * self.options.starts
+            self._uncorrect()
             if len(self._state.runs) <= first:
                 self._state.runs += self._starts(attempt)
             for number, stage in enumerate(self.stages):
                 for run in self._state.going(number):
-                    yield from self._descend(run, number, stage, _LAST_STEPS if number == len(self.stages) - 1 else _STEPS)
+                    yield from self._descend(run, number, stage, self._limits(number))
                     run.stage = number
                     if state is not None:
                         self._state.write(state, fingerprint)
                 self._state.choose(number, len(self.stages) - 2 - number, first)
-            if attempt < tries - 1 and self._is_explained():
+            if not self.arrays:
+                yield from self._correct(self._state.best_from(first))
+            if attempt < tries - 1 and self._unexplained(self.best) <= EXPLAINED:
                 break
         for number in range(self._state.array_stage, len(self.stages) if self.arrays else 0):
             if number >= len(self.stages) - _ARRAY_STAGES:
@@ -132,6 +142,8 @@ class Fit:
                 self._state.array_stage = number + 1
                 if state is not None:
                     self._state.write(state, fingerprint)
+        if self._corrections is not None:
+            self._corrections.put(self.best)
 
     def _starts(self, attempt: int) -> list[Run]:
         """The starts of a try: the best of many candidates. Their ranges grow from try to try."""
@@ -141,14 +153,38 @@ class Fit:
         drawn = draw(ranges, self._low[:scene], self._high[:scene], options.starts, (options.seed, attempt), scene=attempt == 0)
         return [Run(attempt * options.starts + k, x) for k, x in enumerate(chosen(drawn, first, options.starts))]
 
-    def _is_explained(self) -> bool:
-        """True if the scene explains the pictures."""
-        objective = self.stages[-1].objective
-        return is_explained(objective.at(self.best), objective)
+    def _limits(self, number: int) -> Limits:
+        """Limits of the steps in a stage."""
+        steps = _LAST_STEPS if number == len(self.stages) - 1 else _STEPS
+        return Limits(self._low, self._high, _LONGEST, steps, _ENOUGH)
 
-    def _descend(self, run: Run, number: int, stage: Stage, steps: int) -> Iterator[Step]:
+    def _unexplained(self, x: Array) -> float:
+        """Share of the pictures' edges that the scene does not explain."""
+        objective = self.stages[-1].objective
+        return unexplained(objective.at(x), objective)
+
+    def _uncorrect(self) -> None:
+        if self._corrections is not None:
+            self._corrections.remove()
+
+    def _correct(self, run: Run) -> Iterator[Step]:
+        """Steps of a start with corrected images."""
+        number = len(self.stages) - 1
+        if self._corrections is None or run.corrected or self._unexplained(run.x) > _FAR:
+            return
+        limits = Limits(self._low, self._high, _LONGEST, _CORRECTED_STEPS, _LITTLE, _SHORT)
+        for _ in range(_CORRECTIONS):
+            before = run.x
+            if not self._corrections.put(before):
+                return
+            yield from self._descend(run, number, self.stages[number], limits)
+            if np.abs(run.x - before).max(initial=0) < _SHORT:
+                break
+        self._corrections.put(run.x)
+        run.cost, run.corrected = self.stages[number].objective.at(run.x).cost, True
+
+    def _descend(self, run: Run, number: int, stage: Stage, limits: Limits) -> Iterator[Step]:
         """Steps of a start in a stage."""
-        limits = Limits(self._low, self._high, _LONGEST, steps, _ENOUGH)
         point = stage.objective.at(run.x)
         run.cost = point.cost
         yield self._note(run, number, point)
@@ -165,13 +201,16 @@ class Fit:
         descents = [array.descent(own) for array, own in zip(self.arrays, self._state.values, strict=True)]
         values = [device_array(type(g), own) for g, own in zip(stage.objective.views[0].values, self._state.values, strict=True)]
         for _ in range(_ROUNDS):
+            if number == len(self.stages) - 1 and self._corrections is not None:
+                self._corrections.remove()
+                self._corrections.put(run.x)
             for _ in range(each):
                 share = 1 - (1 - _LAST_SHARE) * done / total
                 gradients = stage.objective.gradient(run.x)
                 values = [descent.step(one, share) for descent, one in zip(descents, gradients, strict=True)]
                 stage.objective.set_values(values)
                 done += 1
-            yield from self._descend(run, number, stage, 3)
+            yield from self._descend(run, number, stage, replace(self._limits(number), steps=3))
         self._state.values = [np.array(one, np.float32) for one in values]
         self._set_values(values)
 
@@ -229,11 +268,15 @@ class Fit:
         estimates, names = estimates_of(x, self.parameters, self.renderer, self.change(x), spread)
         of_gains, names_of_gains = gain_estimates(x, self.targets, self.gains, objective.gains, spread)
         names += names_of_gains
-        found, words = judge(point, objective, spread, names)
+        share = unexplained(point, objective)
+        words = sentences(share, point.error, spread, names)
+        if self._corrections is not None and self._corrections.failure:
+            words.append(f"Images are not corrected, since Mitsuba cannot render the fitted scene: {self._corrections.failure}.")
         seconds = time.perf_counter() - self._began
         return FitResult(
-            found=found,
+            found=share <= EXPLAINED,
             words=words,
+            unexplained=share,
             estimates=[*estimates, *array_estimates(self.arrays, self._state.values), *of_gains],
             correlations=spread.correlations,
             names=names,
@@ -248,12 +291,13 @@ class Fit:
         """Pictures of the scene as it was given, and as it is at a point."""
         objective, values = self.stages[-1].objective, self.stages[-1].objective.views[0].values
         objective.set_values([device_array(type(one), array.start) for one, array in zip(values, self.arrays, strict=True)])
-        start = objective.at(with_gains(np.zeros(objective.views[0].count), objective))
+        first = with_gains(np.zeros(objective.views[0].count), objective)
+        start = [objective.recorded(k, view.image(first).copy(), first) for k, view in enumerate(objective.views)]
         objective.set_values(values)
         return [
             Picture(
                 target=seen.image,
-                start=start.recorded[k],
+                start=start[k],
                 fit=point.recorded[k],
                 weight=seen.weight,
                 shadows=lit_share(objective.views[k], point.x),

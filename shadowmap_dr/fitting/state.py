@@ -27,6 +27,7 @@ class Run:
         cost: loss in the last stage.
         stage: last stage that is done, -1 for none.
         last: last stage that it is to take part in.
+        corrected: True after the steps with corrected images.
         trail: (stage, numbers) of all steps.
     """
 
@@ -35,6 +36,7 @@ class Run:
     cost: float = math.inf
     stage: int = -1
     last: int = 1 << 30
+    corrected: bool = False
     trail: list[tuple[int, Array]] = field(default_factory=list)
 
 
@@ -50,7 +52,11 @@ class State:
     @property
     def best(self) -> Run:
         """The start with the smallest loss of those that came farthest."""
-        return min(self.runs, key=lambda run: (-run.stage, run.cost))
+        return self.best_from(0)
+
+    def best_from(self, first: int) -> Run:
+        """The same of the starts from number ``first`` on."""
+        return min((run for run in self.runs if run.number >= first), key=lambda run: (-run.stage, not run.corrected, run.cost))
 
     def going(self, stage: int) -> list[Run]:
         """Starts that have a stage before them."""
@@ -75,7 +81,7 @@ class State:
             path,
             fingerprint,
             {
-                "numbers": [[run.number, run.stage, run.last] for run in self.runs],
+                "numbers": [[run.number, run.stage, run.last, run.corrected] for run in self.runs],
                 "costs": [run.cost for run in self.runs],
                 "x": np.array([run.x for run in self.runs]).reshape(len(self.runs), count),
                 "trail": np.array([entry[:2] for entry in trail], np.int64).reshape(-1, 2),
@@ -96,8 +102,8 @@ class State:
         arrays = read_checkpoint(path, fingerprint)
         try:
             runs = [
-                Run(int(number), x, float(cost), int(stage), int(last))
-                for (number, stage, last), cost, x in zip(arrays["numbers"], arrays["costs"], arrays["x"], strict=True)
+                Run(int(number), x, float(cost), int(stage), int(last), bool(corrected))
+                for (number, stage, last, corrected), cost, x in zip(arrays["numbers"], arrays["costs"], arrays["x"], strict=True)
             ]
             by_number = {run.number: run for run in runs}
             for (number, stage), x in zip(arrays["trail"], arrays["trail_x"], strict=True):

@@ -114,6 +114,15 @@ class View:
         """Linear image (H, W, 3) at the numbers x (n,)."""
         return self._pass(-1, x, np.zeros(1))[0]
 
+    @property
+    def size(self) -> ImageSize:
+        """Size of the images."""
+        return self._size
+
+    def camera(self, x: Array) -> Sensor:
+        """The camera of the images at the numbers x (n,); its window is all of its film."""
+        return self._camera(self.change(x).camera(self._sensor))
+
     def derivative(self, x: Array, number: int) -> tuple[Image, Image]:
         """Image, and its derivative (H, W, 3) by one of the numbers."""
         entry = int(np.searchsorted(self._starts, number, side="right")) - 1

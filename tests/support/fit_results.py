@@ -71,7 +71,8 @@ def result(**changes: Any) -> FitResult:  # Any: entries of a FitResult
     correlations = np.eye(7)
     correlations[0, 1] = correlations[1, 0] = -0.97
     entries: dict[str, Any] = {
-        **{"found": True, "words": ["translation z is not determined."], "estimates": [estimate(), vertices()]},
+        **{"found": True, "words": ["translation z is not determined."], "unexplained": 0.02},
+        **{"estimates": [estimate(), vertices()]},
         **{"correlations": correlations, "names": names, "pictures": [picture()], "history": history(), "seconds": 12.5},
         **{"command": "shadowmap-dr fit scene.xml --target photo.png", "settings": {"starts": 3, "vary": ["bunny:pose"]}},
     }

@@ -43,7 +43,8 @@ def sun(**changes: Any) -> dict[str, Any]:
 
 def scene_of(**parts: Any) -> mi.Scene:
     """A box on a floor under the sun; None leaves a part out."""
-    full = {"type": "scene", "camera": camera(), "box": box(0), "floor": floor(), "sun": sun(), **parts}
+    direct = {"type": "direct"}
+    full = {"type": "scene", "integrator": direct, "camera": camera(), "box": box(0), "floor": floor(), "sun": sun(), **parts}
     return mi.load_dict({name: part for name, part in full.items() if part is not None}, optimize=False)
 
 

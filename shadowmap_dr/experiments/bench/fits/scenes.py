@@ -153,14 +153,22 @@ class Scene:
         return float(np.linalg.norm(points.max(0) - points.min(0)))
 
 
-def write_scene(scene: Scene, folder: Path, suffix: str = ".png") -> Path:
+#: Depth of paths in pictures with light that bounces.
+MAX_DEPTH = 8
+
+
+def write_scene(scene: Scene, folder: Path, suffix: str = ".png", integrator: str = "direct") -> Path:
     """Write ``scene.xml`` into a folder, with the meshes and pictures that it names. Returns its path.
 
-    ``suffix``: of textures. Mitsuba keeps those of ``.png`` as bytes, to which no derivatives flow; ``.exr`` become floats.
+    Args:
+        suffix: of textures. Mitsuba keeps those of ``.png`` as bytes, to which no derivatives flow; ``.exr`` become floats.
+        integrator: of the scene: `direct` or `path`.
     """
     folder.mkdir(parents=True, exist_ok=True)
     root = ElementTree.Element("scene", version="3.0.0")
-    ElementTree.SubElement(root, "integrator", type="direct")
+    element = ElementTree.SubElement(root, "integrator", type=integrator)
+    if integrator == "path":
+        ElementTree.SubElement(element, "integer", name="max_depth", value=str(MAX_DEPTH))
     for camera in scene.cameras:
         _camera(root, camera)
     for lamp in scene.lamps:

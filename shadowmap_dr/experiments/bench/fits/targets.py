@@ -14,19 +14,18 @@ import numpy.typing as npt
 from ....io.files import atomic
 from ....io.images import read_image, write_exr
 from .problem import FitProblem
-from .scenes import Scene, write_scene
+from .scenes import MAX_DEPTH, Scene, write_scene
 
 Array = npt.NDArray[np.float64]
 #: Samples of a pass: their memory is what one render takes.
 _PASS = 64
-_MAX_DEPTH = 8
 #: A pixel is left out where the intruder changes it by more than this share of the mean, or near such pixels.
 _CHANGED, _NEAR = 0.02, 2
 
 
 def write_problem(problem: FitProblem, start: int, folder: Path, cache: Path) -> None:
     """Write all that the command gets: the scene with start values, photographs and masks."""
-    write_scene(problem.start(start), folder)
+    write_scene(problem.start(start), folder, integrator=problem.integrator)
     pictures = truth_pictures(problem, cache)
     for k, (photo, file) in enumerate(zip(problem.photographs, problem.targets(), strict=True)):
         photo.write(folder / file, pictures[k], seed=problem.seed * 10 + k)
@@ -77,7 +76,7 @@ def _pictures(scene: Scene, problem: FitProblem, cache: Path) -> list[Array]:
 def render(file: Path, integrator: str, spp: int) -> list[Array]:
     """Linear pictures (H, W, 3) by all sensors of a scene file, from one of Mitsuba's integrators."""
     scene = mi.load_file(str(file))
-    settings = {"max_depth": _MAX_DEPTH} if integrator == "path" else {}
+    settings = {"max_depth": MAX_DEPTH} if integrator == "path" else {}
     method = mi.load_dict({"type": integrator, **settings})
     pictures = []
     for sensor in range(len(scene.sensors())):

@@ -1,0 +1,107 @@
+"""Images of a scene by its own integrator, Mitsuba's, with which the images of a fit are corrected."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
+
+from ..io.resampling import area_average
+from ..scene.load import SceneData
+from ..scene.sensor import ImageSize, Sensor
+from .changes import Changes
+from .motions import host_matrix
+from .scene_update import updated
+
+Image = npt.NDArray[np.float32]
+
+# Integrators of Mitsuba's that show a scene as a camera sees it. Others' scenes are rendered by `direct`.
+_INTEGRATORS = (
+    *("DirectIntegrator", "PathIntegrator", "VolumetricPathIntegrator", "VolumetricMisPathIntegrator"),
+    *("PRBIntegrator", "PRBVolpathIntegrator", "ThreePointIntegrator", "DirectProjectiveIntegrator"),
+    *("PathProjectiveIntegrator", "BasicPRBIntegrator"),
+)
+# Samples of an image in all, of a pixel, and of a pass; pixels of an image.
+_SAMPLES, _FEWEST, _MOST, _PASS, _PIXELS = 1 << 22, 4, 512, 1 << 22, 1 << 20
+
+# First seed of the noise: others than those that pictures of Mitsuba's usually have.
+_SEED = 0x5EED0000
+
+
+class Reference:
+    """Images of a scene by Mitsuba.
+
+    Args:
+        data: the scene.
+        sizes: (W, H) of the pictures' windows on the films, one for each image: images are rendered with as many pixels.
+    """
+
+    def __init__(self, data: SceneData, sizes: Sequence[tuple[int, int]]) -> None:
+        self._data, self._sizes = data, tuple(sizes)
+        own = data.scene.integrator()
+        named = own is not None and own.class_name() in _INTEGRATORS
+        self._integrator = own if named else mi.load_dict({"type": "direct"})
+
+    def images(self, changes: Changes, cameras: Sequence[Sensor], sizes: Sequence[ImageSize]) -> list[Image]:
+        """Linear images (H, W, 3), detached.
+
+        Args:
+            changes: of the scene.
+            cameras: one for each image, whose window is all of the film.
+            sizes: of the images.
+
+        Raises:
+            ShadowmapError: Mitsuba's objects cannot be changed so.
+        """
+        with dr.suspend_grad(), updated(self._data, changes) as scene:
+            each = zip(cameras, self._sizes, sizes, strict=True)
+            return [self._image(scene, camera, own, size, number) for number, (camera, own, size) in enumerate(each)]
+
+    def _image(self, scene: mi.Scene, camera: Sensor, own: tuple[int, int], size: ImageSize, number: int) -> Image:
+        width, height = _film_size(own, size)
+        sensor = _sensor(camera, width, height)
+        samples = int(np.clip(_SAMPLES // (width * height), _FEWEST, _MOST))
+        each = max(1, min(samples, _PASS // (width * height)))
+        total, passes = np.zeros((height, width, 3)), -(-samples // each)
+        for k in range(passes):
+            rendered = mi.render(scene, sensor=sensor, integrator=self._integrator, spp=each, seed=_SEED + number * 4096 + k)
+            total += np.array(rendered, np.float64).reshape(height, width, -1)
+        image = np.asarray(total / passes, np.float32)
+        return area_average(lambda rows: image[rows], (height, width), (size.height, size.width))
+
+
+def _film_size(window: tuple[int, int], size: ImageSize) -> tuple[int, int]:
+    """(width, height) in square pixels of the film on which an image is rendered."""
+    share = max(1.0, np.sqrt(window[0] * window[1] / _PIXELS))
+    return max(size.width, round(window[0] / share)), max(size.height, round(window[1] / share))
+
+
+def _sensor(camera: Sensor, width: int, height: int) -> mi.Sensor:
+    """A sensor of Mitsuba's, with a film of its own."""
+    film = {
+        "type": "hdrfilm",
+        "width": width,
+        "height": height,
+        "pixel_format": "luminance" if camera.channels == 1 else "rgb",
+        "component_format": "float32",
+        "rfilter": {"type": "box"},
+    }
+    matrix = host_matrix(camera.to_world)
+    near, far = (float(dr.detach(one)[0]) for one in (camera.near, camera.far))
+    description: dict[str, Any] = {  # Any: a dictionary of Mitsuba's
+        "type": camera.kind,
+        "to_world": mi.ScalarTransform4f(matrix),
+        "near_clip": near,
+        "far_clip": far,
+        "film": film,
+        "sampler": {"type": "independent"},
+    }
+    if camera.kind == "perspective":
+        x, y = (float(dr.detach(one)[0]) for one in camera.principal_point)
+        fov = float(dr.detach(camera.x_fov)[0])
+        description |= {"fov": fov, "fov_axis": "x", "principal_point_offset_x": x, "principal_point_offset_y": y}
+    return mi.load_dict(description)

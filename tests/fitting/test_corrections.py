@@ -1,0 +1,66 @@
+"""Corrections of images by Mitsuba's: light that bounces."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from fitting_scenes import OPTIONS, box, camera, diffuse, scene_of
+
+from shadowmap_dr import Renderer
+from shadowmap_dr.fitting import FitResult, fit, prepared
+
+SIZE = {"width": 64, "height": 48}
+MOVED = np.array([0.06, -0.04, 0.0])
+
+
+@pytest.fixture(autouse=True)
+def one_backend() -> None:
+    """Fits take seconds; that both backends agree is tested for images and derivatives."""
+    mi.set_variant("llvm_ad_rgb")
+
+
+def bouncing(x: float = 0, y: float = 0) -> dict[str, Any]:
+    """A box in a bright corner, in which light bounces."""
+    T = mi.ScalarTransform4f
+    back = {
+        "type": "rectangle",
+        "to_world": T().translate([0, 0.8, 0]).rotate([1, 0, 0], 90).scale(4),
+        "bsdf": diffuse(0.8, 0.4, 0.3),
+    }
+    place = T().translate([x, y, 0]) @ box(0)["to_world"]
+    ground = {"type": "rectangle", "to_world": T().scale(4), "bsdf": diffuse(0.9, 0.8, 0.7)}
+    # The file's own integrator.
+    path = {"type": "path", "max_depth": 5}
+    return {"integrator": path, "camera": camera(film=SIZE), "back": back, "floor": ground, "box": {**box(0), "to_world": place}}
+
+
+def fitted(correct: bool) -> FitResult:
+    truth = scene_of(**bouncing(*MOVED[:2]))
+    picture = np.array(mi.render(truth, spp=512, seed=1), np.float32)[..., :3]
+    renderer = Renderer.from_scene(scene_of(**bouncing()), **OPTIONS)
+    return fit(renderer, picture, ["box:translation"], starts=1, tries=1, correct=correct)
+
+
+def test_the_place_is_that_of_the_picture_when_images_are_corrected() -> None:
+    """Without, shadow maps' images are nearest to the picture elsewhere."""
+    results = [fitted(correct) for correct in (True, False)]
+    errors = [np.linalg.norm(result.estimates[0].values - MOVED) for result in results]
+    assert errors[0] < 0.002
+    assert errors[1] > 3 * errors[0]
+    # Mitsuba's image is shown.
+    assert results[0].pictures[0].error < 0.02
+    assert results[1].pictures[0].error > 4 * results[0].pictures[0].error
+
+
+def test_a_scene_that_mitsuba_cannot_change_is_fitted_without() -> None:
+    """Parts of an instance that move by themselves: Mitsuba has one place for all of them."""
+    group = {"type": "shapegroup", "one": box(0), "other": box(0.9)}
+    parts = {"box": None, "group": group, "copy": {"type": "instance", "shapegroup": {"type": "ref", "id": "group"}}}
+    scene = scene_of(camera=camera(film=SIZE), **parts)
+    picture = np.array(mi.render(scene, spp=64), np.float32)[..., :3]
+    search = prepared(Renderer.from_scene(scene, **OPTIONS), picture, ["copy.one:translation:x"], starts=1)
+    result = search.run()
+    assert any(words.startswith("Images are not corrected") for words in result.words)

@@ -2,24 +2,34 @@
 
 Shadow maps have filters, lamps have few samples, and light bounces: the best image of a fit is not that of the true scene. The
 difference between Mitsuba's image and the fit's own hardly changes with small steps, so it is added to all images of the last
-stage, and rendered again after some steps. In the end Mitsuba's image is fitted, by derivatives of shadow maps.
+stage, and rendered again after some steps. Where it does change, its derivatives follow from the differences that were rendered
+before: secants, as in Broyden's method. In the end Mitsuba's image is fitted, by derivatives of shadow maps.
 
-Source: additive corrections of cheap models, Alexandrov and Lewis, "An overview of first-order model management for engineering
-optimization", 2001.
+Sources: Alexandrov and Lewis, "An overview of first-order model management for engineering optimization", 2001; Bandler et al.,
+"Space mapping: the state of the art", 2004.
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
 from ..errors import ShadowmapError
+from ..io.resampling import area_average
 from ..rendering.renderer import Renderer
 from .estimates import changes_of
-from .objective import Objective
+from .objective import Correction, Objective
 from .reference import Reference
 
 Array = npt.NDArray[np.float64]
+Image = npt.NDArray[np.float32]
+
+# Changes of the images, as a share of the brightness, that noise may make: shorter secants count little. Most secants.
+_NOISE, _SECANTS = 0.003, 6
+# Pixels along each side of the blocks in which secants are constant.
+_BLOCK = 12
 
 
 class Corrections:
@@ -37,15 +47,17 @@ class Corrections:
     def __init__(self, renderer: Renderer, objective: Objective, windows: list[tuple[int, int]]) -> None:
         self._renderer, self._objective = renderer, objective
         self._reference = Reference(renderer.data, windows)
-        self._at: Array | None = None
+        # Numbers, and differences of the images at them, the last one first.
+        self._known: list[tuple[Array, list[Image]]] = []
+        # Effect of each number on the images, where they were first corrected.
+        self._effect: Array | None = None
         self.failure = ""
 
     def put(self, x: Array) -> bool:
         """Correct the images so that they are Mitsuba's at the numbers x (n,). False if it cannot render them."""
-        objective = self._objective
-        if self._at is not None and np.array_equal(self._at, x):
+        if self._known and np.array_equal(self._known[0][0], x):
             return True
-        self.remove()
+        objective = self._objective
         changes = changes_of(objective.views[0].change(x), self._renderer)
         cameras = [view.camera(x) for view in objective.views]
         try:
@@ -53,12 +65,41 @@ class Corrections:
         except (ShadowmapError, RuntimeError) as error:
             self.failure = " ".join(str(error).split()).rstrip(".")
             return False
-        for number, image in enumerate(images):
-            objective.corrections[number] = image - objective.views[number].image(x)
-        self._at = x.copy()
+        differences = [image - view.image(x) for image, view in zip(images, objective.views, strict=True)]
+        self._known = [(x.copy(), differences), *self._known[:_SECANTS]]
+        weights = self._weights(x)
+        for number, image in enumerate(differences):
+            slopes = np.array([_smooth(other[number] - image) for _, other in self._known[1:]]).reshape(-1, *image.shape)
+            objective.corrections[number] = Correction(image, x.copy(), slopes, weights)
         return True
+
+    def keep_constant(self) -> None:
+        """Leave out the secants: derivatives are then those of shadow maps alone, without noise."""
+        plain = [one and replace(one, slopes=one.slopes[:0], weights=one.weights[:0]) for one in self._objective.corrections]
+        self._objective.corrections = plain
+
+    def _weights(self, x: Array) -> Array:
+        """Weights (k, n) of the k secants: those with which they agree best with steps of the numbers.
+
+        Steps are measured by their effect on the images. Gains have no part in them.
+        """
+        if self._effect is None:
+            matrix, _ = self._objective.at(x).system()
+            self._effect = np.sqrt(np.maximum(np.diag(matrix), 0))
+            self._effect[self._objective.views[0].count :] = 0
+        effect = self._effect
+        steps = np.array([other - x for other, _ in self._known[1:]]).reshape(len(self._known) - 1, len(x)) * effect
+        return np.asarray(np.linalg.solve(steps @ steps.T + _NOISE**2 * np.eye(len(steps)), steps) * effect)
 
     def remove(self) -> None:
         """Leave the images as they are."""
         self._objective.corrections = [None] * len(self._objective.views)
-        self._at = None
+        self._known, self._effect = [], None
+
+
+def _smooth(image: Image) -> Image:
+    """An image without its noise, which the residuals have, too: steps would follow it."""
+    height, width, _ = image.shape
+    few = -(-height // _BLOCK), -(-width // _BLOCK)
+    small = area_average(lambda rows: image[rows], (height, width), few)
+    return area_average(lambda rows: small[rows], few, (height, width))

@@ -37,7 +37,7 @@ class Limits:
 
     Attributes:
         low, high: bounds (n,) of the numbers.
-        longest: largest change of a number in a step.
+        longest: largest change of each number in a step.
         steps: most steps.
         improvement: share of the cost; a step that improves less is the last.
         shortest: steps in which no number changes more are the last.
@@ -90,17 +90,25 @@ def minimise(at: Callable[[Array], P], start: P, limits: Limits) -> Generator[P,
 
 
 def _after_step(matrix: Array, right: Array, damping: float, x: Array, limits: Limits) -> Array:
-    """Numbers after a damped step within the bounds. Those at a bound that the loss pushes outwards stay.
+    """Numbers after a damped step within the bounds, in which no number changes by more than the longest step.
 
-    Numbers that reach a bound are equal to it, not up to rounding: the next step looks for them.
+    Numbers at a bound that the loss pushes outwards stay. The number that would go too far by most goes as far as it may, and
+    the others are solved for once more: one that moves nothing, and so runs away, does not hold up the others. Numbers that reach a bound
+    are equal to it, not up to rounding: the next step looks for them.
     """
+    low, high = np.maximum(limits.low, x - limits.longest), np.minimum(limits.high, x + limits.longest)
+    step = np.zeros_like(x)
     free = ~(((x <= limits.low) & (right > 0)) | ((x >= limits.high) & (right < 0)))
     diagonal = np.diag(matrix).copy()
     # Numbers that move nothing get no step, and make no matrix singular.
     diagonal = np.maximum(diagonal, 1e-9 * max(diagonal.max(initial=0), 1e-30))
-    step = np.zeros_like(x)
-    if free.any():
+    while free.any():
         damped = matrix[np.ix_(free, free)] + np.diag(damping * diagonal[free] + 1e-12 * diagonal[free])
-        step[free] = -np.linalg.solve(damped, right[free])
-    step *= min(1.0, limits.longest / max(np.abs(step).max(initial=0), 1e-300))
-    return np.clip(x + step, limits.low, limits.high)
+        step[free] = -np.linalg.solve(damped, right[free] + matrix[np.ix_(free, ~free)] @ step[~free])
+        beyond = np.where(free, np.maximum(low - x - step, x + step - high), 0)
+        worst = int(np.argmax(beyond))
+        if beyond[worst] <= 0:
+            break
+        step[worst] = np.clip(x[worst] + step[worst], low[worst], high[worst]) - x[worst]
+        free[worst] = False
+    return np.clip(x + step, low, high)

@@ -38,6 +38,33 @@ class Observation:
         return float(np.sqrt(square / max(total, 1e-30))) or 1.0
 
 
+@dataclass(frozen=True)
+class Correction:
+    """A linear function of a fit's numbers, with images (H, W, 3) as values.
+
+    Attributes:
+        image: its value at the numbers ``x`` (n,).
+        slopes: images (k, H, W, 3).
+        weights: (k, n): derivatives by the numbers are sums of the slopes, with these weights.
+    """
+
+    image: Image
+    x: Array
+    slopes: Image
+    weights: Array
+
+    def at(self, x: Array) -> Image:
+        """Its value at the numbers x (n,)."""
+        return self.image + self._sum(self.weights @ (x - self.x))
+
+    def derivative(self, number: int) -> Image:
+        """Its derivative by one of the numbers."""
+        return self._sum(self.weights[:, number])
+
+    def _sum(self, weights: Array) -> Image:
+        return np.tensordot(weights.astype(np.float32), self.slopes, 1)
+
+
 class Objective:
     """The loss of a fit at one quality.
 
@@ -50,7 +77,7 @@ class Objective:
     Attributes:
         gains: the numbers of each picture's gain.
         count: number of all numbers.
-        corrections: of each view's image, (H, W, 3), added to it; None for none.
+        corrections: of each view's image, added to it; None for none.
     """
 
     def __init__(self, views: Sequence[View], observations: Sequence[Observation], prior: Array, loss: Loss) -> None:
@@ -62,7 +89,7 @@ class Objective:
         ends = np.cumsum([self._scene, *(observation.gain.count for observation in observations)])
         self.gains = [slice(int(a), int(b)) for a, b in zip(ends[:-1], ends[1:], strict=True)]
         self.count = int(ends[-1])
-        self.corrections: list[Image | None] = [None] * len(self.views)
+        self.corrections: list[Correction | None] = [None] * len(self.views)
 
     def at(self, x: Array) -> Point:
         """The residuals at x (n,)."""
@@ -81,14 +108,14 @@ class Objective:
             factors = seen.gain.factors(shape, x[self.gains[number]]) / scale
             weight = seen.weight[..., None] / (3 * self.pixels)
             correction = self.corrections[number]
-            target = seen.image / scale if correction is None else seen.image / scale - factors * correction
+            target = seen.image / scale if correction is None else seen.image / scale - factors * correction.at(x)
             found = view.gradient(x, target, weight, factors, self.loss.limit)
             total = [a + b for a, b in zip(total, found, strict=True)] if total else found
         return total
 
-    def recorded(self, number: int, image: Image, x: Array, correction: Image | None = None) -> Image:
+    def recorded(self, number: int, image: Image, x: Array) -> Image:
         """The image of a view as its picture's camera records it."""
-        return self.observations[number].gain.apply(image if correction is None else image + correction, x[self.gains[number]])
+        return self.observations[number].gain.apply(image, x[self.gains[number]])
 
 
 class Point:
@@ -102,7 +129,8 @@ class Point:
     def __init__(self, owner: Objective, x: Array) -> None:
         self.x, self._owner = x, owner
         self.images = [view.image(x).copy() for view in owner.views]
-        self.recorded = [owner.recorded(k, image, x, owner.corrections[k]) for k, image in enumerate(self.images)]
+        corrected = [image if c is None else image + c.at(x) for image, c in zip(self.images, owner.corrections, strict=True)]
+        self.recorded = [owner.recorded(k, image, x) for k, image in enumerate(corrected)]
         pairs = zip(self.recorded, owner.observations, owner.brightness, strict=True)
         self.residuals = [np.asarray((image - seen.image) / scale, np.float32) for image, seen, scale in pairs]
         cost = square = 0.0
@@ -142,10 +170,13 @@ class Point:
     def _of_view(self, number: int) -> npt.NDArray[np.float32]:
         owner, view = self._owner, self._owner.views[number]
         scale, gain, own = owner.brightness[number], owner.observations[number].gain, owner.gains[number]
+        correction = owner.corrections[number]
         columns = np.zeros((owner.count, self.residuals[number].size), np.float32)
         with view.scene_at(self.x):
             for k in range(view.count):
                 _, derivative = view.derivative(self.x, k)
+                if correction is not None:
+                    derivative = derivative + correction.derivative(k)
                 columns[k] = (gain.apply(derivative, self.x[own]) / scale).reshape(-1)
         # Of the image without its correction, to which the scene's own numbers do not contribute either: the exposure and the
         # strength of all lights have the same derivatives.

@@ -25,8 +25,9 @@ _INTEGRATORS = (
     *("PRBIntegrator", "PRBVolpathIntegrator", "ThreePointIntegrator", "DirectProjectiveIntegrator"),
     *("PathProjectiveIntegrator", "BasicPRBIntegrator"),
 )
-# Samples of an image in all, of a pixel, and of a pass; pixels of an image.
-_SAMPLES, _FEWEST, _MOST, _PASS, _PIXELS = 1 << 22, 4, 512, 1 << 22, 1 << 20
+# Samples of a pass, and of a pixel in it at most; passes at most; noise, a share of the brightness, below which a pass is the
+# last; pixels of an image.
+_PASS, _MOST, _PASSES, _NOISE, _PIXELS = 1 << 22, 256, 4, 0.02, 1 << 20
 
 # First seed of the noise: others than those that pictures of Mitsuba's usually have.
 _SEED = 0x5EED0000
@@ -64,14 +65,24 @@ class Reference:
     def _image(self, scene: mi.Scene, camera: Sensor, own: tuple[int, int], size: ImageSize, number: int) -> Image:
         width, height = _film_size(own, size)
         sensor = _sensor(camera, width, height)
-        samples = int(np.clip(_SAMPLES // (width * height), _FEWEST, _MOST))
-        each = max(1, min(samples, _PASS // (width * height)))
-        total, passes = np.zeros((height, width, 3)), -(-samples // each)
-        for k in range(passes):
-            rendered = mi.render(scene, sensor=sensor, integrator=self._integrator, spp=each, seed=_SEED + number * 4096 + k)
-            total += np.array(rendered, np.float64).reshape(height, width, -1)
-        image = np.asarray(total / passes, np.float32)
+        spp = int(np.clip(_PASS // (width * height), 1, _MOST))
+        passes: list[Image] = []
+        while len(passes) < _PASSES and _noise(passes) > _NOISE:
+            rendered = mi.render(
+                scene, sensor=sensor, integrator=self._integrator, spp=spp, seed=_SEED + number * 256 + len(passes)
+            )
+            passes.append(np.array(rendered, np.float32).reshape(height, width, -1))
+        image = np.asarray(np.mean(passes, axis=0, dtype=np.float64), np.float32)
         return area_average(lambda rows: image[rows], (height, width), (size.height, size.width))
+
+
+def _noise(passes: Sequence[Image]) -> float:
+    """Standard error of the mean of some images, as a share of its brightness."""
+    if len(passes) < 2:
+        return np.inf
+    mean = np.mean(passes, axis=0, dtype=np.float64)
+    variance = np.square(np.array(passes) - mean).sum() / mean.size / (len(passes) - 1)
+    return float(np.sqrt(variance / len(passes) / max(np.square(mean).mean(), 1e-30)))
 
 
 def _film_size(window: tuple[int, int], size: ImageSize) -> tuple[int, int]:

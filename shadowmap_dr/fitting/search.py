@@ -44,7 +44,7 @@ _STEPS, _LAST_STEPS, _LONGEST = 8, 15, 0.3
 _ENOUGH = 1e-3
 # Corrections of the images at most, steps after each, and the improvement and the length below which steps are the last. Images
 # that explain less than the last share are too far from the pictures to be worth it.
-_CORRECTIONS, _CORRECTED_STEPS, _LITTLE, _SHORT, _FAR = 4, 4, 1e-4, 3e-4, 0.5
+_CORRECTIONS, _CORRECTED_STEPS, _LITTLE, _SHORT, _FAR = 6, 3, 1e-4, 3e-4, 0.5
 # Growth of the ranges of starts from one try to the next.
 _GROWTH = 0.5
 # Textures and vertices: stages in which they are fitted, the last ones; rounds of a stage, in turns with the numbers; size of the
@@ -127,13 +127,13 @@ class Fit:
                 self._state.runs += self._starts(attempt)
             for number, stage in enumerate(self.stages):
                 for run in self._state.going(number):
-                    yield from self._descend(run, number, stage, self._limits(number))
+                    if not (number == len(self.stages) - 1 and self._is_to_be_corrected(run)):
+                        yield from self._descend(run, number, stage, self._limits(number))
                     run.stage = number
                     if state is not None:
                         self._state.write(state, fingerprint)
                 self._state.choose(number, len(self.stages) - 2 - number, first)
-            if not self.arrays:
-                yield from self._correct(self._state.best_from(first))
+            yield from self._correct(self._state.best_from(first))
             if attempt < tries - 1 and self._unexplained(self.best) <= EXPLAINED:
                 break
         for number in range(self._state.array_stage, len(self.stages) if self.arrays else 0):
@@ -142,8 +142,8 @@ class Fit:
                 self._state.array_stage = number + 1
                 if state is not None:
                     self._state.write(state, fingerprint)
-        if self._corrections is not None:
-            self._corrections.put(self.best)
+        if self._corrections is not None and self._corrections.put(self.best):
+            self._corrections.keep_constant()
 
     def _starts(self, attempt: int) -> list[Run]:
         """The starts of a try: the best of many candidates. Their ranges grow from try to try."""
@@ -167,10 +167,16 @@ class Fit:
         if self._corrections is not None:
             self._corrections.remove()
 
+    def _is_to_be_corrected(self, run: Run) -> bool:
+        """True if steps with corrected images follow."""
+        if self._corrections is None or self.arrays or run.corrected:
+            return False
+        return self._unexplained(run.x) <= _FAR and self._corrections.put(run.x)
+
     def _correct(self, run: Run) -> Iterator[Step]:
         """Steps of a start with corrected images."""
         number = len(self.stages) - 1
-        if self._corrections is None or run.corrected or self._unexplained(run.x) > _FAR:
+        if self._corrections is None or not self._is_to_be_corrected(run):
             return
         limits = Limits(self._low, self._high, _LONGEST, _CORRECTED_STEPS, _LITTLE, _SHORT)
         for _ in range(_CORRECTIONS):
@@ -202,7 +208,7 @@ class Fit:
         values = [device_array(type(g), own) for g, own in zip(stage.objective.views[0].values, self._state.values, strict=True)]
         for _ in range(_ROUNDS):
             if number == len(self.stages) - 1 and self._corrections is not None:
-                self._corrections.remove()
+                self._corrections.remove()  # textures and vertices have changed
                 self._corrections.put(run.x)
             for _ in range(each):
                 share = 1 - (1 - _LAST_SHARE) * done / total

@@ -55,7 +55,7 @@ def qualities(side: int, spp: int, texels: int, samples: int = 64) -> list[Quali
 
 def _light_quality(coarseness: float) -> tuple[int, int]:
     """(samples of an area light, texels of their maps) of a stage with so many times fewer pixels along a side."""
-    return (32, 64) if coarseness < 1.5 else (16, 64) if coarseness < 3 else (8, 64) if coarseness < 6 else (4, 32)
+    return (16, 64) if coarseness < 1.5 else (8, 64) if coarseness < 6 else (4, 32)
 
 
 def make_stages(

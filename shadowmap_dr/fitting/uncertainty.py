@@ -80,6 +80,9 @@ def uncertainty(point: Point, objective: Objective, low: Array | float = -np.inf
     idle = moved < 1e-6
     for k in np.flatnonzero(~idle & (moved < _WEAK)):
         idle[k] = 2 * _FAR * np.sqrt(_change(np.eye(objective.count)[k], point, objective, low, high)) < _SAME
+        if idle[k]:  # a light that is off by now moved much when it was on
+            given = np.where(np.arange(objective.count) == k, np.clip(0, low, high), point.x)
+            idle[k] = np.sqrt(_square(objective.at(given), point, point, objective)) < _SAME
     inverse, free = _inverse(matrix * total, idle)
     # Where a prior alone determines a number, its interval is the prior's.
     scores = INFLATION * _scores(point, objective) + PRIOR_WEIGHT * np.diag(objective.precision * total)
@@ -128,11 +131,16 @@ def _change(direction: Array, point: Point, objective: Objective, low: Array | f
     """Square of the change of the images along a direction, a share of the brightness for a step of one, from two images."""
     ends = [np.clip(point.x + sign * _FAR * direction, low, high) for sign in (1, -1)]
     above, below = (objective.at(end) for end in ends)
-    square = 0.0
-    for one, other, weight in zip(above.residuals, below.residuals, point.weights(), strict=True):
-        square += float((weight * np.square(one - other, dtype=np.float64).reshape(-1)).sum())
     step = float(np.linalg.norm(ends[0] - ends[1]) / np.linalg.norm(direction))
-    return square / (3 * objective.pixels) / step**2 if step > 0 else np.inf
+    return _square(above, below, point, objective) / step**2 if step > 0 else np.inf
+
+
+def _square(one: Point, other: Point, point: Point, objective: Objective) -> float:
+    """Mean square of the difference of two images, weighted as at a point; a share of the brightness."""
+    square = 0.0
+    for first, second, weight in zip(one.residuals, other.residuals, point.weights(), strict=True):
+        square += float((weight * np.square(first - second, dtype=np.float64).reshape(-1)).sum())
+    return square / (3 * objective.pixels)
 
 
 def not_told_apart(found: Uncertainty) -> list[tuple[int, int]]:

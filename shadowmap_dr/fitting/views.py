@@ -95,6 +95,7 @@ class View:
         self._keys = self._keys_of_entries()
         self._differences = [not all(is_recordable(renderer.data.scene, key) for key in own) for own in self._keys]
         self._held = 0
+        self._kept: tuple[Array, list[Float], Image] | None = None
 
     def without_shadows(self) -> View:
         """The same view of the scene without shadows."""
@@ -130,16 +131,22 @@ class View:
         tangent[number - self._starts[entry]] = 1
         if not self._differences[entry]:
             return self._pass(entry, x, tangent)
-        return self.image(x), self._difference(x, number, self._parameters[entry])
+        image = self._image_at(x)
+        return image, self._difference(image, x, entry, number - self._starts[entry])
 
-    def _difference(self, x: Array, number: int, parameter: Parameter) -> Image:
-        """The derivative (H, W, 3) by a value, from two images."""
-        low, high = (parameter.scale.number(bound) if np.isfinite(bound) else bound for bound in parameter.natural)
-        ends = [x.copy(), x.copy()]
-        for end, step in zip(ends, (-_DIFFERENCE, _DIFFERENCE), strict=True):
-            end[number] = np.clip(x[number] + step, np.min(low), np.max(high))
-        below, above = (self._elsewhere(end) for end in ends)
-        return np.asarray((above - below) / max(ends[1][number] - ends[0][number], 1e-12), np.float32)
+    def _image_at(self, x: Array) -> Image:
+        """The image, kept for the next call with the same numbers."""
+        if self._kept is None or self._kept[1] is not self.values or not np.array_equal(self._kept[0], x):
+            self._kept = x.copy(), self.values, self.image(x).copy()
+        return self._kept[2]
+
+    def _difference(self, image: Image, x: Array, entry: int, own: int) -> Image:
+        """The derivative (H, W, 3) by one of an entry's numbers, from the image at x and one on the side with more room."""
+        parameter, number = self._parameters[entry], self._starts[entry] + own
+        low, high = (np.broadcast_to(parameter.scale.number(bound), len(parameter.labels)) for bound in parameter.natural)
+        end = x.copy()
+        end[number] += _DIFFERENCE if high[own] - x[number] >= x[number] - low[own] else -_DIFFERENCE
+        return np.asarray((self._elsewhere(end) - image) / (end[number] - x[number]), np.float32)
 
     def _elsewhere(self, x: Array) -> Image:
         """Image at other numbers than those that Mitsuba's objects have now."""

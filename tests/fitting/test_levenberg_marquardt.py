@@ -225,7 +225,14 @@ def test_steps_are_no_longer_than_allowed() -> None:
     minimise(problem.at, start, free(2, longest=0.3, steps=4), accepted.append)
     lengths = [np.abs(b.x - a.x).max() for a, b in zip([start, *accepted[:-1]], accepted, strict=True)]
     np.testing.assert_allclose(lengths, 0.3)
-    np.testing.assert_allclose(accepted[0].x, [0.3, 0.15], rtol=1e-3)  # shorter, in the same direction
+    np.testing.assert_allclose(accepted[0].x, 0.3)
+
+
+def test_a_number_that_runs_away_does_not_hold_up_the_others() -> None:
+    """The first one hardly matters; the second is at its best value after one step, where the first has gone as far as it may."""
+    problem, accepted = linear([[1e-3, 0], [0.01, 1.0]], [1.0, 0.2]), list[Point]()
+    minimise(problem.at, problem.at(np.zeros(2)), free(2, longest=0.3, steps=1), accepted.append)
+    np.testing.assert_allclose(accepted[0].x, [0.3, 0.2 - 0.01 * 0.3], rtol=2e-3)
 
 
 def test_small_improvements_end_the_search() -> None:

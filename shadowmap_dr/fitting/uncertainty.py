@@ -74,7 +74,7 @@ class Uncertainty:
 def uncertainty(point: Point, objective: Objective, low: Array | float = -np.inf, high: Array | float = np.inf) -> Uncertainty:
     """The uncertainty of a fit that ended at a point. ``low``, ``high``: bounds (n,) of its numbers."""
     matrix, _ = point.system()
-    total = 3 * objective.pixels
+    total = objective.terms
     moved = np.sqrt(np.maximum(np.diag(matrix - np.diag(objective.precision)), 0))
     # Shares of the brightness that a change of a number by one makes.
     idle = moved < 1e-6
@@ -132,7 +132,7 @@ def _change(direction: Array, point: Point, objective: Objective, low: Array | f
     for one, other, weight in zip(above.residuals, below.residuals, point.weights(), strict=True):
         square += float((weight * np.square(one - other, dtype=np.float64).reshape(-1)).sum())
     step = float(np.linalg.norm(ends[0] - ends[1]) / np.linalg.norm(direction))
-    return square / (3 * objective.pixels) / step**2 if step > 0 else np.inf
+    return square / objective.terms / step**2 if step > 0 else np.inf
 
 
 def not_told_apart(found: Uncertainty) -> list[tuple[int, int]]:
@@ -164,7 +164,7 @@ def _scores(point: Point, objective: Objective) -> Array:
     total = np.zeros((objective.count, objective.count))
     for columns, weight, residual in zip(point.columns(), point.weights(), point.residuals, strict=True):
         rows, width, _ = residual.shape
-        product = (columns * (weight * residual.reshape(-1))).reshape(objective.count, rows, width, 3).sum(3, dtype=np.float64)
+        product = (columns * (weight * residual.reshape(-1))).reshape(objective.count, *residual.shape).sum(3, dtype=np.float64)
         blocks = np.add.reduceat(np.add.reduceat(product, range(0, rows, _BLOCK), 1), range(0, width, _BLOCK), 2)
         flat = blocks.reshape(objective.count, blocks[0].size if len(blocks) else 0)
         total += flat @ flat.T
@@ -174,10 +174,12 @@ def _scores(point: Point, objective: Objective) -> Array:
 def _shared_errors(point: Point, objective: Objective) -> list[Array]:
     """Right sides (n,) of errors that all of a picture shares."""
     found = []
-    each = zip(point.columns(), point.weights(), point.recorded, objective.brightness, strict=True)
-    for columns, weight, image, scale in each:
-        shown = image.astype(np.float64) / scale
+    each = zip(point.columns(), point.weights(), point.recorded, objective.observations, objective.comparisons, strict=True)
+    for columns, weight, image, seen, compared in each:
+        shown = image.astype(np.float64)
         down, right = np.gradient(shown, axis=(0, 1)) if min(shown.shape[:2]) > 1 else (0 * shown, 0 * shown)
-        for error in (DISPLACEMENT * down, DISPLACEMENT * right, FACTOR * shown, np.full_like(shown, OFFSET)):
-            found.append((columns * weight).astype(np.float64) @ error.reshape(-1))
+        offset = np.full_like(shown, OFFSET * seen.brightness)
+        errors = [np.asarray(one, np.float32) for one in (DISPLACEMENT * down, DISPLACEMENT * right, FACTOR * shown, offset)]
+        for error in compared.derivatives(image, errors):
+            found.append((columns * weight).astype(np.float64) @ np.nan_to_num(error, posinf=0, neginf=0).reshape(-1))
     return found

@@ -5,7 +5,8 @@ They are called between passes, never in a recording: a function that cannot be 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import drjit as dr
@@ -28,6 +29,9 @@ def function_name(function: OwnFunction) -> str:
     return str(getattr(function, "__name__", type(function).__name__))
 
 
+# Effect of pixels that do not count on a residual, as a share of that of all pixels, up to which it counts; number of images of
+# noise by which effects are measured.
+_LITTLE, _TRIALS = 0.1, 3
 # Sides of arrays that count as images: shorter ones have no neighbours to speak of.
 _SHORTEST = 4
 
@@ -47,6 +51,15 @@ class _OwnFunction:
         mean = (share * seen.image).sum((0, 1)) / max(float(share.sum()), 1e-30)
         #: A picture that shows nothing: the mean colour.
         self._flat = self._masked(np.broadcast_to(mean, seen.image.shape))
+
+    @contextmanager
+    def _uncovered(self) -> Iterator[None]:
+        """Context in which pixels that do not count are seen."""
+        counts, self._counts = self._counts, np.ones_like(self._counts)
+        try:
+            yield
+        finally:
+            self._counts = counts
 
     def _masked(self, image: npt.NDArray[Any]) -> Image:
         return np.asarray(np.where(self._counts, image, 0), np.float32)
@@ -117,7 +130,8 @@ class OwnResiduals(_OwnFunction):
         seen: the picture.
 
     Attributes:
-        weight: that of the picture's pixels, for residuals (H, W, ...); of others all count alike.
+        weight: (rows, columns, 1): that of the picture's pixels, for residuals (H, W, ...); of others all count alike. Zero for
+            residuals that see much of pixels that do not count.
 
     Raises:
         ShadowmapError: The function fails, returns something else, has no derivatives, or values that are not finite.
@@ -139,9 +153,8 @@ class OwnResiduals(_OwnFunction):
         step = np.random.default_rng(0).normal(size=self._picture.shape).astype(np.float32)
         for what, one in pictures.items():
             self._check_finite(self.derivatives(one, [step])[0], f"the derivative {what}")
-        rows, columns = seen.weight.shape
-        own = self._shape[:2] == (rows, columns)
-        self.weight = seen.weight[..., None] if own else np.ones((1, 1, 1), np.float32)
+        own = self._shape[:2] == seen.weight.shape
+        self.weight = self._own_share() * (seen.weight[..., None] if own else np.float32(1))
         for what in ("of a picture of one colour", "of a black picture"):
             square = np.average(np.square(values[what], dtype=np.float64), weights=np.broadcast_to(self.weight, self._shape))
             if square > 0:
@@ -149,6 +162,24 @@ class OwnResiduals(_OwnFunction):
                 break
         else:
             raise ShadowmapError(f"{self.name}: all are zero, even between the picture and a black one: they tell nothing.")
+
+    def _own_share(self) -> Image:
+        """(rows, columns, 1): 0 for residuals that see more than a little of pixels that do not count, 1 for others.
+
+        Differences at the border of a mask are those between the picture and black. If all residuals see such pixels, as after a
+        Fourier transform, all count.
+        """
+        ones = np.ones((*self._shape[:2], 1), np.float32)
+        if self._counts.all():
+            return ones
+        generator, seen, parts = np.random.default_rng(1), [], (self._counts, ~self._counts)
+        with self._uncovered():
+            for counts in parts:
+                steps = generator.normal(size=(_TRIALS, *self._picture.shape)) * counts
+                effects = self.derivatives(self._picture, [np.asarray(step, np.float32) for step in steps])
+                seen.append(np.sqrt(np.square(effects).mean(0)))
+        kept = (seen[1] <= _LITTLE * (seen[0] + seen[1])).all(2, keepdims=True)
+        return np.asarray(kept, np.float32) if kept.any() else ones
 
     def residuals(self, image: Image) -> Image:
         return self._against(image, self._picture)

@@ -40,7 +40,7 @@ class Parameters:
     Attributes:
         count: the number n of numbers.
         labels: names of the numbers.
-        units: units of :meth:`values`: "deg", "times", "" for units of the scene.
+        units: units of :meth:`values`: "deg", "times", "units" for those of the scene.
 
     Raises:
         ShadowmapError: names that the scene does not have; textures and vertices, which need no parametrisation.

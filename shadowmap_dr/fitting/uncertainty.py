@@ -26,8 +26,8 @@ PIXEL = 0.005
 #: Factor of the blocks' covariance: errors of the model are alike over more than a block. Found, as the numbers above, on the
 #: calibration problems of `shadowmap-dr bench --only fits`, where 99 % of 97 intervals then hold the true value.
 INFLATION = 10.0
-#: Further factor for residuals of users, whose errors are not known as those of colours are: edges and shares of colours hold the
-#: truth in half of their intervals without it. Found on ten places of a box, with six functions: 118 of 120 intervals hold it then.
+#: Further factor for residuals of users, whose errors are not known as those of colours are. Found on ten places of a box with
+#: six functions: half of the intervals by edges and by shares of colours hold the truth without it, all of 120 with it.
 OWN_INFLATION = 9.0
 # A number with a smaller effect than the first, a share of the brightness for a change by one, is idle if a change by the second
 # makes no larger difference than the third: derivatives of outlines are not exact.

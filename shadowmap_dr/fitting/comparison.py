@@ -50,7 +50,7 @@ class Comparison(Protocol):
         """Gradient by the image (H, W, 3), from that by the residuals."""
 
     def contents(self, image: Image) -> tuple[Image, Image]:
-        """What image and picture show, as residuals between each of them and a picture that shows nothing.
+        """Contents of image and picture: residuals between each of them and a picture that shows nothing.
 
         Only differences between neighbours, and squares, have a meaning.
         """

@@ -162,13 +162,13 @@ class Point:
             for k in range(view.count):
                 _, derivative = view.derivative(self.x, k)
                 changes[k] = gain.apply(derivative, self.x[own])
-        # Of the image without its correction, to which the scene's own numbers do not contribute either: the exposure and the
+        # At the image without its correction, to which the scene's own numbers do not contribute either: the exposure and the
         # strength of all lights have the same derivatives.
         plain = owner.recorded(number, self.images[number], self.x)
         for k, derivative in enumerate(gain.derivatives(plain, self.x[own])):
             changes[own.start + k] = derivative
         columns = np.zeros((owner.count, self.residuals[number].size), np.float32)
-        found = owner.comparisons[number].derivatives(self.recorded[number], list(changes.values()))
+        found = owner.comparisons[number].derivatives(plain, list(changes.values()))
         for k, derivative in zip(changes, found, strict=True):
             columns[k] = derivative.reshape(-1)
         columns[~np.isfinite(columns)] = 0

@@ -168,9 +168,9 @@ def renderer() -> Renderer:
 
 
 def unevenly_lit(picture: Image) -> Image:
-    """As by another lamp, which the scene does not have: six times as bright on the right as on the left."""
-    x = np.linspace(-0.9, 0.9, picture.shape[1], dtype=np.float32)
-    return np.asarray(0.5 * picture * np.exp(x)[None, :, None], np.float32)
+    """As by another lamp, twenty times as bright on the right as on the left, and by another tone curve."""
+    x = np.linspace(-1.5, 1.5, picture.shape[1], dtype=np.float32)
+    return np.asarray((0.5 * picture * np.exp(x)[None, :, None]) ** 0.7, np.float32)
 
 
 def place(result: FitResult) -> npt.NDArray[np.float64]:

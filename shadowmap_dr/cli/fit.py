@@ -55,15 +55,16 @@ def fit(
 
         console.show(listed(loaded))
         return
-    from ..fitting.command import RESULT, run_fit
+    from ..fitting.command import run_fit
     from ..fitting.table import table
+    from ..fitting.writing import REPORT, RESULT
 
     result = run_fit(task, loaded, path, out, resume=resume)
     console.show(table(result))
     for words in result.words:
         typer.echo(words)
     typer.echo(f"{'Found' if result.found else 'Not found'}, in {result.seconds:.0f} s.")
-    console.result(out / "report.html", out / RESULT)
+    console.result(out / REPORT, out / RESULT)
 
 
 def _task(scene: str, given: Given[FitOptions], targets: list[str], masks: list[str], parameters: dict[str, str]) -> FitTask:

@@ -9,6 +9,7 @@ from .scene_change import SceneChange
 from .search import Fit
 from .targets import Target, make_target, read_target
 from .vary import Vary
+from .writing import write_fit
 
 __all__ = [
     "Estimate",
@@ -24,5 +25,6 @@ __all__ = [
     "prepared",
     "read_fit",
     "read_target",
+    "write_fit",
     "write_report",
 ]

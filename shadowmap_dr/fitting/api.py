@@ -11,8 +11,11 @@ import mitsuba as mi
 
 from ..errors import ShadowmapError
 from ..rendering.renderer import Renderer
+from ..scene.origin import SceneOrigin
+from .losses import LossKind
 from .options import FitOptions
 from .own import Own
+from .own_losses import OwnFunction
 from .result import FitResult
 from .scene_loading import load_scene
 from .search import Fit
@@ -27,6 +30,9 @@ def fit(
     scene: mi.Scene | Renderer | str | os.PathLike[str],
     targets: Picture | Sequence[Picture] | Mapping[int, Picture],
     vary: Sequence[str | Vary | Own | Mapping[str, Any]],
+    *,
+    residuals: OwnFunction | None = None,
+    loss: LossKind | OwnFunction = "huber",
     **options: Any,  # Any: fields of FitOptions
 ) -> FitResult:
     """Fit a scene to pictures: find poses, lights, materials, cameras, textures or vertices.
@@ -35,28 +41,42 @@ def fit(
         scene: a scene, loaded with ``optimize=False`` so that shapes keep their names; a renderer of it; or a scene file.
         targets: a picture of the scene's first sensor, several of the first, second, ... sensor, or a mapping from numbers of
             sensors. A picture is a file (sRGB, or OpenEXR: linear), an array of linear colours (H, W, 3), or a
-            :class:`~shadowmap_dr.fitting.targets.Target`, which has a mask.
+            :class:`~shadowmap_dr.fitting.targets.Target`, which has a mask and a known exposure.
         vary: things that vary, as for ``shadowmap-dr fit --vary``: ``"bunny:pose"``, ``"sun:direction"``,
             ``"wall.bsdf.reflectance,max=0.8"``, mappings ``{"name": "sun", "kind": "direction", "spread": 60}``, or
             parametrisations of your own (:class:`~shadowmap_dr.fitting.own.Own`).
-        options: fields of :class:`~shadowmap_dr.fitting.options.FitOptions` by name: ``exposure=True``, ``starts=16``, ...
+        residuals: function of yours, instead of differences of colours: it gets an image and the picture, two ``mi.TensorXf``
+            (H, W, 3), linear, and returns residuals, a float array of Dr.Jit of any shape; zero where both are alike. The image
+            has the picture's exposure, and is attached: use functions of ``drjit``. Pixels that do not count are black in both.
+            It is called at several sizes, outside of recordings.
+        loss: ``huber``, ``l2`` or ``l1``, of the residuals. Or, where nothing but textures and vertices varies, a function of an
+            image and the picture that returns one number.
+        options: further fields of :class:`~shadowmap_dr.fitting.options.FitOptions` by name: ``exposure=True``,
+            ``starts=16``, ...
 
     Returns:
         The result: ``found``, ``estimates`` with 95 % intervals, ``words``, ``pictures``.
 
     Raises:
-        ShadowmapError: names that the scene does not have, pictures of another shape, unknown options.
+        ShadowmapError: names that the scene does not have, pictures of another shape, unknown options, functions that fail or
+            have no derivatives.
     """
-    return prepared(scene, targets, vary, **options).run()
+    return prepared(scene, targets, vary, residuals=residuals, loss=loss, **options).run()
 
 
 def prepared(
     scene: mi.Scene | Renderer | str | os.PathLike[str],
     targets: Picture | Sequence[Picture] | Mapping[int, Picture],
     vary: Sequence[str | Vary | Own | Mapping[str, Any]],
+    *,
+    residuals: OwnFunction | None = None,
+    loss: LossKind | OwnFunction = "huber",
     **options: Any,  # Any: fields of FitOptions
 ) -> Fit:
     """The fit that :func:`fit` runs, to take its steps one by one. Arguments as there."""
+    own_loss = None if isinstance(loss, str) else loss
+    if own_loss is None:
+        options["loss"] = loss
     entries = [vary] if isinstance(vary, (str, Vary, Own)) else vary
     try:
         chosen = FitOptions(vary=tuple(entry if isinstance(entry, Own) else Vary.of(entry) for entry in entries), **options)
@@ -69,7 +89,8 @@ def prepared(
         renderer = Renderer.from_scene(scene)
     else:
         renderer = Renderer.from_scene(load_scene(scene))
-    return Fit(renderer, _targets(targets), chosen)
+        renderer.origin = SceneOrigin(scene)
+    return Fit(renderer, _targets(targets), chosen, residuals, own_loss)
 
 
 def _targets(given: Any) -> list[Target]:  # Any: see `fit`

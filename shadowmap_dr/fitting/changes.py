@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy.typing as npt
@@ -28,3 +30,20 @@ class Changes:
     values: dict[str, Array] = field(default_factory=dict)
     transforms: dict[str, Array] = field(default_factory=dict)
     vertices: dict[str, Array] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class FittedScene:
+    """A scene as a fit leaves it.
+
+    Attributes:
+        changes: the fitted values.
+        source: the scene's file, or its dictionary; None if neither is known.
+        parameters: values of ``$name`` in the file.
+        names: names of ``mi.traverse(scene)``, all and in order.
+    """
+
+    changes: Changes
+    source: Path | Mapping[str, Any] | None = None
+    parameters: Mapping[str, str] = field(default_factory=dict)
+    names: Sequence[str] = ()

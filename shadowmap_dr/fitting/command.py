@@ -8,23 +8,19 @@ from pathlib import Path
 
 import mitsuba as mi
 from rich.console import Console
-from rich.progress import Progress
 
-from ..errors import ShadowmapError, warn
 from ..io import console as io_console
 from ..io import files
 from ..rendering.renderer import Renderer
-from .film import write_film
-from .glb import write_glb
-from .report import write_report
+from ..scene.origin import SceneOrigin
 from .result import FitResult, Step
-from .scene_file import write_fitted_scene
 from .search import Fit
 from .task import FitTask
 from .toml import to_toml
+from .writing import write_fit
 
-# Files in the folder of results.
-RESULT, TASK, REPORT, FILM, MODEL, STATE = "fit.json", "fit.toml", "report.html", "film.webp", "scene.glb", "fit.npz"
+# Files in the folder of results, beside those of `write_fit`.
+TASK, STATE = "fit.toml", "fit.npz"
 
 
 def run_fit(
@@ -54,7 +50,8 @@ def run_fit(
     """
     console = console or io_console.notes()
     renderer = Renderer.from_scene(scene)
-    fit = Fit(renderer, [picture.read() for picture in task.pictures], task.options, [p.exposure for p in task.pictures])
+    renderer.origin = SceneOrigin(scene_file, None, task.parameters)
+    fit = Fit(renderer, [picture.read() for picture in task.pictures], task.options)
     steps = fit.steps(out / STATE, resume=resume)
     files.make_folder(out)
     (out / TASK).write_text(to_toml(_beside(task, out)), encoding="utf-8")
@@ -65,7 +62,8 @@ def run_fit(
     result = fit.result(shlex.join(["shadowmap-dr", *sys.argv[1:]]))
     result.settings = task.plain()
     with io_console.progress(console) as progress:
-        _write(result, fit, task, scene_file, out, progress)
+        with io_console.task(progress, "report, film and fitted scene"):
+            write_fit(result, out)
     (out / STATE).unlink(missing_ok=True)
     return result
 
@@ -77,35 +75,6 @@ def _words(step: Step, fit: Fit) -> str:
         f"images of {step['stage']}, start {step['start'] + 1}: off by {100 * step['error']:.0f} % of the picture's brightness, "
         f"{100 * best:.0f} % at best"
     )
-
-
-def _write(result: FitResult, fit: Fit, task: FitTask, scene_file: Path, out: Path, progress: Progress) -> None:
-    """Write the results; problems of single files become warnings, so that nothing is lost."""
-    result.write_json(out / RESULT)
-    with io_console.task(progress, "report and film"):
-        write_report(result, out / REPORT)
-        if any(picture.frames for picture in result.pictures):
-            write_film(result.pictures, out / FILM)
-    with io_console.task(progress, "fitted scene"):
-        _write_scene(fit, task, scene_file, out)
-
-
-def _write_scene(fit: Fit, task: FitTask, scene_file: Path, out: Path) -> None:
-    """Write the fitted scene, as XML and as glTF."""
-    names = [key for key in mi.traverse(fit.renderer.data.scene).keys()]  # noqa: SIM118, C416
-    try:
-        written = write_fitted_scene(scene_file, dict(task.parameters), fit.changes(), out, names=names, copy_files=True)
-    except ShadowmapError as error:
-        warn(f"the fitted scene was not written: {error}")
-        return
-    for note in written.notes:
-        warn(f"{written.files[0]}: {note}.")
-    try:
-        loaded = mi.load_file(str(written.files[0]), optimize=False)
-        for note in write_glb(loaded, out / MODEL):
-            io_console.note(f"{out / MODEL}: {note}.")
-    except (ShadowmapError, RuntimeError) as error:
-        io_console.note(f"{out / MODEL} was not written: {' '.join(str(error).split())}")
 
 
 def _beside(task: FitTask, out: Path) -> dict[str, object]:

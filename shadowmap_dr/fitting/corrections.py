@@ -19,8 +19,9 @@ import numpy.typing as npt
 from ..errors import ShadowmapError
 from ..io.resampling import area_average
 from ..rendering.renderer import Renderer
+from .affine_image import AffineImage
 from .estimates import changes_of
-from .objective import Correction, Objective
+from .objective import Objective
 from .reference import Reference
 
 Array = npt.NDArray[np.float64]
@@ -70,7 +71,7 @@ class Corrections:
         weights = self._weights(x)
         for number, image in enumerate(differences):
             slopes = np.array([_smooth(other[number] - image) for _, other in self._known[1:]]).reshape(-1, *image.shape)
-            objective.corrections[number] = Correction(image, x.copy(), slopes, weights)
+            objective.corrections[number] = AffineImage(image, x.copy(), slopes, weights)
         return True
 
     def keep_constant(self) -> None:

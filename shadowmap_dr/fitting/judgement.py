@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import numpy.typing as npt
 
+from .comparison import Colours
 from .objective import Objective, Point
+from .own_losses import is_image
 from .uncertainty import Uncertainty, not_told_apart
 
 Array = npt.NDArray[np.float64]
@@ -17,12 +19,14 @@ Image = npt.NDArray[np.float32]
 EXPLAINED = 0.16
 # Pixels along the longer side of the images whose edges are compared, at most: noise and blurred outlines count little there.
 _SIDE = 56
+# Mean square of differences between neighbours below which they are alike, as a share of that of unrelated neighbours.
+_SMOOTH = 0.5
 # Pixels matter where a change of a number by the first moves them by more than the second, a share of the brightness; and
 # where the residual is larger.
 _CHANGE, _VISIBLE = 0.05, 0.03
 
 
-def sentences(share: float, error: float, spread: Uncertainty, names: Sequence[str]) -> list[str]:
+def sentences(share: float, error: float, spread: Uncertainty, names: Sequence[str], *, own: bool = False) -> list[str]:
     """Sentences about a fit: whether the scene explains the pictures, and the numbers that they do not determine.
 
     Args:
@@ -30,12 +34,14 @@ def sentences(share: float, error: float, spread: Uncertainty, names: Sequence[s
         error: of the best point.
         spread: its uncertainty.
         names: of all numbers.
+        own: true if share and error are those of a user's residuals.
     """
     words: list[str] = []
     if share > EXPLAINED:
         words.append(
-            f"Not found: {100 * share:.0f} % of the edges that matter in the picture are not where the scene has them, and the "
-            f"images differ by {100 * error:.0f} % of the brightness. Try more starts, a scene that is nearer to the "
+            f"Not found: {100 * share:.0f} % of {'what your residuals see' if own else 'the edges that matter'} in the picture "
+            f"{'is' if own else 'are'} not where the scene has {'it' if own else 'them'}, and the images differ by "
+            f"{100 * error:.0f} % of {'it' if own else 'the brightness'}. Try more starts, a scene that is nearer to the "
             "picture, or let more vary; mask what the scene does not have."
         )
     idle = [name for name, none in zip(names, spread.idle, strict=True) if none]
@@ -51,25 +57,45 @@ def sentences(share: float, error: float, spread: Uncertainty, names: Sequence[s
 def unexplained(point: Point, objective: Objective) -> float:
     """Share of the pictures' edges that the images do not have, or have elsewhere: 0 for equal images, 1 for unrelated ones.
 
-    Edges count where the fitted numbers, or errors, change the images. Smooth differences, such as light that bounces, hardly
-    count.
+    Edges are differences between neighbouring pixels. They count where the fitted numbers, or errors, change the images. Smooth
+    differences, such as light that bounces, hardly count. Residuals of users that are like edges, or no images at all, are
+    taken as they are.
     """
     missing = total = 0.0
-    each = zip(point.columns(), point.recorded, point.residuals, objective.observations, objective.brightness, strict=True)
-    for columns, image, residual, seen, scale in each:
+    for columns, image, residual, compared in zip(
+        point.columns(), point.recorded, point.residuals, objective.comparisons, strict=True
+    ):
         moved = np.abs(columns).reshape(len(columns), *residual.shape).max(0, initial=0) * _CHANGE
-        times = max(2, round(max(seen.weight.shape) / _SIDE))
-        ours, theirs, weight = (_reduced(one, times) for one in (image / scale, seen.image / scale, seen.weight))
-        matters = np.maximum(_reduced(moved.max(2), times), np.abs(_reduced(residual, times)).mean(2)) > _VISIBLE
+        weight = np.broadcast_to(compared.weight, (*residual.shape[:2], 1))[..., 0]
+        arrays = *compared.contents(image), residual, moved.max(2), weight, np.asarray(weight > 0, np.float32)
+        times = max(2, round(max(weight.shape) / _SIDE)) if is_image(residual.shape) else 1
+        ours, theirs, left, moved, weight, whole = (_reduced(one, times) for one in arrays)
+        pairs = isinstance(compared, Colours) or is_image(residual.shape) and _is_smooth(theirs)
+        matters = np.maximum(moved, np.abs(left).mean(2)) > _VISIBLE
         # Pixels that do not count are black: blocks with one count for nothing.
-        whole = _reduced(np.asarray(seen.weight > 0, np.float32), times) == 1
-        weight = np.asarray(weight * whole * matters, np.float32)
-        for axis in (0, 1):
-            both = np.minimum(np.take(weight, range(1, weight.shape[axis]), axis), _without_last(weight, axis))[..., None]
-            of_image, of_picture = np.diff(ours, axis=axis), np.diff(theirs, axis=axis)
-            missing += float((both * (of_image - of_picture) ** 2).sum(dtype=np.float64))
+        weight = np.asarray(weight * (whole == 1) * matters, np.float32)
+        for of_image, of_picture, of_residual, both in _edges(pairs, ours, theirs, left, weight[..., None]):
+            missing += float((both * of_residual**2).sum(dtype=np.float64))
             total += float((both * (of_image**2 + of_picture**2)).sum(dtype=np.float64))
     return missing / total if total > 0 else 0.0
+
+
+def _is_smooth(image: Image) -> bool:
+    """True if neighbours are mostly alike: colours, and not edges of colours."""
+    square = float(np.square(image, dtype=np.float64).sum())
+    steps = [float(np.square(np.diff(image, axis=axis), dtype=np.float64).sum()) for axis in (0, 1)]
+    return sum(steps) < _SMOOTH * 4 * square
+
+
+def _edges(pairs: bool, *arrays: Image) -> Iterator[tuple[Image, ...]]:
+    """Differences between neighbours along each axis, if ``pairs``; of the last array, the weights, the smaller ones."""
+    if not pairs:
+        yield arrays
+        return
+    *images, weight = arrays
+    for axis in (0, 1):
+        both = np.minimum(np.take(weight, range(1, weight.shape[axis]), axis), _without_last(weight, axis))
+        yield *(np.diff(image, axis=axis) for image in images), both
 
 
 def _reduced(image: Image, times: int) -> Image:

@@ -93,8 +93,8 @@ def _after_step(matrix: Array, right: Array, damping: float, x: Array, limits: L
     """Numbers after a damped step within the bounds, in which no number changes by more than the longest step.
 
     Numbers at a bound that the loss pushes outwards stay. The number that would go too far by most goes as far as it may, and
-    the others are solved for once more: one that moves nothing, and so runs away, does not hold up the others. Numbers that reach a bound
-    are equal to it, not up to rounding: the next step looks for them.
+    the others are solved for once more: one that moves nothing, and so runs away, does not hold up the others. Numbers that
+    reach a bound are equal to it, not up to rounding: the next step looks for them.
     """
     low, high = np.maximum(limits.low, x - limits.longest), np.minimum(limits.high, x + limits.longest)
     step = np.zeros_like(x)

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from ..jit.types import Float
-from .gains import Gain
+from .affine_image import AffineImage
+from .comparison import Colours, Comparison, Observation
 from .losses import Loss
+from .own_losses import OwnFunction, OwnLoss, OwnResiduals
 from .views import View
 
 Array = npt.NDArray[np.float64]
@@ -22,49 +23,6 @@ _USUAL, _ALIKE = 0.02, 64
 PRIOR_WEIGHT = _USUAL**2 * _ALIKE
 
 
-@dataclass(frozen=True)
-class Observation:
-    """A picture at the size of a view: linear ``image`` (H, W, 3), ``weight`` (H, W) of its pixels, and its ``gain``."""
-
-    image: Image
-    weight: Image
-    gain: Gain
-
-    @property
-    def brightness(self) -> float:
-        """Root of the mean square of the weighted pixels."""
-        total = 3.0 * float(self.weight.sum(dtype=np.float64))
-        square = float((self.weight[..., None] * self.image.astype(np.float64) ** 2).sum())
-        return float(np.sqrt(square / max(total, 1e-30))) or 1.0
-
-
-@dataclass(frozen=True)
-class Correction:
-    """A linear function of a fit's numbers, with images (H, W, 3) as values.
-
-    Attributes:
-        image: its value at the numbers ``x`` (n,).
-        slopes: images (k, H, W, 3).
-        weights: (k, n): derivatives by the numbers are sums of the slopes, with these weights.
-    """
-
-    image: Image
-    x: Array
-    slopes: Image
-    weights: Array
-
-    def at(self, x: Array) -> Image:
-        """Its value at the numbers x (n,)."""
-        return self.image + self._sum(self.weights @ (x - self.x))
-
-    def derivative(self, number: int) -> Image:
-        """Its derivative by one of the numbers."""
-        return self._sum(self.weights[:, number])
-
-    def _sum(self, weights: Array) -> Image:
-        return np.tensordot(weights.astype(np.float32), self.slopes, 1)
-
-
 class Objective:
     """The loss of a fit at one quality.
 
@@ -73,23 +31,39 @@ class Objective:
         observations: the pictures.
         prior: (n,) standard deviations about zero of all numbers, infinite for none.
         loss: the loss of residuals.
+        residuals: a user's residuals instead of differences of colours.
+        own_loss: a user's loss instead of that of residuals, for textures and vertices alone.
 
     Attributes:
+        comparisons: residuals of each picture.
         gains: the numbers of each picture's gain.
         count: number of all numbers.
         corrections: of each view's image, added to it; None for none.
+        terms: sum of the weights of all residuals.
     """
 
-    def __init__(self, views: Sequence[View], observations: Sequence[Observation], prior: Array, loss: Loss) -> None:
+    def __init__(
+        self,
+        views: Sequence[View],
+        observations: Sequence[Observation],
+        prior: Array,
+        loss: Loss,
+        residuals: OwnFunction | None = None,
+        own_loss: OwnFunction | None = None,
+    ) -> None:
         self.views, self.observations, self.loss = tuple(views), tuple(observations), loss
-        self.brightness = [observation.brightness for observation in observations]
-        self.pixels = float(sum(observation.weight.sum(dtype=np.float64) for observation in observations))
-        self.precision = PRIOR_WEIGHT / (3 * self.pixels) / np.square(prior)
+        self.comparisons: list[Comparison] = [
+            Colours(seen) if residuals is None else OwnResiduals(residuals, seen) for seen in observations
+        ]
+        self.has_own_residuals = residuals is not None
+        self.own_losses = [] if own_loss is None else [OwnLoss(own_loss, seen) for seen in observations]
+        self.terms = sum(_terms(one, seen) for one, seen in zip(self.comparisons, observations, strict=True))
+        self.precision = PRIOR_WEIGHT / self.terms / np.square(prior)
         self._scene = views[0].count
         ends = np.cumsum([self._scene, *(observation.gain.count for observation in observations)])
         self.gains = [slice(int(a), int(b)) for a, b in zip(ends[:-1], ends[1:], strict=True)]
         self.count = int(ends[-1])
-        self.corrections: list[Correction | None] = [None] * len(self.views)
+        self.corrections: list[AffineImage | None] = [None] * len(self.views)
 
     def at(self, x: Array) -> Point:
         """The residuals at x (n,)."""
@@ -103,15 +77,31 @@ class Objective:
     def gradient(self, x: Array) -> list[Float]:
         """Derivatives of the mean loss by the values of the parameters with many values, Float each."""
         total: list[Float] = []
-        for number, (view, seen) in enumerate(zip(self.views, self.observations, strict=True)):
-            scale, shape = self.brightness[number], np.zeros((*seen.weight.shape, 3), np.float32)
-            factors = seen.gain.factors(shape, x[self.gains[number]]) / scale
-            weight = seen.weight[..., None] / (3 * self.pixels)
-            correction = self.corrections[number]
-            target = seen.image / scale if correction is None else seen.image / scale - factors * correction.at(x)
-            found = view.gradient(x, target, weight, factors, self.loss.limit)
+        for number in range(len(self.views)):
+            found = self._gradient(number, x)
             total = [a + b for a, b in zip(total, found, strict=True)] if total else found
         return total
+
+    def _gradient(self, number: int, x: Array) -> list[Float]:
+        """The share of one picture in :meth:`gradient`."""
+        view, seen, compared = self.views[number], self.observations[number], self.comparisons[number]
+        correction = self.corrections[number]
+        factors = seen.gain.factors(np.zeros((*seen.weight.shape, 3), np.float32), x[self.gains[number]])
+        if isinstance(compared, Colours) and not self.own_losses:
+            # Image and derivatives in one pass.
+            scale = seen.brightness
+            weight = seen.weight[..., None] / self.terms
+            target = seen.image if correction is None else seen.image - factors * correction.at(x)
+            return view.gradient(x, np.asarray(target / scale, np.float32), weight, factors / scale, self.loss.limit)
+        plain = view.image(x)
+        image = self.recorded(number, plain if correction is None else plain + correction.at(x), x)
+        if self.own_losses:
+            adjoint: Image = self.own_losses[number].gradient(image) / np.float32(len(self.views))
+        else:
+            residual = compared.residuals(image)
+            weight = compared.weight / np.float32(self.terms)
+            adjoint = compared.adjoint(image, weight * self.loss.weight(residual) * residual)
+        return view.pulled(x, adjoint * factors)
 
     def recorded(self, number: int, image: Image, x: Array) -> Image:
         """The image of a view as its picture's camera records it."""
@@ -119,7 +109,7 @@ class Objective:
 
 
 class Point:
-    """Residuals of all pictures at one x, as shares of the pictures' brightness, and their derivatives when asked for.
+    """Residuals of all pictures at one x, as shares of what the pictures show, and their derivatives when asked for.
 
     Attributes:
         cost: mean loss of the weighted residuals, and the priors' share.
@@ -131,16 +121,17 @@ class Point:
         self.images = [view.image(x).copy() for view in owner.views]
         corrected = [image if c is None else image + c.at(x) for image, c in zip(self.images, owner.corrections, strict=True)]
         self.recorded = [owner.recorded(k, image, x) for k, image in enumerate(corrected)]
-        pairs = zip(self.recorded, owner.observations, owner.brightness, strict=True)
-        self.residuals = [np.asarray((image - seen.image) / scale, np.float32) for image, seen, scale in pairs]
+        pairs = zip(self.recorded, owner.comparisons, strict=True)
+        self.residuals = [compared.residuals(image) for image, compared in pairs]
         cost = square = 0.0
-        for residual, seen in zip(self.residuals, owner.observations, strict=True):
-            weight = seen.weight[..., None]
-            cost += float((weight * owner.loss.value(residual)).sum(dtype=np.float64))
-            square += float((weight * residual * residual).sum(dtype=np.float64))
-        total = 3 * max(owner.pixels, 1e-30)
-        self.cost = cost / total + 0.5 * float((owner.precision * x * x).sum())
-        self.error = float(np.sqrt(square / total))
+        for residual, compared in zip(self.residuals, owner.comparisons, strict=True):
+            cost += float((compared.weight * owner.loss.value(residual)).sum(dtype=np.float64))
+            square += float((compared.weight * residual * residual).sum(dtype=np.float64))
+        self.cost = cost / owner.terms + 0.5 * float((owner.precision * x * x).sum())
+        self.error = float(np.sqrt(square / owner.terms))
+        if owner.own_losses:
+            values = [own.value(image) for own, image in zip(owner.own_losses, self.recorded, strict=True)]
+            self.cost = float(np.mean(values))
         if not np.isfinite(self.cost):
             self.cost = self.error = np.inf
         self._columns: list[npt.NDArray[np.float32]] | None = None
@@ -153,8 +144,8 @@ class Point:
 
     def weights(self) -> list[npt.NDArray[np.float32]]:
         """Weights of the residuals, of the pictures' and the loss's: for each picture (H W 3,)."""
-        pairs = zip(self.residuals, self._owner.observations, strict=True)
-        return [(seen.weight[..., None] * self._owner.loss.weight(residual)).reshape(-1) for residual, seen in pairs]
+        pairs = zip(self.residuals, self._owner.comparisons, strict=True)
+        return [(compared.weight * self._owner.loss.weight(residual)).reshape(-1) for residual, compared in pairs]
 
     def system(self) -> tuple[Array, Array]:
         """(matrix (n, n), right side (n,)) of the normal equations, means over the residuals: matrix step = - right side."""
@@ -164,24 +155,32 @@ class Point:
             weighted = columns * weight
             matrix += weighted @ columns.T
             right += weighted @ residual.reshape(-1)
-        total = 3 * max(owner.pixels, 1e-30)
-        return matrix / total + np.diag(owner.precision), right / total + owner.precision * self.x
+        return matrix / owner.terms + np.diag(owner.precision), right / owner.terms + owner.precision * self.x
 
     def _of_view(self, number: int) -> npt.NDArray[np.float32]:
         owner, view = self._owner, self._owner.views[number]
-        scale, gain, own = owner.brightness[number], owner.observations[number].gain, owner.gains[number]
-        correction = owner.corrections[number]
-        columns = np.zeros((owner.count, self.residuals[number].size), np.float32)
+        gain, own = owner.observations[number].gain, owner.gains[number]
+        correction, changes = owner.corrections[number], dict[int, Image]()
         with view.scene_at(self.x):
             for k in range(view.count):
                 _, derivative = view.derivative(self.x, k)
                 if correction is not None:
                     derivative = derivative + correction.derivative(k)
-                columns[k] = (gain.apply(derivative, self.x[own]) / scale).reshape(-1)
-        # Of the image without its correction, to which the scene's own numbers do not contribute either: the exposure and the
+                changes[k] = gain.apply(derivative, self.x[own])
+        # At the image without its correction, to which the scene's own numbers do not contribute either: the exposure and the
         # strength of all lights have the same derivatives.
         plain = owner.recorded(number, self.images[number], self.x)
         for k, derivative in enumerate(gain.derivatives(plain, self.x[own])):
-            columns[own.start + k] = (derivative / scale).reshape(-1)
+            changes[own.start + k] = derivative
+        columns = np.zeros((owner.count, self.residuals[number].size), np.float32)
+        found = owner.comparisons[number].derivatives(plain, list(changes.values()))
+        for k, derivative in zip(changes, found, strict=True):
+            columns[k] = derivative.reshape(-1)
         columns[~np.isfinite(columns)] = 0
         return columns
+
+
+def _terms(compared: Comparison, seen: Observation) -> float:
+    """Sum of the weights of a picture's residuals; not zero."""
+    shape = compared.residuals(seen.image).shape
+    return max(float(np.broadcast_to(compared.weight, shape).sum(dtype=np.float64)), 1e-30)

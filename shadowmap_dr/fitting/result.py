@@ -13,6 +13,7 @@ import numpy.typing as npt
 from ..errors import ShadowmapError
 from ..io.machine import header
 from ..io.records import plain, read_json, write_json
+from .changes import FittedScene
 
 #: First entry of fit.json. The number grows when a reader of an earlier version could misread the file.
 FORMAT = "shadowmap-dr fit 1"
@@ -147,6 +148,7 @@ class FitResult:
         command: to reproduce it, quoted for a shell.
         settings: all options.
         made: version and machine of a result that was read from a file; empty: this version, on this machine.
+        scene: the fitted scene, for :func:`~shadowmap_dr.fitting.write_fit`. None if the result was read from a file.
     """
 
     found: bool
@@ -161,6 +163,7 @@ class FitResult:
     command: str
     settings: dict[str, Any]
     made: dict[str, Any] = field(default_factory=dict)
+    scene: FittedScene | None = None
 
     def to_json(self) -> dict[str, Any]:
         """The result as JSON values, as they stand in fit.json. Numbers that are not finite are None."""

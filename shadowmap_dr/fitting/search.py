@@ -16,7 +16,7 @@ from ..io import records
 from ..jit.arrays import device_array
 from ..jit.types import Float
 from ..rendering.renderer import Renderer
-from .changes import Changes
+from .changes import Changes, FittedScene
 from .corrections import Corrections
 from .estimates import array_estimates, changes_of, estimates_of, gain_estimates
 from .gains import Gain
@@ -25,6 +25,7 @@ from .levenberg_marquardt import Limits, minimise
 from .losses import Loss
 from .objective import Point
 from .options import FitOptions
+from .own_losses import OwnFunction, function_name
 from .parameters import Parameter
 from .resolve import Resolver
 from .result import FitResult, Picture, Step
@@ -61,14 +62,20 @@ class Fit:
         renderer: the renderer of the scene as it was given. It is not changed.
         targets: pictures, one or several, of one or several sensors.
         options: things that vary, and settings of the search.
-        known: known exposures of the pictures, factors; 1 where not given.
+        residuals, loss: functions of yours, see :func:`~shadowmap_dr.fitting.fit`.
 
     Raises:
-        ShadowmapError: names that the scene does not have; pictures that do not fit to their sensors; nothing varies.
+        ShadowmapError: names that the scene does not have; pictures that do not fit to their sensors; nothing varies; functions
+            that are not differentiable.
     """
 
     def __init__(
-        self, renderer: Renderer, targets: Sequence[Target], options: FitOptions, known: Sequence[float] | None = None
+        self,
+        renderer: Renderer,
+        targets: Sequence[Target],
+        options: FitOptions,
+        residuals: OwnFunction | None = None,
+        loss: OwnFunction | None = None,
     ) -> None:
         self.renderer, self.targets, self.options = renderer, tuple(targets), options
         if not targets:
@@ -76,15 +83,19 @@ class Fit:
         resolver = Resolver(renderer)
         self.parameters, self.arrays = resolver.parameters(options.vary)
         colours = 3 if options.white_balance else 1 if options.exposure else 0
-        self.gains = [Gain(colours, options.vignetting, exposure) for exposure in known or [1.0] * len(targets)]
+        self.gains = [Gain(colours, options.vignetting, target.exposure) for target in targets]
         if not options.vary and not any(gain.count for gain in self.gains):
             raise ShadowmapError("nothing varies: name something by --vary; --list lists all that can vary.")
         _check_sizes(renderer, self.targets)
+        _check_functions(residuals, loss, numbers=bool(self.parameters) or any(gain.count for gain in self.gains))
+        functions = {"residuals": residuals, "loss": loss}
+        self._own_settings = {key: function_name(one) for key, one in functions.items() if one is not None}
         self._low, self._high, prior = _bounds(self.parameters, self.gains)
         side = min(options.resolution, max(max(target.width, target.height) for target in targets))
         levels = qualities(side, options.spp, renderer.settings.shadow.resolution)
         pictures = self.parameters, self.arrays, targets, self.gains
-        self.stages: list[Stage] = make_stages(renderer, *pictures, prior, Loss(options.loss, options.delta), levels)
+        compared = Loss(options.loss, options.delta), levels, residuals, loss
+        self.stages: list[Stage] = make_stages(renderer, *pictures, prior, *compared)
         windows = [(target.width, target.height) for target in targets]
         self._corrections = Corrections(renderer, self.stages[-1].objective, windows) if options.correct else None
         self._began = time.perf_counter()
@@ -238,7 +249,7 @@ class Fit:
     def _fingerprint(self) -> str:
         """Text that identifies the fit."""
         sums = [[float(t.image.sum(dtype=np.float64)), float(t.weight.sum(dtype=np.float64)), t.sensor] for t in self.targets]
-        entries = {"options": repr(self.options), "pictures": sums, "numbers": len(self._low)}
+        entries = {"options": repr(self.options), "pictures": sums, "numbers": len(self._low), "functions": self._own_settings}
         return records.digest(entries)
 
     # ------------------------------------------------------------------------------------------------------ results
@@ -263,6 +274,14 @@ class Fit:
         """The fitted values for files, by the names of the scene's parameters."""
         return changes_of(self.change(self.best), self.renderer)
 
+    def fitted_scene(self) -> FittedScene:
+        """The scene as it is after the steps taken so far, for files."""
+        origin, names = self.renderer.origin, list(mi.traverse(self.renderer.data.scene).properties)
+        if origin is None:
+            return FittedScene(self.changes(), names=names)
+        source = origin.description if origin.file is None else Path(origin.file)
+        return FittedScene(self.changes(), source, origin.parameters, names)
+
     def result(self, command: str = "") -> FitResult:
         """The result of the steps taken so far."""
         objective = self.stages[-1].objective
@@ -275,7 +294,7 @@ class Fit:
         of_gains, names_of_gains = gain_estimates(x, self.targets, self.gains, objective.gains, spread)
         names += names_of_gains
         share = unexplained(point, objective)
-        words = sentences(share, point.error, spread, names)
+        words = sentences(share, point.error, spread, names, own=objective.has_own_residuals)
         if self._corrections is not None and self._corrections.failure:
             words.append(f"Images are not corrected, since Mitsuba cannot render the fitted scene: {self._corrections.failure}.")
         seconds = time.perf_counter() - self._began
@@ -290,7 +309,8 @@ class Fit:
             history=self.history,
             seconds=seconds,
             command=command,
-            settings={"vary": [vary.plain() for vary in self.options.vary]},
+            settings={**self._own_settings, "vary": [vary.plain() for vary in self.options.vary]},
+            scene=self.fitted_scene(),
         )
 
     def _pictures(self, point: Point) -> list[Picture]:
@@ -342,6 +362,17 @@ def _bounds(parameters: Sequence[Parameter], gains: Sequence[Gain]) -> tuple[Arr
         high.append(np.array([8.0] * gain.colours + [1.0] * gain.vignetting))
         prior.append(np.full(gain.count, np.inf))
     return np.concatenate(low), np.concatenate(high), np.concatenate(prior)
+
+
+def _check_functions(residuals: OwnFunction | None, loss: OwnFunction | None, *, numbers: bool) -> None:
+    """ShadowmapError for functions that do not go together, or not with what varies. ``numbers``: true if few numbers vary."""
+    if residuals is not None and loss is not None:
+        raise ShadowmapError("residuals and loss are both functions: give one of them; loss may name a loss of residuals.")
+    if loss is not None and numbers:
+        raise ShadowmapError(
+            f"loss {function_name(loss)}: a function of one number serves textures and vertices, which follow gradients; poses, "
+            "lights, colours and exposures need residuals: give residuals=, or use shadowmap_dr.torch.Parameters in a loop."
+        )
 
 
 def _check_sizes(renderer: Renderer, targets: Sequence[Target]) -> None:

@@ -12,9 +12,11 @@ import numpy.typing as npt
 from ..rendering.renderer import Renderer
 from ..scene.sensor import ImageSize
 from .arrays import ArrayParameter
+from .comparison import Observation
 from .gains import Gain
 from .losses import Loss
-from .objective import Objective, Observation
+from .objective import Objective
+from .own_losses import OwnFunction
 from .parameters import Parameter
 from .targets import Target
 from .views import Quality, View
@@ -67,6 +69,8 @@ def make_stages(
     prior: Array,
     loss: Loss,
     levels: Sequence[Quality],
+    residuals: OwnFunction | None = None,
+    own_loss: OwnFunction | None = None,
 ) -> list[Stage]:
     """The stages of a fit, coarse first. Arguments as of :class:`Objective`, for pictures at their own sizes."""
     stages = []
@@ -77,7 +81,7 @@ def make_stages(
             views.append(View(renderer, parameters, arrays, target.sensor, size, quality))
             small = target.resized(size.width, size.height)
             observations.append(Observation(small.image, small.weight, gain))
-        stages.append(Stage(quality, Objective(views, observations, prior, loss)))
+        stages.append(Stage(quality, Objective(views, observations, prior, loss, residuals, own_loss)))
     return stages
 
 

@@ -31,13 +31,18 @@ class Target:
 
     ``image`` float32 (H, W, 3), finite, not negative. ``weight`` float32 (H, W) in 0..1: 0 for masked, transparent and saturated
     pixels, and for pixels that are not finite; there ``image`` is 0, too. ``sensor``: number of the scene's sensor that took it.
-    ``name``: of the file, for messages.
+    ``name``: of the file, for messages. ``exposure``: known exposure, the factor of the rendered colours, as in fit.toml.
     """
 
     image: Array
     weight: Array
     sensor: int = 0
     name: str = ""
+    exposure: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.exposure < np.inf:
+            raise ShadowmapError(f"{self._named}: exposure is {self.exposure!r}; give a positive number.")
 
     @property
     def width(self) -> int:
@@ -91,6 +96,7 @@ def read_target(
     sensor: int = 0,
     saturation: float | None = None,
     longer_side: int = LONGER_SIDE,
+    exposure: float = 1.0,
 ) -> Target:
     """Read a target from a picture file.
 
@@ -105,6 +111,7 @@ def read_target(
         saturation: least value of a saturated channel: a fraction of the largest value in sRGB pictures, a linear value in linear
             ones. None: :data:`SATURATED` in the former, no limit in the latter. ``inf``: no pixel is saturated.
         longer_side: larger pictures are reduced to so many pixels along their longer side.
+        exposure: known exposure of the picture, the factor of the rendered colours.
 
     Raises:
         ShadowmapError: A file that does not exist, is damaged, or too large; a mask of another aspect ratio; no pixel counts.
@@ -112,7 +119,7 @@ def read_target(
     pixels = read_pixels(path)
     if saturation is None:
         saturation = np.inf if pixels.dtype == np.float32 else SATURATED
-    return _target(pixels, mask, sensor, str(path), saturation, longer_side)
+    return replace(_target(pixels, mask, sensor, str(path), saturation, longer_side), exposure=exposure)
 
 
 def make_target(
@@ -123,13 +130,14 @@ def make_target(
     name: str = "the target",
     saturation: float = np.inf,
     longer_side: int = LONGER_SIDE,
+    exposure: float = 1.0,
 ) -> Target:
     """Make a target from an array. No gradients flow to it.
 
     Args:
         image: floats (H, W), (H, W, 1), (H, W, 3), or (H, W, 4), linear, as Mitsuba's renderings: a fourth channel is alpha, by
             which the colours are multiplied. An array of NumPy, a tensor of Dr.Jit, or whatever NumPy can convert.
-        mask, sensor, saturation, longer_side: see :func:`read_target`.
+        mask, sensor, saturation, longer_side, exposure: see :func:`read_target`.
         name: for messages.
 
     Raises:
@@ -152,7 +160,7 @@ def make_target(
     if values.shape[2] < 4:
         colours = np.broadcast_to(values, (*values.shape[:2], 3))
         values = np.concatenate([colours, np.ones_like(values[..., :1])], axis=-1)
-    return _target(values, mask, sensor, name, saturation, longer_side)
+    return replace(_target(values, mask, sensor, name, saturation, longer_side), exposure=exposure)
 
 
 def is_same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:

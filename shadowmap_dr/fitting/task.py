@@ -28,7 +28,7 @@ class PictureFile:
 
     def read(self) -> Target:
         """Read the picture."""
-        return read_target(self.file, self.mask, sensor=self.sensor)
+        return read_target(self.file, self.mask, sensor=self.sensor, exposure=self.exposure)
 
 
 @dataclass(frozen=True)

@@ -87,10 +87,11 @@ class View:
         self._starts = np.cumsum([0, *counts]).tolist()
         # One recording for each entry: a pass computes the derivative of a combination of its numbers.
         self._passes = [freeze(self._recorded(k)) for k in range(len(parameters))]
-        gradient = self._recorded_gradient()
         keys = [array.key for array in arrays if isinstance(array, TextureValues)]
         recordable = all(is_recordable(renderer.data.scene, key) for key in keys)
-        self._image, self._gradient = freeze(self._recorded(-1)), freeze(gradient) if recordable else gradient
+        self._image = freeze(self._recorded(-1))
+        gradients = self._recorded_gradient(_of_huber), self._recorded_gradient(_given)
+        self._gradient, self._pulled = (freeze(one) if recordable else one for one in gradients)
         # Names of Mitsuba's values that each entry changes, and entries whose derivatives are differences of images.
         self._keys = self._keys_of_entries()
         self._differences = [not all(is_recordable(renderer.data.scene, key) for key in own) for own in self._keys]
@@ -166,6 +167,13 @@ class View:
         numbers, bound = _input(x[: self.count]), device_array(mi.Float, np.array([limit], np.float32))
         with self.scene_at(x):
             return list(self._gradient(numbers, self.values, pixels, bound, self._renderer))
+
+    def pulled(self, x: Array, adjoint: Image) -> list[Float]:
+        """Derivatives of a loss by all ``values``, Float each, from its derivative (H, W, 3) by the image at the numbers x."""
+        pixels = self._planes(adjoint) if self._channels == 3 else np.ravel(adjoint.sum(2))
+        given, numbers = [device_array(mi.Float, pixels.astype(np.float32))], _input(x[: self.count])
+        with self.scene_at(x):
+            return list(self._pulled(numbers, self.values, given, mi.Float(0), self._renderer))
 
     @contextmanager
     def scene_at(self, x: Array) -> Iterator[None]:
@@ -269,8 +277,8 @@ class View:
 
         return derivative
 
-    def _recorded_gradient(self) -> Any:  # Any: a function for dr.freeze
-        """The pass of :meth:`gradient`."""
+    def _recorded_gradient(self, adjoint: Callable[[Float, list[Float], Float], Float]) -> Any:  # Any: a function for dr.freeze
+        """The pass of :meth:`gradient`, or of :meth:`pulled`. ``adjoint``: derivative by the image, from image and inputs."""
 
         def gradient(x: Float, values: list[Float], pixels: list[Float], limit: Float, renderer: Renderer) -> list[Float]:
             numbers = [
@@ -279,10 +287,8 @@ class View:
             ]
             own = [mi.Float(dr.detach(one)) for one in values]
             dr.enable_grad(own)
-            target, weight, factors = pixels
             with self._rendered(renderer, numbers, own, -1, arrays=True) as image:
-                difference = factors * dr.detach(image) - target
-                dr.set_grad(image, weight * factors * dr.clip(difference, -limit, limit))
+                dr.set_grad(image, adjoint(dr.detach(image), pixels, limit))
                 dr.enqueue(dr.ADMode.Backward, image)
                 dr.traverse(dr.ADMode.Backward)
                 gradients = [dr.grad(one) for one in own]
@@ -323,6 +329,17 @@ class View:
             yield image.array
         finally:
             restore()
+
+
+def _of_huber(image: Float, pixels: list[Float], limit: Float) -> Float:
+    """Derivative of the loss of :meth:`View.gradient` by the image."""
+    target, weight, factors = pixels
+    return weight * factors * dr.clip(factors * image - target, -limit, limit)
+
+
+def _given(image: Float, pixels: list[Float], limit: Float) -> Float:
+    """The derivative by the image that was given to :meth:`View.pulled`."""
+    return pixels[0]
 
 
 def is_recordable(scene: mi.Scene, key: str) -> bool:

@@ -25,6 +25,7 @@ except ModuleNotFoundError as error:
     raise ImportError(f"shadowmap_dr.torch needs PyTorch: {install_hint('torch')}.", name="torch") from None
 
 from .antialias import antialias, build_topology
+from .parameters import Parameters
 from .raster import interpolate, rasterize
 from .records import Raster, Topology
 from .render import Renderer
@@ -33,6 +34,7 @@ from .shadow import DirectionalLight, Light, PointLight, ShadowMaps, SpotLight, 
 __all__ = [
     "DirectionalLight",
     "Light",
+    "Parameters",
     "PointLight",
     "Raster",
     "Renderer",

@@ -27,6 +27,12 @@ from .checks import check_devices, check_floats, check_kind, number_of
 from .crossing import cross, eager
 from .transforms import plain
 
+# Fields of a sensor's record, and shapes of tensors that may replace them.
+_CAMERA_FIELDS: dict[str, tuple[tuple[int, ...], ...]] = {
+    "to_world": ((4, 4),),
+    "x_fov": ((1,), ()),
+    "principal_point": ((2,),),
+}
 _LOOP = "render the images of different directions in a loop"
 
 
@@ -143,6 +149,8 @@ class Renderer:
         parameters: Mapping[str, torch.Tensor] | None = None,
         sensor: int | Sensor = 0,
         spp: int = 1,
+        transforms: Mapping[str, torch.Tensor] | None = None,
+        camera: Mapping[str, torch.Tensor] | None = None,
     ) -> torch.Tensor:
         """Render an image.
 
@@ -156,6 +164,10 @@ class Renderer:
                 all other parameters from the scene, too, and loads textures anew.
             sensor: number of the scene's sensor, or a record (``cameras.Camera.record()``), to which no gradients flow.
             spp: samples per pixel, see :meth:`shadowmap_dr.Renderer.render`.
+            transforms: affine maps of world space (4, 4), by the name of the shape that they move, see
+                :meth:`shadowmap_dr.Renderer.render`.
+            camera: new values of fields of the sensor's record (:mod:`shadowmap_dr.scene.sensor`): ``to_world`` (4, 4),
+                ``x_fov`` (1,) in degrees, ``principal_point`` (2,).
 
         Returns:
             float32 (H, W, C): linear colour, then alpha if the film has it, then the AOVs. Attached to all tensors.
@@ -163,7 +175,8 @@ class Renderer:
         Raises:
             ShadowmapError: unknown names, tensors that do not fit, a variant that does not fit the tensors.
         """
-        for name, value in (("vertex_positions", vertex_positions), ("lights", lights), ("parameters", parameters)):
+        mappings = {"vertex_positions": vertex_positions, "lights": lights, "parameters": parameters}
+        for name, value in {**mappings, "transforms": transforms, "camera": camera}.items():
             check_kind(name, {} if value is None else value, Mapping)
         for name, value in (lights or {}).items():
             check_kind(f"lights['{name}']", value, Mapping)
@@ -171,11 +184,13 @@ class Renderer:
         if hasattr(sensor, "record"):
             raise ShadowmapError(f"the sensor is a {type(sensor).__name__}: give camera.record().")
         sensor = sensor if isinstance(sensor, Sensor) else number_of("sensor", sensor, int)
-        given = self._inputs(vertex_positions, lights, parameters)
+        given = self._inputs(vertex_positions, lights, parameters, transforms, camera)
         count = len(self._renderer.data.sensors)
         if not (isinstance(sensor, Sensor) or 0 <= sensor < count) or not 1 <= samples < math.inf:
             why = f"there are {count} sensors, counted from 0; spp is 1 or more"
             raise ShadowmapError(f"sensor {sensor}, spp {samples:g}: {why}.")
+        if camera and len(self._renderer.data.cameras(sensor)) != 1:
+            raise ShadowmapError(f"camera: sensor {sensor} is a batch of cameras; render them one by one.")
         operation = _Rendering(self, tuple(given), sensor, math.ceil(samples))
         if given:
             return cross(operation, *given.values())[0]
@@ -188,6 +203,8 @@ class Renderer:
         vertex_positions: Mapping[str, torch.Tensor] | None,
         lights: Mapping[str, Mapping[str, torch.Tensor]] | None,
         parameters: Mapping[str, torch.Tensor] | None,
+        transforms: Mapping[str, torch.Tensor] | None,
+        camera: Mapping[str, torch.Tensor] | None,
     ) -> dict[_Place, torch.Tensor]:
         """All tensors, checked, by their purpose."""
         check_variant(mi.variant(), self._variant)
@@ -206,6 +223,15 @@ class Renderer:
                 if key == "direction":
                     _check_direction(f"lights['{name}']['direction']", value)
                 given[_Place("light", name, key)] = value
+        for name, value in (transforms or {}).items():
+            self._renderer.data.geometry.shape(name)  # raises if there is none
+            check_floats(f"transforms['{name}']", value, (4, 4))
+            given[_Place("transform", name)] = value
+        for name, value in (camera or {}).items():
+            if name not in _CAMERA_FIELDS:
+                raise ShadowmapError(f"camera: there is no '{name}' that a tensor could replace: {', '.join(_CAMERA_FIELDS)}.")
+            check_floats(f"camera['{name}']", value, *_CAMERA_FIELDS[name])
+            given[_Place("camera", name)] = value
         if parameters:
             current = mi.traverse(self._renderer.data.scene)
             for name, value in parameters.items():
@@ -225,7 +251,7 @@ class Renderer:
 
 @dataclass(frozen=True)
 class _Place:
-    """Purpose of a tensor: ``kind`` is vertices, light or parameter."""
+    """Purpose of a tensor: ``kind`` is vertices, light, parameter, transform or camera."""
 
     kind: str
     name: str
@@ -348,7 +374,12 @@ def _forward(
         if place.kind == "light":
             light = lights.get(place.name, renderer.light(place.name))
             lights[place.name] = replace(light, **{place.field: _converted(getattr(light, place.field), array)})
-    image = renderer.render(vertices, lights, sensor, spp)
+    transforms = {place.name: _converted(mi.Transform4f(), array) for place, array in given if place.kind == "transform"}
+    viewed = {place.name: array for place, array in given if place.kind == "camera"}
+    if viewed:
+        record = renderer.data.cameras(sensor)[0]
+        sensor = replace(record, **{name: _converted(getattr(record, name), array) for name, array in viewed.items()})
+    image = renderer.render(vertices, lights, sensor, spp, transforms=transforms or None)
     return image, (renderer.frusta, renderer.soft_frusta)
 
 

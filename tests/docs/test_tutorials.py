@@ -21,7 +21,7 @@ from shadowmap_dr.io.records import read_json
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "tutorials"
 # With a loop for any integrator and a recorded one, then those with a loop of their own.
 RACED = ("pose", "shape", "curve")
-OTHERS = ("torch", "sun", "art", "photo", "certainty")
+OTHERS = ("torch", "sun", "art", "photo", "certainty", "own_loss")
 FEW = {"type": "shadowmap", "area_light_samples": 4, "environment_light_samples": 8, "soft_map_resolution": 64}
 PARAMETERS: dict[str, dict[str, Any]] = {
     "pose": {"resolution": 64, "steps": 36, "reference_samples": 256, "integrator": FEW},
@@ -34,6 +34,7 @@ PARAMETERS: dict[str, dict[str, Any]] = {
     "sun": {"resolution": 32, "steps": 8, "texels": 20, "reference_samples": 32},
     "photo": {"width": 64, "height": 48, "starts": 6, "reference_samples": 64},
     "certainty": {"reference_samples": 64},
+    "own_loss": {"width": 80, "height": 60, "starts": 3, "reference_samples": 64},
     "art": {"resolution": 64, "rings": 12, "steps": 80, "picture_size": 32, "picture_samples": 2},
 }  # fmt: skip
 # Share of the start's errors that may be left.
@@ -137,6 +138,17 @@ def test_certainty_is_that_of_the_photos() -> None:
     assert two.half_width[1] < shadow.half_width[1] < 0.1 * alone.half_width[1]
     for found in (shadow, two):
         assert abs(found.values[1] - 0.2) < found.half_width[1]
+
+
+def test_edges_find_what_colours_do_not() -> None:
+    """The text of the notebook says all of this."""
+    names, lines = run_small("own_loss", "run")
+    assert not names["by_colours"].found and abs(names["off"](names["by_colours"])[0]) > 5
+    turn, place = names["off"](names["by_edges"])
+    assert names["by_edges"].found and abs(turn) < 0.5 and place < 0.02
+    lids = {name: abs(result.estimates[0].values[0] - names["LID"]) for name, result in names["opened"].items()}
+    assert names["opened"]["edges"].found and lids["edges"] < 1 and lids["colours"] > 2 * lids["edges"]
+    assert "take a way through NumPy" in lines[-1]
 
 
 def test_notebooks_are_whole_and_small() -> None:

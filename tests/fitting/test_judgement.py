@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from shadowmap_dr.fitting.comparison import Colours, Observation
+from shadowmap_dr.fitting.gains import Gain
 from shadowmap_dr.fitting.judgement import EXPLAINED, unexplained
 
 SIDE = 128
@@ -24,8 +26,8 @@ def judged(image: np.ndarray, picture: np.ndarray, weight: np.ndarray | None = N
     """The share for one number that moves the image sideways, by 20 pixels for a change by one."""
     weight = np.ones((SIDE, SIDE), np.float32) if weight is None else weight
     slope = 20 * np.gradient(image, axis=1).reshape(1, -1)
-    point: Any = SimpleNamespace(columns=lambda: [slope], recorded=[image], residuals=[image - picture])
-    objective: Any = SimpleNamespace(observations=[SimpleNamespace(image=picture, weight=weight)], brightness=[1.0])
+    objective: Any = SimpleNamespace(comparisons=[Colours(Observation(picture, weight, Gain()))])
+    point: Any = SimpleNamespace(columns=lambda: [slope], recorded=[image], residuals=[objective.comparisons[0].residuals(image)])
     return unexplained(point, objective)
 
 

@@ -15,9 +15,10 @@ from hypothesis import strategies as st
 
 from shadowmap_dr import Renderer
 from shadowmap_dr.errors import ShadowmapError
+from shadowmap_dr.fitting.comparison import Observation
 from shadowmap_dr.fitting.gains import Gain
 from shadowmap_dr.fitting.losses import Loss
-from shadowmap_dr.fitting.objective import Objective, Observation
+from shadowmap_dr.fitting.objective import Objective
 from shadowmap_dr.fitting.resolve import Resolver
 from shadowmap_dr.fitting.vary import Vary
 from shadowmap_dr.fitting.views import Quality, View
@@ -193,7 +194,7 @@ def test_priors_pull_to_the_scene() -> None:
     halved = objective_of(LOSSES[0], [Gain()], prior=0.05)
     np.testing.assert_allclose(halved.precision, 4 * tight.precision)
     # A deviation of one costs as much as usual differences of 64 pixels.
-    expected = 0.5 * 64 * 0.02**2 / (3 * tight.pixels)
+    expected = 0.5 * 64 * 0.02**2 / tight.terms
     assert tight.at(np.array([0.1, 0, 0])).cost - loose.at(np.array([0.1, 0, 0])).cost == pytest.approx(expected, rel=1e-5)
 
 
@@ -205,7 +206,7 @@ def test_masked_pixels_count_for_nothing() -> None:
     image = seen.image.copy()
     image[0] = 1000
     other = Objective(first.views, [Observation(image, seen.weight, seen.gain)], np.full(4, np.inf), first.loss)
-    assert other.brightness == first.brightness and other.at(x).cost == first.at(x).cost
+    assert other.observations[0].brightness == seen.brightness and other.at(x).cost == first.at(x).cost
     for ours, theirs in zip(other.at(x).system(), first.at(x).system(), strict=True):
         np.testing.assert_array_equal(ours, theirs)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -141,11 +142,11 @@ def test_exposure_alone_is_found(picture: Image) -> None:
 
 
 def test_known_exposures_are_applied(picture: Image) -> None:
-    target = make_target(picture * np.float32(0.25))
+    target = make_target(picture * np.float32(0.25), exposure=0.25)
     options = FitOptions(vary=(Vary("sun", "brightness"),), starts=1)
-    known = Fit(renderer(), [target], options, known=[0.25]).run()
+    known = fit(renderer(), target, "sun:brightness", starts=1)
     np.testing.assert_allclose(estimate(known, "sun:brightness").values, 1, rtol=0.01)
-    unknown = Fit(renderer(), [target], options).run()
+    unknown = Fit(renderer(), [replace(target, exposure=1.0)], options).run()
     np.testing.assert_allclose(estimate(unknown, "sun:brightness").values, 0.25, rtol=0.01)
 
 

@@ -32,8 +32,10 @@ class Linear:
 
     def __post_init__(self) -> None:
         self.count = len(self.derivatives[0])
-        self.pixels = float(sum(residual[..., 0].size for residual in self.residuals))
-        self.brightness = [1.0] * len(self.residuals)
+        self.has_own_residuals = False
+        self.terms = float(sum(residual.size for residual in self.residuals))
+        self.observations = [SimpleNamespace(brightness=1.0)] * len(self.residuals)
+        self.comparisons = [SimpleNamespace(derivatives=lambda image, changes: list(changes))] * len(self.residuals)
 
     @property
     def x(self) -> Array:
@@ -50,7 +52,7 @@ class Linear:
         return [np.ones(own.size, np.float32) for own in self.residuals]
 
     def system(self) -> tuple[Array, Array]:
-        matrix = sum(own @ own.T for own in self.derivatives) / (3 * self.pixels) + np.diag(self.precision)
+        matrix = sum(own @ own.T for own in self.derivatives) / self.terms + np.diag(self.precision)
         return np.asarray(matrix), np.zeros(self.count)
 
 

@@ -21,7 +21,15 @@ def of(columns: np.ndarray, noise: float = 0.01, prior: np.ndarray | None = None
     residual = np.random.default_rng(1).normal(0, noise, (SIZE, SIZE, 3))
     precision = PRIOR_WEIGHT / (3 * pixels) / np.square(np.full(count, np.inf) if prior is None else prior)
     at = lambda x: SimpleNamespace(residuals=[residual + (x @ flat).reshape(residual.shape)])  # noqa: E731
-    objective = SimpleNamespace(pixels=pixels, precision=precision, count=count, brightness=[1.0], at=at)
+    objective = SimpleNamespace(
+        terms=3 * pixels,
+        precision=precision,
+        count=count,
+        observations=[SimpleNamespace(brightness=1.0)],
+        comparisons=[SimpleNamespace(derivatives=lambda image, changes: list(changes))],
+        has_own_residuals=False,
+        at=at,
+    )
     point = SimpleNamespace(
         system=lambda: (flat @ flat.T / (3 * pixels) + np.diag(precision), None),
         columns=lambda: [flat],

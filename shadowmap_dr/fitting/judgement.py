@@ -69,15 +69,27 @@ def unexplained(point: Point, objective: Objective) -> float:
         weight = np.broadcast_to(compared.weight, (*residual.shape[:2], 1))[..., 0]
         arrays = *compared.contents(image), residual, moved.max(2), weight, np.asarray(weight > 0, np.float32)
         times = max(2, round(max(weight.shape) / _SIDE)) if is_image(residual.shape) else 1
+        noise = _noise(residual, weight, times)
         ours, theirs, left, moved, weight, whole = (_reduced(one, times) for one in arrays)
         pairs = isinstance(compared, Colours) or is_image(residual.shape) and _is_smooth(theirs)
         matters = np.maximum(moved, np.abs(left).mean(2)) > _VISIBLE
         # Pixels that do not count are black: blocks with one count for nothing.
         weight = np.asarray(weight * (whole == 1) * matters, np.float32)
         for of_image, of_picture, of_residual, both in _edges(pairs, ours, theirs, left, weight[..., None]):
-            missing += float((both * of_residual**2).sum(dtype=np.float64))
+            found = float((both * of_residual**2).sum(dtype=np.float64))
+            expected = noise * of_residual.shape[2] * float(both.sum(dtype=np.float64)) * (2 if pairs else 1)
+            missing += max(found - expected, 0.0)
             total += float((both * (of_image**2 + of_picture**2)).sum(dtype=np.float64))
     return missing / total if total > 0 else 0.0
+
+
+def _noise(residual: Image, weight: Image, times: int) -> float:
+    """Variance of blocks' means that noise of single pixels makes: edges that are elsewhere vary in few blocks alone."""
+    if times < 2:
+        return 0.0
+    inside = _reduced(np.square(residual), times) - np.square(_reduced(residual, times))
+    counts = _reduced(np.asarray(weight > 0, np.float32), times) == 1
+    return float(np.median(inside.mean(2)[counts])) / (times**2 - 1) if counts.any() else 0.0
 
 
 def _is_smooth(image: Image) -> bool:

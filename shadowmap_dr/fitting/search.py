@@ -32,7 +32,7 @@ from .result import FitResult, Picture, Step
 from .scene_change import SceneChange
 from .shadow_pictures import lit_share
 from .stages import Stage, make_stages, qualities
-from .starts import chosen, draw, half_ranges, with_gains
+from .starts import chosen, draw, groups_of, half_ranges, redraw, with_gains
 from .state import Run, State
 from .targets import Target
 from .uncertainty import uncertainty
@@ -157,11 +157,17 @@ class Fit:
             self._corrections.keep_constant()
 
     def _starts(self, attempt: int) -> list[Run]:
-        """The starts of a try: the best of many candidates. Their ranges grow from try to try."""
+        """The starts of a try: the best of many candidates.
+
+        The ranges grow from try to try, and later tries have candidates that differ from the best numbers in a part only.
+        """
         first = self.stages[0].objective
         scene, options = first.views[0].count, self.options
         ranges = half_ranges(self.parameters) * (1 + attempt * _GROWTH)
-        drawn = draw(ranges, self._low[:scene], self._high[:scene], options.starts, (options.seed, attempt), scene=attempt == 0)
+        low, high, seed = self._low[:scene], self._high[:scene], (options.seed, attempt)
+        drawn = draw(ranges, low, high, options.starts, seed, scene=attempt == 0)
+        if attempt:
+            drawn += redraw(self.best[:scene], groups_of(self.parameters), ranges, low, high, len(drawn), seed)
         return [Run(attempt * options.starts + k, x) for k, x in enumerate(chosen(drawn, first, options.starts))]
 
     def _limits(self, number: int) -> Limits:

@@ -46,6 +46,32 @@ def draw(ranges: Array, low: Array, high: Array, count: int, seed: int | tuple[i
     return [np.clip(x, low, high) for x in others]
 
 
+def redraw(
+    best: Array, groups: Sequence[npt.NDArray[np.intp]], ranges: Array, low: Array, high: Array, count: int, seed: tuple[int, int]
+) -> list[Array]:
+    """``count`` candidates that differ from the best numbers (n,) in one group each, drawn as by :func:`draw`.
+
+    Often all but one of several objects are right, or the place of an object that is turned wrongly.
+    """
+    generator, found = np.random.default_rng((*seed, 1)), []
+    for k in range(count if groups else 0):
+        x, own = best.copy(), groups[k % len(groups)]
+        x[own] = generator.uniform(-ranges[own], ranges[own])
+        found.append(np.clip(x, low, high))
+    return found
+
+
+def groups_of(parameters: Sequence[Parameter]) -> list[npt.NDArray[np.intp]]:
+    """Numbers that :func:`redraw` draws together: those of each entry, and its rotations alone."""
+    groups, first = list[npt.NDArray[np.intp]](), 0
+    for parameter in parameters:
+        own = np.arange(first, first + len(parameter.labels))
+        turns = own[[label.startswith("rotation") for label in parameter.labels]]
+        groups += [own, turns] if 0 < len(turns) < len(own) else [own]
+        first += len(own)
+    return groups
+
+
 def chosen(candidates: Sequence[Array], objective: Objective, count: int) -> list[Array]:
     """The first of some candidates and the best others, ``count`` in all, with gains."""
     full = [with_gains(x, objective) for x in candidates]

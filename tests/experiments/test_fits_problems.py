@@ -151,7 +151,7 @@ def record_of(problem: FitProblem, start: Scene, at: Scene, exposure: float = 1.
                 "half_width": [width],
             }
         )
-    return {"found": True, "words": [], "estimates": estimates, "pictures": pictures}
+    return {"found": True, "words": [], "unexplained": 0.01, "estimates": estimates, "pictures": pictures}
 
 
 def turning(start: Scene, part: str) -> dict[str, Any]:
@@ -461,7 +461,7 @@ def test_the_section_runs_the_command(tmp_path: Path, monkeypatch: pytest.Monkey
     assert [one["solved"] for one in result["starts"]] == [True, False]
     assert result["seconds"]["fit"]["count"] == 2 and result["vary"] == ["bunny:pose"]
     first, second = (trial.line(one) for one in result["starts"])
-    assert ", solved, called found; bunny:pose rotation " in first
+    assert ", solved, called found (1.0 % unexplained); bunny:pose rotation " in first
     assert ("failed: status 1: Error: this went wrong." if failing == 1 else "NOT SOLVED, called found") in second
     if failing == 1:
         assert "this went wrong" in result["starts"][1]["failed"]

@@ -89,6 +89,7 @@ def score(problem: FitProblem, start: Scene, record: Record, folder: Path) -> di
     return {
         "solved": all(one.is_met for one in found),
         "found": bool(record["found"]),
+        "unexplained": record["unexplained"],
         "deviations": [asdict(one) for one in found],
         "intervals": [asdict(one) for one in stated],
         "words": list(record.get("words", ())),

@@ -24,7 +24,7 @@ def line(run: Mapping[str, Any]) -> str:
     head = f"{run['problem']} {run['start']}: {run['seconds']:.1f} s, "
     if "failed" in run:
         return f"{head}failed: {run['failed']}"
-    told = "found" if run["found"] else "not found"
+    told = f"{'found' if run['found'] else 'not found'} ({100 * run['unexplained']:.1f} % unexplained)"
     errors = ", ".join(f"{one['name']} {one['what']} {one['error']:.3g} / {one['bar']:g}" for one in run["deviations"])
     return f"{head}{'solved' if run['solved'] else 'NOT SOLVED'}, called {told}; {errors}"
 

@@ -1,0 +1,45 @@
+"""Candidates for the starts of a fit."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from shadowmap_dr.fitting.starts import draw, groups_of, redraw
+
+RANGES = np.array([0.3, 0.3, 0.3, 0.1, 0.1, 0.5])
+LOW, HIGH = np.full(6, -np.inf), np.array([np.inf] * 5 + [0.2])
+
+
+def entries(*labels: tuple[str, ...]) -> list[Any]:
+    return [SimpleNamespace(labels=one) for one in labels]
+
+
+def test_the_first_candidate_is_the_scene_and_others_lie_in_the_ranges() -> None:
+    found = draw(RANGES, LOW, HIGH, 8, 0)
+    assert len(found) == 57
+    np.testing.assert_array_equal(found[0], 0)
+    others = np.array(found[1:])
+    assert (np.abs(others) <= RANGES).all() and others[:, 5].max() <= 0.2
+    assert (np.abs(others).max(0) > 0.8 * np.minimum(RANGES, HIGH)).all()
+
+
+def test_groups_are_entries_and_the_rotations_of_poses() -> None:
+    pose = ("rotation x", "rotation y", "rotation z", "translation x", "translation y")
+    found = groups_of(entries(pose, ("value",), ("rotation y",)))
+    assert [group.tolist() for group in found] == [[0, 1, 2, 3, 4], [0, 1, 2], [5], [6]]
+
+
+def test_redrawn_candidates_differ_from_the_best_in_one_group() -> None:
+    best = np.array([1.0, -2.0, 3.0, 0.5, 0.25, 0.1])
+    groups = [np.arange(5), np.arange(3), np.array([5])]
+    found = redraw(best, groups, RANGES, LOW, HIGH, 30, (0, 1))
+    assert len(found) == 30
+    for k, x in enumerate(found):
+        own = groups[k % 3]
+        np.testing.assert_array_equal(np.delete(x, own), np.delete(best, own))
+        assert (np.abs(x[own]) <= RANGES[own]).all() and (x[own] != best[own]).any()
+    assert not np.array_equal(found[0], found[3])
+    assert redraw(best, [], RANGES, LOW, HIGH, 30, (0, 1)) == []

@@ -14,7 +14,7 @@ from ..errors import ShadowmapError, warn
 from ..io import console as io_console
 from ..io import files
 from ..rendering.renderer import Renderer
-from .film import write_film
+from .film import encode_film
 from .glb import write_glb
 from .report import write_report
 from .result import FitResult, Step
@@ -83,9 +83,11 @@ def _write(result: FitResult, fit: Fit, task: FitTask, scene_file: Path, out: Pa
     """Write the results; problems of single files become warnings, so that nothing is lost."""
     result.write_json(out / RESULT)
     with io_console.task(progress, "report and film"):
-        write_report(result, out / REPORT)
-        if any(picture.frames for picture in result.pictures):
-            write_film(result.pictures, out / FILM)
+        film = encode_film(result.pictures) if any(picture.frames for picture in result.pictures) else None
+        write_report(result, out / REPORT, film=film)
+        if film is not None:
+            with files.atomic(out / FILM) as temporary:
+                temporary.write_bytes(film)
     with io_console.task(progress, "fitted scene"):
         _write_scene(fit, task, scene_file, out)
 

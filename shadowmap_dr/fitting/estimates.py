@@ -18,7 +18,6 @@ from .motions import host_matrix, tangents
 from .parameters import Parameter
 from .result import Estimate
 from .scene_change import SceneChange
-from .targets import Target
 from .uncertainty import Uncertainty
 
 Array = npt.NDArray[np.float64]
@@ -61,14 +60,14 @@ def estimates_of(
 
 
 def gain_estimates(
-    x: Array, targets: Sequence[Target], gains: Sequence[Gain], places: Sequence[slice], spread: Uncertainty
+    x: Array, pictures: Sequence[str], gains: Sequence[Gain], places: Sequence[slice], spread: Uncertainty
 ) -> tuple[list[Estimate], list[str]]:
-    """(estimates of the pictures' gains, names of their numbers). ``places``: of the gains' numbers in x."""
+    """(estimates of the pictures' gains, names of their numbers). ``pictures``: names; ``places``: of the gains' numbers in x."""
     estimates: list[Estimate] = []
     names: list[str] = []
     half = spread.half_widths
-    for target, gain, own in zip(targets, gains, places, strict=True):
-        shown = target.name or "the picture"
+    for name, gain, own in zip(pictures, gains, places, strict=True):
+        shown = name or "the picture"
         if gain.colours:
             one = slice(own.start, own.start + gain.colours)
             kind = "exposure" if gain.colours == 1 else "white balance"

@@ -31,25 +31,26 @@ _LINE = 80
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'"
 
 
-def write_report(result: FitResult, path: str | os.PathLike[str]) -> None:
+def write_report(result: FitResult, path: str | os.PathLike[str], *, film: bytes | None = None) -> None:
     """Write the report (.html). Raises OutputError if it cannot be written.
 
-    All texts of the result are escaped. Pictures are embedded with at most 1024 pixels along the longer side.
+    All texts of the result are escaped. Pictures are embedded with at most 1024 pixels along the longer side. ``film``: content
+    of the film's file (.webp), if it is there already.
     """
-    page = report_html(result)
+    page = report_html(result, film)
     with atomic(path) as temporary:
         temporary.write_text(page, encoding="utf-8", errors="replace")
 
 
-def report_html(result: FitResult) -> str:
-    """The report as text."""
+def report_html(result: FitResult, film: bytes | None = None) -> str:
+    """The report as text. ``film``: see `write_report`."""
     pictures = [picture for picture in result.pictures if picture.target.size]
     title, verdict = _verdict(result)
     sections = [
         verdict,
         *(_picture(picture, number, len(pictures)) for number, picture in enumerate(pictures)),
         "" if pictures else "<h2>Pictures</h2><p>The result has no pictures.</p>",
-        _film(pictures),
+        _film(pictures, film),
         _curves(result),
         f"<h2>Estimates</h2>{report_numbers.estimates(result)}" if result.estimates else "",
         report_numbers.correlations(result),
@@ -196,16 +197,17 @@ def _data(kind: str, content: bytes) -> str:
     return f"data:{kind};base64,{base64.b64encode(content).decode()}"
 
 
-def _film(pictures: Sequence[Picture]) -> str:
+def _film(pictures: Sequence[Picture], film: bytes | None) -> str:
     if not any(picture.frames for picture in pictures):
         return ""
     last = still(pictures)
     height, width = last.shape[:2]
     alt = "Film: the target, the fit from the start to the end, and their difference"
+    content = encode_film(pictures) if film is None else film
     return (
         '<h2>Film</h2><details class="film" open><summary>The fit from coarse to fine</summary><picture>'
         f'<source media="(prefers-reduced-motion: reduce)" srcset="{_webp(last, lossless=False)}">'
-        f'<img src="{_data("image/webp", encode_film(pictures))}" alt="{alt}" width="{width}" height="{height}">'
+        f'<img src="{_data("image/webp", content)}" alt="{alt}" width="{width}" height="{height}">'
         "</picture></details>"
         '<p class="pale">From left to right: target, fit, difference. First the start, then coarse and finer images, at last '
         "the fit. The error is a fraction of the target's brightness.</p>"

@@ -34,7 +34,7 @@ from .shadow_pictures import lit_share
 from .stages import Stage, make_stages, qualities
 from .starts import chosen, draw, groups_of, half_ranges, redraw, with_gains
 from .state import Run, State
-from .targets import Target
+from .targets import Target, short_names
 from .uncertainty import uncertainty
 
 Array = npt.NDArray[np.float64]
@@ -297,7 +297,7 @@ class Fit:
         x = np.where(spread.idle, np.clip(0, self._low, self._high), point.x)
         self.best_run.x = x
         estimates, names = estimates_of(x, self.parameters, self.renderer, self.change(x), spread)
-        of_gains, names_of_gains = gain_estimates(x, self.targets, self.gains, objective.gains, spread)
+        of_gains, names_of_gains = gain_estimates(x, short_names(self.targets), self.gains, objective.gains, spread)
         names += names_of_gains
         share = unexplained(point, objective)
         words = sentences(share, point.error, spread, names, own=objective.has_own_residuals)
@@ -326,6 +326,7 @@ class Fit:
         first = with_gains(np.zeros(objective.views[0].count), objective)
         start = [objective.recorded(k, view.image(first).copy(), first) for k, view in enumerate(objective.views)]
         objective.set_values(values)
+        shown = short_names(self.targets)
         return [
             Picture(
                 target=seen.image,
@@ -334,7 +335,7 @@ class Fit:
                 weight=seen.weight,
                 shadows=lit_share(objective.views[k], point.x),
                 frames=self._frames(k),
-                name=self.targets[k].name,
+                name=shown[k],
                 exposure=float(np.mean(seen.gain.colour_factors(point.x[objective.gains[k]]))),
             )
             for k, seen in enumerate(objective.observations)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import PurePath
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -31,7 +33,7 @@ class Target:
 
     ``image`` float32 (H, W, 3), finite, not negative. ``weight`` float32 (H, W) in 0..1: 0 for masked, transparent and saturated
     pixels, and for pixels that are not finite; there ``image`` is 0, too. ``sensor``: number of the scene's sensor that took it.
-    ``name``: of the file, for messages. ``exposure``: known exposure, the factor of the rendered colours, as in fit.toml.
+    ``name``: path of the file, for messages. ``exposure``: known exposure, the factor of the rendered colours, as in fit.toml.
     """
 
     image: Array
@@ -161,6 +163,29 @@ def make_target(
         colours = np.broadcast_to(values, (*values.shape[:2], 3))
         values = np.concatenate([colours, np.ones_like(values[..., :1])], axis=-1)
     return replace(_target(values, mask, sensor, name, saturation, longer_side), exposure=exposure)
+
+
+def short_names(targets: Sequence[Target]) -> list[str]:
+    """Names of pictures for results, none twice: those of the files, with as many folders as tell them apart.
+
+    Pictures of one path, or of arrays, have the number of their sensor or their place in addition. A single picture without a
+    name has none.
+    """
+    paths = [PurePath(target.name).parts for target in targets]
+    names = []
+    for own in paths:
+        others = [other for other in paths if other != own]
+        count = next((k for k in range(1, len(own)) if all(other[-k:] != own[-k:] for other in others)), len(own))
+        names.append(str(PurePath(*own[len(own) - count :])) if own else "")
+    return [name if names.count(name) == 1 else _numbered(targets, names, place) for place, name in enumerate(names)]
+
+
+def _numbered(targets: Sequence[Target], names: Sequence[str], place: int) -> str:
+    """The name of a picture that others have, too, with a number."""
+    group = [k for k, name in enumerate(names) if name == names[place]]
+    sensors = [targets[k].sensor for k in group]
+    number = f"sensor {targets[place].sensor}" if len(set(sensors)) == len(group) else f"{group.index(place) + 1} of {len(group)}"
+    return f"{names[place] or 'the picture'} ({number})"
 
 
 def is_same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:

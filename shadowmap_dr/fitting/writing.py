@@ -11,7 +11,7 @@ import mitsuba as mi
 
 from ..errors import ShadowmapError, warn
 from ..io import console, files
-from .film import write_film
+from .film import encode_film
 from .glb import write_glb
 from .report import write_report
 from .result import FitResult
@@ -49,10 +49,12 @@ def write_fit(
     out = Path(folder)
     files.make_folder(out)
     result.write_json(out / RESULT)
-    write_report(result, out / REPORT)
+    film = encode_film(result.pictures) if any(picture.frames for picture in result.pictures) else None
+    write_report(result, out / REPORT, film=film)
     written = [out / RESULT, out / REPORT]
-    if any(picture.frames for picture in result.pictures):
-        write_film(result.pictures, out / FILM)
+    if film is not None:
+        with files.atomic(out / FILM) as temporary:
+            temporary.write_bytes(film)
         written.append(out / FILM)
     return written + _scene_files(result, out, scene, parameters)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from PIL import Image
 
 from shadowmap_dr.errors import ShadowmapError
 from shadowmap_dr.fitting import targets
-from shadowmap_dr.fitting.targets import Target, is_same_shape, make_target, read_target
+from shadowmap_dr.fitting.targets import Target, is_same_shape, make_target, read_target, short_names
 from shadowmap_dr.io.images import to_srgb, write_exr, write_png
 
 
@@ -400,3 +401,20 @@ def test_large_pictures_need_little_more_memory_than_their_pixels(tmp_path: Path
     run = subprocess.run([sys.executable, "-c", code, str(tmp_path / "large.png")], capture_output=True, text=True, check=True)
     pixels = 6000 * 4000 * 4
     assert int(run.stdout) < 5 * pixels, f"{int(run.stdout) / pixels:.2f} times the pixels"
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        (["a/photo.png"], ["photo.png"]),
+        (["a/left.png", "a/right.png"], ["left.png", "right.png"]),
+        (["one/photo.png", "two/photo.png"], ["one/photo.png", "two/photo.png"]),
+        (["x/one/photo.png", "y/one/photo.png", "y/other.png"], ["x/one/photo.png", "y/one/photo.png", "other.png"]),
+        (["a/photo.png", "a/photo.png"], ["photo.png (sensor 0)", "photo.png (sensor 1)"]),
+        ([""], [""]),
+    ],
+)
+def test_short_names_tell_pictures_apart(given: list[str], expected: list[str]) -> None:
+    image = np.ones((2, 2, 3), np.float32)
+    targets = [replace(make_target(image), name=name, sensor=number) for number, name in enumerate(given)]
+    assert short_names(targets) == expected

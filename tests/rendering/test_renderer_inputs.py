@@ -92,7 +92,7 @@ def test_directions_of_any_length(renderer: Renderer, length: float) -> None:
 @pytest.mark.parametrize("axis", range(3))
 def test_a_vertex_that_is_not_finite_takes_its_triangles_only(renderer: Renderer, axis: int, value: float) -> None:
     """And not the shadow of the whole mesh, whose bounds it is in."""
-    points = rest(renderer).numpy().reshape(-1, 3).copy()
+    points = rest(renderer).numpy().T.copy()
     # On the lower side, where neither the camera nor a light sees its triangles.
     lowest = int(points[:, 2].argmin())
     expected = renderer.render(vertex_positions={"ball": mi.Float(points.ravel())}).numpy()

@@ -107,7 +107,7 @@ def test_deep_copies_have_a_fit_of_their_own(kind: Any, known: bool) -> None:
     core, own = (getattr(r, "_renderer", r) for r in (renderer, copied))
     assert copied is not renderer and np.allclose(image(copied), first, atol=1e-6)
     width = float(core.frusta.half_x[0])
-    vertices = torch.tensor(np.array(core.data.geometry.shape_positions("ball"))).reshape(-1, 3) * 2 + torch.tensor([1.0, 1, 1])
+    vertices = torch.tensor(core.data.geometry.shape_positions("ball").numpy().T) * 2 + torch.tensor([1.0, 1, 1])
     given = vertices if kind is sdr.Renderer else mi.TensorXf(vertices)
     copied.render({"ball": given})
     assert float(core.frusta.half_x[0]) == width != float(own.frusta.half_x[0]) and np.allclose(image(renderer), first, atol=1e-6)

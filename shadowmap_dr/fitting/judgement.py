@@ -15,21 +15,34 @@ from .uncertainty import Uncertainty, not_told_apart
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
 
-#: Largest share of unexplained edges with which a fit counts as found.
-EXPLAINED = 0.16
+#: Largest share of unexplained edges with which a fit counts as found, and that of corrected images of few numbers.
+EXPLAINED, EXPLAINED_CORRECTED = 0.16, 0.04
 # Pixels along the longer side of the images whose edges are compared, at most: noise and blurred outlines count little there.
 _SIDE = 56
 # Mean square of differences between neighbours below which they are alike, as a share of that of unrelated neighbours.
 _SMOOTH = 0.5
+# Largest share of the edges that noise may explain.
+_NOISY = 0.1
 # Pixels matter where a change of a number by the first moves them by more than the second, a share of the brightness; and
 # where the residual is larger.
 _CHANGE, _VISIBLE = 0.05, 0.03
 
 
-def sentences(share: float, error: float, spread: Uncertainty, names: Sequence[str], *, own: bool = False) -> list[str]:
+def largest_share(objective: Objective) -> float:
+    """Largest share of unexplained edges with which a fit counts as found."""
+    corrected = all(one is not None for one in objective.corrections)
+    # Textures and vertices take a given number of steps, and residuals of users see other things.
+    plain = not objective.has_own_residuals and not objective.views[0].values
+    return EXPLAINED_CORRECTED if corrected and plain else EXPLAINED
+
+
+def sentences(
+    found: bool, share: float, error: float, spread: Uncertainty, names: Sequence[str], *, own: bool = False
+) -> list[str]:
     """Sentences about a fit: whether the scene explains the pictures, and the numbers that they do not determine.
 
     Args:
+        found: true if it does.
         share: of unexplained edges.
         error: of the best point.
         spread: its uncertainty.
@@ -37,7 +50,7 @@ def sentences(share: float, error: float, spread: Uncertainty, names: Sequence[s
         own: true if share and error are those of a user's residuals.
     """
     words: list[str] = []
-    if share > EXPLAINED:
+    if not found:
         words.append(
             f"Not found: {100 * share:.0f} % of {'what your residuals see' if own else 'the edges that matter'} in the picture "
             f"{'is' if own else 'are'} not where the scene has {'it' if own else 'them'}, and the images differ by "
@@ -78,8 +91,9 @@ def unexplained(point: Point, objective: Objective) -> float:
         for of_image, of_picture, of_residual, both in _edges(pairs, ours, theirs, left, weight[..., None]):
             found = float((both * of_residual**2).sum(dtype=np.float64))
             expected = noise * of_residual.shape[2] * float(both.sum(dtype=np.float64)) * (2 if pairs else 1)
-            missing += max(found - expected, 0.0)
-            total += float((both * (of_image**2 + of_picture**2)).sum(dtype=np.float64))
+            there = float((both * (of_image**2 + of_picture**2)).sum(dtype=np.float64))
+            missing += max(found - min(expected, _NOISY * there), 0.0)
+            total += there
     return missing / total if total > 0 else 0.0
 
 

@@ -20,7 +20,7 @@ from .changes import Changes, FittedScene
 from .corrections import Corrections
 from .estimates import array_estimates, changes_of, estimates_of, gain_estimates
 from .gains import Gain
-from .judgement import EXPLAINED, sentences, unexplained
+from .judgement import largest_share, sentences, unexplained
 from .levenberg_marquardt import Limits, minimise
 from .losses import Loss
 from .objective import Point
@@ -145,7 +145,7 @@ class Fit:
                         self._state.write(state, fingerprint)
                 self._state.choose(number, len(self.stages) - 2 - number, first)
             yield from self._correct(self._state.best_from(first))
-            if attempt < tries - 1 and self._unexplained(self.best) <= EXPLAINED:
+            if attempt < tries - 1 and self._unexplained(self.best) <= largest_share(self.stages[-1].objective):
                 break
         for number in range(self._state.array_stage, len(self.stages) if self.arrays else 0):
             if number >= len(self.stages) - _ARRAY_STAGES:
@@ -300,12 +300,13 @@ class Fit:
         of_gains, names_of_gains = gain_estimates(x, short_names(self.targets), self.gains, objective.gains, spread)
         names += names_of_gains
         share = unexplained(point, objective)
-        words = sentences(share, point.error, spread, names, own=objective.has_own_residuals)
+        found = share <= largest_share(objective)
+        words = sentences(found, share, point.error, spread, names, own=objective.has_own_residuals)
         if self._corrections is not None and self._corrections.failure:
             words.append(f"Images are not corrected, since Mitsuba cannot render the fitted scene: {self._corrections.failure}.")
         seconds = time.perf_counter() - self._began
         return FitResult(
-            found=share <= EXPLAINED,
+            found=found,
             words=words,
             unexplained=share,
             estimates=[*estimates, *array_estimates(self.arrays, self._state.values), *of_gains],

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from shadowmap_dr.fitting import FitOptions, Vary
-from shadowmap_dr.fitting.judgement import EXPLAINED
+from shadowmap_dr.fitting.judgement import EXPLAINED, EXPLAINED_CORRECTED
 from shadowmap_dr.fitting.task import PictureFile, read_task
 from shadowmap_dr.fitting.uncertainty import DISPLACEMENT, FACTOR
 from shadowmap_dr.fitting.vary import KINDS
@@ -46,5 +46,6 @@ def test_all_keys_and_kinds_are_in_the_tables() -> None:
 
 
 def test_numbers_of_the_text_are_those_of_the_program() -> None:
-    assert f"at most {100 * EXPLAINED:g} % of the edges that matter" in TEXT
+    assert f"at most {100 * EXPLAINED_CORRECTED:g} % of the edges that matter" in TEXT
+    assert f"({100 * EXPLAINED:g} % where\ntextures or vertices vary, or images are not corrected)" in TEXT
     assert f"displaced by {DISPLACEMENT:g} pixels, a brightness that is wrong by {100 * FACTOR:g} %" in TEXT

@@ -21,8 +21,8 @@ EXPLAINED, EXPLAINED_CORRECTED = 0.16, 0.04
 _SIDE = 56
 # Mean square of differences between neighbours below which they are alike, as a share of that of unrelated neighbours.
 _SMOOTH = 0.5
-# Largest share of the edges that noise may explain.
-_NOISY = 0.1
+# Largest share of the edges that noise may explain, and multiple of its deviation that residuals exceed where they matter.
+_NOISY, _ABOVE = 0.1, 2.5
 # Pixels matter where a change of a number by the first moves them by more than the second, a share of the brightness; and
 # where the residual is larger.
 _CHANGE, _VISIBLE = 0.05, 0.03
@@ -85,7 +85,7 @@ def unexplained(point: Point, objective: Objective) -> float:
         noise = _noise(residual, weight, times)
         ours, theirs, left, moved, weight, whole = (_reduced(one, times) for one in arrays)
         pairs = isinstance(compared, Colours) or is_image(residual.shape) and _is_smooth(theirs)
-        matters = np.maximum(moved, np.abs(left).mean(2)) > _VISIBLE
+        matters = (moved > _VISIBLE) | (np.abs(left).mean(2) > max(_VISIBLE, _ABOVE * np.sqrt(noise)))
         # Pixels that do not count are black: blocks with one count for nothing.
         weight = np.asarray(weight * (whole == 1) * matters, np.float32)
         for of_image, of_picture, of_residual, both in _edges(pairs, ours, theirs, left, weight[..., None]):

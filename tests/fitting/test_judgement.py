@@ -10,7 +10,7 @@ import pytest
 
 from shadowmap_dr.fitting.comparison import Colours, Observation
 from shadowmap_dr.fitting.gains import Gain
-from shadowmap_dr.fitting.judgement import EXPLAINED, unexplained
+from shadowmap_dr.fitting.judgement import EXPLAINED, EXPLAINED_CORRECTED, unexplained
 
 SIDE = 128
 
@@ -46,6 +46,16 @@ def test_noise_blur_and_smooth_light_are_no_matter() -> None:
     ramp = np.linspace(0, 0.2, SIDE, dtype=np.float32)[None, :, None]
     for picture in (disc(60, 60) + noise, disc(60, 60, softness=2), disc(60, 60) + ramp, disc(60.3, 60)):
         assert judged(disc(60, 60), picture) < 0.6 * EXPLAINED
+
+
+def test_noise_of_single_pixels_hides_no_displacement() -> None:
+    """Strong noise, as of few samples: its part is left out, and no more."""
+    noise = np.random.default_rng(0).normal(0, 0.15, (SIDE, SIDE, 3)).astype(np.float32)
+    assert judged(disc(60, 60), disc(60, 60) + noise) < 0.25 * EXPLAINED_CORRECTED
+    clean, noisy = (judged(disc(60, 60), disc(63, 60) + scale * noise) for scale in (0, 1))
+    assert noisy == pytest.approx(clean, rel=0.2)
+    # A picture of noise alone is explained by nothing.
+    assert judged(disc(60, 60), 5 * noise) > EXPLAINED
 
 
 def test_masked_parts_count_for_nothing() -> None:

@@ -32,6 +32,8 @@ OWN_INFLATION = 9.0
 # A number with a smaller effect than the first, a share of the brightness for a change by one, is idle if a change by the second
 # makes no larger difference than the third: derivatives of outlines are not exact.
 _WEAK, _FAR, _SAME = 0.3, 0.3, 0.005
+# And if the scene's own value makes no larger difference than this one.
+_ALIKE_AFAR = 0.02
 # Numbers may depend on each other where an eigenvalue of the matrix, with a diagonal of one, is smaller: images tell how much.
 # Those with a smaller share of the eigenvector have no part in it.
 _DEPENDENT, _SHARE = 0.05, 0.02
@@ -85,7 +87,7 @@ def uncertainty(point: Point, objective: Objective, low: Array | float = -np.inf
         idle[k] = 2 * _FAR * np.sqrt(_change(np.eye(objective.count)[k], point, objective, low, high)) < _SAME
         if idle[k]:  # a light that is off by now moved much when it was on
             given = np.where(np.arange(objective.count) == k, np.clip(0, low, high), point.x)
-            idle[k] = np.sqrt(_square(objective.at(given), point, point, objective)) < _SAME
+            idle[k] = np.sqrt(_square(objective.at(given), point, point, objective)) < _ALIKE_AFAR
     inverse, free = _inverse(matrix * total, idle)
     # Where a prior alone determines a number, its interval is the prior's.
     unknown = OWN_INFLATION if objective.has_own_residuals else 1.0

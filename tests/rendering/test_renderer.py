@@ -417,4 +417,5 @@ def test_recorded_steps_of_shapes_without_size_guards_stay_within_their_shape(va
     count = rest.shape[1]
     expected = [run(count) for _ in range(3)][-1]
     run(100 * count)
-    np.testing.assert_array_equal(run(count), expected)
+    # Up to the order of sums.
+    np.testing.assert_allclose(run(count), expected, rtol=0, atol=1e-6)

@@ -21,8 +21,9 @@ EXPLAINED, EXPLAINED_CORRECTED = 0.16, 0.04
 _SIDE = 56
 # Mean square of differences between neighbours below which they are alike, as a share of that of unrelated neighbours.
 _SMOOTH = 0.5
-# Largest share of the edges that noise may explain, and multiple of its deviation that residuals exceed where they matter.
-_NOISY, _ABOVE = 0.1, 2.5
+# Largest share of the edges that noise may explain, multiple of its deviation that residuals exceed where they matter, and
+# multiple of its median variance that it has at most.
+_NOISY, _ABOVE, _UNEVEN = 0.5, 2.5, 4.0
 # Pixels matter where a change of a number by the first moves them by more than the second, a share of the brightness; and
 # where the residual is larger.
 _CHANGE, _VISIBLE = 0.05, 0.03
@@ -85,25 +86,29 @@ def unexplained(point: Point, objective: Objective) -> float:
         noise = _noise(residual, weight, times)
         ours, theirs, left, moved, weight, whole = (_reduced(one, times) for one in arrays)
         pairs = isinstance(compared, Colours) or is_image(residual.shape) and _is_smooth(theirs)
-        matters = (moved > _VISIBLE) | (np.abs(left).mean(2) > max(_VISIBLE, _ABOVE * np.sqrt(noise)))
+        matters = (moved > _VISIBLE) | (np.abs(left).mean(2) > np.maximum(_VISIBLE, _ABOVE * np.sqrt(noise[..., 0])))
         # Pixels that do not count are black: blocks with one count for nothing.
         weight = np.asarray(weight * (whole == 1) * matters, np.float32)
-        for of_image, of_picture, of_residual, both in _edges(pairs, ours, theirs, left, weight[..., None]):
+        for of_image, of_picture, of_residual, both, of_noise in _edges(pairs, ours, theirs, left, weight[..., None], noise):
             found = float((both * of_residual**2).sum(dtype=np.float64))
-            expected = noise * of_residual.shape[2] * float(both.sum(dtype=np.float64)) * (2 if pairs else 1)
+            expected = of_residual.shape[2] * float((both * of_noise).sum(dtype=np.float64))
             there = float((both * (of_image**2 + of_picture**2)).sum(dtype=np.float64))
             missing += max(found - min(expected, _NOISY * there), 0.0)
             total += there
     return missing / total if total > 0 else 0.0
 
 
-def _noise(residual: Image, weight: Image, times: int) -> float:
-    """Variance of blocks' means that noise of single pixels makes: edges that are elsewhere vary in few blocks alone."""
+def _noise(residual: Image, weight: Image, times: int) -> Image:
+    """Variance (h, w, 1) of blocks' means that noise of single pixels makes.
+
+    It differs from place to place, but edges that are elsewhere, which vary in few blocks alone, are no noise.
+    """
     if times < 2:
-        return 0.0
-    inside = _reduced(np.square(residual), times) - np.square(_reduced(residual, times))
+        return np.zeros((*weight.shape, 1), np.float32)
+    inside = (_reduced(np.square(residual), times) - np.square(_reduced(residual, times))).mean(2) / (times**2 - 1)
     counts = _reduced(np.asarray(weight > 0, np.float32), times) == 1
-    return float(np.median(inside.mean(2)[counts])) / (times**2 - 1) if counts.any() else 0.0
+    most = _UNEVEN * float(np.median(inside[counts])) if counts.any() else 0.0
+    return np.asarray(np.clip(inside, 0, most)[..., None], np.float32)
 
 
 def _is_smooth(image: Image) -> bool:
@@ -114,14 +119,17 @@ def _is_smooth(image: Image) -> bool:
 
 
 def _edges(pairs: bool, *arrays: Image) -> Iterator[tuple[Image, ...]]:
-    """Differences between neighbours along each axis, if ``pairs``; of the last array, the weights, the smaller ones."""
+    """Differences between neighbours along each axis, if ``pairs``; of the weights, the last but one, the smaller ones, and of
+    the variances of noise, the last one, the sums."""
     if not pairs:
         yield arrays
         return
-    *images, weight = arrays
+    *images, weight, noise = arrays
     for axis in (0, 1):
-        both = np.minimum(np.take(weight, range(1, weight.shape[axis]), axis), _without_last(weight, axis))
-        yield *(np.diff(image, axis=axis) for image in images), both
+        (first, second), (one, other) = (
+            (np.take(array, range(1, array.shape[axis]), axis), _without_last(array, axis)) for array in (weight, noise)
+        )
+        yield *(np.diff(image, axis=axis) for image in images), np.minimum(first, second), one + other
 
 
 def _reduced(image: Image, times: int) -> Image:

@@ -32,6 +32,8 @@ OWN_INFLATION = 9.0
 # A number with a smaller effect than the first, a share of the brightness for a change by one, is idle if a change by the second
 # makes no larger difference than the third: derivatives of outlines are not exact.
 _WEAK, _FAR, _SAME = 0.3, 0.3, 0.005
+# Where images change by a smaller share than derivatives say, these are errors: a larger difference is none, too, of facets.
+_FALSE, _NEARLY = 0.4, 0.015
 # And if the scene's own value makes no larger difference than this one.
 _ALIKE_AFAR = 0.02
 # Numbers may depend on each other where an eigenvalue of the matrix, with a diagonal of one, is smaller: images tell how much.
@@ -84,7 +86,8 @@ def uncertainty(point: Point, objective: Objective, low: Array | float = -np.inf
     # Shares of the brightness that a change of a number by one makes.
     idle = moved < 1e-6
     for k in np.flatnonzero(~idle & (moved < _WEAK)):
-        idle[k] = 2 * _FAR * np.sqrt(_change(np.eye(objective.count)[k], point, objective, low, high)) < _SAME
+        change = np.sqrt(_change(np.eye(objective.count)[k], point, objective, low, high))
+        idle[k] = 2 * _FAR * change < (_SAME if change > _FALSE * moved[k] else _NEARLY)
         if idle[k]:  # a light that is off by now moved much when it was on
             given = np.where(np.arange(objective.count) == k, np.clip(0, low, high), point.x)
             idle[k] = np.sqrt(_square(objective.at(given), point, point, objective)) < _ALIKE_AFAR

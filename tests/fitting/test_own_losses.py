@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import re
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -14,9 +15,9 @@ import numpy.typing as npt
 import pytest
 from fitting_scenes import OPTIONS, box, camera, diffuse, floor, rgb, scene_of
 
-from shadowmap_dr import Renderer
+from shadowmap_dr import Renderer, fitting
 from shadowmap_dr.errors import ShadowmapError
-from shadowmap_dr.fitting import Fit, FitResult, Own, SceneChange, fit, make_target, prepared
+from shadowmap_dr.fitting import Fit, FitResult, Own, SceneChange, make_target
 from shadowmap_dr.fitting.comparison import Observation
 from shadowmap_dr.fitting.gains import Gain
 from shadowmap_dr.fitting.judgement import EXPLAINED, unexplained
@@ -28,6 +29,8 @@ from shadowmap_dr.jit.types import Float, TensorXf
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
 SHAPE = (20, 24, 3)
+# Corrections, which take Mitsuba's kernels, have tests of their own.
+fit, prepared = partial(fitting.fit, correct=False), partial(fitting.prepared, correct=False)
 
 
 @pytest.fixture(autouse=True)

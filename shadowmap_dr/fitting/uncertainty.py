@@ -32,8 +32,8 @@ OWN_INFLATION = 9.0
 # A number with a smaller effect than the first, a share of the brightness for a change by one, is idle if a change by the second
 # makes no larger difference than the third: derivatives of outlines are not exact.
 _WEAK, _FAR, _SAME = 0.3, 0.3, 0.005
-# Where images change by a smaller share than derivatives say, these are errors: a larger difference is none, too, of facets.
-_FALSE, _NEARLY = 0.4, 0.015
+# A larger difference, up to the first number, counts as none if it is below the second times that of a change by the third.
+_NEARLY, _GROWN, _NEAR = 0.015, 1.7, 0.1
 # And if the scene's own value makes no larger difference than this one.
 _ALIKE_AFAR = 0.02
 # Numbers may depend on each other where an eigenvalue of the matrix, with a diagonal of one, is smaller: images tell how much.
@@ -86,8 +86,7 @@ def uncertainty(point: Point, objective: Objective, low: Array | float = -np.inf
     # Shares of the brightness that a change of a number by one makes.
     idle = moved < 1e-6
     for k in np.flatnonzero(~idle & (moved < _WEAK)):
-        change = np.sqrt(_change(np.eye(objective.count)[k], point, objective, low, high))
-        idle[k] = 2 * _FAR * change < (_SAME if change > _FALSE * moved[k] else _NEARLY)
+        idle[k] = _is_idle(np.eye(objective.count)[k], point, objective, low, high)
         if idle[k]:  # a light that is off by now moved much when it was on
             given = np.where(np.arange(objective.count) == k, np.clip(0, low, high), point.x)
             idle[k] = np.sqrt(_square(objective.at(given), point, point, objective)) < _ALIKE_AFAR
@@ -136,9 +135,21 @@ def _dependence(
     return result
 
 
-def _change(direction: Array, point: Point, objective: Objective, low: Array | float, high: Array | float) -> float:
+def _is_idle(direction: Array, point: Point, objective: Objective, low: Array | float, high: Array | float) -> bool:
+    """True if images along a direction are alike.
+
+    Differences in proportion to the distance tell. Those of facets do not grow with it, and shadow maps that are fitted anew make
+    a step somewhere.
+    """
+    far, near = (2 * step * np.sqrt(_change(direction, point, objective, low, high, step)) for step in (_FAR, _NEAR))
+    return bool(min(far, near * _FAR / _NEAR) < _SAME or far < _NEARLY and far < _GROWN * near)
+
+
+def _change(
+    direction: Array, point: Point, objective: Objective, low: Array | float, high: Array | float, far: float = _FAR
+) -> float:
     """Square of the change of the images along a direction, a share of the brightness for a step of one, from two images."""
-    ends = [np.clip(point.x + sign * _FAR * direction, low, high) for sign in (1, -1)]
+    ends = [np.clip(point.x + sign * far * direction, low, high) for sign in (1, -1)]
     above, below = (objective.at(end) for end in ends)
     step = float(np.linalg.norm(ends[0] - ends[1]) / np.linalg.norm(direction))
     return _square(above, below, point, objective) / step**2 if step > 0 else np.inf

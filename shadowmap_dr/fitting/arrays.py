@@ -70,10 +70,11 @@ class TextureValues:
     kind: str = "texture"
 
     def put(self, values: Float, change: SceneChange) -> None:
-        change.arrays[self.key] = (values, self.shape)
+        factor = change.factors.get(self.key)
+        change.arrays[self.key] = (values if factor is None else values * factor, self.shape)
 
     def descent(self, values: Array) -> Descent:
-        return _ValueDescent(values, self.low, self.high)
+        return ValueDescent(values, self.low, self.high)
 
     def arrays(self, values: Array) -> dict[str, npt.NDArray[np.float64]]:
         return {"texture": values.reshape(self.shape).astype(np.float64)}
@@ -99,7 +100,7 @@ class MeshVertices:
         return {"vertices": values.reshape(-1, 3).astype(np.float64)}
 
 
-class _ValueDescent:
+class ValueDescent:
     """Adam on values within bounds."""
 
     def __init__(self, values: Array, low: float, high: float) -> None:
@@ -111,7 +112,14 @@ class _ValueDescent:
         values = self._adam["values"]
         dr.set_grad(values, gradient)
         self._adam.step()
-        self._adam["values"] = dr.clip(dr.detach(self._adam["values"]), self._low, self._high)
+        return self._set(self._adam["values"])
+
+    def scaled(self, factor: float) -> Float:
+        """Multiply the values (Float, n) by a factor. Returns them."""
+        return self._set(self._adam["values"] * factor)
+
+    def _set(self, values: Float) -> Float:
+        self._adam["values"] = dr.clip(dr.detach(values), self._low, self._high)
         return dr.detach(self._adam["values"])
 
 

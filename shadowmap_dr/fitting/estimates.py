@@ -18,6 +18,7 @@ from .motions import host_matrix, tangents
 from .parameters import Parameter
 from .result import Estimate
 from .scene_change import SceneChange
+from .texture_brightness import TextureBrightness
 from .uncertainty import Uncertainty
 
 Array = npt.NDArray[np.float64]
@@ -53,8 +54,9 @@ def estimates_of(
         with np.errstate(invalid="ignore"):
             widths = np.where(np.isfinite(half[own]), scale.widths(x[own], half[own]), np.inf)
         shown = scale.shown(x[own]), scale.shown(np.zeros(count)), widths
-        arrays = parameter.arrays(renderer, change)
-        estimates.append(Estimate(label, parameter.kind, parameter.labels, parameter.units, *shown, arrays=arrays))
+        if not isinstance(parameter, TextureBrightness):  # part of the texture
+            arrays = parameter.arrays(renderer, change)
+            estimates.append(Estimate(label, parameter.kind, parameter.labels, parameter.units, *shown, arrays=arrays))
         names += [label if count == 1 else f"{label} {one}" for one in parameter.labels]
     return estimates, names
 

@@ -22,6 +22,7 @@ class SceneChange:
         lights: changed records of lights.
         cameras: changed records of sensors, by number.
         values: numbers of Mitsuba's parameters by their names in ``mi.traverse``.
+        factors: common factors of the values of Mitsuba's arrays by their names.
         arrays: (values, shape) of Mitsuba's arrays by their names.
         vertices: world-space vertices of meshes, before they are moved.
     """
@@ -31,6 +32,7 @@ class SceneChange:
     lights: dict[str, Light] = field(default_factory=dict)
     cameras: dict[int, Sensor] = field(default_factory=dict)
     values: dict[str, list[Float]] = field(default_factory=dict)
+    factors: dict[str, Float] = field(default_factory=dict)
     arrays: dict[str, tuple[Float, tuple[int, ...]]] = field(default_factory=dict)
     vertices: dict[str, Float] = field(default_factory=dict)
 

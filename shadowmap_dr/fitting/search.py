@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -16,6 +17,7 @@ from ..io import records
 from ..jit.arrays import device_array
 from ..jit.types import Float
 from ..rendering.renderer import Renderer
+from .arrays import ArrayParameter, TextureValues, ValueDescent
 from .changes import Changes, FittedScene
 from .corrections import Corrections
 from .estimates import array_estimates, changes_of, estimates_of, gain_estimates
@@ -35,6 +37,7 @@ from .stages import Stage, make_stages, qualities
 from .starts import chosen, draw, groups_of, half_ranges, redraw, with_gains
 from .state import Run, State
 from .targets import Target, short_names
+from .texture_brightness import TextureBrightness
 from .uncertainty import uncertainty
 
 Array = npt.NDArray[np.float64]
@@ -87,7 +90,14 @@ class Fit:
         if not options.vary and not any(gain.count for gain in self.gains):
             raise ShadowmapError("nothing varies: name something by --vary; --list lists all that can vary.")
         _check_sizes(renderer, self.targets)
-        _check_functions(residuals, loss, numbers=bool(self.parameters) or any(gain.count for gain in self.gains))
+        numbers = bool(self.parameters) or any(gain.count for gain in self.gains)
+        _check_functions(residuals, loss, numbers=numbers)
+        # Textures make up for exposures, lights and colours.
+        textures = [array for array in self.arrays if isinstance(array, TextureValues)]
+        factors = [TextureBrightness(texture) for texture in textures] if numbers else []
+        first = sum(len(one.labels) for one in self.parameters)
+        self._brightness = list(zip(range(first, first + len(factors)), textures, strict=False))
+        self.parameters += factors
         functions = {"residuals": residuals, "loss": loss}
         self._own_settings = {key: function_name(one) for key, one in functions.items() if one is not None}
         self._low, self._high, prior = _bounds(self.parameters, self.gains)
@@ -221,6 +231,10 @@ class Fit:
         each = max(1, self.options.steps // (len(self.stages) - begin) // _ROUNDS)
         total = each * _ROUNDS * (len(self.stages) - begin)
         done = each * _ROUNDS * (number - begin)
+        self._state.values = [
+            own * self._factor_of(array, run.x) for array, own in zip(self.arrays, self._state.values, strict=True)
+        ]
+        run.x = self._without_brightness(run.x)
         descents = [array.descent(own) for array, own in zip(self.arrays, self._state.values, strict=True)]
         values = [device_array(type(g), own) for g, own in zip(stage.objective.views[0].values, self._state.values, strict=True)]
         for _ in range(_ROUNDS):
@@ -234,8 +248,23 @@ class Fit:
                 stage.objective.set_values(values)
                 done += 1
             yield from self._descend(run, number, stage, replace(self._limits(number), steps=3))
+            for k, (array, descent) in enumerate(zip(self.arrays, descents, strict=True)):
+                if isinstance(descent, ValueDescent):
+                    values[k] = descent.scaled(self._factor_of(array, run.x))
+            run.x = self._without_brightness(run.x)
+            stage.objective.set_values(values)
         self._state.values = [np.array(one, np.float32) for one in values]
         self._set_values(values)
+
+    def _factor_of(self, array: ArrayParameter, x: Array) -> float:
+        """The common factor of an array's values at the numbers x."""
+        return math.exp(sum(x[k] for k, texture in self._brightness if texture is array))
+
+    def _without_brightness(self, x: Array) -> Array:
+        """The numbers x after the factors of the textures have become part of their values."""
+        x = x.copy()
+        x[[k for k, _ in self._brightness]] = 0
+        return x
 
     def _set_values(self, values: Sequence[Float]) -> None:
         """Set the values of textures and vertices in all stages."""
@@ -249,7 +278,7 @@ class Fit:
         seconds = time.perf_counter() - self._began
         step: Step = {"start": run.number, "stage": stage, "step": count, "error": point.error, "seconds": seconds}
         self.history.append(step)
-        run.trail.append((number, point.x))
+        run.trail.append((number, self._without_brightness(point.x)))
         return step
 
     def _fingerprint(self) -> str:

@@ -38,8 +38,8 @@ def draw(ranges: Array, low: Array, high: Array, count: int, seed: int | tuple[i
     The first is the scene as it is, if ``scene``.
     """
     generator = np.random.default_rng(seed)
-    if not len(ranges):
-        return [np.zeros(0)]
+    if not ranges.any():
+        return [np.clip(np.zeros(len(ranges)), low, high)]
     others = [generator.uniform(-ranges, ranges) for _ in range(1 + (count - 1) * _TRIED)]
     if scene:
         others[0] = np.zeros(len(ranges))

@@ -29,7 +29,7 @@ Image = npt.NDArray[np.float32]
 
 # Classes of Mitsuba's whose parameters may change in recordings.
 _RECORDABLE = (
-    *("SRGBReflectanceSpectrum", "SRGBEmitterSpectrum", "UniformSpectrum", "BitmapTexture", "SmoothDiffuse", "TwoSidedBRDF"),
+    *("SRGBReflectanceSpectrum", "SRGBEmitterSpectrum", "UniformSpectrum", "BitmapTextureImpl", "SmoothDiffuse", "TwoSidedBRDF"),
     *("AreaLight", "ConstantBackgroundEmitter", "EnvironmentMapEmitter"),
 )
 # Step of differences of images, in the fit's own numbers.
@@ -195,9 +195,9 @@ class View:
         change, found = SceneChange(self._renderer), list[tuple[str, ...]]()
         with dr.suspend_grad():
             for parameter in self._parameters:
-                before = set(change.values)
+                before = {*change.values, *change.factors}
                 parameter.put([mi.Float(0)] * len(parameter.labels), change)
-                found.append(tuple(key for key in change.values if key not in before))
+                found.append(tuple(key for key in (*change.values, *change.factors) if key not in before))
         return found
 
     def change(self, x: Array) -> SceneChange:
@@ -315,7 +315,7 @@ class View:
         attached = replace(
             change,
             values={key: parts for key, parts in change.values.items() if key in mine},
-            arrays=change.arrays if arrays else {},
+            arrays=change.arrays if arrays else {key: array for key, array in change.arrays.items() if key in mine},
         )
         restore = set_values(renderer.data.scene, attached)
         try:
@@ -351,7 +351,8 @@ def is_recordable(scene: mi.Scene, key: str) -> bool:
     table = mi.traverse(scene)
     node = table.properties[key][2]
     while node is not None:
-        if node.class_name() not in _RECORDABLE and not isinstance(node, (mi.Shape, mi.Scene)):
+        kind = node.class_name().partition("[")[0]  # without the type of a texture's texels
+        if kind not in _RECORDABLE and not isinstance(node, (mi.Shape, mi.Scene)):
             return False
         node = table.hierarchy[node][0] if node in table.hierarchy else None
     return True

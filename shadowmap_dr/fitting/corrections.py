@@ -11,6 +11,7 @@ Sources: Alexandrov and Lewis, "An overview of first-order model management for 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -22,7 +23,7 @@ from ..rendering.renderer import Renderer
 from .affine_image import AffineImage
 from .estimates import changes_of
 from .objective import Objective
-from .reference import Reference
+from .reference import Reference, reduced
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
@@ -91,6 +92,21 @@ class Corrections:
         effect = self._effect
         steps = np.array([other - x for other, _ in self._known[1:]]).reshape(len(self._known) - 1, len(x)) * effect
         return np.asarray(np.linalg.solve(steps @ steps.T + _NOISE**2 * np.eye(len(steps)), steps) * effect)
+
+    def share(self, objectives: Sequence[Objective], x: Array) -> None:
+        """Correct the images of several objectives, of the same pictures, by the constant differences at the numbers x (n,).
+
+        Coarse images have large errors: coarse filters of shadow maps, few samples of lamps. They hide small objects.
+        """
+        if not self.put(x):
+            return
+        rendered = self._reference.rendered
+        self.remove()
+        for objective in objectives:
+            for number, (image, view) in enumerate(zip(rendered, objective.views, strict=True)):
+                difference = reduced(image, view.size) - view.image(x)
+                none = np.zeros((0, *difference.shape), np.float32)
+                objective.corrections[number] = AffineImage(difference, x.copy(), none, np.zeros((0, len(x))))
 
     def remove(self) -> None:
         """Leave the images as they are."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -25,8 +26,30 @@ _SMOOTH = 0.5
 # multiple of its median variance that it has at most.
 _NOISY, _ABOVE, _UNEVEN = 0.5, 2.5, 4.0
 # Pixels matter where a change of a number by the first moves them by more than the second, a share of the brightness; and
-# where the residual is larger.
-_CHANGE, _VISIBLE = 0.05, 0.03
+# where the residual is larger. Numbers that move fewer blocks of pixels are not judged on their own.
+_CHANGE, _VISIBLE, _FEW = 0.05, 0.03, 8
+
+
+@dataclass(frozen=True)
+class Unexplained:
+    """Shares of the pictures' edges that the images do not have, or have elsewhere: 0 for equal images, 1 for unrelated ones.
+
+    Attributes:
+        whole: of all edges that matter.
+        numbers: (n,) of those that each of the scene's numbers moves; 0 for numbers that move few.
+    """
+
+    whole: float
+    numbers: Array
+
+    @property
+    def largest(self) -> float:
+        """The largest share. A small object that is turned wrongly is hardly a part of the whole."""
+        return max(self.whole, float(self.numbers.max(initial=0)))
+
+    def wrong(self, limit: float) -> npt.NDArray[np.bool_]:
+        """True (n,) for the numbers whose share is beyond a limit."""
+        return np.asarray(self.numbers > limit)
 
 
 def largest_share(objective: Objective) -> float:
@@ -38,13 +61,13 @@ def largest_share(objective: Objective) -> float:
 
 
 def sentences(
-    found: bool, share: float, error: float, spread: Uncertainty, names: Sequence[str], *, own: bool = False
+    found: bool, shares: Unexplained, error: float, spread: Uncertainty, names: Sequence[str], *, own: bool = False
 ) -> list[str]:
     """Sentences about a fit: whether the scene explains the pictures, and the numbers that they do not determine.
 
     Args:
         found: true if it does.
-        share: of unexplained edges.
+        shares: of unexplained edges.
         error: of the best point.
         spread: its uncertainty.
         names: of all numbers.
@@ -52,8 +75,11 @@ def sentences(
     """
     words: list[str] = []
     if not found:
+        seen, where = "what your residuals see" if own else "the edges that matter", ""
+        if shares.whole < shares.largest:
+            where = f", where {names[int(np.argmax(shares.numbers))]} moves it,"
         words.append(
-            f"Not found: {100 * share:.0f} % of {'what your residuals see' if own else 'the edges that matter'} in the picture "
+            f"Not found: {100 * shares.largest:.0f} % of {seen} in the picture{where} "
             f"{'is' if own else 'are'} not where the scene has {'it' if own else 'them'}, and the images differ by "
             f"{100 * error:.0f} % of {'it' if own else 'the brightness'}. Try more starts, a scene that is nearer to the "
             "picture, or let more vary; mask what the scene does not have."
@@ -68,34 +94,38 @@ def sentences(
     return words
 
 
-def unexplained(point: Point, objective: Objective) -> float:
-    """Share of the pictures' edges that the images do not have, or have elsewhere: 0 for equal images, 1 for unrelated ones.
+def unexplained(point: Point, objective: Objective) -> Unexplained:
+    """Shares of the pictures' edges that the images do not have, or have elsewhere.
 
     Edges are differences between neighbouring pixels. They count where the fitted numbers, or errors, change the images. Smooth
     differences, such as light that bounces, hardly count. Residuals of users that are like edges, or no images at all, are
     taken as they are.
     """
-    missing = total = 0.0
+    count = objective.views[0].count
+    missing, total, blocks = np.zeros(1 + count), np.zeros(1 + count), np.zeros(1 + count)
     for columns, image, residual, compared in zip(
         point.columns(), point.recorded, point.residuals, objective.comparisons, strict=True
     ):
-        moved = np.abs(columns).reshape(len(columns), *residual.shape).max(0, initial=0) * _CHANGE
         weight = np.broadcast_to(compared.weight, (*residual.shape[:2], 1))[..., 0]
-        arrays = *compared.contents(image), residual, moved.max(2), weight, np.asarray(weight > 0, np.float32)
+        arrays = *compared.contents(image), residual, weight, np.asarray(weight > 0, np.float32)
         times = max(2, round(max(weight.shape) / _SIDE)) if is_image(residual.shape) else 1
         noise = _noise(residual, weight, times)
-        ours, theirs, left, moved, weight, whole = (_reduced(one, times) for one in arrays)
+        ours, theirs, left, weight, whole = (_reduced(one, times) for one in arrays)
         pairs = isinstance(compared, Colours) or is_image(residual.shape) and _is_smooth(theirs)
-        matters = (moved > _VISIBLE) | (np.abs(left).mean(2) > np.maximum(_VISIBLE, _ABOVE * np.sqrt(noise[..., 0])))
-        # Pixels that do not count are black: blocks with one count for nothing.
-        weight = np.asarray(weight * (whole == 1) * matters, np.float32)
-        for of_image, of_picture, of_residual, both, of_noise in _edges(pairs, ours, theirs, left, weight[..., None], noise):
-            found = float((both * of_residual**2).sum(dtype=np.float64))
-            expected = of_residual.shape[2] * float((both * of_noise).sum(dtype=np.float64))
-            there = float((both * (of_image**2 + of_picture**2)).sum(dtype=np.float64))
-            missing += max(found - min(expected, _NOISY * there), 0.0)
-            total += there
-    return missing / total if total > 0 else 0.0
+        moved = [_reduced(np.abs(column).reshape(residual.shape).max(2) * _CHANGE, times) > _VISIBLE for column in columns]
+        wrong = np.abs(left).mean(2) > np.maximum(_VISIBLE, _ABOVE * np.sqrt(noise[..., 0]))
+        for k, matters in enumerate([np.any([*moved, wrong], axis=0), *moved[:count]]):
+            # Pixels that do not count are black: blocks with one count for nothing.
+            counted = np.asarray(weight * (whole == 1) * matters, np.float32)
+            blocks[k] += np.count_nonzero(counted)
+            for of_image, of_picture, of_residual, both, of_noise in _edges(pairs, ours, theirs, left, counted[..., None], noise):
+                found = float((both * of_residual**2).sum(dtype=np.float64))
+                expected = of_residual.shape[2] * float((both * of_noise).sum(dtype=np.float64))
+                there = float((both * (of_image**2 + of_picture**2)).sum(dtype=np.float64))
+                missing[k] += max(found - min(expected, _NOISY * there), 0.0)
+                total[k] += there
+    shares = np.where(total > 0, missing / np.where(total > 0, total, 1), 0)
+    return Unexplained(float(shares[0]), np.where(blocks >= _FEW, shares, 0)[1:])
 
 
 def _noise(residual: Image, weight: Image, times: int) -> Image:
@@ -107,7 +137,7 @@ def _noise(residual: Image, weight: Image, times: int) -> Image:
         return np.zeros((*weight.shape, 1), np.float32)
     inside = (_reduced(np.square(residual), times) - np.square(_reduced(residual, times))).mean(2) / (times**2 - 1)
     counts = _reduced(np.asarray(weight > 0, np.float32), times) == 1
-    most = _UNEVEN * float(np.median(inside[counts])) if counts.any() else 0.0
+    most = max(_UNEVEN * float(np.median(inside[counts])), 0.0) if counts.any() else 0.0
     return np.asarray(np.clip(inside, 0, most)[..., None], np.float32)
 
 

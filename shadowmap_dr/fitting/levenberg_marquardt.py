@@ -5,7 +5,7 @@ Source: Nocedal and Wright, "Numerical Optimization", 2006, section 10.3; Marqua
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
@@ -16,6 +16,9 @@ Array = npt.NDArray[np.float64]
 
 # Damping: at first, after success and failure, least and most.
 _DAMPING, _BETTER, _WORSE, _LEAST, _MOST = 1e-3, 0.2, 5.0, 1e-9, 1e4
+# Full steps that may be worse, at most; promised decrease, as a share of the cost, for which they are taken; steps that follow to
+# make them better.
+_DARES, _PROMISING, _PROOF = 2, 5e-3, 4
 
 
 class Residuals(Protocol):
@@ -54,6 +57,10 @@ class Limits:
 def minimise(at: Callable[[Array], P], start: P, limits: Limits) -> Generator[P, None, bool]:
     """Minimise a loss from a point on.
 
+    Losses jump where shadow maps are fitted anew. If steps gain little of what the derivatives promise, a full one is taken, even
+    if it is worse; the steps that follow have to make it better. Source: Chamberlain et al., "The watchdog technique for forcing
+    convergence in algorithms for constrained optimization", 1982.
+
     Args:
         at: the point at given numbers.
         start: the first point.
@@ -65,28 +72,58 @@ def minimise(at: Callable[[Array], P], start: P, limits: Limits) -> Generator[P,
     Returns:
         True if steps or improvements had become small, False after the last step of the limits.
     """
-    point, damping = start, _DAMPING
-    for _ in range(limits.steps):
+    best, left = start, limits.steps
+    for dared in range(1 + _DARES):
+        if dared:
+            dare = _full_step(at, best, limits)
+            if dare is None or not left:
+                break
+            steps = list(_descent(at, dare, limits, min(left, _PROOF)))
+            left -= len(steps)
+            if not steps or not steps[-1].cost < best.cost:
+                break
+            best = steps[-1]
+            yield best
+        for better in _descent(at, best, limits, left):
+            best = better
+            left -= 1
+            yield best
+    return left > 0
+
+
+def _full_step(at: Callable[[Array], P], point: P, limits: Limits) -> P | None:
+    """The point after a full step, if its derivatives promise much."""
+    matrix, right = point.system()
+    step = _after_step(matrix, right, _DAMPING, point.x, limits) - point.x
+    promised = -float(right @ step + 0.5 * step @ matrix @ step)
+    if not promised > _PROMISING * point.cost or np.abs(step).max(initial=0) < limits.shortest:
+        return None
+    return at(point.x + step)
+
+
+def _descent(at: Callable[[Array], P], point: P, limits: Limits, steps: int) -> Iterator[P]:
+    """Better and better points, one after each step, until steps or improvements are small."""
+    damping = _DAMPING
+    for _ in range(steps):
         matrix, right = point.system()
         while True:
             x = _after_step(matrix, right, damping, point.x, limits)
             if np.abs(x - point.x).max(initial=0) < limits.shortest:
-                return True
+                return
             candidate = at(x)
             if candidate.cost < point.cost:
                 break
             if candidate.cost < point.cost * (1 + limits.improvement):
-                return True  # the differences are those of rounding, and of shadow maps that were fitted anew
+                return  # the differences are those of rounding
             damping *= _WORSE
             if damping > _MOST:
-                return True
+                return
         damping = max(damping * _BETTER, _LEAST)
         gained = (point.cost - candidate.cost) / max(point.cost, 1e-300)
         point = candidate
         yield point
         if gained < limits.improvement:
-            return True
-    return False
+            return
 
 
 def _after_step(matrix: Array, right: Array, damping: float, x: Array, limits: Limits) -> Array:

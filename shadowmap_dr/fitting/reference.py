@@ -39,10 +39,13 @@ class Reference:
     Args:
         data: the scene.
         sizes: (W, H) of the pictures' windows on the films, one for each image: images are rendered with as many pixels.
+
+    Attributes:
+        rendered: the images of the last call as they were rendered.
     """
 
     def __init__(self, data: SceneData, sizes: Sequence[tuple[int, int]]) -> None:
-        self._data, self._sizes = data, tuple(sizes)
+        self._data, self._sizes, self.rendered = data, tuple(sizes), list[Image]()
         own = data.scene.integrator()
         named = own is not None and own.class_name() in _INTEGRATORS
         self._integrator = own if named else mi.load_dict({"type": "direct"})
@@ -60,7 +63,8 @@ class Reference:
         """
         with dr.suspend_grad(), updated(self._data, changes) as scene:
             each = zip(cameras, self._sizes, sizes, strict=True)
-            return [self._image(scene, camera, own, size, number) for number, (camera, own, size) in enumerate(each)]
+            self.rendered = [self._image(scene, camera, own, size, number) for number, (camera, own, size) in enumerate(each)]
+        return [reduced(image, size) for image, size in zip(self.rendered, sizes, strict=True)]
 
     def _image(self, scene: mi.Scene, camera: Sensor, own: tuple[int, int], size: ImageSize, number: int) -> Image:
         width, height = _film_size(own, size)
@@ -72,8 +76,12 @@ class Reference:
                 scene, sensor=sensor, integrator=self._integrator, spp=spp, seed=_SEED + number * 256 + len(passes)
             )
             passes.append(np.array(rendered, np.float32).reshape(height, width, -1))
-        image = np.asarray(np.mean(passes, axis=0, dtype=np.float64), np.float32)
-        return area_average(lambda rows: image[rows], (height, width), (size.height, size.width))
+        return np.asarray(np.mean(passes, axis=0, dtype=np.float64), np.float32)
+
+
+def reduced(image: Image, size: ImageSize) -> Image:
+    """An image (H, W, C) with fewer pixels."""
+    return area_average(lambda rows: image[rows], (image.shape[0], image.shape[1]), (size.height, size.width))
 
 
 def _noise(passes: Sequence[Image]) -> float:

@@ -138,7 +138,8 @@ class FitResult:
     Attributes:
         found: True if the scene explains the pictures.
         words: plain sentences: numbers that are not determined, what went wrong, what to try.
-        unexplained: share of the pictures' edges that the scene does not explain.
+        unexplained: share of the pictures' edges that the scene does not explain: of all that matter, or of those that one number
+            moves, if that is larger.
         estimates: in the order of the command line.
         correlations: (n, n) over all labelled numbers, in order.
         names: of these n numbers.

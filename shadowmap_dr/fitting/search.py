@@ -22,7 +22,7 @@ from .changes import Changes, FittedScene
 from .corrections import Corrections
 from .estimates import array_estimates, changes_of, estimates_of, gain_estimates
 from .gains import Gain
-from .judgement import largest_share, sentences, unexplained
+from .judgement import Unexplained, largest_share, sentences, unexplained
 from .levenberg_marquardt import Limits, minimise
 from .losses import Loss
 from .objective import Point
@@ -49,8 +49,10 @@ _ENOUGH = 1e-3
 # Corrections of the images at most, steps after each, and the improvement and the length below which steps are the last. Images
 # that explain less than the last share are too far from the pictures to be worth it.
 _CORRECTIONS, _CORRECTED_STEPS, _LITTLE, _SHORT, _FAR = 6, 3, 1e-4, 3e-4, 0.5
-# Growth of the ranges of starts from one try to the next.
-_GROWTH = 0.5
+# Corrections after which a start is left, if it leaves a larger share unexplained.
+_FEW_CORRECTIONS, _CLOSE = 2, 0.15
+# Growth of the ranges of starts from one try to the next. First stage of turned objects, and their least turn in ranges.
+_GROWTH, _TURNED_STAGE, _APART = 0.5, 2, 0.7
 # Textures and vertices: stages in which they are fitted, the last ones; rounds of a stage, in turns with the numbers; size of the
 # last step as a share of the first one's.
 _ARRAY_STAGES, _ROUNDS, _LAST_SHARE = 3, 3, 0.1
@@ -143,7 +145,8 @@ class Fit:
         tries = self.options.tries if self.parameters and not self.arrays else 1
         for attempt in range(tries):
             first = attempt * self.options.starts
-            self._uncorrect()
+            if attempt and self._corrections is not None and self.best_run.corrected:
+                self._corrections.share([stage.objective for stage in self.stages], self.best)
             if len(self._state.runs) <= first:
                 self._state.runs += self._starts(attempt)
             for number, stage in enumerate(self.stages):
@@ -154,8 +157,8 @@ class Fit:
                     if state is not None:
                         self._state.write(state, fingerprint)
                 self._state.choose(number, len(self.stages) - 2 - number, first)
-            yield from self._correct(self._state.best_from(first))
-            if attempt < tries - 1 and self._unexplained(self.best) <= largest_share(self.stages[-1].objective):
+            yield from self._correct(self._state.best_from(first), last=attempt == tries - 1)
+            if attempt < tries - 1 and self._unexplained(self.best).largest <= largest_share(self.stages[-1].objective):
                 break
         for number in range(self._state.array_stage, len(self.stages) if self.arrays else 0):
             if number >= len(self.stages) - _ARRAY_STAGES:
@@ -171,50 +174,57 @@ class Fit:
 
         The ranges grow from try to try, and later tries have candidates that differ from the best numbers in a part only.
         """
-        first = self.stages[0].objective
-        scene, options = first.views[0].count, self.options
+        options, scene = self.options, self.stages[0].objective.views[0].count
         ranges = half_ranges(self.parameters) * (1 + attempt * _GROWTH)
         low, high, seed = self._low[:scene], self._high[:scene], (options.seed, attempt)
-        drawn = draw(ranges, low, high, options.starts, seed, scene=attempt == 0)
+        drawn, turned = draw(ranges, low, high, options.starts, seed, scene=attempt == 0), list[Array]()
         if attempt:
-            drawn += redraw(self.best[:scene], groups_of(self.parameters), ranges, low, high, len(drawn), seed)
-        return [Run(attempt * options.starts + k, x) for k, x in enumerate(chosen(drawn, first, options.starts))]
+            wrong, best = self._unexplained(self.best).wrong(largest_share(self.stages[-1].objective)), self.best[:scene]
+            every, turns = ([own for own in groups if wrong[own].any()] for groups in groups_of(self.parameters))
+            # Objects in their places, but turned: coarse images do not tell turns apart.
+            turned = redraw(best, turns, ranges, low, high, len(drawn), (*seed, 1), apart=_APART)
+            drawn += redraw(best, every, ranges, low, high, len(drawn), (*seed, 2))
+        middle = min(_TURNED_STAGE, len(self.stages) - 1)
+        starts = [(x, -1) for x in chosen(drawn, self.stages[0].objective, options.starts, keep=attempt == 0)]
+        if turned:
+            half = options.starts // 2
+            finer = chosen(turned, self.stages[middle].objective, half, keep=False)
+            starts = starts[: options.starts - half] + [(x, middle - 1) for x in finer]
+        return [Run(attempt * options.starts + k, x, stage=stage) for k, (x, stage) in enumerate(starts)]
 
     def _limits(self, number: int) -> Limits:
         """Limits of the steps in a stage."""
         steps = _LAST_STEPS if number == len(self.stages) - 1 else _STEPS
         return Limits(self._low, self._high, _LONGEST, steps, _ENOUGH)
 
-    def _unexplained(self, x: Array) -> float:
-        """Share of the pictures' edges that the scene does not explain."""
+    def _unexplained(self, x: Array) -> Unexplained:
+        """Shares of the pictures' edges that the scene does not explain."""
         objective = self.stages[-1].objective
         return unexplained(objective.at(x), objective)
-
-    def _uncorrect(self) -> None:
-        if self._corrections is not None:
-            self._corrections.remove()
 
     def _is_to_be_corrected(self, run: Run) -> bool:
         """True if steps with corrected images follow."""
         if self._corrections is None or self.arrays or run.corrected:
             return False
-        return self._unexplained(run.x) <= _FAR and self._corrections.put(run.x)
+        return self._unexplained(run.x).whole <= _FAR and self._corrections.put(run.x)
 
-    def _correct(self, run: Run) -> Iterator[Step]:
-        """Steps of a start with corrected images."""
-        number = len(self.stages) - 1
+    def _correct(self, run: Run, *, last: bool) -> Iterator[Step]:
+        """Steps of a start with corrected images. ``last``: no other try follows; else far starts are left early."""
+        stage = len(self.stages) - 1
         if self._corrections is None or not self._is_to_be_corrected(run):
             return
         limits = Limits(self._low, self._high, _LONGEST, _CORRECTED_STEPS, _LITTLE, _SHORT)
-        for _ in range(_CORRECTIONS):
+        for number in range(_CORRECTIONS):
             before = run.x
             if not self._corrections.put(before):
                 return
-            yield from self._descend(run, number, self.stages[number], limits)
+            if number == _FEW_CORRECTIONS and not last and self._unexplained(run.x).largest > _CLOSE:
+                break
+            yield from self._descend(run, stage, self.stages[stage], limits)
             if np.abs(run.x - before).max(initial=0) < _SHORT:
                 break
         self._corrections.put(run.x)
-        run.cost, run.corrected = self.stages[number].objective.at(run.x).cost, True
+        run.cost, run.corrected = self.stages[stage].objective.at(run.x).cost, True
 
     def _descend(self, run: Run, number: int, stage: Stage, limits: Limits) -> Iterator[Step]:
         """Steps of a start in a stage."""
@@ -328,16 +338,16 @@ class Fit:
         estimates, names = estimates_of(x, self.parameters, self.renderer, self.change(x), spread)
         of_gains, names_of_gains = gain_estimates(x, short_names(self.targets), self.gains, objective.gains, spread)
         names += names_of_gains
-        share = unexplained(point, objective)
-        found = share <= largest_share(objective)
-        words = sentences(found, share, point.error, spread, names, own=objective.has_own_residuals)
+        shares = unexplained(point, objective)
+        found = shares.largest <= largest_share(objective)
+        words = sentences(found, shares, point.error, spread, names, own=objective.has_own_residuals)
         if self._corrections is not None and self._corrections.failure:
             words.append(f"Images are not corrected, since Mitsuba cannot render the fitted scene: {self._corrections.failure}.")
         seconds = time.perf_counter() - self._began
         return FitResult(
             found=found,
             words=words,
-            unexplained=share,
+            unexplained=shares.largest,
             estimates=[*estimates, *array_estimates(self.arrays, self._state.values), *of_gains],
             correlations=spread.correlations,
             names=names,

@@ -11,9 +11,12 @@ from .objective import Objective
 from .parameters import Parameter
 
 Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.intp]
 
 # Candidates for each start.
 _TRIED = 8
+# Draws of a candidate at most.
+_DRAWS = 20
 # Starts that go on: to stages of half of the last one's pixels along a side, of a quarter, ...
 _GOING_ON = (1, 2, 4, 8, 16)
 
@@ -47,36 +50,52 @@ def draw(ranges: Array, low: Array, high: Array, count: int, seed: int | tuple[i
 
 
 def redraw(
-    best: Array, groups: Sequence[npt.NDArray[np.intp]], ranges: Array, low: Array, high: Array, count: int, seed: tuple[int, int]
+    best: Array,
+    groups: Sequence[Indices],
+    ranges: Array,
+    low: Array,
+    high: Array,
+    count: int,
+    seed: tuple[int, ...],
+    apart: float = 0.0,
 ) -> list[Array]:
     """``count`` candidates that differ from the best numbers (n,) in one group each, drawn as by :func:`draw`.
 
     Often all but one of several objects are right, or the place of an object that is turned wrongly.
+
+    Args:
+        apart: least distance from the best numbers, in ranges.
     """
-    generator, found = np.random.default_rng((*seed, 1)), []
+    generator, found = np.random.default_rng(seed), []
     for k in range(count if groups else 0):
         x, own = best.copy(), groups[k % len(groups)]
-        x[own] = generator.uniform(-ranges[own], ranges[own])
+        for _ in range(_DRAWS):
+            x[own] = generator.uniform(-ranges[own], ranges[own])
+            if np.linalg.norm((x - best)[own] / np.maximum(ranges[own], 1e-30)) >= apart:
+                break
         found.append(np.clip(x, low, high))
     return found
 
 
-def groups_of(parameters: Sequence[Parameter]) -> list[npt.NDArray[np.intp]]:
-    """Numbers that :func:`redraw` draws together: those of each entry, and its rotations alone."""
-    groups, first = list[npt.NDArray[np.intp]](), 0
+def groups_of(parameters: Sequence[Parameter]) -> tuple[list[Indices], list[Indices]]:
+    """(numbers of each entry, numbers of each entry that turn an object): :func:`redraw` draws them together."""
+    every, turns, first = list[Indices](), list[Indices](), 0
     for parameter in parameters:
         own = np.arange(first, first + len(parameter.labels))
-        turns = own[[label.startswith("rotation") for label in parameter.labels]]
-        groups += [own, turns] if 0 < len(turns) < len(own) else [own]
+        turn = own[[label.startswith("rotation") for label in parameter.labels]]
+        every.append(own)
+        turns += [turn] if len(turn) else []
         first += len(own)
-    return groups
+    return every, turns
 
 
-def chosen(candidates: Sequence[Array], objective: Objective, count: int) -> list[Array]:
-    """The first of some candidates and the best others, ``count`` in all, with gains."""
+def chosen(candidates: Sequence[Array], objective: Objective, count: int, *, keep: bool) -> list[Array]:
+    """The best ``count`` of some candidates with gains, best first; if ``keep``, the first candidate is always one, the first."""
     full = [with_gains(x, objective) for x in candidates]
-    costs = [objective.at(x).cost for x in full[1:]]
-    return [full[0], *(full[1 + int(k)] for k in np.argsort(costs, kind="stable")[: count - 1])]
+    kept = full[:1] if keep else []
+    others = full[len(kept) :]
+    costs = [objective.at(x).cost for x in others]
+    return kept + [others[k] for k in np.argsort(costs, kind="stable")[: count - len(kept)].tolist()]
 
 
 def with_gains(x: Array, objective: Objective) -> Array:

@@ -64,11 +64,11 @@ class State:
 
     def choose(self, stage: int, left: int, first: int = 0) -> None:
         """Choose the starts that go on, of those from number ``first`` on, after a stage which ``left`` others but the next one
-        follow; once."""
-        own = [run for run in self.runs if run.number >= first]
-        if left < 0 or any(run.stage > stage for run in own):  # those of a file were chosen
+        follow."""
+        # Not those that begin with the next stage, nor those of a file that were not chosen.
+        done = [run for run in self.runs if run.number >= first and run.stage == stage and run.trail and run.last > stage]
+        if left < 0:
             return
-        done = [run for run in own if run.stage == stage]
         on = {done[k].number for k in going_on([run.cost for run in done], left)}
         for run in done:
             run.last = 1 << 30 if run.number in on else stage

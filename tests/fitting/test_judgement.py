@@ -23,12 +23,14 @@ def disc(x: float, y: float, softness: float = 1.0) -> np.ndarray:
 
 
 def judged(image: np.ndarray, picture: np.ndarray, weight: np.ndarray | None = None) -> float:
-    """The share for one number that moves the image sideways, by 20 pixels for a change by one."""
+    """The whole share for one number that moves the image sideways, by 20 pixels for a change by one."""
     weight = np.ones((SIDE, SIDE), np.float32) if weight is None else weight
     slope = 20 * np.gradient(image, axis=1).reshape(1, -1)
-    objective: Any = SimpleNamespace(comparisons=[Colours(Observation(picture, weight, Gain()))])
+    objective: Any = SimpleNamespace(
+        views=[SimpleNamespace(count=1)], comparisons=[Colours(Observation(picture, weight, Gain()))]
+    )
     point: Any = SimpleNamespace(columns=lambda: [slope], recorded=[image], residuals=[objective.comparisons[0].residuals(image)])
-    return unexplained(point, objective)
+    return unexplained(point, objective).whole
 
 
 def test_equal_images_are_explained() -> None:
@@ -66,3 +68,22 @@ def test_masked_parts_count_for_nothing() -> None:
     assert judged(disc(60, 60), picture) > EXPLAINED
     assert judged(disc(60, 60), picture, weight) == 0
     assert judged(disc(60, 60), np.zeros((SIDE, SIDE, 3), np.float32), 0 * weight) == 0
+
+
+def test_a_small_object_elsewhere_is_no_small_matter() -> None:
+    """A brightness moves all edges of a large picture, of which those of the object are few."""
+    rows, columns = np.mgrid[:SIDE, :SIDE]
+    ground = (1 + 0.5 * np.sin(columns / 9) * np.sin(rows / 7))[..., None].astype(np.float32)
+
+    def spot(x: float) -> np.ndarray:
+        return 0.3 * np.exp(-((columns - x) ** 2 + (rows - 64) ** 2) / 60)[..., None].astype(np.float32)
+
+    image, picture = (np.repeat(ground + spot(x), 3, 2) for x in (60, 72))
+    slopes = np.stack([60 * np.repeat(np.gradient(spot(60), axis=1), 3, 2), image]).reshape(2, -1)
+    observation = Observation(picture, np.ones((SIDE, SIDE), np.float32), Gain())
+    objective: Any = SimpleNamespace(views=[SimpleNamespace(count=2)], comparisons=[Colours(observation)])
+    residuals = [objective.comparisons[0].residuals(image)]
+    shares = unexplained(SimpleNamespace(columns=lambda: [slopes], recorded=[image], residuals=residuals), objective)  # type: ignore[arg-type]
+    assert shares.whole < EXPLAINED_CORRECTED and shares.numbers[1] < EXPLAINED_CORRECTED
+    assert shares.largest == shares.numbers[0] > 0.3
+    assert shares.wrong(EXPLAINED_CORRECTED).tolist() == [True, False]

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from shadowmap_dr.fitting.starts import draw, groups_of, redraw
+from shadowmap_dr.fitting.starts import chosen, draw, groups_of, redraw
 
 RANGES = np.array([0.3, 0.3, 0.3, 0.1, 0.1, 0.5])
 LOW, HIGH = np.full(6, -np.inf), np.array([np.inf] * 5 + [0.2])
@@ -28,8 +28,9 @@ def test_the_first_candidate_is_the_scene_and_others_lie_in_the_ranges() -> None
 
 def test_groups_are_entries_and_the_rotations_of_poses() -> None:
     pose = ("rotation x", "rotation y", "rotation z", "translation x", "translation y")
-    found = groups_of(entries(pose, ("value",), ("rotation y",)))
-    assert [group.tolist() for group in found] == [[0, 1, 2, 3, 4], [0, 1, 2], [5], [6]]
+    every, turns = groups_of(entries(pose, ("value",), ("rotation y",)))
+    assert [group.tolist() for group in every] == [[0, 1, 2, 3, 4], [5], [6]]
+    assert [group.tolist() for group in turns] == [[0, 1, 2], [6]]
 
 
 def test_redrawn_candidates_differ_from_the_best_in_one_group() -> None:
@@ -43,3 +44,19 @@ def test_redrawn_candidates_differ_from_the_best_in_one_group() -> None:
         assert (np.abs(x[own]) <= RANGES[own]).all() and (x[own] != best[own]).any()
     assert not np.array_equal(found[0], found[3])
     assert redraw(best, [], RANGES, LOW, HIGH, 30, (0, 1)) == []
+
+
+def test_redrawn_candidates_keep_their_distance() -> None:
+    best, turns = np.zeros(6), [np.arange(3)]
+    distances = [
+        [np.linalg.norm(x[:3] / RANGES[:3]) for x in redraw(best, turns, RANGES, LOW, HIGH, 60, (0, 1), apart=apart)]
+        for apart in (0.0, 0.7)
+    ]
+    assert min(distances[0]) < 0.6 and min(distances[1]) >= 0.7
+
+
+def test_the_best_candidates_are_chosen_and_the_scene_if_it_is_kept() -> None:
+    objective: Any = SimpleNamespace(count=1, observations=[], at=lambda x: SimpleNamespace(cost=abs(float(x[0]) - 3)))
+    candidates = [np.array([float(x)]) for x in (0, 1, 2, 5, 4, 3.5)]
+    assert [float(x[0]) for x in chosen(candidates, objective, 3, keep=True)] == [0, 3.5, 2]
+    assert [float(x[0]) for x in chosen(candidates, objective, 3, keep=False)] == [3.5, 2, 4]

@@ -86,3 +86,12 @@ def test_damped_steps_go_down_and_end_where_no_step_is_worth_it(problem: PosePro
     np.testing.assert_allclose(steps.point.x, NEAR, atol=3e-3)
     last = steps.point
     assert not steps.advance() and steps.point is last
+
+
+def test_fixed_numbers_stay(problem: PoseProblem) -> None:
+    target = differences(problem, np.ones((32, 32, 3)), 16, 64).image(np.array([0, 0.08, -0.06]))
+    start = np.array([0.1, 0, 0])
+    steps = DampedSteps(differences(problem, target, 16, 64), start, 1e-4, fixed=(0,))
+    while steps.advance():
+        assert steps.point.x[0] == start[0]
+    assert np.abs(steps.point.x[1:] - [0.08, -0.06]).max() < 0.03

@@ -30,8 +30,8 @@ _COMPARED, _SLOPE_SAMPLES = 64, 256
 # Most steps in coarse and in fine images. The last one is shorter than _SHORTEST (radians, or scene units). A fine step longer
 # than _FAR calls for other derivatives, and one after which the loss is larger by _NOISE is taken back.
 _COARSE_STEPS, _FINE_STEPS, _SHORTEST, _FAR, _NOISE = 12, 4, 5e-4, 0.015, 1.1
-# Rotations to either side, in steps of TURN_DEG, and descents at most, of the search for another basin.
-_TURNS, _DESCENTS = 4, 4
+# Rotations of the search for another basin, in multiples of TURN_DEG.
+_NEAR, _FARTHER = (1, -1, 2, -2), (3, -3, 4, -4)
 
 
 class GaussNewtonPose:
@@ -76,7 +76,8 @@ class GaussNewtonPose:
         self._without = self._coarse.at(AWAY).loss
         self._settings = dict(settings or {})
         self._qualities = [f"{one.side} px, {one.spp} spp, {one.texels} texels" for one in (coarse, fine, slopes)]
-        self._x, self._stage, self._loss = np.zeros(3), 0, 0.0
+        self._x = self._start = np.zeros(3)
+        self._stage, self._loss = 0, 0.0
         self._course: Iterator[float] = iter(())
         self.reset(np.zeros(3))
 
@@ -106,7 +107,7 @@ class GaussNewtonPose:
         self._x = np.array(state["parameters"], np.float64).ravel()
         if self._x.shape != (3,):
             raise ShadowmapError(f"a pose of {self._x.size} numbers: give rotation (radians), x and y.")
-        self._stage, self._loss = int(state["stage"][0]), float(state["loss"][0])
+        self._start, self._stage, self._loss = self._x, int(state["stage"][0]), float(state["loss"][0])
         self._course = self._steps()
 
     def describe(self) -> dict[str, Any]:
@@ -136,22 +137,33 @@ class GaussNewtonPose:
         return steps.point.loss
 
     def _descend_elsewhere(self, loss: float) -> Iterator[float]:
-        """Descents from other rotations, those with the smallest loss first, until one is good enough. Ends at the best pose.
+        """Descents from other rotations until one is good enough. Ends at the best pose.
 
-        ``loss``: at the current pose, the end of the first descent. Its offset is better than that of the start.
+        The first ones begin at offsets of the current pose, which is the end of the first descent with the loss ``loss``. Others
+        follow from the start, whose offset is fitted alone before.
         """
         best, found = self._x, loss
-        turns = [sign * k for k in range(1, _TURNS + 1) for sign in (1, -1)]
-        starts = [best + np.array([math.radians(TURN_DEG * turn), 0, 0]) for turn in turns]
-        losses = [self._coarse.loss(start) for start in starts]
-        for k in np.argsort(losses)[:_DESCENTS]:
-            self._x = starts[k]
-            end = yield from self._descend()
-            if end < found:
-                best, found = self._x, end
-            if found <= EXPLAINED * self._without:
-                break
+        for slid, turns in ((False, _NEAR), (True, (0, *_NEAR)), (True, _FARTHER)):
+            middle = self._slid() if slid else best
+            starts = [middle + np.array([math.radians(TURN_DEG * turn), 0, 0]) for turn in turns]
+            losses = [self._coarse.loss(start) for start in starts]
+            for k in np.argsort(losses):
+                self._x = starts[k]
+                end = yield from self._descend()
+                if end < found:
+                    best, found = self._x, end
+                if found <= EXPLAINED * self._without:
+                    self._x = best
+                    return
         self._x = best
+
+    def _slid(self) -> Array:
+        """The start with the best offset at its rotation, in coarse images."""
+        steps = DampedSteps(self._coarse, self._start, _SHORTEST, fixed=(0,))
+        for _ in range(_COARSE_STEPS):
+            if not steps.advance():
+                break
+        return steps.point.x
 
     def _refine(self) -> Iterator[float]:
         """Steps in fine images. The derivatives are those of the first pose, scaled to the changes that images show."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,8 +58,8 @@ class Linear:
         # Sums of products, not `@`: the threads of the linear algebra and those of Dr.Jit would wait for each other.
         return float(np.clip(np.sum(expected * change) / max(np.sum(expected * expected), 1e-30), _SMALLEST, 1.0))
 
-    def times(self, factor: float) -> Linear:
-        """The model with all derivatives times a factor."""
+    def times(self, factor: float | Array) -> Linear:
+        """The model with all derivatives times a factor, or those by each number times its own, (n, 1)."""
         return Linear(self.columns * factor)
 
 
@@ -129,15 +130,17 @@ class DampedSteps:
         differences: what is minimised.
         start: (n,) numbers.
         shortest: steps in which no number changes more are not taken.
+        fixed: numbers that stay as they are, by their index.
 
     Attributes:
         point: the current point.
     """
 
-    def __init__(self, differences: Differences, start: Array, shortest: float) -> None:
+    def __init__(self, differences: Differences, start: Array, shortest: float, fixed: Sequence[int] = ()) -> None:
         self._differences, self._shortest, self._damping = differences, shortest, _DAMPING
+        self._moves = np.array([number not in fixed for number in range(len(start))], np.float64)[:, None]
         self.point = differences.at(start)
-        self._model = self.point.model
+        self._model = self.point.model.times(self._moves)
 
     def advance(self) -> bool:
         """Go to a better point. False, at the same point, if no step is worth it."""
@@ -151,7 +154,7 @@ class DampedSteps:
                 self._damping = max(self._damping * _BETTER, _LEAST)
                 # The noise of the next derivatives is about that of these.
                 factor = point.model.factor(step, candidate.values - point.values)
-                self.point, self._model = candidate, candidate.model.times(factor)
+                self.point, self._model = candidate, candidate.model.times(factor * self._moves)
                 return True
-            self._damping, self._model = max(self._damping * _WORSE, _AFTER_FAILURE), point.model
+            self._damping, self._model = max(self._damping * _WORSE, _AFTER_FAILURE), point.model.times(self._moves)
         return False

@@ -87,6 +87,7 @@ class View:
         self._starts = np.cumsum([0, *counts]).tolist()
         # One recording for each entry: a pass computes the derivative of a combination of its numbers.
         self._passes = [freeze(self._recorded(k)) for k in range(len(parameters))]
+        self._jacobians = [freeze(self._recorded_jacobian(k)) for k in range(len(parameters))]
         keys = [array.key for array in arrays if isinstance(array, TextureValues)]
         recordable = all(is_recordable(renderer.data.scene, key) for key in keys)
         self._image = freeze(self._recorded(-1))
@@ -134,6 +135,20 @@ class View:
             return self._pass(entry, x, tangent)
         image = self._image_at(x)
         return image, self._difference(image, x, entry, number - self._starts[entry])
+
+    def jacobian(self, x: Array, entry: int = 0) -> tuple[Image, list[Image]]:
+        """Image, and its derivatives (H, W, 3) by all numbers of an entry.
+
+        One recording makes them all. It takes less time than a call of :meth:`derivative` for each number, mostly where images
+        are small, but its first call takes longer.
+        """
+        first, end = self._starts[entry], self._starts[entry + 1]
+        if self._differences[entry]:
+            return self._image_at(x), [self.derivative(x, number)[1] for number in range(first, end)]
+        units = [_input(row) for row in np.eye(end - first)]
+        with self.scene_at(x):
+            image, derivatives = self._jacobians[entry](_input(x[: self.count]), units, self.values, self._renderer)
+            return self._shaped(image), [self._shaped(derivative) for derivative in derivatives]
 
     def _image_at(self, x: Array) -> Image:
         """The image, kept for the next call with the same numbers."""
@@ -276,6 +291,16 @@ class View:
             return dr.detach(image), change
 
         return derivative
+
+    def _recorded_jacobian(self, entry: int) -> Any:  # Any: a function for dr.freeze
+        """The passes of :meth:`jacobian`. ``units``: a tangent of the entry's numbers for each derivative."""
+        one = self._recorded(entry)
+
+        def jacobian(x: Float, units: list[Float], values: list[Float], renderer: Renderer) -> tuple[Float, list[Float]]:
+            passes = [one(x, unit, values, renderer) for unit in units]
+            return passes[0][0], [derivative for _, derivative in passes]
+
+        return jacobian
 
     def _recorded_gradient(self, adjoint: Callable[[Float, list[Float], Float], Float]) -> Any:  # Any: a function for dr.freeze
         """The pass of :meth:`gradient`, or of :meth:`pulled`. ``adjoint``: derivative by the image, from image and inputs."""

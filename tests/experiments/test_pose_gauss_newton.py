@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from shadowmap_dr.errors import ShadowmapError
+from shadowmap_dr.experiments.pose import gauss_newton
 from shadowmap_dr.experiments.pose.gauss_newton import GaussNewtonPose
 from shadowmap_dr.experiments.pose.methods import build_method
-from shadowmap_dr.experiments.pose.scene import PoseProblem, make_problem, pose_errors
+from shadowmap_dr.experiments.pose.scene import PoseProblem, make_problem, pose_errors, start_pose
+from shadowmap_dr.experiments.pose.search import AWAY
 from shadowmap_dr.inverse import PoseFit, optimize
 
 START = np.array([np.radians(20), 0.15, -0.1])
@@ -35,12 +37,34 @@ def method(problem: PoseProblem, reference: np.ndarray) -> GaussNewtonPose:
     return built
 
 
-def test_a_pose_is_found_in_few_steps(method: GaussNewtonPose) -> None:
+def test_a_pose_is_found_in_few_steps(method: GaussNewtonPose, reference: np.ndarray) -> None:
     history = optimize(method, START, 40)
     degrees, offset = pose_errors(history.final)
     assert degrees < 0.3 and offset < 0.5
-    # Steps after the last stage change nothing, and cost nothing.
+    # Steps after the last one change nothing, and cost nothing.
     np.testing.assert_array_equal(history.parameters[-1], history.parameters[-5])
+    assert (history.loss[-5:] == history.loss[-1]).all()
+    # The loss is in the unit of Adam's, and says how much of the differences is left.
+    without = np.mean(np.square(method.render(AWAY) - reference))
+    assert history.loss[-1] < 0.05 * without < history.loss[0]
+
+
+def test_a_start_in_another_basin_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From there a descent alone ends at a face that looks the other way."""
+    problem = make_problem("suzanne", 64, normals="vertex", work=tmp_path)
+    reference = np.array(mi.render(problem.scene, integrator=mi.load_dict({"type": "direct"}), spp=64))
+    method = build_method("shadows", problem, reference, samples=16, optimiser="lm")
+    assert isinstance(method, GaussNewtonPose)
+    degrees, offset = pose_errors(optimize(method, start_pose(4, 0), 60).final)
+    assert degrees < 0.2 and offset < 0.3
+    monkeypatch.setattr(GaussNewtonPose, "_descend_elsewhere", lambda self, loss: iter(()))
+    alone = optimize(method, start_pose(4, 0), 60)
+    assert pose_errors(alone.final)[0] > 30
+
+
+@pytest.mark.parametrize(("size", "block"), [((128, 128), 2), ((512, 512), 8), ((64, 64), 1), ((100, 100), 2), ((127, 127), 1)])
+def test_fine_images_are_compared_in_blocks_that_divide_them(size: tuple[int, int], block: int) -> None:
+    assert gauss_newton._block(*size) == block
 
 
 def test_images_are_those_of_adams_method(problem: PoseProblem, reference: np.ndarray, method: GaussNewtonPose) -> None:

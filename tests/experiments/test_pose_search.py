@@ -73,7 +73,12 @@ def test_files_are_searched_for_by_their_facets_and_own_objects_as_in_the_paper(
         assert choose(problem, path, None, None, None) == Search(samples, resolution / 16, 5)
         assert choose(problem, path, 9, 0.0, 2) == Search(9, 0.0, 2)
     for name in ("spot", "dragon"):
-        assert choose(make_problem(name, 128, work=tmp_path), name, None, None, None) == Search()
+        problem = make_problem(name, 128, work=tmp_path)
+        assert choose(problem, name, None, None, None) == Search()
+        # The last images of the other optimiser need more samples.
+        assert choose(problem, name, None, None, None, "lm") == Search(9, optimiser="lm")
+        assert choose(problem, name, 1, None, None, "lm") == Search(1, optimiser="lm")
+    assert choose(make_problem("spot", 512, work=tmp_path), "spot", None, None, None, "lm").samples == 1
 
 
 @pytest.mark.usefixtures("no_pictures")

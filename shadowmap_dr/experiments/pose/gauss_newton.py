@@ -1,44 +1,51 @@
-"""Fit of a pose by Levenberg and Marquardt's method, from coarse images to fine ones."""
+"""Fit of a pose by Levenberg and Marquardt's method: in small images first, then in averages of fine ones."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import math
+from collections.abc import Generator, Iterator, Mapping
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ...errors import ShadowmapError
-from ...fitting.gains import Gain
-from ...fitting.levenberg_marquardt import Limits, minimise
-from ...fitting.losses import Loss
 from ...fitting.motion_parameters import ShapeMotion
-from ...fitting.objective import Point
-from ...fitting.stages import make_stages, qualities
 from ...fitting.targets import make_target
 from ...fitting.vary import Vary
+from ...fitting.views import Quality
 from ...rendering.receivers.checks import real_array
 from ...rendering.renderer import Renderer
+from .least_squares import DampedSteps, Differences, Linear, mean_square
+from .search import AWAY, EXPLAINED, TURN_DEG
 
 Array = npt.NDArray[np.float64]
 
-# Longest change of a number in a step: radians, or scene units. Most steps of a stage.
-_LONGEST, _STEPS = 0.3, 6
-# Samples along a side of coarse images: with fewer, they miss parts of thin objects, and starts end elsewhere.
-_SAMPLES = 128
+# Pixels, texels, and samples along a side of the coarse images. With fewer samples, images miss parts of thin objects, and
+# descents end elsewhere; with fewer pixels, other poses look alike.
+_COARSE, _COARSE_TEXELS, _COARSE_SAMPLES = 16, 64, 128
+# Pixels along a side, at most, at which fine images are compared, and samples along a side of their derivatives. Samples matter:
+# derivatives at few of them hold noise, by which steps become too short.
+_COMPARED, _SLOPE_SAMPLES = 64, 256
+# Most steps in coarse and in fine images. The last one is shorter than _SHORTEST (radians, or scene units). A fine step longer
+# than _FAR calls for other derivatives, and one after which the loss is larger by _NOISE is taken back.
+_COARSE_STEPS, _FINE_STEPS, _SHORTEST, _FAR, _NOISE = 12, 4, 5e-4, 0.015, 1.1
+# Rotations of the search for another basin, in multiples of TURN_DEG.
+_NEAR, _FARTHER = (1, -1, 2, -2), (3, -3, 4, -4)
 
 
 class GaussNewtonPose:
     """Fit of a rotation about y (radians) and an offset in x and y: a `Method` of the optimisation loop, as `PoseFit`.
 
-    A step is one of Levenberg and Marquardt's method, or goes to the next, finer images. After the last stage steps change
-    nothing.
+    A descent in coarse images comes first. While it leaves more of the differences than `EXPLAINED` allows, others follow from
+    rotations whose coarse images fit best. Then a few steps follow in averages of fine images, with derivatives that are computed
+    once. After these, steps change nothing.
 
     Args:
         renderer: of the scene with the object in its target pose.
         shape: name of the object.
         reference: (H, W, 3) linear image.
-        spp: samples per pixel of the last stage.
+        spp: samples per pixel of the fine images.
         shift_z: offset in z that the object has in the scene; the axis of rotation has it, too.
         settings: further entries for `describe`.
     """
@@ -56,35 +63,32 @@ class GaussNewtonPose:
         image = real_array("reference", reference)
         if image.ndim != 3 or not np.isfinite(image).all():
             raise ShadowmapError(f"a reference of shape {image.shape}: give finite values in the shape (H, W, C).")
-        entry = Vary(shape, "pose")
-        motion = ShapeMotion(entry, 1.0, ("ry", "tx", "ty"), (shape,), np.array([0, 0, shift_z]))
-        levels = qualities(max(image.shape[:2]), spp, renderer.settings.shadow.resolution, _SAMPLES)
-        free, target = np.full(3, np.inf), make_target(np.maximum(image, 0))
-        self._stages = make_stages(renderer, [motion], [], [target], [Gain()], free, Loss("l2"), levels)
-        self._limits = Limits(-free, free, _LONGEST, _STEPS, improvement=1e-2, shortest=1e-4)
+        motion = ShapeMotion(Vary(shape, "pose"), 1.0, ("ry", "tx", "ty"), (shape,), np.array([0, 0, shift_z]))
+        target, side, texels = make_target(np.maximum(image, 0)), max(image.shape[:2]), renderer.settings.shadow.resolution
+        block = _block(image.shape[0], image.shape[1])
+        fine = _quality(side, spp, texels)
+        coarse = _quality(min(side, _COARSE), _spp(_COARSE_SAMPLES, min(side, _COARSE)), min(texels, _COARSE_TEXELS))
+        slope_texels = max(min(texels, _COARSE_TEXELS), texels // block)
+        slopes = _quality(side // block, _spp(_SLOPE_SAMPLES, side // block), slope_texels)
+        self._coarse = Differences(renderer, motion, target, coarse)
+        self._fine = Differences(renderer, motion, target, fine, block)
+        self._slopes = Differences(renderer, motion, target, slopes)
+        self._without = self._coarse.at(AWAY).loss
         self._settings = dict(settings or {})
-        self._x, self._stage = np.zeros(3), 0
-        self._points: Iterator[Point] | None = None
-        self._point = self._stages[0].objective.at(self._x)
+        self._qualities = [f"{one.side} px, {one.spp} spp, {one.texels} texels" for one in (coarse, fine, slopes)]
+        self._x = self._start = np.zeros(3)
+        self._stage, self._loss = 0, 0.0
+        self._course: Iterator[float] = iter(())
+        self.reset(np.zeros(3))
 
     def reset(self, start: npt.ArrayLike) -> None:
         """Start from (rotation in radians, x, y)."""
-        self.load_state({"parameters": real_array("start", start), "stage": np.zeros(1)})
+        self.load_state({"parameters": real_array("start", start), "stage": np.zeros(1), "loss": np.zeros(1)})
 
     def step(self) -> float:
-        """Take one step. Returns the loss before it."""
-        while self._stage < len(self._stages):
-            if self._points is None:
-                objective = self._stages[self._stage].objective
-                self._point = objective.at(self._x)
-                self._points = minimise(objective.at, self._point, self._limits)
-            before = self._point
-            better = next(self._points, None)
-            if better is not None:
-                self._point, self._x = better, better.x
-                return float(before.cost)
-            self._stage, self._points = self._stage + 1, None
-        return float(self._point.cost)
+        """Take one step. Returns the mean squared difference of linear colours before it, in the images of its stage."""
+        self._loss = next(self._course, self._loss)
+        return self._loss
 
     def parameters(self) -> Array:
         """Current parameters (3,): rotation in radians, x, y."""
@@ -92,21 +96,112 @@ class GaussNewtonPose:
 
     def render(self, parameters: npt.ArrayLike) -> npt.NDArray[np.float32]:
         """Linear image (H, W, 3) at the given parameters."""
-        return self._stages[-1].objective.views[0].image(real_array("parameters", parameters).astype(np.float64)).copy()
+        return self._fine.image(real_array("parameters", parameters).astype(np.float64)).copy()
 
     def state(self) -> dict[str, npt.NDArray[Any]]:
-        """Parameters (3,), and the stage (1,)."""
-        return {"parameters": self._x, "stage": np.array([self._stage])}
+        """Parameters (3,), the stage (1,): 0 coarse, 1 fine, 2 finished, and the last loss (1,)."""
+        return {"parameters": self._x, "stage": np.array([self._stage]), "loss": np.array([self._loss])}
 
     def load_state(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
         """Continue from a result of `state`: from the beginning of its stage."""
         self._x = np.array(state["parameters"], np.float64).ravel()
         if self._x.shape != (3,):
             raise ShadowmapError(f"a pose of {self._x.size} numbers: give rotation (radians), x and y.")
-        self._stage = int(state["stage"][0])
-        self._points = None
-        self._point = self._stages[min(self._stage, len(self._stages) - 1)].objective.at(self._x)
+        self._start, self._stage, self._loss = self._x, int(state["stage"][0]), float(state["loss"][0])
+        self._course = self._steps()
 
     def describe(self) -> dict[str, Any]:
         """Settings for the record."""
-        return {**self._settings, "optimizer": "Levenberg-Marquardt", "stages": [stage.name for stage in self._stages]}
+        return {**self._settings, "optimizer": "Levenberg-Marquardt", "images": self._qualities}
+
+    def _steps(self) -> Iterator[float]:
+        """All steps from the current stage on. Each sets the pose and yields the loss before it."""
+        if self._stage == 0:
+            loss = yield from self._descend()
+            if loss > EXPLAINED * self._without:
+                yield from self._descend_elsewhere(loss)
+            self._stage = 1
+        if self._stage == 1:
+            yield from self._refine()
+            self._stage = 2
+
+    def _descend(self) -> Generator[float, None, float]:
+        """Steps in coarse images. Returns the loss at their end."""
+        steps = DampedSteps(self._coarse, self._x, _SHORTEST)
+        for _ in range(_COARSE_STEPS):
+            before = steps.point.loss
+            if not steps.advance():
+                break
+            self._x = steps.point.x
+            yield before
+        return steps.point.loss
+
+    def _descend_elsewhere(self, loss: float) -> Iterator[float]:
+        """Descents from other rotations until one is good enough. Ends at the best pose.
+
+        The first ones begin at offsets of the current pose, which is the end of the first descent with the loss ``loss``. Others
+        follow from the start, whose offset is fitted alone before.
+        """
+        best, found = self._x, loss
+        for slid, turns in ((False, _NEAR), (True, (0, *_NEAR)), (True, _FARTHER)):
+            middle = self._slid() if slid else best
+            starts = [middle + np.array([math.radians(TURN_DEG * turn), 0, 0]) for turn in turns]
+            losses = [self._coarse.loss(start) for start in starts]
+            for k in np.argsort(losses):
+                self._x = starts[k]
+                end = yield from self._descend()
+                if end < found:
+                    best, found = self._x, end
+                if found <= EXPLAINED * self._without:
+                    self._x = best
+                    return
+        self._x = best
+
+    def _slid(self) -> Array:
+        """The start with the best offset at its rotation, in coarse images."""
+        steps = DampedSteps(self._coarse, self._start, _SHORTEST, fixed=(0,))
+        for _ in range(_COARSE_STEPS):
+            if not steps.advance():
+                break
+        return steps.point.x
+
+    def _refine(self) -> Iterator[float]:
+        """Steps in fine images. The derivatives are those of the first pose, scaled to the changes that images show."""
+        slopes: Linear | None = None
+        last: tuple[Array, Array, Array] | None = None  # pose, differences and step before
+        for _ in range(_FINE_STEPS):
+            difference = self._fine.difference(self._x)
+            loss = mean_square(difference)
+            if last is not None:
+                pose, before, step = last
+                if loss > mean_square(before):
+                    # Most often noise of images is all that is left, and the later pose is the better one.
+                    self._x = pose if loss > _NOISE * mean_square(before) else self._x
+                    return
+                slopes = slopes and slopes.times(slopes.factor(step, difference - before))
+            if slopes is None:
+                slopes = Linear(self._slopes.columns(self._x))
+            step = slopes.step(difference)
+            last, self._x = (self._x, difference, step), self._x + step
+            yield loss
+            length = np.abs(step).max()
+            if length < _SHORTEST:
+                return
+            if length > _FAR:
+                slopes = None
+
+
+def _block(height: int, width: int) -> int:
+    """Side in pixels of the blocks over which fine images of a size are averaged; 1 if no side fits well."""
+    side = max(height, width)
+    least = math.ceil(side / _COMPARED)
+    return next((k for k in range(least, 2 * least) if height % k == width % k == 0), 1)
+
+
+def _spp(samples: int, side: int) -> int:
+    """Samples per pixel, a square number, of an image with about so many samples along a side."""
+    return math.ceil(samples / side) ** 2
+
+
+def _quality(side: int, spp: int, texels: int) -> Quality:
+    return Quality(side, spp, texels, 16, 64)

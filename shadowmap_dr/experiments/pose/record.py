@@ -20,12 +20,10 @@ from ...io import records
 from ...io.machine import DRJIT_VERSION
 from .methods import Image, fairness
 from .scene import PoseProblem, ReferenceKind, pose_errors, start_pose
-from .search import EXPLAINED, TURN_DEG
+from .search import AWAY, EXPLAINED, TURN_DEG
 
 RECOVERED_DEG, RECOVERED_X100 = 0.2, 0.3
 TIME_TO_POSE_DEG = 0.1
-#: A pose in which neither an object in [-1, 1]^3 nor its shadow is near anything.
-AWAY = np.array([0.0, 50.0, 0.0])
 # Steps whose mean loss stands for the end of a descent.
 _LAST = 5
 

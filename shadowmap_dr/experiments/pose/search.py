@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mitsuba as mi
 import numpy as np
@@ -24,10 +24,14 @@ from .scene import PoseProblem
 EXPLAINED = 0.05
 #: Rotation between the starts of a run's tries, in degrees.
 TURN_DEG = 25.0
+#: A pose in which neither an object in [-1, 1]^3 nor its shadow is near anything.
+AWAY = np.array([0.0, 50.0, 0.0])
 # Sides of grids of samples, and distances of samples that the narrowest tenth of an object's area has to be wide.
 _GRIDS, _WIDE, _NARROW_SHARE = (1, 2, 4), 2.0, 0.1
 # Blur by the width of an image, 8 pixels of 128; share of the steps with blur; tries.
 _BLUR, _BLUR_STEPS, _TRIES = 1 / 16, 2 / 3, 5
+# Samples along a side of the last images of Levenberg and Marquardt's method.
+_SAMPLES = 384
 
 
 @dataclass(frozen=True)
@@ -57,6 +61,9 @@ def choose(
     """Settings for a problem whose object is called ``file`` by the user; None stands for a choice."""
     known = file in assets.mesh_names()
     chosen = Search() if known else Search(samples_for(facet_widths(problem)), _BLUR * problem.resolution, _TRIES)
+    if optimiser == "lm":
+        # It stops at the first minimum, and the loss of images with few samples has many.
+        chosen = replace(chosen, samples=max(chosen.samples, math.ceil(_SAMPLES / problem.resolution) ** 2))
     return Search(
         chosen.samples if samples is None else samples,
         chosen.blur if blur is None else blur,

@@ -54,10 +54,9 @@ class Unexplained:
 
 def largest_share(objective: Objective) -> float:
     """Largest share of unexplained edges with which a fit counts as found."""
-    corrected = all(one is not None for one in objective.corrections)
     # Textures and vertices take a given number of steps, and residuals of users see other things.
     plain = not objective.has_own_residuals and not objective.views[0].values
-    return EXPLAINED_CORRECTED if corrected and plain else EXPLAINED
+    return EXPLAINED_CORRECTED if objective.is_corrected and plain else EXPLAINED
 
 
 def sentences(

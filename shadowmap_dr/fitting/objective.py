@@ -65,6 +65,11 @@ class Objective:
         self.count = int(ends[-1])
         self.corrections: list[AffineImage | None] = [None] * len(self.views)
 
+    @property
+    def is_corrected(self) -> bool:
+        """True if the images of all views are corrected."""
+        return all(one is not None for one in self.corrections)
+
     def at(self, x: Array) -> Point:
         """The residuals at x (n,)."""
         return Point(self, np.asarray(x, np.float64))

@@ -32,7 +32,7 @@ class Linear:
 
     def __post_init__(self) -> None:
         self.count = len(self.derivatives[0])
-        self.has_own_residuals = False
+        self.has_own_residuals = self.is_corrected = False
         self.terms = float(sum(residual.size for residual in self.residuals))
         self.observations = [SimpleNamespace(brightness=1.0)] * len(self.residuals)
         self.comparisons = [SimpleNamespace(derivatives=lambda image, changes: list(changes))] * len(self.residuals)

@@ -28,6 +28,7 @@ def of(columns: np.ndarray, noise: float = 0.01, prior: np.ndarray | None = None
         observations=[SimpleNamespace(brightness=1.0)],
         comparisons=[SimpleNamespace(derivatives=lambda image, changes: list(changes))],
         has_own_residuals=False,
+        is_corrected=False,
         at=at,
     )
     point = SimpleNamespace(

@@ -42,6 +42,15 @@ def _threads() -> set[int]:
     return {int(task.name) for task in tasks.iterdir()} if tasks.is_dir() else set()
 
 
+@pytest.hookimpl(hookwrapper=True, trylast=True)
+def pytest_runtest_call() -> Iterator[None]:
+    yield
+    quick_kernels.flush_messages()  # while they are captured
+
+
+pytest_runtest_setup = pytest_runtest_teardown = pytest_runtest_call
+
+
 @pytest.hookimpl(hookwrapper=True)
 def pytest_runtest_makereport() -> Iterator[None]:
     report = (yield).get_result()

@@ -32,8 +32,8 @@ PARAMETERS: dict[str, dict[str, Any]] = {
     "curve": {"resolution": 48, "steps": 40, "reference_samples": 128, "check_samples": 32, "integrator": FEW},
     "torch": {"resolution": 32, "steps": 8, "batch": 2, "subdivisions": 3, "reference_samples": 8, "picture_size": 32},
     "sun": {"resolution": 32, "steps": 8, "texels": 20, "reference_samples": 32},
-    "photo": {"width": 64, "height": 48, "starts": 3, "reference_samples": 64},
-    "certainty": {"starts": 2, "reference_samples": 64},
+    "photo": {"width": 64, "height": 48, "starts": 1, "reference_samples": 64},
+    "certainty": {"starts": 1, "reference_samples": 64},
     "own_loss": {"width": 80, "height": 60, "starts": 3, "reference_samples": 64},
     "art": {"resolution": 64, "rings": 12, "steps": 80, "picture_size": 32, "picture_samples": 2},
 }  # fmt: skip

@@ -346,7 +346,7 @@ def painting() -> Image:
 
 def test_a_texture_is_found(painting: Image) -> None:
     """Of 16 x 16 texels, from grey."""
-    result = fit(renderer(**painted(GREY)), painting, ["floor:texture"], starts=1, steps=120)
+    result = fit(renderer(**painted(GREY)), painting, ["floor:texture"], starts=1, steps=80)
     texels = estimate(result, "floor:texture").arrays["texture"]
     assert result.found and texels.shape == (16, 16, 3)
     assert ((texels >= 0) & (texels <= 1)).all()
@@ -360,7 +360,7 @@ def test_a_texture_is_found(painting: Image) -> None:
 
 def repainted(painting: Image) -> Fit:
     entries = ["floor:texture", "sun:brightness,prior=0.01"]
-    return prepared(renderer(**painted(GREY)), painting, entries, starts=1, steps=60, resolution=24, spp=1, correct=False)
+    return prepared(renderer(**painted(GREY)), painting, entries, starts=1, steps=30, resolution=24, spp=1, correct=False)
 
 
 @pytest.fixture(scope="module")

@@ -68,8 +68,8 @@ SCENES: dict[str, tuple[Any, list[str]]] = {
         ],
     ),
     "a table of spots": (
-        lambda: {f"spot{k}": spot(k) for k in range(24)},
-        ["spot3.to_world", "spot17.intensity.value", "ball.vertex_positions", "camera.to_world"],
+        lambda: {f"spot{k}": spot(k) for k in range(16)},
+        ["spot3.to_world", "spot11.intensity.value", "ball.vertex_positions", "camera.to_world"],
     ),
     "extended lights": (
         lambda: {"sun": None, "lamp": lamp(1, bitmap(4, 4, 3)), "second": lamp(-1), "sky": {"type": "constant", "radiance": 0.3}},

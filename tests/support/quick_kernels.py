@@ -3,19 +3,32 @@
 Kernels of tests are compiled without LLVM's optional passes and with its fast register allocator: thousands of kernels that run
 once each, in a third of the time. The code that Dr.Jit is given, which is what is tested, is the same. Processes that tests start
 (the command line, examples, tutorials) compile as users' do what no test has compiled yet; so do all tests with
-``SHADOWMAP_TESTS_OPTIMIZE=1``. With ``pytest -s``, LLVM is seen to name each pass that it leaves out.
+``SHADOWMAP_TESTS_OPTIMIZE=1``. With ``pytest -s``, LLVM is seen to name each pass that it leaves out: hundreds for each kernel,
+word by word, which took a tenth of the time of compiling. They are buffered, and written at the end of each phase of a test.
 """
 
 from __future__ import annotations
 
 import ctypes
 import os
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 #: Dr.Jit finds kernels again by what they compute, however they were compiled: those of users are to stay quick to run.
 FOLDER = Path(__file__).parents[2] / ".pytest_cache" / "kernels"
 # Options of LLVM's own tools, which the library has, too.
 _OPTIONS = (b"-opt-bisect-limit=0", b"-regalloc=fast", b"-optimize-regalloc=false")
+# LLVM's stream of errors, and two methods of it. C has no names for them.
+_STREAM, _BUFFER, _FLUSH = "_ZN4llvm4errsEv", "_ZN4llvm11raw_ostream11SetBufferedEv", "_ZN4llvm11raw_ostream14flush_nonemptyEv"
+
+
+def _nothing() -> None:
+    pass
+
+
+#: Writes what LLVM's stream of errors has kept back; does nothing while it keeps nothing back.
+flush_messages: Callable[[], None] = _nothing
 
 
 def _leave_out_passes() -> None:
@@ -26,7 +39,18 @@ def _leave_out_passes() -> None:
     library = _llvm.loaded_library()
     if library is not None and _llvm.loaded_version() is not None:
         arguments = (ctypes.c_char_p * (1 + len(_OPTIONS)))(b"tests", *_OPTIONS)
-        ctypes.CDLL(library).LLVMParseCommandLineOptions(len(arguments), arguments, b"")
+        llvm = ctypes.CDLL(library)
+        llvm.LLVMParseCommandLineOptions(len(arguments), arguments, b"")
+        if all(hasattr(llvm, name) for name in (_STREAM, _BUFFER, _FLUSH)):
+            _buffer_messages(llvm)
+
+
+def _buffer_messages(llvm: ctypes.CDLL) -> None:
+    global flush_messages
+    getattr(llvm, _STREAM).restype = ctypes.c_void_p
+    stream = ctypes.c_void_p(getattr(llvm, _STREAM)())
+    getattr(llvm, _BUFFER)(stream)
+    flush_messages = partial(getattr(llvm, _FLUSH), stream)
 
 
 def without_messages(output: str) -> str:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import gc
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -64,6 +66,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if f"{item.path.relative_to(TESTS).as_posix()}::{getattr(item, 'originalname', item.name)}" in slow:
             item.add_marker(pytest.mark.slow)
+        # Before fixtures, some of which collect garbage.
+        reason = _missing(str(_values(item).get("variant", "")))
+        if reason:
+            item.add_marker(pytest.mark.skip(reason=reason))
     # Tests of one scene of the gradient suite after one another: they share derivative images, the first of them takes new ones.
     places = [place for place, item in enumerate(items) if item.path.name == "test_gradients.py"]
     for place, item in zip(places, sorted((items[place] for place in places), key=_scene_of), strict=True):
@@ -77,21 +83,35 @@ def pytest_collection_finish() -> None:
 
 
 def _scene_of(item: pytest.Item) -> tuple[str, str, bool]:
-    values = getattr(item, "callspec", None)
-    values = values.params if values else {}
+    values = _values(item)
     scene = values["traced"].case if "traced" in values else values.get("case", "")
     return values.get("variant", ""), scene, "reverse_mode" not in item.name
+
+
+def _values(item: pytest.Item) -> dict[str, Any]:  # Any: parameters of a test
+    call = getattr(item, "callspec", None)
+    return call.params if call else {}
+
+
+@functools.cache
+def _missing(variant: str) -> str:
+    """Reason for which tests of a variant of Mitsuba cannot run; empty if they can."""
+    if not variant.endswith("_ad_rgb"):
+        return ""
+    if variant not in mi.variants():
+        return f"this Mitsuba has no variant {variant}"
+    on_gpu = variant.startswith("cuda")
+    if dr.has_backend(dr.JitBackend.CUDA if on_gpu else dr.JitBackend.LLVM):
+        return ""
+    return "no GPU" if on_gpu else "no LLVM"
 
 
 @pytest.fixture(params=["llvm_ad_rgb", "cuda_ad_rgb"])
 def variant(request: pytest.FixtureRequest) -> Iterator[str]:
     """Sets the Mitsuba variant for a test and names it; tests that use it run once for each backend at hand."""
     name: str = request.param
-    backend = dr.JitBackend.CUDA if name.startswith("cuda") else dr.JitBackend.LLVM
-    if name not in mi.variants():
-        pytest.skip(f"this Mitsuba has no variant {name}")
-    if not dr.has_backend(backend):
-        pytest.skip("no GPU" if backend == dr.JitBackend.CUDA else "no LLVM")
+    if _missing(name):
+        pytest.skip(_missing(name))
     mi.set_variant(name)
     yield name
 

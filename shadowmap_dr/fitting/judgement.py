@@ -28,6 +28,8 @@ _NOISY, _ABOVE, _UNEVEN = 0.5, 2.5, 4.0
 # Pixels matter where a change of a number by the first moves them by more than the second, a share of the brightness; and
 # where the residual is larger. Numbers that move fewer blocks of pixels are not judged on their own.
 _CHANGE, _VISIBLE, _FEW = 0.05, 0.03, 8
+# Largest share of the edges that one number moves, as a multiple of that of the whole.
+_OF_NUMBER = 2.0
 
 
 @dataclass(frozen=True)
@@ -47,9 +49,13 @@ class Unexplained:
         """The largest share. A small object that is turned wrongly is hardly a part of the whole."""
         return max(self.whole, float(self.numbers.max(initial=0)))
 
+    def is_small(self, limit: float) -> bool:
+        """True if the whole is at most a limit, and no number is :meth:`wrong`."""
+        return self.whole <= limit and not self.wrong(limit).any()
+
     def wrong(self, limit: float) -> npt.NDArray[np.bool_]:
-        """True (n,) for the numbers whose share is beyond a limit."""
-        return np.asarray(self.numbers > limit)
+        """True (n,) for the numbers whose share is beyond the limit of fewer edges, among which noise weighs more."""
+        return np.asarray(self.numbers > _OF_NUMBER * limit)
 
 
 def largest_share(objective: Objective) -> float:

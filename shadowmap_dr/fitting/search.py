@@ -158,7 +158,7 @@ class Fit:
                         self._state.write(state, fingerprint)
                 self._state.choose(number, len(self.stages) - 2 - number, first)
             yield from self._correct(self._state.best_from(first), last=attempt == tries - 1)
-            if attempt < tries - 1 and self._unexplained(self.best).largest <= largest_share(self.stages[-1].objective):
+            if attempt < tries - 1 and self._unexplained(self.best).is_small(largest_share(self.stages[-1].objective)):
                 break
         for number in range(self._state.array_stage, len(self.stages) if self.arrays else 0):
             if number >= len(self.stages) - _ARRAY_STAGES:
@@ -339,7 +339,7 @@ class Fit:
         of_gains, names_of_gains = gain_estimates(x, short_names(self.targets), self.gains, objective.gains, spread)
         names += names_of_gains
         shares = unexplained(point, objective)
-        found = shares.largest <= largest_share(objective)
+        found = shares.is_small(largest_share(objective))
         words = sentences(found, shares, point.error, spread, names, own=objective.has_own_residuals)
         if self._corrections is not None and self._corrections.failure:
             words.append(f"Images are not corrected, since Mitsuba cannot render the fitted scene: {self._corrections.failure}.")

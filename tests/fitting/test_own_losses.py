@@ -233,6 +233,7 @@ def test_a_picture_of_another_scene_is_not_found(picture: Image) -> None:
     noise = np.random.default_rng(0).uniform(0, 1, picture.shape).astype(np.float32)
     result = fit(renderer(), noise, "box:translation:xy", residuals=edges, starts=2, tries=1)
     assert not result.found and "of what your residuals see in the picture" in result.words[0]
+    assert "is not where the scene has it" in result.words[0]
 
 
 # ------------------------------------------------------------------------------------------------------ textures and vertices

@@ -403,6 +403,9 @@ def test_recorded_steps_of_shapes_without_size_guards_stay_within_their_shape(va
     """Scenes of very many sizes guard the largest shapes only: more vertices than recorded change no other memory."""
     renderer, name = renderer_of(), "ball"
     renderer.data = replace(renderer.data, geometry=replace(renderer.data.geometry, size_guards=()))
+    # Outlines are sums without a fixed order, which differ by rounding.
+    shadow = replace(renderer.settings.shadow, antialias=False)
+    renderer.settings = replace(renderer.settings, antialias=False, shadow=shadow)
     rest = np.array(renderer.vertices(name))
 
     @dr.freeze
@@ -417,5 +420,4 @@ def test_recorded_steps_of_shapes_without_size_guards_stay_within_their_shape(va
     count = rest.shape[1]
     expected = [run(count) for _ in range(3)][-1]
     run(100 * count)
-    # Up to the order of sums.
-    np.testing.assert_allclose(run(count), expected, rtol=0, atol=1e-6)
+    np.testing.assert_array_equal(run(count), expected)

@@ -10,7 +10,7 @@ import pytest
 
 from shadowmap_dr.fitting.comparison import Colours, Observation
 from shadowmap_dr.fitting.gains import Gain
-from shadowmap_dr.fitting.judgement import EXPLAINED, EXPLAINED_CORRECTED, unexplained
+from shadowmap_dr.fitting.judgement import EXPLAINED, EXPLAINED_CORRECTED, Unexplained, unexplained
 
 SIDE = 128
 
@@ -87,3 +87,10 @@ def test_a_small_object_elsewhere_is_no_small_matter() -> None:
     assert shares.whole < EXPLAINED_CORRECTED and shares.numbers[1] < EXPLAINED_CORRECTED
     assert shares.largest == shares.numbers[0] > 5 * EXPLAINED_CORRECTED
     assert shares.wrong(EXPLAINED_CORRECTED).tolist() == [True, False]
+    assert not shares.is_small(EXPLAINED_CORRECTED)
+
+
+def test_a_number_may_leave_twice_the_share_of_the_whole() -> None:
+    assert Unexplained(0.04, np.array([0.08, 0.0])).is_small(0.04)
+    assert not Unexplained(0.04, np.array([0.081])).is_small(0.04)
+    assert not Unexplained(0.041, np.zeros(1)).is_small(0.04)

@@ -13,7 +13,7 @@ import pytest
 from fakes import POINTS, BlobRenderer
 
 from shadowmap_dr.errors import ShadowmapError
-from shadowmap_dr.inverse import PoseFit, apply_pose, optimize
+from shadowmap_dr.inverse import History, PoseFit, apply_pose, optimize
 from shadowmap_dr.inverse.image_blur import blurred
 
 START = [0.3, 0.15, -0.1]
@@ -227,6 +227,15 @@ def test_history_of_a_method_on_the_host() -> None:
     assert list(history.warm) == [False] * 5 + [True] * 7
     assert history.seconds_per_iteration == pytest.approx(np.median(history.seconds[5:]))
     assert history.seconds_total == pytest.approx(history.seconds.sum())
+
+
+def test_steps_after_the_end_of_a_method_have_no_part_in_its_time() -> None:
+    parameters = np.array([0.0, 0.3, 0.4, 0.5, 0.5, 0.5, 0.5, 0.5])[:, None]
+    seconds = np.array([9.0, 4.0, 2.0, 1e-7, 1e-7, 1e-7, 1e-7])
+    warm = np.arange(7) > 0
+    history = History(np.zeros(7), parameters, seconds, warm)
+    assert history.seconds_per_iteration == 3.0
+    assert History(np.zeros(7), np.zeros((8, 1)), seconds, warm).seconds_per_iteration == 1e-7  # it never moved
 
 
 def test_bad_input_is_refused(variant: str) -> None:

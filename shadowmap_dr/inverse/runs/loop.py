@@ -83,10 +83,16 @@ class History:
 
     @property
     def seconds_per_iteration(self) -> float:
-        """Median time of a step after the warm-up, or of all steps if all belong to the warm-up; NaN without steps."""
+        """Median time of a step after the warm-up, or of all steps if all belong to the warm-up; NaN without steps.
+
+        Steps after the last change of the parameters do not count: a method that has ended does nothing in them.
+        """
         if not len(self.seconds):
             return float("nan")
-        return float(np.median(self.seconds[self.warm] if self.warm.any() else self.seconds))
+        moved = np.flatnonzero((self.parameters[1:] != self.parameters[:-1]).any(1))
+        count = int(moved[-1]) + 1 if len(moved) else len(self.seconds)
+        seconds, warm = self.seconds[:count], self.warm[:count]
+        return float(np.median(seconds[warm] if warm.any() else seconds))
 
     @property
     def seconds_total(self) -> float:

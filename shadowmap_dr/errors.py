@@ -12,9 +12,45 @@ import warnings
 from collections.abc import Iterable
 from pathlib import Path
 
+# Most characters of a message, and of its words while it has more.
+_MESSAGE, _WORDS = 400, (160, 80, 40)
+
+
+def shortened(text: object, most: int = 80) -> str:
+    """What users gave, for a message: a long text is its begin and its end, with an ellipsis between them."""
+    words = str(text)
+    return words if len(words) <= most else f"{words[: most // 2]}…{words[-(most - most // 2 - 1) :]}"
+
+
+def quoted(value: object, most: int = 80) -> str:
+    """A value as Python writes it, shortened."""
+    try:
+        return shortened(repr(value), most)
+    except ValueError:  # Python writes no integers of thousands of digits
+        return f"a very long {type(value).__name__}"
+
+
+def concise(message: object) -> str:
+    """A message in one line of at most 400 characters.
+
+    Words are shortened first, such as names of thousands of letters. If that is not enough, the middle of the message is left
+    out: it begins with the thing, and ends with what to do.
+    """
+    line = " ".join(str(message).splitlines())
+    for most in _WORDS:
+        if len(line) > _MESSAGE:
+            line = " ".join(shortened(word, most) for word in line.split(" "))
+    return shortened(line, _MESSAGE)
+
 
 class ShadowmapError(ValueError):
-    """Bad input to shadowmap_dr: a scene, an option or an array that cannot be used as given."""
+    """Bad input to shadowmap_dr: a scene, an option or an array that cannot be used as given.
+
+    Its text is one line of at most 400 characters; ``args`` keeps what was left out.
+    """
+
+    def __str__(self) -> str:
+        return concise(super().__str__())
 
 
 class UnsupportedShape(ShadowmapError):

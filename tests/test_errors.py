@@ -75,3 +75,22 @@ def test_nearest_words(word: str, found: Any) -> None:
     known = ["pose", "gradients", "art", "maps", "map_size", "soft_map_size"]
     assert errors.nearest(word, known) == found
     assert errors.did_you_mean(word, known) == (f" Did you mean {found!r}?" if found else "")
+
+
+def test_long_texts_keep_their_ends() -> None:
+    assert errors.shortened("a name") == "a name" and errors.quoted("a name") == "'a name'"
+    text = errors.shortened("b" + 5000 * "x" + "e")
+    assert len(text) == 80 and text.startswith("bx") and text.endswith("xe") and "…" in text
+    assert len(errors.quoted(5000 * "x")) == 80 and errors.quoted(10**5000) == "a very long int"
+
+
+@pytest.mark.parametrize("given", [5000 * "x", "/".join(900 * ["folder"]), 900 * "two words ", 3000 * "\n", 700 * "x y\n"])
+def test_messages_are_one_short_line(given: str) -> None:
+    """They keep their begin and their end, and ``args`` keeps all."""
+    for kind in (errors.ShadowmapError, errors.OutputError, errors.LLVMError):
+        error = kind(f"the thing {given} is wrong: give another.")
+        assert len(str(error)) <= 400 and "\n" not in str(error)
+        assert str(error).startswith("the thing ") and str(error).endswith("is wrong: give another.")
+        assert given in error.args[0]
+    path = "/".join(30 * ["folder"])
+    assert str(errors.ShadowmapError(f"no file {path!r}.")) == f"no file {path!r}."

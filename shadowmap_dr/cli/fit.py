@@ -9,13 +9,16 @@ from typing import Annotated, Any
 
 import typer
 
-from ..errors import ShadowmapError
+from ..errors import ShadowmapError, quoted, shortened
 from ..fitting.options import FitOptions
 from ..fitting.task import FitTask, PictureFile, read_task
 from ..io import console, files
 from ..variants import DEFAULT_VARIANT, set_variant
 from .options import Given, Variant, from_record
 from .scene_argument import definitions, load, scene_file
+
+# Most digits of the number of a sensor.
+_DIGITS = 9
 
 
 @from_record(first=("vary",))
@@ -73,13 +76,13 @@ def _task(scene: str, given: Given[FitOptions], targets: list[str], masks: list[
     for entry in masks:
         sensor, file = _numbered("--mask", entry)
         if sensor in masked:
-            raise ShadowmapError(f"--mask {entry}: the picture of sensor {sensor} has a mask already.")
+            raise ShadowmapError(f"--mask {shortened(entry)}: the picture of sensor {sensor} has a mask already.")
         masked[sensor] = file
     pictures = [PictureFile(file, sensor) for sensor, file in (_numbered("--target", entry) for entry in targets)]
     sensors = {picture.sensor for picture in pictures}
     for sensor in masked:
         if sensor not in sensors and targets:
-            raise ShadowmapError(f"--mask {sensor}={masked[sensor]}: there is no --target of sensor {sensor}.")
+            raise ShadowmapError(f"--mask {sensor}={shortened(masked[sensor])}: there is no --target of sensor {sensor}.")
     pictures = [replace(picture, mask=masked.get(picture.sensor)) for picture in pictures]
     if not scene.lower().endswith(".toml"):
         return FitTask(scene, parameters, pictures, given.make())
@@ -93,6 +96,9 @@ def _numbered(option: str, entry: str) -> tuple[int, str]:
     """(sensor, file) of ``FILE`` or ``N=FILE``."""
     found = re.fullmatch(r"(?:(\d+)=)?(.+)", entry, re.DOTALL)
     if found is None:
-        raise ShadowmapError(f"{option} {entry!r}: write FILE or N=FILE, with the number of the sensor.")
+        raise ShadowmapError(f"{option} {quoted(entry)}: write FILE or N=FILE, with the number of the sensor.")
     files.check_name(found[2])
-    return int(found[1] or 0), found[2]
+    number = found[1] or "0"
+    if len(number) > _DIGITS:
+        raise ShadowmapError(f"{option} {quoted(entry)}: no scene has so many sensors; N is counted from 0.")
+    return int(number), found[2]

@@ -17,7 +17,7 @@ import typer
 import typer.core
 
 from .. import __version__
-from ..errors import ShadowmapError, Verbosity, is_interrupt, set_verbosity, verbosity
+from ..errors import ShadowmapError, Verbosity, concise, is_interrupt, set_verbosity, verbosity
 from .usage import explained
 
 
@@ -217,7 +217,7 @@ def _drop_output() -> None:
 def _fail(message: str, status: int) -> None:
     if verbosity() is Verbosity.VERBOSE and sys.exc_info()[0] is not None:
         traceback.print_exc()
-    _note(f"error: {message}")
+    _note(concise(f"error: {message}"))
     sys.exit(status)
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable
 from pathlib import Path
 
 import mitsuba as mi
 
-from ..errors import ShadowmapError, mitsuba_message, nearest
+from ..errors import ShadowmapError, mitsuba_message, nearest, quoted, shortened
 from ..importing.reader import SUFFIXES as IMPORTED
 from ..io import assets, files
 from ..io.pictures import SUFFIXES
@@ -21,8 +22,8 @@ def scene_file(name: str) -> Path:
     """Path of a scene by name or file. ShadowmapError, with what to do, for a folder, a mesh, a picture, and what is no XML."""
     files.check_name(name)
     given = Path(name)
-    if name in assets.scene_names() or not given.exists():
-        beside = [path.name for path in given.parent.glob("*.xml")] if given.parent.is_dir() else []
+    if name in assets.scene_names() or not os.path.exists(given):
+        beside = [path.name for path in given.parent.glob("*.xml")] if os.path.isdir(given.parent) else []
         if name not in assets.scene_names() and beside and (near := nearest(given.name, beside)):
             raise ShadowmapError(f"no scene {name!r}: there is no such file. Did you mean {str(given.with_name(near))!r}?")
         return assets.scene(name)
@@ -49,13 +50,13 @@ def definitions(entries: list[str]) -> dict[str, str]:
     for entry in entries:
         match = re.fullmatch(r"([A-Za-z_]\w*)=(.*)", entry)
         if match is None:
-            raise ShadowmapError(f"-D {entry}: write it as NAME=VALUE, for instance -D resolution=256.")
+            raise ShadowmapError(f"-D {shortened(entry)}: write it as NAME=VALUE, for instance -D resolution=256.")
         name, value = match.groups()
         files.check_name(value)
         if name in values:
-            raise ShadowmapError(f"-D {entry}: {name} has a value already, {values[name]!r}.")
+            raise ShadowmapError(f"-D {shortened(entry)}: {shortened(name)} has a value already, {quoted(values[name])}.")
         if value.strip().lower() in ("nan", "-nan", "inf", "-inf", "+inf", "infinity", "-infinity"):
-            raise ShadowmapError(f"-D {entry}: {value} is no finite number.")
+            raise ShadowmapError(f"-D {shortened(entry)}: {value} is no finite number.")
         values[name] = value
     return values
 

@@ -131,7 +131,7 @@ class _VertexDescent:
         try:
             self._steps = mi.ad.LargeSteps(points, device_array(mi.UInt32, mesh.faces.ravel()), lambda_=_SMOOTHNESS)
         except (ImportError, ModuleNotFoundError) as error:
-            raise ShadowmapError(f"vary {mesh.vary.label}: the package cholespy is missing: {install_hint('art')}") from error
+            raise ShadowmapError(f"{mesh.vary.named}: the package cholespy is missing: {install_hint('art')}") from error
         extent = float(np.ptp(mesh.start.reshape(-1, 3), axis=0).max()) or 1.0
         self._rate = _VERTEX_STEP * extent * (1 + _SMOOTHNESS)
         self._adam = mi.ad.Adam(lr=self._rate, uniform=True, params={"u": self._steps.to_differential(points)})
@@ -153,18 +153,26 @@ def texture_values(renderer: Renderer, vary: Vary, key: str) -> TextureValues:
     flat = np.array(dr.detach(value), np.float32)
     shape = tuple(int(n) for n in value.shape) if dr.is_tensor_v(value) else flat.shape
     share = any(word in key for word in ("reflectance", "base_color", "albedo", "opacity", "alpha", "roughness", "weight"))
+    given = [name for name in ("prior", "spread") if name in vary.plain()]
+    if given:
+        raise ShadowmapError(f"{vary.named}: textures have no {given[0]}: leave it out.")
     low = vary.low if vary.low is not None else 0.0
     high = vary.high if vary.high is not None else 1.0 if share else np.inf
+    if low >= high:
+        raise ShadowmapError(f"{vary.named}: the bounds leave nothing between {low:g} and {high:g}.")
     return TextureValues(vary, key, shape, flat.ravel(), low, high)
 
 
 def mesh_vertices(renderer: Renderer, vary: Vary, shape: str) -> MeshVertices:
     """The parameter of the vertices of a mesh."""
+    given = [name for name in ("min", "max", "prior", "spread") if name in vary.plain()]
+    if given:
+        raise ShadowmapError(f"{vary.named}: vertices have no {given[0]}: leave it out.")
     geometry = renderer.data.geometry
     info = geometry.shape(shape)
     faces = geometry.faces.numpy().reshape(-1, 3)[info.face_start : info.face_start + info.face_count] - info.vertex_start
     points = np.array(dr.detach(geometry.positions), np.float32).reshape(-1, 3)
     own = points[info.vertex_start : info.vertex_start + info.vertex_count]
     if not np.isfinite(own).all():
-        raise ShadowmapError(f"vary {vary.label}: shape '{shape}' has vertices that are not finite.")
+        raise ShadowmapError(f"{vary.named}: shape '{shape}' has vertices that are not finite.")
     return MeshVertices(vary, shape, faces.astype(np.uint32), own.ravel())

@@ -8,12 +8,14 @@ from typing import Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import ShadowmapError, did_you_mean
+from ..errors import ShadowmapError, did_you_mean, quoted
 
 Image = npt.NDArray[np.float32]
 LossKind = Literal["huber", "l2", "l1"]
 _KINDS = get_args(LossKind)
 
+# Largest delta: products with residuals are numbers in single precision.
+_MOST_DELTA = 1e12
 # Residuals below this share of the picture's brightness count as squares in the loss l1, which has no second derivative.
 _SMALL = 0.005
 
@@ -32,9 +34,9 @@ class Loss:
 
     def __post_init__(self) -> None:
         if self.kind not in _KINDS:
-            raise ShadowmapError(f"loss is {self.kind!r}: choose huber, l2 or l1.{did_you_mean(self.kind, _KINDS)}")
-        if not 0 < self.delta < np.inf:
-            raise ShadowmapError(f"delta of the loss is {self.delta!r}: give a positive number.")
+            raise ShadowmapError(f"loss is {quoted(self.kind)}: choose huber, l2 or l1.{did_you_mean(self.kind, _KINDS)}")
+        if not 0 < self.delta <= _MOST_DELTA:
+            raise ShadowmapError(f"delta of the loss is {quoted(self.delta)}: give a positive number up to {_MOST_DELTA:g}.")
 
     @property
     def limit(self) -> float:

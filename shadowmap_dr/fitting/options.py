@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 
-from ..errors import ShadowmapError
+from ..errors import ShadowmapError, shortened
 from ..io.options import option
 from ..io.ranges import check_ranges
 from .losses import Loss, LossKind
@@ -57,7 +58,6 @@ class FitOptions:
         Loss(self.loss, self.delta)
         if self.exposure and self.white_balance:
             raise ShadowmapError("exposure and white_balance: leave exposure out; white balance has an exposure of each colour.")
-        labels = [vary.label for vary in self.vary]
-        for label in labels:
-            if labels.count(label) > 1:
-                raise ShadowmapError(f"vary {label} is given twice: give it once.")
+        for label, count in Counter(vary.label for vary in self.vary).items():
+            if count > 1:
+                raise ShadowmapError(f"vary {shortened(label)} is given twice: give it once.")

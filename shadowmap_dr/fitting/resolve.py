@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import ShadowmapError, did_you_mean
+from ..errors import ShadowmapError, did_you_mean, quoted, shortened
 from ..rendering.renderer import Renderer
 from .arrays import ArrayParameter, MeshVertices, TextureValues, mesh_vertices, texture_values
 from .motion_parameters import CameraMotion, LightMotion, ShapeMotion
@@ -81,7 +81,7 @@ class Resolver:
         matched = [shape for shape in self.shapes if shape == name or fnmatchcase(shape, name)]
         if vary.kind == "vertices":
             if len(matched) != 1:
-                raise ShadowmapError(f"vary {vary.label}: {len(matched)} shapes are called {name!r}; name one mesh.")
+                raise ShadowmapError(f"{vary.named}: {len(matched)} shapes are called {quoted(name)}; name one mesh.")
             return mesh_vertices(self.renderer, vary, matched[0])
         if vary.kind == "texture":
             return texture_values(self.renderer, vary, self._texture_key(vary))
@@ -91,8 +91,8 @@ class Resolver:
         given = [name for name in ("min", "max", "prior", "spread") if name in vary.plain()]
         if found.kind == "pose" and given:
             raise ShadowmapError(
-                f"vary {vary.label}: {given[0]} is one number, but a pose has degrees and scene units: give {name}:rotation and "
-                f"{name}:translation, each with its own."
+                f"{vary.named}: {given[0]} is one number, but a pose has degrees and scene units: give "
+                f"{shortened(name)}:rotation and {shortened(name)}:translation, each with its own."
             )
         return found
 
@@ -176,7 +176,7 @@ class Resolver:
         record = self.renderer.data.cameras(number)[0]
         if kind == "fov":
             if record.kind != "perspective":
-                raise ShadowmapError(f"vary {vary.label}: the sensor is orthographic and has no angle of view.")
+                raise ShadowmapError(f"{vary.named}: the sensor is orthographic and has no angle of view.")
             return FieldOfView(vary, number, float(dr.detach(record.x_fov)[0]))
         parts = _rigid_parts(vary.axes).get(kind)
         if parts is None:
@@ -194,15 +194,15 @@ class Resolver:
         key = self._key(vary)
         light, _, field = key.partition(".")
         if field == "position" and light in self.lights:
-            raise ShadowmapError(f"vary {vary.label}: the position of a light is a kind of it: give {light}:position.")
+            raise ShadowmapError(f"{vary.named}: the position of a light is a kind of it: give {light}:position.")
         array = self._numbers(key)
         if array is None:
-            raise ShadowmapError(f"vary {vary.label}: {key} is a {type(self.table[key]).__name__}, to which no derivatives flow.")
+            raise ShadowmapError(f"{vary.named}: {key} is a {type(self.table[key]).__name__}, to which no derivatives flow.")
         common = vary.kind in ("brightness", "sky")
         if vary.kind not in ("", "value", "brightness", "sky"):
             raise _no_kind(vary, "a value", ("value", "brightness"))
         if len(array) > _MOST:
-            raise ShadowmapError(f"vary {vary.label}: {key} has {len(array)} values; give the kind texture.")
+            raise ShadowmapError(f"{vary.named}: {key} has {len(array)} values; give the kind texture.")
         owner, _, end = key.partition(".")
         light = owner if owner in self.lights and end in _FIELDS else ""
         last = next((part for part in reversed(key.split(".")) if part not in ("value", "data")), key)
@@ -217,7 +217,7 @@ class Resolver:
             natural = (-np.inf, np.inf)
         if common and not (array.max() > 0):
             raise ShadowmapError(
-                f"vary {vary.label}: {key} is {_shown(array)}; a factor of zero changes nothing: give the kind value."
+                f"{vary.named}: {key} is {_shown(array)}; a factor of zero changes nothing: give the kind value."
             )
         logarithmic = not common and natural == (0.0, np.inf) or natural == (0.1, 179.0)
         bounds = (0.0, np.inf) if common else natural
@@ -236,7 +236,7 @@ class Resolver:
                 return key
         known = [*self.shapes, *self.lights, *self.sensors, *(key.removesuffix(".value") for key in self.keys)]
         near = did_you_mean(name, known)
-        raise ShadowmapError(f"vary {vary.label}: the scene has no object or value {name!r}; --list lists all.{near}")
+        raise ShadowmapError(f"{vary.named}: the scene has no object or value {quoted(name)}; --list lists all.{near}")
 
     def _texture_key(self, vary: Vary) -> str:
         """Mitsuba's name of the array of an entry: itself, or the only one of a material or light."""
@@ -245,16 +245,18 @@ class Resolver:
         if len(arrays) == 1:
             return arrays[0]
         if arrays:
-            raise ShadowmapError(f"vary {vary.label}: there are several, {', '.join(arrays)}; name one.")
+            raise ShadowmapError(f"{vary.named}: there are several, {shortened(', '.join(arrays), 160)}; name one.")
         coarse = [key for key in own if key.endswith(".data") and not dr.is_float_v(self.table[key])]
         if coarse:
             raise ShadowmapError(
-                f"vary {vary.label}: {coarse[0]} holds whole numbers, to which no derivatives flow: give the scene's file "
+                f"{vary.named}: {coarse[0]} holds whole numbers, to which no derivatives flow: give the scene's file "
                 "instead of the scene, or the texture 'format': 'variant'."
             )
         known = [key for key in self.keys if key.endswith(".data")]
         near = did_you_mean(vary.name, known)
-        raise ShadowmapError(f"vary {vary.label}: '{vary.name}' has no texture; textures: {', '.join(known) or 'none'}.{near}")
+        raise ShadowmapError(
+            f"{vary.named}: {quoted(vary.name)} has no texture; textures: {shortened(', '.join(known), 160) or 'none'}.{near}"
+        )
 
     def _numbers(self, key: str) -> Array | None:
         """The values (n,) of a parameter of Mitsuba's; None if no derivatives flow to it, and for parts of meshes and films."""
@@ -282,7 +284,7 @@ def _bounds(points: Array) -> tuple[Array, float]:
 
 
 def _no_kind(vary: Vary, what: str, kinds: Sequence[str]) -> ShadowmapError:
-    return ShadowmapError(f"vary {vary.label}: '{vary.name}' is {what} and has the kinds {', '.join(kinds)}.")
+    return ShadowmapError(f"{vary.named}: {quoted(vary.name)} is {what} and has the kinds {', '.join(kinds)}.")
 
 
 def _shown(values: Array) -> str:

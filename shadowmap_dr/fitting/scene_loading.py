@@ -25,7 +25,7 @@ def load_scene(file: str | os.PathLike[str], parameters: Mapping[str, str] | Non
         ShadowmapError: Mitsuba does not understand the file, or it is no scene.
     """
     path = Path(file).absolute()
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise ShadowmapError(f"no scene {str(file)!r}: the file does not exist.")
     config, state = parsed(path, parameters or {})
     for node in state.nodes:

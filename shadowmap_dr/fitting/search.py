@@ -34,8 +34,8 @@ from .result import FitResult, Picture, Step
 from .scene_change import SceneChange
 from .shadow_pictures import lit_share
 from .stages import Stage, make_stages, qualities
-from .starts import chosen, draw, groups_of, half_ranges, redraw, with_gains
-from .state import Run, State
+from .starts import LARGEST_FACTOR, chosen, draw, groups_of, half_ranges, redraw, with_gains
+from .state import Run, Sizes, State
 from .targets import Target, short_names
 from .texture_brightness import TextureBrightness
 from .uncertainty import uncertainty
@@ -53,6 +53,8 @@ _CORRECTIONS, _CORRECTED_STEPS, _LITTLE, _SHORT, _FAR = 6, 3, 1e-4, 3e-4, 0.5
 _FEW_CORRECTIONS, _CLOSE = 2, 0.15
 # Growth of the ranges of starts from one try to the next. First stage of turned objects, and their least turn in ranges.
 _GROWTH, _TURNED_STAGE, _APART = 0.5, 2, 0.7
+# Least standard deviation of a prior, in the fit's own numbers: with less, matrices are singular.
+_TIGHTEST = 1e-6
 # Textures and vertices: stages in which they are fitted, the last ones; rounds of a stage, in turns with the numbers; size of the
 # last step as a share of the first one's.
 _ARRAY_STAGES, _ROUNDS, _LAST_SHARE = 3, 3, 0.1
@@ -136,7 +138,7 @@ class Fit:
         """
         fingerprint = self._fingerprint()
         if state is not None and resume and state.exists():
-            self._state = State.read(state, fingerprint)
+            self._state = State.read(state, fingerprint, self._sizes())
             self._began = time.perf_counter() - max((step["seconds"] for step in self.history), default=0.0)
             self._set_values([mi.Float(own) for own in self._state.values])
         return self._all_steps(state, fingerprint)
@@ -175,7 +177,7 @@ class Fit:
         The ranges grow from try to try, and later tries have candidates that differ from the best numbers in a part only.
         """
         options, scene = self.options, self.stages[0].objective.views[0].count
-        ranges = half_ranges(self.parameters) * (1 + attempt * _GROWTH)
+        ranges = half_ranges(self.parameters, 1 + attempt * _GROWTH)
         low, high, seed = self._low[:scene], self._high[:scene], (options.seed, attempt)
         drawn, turned = draw(ranges, low, high, options.starts, seed, scene=attempt == 0), list[Array]()
         if attempt:
@@ -291,6 +293,10 @@ class Fit:
         run.trail.append((number, self._without_brightness(point.x)))
         return step
 
+    def _sizes(self) -> Sizes:
+        """Sizes of the state of this fit."""
+        return Sizes(len(self._low), len(self.stages), tuple(len(array.start) for array in self.arrays))
+
     def _fingerprint(self) -> str:
         """Text that identifies the fit."""
         sums = [[float(t.image.sum(dtype=np.float64)), float(t.weight.sum(dtype=np.float64)), t.sensor] for t in self.targets]
@@ -398,12 +404,18 @@ def _bounds(parameters: Sequence[Parameter], gains: Sequence[Gain]) -> tuple[Arr
         vary, scale, count = parameter.vary, parameter.scale, len(parameter.labels)
         least = parameter.natural[0] if vary.low is None else vary.low
         most = parameter.natural[1] if vary.high is None else vary.high
-        if vary.low is not None and vary.high is None and least >= most or vary.high is not None and most <= least:
-            raise ShadowmapError(f"vary {vary.label}: the bounds leave nothing between {least:g} and {most:g}.")
+        nothing = vary.low is not None and vary.high is None and least >= most or vary.high is not None and most <= least
+        if nothing or scale.logarithmic and most <= 0:
+            least = max(least, 0.0) if scale.logarithmic else least
+            raise ShadowmapError(f"{vary.named}: the bounds leave nothing between {least:g} and {most:g}.")
+        if vary.spread is not None and scale.logarithmic and not 1 / LARGEST_FACTOR <= vary.spread <= LARGEST_FACTOR:
+            raise ShadowmapError(
+                f"{vary.named}: spread is {vary.spread:g}, a factor here: give one from 1 to {LARGEST_FACTOR:g}."
+            )
         low.append(np.broadcast_to(scale.number(least) if np.isfinite(least) else -np.inf, count))
         high.append(np.broadcast_to(scale.number(most) if np.isfinite(most) else np.inf, count))
         unit = np.abs(scale.shown(np.zeros(count)) if scale.logarithmic else scale.factor)
-        prior.append(np.full(count, np.inf) if vary.prior is None else vary.prior / unit)
+        prior.append(np.full(count, np.inf) if vary.prior is None else np.maximum(vary.prior / unit, _TIGHTEST))
     for gain in gains:
         low.append(np.array([-8.0] * gain.colours + [-0.95] * gain.vignetting))
         high.append(np.array([8.0] * gain.colours + [1.0] * gain.vignetting))

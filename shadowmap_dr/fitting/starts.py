@@ -13,6 +13,8 @@ from .parameters import Parameter
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
 
+#: Largest factor in the ranges of values that stay positive: from its inverse to itself.
+LARGEST_FACTOR = 1e6
 # Candidates for each start.
 _TRIED = 8
 # Draws of a candidate at most.
@@ -21,17 +23,18 @@ _DRAWS = 20
 _GOING_ON = (1, 2, 4, 8, 16)
 
 
-def half_ranges(parameters: Sequence[Parameter]) -> Array:
-    """Half ranges (n,) of starts, in the fit's numbers."""
+def half_ranges(parameters: Sequence[Parameter], growth: float = 1.0) -> Array:
+    """Half ranges (n,) of starts, in the fit's numbers; ``growth`` times as wide as those of the first ones."""
     found = []
     for parameter in parameters:
         spread, scale, count = parameter.vary.spread, parameter.scale, len(parameter.labels)
         if spread is None:
-            found.append(parameter.usual)
+            half = parameter.usual
         elif scale.logarithmic:
-            found.append(np.full(count, abs(np.log(spread))))
+            half = np.full(count, abs(np.log(spread)))
         else:
-            found.append(np.broadcast_to(spread / scale.factor, count))
+            half = np.broadcast_to(spread / scale.factor, count)
+        found.append(np.minimum(half * growth, np.log(LARGEST_FACTOR)) if scale.logarithmic else half * growth)
     return np.concatenate([np.zeros(0), *found])
 
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, get_type_hints
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +17,19 @@ from .result import Step
 from .starts import going_on
 
 Array = npt.NDArray[np.float64]
+
+
+# Types of the entries of a step, and a number that none of a fit reaches.
+_STEP, _MOST = get_type_hints(Step), 1e30
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Sizes of a fit: its numbers, stages, and values of each texture and mesh."""
+
+    numbers: int
+    stages: int
+    values: tuple[int, ...]
 
 
 @dataclass
@@ -93,14 +108,15 @@ class State:
         )
 
     @classmethod
-    def read(cls, path: Path, fingerprint: str) -> State:
-        """Read a state.
+    def read(cls, path: Path, fingerprint: str, sizes: Sizes) -> State:
+        """Read a state of a fit of some sizes.
 
         Raises:
             ShadowmapError: The file is damaged, or of another fit.
         """
         arrays = read_checkpoint(path, fingerprint)
         try:
+            _check(arrays, sizes)
             runs = [
                 Run(int(number), x, float(cost), int(stage), int(last), bool(corrected))
                 for (number, stage, last, corrected), cost, x in zip(arrays["numbers"], arrays["costs"], arrays["x"], strict=True)
@@ -108,7 +124,39 @@ class State:
             by_number = {run.number: run for run in runs}
             for (number, stage), x in zip(arrays["trail"], arrays["trail_x"], strict=True):
                 by_number[int(number)].trail.append((int(stage), x))
-            values = [arrays[f"values{k}"] for k in range(sum(name.startswith("values") for name in arrays))]
-            return cls(runs, json.loads(str(arrays["history"])), int(arrays["array_stage"]), values)
-        except (KeyError, ValueError, TypeError) as error:
+            values = [arrays[f"values{k}"] for k in range(len(sizes.values))]
+            return cls(runs, _history(str(arrays["history"])), int(arrays["array_stage"]), values)
+        except (KeyError, ValueError, TypeError, AttributeError, RecursionError) as error:
             raise unreadable(path) from error
+
+
+def _check(arrays: Mapping[str, npt.NDArray[Any]], sizes: Sizes) -> None:
+    """ValueError for arrays of other types or shapes than those of a fit, and for values that no fit has."""
+    numbers, costs, x, trail, trail_x = (arrays[name] for name in ("numbers", "costs", "x", "trail", "trail_x"))
+    values = [arrays[f"values{k}"] for k in range(len(sizes.values))]
+    shapes = {
+        "numbers": (numbers, "i", (len(costs), 4)),
+        "costs": (costs, "f", (len(costs),)),
+        "x": (x, "f", (len(costs), sizes.numbers)),
+        "trail": (trail, "i", (len(trail), 2)),
+        "trail_x": (trail_x, "f", (len(trail), sizes.numbers)),
+        "array_stage": (arrays["array_stage"], "i", ()),
+        **{f"values{k}": (own, "f", (sizes.values[k],)) for k, own in enumerate(values)},
+    }
+    for name, (array, kind, shape) in shapes.items():
+        if array.dtype.kind != kind or array.shape != shape:
+            raise ValueError(f"{name}: {array.dtype} {array.shape}")
+    # Numbers become single-precision ones.
+    finite = all(np.isfinite(one).all() and np.abs(one).max(initial=0) < _MOST for one in (x, trail_x, *values))
+    stages = all(((one >= least) & (one < sizes.stages)).all() for one, least in ((numbers[:, 1], -1), (trail[:, 1], 0)))
+    if not finite or not stages or not len(costs) or np.isnan(costs).any() or not 0 <= arrays["array_stage"] <= sizes.stages:
+        raise ValueError("values that no fit has")
+
+
+def _history(text: str) -> list[Step]:
+    """Errors of all steps. ValueError for other JSON."""
+    history = json.loads(text)
+    for step in history:
+        if {name: type(value) for name, value in step.items()} != _STEP or not math.isfinite(step["seconds"]):
+            raise ValueError("no step")
+    return list[Step](history)

@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import ShadowmapError
+from ..errors import ShadowmapError, quoted
 from ..io.images import to_linear
 from ..io.pictures import read_pixels
 from ..io.resampling import area_average
@@ -20,6 +20,8 @@ Array: TypeAlias = npt.NDArray[np.float32]
 
 #: Most pixels along the longer side of a target that is read; larger pictures are reduced to it.
 LONGER_SIDE = 2048
+#: Largest exposure: images times it are numbers in single precision.
+MOST_EXPOSED = 1e6
 #: Smallest value of a saturated channel, of 8 and 16 bits, as a fraction of the largest one.
 SATURATED = 254 / 255
 
@@ -43,8 +45,10 @@ class Target:
     exposure: float = 1.0
 
     def __post_init__(self) -> None:
-        if not 0 < self.exposure < np.inf:
-            raise ShadowmapError(f"{self._named}: exposure is {self.exposure!r}; give a positive number.")
+        if not 0 < self.exposure <= MOST_EXPOSED:
+            raise ShadowmapError(
+                f"{self._named}: exposure is {quoted(self.exposure)}; give a positive number up to {MOST_EXPOSED:g}."
+            )
 
     @property
     def width(self) -> int:
@@ -306,9 +310,11 @@ def _mask_values(mask: npt.ArrayLike, what: str) -> Array:
 
 
 def _grey(pixels: npt.NDArray[Any]) -> Array:
-    """Grey values (H, W) in 0..1 of a mask's pixels, over black."""
+    """Grey values (H, W) in 0..1 of a mask's pixels, over black. Those that are not finite are black: no such pixel counts."""
     if pixels.dtype == np.float32:
-        return np.clip(np.nan_to_num(pixels[..., :3]).mean(-1), 0, 1) * (pixels[..., 3] > 0)
+        counts = np.isfinite(pixels).all(-1) & (pixels[..., 3] > 0)
+        colours = np.where(counts[..., None], pixels[..., :3], np.float32(0))
+        return np.clip(colours.mean(-1, dtype=np.float64), 0, 1).astype(np.float32)
     most = np.float32(np.iinfo(pixels.dtype).max)
     return pixels[..., :3].mean(-1, dtype=np.float32) / most * (pixels[..., 3] / most)
 

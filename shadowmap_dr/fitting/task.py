@@ -9,9 +9,9 @@ from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from ..errors import ShadowmapError, did_you_mean
+from ..errors import ShadowmapError, did_you_mean, quoted
 from .options import FitOptions
-from .targets import Target, read_target
+from .targets import MOST_EXPOSED, Target, read_target
 from .vary import Vary
 
 _KEYS = {"scene", "parameters", "target"}
@@ -129,8 +129,10 @@ class _Reader:
         for name in ("sensor", "exposure"):
             if name in table:
                 picture = replace(picture, **{name: self._kind(table[name], getattr(picture, name), f"target: {name}")})
-        if not 0 < picture.exposure < float("inf"):
-            raise ShadowmapError(f"{self.path}: target: exposure is {picture.exposure:g}; give a positive number.")
+        if not 0 < picture.exposure <= MOST_EXPOSED:
+            raise ShadowmapError(
+                f"{self.path}: target: exposure is {picture.exposure:g}; give a positive number up to {MOST_EXPOSED:g}."
+            )
         return picture
 
     def _vary(self, entry: Any) -> Vary:  # Any: TOML
@@ -146,7 +148,7 @@ class _Reader:
     def _known(self, table: Mapping[str, Any], known: Sequence[str], where: str) -> None:
         for key in table:
             if key not in known:
-                raise ShadowmapError(f"{self.path}: {where}there is no key {key!r}.{did_you_mean(key, known)}")
+                raise ShadowmapError(f"{self.path}: {where}there is no key {quoted(key)}.{did_you_mean(key, known)}")
 
     def _kind(self, value: Any, like: Any, name: str) -> Any:  # Any: TOML
         if like is MISSING:
@@ -155,20 +157,22 @@ class _Reader:
         if isinstance(like, float) and isinstance(value, int) and not isinstance(value, bool):
             return _as_float(value)
         if not fits:
-            raise ShadowmapError(f"{self.path}: {name} is {value!r}; give a value like {like!r}.")
+            raise ShadowmapError(f"{self.path}: {name} is {quoted(value)}; give a value like {like!r}.")
         return value
 
     def _text(self, value: Any, name: str) -> str:  # Any: TOML
         if not isinstance(value, str) or not value:
-            raise ShadowmapError(f"{self.path}: {name} is {'missing' if value is None else repr(value)}; give a text in quotes.")
+            raise ShadowmapError(
+                f"{self.path}: {name} is {'missing' if value is None else quoted(value)}; give a text in quotes."
+            )
         return value
 
     def _table(self, value: Any, name: str) -> Mapping[str, Any]:  # Any: TOML
         if not isinstance(value, Mapping):
-            raise ShadowmapError(f"{self.path}: {name} is {value!r:.60}; give a table.")
+            raise ShadowmapError(f"{self.path}: {name} is {quoted(value)}; give a table.")
         return value
 
     def _list(self, value: Any, name: str) -> Sequence[Any]:  # Any: TOML
         if not isinstance(value, list):
-            raise ShadowmapError(f"{self.path}: {name} is {value!r:.60}; give a list, or [[{name}]].")
+            raise ShadowmapError(f"{self.path}: {name} is {quoted(value)}; give a list, or [[{name}]].")
         return value

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
-from ..errors import ShadowmapError, did_you_mean
+from ..errors import ShadowmapError, did_you_mean, quoted, shortened
 
 #: Kinds of variation -> what varies.
 KINDS = {
@@ -26,6 +26,8 @@ KINDS = {
 }
 _WITH_AXES = ("rotation", "translation", "position")
 _OPTIONS = {"min": "low", "max": "high", "prior": "prior", "spread": "spread"}
+# Largest size of numbers: squares of such colours are numbers in single precision.
+_LARGEST = 1e12
 
 
 def _is_finite(value: object) -> bool:
@@ -60,31 +62,38 @@ class Vary:
 
     def __post_init__(self) -> None:
         if not self.name:
-            raise ShadowmapError(f"vary {self.label!r}: the name is missing; write NAME:KIND, for instance bunny:pose.")
+            raise ShadowmapError(f"vary {quoted(self.label)}: the name is missing; write NAME:KIND, for instance bunny:pose.")
         if self.kind and self.kind not in KINDS:
             known = ", ".join(KINDS)
             raise ShadowmapError(
-                f"vary {self.label}: there is no kind {self.kind!r}: choose from {known}.{did_you_mean(self.kind, KINDS)}"
+                f"{self.named}: there is no kind {quoted(self.kind)}: choose from {known}.{did_you_mean(self.kind, KINDS)}"
             )
         if self.axes and self.kind not in _WITH_AXES:
-            raise ShadowmapError(f"vary {self.label}: only {', '.join(_WITH_AXES)} have axes.")
+            raise ShadowmapError(f"{self.named}: only {', '.join(_WITH_AXES)} have axes.")
         if set(self.axes) - set("xyz") or len(set(self.axes)) != len(self.axes):
-            raise ShadowmapError(f"vary {self.label}: axes are letters out of xyz, for instance x or xz.")
+            raise ShadowmapError(f"{self.named}: axes are letters out of xyz, for instance x or xz.")
         for name in ("low", "high", "prior", "spread"):
             value = getattr(self, name)
             if value is not None and not _is_finite(value):
-                raise ShadowmapError(f"vary {self.label}: {name} is {value!r}; give a finite number.")
+                raise ShadowmapError(f"{self.named}: {name} is {quoted(value)}; give a finite number.")
+            if value is not None and abs(value) > _LARGEST:
+                raise ShadowmapError(f"{self.named}: {name} is {value:g}; give a number of a size up to {_LARGEST:g}.")
         for name in ("prior", "spread"):
             value = getattr(self, name)
             if value is not None and value <= 0:
-                raise ShadowmapError(f"vary {self.label}: {name} is {value:g}; give a positive number.")
+                raise ShadowmapError(f"{self.named}: {name} is {value:g}; give a positive number.")
         if self.low is not None and self.high is not None and self.low >= self.high:
-            raise ShadowmapError(f"vary {self.label}: min is {self.low:g} and max is {self.high:g}; give min below max.")
+            raise ShadowmapError(f"{self.named}: min is {self.low:g} and max is {self.high:g}; give min below max.")
 
     @property
     def label(self) -> str:
         """The entry as users write it, without options."""
         return ":".join(part for part in (self.name, self.kind, self.axes) if part)
+
+    @property
+    def named(self) -> str:
+        """The entry in messages, shortened."""
+        return f"vary {shortened(self.label)}"
 
     @classmethod
     def parse(cls, text: str) -> Vary:
@@ -101,12 +110,12 @@ class Vary:
             key, equals, value = option.strip().partition("=")
             if key not in _OPTIONS or not equals:
                 raise ShadowmapError(
-                    f"vary {text}: {option.strip()!r} is not understood: write {', '.join(_OPTIONS)} = a number."
+                    f"vary {shortened(text)}: {quoted(option.strip())} is not understood: write {', '.join(_OPTIONS)} = a number."
                 )
             try:
                 values[_OPTIONS[key]] = float(value)
             except ValueError:
-                raise ShadowmapError(f"vary {text}: {key} is {value!r}; give a number.") from None
+                raise ShadowmapError(f"vary {shortened(text)}: {key} is {quoted(value)}; give a number.") from None
         return cls(name, kind, axes, **values)
 
     @classmethod
@@ -118,16 +127,16 @@ class Vary:
             return cls.parse(entry)
         if not isinstance(entry, Mapping):
             raise ShadowmapError(
-                f"vary: {entry!r:.60} is a {type(entry).__name__}; give text such as 'bunny:pose', or a mapping."
+                f"vary: {quoted(entry)} is a {type(entry).__name__}; give text such as 'bunny:pose', or a mapping."
             )
         known = [field.name for field in fields(cls)]
         values = {_OPTIONS.get(key, key): value for key, value in entry.items()}
         for key in values:
             if key not in known:
-                raise ShadowmapError(f"vary: there is no key {key!r}: there are name, kind, axes, {', '.join(_OPTIONS)}.")
+                raise ShadowmapError(f"vary: there is no key {quoted(key)}: there are name, kind, axes, {', '.join(_OPTIONS)}.")
         for key in ("name", "kind", "axes"):
             if not isinstance(values.get(key, ""), str):
-                raise ShadowmapError(f"vary: {key} is {values[key]!r}; give text.")
+                raise ShadowmapError(f"vary: {key} is {quoted(values[key])}; give text.")
         return cls(**{"name": "", **values})
 
     def plain(self) -> dict[str, Any]:

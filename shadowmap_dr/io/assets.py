@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from ..errors import ShadowmapError, did_you_mean
@@ -52,6 +53,6 @@ def _find(name: str, suffix: str, folder: Path, known: list[str], kind: str) -> 
         return folder / (name + suffix)
     check_name(name)
     path = Path(name)
-    if path.is_file():
+    if os.path.isfile(path):
         return path.resolve()
     raise ShadowmapError(f"no {kind} {name!r}: give a file that exists, or one of {', '.join(known)}.{did_you_mean(name, known)}")

@@ -33,7 +33,7 @@ def read_checkpoint(path: Path, fingerprint: str) -> dict[str, npt.NDArray[Any]]
     Raises ShadowmapError if the file cannot be read, arrays differ from those that were written, or the run was another one.
     """
     try:
-        arrays = read_arrays(path)
+        arrays = read_arrays(path, compressed=False)
         found, checks = str(arrays.pop(_FINGERPRINT)), json.loads(str(arrays.pop(_CHECKS)))
         if any(checks.get(name) != _digest(array) for name, array in arrays.items()):
             raise ValueError("edited")

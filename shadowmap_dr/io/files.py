@@ -112,7 +112,7 @@ def check_output(path: str | os.PathLike[str], suffixes: tuple[str, ...] = SUFFI
 def check_readable(path: Path) -> None:
     """ShadowmapError if a file does not exist, or if libraries cannot be told its name: names may be of any bytes."""
     check_name(path)
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise ShadowmapError(f"no file {str(path)!r}.")
 
 
@@ -124,18 +124,28 @@ def check_name(path: str | os.PathLike[str]) -> None:
         raise OutputError(f"the name {os.fspath(path)!r} is not UTF-8: choose another, or rename the file.") from None
 
 
-def read_arrays(path: str | os.PathLike[str], only: Collection[str] | None = None) -> dict[str, npt.NDArray[Any]]:
-    """The arrays of an .npz file by name (only the names in ``only``). Raises ShadowmapError if it cannot be read."""
+def read_arrays(
+    path: str | os.PathLike[str], only: Collection[str] | None = None, *, compressed: bool = True
+) -> dict[str, npt.NDArray[Any]]:
+    """The arrays of an .npz file by name.
+
+    Args:
+        path: the file.
+        only: names of the arrays that are read; None for all.
+        compressed: False for files whose arrays take no more bytes than they do.
+
+    Raises ShadowmapError if it cannot be read.
+    """
     try:
-        if not zipfile.is_zipfile(path):  # NumPy would call other files pickled objects
+        if not os.path.isfile(path) or not zipfile.is_zipfile(path):  # NumPy would call other files pickled objects
             raise ValueError("no archive")
         with zipfile.ZipFile(path) as archive:
             sizes = {entry.filename.removesuffix(".npy"): entry.file_size for entry in archive.infolist()}
         decoded = sum(size for name, size in sizes.items() if only is None or name in only)
-        if decoded > MOST_DECODED:
+        most = MOST_DECODED if compressed else min(MOST_DECODED, os.path.getsize(path))
+        if decoded > most:
             raise ShadowmapError(
-                f"cannot read {path}: its arrays take {decoded / 1e6:.0f} MB, more than {MOST_DECODED / 1e6:.0f} MB: "
-                "give smaller ones."
+                f"cannot read {path}: its arrays take {decoded / 1e6:.0f} MB, more than {most / 1e6:.0f} MB: give smaller ones."
             )
         with np.load(path, allow_pickle=False) as file:
             return {name: file[name] for name in file.files if only is None or name in only}

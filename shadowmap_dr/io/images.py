@@ -53,7 +53,7 @@ def read_exr(path: str | os.PathLike[str]) -> tuple[dict[str, Array], dict[str, 
     """Channels (name -> (H, W) array) and the header's strings of an OpenEXR file. Raises ShadowmapError if it is unreadable."""
     import OpenEXR
 
-    if not Path(path).is_file():
+    if not os.path.isfile(path):
         raise ShadowmapError(f"no image {str(path)!r}: the file does not exist.")
     try:
         with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:

@@ -76,7 +76,7 @@ def read_pixels(path: str | os.PathLike[str], data: bytes | None = None) -> npt.
 
     Raises ShadowmapError if it is too large, damaged, or no picture.
     """
-    if data is None and not Path(path).is_file():
+    if data is None and not os.path.isfile(path):
         raise ShadowmapError(f"no image {str(path)!r}: the file does not exist.")
     if data is None and Path(path).suffix.lower() == ".exr":
         return _exr_pixels(path)

@@ -6,7 +6,7 @@ from dataclasses import fields
 from numbers import Integral, Real
 from typing import Any
 
-from ..errors import ShadowmapError
+from ..errors import ShadowmapError, quoted
 from .options import Range, description
 
 #: Usual ranges: sides of images and of shadow maps, sides of filters, samples per pixel, steps, runs, and seeds.
@@ -33,4 +33,4 @@ def check_range(name: str, value: Any, allowed: Range) -> None:  # Any: what use
     kind = Integral if whole else Real
     is_number = isinstance(value, kind) and not isinstance(value, bool)
     if not is_number or not low <= value <= high:
-        raise ShadowmapError(f"{name} is {value!r}: give a {'whole ' if whole else ''}number from {low} to {high}.")
+        raise ShadowmapError(f"{name} is {quoted(value)}: give a {'whole ' if whole else ''}number from {low} to {high}.")

@@ -271,6 +271,9 @@ def _sensor_of(sensor: mi.Sensor, film: mi.Film, film_column: int) -> Sensor:
         raise ShadowmapError(f"The film of sensor '{sensor.id()}' stores XYZ, which is not supported: use pixel_format rgb.")
     values = parameters(sensor)
     window = sensor.film()  # for a camera of a batch sensor its own film, not the common one
+    width, height = _pair(window.crop_size())
+    if width < 1 or height < 1:
+        raise ShadowmapError(f"The film of sensor '{sensor.id()}' has {width} x {height} pixels: it needs at least one.")
     alpha = film.base_channels_count() in (2, 4)
     zero = mi.Float(0.0)
     return Sensor(
@@ -282,7 +285,7 @@ def _sensor_of(sensor: mi.Sensor, film: mi.Film, film_column: int) -> Sensor:
         near=mi.Float(values["near_clip"]),
         far=mi.Float(values["far_clip"]),
         film_size=ImageSize(*_pair(window.size())),
-        crop_size=ImageSize(*_pair(window.crop_size())),
+        crop_size=ImageSize(width, height),
         crop_offset=_pair(window.crop_offset()),
         channels=int(film.base_channels_count()) - alpha,
         alpha=alpha,

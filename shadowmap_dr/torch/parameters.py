@@ -57,7 +57,7 @@ class Parameters:
             self._parameters, arrays = Resolver(self._renderer).parameters(chosen)
             if arrays:
                 raise ShadowmapError(
-                    f"vary {arrays[0].vary.label}: textures and vertices are tensors already: give them to render() as "
+                    f"{arrays[0].vary.named}: textures and vertices are tensors already: give them to render() as "
                     "parameters= or vertex_positions=."
                 )
             if not self._parameters:

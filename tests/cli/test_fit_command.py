@@ -134,7 +134,7 @@ def test_the_list_names_all_that_can_vary(run: Any, tmp_path: Path) -> None:
     assert not (tmp_path / "fit").exists()
 
 
-TARGET = ("--target", "photo.png")
+TARGET, LONG = ("--target", "photo.png"), 5000 * "x"
 BAD: list[tuple[tuple[str, ...], str]] = [
     (("room.xml", *TARGET), "nothing varies: name something by --vary; --list lists all"),
     (("room.xml", "--vary", "sun"), "there is no picture to fit to: give one by --target"),
@@ -163,18 +163,45 @@ BAD: list[tuple[tuple[str, ...], str]] = [
     (("none.toml", "--vary", "sun", *TARGET), "none.toml"),
     (("bad.toml",), "bad.toml: there is no key 'strats'. Did you mean 'starts'?"),
     (("room.xml", "--vary", "sun", *TARGET, "--out", "photo.png"), "photo.png"),
+    (("room.xml", "--vary", "sun", *TARGET, "-D", "height=0"), "The film of sensor 'camera' has 48 x 0 pixels"),
+    (("room.xml", "--vary", "sun", "--target", f"{5000 * '9'}=photo.png"), "no scene has so many sensors"),
+    (("room.xml", "--vary", "box:scale,max=-1", *TARGET), "vary box:scale: the bounds leave nothing between 0 and -1"),
+    (("room.xml", "--vary", "box:scale,spread=1e9", *TARGET), "spread is 1e+09, a factor here: give one from 1 to 1e+06"),
+    (("room.xml", "--vary", "box:vertices,min=0", *TARGET), "vary box:vertices: vertices have no min: leave it out"),
+    (("room.xml", "--vary", LONG, *TARGET), "the scene has no object or value 'x"),
+    (("room.xml", "--vary", f"sun:{LONG}", *TARGET), "choose from pose"),
+    (("room.xml", "--vary", "sun", "--target", LONG), "the file does not exist"),
+    (("room.xml", "--vary", "sun", "--target", "/".join(LONG)), "the file does not exist"),
+    (("room.xml", "--vary", "sun", *TARGET, "--mask", LONG), "the file does not exist"),
+    (("room.xml", "--vary", "sun", *TARGET, "--mask", "mask.png", "--mask", LONG), "sensor 0 has a mask already"),
+    (("room.xml", "--vary", "sun", *TARGET, "--loss", LONG), "choose huber, l2 or l1"),
+    (("room.xml", "--vary", "sun", *TARGET, "-D", LONG), "write it as NAME=VALUE"),
+    (("room.xml", "--vary", "sun", *TARGET, "-D", f"{LONG}=1"), "unused parameters"),
+    (("room.xml", "--vary", "sun", *TARGET, "--out", LONG), "File name too long"),
+    (("room.xml", "--vary", "sun", *TARGET, "--variant", LONG), "no variant 'x"),
+    ((LONG, "--vary", "sun", *TARGET), "give a file that exists"),
+    ((f"{LONG}.toml",), "no file 'x"),
+    (("long.toml",), "long.toml: there is no key 'x"),
 ]
 
 
-@pytest.mark.parametrize(("arguments", "words"), BAD, ids=lambda value: " ".join(value) if isinstance(value, tuple) else "")
+@pytest.mark.parametrize("arguments", [(f"--{LONG}",), (LONG,), ("--starts", LONG), (f"--no-{LONG}",), ("--exposure=" + LONG,)])
+def test_wrong_usage_is_one_short_line(run: Any, arguments: tuple[str, ...]) -> None:
+    result = run("fit", "room.xml", *arguments)
+    (line,) = (line for line in result.err.splitlines() if line.startswith("error: "))
+    assert result.status == 2 and len(line) <= 400
+
+
+@pytest.mark.parametrize(("arguments", "words"), BAD, ids=lambda value: " ".join(value)[:80] if isinstance(value, tuple) else "")
 def test_bad_input_is_one_line(run: Any, tmp_path: Path, arguments: tuple[str, ...], words: str) -> None:
     (tmp_path / "folder").mkdir()
     (tmp_path / "bad.toml").write_text("scene = 'room.xml'\nstrats = 3")
+    (tmp_path / "long.toml").write_text(f"scene = 'room.xml'\n{LONG} = 3")
     Image.fromarray(np.full((40, 40, 3), 128, np.uint8)).save(tmp_path / "square.png")
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     result = run("fit", *arguments)
     assert result.status == 1 and result.err.count("\n") == 1 and result.err.startswith("error: "), result.err
-    assert words in result.err, result.err
+    assert words in result.err and len(result.err) <= 402, result.err
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
     assert not (tmp_path / "fit").exists()
 

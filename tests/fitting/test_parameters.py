@@ -23,6 +23,8 @@ from shadowmap_dr.fitting.scene_change import SceneChange
 from shadowmap_dr.fitting.starts import half_ranges
 from shadowmap_dr.fitting.vary import KINDS, Vary
 
+LONG, WORDS = 5000 * "x", 900 * "two words "
+
 # ------------------------------------------------------------------------------------------------------------------ entries
 
 
@@ -61,12 +63,20 @@ def test_entries_are_parsed(text: str, expected: Vary) -> None:
         ("bunny,spread=-1", "spread is -1; give a positive number"),
         ("bunny,min=2,max=1", "min is 2 and max is 1; give min below max"),
         ("bunny,min=1,max=1", "give min below max"),
+        ("bunny,max=1e300", "high is 1e.300; give a number of a size up to 1e.12"),
+        ("bunny,min=-1e300", "low is -1e.300; give a number of a size up to 1e.12"),
+        (f"{LONG}:rotation,", "'' is not understood"),
+        (f"bunny:{LONG}", "there is no kind 'x+…x+': choose from pose, "),
+        (f"bunny:rotation:{LONG}", "axes are letters out of xyz"),
+        (f"bunny,{LONG}", "'x+…x+' is not understood"),
+        (f"bunny,min={LONG}", "min is 'x+…x+'; give a number"),
+        (f"{WORDS},min={WORDS}", "min is 'two words .*….*'; give a number"),
     ],
 )
 def test_bad_texts_are_refused(text: str, words: str) -> None:
     with pytest.raises(ShadowmapError, match=words) as raised:
         Vary.parse(text)
-    assert str(raised.value).startswith("vary ") and "\n" not in str(raised.value)
+    assert str(raised.value).startswith("vary ") and "\n" not in str(raised.value) and len(str(raised.value)) <= 400
 
 
 @pytest.mark.parametrize(
@@ -81,6 +91,8 @@ def test_bad_texts_are_refused(text: str, words: str) -> None:
         ({"name": "sun", "min": True}, "low is True; give a finite number"),
         ({"name": "sun", "min": "3"}, "low is '3'; give a finite number"),
         ({"name": "sun", "min": 10**400}, "give a finite number"),
+        ({"name": "sun", "min": 10**5000}, "low is a very long int; give a finite number"),
+        ({"name": "sun", 5000 * "x": 1}, "there is no key 'x+…x+': there are name"),
     ],
 )
 def test_bad_mappings_are_refused(entry: Any, words: str) -> None:

@@ -309,6 +309,12 @@ def test_states_of_other_fits_are_refused(picture: Image, tmp_path: Path) -> Non
     assert next(iter(others[0].steps(state)))["start"] == 0
 
 
+def test_a_prior_without_width_holds_a_number(picture: Image) -> None:
+    """Matrices of the steps are not singular."""
+    result = fit(renderer(), [make_target(picture)], "sun.irradiance,prior=1e-300", starts=1, tries=1, resolution=12, spp=1)
+    np.testing.assert_allclose(result.estimates[0].values, result.estimates[0].start, rtol=1e-4)
+
+
 @pytest.mark.parametrize("damage", ["empty", "half", "text", "bit"])
 def test_damaged_states_are_refused(picture: Image, tmp_path: Path, damage: str) -> None:
     state = tmp_path / "fit.npz"

@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from shadowmap_dr.fitting.starts import chosen, draw, groups_of, redraw
+from shadowmap_dr.fitting.parameters import Value
+from shadowmap_dr.fitting.starts import chosen, draw, groups_of, half_ranges, redraw
+from shadowmap_dr.fitting.vary import Vary
 
 RANGES = np.array([0.3, 0.3, 0.3, 0.1, 0.1, 0.5])
 LOW, HIGH = np.full(6, -np.inf), np.array([np.inf] * 5 + [0.2])
@@ -60,3 +62,11 @@ def test_the_best_candidates_are_chosen_and_the_scene_if_it_is_kept() -> None:
     candidates = [np.array([float(x)]) for x in (0, 1, 2, 5, 4, 3.5)]
     assert [float(x[0]) for x in chosen(candidates, objective, 3, keep=True)] == [0, 3.5, 2]
     assert [float(x[0]) for x in chosen(candidates, objective, 3, keep=False)] == [3.5, 2, 4]
+
+
+def test_ranges_of_positive_values_end_at_a_factor() -> None:
+    """However many tries widen them: larger factors are no numbers in single precision."""
+    value = Value(Vary("a", spread=8.0), "a", np.ones(1), (0.0, np.inf), logarithmic=True)
+    place = Value(Vary("a", spread=8.0), "a", np.ones(1), (-np.inf, np.inf), logarithmic=False)
+    np.testing.assert_allclose(half_ranges([value, place], 2.0), [2 * np.log(8), 16])
+    np.testing.assert_allclose(half_ranges([value, place], 50.0), [np.log(1e6), 400])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -256,6 +257,24 @@ def test_masks_in_all_forms(tmp_path: Path, variant: str) -> None:
         target = read_target(path, form)
         np.testing.assert_array_equal(target.weight, mask, err_msg=name)
         assert not target.image[~mask].any()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("channels", ["R", "RGB", "A"])
+def test_mask_pixels_that_are_not_finite_do_not_count(tmp_path: Path, value: float, channels: str) -> None:
+    """As those of pictures. Large numbers are white."""
+    path, mask = save(tmp_path / "8.png", noise(8, 12, 3)), {name: np.ones((8, 12), np.float32) for name in "RGBA"}
+    for name in channels:
+        mask[name][2, 3] = value
+    for name in "RGB":
+        mask[name][4, 5] = 3e38
+    write_exr(tmp_path / "mask.exr", mask)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        weight = read_target(path, tmp_path / "mask.exr").weight
+    expected = np.ones((8, 12))
+    expected[2, 3] = 0
+    np.testing.assert_array_equal(weight, expected)
 
 
 @pytest.mark.parametrize("times", [2, 5, 0.5])

@@ -98,6 +98,9 @@ def test_files_are_beside_the_task(tmp_path: Path) -> None:
     assert found.scene == "pose" and found.parameters == {"resolution": "64"} and found.pictures[0].file == "/a.png"
 
 
+LONG = 5000 * "x"
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -133,6 +136,12 @@ def test_files_are_beside_the_task(tmp_path: Path) -> None:
         ("scene = 'a'\nvary = [{name = 'sun', mni = 1}]", "vary: there is no key 'mni'"),
         ("scene = 'a'\nvary = ['sun', 'sun']", "vary sun is given twice"),
         ("scene = 'a'\nparameters = 3", "parameters is 3; give a table"),
+        ("scene = 'a'\ntarget = [{file = 'a.png', exposure = 1e300}]", "exposure is 1e+300; give a positive number up to 1e+06"),
+        ("scene = 'a'\ndelta = 1e300", "delta of the loss is 1e+300: give a positive number up to 1e+12"),
+        (f"scene = 'a'\n{LONG} = 3", "there is no key 'xxx"),
+        (f"scene = 'a'\nstarts = '{LONG}'", "; give a value like 8"),
+        (f"scene = 'a'\ntarget = [{{file = ['{LONG}']}}]", "; give a text in quotes"),
+        (f"scene = 'a'\nvary = ['sun:pose', '{LONG}', '{LONG}']", "is given twice"),
     ],
 )
 def test_bad_tasks_are_named_in_one_line(tmp_path: Path, text: str, words: str) -> None:
@@ -141,7 +150,7 @@ def test_bad_tasks_are_named_in_one_line(tmp_path: Path, text: str, words: str) 
     with pytest.raises(ShadowmapError) as raised:
         read_task(path)
     message = str(raised.value)
-    assert words in message and str(path) in message and "\n" not in message
+    assert words in message and str(path) in message and "\n" not in message and len(message) <= 400
 
 
 def test_files_that_are_no_text(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 
 from shadowmap_dr.errors import ShadowmapError
 from shadowmap_dr.io.checkpoints import read_checkpoint, write_checkpoint
+from shadowmap_dr.io.files import read_arrays
 
 ARRAYS = {"a": np.arange(6.0).reshape(2, 3), "b": np.array([True, False]), "c": np.array(3, np.uint32), "d": np.zeros((0, 3))}
 
@@ -23,6 +25,19 @@ def test_arrays_come_back(tmp_path: Path) -> None:
         assert found[name].dtype == array.dtype
     with pytest.raises(ShadowmapError, match=r"a\.npz belongs to a run with other settings"):
         read_checkpoint(tmp_path / "a.npz", "another run")
+
+
+def test_compressed_arrays_are_not_unpacked(tmp_path: Path) -> None:
+    """A small file may hold very large ones."""
+    path = tmp_path / "a.npz"
+    write_checkpoint(path, "this run", ARRAYS)
+    np.savez_compressed(path, **np.load(path))
+    assert read_arrays(path).keys() >= ARRAYS.keys()
+    with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive, archive.open("zeros.npy", "w") as file:
+        np.lib.format.write_array(file, np.zeros(1_000_000))
+    with pytest.raises(ShadowmapError, match=r"cannot read the checkpoint") as raised:
+        read_checkpoint(path, "this run")
+    assert "its arrays take 8 MB, more than 0 MB" in str(raised.value.__cause__)
 
 
 @pytest.mark.parametrize(

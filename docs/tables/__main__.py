@@ -1,0 +1,5 @@
+"""The command ``python -m docs.tables``."""
+
+from . import main
+
+main()

@@ -78,7 +78,7 @@ class Resolver:
             ShadowmapError: The scene has no such object or value, or it has no such kind; with the nearest known name.
         """
         name = vary.name
-        matched = [shape for shape in self.shapes if shape == name or fnmatchcase(shape, name)]
+        matched = self._matched(vary)
         if vary.kind == "vertices":
             if len(matched) != 1:
                 raise ShadowmapError(f"{vary.named}: {len(matched)} shapes are called {quoted(name)}; name one mesh.")
@@ -94,6 +94,15 @@ class Resolver:
                 f"{vary.named}: {given[0]} is one number, but a pose has degrees and scene units: give "
                 f"{shortened(name)}:rotation and {shortened(name)}:translation, each with its own."
             )
+        return found
+
+    def _matched(self, vary: Vary) -> list[str]:
+        """Shapes that a name stands for: its own, or those of `a+b` or `a*`, which move together."""
+        patterns = [vary.name] if vary.name in self.shapes else vary.name.split("+")
+        found = [shape for shape in self.shapes if any(shape == name or fnmatchcase(shape, name) for name in patterns)]
+        for name in patterns:
+            if found and not any(shape == name or fnmatchcase(shape, name) for shape in found):
+                raise ShadowmapError(f"vary {vary.label}: the scene has no shape {name!r}; --list lists all.")
         return found
 
     def parameters(self, entries: Sequence[Vary | Own]) -> tuple[list[Parameter], list[ArrayParameter]]:

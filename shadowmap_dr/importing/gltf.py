@@ -18,10 +18,11 @@ _LIGHTS = "KHR_lights_punctual"
 #: Extensions that change what is seen, and that are not heeded.
 _LEFT_OUT = {
     "KHR_materials_transmission": "materials that transmit light are opaque",
-    "KHR_texture_transform": "transformations of textures are ignored",
     "KHR_materials_clearcoat": "clear coats are left out",
     "KHR_materials_sheen": "sheen is left out",
     "KHR_materials_unlit": "unlit materials are lit",
+    "KHR_materials_pbrSpecularGlossiness": "specular colours are left out",
+    "KHR_techniques_webgl": "shaders are left out, and with them colours",
     "EXT_mesh_gpu_instancing": "instances are left out",
 }
 #: Extensions without which a file cannot be read, and what to do.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import struct
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -11,10 +12,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import ShadowmapError
+from ..io import obj
 from ..io.files import check_readable
 from ..io.images import check_size, to_linear
 from ..io.meshes import MOST_BYTES, MOST_TRIANGLES, read_placed_mesh
-from . import gltf
+from . import gltf, gltf_arrays
 from .model import Array, Material, Model, Part, Picture, PlacedCamera, PlacedLight
 
 if TYPE_CHECKING:
@@ -23,6 +25,7 @@ if TYPE_CHECKING:
 
 #: Suffixes of files that can be imported.
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off")
+_Look = tuple[Material | None, Array | None, Array | None]
 # Formats whose files are one mesh without materials.
 _PLAIN = (".stl", ".off")
 
@@ -38,7 +41,7 @@ def read_model(path: Path, normals: str = "auto") -> Model:
     check_readable(path)
     if path.stat().st_size > MOST_BYTES:
         raise ShadowmapError(f"cannot import {path}: it has more than {MOST_BYTES / 1e6:.0f} MB; decimate its meshes.")
-    cameras, lights, notes = list[PlacedCamera](), list[PlacedLight](), list[str]()
+    cameras, lights, notes, content = list[PlacedCamera](), list[PlacedLight](), list[str](), None
     if suffix in (".glb", ".gltf"):
         document = _document(path)
         try:
@@ -46,8 +49,9 @@ def read_model(path: Path, normals: str = "auto") -> Model:
             notes = gltf.notes(document)
         except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
             raise ShadowmapError(f"cannot import {path}: its nodes, cameras or lights are damaged ({error}).") from error
+        content = _rewritten(path, document)
     smooth = normals == "smooth" or (normals == "auto" and suffix not in (".glb", ".gltf", ".stl"))
-    parts = [replace(part, smooth=smooth) for part in _parts(path, suffix)]
+    parts = [replace(part, smooth=smooth) for part in _parts(path, suffix, content)]
     kinds = {light.kind for light in lights}
     lights = [light for light in lights if light.kind in ("directional", "point", "spot")]
     notes += [f"lights of the kind {kind!r} are left out" for kind in sorted(kinds - {light.kind for light in lights})]
@@ -59,6 +63,9 @@ def _document(path: Path) -> gltf.Json:
         document = gltf.document(path.read_bytes())
     except Exception as error:
         raise ShadowmapError(f"cannot import {path}: it is no glTF file, or it is damaged.") from error
+    version = str(document.get("asset", {}).get("version", "2.0")) if isinstance(document.get("asset", {}), dict) else "2.0"
+    if version.startswith(("0", "1")):
+        raise ShadowmapError(f"cannot import {path}: it is glTF {version}: export it as glTF 2.0.")
     for extension, reason in gltf.UNREADABLE.items():
         if extension in document.get("extensionsRequired", ()):
             raise ShadowmapError(f"cannot import {path}: it is {reason}.")
@@ -69,6 +76,15 @@ def _document(path: Path) -> gltf.Json:
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise ShadowmapError(f"cannot import {path}: its accessors or buffers are damaged.") from error
     return document
+
+
+def _rewritten(path: Path, document: gltf.Json) -> bytes | None:
+    try:
+        return gltf_arrays.rewritten(path, document)
+    except OSError as error:
+        raise ShadowmapError(f"cannot import {path}: a file that it names is missing ({error.filename}).") from error
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, struct.error) as error:
+        raise ShadowmapError(f"cannot import {path}: its arrays or materials are damaged ({error}).") from error
 
 
 def _check_counts(path: Path, document: gltf.Json) -> None:
@@ -83,17 +99,18 @@ def _check_counts(path: Path, document: gltf.Json) -> None:
             raise ShadowmapError(f"cannot import {path}: it announces {count} values, but its buffers have {held} bytes.")
 
 
-def _parts(path: Path, suffix: str) -> list[Part]:
+def _parts(path: Path, suffix: str, content: bytes | None) -> list[Part]:
+    """All meshes of a file. ``content`` is that of a text glTF file instead of its own."""
     if suffix in _PLAIN:
         return [_plain(path)]
     try:
-        scene = _loaded(path, suffix)
+        scene = _loaded(path, suffix) if content is None else _loaded(path, ".gltf", content)
         instances = [scene.graph[node] for node in scene.graph.nodes_geometry]
         count = sum(len(getattr(scene.geometry[name], "faces", ())) for _, name in instances)
         if count > MOST_TRIANGLES:
             raise ShadowmapError(f"cannot import {path}: its {count} triangles are more than {MOST_TRIANGLES}; decimate them.")
         materials: dict[int, Material | None] = {}
-        found = list(_placed(scene, path.stem, materials))
+        found = list(_placed(scene, path, materials))
     except ShadowmapError:
         raise
     except MemoryError:
@@ -117,14 +134,15 @@ def _plain(path: Path) -> Part:
     return Part(path.stem, vertices.astype(np.float64) * scale + middle, faces.astype(np.int64))
 
 
-def _loaded(path: Path, suffix: str) -> trimesh.Scene:
+def _loaded(path: Path, suffix: str, content: bytes | None = None) -> trimesh.Scene:
     import trimesh
 
     options: dict[str, Any] = {"split_objects": True, "group_material": True} if suffix == ".obj" else {}
+    data = path.read_bytes() if content is None else content
+    if suffix == ".obj":
+        data = obj.split_concave_faces(data)
     # glTF's nodes are kept apart: their names are those of the scene.
-    return trimesh.load_scene(
-        io.BytesIO(path.read_bytes()), file_type=suffix[1:], resolver=_resolver(path), process=False, **options
-    )
+    return trimesh.load_scene(io.BytesIO(data), file_type=suffix[1:], resolver=_resolver(path), process=False, **options)
 
 
 def _resolver(path: Path) -> Any:  # Any: trimesh's resolver
@@ -133,22 +151,26 @@ def _resolver(path: Path) -> Any:  # Any: trimesh's resolver
     return FilePathResolver(str(path))
 
 
-def _placed(scene: trimesh.Scene, stem: str, materials: dict[int, Material | None]) -> Iterator[Part]:
+def _placed(scene: trimesh.Scene, path: Path, materials: dict[int, Material | None]) -> Iterator[Part]:
+    linear = path.suffix.lower() in (".glb", ".gltf")
     for node in scene.graph.nodes_geometry:
         matrix, name = scene.graph[node]
         mesh = scene.geometry[name]
         faces = np.asarray(getattr(mesh, "faces", np.empty((0, 3))), np.int64).reshape(-1, 3)
         if not len(faces):
             continue  # points and lines
-        label = str(node) if len(scene.geometry) > 1 or "." not in str(node) else stem
-        yield _part(mesh, label, np.asarray(matrix, np.float64), faces, materials)
+        label = str(node) if len(scene.geometry) > 1 or "." not in str(node) else path.stem
+        if faces.min() < 0 or faces.max() >= len(mesh.vertices):
+            raise ShadowmapError(
+                f"cannot import {path}: mesh {label!r} has {len(mesh.vertices)} vertices, but its triangles go to {faces.max()}."
+            )
+        yield _part(mesh, label, np.asarray(matrix, np.float64), faces, _look(mesh, materials, linear))
 
 
-def _part(
-    mesh: trimesh.Trimesh, name: str, matrix: Array, faces: Any, materials: dict[int, Material | None]
-) -> Part:  # Any: indices
+def _part(mesh: trimesh.Trimesh, name: str, matrix: Array, faces: Any, look: _Look) -> Part:  # Any: indices
     linear = matrix[:3, :3]
-    vertices = np.asarray(mesh.vertices, np.float64) @ linear.T + matrix[:3, 3]
+    with np.errstate(invalid="ignore"):  # infinite ones, which are refused later
+        vertices = np.asarray(mesh.vertices, np.float64) @ linear.T + matrix[:3, 3]
     normals = None
     if "vertex_normals" in mesh._cache:  # those of the file; trimesh would make others
         normals = np.asarray(mesh.vertex_normals, np.float64) @ np.linalg.inv(linear)
@@ -156,31 +178,42 @@ def _part(
         normals = normals / np.where(length > 0, length, 1) if (length > 0).all() and np.isfinite(normals).all() else None
     if np.linalg.det(linear) < 0:
         faces = faces[:, ::-1]
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise ShadowmapError(f"mesh {name!r} has {len(vertices)} vertices, but its triangles go to {faces.max()}.")
-    material, colours, texcoords = _look(mesh, materials)
+    material, colours, texcoords = look
     return Part(name, vertices, faces, normals, texcoords, colours, material)
 
 
-def _look(mesh: trimesh.Trimesh, materials: dict[int, Material | None]) -> tuple[Material | None, Array | None, Array | None]:
-    """(material, colours of the vertices, texture coordinates) of a mesh."""
+def _look(mesh: trimesh.Trimesh, materials: dict[int, Material | None], linear: bool) -> _Look:
+    """Material, colours of the vertices and texture coordinates of a mesh. ``linear`` says that bytes of colours are so."""
     visual: Any = mesh.visual  # Any: one of trimesh's classes, told apart by their kind
     if visual.kind == "texture" and getattr(visual, "material", None) is not None:
-        made = materials.setdefault(id(visual.material), None) or _material(visual.material)
-        materials[id(visual.material)] = made
         uv = visual.uv
         texcoords = None if uv is None or np.shape(uv) != (len(mesh.vertices), 2) else np.array(uv, np.float64) * [1, -1] + [0, 1]
+        if _is_stand_in(visual.material):
+            return None, None, texcoords
+        made = materials.setdefault(id(visual.material), None) or _material(visual.material)
+        materials[id(visual.material)] = made
         colours = visual.vertex_attributes.get("color") if made.picture is None else None
-        return made, None if colours is None else _linear_bytes(colours), texcoords
+        return made, None if colours is None else _linear_colours(colours, linear) * made.colour, texcoords
     if visual.kind == "vertex":
-        return None, _linear_bytes(visual.vertex_colors), None
+        return None, _linear_colours(visual.vertex_colors, linear), None
     return None, None, None
 
 
-def _linear_bytes(colours: Any) -> Array:  # Any: (V, 3 or 4) bytes or numbers
-    """Colours (V, 3), linear, of sRGB bytes; floating-point ones are linear already."""
+def _is_stand_in(material: Any) -> bool:  # Any: a material of trimesh
+    """True for the dark grey that trimesh gives to meshes with texture coordinates and no material."""
+    from trimesh.visual.material import color_image
+
+    picture = getattr(material, "image", None)
+    return picture is not None and picture.size == (2, 2) and picture.tobytes() == color_image().tobytes()
+
+
+def _linear_colours(colours: Any, linear: bool) -> Array:  # Any: (V, 3 or 4) bytes or numbers
+    """Colours (V, 3), linear: bytes are sRGB if they are not ``linear``, floating-point numbers are linear already."""
     values = np.asarray(colours)[:, :3]
-    return to_linear(values / 255.0) if values.dtype.kind in "ui" else values.astype(np.float64)
+    if values.dtype.kind not in "ui":
+        return values.astype(np.float64)
+    fractions = values / np.iinfo(values.dtype).max
+    return np.asarray(fractions if linear else to_linear(fractions))
 
 
 def _material(source: Any) -> Material:  # Any: a material of trimesh

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import OutputError, ShadowmapError, warn
-from . import ply
+from . import obj, off, ply
 from .files import atomic, check_readable
 
 if TYPE_CHECKING:
@@ -107,8 +107,13 @@ def _loaded(data: bytes, kind: str) -> tuple[npt.NDArray[np.float64], npt.NDArra
         data, binary = header.cleaned, header if header.order else None
     elif kind == "glb":
         _check_counts(data)
-    elif kind in ("obj", "off"):
-        data = data.decode("ascii", "replace").encode("ascii", "replace")  # names in any encoding
+    elif kind == "off":
+        try:
+            return off.parse(data)
+        except ValueError as error:
+            raise _Unreadable(str(error)) from error
+    elif kind == "obj":
+        data = obj.split_concave_faces(data.decode("ascii", "replace").encode("ascii", "replace"))  # names in any encoding
     materials = {"skip_materials": True} if kind in ("ply", "obj", "glb") else {}
     try:
         mesh = trimesh.load_mesh(io.BytesIO(data), file_type=kind, process=False, **materials)

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from .polygons import triangles
+
 _TYPES = {
     **{"char": "b", "uchar": "B", "short": "h", "ushort": "H", "int": "i", "uint": "I", "float": "f", "double": "d"},
     **{"int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "float32": "f", "float64": "d"},
@@ -97,7 +99,7 @@ def parse(data: bytes) -> Ply:
 
 
 def binary_mesh(ply: Ply) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
-    """(V, 3) vertices and (F, 3) triangles of a binary file. Polygons become fans. ValueError if the file is too short."""
+    """(V, 3) vertices and (F, 3) triangles of a binary file. ValueError if the file is too short."""
     at, tables = 0, dict[str, dict[str, list[tuple[float, ...]]]]()
     for element in ply.elements:
         if element.name not in ("vertex", "face") and not any(prop.length for prop in element.properties):
@@ -119,9 +121,8 @@ def binary_mesh(ply: Ply) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64
         tables[element.name] = columns
     faces = tables.get("face", {})
     lists = faces.get("vertex_indices") or faces.get("vertex_index") or []
-    triangles = [(face[0], face[k], face[k + 1]) for face in lists for k in range(1, len(face) - 1)]
     vertices = tables.get("vertex", {})
     if not {"x", "y", "z"} <= set(vertices):
         raise ValueError("its vertices have no x, y and z")
     points = np.concatenate([np.array(vertices[axis], np.float64).reshape(-1, 1) for axis in "xyz"], axis=1)
-    return points, np.array(triangles, np.int64).reshape(-1, 3)
+    return points, triangles(points, [[int(corner) for corner in face] for face in lists])

@@ -196,6 +196,10 @@ def test_patterns_move_shapes_together(resolver: Resolver) -> None:
     """As one body: about the middle of both boxes at x = -1 and x = 1."""
     both = resolver.parameter(Vary.parse("car_*:pose"))
     assert both.shapes == ("car_body", "car_wheel")  # type: ignore[union-attr]
+    joined = resolver.parameter(Vary.parse("car_wheel+car_body:pose"))
+    assert joined.shapes == both.shapes  # type: ignore[union-attr]
+    with pytest.raises(ShadowmapError, match="the scene has no shape 'car_seat'"):
+        resolver.parameter(Vary.parse("car_wheel+car_seat:pose"))
     np.testing.assert_allclose(both.pivot, [0, 0, 0.5], atol=1e-6)  # type: ignore[union-attr]
     one = resolver.parameter(Vary.parse("car_wheel"))
     np.testing.assert_allclose(one.pivot, [1, 0, 0.5], atol=1e-6)  # type: ignore[union-attr]

@@ -196,8 +196,8 @@ class View:
         if self._held or not (any(self._keys) or self._arrays):
             yield
             return
-        change = self.change(x)
-        restore = set_values(self._renderer.data.scene, change)
+        scene = self._renderer.data.scene
+        restore = set_values(scene, without_present_values(scene, self.change(x)))
         self._held += 1
         try:
             yield
@@ -411,6 +411,22 @@ def set_values(scene: mi.Scene, change: SceneChange) -> Callable[[], None]:
         restore()
         raise
     return restore
+
+
+def without_present_values(scene: mi.Scene, change: SceneChange) -> SceneChange:
+    """A detached change without the values that Mitsuba's objects have already.
+
+    Some objects take long to change: rough plastic integrates its transmittance anew for each roughness, for 0.1 s.
+    """
+    if not change.values:
+        return change
+    table = mi.traverse(scene)
+
+    def is_present(key: str, parts: Sequence[Float]) -> bool:
+        present = table[key]
+        return np.array_equal(np.ravel(np.array(type(present)(*parts))), np.ravel(np.array(present)))
+
+    return replace(change, values={key: parts for key, parts in change.values.items() if not is_present(key, parts)})
 
 
 def _at(renderer: Renderer, quality: Quality) -> Renderer:

@@ -17,7 +17,7 @@ _MESSAGE, _WORDS = 400, (160, 80, 40)
 
 
 def shortened(text: object, most: int = 80) -> str:
-    """What users gave, for a message: a long text is its begin and its end, with an ellipsis between them."""
+    """The text of a value for a message: of a long one the beginning and the end, with an ellipsis between them."""
     words = str(text)
     return words if len(words) <= most else f"{words[: most // 2]}…{words[-(most - most // 2 - 1) :]}"
 

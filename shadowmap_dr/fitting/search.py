@@ -49,6 +49,8 @@ _ENOUGH = 1e-3
 # Corrections of the images at most, steps after each, and the improvement and the length below which steps are the last. Images
 # that explain less than the last share are too far from the pictures to be worth it.
 _CORRECTIONS, _CORRECTED_STEPS, _LITTLE, _SHORT, _FAR = 6, 3, 1e-4, 3e-4, 0.5
+# More corrections as long as each lowers the loss by such a share, at most.
+_WORTH_ANOTHER, _MOST_CORRECTIONS = 0.1, 24
 # Corrections after which a start is left, if it leaves a larger share unexplained.
 _FEW_CORRECTIONS, _CLOSE = 2, 0.15
 # Growth of the ranges of starts from one try to the next. First stage of turned objects, and their least turn in ranges.
@@ -216,8 +218,11 @@ class Fit:
         if self._corrections is None or not self._is_to_be_corrected(run):
             return
         limits = Limits(self._low, self._high, _LONGEST, _CORRECTED_STEPS, _LITTLE, _SHORT)
-        for number in range(_CORRECTIONS):
-            before = run.x
+        cost = math.inf
+        for number in range(_MOST_CORRECTIONS):
+            if number >= _CORRECTIONS and run.cost > (1 - _WORTH_ANOTHER) * cost:
+                break
+            before, cost = run.x, run.cost
             if not self._corrections.put(before):
                 return
             if number == _FEW_CORRECTIONS and not last and self._unexplained(run.x).largest > _CLOSE:

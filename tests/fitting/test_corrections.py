@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import mitsuba as mi
@@ -11,6 +12,8 @@ from fitting_scenes import OPTIONS, box, camera, diffuse, scene_of
 
 from shadowmap_dr import Renderer
 from shadowmap_dr.fitting import FitResult, fit, prepared
+from shadowmap_dr.fitting.result import Step
+from shadowmap_dr.fitting.state import Run
 
 SIZE = {"width": 64, "height": 48}
 MOVED = np.array([0.06, -0.04, 0.0])
@@ -64,3 +67,24 @@ def test_a_scene_that_mitsuba_cannot_change_is_fitted_without() -> None:
     search = prepared(Renderer.from_scene(scene, **OPTIONS), picture, ["copy.one:translation:x"], starts=1)
     result = search.run()
     assert any(words.startswith("Images are not corrected") for words in result.words)
+
+
+@pytest.mark.parametrize(("share", "count"), [(0.75, 21), (0.95, 6)])
+def test_images_are_corrected_as_long_as_it_helps(monkeypatch: pytest.MonkeyPatch, share: float, count: int) -> None:
+    """Steps through a long valley were ended after six corrections, a degree from the pose, and called found."""
+    scene = scene_of(camera=camera(film=SIZE), box=box(0))
+    picture = np.array(mi.render(scene, spp=4), np.float32)[..., :3]
+    search = prepared(Renderer.from_scene(scene, **OPTIONS), picture, ["box:translation:x"], starts=1)
+    losses = [share**k for k in range(20)] + [share**19] * 4
+    descents: list[float] = []
+
+    def descend(run: Run, *others: object) -> Iterator[Step]:
+        run.x, run.cost = run.x + 0.01, losses[len(descents)]
+        descents.append(run.cost)
+        yield from ()
+
+    monkeypatch.setattr(search, "_descend", descend)
+    monkeypatch.setattr(search, "_is_to_be_corrected", lambda run: True)
+    monkeypatch.setattr(search._corrections, "put", lambda x: True)
+    list(search._correct(Run(0, np.zeros(1)), last=True))
+    assert len(descents) == count

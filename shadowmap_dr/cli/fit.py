@@ -12,6 +12,7 @@ import typer
 from ..errors import ShadowmapError, quoted, shortened
 from ..fitting.options import FitOptions
 from ..fitting.task import FitTask, PictureFile, read_task
+from ..fitting.vary import Vary
 from ..io import console, files
 from ..variants import DEFAULT_VARIANT, set_variant
 from .options import Given, Variant, from_record
@@ -38,7 +39,9 @@ def fit(
     define: Annotated[
         list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="Value of the parameter $NAME of the scene; repeatable.")
     ] = None,
-    listing: Annotated[bool, typer.Option("--list", help="List all that can vary, and by how much it moves the image.")] = False,
+    listing: Annotated[
+        bool, typer.Option("--list", help="List all that can vary, or what --vary names, and how much it moves the image.")
+    ] = False,
     out: Annotated[Path, typer.Option(metavar="PATH", help="Folder for the results.")] = Path("fit"),
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a fit that did not end.")] = False,
     variant: Variant = DEFAULT_VARIANT,
@@ -56,14 +59,16 @@ def fit(
     if listing:
         from ..fitting.listing import listed
 
-        console.show(listed(loaded))
+        console.show(listed(loaded, [one for one in task.options.vary if isinstance(one, Vary)]))
         return
     from ..fitting.command import run_fit
-    from ..fitting.table import table
+    from ..fitting.table import directions, table
     from ..fitting.writing import REPORT, RESULT
 
     result = run_fit(task, loaded, path, out, resume=resume)
     console.show(table(result))
+    for line in directions(result):
+        typer.echo(line)
     for words in result.words:
         typer.echo(words)
     typer.echo(f"{'Found' if result.found else 'Not found'}, in {result.seconds:.0f} s.")

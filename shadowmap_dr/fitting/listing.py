@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import mitsuba as mi
 import numpy as np
 from rich.table import Table
@@ -20,15 +23,24 @@ from .views import View
 _SIDE = 96
 
 
-def listed(scene: mi.Scene) -> Table:
+def listed(scene: mi.Scene, entries: Sequence[Vary] = ()) -> Table:
     """A table of the objects and values of a scene: names for ``--vary``, kinds, present values, effect on the image.
 
     The effect is the change of the first sensor's image by a change of a degree, a hundredth of the extent, or one per cent, as a
     share of the image's brightness.
+
+    Args:
+        scene: the scene.
+        entries: variations to list instead of all.
+
+    Raises:
+        ShadowmapError: a variation of something that the scene does not have.
     """
     renderer = Renderer.from_scene(scene)
     resolver = Resolver(renderer)
-    rows = [[one.name, ", ".join(one.kinds), one.value, _effect(renderer, resolver, one)] for one in resolver.candidates()]
+    resolver.parameters(entries)
+    chosen = [_chosen(resolver, entry) for entry in entries] if entries else resolver.candidates()
+    rows = [[one.name, ", ".join(one.kinds), one.value, _effect(renderer, resolver, one)] for one in chosen]
     columns = ["name", "kinds", "now", "moves the image by"]
     table = console.table("What can vary: --vary NAME:KIND", columns, rows, wrapped=(0, 1))
     table.caption = "Changes of a degree, of a hundredth of the size, or of one per cent, as shares of the image's brightness."
@@ -36,9 +48,16 @@ def listed(scene: mi.Scene) -> Table:
     return table
 
 
+def _chosen(resolver: Resolver, entry: Vary) -> Candidate:
+    """A variation as a row of the list, with the kinds and the present value of what it names."""
+    names = (entry.name, f"{entry.name}.value")
+    known = next((one for one in resolver.candidates() if one.name in names), Candidate(entry.name, (), ""))
+    return replace(known, kinds=(entry.kind,) if entry.kind else known.kinds)
+
+
 def _effect(renderer: Renderer, resolver: Resolver, candidate: Candidate) -> str:
     """The effect of an object's or value's first kind in words."""
-    kind = candidate.kinds[0]
+    kind = candidate.kinds[0] if candidate.kinds else ""
     if kind == "texture":
         return ""
     try:

@@ -55,6 +55,16 @@ def table(result: FitResult) -> Table:
     return made
 
 
+def directions(result: FitResult) -> list[str]:
+    """Lines with the fitted directions of lights, which the table has as turns from those of the scene file."""
+    found = []
+    for estimate in result.estimates:
+        if "direction" in estimate.arrays:
+            numbers = ", ".join(_significant(float(one)) for one in np.ravel(estimate.arrays["direction"]))
+            found.append(f"{estimate.name}: light travels along ({numbers}).")
+    return found
+
+
 def rounded(value: float, half_width: float | None = None) -> tuple[str, str]:
     """Texts of a number and of the half-width of its interval, to the digits that the interval gives: "0.12" and "0.01".
 

@@ -134,6 +134,17 @@ def test_the_list_names_all_that_can_vary(run: Any, tmp_path: Path) -> None:
     assert not (tmp_path / "fit").exists()
 
 
+def test_the_list_has_chosen_entries_alone(run: Any, tmp_path: Path) -> None:
+    (tmp_path / "room.xml").write_text(ROOM.replace("X", "0"))
+    result = run("fit", "room.xml", "--list", "--vary", "box:translation:x", "--vary", "sun.irradiance")
+    assert result.status == 0, result.err
+    words = " ".join(result.out.split())
+    assert "box translation" in words and "sun.irradiance.value value" in words and words.count("%") >= 2
+    assert "reflectance" not in words and "floor" not in words
+    wrong = run("fit", "room.xml", "--list", "--vary", "bix:pose")
+    assert wrong.status != 0 and "bix" in wrong.err and not wrong.out
+
+
 TARGET, LONG = ("--target", "photo.png"), 5000 * "x"
 BAD: list[tuple[tuple[str, ...], str]] = [
     (("room.xml", *TARGET), "nothing varies: name something by --vary; --list lists all"),

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
-from shadowmap_dr.fitting.table import NOT_DETERMINED, rounded, rows, table
+from shadowmap_dr.fitting.table import NOT_DETERMINED, directions, rounded, rows, table
 
 
 @pytest.mark.parametrize(
@@ -86,3 +86,8 @@ def test_the_table_names_each_estimate_once() -> None:
     with console.capture() as captured:
         console.print(table(result(found=False)))
     assert "No fit was found" in captured.get()
+
+
+def test_directions_of_lights_have_lines() -> None:
+    sun = estimate(name="sun:direction", kind="direction", arrays={"direction": np.array([0.6, 0.0, -0.8])})
+    assert directions(result(estimates=[estimate(), sun])) == ["sun:direction: light travels along (0.6, 0, -0.8)."]

@@ -15,6 +15,7 @@ from ..errors import ShadowmapError, quoted
 from ..io.images import to_linear
 from ..io.pictures import read_pixels
 from ..io.resampling import area_average
+from .fireflies import fireflies
 
 Array: TypeAlias = npt.NDArray[np.float32]
 
@@ -107,7 +108,8 @@ def read_target(
     """Read a target from a picture file.
 
     OpenEXR and floating-point TIFF are linear, all others sRGB, of 8 or 16 bits. Pictures are turned as EXIF says. The weight of
-    a pixel is its alpha times its mask; saturated pixels and those that are not finite have none.
+    a pixel is its alpha times its mask; saturated pixels, those that are not finite, and fireflies (single pixels of linear
+    pictures, many times brighter than nearly all others and than their neighbours) have none.
 
     Args:
         path: picture file.
@@ -220,7 +222,11 @@ def _target(
     to = max(1, round(height * times)), max(1, round(width * times))
     without: dict[str, int] = {}
     curve = None
-    if pixels.dtype != np.float32:
+    if pixels.dtype == np.float32:
+        bright = fireflies(pixels)
+        if bright.any():
+            counts = np.where(bright, np.float32(0), np.float32(1) if counts is None else counts)
+    else:
         most = np.iinfo(pixels.dtype).max
         curve = to_linear(np.arange(most + 1) / most).astype(np.float32)
 

@@ -87,7 +87,8 @@ class Corrections:
         """
         if self._effect is None:
             matrix, _ = self._objective.at(x).system()
-            self._effect = np.sqrt(np.maximum(np.diag(matrix), 0))
+            of_images = np.diag(matrix) - self._objective.precision  # without the priors' share
+            self._effect = np.sqrt(np.maximum(of_images, 0))
             self._effect[self._objective.views[0].count :] = 0
         effect = self._effect
         steps = np.array([other - x for other, _ in self._known[1:]]).reshape(len(self._known) - 1, len(x)) * effect

@@ -88,3 +88,19 @@ def test_images_are_corrected_as_long_as_it_helps(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(search._corrections, "put", lambda x: True)
     list(search._correct(Run(0, np.zeros(1)), last=True))
     assert len(descents) == count
+
+
+def test_effects_on_images_are_without_priors() -> None:
+    """Secants are weighed by them: a narrow prior made a number that moves little the only one that counts."""
+    effects = []
+    for prior in ("", ",prior=0.001"):
+        scene = scene_of(camera=camera(film=SIZE), box=box(0))
+        picture = np.array(mi.render(scene, spp=4), np.float32)[..., :3]
+        search = prepared(
+            Renderer.from_scene(scene, **OPTIONS), picture, [f"box:translation:x{prior}", "sun:direction"], starts=1
+        )
+        corrections = search._corrections
+        assert corrections is not None and corrections.put(np.zeros(3))
+        effects.append(corrections._effect)
+    np.testing.assert_allclose(effects[1], effects[0], rtol=1e-3)
+    assert min(effects[0]) > 0

@@ -13,7 +13,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 # Most characters of a message, and of its words while it has more.
-_MESSAGE, _WORDS = 400, (160, 80, 40)
+_MESSAGE, _WORDS = 600, (160, 80, 40)
 
 
 def shortened(text: object, most: int = 80) -> str:
@@ -31,7 +31,7 @@ def quoted(value: object, most: int = 80) -> str:
 
 
 def concise(message: object) -> str:
-    """A message in one line of at most 400 characters.
+    """A message in one line of at most 600 characters.
 
     Words are shortened first, such as names of thousands of letters. If that is not enough, the middle of the message is left
     out: it begins with the thing, and ends with what to do.
@@ -46,7 +46,7 @@ def concise(message: object) -> str:
 class ShadowmapError(ValueError):
     """Bad input to shadowmap_dr: a scene, an option or an array that cannot be used as given.
 
-    Its text is one line of at most 400 characters; ``args`` keeps what was left out.
+    Its text is one line of at most 600 characters; ``args`` keeps what was left out.
     """
 
     def __str__(self) -> str:

@@ -150,7 +150,7 @@ def test_bad_tasks_are_named_in_one_line(tmp_path: Path, text: str, words: str) 
     with pytest.raises(ShadowmapError) as raised:
         read_task(path)
     message = str(raised.value)
-    assert words in message and str(path) in message and "\n" not in message and len(message) <= 400
+    assert words in message and str(path) in message and "\n" not in message and len(message) <= 600
 
 
 def test_files_that_are_no_text(tmp_path: Path) -> None:

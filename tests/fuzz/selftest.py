@@ -12,7 +12,7 @@ import numpy as np
 
 from shadowmap_dr.errors import ShadowmapError
 
-from .outcome import check
+from .outcome import Refused, check
 from .values import pick
 
 BEHAVIOURS = ("result", "refusal", "long refusal", "error", "wrong", "warning", "signal", "exit", "hang", "memory")
@@ -29,7 +29,7 @@ def run(rng: np.random.Generator, folder: Path) -> str:
     if chosen == "refusal":
         raise ShadowmapError("a bad value: give another.")
     if chosen == "long refusal":
-        raise ShadowmapError("a bad value:\ngive another.")
+        raise Refused("a bad value:\ngive another.")  # as a command writes it; ShadowmapError has one line
     if chosen == "error":
         return str(vars()["none"])
     if chosen == "signal":

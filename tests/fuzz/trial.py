@@ -17,7 +17,7 @@ from shadowmap_dr.errors import ShadowmapError
 from .outcome import FAULT, REFUSED, RESULT, Outcome, Refused, Wrong
 
 _PACKAGE = str(Path(shadowmap_dr.__file__).parent)
-_MOST_LINE = 4000
+_MOST_LINE = 2000
 
 
 def outcome_of(run: Callable[[], str]) -> Outcome:

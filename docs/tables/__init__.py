@@ -30,6 +30,7 @@ TABLES: dict[str, Callable[[], Lines]] = {
     "poses beside Mitsuba's, smooth": lambda: poses.poses_compared("vertex"),
     "default shading": poses.default_shading,
     "poses of users' meshes": poses.foreign_meshes,
+    "poses by Levenberg-Marquardt": poses.levenberg_marquardt,
     "speed": speed.speed,
     "figures": speed.figures,
     "steps on a GPU": speed.on_a_gpu,

@@ -84,3 +84,20 @@ def default_shading() -> Lines:
 def foreign_meshes() -> Lines:
     """Meshes of users."""
     return foreign.table(record("pose-foreign"))
+
+
+def levenberg_marquardt() -> Lines:
+    """Poses found by `--optimiser lm`, and the seconds of its runs."""
+    lines, runs = [], record("pose-lm")["runs"]
+    for normals in ("vertex", "face"):
+        for name in dict.fromkeys(run["object"] for run in runs):
+            own = [run for run in runs if (run["object"], run["normals"]) == (name, normals)]
+            times = np.array([np.inf if run["seconds_to_pose"] is None else run["seconds_to_pose"] for run in own])
+            turned = np.median([run["rotation_error_deg"] for run in own])
+            whole = np.median([run["seconds_total"] for run in own])
+            found = f"{sum(run['found'] for run in own)} of {len(own)}"
+            within = f"{np.count_nonzero(times <= 0.1)}"
+            cells = [f"{turned:.4f}", f"{np.median(times):.3f}", f"{times.max():.3f}", within, f"{whole:.3f}"]
+            lines.append([{"vertex": "smooth", "face": "flat"}[normals], name, found, *cells])
+    times = ["time to pose, median [s]", "longest [s]", "runs within 0.1 s", "whole run, median [s]"]
+    return markdown(["shading", "object", "found", "rotation, median [deg]", *times], lines)

@@ -197,7 +197,7 @@ class View:
             yield
             return
         scene = self._renderer.data.scene
-        restore = set_values(scene, without_present_values(scene, self.change(x)))
+        restore = set_values(scene, self.change(x), all_values=False)
         self._held += 1
         try:
             yield
@@ -388,12 +388,22 @@ def _input(numbers: Array) -> Float:
     return mi.Float(numbers.astype(np.float32) if len(numbers) else np.zeros(1, np.float32))
 
 
-def set_values(scene: mi.Scene, change: SceneChange) -> Callable[[], None]:
-    """Give parameters of Mitsuba's objects new values; returns a function that gives them the old ones back."""
+def set_values(scene: mi.Scene, change: SceneChange, *, all_values: bool = True) -> Callable[[], None]:
+    """Give parameters of Mitsuba's objects new values; returns a function that gives them the old ones back.
+
+    Args:
+        scene: the scene.
+        change: the values. Detached ones, if not all of them are set.
+        all_values: false to leave out values that the objects have already. Some objects take long to change: rough plastic
+            integrates its transmittance anew for each roughness, for 0.1 s.
+    """
     if not change.values and not change.arrays:
         return lambda: None
     table = mi.traverse(scene)
-    before = {key: type(table[key])(dr.detach(table[key])) for key in (*change.values, *change.arrays)}
+    values = {key: type(table[key])(*parts) for key, parts in change.values.items()}
+    if not all_values:
+        values = {key: value for key, value in values.items() if not np.array_equal(np.array(value), np.array(table[key]))}
+    before = {key: type(table[key])(dr.detach(table[key])) for key in (*values, *change.arrays)}
 
     def restore() -> None:
         for key, value in before.items():
@@ -401,32 +411,16 @@ def set_values(scene: mi.Scene, change: SceneChange) -> Callable[[], None]:
         table.update()
 
     try:
-        for key, parts in change.values.items():
-            table[key] = type(before[key])(*parts)
-        for key, (values, shape) in change.arrays.items():
+        for key, value in values.items():
+            table[key] = value
+        for key, (own, shape) in change.arrays.items():
             kind = type(before[key])
-            table[key] = kind(values, shape) if dr.is_tensor_v(kind) else kind(values)
+            table[key] = kind(own, shape) if dr.is_tensor_v(kind) else kind(own)
         table.update()
     except RuntimeError:
         restore()
         raise
     return restore
-
-
-def without_present_values(scene: mi.Scene, change: SceneChange) -> SceneChange:
-    """A detached change without the values that Mitsuba's objects have already.
-
-    Some objects take long to change: rough plastic integrates its transmittance anew for each roughness, for 0.1 s.
-    """
-    if not change.values:
-        return change
-    table = mi.traverse(scene)
-
-    def is_present(key: str, parts: Sequence[Float]) -> bool:
-        present = table[key]
-        return np.array_equal(np.ravel(np.array(type(present)(*parts))), np.ravel(np.array(present)))
-
-    return replace(change, values={key: parts for key, parts in change.values.items() if not is_present(key, parts)})
 
 
 def _at(renderer: Renderer, quality: Quality) -> Renderer:

@@ -96,9 +96,8 @@ def _ear(flat: Array) -> int | None:
     for at in np.flatnonzero(areas > 0):
         corners = (a[at], flat[at], c[at])
         sides = [_twice_area(*edge, flat) for edge in zip(corners, (*corners[1:], corners[0]), strict=True)]
-        same = (np.abs(flat[:, None] - np.stack(corners)).max(-1) <= 1e-9 * extent).any(
-            1
-        )  # both ends of a line that is followed twice
+        # Both ends of a line that is followed twice are the same point.
+        same = (np.abs(flat[:, None] - np.stack(corners)).max(-1) <= 1e-9 * extent).any(1)
         if not ((np.minimum.reduce(sides) >= -least) & ~same).any():
             return int(at)
     return None

@@ -197,7 +197,7 @@ def test_patterns_move_shapes_together(resolver: Resolver) -> None:
     both = resolver.parameter(Vary.parse("car_*:pose"))
     assert both.shapes == ("car_body", "car_wheel")  # type: ignore[union-attr]
     joined = resolver.parameter(Vary.parse("car_wheel+car_body:pose"))
-    assert joined.shapes == both.shapes  # type: ignore[union-attr]
+    assert joined.shapes == both.shapes
     with pytest.raises(ShadowmapError, match="the scene has no shape 'car_seat'"):
         resolver.parameter(Vary.parse("car_wheel+car_seat:pose"))
     np.testing.assert_allclose(both.pivot, [0, 0, 0.5], atol=1e-6)  # type: ignore[union-attr]

@@ -11,19 +11,20 @@ import numpy as np
 import pytest
 
 from shadowmap_dr.errors import ShadowmapError
+from shadowmap_dr.fitting.result import Step
 from shadowmap_dr.fitting.state import Run, Sizes, State
 from shadowmap_dr.io.checkpoints import write_checkpoint
 from shadowmap_dr.io.files import read_arrays
 
 SIZES = Sizes(2, 3, (4,))
-STEP: dict[str, Any] = {"start": 0, "stage": "12 px", "step": 0, "error": math.inf, "seconds": 0.5}
+STEP: Step = {"start": 0, "stage": "12 px", "step": 0, "error": math.inf, "seconds": 0.5}
 
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
     """The file of a state of two starts and a texture."""
     runs = [Run(0, np.array([0.5, 1]), 2.0, 1, trail=[(0, np.zeros(2)), (1, np.ones(2))]), Run(1, np.zeros(2))]
-    State(runs, [STEP], 1, [np.ones(4, np.float32)]).write(tmp_path / "fit.npz", "this fit")  # type: ignore[list-item]
+    State(runs, [STEP], 1, [np.ones(4, np.float32)]).write(tmp_path / "fit.npz", "this fit")
     return tmp_path / "fit.npz"
 
 

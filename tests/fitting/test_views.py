@@ -18,7 +18,7 @@ from shadowmap_dr.fitting.parameters import Parameter
 from shadowmap_dr.fitting.resolve import Resolver
 from shadowmap_dr.fitting.scene_change import SceneChange
 from shadowmap_dr.fitting.vary import Vary
-from shadowmap_dr.fitting.views import Quality, View, set_values, without_present_values
+from shadowmap_dr.fitting.views import Quality, View, set_values
 from shadowmap_dr.scene.sensor import ImageSize
 
 SIZE = ImageSize(60, 45)
@@ -276,20 +276,6 @@ def test_values_are_set_and_given_back() -> None:
     np.testing.assert_allclose(numbers_of(scene)["box.bsdf.reflectance.value"].ravel(), [0.1, 0.2, 0.3], atol=1e-6)
     restore()
     np.testing.assert_array_equal(numbers_of(scene)["box.bsdf.reflectance.value"], before["box.bsdf.reflectance.value"])
-
-
-def test_values_that_are_present_are_not_set() -> None:
-    mi.set_variant("llvm_ad_rgb")
-    renderer = Renderer.from_scene(scene_of(), **OPTIONS)
-    scene = renderer.data.scene
-    change = SceneChange(renderer)
-    key = "box.bsdf.reflectance.value"
-    change.values[key] = [mi.Float(0.1), mi.Float(0.2), mi.Float(0.3)]
-    assert without_present_values(scene, change).values == change.values
-    restore = set_values(scene, change)
-    assert without_present_values(scene, change).values == {}
-    restore()
-    assert list(without_present_values(scene, change).values) == [key]
 
 
 def test_objects_that_are_slow_to_change_are_changed_when_their_values_are(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -102,7 +102,7 @@ class Resolver:
         found = [shape for shape in self.shapes if any(shape == name or fnmatchcase(shape, name) for name in patterns)]
         for name in patterns:
             if found and not any(shape == name or fnmatchcase(shape, name) for shape in found):
-                raise ShadowmapError(f"vary {vary.label}: the scene has no shape {name!r}; --list lists all.")
+                raise ShadowmapError(f"{vary.named}: the scene has no shape {quoted(name)}; --list lists all.")
         return found
 
     def parameters(self, entries: Sequence[Vary | Own]) -> tuple[list[Parameter], list[ArrayParameter]]:

@@ -23,6 +23,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .arrays import backend
+from .kernel_inputs import split, uint_input
 from .pytree import tree_map
 from .types import AnyArray, Float, PyTree, UInt32
 
@@ -105,15 +106,16 @@ class Copies(dr.CustomOp):
 def copied(array: _ArrayT, count: int) -> _ArrayT:
     """``count`` copies of an array (N) of any Dr.Jit type, one after the other (N * count)."""
     width = dr.width(array)
-    lane = dr.arange(backend(array).UInt32, count * width)
-    return dr.gather(type(array), array, lane - lane // width * width)
+    _, place = split(dr.arange(backend(array).UInt32, count * width), "width of a copy", width, count)
+    return dr.gather(type(array), array, place)
 
 
 def sum_of_copies(array: _ArrayT, count: int) -> _ArrayT:
     """The sum (N) of ``count`` arrays that lie one after the other (N * count)."""
     width = dr.width(array) // count
-    lane = dr.arange(backend(array).UInt32, width)
-    return cast(_ArrayT, sum(dr.gather(type(array), array, lane + k * width) for k in range(count)))
+    module = backend(array)
+    lane, step = dr.arange(module.UInt32, width), uint_input(module, "width of a copy", width)
+    return cast(_ArrayT, sum(dr.gather(type(array), array, lane + k * step) for k in range(count)))
 
 
 def broadcast_differentiable(record: PyTree, width: int) -> PyTree:

@@ -1,4 +1,7 @@
-"""A limit on cached kernels: each image size has kernels of its own, and Dr.Jit keeps all of them until the process ends."""
+"""A limit on cached kernels: sizes of images and counts of samples have some of their own, which Dr.Jit keeps until it ends.
+
+Most kernels serve all sizes (:mod:`shadowmap_dr.jit.kernel_inputs`), those of loops of callers often do not.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ from collections.abc import Hashable
 
 import drjit as dr
 
-# A size has about 1 MiB of kernels. A loop over at most this many sizes keeps all of its kernels.
+# A size may have 1 MiB of kernels. A loop over at most this many sizes keeps all of its kernels.
 _MOST_SIZES = 64
 
 _sizes: set[Hashable] = set()

@@ -5,9 +5,10 @@ from __future__ import annotations
 import drjit as dr
 
 from ..jit.arrays import backend
+from ..jit.kernel_inputs import quotient, split, uint_input
 from ..jit.types import Bool, Float, UInt32, Vector4f
 from .screen_planes import offset, pixels, planes
-from .types import NO_TRIANGLE, RasterOutput, by_image
+from .types import NO_TRIANGLE, RasterOutput
 
 # Pixels of a lane: the size of a packet.
 _STRIP = 4
@@ -34,10 +35,10 @@ def _strips(raster: RasterOutput, depths: Float, weights: tuple[Float, ...]) -> 
     module = backend(depths)
     count = dr.width(raster.triangle)
     lane = dr.arange(module.UInt32, count // _STRIP)
-    line = lane * _STRIP // raster.width
-    column = lane * _STRIP - line * raster.width
-    image, row = by_image(line, raster.height, raster.batch)
-    base = image * raster.face_count
+    line = quotient(lane * _STRIP, "width", raster.width)
+    column = lane * _STRIP - line * uint_input(module, "width", raster.width)
+    image, row = split(line, "height", raster.height, raster.batch)
+    base = image * uint_input(module, "faces", raster.face_count)
     triangle = dr.gather(module.Array4u, raster.triangle, lane)
     shared = dr.minimum(dr.minimum(triangle[0], triangle[1]), dr.minimum(triangle[2], triangle[3]))  # NO_TRIANGLE is the largest
     records = _look_up(base + shared, shared != NO_TRIANGLE, depths, weights)

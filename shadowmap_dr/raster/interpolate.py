@@ -7,6 +7,7 @@ from typing import cast
 import drjit as dr
 
 from ..jit.arrays import backend, ravel
+from ..jit.kernel_inputs import uint_input
 from ..jit.types import TensorXf, TensorXu, UInt32
 from .types import RasterOutput, check_array, check_range, pixel_coordinates
 
@@ -46,7 +47,7 @@ def interpolate(attributes: TensorXf, raster: RasterOutput, faces: TensorXu | UI
         check_range(face_indices, shape[-2], "attribute row")
     channels = shape[-1]
     image, _, _ = pixel_coordinates(module, raster.batch, raster.height, raster.width)
-    first = image * shape[1] if len(shape) == 3 else 0
+    first = image * uint_input(module, "attributes", shape[1]) if len(shape) == 3 else 0
     hit = raster.valid
     corners = dr.gather(module.Array3u, module.UInt32(face_indices), raster.triangle, hit)
     weights = (1 - raster.u - raster.v, raster.u, raster.v)

@@ -11,12 +11,13 @@ from typing import Any, cast
 import drjit as dr
 
 from ..jit.arrays import backend, ravel, replace_grad
+from ..jit.kernel_inputs import float_input, split, uint_input
 from ..jit.types import Bool, Float, Float64, TensorXf, TensorXu, UInt32, UInt64, Vector4f
 from .barycentrics import pixel_barycentrics
 from .small_triangles import EMPTY, draw
 from .tile_lists import STRIP, Strips, TileGrid, TileLists, build_tile_lists, nearest_covers, strips
 from .triangle_setup import Line, centred, covers, edge_lines, fragment_key, gather_triangle, set_up
-from .types import MAX_RESOLUTION, NO_TRIANGLE, RasterOutput, Records, by_image, check_array, check_range, pixel_coordinates
+from .types import MAX_RESOLUTION, NO_TRIANGLE, RasterOutput, Records, check_array, check_range, pixel_coordinates
 
 #: A triangle that covers more pixels than this, and is not thin, goes through the lists of tiles.
 _LARGE = 512
@@ -166,9 +167,9 @@ def _locate(
     """
     module = backend(positions)
     image, row, column = pixel_coordinates(module, batch, height, width)
-    (x, x_rest), (y, y_rest) = _exact_ndc(module, column, width), _exact_ndc(module, row, height)
+    (x, x_rest), (y, y_rest) = _exact_ndc(module, column, "width", width), _exact_ndc(module, row, "height", height)
     hit = triangle != NO_TRIANGLE
-    p0, p1, p2 = gather_triangle(positions, faces, triangle, image * vertex_count, hit)
+    p0, p1, p2 = gather_triangle(positions, faces, triangle, image * uint_input(module, "vertices", vertex_count), hit)
 
     def shear(p: Vector4f) -> tuple[Float, Float]:
         return dr.fma(-p.w, x_rest, dr.fma(-p.w, x, p.x)), dr.fma(-p.w, y_rest, dr.fma(-p.w, y, p.y))
@@ -203,11 +204,12 @@ def cross2(ax: Float, ay: Float, bx: Float, by: Float) -> Float:
     return dr.fma(ax, by, -product) + rounding
 
 
-def _exact_ndc(module: ModuleType, index: UInt32, size: int) -> tuple[Float, Float]:
+def _exact_ndc(module: ModuleType, index: UInt32, name: str, size: int) -> tuple[Float, Float]:
     """NDC coordinate of a pixel centre as a sum of two floats: on steep triangles, an error of half an ulp shows in the depth."""
-    numerator = dr.fma(module.Float(index), 2.0, 1.0 - size)
-    ndc = numerator / size
-    return ndc, dr.fma(-ndc, size, numerator) / size
+    width = float_input(module, name, size)
+    numerator = dr.fma(module.Float(index), 2.0, float_input(module, name, 1.0 - size))
+    ndc = numerator / width
+    return ndc, dr.fma(-ndc, width, numerator) / width
 
 
 def _visible_triangles(
@@ -264,12 +266,15 @@ def _nearest_fragments(
     UInt64 = module.UInt64
     face_count = dr.width(faces) // 3
     grid = TileGrid(batch, height, width)
+    rows, columns, vertices = (
+        uint_input(module, name, size) for name, size in (("height", height), ("width", width), ("vertices", vertex_count))
+    )
     # The keys of a tile are contiguous, so that neighbours in the image are near in memory in both directions.
     tiled = not peel and height * width > _LARGE
     keys = _empty_keys(module, grid.pixel_count if tiled else batch * height * width)
     index = dr.arange(module.UInt32, batch * face_count)
-    image, triangle = by_image(index, face_count, batch)
-    triangles = set_up(gather_triangle(positions, faces, triangle, image * vertex_count, True), height, width)
+    image, triangle = split(index, "faces", face_count, batch)
+    triangles = set_up(gather_triangle(positions, faces, triangle, image * vertices, True), height, width)
     # Three flat arrays: Dr.Jit would write the components of a nested array in separate kernels.
     records = ravel(triangles.a), ravel(triangles.b), ravel(triangles.c)
 
@@ -282,7 +287,7 @@ def _nearest_fragments(
     small = triangles.active & ((triangles.fragments <= _LARGE) | (triangles.fragments <= 5 * sides))
 
     def pixel_index(row: UInt32, column: UInt32) -> UInt32:
-        return grid.pixel(image, row, column) if tiled else (image * height + row) * width + column
+        return grid.pixel(image, row, column) if tiled else (image * rows + row) * columns + column
 
     draw(triangles, keys, behind, pixel_index, triangle, triangles.box, small)
     if height * width <= _LARGE:  # no triangle can be large
@@ -295,8 +300,8 @@ def _nearest_fragments(
     dr.eval(records, keys, nearest, large, first, last)
 
     def exact_lines(index: UInt32) -> tuple[list[Line], Float64]:
-        image, triangle = by_image(index, face_count, batch)
-        return edge_lines(gather_triangle(positions, faces, triangle, image * vertex_count, True))
+        image, triangle = split(index, "faces", face_count, batch)
+        return edge_lines(gather_triangle(positions, faces, triangle, image * vertices, True))
 
     a, b, c = (dr.gather(module.Array4f, record, index, large) for record in records)
     box = tuple(module.Int32(corner) for corner in (first & 0xFFFF, first >> 16, last & 0xFFFF, last >> 16))
@@ -348,7 +353,7 @@ def _merge_large(
         nearer = []
         for k, old in enumerate(best):
             covered = covers(values[k], strip.row, strip.column + k, grid.height, grid.width, lambda: exact_lines(index))
-            key = fragment_key(values[k].w, index - strip.image * face_count)
+            key = fragment_key(values[k].w, index - strip.image * uint_input(module, "faces", face_count))
             if beyond is not None:
                 covered &= key > beyond[k]
             nearer.append(dr.select(covered & (key < old), key, old))

@@ -9,9 +9,10 @@ from __future__ import annotations
 import drjit as dr
 
 from ..jit.arrays import backend, ravel, replace_grad
+from ..jit.kernel_inputs import double_input, float_input, split, uint_input
 from ..jit.types import Bool, Float, UInt32, Vector4f
-from .triangle_setup import Corners, edge_lines, gather_triangle
-from .types import MAX_RESOLUTION, RasterOutput, by_image, pixel_coordinates, precise_rcp
+from .triangle_setup import Corners, edge_lines, exact_centres, gather_triangle
+from .types import MAX_RESOLUTION, RasterOutput, pixel_coordinates, precise_rcp
 
 # Smallest determinant (twice the area in NDC times all three w) of a visible triangle.
 _LEAST = 1e-25
@@ -52,8 +53,9 @@ def depth_at(depths: Float, index: UInt32, row: UInt32, column: UInt32, hit: Boo
 
 def pixels(raster: RasterOutput) -> tuple[UInt32, UInt32, UInt32]:
     """(index of the triangle in the batch, row, column) of each pixel."""
-    image, row, column = pixel_coordinates(backend(raster.triangle), raster.batch, raster.height, raster.width)
-    return image * raster.face_count + raster.triangle, row, column
+    module = backend(raster.triangle)
+    image, row, column = pixel_coordinates(module, raster.batch, raster.height, raster.width)
+    return image * uint_input(module, "faces", raster.face_count) + raster.triangle, row, column
 
 
 def offset(plane: Vector4f, row: UInt32, column: UInt32) -> tuple[Float, Float]:
@@ -84,9 +86,9 @@ def planes(
     Float, Float64, UInt32 = module.Float, module.Float64, module.UInt32
     width, height = raster.width, raster.height
     index = dr.arange(UInt32, raster.batch * raster.face_count)
-    image, triangle = by_image(index, raster.face_count, raster.batch)
+    image, triangle = split(index, "faces", raster.face_count, raster.batch)
     vertex_count = dr.width(positions) // (4 * raster.batch)
-    corners = gather_triangle(positions, faces, triangle, image * vertex_count, True)
+    corners = gather_triangle(positions, faces, triangle, image * uint_input(module, "vertices", vertex_count), True)
     heights = [p.z for p in corners]
     if reciprocal is not None:
         inverted = dr.gather(module.Bool, reciprocal, image)
@@ -97,16 +99,15 @@ def planes(
         # Degenerate slivers would have infinite weights, and NaN derivatives although no pixel sees them.
         regular = dr.isfinite(det) & (dr.abs(det) > _LEAST)
         inverse = dr.select(regular, precise_rcp(dr.select(regular, det, 1)), 0)
-        near = [_pixel_near(own, axis, size) for axis, size in ((0, width), (1, height))]
-        # Pixel p has the NDC coordinate (2 p + 1 - size) / size.
-        x, y = ((2 * Float64(p) + (1 - size)) / size for p, size in zip(near, (width, height), strict=True))
+        near = [_pixel_near(own, axis, name, size) for axis, name, size in ((0, "width", width), (1, "height", height))]
+        x, y = exact_centres(module, near[1], near[0], height, width)
         # Barycentrics divided by w, at the pixel and their change by column and row.
-        change_x = [line[0] * inverse * (2 / width) for line in lines]
-        change_y = [line[1] * inverse * (2 / height) for line in lines]
+        change_x = [line[0] * inverse * double_input(module, "width", 2 / width) for line in lines]
+        change_y = [line[1] * inverse * double_input(module, "height", 2 / height) for line in lines]
         there = [dr.fma(line[0], x, dr.fma(line[1], y, line[2])) * inverse for line in lines]
         zs = [Float64(dr.detach(z)) for z in heights]
         dx, dy, d = (sum(w * z for w, z in zip(weights, zs, strict=True)) for weights in (change_x, change_y, there))
-        slope_x, slope_y = dx * (0.5 * width), dy * (0.5 * height)
+        slope_x, slope_y = dx * double_input(module, "width", 0.5 * width), dy * double_input(module, "height", 0.5 * height)
         w_part = d - slope_x * x - slope_y * y
         slopes = [Float(v) for v in (slope_x, slope_y, w_part)]
         weights = [[Float(w) for w in row] for row in (change_x, change_y, there)]
@@ -126,7 +127,7 @@ def planes(
         return depths, (*(ravel(packet) for packet in packets), inverse_w[2])
 
 
-def _pixel_near(corners: Corners, axis: int, size: int) -> UInt32:
+def _pixel_near(corners: Corners, axis: int, name: str, size: int) -> UInt32:
     """Column (axis 0) or row (axis 1) of a pixel in the image close to the corners."""
     module = backend(corners[0])
     middle = module.Float(0)
@@ -134,4 +135,5 @@ def _pixel_near(corners: Corners, axis: int, size: int) -> UInt32:
         front = p.w > 0
         ndc = dr.select(front, p[axis] / dr.select(front, p.w, 1), 0)
         middle += dr.clip(ndc, -1, 1) / 3
-    return module.UInt32(dr.clip((middle * 0.5 + 0.5) * size, 0, size - 1))
+    place = (middle * 0.5 + 0.5) * float_input(module, name, size)
+    return module.UInt32(dr.clip(place, 0, float_input(module, name, size - 1)))

@@ -11,6 +11,7 @@ from collections.abc import Callable
 import drjit as dr
 
 from ..jit.arrays import backend
+from ..jit.kernel_inputs import float_input
 from ..jit.types import Bool, Int32, UInt32, UInt64, Vector4f
 from .triangle_setup import Box, Triangles, centred, covers, fragment_key, rounding_error
 
@@ -41,7 +42,8 @@ def draw(
     module = backend(t.a)
     Float, UInt32 = module.Float, module.UInt32
     x0, y0, x1, y1 = (module.Int32(b) for b in box)
-    rounding = rounding_error(t.height, t.width)
+    rounding = rounding_error(module, t.height, t.width)
+    width, middle = float_input(module, "width", t.width), float_input(module, "width", 0.5 * t.width - 0.5)
     tiny = 1e-12
     slope = [dr.select(dr.abs(t.a[k]) < tiny, dr.select(t.a[k] < 0, Float(-tiny), Float(tiny)), t.a[k]) for k in range(3)]
     inverse = [dr.rcp(s) for s in slope]
@@ -53,11 +55,11 @@ def draw(
         # The bounds are widened by rounding errors; the coverage test decides.
         low, high = Float(x0), Float(x1)
         for k in range(3):
-            crossing = dr.fma(-at_middle[k], inverse[k], 0.5 * t.width - 0.5)
+            crossing = dr.fma(-at_middle[k], inverse[k], middle)
             error = dr.fma(dr.abs(inverse[k]), rounding, 1e-3)
             low = dr.select(slope[k] > 0, dr.maximum(low, crossing - error), low)
             high = dr.select(slope[k] < 0, dr.minimum(high, crossing + error), high)
-        return at_middle, module.Int32(dr.ceil(dr.minimum(low, t.width))), module.Int32(dr.floor(dr.maximum(high, -1.0)))
+        return at_middle, module.Int32(dr.ceil(dr.minimum(low, width))), module.Int32(dr.floor(dr.maximum(high, -1.0)))
 
     def draw_pixel(row, column, end, at_middle):  # noqa: ANN001, ANN202
         x, _ = centred(module, 0, column, t.height, t.width)

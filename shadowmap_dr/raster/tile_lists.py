@@ -13,10 +13,10 @@ from types import ModuleType
 import drjit as dr
 
 from ..jit.arrays import backend, scatter_inc
+from ..jit.kernel_inputs import float_input, quotient, split, uint_input
 from ..jit.types import Bool, UInt32, UInt64
 from .small_triangles import draw
 from .triangle_setup import Box, Triangles, centred, depth_key, rounding_error
-from .types import by_image
 
 #: log2 of the side of a tile in pixels.
 TILE = 4
@@ -72,11 +72,17 @@ class TileGrid:
 
     def tile(self, image: UInt32, row: UInt32, column: UInt32) -> UInt32:
         """Index of the tile in a row and column of tiles."""
-        return (image * self.rows + row) * self.columns + column
+        return self._node("tiles", image, row, column, self.rows, self.columns)
 
     def block(self, image: UInt32, row: UInt32, column: UInt32) -> UInt32:
         """Index of the block that holds the tile in a row and column of tiles."""
-        return (image * self._block_rows + row // BLOCK) * self._block_columns + column // BLOCK
+        return self._node("blocks", image, row // BLOCK, column // BLOCK, self._block_rows, self._block_columns)
+
+    @staticmethod
+    def _node(name: str, image: UInt32, row: UInt32, column: UInt32, rows: int, columns: int) -> UInt32:
+        module = backend(row)
+        line = image * uint_input(module, f"rows of {name}", rows) + row
+        return line * uint_input(module, f"columns of {name}", columns) + column
 
 
 @dataclass(frozen=True)
@@ -117,10 +123,11 @@ class Strips:
         """
         if tiled:  # strips are in this order, too
             return list(dr.gather(backend(flat).Array4u64, flat, dr.arange(type(self.tile), dr.width(flat) // STRIP)))
-        inside = self.row < self.height
+        module = backend(self.row)
+        inside, width = self.row < uint_input(module, "height", self.height), uint_input(module, "width", self.width)
         if self.width % STRIP == 0:
-            return list(dr.gather(backend(flat).Array4u64, flat, self.index // STRIP, inside & (self.column < self.width)))
-        return [dr.gather(type(flat), flat, self.index + k, inside & (self.column + k < self.width)) for k in range(STRIP)]
+            return list(dr.gather(backend(flat).Array4u64, flat, self.index // STRIP, inside & (self.column < width)))
+        return [dr.gather(type(flat), flat, self.index + k, inside & (self.column + k < width)) for k in range(STRIP)]
 
     def written(self, values: Sequence[UInt32 | UInt64]) -> UInt32 | UInt64:
         """A flat row-major batch of images, evaluated, from the values of the four pixels of each strip."""
@@ -130,16 +137,17 @@ class Strips:
         rows = self.images * self.height
         # One packet scatter for each strip: several scatters would be separate kernels.
         padded = dr.empty(kind, rows * across * STRIP)
-        inside = (self.row < self.height) & (self.column < self.width)
+        height, width = uint_input(module, "height", self.height), uint_input(module, "width", self.width)
+        inside = (self.row < height) & (self.column < width)
         packet = {module.UInt32: module.Array4u, module.UInt64: module.Array4u64}[kind]
-        at = (self.image * self.height + self.row) * across + self.column // STRIP
+        at = (self.image * height + self.row) * uint_input(module, "strips", across) + self.column // STRIP
         dr.scatter(padded, packet(*values), at, inside)
         dr.eval(padded)
         if self.width % STRIP == 0:
             return padded
         pixel = dr.arange(module.UInt32, rows * self.width)
-        row = pixel // self.width
-        result = dr.gather(kind, padded, row * (across * STRIP) + (pixel - row * self.width))
+        row = quotient(pixel, "width", self.width)
+        result = dr.gather(kind, padded, row * uint_input(module, "padded width", across * STRIP) + (pixel - row * width))
         dr.eval(result)
         return result
 
@@ -149,11 +157,11 @@ def strips(grid: TileGrid, module: ModuleType) -> Strips:
     lane = dr.arange(module.UInt32, grid.count << (2 * TILE - 2))
     within = lane & ((1 << (2 * TILE - 2)) - 1)
     tile = lane >> (2 * TILE - 2)
-    row_of_tiles = tile // grid.columns
-    image, row_within = by_image(row_of_tiles, grid.rows, grid.batch)
+    row_of_tiles, column_of_tiles = split(tile, "columns of tiles", grid.columns, grid.batch * grid.rows)
+    image, row_within = split(row_of_tiles, "rows of tiles", grid.rows, grid.batch)
     row = (row_within << TILE) + (within >> (TILE - 2))
-    column = ((tile - row_of_tiles * grid.columns) << TILE) + ((within & ((1 << (TILE - 2)) - 1)) * STRIP)
-    index = (image * grid.height + row) * grid.width + column
+    column = (column_of_tiles << TILE) + ((within & ((1 << (TILE - 2)) - 1)) * STRIP)
+    index = (image * uint_input(module, "height", grid.height) + row) * uint_input(module, "width", grid.width) + column
     return Strips(image, row, column, tile, index, grid.batch, grid.height, grid.width)
 
 
@@ -165,10 +173,11 @@ def nearest_covers(grid: TileGrid, triangles: Triangles, image: UInt32, active: 
     module = backend(triangles.a)
     nearest = dr.full(module.UInt32, 0xFFFFFFFF, grid.count + grid.block_count)
     dr.eval(nearest)
+    tiles = uint_input(module, "tiles", grid.count)
 
     def visit(row: UInt32, column: UInt32, is_tile: Bool) -> Bool:
         span = _Span(triangles, row, column, is_tile)
-        node = dr.select(is_tile, grid.tile(image, row, column), grid.count + grid.block(image, row, column))
+        node = dr.select(is_tile, grid.tile(image, row, column), tiles + grid.block(image, row, column))
         dr.scatter_reduce(dr.ReduceOp.Min, nearest, depth_key(span.farthest), node, span.covered, mode=dr.ReduceMode.Direct)
         return ~span.missed & ~span.covered
 
@@ -204,6 +213,7 @@ def build_tile_lists(
     count = dr.zeros(module.UInt32, grid.count)
     items = dr.empty(module.UInt32, grid.count * CAPACITY)
     dr.eval(count, items)
+    tiles = uint_input(module, "tiles", grid.count)
 
     def visit(row: UInt32, column: UInt32, is_tile: Bool) -> Bool:
         span = _Span(triangles, row, column, is_tile)
@@ -211,7 +221,7 @@ def build_tile_lists(
         seen = ~span.missed
         if nearest is not None:
             depth = depth_key(span.nearest)
-            seen &= depth <= dr.gather(module.UInt32, nearest, grid.count + grid.block(image, row, column), seen)
+            seen &= depth <= dr.gather(module.UInt32, nearest, tiles + grid.block(image, row, column), seen)
             seen &= ~is_tile | (depth <= dr.gather(module.UInt32, nearest, tile, seen & is_tile))
         wanted = seen & is_tile
         slot = scatter_inc(count, tile, wanted)
@@ -276,9 +286,10 @@ class _Span:
         x, y = centred(module, row << TILE, column << TILE, t.height, t.width)
         middle = dr.fma(t.a, x + half, dr.fma(t.b, y + half, t.c))
         reach = (dr.abs(t.a) + dr.abs(t.b)) * half
-        error = rounding_error(t.height, t.width)
+        error = rounding_error(module, t.height, t.width)
         # Fragments evaluate the depth in another order, with rounding errors relative to the largest term.
-        error_depth = 1e-6 * dr.fma(dr.abs(t.a.w), 0.5 * t.width, dr.fma(dr.abs(t.b.w), 0.5 * t.height, dr.abs(t.c.w)))
+        half_width, half_height = float_input(module, "width", 0.5 * t.width), float_input(module, "height", 0.5 * t.height)
+        error_depth = 1e-6 * dr.fma(dr.abs(t.a.w), half_width, dr.fma(dr.abs(t.b.w), half_height, dr.abs(t.c.w)))
         self.nearest = middle.w - reach.w - error_depth
         self.farthest = middle.w + reach.w + error_depth
         outside = [middle[k] + reach[k] < -error for k in range(3)]

@@ -10,6 +10,7 @@ from typing import TypeAlias
 import drjit as dr
 
 from ..jit.arrays import backend, reinterpret
+from ..jit.kernel_inputs import double_input, float_input, int_input
 from ..jit.types import Bool, Float, Float64, Int32, UInt32, UInt64, Vector4f
 from .types import precise_rcp
 
@@ -73,7 +74,7 @@ def set_up(corners: Corners, height: int, width: int) -> Triangles:
     inv_det = precise_rcp(dr.select(active, det, 1))
 
     # NDC -> pixels from the image centre: this origin keeps single-precision errors smallest.
-    sx, sy = 2.0 / width, 2.0 / height
+    sx, sy = double_input(module, "width", 2.0 / width), double_input(module, "height", 2.0 / height)
     coefficients: list[list[Float]] = [[], [], []]
     for a, b, c in lines:
         norm = dr.sqrt(a * a * (sx * sx) + b * b * (sy * sy))
@@ -93,8 +94,8 @@ def set_up(corners: Corners, height: int, width: int) -> Triangles:
     box = (
         dr.maximum(Int32(dr.ceil(x_min - (0.5 + m))), 0),
         dr.maximum(Int32(dr.ceil(y_min - (0.5 + m))), 0),
-        dr.minimum(Int32(dr.floor(x_max - (0.5 - m))), width - 1),
-        dr.minimum(Int32(dr.floor(y_max - (0.5 - m))), height - 1),
+        dr.minimum(Int32(dr.floor(x_max - (0.5 - m))), int_input(module, "width", width - 1)),
+        dr.minimum(Int32(dr.floor(y_max - (0.5 - m))), int_input(module, "height", height - 1)),
     )
     active &= (box[0] <= box[2]) & (box[1] <= box[3])
 
@@ -102,7 +103,7 @@ def set_up(corners: Corners, height: int, width: int) -> Triangles:
     # det is twice the area in NDC times the product of the w, where all of them are positive.
     w3 = corners[0].w * corners[1].w * corners[2].w
     before = (corners[0].w > 0) & (corners[1].w > 0) & (corners[2].w > 0)
-    area = dr.abs(module.Float(det)) * (width * height / 8) / dr.select(before, w3, 1)
+    area = dr.abs(module.Float(det)) * float_input(module, "pixels", width * height / 8) / dr.select(before, w3, 1)
     fragments = dr.select(before, dr.minimum(area + (columns + rows), columns * rows), columns * rows)
     a, b, c = (module.Array4f(*values) for values in coefficients)
     return Triangles(a, b, c, lambda: (lines, det), box, active, fragments, height, width)
@@ -120,16 +121,28 @@ def edge_lines(corners: Corners) -> tuple[list[Line], Float64]:
     return lines, lines[0][0] * xs[0] + lines[0][1] * ys[0] + lines[0][2] * ws[0]
 
 
-def rounding_error(height: int, width: int) -> float:
+def rounding_error(module: ModuleType, height: int, width: int) -> Float:
     """Bound of the error (pixels) of a single-precision edge function anywhere in the image."""
-    return max(width, height) * 3e-7
+    return float_input(module, "larger side", max(width, height) * 3e-7)
 
 
 def centred(
     module: ModuleType, row: UInt32 | Int32 | int, column: UInt32 | Int32 | int, height: int, width: int
 ) -> tuple[Float, Float]:
     """Pixel centres counted from the image centre."""
-    return module.Float(column) + (0.5 - 0.5 * width), module.Float(row) + (0.5 - 0.5 * height)
+    left, top = float_input(module, "width", 0.5 - 0.5 * width), float_input(module, "height", 0.5 - 0.5 * height)
+    return module.Float(column) + left, module.Float(row) + top
+
+
+def exact_centres(
+    module: ModuleType, row: UInt32 | Int32, column: UInt32 | Int32, height: int, width: int
+) -> tuple[Float64, Float64]:
+    """NDC of pixel centres, in double precision."""
+    x, y = (
+        (2 * module.Float64(index) + double_input(module, name, 1 - size)) / double_input(module, name, size)
+        for index, name, size in ((column, "width", width), (row, "height", height))
+    )
+    return x, y
 
 
 def covers(
@@ -151,14 +164,12 @@ def covers(
         exact_lines: returns (lines, det) of the triangle; called within a branch.
     """
     module = backend(values)
-    Float64 = module.Float64
     least = dr.minimum(dr.minimum(values.x, values.y), values.z)
     in_range = (values.w >= -1) & (values.w <= 1)
 
     def exact(row, column):  # noqa: ANN001, ANN202
         lines, det = exact_lines()
-        x = (2 * Float64(column) + (1 - width)) / width
-        y = (2 * Float64(row) + (1 - height)) / height
+        x, y = exact_centres(module, row, column, height, width)
         covered = module.Bool(True)
         for la, lb, lc in lines:
             la, lb, lc = (dr.select(det < 0, -q, q) for q in (la, lb, lc))
@@ -167,7 +178,7 @@ def covers(
             covered &= (value > 0) | ((value == 0) & ((la > 0) | ((la == 0) & (lb > 0))))
         return covered
 
-    undecided = in_range & (dr.abs(least) <= rounding_error(height, width))
+    undecided = in_range & (dr.abs(least) <= rounding_error(module, height, width))
     covered = dr.if_stmt((row, column), undecided, exact, lambda *_: least > 0, mode="symbolic", label="exact edge test")
     return covered & in_range
 
@@ -219,16 +230,16 @@ def _screen_bounds(corners: Corners, height: int, width: int) -> tuple[Float, Fl
         include(q.x, q.y, q.w, crosses)
 
     # Clamp before the conversion to integers: a vertex near the camera plane projects beyond their range.
-    def to_pixel(ndc: Float, size: int) -> Float:
-        pixel = dr.fma(ndc, 0.5 * size, 0.5 * size)
-        return dr.clip(pixel, -2.0, size + 2.0)
+    def to_pixel(ndc: Float, name: str, size: int) -> Float:
+        half = float_input(module, name, 0.5 * size)
+        return dr.clip(dr.fma(ndc, half, half), -2.0, float_input(module, name, size + 2.0))
 
     seen = ~beyond_far & (unbounded | (x_max >= x_min))
     wide = unbounded | ~seen
     return (
-        dr.select(wide, 0, to_pixel(dr.select(wide, 0, x_min), width)),
-        dr.select(wide, 0, to_pixel(dr.select(wide, 0, y_min), height)),
-        dr.select(wide, width, to_pixel(dr.select(wide, 0, x_max), width)),
-        dr.select(wide, height, to_pixel(dr.select(wide, 0, y_max), height)),
+        dr.select(wide, 0, to_pixel(dr.select(wide, 0, x_min), "width", width)),
+        dr.select(wide, 0, to_pixel(dr.select(wide, 0, y_min), "height", height)),
+        dr.select(wide, float_input(module, "width", width), to_pixel(dr.select(wide, 0, x_max), "width", width)),
+        dr.select(wide, float_input(module, "height", height), to_pixel(dr.select(wide, 0, y_max), "height", height)),
         seen,
     )

@@ -10,6 +10,7 @@ import drjit as dr
 import numpy as np
 
 from ..jit.arrays import backend
+from ..jit.kernel_inputs import quotient, split, uint_input
 from ..jit.types import Bool, Float, Float64, UInt32, Vector4f
 
 #: Edge functions and depth planes of triangles: coefficients a, b, c, four numbers a triangle each.
@@ -61,16 +62,19 @@ class RasterOutput:
             triangle: valid index where ``active``.
         """
         Array4f = backend(self.records[0]).Array4f
-        index = image * self.face_count + triangle
+        index = self._record(image, triangle)
         a, b, c = (dr.gather(Array4f, record, index, active) for record in self.records)
         return a, b, c
 
     def depth_plane(self, image: UInt32, triangle: UInt32, active: Bool | bool = True) -> tuple[Float, Float, Float]:
         """NDC depth plane alone, the last component of :func:`edge_functions`: (dx, dy, d). Detached."""
         Float = backend(self.records[0]).Float
-        index = 4 * (image * self.face_count + triangle) + 3
+        index = 4 * self._record(image, triangle) + 3
         dx, dy, d = (dr.gather(Float, record, index, active) for record in self.records)
         return dx, dy, d
+
+    def _record(self, image: UInt32, triangle: UInt32) -> UInt32:
+        return image * uint_input(backend(triangle), "faces", self.face_count) + triangle
 
     @property
     def valid(self) -> Bool:
@@ -99,24 +103,17 @@ def check_range(faces: UInt32, count: int, what: str) -> None:
         raise ValueError(f"faces refer to {what} {largest}, but there are only {count}")
 
 
-def by_image(index: UInt32, size: int, batch: int) -> tuple[UInt32, UInt32]:
-    """(image of the batch, index within that image) of an index below ``batch * size``.
-
-    For a batch of one image the image index is a constant 0. Kernels then hold no division and no mesh size, and so serve other
-    meshes, too.
-    """
-    if batch == 1:
-        return type(index)(0), index
-    image = index // size
-    return image, index - image * size
+def by_pixel(index: UInt32, batch: int, height: int, width: int) -> tuple[UInt32, UInt32, UInt32]:
+    """(image of the batch, row, column) of pixels, from their indices in a flat row-major batch of images."""
+    row_flat = quotient(index, "width", width)
+    image, row = split(row_flat, "height", height, batch)
+    return image, row, index - row_flat * uint_input(backend(index), "width", width)
 
 
 def pixel_coordinates(module: ModuleType, batch: int, height: int, width: int) -> tuple[UInt32, UInt32, UInt32]:
     """Image index, row and column (``UInt32``) of every entry of a flat row-major batch of images."""
     index = dr.arange(module.UInt32, batch * height * width)
-    row_flat = index // width
-    image, row = by_image(row_flat, height, batch)
-    return image, row, index - row_flat * width
+    return by_pixel(index, batch, height, width)
 
 
 def zeros(module: ModuleType, size: int, count: int) -> list[Float]:

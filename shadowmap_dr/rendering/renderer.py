@@ -17,6 +17,7 @@ from ..jit.call_data import rewrite_scalars
 from ..jit.frozen import take_apart
 from ..jit.gpu import keep_registers
 from ..jit.kernel_cache import note_size
+from ..jit.kernel_inputs import shared_inputs
 from ..jit.pytree import tree_map
 from ..jit.types import Bool, Float, Point3f, TensorXf
 from ..raster import Topology, build_topology, outward_faces
@@ -217,6 +218,7 @@ class Renderer:
         """The same renderer with the scene's current vertices, lights and sensors, attached where they carry gradients."""
         return self.with_data(refresh(self.data))
 
+    @shared_inputs()
     def render(
         self,
         vertex_positions: Mapping[str, Any] | None = None,

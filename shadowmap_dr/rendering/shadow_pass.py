@@ -12,6 +12,7 @@ import numpy as np
 
 from ..errors import ShadowmapError
 from ..jit.arrays import device_array
+from ..jit.kernel_inputs import split
 from ..jit.types import Bool, Float, Point3f, UInt32, Vector3f
 from ..raster import RasterOutput, Topology
 from ..scene.geometry import Geometry, rows_of
@@ -207,11 +208,11 @@ def _culled(plan: MapPlan, count: int, outward: Bool | None) -> Bool | None:
         return outward
     faces = dr.width(outward)
     lane = dr.arange(mi.UInt32, count * faces)
-    which = lane // faces
+    which, face = split(lane, "faces", faces, count)
     chosen = mi.Bool(False)
     for first in directional:
         chosen |= which == first
-    return chosen & dr.gather(mi.Bool, outward, lane - which * faces)
+    return chosen & dr.gather(mi.Bool, outward, face)
 
 
 def _views(plan: MapPlan, light: Light, kind: str, settings: ShadowSettings) -> tuple[LightView, ...]:

@@ -14,7 +14,9 @@ import drjit as dr
 import mitsuba as mi
 
 from ..errors import ShadowmapError
+from ..jit.arrays import backend
 from ..jit.broadcast import broadcast_differentiable
+from ..jit.kernel_inputs import float_input, split
 from ..jit.types import Float, Matrix4f, Point2f, Point3f, Vector3f
 from .mitsuba_objects import children, parameters
 from .pixel_filter import Filter
@@ -168,9 +170,7 @@ class Sensor:
         ``width`` and ``height`` ask for another grid over the same window (supersampling).
         """
         width, height = width or self.width, height or self.height
-        index = dr.arange(mi.UInt32, width * height)
-        ndc_x = (mi.Float(index % width) + 0.5) * (2.0 / width) - 1.0
-        ndc_y = (mi.Float(index // width) + 0.5) * (2.0 / height) - 1.0
+        ndc_x, ndc_y = _pixel_centres(width, height)
         if self.kind == "orthographic":
             return dr.select(mi.Bool(True), self.direction, dr.zeros(mi.Vector3f, width * height))
         projection = self.projection
@@ -188,10 +188,7 @@ class Sensor:
                 (orthographic), or with a unit component along the viewing axis (perspective).
             pixel: Float (1,), height of a pixel, world units, at unit distance along a perspective camera's axis. Detached.
         """
-        index = dr.arange(mi.UInt32, width * height)
-        row = index // width
-        ndc_x = (mi.Float(index - row * width) + 0.5) * (2.0 / width) - 1.0
-        ndc_y = (mi.Float(row) + 0.5) * (2.0 / height) - 1.0
+        ndc_x, ndc_y = _pixel_centres(width, height)
         projection, linear = self.projection, mi.Matrix3f(self.to_world.matrix)
         column = 2 if self.kind == "perspective" else 3
         across, down = linear @ mi.Vector3f(dr.rcp(projection[0, 0]), 0, 0), linear @ mi.Vector3f(0, dr.rcp(projection[1, 1]), 0)
@@ -204,13 +201,22 @@ class Sensor:
             fixed = self.direction
         # Twelve numbers that all pixels share: evaluated once, and one kernel sums their derivatives over the pixels.
         parts = (fixed, mi.Vector3f(centre), mi.Vector3f(across), mi.Vector3f(down))
-        pixel = dr.norm(dr.detach(parts[3])) * (2.0 / height)
+        pixel = dr.norm(dr.detach(parts[3])) * float_input(backend(parts[3]), "height", 2.0 / height)
         dr.eval(parts, pixel)
         fixed, centre, across, down = broadcast_differentiable(parts, width * height)
         varying = dr.fma(across, ndc_x, dr.fma(down, ndc_y, centre))
         if self.kind == "perspective":
             return mi.Point3f(fixed), varying, pixel
         return mi.Point3f(varying), fixed, pixel
+
+
+def _pixel_centres(width: int, height: int) -> tuple[Float, Float]:
+    """Normalized device coordinates (-1 to 1) of all pixel centres, row-major, row 0 at -1."""
+    index = dr.arange(mi.UInt32, width * height)
+    module = backend(index)
+    row, column = split(index, "width", width, height)
+    x, y = (mi.Float(place) + 0.5 for place in (column, row))
+    return x * float_input(module, "width", 2.0 / width) - 1.0, y * float_input(module, "height", 2.0 / height) - 1.0
 
 
 def lenses_of(sensor: mi.Sensor) -> list[str]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import drjit as dr
 
 from ..jit.arrays import backend
+from ..jit.kernel_inputs import split
 from ..jit.types import Bool, Float, Normal3f, Point3f, UInt32
 from .light_camera import Views, of_map
 
@@ -76,8 +77,7 @@ def casting_shapes(
         dr.eval(normal, point, planar)
         reach = _reach(normal, point, boxes)
         index = dr.arange(module.UInt32, views.count * shapes)
-        which = index // shapes
-        shape = index - which * shapes
+        which, shape = split(index, "shapes", shapes, views.count)
         view = of_map(views, which, views.count)
         n, p = (module.Array3f(*(dr.gather(module.Float, v[c], shape) for c in range(3))) for v in (normal, point))
         above = dr.dot(n, dr.select(view.spread > 0, view.origin - p, -view.forward)) > 0
@@ -94,8 +94,7 @@ def _reach(normal: Normal3f, point: Point3f, boxes: Boxes) -> Float:
     module, shapes = backend(boxes.low), boxes.count
     Float = module.Float
     pair = dr.arange(module.UInt32, shapes * shapes)
-    own = pair // shapes
-    other = pair - own * shapes
+    own, other = split(pair, "shapes", shapes, shapes)
     sizes = [dr.max(dr.gather(module.Array3f, dr.ravel(boxes.high - boxes.low), which)) for which in (own, other)]
     before, behind, extent, far, stands = Float(0), Float(0), Float(0), Float(0), module.Bool(True)
     for c in range(3):

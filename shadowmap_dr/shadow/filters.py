@@ -9,6 +9,7 @@ import drjit as dr
 import numpy as np
 
 from ..jit.arrays import backend, ravel
+from ..jit.kernel_inputs import int_input, quotient, shared_inputs, split
 from ..jit.types import AnyArray, Float, Int32
 
 FILTERS = ("box", "gaussian", "wendland", "none")
@@ -94,9 +95,11 @@ class _Convolve(dr.CustomOp):
         self.arguments = (weights, axis, shape)
         return _convolve(values, *self.arguments, transpose=False)
 
+    @shared_inputs()
     def forward(self) -> None:
         self.set_grad_out(_convolve(cast("Float", self.grad_in("values")), *self.arguments, transpose=False))
 
+    @shared_inputs()
     def backward(self) -> None:
         self.set_grad_in("values", _convolve(cast("Float", self.grad_out()), *self.arguments, transpose=True))
 
@@ -116,11 +119,14 @@ def _convolve(values: Float, weights: list[float], axis: int, shape: tuple[int, 
     packet = {1: module.Float, 2: module.Array2f, 4: module.Array4f}[channels]
     n, stride = (height, width) if axis == 0 else (width, parts)
     lane = dr.arange(module.UInt32, maps * height * width * parts)
-    at = module.Int32((lane // stride) % n)
+    # Rows above each other, or the packets of a texel: both are strides to the neighbours on the axis.
+    _, place = split(quotient(lane, "stride", stride), "length", n, dr.width(lane) // (stride * n))
+    at, step = module.Int32(place), int_input(module, "stride", stride)
+    last = int_input(module, "length", n - 1)
 
     def read(k: int) -> AnyArray:
-        clamped = dr.clip(at + k, 0, n - 1)
-        return dr.gather(packet, values, module.UInt32(module.Int32(lane) + (clamped - at) * stride))
+        clamped = dr.clip(at + k, 0, last)
+        return dr.gather(packet, values, module.UInt32(module.Int32(lane) + (clamped - at) * step))
 
     total = _weighted(read, at, n, weights, transpose)
     return cast("Float", total) if channels == 1 else ravel(total)
@@ -131,14 +137,15 @@ def _convolve_pairs(values: Float, weights: list[float], rows: int, width: int, 
     module = backend(values)
     Int32, UInt32 = module.Int32, module.UInt32
     lane = dr.arange(UInt32, rows * width // 2)
-    at = Int32(2 * (lane % (width // 2)))
+    _, pair = split(lane, "pairs", width // 2, rows)
+    at, last = Int32(2 * pair), int_input(module, "length", width - 1)
     own = dr.gather(module.Array4f, values, lane)
     texels = {0: module.Array2f(own.x, own.y), 1: module.Array2f(own.z, own.w)}
 
     def read(k: int) -> AnyArray:
         """The texel k columns from the first of the lane's two texels."""
         if k not in texels:
-            texels[k] = dr.gather(module.Array2f, values, UInt32(2 * Int32(lane) + (dr.clip(at + k, 0, width - 1) - at)))
+            texels[k] = dr.gather(module.Array2f, values, UInt32(2 * Int32(lane) + (dr.clip(at + k, 0, last) - at)))
         return texels[k]
 
     first = _weighted(read, at, width, weights, transpose)
@@ -150,18 +157,19 @@ def _weighted(read: Callable[[int], AnyArray], at: Int32, n: int, weights: list[
     """Sum over the taps. ``read(k)``: texels k places from ``at`` (0 to n - 1), clamped to the border."""
     module = backend(at)
     radius = len(weights) // 2
+    size = int_input(module, "length", n)
 
     def tap(k: int) -> AnyArray:
         weight = module.Float(weights[k + radius])
         if transpose:
             # The forward pass reads border texels for taps beyond the border: the adjoints of these taps go to border lanes.
             source = at - k
-            inside = (source >= 0) & (source < n)
+            inside = (source >= 0) & (source < size)
             weight = dr.select(inside, weight, 0)
             for j in range(-radius, radius + 1):
                 w = weights[j + radius]
                 weight += dr.select(inside & (at == 0) & (source + j < 0), w, 0)
-                weight += dr.select(inside & (at == n - 1) & (source + j > n - 1), w, 0)
+                weight += dr.select(inside & (at == size - 1) & (source + j > size - 1), w, 0)
         return read(-k if transpose else k) * weight
 
     total = tap(-radius)

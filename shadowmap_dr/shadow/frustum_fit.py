@@ -8,6 +8,7 @@ from typing import TypeAlias
 import drjit as dr
 
 from ..jit.arrays import backend
+from ..jit.kernel_inputs import float_input, quotient, split
 from ..jit.types import Bool, Float, Point3f, UInt32
 from .light_camera import Frusta, Views, of_map, to_light_space
 
@@ -102,7 +103,7 @@ def fit_frusta(
         views = dr.detach(views)
         module = backend(views.spread)
         index = dr.arange(module.UInt32, views.count * shape_count)
-        map_index = index // shape_count
+        map_index = quotient(index, "shapes", shape_count)
         extent = bounds.of(index)
         casts &= ~(of_map(views, map_index, views.count).spread > 0) | (extent[5] > 0)
         window = _window(views, seen)
@@ -130,10 +131,9 @@ def _window(views: Views, seen: tuple[Point3f, Bool] | None) -> Extent:
     points, active = seen
     count = dr.width(points)
     lane = dr.arange(module.UInt32, views.count * count)
-    map_index = lane // count
+    map_index, source = split(lane, "points", count, views.count)
     view = of_map(views, map_index, views.count)
     if views.count > 1:
-        source = lane - map_index * count
         points = module.Array3f(*(dr.gather(module.Float, points[c], source) for c in range(3)))
         active = dr.gather(module.Bool, module.Bool(active), source)
     point = module.Array3f(points)
@@ -193,7 +193,7 @@ def _fit(
 
     def widen(lo: Float, hi: Float) -> tuple[Float, Float]:
         half = 0.5 * (hi - lo)
-        grown = half * max(1 + 2 * _MARGIN, 1 / (1 - 2 * (filter_size / 2 + 2) / resolution))
+        grown = half * float_input(module, "texels", max(1 + 2 * _MARGIN, 1 / (1 - 2 * (filter_size / 2 + 2) / resolution)))
         middle = 0.5 * (lo + hi)
         lo, hi = dr.maximum(middle - grown, -views.limit), dr.minimum(middle + grown, views.limit)
         limited = dr.isfinite(views.limit)
@@ -205,7 +205,7 @@ def _fit(
 
 def _still_fits(views: Views, old: Frusta, new: Frusta, needed: tuple[Float, ...], resolution: int, filter_size: int) -> Bool:
     x0, y0, x1, y1, z0, z1, receivers = needed
-    room = 2 * (filter_size / 2 + 1) / resolution
+    room = float_input(backend(views.spread), "texels", 2 * (filter_size / 2 + 1) / resolution)
 
     def holds(lo: Float, hi: Float, center: Float, half: Float) -> Bool:
         # A map that reaches its limit needs no margin there.

@@ -16,6 +16,7 @@ import drjit as dr
 
 from ..jit.arrays import backend
 from ..jit.broadcast import from_one_buffer, look_up
+from ..jit.kernel_inputs import float_input, split
 from ..jit.types import AnyArray, Bool, Float, Point3f, UInt32, Vector3f, Vector4f
 from ..jit.vectors import unit
 
@@ -127,7 +128,8 @@ def spot_view(position: Point3f, right: Vector3f, up: Vector3f, forward: Vector3
 def cube_views(position: Point3f, resolution: int, filter_size: int) -> tuple[LightView, ...]:
     """Six views along the world axes, each slightly wider than 90 degrees, so that filters at a face's edge see its neighbour."""
     vector, scalar = type(position), type(position[0])
-    spread = scalar(CUBE_FACE / (1.0 - 2.0 * (filter_size // 2 + 1) / resolution))
+    wider = CUBE_FACE / (1.0 - 2.0 * (filter_size // 2 + 1) / resolution)
+    spread = scalar(float_input(backend(position), "texels", wider))
 
     def axis(k: int, sign: float) -> Vector3f:
         return vector(*(scalar(sign if c == k else 0.0) for c in range(3)))
@@ -212,8 +214,9 @@ def vertices_in_maps(views: Views, positions: Float) -> tuple[Point3f, UInt32, U
     module, count = backend(positions), views.count
     number = dr.width(positions) // 3
     lane = dr.arange(module.UInt32, count * number)
-    map_index = lane // number if count > 1 else dr.zeros(module.UInt32, number)
-    vertex = lane - map_index * number
+    map_index, vertex = split(lane, "vertices", number, count)
+    if count == 1:
+        map_index = dr.zeros(module.UInt32, number)
     p_world = dr.gather(module.Array3f, positions, vertex)
     return to_light_space(of_map(views, map_index, count), p_world), map_index, vertex
 

@@ -8,6 +8,7 @@ from typing import TypeAlias
 import drjit as dr
 
 from ..jit.arrays import backend
+from ..jit.kernel_inputs import float_input, quotient, uint_input
 from ..jit.types import Float, Point3f, UInt32, Vector3f
 from ..raster import NO_TRIANGLE, NO_VERTEX, Crossings, RasterOutput
 from ..raster.antialiasing.neighbour_weights import incoming_weights, weight_sum
@@ -92,7 +93,7 @@ class TangentTexels:
         own, changes = list(result[: len(free)]), list(result[len(free) :])
         if crossings is None or rates is None:
             return interleaved(own), interleaved(changes)
-        incoming = incoming_weights(crossings, size)
+        incoming, side = incoming_weights(crossings, size), uint_input(module, "width", size)
         channels = len(own)
 
         def mix(texel: UInt32, image: UInt32, row: UInt32, column: UInt32, *lanes: Float) -> tuple[Float, ...]:
@@ -101,11 +102,11 @@ class TangentTexels:
             scale = dr.rcp(dr.maximum(1, claims))
             # For the right, lower, left and upper neighbour: row and column offset; the texel and direction whose pair holds the
             # weight; the sign of the weight if the neighbour reaches into this texel.
-            steps = ((0, 1, texel, 0, -1), (1, 0, texel, 1, -1), (0, -1, texel - 1, 0, 1), (-1, 0, texel - size, 1, 1))
-            others = []
-            for weight, (down, right, *_) in zip(incoming, steps, strict=True):
+            steps = ((0, 1, texel, 0, -1), (1, 0, texel, 1, -1), (0, -1, texel - 1, 0, 1), (-1, 0, texel - side, 1, 1))
+            others, places = [], (texel + 1, texel + side, texel - 1, texel - side)
+            for weight, place, (down, right, *_) in zip(incoming, places, steps, strict=True):
                 there = weight > 0
-                triangle = dr.gather(module.UInt32, self.raster.triangle, _moved(texel, down * size + right), there)
+                triangle = dr.gather(module.UInt32, self.raster.triangle, place, there)
                 triangle = dr.select(there, triangle, NO_TRIANGLE)
                 others.append(self._own(image, _moved(row, down), _moved(column, right), triangle))
             mixed = [
@@ -145,8 +146,8 @@ class TangentTexels:
         seen = depth_at(self.planes, image * self.raster.face_count + triangle, row, column, hit)
         texels = texel_depths(seen, hit, view, frustum, self.settings)
         n, f = frustum.near, frustum.far
-        ndc_x = dr.fma(module.Float(column), 2.0 / size, 1.0 / size - 1.0)
-        ndc_y = dr.fma(module.Float(row), 2.0 / size, 1.0 / size - 1.0)
+        step, start, half_side = (float_input(module, "width", value) for value in (2.0 / size, 1.0 / size - 1.0, 0.5 * size))
+        ndc_x, ndc_y = dr.fma(module.Float(column), step, start), dr.fma(module.Float(row), step, start)
         # The light-space point that the texel sees, and the slopes of its triangle there.
         half_range = 0.5 * (f - n)
         p = (
@@ -154,8 +155,8 @@ class TangentTexels:
             dr.fma(ndc_y, frustum.half_y, frustum.center_y),
             dr.fma(texels.seen, half_range, 0.5 * (f + n)),
         )
-        slope_x = texels.dx * half_range * (0.5 * size) / frustum.half_x
-        slope_y = texels.dy * half_range * (0.5 * size) / frustum.half_y
+        slope_x = texels.dx * half_range * half_side / frustum.half_x
+        slope_y = texels.dy * half_range * half_side / frustum.half_y
         # Depths before the resolved range are constant.
         scale = dr.select(texels.shown & (texels.depth > -0.5), dr.rcp(f - frustum.first), 0)
         # The texel stays in place while the triangle moves through it.
@@ -197,7 +198,8 @@ def weight_rates(clip: Float, crossings: Crossings, frusta: Frusta, twist: Float
         a, b = (dr.gather(Array4f, clip, v, has) for v in (ends.x, ends.y))
         at = dr.fma(b - a, slope.x, a)
         pixel = pair >> 1
-        frustum, own = of_map(frusta, pixel // (size * size), count), dr.gather(module.Float, twist, pixel // (size * size))
+        image = quotient(pixel, "texels of a map", size * size)
+        frustum, own = of_map(frusta, image, count), dr.gather(module.Float, twist, image)
         n, f = frustum.near, frustum.far
         p = (
             dr.fma(at.x, frustum.half_x, frustum.center_x),

@@ -18,6 +18,7 @@ from typing import Any
 import drjit as dr
 
 from ..jit.arrays import backend, ravel
+from ..jit.kernel_inputs import float_input, split
 from ..jit.types import Bool, Float, Point3f, UInt32
 from ..raster import Topology, find_crossings, visible_triangles
 from .filters import filter_kernel, filter_map, separable_terms
@@ -77,8 +78,7 @@ def tangent_maps(
         count, size = views.count, settings.resolution * settings.supersampling
         vertices = dr.width(p_world)
         lane = dr.arange(module.UInt32, count * vertices)
-        index = lane // vertices
-        vertex = lane - index * vertices
+        index, vertex = split(lane, "vertices", vertices, count)
         point = module.Array3f(*(dr.gather(module.Float, p_world[c], vertex) for c in range(3)))
         view = of_map(views, index, count)
         clip = ravel(to_clip(view, of_map(frusta, index, count), to_light_space(view, point)))
@@ -134,14 +134,14 @@ def tangent_visibility(maps: TangentMaps, map_index: UInt32, p_world: Point3f, a
 
     def look_up(index, u, v, depth, *moves):  # noqa: ANN001, ANN002, ANN202
         # Beyond the centres of the outermost texels, look-ups are constant.
-        end = 1 - 1 / settings.resolution
+        end = float_input(module, "texels", 1 - 1 / settings.resolution)
         rates = [dr.select(dr.abs(u if k % 3 == 0 else v) > end, 0, m) if k % 3 < 2 else m for k, m in enumerate(moves)]
         at, channels = Texels(maps.maps, index, dr.clip(u, -end, end), dr.clip(v, -end, end)), maps.maps.channels
         (values, by_u, by_v), (own, _, _) = (_filtered(at, *numbers, *maps.taps) for numbers in (
             (maps.maps.values, channels), (maps.tangents, 2 * channels)
         ))  # fmt: skip
         # Texture coordinates are in texels.
-        half = 0.5 * settings.resolution
+        half = float_input(module, "texels", 0.5 * settings.resolution)
         value, slopes, slope_depth = _with_gradient(resolve, values, depth)
         result = [value]
         for k in range(2):

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..jit.arrays import backend
 from ..jit.broadcast import copy_of_lane
+from ..jit.kernel_inputs import float_input, int_input, uint_input
 from ..jit.types import AnyArray, Bool, Float, Point3f, UInt32
 from .filters import filter_kernel, separable_terms
 from .light_camera import of_map, project, to_light_space
@@ -73,8 +74,9 @@ def _compare(maps: ShadowMaps, map_index: UInt32, u: Float, v: Float, depth: Flo
     """One comparison with the nearest texel."""
     module = backend(maps.values)
     size = maps.settings.resolution
-    column, row = (module.UInt32(dr.clip((x * 0.5 + 0.5) * size, 0, size - 1)) for x in (u, v))
-    stored = dr.gather(module.Float, maps.values, (map_index * size + row) * size + column)
+    texels, last = uint_input(module, "texels", size), float_input(module, "texels", size - 1)
+    column, row = (module.UInt32(dr.clip((x * 0.5 + 0.5) * texels, 0, last)) for x in (u, v))
+    stored = dr.gather(module.Float, maps.values, (map_index * texels + row) * texels + column)
     return standard_visibility(stored, depth, maps.settings.bias)
 
 
@@ -120,13 +122,14 @@ class Texels:
 
     def __init__(self, maps: ShadowMaps, map_index: UInt32, u: Float, v: Float, active: Bool | bool = True) -> None:
         module = backend(maps.values)
-        self.size = size = maps.settings.resolution
-        x = dr.select(active, dr.fma(u, 0.5 * size, 0.5 * size - 0.5), 0)
-        y = dr.select(active, dr.fma(v, 0.5 * size, 0.5 * size - 0.5), 0)
+        size = maps.settings.resolution
+        self.size = int_input(module, "texels", size)
+        half, middle = float_input(module, "texels", 0.5 * size), float_input(module, "texels", 0.5 * size - 0.5)
+        x, y = (dr.select(active, dr.fma(place, half, middle), 0) for place in (u, v))
         x0, y0 = dr.floor(dr.detach(x)), dr.floor(dr.detach(y))
         self.fx, self.fy = x - x0, y - y0
         self.column, self.row = module.Int32(x0), module.Int32(y0)
-        self.base = module.Int32(map_index) * (size * size)
+        self.base = module.Int32(map_index) * (self.size * self.size)
 
     def index(self, i: int, j: int) -> UInt32:
         """Index of the texel i columns and j rows from the upper left neighbour; the border is replicated."""

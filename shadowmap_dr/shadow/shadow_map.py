@@ -9,6 +9,7 @@ import drjit as dr
 
 from ..jit.arrays import backend, ravel
 from ..jit.broadcast import in_copies
+from ..jit.kernel_inputs import float_input, quotient, uint_input
 from ..jit.types import Bool, Float, Point3f, UInt32
 from ..raster import RasterOutput, Topology, antialias, visible_triangles
 from ..raster.screen_planes import pixel_depth
@@ -185,14 +186,16 @@ def block_means(values: Float, size: int, channels: int, factor: int) -> Float:
     dr.eval(values)
     index = dr.arange(module.UInt32, dr.width(values) // factor**2)
     texel = index // channels
-    row = texel // (size // factor)  # of the whole batch: maps lie below each other
-    column = texel - row * (size // factor)
-    first = (row * factor * size + column * factor) * channels + (index - texel * channels)
+    # Rows of the whole batch: maps lie below each other.
+    row = quotient(texel, "blocks", size // factor)
+    column = texel - row * uint_input(module, "blocks", size // factor)
+    width = uint_input(module, "width", size)
+    first = (row * factor * width + column * factor) * channels + (index - texel * channels)
     total = module.Float(0)
     for j in range(factor):
         for i in range(factor):
             # Each number is read once here, so that the backward pass needs no atomics. Other operations may read it, too.
-            total += dr.gather(module.Float, values, first + (j * size + i) * channels, mode=dr.ReduceMode.NoConflicts)
+            total += dr.gather(module.Float, values, first + (j * width + i) * channels, mode=dr.ReduceMode.NoConflicts)
     return total * (1 / factor**2)
 
 
@@ -211,8 +214,9 @@ def _radial_depth(view: Views, frustum: Frusta, raster: RasterOutput, row: UInt3
     perspective = view.spread > 0
     z = dr.select(perspective, raster.w, dr.fma(0.5 * raster.depth + 0.5, frustum.far - frustum.near, frustum.near))
     scale = dr.select(perspective, z, 1.0)
-    x = dr.fma((2 * module.Float(column) + (1 - size)) / size, frustum.half_x, frustum.center_x) * scale
-    y = dr.fma((2 * module.Float(row) + (1 - size)) / size, frustum.half_y, frustum.center_y) * scale
+    side, start = float_input(module, "width", size), float_input(module, "width", 1 - size)
+    x = dr.fma((2 * module.Float(column) + start) / side, frustum.half_x, frustum.center_x) * scale
+    y = dr.fma((2 * module.Float(row) + start) / side, frustum.half_y, frustum.center_y) * scale
     return dr.sqrt(dr.fma(x, x, dr.fma(y, y, z * z)))
 
 
@@ -220,7 +224,11 @@ def _slope_square(view: Views, frustum: Frusta, linear: Float, slopes: list[Floa
     """Squared change of linear depth across a texel, given its change along both axes."""
     n, f = frustum.first, frustum.far
     # The side of a texel in units of depth.
-    texel = dr.select(view.spread > 0, dr.fma(linear + 0.5, f - n, n), 1.0) * (2 / size) / (f - n)
+    texel = (
+        dr.select(view.spread > 0, dr.fma(linear + 0.5, f - n, n), 1.0)
+        * float_input(backend(linear), "width", 2 / size)
+        / (f - n)
+    )
     sx = dr.minimum(dr.abs(slopes[0]), _MAX_SLOPE * texel * frustum.half_x)
     sy = dr.minimum(dr.abs(slopes[1]), _MAX_SLOPE * texel * frustum.half_y)
     return sx * sx + sy * sy

@@ -8,6 +8,7 @@ from typing import cast
 import drjit as dr
 
 from ...jit.arrays import backend, reinterpret
+from ...jit.kernel_inputs import shared_inputs, uint_input
 from ...jit.types import AnyArray, Bool, Float, UInt32, Vector4f
 from ..topology import NO_VERTEX
 from ..types import RasterOutput
@@ -59,12 +60,14 @@ class _Blend(dr.CustomOp):
         self.wanted, self.vertices = wanted, dr.width(positions)
         return self.mixer.values
 
+    @shared_inputs()
     def forward(self) -> None:
         values = cast("Float | list[Float]", self.grad_in("values")) if self.wanted[0] else None
         positions = cast("Float", self.grad_in("positions")) if self.wanted[1] else None
         dr.eval(values, positions)
         self.set_grad_out(self.mixer.tangent(values, positions))
 
+    @shared_inputs()
     def backward(self) -> None:
         adjoint = cast("Float", self.grad_out())
         dr.eval(adjoint)
@@ -249,7 +252,7 @@ class Mixer:
 
     def _neighbour(self, pixel: UInt32, down: Bool) -> UInt32:
         """The second pixel of a pair."""
-        return pixel + dr.select(down, self.module.UInt32(self.width), 1)
+        return pixel + dr.select(down, uint_input(self.module, "width", self.width), 1)
 
     def _is_first(self, shares: Sequence[Float], second: Bool, down: Bool) -> Bool:
         """True if no earlier pair around the pixel has a share; the pixel is the pair's second one if ``second``, else its first.
@@ -364,7 +367,8 @@ class Mixer:
 
     def neighbours(self, pixel: UInt32) -> tuple[UInt32, UInt32, UInt32, UInt32]:
         """Indices of the right, lower, left and upper neighbours."""
-        return pixel + 1, pixel + self.width, pixel - 1, pixel - self.width
+        width = uint_input(self.module, "width", self.width)
+        return pixel + 1, pixel + width, pixel - 1, pixel - width
 
     def around(
         self, right: Float, down: Float, sign: int, signed: bool = False, at: UInt32 | None = None

@@ -15,10 +15,11 @@ from dataclasses import dataclass
 import drjit as dr
 
 from ...jit.arrays import backend
+from ...jit.kernel_inputs import double_input, uint_input
 from ...jit.types import Bool, Float, UInt32
 from ..topology import Topology
-from ..triangle_setup import edge_lines, gather_triangle
-from ..types import NO_TRIANGLE, RasterOutput, by_image
+from ..triangle_setup import edge_lines, exact_centres, gather_triangle
+from ..types import NO_TRIANGLE, RasterOutput, by_pixel
 from .creases import CoplanarCreases, touching
 
 
@@ -89,7 +90,7 @@ class Surroundings:
         """
         module = backend(place)
         own, other = read(taker, active), read(giver, active)
-        step = dr.select(down, module.UInt32(self.width), 1)
+        step = dr.select(down, uint_input(module, "width", self.width), 1)
         forward = giver > taker
         slopes = []
         for near, values, sign in ((taker, own, -1), (giver, other, 1)):
@@ -106,10 +107,10 @@ class Surroundings:
 
     def _inside(self, pixel: UInt32, down: Bool, ahead: Bool, active: Bool | bool) -> Bool:
         """True if the next pixel to the right (left, if not ``ahead``) or below (above) belongs to the same image."""
-        UInt32 = backend(pixel).UInt32
-        row_flat = pixel // self.width
-        at = dr.select(down, row_flat % self.height, pixel - row_flat * self.width)
-        last = dr.select(down, UInt32(self.height), self.width) - 1
+        module = backend(pixel)
+        _, row, column = by_pixel(pixel, self.batch, self.height, self.width)
+        at = dr.select(down, row, column)
+        last = dr.select(down, uint_input(module, "height", self.height - 1), uint_input(module, "width", self.width - 1))
         return dr.select(ahead, at < last, at > 0) & active
 
     def _steady(
@@ -165,18 +166,16 @@ class Surroundings:
         """
         module = backend(pixel)
         Float64 = module.Float64
-        row_flat = pixel // self.width
-        image, row = by_image(row_flat, self.height, self.batch)
-        corners = gather_triangle(self.positions, self.topology.faces, triangle, image * self.vertex_count, True)
-        lines, det = edge_lines(corners)
-        size_x, size_y = self.width, self.height
-        x = (2 * Float64(pixel - row_flat * size_x) + (1 - size_x)) / size_x
-        y = (2 * Float64(row) + (1 - size_y)) / size_y
+        image, row, column = by_pixel(pixel, self.batch, self.height, self.width)
+        first = image * uint_input(module, "vertices", self.vertex_count)
+        lines, det = edge_lines(gather_triangle(self.positions, self.topology.faces, triangle, first, True))
+        x, y = exact_centres(module, row, column, self.height, self.width)
+        per_column, per_row = double_input(module, "width", 1 / self.width), double_input(module, "height", 1 / self.height)
         sign = dr.select((det < 0) == ahead, 1, -1)
         nearest, edge = Float64(dr.inf), module.UInt32(0)
         for k, (a, b, c) in enumerate(lines):
             # Distance from the edge opposite to a corner, in any unit, and its decrease along the ray.
-            value, rate = dr.abs(dr.fma(a, x, dr.fma(b, y, c))), sign * dr.select(down, b / size_y, a / size_x)
+            value, rate = dr.abs(dr.fma(a, x, dr.fma(b, y, c))), sign * dr.select(down, b * per_row, a * per_column)
             distance = dr.select(rate > 0, value / rate, dr.inf)
             edge = dr.select(distance < nearest, (k + 1) % 3, edge)
             nearest = dr.minimum(nearest, distance)

@@ -10,7 +10,8 @@ import drjit as dr
 from ...jit.arrays import backend
 from ...jit.types import AnyArray, Bool, Float, UInt32
 from ..topology import NO_VERTEX, Topology
-from ..types import NO_TRIANGLE, RasterOutput
+from ..triangle_setup import centred
+from ..types import NO_TRIANGLE, RasterOutput, by_pixel
 
 #: Ends of a first and of a second edge, and the weights of both.
 FoundCreases: TypeAlias = tuple[UInt32, UInt32, UInt32, UInt32, Float, Float]
@@ -76,9 +77,8 @@ def find_creases(
     near = touching(topology, here, neighbour)
 
     def search(image: UInt32, pixel: UInt32, here: UInt32, neighbour: UInt32, down: Bool) -> FoundCreases:
-        row = pixel // raster.width
-        x = module.Float(pixel - row * raster.width) + (0.5 - 0.5 * raster.width)
-        y = module.Float(row - image * raster.height) + (0.5 - 0.5 * raster.height)
+        _, row, column = by_pixel(pixel, raster.batch, raster.height, raster.width)
+        x, y = centred(module, row, column, raster.height, raster.width)
         corner_out, way_out, depth, slope = _way_out(raster, image, here, x, y, down, 1)
         x, y = dr.select(down, x, x + 1), dr.select(down, y + 1, y)
         corner_in, way_in, other_depth, other_slope = _way_out(raster, image, neighbour, x, y, down, -1)

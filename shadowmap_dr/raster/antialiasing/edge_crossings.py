@@ -8,9 +8,11 @@ from dataclasses import dataclass
 import drjit as dr
 
 from ...jit.arrays import backend
+from ...jit.kernel_inputs import float_input, uint_input
 from ...jit.types import Bool, Float, UInt32, UInt64, Vector4f
 from ..topology import NO_VERTEX, Topology
-from ..types import NO_TRIANGLE, RasterOutput, by_image, zeros
+from ..triangle_setup import centred
+from ..types import NO_TRIANGLE, RasterOutput, by_pixel, zeros
 from .creases import CoplanarCreases, find_creases, touching
 from .pixel_pairs import PairList, differing_pairs, empty_list
 from .silhouettes import BEFORE, register_silhouettes
@@ -132,10 +134,8 @@ def _measure(
 
     def visit(slot: UInt32, pair: UInt32) -> None:
         down, pixel = (pair & 1) != 0, pair >> 1
-        step = dr.select(down, module.UInt32(raster.width), 1)
-        row_flat = pixel // raster.width
-        image, row = by_image(row_flat, raster.height, raster.batch)
-        column = pixel - row_flat * raster.width
+        step = dr.select(down, uint_input(module, "width", raster.width), 1)
+        image, row, column = by_pixel(pixel, raster.batch, raster.height, raster.width)
         key = dr.gather(module.UInt64, keys, pair)
         silhouette = key != 0
         ends = dr.gather(module.Array2u, topology.edges, ~module.UInt32(key & 0xFFFFFFFF), silhouette)
@@ -164,7 +164,7 @@ def _measure(
             here, there = (dr.gather(module.UInt32, raster.triangle, p, bare) for p in (pixel, pixel + step))
             cross = functools.partial(_cut, topology, raster, image, pixel, here, there, down)
             meetings.add(slot, dr.select(bare, here, NO_TRIANGLE), there, soft, cross)
-        first = image * vertex_count
+        first = image * uint_input(module, "vertices", vertex_count)
         a, b, c, d = (dr.select(end == NO_VERTEX, NO_VERTEX, end + first) for end in (a, b, c, d))
         value, slopes = _weight(positions, a, b, raster, row, column, down, weight)
 
@@ -202,13 +202,11 @@ def _cut(
 
     Their planes cross there, and each triangle is seen where it is the nearer one.
     """
-    Float = backend(raster.records[0]).Float
     active &= ~touching(topology, here, there)
     planes = (raster.depth_plane(image, triangle, active) for triangle in (here, there))
     a, b, c = (u - v for u, v in zip(*planes, strict=True))
-    row_flat = pixel // raster.width
-    x = Float(pixel - row_flat * raster.width) + (0.5 - 0.5 * raster.width)
-    y = Float(row_flat - image * raster.height) + (0.5 - 0.5 * raster.height)
+    _, row, column = by_pixel(pixel, raster.batch, raster.height, raster.width)
+    x, y = centred(backend(pixel), row, column, raster.height, raster.width)
     start = dr.fma(a, x, dr.fma(b, y, c))
     return active & (start < 0) & (start + dr.select(down, b, a) > 0)
 
@@ -240,15 +238,14 @@ def _weight(
     Float, Array4f = module.Float, module.Array4f
     has = a != NO_VERTEX
     p, q = (dr.gather(Array4f, positions, v, has) for v in (a, b))
-    width, height = raster.width, raster.height
+    width, height = float_input(module, "width", raster.width), float_input(module, "height", raster.height)
+    x, y = centred(module, row, column, raster.height, raster.width)
     # The pixel line is y = const (x = const for the lower neighbour) in NDC.
     ndc = dr.select(
-        down,
-        dr.fma(Float(column), 2.0 / width, 1.0 / width - 1.0),
-        dr.fma(Float(row), 2.0 / height, 1.0 / height - 1.0),
+        down, x * float_input(module, "width", 2 / raster.width), y * float_input(module, "height", 2 / raster.height)
     )
     p_along, q_along = dr.select(down, p.y, p.x), dr.select(down, q.y, q.x)
-    size = dr.select(down, Float(height), Float(width))
+    size = dr.select(down, height, width)
     dp = dr.fma(-p.w, ndc, dr.select(down, p.x, p.y))
     dq = dr.fma(-q.w, ndc, dr.select(down, q.x, q.y))
     span = dp - dq
@@ -273,7 +270,9 @@ def _weight(
 def _share(p: Vector4f, q: Vector4f, down: Bool, raster: RasterOutput) -> Float:
     """Weight of an edge for horizontal pairs (vertical ones, if ``down``), from the direction of its line in the image."""
     # The line a x + b y + c = 0 in ndc is a (2 / width) x + ... in pixels.
-    nx, ny = (p.y * q.w - q.y * p.w) / raster.width, (q.x * p.w - p.x * q.w) / raster.height
+    module = backend(p)
+    width, height = float_input(module, "width", raster.width), float_input(module, "height", raster.height)
+    nx, ny = (p.y * q.w - q.y * p.w) / width, (q.x * p.w - p.x * q.w) / height
     square = nx * nx + ny * ny
     share = dr.clip(0.5 + (nx * nx - ny * ny) / dr.select(square > 0, square, 1), 0, 1)
     return dr.select(down, 1 - share, share)

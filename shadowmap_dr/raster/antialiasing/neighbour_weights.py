@@ -8,6 +8,7 @@ from typing import cast
 import drjit as dr
 
 from ...jit.arrays import backend
+from ...jit.kernel_inputs import uint_input
 from ...jit.types import Float, UInt32
 from .edge_crossings import Crossings
 
@@ -33,7 +34,8 @@ def around(
     module = backend(right)
     pixel = dr.arange(module.UInt32, dr.width(right)) if at is None else at
     left = dr.gather(module.Float, right, pixel - 1, pixel >= 1)
-    up = dr.gather(module.Float, down, pixel - width, pixel >= width)
+    columns = uint_input(module, "width", width)
+    up = dr.gather(module.Float, down, pixel - columns, pixel >= columns)
     if at is not None:
         right, down = (dr.gather(module.Float, weights, at) for weights in (right, down))
     values = (-sign * right, -sign * down, sign * left, sign * up)

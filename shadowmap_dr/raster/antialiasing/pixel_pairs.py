@@ -11,8 +11,9 @@ from dataclasses import dataclass
 import drjit as dr
 
 from ...jit.arrays import backend, scatter_inc
+from ...jit.kernel_inputs import double_input, uint_input
 from ...jit.types import Bool, UInt32, UInt64
-from ..types import RasterOutput
+from ..types import RasterOutput, by_pixel
 
 # Slots for each lane. Lanes take slots in rounds, so that short lists end after the first round.
 _ROUNDS = 8
@@ -52,7 +53,8 @@ class PairList:
 
     def at(self, slot: UInt32) -> UInt32:
         """The pair in a slot."""
-        index = dr.select(slot < self.front, slot, dr.width(self.pairs) - 1 - (slot - self.front))
+        last = uint_input(backend(slot), "pairs", dr.width(self.pairs) - 1)
+        index = dr.select(slot < self.front, slot, last - (slot - self.front))
         return dr.gather(type(slot), self.pairs, index)
 
 
@@ -63,12 +65,14 @@ def each_number(count: UInt32, lanes: int, visit: Callable[[UInt32], None]) -> N
     runs of lanes, so that all of them are busy even if there are few numbers.
     """
     module = backend(count)
-    UInt64 = module.UInt64
+    Float64 = module.Float64
     packets = -(-lanes // _PACKET)
     lane = dr.arange(module.UInt32, packets * _PACKET)
     packet = lane // _PACKET
     total = (count + (_PACKET - 1)) // _PACKET
-    first, end = (module.UInt32(UInt64(p) * UInt64(total) // packets) * _PACKET for p in (packet, packet + 1))
+    # Rounded to a whole number, for the last packet ends at the total.
+    share = Float64(total) * double_input(module, "packets", 1 / packets)
+    first, end = (module.UInt32(Float64(p) * share + 0.5) * _PACKET for p in (packet, packet + 1))
     within = lane - packet * _PACKET
 
     def one(number: UInt32, end: UInt32) -> tuple[UInt32, UInt32]:
@@ -96,14 +100,12 @@ def differing_pairs(raster: RasterOutput) -> tuple[PairList, UInt64]:
     module = backend(raster.triangle)
     pixels = dr.width(raster.triangle)
     pixel = dr.arange(module.UInt32, pixels)
-    row = pixel // raster.width
-    column = pixel - row * raster.width
-    if raster.batch > 1:
-        row %= raster.height
-    right, below = column + 1 < raster.width, row + 1 < raster.height
+    _, row, column = by_pixel(pixel, raster.batch, raster.height, raster.width)
+    width, height = uint_input(module, "width", raster.width), uint_input(module, "height", raster.height)
+    right, below = column + 1 < width, row + 1 < height
     here = raster.triangle
     right &= dr.gather(module.UInt32, here, pixel + 1, right) != here
-    below &= dr.gather(module.UInt32, here, pixel + raster.width, below) != here
+    below &= dr.gather(module.UInt32, here, pixel + width, below) != here
     keys = dr.empty(module.UInt64, 2 * pixels)
     result = PairList(dr.empty(module.UInt32, 2 * pixels), dr.zeros(module.UInt32, 1), dr.zeros(module.UInt32, 1))
 
@@ -111,7 +113,7 @@ def differing_pairs(raster: RasterOutput) -> tuple[PairList, UInt64]:
         slot = scatter_inc(result.front, module.UInt32(0), right)
         dr.scatter(result.pairs, 2 * pixel, slot, right)
         slot = scatter_inc(result.back, module.UInt32(0), below)
-        dr.scatter(result.pairs, 2 * pixel + 1, 2 * pixels - 1 - slot, below)
+        dr.scatter(result.pairs, 2 * pixel + 1, uint_input(module, "pairs", 2 * pixels - 1) - slot, below)
         dr.scatter(keys, module.UInt64(0), 2 * pixel, right)
         dr.scatter(keys, module.UInt64(0), 2 * pixel + 1, below)
         return pixel

@@ -10,9 +10,10 @@ from __future__ import annotations
 import drjit as dr
 
 from ...jit.arrays import backend, reinterpret, scatter_inc
+from ...jit.kernel_inputs import float_input, int_input, split, uint_input
 from ...jit.types import Bool, Float, UInt32, UInt64, Vector3f, Vector4f
 from ..topology import NO_VERTEX, Topology
-from ..types import NO_TRIANGLE, RasterOutput, by_image
+from ..types import NO_TRIANGLE, RasterOutput
 from .pixel_pairs import PairList
 
 # An edge must lie this far (relative) before the surface behind it to count as a discontinuity.
@@ -59,7 +60,7 @@ def register_silhouettes(
         a, b = (dr.gather(module.Array4f, records, 2 * slot + k) for k in range(2))
         index = dr.gather(module.UInt32, edges, slot)
         _walk(a, b, index, turn, stride, topology, raster, keys, found, gap, touching)
-        return (lane + lanes,)
+        return (lane + uint_input(module, "lanes", lanes),)
 
     dr.while_loop(
         (dr.arange(module.UInt32, lanes),), lambda *state: state[0] < count * stride, walk, mode="symbolic", label="silhouettes"
@@ -76,12 +77,12 @@ def _collect(positions: Float, topology: Topology, raster: RasterOutput, vertex_
     width, height = raster.width, raster.height
     total = raster.batch * topology.count
     index = dr.arange(module.UInt32, total)
-    image, edge = by_image(index, topology.count, raster.batch)
+    image, edge = split(index, "edges", topology.count, raster.batch)
     p, q, side, active = _silhouettes(positions, topology, image, edge, vertex_count)
     a, b, active = _project(p, q, active, width, height)
     share = _horizontal_share(b.x - a.x, b.y - a.y, active)
-    _, rows = _lines(a.y, b.y, active & (share > 0), height)
-    _, columns = _lines(a.x, b.x, active & (share < 1), width)
+    _, rows = _lines(a.y, b.y, active & (share > 0), "height", height)
+    _, columns = _lines(a.x, b.x, active & (share < 1), "width", width)
     active &= rows + columns > 0
     count, edges, records = dr.zeros(module.UInt32, 1), dr.empty(module.UInt32, total), dr.empty(module.Float, 8 * total)
 
@@ -112,18 +113,19 @@ def _walk(
     """Visit every ``stride``-th of the lines through pixel centres that edges cross, beginning with ``line``."""
     module = backend(a)
     Float, UInt64 = module.Float, module.UInt64
-    width, height = raster.width, raster.height
+    width, height = uint_input(module, "width", raster.width), uint_input(module, "height", raster.height)
+    left, top = float_input(module, "width", 0.5 - 0.5 * raster.width), float_input(module, "height", 0.5 - 0.5 * raster.height)
     side, share = a.w, b.w
-    image, edge = by_image(index, topology.count, raster.batch)
-    first_row, rows = _lines(a.y, b.y, share > 0, height)
-    first_column, columns = _lines(a.x, b.x, share < 1, width)
+    image, edge = split(index, "edges", topology.count, raster.batch)
+    first_row, rows = _lines(a.y, b.y, share > 0, "height", raster.height)
+    first_column, columns = _lines(a.x, b.x, share < 1, "width", raster.width)
 
     def step(line: UInt32, again: Bool) -> tuple[UInt32, Bool]:
         """Process one line through pixel centres: a row (the edge separates pixels of two columns), or a column."""
         across_rows = line < rows
         down = ~across_rows
         at = dr.select(across_rows, first_row + line, first_column + (line - rows))
-        fixed = Float(at) + dr.select(across_rows, 0.5 - 0.5 * height, 0.5 - 0.5 * width)
+        fixed = Float(at) + dr.select(across_rows, top, left)
         a_along, a_across = dr.select(down, a.y, a.x), dr.select(down, a.x, a.y)
         b_along, b_across = dr.select(down, b.y, b.x), dr.select(down, b.x, b.y)
         extent = b_across - a_across
@@ -132,7 +134,7 @@ def _walk(
         z = dr.fma(s, b.z - a.z, a.z)
 
         # Pair (i, i + 1) contains the crossing; one on a pixel's centre belongs to (i - 1, i) as well, which comes next.
-        size = dr.select(down, Float(height), Float(width))
+        size = Float(dr.select(down, height, width))
         middle = 0.5 * size - 0.5
         near = dr.floor(dr.clip(crossing + middle, -2, size + 1))
         near = dr.select(crossing < near - middle, near - 1, near)
@@ -144,7 +146,7 @@ def _walk(
         row, column = dr.select(down, module.UInt32(near), at), dr.select(down, at, module.UInt32(near))
         pixel = (image * height + row) * width + column
         here = dr.gather(module.UInt32, raster.triangle, pixel, ok)
-        neighbour = dr.gather(module.UInt32, raster.triangle, pixel + dr.select(down, module.UInt32(width), 1), ok)
+        neighbour = dr.gather(module.UInt32, raster.triangle, pixel + dr.select(down, width, 1), ok)
         ok &= here != neighbour
         covers_here = dr.select(down, -side, side) * extent > 0
         hidden = dr.select(covers_here, neighbour, here)
@@ -196,7 +198,7 @@ def _silhouettes(
     module = backend(positions)
     Array4f, Array2u = module.Array4f, module.Array2u
     ends, opposite = dr.gather(Array2u, topology.edges, edge), dr.gather(Array2u, topology.opposite, edge)
-    first = image * vertex_count
+    first = image * uint_input(module, "vertices", vertex_count)
     a, b = (dr.gather(Array4f, positions, first + ends[k]) for k in range(2))
     # Orientation is compared, not measured: the cross product is taken around one end point to keep small triangles exact.
     sides = []
@@ -235,9 +237,11 @@ def _project(a: Vector4f, b: Vector4f, active: Bool, width: int, height: int) ->
     a, b = clip(a, b, near_a, near_b), clip(b, a, near_b, near_a)
     active &= (a.w > 0) & (b.w > 0)
 
+    half_width, half_height = float_input(module, "width", 0.5 * width), float_input(module, "height", 0.5 * height)
+
     def project(p: Vector4f) -> Vector3f:
         inv = dr.rcp(dr.select(active, p.w, 1))
-        return module.Array3f(p.x * inv * (0.5 * width), p.y * inv * (0.5 * height), p.z * inv)
+        return module.Array3f(p.x * inv * half_width, p.y * inv * half_height, p.z * inv)
 
     start, end = project(a), project(b)
     active &= dr.isfinite(start.x + start.y + end.x + end.y)
@@ -251,14 +255,16 @@ def _horizontal_share(dx: Float, dy: Float, active: Bool) -> Float:
     return dr.clip(0.5 + (dy * dy - dx * dx) / dr.select(square > 0, square, 1), 0, 1)
 
 
-def _lines(p: Float, q: Float, active: Bool, size: int) -> tuple[UInt32, UInt32]:
+def _lines(p: Float, q: Float, active: Bool, name: str, size: int) -> tuple[UInt32, UInt32]:
     """First of the lines through pixel centres within [p, q] (pixels from the image's centre), and their number."""
     module = backend(p)
     p, q = dr.select(active, p, 0), dr.select(active, q, 0)
-    low = dr.clip(dr.minimum(p, q) + (0.5 * size - 0.5 - _MARGIN), -1, size)
-    high = dr.clip(dr.maximum(p, q) + (0.5 * size - 0.5 + _MARGIN), -1, size)
+    before, after, end = (
+        float_input(module, name, value) for value in (0.5 * size - 0.5 - _MARGIN, 0.5 * size - 0.5 + _MARGIN, size)
+    )
+    low, high = dr.clip(dr.minimum(p, q) + before, -1, end), dr.clip(dr.maximum(p, q) + after, -1, end)
     first = dr.maximum(module.Int32(dr.floor(low)) + 1, 0)
-    last = dr.minimum(module.Int32(dr.floor(high)), size - 1)
+    last = dr.minimum(module.Int32(dr.floor(high)), int_input(module, name, size - 1))
     return module.UInt32(first), module.UInt32(dr.select(active, dr.maximum(last - first + 1, 0), 0))
 
 

@@ -19,10 +19,11 @@ from typing import cast
 import drjit as dr
 
 from ...jit.arrays import backend, scatter_inc
+from ...jit.kernel_inputs import double_input, uint_input
 from ...jit.types import Bool, Float, Float64, UInt32, Vector4f
 from ..topology import NO_VERTEX, Topology
-from ..triangle_setup import Corners, Line, edge_lines, gather_triangle
-from ..types import NO_TRIANGLE, RasterOutput, by_image, precise_rcp
+from ..triangle_setup import Corners, Line, edge_lines, exact_centres, gather_triangle
+from ..types import NO_TRIANGLE, RasterOutput, by_pixel, precise_rcp
 from .pixel_pairs import each_number
 
 # Surfaces coincide if the difference of their depths changes by less than this (relative) from one pixel to the next.
@@ -131,17 +132,12 @@ class Meetings:
         """Weight, its change with the first depth minus the second, and (vertices, depth plane, barycentrics / w) of both."""
         module = backend(self.positions)
         Float, UInt32 = module.Float, module.UInt32
-        row_flat = pixel // self.width
-        image, row = by_image(row_flat, self.height, self.batch)
-        column = pixel - row_flat * self.width
-        first = image * self.vertex_count
+        image, row, column = by_pixel(pixel, self.batch, self.height, self.width)
+        first = image * uint_input(module, "vertices", self.vertex_count)
         # Centre of the pixel, and the offset of its neighbour, in NDC.
-        x, y = (
-            (2 * module.Float64(column) + (1 - self.width)) / self.width,
-            (2 * module.Float64(row) + (1 - self.height)) / self.height,
-        )
-        step_x, step_y = 2 / self.width, 2 / self.height
-        step = dr.select(down, UInt32(self.width), 1)
+        x, y = exact_centres(module, row, column, self.height, self.width)
+        step_x, step_y = double_input(module, "width", 2 / self.width), double_input(module, "height", 2 / self.height)
+        step = dr.select(down, uint_input(module, "width", self.width), 1)
         found, seen, parts = [], [], []
         # Weight of ridges and valleys; smooth surfaces have none.
         soft = Float(0 if self.creases is None else 1)

@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ...jit.types import UInt32
+from ...raster.types import by_pixel
 from ...scene.sensor import ImageSize
 
 # Each point of a light is seen by at least so many samples along each side of a pixel, and each sample sees so many points.
@@ -42,8 +43,8 @@ class Interleaving:
         if side == 1:
             return cls(points)
         lane = dr.arange(mi.UInt32, size.width * size.height)
-        row = lane // size.width
-        return cls(points, side * side, lane % size.width % side + row % side * side)
+        _, row, column = by_pixel(lane, 1, size.height, size.width)
+        return cls(points, side * side, column % side + row % side * side)
 
     @property
     def seen(self) -> int:

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from ...jit.arrays import backend
+from ...jit.kernel_inputs import float_input, uint_input
 from ...jit.types import Bool, Float, Point3f, PyTree, UInt32, Vector2f, Vector3f
 from ...scene.sums import sum_over
 from ...shadow import Frusta, ShadowMaps, Views, chebyshev_visibility
@@ -54,9 +56,10 @@ class Pyramid:
         Attached to all but the level.
         """
         full, count = self.maps.settings.resolution, self.maps.views.count
-        size = mi.UInt32(full) >> level
+        texels = uint_input(backend(level), "texels", full)
+        size = mi.UInt32(texels) >> level
         # 1 + 1/4 + 1/16 + ... of the texels of the finest level come first; exact, since sizes are powers of two.
-        before = (mi.UInt32(full * full) - size * size) // 3 * 4 * count + which * size * size
+        before = (mi.UInt32(texels * texels) - size * size) // 3 * 4 * count + which * size * size
         fx, fy = (dr.fma(v, mi.Float(size), -0.5) for v in (x, y))
         x0, y0 = dr.floor(dr.detach(fx)), dr.floor(dr.detach(fy))
         fx, fy = fx - x0, fy - y0
@@ -151,7 +154,9 @@ class _Place:
         """(moments at a sample place of an ellipse around the point, depth of the point's tangent plane at that place)."""
         rx, ry = radii if attached else (dr.detach(r) for r in radii)
         # Each place stands for its share of the ellipse.
-        texels = dr.detach(dr.maximum(rx, ry)) * (pyramid.maps.settings.resolution * math.sqrt(math.pi / _TAPS))
+        texels = dr.detach(dr.maximum(rx, ry)) * float_input(
+            backend(rx), "texels", pyramid.maps.settings.resolution * math.sqrt(math.pi / _TAPS)
+        )
         level = mi.UInt32(dr.clip(dr.log2(dr.maximum(texels, 1)) + 0.5, 0, pyramid.levels - 1))
         number = mi.Float(tap)
         sine, cosine = dr.sincos(number * (math.pi * (3 - math.sqrt(5))))

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
+from ...jit.kernel_inputs import split
 from ...jit.types import Bool, Point3f, UInt32, Vector3f
 from ...raster import RasterOutput, Topology
 from ...scene.geometry import Geometry
@@ -231,8 +232,7 @@ def _facing(plans: Sequence[SoftPlan], geometry: Geometry) -> Bool | None:
         return None
     first, last = (dr.concat([dr.full(mi.UInt32, plan.facing[k], plan.maps) for plan in plans]) for k in range(2))
     lane = dr.arange(mi.UInt32, dr.width(first) * geometry.face_count)
-    which = lane // geometry.face_count
-    face = lane - which * geometry.face_count
+    which, face = split(lane, "faces", geometry.face_count, dr.width(first))
     return (face >= dr.gather(mi.UInt32, first, which)) & (face < dr.gather(mi.UInt32, last, which))
 
 
@@ -305,8 +305,7 @@ def _fit(
         boxes = boxes_of(geometry)
         lane = dr.arange(mi.UInt32, count * shapes * 8)
         entry = lane >> 3
-        which = entry // shapes
-        shape = entry - which * shapes
+        which, shape = split(entry, "shapes", shapes, count)
         corner = boxes.corners(shape, lane & 7)
         bounds = shape_bounds(views, to_light_space(of_map(dr.detach(views), which, count), corner), which, shape, shapes)
         casts = casting_shapes(views, *shape_planes(scene, geometry), boxes, hidden)

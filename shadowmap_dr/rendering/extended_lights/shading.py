@@ -8,6 +8,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ...jit.kernel_inputs import split
 from ...jit.types import Color3f, Float, PyTree, UInt32, Vector3f
 from ...scene.sensor import ImageSize
 from ...scene.sums import attached_parameters, sum_over
@@ -103,9 +104,8 @@ def sample_visibilities(
     with dr.suspend_grad():
         count, table = dr.width(seen.shape), samples.table()
         lane = dr.arange(mi.UInt32, interleaving.seen * count)
-        number = lane // count
+        number, pixel = split(lane, "pixels", count, interleaving.seen)
         dr.eval(seen.p_world, seen.active, interleaving.group)
-        pixel = lane - number * count
         group = None if interleaving.group is None else dr.gather(mi.UInt32, interleaving.group, pixel)
         sample = interleaving.point(number, group)
         p_world, active = dr.gather(mi.Point3f, seen.p_world, pixel), dr.gather(mi.Bool, seen.active, pixel)

@@ -11,7 +11,8 @@ import drjit as dr
 import mitsuba as mi
 
 from ...errors import ShadowmapError, warn
-from ...jit.arrays import ravel
+from ...jit.arrays import backend, ravel
+from ...jit.kernel_inputs import split, uint_input
 from ...jit.types import Bool, Color3f, Float, TensorXf
 from ...raster import MAX_RESOLUTION
 from ...scene.sensor import ImageSize, Sensor
@@ -142,11 +143,13 @@ def _means(image: TensorXf, factor: int) -> TensorXf:
     height, width, channels = image.shape[0] // factor, image.shape[1] // factor, image.shape[2]
     index = dr.arange(mi.UInt32, height * width * channels)
     pixel, channel = index // channels, index % channels
-    row, column = pixel // width, pixel % width
+    module = backend(index)
+    row, column = split(pixel, "width", width, height)
+    samples = uint_input(module, "width", width * factor)
     total = dr.zeros(mi.Float, height * width * channels)
     for j in range(factor):
         for i in range(factor):
-            source = ((row * factor + j) * (width * factor) + column * factor + i) * channels + channel
+            source = ((row * factor + j) * samples + column * factor + i) * channels + channel
             total += dr.gather(mi.Float, image.array, source)
     return mi.TensorXf(total * (1 / factor**2), shape=(height, width, channels))
 

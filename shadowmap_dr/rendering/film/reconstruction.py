@@ -13,7 +13,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ...jit.arrays import ravel
+from ...jit.arrays import backend, ravel
+from ...jit.kernel_inputs import int_input, split, uint_input
 from ...jit.types import Float, TensorXf, UInt32
 from ...scene.pixel_filter import Filter
 
@@ -36,17 +37,18 @@ def reconstruct(samples: TensorXf, filter: Filter, factor: int, border: int) -> 
     values = dr.custom(_Gathered, values, weights, _Axis(1, rows, height, width * channels, factor, first))
     if first < 0:
         pixel = dr.arange(mi.UInt32, height * width * channels) // channels
-        row = pixel // width
-        values *= _share(row, height, weights, factor, first) * _share(pixel - row * width, width, weights, factor, first)
+        row, column = split(pixel, "width", width, height)
+        values *= _share(row, "height", height, weights, factor, first) * _share(column, "width", width, weights, factor, first)
     return mi.TensorXf(values, shape=(height, width, channels))
 
 
-def _share(at: UInt32, size: int, weights: tuple[float, ...], factor: int, first: int) -> Float:
+def _share(at: UInt32, name: str, size: int, weights: tuple[float, ...], factor: int, first: int) -> Float:
     """1 / (sum of the weights of the samples that exist) for pixels ``at`` along an axis of ``size``."""
     total = mi.Float(1.0)
+    end = uint_input(backend(at), name, size)
     for k in range(min(size, -(first // factor))):
         missing = sum(weights[: -first - k * factor])
-        total -= dr.select(at == k, missing, 0.0) + dr.select(at == size - 1 - k, missing, 0.0)
+        total -= dr.select(at == k, missing, 0.0) + dr.select(at == end - 1 - k, missing, 0.0)
     return dr.rcp(total)
 
 
@@ -89,31 +91,32 @@ def _packets(axis: _Axis) -> tuple[Any, int]:
 def _to_pixels(values: Float, weights: tuple[float, ...], axis: _Axis) -> Float:
     packet, after = _packets(axis)
     lane = dr.arange(mi.UInt32, axis.before * axis.pixels * after)
-    entry = lane // after
-    before = entry // axis.pixels
-    start = mi.Int32((entry - before * axis.pixels) * axis.factor) + axis.first
-    base = mi.Int32(before * axis.samples)
-    offset = mi.Int32(lane - entry * after)
+    module = backend(lane)
+    entry, offset = split(lane, "channels of a row", after, axis.before * axis.pixels)
+    before, place = split(entry, "pixels", axis.pixels, axis.before)
+    samples, across = int_input(module, "samples", axis.samples), int_input(module, "channels of a row", after)
+    start, base = mi.Int32(place * axis.factor) + axis.first, mi.Int32(before) * samples
     dr.eval(values)
     total = dr.zeros(packet)
     for k, weight in enumerate(weights):
         at = start + k
-        inside = True if axis.first >= 0 else (at >= 0) & (at < axis.samples)
-        total += dr.gather(packet, values, mi.UInt32((base + at) * after + offset), inside) * weight
+        inside = True if axis.first >= 0 else (at >= 0) & (at < samples)
+        total += dr.gather(packet, values, mi.UInt32((base + at) * across + mi.Int32(offset)), inside) * weight
     return total if packet is mi.Float else ravel(total)
 
 
 def _to_samples(values: Float, weights: tuple[float, ...], axis: _Axis) -> Float:
     packet, after = _packets(axis)
     lane = dr.arange(mi.UInt32, axis.before * axis.samples * after)
-    entry = lane // after
-    before = entry // axis.samples
-    base = mi.Int32(before * axis.pixels)
-    offset = mi.Int32(lane - entry * after)
+    module = backend(lane)
+    entry, offset = split(lane, "channels of a row", after, axis.before * axis.samples)
+    before, sample = split(entry, "samples", axis.samples, axis.before)
+    size, across = int_input(module, "pixels", axis.pixels), int_input(module, "channels of a row", after)
+    base = mi.Int32(before) * size
     # The last pixel whose weights reach this sample, and which of its weights does. Shifted, since division rounds to zero.
     pixels = -(-len(weights) // axis.factor)
     shift = max(0, axis.first) // axis.factor + 1
-    place = (entry - before * axis.samples) + (shift * axis.factor - axis.first)
+    place = sample + (shift * axis.factor - axis.first)
     last = place // axis.factor
     which = place - last * axis.factor
     last_pixel = mi.Int32(last) - shift
@@ -121,9 +124,9 @@ def _to_samples(values: Float, weights: tuple[float, ...], axis: _Axis) -> Float
     total = dr.zeros(packet)
     for k in range(pixels):
         at = last_pixel - k
-        inside = (at >= 0) & (at < axis.pixels)
+        inside = (at >= 0) & (at < size)
         weight = mi.Float(0.0)
         for j, value in enumerate(weights[k * axis.factor : (k + 1) * axis.factor]):
             weight = mi.Float(value) if axis.factor == 1 else dr.select(which == j, value, weight)
-        total += dr.gather(packet, values, mi.UInt32((base + at) * after + offset), inside) * weight
+        total += dr.gather(packet, values, mi.UInt32((base + at) * across + mi.Int32(offset)), inside) * weight
     return total if packet is mi.Float else ravel(total)

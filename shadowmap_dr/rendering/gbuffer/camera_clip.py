@@ -8,10 +8,13 @@ from collections.abc import Sequence
 import drjit as dr
 import mitsuba as mi
 
-from ...jit.arrays import ravel
+from ...jit.arrays import backend, ravel
 from ...jit.broadcast import broadcast_differentiable
+from ...jit.kernel_inputs import float_input, split, uint_input
 from ...jit.types import Bool, Float, Point3f
 from ...raster import DEPTH_GAP, NO_TRIANGLE, RasterOutput
+from ...raster.triangle_setup import centred
+from ...raster.types import by_pixel
 from ...scene.geometry import Geometry
 from ...scene.sensor import Sensor
 
@@ -61,20 +64,23 @@ def seen_points(sensor: Sensor, raster: RasterOutput, geometry: Geometry) -> tup
     They come from the rasterizer's depth planes, without the cost of interpolating the whole image.
     """
     with dr.suspend_grad():
-        height, width = raster.height, raster.width
+        height, width, module = raster.height, raster.width, backend(raster.triangle)
         stride = max(1, math.ceil(math.sqrt(height * width) / _SEEN_ACROSS))
         columns, rows = -(-width // stride), -(-height // stride)
         lane = dr.arange(mi.UInt32, rows * columns)
-        down, across = lane // columns, lane % columns
+        _, down, across = by_pixel(lane, 1, rows, columns)
         # One pixel of each cell of a lattice, at varying places in the cells: thin objects may lie along a row.
-        row = dr.minimum(down * stride + (5 * across + 2 * down) % stride, height - 1)
-        column = dr.minimum(across * stride + (5 * down + 2 * across) % stride, width - 1)
-        triangle = dr.gather(mi.UInt32, raster.triangle, row * width + column)
+        cell, bottom, right = (
+            uint_input(module, name, value) for name, value in (("stride", stride), ("height", height - 1), ("width", width - 1))
+        )
+        places = [split(5 * p + 2 * q, "stride", stride, 7 * max(rows, columns))[1] for p, q in ((across, down), (down, across))]
+        row, column = dr.minimum(down * cell + places[0], bottom), dr.minimum(across * cell + places[1], right)
+        triangle = dr.gather(mi.UInt32, raster.triangle, row * uint_input(module, "width", width) + column)
         hit = triangle != NO_TRIANGLE
         plane = raster.depth_plane(mi.UInt32(0), triangle, hit)
-        x, y = mi.Float(column) + 0.5, mi.Float(row) + 0.5
-        depth = dr.fma(plane[0], x - 0.5 * width, dr.fma(plane[1], y - 0.5 * height, plane[2]))
-        x, y = 2 / width * x - 1, 2 / height * y - 1
+        x, y = centred(module, row, column, height, width)
+        depth = dr.fma(plane[0], x, dr.fma(plane[1], y, plane[2]))
+        x, y = x * float_input(module, "width", 2 / width), y * float_input(module, "height", 2 / height)
         near = dr.detach(sensor.near)
         projection = dr.detach(sensor.projection)
         if sensor.kind == "perspective":

@@ -11,7 +11,9 @@ from typing import Any, cast
 import drjit as dr
 import mitsuba as mi
 
+from ...jit.arrays import backend
 from ...jit.broadcast import Copies, copied
+from ...jit.kernel_inputs import float_input
 from ...jit.types import Bool, Float, Point3f, Vector3f
 from ...scene.sensor import ImageSize, Sensor
 
@@ -119,8 +121,9 @@ class _Axes:
             right *= dr.norm(mi.Vector3f(matrix[0, 0], matrix[1, 0], matrix[2, 0]))
             up *= dr.norm(mi.Vector3f(matrix[0, 1], matrix[1, 1], matrix[2, 1]))
             view = forward
-        right *= 2 / (size.width * dr.abs(projection[0, 0])) * scale
-        up *= 2 / (size.height * dr.abs(projection[1, 1])) * scale
+        module = backend(scale)
+        right *= float_input(module, "width", 2 / size.width) / dr.abs(projection[0, 0]) * scale
+        up *= float_input(module, "height", 2 / size.height) / dr.abs(projection[1, 1]) * scale
         n = dr.detach(n_world)
         slope = dr.dot(n, view)
         # At grazing angles the footprint grows without bound: it is cut off at a length of four pixels.

@@ -75,7 +75,7 @@ def antialias(
         raster: rasterizer output for the same images.
         positions: clip-space vertices as given to the rasterizer.
         topology: :func:`shadowmap_dr.raster.build_topology` of the mesh.
-        crossings: result of :func:`find_crossings`, to share the search between several calls.
+        crossings: result of :func:`find_crossings`, with the same creases, to share the search between several calls.
         creases, crease_weights: edges of faces that are blended (and differentiated) like silhouettes, and their weights, see
             :func:`find_crossings`.
         meetings: blend (and differentiate) where surfaces intersect without an edge, too, see :func:`find_crossings`.
@@ -105,7 +105,7 @@ def antialias(
         crossings = find_crossings(positions, topology, raster, vertex_count, creases, crease_weights, meetings, gap, folds)
     elif dr.width(crossings.right) != raster.batch * raster.height * raster.width:
         raise ValueError(f"crossings are those of {dr.width(crossings.right)} pixels, but {_size_of(raster)} are given")
-    surroundings = Surroundings.of(raster, positions, topology, creases, folds, crease_weights) if continued else None
+    surroundings = Surroundings.of(raster, positions, topology, crossings.marked, crease_weights) if continued else None
     blended = blend(flat, positions, raster, crossings, surroundings)
     return blended if tensor is None else type(tensor)(blended, shape=tensor.shape)
 

@@ -20,7 +20,7 @@ from ...jit.types import Bool, Float, UInt32
 from ..topology import Topology
 from ..triangle_setup import edge_lines, exact_centres, gather_triangle
 from ..types import NO_TRIANGLE, RasterOutput, by_pixel
-from .creases import CoplanarCreases, touching
+from .creases import MarkedFaces, touching
 
 
 @dataclass(frozen=True)
@@ -31,8 +31,7 @@ class Surroundings:
         triangle: triangle that each pixel sees.
         positions: flat clip-space vertices (4 V B), as rasterized.
         topology: topology of the mesh.
-        creases: (3 F,) edges of faces at which colours jump, or None.
-        folds: creases that do not count between coplanar faces, or None.
+        marked: edges of faces at which colours jump, or None.
         sharpness: for each pixel, or None for 1. It is 1 where flat faces are large enough to show their own colours, 0 where
             they are so small that they show the colours of a smooth surface. In between, colours are partly random and are not
             extrapolated.
@@ -43,8 +42,7 @@ class Surroundings:
     triangle: UInt32
     positions: Float
     topology: Topology
-    creases: Bool | None
-    folds: CoplanarCreases | None
+    marked: MarkedFaces | None
     sharpness: Float | None
     batch: int
     height: int
@@ -57,14 +55,13 @@ class Surroundings:
         raster: RasterOutput,
         positions: Float,
         topology: Topology,
-        creases: Bool | None,
-        folds: CoplanarCreases | None,
+        marked: MarkedFaces | None,
         sharpness: Float | None,
     ) -> Surroundings:
         """For flat positions; sharpness as ``crease_weights`` of :func:`find_crossings`."""
         positions, sharpness = dr.detach(positions), None if sharpness is None else dr.detach(sharpness)
         size = raster.batch, raster.height, raster.width, dr.width(positions) // (4 * raster.batch)
-        return cls(raster.triangle, positions, topology, creases, folds, sharpness, *size)
+        return cls(raster.triangle, positions, topology, marked, sharpness, *size)
 
     def beyond(
         self,
@@ -131,39 +128,34 @@ class Surroundings:
         part, other = (dr.gather(module.UInt32, self.topology.parts, triangle, smooth) for triangle in (here, there))
         smooth &= part == other
         smooth &= ~crossed(dr.select(ahead, near, far), down, smooth)
-        if self.creases is None:
+        marked = self.marked
+        if marked is None:
             return same | smooth
 
         def unbroken(near: UInt32, far: UInt32, down: Bool, ahead: Bool, here: UInt32, there: UInt32, soft: Bool) -> Bool:
-            if self.folds is not None:
-                soft |= touching(self.topology, here, there) & self.folds.flat(here, there)
-            jumps = [[self._jump(3 * triangle + k, soft) for k in range(3)] for triangle in (here, there)]
+            if marked.folds is not None:
+                soft |= touching(self.topology, here, there) & marked.folds.flat(here, there)
+            marks = marked.at(here), marked.at(there)
+            jumps = [[marked.crease(mark, k, soft) for k in range(3)] for mark in marks]
             none = ~functools.reduce(operator.or_, jumps[0] + jumps[1])
             open_ = ~(jumps[0][0] & jumps[0][1] & jumps[0][2]) & ~(jumps[1][0] & jumps[1][1] & jumps[1][2])
 
             def on_the_way(
-                near: UInt32, far: UInt32, down: Bool, ahead: Bool, here: UInt32, there: UInt32, soft: Bool, none: Bool
-            ) -> Bool:
-                return ~self._leaves(near, here, down, ahead, soft) & ~self._leaves(far, there, down, ~ahead, soft)
+                near: UInt32, far: UInt32, down: Bool, ahead: Bool, here: UInt32, there: UInt32, soft: Bool,
+                mark: UInt32, other: UInt32, none: Bool,
+            ) -> Bool:  # fmt: skip
+                way_out, way_in = self._way_out(near, here, down, ahead), self._way_out(far, there, down, ~ahead)
+                return ~marked.crease(mark, way_out, soft) & ~marked.crease(other, way_in, soft)
 
             # Few triangles have creases at only some of their edges.
-            lanes = near, far, down, ahead, here, there, soft, none
+            lanes = near, far, down, ahead, here, there, soft, *marks, none
             return dr.if_stmt(lanes, open_ & ~none, on_the_way, lambda *lanes: lanes[-1], mode="symbolic", label="rims")
 
         lanes = near, far, down, ahead, here, there, soft
         return same | dr.if_stmt(lanes, smooth, unbroken, lambda *_: module.Bool(False), mode="symbolic", label="smooth")
 
-    def _jump(self, edge: UInt32, soft: Bool) -> Bool:
-        """True if an edge is a crease. Folds do not count where they are ``soft``."""
-        Bool = backend(edge).Bool
-        found = dr.gather(Bool, self.creases, edge)
-        return found if self.folds is None else found & ~(soft & dr.gather(Bool, self.folds.edges, edge))
-
-    def _leaves(self, pixel: UInt32, triangle: UInt32, down: Bool, ahead: Bool, soft: Bool) -> Bool:
-        """True if a ray from a pixel's centre towards a neighbour leaves the triangle through a crease.
-
-        Folds do not count (``soft``) between coplanar triangles, and where triangles appear as a smooth surface.
-        """
+    def _way_out(self, pixel: UInt32, triangle: UInt32, down: Bool, ahead: Bool) -> UInt32:
+        """Edge (0 to 2) through which a ray from a pixel's centre towards a neighbour leaves the triangle."""
         module = backend(pixel)
         Float64 = module.Float64
         image, row, column = by_pixel(pixel, self.batch, self.height, self.width)
@@ -179,4 +171,4 @@ class Surroundings:
             distance = dr.select(rate > 0, value / rate, dr.inf)
             edge = dr.select(distance < nearest, (k + 1) % 3, edge)
             nearest = dr.minimum(nearest, distance)
-        return self._jump(3 * triangle + edge, soft)
+        return edge

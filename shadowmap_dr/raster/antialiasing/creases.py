@@ -45,9 +45,45 @@ class CoplanarCreases:
         return (across <= _FLAT**2 * dr.squared_norm(n) * dr.squared_norm(m)) & (dr.dot(n, m) >= 0)
 
 
+@dataclass(frozen=True)
+class MarkedFaces:
+    """Creases of each face in one number, so that a pixel reads those of its triangle at once. Detached.
+
+    Processors gather no bytes: masks are read lane by lane, and each look-up is compiled for each lane.
+
+    Attributes:
+        marks: (F,) with bit k for a crease from corner k to k + 1, and bit 3 + k if it is one of the ``folds``.
+        folds: creases that do not count between coplanar faces, or None.
+    """
+
+    marks: UInt32
+    folds: CoplanarCreases | None
+
+    @classmethod
+    def of(cls, creases: Bool, folds: CoplanarCreases | None) -> MarkedFaces:
+        """From masks of edges, see :func:`find_crossings`."""
+        module = backend(creases)
+        with dr.suspend_grad():
+            face, marks = dr.arange(module.UInt32, dr.width(creases) // 3), module.UInt32(0)
+            for shift, edges in ((0, creases), (3, folds and folds.edges)):
+                for k in range(3 if edges is not None else 0):
+                    marks |= dr.select(dr.gather(module.Bool, edges, 3 * face + k), module.UInt32(1 << (shift + k)), 0)
+            dr.eval(marks)
+        return cls(marks, folds)
+
+    def at(self, face: UInt32, active: Bool | bool = True) -> UInt32:
+        """Marks of faces, 0 where not ``active``."""
+        return dr.gather(type(face), self.marks, face, active)
+
+    def crease(self, mark: UInt32, edge: UInt32 | int, soft: Bool) -> Bool:
+        """True if an edge (0 to 2) of a face with these marks is a crease; folds do not count where they are ``soft``."""
+        bits = mark >> edge
+        found = (bits & 1) != 0
+        return found if self.folds is None else found & ~(soft & ((bits & 8) != 0))
+
+
 def find_creases(
-    creases: Bool,
-    folds: CoplanarCreases | None,
+    marked: MarkedFaces,
     topology: Topology,
     raster: RasterOutput,
     image: UInt32,
@@ -65,7 +101,7 @@ def find_creases(
     first edge, all for the second, or in between. If they do not cross between the edges, each edge counts half.
 
     Args:
-        creases, folds: see :func:`find_crossings`.
+        marked: creases of all faces.
         topology, raster: the mesh and the output of the rasterizer.
         image, pixel: pixels, and their images in the batch.
         here, neighbour: triangles that the pixels and their neighbours see.
@@ -82,12 +118,9 @@ def find_creases(
         corner_out, way_out, depth, slope = _way_out(raster, image, here, x, y, down, 1)
         x, y = dr.select(down, x, x + 1), dr.select(down, y + 1, y)
         corner_in, way_in, other_depth, other_slope = _way_out(raster, image, neighbour, x, y, down, -1)
-        hard_out = dr.gather(module.Bool, creases, 3 * here + corner_out)
-        hard_in = dr.gather(module.Bool, creases, 3 * neighbour + corner_in)
-        if folds is not None:
-            bent = ~folds.flat(here, neighbour)
-            hard_out &= bent | ~dr.gather(module.Bool, folds.edges, 3 * here + corner_out)
-            hard_in &= bent | ~dr.gather(module.Bool, folds.edges, 3 * neighbour + corner_in)
+        flat = module.Bool(False) if marked.folds is None else marked.folds.flat(here, neighbour)
+        hard_out = marked.crease(marked.at(here), corner_out, flat)
+        hard_in = marked.crease(marked.at(neighbour), corner_in, flat)
         a, b = _ends(topology, here, corner_out, hard_out)
         c, d = _ends(topology, neighbour, corner_in, hard_in)
         # If both are the same edge, or only the second one is a crease, one edge remains.

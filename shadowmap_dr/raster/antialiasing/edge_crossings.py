@@ -13,7 +13,7 @@ from ...jit.types import Bool, Float, UInt32, UInt64, Vector4f
 from ..topology import NO_VERTEX, Topology
 from ..triangle_setup import centred
 from ..types import NO_TRIANGLE, RasterOutput, by_pixel, zeros
-from .creases import CoplanarCreases, find_creases, touching
+from .creases import CoplanarCreases, MarkedFaces, find_creases, touching
 from .pixel_pairs import PairList, differing_pairs, empty_list
 from .silhouettes import BEFORE, register_silhouettes
 from .surface_intersections import LEAST_WEIGHT, Meetings, beyond_middle
@@ -35,6 +35,7 @@ class Crossings:
         slopes, second_slopes: four for each slot: (s, slope x, slope y, slope w). The weight changes by the sum over x, y, w of
             slope * (change of the clip-space edge at the crossing), where the edge's ends count by 1 - s and s.
         meetings: intersections of surfaces, which give the weights of pairs without ends; None if these were not searched.
+        marked: creases of all faces; None if there are none.
     """
 
     right: Float
@@ -44,6 +45,7 @@ class Crossings:
     slopes: Float
     second_slopes: Float
     meetings: Meetings | None = None
+    marked: MarkedFaces | None = None
 
 
 def find_crossings(
@@ -91,8 +93,8 @@ def find_crossings(
     with dr.suspend_grad():
         positions = dr.detach(positions)
         meetings = meetings and topology.part_count > 1
-        meet = None
-        if creases is None and not meetings:
+        meet, marked = None, None if creases is None else MarkedFaces.of(dr.detach(creases), folds)
+        if marked is None and not meetings:
             pairs, keys = empty_list(raster)
             register_silhouettes(positions, topology, raster, vertex_count, keys, pairs, gap)
         else:
@@ -101,9 +103,9 @@ def find_crossings(
             crease_weights = None if crease_weights is None else dr.detach(crease_weights)
             dr.eval(crease_weights)
         dr.eval(keys, pairs)
-        if creases is not None or meetings:
-            meet = Meetings.of(positions, topology, raster, vertex_count, meetings, creases, crease_weights)
-        return _measure(positions, topology, raster, vertex_count, keys, pairs, creases, folds, crease_weights, meet)
+        if marked is not None or meetings:
+            meet = Meetings.of(positions, topology, raster, vertex_count, meetings, marked, crease_weights)
+        return _measure(positions, topology, raster, vertex_count, keys, pairs, marked, crease_weights, meet)
 
 
 def _measure(
@@ -113,8 +115,7 @@ def _measure(
     vertex_count: int,
     keys: UInt64,
     pairs: PairList,
-    creases: Bool | None,
-    folds: CoplanarCreases | None,
+    marked: MarkedFaces | None,
     crease_weights: Float | None,
     meetings: Meetings | None,
 ) -> Crossings:
@@ -130,6 +131,7 @@ def _measure(
         dr.empty(Float, 8 * pixels),
         dr.empty(Float, 8 * pixels),
         meetings,
+        marked,
     )
 
     def visit(slot: UInt32, pair: UInt32) -> None:
@@ -141,13 +143,13 @@ def _measure(
         ends = dr.gather(module.Array2u, topology.edges, ~module.UInt32(key & 0xFFFFFFFF), silhouette)
         a, b = (dr.select(silhouette, end, NO_VERTEX) for end in (ends.x, ends.y))
         c, d, weight, weight_2, soft = module.UInt32(NO_VERTEX), module.UInt32(NO_VERTEX), Float(1), Float(0), Float(1)
-        if creases is not None:
+        if marked is not None:
             if crease_weights is not None:
                 soft = dr.minimum(*(dr.gather(Float, crease_weights, p, ~silhouette) for p in (pixel, pixel + step)))
 
             def crease(image, pixel, step, down, a, b, soft):  # noqa: ANN001, ANN202
                 here, neighbour = (dr.gather(module.UInt32, raster.triangle, p) for p in (pixel, pixel + step))
-                a, b, c, d, weight, weight_2 = find_creases(creases, folds, topology, raster, image, pixel, here, neighbour, down)
+                a, b, c, d, weight, weight_2 = find_creases(marked, topology, raster, image, pixel, here, neighbour, down)
                 return a, b, c, d, soft * weight, soft * weight_2
 
             none = dr.full(module.UInt32, NO_VERTEX, dr.width(pair))
@@ -173,7 +175,7 @@ def _measure(
             dr.scatter(found.second_slopes, slopes, slot)
             return dr.select((value != 0) & (value + more == 0), value * LEAST_WEIGHT, value + more)
 
-        if creases is not None:
+        if marked is not None:
             value = dr.if_stmt(
                 (slot, c, d, row, column, down, weight_2, value),
                 c != NO_VERTEX,

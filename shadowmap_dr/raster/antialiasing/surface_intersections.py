@@ -11,7 +11,6 @@ surface also cross at points that do not lie on it.
 from __future__ import annotations
 
 import functools
-import operator
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import cast
@@ -24,6 +23,7 @@ from ...jit.types import Bool, Float, Float64, UInt32, Vector4f
 from ..topology import NO_VERTEX, Topology
 from ..triangle_setup import Corners, Line, edge_lines, exact_centres, gather_triangle
 from ..types import NO_TRIANGLE, RasterOutput, by_pixel, precise_rcp
+from .creases import MarkedFaces
 from .pixel_pairs import each_number
 
 # Surfaces coincide if the difference of their depths changes by less than this (relative) from one pixel to the next.
@@ -54,8 +54,8 @@ class Meetings:
         batch: number of images.
         height, width, vertex_count: of an image.
         unconnected: True to intersect faces of different parts, and faces of one part that cut each other.
-        creases, crease_weights: see :func:`shadowmap_dr.raster.antialiasing.edge_crossings.find_crossings`. If None, faces of one
-            part form no creases.
+        marked, crease_weights: creases, and their weights, see
+            :func:`shadowmap_dr.raster.antialiasing.edge_crossings.find_crossings`. If None, faces of one part form no creases.
         slots, count: candidate pairs without an edge, as slots in the list of all pairs, and their number.
     """
 
@@ -69,7 +69,7 @@ class Meetings:
     width: int
     vertex_count: int
     unconnected: bool
-    creases: Bool | None
+    marked: MarkedFaces | None
     crease_weights: Float | None
     slots: UInt32
     count: UInt32
@@ -82,14 +82,14 @@ class Meetings:
         raster: RasterOutput,
         vertex_count: int,
         unconnected: bool = True,
-        creases: Bool | None = None,
+        marked: MarkedFaces | None = None,
         crease_weights: Float | None = None,
     ) -> Meetings:
         size = raster.batch, raster.height, raster.width, vertex_count
         surfaces = topology.faces, topology.parts, topology.beyond, raster.triangle
         UInt32 = backend(raster.triangle).UInt32
         found = dr.empty(UInt32, 2 * dr.width(raster.triangle)), dr.zeros(UInt32, 1)
-        return cls(dr.detach(positions), *surfaces, *size, unconnected, creases, crease_weights, *found)
+        return cls(dr.detach(positions), *surfaces, *size, unconnected, marked, crease_weights, *found)
 
     def add(self, slot: UInt32, here: UInt32, there: UInt32, soft: Float, cross: Callable[[Bool], Bool]) -> None:
         """List a pair if the triangles that its pixels see may intersect. To be traced only once.
@@ -103,7 +103,7 @@ class Meetings:
         UInt32 = backend(slot).UInt32
         both = (here != NO_TRIANGLE) & (there != NO_TRIANGLE)
         apart = dr.gather(UInt32, self.parts, here, both) != dr.gather(UInt32, self.parts, there, both)
-        folded = (soft > 0) & (self.creases is not None)
+        folded = (soft > 0) & (self.marked is not None)
         listed = both & dr.select(apart, self.unconnected, folded)
         if self.unconnected:
             listed |= cross(both & ~listed)
@@ -140,13 +140,13 @@ class Meetings:
         step = dr.select(down, uint_input(module, "width", self.width), 1)
         found, seen, parts = [], [], []
         # Weight of ridges and valleys; smooth surfaces have none.
-        soft = Float(0 if self.creases is None else 1)
+        soft = Float(0 if self.marked is None else 1)
         for p in (pixel, pixel + step):
             triangle = dr.gather(UInt32, self.triangle, p)
             parts.append(dr.gather(UInt32, self.parts, triangle))
-            if self.creases is not None:
+            if self.marked is not None:
                 weight = 1 if self.crease_weights is None else dr.gather(Float, self.crease_weights, p)
-                flat = functools.reduce(operator.and_, (dr.gather(module.Bool, self.creases, 3 * triangle + k) for k in range(3)))
+                flat = (self.marked.at(triangle) & 7) == 7  # creases on all sides
                 soft = dr.minimum(soft, dr.select(flat, weight, 0))
             corners = gather_triangle(self.positions, self.faces, triangle, first, True)
             lines, plane = _plane(corners)

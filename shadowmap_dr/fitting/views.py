@@ -85,6 +85,8 @@ class View:
         self._renderer = _at(renderer, quality)
         counts = [len(parameter.labels) for parameter in parameters]
         self._starts = np.cumsum([0, *counts]).tolist()
+        # Unit tangents of the numbers of entries, for the passes of their jacobians.
+        self._units: dict[int, list[Float]] = {}
         # One recording for each entry: a pass computes the derivative of a combination of its numbers.
         self._passes = [freeze(self._recorded(k)) for k in range(len(parameters))]
         self._jacobians = [freeze(self._recorded_jacobian(k)) for k in range(len(parameters))]
@@ -145,9 +147,10 @@ class View:
         first, end = self._starts[entry], self._starts[entry + 1]
         if self._differences[entry]:
             return self._image_at(x), [self.derivative(x, number)[1] for number in range(first, end)]
-        units = [_input(row) for row in np.eye(end - first)]
+        if entry not in self._units:
+            self._units[entry] = [_input(row) for row in np.eye(end - first)]
         with self.scene_at(x):
-            image, derivatives = self._jacobians[entry](_input(x[: self.count]), units, self.values, self._renderer)
+            image, derivatives = self._jacobians[entry](_input(x[: self.count]), self._units[entry], self.values, self._renderer)
             return self._shaped(image), [self._shaped(derivative) for derivative in derivatives]
 
     def _image_at(self, x: Array) -> Image:
@@ -385,7 +388,7 @@ def is_recordable(scene: mi.Scene, key: str) -> bool:
 
 def _input(numbers: Array) -> Float:
     """Numbers as an input of a recording. Dr.Jit 1.5 aborts the process at arrays without entries."""
-    return mi.Float(numbers.astype(np.float32) if len(numbers) else np.zeros(1, np.float32))
+    return device_array(mi.Float, numbers if len(numbers) else np.zeros(1))
 
 
 def set_values(scene: mi.Scene, change: SceneChange, *, all_values: bool = True) -> Callable[[], None]:

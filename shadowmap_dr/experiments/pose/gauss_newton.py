@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Generator, Iterator, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ...errors import ShadowmapError
+from ...fitting.levenberg_marquardt import Damping, Limits, after_step, minimise
 from ...fitting.motion_parameters import ShapeMotion
 from ...fitting.targets import make_target
 from ...fitting.vary import Vary
 from ...fitting.views import Quality
 from ...rendering.receivers.checks import real_array
 from ...rendering.renderer import Renderer
-from .least_squares import DampedSteps, Differences, Linear, mean_square
+from .least_squares import Difference, Differences, Linear, mean_square
 from .search import AWAY, EXPLAINED, TURN_DEG
 
 Array = npt.NDArray[np.float64]
@@ -27,9 +29,13 @@ _COARSE, _COARSE_TEXELS, _COARSE_SAMPLES = 16, 64, 128
 # Pixels along a side, at most, at which fine images are compared, and samples along a side of their derivatives. Samples matter:
 # derivatives at few of them hold noise, by which steps become too short.
 _COMPARED, _SLOPE_SAMPLES = 64, 256
-# Most steps in coarse and in fine images. The last one is shorter than _SHORTEST (radians, or scene units). A fine step longer
-# than _FAR calls for other derivatives, and one after which the loss is larger by _NOISE is taken back.
-_COARSE_STEPS, _FINE_STEPS, _SHORTEST, _FAR, _NOISE = 12, 4, 5e-4, 0.015, 1.1
+# Most steps in coarse and in fine images, and steps (radians, or scene units) that are the last, or not worth it. A fine step
+# longer than _FAR calls for other derivatives, and one after which the loss is larger by _NOISE is taken back.
+_COARSE_STEPS, _FINE_STEPS, _COARSE_SHORTEST, _SHORTEST, _FAR, _NOISE = 12, 4, 0.01, 5e-4, 0.015, 1.1
+# Longest change of a number in a step: radians, or scene units. Least share of the loss that a coarse step has to promise.
+_LONGEST, _WORTH = 0.3, 0.1
+# Passes are long, and their number is what counts: steps that fail are soon much shorter, or given up.
+_DAMPING = Damping(worse=8.0, failed=0.03, least=1e-6, most=1.0)
 # Rotations of the search for another basin, in multiples of TURN_DEG.
 _NEAR, _FARTHER = (1, -1, 2, -2), (3, -3, 4, -4)
 
@@ -73,12 +79,13 @@ class GaussNewtonPose:
         self._coarse = Differences(renderer, motion, target, coarse)
         self._fine = Differences(renderer, motion, target, fine, block)
         self._slopes = Differences(renderer, motion, target, slopes)
-        self._without = self._coarse.at(AWAY).loss
+        self._without = self._coarse.at(AWAY).cost
         self._settings = dict(settings or {})
         self._qualities = [f"{one.side} px, {one.spp} spp, {one.texels} texels" for one in (coarse, fine, slopes)]
         self._x = self._start = np.zeros(3)
         self._stage, self._loss = 0, 0.0
         self._course: Iterator[float] = iter(())
+        self._record()
         self.reset(np.zeros(3))
 
     def reset(self, start: npt.ArrayLike) -> None:
@@ -114,6 +121,14 @@ class GaussNewtonPose:
         """Settings for the record."""
         return {**self._settings, "optimizer": "Levenberg-Marquardt", "images": self._qualities}
 
+    def _record(self) -> None:
+        """Record all passes, so that no run waits for it. The first calls of some are recorded twice."""
+        for x in np.array([[0.0, 0.0, 0.0], [0.01, 0.01, 0.01]]):
+            self._coarse.at(x)
+            self._coarse.difference(x)
+            self._fine.difference(x)
+            self._slopes.columns(x)
+
     def _steps(self) -> Iterator[float]:
         """All steps from the current stage on. Each sets the pose and yields the loss before it."""
         if self._stage == 0:
@@ -127,14 +142,12 @@ class GaussNewtonPose:
 
     def _descend(self) -> Generator[float, None, float]:
         """Steps in coarse images. Returns the loss at their end."""
-        steps = DampedSteps(self._coarse, self._x, _SHORTEST)
-        for _ in range(_COARSE_STEPS):
-            before = steps.point.loss
-            if not steps.advance():
-                break
-            self._x = steps.point.x
-            yield before
-        return steps.point.loss
+        point = self._coarse.at(self._x)
+        for better in minimise(self._coarse.at, point, _limits(), Difference.follow):
+            self._x = better.x
+            yield point.cost
+            point = better
+        return point.cost
 
     def _descend_elsewhere(self, loss: float) -> Iterator[float]:
         """Descents from other rotations until one is good enough. Ends at the best pose.
@@ -159,11 +172,11 @@ class GaussNewtonPose:
 
     def _slid(self) -> Array:
         """The start with the best offset at its rotation, in coarse images."""
-        steps = DampedSteps(self._coarse, self._start, _SHORTEST, fixed=(0,))
-        for _ in range(_COARSE_STEPS):
-            if not steps.advance():
-                break
-        return steps.point.x
+        limits, start = _limits(), self._start
+        low, high = (np.concatenate([start[:1], bounds[1:]]) for bounds in (limits.low, limits.high))
+        point = self._coarse.at(start)
+        ends = list(minimise(self._coarse.at, point, replace(limits, low=low, high=high), Difference.follow))
+        return (ends or [point])[-1].x
 
     def _refine(self) -> Iterator[float]:
         """Steps in fine images. The derivatives are those of the first pose, scaled to the changes that images show."""
@@ -181,7 +194,7 @@ class GaussNewtonPose:
                 slopes = slopes and slopes.times(slopes.factor(step, difference - before))
             if slopes is None:
                 slopes = Linear(self._slopes.columns(self._x))
-            step = slopes.step(difference)
+            step = after_step(*slopes.system(difference), 0.0, self._x, _limits()) - self._x
             last, self._x = (self._x, difference, step), self._x + step
             yield loss
             length = np.abs(step).max()
@@ -189,6 +202,22 @@ class GaussNewtonPose:
                 return
             if length > _FAR:
                 slopes = None
+
+
+def _limits() -> Limits:
+    """Limits of steps in coarse images."""
+    free = np.full(3, np.inf)
+    return Limits(
+        -free,
+        free,
+        longest=_LONGEST,
+        steps=_COARSE_STEPS,
+        improvement=0.0,
+        shortest=_COARSE_SHORTEST,
+        worth=_WORTH,
+        dares=0,
+        damping=_DAMPING,
+    )
 
 
 def _block(height: int, width: int) -> int:

@@ -29,15 +29,19 @@ _COARSE, _COARSE_TEXELS, _COARSE_SAMPLES = 16, 64, 128
 # Pixels along a side, at most, at which fine images are compared, and samples along a side of their derivatives. Samples matter:
 # derivatives at few of them hold noise, by which steps become too short.
 _COMPARED, _SLOPE_SAMPLES = 64, 256
-# Most steps in coarse and in fine images, and steps (radians, or scene units) that are the last, or not worth it. A fine step
-# longer than _FAR calls for other derivatives, and one after which the loss is larger by _NOISE is taken back.
-_COARSE_STEPS, _FINE_STEPS, _COARSE_SHORTEST, _SHORTEST, _FAR, _NOISE = 12, 4, 0.01, 5e-4, 0.015, 1.1
-# Longest change of a number in a step: radians, or scene units. Least share of the loss that a coarse step has to promise.
-_LONGEST, _WORTH = 0.3, 0.1
+# Most steps in coarse and in fine images. Coarse steps shorter than _COARSE_SHORTEST (radians, or scene units) are not worth it;
+# one shorter than _NEAR is the last if the image is explained, and nobody looks where it leads: fine images are better at that. A
+# fine step longer than _FAR calls for other derivatives, one shorter than _SHORTEST is the last, and one after which the loss is
+# larger by _NOISE is taken back.
+_COARSE_STEPS, _COARSE_SHORTEST, _NEAR = 12, 0.01, 0.06
+_FINE_STEPS, _FAR, _SHORTEST, _NOISE = 4, 0.015, 5e-4, 1.1
+# Longest change of a number in a step: radians, or scene units. Least share of the loss that a coarse step has to promise. After
+# several descents have failed, the least share, and full steps that may be worse.
+_LONGEST, _WORTH, _PATIENT_WORTH, _PATIENT_DARES = 0.3, 0.1, 0.01, 2
 # Passes are long, and their number is what counts: steps that fail are soon much shorter, or given up.
 _DAMPING = Damping(worse=8.0, failed=0.03, least=1e-6, most=1.0)
 # Rotations of the search for another basin, in multiples of TURN_DEG.
-_NEAR, _FARTHER = (1, -1, 2, -2), (3, -3, 4, -4)
+_TURNS, _FARTHER = (1, -1, 2, -2), (3, -3, 4, -4)
 
 
 class GaussNewtonPose:
@@ -133,46 +137,55 @@ class GaussNewtonPose:
         """All steps from the current stage on. Each sets the pose and yields the loss before it."""
         if self._stage == 0:
             loss = yield from self._descend()
-            if loss > EXPLAINED * self._without:
+            if not self._explained(loss):
                 yield from self._descend_elsewhere(loss)
             self._stage = 1
         if self._stage == 1:
             yield from self._refine()
             self._stage = 2
 
-    def _descend(self) -> Generator[float, None, float]:
-        """Steps in coarse images. Returns the loss at their end."""
+    def _descend(self, *, patient: bool = False) -> Generator[float, None, float]:
+        """Steps in coarse images. Returns the loss before the last one."""
         point = self._coarse.at(self._x)
-        for better in minimise(self._coarse.at, point, _limits(), Difference.follow):
-            self._x = better.x
-            yield point.cost
-            point = better
+        for shortest in (_NEAR, _COARSE_SHORTEST):
+            for better in minimise(self._coarse.at, point, _limits(shortest, patient=patient), Difference.follow):
+                self._x = better.x
+                yield point.cost
+                point = better
+            if self._explained(point.cost):
+                self._x = after_step(*point.system(), 0.0, point.x, _limits())
+                yield point.cost
+                break
         return point.cost
 
     def _descend_elsewhere(self, loss: float) -> Iterator[float]:
         """Descents from other rotations until one is good enough. Ends at the best pose.
 
         The first ones begin at offsets of the current pose, which is the end of the first descent with the loss ``loss``. Others
-        follow from the start, whose offset is fitted alone before.
+        follow from the start, whose offset is fitted alone before, with more patience.
         """
         best, found = self._x, loss
-        for slid, turns in ((False, _NEAR), (True, (0, *_NEAR)), (True, _FARTHER)):
+        for slid, turns in ((False, _TURNS), (True, (0, *_TURNS)), (True, _FARTHER)):
             middle = self._slid() if slid else best
             starts = [middle + np.array([math.radians(TURN_DEG * turn), 0, 0]) for turn in turns]
             losses = [self._coarse.loss(start) for start in starts]
             for k in np.argsort(losses):
                 self._x = starts[k]
-                end = yield from self._descend()
+                end = yield from self._descend(patient=slid)
                 if end < found:
                     best, found = self._x, end
-                if found <= EXPLAINED * self._without:
+                if self._explained(found):
                     self._x = best
                     return
         self._x = best
 
+    def _explained(self, loss: float) -> bool:
+        """True if so little of the differences is left in coarse images that the pose is near."""
+        return loss <= EXPLAINED * self._without
+
     def _slid(self) -> Array:
         """The start with the best offset at its rotation, in coarse images."""
-        limits, start = _limits(), self._start
+        limits, start = _limits(patient=True), self._start
         low, high = (np.concatenate([start[:1], bounds[1:]]) for bounds in (limits.low, limits.high))
         point = self._coarse.at(start)
         ends = list(minimise(self._coarse.at, point, replace(limits, low=low, high=high), Difference.follow))
@@ -204,8 +217,8 @@ class GaussNewtonPose:
                 slopes = None
 
 
-def _limits() -> Limits:
-    """Limits of steps in coarse images."""
+def _limits(shortest: float = _COARSE_SHORTEST, *, patient: bool = False) -> Limits:
+    """Limits of steps in coarse images. ``patient``: also with steps that promise little, and with full ones over jumps."""
     free = np.full(3, np.inf)
     return Limits(
         -free,
@@ -213,9 +226,9 @@ def _limits() -> Limits:
         longest=_LONGEST,
         steps=_COARSE_STEPS,
         improvement=0.0,
-        shortest=_COARSE_SHORTEST,
-        worth=_WORTH,
-        dares=0,
+        shortest=shortest,
+        worth=_PATIENT_WORTH if patient else _WORTH,
+        dares=_PATIENT_DARES if patient else 0,
         damping=_DAMPING,
     )
 

@@ -6,7 +6,7 @@ Source: Nocedal and Wright, "Numerical Optimization", 2006, section 10.3; Marqua
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -14,24 +14,46 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 
-# Damping: at first, after success and failure, least and most.
-_DAMPING, _BETTER, _WORSE, _LEAST, _MOST = 1e-3, 0.2, 5.0, 1e-9, 1e4
-# Full steps that may be worse, at most; promised decrease, as a share of the cost, for which they are taken; steps that follow to
-# make them better.
-_DARES, _PROMISING, _PROOF = 2, 5e-3, 4
+# Promised decrease, as a share of the cost, for which full steps are taken that may be worse; steps that follow to make them
+# better.
+_PROMISING, _PROOF = 5e-3, 4
 
 
 class Residuals(Protocol):
-    """A point of an objective. ``x`` (n,); ``cost``: the loss."""
+    """A point of an objective."""
 
-    x: Array
-    cost: float
+    @property
+    def x(self) -> Array:
+        """The numbers (n,)."""
+
+    @property
+    def cost(self) -> float:
+        """The loss."""
 
     def system(self) -> tuple[Array, Array]:
         """(matrix (n, n), right side (n,)) of the normal equations."""
 
 
 P = TypeVar("P", bound=Residuals)
+
+
+@dataclass(frozen=True)
+class Damping:
+    """Damping of steps, as a share of the diagonal.
+
+    Attributes:
+        first: of the first step.
+        better, worse: factors after a step that is better, or worse.
+        failed: least damping after a step that is worse.
+        least, most: limits.
+    """
+
+    first: float = 1e-3
+    better: float = 0.2
+    worse: float = 5.0
+    failed: float = 0.0
+    least: float = 1e-9
+    most: float = 1e4
 
 
 @dataclass(frozen=True)
@@ -44,6 +66,9 @@ class Limits:
         steps: most steps.
         improvement: share of the cost; a step that improves less is the last.
         shortest: steps in which no number changes more are the last.
+        worth: least share of the cost that the derivatives have to promise of a step.
+        dares: most full steps that may be worse.
+        damping: damping of steps.
     """
 
     low: Array
@@ -52,9 +77,14 @@ class Limits:
     steps: int = 10
     improvement: float = 1e-4
     shortest: float = 1e-5
+    worth: float = 0.0
+    dares: int = 2
+    damping: Damping = field(default_factory=Damping)
 
 
-def minimise(at: Callable[[Array], P], start: P, limits: Limits) -> Generator[P, None, bool]:
+def minimise(
+    at: Callable[[Array], P], start: P, limits: Limits, follow: Callable[[P, P], P] = lambda before, after: after
+) -> Generator[P, None, bool]:
     """Minimise a loss from a point on.
 
     Losses jump where shadow maps are fitted anew. If steps gain little of what the derivatives promise, a full one is taken, even
@@ -65,6 +95,7 @@ def minimise(at: Callable[[Array], P], start: P, limits: Limits) -> Generator[P,
         at: the point at given numbers.
         start: the first point.
         limits: bounds and ends.
+        follow: the better point of a step, from the points before and after it. It may correct the derivatives of the latter.
 
     Yields:
         Better and better points, one after each step.
@@ -73,18 +104,18 @@ def minimise(at: Callable[[Array], P], start: P, limits: Limits) -> Generator[P,
         True if steps or improvements had become small, False after the last step of the limits.
     """
     best, left = start, limits.steps
-    for dared in range(1 + _DARES):
+    for dared in range(1 + limits.dares):
         if dared:
             dare = _full_step(at, best, limits)
             if dare is None or not left:
                 break
-            steps = list(_descent(at, dare, limits, min(left, _PROOF)))
+            steps = list(_descent(at, dare, limits, min(left, _PROOF), follow))
             left -= len(steps)
             if not steps or not steps[-1].cost < best.cost:
                 break
             best = steps[-1]
             yield best
-        for better in _descent(at, best, limits, left):
+        for better in _descent(at, best, limits, left, follow):
             best = better
             left -= 1
             yield best
@@ -94,39 +125,46 @@ def minimise(at: Callable[[Array], P], start: P, limits: Limits) -> Generator[P,
 def _full_step(at: Callable[[Array], P], point: P, limits: Limits) -> P | None:
     """The point after a full step, if its derivatives promise much."""
     matrix, right = point.system()
-    step = _after_step(matrix, right, _DAMPING, point.x, limits) - point.x
-    promised = -float(right @ step + 0.5 * step @ matrix @ step)
-    if not promised > _PROMISING * point.cost or np.abs(step).max(initial=0) < limits.shortest:
+    step = after_step(matrix, right, limits.damping.first, point.x, limits) - point.x
+    if not promised(matrix, right, step) > max(_PROMISING, limits.worth) * point.cost:
         return None
-    return at(point.x + step)
+    return None if np.abs(step).max(initial=0) < limits.shortest else at(point.x + step)
 
 
-def _descent(at: Callable[[Array], P], point: P, limits: Limits, steps: int) -> Iterator[P]:
+def _descent(at: Callable[[Array], P], point: P, limits: Limits, steps: int, follow: Callable[[P, P], P]) -> Iterator[P]:
     """Better and better points, one after each step, until steps or improvements are small."""
-    damping = _DAMPING
+    factors = limits.damping
+    damping = factors.first
     for _ in range(steps):
         matrix, right = point.system()
         while True:
-            x = _after_step(matrix, right, damping, point.x, limits)
+            x = after_step(matrix, right, damping, point.x, limits)
             if np.abs(x - point.x).max(initial=0) < limits.shortest:
+                return
+            if limits.worth and promised(matrix, right, x - point.x) < limits.worth * point.cost:
                 return
             candidate = at(x)
             if candidate.cost < point.cost:
                 break
             if candidate.cost < point.cost * (1 + limits.improvement):
                 return  # the differences are those of rounding
-            damping *= _WORSE
-            if damping > _MOST:
+            damping = max(damping * factors.worse, factors.failed)
+            if damping > factors.most:
                 return
-        damping = max(damping * _BETTER, _LEAST)
+        damping = max(damping * factors.better, factors.least)
         gained = (point.cost - candidate.cost) / max(point.cost, 1e-300)
-        point = candidate
+        point = follow(point, candidate)
         yield point
         if gained < limits.improvement:
             return
 
 
-def _after_step(matrix: Array, right: Array, damping: float, x: Array, limits: Limits) -> Array:
+def promised(matrix: Array, right: Array, step: Array) -> float:
+    """Decrease of the loss that the normal equations promise of a step."""
+    return -float(right @ step + 0.5 * step @ matrix @ step)
+
+
+def after_step(matrix: Array, right: Array, damping: float, x: Array, limits: Limits) -> Array:
     """Numbers after a damped step within the bounds, in which no number changes by more than the longest step.
 
     Numbers at a bound that the loss pushes outwards stay. The number that would go too far by most goes as far as it may, and

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..jit.arrays import device_array
+from ..jit.branches import traversed_again
 from ..jit.frozen import freeze
 from ..jit.types import Float, TensorXf
 from ..rendering.renderer import Renderer
@@ -85,6 +86,8 @@ class View:
         self._renderer = _at(renderer, quality)
         counts = [len(parameter.labels) for parameter in parameters]
         self._starts = np.cumsum([0, *counts]).tolist()
+        # Unit tangents of the numbers of entries, for the passes of their jacobians.
+        self._units: dict[int, list[Float]] = {}
         # One recording for each entry: a pass computes the derivative of a combination of its numbers.
         self._passes = [freeze(self._recorded(k)) for k in range(len(parameters))]
         self._jacobians = [freeze(self._recorded_jacobian(k)) for k in range(len(parameters))]
@@ -145,9 +148,10 @@ class View:
         first, end = self._starts[entry], self._starts[entry + 1]
         if self._differences[entry]:
             return self._image_at(x), [self.derivative(x, number)[1] for number in range(first, end)]
-        units = [_input(row) for row in np.eye(end - first)]
+        if entry not in self._units:
+            self._units[entry] = [_input(row) for row in np.eye(end - first)]
         with self.scene_at(x):
-            image, derivatives = self._jacobians[entry](_input(x[: self.count]), units, self.values, self._renderer)
+            image, derivatives = self._jacobians[entry](_input(x[: self.count]), self._units[entry], self.values, self._renderer)
             return self._shaped(image), [self._shaped(derivative) for derivative in derivatives]
 
     def _image_at(self, x: Array) -> Image:
@@ -274,14 +278,10 @@ class View:
         """The pass of one entry: image, and its derivative along a tangent of the entry's numbers. -1: of none."""
 
         def derivative(x: Float, tangent: Float, values: list[Float], renderer: Renderer) -> tuple[Float, Float]:
-            every: list[list[Float]] = []
-            for k in range(len(self._parameters)):
-                own = [dr.gather(mi.Float, x, mi.UInt32(j)) for j in range(self._starts[k], self._starts[k + 1])]
-                if k == entry:
-                    for j, number in enumerate(own):
-                        dr.enable_grad(number)
-                        dr.set_grad(number, dr.gather(mi.Float, tangent, mi.UInt32(j)))
-                every.append(own)
+            every = self._numbers(x)
+            for j, number in enumerate(every[entry] if entry >= 0 else ()):
+                dr.enable_grad(number)
+                dr.set_grad(number, dr.gather(mi.Float, tangent, mi.UInt32(j)))
             with dr.suspend_grad(when=entry < 0), self._rendered(renderer, every, values, entry, arrays=False) as image:
                 if entry < 0:
                     return image, mi.Float(image)
@@ -293,23 +293,43 @@ class View:
         return derivative
 
     def _recorded_jacobian(self, entry: int) -> Any:  # Any: a function for dr.freeze
-        """The passes of :meth:`jacobian`. ``units``: a tangent of the entry's numbers for each derivative."""
+        """The pass of :meth:`jacobian`. ``units``: a tangent of the entry's numbers for each derivative."""
         one = self._recorded(entry)
 
         def jacobian(x: Float, units: list[Float], values: list[Float], renderer: Renderer) -> tuple[Float, list[Float]]:
-            passes = [one(x, unit, values, renderer) for unit in units]
-            return passes[0][0], [derivative for _, derivative in passes]
+            if renderer.soft or self._keys[entry]:
+                # Sums over samples, and materials, clear the graph on the way.
+                passes = [one(x, unit, values, renderer) for unit in units]
+                return passes[0][0], [derivative for _, derivative in passes]
+            every = self._numbers(x)
+            dr.enable_grad(every[entry])
+            with traversed_again(), self._rendered(renderer, every, values, entry, arrays=False) as image:
+                derivatives = []
+                for k, unit in enumerate(units):
+                    for j, number in enumerate(every[entry]):
+                        dr.set_grad(number, dr.gather(mi.Float, unit, mi.UInt32(j)))
+                    # The graph stays for the next tangent: all of them share one image.
+                    clear = dr.ADFlag.ClearVertices if k < len(units) - 1 else dr.ADFlag.ClearEdges
+                    dr.forward_to(image, flags=clear | dr.ADFlag.AllowNoGrad)
+                    derivatives.append(dr.grad(image))
+                    dr.clear_grad(image)
+                dr.eval(image, derivatives)
+            return dr.detach(image), derivatives
 
         return jacobian
+
+    def _numbers(self, x: Float) -> list[list[Float]]:
+        """The numbers of each entry."""
+        return [
+            [dr.gather(mi.Float, x, mi.UInt32(j)) for j in range(self._starts[k], self._starts[k + 1])]
+            for k in range(len(self._parameters))
+        ]
 
     def _recorded_gradient(self, adjoint: Callable[[Float, list[Float], Float], Float]) -> Any:  # Any: a function for dr.freeze
         """The pass of :meth:`gradient`, or of :meth:`pulled`. ``adjoint``: derivative by the image, from image and inputs."""
 
         def gradient(x: Float, values: list[Float], pixels: list[Float], limit: Float, renderer: Renderer) -> list[Float]:
-            numbers = [
-                [dr.gather(mi.Float, x, mi.UInt32(j)) for j in range(self._starts[k], self._starts[k + 1])]
-                for k in range(len(self._parameters))
-            ]
+            numbers = self._numbers(x)
             own = [mi.Float(dr.detach(one)) for one in values]
             dr.enable_grad(own)
             with self._rendered(renderer, numbers, own, -1, arrays=True) as image:
@@ -385,7 +405,7 @@ def is_recordable(scene: mi.Scene, key: str) -> bool:
 
 def _input(numbers: Array) -> Float:
     """Numbers as an input of a recording. Dr.Jit 1.5 aborts the process at arrays without entries."""
-    return mi.Float(numbers.astype(np.float32) if len(numbers) else np.zeros(1, np.float32))
+    return device_array(mi.Float, numbers if len(numbers) else np.zeros(1))
 
 
 def set_values(scene: mi.Scene, change: SceneChange, *, all_values: bool = True) -> Callable[[], None]:

@@ -9,6 +9,7 @@ import drjit as dr
 import numpy as np
 
 from ..jit.arrays import backend
+from ..jit.branches import branch
 from ..jit.broadcast import copy_of_lane
 from ..jit.kernel_inputs import float_input, int_input, uint_input
 from ..jit.types import AnyArray, Bool, Float, Point3f, UInt32
@@ -53,14 +54,10 @@ def visibility(maps: ShadowMaps, map_index: UInt32 | int, p_world: Point3f, acti
 
 def _where(active: Bool, function: Callable[..., Float], maps: ShadowMaps, *lanes: AnyArray) -> Float:
     """``function(maps, *lanes)`` where ``active``, 1 elsewhere. A branch, for maps cover the casters, not all visible points."""
-    return dr.if_stmt(
-        lanes,
-        active,
-        lambda *lanes: function(maps, *lanes),
-        lambda *lanes: type(lanes[1])(1),
-        mode="symbolic",
-        label="shadow look-up",
+    found: Float = branch(
+        active, lambda *lanes: function(maps, *lanes), lambda *lanes: type(lanes[1])(1), lanes, "shadow look-up"
     )
+    return found
 
 
 def _resolve(maps: ShadowMaps, map_index: UInt32, u: Float, v: Float, depth: Float) -> Float:

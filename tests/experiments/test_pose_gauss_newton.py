@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from pathlib import Path
 
 import mitsuba as mi
@@ -60,6 +61,31 @@ def test_a_start_in_another_basin_is_left(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(GaussNewtonPose, "_descend_elsewhere", lambda self, loss: iter(()))
     alone = optimize(method, start_pose(4, 0), 60)
     assert pose_errors(alone.final)[0] > 30
+
+
+def test_a_start_whose_steps_promise_little_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Descents from all rotations fail, until one is taken whose offset was found with more patience."""
+    problem = make_problem("dragon", 128, normals="vertex", work=tmp_path)
+    reference = np.array(mi.render(problem.scene, integrator=mi.load_dict({"type": "direct"}), spp=64))
+    method = build_method("shadows", problem, reference, samples=9, optimiser="lm")
+    degrees, offset = pose_errors(optimize(method, start_pose(0, 34), 80).final)
+    assert degrees < 0.2 and offset < 0.3
+    for name, value in (("_PATIENT_WORTH", gauss_newton._WORTH), ("_PATIENT_DARES", 0)):
+        monkeypatch.setattr(gauss_newton, name, value)
+    assert pose_errors(optimize(method, start_pose(0, 34), 80).final)[0] > 10
+
+
+def test_no_pass_is_recorded_in_a_run(problem: PoseProblem, reference: np.ndarray) -> None:
+    """They are before the first one."""
+    gc.collect()  # recordings end with the objects of other scenes
+    method = build_method("shadows", problem, reference, optimiser="lm")
+    assert isinstance(method, GaussNewtonPose)
+    views = [part._view for part in (method._coarse, method._fine, method._slopes)]
+    passes = [one for view in views for one in (view._image, *view._jacobians)]
+    counts = [one.n_recordings for one in passes]
+    for run in range(3):
+        optimize(method, start_pose(0, run), 40)
+    assert [one.n_recordings for one in passes] == counts
 
 
 @pytest.mark.parametrize(("size", "block"), [((128, 128), 2), ((512, 512), 8), ((64, 64), 1), ((100, 100), 2), ((127, 127), 1)])

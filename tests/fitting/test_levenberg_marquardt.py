@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shadowmap_dr.fitting.levenberg_marquardt import Limits
+from shadowmap_dr.fitting.levenberg_marquardt import Damping, Limits
 from shadowmap_dr.fitting.levenberg_marquardt import minimise as steps_of
 
 Array = npt.NDArray[np.float64]
@@ -246,6 +246,35 @@ def test_small_steps_end_the_search() -> None:
     problem, accepted = linear(np.eye(1), [1e-6]), list[Point]()
     best, ended = minimise(problem.at, problem.at(np.zeros(1)), free(1, shortest=1e-5), accepted.append)
     assert ended and not accepted and best.x[0] == 0 and len(problem.asked) == 1
+
+
+def test_steps_that_promise_little_are_not_taken() -> None:
+    """A tenth of the cost can be removed."""
+    problem = linear([[1.0], [0.0]], [1.0, 3.0])
+    best, ended = minimise(problem.at, problem.at(np.zeros(1)), free(1, worth=0.11))
+    assert ended and best.x[0] == 0 and len(problem.asked) == 1
+    best, _ = minimise(problem.at, problem.at(np.zeros(1)), free(1, worth=0.09))
+    assert best.x[0] == pytest.approx(1, abs=1e-2)
+
+
+def test_dampings_after_failures() -> None:
+    """Candidates are refused, and steps become shorter, until the damping is too large."""
+    problem = Problem(lambda x: [1.0 if x[0] == 0 else 2.0], lambda x: [[1.0]])
+    damping = Damping(first=1e-3, worse=10.0, failed=0.5, most=100.0)
+    minimise(problem.at, problem.at(np.zeros(1)), free(1, damping=damping, dares=0))
+    np.testing.assert_allclose(np.ravel(problem.asked), [0, *(-1 / (1 + d) for d in (1e-3, 0.5, 5, 50))], rtol=1e-6)
+
+
+def test_points_that_follow_may_have_other_derivatives() -> None:
+    """Derivatives that are too large by a half make steps too short; the first step tells."""
+    problem = Problem(lambda x: [x[0] - 1], lambda x: [[1.5]])
+
+    def corrected(before: Point, after: Point) -> Point:
+        change = (after.residuals - before.residuals) / (after.x - before.x)
+        return replace(after, derivatives=change[None])
+
+    steps = list(steps_of(problem.at, problem.at(np.zeros(1)), free(1), corrected))
+    assert steps[0].x[0] == pytest.approx(2 / 3, abs=1e-2) and steps[1].x[0] == pytest.approx(1, abs=1e-3)
 
 
 def test_differences_of_rounding_end_the_search() -> None:

@@ -119,6 +119,21 @@ def test_a_jacobian_has_the_derivatives_of_all_numbers_of_an_entry(
             assert np.linalg.norm(column - derivative) < 0.02 * np.linalg.norm(derivative)
 
 
+@pytest.mark.parametrize("what", ["image", "derivative", "jacobian"])
+def test_passes_are_recorded_once_wherever_numpy_has_its_numbers(renderers: dict[str, Renderer], what: str) -> None:
+    """Their addresses are of all alignments."""
+    view = view_of(renderers["sun"], "box:pose", size=ImageSize(8, 6), quality=Quality(8, 1, 16, 4, 32))
+    calls = {"image": view.image, "derivative": lambda x: view.derivative(x, 1), "jacobian": view.jacobian}
+    recorded = {"image": view._image, "derivative": view._passes[0], "jacobian": view._jacobians[0]}[what]
+    calls[what](np.zeros(view.count))
+    calls[what](np.zeros(view.count))
+    before, kept = recorded.n_recordings, []
+    for k in range(24):
+        kept.append(np.zeros(1 + k % 7, np.float32))
+        calls[what](np.full(view.count, 0.001 * k))
+    assert recorded.n_recordings == before
+
+
 def test_a_jacobian_of_values_that_are_not_recorded_has_differences(renderers: dict[str, Renderer]) -> None:
     view, x = view_of(renderers["sun"], "floor:value"), np.zeros(3)
     recorded = [column.copy() for column in view.jacobian(x)[1]]

@@ -1,9 +1,8 @@
-"""Least squares of differences between images of a pose and a reference: linear models, and damped steps."""
+"""Least squares of differences between images of a pose and a reference, and their linear models."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -17,12 +16,6 @@ from ...rendering.renderer import Renderer
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
 
-# Longest change of a number in a step: radians, or scene units.
-_LONGEST = 0.3
-# Damping: at first, least, after a failure at least, most; factors after success and after failure.
-_DAMPING, _LEAST, _AFTER_FAILURE, _MOST, _BETTER, _WORSE = 1e-3, 1e-6, 0.03, 1.0, 0.2, 8.0
-# Least share of the loss that a step has to promise.
-_WORTH = 0.1
 # Least factor by which derivatives are scaled to the changes of images. Noise does not make them smaller than they are.
 _SMALLEST = 0.5
 
@@ -33,21 +26,10 @@ class Linear:
 
     columns: Array
 
-    def step(self, difference: Array, damping: float = 0.0) -> Array:
-        """Step (n,) to the least squares of the model, from where the differences (N,) are, shortened to the longest change.
-
-        ``damping``: times the diagonal of the normal equations.
-        """
-        matrix = self.columns @ self.columns.T
-        diagonal = np.diag(matrix)
-        matrix += np.diag(damping * diagonal + 1e-12 * max(diagonal.max(), 1e-30))
-        step: Array = -np.linalg.solve(matrix, self.columns @ difference)
-        return step * min(1.0, _LONGEST / max(np.abs(step).max(), 1e-30))
-
-    def promise(self, difference: Array, step: Array) -> float:
-        """Decrease of the mean square that the model expects of a step."""
-        change = step @ self.columns
-        return -float(np.mean(change * (2 * difference + change)))
+    def system(self, difference: Array) -> tuple[Array, Array]:
+        """(matrix (n, n), right side (n,)) of the normal equations of the mean square, where the differences (N,) are."""
+        scale = 2 / difference.size
+        return scale * self.columns @ self.columns.T, scale * self.columns @ difference
 
     def factor(self, step: Array, change: Array) -> float:
         """Factor with which the model's change along a step is nearest to that of the images, ``change`` (N,), within limits.
@@ -58,19 +40,34 @@ class Linear:
         # Sums of products, not `@`: the threads of the linear algebra and those of Dr.Jit would wait for each other.
         return float(np.clip(np.sum(expected * change) / max(np.sum(expected * expected), 1e-30), _SMALLEST, 1.0))
 
-    def times(self, factor: float | Array) -> Linear:
-        """The model with all derivatives times a factor, or those by each number times its own, (n, 1)."""
+    def times(self, factor: float) -> Linear:
+        """The model with all derivatives times a factor."""
         return Linear(self.columns * factor)
 
 
 @dataclass(frozen=True)
 class Difference:
-    """Differences (N,) between the image at a pose ``x`` (n,) and the reference, their model, and their mean square, ``loss``."""
+    """Differences (N,) between the image at a pose ``x`` (n,) and the reference, and their model.
+
+    ``cost``: their mean square. ``scale``: factor of all derivatives, see :meth:`follow`.
+    """
 
     x: Array
     values: Array
     model: Linear
-    loss: float
+    cost: float
+    scale: float = 1.0
+
+    def system(self) -> tuple[Array, Array]:
+        """(matrix (n, n), right side (n,)) of the normal equations."""
+        return self.model.times(self.scale).system(self.values)
+
+    def follow(self, after: Difference) -> Difference:
+        """The point ``after`` a step from this one, with derivatives scaled as this one's should have been along the step.
+
+        The noise of the next derivatives is about that of these.
+        """
+        return replace(after, scale=self.model.factor(after.x - self.x, after.values - self.values))
 
 
 class Differences:
@@ -121,40 +118,3 @@ class Differences:
 def mean_square(values: Array) -> float:
     """Mean of the squares of values (N,)."""
     return float(np.mean(np.square(values)))
-
-
-class DampedSteps:
-    """Steps of Levenberg and Marquardt's method.
-
-    Args:
-        differences: what is minimised.
-        start: (n,) numbers.
-        shortest: steps in which no number changes more are not taken.
-        fixed: numbers that stay as they are, by their index.
-
-    Attributes:
-        point: the current point.
-    """
-
-    def __init__(self, differences: Differences, start: Array, shortest: float, fixed: Sequence[int] = ()) -> None:
-        self._differences, self._shortest, self._damping = differences, shortest, _DAMPING
-        self._moves = np.array([number not in fixed for number in range(len(start))], np.float64)[:, None]
-        self.point = differences.at(start)
-        self._model = self.point.model.times(self._moves)
-
-    def advance(self) -> bool:
-        """Go to a better point. False, at the same point, if no step is worth it."""
-        point = self.point
-        while self._damping <= _MOST:
-            step = self._model.step(point.values, self._damping)
-            if np.abs(step).max() < self._shortest or self._model.promise(point.values, step) < _WORTH * point.loss:
-                return False
-            candidate = self._differences.at(point.x + step)
-            if candidate.loss < point.loss:
-                self._damping = max(self._damping * _BETTER, _LEAST)
-                # The noise of the next derivatives is about that of these.
-                factor = point.model.factor(step, candidate.values - point.values)
-                self.point, self._model = candidate, candidate.model.times(factor * self._moves)
-                return True
-            self._damping, self._model = max(self._damping * _WORSE, _AFTER_FAILURE), point.model.times(self._moves)
-        return False

@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...jit.arrays import device_array, ravel
+from ...jit.branches import branch
 from ...jit.types import Bool, Float, Normal3f, UInt32, Vector3f, Vector4f
 from ...jit.vectors import normalize_or
 from ...raster import Topology
@@ -141,12 +142,6 @@ def prefilter_normals(
         return n_world, n_shading, mi.Float(1)
 
     # Most pixels of a large image see large facets: the branch skips their look-ups.
-    n_world, n_shading, own = dr.if_stmt(
-        (hits.triangle, hits.u, hits.v, *normals, square, pixel),
-        soft,
-        mixed,
-        own_normals,
-        mode="symbolic",
-        label="soften facets",
-    )
+    arguments = (hits.triangle, hits.u, hits.v, *normals, square, pixel)
+    n_world, n_shading, own = branch(soft, mixed, own_normals, arguments, "soften facets")
     return (n_world, n_shading), dr.detach(own)

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ...jit.arrays import backend, ravel
+from ...jit.branches import branch
 from ...jit.broadcast import LIKE_LANES, broadcast_differentiable, copy_of_lane, in_copies
 from ...jit.types import Bool, Color3f, Float, Normal3f, Point3f, UInt32, Vector3f, Vector3u
 from ...jit.vectors import normalize_or
@@ -118,9 +119,7 @@ def normals_at(geometry: Geometry, hits: SurfacePoints) -> tuple[Normal3f, Norma
         needed &= ~flags.test(FACETED) | hits.changed
     elif all(info.has_normals for info in infos):
         return n_world, interpolated(*arguments, hits.active)
-    return n_world, dr.if_stmt(
-        arguments, needed, interpolated, lambda *args: mi.Normal3f(args[4]), mode="symbolic", label="smooth normals"
-    )
+    return n_world, branch(needed, interpolated, lambda *args: mi.Normal3f(args[4]), arguments, "smooth normals")
 
 
 def surface_at(

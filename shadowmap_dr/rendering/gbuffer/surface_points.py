@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ...jit.arrays import replace_grad
+from ...jit.branches import branch
 from ...jit.types import AnyArray, ArrayT, Bool, Float, Point3f, UInt32, Vector3f, Vector3u
 from ...jit.vectors import normalize_or
 from ...scene.geometry import NO_TRIANGLE, Geometry
@@ -113,9 +114,7 @@ def pixel_hits(geometry: Geometry, sensor: Sensor, triangle: UInt32, size: Image
             return tuple(dr.zeros(kind) for kind in kinds)
 
         # Derivatives separately, in a branch: in many images most pixels see nothing that moves.
-        attached = dr.if_stmt(
-            (face, changed, ray_o, ray_d, row), changed, intersect, none, mode="symbolic", label="attached hits"
-        )
+        attached = branch(changed, intersect, none, (face, changed, ray_o, ray_d, row), "attached hits")
         found = tuple(replace_grad(value, other) for value, other in zip(found, attached, strict=True))
     e1, e2, normal, u, v, p_world = found
     wi_world = -dr.normalize(ray_d)

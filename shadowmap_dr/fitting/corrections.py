@@ -67,7 +67,7 @@ class Corrections:
         except (ShadowmapError, RuntimeError) as error:
             self.failure = " ".join(str(error).split()).rstrip(".")
             return False
-        differences = [image - view.image(x) for image, view in zip(images, objective.views, strict=True)]
+        differences = [image - own for image, own in zip(images, objective.images(x), strict=True)]
         self._known = [(x.copy(), differences), *self._known[:_SECANTS]]
         weights = self._weights(x)
         for number, image in enumerate(differences):

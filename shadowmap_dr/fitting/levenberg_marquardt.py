@@ -19,6 +19,13 @@ _DAMPING, _BETTER, _WORSE, _LEAST, _MOST = 1e-3, 0.2, 5.0, 1e-9, 1e4
 # Full steps that may be worse, at most; promised decrease, as a share of the cost, for which they are taken; steps that follow to
 # make them better.
 _DARES, _PROMISING, _PROOF = 2, 5e-3, 4
+# Share of the promised decrease from which on derivatives are good enough to follow from those before.
+_AGREES = 0.5
+# Share of a step, of the limits, as which a step with such derivatives counts.
+_FOLLOWED = 0.25
+
+
+P = TypeVar("P", bound="Residuals")
 
 
 class Residuals(Protocol):
@@ -27,11 +34,18 @@ class Residuals(Protocol):
     x: Array
     cost: float
 
+    @property
+    def is_exact(self) -> bool:
+        """False if derivatives follow from those at other points."""
+
     def system(self) -> tuple[Array, Array]:
         """(matrix (n, n), right side (n,)) of the normal equations."""
 
+    def follow(self: P, other: P) -> None:
+        """Take the derivatives of another point, so changed that they agree with the difference between the two."""
 
-P = TypeVar("P", bound=Residuals)
+    def refresh(self) -> None:
+        """Make derivatives exact: the next system computes them."""
 
 
 @dataclass(frozen=True)
@@ -72,57 +86,84 @@ def minimise(at: Callable[[Array], P], start: P, limits: Limits) -> Generator[P,
     Returns:
         True if steps or improvements had become small, False after the last step of the limits.
     """
-    best, left = start, limits.steps
+    best, left = start, _Left(limits.steps)
     for dared in range(1 + _DARES):
         if dared:
-            dare = _full_step(at, best, limits)
-            if dare is None or not left:
+            dare = _full_step(at, best, limits) if left.steps > 0 else None
+            if dare is None:
                 break
-            steps = list(_descent(at, dare, limits, min(left, _PROOF)))
-            left -= len(steps)
+            own = _Left(min(left.steps, _PROOF))
+            left.steps -= own.steps
+            steps = list(_descent(at, dare, limits, own))
+            left.steps += own.steps
             if not steps or not steps[-1].cost < best.cost:
                 break
             best = steps[-1]
             yield best
         for better in _descent(at, best, limits, left):
             best = better
-            left -= 1
             yield best
-    return left > 0
+    return left.steps > 0
+
+
+@dataclass
+class _Left:
+    """Steps that are left. Those with derivatives that follow from others count as a part of one: they take less time."""
+
+    steps: float
+
+    def take(self, *, exact: bool) -> None:
+        self.steps -= 1 if exact else _FOLLOWED
 
 
 def _full_step(at: Callable[[Array], P], point: P, limits: Limits) -> P | None:
     """The point after a full step, if its derivatives promise much."""
     matrix, right = point.system()
     step = _after_step(matrix, right, _DAMPING, point.x, limits) - point.x
-    promised = -float(right @ step + 0.5 * step @ matrix @ step)
+    promised = _promised(matrix, right, step)
     if not promised > _PROMISING * point.cost or np.abs(step).max(initial=0) < limits.shortest:
         return None
     return at(point.x + step)
 
 
-def _descent(at: Callable[[Array], P], point: P, limits: Limits, steps: int) -> Iterator[P]:
+def _promised(matrix: Array, right: Array, step: Array) -> float:
+    """Decrease of the cost by a step, as its derivatives promise it."""
+    return -float(right @ step + 0.5 * step @ matrix @ step)
+
+
+def _descent(at: Callable[[Array], P], point: P, limits: Limits, left: _Left) -> Iterator[P]:
     """Better and better points, one after each step, until steps or improvements are small."""
-    damping = _DAMPING
-    for _ in range(steps):
+    damping, followed = _DAMPING, 0
+    while left.steps > 0:
         matrix, right = point.system()
         while True:
             x = _after_step(matrix, right, damping, point.x, limits)
-            if np.abs(x - point.x).max(initial=0) < limits.shortest:
-                return
-            candidate = at(x)
-            if candidate.cost < point.cost:
+            short = np.abs(x - point.x).max(initial=0) < limits.shortest
+            candidate = None if short else at(x)
+            if candidate is not None and candidate.cost < point.cost:
                 break
-            if candidate.cost < point.cost * (1 + limits.improvement):
+            if not point.is_exact:
+                point.refresh()
+                matrix, right = point.system()
+                followed = 0
+                continue
+            if candidate is None or candidate.cost < point.cost * (1 + limits.improvement):
                 return  # the differences are those of rounding
             damping *= _WORSE
             if damping > _MOST:
                 return
         damping = max(damping * _BETTER, _LEAST)
-        gained = (point.cost - candidate.cost) / max(point.cost, 1e-300)
+        left.take(exact=point.is_exact)
+        step, gained = x - point.x, point.cost - candidate.cost
+        last = point.is_exact and gained < limits.improvement * point.cost
+        if gained > _AGREES * _promised(matrix, right, step) and gained >= limits.improvement * point.cost and followed < len(x):
+            candidate.follow(point)
+            followed += 1
+        else:
+            followed = 0
         point = candidate
         yield point
-        if gained < limits.improvement:
+        if last:
             return
 
 

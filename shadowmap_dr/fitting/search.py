@@ -342,6 +342,7 @@ class Fit:
         """The result of the steps taken so far."""
         objective = self.stages[-1].objective
         point = objective.at(self.best)
+        point.refresh()
         spread = uncertainty(point, objective, self._low, self._high)
         # Numbers that move nothing, which starts have left anywhere, are those of the scene.
         x = np.where(spread.idle, np.clip(0, self._low, self._high), point.x)

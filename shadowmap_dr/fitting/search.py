@@ -49,6 +49,9 @@ _ENOUGH = 1e-3
 # Corrections of the images at most, steps after each, and the improvement and the length below which steps are the last. Images
 # that explain less than the last share are too far from the pictures to be worth it.
 _CORRECTIONS, _CORRECTED_STEPS, _LITTLE, _SHORT, _FAR = 6, 3, 1e-4, 3e-4, 0.5
+# Change of the images by the steps after a correction, as a share of the brightness, below which it is the last: intervals allow
+# for more (uncertainty.py: FACTOR, OFFSET).
+_SLIGHT = 0.001
 # More corrections as long as each lowers the loss by such a share, at most.
 _WORTH_ANOTHER, _MOST_CORRECTIONS = 0.1, 24
 # Corrections after which a start is left, if it leaves a larger share unexplained.
@@ -210,7 +213,7 @@ class Fit:
         """True if steps with corrected images follow."""
         if self._corrections is None or self.arrays or run.corrected:
             return False
-        return self._unexplained(run.x).whole <= _FAR and self._corrections.put(run.x)
+        return self._unexplained(run.x).whole <= _FAR and self._corrections.put(run.x, rough=True)
 
     def _correct(self, run: Run, *, last: bool) -> Iterator[Step]:
         """Steps of a start with corrected images. ``last``: no other try follows; else far starts are left early."""
@@ -218,20 +221,29 @@ class Fit:
         if self._corrections is None or not self._is_to_be_corrected(run):
             return
         limits = Limits(self._low, self._high, _LONGEST, _CORRECTED_STEPS, _LITTLE, _SHORT)
-        cost = math.inf
+        cost, rough = math.inf, True
         for number in range(_MOST_CORRECTIONS):
-            if number >= _CORRECTIONS and run.cost > (1 - _WORTH_ANOTHER) * cost:
+            little = run.cost > (1 - _WORTH_ANOTHER) * cost
+            if number >= _CORRECTIONS and little and not rough:
                 break
+            rough = rough and not little
             before, cost = run.x, run.cost
-            if not self._corrections.put(before):
+            if not self._corrections.put(before, rough=rough):
                 return
             if number == _FEW_CORRECTIONS and not last and self._unexplained(run.x).largest > _CLOSE:
                 break
             yield from self._descend(run, stage, self.stages[stage], limits)
-            if np.abs(run.x - before).max(initial=0) < _SHORT:
-                break
+            if self._effect_of(run.x - before, run.x) < _SLIGHT or np.abs(run.x - before).max(initial=0) < _SHORT:
+                if not rough:
+                    break
+                rough = False
         self._corrections.put(run.x)
         run.cost, run.corrected = self.stages[stage].objective.at(run.x).cost, True
+
+    def _effect_of(self, step: Array, x: Array) -> float:
+        """Root of the mean square by which a step (n,) to the numbers x changes the last images, a share of their brightness."""
+        matrix, _ = self.stages[-1].objective.at(x).system()
+        return math.sqrt(max(float(step @ matrix @ step), 0.0))
 
     def _descend(self, run: Run, number: int, stage: Stage, limits: Limits) -> Iterator[Step]:
         """Steps of a start in a stage."""

@@ -69,7 +69,7 @@ def test_a_scene_that_mitsuba_cannot_change_is_fitted_without() -> None:
     assert any(words.startswith("Images are not corrected") for words in result.words)
 
 
-@pytest.mark.parametrize(("share", "count"), [(0.75, 21), (0.95, 6)])
+@pytest.mark.parametrize(("share", "count"), [(0.75, 22), (0.95, 6)])
 def test_images_are_corrected_as_long_as_it_helps(monkeypatch: pytest.MonkeyPatch, share: float, count: int) -> None:
     """Steps through a long valley were ended after six corrections, a degree from the pose, and called found."""
     scene = scene_of(camera=camera(film=SIZE), box=box(0))
@@ -85,9 +85,34 @@ def test_images_are_corrected_as_long_as_it_helps(monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr(search, "_descend", descend)
     monkeypatch.setattr(search, "_is_to_be_corrected", lambda run: True)
-    monkeypatch.setattr(search._corrections, "put", lambda x: True)
+    monkeypatch.setattr(search._corrections, "put", lambda x, **named: True)
     list(search._correct(Run(0, np.zeros(1)), last=True))
     assert len(descents) == count
+
+
+def test_corrections_are_rough_while_they_help_much(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And the last one is not, whose steps change the images little."""
+    scene = scene_of(camera=camera(film=SIZE), box=box(0))
+    picture = np.array(mi.render(scene, spp=4), np.float32)[..., :3]
+    search = prepared(Renderer.from_scene(scene, **OPTIONS), picture, ["box:translation:x"], starts=1)
+    losses, effects = [1, 0.5, 0.2, 0.19, 0.18, 0.17], iter([1, 0.5, 0.2, 0.1, 0.0005, 0.0005])
+    given: list[bool] = []
+
+    def descend(run: Run, *others: object) -> Iterator[Step]:
+        run.x, run.cost = run.x + 0.01, losses[len(given) - 1]
+        yield from ()
+
+    def put(x: np.ndarray[Any, Any], *, rough: bool = False) -> bool:
+        given.append(rough)
+        return True
+
+    monkeypatch.setattr(search, "_descend", descend)
+    monkeypatch.setattr(search, "_effect_of", lambda step, x: next(effects))
+    monkeypatch.setattr(search, "_is_to_be_corrected", lambda run: True)
+    monkeypatch.setattr(search._corrections, "put", put)
+    list(search._correct(Run(0, np.zeros(1)), last=True))
+    # The last one corrects the images of the result.
+    assert given == [True, True, True, True, False, False]
 
 
 def test_effects_on_images_are_without_priors() -> None:

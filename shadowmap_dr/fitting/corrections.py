@@ -85,6 +85,10 @@ class Corrections:
             objective.corrections[number] = AffineImage(image - plain, x.copy(), slopes, weights)
         return True
 
+    def keep(self, x: Array) -> None:
+        """Keep the images' corrections at the numbers x (n,): those where they were rendered differ too little to matter."""
+        self._known[0] = x.copy(), self._known[0][1]
+
     def keep_constant(self) -> None:
         """Leave out the secants: derivatives are then those of shadow maps alone, without noise."""
         plain = [one and replace(one, slopes=one.slopes[:0], weights=one.weights[:0]) for one in self._objective.corrections]

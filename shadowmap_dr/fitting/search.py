@@ -233,10 +233,11 @@ class Fit:
             if number == _FEW_CORRECTIONS and not last and self._unexplained(run.x).largest > _CLOSE:
                 break
             yield from self._descend(run, stage, self.stages[stage], limits)
-            if self._effect_of(run.x - before, run.x) < _SLIGHT or np.abs(run.x - before).max(initial=0) < _SHORT:
-                if not rough:
-                    break
-                rough = False
+            slight = self._effect_of(run.x - before, run.x) < _SLIGHT or np.abs(run.x - before).max(initial=0) < _SHORT
+            if slight and not rough:
+                self._corrections.keep(run.x)
+                break
+            rough = rough and not slight
         self._corrections.put(run.x)
         run.cost, run.corrected = self.stages[stage].objective.at(run.x).cost, True
 

@@ -110,9 +110,21 @@ def test_corrections_are_rough_while_they_help_much(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(search, "_effect_of", lambda step, x: next(effects))
     monkeypatch.setattr(search, "_is_to_be_corrected", lambda run: True)
     monkeypatch.setattr(search._corrections, "put", put)
+    monkeypatch.setattr(search._corrections, "keep", lambda x: None)
     list(search._correct(Run(0, np.zeros(1)), last=True))
     # The last one corrects the images of the result.
     assert given == [True, True, True, True, False, False]
+
+
+def test_corrections_that_are_kept_are_not_rendered_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = scene_of(camera=camera(film=SIZE), box=box(0))
+    picture = np.array(mi.render(scene, spp=4), np.float32)[..., :3]
+    corrections = prepared(Renderer.from_scene(scene, **OPTIONS), picture, ["box:translation:x"], starts=1)._corrections
+    assert corrections is not None and corrections.put(np.zeros(1))
+    kept = corrections._objective.corrections[0]
+    corrections.keep(np.array([1e-4]))
+    monkeypatch.setattr(corrections, "_reference", None)
+    assert corrections.put(np.array([1e-4])) and corrections._objective.corrections[0] is kept
 
 
 def test_effects_on_images_are_without_priors() -> None:

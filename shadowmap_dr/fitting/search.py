@@ -38,7 +38,7 @@ from .starts import LARGEST_FACTOR, chosen, draw, groups_of, half_ranges, redraw
 from .state import Run, Sizes, State
 from .targets import Target, short_names
 from .texture_brightness import TextureBrightness
-from .uncertainty import uncertainty
+from .uncertainty import shares_of_intervals, uncertainty
 
 Array = npt.NDArray[np.float64]
 
@@ -49,9 +49,8 @@ _ENOUGH = 1e-3
 # Corrections of the images at most, steps after each, and the improvement and the length below which steps are the last. Images
 # that explain less than the last share are too far from the pictures to be worth it.
 _CORRECTIONS, _CORRECTED_STEPS, _LITTLE, _SHORT, _FAR = 6, 3, 1e-4, 3e-4, 0.5
-# Change of the images by the steps after a correction, as a share of the brightness, below which it is the last: intervals allow
-# for more (uncertainty.py: FACTOR, OFFSET).
-_SLIGHT = 0.001
+# Steps after a correction, in half-widths of intervals, below which it is the last.
+_SLIGHT = 0.15
 # More corrections as long as each lowers the loss by such a share, at most.
 _WORTH_ANOTHER, _MOST_CORRECTIONS = 0.1, 24
 # Corrections after which a start is left, if it leaves a larger share unexplained.
@@ -233,7 +232,7 @@ class Fit:
             if number == _FEW_CORRECTIONS and not last and self._unexplained(run.x).largest > _CLOSE:
                 break
             yield from self._descend(run, stage, self.stages[stage], limits)
-            slight = self._effect_of(run.x - before, run.x) < _SLIGHT or np.abs(run.x - before).max(initial=0) < _SHORT
+            slight = self._is_slight(run.x - before, run.x)
             if slight and not rough:
                 self._corrections.keep(run.x)
                 break
@@ -241,10 +240,12 @@ class Fit:
         self._corrections.put(run.x)
         run.cost, run.corrected = self.stages[stage].objective.at(run.x).cost, True
 
-    def _effect_of(self, step: Array, x: Array) -> float:
-        """Root of the mean square by which a step (n,) to the numbers x changes the last images, a share of their brightness."""
-        matrix, _ = self.stages[-1].objective.at(x).system()
-        return math.sqrt(max(float(step @ matrix @ step), 0.0))
+    def _is_slight(self, step: Array, x: Array) -> bool:
+        """True for a step (n,) to the numbers x that hardly matters."""
+        if np.abs(step).max(initial=0) < _SHORT:
+            return True
+        objective = self.stages[-1].objective
+        return bool(shares_of_intervals(step, objective.at(x), objective).max(initial=0) < _SLIGHT)
 
     def _descend(self, run: Run, number: int, stage: Stage, limits: Limits) -> Iterator[Step]:
         """Steps of a start in a stage."""

@@ -91,11 +91,11 @@ def test_images_are_corrected_as_long_as_it_helps(monkeypatch: pytest.MonkeyPatc
 
 
 def test_corrections_are_rough_while_they_help_much(monkeypatch: pytest.MonkeyPatch) -> None:
-    """And the last one is not, whose steps change the images little."""
+    """And the last one is not, whose steps hardly matter."""
     scene = scene_of(camera=camera(film=SIZE), box=box(0))
     picture = np.array(mi.render(scene, spp=4), np.float32)[..., :3]
     search = prepared(Renderer.from_scene(scene, **OPTIONS), picture, ["box:translation:x"], starts=1)
-    losses, effects = [1, 0.5, 0.2, 0.19, 0.18, 0.17], iter([1, 0.5, 0.2, 0.1, 0.0005, 0.0005])
+    losses, slight = [1, 0.5, 0.2, 0.19, 0.18, 0.17], iter([False, False, False, False, True, True])
     given: list[bool] = []
 
     def descend(run: Run, *others: object) -> Iterator[Step]:
@@ -107,7 +107,7 @@ def test_corrections_are_rough_while_they_help_much(monkeypatch: pytest.MonkeyPa
         return True
 
     monkeypatch.setattr(search, "_descend", descend)
-    monkeypatch.setattr(search, "_effect_of", lambda step, x: next(effects))
+    monkeypatch.setattr(search, "_is_slight", lambda step, x: next(slight))
     monkeypatch.setattr(search, "_is_to_be_corrected", lambda run: True)
     monkeypatch.setattr(search._corrections, "put", put)
     monkeypatch.setattr(search._corrections, "keep", lambda x: None)

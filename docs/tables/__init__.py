@@ -16,7 +16,20 @@ from pathlib import Path
 from shadowmap_dr.experiments.art import gallery
 from shadowmap_dr.experiments.pose import table as pose
 
-from . import agreement, art, extended_lights, faces, fits, gradients, light_directions, modelling, poses, readme, shadow_maps, speed
+from . import (
+    agreement,
+    art,
+    extended_lights,
+    faces,
+    fits,
+    gradients,
+    light_directions,
+    modelling,
+    poses,
+    readme,
+    shadow_maps,
+    speed,
+)
 from .records import DOCS, RESULTS, Lines, record
 
 REGION = re.compile(r"^<!-- table: (?P<name>[^\n]+) -->\n(?P<body>.*?)^<!-- end of table -->$", re.MULTILINE | re.DOTALL)

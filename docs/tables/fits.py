@@ -41,7 +41,16 @@ def fits() -> Lines:
             ]
         )
     return markdown(
-        ["problem", "fitted", "pictures by", "solved", "median [s]", "longest [s]", "largest error over bar", "intervals that hold"],
+        [
+            "problem",
+            "fitted",
+            "pictures by",
+            "solved",
+            "median [s]",
+            "longest [s]",
+            "largest error over bar",
+            "intervals that hold",
+        ],
         rows,
     )
 

@@ -49,31 +49,45 @@ class Corrections:
     def __init__(self, renderer: Renderer, objective: Objective, windows: list[tuple[int, int]]) -> None:
         self._renderer, self._objective = renderer, objective
         self._reference = Reference(renderer.data, windows)
-        # Numbers, and differences of the images at them, the last one first.
+        # Numbers, and differences of the images of each pass (P, H, W, 3) at them, the last one first.
         self._known: list[tuple[Array, list[Image]]] = []
+        self._rough = False
         # Effect of each number on the images, where they were first corrected.
         self._effect: Array | None = None
         self.failure = ""
 
-    def put(self, x: Array) -> bool:
-        """Correct the images so that they are Mitsuba's at the numbers x (n,). False if it cannot render them."""
-        if self._known and np.array_equal(self._known[0][0], x):
+    def put(self, x: Array, *, rough: bool = False) -> bool:
+        """Correct the images so that they are Mitsuba's at the numbers x (n,). False if it cannot render them.
+
+        Args:
+            x: the numbers.
+            rough: images with more noise do: far from the end, it moves the numbers less than their steps.
+        """
+        again = bool(self._known) and np.array_equal(self._known[0][0], x)
+        if again and (rough or not self._rough):
             return True
         objective = self._objective
         changes = changes_of(objective.views[0].change(x), self._renderer)
         cameras = [view.camera(x) for view in objective.views]
         try:
-            images = self._reference.images(changes, cameras, [view.size for view in objective.views])
+            images = self._reference.images(changes, cameras, [view.size for view in objective.views], rough=rough, more=again)
         except (ShadowmapError, RuntimeError) as error:
             self.failure = " ".join(str(error).split()).rstrip(".")
             return False
-        differences = [image - view.image(x) for image, view in zip(images, objective.views, strict=True)]
-        self._known = [(x.copy(), differences), *self._known[:_SECANTS]]
+        own = objective.images(x)
+        differences = [passes - image for passes, image in zip(self._reference.passes, own, strict=True)]
+        self._known = [(x.copy(), differences), *(self._known[1:] if again else self._known[:_SECANTS])]
+        self._rough = rough
         weights = self._weights(x)
-        for number, image in enumerate(differences):
-            slopes = np.array([_smooth(other[number] - image) for _, other in self._known[1:]]).reshape(-1, *image.shape)
-            objective.corrections[number] = AffineImage(image, x.copy(), slopes, weights)
+        for number, (image, plain) in enumerate(zip(images, own, strict=True)):
+            here = differences[number]
+            slopes = np.array([_change(here, other[number]) for _, other in self._known[1:]]).reshape(-1, *image.shape)
+            objective.corrections[number] = AffineImage(image - plain, x.copy(), slopes, weights)
         return True
+
+    def keep(self, x: Array) -> None:
+        """Keep the images' corrections at the numbers x (n,): those where they were rendered differ too little to matter."""
+        self._known[0] = x.copy(), self._known[0][1]
 
     def keep_constant(self) -> None:
         """Leave out the secants: derivatives are then those of shadow maps alone, without noise."""
@@ -113,6 +127,12 @@ class Corrections:
         """Leave the images as they are."""
         self._objective.corrections = [None] * len(self._objective.views)
         self._known, self._effect = [], None
+
+
+def _change(here: Image, there: Image) -> Image:
+    """Difference of two images from their passes (P, H, W, 3): those that both have, whose noise is alike."""
+    count = min(len(here), len(there))
+    return _smooth(np.asarray(there[:count].mean(0) - here[:count].mean(0), np.float32))
 
 
 def _smooth(image: Image) -> Image:

@@ -17,6 +17,12 @@ Array = npt.NDArray[np.float64]
 # Promised decrease, as a share of the cost, for which full steps are taken that may be worse; steps that follow to make them
 # better.
 _PROMISING, _PROOF = 5e-3, 4
+# Share of the promised decrease from which on derivatives are good enough to follow from those before.
+_AGREES = 0.5
+# Share of a step, of the limits, as which a step with such derivatives counts.
+_FOLLOWED = 0.25
+
+P = TypeVar("P", bound="Residuals")
 
 
 class Residuals(Protocol):
@@ -30,11 +36,22 @@ class Residuals(Protocol):
     def cost(self) -> float:
         """The loss."""
 
+    @property
+    def is_exact(self) -> bool:
+        """False if derivatives follow from those at other points."""
+
     def system(self) -> tuple[Array, Array]:
         """(matrix (n, n), right side (n,)) of the normal equations."""
 
+    def after(self: P, before: P, *, trusted: bool) -> P:
+        """The point to go on from, after a step from another point to this one.
 
-P = TypeVar("P", bound=Residuals)
+        Derivatives may follow from those before, and from the difference between the two; if the step had the success that these
+        promised, they are ``trusted``.
+        """
+
+    def refresh(self) -> None:
+        """Make derivatives exact: the next system computes them."""
 
 
 @dataclass(frozen=True)
@@ -82,9 +99,7 @@ class Limits:
     damping: Damping = field(default_factory=Damping)
 
 
-def minimise(
-    at: Callable[[Array], P], start: P, limits: Limits, follow: Callable[[P, P], P] = lambda before, after: after
-) -> Generator[P, None, bool]:
+def minimise(at: Callable[[Array], P], start: P, limits: Limits) -> Generator[P, None, bool]:
     """Minimise a loss from a point on.
 
     Losses jump where shadow maps are fitted anew. If steps gain little of what the derivatives promise, a full one is taken, even
@@ -95,7 +110,6 @@ def minimise(
         at: the point at given numbers.
         start: the first point.
         limits: bounds and ends.
-        follow: the better point of a step, from the points before and after it. It may correct the derivatives of the latter.
 
     Yields:
         Better and better points, one after each step.
@@ -103,23 +117,34 @@ def minimise(
     Returns:
         True if steps or improvements had become small, False after the last step of the limits.
     """
-    best, left = start, limits.steps
+    best, left = start, _Left(limits.steps)
     for dared in range(1 + limits.dares):
         if dared:
-            dare = _full_step(at, best, limits)
-            if dare is None or not left:
+            dare = _full_step(at, best, limits) if left.steps > 0 else None
+            if dare is None:
                 break
-            steps = list(_descent(at, dare, limits, min(left, _PROOF), follow))
-            left -= len(steps)
+            own = _Left(min(left.steps, _PROOF))
+            left.steps -= own.steps
+            steps = list(_descent(at, dare, limits, own))
+            left.steps += own.steps
             if not steps or not steps[-1].cost < best.cost:
                 break
             best = steps[-1]
             yield best
-        for better in _descent(at, best, limits, left, follow):
+        for better in _descent(at, best, limits, left):
             best = better
-            left -= 1
             yield best
-    return left > 0
+    return left.steps > 0
+
+
+@dataclass
+class _Left:
+    """Steps that are left. Those with derivatives that follow from others count as a part of one: they take less time."""
+
+    steps: float
+
+    def take(self, *, exact: bool) -> None:
+        self.steps -= 1 if exact else _FOLLOWED
 
 
 def _full_step(at: Callable[[Array], P], point: P, limits: Limits) -> P | None:
@@ -131,31 +156,41 @@ def _full_step(at: Callable[[Array], P], point: P, limits: Limits) -> P | None:
     return None if np.abs(step).max(initial=0) < limits.shortest else at(point.x + step)
 
 
-def _descent(at: Callable[[Array], P], point: P, limits: Limits, steps: int, follow: Callable[[P, P], P]) -> Iterator[P]:
+def _descent(at: Callable[[Array], P], point: P, limits: Limits, left: _Left) -> Iterator[P]:
     """Better and better points, one after each step, until steps or improvements are small."""
     factors = limits.damping
-    damping = factors.first
-    for _ in range(steps):
+    damping, followed = factors.first, 0
+    while left.steps > 0:
         matrix, right = point.system()
         while True:
             x = after_step(matrix, right, damping, point.x, limits)
-            if np.abs(x - point.x).max(initial=0) < limits.shortest:
-                return
-            if limits.worth and promised(matrix, right, x - point.x) < limits.worth * point.cost:
-                return
-            candidate = at(x)
-            if candidate.cost < point.cost:
+            step = x - point.x
+            short = np.abs(step).max(initial=0) < limits.shortest
+            idle = limits.worth > 0 and promised(matrix, right, step) < limits.worth * point.cost
+            candidate = None if short or idle else at(x)
+            if candidate is not None and candidate.cost < point.cost:
                 break
-            if candidate.cost < point.cost * (1 + limits.improvement):
+            if not point.is_exact:
+                point.refresh()
+                matrix, right = point.system()
+                followed = 0
+                continue
+            if candidate is None or candidate.cost < point.cost * (1 + limits.improvement):
                 return  # the differences are those of rounding
             damping = max(damping * factors.worse, factors.failed)
             if damping > factors.most:
                 return
         damping = max(damping * factors.better, factors.least)
-        gained = (point.cost - candidate.cost) / max(point.cost, 1e-300)
-        point = follow(point, candidate)
+        left.take(exact=point.is_exact)
+        gained = point.cost - candidate.cost
+        small = gained < limits.improvement * point.cost
+        trusted = gained > _AGREES * promised(matrix, right, step) and not small and followed < len(x)
+        last = point.is_exact and small
+        candidate = candidate.after(point, trusted=trusted)
+        followed = 0 if candidate.is_exact else followed + 1
+        point = candidate
         yield point
-        if gained < limits.improvement:
+        if last:
             return
 
 

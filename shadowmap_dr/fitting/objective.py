@@ -19,6 +19,8 @@ Image = npt.NDArray[np.float32]
 
 # Differences that remain in good fits, as shares of a picture's brightness, and pixels that err alike: they weigh priors.
 _USUAL, _ALIKE = 0.02, 64
+# Difference of two images, as a share of the brightness, that jumps from pixel to pixel may make.
+_JUMPS = 0.01
 #: Weight of a prior's squares beside those of residuals.
 PRIOR_WEIGHT = _USUAL**2 * _ALIKE
 
@@ -64,6 +66,9 @@ class Objective:
         self.gains = [slice(int(a), int(b)) for a, b in zip(ends[:-1], ends[1:], strict=True)]
         self.count = int(ends[-1])
         self.corrections: list[AffineImage | None] = [None] * len(self.views)
+        # The last point with derivatives: corrections that change at its numbers change neither its images nor them.
+        self.last: Point | None = None
+        self._latest: tuple[Array, list[Image]] | None = None
 
     @property
     def is_corrected(self) -> bool:
@@ -74,8 +79,18 @@ class Objective:
         """The residuals at x (n,)."""
         return Point(self, np.asarray(x, np.float64))
 
+    def images(self, x: Array) -> list[Image]:
+        """Images of all views at x (n,), without gains and corrections. Those of the last call are kept: gains change none."""
+        own = np.asarray(x, np.float64)[: self._scene]
+        if self.last is not None and np.array_equal(self.last.x[: self._scene], own):
+            return self.last.images
+        if self._latest is None or not np.array_equal(self._latest[0], own):
+            self._latest = own.copy(), [view.image(x).copy() for view in self.views]
+        return self._latest[1]
+
     def set_values(self, values: Sequence[Float]) -> None:
         """Set the values of the parameters with many values."""
+        self.last = self._latest = None
         for view in self.views:
             view.values = list(values)
 
@@ -123,7 +138,8 @@ class Point:
 
     def __init__(self, owner: Objective, x: Array) -> None:
         self.x, self._owner = x, owner
-        self.images = [view.image(x).copy() for view in owner.views]
+        known = owner.last if owner.last is not None and np.array_equal(owner.last.x, x) else None
+        self.images: list[Image] = owner.images(x)
         corrected = [image if c is None else image + c.at(x) for image, c in zip(self.images, owner.corrections, strict=True)]
         self.recorded = [owner.recorded(k, image, x) for k, image in enumerate(corrected)]
         pairs = zip(self.recorded, owner.comparisons, strict=True)
@@ -140,11 +156,45 @@ class Point:
         if not np.isfinite(self.cost):
             self.cost = self.error = np.inf
         self._columns: list[npt.NDArray[np.float32]] | None = None
+        self._derivatives: list[Image] | None = None if known is None else known._derivatives
+        self.is_exact: bool = known is None or known.is_exact
+
+    def after(self, before: Point, *, trusted: bool) -> Point:
+        """This point, after a step from another one, whose derivatives it takes if they are trusted.
+
+        They are so changed that they agree with the difference between the images.
+
+        Source: Broyden, "A class of methods for solving nonlinear simultaneous equations", 1965. Numbers are scaled by their
+        effects on the images. Images jump a little with each step, so short ones change little.
+        """
+        if not trusted:
+            return self
+        count, matrix = self._owner.views[0].count, before.system()[0]
+        step = (self.x - before.x)[:count]
+        effect = np.maximum(np.diag(matrix) - self._owner.precision, 0)[:count]
+        scaled = effect * step / (float(effect @ step**2) + _JUMPS**2)
+        self._derivatives, self.is_exact, self._owner.last = [], False, self
+        for image, old, derivatives in zip(self.images, before.images, before.derivatives(), strict=True):
+            missed = image - old - np.tensordot(step.astype(np.float32), derivatives, 1)
+            self._derivatives.append(derivatives + scaled.astype(np.float32)[:, None, None, None] * missed)
+        return self
+
+    def refresh(self) -> None:
+        """Make derivatives exact that follow from those of another point: they are computed when asked for."""
+        if not self.is_exact:
+            self._derivatives = self._columns = None
+            self.is_exact = True
+
+    def derivatives(self) -> list[Image]:
+        """Derivatives of the images, without their corrections, by the scene's numbers: for each picture (n, H, W, 3)."""
+        if self._derivatives is None:
+            self._derivatives, self._owner.last = [self._of_view(k) for k in range(len(self.images))], self
+        return self._derivatives
 
     def columns(self) -> list[npt.NDArray[np.float32]]:
         """Derivatives of the residuals by all numbers: for each picture (n, H W 3)."""
         if self._columns is None:
-            self._columns = [self._of_view(k) for k in range(len(self.images))]
+            self._columns = [self._columns_of(k) for k in range(len(self.images))]
         return self._columns
 
     def weights(self) -> list[npt.NDArray[np.float32]]:
@@ -162,16 +212,21 @@ class Point:
             right += weighted @ residual.reshape(-1)
         return matrix / owner.terms + np.diag(owner.precision), right / owner.terms + owner.precision * self.x
 
-    def _of_view(self, number: int) -> npt.NDArray[np.float32]:
-        owner, view = self._owner, self._owner.views[number]
-        gain, own = owner.observations[number].gain, owner.gains[number]
-        correction, changes = owner.corrections[number], dict[int, Image]()
+    def _of_view(self, number: int) -> Image:
+        view = self._owner.views[number]
+        derivatives = np.zeros((view.count, *self.images[number].shape), np.float32)
         with view.scene_at(self.x):
             for k in range(view.count):
-                _, derivative = view.derivative(self.x, k)
-                if correction is not None:
-                    derivative = derivative + correction.derivative(k)
-                changes[k] = gain.apply(derivative, self.x[own])
+                derivatives[k] = view.derivative(self.x, k)[1]
+        return derivatives
+
+    def _columns_of(self, number: int) -> npt.NDArray[np.float32]:
+        owner = self._owner
+        gain, own = owner.observations[number].gain, owner.gains[number]
+        correction, changes = owner.corrections[number], dict[int, Image]()
+        for k, derivative in enumerate(self.derivatives()[number]):
+            whole = derivative if correction is None else derivative + correction.derivative(k)
+            changes[k] = gain.apply(whole, self.x[own])
         # At the image without its correction, to which the scene's own numbers do not contribute either: the exposure and the
         # strength of all lights have the same derivatives.
         plain = owner.recorded(number, self.images[number], self.x)

@@ -38,7 +38,7 @@ from .starts import LARGEST_FACTOR, chosen, draw, groups_of, half_ranges, redraw
 from .state import Run, Sizes, State
 from .targets import Target, short_names
 from .texture_brightness import TextureBrightness
-from .uncertainty import uncertainty
+from .uncertainty import shares_of_intervals, uncertainty
 
 Array = npt.NDArray[np.float64]
 
@@ -49,6 +49,8 @@ _ENOUGH = 1e-3
 # Corrections of the images at most, steps after each, and the improvement and the length below which steps are the last. Images
 # that explain less than the last share are too far from the pictures to be worth it.
 _CORRECTIONS, _CORRECTED_STEPS, _LITTLE, _SHORT, _FAR = 6, 3, 1e-4, 3e-4, 0.5
+# Steps after a correction, in half-widths of intervals, below which it is the last.
+_SLIGHT = 0.15
 # More corrections as long as each lowers the loss by such a share, at most.
 _WORTH_ANOTHER, _MOST_CORRECTIONS = 0.1, 24
 # Corrections after which a start is left, if it leaves a larger share unexplained.
@@ -210,7 +212,7 @@ class Fit:
         """True if steps with corrected images follow."""
         if self._corrections is None or self.arrays or run.corrected:
             return False
-        return self._unexplained(run.x).whole <= _FAR and self._corrections.put(run.x)
+        return self._unexplained(run.x).whole <= _FAR and self._corrections.put(run.x, rough=True)
 
     def _correct(self, run: Run, *, last: bool) -> Iterator[Step]:
         """Steps of a start with corrected images. ``last``: no other try follows; else far starts are left early."""
@@ -218,20 +220,32 @@ class Fit:
         if self._corrections is None or not self._is_to_be_corrected(run):
             return
         limits = Limits(self._low, self._high, _LONGEST, _CORRECTED_STEPS, _LITTLE, _SHORT)
-        cost = math.inf
+        cost, rough = math.inf, True
         for number in range(_MOST_CORRECTIONS):
-            if number >= _CORRECTIONS and run.cost > (1 - _WORTH_ANOTHER) * cost:
+            little = run.cost > (1 - _WORTH_ANOTHER) * cost
+            if number >= _CORRECTIONS and little and not rough:
                 break
+            rough = rough and not little
             before, cost = run.x, run.cost
-            if not self._corrections.put(before):
+            if not self._corrections.put(before, rough=rough):
                 return
             if number == _FEW_CORRECTIONS and not last and self._unexplained(run.x).largest > _CLOSE:
                 break
             yield from self._descend(run, stage, self.stages[stage], limits)
-            if np.abs(run.x - before).max(initial=0) < _SHORT:
+            slight = self._is_slight(run.x - before, run.x)
+            if slight and not rough:
+                self._corrections.keep(run.x)
                 break
+            rough = rough and not slight
         self._corrections.put(run.x)
         run.cost, run.corrected = self.stages[stage].objective.at(run.x).cost, True
+
+    def _is_slight(self, step: Array, x: Array) -> bool:
+        """True for a step (n,) to the numbers x that hardly matters."""
+        if np.abs(step).max(initial=0) < _SHORT:
+            return True
+        objective = self.stages[-1].objective
+        return bool(shares_of_intervals(step, objective.at(x), objective).max(initial=0) < _SLIGHT)
 
     def _descend(self, run: Run, number: int, stage: Stage, limits: Limits) -> Iterator[Step]:
         """Steps of a start in a stage."""
@@ -342,6 +356,7 @@ class Fit:
         """The result of the steps taken so far."""
         objective = self.stages[-1].objective
         point = objective.at(self.best)
+        point.refresh()
         spread = uncertainty(point, objective, self._low, self._high)
         # Numbers that move nothing, which starts have left anywhere, are those of the scene.
         x = np.where(spread.idle, np.clip(0, self._low, self._high), point.x)

@@ -94,10 +94,11 @@ def groups_of(parameters: Sequence[Parameter]) -> tuple[list[Indices], list[Indi
 
 def chosen(candidates: Sequence[Array], objective: Objective, count: int, *, keep: bool) -> list[Array]:
     """The best ``count`` of some candidates with gains, best first; if ``keep``, the first candidate is always one, the first."""
-    full = [with_gains(x, objective) for x in candidates]
-    kept = full[:1] if keep else []
-    others = full[len(kept) :]
-    costs = [objective.at(x).cost for x in others]
+    kept = [with_gains(x, objective) for x in candidates[: int(keep)]]
+    others, costs = list[Array](), list[float]()
+    for x in candidates[len(kept) :]:
+        others.append(with_gains(x, objective))
+        costs.append(objective.at(others[-1]).cost)  # of the image that gave the gains
     return kept + [others[k] for k in np.argsort(costs, kind="stable")[: count - len(kept)].tolist()]
 
 
@@ -108,7 +109,7 @@ def with_gains(x: Array, objective: Objective) -> Array:
         gain, own = seen.gain, objective.gains[number]
         if not gain.colours:
             continue
-        image = objective.recorded(number, objective.views[number].image(full), full)
+        image = objective.recorded(number, objective.images(full)[number], full)
         weight = seen.weight[..., None].astype(np.float64)
         ours, theirs = ((weight * picture).sum((0, 1)) for picture in (image, seen.image))
         if gain.colours == 1:

@@ -21,6 +21,8 @@ Array = npt.NDArray[np.float64]
 
 # Types of the entries of a step, and a number that none of a fit reaches.
 _STEP, _MOST = get_type_hints(Step), 1e30
+# Starts have met whose losses differ by less than this share, and whose numbers by less than this.
+_SAME_COST, _SAME_PLACE = 0.01, 0.02
 
 
 @dataclass(frozen=True)
@@ -79,14 +81,18 @@ class State:
 
     def choose(self, stage: int, left: int, first: int = 0) -> None:
         """Choose the starts that go on, of those from number ``first`` on, after a stage which ``left`` others but the next one
-        follow."""
+        follow. Of those that have met, one does."""
         # Not those that begin with the next stage, nor those of a file that were not chosen.
         done = [run for run in self.runs if run.number >= first and run.stage == stage and run.trail and run.last > stage]
         if left < 0:
             return
-        on = {done[k].number for k in going_on([run.cost for run in done], left)}
+        on = list[Run]()
+        for k in going_on([run.cost for run in done], left):
+            if not any(_is_same(done[k], other) for other in on):
+                on.append(done[k])
+        numbers = {run.number for run in on}
         for run in done:
-            run.last = 1 << 30 if run.number in on else stage
+            run.last = 1 << 30 if run.number in numbers else stage
 
     def write(self, path: Path, fingerprint: str) -> None:
         """Write the state. ``fingerprint``: text that identifies the fit."""
@@ -128,6 +134,12 @@ class State:
             return cls(runs, _history(str(arrays["history"])), int(arrays["array_stage"]), values)
         except (KeyError, ValueError, TypeError, AttributeError, RecursionError) as error:
             raise unreadable(path) from error
+
+
+def _is_same(one: Run, other: Run) -> bool:
+    """True for starts that have met: both are on the way to the same place."""
+    alike = abs(one.cost - other.cost) <= _SAME_COST * min(one.cost, other.cost)
+    return alike and float(np.abs(one.x - other.x).max(initial=0)) <= _SAME_PLACE
 
 
 def _check(arrays: Mapping[str, npt.NDArray[Any]], sizes: Sizes) -> None:

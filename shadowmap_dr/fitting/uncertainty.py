@@ -82,7 +82,6 @@ class Uncertainty:
 def uncertainty(point: Point, objective: Objective, low: Array | float = -np.inf, high: Array | float = np.inf) -> Uncertainty:
     """The uncertainty of a fit that ended at a point. ``low``, ``high``: bounds (n,) of its numbers."""
     matrix, _ = point.system()
-    total = objective.terms
     moved = np.sqrt(np.maximum(np.diag(matrix - np.diag(objective.precision)), 0))
     # Shares of the brightness that a change of a number by one makes.
     idle = moved < 1e-6
@@ -91,7 +90,22 @@ def uncertainty(point: Point, objective: Objective, low: Array | float = -np.inf
         if idle[k]:  # a light that is off by now moved much when it was on
             given = np.where(np.arange(objective.count) == k, np.clip(0, low, high), point.x)
             idle[k] = np.sqrt(_square(objective.at(given), point, point, objective)) < _ALIKE_AFAR
-    inverse, free = _inverse(matrix * total, idle)
+    covariance = _covariance(point, objective, idle)
+    return Uncertainty(covariance + _dependence(matrix, covariance, idle, point, objective, low, high), idle)
+
+
+def shares_of_intervals(step: Array, point: Point, objective: Objective) -> Array:
+    """A step (n,) to a point, in half-widths of the intervals there, without what further images would tell of them."""
+    matrix, _ = point.system()
+    idle = np.asarray(np.diag(matrix) - objective.precision < 1e-12)
+    half = Uncertainty(_covariance(point, objective, idle), idle).half_widths
+    return np.abs(step) / np.maximum(half, 1e-30)
+
+
+def _covariance(point: Point, objective: Objective, idle: npt.NDArray[np.bool_]) -> Array:
+    """Covariance (n, n) of the numbers at a point, by its residuals; of those that move nothing zero."""
+    total = objective.terms
+    inverse, free = _inverse(point.system()[0] * total, idle)
     # Where a prior alone determines a number, its interval is the prior's.
     unknown = OWN_INFLATION if objective.has_own_residuals else 1.0
     inflation = INFLATION_CORRECTED if objective.is_corrected and not objective.has_own_residuals else INFLATION
@@ -100,7 +114,7 @@ def uncertainty(point: Point, objective: Objective, low: Array | float = -np.inf
     for error in _shared_errors(point, objective):
         shift = inverse @ error
         covariance += unknown * np.outer(shift, shift)
-    return Uncertainty(covariance + _dependence(matrix, covariance, idle, point, objective, low, high), idle)
+    return covariance
 
 
 def _dependence(

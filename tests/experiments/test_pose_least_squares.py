@@ -63,8 +63,8 @@ def test_noise_of_derivatives_shortens_steps_and_the_factor_makes_up_for_it() ->
     assert Linear(columns).factor(step, step @ columns) == pytest.approx(1)
     assert Linear(columns).factor(step, -step @ columns) == 0.5 and Linear(columns).factor(step, 3 * step @ columns) == 1
     # The points that follow have the factor of the step before. It is measured with derivatives that have none.
-    second = start.follow(replace(start, x=step, values=difference + step @ columns))
-    third = second.follow(replace(start, x=truth, values=0 * difference))
+    second = replace(start, x=step, values=difference + step @ columns).after(start, trusted=False)
+    third = replace(start, x=truth, values=0 * difference).after(second, trusted=True)
     assert second.scale == pytest.approx(factor) and third.scale == pytest.approx(factor, abs=0.03)
     np.testing.assert_allclose(after_step(*second.system(), 0.0, step, FREE), truth, atol=0.01)
 
@@ -86,7 +86,7 @@ def test_models_are_the_derivatives_of_averaged_differences(problem: PoseProblem
 def steps_of(differences: Differences, start: np.ndarray, limits: Limits) -> Iterator[Difference]:
     point = differences.at(start)
     yield point
-    yield from minimise(differences.at, point, limits, Difference.follow)
+    yield from minimise(differences.at, point, limits)
 
 
 def test_damped_steps_go_down_and_end_where_no_step_is_worth_it(problem: PoseProblem) -> None:

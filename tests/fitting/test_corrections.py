@@ -69,7 +69,7 @@ def test_a_scene_that_mitsuba_cannot_change_is_fitted_without() -> None:
     assert any(words.startswith("Images are not corrected") for words in result.words)
 
 
-@pytest.mark.parametrize(("share", "count"), [(0.75, 21), (0.95, 6)])
+@pytest.mark.parametrize(("share", "count"), [(0.75, 22), (0.95, 6)])
 def test_images_are_corrected_as_long_as_it_helps(monkeypatch: pytest.MonkeyPatch, share: float, count: int) -> None:
     """Steps through a long valley were ended after six corrections, a degree from the pose, and called found."""
     scene = scene_of(camera=camera(film=SIZE), box=box(0))
@@ -85,9 +85,46 @@ def test_images_are_corrected_as_long_as_it_helps(monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr(search, "_descend", descend)
     monkeypatch.setattr(search, "_is_to_be_corrected", lambda run: True)
-    monkeypatch.setattr(search._corrections, "put", lambda x: True)
+    monkeypatch.setattr(search._corrections, "put", lambda x, **named: True)
     list(search._correct(Run(0, np.zeros(1)), last=True))
     assert len(descents) == count
+
+
+def test_corrections_are_rough_while_they_help_much(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And the last one is not, whose steps hardly matter."""
+    scene = scene_of(camera=camera(film=SIZE), box=box(0))
+    picture = np.array(mi.render(scene, spp=4), np.float32)[..., :3]
+    search = prepared(Renderer.from_scene(scene, **OPTIONS), picture, ["box:translation:x"], starts=1)
+    losses, slight = [1, 0.5, 0.2, 0.19, 0.18, 0.17], iter([False, False, False, False, True, True])
+    given: list[bool] = []
+
+    def descend(run: Run, *others: object) -> Iterator[Step]:
+        run.x, run.cost = run.x + 0.01, losses[len(given) - 1]
+        yield from ()
+
+    def put(x: np.ndarray[Any, Any], *, rough: bool = False) -> bool:
+        given.append(rough)
+        return True
+
+    monkeypatch.setattr(search, "_descend", descend)
+    monkeypatch.setattr(search, "_is_slight", lambda step, x: next(slight))
+    monkeypatch.setattr(search, "_is_to_be_corrected", lambda run: True)
+    monkeypatch.setattr(search._corrections, "put", put)
+    monkeypatch.setattr(search._corrections, "keep", lambda x: None)
+    list(search._correct(Run(0, np.zeros(1)), last=True))
+    # The last one corrects the images of the result.
+    assert given == [True, True, True, True, False, False]
+
+
+def test_corrections_that_are_kept_are_not_rendered_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = scene_of(camera=camera(film=SIZE), box=box(0))
+    picture = np.array(mi.render(scene, spp=4), np.float32)[..., :3]
+    corrections = prepared(Renderer.from_scene(scene, **OPTIONS), picture, ["box:translation:x"], starts=1)._corrections
+    assert corrections is not None and corrections.put(np.zeros(1))
+    kept = corrections._objective.corrections[0]
+    corrections.keep(np.array([1e-4]))
+    monkeypatch.setattr(corrections, "_reference", None)
+    assert corrections.put(np.array([1e-4])) and corrections._objective.corrections[0] is kept
 
 
 def test_effects_on_images_are_without_priors() -> None:

@@ -25,6 +25,7 @@ class Point:
     x: Array
     residuals: Array
     derivatives: Array
+    is_exact: bool = True
 
     @property
     def cost(self) -> float:
@@ -32,6 +33,40 @@ class Point:
 
     def system(self) -> tuple[Array, Array]:
         return self.derivatives.T @ self.derivatives, self.derivatives.T @ self.residuals
+
+    def after(self, before: Point, *, trusted: bool) -> Point:
+        """Derivatives of these points take no time."""
+        return self
+
+    def refresh(self) -> None:
+        pass
+
+
+class Following(Point):
+    """A point whose derivatives follow from those of others, by secants. ``exact``: how often they were computed."""
+
+    exact = 0
+
+    def __init__(self, point: Point) -> None:
+        super().__init__(point.x, point.residuals, point.derivatives)
+        self._own: Array | None = None
+
+    def system(self) -> tuple[Array, Array]:
+        if self._own is None:
+            self._own = self.derivatives
+            Following.exact += 1
+        return self._own.T @ self._own, self._own.T @ self.residuals
+
+    def after(self, before: Point, *, trusted: bool) -> Point:
+        if trusted:
+            assert isinstance(before, Following) and before._own is not None
+            step = self.x - before.x
+            missed = self.residuals - before.residuals - before._own @ step
+            self._own, self.is_exact = before._own + np.outer(missed, step) / (step @ step), False
+        return self
+
+    def refresh(self) -> None:
+        self._own, self.is_exact = None, True
 
 
 class Problem:
@@ -207,6 +242,29 @@ def test_each_accepted_point_is_better(seed: int) -> None:
     assert best.cost == costs[-1]
 
 
+def test_derivatives_follow_from_those_before() -> None:
+    """The same minimum, with derivatives at fewer points."""
+    curved = Problem(
+        lambda x: [x[0] + 0.1 * x[1] ** 2 - 1, x[1] - 0.1 * x[0] ** 2 - 2, x[0] * x[1] / 10],
+        lambda x: [[1, 0.2 * x[1]], [-0.2 * x[0], 1], [x[1] / 10, x[0] / 10]],
+    )
+    Following.exact, accepted = 0, list[Point]()
+    best, ended = minimise(
+        lambda x: Following(curved.at(x)), Following(curved.at(np.zeros(2))), free(2, longest=0.3), accepted.append
+    )
+    expected, _ = minimise(curved.at, curved.at(np.zeros(2)), free(2))
+    np.testing.assert_allclose(best.x, expected.x, atol=1e-5)
+    assert ended and Following.exact < 0.6 * len(accepted)
+
+
+@pytest.mark.parametrize("start", [(-1.2, 1), (0, 0), (3, -2), (-5, 5)])
+def test_derivatives_that_follow_find_the_end_of_a_valley(start: Sequence[float]) -> None:
+    problem = rosenbrock()
+    best, ended = minimise(lambda x: Following(problem.at(x)), Following(problem.at(np.array(start, float))), free(2))
+    np.testing.assert_allclose(best.x, 1, atol=1e-5)
+    assert ended
+
+
 # -------------------------------------------------------------------------------------------------------------------- stops
 
 
@@ -217,6 +275,20 @@ def test_steps_are_counted() -> None:
     at = np.array([-1.2, 1])
     best, ended = minimise(problem.at, problem.at(at), free(2, steps=0))
     assert not ended and best.x.tolist() == at.tolist()
+
+
+def test_steps_with_derivatives_that_follow_count_less() -> None:
+    problem, accepted = linear(np.eye(2), [100.0, 50.0]), list[Point]()
+    start = Following(problem.at(np.zeros(2)))
+    minimise(lambda x: Following(problem.at(x)), start, free(2, longest=0.3, steps=3), accepted.append)
+    assert 3 < len(accepted) <= 12
+
+
+def test_no_derivatives_are_computed_after_the_last_step() -> None:
+    problem = linear(np.eye(2), [100.0, 50.0])
+    Following.exact, start = 0, Following(problem.at(np.zeros(2)))
+    minimise(lambda x: Following(problem.at(x)), start, free(2, longest=0.3, steps=1))
+    assert Following.exact == 1
 
 
 def test_steps_are_no_longer_than_allowed() -> None:
@@ -269,11 +341,16 @@ def test_points_that_follow_may_have_other_derivatives() -> None:
     """Derivatives that are too large by a half make steps too short; the first step tells."""
     problem = Problem(lambda x: [x[0] - 1], lambda x: [[1.5]])
 
-    def corrected(before: Point, after: Point) -> Point:
-        change = (after.residuals - before.residuals) / (after.x - before.x)
-        return replace(after, derivatives=change[None])
+    class Corrected(Point):
+        def after(self, before: Point, *, trusted: bool) -> Point:
+            change = (self.residuals - before.residuals) / (self.x - before.x)
+            return Corrected(self.x, self.residuals, change[None])
 
-    steps = list(steps_of(problem.at, problem.at(np.zeros(1)), free(1), corrected))
+    def at(x: Array) -> Corrected:
+        point = problem.at(x)
+        return Corrected(point.x, point.residuals, point.derivatives)
+
+    steps = list(steps_of(at, at(np.zeros(1)), free(1)))
     assert steps[0].x[0] == pytest.approx(2 / 3, abs=1e-2) and steps[1].x[0] == pytest.approx(1, abs=1e-3)
 
 

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from shadowmap_dr import Renderer
 from shadowmap_dr.errors import ShadowmapError
+from shadowmap_dr.fitting.affine_image import AffineImage
 from shadowmap_dr.fitting.comparison import Observation
 from shadowmap_dr.fitting.gains import Gain
 from shadowmap_dr.fitting.losses import Loss
@@ -143,6 +144,57 @@ def brute_force(objective: Objective, x: Array) -> tuple[float, float, list[Arra
         square += (seen.weight[..., None] * r**2).sum()
         total += 3 * seen.weight.sum()
     return float(cost / total), float(np.sqrt(square / total)), residuals
+
+
+class CountingView(FakeView):
+    """A view that counts its images and derivatives."""
+
+    images = derivatives = 0
+
+    def image(self, x: Array) -> npt.NDArray[np.float32]:
+        self.images += 1
+        return super().image(x)
+
+    def derivative(self, x: Array, number: int) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+        self.derivatives += 1
+        image = super().image(x)
+        return image, np.asarray(image * self._slopes[number], np.float32)
+
+
+def test_derivatives_that_follow_agree_with_the_difference_of_the_images() -> None:
+    view = CountingView(1)
+    objective = objective_of(Loss("l2"), [Gain(1)], views=[view])
+    before, after = objective.at(np.array([0.1, -0.2, 0.15, 0.1])), objective.at(np.array([0.4, 0.1, -0.15, 0.1]))
+    stale = np.array(before.derivatives())
+    assert after.after(before, trusted=False) is after and after.is_exact
+    assert after.after(before, trusted=True) is after
+    followed, step = np.array(after.derivatives()), (after.x - before.x)[:3]
+    assert view.derivatives == 3 and not after.is_exact
+    difference = after.images[0] - before.images[0]
+    np.testing.assert_allclose(np.tensordot(step, followed[0], 1), difference, atol=0.02 * np.abs(difference).max())
+    after.refresh()
+    exact = np.array(after.derivatives())
+    assert view.derivatives == 6 and after.is_exact
+    np.testing.assert_allclose(exact[0], [view.derivative(after.x, k)[1] for k in range(3)])
+    assert np.linalg.norm(followed - exact) < 0.9 * np.linalg.norm(stale - exact)
+
+
+def test_images_at_the_same_numbers_are_rendered_once() -> None:
+    """Gains and corrections change neither images nor derivatives; textures and vertices do."""
+    view = CountingView(1)
+    objective = objective_of(Loss("l2"), [Gain(1)], views=[view])
+    x = np.array([0.1, -0.2, 0.15, 0.1])
+    first = objective.at(x)
+    first.system()
+    other = objective.at(x + [0, 0, 0, 0.3])
+    objective.corrections[0] = AffineImage(np.ones(SHAPE, np.float32), x, np.zeros((0, *SHAPE), np.float32), np.zeros((0, 4)))
+    again = objective.at(x)
+    again.system()
+    assert (view.images, view.derivatives) == (1, 3)
+    assert len({first.cost, other.cost, again.cost}) == 3
+    objective.set_values([])
+    objective.at(x).system()
+    assert (view.images, view.derivatives) == (2, 6)
 
 
 ALL_GAINS = [[Gain()], [Gain(1, True)], [Gain(3), Gain(1, True), Gain()]]

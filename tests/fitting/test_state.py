@@ -38,6 +38,15 @@ def test_states_come_back(path: Path) -> None:
     assert found.history == [STEP] and found.array_stage == 1 and found.values[0].tolist() == [1, 1, 1, 1]
 
 
+def test_of_starts_that_have_met_one_goes_on() -> None:
+    places = {0: (0.5, 1), 1: (0.5, 1.001), 2: (0.5, 1.5), 3: (0.501, 1), 4: (-1, 0)}
+    costs = {0: 1.0, 1: 1.001, 2: 1.002, 3: 1.2, 4: 3.0}
+    runs = [Run(k, np.array(places[k], float), costs[k], 0, trail=[(0, np.zeros(2))]) for k in places]
+    state = State(runs, [STEP], 0, [])
+    state.choose(0, 2)
+    assert [run.number for run in state.going(1)] == [0, 2, 3]
+
+
 NUMBERS = np.array([[0, 1, 9, 0], [1, -1, 9, 0]])
 
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from shadowmap_dr.fitting import uncertainty as module
 from shadowmap_dr.fitting.objective import PRIOR_WEIGHT, Objective, Point
-from shadowmap_dr.fitting.uncertainty import Uncertainty, not_told_apart, uncertainty
+from shadowmap_dr.fitting.uncertainty import Uncertainty, not_told_apart, shares_of_intervals, uncertainty
 
 Array = npt.NDArray[np.float64]
 SHAPE = (112, 160, 3)
@@ -180,6 +180,17 @@ def test_priors_narrow_the_intervals() -> None:
     precision = np.array([PRIOR_WEIGHT / residual.size / (0.01 * free[0] / 1.96) ** 2, 0, 0, 0])
     held = found(made(jacobian, residual, precision=precision)).half_widths
     assert held[0] < 0.05 * free[0] and (held[1:] > 0.3 * free[1:]).all()
+
+
+def test_steps_are_measured_in_intervals() -> None:
+    """A number that moves nothing has no part in them."""
+    jacobian = smooth_derivatives()
+    jacobian[2] = 0
+    residual = np.random.default_rng(0).normal(scale=NOISE, size=SHAPE)
+    problem, step = made(jacobian, residual, residual), np.array([0.01, -0.02, 5, 0.001])
+    shares = shares_of_intervals(step, cast(Point, problem), cast(Objective, problem))
+    np.testing.assert_allclose(shares, np.abs(step) / found(problem).half_widths, rtol=1e-6)
+    assert shares[2] == 0
 
 
 # ---------------------------------------------------------------------------------------------------------- what is not known

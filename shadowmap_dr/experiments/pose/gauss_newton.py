@@ -18,7 +18,7 @@ from ...fitting.vary import Vary
 from ...fitting.views import Quality
 from ...rendering.receivers.checks import real_array
 from ...rendering.renderer import Renderer
-from .least_squares import Difference, Differences, Linear, mean_square
+from .least_squares import Differences, Linear, mean_square
 from .search import AWAY, EXPLAINED, TURN_DEG
 
 Array = npt.NDArray[np.float64]
@@ -148,7 +148,7 @@ class GaussNewtonPose:
         """Steps in coarse images. Returns the loss before the last one."""
         point = self._coarse.at(self._x)
         for shortest in (_NEAR, _COARSE_SHORTEST):
-            for better in minimise(self._coarse.at, point, _limits(shortest, patient=patient), Difference.follow):
+            for better in minimise(self._coarse.at, point, _limits(shortest, patient=patient)):
                 self._x = better.x
                 yield point.cost
                 point = better
@@ -188,7 +188,7 @@ class GaussNewtonPose:
         limits, start = _limits(patient=True), self._start
         low, high = (np.concatenate([start[:1], bounds[1:]]) for bounds in (limits.low, limits.high))
         point = self._coarse.at(start)
-        ends = list(minimise(self._coarse.at, point, replace(limits, low=low, high=high), Difference.follow))
+        ends = list(minimise(self._coarse.at, point, replace(limits, low=low, high=high)))
         return (ends or [point])[-1].x
 
     def _refine(self) -> Iterator[float]:

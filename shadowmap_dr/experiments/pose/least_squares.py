@@ -49,7 +49,7 @@ class Linear:
 class Difference:
     """Differences (N,) between the image at a pose ``x`` (n,) and the reference, and their model.
 
-    ``cost``: their mean square. ``scale``: factor of all derivatives, see :meth:`follow`.
+    ``cost``: their mean square. ``scale``: factor of all derivatives, see :meth:`after`.
     """
 
     x: Array
@@ -62,12 +62,20 @@ class Difference:
         """(matrix (n, n), right side (n,)) of the normal equations."""
         return self.model.times(self.scale).system(self.values)
 
-    def follow(self, after: Difference) -> Difference:
-        """The point ``after`` a step from this one, with derivatives scaled as this one's should have been along the step.
+    @property
+    def is_exact(self) -> bool:
+        """True: derivatives are those of this point, but for their scale."""
+        return True
 
-        The noise of the next derivatives is about that of these.
+    def after(self, before: Difference, *, trusted: bool) -> Difference:
+        """This point, after a step from another one, with derivatives scaled as those should have been along the step.
+
+        The noise of the next derivatives is about that of the last ones.
         """
-        return replace(after, scale=self.model.factor(after.x - self.x, after.values - self.values))
+        return replace(self, scale=before.model.factor(self.x - before.x, self.values - before.values))
+
+    def refresh(self) -> None:
+        """Nothing to do: derivatives are exact."""
 
 
 class Differences:

@@ -188,7 +188,7 @@ class Point:
     def derivatives(self) -> list[Image]:
         """Derivatives of the images, without their corrections, by the scene's numbers: for each picture (n, H, W, 3)."""
         if self._derivatives is None:
-            self._derivatives, self._owner.last = [self._of_view(k) for k in range(len(self.images))], self
+            self._derivatives, self._owner.last = [self._of_view(view) for view in self._owner.views], self
         return self._derivatives
 
     def columns(self) -> list[npt.NDArray[np.float32]]:
@@ -212,13 +212,9 @@ class Point:
             right += weighted @ residual.reshape(-1)
         return matrix / owner.terms + np.diag(owner.precision), right / owner.terms + owner.precision * self.x
 
-    def _of_view(self, number: int) -> Image:
-        view = self._owner.views[number]
-        derivatives = np.zeros((view.count, *self.images[number].shape), np.float32)
+    def _of_view(self, view: View) -> Image:
         with view.scene_at(self.x):
-            for k in range(view.count):
-                derivatives[k] = view.derivative(self.x, k)[1]
-        return derivatives
+            return view.derivatives(self.x)
 
     def _columns_of(self, number: int) -> npt.NDArray[np.float32]:
         owner = self._owner

@@ -139,6 +139,11 @@ class View:
         image = self._image_at(x)
         return image, self._difference(image, x, entry, number - self._starts[entry])
 
+    def derivatives(self, x: Array) -> Image:
+        """Derivatives (n, H, W, 3) of the image by all numbers."""
+        found = [one for entry in range(len(self._parameters)) for one in self.jacobian(x, entry)[1]]
+        return np.array(found).reshape(-1, self._size.height, self._size.width, 3)
+
     def jacobian(self, x: Array, entry: int = 0) -> tuple[Image, list[Image]]:
         """Image, and its derivatives (H, W, 3) by all numbers of an entry.
 

@@ -46,8 +46,9 @@ Array = npt.NDArray[np.float64]
 _STEPS, _LAST_STEPS, _LONGEST = 8, 15, 0.3
 # Improvement of the loss, as a share, below which a step is the last of its stage.
 _ENOUGH = 1e-3
-# Corrections of the images at most, steps after each, and the improvement and the length below which steps are the last. Images
-# that explain less than the last share are too far from the pictures to be worth it.
+# Corrections of the images at most, twice as many while steps are longer than half an interval; steps after each, and the
+# improvement and the length below which steps are the last. Images that explain less than the last share are too far from the
+# pictures to be worth it.
 _CORRECTIONS, _CORRECTED_STEPS, _LITTLE, _SHORT, _FAR = 6, 3, 1e-4, 3e-4, 0.5
 # Steps after a correction, in half-widths of intervals, below which it is the last.
 _SLIGHT = 0.15
@@ -220,10 +221,10 @@ class Fit:
         if self._corrections is None or not self._is_to_be_corrected(run):
             return
         limits = Limits(self._low, self._high, _LONGEST, _CORRECTED_STEPS, _LITTLE, _SHORT)
-        cost, rough = math.inf, True
+        cost, rough, share = math.inf, True, 0.0
         for number in range(_MOST_CORRECTIONS):
             little = run.cost > (1 - _WORTH_ANOTHER) * cost
-            if number >= _CORRECTIONS and little and not rough:
+            if number >= _CORRECTIONS * (1 if share < 1 else 2) and little and not rough:
                 break
             rough = rough and not little
             before, cost = run.x, run.cost
@@ -232,7 +233,8 @@ class Fit:
             if number == _FEW_CORRECTIONS and not last and self._unexplained(run.x).largest > _CLOSE:
                 break
             yield from self._descend(run, stage, self.stages[stage], limits)
-            slight = self._is_slight(run.x - before, run.x)
+            share = self._share_of_intervals(run.x - before, run.x)
+            slight = share < _SLIGHT
             if slight and not rough:
                 self._corrections.keep(run.x)
                 break
@@ -240,12 +242,12 @@ class Fit:
         self._corrections.put(run.x)
         run.cost, run.corrected = self.stages[stage].objective.at(run.x).cost, True
 
-    def _is_slight(self, step: Array, x: Array) -> bool:
-        """True for a step (n,) to the numbers x that hardly matters."""
+    def _share_of_intervals(self, step: Array, x: Array) -> float:
+        """Largest share of a number's half interval in a step (n,) to the numbers x; 0 for steps too short to matter."""
         if np.abs(step).max(initial=0) < _SHORT:
-            return True
+            return 0.0
         objective = self.stages[-1].objective
-        return bool(shares_of_intervals(step, objective.at(x), objective).max(initial=0) < _SLIGHT)
+        return float(shares_of_intervals(step, objective.at(x), objective).max(initial=0))
 
     def _descend(self, run: Run, number: int, stage: Stage, limits: Limits) -> Iterator[Step]:
         """Steps of a start in a stage."""

@@ -69,9 +69,12 @@ def test_a_scene_that_mitsuba_cannot_change_is_fitted_without() -> None:
     assert any(words.startswith("Images are not corrected") for words in result.words)
 
 
-@pytest.mark.parametrize(("share", "count"), [(0.75, 22), (0.95, 6)])
-def test_images_are_corrected_as_long_as_it_helps(monkeypatch: pytest.MonkeyPatch, share: float, count: int) -> None:
-    """Steps through a long valley were ended after six corrections, a degree from the pose, and called found."""
+@pytest.mark.parametrize(("share", "step", "count"), [(0.75, 0.5, 22), (0.95, 0.5, 6), (0.95, 4, 12)])
+def test_images_are_corrected_as_long_as_it_helps(monkeypatch: pytest.MonkeyPatch, share: float, step: float, count: int) -> None:
+    """Steps through a long valley were ended after six corrections, a degree from the pose, and called found.
+
+    Others were ended while each was as long as several intervals, which then were too narrow.
+    """
     scene = scene_of(camera=camera(film=SIZE), box=box(0))
     picture = np.array(mi.render(scene, spp=4), np.float32)[..., :3]
     search = prepared(Renderer.from_scene(scene, **OPTIONS), picture, ["box:translation:x"], starts=1)
@@ -86,6 +89,7 @@ def test_images_are_corrected_as_long_as_it_helps(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(search, "_descend", descend)
     monkeypatch.setattr(search, "_is_to_be_corrected", lambda run: True)
     monkeypatch.setattr(search._corrections, "put", lambda x, **named: True)
+    monkeypatch.setattr(search, "_share_of_intervals", lambda *given: step)
     list(search._correct(Run(0, np.zeros(1)), last=True))
     assert len(descents) == count
 
@@ -95,7 +99,7 @@ def test_corrections_are_rough_while_they_help_much(monkeypatch: pytest.MonkeyPa
     scene = scene_of(camera=camera(film=SIZE), box=box(0))
     picture = np.array(mi.render(scene, spp=4), np.float32)[..., :3]
     search = prepared(Renderer.from_scene(scene, **OPTIONS), picture, ["box:translation:x"], starts=1)
-    losses, slight = [1, 0.5, 0.2, 0.19, 0.18, 0.17], iter([False, False, False, False, True, True])
+    losses, shares = [1, 0.5, 0.2, 0.19, 0.18, 0.17], iter([9, 7, 5, 3, 0.1, 0.1])
     given: list[bool] = []
 
     def descend(run: Run, *others: object) -> Iterator[Step]:
@@ -107,7 +111,7 @@ def test_corrections_are_rough_while_they_help_much(monkeypatch: pytest.MonkeyPa
         return True
 
     monkeypatch.setattr(search, "_descend", descend)
-    monkeypatch.setattr(search, "_is_slight", lambda step, x: next(slight))
+    monkeypatch.setattr(search, "_share_of_intervals", lambda step, x: next(shares))
     monkeypatch.setattr(search, "_is_to_be_corrected", lambda run: True)
     monkeypatch.setattr(search._corrections, "put", put)
     monkeypatch.setattr(search._corrections, "keep", lambda x: None)

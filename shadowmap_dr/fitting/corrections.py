@@ -51,33 +51,25 @@ class Corrections:
         self._reference = Reference(renderer.data, windows)
         # Numbers, and differences of the images of each pass (P, H, W, 3) at them, the last one first.
         self._known: list[tuple[Array, list[Image]]] = []
-        self._rough = False
         # Effect of each number on the images, where they were first corrected.
         self._effect: Array | None = None
         self.failure = ""
 
-    def put(self, x: Array, *, rough: bool = False) -> bool:
-        """Correct the images so that they are Mitsuba's at the numbers x (n,). False if it cannot render them.
-
-        Args:
-            x: the numbers.
-            rough: images with more noise do: far from the end, it moves the numbers less than their steps.
-        """
-        again = bool(self._known) and np.array_equal(self._known[0][0], x)
-        if again and (rough or not self._rough):
+    def put(self, x: Array) -> bool:
+        """Correct the images so that they are Mitsuba's at the numbers x (n,). False if it cannot render them."""
+        if self._known and np.array_equal(self._known[0][0], x):
             return True
         objective = self._objective
         changes = changes_of(objective.views[0].change(x), self._renderer)
         cameras = [view.camera(x) for view in objective.views]
         try:
-            images = self._reference.images(changes, cameras, [view.size for view in objective.views], rough=rough, more=again)
+            images = self._reference.images(changes, cameras, [view.size for view in objective.views])
         except (ShadowmapError, RuntimeError) as error:
             self.failure = " ".join(str(error).split()).rstrip(".")
             return False
         own = objective.images(x)
         differences = [passes - image for passes, image in zip(self._reference.passes, own, strict=True)]
-        self._known = [(x.copy(), differences), *(self._known[1:] if again else self._known[:_SECANTS])]
-        self._rough = rough
+        self._known = [(x.copy(), differences), *self._known[:_SECANTS]]
         weights = self._weights(x)
         for number, (image, plain) in enumerate(zip(images, own, strict=True)):
             here = differences[number]

@@ -47,59 +47,37 @@ class Reference:
 
     def __init__(self, data: SceneData, sizes: Sequence[tuple[int, int]]) -> None:
         self._data, self._sizes, self.rendered = data, tuple(sizes), list[Image]()
-        self._passes: list[list[Image]] = [[] for _ in sizes]
         self.passes = list[Image]()
         own = data.scene.integrator()
         named = own is not None and own.class_name() in _INTEGRATORS
         self._integrator = own if named else mi.load_dict({"type": "direct"})
 
-    def images(
-        self,
-        changes: Changes,
-        cameras: Sequence[Sensor],
-        sizes: Sequence[ImageSize],
-        *,
-        rough: bool = False,
-        more: bool = False,
-    ) -> list[Image]:
+    def images(self, changes: Changes, cameras: Sequence[Sensor], sizes: Sequence[ImageSize]) -> list[Image]:
         """Linear images (H, W, 3), detached.
 
         Args:
             changes: of the scene.
             cameras: one for each image, whose window is all of the film.
             sizes: of the images.
-            rough: images of one pass, with its noise.
-            more: add passes to those of the last call, which had the same arguments but ``rough``.
 
         Raises:
             ShadowmapError: Mitsuba's objects cannot be changed so.
         """
         with dr.suspend_grad(), updated(self._data, changes) as scene:
             each = zip(cameras, self._sizes, sizes, strict=True)
-            for number, (camera, own, size) in enumerate(each):
-                before = self._passes[number] if more else []
-                self._passes[number] = self._rendered(scene, camera, own, size, number, before, 1 if rough else _PASSES)
-        self.rendered = [np.asarray(np.mean(own, axis=0, dtype=np.float64), np.float32) for own in self._passes]
-        pairs = list(zip(self._passes, sizes, strict=True))
+            found = [self._passes(scene, camera, own, size, number) for number, (camera, own, size) in enumerate(each)]
+        self.rendered = [np.asarray(np.mean(own, axis=0, dtype=np.float64), np.float32) for own in found]
+        pairs = list(zip(found, sizes, strict=True))
         self.passes = [np.array([reduced(image, size) for image in passes]) for passes, size in pairs]
         return [reduced(image, size) for image, size in zip(self.rendered, sizes, strict=True)]
 
-    def _rendered(
-        self,
-        scene: mi.Scene,
-        camera: Sensor,
-        own: tuple[int, int],
-        size: ImageSize,
-        number: int,
-        before: Sequence[Image],
-        most: int,
-    ) -> list[Image]:
-        """Passes of an image, ``most`` at most; those ``before`` are the first ones."""
+    def _passes(self, scene: mi.Scene, camera: Sensor, own: tuple[int, int], size: ImageSize, number: int) -> list[Image]:
+        """Passes of an image, until their mean has little noise."""
         width, height = _film_size(own, size)
         sensor = _sensor(camera, width, height)
         spp = int(np.clip(_PASS // (width * height), 1, _MOST))
-        passes = list(before)
-        while len(passes) < most and _noise(passes) > _NOISE:
+        passes: list[Image] = []
+        while len(passes) < _PASSES and _noise(passes) > _NOISE:
             rendered = mi.render(
                 scene, sensor=sensor, integrator=self._integrator, spp=spp, seed=_SEED + number * 256 + len(passes)
             )

@@ -213,7 +213,7 @@ class Fit:
         """True if steps with corrected images follow."""
         if self._corrections is None or self.arrays or run.corrected:
             return False
-        return self._unexplained(run.x).whole <= _FAR and self._corrections.put(run.x, rough=True)
+        return self._unexplained(run.x).whole <= _FAR and self._corrections.put(run.x)
 
     def _correct(self, run: Run, *, last: bool) -> Iterator[Step]:
         """Steps of a start with corrected images. ``last``: no other try follows; else far starts are left early."""
@@ -221,24 +221,21 @@ class Fit:
         if self._corrections is None or not self._is_to_be_corrected(run):
             return
         limits = Limits(self._low, self._high, _LONGEST, _CORRECTED_STEPS, _LITTLE, _SHORT)
-        cost, rough, share = math.inf, True, 0.0
+        cost, share = math.inf, 0.0
         for number in range(_MOST_CORRECTIONS):
             little = run.cost > (1 - _WORTH_ANOTHER) * cost
-            if number >= _CORRECTIONS * (1 if share < 1 else 2) and little and not rough:
+            if number >= _CORRECTIONS * (1 if share < 1 else 2) and little:
                 break
-            rough = rough and not little
             before, cost = run.x, run.cost
-            if not self._corrections.put(before, rough=rough):
+            if not self._corrections.put(before):
                 return
             if number == _FEW_CORRECTIONS and not last and self._unexplained(run.x).largest > _CLOSE:
                 break
             yield from self._descend(run, stage, self.stages[stage], limits)
             share = self._share_of_intervals(run.x - before, run.x)
-            slight = share < _SLIGHT
-            if slight and not rough:
+            if share < _SLIGHT:
                 self._corrections.keep(run.x)
                 break
-            rough = rough and not slight
         self._corrections.put(run.x)
         run.cost, run.corrected = self.stages[stage].objective.at(run.x).cost, True
 

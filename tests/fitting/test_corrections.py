@@ -94,20 +94,19 @@ def test_images_are_corrected_as_long_as_it_helps(monkeypatch: pytest.MonkeyPatc
     assert len(descents) == count
 
 
-def test_corrections_are_rough_while_they_help_much(monkeypatch: pytest.MonkeyPatch) -> None:
-    """And the last one is not, whose steps hardly matter."""
+def test_corrections_end_where_steps_are_short_beside_the_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = scene_of(camera=camera(film=SIZE), box=box(0))
     picture = np.array(mi.render(scene, spp=4), np.float32)[..., :3]
     search = prepared(Renderer.from_scene(scene, **OPTIONS), picture, ["box:translation:x"], starts=1)
     losses, shares = [1, 0.5, 0.2, 0.19, 0.18, 0.17], iter([9, 7, 5, 3, 0.1, 0.1])
-    given: list[bool] = []
+    given: list[float] = []
 
     def descend(run: Run, *others: object) -> Iterator[Step]:
         run.x, run.cost = run.x + 0.01, losses[len(given) - 1]
         yield from ()
 
-    def put(x: np.ndarray[Any, Any], *, rough: bool = False) -> bool:
-        given.append(rough)
+    def put(x: np.ndarray[Any, Any]) -> bool:
+        given.append(float(x[0]))
         return True
 
     monkeypatch.setattr(search, "_descend", descend)
@@ -117,7 +116,7 @@ def test_corrections_are_rough_while_they_help_much(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(search._corrections, "keep", lambda x: None)
     list(search._correct(Run(0, np.zeros(1)), last=True))
     # The last one corrects the images of the result.
-    assert given == [True, True, True, True, False, False]
+    np.testing.assert_allclose(given, [0, 0.01, 0.02, 0.03, 0.04, 0.05])
 
 
 def test_corrections_that_are_kept_are_not_rendered_again(monkeypatch: pytest.MonkeyPatch) -> None:

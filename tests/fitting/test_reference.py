@@ -225,18 +225,6 @@ def image_of(renderer: Renderer, camera: Sensor, window: tuple[int, int], size: 
     return found
 
 
-def test_rough_images_are_refined_by_further_passes() -> None:
-    renderer, size = renderer_of(), ImageSize(32, 24)
-    reference, camera = Reference(renderer.data, [(32, 24)]), view_of(renderer, size).camera(np.zeros(0))
-    (rough,) = reference.images(Changes(), [camera], [size], rough=True)
-    assert len(reference.passes[0]) == 1
-    (more,) = reference.images(Changes(), [camera], [size], more=True)
-    assert len(reference.passes[0]) > 1
-    np.testing.assert_array_equal(reference.passes[0][0], rough)
-    np.testing.assert_array_equal(more, image_of(renderer, camera, (32, 24), size))
-    assert np.abs(more - rough).max() > 0
-
-
 def test_light_bounces_if_the_scene_says_so() -> None:
     images = {}
     for name in ("direct", "path"):

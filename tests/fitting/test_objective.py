@@ -114,6 +114,9 @@ class FakeView:
         image = self.image(x)
         return image, np.asarray(image * self._slopes[number], np.float32)
 
+    def derivatives(self, x: Array) -> npt.NDArray[np.float32]:
+        return np.array([self.derivative(x, k)[1] for k in range(self.count)])
+
 
 def objective_of(loss: Loss, gains: list[Gain], prior: float = np.inf, views: list[Any] | None = None) -> Objective:
     generator = np.random.default_rng(9)
@@ -149,14 +152,14 @@ def brute_force(objective: Objective, x: Array) -> tuple[float, float, list[Arra
 class CountingView(FakeView):
     """A view that counts its images and derivatives."""
 
-    images = derivatives = 0
+    images = columns = 0
 
     def image(self, x: Array) -> npt.NDArray[np.float32]:
         self.images += 1
         return super().image(x)
 
     def derivative(self, x: Array, number: int) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-        self.derivatives += 1
+        self.columns += 1
         image = super().image(x)
         return image, np.asarray(image * self._slopes[number], np.float32)
 
@@ -169,12 +172,12 @@ def test_derivatives_that_follow_agree_with_the_difference_of_the_images() -> No
     assert after.after(before, trusted=False) is after and after.is_exact
     assert after.after(before, trusted=True) is after
     followed, step = np.array(after.derivatives()), (after.x - before.x)[:3]
-    assert view.derivatives == 3 and not after.is_exact
+    assert view.columns == 3 and not after.is_exact
     difference = after.images[0] - before.images[0]
     np.testing.assert_allclose(np.tensordot(step, followed[0], 1), difference, atol=0.02 * np.abs(difference).max())
     after.refresh()
     exact = np.array(after.derivatives())
-    assert view.derivatives == 6 and after.is_exact
+    assert view.columns == 6 and after.is_exact
     np.testing.assert_allclose(exact[0], [view.derivative(after.x, k)[1] for k in range(3)])
     assert np.linalg.norm(followed - exact) < 0.9 * np.linalg.norm(stale - exact)
 
@@ -190,11 +193,11 @@ def test_images_at_the_same_numbers_are_rendered_once() -> None:
     objective.corrections[0] = AffineImage(np.ones(SHAPE, np.float32), x, np.zeros((0, *SHAPE), np.float32), np.zeros((0, 4)))
     again = objective.at(x)
     again.system()
-    assert (view.images, view.derivatives) == (1, 3)
+    assert (view.images, view.columns) == (1, 3)
     assert len({first.cost, other.cost, again.cost}) == 3
     objective.set_values([])
     objective.at(x).system()
-    assert (view.images, view.derivatives) == (2, 6)
+    assert (view.images, view.columns) == (2, 6)
 
 
 ALL_GAINS = [[Gain()], [Gain(1, True)], [Gain(3), Gain(1, True), Gain()]]

@@ -97,6 +97,9 @@ class FakeView:
         image = self.image(x)
         return image, np.asarray(image * self._slopes[number], np.float32)
 
+    def derivatives(self, x: Array) -> Image:
+        return np.array([self.derivative(x, k)[1] for k in range(self.count)])
+
 
 @pytest.mark.parametrize("function", FUNCTIONS)
 def test_derivatives_of_residuals_are_those_of_differences(function: Callable[..., Any]) -> None:

@@ -39,7 +39,7 @@ _NEARLY, _GROWN, _NEAR = 0.015, 1.7, 0.1
 _ALIKE_AFAR = 0.02
 # Numbers may depend on each other where an eigenvalue of the matrix, with a diagonal of one, is smaller: images tell how much.
 # Those with a smaller share of the eigenvector have no part in it.
-_DEPENDENT, _SHARE = 0.05, 0.02
+_DEPENDENT, _SHARE = 0.25, 0.02
 # Directions in which numbers move the images by less than this square share of their single effects are not determined. Residuals
 # say nothing of them: no change of the images can leave any. Their largest number gets this deviation.
 _LEAST, _FREE = 1e-6, 10.0

@@ -14,11 +14,12 @@ from fitting_scenes import OPTIONS, box, camera, diffuse, floor, rgb, scene_of, 
 
 from mitsuba_baselines import derivatives
 from shadowmap_dr import Renderer
+from shadowmap_dr.fitting.mitsuba_values import set_values
 from shadowmap_dr.fitting.parameters import Parameter
 from shadowmap_dr.fitting.resolve import Resolver
 from shadowmap_dr.fitting.scene_change import SceneChange
 from shadowmap_dr.fitting.vary import Vary
-from shadowmap_dr.fitting.views import Quality, View, set_values
+from shadowmap_dr.fitting.views import Quality, View
 from shadowmap_dr.scene.sensor import ImageSize
 
 SIZE = ImageSize(60, 45)

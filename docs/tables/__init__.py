@@ -16,7 +16,20 @@ from pathlib import Path
 from shadowmap_dr.experiments.art import gallery
 from shadowmap_dr.experiments.pose import table as pose
 
-from . import agreement, art, extended_lights, faces, gradients, light_directions, modelling, poses, readme, shadow_maps, speed
+from . import (
+    agreement,
+    art,
+    extended_lights,
+    faces,
+    fits,
+    gradients,
+    light_directions,
+    modelling,
+    poses,
+    readme,
+    shadow_maps,
+    speed,
+)
 from .records import DOCS, RESULTS, Lines, record
 
 REGION = re.compile(r"^<!-- table: (?P<name>[^\n]+) -->\n(?P<body>.*?)^<!-- end of table -->$", re.MULTILINE | re.DOTALL)
@@ -59,6 +72,8 @@ TABLES: dict[str, Callable[[], Lines]] = {
     "art": art.art,
     "holes": art.holes,
     "modelling": modelling.modelling,
+    "fits": fits.fits,
+    "fits in short": fits.fits_in_short,
 }
 #: Pages that are written as a whole, below docs/.
 FILES: dict[str, Callable[[], str]] = {

@@ -40,6 +40,9 @@ _ALIKE_AFAR = 0.02
 # Numbers may depend on each other where an eigenvalue of the matrix, with a diagonal of one, is smaller: images tell how much.
 # Those with a smaller share of the eigenvector have no part in it.
 _DEPENDENT, _SHARE = 0.25, 0.02
+# Images of the first step differ by about twice the first number, a share of their brightness. Steps grow by the second factor
+# while the square of the change is below the third share of the stated one. The others' part is corrected so many times at each.
+_LINEAR, _LONGER, _FEWER, _CORRECTED, _DAMPED = 0.02, 2.0, 0.6, 2, 1e-3
 # Directions in which numbers move the images by less than this square share of their single effects are not determined. Residuals
 # say nothing of them: no change of the images can leave any. Their largest number gets this deviation.
 _LEAST, _FREE = 1e-6, 10.0
@@ -128,27 +131,61 @@ def _dependence(
 ) -> Array:
     """Further covariance (n, n) of numbers that can make up for each other, such as the size of a shape and its distance.
 
-    Derivatives of outlines are not exact, and hide it: the effect of such numbers together is smaller in images at a distance.
+    Derivatives of outlines are not exact, and hide it: images tell how little such numbers change together.
     """
-    keep, result = np.flatnonzero(~idle), np.zeros_like(matrix)
+    keep, result, done = np.flatnonzero(~idle), np.zeros_like(matrix), set[int]()
     scale = np.sqrt(np.diag(matrix)[keep])
     values, vectors = np.linalg.eigh(matrix[np.ix_(keep, keep)] / np.outer(scale, scale))
     for k in np.flatnonzero((values > _LEAST) & (values < _DEPENDENT)):
-        vector = np.where(np.abs(vectors[:, k]) < _SHARE, 0, vectors[:, k])
-        if objective.precision[keep][vector != 0].any():
-            continue  # a prior holds them
-        direction = np.zeros(objective.count)
-        direction[keep] = vectors[:, k] / scale
-        direction /= np.abs(direction).max()
-        stated = float(direction @ matrix @ direction)
-        ratio = max(min(1.0, _change(direction, point, objective, low, high) / stated), 1e-6)
-        along = np.zeros(objective.count)
-        along[keep] = vectors[:, k] * scale
-        variance = float(along @ covariance @ along) * (ratio**-2 - 1)
-        spread = np.zeros(objective.count)
-        spread[keep] = vector / scale
-        result += min(variance, (_FREE / np.abs(spread).max()) ** 2) * np.outer(spread, spread)
+        number = int(keep[np.abs(vectors[:, k]).argmax()])
+        held = objective.precision[keep][np.abs(vectors[:, k]) > _SHARE].any()  # by a prior
+        if number in done or held:
+            continue
+        done.add(number)
+        others = keep[keep != number]
+        ratio, direction = _joint_change(number, others, matrix, point, objective, low, high)
+        direction[keep[np.abs(direction[keep]) * scale < _SHARE * np.abs(direction[keep] * scale).max()]] = 0
+        variance = min(float(covariance[number, number]) * (ratio**-2 - 1), (_FREE / np.abs(direction).max()) ** 2)
+        result += variance * np.outer(direction, direction)
     return result
+
+
+def _joint_change(
+    number: int,
+    others: npt.NDArray[np.intp],
+    matrix: Array,
+    point: Point,
+    objective: Objective,
+    low: Array | float,
+    high: Array | float,
+) -> tuple[float, Array]:
+    """(square of the images' change, in shares of that which derivatives state, when others make up for one number; direction).
+
+    The direction (n,) has a one at the number. It starts as derivatives say, and is corrected by differences of images. Steps are
+    short at first: independent numbers leave the range of their derivatives soon. They grow as long as the images change less
+    than stated, since errors of single pixels hide that over a short distance.
+    """
+    own = matrix[np.ix_(others, others)]
+    own = own + _DAMPED * np.diag(np.diag(own))
+    direction = np.zeros(objective.count)
+    direction[number], direction[others] = 1, -np.linalg.solve(own, matrix[others, number])
+    stated = max(float(direction @ matrix @ direction), 1e-30)
+    best, found, step = 1.0, direction.copy(), _LINEAR / np.sqrt(stated)
+    while True:
+        far = min(step, _FAR / np.abs(direction).max())
+        for _ in range(_CORRECTED):
+            ends = [np.clip(point.x + sign * far * direction, low, high) for sign in (1, -1)]
+            length = float((ends[0] - ends[1])[number])
+            if length <= 0:
+                return best, found
+            above, below = (objective.at(end) for end in ends)
+            ratio = max(_square(above, below, point, objective) / length**2 / stated, 1e-6)
+            if ratio < best:
+                best, found = ratio, direction.copy()
+            direction[others] -= np.linalg.solve(own, _products(above, below, point, objective)[others] / length)
+        if best > _FEWER or far < step:
+            return best, found
+        step *= _LONGER
 
 
 def _is_idle(direction: Array, point: Point, objective: Objective, low: Array | float, high: Array | float) -> bool:
@@ -177,6 +214,14 @@ def _square(one: Point, other: Point, point: Point, objective: Objective) -> flo
     for first, second, weight in zip(one.residuals, other.residuals, point.weights(), strict=True):
         square += float((weight * np.square(first - second, dtype=np.float64).reshape(-1)).sum())
     return square / objective.terms
+
+
+def _products(one: Point, other: Point, point: Point, objective: Objective) -> Array:
+    """Products (n,) of a point's derivatives with the difference of two images, weighted as :func:`_square` does."""
+    total = np.zeros(objective.count)
+    for columns, first, second, weight in zip(point.columns(), one.residuals, other.residuals, point.weights(), strict=True):
+        total += columns @ (weight * (first - second).reshape(-1))
+    return total / objective.terms
 
 
 def not_told_apart(found: Uncertainty) -> list[tuple[int, int]]:

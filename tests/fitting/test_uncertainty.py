@@ -275,3 +275,34 @@ def test_dependent_numbers_are_measured_by_images() -> None:
     result = found(measured)
     assert (result.half_widths[:2] > 10 * found(stated).half_widths[:2]).all() and not_told_apart(result) == [(0, 1)]
     np.testing.assert_allclose(result.half_widths[2], found(stated).half_widths[2], rtol=0.05)
+
+
+@pytest.mark.usefixtures("plain")
+def test_derivatives_that_point_beside_the_valley_do_not_hide_it() -> None:
+    """Twice the second number makes up for the first one; derivatives state another factor, and an effect of both together."""
+    true = smooth_derivatives(3)
+    true[1] = 2 * true[0]
+    wrong = true.copy()
+    wrong[1] = 1.4 * true[0]
+    wrong += np.random.default_rng(1).normal(scale=0.15, size=true.shape)
+    residual = np.random.default_rng(0).normal(scale=NOISE, size=SHAPE)
+    problem = made(wrong, residual)
+    problem.at = lambda x: SimpleNamespace(residuals=[residual + (x @ true).reshape(SHAPE)])  # type: ignore[method-assign]
+    result = found(problem)
+    assert (result.half_widths[:2] > 1).all() and not_told_apart(result) == [(0, 1)]
+    assert result.half_widths[2] < 0.05
+
+
+@pytest.mark.usefixtures("plain")
+def test_images_that_saturate_do_not_widen_intervals() -> None:
+    """Two numbers have similar effects; each is told. Over long steps images change less than derivatives say."""
+    true = smooth_derivatives(3)
+    true[1] = true[0] + 0.5 * true[1]
+    residual = np.random.default_rng(0).normal(scale=NOISE, size=SHAPE)
+    linear, bent = made(true, residual), made(true, residual)
+
+    def saturated(x: Array) -> Any:
+        return SimpleNamespace(residuals=[residual + (0.05 * np.tanh(x @ true / 0.05)).reshape(SHAPE)])
+
+    bent.at = saturated  # type: ignore[method-assign]
+    np.testing.assert_allclose(found(bent).half_widths, found(linear).half_widths, rtol=0.25)

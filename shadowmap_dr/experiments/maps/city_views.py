@@ -1,0 +1,156 @@
+"""Views of cities: from streets and from the air, with the sun in four directions.
+
+The same for a city of a file: its meshes, whose materials are left out, are read from a scene file of Mitsuba.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
+
+from ...errors import ShadowmapError
+from .city import City, make_city
+from .view import USUAL, Motion, View, points_of, shape_image
+
+#: Azimuths of the sun, degrees.
+AZIMUTHS = (20, 110, 200, 290)
+# Views that are less dark are left out, as a share of the image.
+_LEAST_DARK = 0.01
+# With this sun, derivatives are compared.
+_MOVED = AZIMUTHS[1]
+#: Height of cameras in streets above the ground, metres.
+EYE = 5.0
+# Places for streets: a grid of so many lines to each side of the middle, a thirtieth of the city apart.
+_LINES = 6
+# Shapes smaller than this, metres, are small; pixels that a shape must have for derivatives by its place or height.
+_SMALL, _LEAST = 25.0, 12
+# Shadows of a house are about so long, metres.
+_SHADOW = 20.0
+
+
+@dataclass(frozen=True)
+class Place:
+    """A camera: its name, its position and what it looks at, metres."""
+
+    name: str
+    origin: tuple[float, float, float]
+    target: tuple[float, float, float]
+
+
+def city_views(city: City | None = None) -> Iterator[View]:
+    """Views of a city of :func:`~shadowmap_dr.experiments.maps.city.make_city`, among them one of its square."""
+    city = city or make_city()
+    meshes = city.meshes()
+    rises = {body.name: body.solid.rise for body in city.buildings}
+    column = city.body("column_000").solid.points
+    x, y, z = column[:, 0].mean(), column[:, 1].mean(), column[:, 2].min()
+    places = [*protocol_places(meshes), Place("square", (x - 34.0, y - 22.0, z + EYE), (x, y, z + 4.0))]
+    yield from _views("city", meshes, places, rises)
+
+
+def file_views(path: Path) -> Iterator[View]:
+    """Views of the city of a scene file; its name is that of the file.
+
+    Raises:
+        ShadowmapError: the file or one of its meshes cannot be read.
+    """
+    meshes = file_meshes(path)
+    rises = {}
+    for name, mesh in meshes.items():
+        heights = points_of(mesh)[:, 2]
+        # Vertices of walls are at their foot, those of roofs are not.
+        rises[name] = (heights > heights.min() + 1.0).astype(np.float64)
+    yield from _views(path.stem, meshes, protocol_places(meshes), rises)
+
+
+def file_meshes(path: Path) -> dict[str, mi.Mesh]:
+    """The meshes of a scene file with one grey material.
+
+    Raises:
+        ShadowmapError: the file or one of its meshes cannot be read.
+    """
+    material = mi.load_dict({"type": "twosided", "bsdf": {"type": "diffuse"}})
+    meshes: dict[str, mi.Mesh] = {}
+    try:
+        for index, shape in enumerate(ElementTree.parse(path).getroot().findall("shape")):
+            file = shape.find("string[@name='filename']")
+            if file is None:
+                continue
+            source = {"type": shape.get("type"), "filename": str(path.parent / file.get("value", "")), "face_normals": True}
+            name = shape.get("id") or f"shape_{index}"
+            meshes[name] = mi.load_dict({"type": "scene", name: {**source, "bsdf": material}}, optimize=False).shapes()[0]
+    except (OSError, ElementTree.ParseError, RuntimeError) as error:
+        raise ShadowmapError(f"cannot read the city {path}: {' '.join(str(error).split())}") from error
+    if not meshes:
+        raise ShadowmapError(f"the city {path} has no meshes: give a scene file with shapes that name files.")
+    return meshes
+
+
+def protocol_places(meshes: Mapping[str, mi.Mesh]) -> list[Place]:
+    """Two streets, which are the lowest places of a grid about the middle, and the air."""
+    whole = mi.load_dict({"type": "scene", **meshes}, optimize=False)
+    box = whole.bbox()
+    (x, y, _), (w, d, _) = (np.array(v, np.float64).ravel() for v in (box.center(), box.extents()))
+    steps = range(-_LINES, _LINES + 1)
+    spots = sorted((_ground(whole, x + i * w / 30, y + j * d / 30), i, j) for i in steps for j in steps)
+    streets = []
+    for number, (height, i, j) in enumerate((spots[0], spots[len(spots) // 8])):
+        px, py, pz = x + i * w / 30, y + j * d / 30, height + EYE
+        streets.append(Place(f"street {number}", (px, py, pz), (px + 100, py + 60, pz)))
+    return [*streets, Place("air", (x - 0.45 * w, y - 0.45 * d, 0.35 * w), (x, y, 0.0))]
+
+
+def _views(
+    city: str,
+    meshes: Mapping[str, mi.Mesh],
+    places: list[Place],
+    rises: Mapping[str, npt.NDArray[np.float64]],
+) -> Iterator[View]:
+    """All cameras and suns; with one of the suns parts move."""
+    for place in places:
+        for azimuth in AZIMUTHS:
+            view = View(
+                f"{city}, {place.name}, sun {azimuth}", meshes, place.origin, place.target, azimuth, least_dark=_LEAST_DARK
+            )
+            yield replace(view, motions=_motions(view, rises)) if azimuth == _MOVED else view
+
+
+def _motions(view: View, rises: Mapping[str, npt.NDArray[np.float64]]) -> dict[str, Motion]:
+    """Motions of the sun, and of the building and the small shape that have most pixels."""
+    shapes, p_world = shape_image(view, view.scene(USUAL), USUAL)
+    names, counts = list(view.meshes), np.bincount(shapes[shapes >= 0].ravel(), minlength=len(view.meshes))
+    pixel = np.tan(np.radians(0.5 * view.fov)) * 2 / USUAL
+
+    def most(allowed: list[str]) -> tuple[str, float]:
+        """Name of the shape with most pixels, "" if it has few, and the width of a pixel there in metres."""
+        allowed = [name for name in allowed if counts[names.index(name)] >= _LEAST]
+        if not allowed:
+            return "", 0.0
+        chosen = max(allowed, key=lambda name: int(counts[names.index(name)]))
+        away = np.linalg.norm(p_world[shapes == names.index(chosen)] - np.array(view.origin), axis=-1)
+        return chosen, float(np.median(away)) * pixel
+
+    away = np.linalg.norm(p_world[shapes >= 0] - np.array(view.origin), axis=-1)
+    motions = {"sun": Motion(0.5 * float(np.median(away)) * pixel / _SHADOW)}
+    building, width = most(list(rises))
+    if building:
+        rate = np.zeros((len(rises[building]), 3))
+        rate[:, 2] = rises[building]
+        motions["height"] = Motion(0.5 * width, building, rate)
+    sizes = {name: float(np.ptp(points_of(mesh), axis=0).max()) for name, mesh in view.meshes.items()}
+    small, width = most([name for name, size in sizes.items() if size < _SMALL and name not in rises])
+    if small:
+        motions["place"] = Motion(0.5 * width, small, np.array([[1.0, 0.0, 0.0]]))
+    return motions
+
+
+def _ground(scene: mi.Scene, x: float, y: float) -> float:
+    """Height of whatever is below (x, y), metres."""
+    ray = mi.Ray3f(mi.Point3f(float(x), float(y), 1e4), mi.Vector3f(0, 0, -1))
+    return float(scene.ray_intersect(ray).p.z[0])

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from ...errors import ShadowmapError
 from .city import City, make_city
-from .view import USUAL, Motion, View, points_of, shape_image
+from .view import USUAL, Motion, View, points_of, seen_by
 
 #: Azimuths of the sun, degrees.
 AZIMUTHS = (20, 110, 200, 290)
@@ -28,10 +28,8 @@ _MOVED = AZIMUTHS[1]
 EYE = 5.0
 # Places for streets: a grid of so many lines to each side of the middle, a thirtieth of the city apart.
 _LINES = 6
-# Shapes smaller than this, metres, are small; pixels that a shape must have for derivatives by its place or height.
-_SMALL, _LEAST = 25.0, 12
-# Shadows of a house are about so long, metres.
-_SHADOW = 20.0
+# Shapes smaller than this, metres, are small; pixels that its shadow must have for derivatives by its place or height.
+_SMALL, _LEAST = 25.0, 5
 
 
 @dataclass(frozen=True)
@@ -98,10 +96,12 @@ def protocol_places(meshes: Mapping[str, mi.Mesh]) -> list[Place]:
     box = whole.bbox()
     (x, y, _), (w, d, _) = (np.array(v, np.float64).ravel() for v in (box.center(), box.extents()))
     steps = range(-_LINES, _LINES + 1)
-    spots = sorted((_ground(whole, x + i * w / 30, y + j * d / 30), i, j) for i in steps for j in steps)
+    spots = np.array([(x + i * w / 30, y + j * d / 30) for i in steps for j in steps])
+    heights = _ground(whole, spots)
+    order = np.argsort(heights, kind="stable")
     streets = []
-    for number, (height, i, j) in enumerate((spots[0], spots[len(spots) // 8])):
-        px, py, pz = x + i * w / 30, y + j * d / 30, height + EYE
+    for number, spot in enumerate((order[0], order[len(order) // 8])):
+        px, py, pz = float(spots[spot, 0]), float(spots[spot, 1]), float(heights[spot]) + EYE
         streets.append(Place(f"street {number}", (px, py, pz), (px + 100, py + 60, pz)))
     return [*streets, Place("air", (x - 0.45 * w, y - 0.45 * d, 0.35 * w), (x, y, 0.0))]
 
@@ -122,35 +122,37 @@ def _views(
 
 
 def _motions(view: View, rises: Mapping[str, npt.NDArray[np.float64]]) -> dict[str, Motion]:
-    """Motions of the sun, and of the building and the small shape that have most pixels."""
-    shapes, p_world = shape_image(view, view.scene(USUAL), USUAL)
-    names, counts = list(view.meshes), np.bincount(shapes[shapes >= 0].ravel(), minlength=len(view.meshes))
-    pixel = np.tan(np.radians(0.5 * view.fov)) * 2 / USUAL
-
-    def most(allowed: list[str]) -> tuple[str, float]:
-        """Name of the shape with most pixels, "" if it has few, and the width of a pixel there in metres."""
-        allowed = [name for name in allowed if counts[names.index(name)] >= _LEAST]
-        if not allowed:
-            return "", 0.0
-        chosen = max(allowed, key=lambda name: int(counts[names.index(name)]))
-        away = np.linalg.norm(p_world[shapes == names.index(chosen)] - np.array(view.origin), axis=-1)
-        return chosen, float(np.median(away)) * pixel
-
-    away = np.linalg.norm(p_world[shapes >= 0] - np.array(view.origin), axis=-1)
-    motions = {"sun": Motion(0.5 * float(np.median(away)) * pixel / _SHADOW)}
-    building, width = most(list(rises))
-    if building:
-        rate = np.zeros((len(rises[building]), 3))
-        rate[:, 2] = rises[building]
-        motions["height"] = Motion(0.5 * width, building, rate)
+    """Motions of the sun, and of the building and the small shape whose shadows have most pixels."""
+    seen = seen_by(view, view.scene(USUAL), USUAL)
+    names = list(view.meshes)
+    dark = seen.caster >= 0
+    if dark.sum() < _LEAST:
+        return {}
+    away = np.linalg.norm(seen.p_world - np.array(view.origin), axis=-1)
+    half_pixel = away * np.tan(np.radians(0.5 * view.fov)) / USUAL
+    sun = half_pixel[dark] / (seen.distance[dark] * np.cos(np.radians(view.elevation)))
+    # A pixel for the longer shadows, less for the shorter ones.
+    motions = {"sun": Motion(float(np.percentile(sun, 25)))}
+    counts = np.bincount(seen.caster[dark], minlength=len(names))
     sizes = {name: float(np.ptp(points_of(mesh), axis=0).max()) for name, mesh in view.meshes.items()}
-    small, width = most([name for name, size in sizes.items() if size < _SMALL and name not in rises])
-    if small:
-        motions["place"] = Motion(0.5 * width, small, np.array([[1.0, 0.0, 0.0]]))
+    small = [name for name, size in sizes.items() if size < _SMALL and name not in rises]
+    for motion, allowed in (("height", list(rises)), ("place", small)):
+        chosen = max(allowed, key=lambda name: int(counts[names.index(name)]), default="")
+        if chosen and counts[names.index(chosen)] >= _LEAST:
+            step = float(np.median(half_pixel[seen.caster == names.index(chosen)]))
+            motions[motion] = Motion(step, chosen, _rate(motion, rises.get(chosen)))
     return motions
 
 
-def _ground(scene: mi.Scene, x: float, y: float) -> float:
-    """Height of whatever is below (x, y), metres."""
-    ray = mi.Ray3f(mi.Point3f(float(x), float(y), 1e4), mi.Vector3f(0, 0, -1))
-    return float(scene.ray_intersect(ray).p.z[0])
+def _rate(motion: str, rise: npt.NDArray[np.float64] | None) -> npt.NDArray[np.float64]:
+    """Motion of vertices: by their rise upwards, or all along x."""
+    if motion == "place" or rise is None:
+        return np.array([[1.0, 0.0, 0.0]])
+    return np.column_stack([0 * rise, 0 * rise, rise])
+
+
+def _ground(scene: mi.Scene, places: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Heights (N,) of whatever is below places (N, 2), metres."""
+    x, y = (mi.Float(places[:, k].astype(np.float32)) for k in (0, 1))
+    hit = scene.ray_intersect(mi.Ray3f(mi.Point3f(x, y, 1e4), mi.Vector3f(0, 0, -1)))
+    return np.array(hit.p.z, np.float64)

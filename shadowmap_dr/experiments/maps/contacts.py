@@ -102,7 +102,7 @@ def _statue() -> View:
     shield = prism(rectangle(-0.12, -0.42, 0.30, -0.36), 0.6, 1.15)
     figure = joined([Solid(points, body.faces, body.rise), *arms, shield, post(-0.5, -0.1, 0.04, 0.0, 2.2)]).moved(0, 0, 0.6)
     base = joined([post(0, 0, 1.5, -0.05, 0.3), post(0, 0, 1.15, 0.3, 0.6)])
-    motions = {"sun": Motion(0.02), "place": Motion(0.004, "statue", np.array([[1.0, 0.0, 0.0]]))}
+    motions = {"sun": Motion(0.006), "place": Motion(0.004, "statue", np.array([[1.0, 0.0, 0.0]]))}
     solids = {"ground": _slab(8.0), "base": base, "statue": figure}
     return View("statue", _meshes(solids), (0.0, -6.0, 2.6), (0.0, 0.0, 1.3), 262, 30, fov=30, near=0.1, far=100, motions=motions)
 

@@ -126,20 +126,45 @@ def points_of(mesh: mi.Mesh) -> npt.NDArray[np.float64]:
     return np.array(mesh_buffers(mesh).positions, np.float64).reshape(-1, 3)
 
 
-def shape_image(view: View, scene: mi.Scene, resolution: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float32]]:
-    """Number (H, W) of the shape (in the order of ``view.meshes``) in the middle of each pixel, -1 for none, and its place.
+@dataclass(frozen=True)
+class Seen:
+    """What the middles of pixels show, all (H, W).
 
-    Places (H, W, 3) are metres, not numbers where there is no shape.
+    Attributes:
+        shape: number of the shape, in the order of the view's meshes; -1 for none.
+        p_world: (H, W, 3), metres; not numbers where there is no shape.
+        caster: number of the shape that casts a shadow there; -1 for none, and on surfaces that do not face the sun.
+        distance: from there to the caster, metres; infinite where there is none.
     """
+
+    shape: npt.NDArray[np.int64]
+    p_world: npt.NDArray[np.float32]
+    caster: npt.NDArray[np.int64]
+    distance: npt.NDArray[np.float32]
+
+
+def seen_by(view: View, scene: mi.Scene, resolution: int) -> Seen:
+    """Trace rays through the middles of pixels, and from there to the sun."""
     middle = (np.arange(resolution) + 0.5) / resolution
     v, u = np.meshgrid(middle, middle, indexing="ij")
     sample = mi.Point2f(mi.Float(u.ravel().astype(np.float32)), mi.Float(v.ravel().astype(np.float32)))
     ray, _ = scene.sensors()[0].sample_ray(0.0, 0.5, sample, mi.Point2f(0.5))
     hit = scene.ray_intersect(ray)
+    towards = mi.Vector3f(*(-view.direction()).tolist())
+    faces = dr.dot(hit.n, towards) * dr.dot(hit.n, ray.d) < 0
+    above = scene.ray_intersect(hit.spawn_ray(towards), hit.is_valid() & faces)
     # Dr.Jit numbers all shapes.
-    numbers = {int(np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape)))[0]): shape.id() for shape in scene.shapes()}
     order = {name: index for index, name in enumerate(view.meshes)}
-    pointers, index = np.unique(np.array(dr.reinterpret_array(mi.UInt32, hit.shape)), return_inverse=True)
-    shapes = np.array([order[numbers[pointer]] if pointer in numbers else -1 for pointer in pointers])[index]
+    pointers = {_number(mi.ShapePtr(shape))[0]: order[shape.id()] for shape in scene.shapes()}
+
+    def numbers(found: mi.SurfaceInteraction3f) -> npt.NDArray[np.int64]:
+        own, index = np.unique(_number(dr.select(found.is_valid(), found.shape, mi.ShapePtr(None))), return_inverse=True)
+        return np.array([pointers.get(pointer, -1) for pointer in own])[index].reshape(resolution, resolution)
+
     places = np.array(mi.Point3f(dr.select(hit.is_valid(), hit.p, dr.nan))).T.reshape(resolution, resolution, 3)
-    return shapes.reshape(resolution, resolution), places.astype(np.float32)
+    distance = np.array(dr.select(above.is_valid(), above.t, dr.inf)).reshape(resolution, resolution)
+    return Seen(numbers(hit), places.astype(np.float32), numbers(above), distance.astype(np.float32))
+
+
+def _number(pointer: mi.ShapePtr) -> npt.NDArray[np.uint32]:
+    return np.atleast_1d(np.array(dr.reinterpret_array(mi.UInt32, pointer)))

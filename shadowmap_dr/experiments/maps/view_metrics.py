@@ -14,8 +14,8 @@ Mask = npt.NDArray[np.bool_]
 # Shares of the brightness (its 95th percentile): surfaces above the first are in the sun's direction, pixels within the second
 # of black are dark, and within the second of the unshadowed image they are lit.
 _SHONE_ON, _SAME = 0.2, 0.02
-# Pixels between the borders of dark areas and their inside; least number of pixels of a mean.
-_INSIDE, _LEAST = 2, 30
+# Pixels between the borders of dark areas and their inside; least number of pixels of a mean, and of edges.
+_INSIDE, _LEAST, _LEAST_EDGES = 2, 30, 10
 #: Largest distance of a shadow from its caster, pixels. One that is not found counts as much.
 FARTHEST = 24
 
@@ -85,7 +85,7 @@ def detachment(visibility: Image, truth: Truth, caster: Mask, along: tuple[int, 
     traced, found = _distances(truth.visibility, truth.shone_on, caster, along)
     ours, _ = _distances(visibility, truth.shone_on, caster, along)
     there = found & (traced < FARTHEST)
-    return float((ours - traced)[there].mean()) if there.sum() >= _LEAST else float("nan")
+    return float((ours - traced)[there].mean()) if there.sum() >= _LEAST_EDGES else float("nan")
 
 
 def _distances(visibility: Image, shone_on: Mask, caster: Mask, along: tuple[int, int]) -> tuple[npt.NDArray[np.int64], Mask]:

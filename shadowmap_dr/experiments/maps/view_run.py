@@ -22,13 +22,15 @@ from ...shadow import Frusta, directional_view
 from .city_views import city_views, file_views
 from .contacts import CONTACTS
 from .metrics import Image, texel_in_pixels
-from .view import View, shape_image
+from .view import View, seen_by
 from .view_metrics import Truth, detachment, view_metrics
 
 #: Words for scenes that are views under the sun.
 VIEWS = (*CONTACTS, "city")
 #: The file of a real city in its folder.
 REAL_CITY = Path("munich/munich.xml")
+# Derivatives of path-traced images need more samples: two references of 4 x 64 agree to a cosine of 0.995.
+_MORE = 4
 #: The first thing that is being done in a view.
 FIRST = "reference"
 
@@ -79,9 +81,9 @@ def measure(view: View, options: ViewOptions, note: Callable[[str], None]) -> tu
     truth = Truth.of(traced, bare)
     if truth.dark.mean() < view.least_dark:
         return {}, {}
-    shapes, p_world = shape_image(view, scene, options.resolution)
-    caster = shapes == list(view.meshes).index(view.caster) if view.caster else np.zeros_like(truth.dark)
-    footprint = _footprint(view, p_world, truth.shone_on, options)
+    seen = seen_by(view, scene, options.resolution)
+    caster = seen.shape == list(view.meshes).index(view.caster) if view.caster else np.zeros_like(truth.dark)
+    footprint = _footprint(view, seen.p_world, truth.shone_on, options)
     derivatives = _reference_derivatives(view, options)
     methods: dict[str, Any] = {}
     pictures, errors = {"path traced": traced}, {"visibility": truth.visibility[..., None]}
@@ -129,7 +131,7 @@ def _reference_derivatives(view: View, options: ViewOptions) -> dict[str, Image]
     found = {}
     for motion in view.motions:
         build = functools.partial(view.scene, options.resolution, motion)
-        image = central_difference(build, view.step(motion, options.resolution), spp=options.spp).image
+        image = central_difference(build, view.step(motion, options.resolution), spp=_MORE * options.spp).image
         if image.any():
             found[motion] = image
     return found

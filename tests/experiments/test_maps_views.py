@@ -99,7 +99,7 @@ def test_views_of_a_city_have_motions_with_one_sun(variant: str, hamlet: City) -
     views = list(city_views(hamlet))
     assert len(views) == 16 and len({view.name for view in views}) == 16
     moving = [view for view in views if view.motions]
-    assert len(moving) == 4 and all(view.azimuth == 110 for view in moving)
+    assert len(moving) == len({view.origin for view in moving}) == 4
     assert moving[-1].motions.keys() == {"sun", "height", "place"}
 
 
@@ -115,7 +115,7 @@ def test_motions_and_scenes_agree(variant: str) -> None:
 
 @pytest.mark.parametrize("motion", ["sun", "place"])
 def test_derivatives_are_those_of_the_motions(variant: str, motion: str) -> None:
-    """Against differences of our own images. For each direction of the sun the map is fitted anew, so that texels differ a little."""
+    """Against differences of our own images. The map is fitted anew for each sun: texels differ a little."""
     view = CONTACTS["box"]()
     step = view.step(motion, 128)
     derivative = view.derivative(Renderer.from_scene(view.scene(128)), motion)
@@ -131,7 +131,8 @@ def test_contacts_have_shadows_in_view(variant: str, name: str) -> None:
     seen = seen_by(view, scene, 96)
     assert np.isfinite(seen.p_world[seen.shape >= 0]).all() and np.isnan(seen.p_world[seen.shape < 0]).all()
     assert not view.caster or (seen.shape == list(view.meshes).index(view.caster)).sum() > 50
-    assert (seen.caster >= 0).any() and np.array_equal(seen.caster >= 0, np.isfinite(seen.distance))
+    assert (seen.caster >= 0).any() and np.array_equal(seen.caster >= 0, np.isfinite(seen.p_caster[..., 0]))
+    assert seen.lit.any() and not (seen.lit & (seen.caster >= 0)).any()
     traced = np.array(mi.render(scene, integrator=mi.load_dict({"type": "direct"}), spp=4))
     bare = np.array(Renderer.from_scene(scene, shadow_method="none").render())
     dark = Truth.of(traced, bare).dark.mean()

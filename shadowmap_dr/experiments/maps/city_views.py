@@ -16,14 +16,12 @@ import numpy.typing as npt
 
 from ...errors import ShadowmapError
 from .city import City, make_city
-from .view import USUAL, Motion, View, points_of, seen_by
+from .view import USUAL, Motion, Seen, View, points_of, seen_by
 
 #: Azimuths of the sun, degrees.
 AZIMUTHS = (20, 110, 200, 290)
 # Views that are less dark are left out, as a share of the image.
 _LEAST_DARK = 0.01
-# With this sun, derivatives are compared.
-_MOVED = AZIMUTHS[1]
 #: Height of cameras in streets above the ground, metres.
 EYE = 5.0
 # Places for streets: a grid of so many lines to each side of the middle, a thirtieth of the city apart.
@@ -112,36 +110,49 @@ def _views(
     places: list[Place],
     rises: Mapping[str, npt.NDArray[np.float64]],
 ) -> Iterator[View]:
-    """All cameras and suns; with one of the suns parts move."""
+    """All cameras and suns. Parts move with the sun that shows most of both light and shadow."""
     for place in places:
+        views, shown = [], []
         for azimuth in AZIMUTHS:
-            view = View(
-                f"{city}, {place.name}, sun {azimuth}", meshes, place.origin, place.target, azimuth, least_dark=_LEAST_DARK
-            )
-            yield replace(view, motions=_motions(view, rises)) if azimuth == _MOVED else view
+            name = f"{city}, {place.name}, sun {azimuth}"
+            view = View(name, meshes, place.origin, place.target, azimuth, least_dark=_LEAST_DARK)
+            seen = seen_by(view, view.scene(USUAL), USUAL)
+            views.append(view)
+            shown.append(seen)
+        both = [min(int((seen.caster >= 0).sum()), int(seen.lit.sum())) for seen in shown]
+        best = int(np.argmax(both))
+        views[best] = replace(views[best], motions=_motions(views[best], shown[best], rises))
+        yield from views
 
 
-def _motions(view: View, rises: Mapping[str, npt.NDArray[np.float64]]) -> dict[str, Motion]:
-    """Motions of the sun, and of the building and the small shape whose shadows have most pixels."""
-    seen = seen_by(view, view.scene(USUAL), USUAL)
-    names = list(view.meshes)
-    dark = seen.caster >= 0
+def _motions(view: View, seen: Seen, rises: Mapping[str, npt.NDArray[np.float64]]) -> dict[str, Motion]:
+    """Motions of the sun, and of the building and the small shape whose shadows have the longest edges."""
+    names, dark = list(view.meshes), seen.caster >= 0
     if dark.sum() < _LEAST:
         return {}
-    away = np.linalg.norm(seen.p_world - np.array(view.origin), axis=-1)
-    half_pixel = away * np.tan(np.radians(0.5 * view.fov)) / USUAL
-    sun = half_pixel[dark] / (seen.distance[dark] * np.cos(np.radians(view.elevation)))
+    half_pixel = np.linalg.norm(seen.p_world - np.array(view.origin), axis=-1) * np.tan(np.radians(0.5 * view.fov)) / USUAL
+    across = np.linalg.norm((seen.p_caster - seen.p_world)[..., :2], axis=-1)
     # A pixel for the longer shadows, less for the shorter ones.
-    motions = {"sun": Motion(float(np.percentile(sun, 25)))}
-    counts = np.bincount(seen.caster[dark], minlength=len(names))
-    sizes = {name: float(np.ptp(points_of(mesh), axis=0).max()) for name, mesh in view.meshes.items()}
-    small = [name for name, size in sizes.items() if size < _SMALL and name not in rises]
-    for motion, allowed in (("height", list(rises)), ("place", small)):
-        chosen = max(allowed, key=lambda name: int(counts[names.index(name)]), default="")
+    motions = {"sun": Motion(float(np.percentile(half_pixel[dark] / across[dark], 25)))}
+    edge = dark & _beside(seen.lit)
+    boxes = {name: points_of(mesh) for name, mesh in view.meshes.items()}
+    low, high = (np.array([end(boxes[name][:, 2]) for name in names]) for end in (np.min, np.max))
+    # Only the upper parts of a building move with its height.
+    upper = edge & (seen.p_caster[..., 2] > 0.4 * low[seen.caster] + 0.6 * high[seen.caster])
+    small = [name for name in names if np.ptp(boxes[name], axis=0).max() < _SMALL and name not in rises]
+    for motion, allowed, where in (("height", list(rises), upper), ("place", small, edge)):
+        counts = np.bincount(seen.caster[where], minlength=len(names))
+        chosen = max(((int(counts[names.index(name)]), name) for name in allowed), default=(0, ""))[1]
         if chosen and counts[names.index(chosen)] >= _LEAST:
-            step = float(np.median(half_pixel[seen.caster == names.index(chosen)]))
+            step = float(np.median(half_pixel[where & (seen.caster == names.index(chosen))]))
             motions[motion] = Motion(step, chosen, _rate(motion, rises.get(chosen)))
     return motions
+
+
+def _beside(mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    """Pixels (H, W) with a neighbour in a mask."""
+    padded = np.pad(mask, 1)
+    return padded[:-2, 1:-1] | padded[2:, 1:-1] | padded[1:-1, :-2] | padded[1:-1, 2:]
 
 
 def _rate(motion: str, rise: npt.NDArray[np.float64] | None) -> npt.NDArray[np.float64]:

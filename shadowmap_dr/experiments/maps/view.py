@@ -134,13 +134,15 @@ class Seen:
         shape: number of the shape, in the order of the view's meshes; -1 for none.
         p_world: (H, W, 3), metres; not numbers where there is no shape.
         caster: number of the shape that casts a shadow there; -1 for none, and on surfaces that do not face the sun.
-        distance: from there to the caster, metres; infinite where there is none.
+        p_caster: (H, W, 3), where light is held up, metres; not numbers where nothing does.
+        lit: pixels of surfaces that face the sun and have no caster.
     """
 
     shape: npt.NDArray[np.int64]
     p_world: npt.NDArray[np.float32]
     caster: npt.NDArray[np.int64]
-    distance: npt.NDArray[np.float32]
+    p_caster: npt.NDArray[np.float32]
+    lit: npt.NDArray[np.bool_]
 
 
 def seen_by(view: View, scene: mi.Scene, resolution: int) -> Seen:
@@ -161,9 +163,12 @@ def seen_by(view: View, scene: mi.Scene, resolution: int) -> Seen:
         own, index = np.unique(_number(dr.select(found.is_valid(), found.shape, mi.ShapePtr(None))), return_inverse=True)
         return np.array([pointers.get(pointer, -1) for pointer in own])[index].reshape(resolution, resolution)
 
-    places = np.array(mi.Point3f(dr.select(hit.is_valid(), hit.p, dr.nan))).T.reshape(resolution, resolution, 3)
-    distance = np.array(dr.select(above.is_valid(), above.t, dr.inf)).reshape(resolution, resolution)
-    return Seen(numbers(hit), places.astype(np.float32), numbers(above), distance.astype(np.float32))
+    def places(found: mi.SurfaceInteraction3f) -> npt.NDArray[np.float32]:
+        at = np.array(mi.Point3f(dr.select(found.is_valid(), found.p, dr.nan)), np.float32)
+        return at.T.reshape(resolution, resolution, 3)
+
+    lit = np.array(hit.is_valid() & faces & ~above.is_valid()).reshape(resolution, resolution)
+    return Seen(numbers(hit), places(hit), numbers(above), places(above), lit)
 
 
 def _number(pointer: mi.ShapePtr) -> npt.NDArray[np.uint32]:

@@ -206,7 +206,9 @@ def test_a_city_of_a_file(variant: str, tmp_path: Path, hamlet: City) -> None:
 
 
 def test_small_run_of_views(variant: str, tmp_path: Path) -> None:
-    options = MapsOptions(scenes=("box",), candidates=("evsm4",), resolution=96, view_spp=4, pose_runs=0, out=tmp_path / "m")
+    options = MapsOptions(
+        scenes=("box",), candidates=("evsm4",), resolution=96, view_spp=4, pose_runs=0, rounds=2, out=tmp_path / "m"
+    )
     record = run_maps(options)
     stored = json.loads((tmp_path / "m" / "maps.json").read_text())
     assert stored["scenes"] == {} and stored["views"].keys() == {"box"}
@@ -214,6 +216,7 @@ def test_small_run_of_views(variant: str, tmp_path: Path) -> None:
     entry = record["views"]["box"]["methods"]["evsm4"]
     assert 0 < entry["light_in_shadow"] < 0.5 and entry["rmse"] < 0.2 and abs(entry["detachment_pixels"]) < 3
     assert entry["derivatives"].keys() == {"sun", "place"} and entry["derivatives"]["place"]["cosine"] > 0.7
+    assert np.isfinite(entry["seconds"])
     faults, derivatives = maps.tables(record)
     assert faults.row_count == derivatives.row_count == 1
     assert view_run.faults_table({"scenes": {}}) is None

@@ -154,6 +154,8 @@ def _add_views(record: dict[str, Any], options: MapsOptions, progress: Progress)
         entry, rows = view_run.measure(view, chosen, note)
         progress.update(task, completed=len(options.candidates) + 1)
         if entry:
+            if view.motions:
+                _add_times(entry["methods"], view.scene(options.resolution), options)
             record.setdefault("views", {})[view.name] = entry
             records.write_json(options.out / "maps.json", record)
         if view.motions:

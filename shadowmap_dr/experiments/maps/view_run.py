@@ -156,14 +156,18 @@ def _agreements(view: View, renderer: Renderer, references: Mapping[str, Image],
 
 def faults_table(record: dict[str, Any]) -> Table | None:
     """Table of the errors in views, with a row for each view and method; None without views."""
-    columns = ["view, method", "light in shadow", "inside", "dark in light", "RMSE", "detached"]
+    columns = ["view, method", "light", "inside", "dark", "RMSE", "detached", "time"]
     keys = ("light_in_shadow", "light_in_shadow_inside", "dark_in_light", "rmse", "detachment_pixels")
     rows = [
-        [f"{name}, {label}", *(cell(entry.get(key)) for key in keys)]
+        [f"{name}, {label}", *(cell(entry.get(key)) for key in keys), _time(entry.get("seconds"))]
         for name, view in record.get("views", {}).items()
         for label, entry in view["methods"].items()
     ]
-    return io_console.table("Views under the sun against path tracing (detached: pixels)", columns, rows) if rows else None
+    return (
+        io_console.table("Views: light in shadow (inside: away from borders), dark in light, pixels detached", columns, rows)
+        if rows
+        else None
+    )
 
 
 def derivatives_table(record: dict[str, Any]) -> Table | None:
@@ -183,6 +187,10 @@ def derivatives_table(record: dict[str, Any]) -> Table | None:
 def cell(value: float | None) -> str:
     """A number of a table; records have None where a quantity is not defined, for instance a shift where there is no outline."""
     return "-" if value is None or not np.isfinite(value) else f"{value:.3f}"
+
+
+def _time(seconds: float | None) -> str:
+    return "-" if seconds is None else f"{1e3 * seconds:.1f} ms"
 
 
 def check_city_folder(folder: Path | None) -> None:

@@ -48,9 +48,13 @@ def views() -> Lines:
         pairs = [[_mean([m.get(motion, {}).get(key) for m in moved]) for key in ("cosine", "scale")] for motion in _MOTIONS]
         seconds = _mean([e.get("seconds") for e in entries])
         time = "-" if seconds is None else formats.time(max(seconds, 1e-6))
-        rows.append([place, method, *numbers, time, *(", ".join(formats.number(v, 2) for v in pair) for pair in pairs)])
+        rows.append([place, method, *numbers, time, *(_pair(*pair) for pair in pairs)])
     columns = ["scene", "method", "light in shadow", "inside", "dark in light", "RMSE", "detached"]
     return markdown([*columns, "time", *(f"{motion}: c, s" for motion in _MOTIONS)], rows)
+
+
+def _pair(cosine: float | None, scale: float | None) -> str:
+    return "-" if cosine is None else f"{formats.number(cosine, 2)}, {formats.number(scale, 2)}"
 
 
 def _mean(values: list[float | None]) -> float | None:

@@ -101,7 +101,7 @@ def measure(view: View, options: ViewOptions, note: Callable[[str], None]) -> tu
         error = np.where(truth.shone_on, np.clip(share, 0, 1) - truth.visibility, 0)
         errors[f"difference, {label}"] = error.astype(np.float32)[..., None]
     record = {"dark": float(truth.dark.mean()), "footprint_pixels": footprint, "methods": methods}
-    return record, {view.name: pictures, f"{view.name}: visibility": errors}
+    return record, {view.name: pictures, f"{view.name}\nerrors": errors}
 
 
 def _image(renderer: Renderer) -> Image:

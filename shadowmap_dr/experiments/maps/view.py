@@ -128,7 +128,7 @@ def points_of(mesh: mi.Mesh) -> npt.NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class Seen:
-    """What the middles of pixels show, all (H, W).
+    """Surfaces and casters of shadows in the middles of pixels, all (H, W).
 
     Attributes:
         shape: number of the shape, in the order of the view's meshes; -1 for none.

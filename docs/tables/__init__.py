@@ -49,6 +49,7 @@ TABLES: dict[str, Callable[[], Lines]] = {
     "steps on a GPU": speed.on_a_gpu,
     "memory": speed.memory,
     "shadow maps": shadow_maps.shadow_maps,
+    "views of maps": shadow_maps.views,
     "poses by shadow maps": shadow_maps.poses_by_map,
     "methods": shadow_maps.methods,
     "extended lights": extended_lights.extended_lights,

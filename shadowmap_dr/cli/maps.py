@@ -12,11 +12,10 @@ from .options import Variant, from_record
 def maps(options: maps_experiment.MapsOptions, variant: Variant = DEFAULT_VARIANT) -> None:
     """Compare all shadow maps on scenes that are hard for them, against path tracing.
 
-    Writes OUT/maps.json and a sheet of pictures, OUT/maps.png.
+    Writes OUT/maps.json and sheets of pictures: OUT/maps.png, and OUT/views.png of contacts and cities.
     """
     set_variant(variant, COLOURED)
     record = maps_experiment.run_maps(options)
-    for table in (maps_experiment.table(record), maps_experiment.poses_table(record)):
-        if table is not None:
-            console.show(table)
-    console.result(options.out / "maps.png", options.out / "maps.json")
+    for table in maps_experiment.tables(record):
+        console.show(table)
+    console.result(options.out / ("views.png" if record.get("views") else "maps.png"), options.out / "maps.json")

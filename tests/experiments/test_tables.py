@@ -39,6 +39,8 @@ def tables(name: str) -> Iterator[Table | None]:
         yield lights.table(stored["summaries"])
     elif name == "maps":
         yield from (maps.table(stored), maps.poses_table(stored))
+    elif name == "maps-views":
+        yield from maps.tables(stored)
     elif name == "soft":
         yield from (soft.table(stored), soft.times_table(stored))
     else:
@@ -63,7 +65,7 @@ def assert_whole(table: Table) -> None:
             assert all(word in text for word in str(cell).split()), cell
 
 
-@pytest.mark.parametrize("name", ["bench", "faces", "gradients", "lights", "maps", "soft"])
+@pytest.mark.parametrize("name", ["bench", "faces", "gradients", "lights", "maps", "maps-views", "soft"])
 def test_tables_are_whole_at_80_columns(name: str) -> None:
     found = [table for table in tables(name) if table is not None]
     assert found

@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 from rich.console import Console
-from rich.progress import Progress
+from rich.progress import Progress, TaskID
 from rich.table import Table
 
 from ...errors import ShadowmapError, did_you_mean
@@ -30,6 +30,7 @@ from ...shadow import ShadowSettings, directional_view
 from ..common.timing import Contender, alternate
 from . import pose as maps_pose
 from . import scenes as maps_scenes
+from . import view_run
 from .metrics import Image, Texel, metrics, texel_in_pixels
 
 #: Labels of the compared shadow maps, and their options of the `Renderer`.
@@ -48,6 +49,10 @@ CANDIDATES: dict[str, dict[str, Any]] = {
 }
 
 
+#: Names of all scenes: those that are seen from above, and views under the sun.
+ALL_SCENES = (*maps_scenes.SCENES, *view_run.VIEWS)
+
+
 @dataclass(frozen=True)
 class MapsOptions:
     """Options of the experiment.
@@ -56,7 +61,7 @@ class MapsOptions:
     """
 
     scenes: tuple[str, ...] = option(
-        tuple(maps_scenes.SCENES), names=("--scene",), choices=maps_scenes.SCENES, shown="all", help="Scene; repeatable."
+        ALL_SCENES, names=("--scene",), choices=ALL_SCENES, shown="all", help="Scene; repeatable. A city is 16 views."
     )
     candidates: tuple[str, ...] = option(
         tuple(CANDIDATES), names=("--method",), choices=CANDIDATES, shown="all", help="Shadow map; repeatable."
@@ -66,12 +71,18 @@ class MapsOptions:
     filter_size: int = option(3, allowed=FILTER_SIDE, help="Texels along each side of the filter.")
     reference_spp: int = option(1024, names=("--spp",), allowed=SAMPLES, help="Samples per pixel of the path-traced images.")
     pose_runs: int = option(10, allowed=(0, 100000), help="Poses to find with each shadow map, from shadows alone; 0 for none.")
+    view_spp: int = option(64, allowed=SAMPLES, help="Samples per pixel of the path-traced images of contacts and cities.")
+    city_folder: Path | None = option(
+        None,
+        metavar="FOLDER",
+        help=f"Folder with {view_run.REAL_CITY}, a real city, to measure as well.",
+    )
     out: Path = option(Path("maps"), help="Folder for the results.")
     rounds: int = setting(30, allowed=(1, 10000), help="Number of timed renderings of each shadow map.")
 
     def __post_init__(self) -> None:
         check_ranges(self)
-        for kind, names, known in (("scene", self.scenes, maps_scenes.SCENES), ("method", self.candidates, CANDIDATES)):
+        for kind, names, known in (("scene", self.scenes, ALL_SCENES), ("method", self.candidates, CANDIDATES)):
             if not names:
                 raise ShadowmapError(f"no {kind} given: name at least one.")
             for name in names:
@@ -79,6 +90,7 @@ class MapsOptions:
                     raise ShadowmapError(
                         f"no {kind} {name!r}: choose from {', '.join(map(repr, known))}.{did_you_mean(name, known)}"
                     )
+        view_run.check_city_folder(self.city_folder)
         try:
             ShadowSettings(resolution=self.map_resolution, filter_size=self.filter_size)
         except ValueError as error:
@@ -86,13 +98,19 @@ class MapsOptions:
 
 
 def run_maps(options: MapsOptions, *, console: Console | None = None) -> dict[str, Any]:
-    """Measure all candidates on all scenes, write `maps.json` and `maps.png` into `options.out`, and return the record."""
+    """Measure all candidates on all scenes, and return the record.
+
+    Writes `maps.json` into `options.out`, `maps.png` with the scenes that are seen from above, and `views.png` with views under
+    the sun.
+    """
     console = console or io_console.notes()
     files.check_output(options.out / "maps.json", (".json",))
     record: dict[str, Any] = {**header(asdict(options)), "candidates": CANDIDATES, "scenes": {}}
     sheet: dict[str, dict[str, Image]] = {}
     with io_console.progress(console) as progress:
         for name in options.scenes:
+            if name not in maps_scenes.SCENES:
+                continue
             task = progress.add_task(name, total=len(options.candidates) + 1, note="reference")
             scene = maps_scenes.build(name, options.resolution)
             reference, mask = reference_visibility(scene, options.reference_spp)
@@ -115,8 +133,34 @@ def run_maps(options: MapsOptions, *, console: Console | None = None) -> dict[st
         if options.pose_runs:
             record["poses"] = _poses(options, progress)
             records.write_json(options.out / "maps.json", record)
-    plots.image_sheet(options.out / "maps.png", sheet, size=1.8)
+        views = _add_views(record, options, progress)
+    for name, rows in (("maps", sheet), ("views", views)):
+        if rows:
+            plots.image_sheet(options.out / f"{name}.png", rows, size=1.8)
     return record
+
+
+def _add_views(record: dict[str, Any], options: MapsOptions, progress: Progress) -> dict[str, dict[str, Image]]:
+    """Add all views under the sun to a record, and return rows of pictures of those in which parts move."""
+    settings = {label: _settings(label, options) for label in options.candidates}
+    chosen = view_run.ViewOptions(settings, options.resolution, options.map_resolution, options.filter_size, options.view_spp)
+    sheet: dict[str, dict[str, Image]] = {}
+    for view in view_run.views_of(options.scenes, options.city_folder):
+        task = progress.add_task(view.name, total=len(options.candidates) + 1, note="")
+
+        def note(text: str, task: TaskID = task) -> None:
+            progress.update(task, advance=int(text != view_run.FIRST), note=text)
+
+        entry, rows = view_run.measure(view, chosen, note)
+        progress.update(task, completed=len(options.candidates) + 1)
+        if entry:
+            if view.motions:
+                _add_times(entry["methods"], view.scene(options.resolution), options)
+            record.setdefault("views", {})[view.name] = entry
+            records.write_json(options.out / "maps.json", record)
+        if view.motions:
+            sheet |= rows
+    return sheet
 
 
 def _poses(options: MapsOptions, progress: Progress) -> dict[str, Any]:
@@ -227,6 +271,12 @@ def _add_times(entries: dict[str, dict[str, Any]], scene: mi.Scene, options: Map
             entry["seconds_over_plain_vsm"] = seconds[label] / seconds["plain vsm"]
 
 
+def tables(record: dict[str, Any]) -> list[Table]:
+    """All tables of a record that have rows."""
+    found = (poses_table(record), view_run.faults_table(record), view_run.derivatives_table(record))
+    return [*([table(record)] if record["scenes"] else []), *(each for each in found if each is not None)]
+
+
 def table(record: dict[str, Any]) -> Table:
     """Table with a row for each scene and method."""
     columns = ["scene, method", "RMSE", "shade", "bleed", "acne", "shift", "cos", "scale", "time"]
@@ -237,8 +287,8 @@ def table(record: dict[str, Any]) -> Table:
             rows.append(
                 [
                     f"{scene}, {label}",
-                    *(_number(e[key]) for key in ("rmse", "rmse_shadowed", "bleeding", "acne", "contour_shift_texels")),
-                    *(_number(e[key]) for key in ("derivative_cosine", "derivative_scale")),
+                    *(view_run.cell(e[key]) for key in ("rmse", "rmse_shadowed", "bleeding", "acne", "contour_shift_texels")),
+                    *(view_run.cell(e[key]) for key in ("derivative_cosine", "derivative_scale")),
                     f"{ratio:.2f}x" if ratio is not None else f"{1e3 * e['seconds']:.2f} ms",
                 ]
             )
@@ -253,8 +303,3 @@ def poses_table(record: dict[str, Any]) -> Table | None:
     ]
     columns = ["method", "found", "degrees", "offset x 100"]
     return io_console.table("Poses found with the shadow maps, medians of the errors", columns, rows) if rows else None
-
-
-def _number(value: float | None) -> str:
-    """A cell; records have None where a quantity is not defined, for instance a shift where there is no outline."""
-    return "-" if value is None or not np.isfinite(value) else f"{value:.3f}"

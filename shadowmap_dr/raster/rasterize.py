@@ -4,19 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from operator import index
 from types import ModuleType
 from typing import Any, cast
 
 import drjit as dr
 
-from ..jit.arrays import backend, ravel, replace_grad
+from ..jit.arrays import backend, replace_grad
 from ..jit.kernel_inputs import float_input, split, uint_input
 from ..jit.types import Bool, Float, Float64, TensorXf, TensorXu, UInt32, UInt64, Vector4f
 from .barycentrics import pixel_barycentrics
 from .small_triangles import EMPTY, draw
-from .tile_lists import STRIP, Strips, TileGrid, TileLists, build_tile_lists, nearest_covers, strips
-from .triangle_setup import Line, centred, covers, edge_lines, fragment_key, gather_triangle, set_up
+from .tile_lists import STRIP, Strips, TileGrid, TileLists, build_tile_lists, cover, no_covers, strips
+from .triangle_setup import Line, Triangles, beside, centred, covers, edge_lines, fragment_key, gather_triangle, set_up
 from .types import MAX_RESOLUTION, NO_TRIANGLE, RasterOutput, Records, check_array, check_range, pixel_coordinates
 
 #: A triangle that covers more pixels than this, and is not thin, goes through the lists of tiles.
@@ -274,30 +275,40 @@ def _nearest_fragments(
     keys = _empty_keys(module, grid.pixel_count if tiled else batch * height * width)
     index = dr.arange(module.UInt32, batch * face_count)
     image, triangle = split(index, "faces", face_count, batch)
-    triangles = set_up(gather_triangle(positions, faces, triangle, image * vertices, True), height, width)
+    total, empty = batch * face_count, height * width <= _LARGE  # no triangle can be large
     # Three flat arrays: Dr.Jit would write the components of a nested array in separate kernels.
-    records = ravel(triangles.a), ravel(triangles.b), ravel(triangles.c)
+    records = tuple(dr.empty(module.Float, 4 * total) for _ in range(3))
 
-    x0, y0, x1, y1 = triangles.box
-    sides = module.Float(x1 - x0 + (y1 - y0) + 2)
-    if one_sided is not None:
-        _, det = triangles.exact()
-        culled = dr.gather(module.Bool, one_sided, triangle if dr.width(one_sided) == face_count else index)
-        triangles = replace(triangles, active=triangles.active & ((det < 0) | ~culled))
-    small = triangles.active & ((triangles.fragments <= _LARGE) | (triangles.fragments <= 5 * sides))
-
-    def pixel_index(row: UInt32, column: UInt32) -> UInt32:
+    def pixel_index(image: UInt32, row: UInt32, column: UInt32) -> UInt32:
         return grid.pixel(image, row, column) if tiled else (image * rows + row) * columns + column
 
-    draw(triangles, keys, behind, pixel_index, triangle, triangles.box, small)
-    if height * width <= _LARGE:  # no triangle can be large
-        dr.eval(records, keys)
-        return keys if peel else _triangle_of(keys), records
+    def visit(index: UInt32, image: UInt32, triangle: UInt32) -> tuple[UInt32, UInt32, Bool]:
+        """Write the records and draw the small triangles. Returns the corners of the boxes, and the large triangles."""
+        triangles = set_up(gather_triangle(positions, faces, triangle, image * vertices, True), height, width)
+        for record, values in zip(records, (triangles.a, triangles.b, triangles.c), strict=True):
+            dr.scatter(record, values, index)
+        x0, y0, x1, y1 = triangles.box
+        sides = module.Float(x1 - x0 + (y1 - y0) + 2)
+        if one_sided is not None:
+            _, det = triangles.exact()
+            culled = dr.gather(module.Bool, one_sided, triangle if dr.width(one_sided) == face_count else index)
+            triangles = replace(triangles, active=triangles.active & ((det < 0) | ~culled))
+        small = triangles.active & ((triangles.fragments <= _LARGE) | (triangles.fragments <= 5 * sides))
+        draw(triangles, keys, behind, partial(pixel_index, image), triangle, triangles.box, small)
+        large = triangles.active & ~small
+        if nearest is not None:
+            cover(grid, nearest, triangles, image, large)
+        first, last = (module.UInt32(x) | (module.UInt32(y) << 16) for x, y in ((x0, y0), (x1, y1)))
+        return first, last, large
 
-    large = triangles.active & ~small
-    nearest = nearest_covers(grid, triangles, image, large) if not peel else None
-    first, last = (module.UInt32(x) | (module.UInt32(y) << 16) for x, y in ((x0, y0), (x1, y1)))
+    nearest = None if peel or empty else no_covers(grid, module)
+    # Most triangles of a large scene lie beside a shadow map, or beside what a camera sees.
+    near = ~beside(gather_triangle(positions, faces, triangle, image * vertices, True))
+    nothing = module.UInt32(0), module.UInt32(0), module.Bool(False)
+    first, last, large = dr.if_stmt((index, image, triangle), near, visit, lambda *_: nothing, mode="symbolic", label="triangle")
     dr.eval(records, keys, nearest, large, first, last)
+    if empty:
+        return keys if peel else _triangle_of(keys), records
 
     def exact_lines(index: UInt32) -> tuple[list[Line], Float64]:
         image, triangle = split(index, "faces", face_count, batch)
@@ -305,8 +316,8 @@ def _nearest_fragments(
 
     a, b, c = (dr.gather(module.Array4f, record, index, large) for record in records)
     box = tuple(module.Int32(corner) for corner in (first & 0xFFFF, first >> 16, last & 0xFFFF, last >> 16))
-    again = replace(triangles, a=a, b=b, c=c, box=box, exact=lambda: exact_lines(index))
-    lists = build_tile_lists(grid, again, index, image, triangle, large, nearest, keys, behind, pixel_index)
+    again = Triangles(a, b, c, lambda: exact_lines(index), box, large, module.Float(0), height, width)
+    lists = build_tile_lists(grid, again, index, image, triangle, large, nearest, keys, behind, partial(pixel_index, image))
     strip, kind = strips(grid, module), UInt64 if peel else module.UInt32
     merged = _merge_large(lists, strip, strip.gather(keys, tiled), behind, records, exact_lines, face_count, kind)
     return merged, records

@@ -9,9 +9,10 @@ from __future__ import annotations
 import drjit as dr
 
 from ..jit.arrays import backend, ravel, replace_grad
+from ..jit.branches import branch
 from ..jit.kernel_inputs import double_input, float_input, split, uint_input
 from ..jit.types import Bool, Float, UInt32, Vector4f
-from .triangle_setup import Corners, edge_lines, exact_centres, gather_triangle
+from .triangle_setup import Corners, beside, edge_lines, exact_centres, gather_triangle
 from .types import MAX_RESOLUTION, RasterOutput, pixel_coordinates, precise_rcp
 
 # Smallest determinant (twice the area in NDC times all three w) of a visible triangle.
@@ -83,47 +84,61 @@ def planes(
         change of 1 / w by column (row); and the values of 1 / w.
     """
     module = backend(positions)
-    Float, Float64, UInt32 = module.Float, module.Float64, module.UInt32
+    Float64 = module.Float64
     width, height = raster.width, raster.height
-    index = dr.arange(UInt32, raster.batch * raster.face_count)
+    index = dr.arange(module.UInt32, raster.batch * raster.face_count)
     image, triangle = split(index, "faces", raster.face_count, raster.batch)
-    vertex_count = dr.width(positions) // (4 * raster.batch)
-    corners = gather_triangle(positions, faces, triangle, image * uint_input(module, "vertices", vertex_count), True)
-    heights = [p.z for p in corners]
-    if reciprocal is not None:
-        inverted = dr.gather(module.Bool, reciprocal, image)
-        heights = [dr.select(inverted, 1, z) for z in heights]
-    with dr.suspend_grad():
-        own = dr.detach(corners[0]), dr.detach(corners[1]), dr.detach(corners[2])
-        lines, det = edge_lines(own)
-        # Degenerate slivers would have infinite weights, and NaN derivatives although no pixel sees them.
-        regular = dr.isfinite(det) & (dr.abs(det) > _LEAST)
-        inverse = dr.select(regular, precise_rcp(dr.select(regular, det, 1)), 0)
-        near = [_pixel_near(own, axis, name, size) for axis, name, size in ((0, "width", width), (1, "height", height))]
-        x, y = exact_centres(module, near[1], near[0], height, width)
-        # Barycentrics divided by w, at the pixel and their change by column and row.
-        change_x = [line[0] * inverse * double_input(module, "width", 2 / width) for line in lines]
-        change_y = [line[1] * inverse * double_input(module, "height", 2 / height) for line in lines]
-        there = [dr.fma(line[0], x, dr.fma(line[1], y, line[2])) * inverse for line in lines]
-        zs = [Float64(dr.detach(z)) for z in heights]
-        dx, dy, d = (sum(w * z for w, z in zip(weights, zs, strict=True)) for weights in (change_x, change_y, there))
-        slope_x, slope_y = dx * double_input(module, "width", 0.5 * width), dy * double_input(module, "height", 0.5 * height)
-        w_part = d - slope_x * x - slope_y * y
-        slopes = [Float(v) for v in (slope_x, slope_y, w_part)]
-        weights = [[Float(w) for w in row] for row in (change_x, change_y, there)]
-        value = [Float(v) for v in (dx, dy, d)]
-    if dr.grad_enabled(positions):
-        # z = A x + B y + C w holds for all corners: the change of the plane balances that of each corner.
-        excess = [z - slopes[0] * p.x - slopes[1] * p.y - slopes[2] * p.w for p, z in zip(corners, heights, strict=True)]
-        value = [
-            replace_grad(v, sum(w * e for w, e in zip(row, excess, strict=True))) for v, row in zip(value, weights, strict=True)
-        ]
-    depths = ravel(module.Array4f(*value, Float((near[1] << _COLUMN_BITS) | near[0])))
+    first = image * uint_input(module, "vertices", dr.width(positions) // (4 * raster.batch))
+
+    def numbers(triangle: UInt32, image: UInt32, first: UInt32) -> tuple[Float, ...]:
+        """Numbers of the depth, then of the barycentrics if asked for."""
+        corners = gather_triangle(positions, faces, triangle, first, True)
+        heights = [p.z for p in corners]
+        if reciprocal is not None:
+            inverted = dr.gather(module.Bool, reciprocal, image)
+            heights = [dr.select(inverted, 1, z) for z in heights]
+        with dr.suspend_grad():
+            own = dr.detach(corners[0]), dr.detach(corners[1]), dr.detach(corners[2])
+            lines, det = edge_lines(own)
+            # Degenerate slivers would have infinite weights, and NaN derivatives although no pixel sees them.
+            regular = dr.isfinite(det) & (dr.abs(det) > _LEAST)
+            inverse = dr.select(regular, precise_rcp(dr.select(regular, det, 1)), 0)
+            near = [_pixel_near(own, axis, name, size) for axis, name, size in ((0, "width", width), (1, "height", height))]
+            x, y = exact_centres(module, near[1], near[0], height, width)
+            # Barycentrics divided by w, at the pixel and their change by column and row.
+            change_x = [line[0] * inverse * double_input(module, "width", 2 / width) for line in lines]
+            change_y = [line[1] * inverse * double_input(module, "height", 2 / height) for line in lines]
+            there = [dr.fma(line[0], x, dr.fma(line[1], y, line[2])) * inverse for line in lines]
+            zs = [Float64(dr.detach(z)) for z in heights]
+            dx, dy, d = (sum(w * z for w, z in zip(weights, zs, strict=True)) for weights in (change_x, change_y, there))
+            slope_x = dx * double_input(module, "width", 0.5 * width)
+            slope_y = dy * double_input(module, "height", 0.5 * height)
+            slopes = [module.Float(v) for v in (slope_x, slope_y, d - slope_x * x - slope_y * y)]
+            weights = [[module.Float(w) for w in row] for row in (change_x, change_y, there)]
+            value = [module.Float(v) for v in (dx, dy, d)]
+        if dr.grad_enabled(positions):
+            # z = A x + B y + C w holds for all corners: the change of the plane balances that of each corner.
+            excess = [z - slopes[0] * p.x - slopes[1] * p.y - slopes[2] * p.w for p, z in zip(corners, heights, strict=True)]
+            value = [
+                replace_grad(v, sum(w * e for w, e in zip(row, excess, strict=True)))
+                for v, row in zip(value, weights, strict=True)
+            ]
+        found = *value, module.Float((near[1] << _COLUMN_BITS) | near[0])
+        if not barycentrics:
+            return found
+        inverse_w = [module.Float(sum(row)) for row in (change_x, change_y, there)]
+        return *found, *(row[k] for k in (1, 2) for row in weights), *inverse_w
+
+    # Triangles beside the image are seen by no pixel. In large scenes most of them are.
+    seen = ~beside(dr.detach(gather_triangle(positions, faces, triangle, first, True)))
+    zeros = (module.Float(0),) * (13 if barycentrics else 4)
+    found = branch(seen, numbers, lambda *_: zeros, (triangle, image, first), "planes")
+    depths = ravel(module.Array4f(*found[:4]))
     if not barycentrics:
         return depths, ()
     with dr.suspend_grad():
-        inverse_w = [Float(sum(row)) for row in (change_x, change_y, there)]
-        packets = [module.Array4f(*(row[k] for row in weights), inverse_w[k - 1]) for k in (1, 2)]
+        rows, inverse_w = found[4:10], found[10:]
+        packets = [module.Array4f(*rows[3 * k : 3 * k + 3], inverse_w[k]) for k in range(2)]
         return depths, (*(ravel(packet) for packet in packets), inverse_w[2])
 
 

@@ -165,15 +165,19 @@ def strips(grid: TileGrid, module: ModuleType) -> Strips:
     return Strips(image, row, column, tile, index, grid.batch, grid.height, grid.width)
 
 
-def nearest_covers(grid: TileGrid, triangles: Triangles, image: UInt32, active: Bool) -> UInt32:
-    """Occlusion depth of each tile, then of each block, as :func:`depth_key`: a triangle that covers it lies before this depth.
+def no_covers(grid: TileGrid, module: ModuleType) -> UInt32:
+    """Occlusion depths of tiles, then of blocks, before any triangle covers one (:func:`cover`). Evaluated."""
+    nearest = dr.full(module.UInt32, 0xFFFFFFFF, grid.count + grid.block_count)
+    dr.eval(nearest)
+    return nearest
+
+
+def cover(grid: TileGrid, nearest: UInt32, triangles: Triangles, image: UInt32, active: Bool) -> None:
+    """Lower the occlusion depths of tiles and blocks, as :func:`depth_key`: a triangle that covers one lies before this depth.
 
     Triangles that cover a whole block count for the block, not for its tiles again.
     """
-    module = backend(triangles.a)
-    nearest = dr.full(module.UInt32, 0xFFFFFFFF, grid.count + grid.block_count)
-    dr.eval(nearest)
-    tiles = uint_input(module, "tiles", grid.count)
+    tiles = uint_input(backend(nearest), "tiles", grid.count)
 
     def visit(row: UInt32, column: UInt32, is_tile: Bool) -> Bool:
         span = _Span(triangles, row, column, is_tile)
@@ -182,7 +186,6 @@ def nearest_covers(grid: TileGrid, triangles: Triangles, image: UInt32, active: 
         return ~span.missed & ~span.covered
 
     _for_each_tile(triangles.box, active, visit)
-    return nearest
 
 
 def build_tile_lists(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import ModuleType
 from typing import TypeAlias
@@ -57,6 +57,19 @@ def gather_triangle(positions: Float, faces: UInt32, triangle: UInt32, first_ver
     module = backend(positions)
     i = dr.gather(module.Array3u, faces, triangle, active)
     return tuple(dr.gather(module.Array4f, positions, first_vertex + i[k], active) for k in range(3))
+
+
+def beside(corners: Sequence[Vector4f]) -> Bool:
+    """True for triangles and edges whose corners all lie beyond one side of the image or of the depth range. Cheap."""
+    x, y, z, w = ([p[c] for p in corners] for c in range(4))
+    outside = backend(corners[0]).Bool(False)
+    for values in (x, y, z):
+        above, below = backend(corners[0]).Bool(True), backend(corners[0]).Bool(True)
+        for value, limit in zip(values, w, strict=True):
+            above &= value > limit
+            below &= value < -limit
+        outside |= above | below
+    return outside
 
 
 def set_up(corners: Corners, height: int, width: int) -> Triangles:

@@ -13,6 +13,7 @@ from ...jit.arrays import backend, reinterpret, scatter_inc
 from ...jit.kernel_inputs import float_input, int_input, split, uint_input
 from ...jit.types import Bool, Float, UInt32, UInt64, Vector3f, Vector4f
 from ..topology import NO_VERTEX, Topology
+from ..triangle_setup import beside
 from ..types import NO_TRIANGLE, RasterOutput
 from .pixel_pairs import PairList
 
@@ -78,12 +79,6 @@ def _collect(positions: Float, topology: Topology, raster: RasterOutput, vertex_
     total = raster.batch * topology.count
     index = dr.arange(module.UInt32, total)
     image, edge = split(index, "edges", topology.count, raster.batch)
-    p, q, side, active = _silhouettes(positions, topology, image, edge, vertex_count)
-    a, b, active = _project(p, q, active, width, height)
-    share = _horizontal_share(b.x - a.x, b.y - a.y, active)
-    _, rows = _lines(a.y, b.y, active & (share > 0), "height", height)
-    _, columns = _lines(a.x, b.x, active & (share < 1), "width", width)
-    active &= rows + columns > 0
     count, edges, records = dr.zeros(module.UInt32, 1), dr.empty(module.UInt32, total), dr.empty(module.Float, 8 * total)
 
     def add(index: UInt32, a: Vector3f, b: Vector3f, side: Float, share: Float) -> UInt32:
@@ -92,7 +87,20 @@ def _collect(positions: Float, topology: Topology, raster: RasterOutput, vertex_
         dr.scatter(records, module.ArrayXf(*a, side, *b, share), slot)
         return slot
 
-    dr.if_stmt((index, a, b, side, share), active, add, lambda index, *_: index, mode="symbolic", label="silhouette")
+    def test(index: UInt32, image: UInt32, edge: UInt32) -> UInt32:
+        p, q, side, active = _silhouettes(positions, topology, image, edge, vertex_count)
+        a, b, active = _project(p, q, active, width, height)
+        share = _horizontal_share(b.x - a.x, b.y - a.y, active)
+        _, rows = _lines(a.y, b.y, active & (share > 0), "height", height)
+        _, columns = _lines(a.x, b.x, active & (share < 1), "width", width)
+        active &= rows + columns > 0
+        return dr.if_stmt((index, a, b, side, share), active, add, lambda index, *_: index, mode="symbolic", label="silhouette")
+
+    # Most edges of a large scene lie beside a shadow map, or beside what a camera sees.
+    ends = dr.gather(module.Array2u, topology.edges, edge)
+    first = image * uint_input(module, "vertices", vertex_count)
+    near = ~beside([dr.gather(module.Array4f, positions, first + ends[k]) for k in range(2)])
+    dr.if_stmt((index, image, edge), near, test, lambda index, *_: index, mode="symbolic", label="edge")
     dr.eval(count, edges, records)
     return count, records, edges
 

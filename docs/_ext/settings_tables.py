@@ -13,6 +13,7 @@ from tables import code, table
 from shadowmap_dr import ShadowmapError
 from shadowmap_dr.integrator.options import Options
 from shadowmap_dr.rendering.film.aovs import AOVS
+from shadowmap_dr.rendering.settings import AUTO
 
 #: Values of channels, their units, and their value where nothing is seen.
 CHANNELS = {
@@ -74,6 +75,8 @@ def _accepted(option: Field[object]) -> str:
         return "[channels](channels.md)"
     if isinstance(option.default, bool):
         return "`true`, `false`"
+    if option.name == "shadow_map_resolution":
+        return f"{code(AUTO)}; {_whole_numbers(lambda value: _error(option.name, value) is None)}"
     if isinstance(option.default, str):
         return ", ".join(map(code, _choices(option.name)))
 
@@ -103,6 +106,8 @@ def _choices(name: str) -> list[str]:
 
 def _whole_numbers(accepts: Callable[[float], bool]) -> str:
     low = [value for value in range(-4, 33) if accepts(value)]
+    if low[:2] == [0, 1] and not accepts(2):  # 0 has a meaning of its own
+        return "0; " + _whole_numbers(lambda value: value > 0 and accepts(value))
     odd, even = (all(value % 2 == rest for value in low) for rest in (1, 0))
     step = 2 if odd or even else 1
     words = "odd, " if odd else "even, " if even else ""

@@ -79,7 +79,7 @@ class View:
         self._parameters, self._arrays, self._sensor = tuple(parameters), tuple(arrays), sensor
         self._size, self._spp = size, quality.spp
         self.values = [device_array(mi.Float, array.start) for array in arrays]
-        self._renderer = _at(renderer, quality)
+        self._renderer = _at(renderer, quality, size.width * size.height)
         counts = [len(parameter.labels) for parameter in parameters]
         self._starts = np.cumsum([0, *counts]).tolist()
         # Unit tangents of the numbers of entries, for the passes of their jacobians.
@@ -393,8 +393,8 @@ def _input(numbers: Array) -> Float:
     return device_array(mi.Float, numbers if len(numbers) else np.zeros(1))
 
 
-def _at(renderer: Renderer, quality: Quality) -> Renderer:
-    """A copy of a renderer at a quality, with a fit of the shadow maps of its own."""
+def _at(renderer: Renderer, quality: Quality, pixels: int) -> Renderer:
+    """A copy of a renderer at a quality, for images of so many pixels, with a fit of the shadow maps of its own."""
     settings = renderer.settings
     changed = replace(
         settings,
@@ -403,5 +403,5 @@ def _at(renderer: Renderer, quality: Quality) -> Renderer:
         environment_light_samples=max(1, min(settings.environment_light_samples, 2 * quality.light_samples)),
         soft_map_resolution=min(settings.soft_map_resolution, quality.soft_texels),
     )
-    copied = copy.deepcopy(replace(renderer, settings=changed))
+    copied = copy.deepcopy(replace(renderer, settings=changed)).with_maps_for(pixels)
     return copied.with_replanned_lights() if copied.soft else copied

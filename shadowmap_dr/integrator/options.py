@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import ShadowmapError, warn
 from ..rendering.film.aovs import split_aovs
-from ..rendering.settings import DIRECT, RenderSettings
+from ..rendering.settings import AUTO, DIRECT, RenderSettings
 from ..shadow import ShadowSettings
 from .name import PLUGIN
 
@@ -29,15 +29,22 @@ _FOREIGN = (
 )  # fmt: skip
 
 
+# Types of values in ``mi.Properties`` that are not those of the defaults. They hold no sequences: names of channels are text.
+_KINDS: dict[str, type] = {"aovs": str, "shadow_map_resolution": int}
+
+
 @dataclass(frozen=True)
 class Options:
     """Parameters of the plug-in, as in XML or a dictionary.
 
-    shadow_map_resolution  texels along each side of a shadow map, at least six more than those of the filter, at most 4096
+    shadow_map_resolution  texels along each side of a shadow map, at least six more than those of the filter, at most 4096; or
+                           ``auto``: 256, and directional lights and spots get as many maps as the pixels that see their
+                           shadows are worth
+    shadow_tiles           most maps of such a light, at most 16; 0: 16 for ``auto``, else 1
     shadow_method          ``auto`` (``evsm4``), ``vsm``, ``esm``, ``evsm2``, ``evsm4``, ``msm``, ``csm``, ``pcf``, ``standard``
                            (no shadow gradients) or ``none`` (no shadows); see ``shadowmap_dr.shadow.ShadowSettings``
     shadow_filter          ``box``, ``gaussian``, ``wendland`` or ``none``
-    shadow_filter_size     odd number of texels
+    shadow_filter_size     odd number of texels; 0: 3, or 1 for lights that have several maps
     shadow_antialias       anti-alias shadow maps; without it casters get no gradient from the outlines of their shadows
     shadow_bleeding        visibilities below this count as 0, against light that bleeds through (``vsm``, ``evsm``, ``msm``)
     shadow_order           terms of the Fourier series of ``csm``, an even number from 2 to 16
@@ -65,10 +72,11 @@ class Options:
     compat                 conventions of Worchel and Alexa's code
     """
 
-    shadow_map_resolution: int = ShadowSettings.resolution
+    shadow_map_resolution: int | str = AUTO
+    shadow_tiles: int = 0
     shadow_method: str = ShadowSettings.method
     shadow_filter: str = ShadowSettings.filter
-    shadow_filter_size: int = ShadowSettings.filter_size
+    shadow_filter_size: int = 0
     shadow_antialias: bool = ShadowSettings.antialias
     shadow_bleeding: float = ShadowSettings.bleeding
     shadow_order: int = ShadowSettings.order
@@ -101,8 +109,9 @@ class Options:
         foreign = []
         for name in props.keys():  # noqa: SIM118  (Properties is no dictionary)
             if name in defaults:
-                # Properties hold no sequences: names of channels are text there.
-                values[name] = _typed(name, props[name], str if name == "aovs" else type(defaults[name]))
+                if name == "shadow_map_resolution" and props[name] == AUTO:
+                    continue  # the default
+                values[name] = _typed(name, props[name], _KINDS.get(name) or type(defaults[name]))
             elif any(fnmatchcase(name, pattern) for pattern in _FOREIGN):
                 _ = props[name]  # otherwise Mitsuba would report an unqueried parameter
                 foreign.append(name)

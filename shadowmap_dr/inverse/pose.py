@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from dataclasses import fields, replace
 from typing import Any, cast
 
 import drjit as dr
@@ -126,7 +125,7 @@ class PoseFit:
         state = {"parameters": np.array(dr.detach(pose)), "m": np.array(m), "v": np.array(v), "t": np.array(t)}
         frusta = getattr(self._renderer, "frusta", None)
         if frusta is not None:
-            state |= {f"frusta.{field.name}": np.array(getattr(frusta, field.name)) for field in fields(frusta)}
+            state |= {f"frusta.{name}": value for name, value in frusta.arrays().items()}
         return state
 
     def load_state(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
@@ -142,9 +141,8 @@ class PoseFit:
         # The fit of the shadow maps depends on earlier images: a new run starts from the first fit, a resumed run from its own.
         self._renderer = copy.copy(self._initial_renderer)
         fit = {name.removeprefix("frusta."): value for name, value in state.items() if name.startswith("frusta.")}
-        stored = {name: device_array(mi.Float, value) for name, value in fit.items()}
-        if stored:
-            self._renderer.frusta = replace(self._renderer.frusta, **stored)
+        if fit:
+            self._renderer.frusta = self._renderer.frusta.with_arrays(fit)
 
     def recordings(self) -> int:
         """Number of recordings of the step so far. It stays the same once the fit is warm."""

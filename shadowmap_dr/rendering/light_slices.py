@@ -92,7 +92,7 @@ def plan_slices(data: SceneData, plan: MapPlan, soft: Sequence[SoftPlan], settin
             f"({settings.light_memory:g} GiB) and this machine ({memory / 2**30:.3g} GiB): lower shadow_map_resolution, "
             f"soft_map_resolution or the number of the light's samples."
         )
-    own = [6 if kind == "cube" else 1 for kind in plan.kinds]
+    own = plan.counts
     groups = _groups(sizes, budget)
     return tuple(_slice(first, last, own, soft) for first, last in groups) if len(groups) > 1 else ()
 
@@ -112,7 +112,7 @@ class _Sizes:
     @classmethod
     def of(cls, data: SceneData, plan: MapPlan, soft: Sequence[SoftPlan], settings: RenderSettings) -> _Sizes:
         sampled, single = settings.soft_shadow
-        kinds = [(6 if kind == "cube" else 1, settings.shadow) for kind in plan.kinds]
+        kinds = [(count, settings.shadow) for count in plan.counts]
         kinds += [(one.maps, single if one.kind == "single" else sampled) for one in soft]
         maps = [count * map_bytes(setting, data.geometry) for count, setting in kinds]
         gradients = [count * _GRADIENT * _numbers(setting) * setting.resolution**2 for count, setting in kinds]

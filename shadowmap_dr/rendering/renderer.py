@@ -38,6 +38,7 @@ from .gbuffer.shading_edges import ShadingEdges
 from .image_pass import ImagePass
 from .light_pass import Lighting, LightPass, plan_extended_lights
 from .light_slices import LightSlice, plan_slices
+from .light_tiles import with_tiles
 from .pass_cache import CacheLevel, PassCache
 from .settings import RenderSettings
 from .shadow_pass import MapPlan, check_sizes, plan_maps
@@ -183,13 +184,27 @@ class Renderer:
         renderer = cls(data, topology, plan, settings, flat_faces(geometry, topology), creases, outward, soft, slices=slices)
         renderer.untracked = UntrackedState((*data.scene.emitters(), *data.materials()))
         # The first fit is made here, so that a step which is recorded later always starts from one.
-        if data.sensors:
-            with dr.suspend_grad():
-                cameras = renderer.camera_pass
-                shapes = cameras.placed(geometry)
-                views = [cameras.view(camera, shapes, 1) for camera in sample_windows(data.sensors[0])]
-                renderer.frusta, renderer.soft_frusta = renderer.light_pass.fit(shapes, cameras.seen(views, geometry))
-        return renderer
+        return renderer.with_maps_for() if data.sensors else renderer
+
+    def with_maps_for(self, samples: int | None = None) -> Renderer:
+        """The same renderer with as many maps of each light as images of so many samples are worth, fitted to its first sensor.
+
+        None: images of the first sensor with a sample for each pixel.
+        """
+        data, plan = self.data, self.plan.undivided
+        made = replace(self, plan=plan, slices=plan_slices(data, plan, self.soft, self.settings))
+        with dr.suspend_grad():
+            cameras = made.camera_pass
+            shapes = cameras.placed(data.geometry)
+            views = [cameras.view(camera, shapes, 1) for camera in sample_windows(data.sensors[0])]
+            seen = cameras.seen(views, data.geometry)
+            made.frusta, made.soft_frusta = made.light_pass.fit(shapes, seen)
+            samples = samples or sum(view.size.width * view.size.height for view in views)
+            plan = with_tiles(plan, data, self.settings, made.frusta, seen, samples)
+            if plan.maps > made.plan.maps:
+                made.plan, made.slices = plan, plan_slices(data, plan, self.soft, self.settings)
+                made.frusta, made.soft_frusta = made.light_pass.fit(shapes, seen)
+        return made
 
     def with_data(self, data: SceneData) -> Renderer:
         """The same renderer for re-read records (:func:`shadowmap_dr.scene.load.refresh`) of the same scene."""

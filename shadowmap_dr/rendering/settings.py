@@ -8,7 +8,7 @@ from numbers import Integral, Real
 from typing import Any
 
 from ..errors import ShadowmapError, did_you_mean
-from ..shadow import ShadowSettings
+from ..shadow import MAX_TILES, ShadowSettings
 from .film.aovs import AOVS, split_aovs
 
 #: Most samples of one extended light.
@@ -21,11 +21,13 @@ SHADOW_NAMES = {
     **{
         f"shadow_{name}": name
         for name in (
-            *("method", "filter", "filter_size", "antialias", "bleeding", "order", "supersampling", "receiver_range"),
-            "cull_backfaces",
+            *("method", "tiles", "filter", "filter_size", "antialias", "bleeding", "order", "supersampling"),
+            *("receiver_range", "cull_backfaces"),
         )
     },
 }
+#: A ``shadow_map_resolution``: texels follow pixels.
+AUTO = "auto"
 #: ``max_depth`` of light that is reflected once on its way to the camera.
 DIRECT = 2
 
@@ -55,7 +57,7 @@ class RenderSettings:
             tuple, as in the plug-in.
     """
 
-    shadow: ShadowSettings = field(default_factory=ShadowSettings)
+    shadow: ShadowSettings = field(default_factory=lambda: ShadowSettings(**_automatic({})))
     antialias: bool = True
     ambient: float = 0.0
     hide_emitters: bool = False
@@ -118,7 +120,7 @@ class RenderSettings:
                 hint = f"; the nearest is '{nearest[0]}'" if nearest else ""
                 raise ShadowmapError(f"There is no setting '{name}': there are {', '.join(known)}{hint}.")
         try:
-            shadow = ShadowSettings(**{SHADOW_NAMES[name]: value for name, value in named.items() if name in SHADOW_NAMES})
+            shadow = ShadowSettings(**_automatic({SHADOW_NAMES[n]: value for n, value in named.items() if n in SHADOW_NAMES}))
         except ValueError as error:
             raise ShadowmapError(str(error)) from None
         return cls(shadow, **{name: value for name, value in named.items() if name in own})
@@ -142,3 +144,15 @@ class RenderSettings:
         except ValueError as error:
             raise ShadowmapError(f"{error} (soft_map_resolution)") from None
         return sampled, replace(self.shadow, method="vsm", filter="none", filter_size=1, supersampling=1, compat=False)
+
+
+def _automatic(shadow: dict[str, Any]) -> dict[str, Any]:  # Any: checked by the record
+    """Values of :class:`ShadowSettings` without ``auto`` as a resolution, which is the default: tiles as pixels need them."""
+    automatic = shadow.get("resolution", AUTO) == AUTO
+    given = {name: value for name, value in shadow.items() if not (name == "resolution" and automatic)}
+    if given.get("tiles", 0) == 0:
+        given["tiles"] = MAX_TILES if automatic and not given.get("compat") else 1
+    if given.get("filter_size", 0) == 0:
+        given.pop("filter_size", None)
+        given["tile_filter_size"] = 1  # texels of tiles are as small as pixels
+    return given

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate
 from typing import Any
 
 import drjit as dr
@@ -21,6 +22,7 @@ from ..scene.lights.read import Light
 from ..shadow import (
     Boxes,
     Frusta,
+    Group,
     LightView,
     ShadowMaps,
     ShadowSettings,
@@ -29,10 +31,13 @@ from ..shadow import (
     cube_face,
     filter_maps,
     fit_frusta,
+    fit_tiles,
     render_maps,
     shape_bounds,
     shape_boxes,
     stack_views,
+    steady_axes,
+    tiled_visibility,
     vertices_in_maps,
     visibility,
 )
@@ -45,34 +50,51 @@ _PIECE = 1 << 15
 class MapPlan:
     """The maps of each light. Static, made once for a scene.
 
-    ``kinds``: ``directional``, ``beam``, ``spot`` (one map each) or ``cube`` (six). ``first``: number of each light's first map.
+    ``kinds``: ``directional``, ``beam``, ``spot`` (one map each) or ``cube`` (six). ``tiles``: maps that share the image plane of
+    each light, 1 for beams and cubes.
     ``planes``: index of the largest face of each planar shape, of any face for other shapes. ``planar``: Bool (S,).
     ``center``, ``radius``: a sphere around the scene at rest, world space, for the fixed frusta of ``compat``.
     """
 
     kinds: tuple[str, ...]
-    first: tuple[int, ...]
+    tiles: tuple[int, ...]
     planes: UInt32
     planar: Bool
     center: tuple[float, float, float]
     radius: float
 
     @property
+    def counts(self) -> tuple[int, ...]:
+        """Number of maps of each light."""
+        return tuple(6 if kind == "cube" else tiles for kind, tiles in zip(self.kinds, self.tiles, strict=True))
+
+    @property
+    def first(self) -> tuple[int, ...]:
+        """Number of each light's first map."""
+        return tuple(accumulate(self.counts, initial=0))[:-1]
+
+    @property
     def maps(self) -> int:
         """Number of maps."""
-        return sum(_maps_of(kind) for kind in self.kinds)
+        return sum(self.counts)
+
+    def settings(self, shadow: ShadowSettings) -> ShadowSettings:
+        """Settings of the maps. They are one batch: with tiles among them, all are filtered as tiles."""
+        return shadow.of_tiles if self.groups else shadow
+
+    @property
+    def undivided(self) -> MapPlan:
+        """The plan with one map for each image plane."""
+        return replace(self, tiles=(1,) * len(self.tiles))
+
+    @property
+    def groups(self) -> tuple[Group, ...]:
+        """Maps of the lights that have several tiles."""
+        return tuple((first, tiles) for first, tiles in zip(self.first, self.tiles, strict=True) if tiles > 1)
 
     def part(self, first: int, last: int) -> MapPlan:
         """The maps of the lights from number ``first`` to before number ``last``."""
-        return replace(self, kinds=self.kinds[first:last], first=_first_maps(self.kinds[first:last]))
-
-
-def _maps_of(kind: str) -> int:
-    return 6 if kind == "cube" else 1
-
-
-def _first_maps(kinds: Sequence[str]) -> tuple[int, ...]:
-    return tuple(int(n) for n in np.cumsum([0, *(_maps_of(kind) for kind in kinds)])[:-1])
+        return replace(self, kinds=self.kinds[first:last], tiles=self.tiles[first:last])
 
 
 def plan_maps(lights: Sequence[Light], geometry: Geometry) -> MapPlan:
@@ -94,7 +116,7 @@ def plan_maps(lights: Sequence[Light], geometry: Geometry) -> MapPlan:
     center, radius = _sphere_around(positions)
     return MapPlan(
         kinds,
-        _first_maps(kinds),
+        (1,) * len(kinds),
         device_array(mi.UInt32, planes),
         device_array(mi.Bool, [info.planar for info in geometry.shapes]),
         center,
@@ -145,6 +167,7 @@ def make_maps(
     ``seen`` points on what the cameras see (Point3f, world space) and a mask of those that count, ``outward`` faces (Bool, F) of
     which the maps of directional lights show the fronts only (:func:`shadowmap_dr.raster.outward_faces`).
     """
+    settings = plan.settings(settings)
     views, p_light, lanes, frusta = _fitted(plan, lights, geometry, settings, previous, seen)
     culled = None if transparent is not None else _culled(plan, views.count, outward)
     return filter_maps(render_maps(p_light, lanes, geometry.faces, topology, views, frusta, settings, transparent, culled))
@@ -159,7 +182,7 @@ def fit_maps(
     seen: tuple[Point3f, Bool] | None = None,
 ) -> Frusta:
     """The fit of the maps of :func:`make_maps`, without rendering them. Arguments as there."""
-    return _fitted(plan, lights, geometry, settings, previous, seen)[3]
+    return _fitted(plan, lights, geometry, plan.settings(settings), previous, seen)[3]
 
 
 def _fitted(
@@ -171,8 +194,12 @@ def _fitted(
     seen: tuple[Point3f, Bool] | None,
 ) -> tuple[Views, Point3f, UInt32, Frusta]:
     """(cameras of all maps, light-space vertices, the map of each of these, the fit)."""
-    views = [view for light, kind in zip(lights, plan.kinds, strict=True) for view in _views(plan, light, kind, settings)]
-    stacked = stack_views(views)
+    each = zip(lights, plan.kinds, plan.tiles, strict=True)
+    stacked = stack_views([view for light, kind, tiles in each for view in _views(plan, light, kind, settings) * tiles])
+    tiles = None
+    if plan.groups:
+        assert seen is not None, "lights have tiles only if visible points are known"
+        tiles = fit_tiles(stacked, plan.groups, seen, None if previous is None else previous.tiles)
     p_light, lanes, vertex = vertices_in_maps(stacked, geometry.positions)
     if settings.compat:
         frusta = _compat_frusta(plan, stacked)
@@ -191,8 +218,12 @@ def _fitted(
             previous,
             seen,
             settings.receiver_range,
+            tiles,
         )
         frusta = _from_beams_on(plan, lights, frusta)
+        if seen is not None and "directional" in plan.kinds and dr.grad_enabled(stacked.forward):
+            stacked = steady_axes(stacked, frusta, seen)
+            p_light, lanes, _ = vertices_in_maps(stacked, geometry.positions)
     return stacked, p_light, lanes, frusta
 
 
@@ -201,7 +232,8 @@ def _culled(plan: MapPlan, count: int, outward: Bool | None) -> Bool | None:
 
     Only maps of directional lights begin before all casters. Other maps may begin inside of a caster and see its back faces.
     """
-    directional = [first for kind, first in zip(plan.kinds, plan.first, strict=True) if kind == "directional"]
+    each = zip(plan.kinds, plan.first, plan.tiles, strict=True)
+    directional = [first + k for kind, first, tiles in each if kind == "directional" for k in range(tiles)]
     if outward is None or not directional:
         return None
     if len(directional) == count:
@@ -302,6 +334,8 @@ def _still_planar(plan: MapPlan, geometry: Geometry, planes: tuple[Vector3f, Poi
 
 def light_visibility(maps: ShadowMaps, plan: MapPlan, light: Light, index: int, p_world: Point3f, active: Bool) -> Float:
     """Visibility (Float) of light number ``index`` from world-space points. Attached to points, casters and light."""
+    if plan.tiles[index] > 1:
+        return tiled_visibility(maps, (plan.first[index], plan.tiles[index]), p_world, active)
     # Wide, although it is one number: adjoints of look-ups with it then run in one kernel, others in one for each number.
     which: UInt32 = dr.full(mi.UInt32, plan.first[index], dr.width(p_world))
     if plan.kinds[index] == "cube":

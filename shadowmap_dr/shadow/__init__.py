@@ -10,27 +10,34 @@ from .light_camera import (
     cube_face,
     cube_views,
     directional_view,
+    project,
     spot_view,
     stack_views,
     to_light_space,
     vertices_in_maps,
 )
-from .lookup import visibility
+from .lookup import tiled_visibility, visibility
 from .methods.comparison import standard_visibility
 from .methods.registry import METHODS, PREFILTERED
 from .methods.variance import chebyshev_visibility, variance_moments
-from .settings import ShadowSettings
+from .settings import MAX_TILES, ShadowSettings
 from .shadow_map import ShadowMaps, filter_maps, render_maps
+from .steady_axes import steady_axes
+from .tile_fit import fit_tiles
+from .tiles import Group, Tiles
 
 __all__ = [
     "FILTERS",
+    "MAX_TILES",
     "METHODS",
     "PREFILTERED",
     "Boxes",
     "Frusta",
+    "Group",
     "LightView",
     "ShadowMaps",
     "ShadowSettings",
+    "Tiles",
     "Views",
     "casting_shapes",
     "chebyshev_visibility",
@@ -41,12 +48,16 @@ __all__ = [
     "filter_map",
     "filter_maps",
     "fit_frusta",
+    "fit_tiles",
+    "project",
     "render_maps",
     "shape_bounds",
     "shape_boxes",
     "spot_view",
     "stack_views",
     "standard_visibility",
+    "steady_axes",
+    "tiled_visibility",
     "to_light_space",
     "variance_moments",
     "vertices_in_maps",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import drjit as dr
@@ -11,6 +11,7 @@ from ..jit.arrays import backend
 from ..jit.kernel_inputs import float_input, quotient, split
 from ..jit.types import Bool, Float, Point3f, UInt32
 from .light_camera import Frusta, Views, of_map, to_light_space
+from .tiles import Tiles
 
 #: Bounds in a light's image plane and of depths: (x0, y0, x1, y1, z0, z1).
 Extent: TypeAlias = tuple[Float, Float, Float, Float, Float, Float]
@@ -82,6 +83,7 @@ def fit_frusta(
     previous: Frusta | None,
     seen: tuple[Point3f, Bool] | None = None,
     receiver_range: bool = True,
+    tiles: Tiles | None = None,
 ) -> Frusta:
     """Frusta that cover all possible casters of visible shadows, or the previous frusta as long as they still do. Detached.
 
@@ -96,6 +98,7 @@ def fit_frusta(
             and fill most of them.
         seen: (points in world space, spread over the visible receivers; mask of valid points). None: receivers may be anywhere.
         receiver_range: resolve depths only from shortly before the first receiver on, not from the first caster on.
+        tiles: parts of the image planes that the maps serve; only visible points inside count for a map.
 
     All arithmetic stays on the device: nothing is read back.
     """
@@ -106,23 +109,25 @@ def fit_frusta(
         map_index = quotient(index, "shapes", shape_count)
         extent = bounds.of(index)
         casts &= ~(of_map(views, map_index, views.count).spread > 0) | (extent[5] > 0)
-        window = _window(views, seen)
+        window = _window(views, seen, tiles)
         if not receiver_range:
             window = (*window[:4], module.Float(-dr.inf), window[5])
         fitted = _fit(views, extent, casts, map_index, window, resolution, filter_size)
-        if previous is None:
-            dr.eval(fitted[0])
-            return fitted[0]
-        keep = _still_fits(views, previous, *fitted, resolution, filter_size)
-        result = Frusta(
-            *(dr.select(keep, getattr(previous, name), getattr(fitted[0], name)) for name in Frusta.__dataclass_fields__)
-        )
+        result = fitted[0]
+        if previous is not None:
+            keep = _still_fits(views, previous, *fitted, resolution, filter_size)
+            pairs = zip(previous.columns(), result.columns(), strict=True)
+            result = Frusta(*(dr.select(keep, old, new) for old, new in pairs))
+        result = replace(result, tiles=tiles)
         dr.eval(result)
         return result
 
 
-def _window(views: Views, seen: tuple[Point3f, Bool] | None) -> Extent:
-    """(x0, y0, x1, y1, z0, z1): bounds of the visible points in each map's image plane, within the light's cone, and in depth."""
+def _window(views: Views, seen: tuple[Point3f, Bool] | None, tiles: Tiles | None) -> Extent:
+    """(x0, y0, x1, y1, z0, z1): bounds of the visible points in each map's image plane, within the light's cone, and in depth.
+
+    The window of a tile reaches to its borders, which other points lie on.
+    """
     module = backend(views.spread)
     perspective = views.spread > 0
     limit = dr.select(perspective, views.spread, dr.inf)
@@ -141,8 +146,13 @@ def _window(views: Views, seen: tuple[Point3f, Bool] | None) -> Extent:
     in_perspective = view.spread > 0
     behind = in_perspective & (p.z <= 0)
     w = dr.select(in_perspective & ~behind, p.z, 1)
+    if tiles is not None:
+        active &= tiles.rows(map_index).hold(p.x / w, p.y / w)
     values = [*(dr.select(behind, dr.inf, v / w) for v in (-p.x, -p.y, p.x, p.y)), -p.z, p.z]
     *sides, nearest, farthest = _rows(_maxima(values, map_index, views.count, active), dr.arange(module.UInt32, views.count), 6)
+    if tiles is not None:
+        borders = (-tiles.low_x, -tiles.low_y, tiles.high_x, tiles.high_y)
+        sides = [dr.select(dr.isfinite(border), border, side) for border, side in zip(borders, sides, strict=True)]
     x0, y0, x1, y1 = (dr.minimum(side, limit) for side in sides)
     return -x0, -y0, x1, y1, -nearest, farthest
 

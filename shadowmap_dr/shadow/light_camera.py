@@ -8,17 +8,20 @@ the light's image plane that the map covers) is detached and stable, so that an 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar, cast
 
 import drjit as dr
+import numpy as np
+import numpy.typing as npt
 
-from ..jit.arrays import backend
+from ..jit.arrays import backend, device_array
 from ..jit.broadcast import from_one_buffer, look_up
 from ..jit.kernel_inputs import float_input, split
 from ..jit.types import AnyArray, Bool, Float, Point3f, UInt32, Vector3f, Vector4f
 from ..jit.vectors import unit
+from .tiles import Tiles
 
 #: Half-angle (tangent) of one cube face, before the margin for the filter.
 CUBE_FACE = 1.0
@@ -76,7 +79,7 @@ class Frusta:
     A point with light-space coordinates (x, y, z) has image coordinates (x, y) in an orthographic and (x, y) / z in a perspective
     view. The map covers image coordinates ``center +- half`` and depths from ``near`` to ``far``. It resolves depths from
     ``first`` on; the depths of casters before ``first`` do not matter, for they lie before all receivers. Behind ``last`` there
-    are no casters.
+    are no casters. ``tiles``: parts of the image planes that the maps serve, None if each light has one map for all of it.
     """
 
     center_x: Float
@@ -87,20 +90,39 @@ class Frusta:
     far: Float
     first: Float
     last: Float
+    tiles: Tiles | None = field(default=None, kw_only=True)
 
     def part(self, first: int, count: int) -> Frusta:
         """Those of ``count`` maps from number ``first`` on."""
         index = dr.arange(backend(self.near).UInt32, count) + first
-        return Frusta(*(dr.gather(type(column), column, index) for column in self.columns()))
+        tiles = None if self.tiles is None else self.tiles.rows(index)
+        return Frusta(*(dr.gather(type(column), column, index) for column in self.columns()), tiles=tiles)
 
     def columns(self) -> list[Float]:
-        """All numbers, (M,) each, in a fixed order."""
-        return [getattr(self, name) for name in self.__dataclass_fields__]
+        """All numbers of the maps, (M,) each, in a fixed order; without their tiles."""
+        return [getattr(self, name) for name in self.__dataclass_fields__ if name != "tiles"]
+
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """All numbers, (M,) each, by name, to be stored."""
+        stored = {name: np.array(getattr(self, name)) for name in self.__dataclass_fields__ if name != "tiles"}
+        tiles = {} if self.tiles is None else {f"tiles.{name}": np.array(value) for name, value in vars(self.tiles).items()}
+        return stored | tiles
+
+    def with_arrays(self, stored: Mapping[str, npt.NDArray[Any]]) -> Frusta:
+        """The same frusta with numbers of :meth:`arrays` instead of their own."""
+        made = {name: device_array(type(self.near), value) for name, value in stored.items()}
+        tiles = {name.removeprefix("tiles."): value for name, value in made.items() if name.startswith("tiles.")}
+        own: dict[str, Any] = {name: value for name, value in made.items() if not name.startswith("tiles.")}
+        return replace(self, **own, tiles=Tiles(**tiles) if tiles else self.tiles)
 
     @classmethod
     def joined(cls, parts: Sequence[Frusta]) -> Frusta:
         """Those of the maps of all parts, one part after the other."""
-        return cls(*(dr.concat(list(columns)) for columns in zip(*(part.columns() for part in parts), strict=True)))
+        joined = cls(*(dr.concat(list(columns)) for columns in zip(*(part.columns() for part in parts), strict=True)))
+        if all(part.tiles is None for part in parts):
+            return joined
+        tiles = [part.tiles or Tiles.whole(backend(part.near), dr.width(part.near)) for part in parts]
+        return replace(joined, tiles=Tiles(*(dr.concat(list(c)) for c in zip(*(t.columns() for t in tiles), strict=True))))
 
 
 ViewsOrFrusta = TypeVar("ViewsOrFrusta", Views, Frusta)
@@ -191,7 +213,7 @@ def of_map(table: ViewsOrFrusta, index: UInt32, count: int) -> ViewsOrFrusta:
             return module.Array3f(*(look_up(value[c], index) for c in range(3)))
         return look_up(cast("Float", value), index)
 
-    rows: list[Any] = [pick(getattr(table, name)) for name in table.__dataclass_fields__]
+    rows: list[Any] = [pick(getattr(table, name)) for name in table.__dataclass_fields__ if name != "tiles"]
     return type(table)(*rows)
 
 

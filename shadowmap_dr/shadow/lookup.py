@@ -19,6 +19,8 @@ from .methods.comparison import soft_comparison, standard_visibility
 from .methods.registry import PREFILTERED
 from .methods.variance import MINIMUM_VARIANCE_COMPAT, chebyshev_visibility, reduced_bleeding
 from .shadow_map import FAR, ShadowMaps
+from .tile_fit import image_coordinates
+from .tiles import Group, neighbour, tile_of
 
 # Depth range over which the comparison of percentage-closer filtering falls from 1 to 0. A hard one has no derivative by depth.
 _SOFTNESS = 0.02
@@ -50,6 +52,26 @@ def visibility(maps: ShadowMaps, map_index: UInt32 | int, p_world: Point3f, acti
     depth = dr.select(depth > FAR, FAR, depth)
     look_up = {"standard": _compare, "pcf": _compare_all}.get(maps.settings.method, _resolve)
     return _where(inside, look_up, maps, index, u, v, depth)
+
+
+def tiled_visibility(maps: ShadowMaps, group: Group, p_world: Point3f, active: Bool | bool = True) -> Float:
+    """Visibility as of :func:`visibility` from the tiles of a light; along borders a mean of both tiles.
+
+    Args:
+        maps: filtered maps.
+        group: maps of the light.
+        p_world: points. Attached. The share of each tile is detached.
+        active: mask of the points to look up; the others get 1.
+    """
+    tiles, frusta = maps.frusta.tiles, maps.frusta
+    assert tiles is not None, "fitted with the maps"
+    x, y, _ = image_coordinates(maps.views, group[0], p_world)
+    tile = tile_of(tiles, group, x, y)
+    other, share = neighbour(tiles, (frusta.half_x, frusta.half_y), group, tile, x, y)
+    if not dr.flag(dr.JitFlag.SymbolicScope):
+        dr.eval(tile, other, share)  # otherwise each pass would find them again
+    own = visibility(maps, tile, p_world, active)
+    return dr.fma(share, visibility(maps, other, p_world, active & (share > 0)) - own, own)
 
 
 def _where(active: Bool, function: Callable[..., Float], maps: ShadowMaps, *lanes: AnyArray) -> Float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import index
 
 from ..raster import MAX_RESOLUTION
@@ -12,6 +12,8 @@ from .methods.registry import DEFAULT, METHODS, PREFILTERED
 
 #: Most texels along each side of a filter.
 MAX_FILTER_SIZE = 255
+#: Most tiles of a light.
+MAX_TILES = 16
 
 
 @dataclass(frozen=True)
@@ -24,8 +26,11 @@ class ShadowSettings:
             ``pcf`` (percentage-closer: the look-up compares depths and filters the results; a texel that an outline crosses
             has two depths, weighted by area), ``standard`` (one comparison, no gradients) or ``none``.
         resolution: texels along each side of a map.
+        tiles: most maps that share the image plane of a directional light or a spot. A renderer takes as many, a power of two, as
+            the pixels that see shadows are worth.
         filter: ``box``, ``gaussian``, ``wendland`` or ``none``.
         filter_size: odd number of texels.
+        tile_filter_size: the same for maps of which several share a light's image plane, None for ``filter_size``.
         antialias: anti-alias the maps; without it shadows have no gradient to the outlines of their casters.
         bias: depth offset of ``standard`` and ``pcf``, in units of the depth range of the map.
         bleeding: visibilities below this are cut off and the rest is stretched to 0..1; for ``vsm``, ``evsm`` and ``msm``.
@@ -43,8 +48,10 @@ class ShadowSettings:
 
     method: str = "auto"
     resolution: int = 256
+    tiles: int = 1
     filter: str = "gaussian"
     filter_size: int = 3
+    tile_filter_size: int | None = None
     antialias: bool = True
     bias: float = 5e-3
     compat: bool = False
@@ -55,7 +62,7 @@ class ShadowSettings:
     cull_backfaces: bool = False
 
     def __post_init__(self) -> None:
-        for name in ("resolution", "filter_size", "order", "supersampling"):
+        for name in ("resolution", "tiles", "filter_size", "order", "supersampling"):
             if isinstance(getattr(self, name), bool):
                 raise ValueError(f"shadow map {name} is {getattr(self, name)!r}; give a whole number")
             try:
@@ -83,6 +90,8 @@ class ShadowSettings:
             raise ValueError(f"the order of the Fourier series is {self.order}; it must be an even number from 2 to 16")
         if not 1 <= self.resolution <= 4096:
             raise ValueError(f"shadow map resolution is {self.resolution}; it must lie between 1 and 4096")
+        if not 1 <= self.tiles <= MAX_TILES:
+            raise ValueError(f"shadow tiles are {self.tiles}; they must lie between 1 and {MAX_TILES}")
         if self.compat and self.cull_backfaces:
             raise ValueError("compat has fixed frusta, which may begin inside of a caster: do not combine it with cull_backfaces")
         if not 1 <= self.supersampling <= 8 or self.supersampling * self.resolution > MAX_RESOLUTION:
@@ -95,11 +104,18 @@ class ShadowSettings:
         if not 1 <= self.filter_size <= MAX_FILTER_SIZE:
             raise ValueError(f"shadow filter size is {self.filter_size}; it must be odd, and lie between 1 and {MAX_FILTER_SIZE}")
         filter_kernel(self.filter, self.filter_size)
+        if self.tile_filter_size is not None:
+            filter_kernel(self.filter, self.tile_filter_size)
         if self.filter_size + 6 > self.resolution and self.method != "none":
             raise ValueError(
                 f"shadow filter size {self.filter_size} is too large for maps of {self.resolution} texels; "
                 f"use at least {self.filter_size + 6} texels"
             )
+
+    @property
+    def of_tiles(self) -> ShadowSettings:
+        """Settings of maps that share a light's image plane."""
+        return self if self.tile_filter_size is None else replace(self, filter_size=self.tile_filter_size)
 
     @property
     def filterable(self) -> bool:

@@ -18,7 +18,7 @@ from integrator_scenes import camera, render, shadowmap, small_scene
 import shadowmap_dr
 from shadowmap_dr import ShadowmapError
 from shadowmap_dr.integrator.options import Options
-from shadowmap_dr.rendering.settings import SHADOW_NAMES, RenderSettings
+from shadowmap_dr.rendering.settings import AUTO, SHADOW_NAMES, RenderSettings
 from shadowmap_dr.shadow import ShadowSettings
 
 XML = """
@@ -172,8 +172,9 @@ def test_parameters_are_the_settings_of_the_renderer() -> None:
     options = {option.name: option.default for option in fields(Options) if option.name not in own}
     settings = {setting.name: setting.default for setting in fields(RenderSettings) if setting.name != "shadow"}
     shadow = {name: getattr(ShadowSettings, SHADOW_NAMES[name]) for name in SHADOW_NAMES}
+    shadow |= {"shadow_map_resolution": AUTO, "shadow_tiles": 0, "shadow_filter_size": 0}  # chosen by the renderer
     assert options == {**settings, **shadow}
-    assert {setting.name for setting in fields(ShadowSettings)} == {*SHADOW_NAMES.values(), "bias"}
+    assert {setting.name for setting in fields(ShadowSettings)} == {*SHADOW_NAMES.values(), "bias", "tile_filter_size"}
     assert RenderSettings.of(**options) == RenderSettings()
 
 

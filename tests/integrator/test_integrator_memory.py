@@ -115,7 +115,7 @@ def test_derivatives_see_the_frusta_of_the_image(variant: str) -> None:
 def _frusta(integrator: Any) -> np.ndarray:
     """Numbers of the frusta of the latest image."""
     _, frusta, _ = integrator.shell.scenes[0].fits[0]
-    return np.array([value.numpy() for value in vars(frusta).values()])
+    return np.array(list(frusta.arrays().values()))
 
 
 def test_scenes_are_not_kept_alive(variant: str) -> None:

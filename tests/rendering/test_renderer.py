@@ -284,7 +284,7 @@ def test_anti_aliasing_brings_an_image_closer_to_supersampling(renderer: Rendere
 
 
 def frusta(renderer: Renderer) -> np.ndarray:
-    return np.array([value.numpy() for value in vars(renderer.frusta).values()])
+    return np.array(list(renderer.frusta.arrays().values()))
 
 
 def test_frusta_do_not_see_small_moves(renderer: Renderer) -> None:

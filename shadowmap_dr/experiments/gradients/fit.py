@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from dataclasses import fields, replace
 from typing import Any
 
 import drjit as dr
@@ -100,7 +99,7 @@ class ShadowFit:
         state = {name: np.array(dr.concat(array)) for name, array in arrays.items()}
         frusta = self._renderer.frusta
         if frusta is not None:
-            state |= {f"frusta.{field.name}": np.array(getattr(frusta, field.name)) for field in fields(frusta)}
+            state |= {f"frusta.{name}": value for name, value in frusta.arrays().items()}
         return state | {"t": np.array([self._t])}
 
     def load_state(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
@@ -116,9 +115,8 @@ class ShadowFit:
         # The map's frustum follows the occluder with inertia: a run starts from the initial frustum, or from its stored one.
         self._renderer = copy.copy(self._initial)
         fit = {name.removeprefix("frusta."): value for name, value in state.items() if name.startswith("frusta.")}
-        stored = {name: device_array(mi.Float, value) for name, value in fit.items()}
-        if stored and self._renderer.frusta is not None:
-            self._renderer.frusta = replace(self._renderer.frusta, **stored)
+        if fit and self._renderer.frusta is not None:
+            self._renderer.frusta = self._renderer.frusta.with_arrays(fit)
 
     def describe(self) -> dict[str, Any]:
         """Settings for the record."""

@@ -26,6 +26,7 @@ from ...io.ranges import FILTER_SIDE, MAP_SIDE, SAMPLES, check_ranges
 from ...jit.frozen import freeze
 from ...jit.types import Float
 from ...rendering.renderer import Renderer
+from ...rendering.settings import AUTO
 from ...shadow import ShadowSettings, directional_view
 from ..common.timing import Contender, alternate
 from . import pose as maps_pose
@@ -46,6 +47,8 @@ CANDIDATES: dict[str, dict[str, Any]] = {
     "msm": {"shadow_method": "msm"},
     "msm, cut": {"shadow_method": "msm", "shadow_bleeding": 0.1},
     "csm": {"shadow_method": "csm", "shadow_order": 8},
+    # As many maps as pixels are worth, as the renderer chooses without any option.
+    "default": {"shadow_map_resolution": AUTO, "shadow_filter_size": 0},
 }
 
 

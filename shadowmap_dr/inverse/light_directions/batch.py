@@ -7,7 +7,7 @@ rendered as one batch of R images and R n shadow maps. Every run has its own los
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -216,7 +216,7 @@ def _zeros(count: int) -> Float:
 
 def _own_arrays(frusta: Frusta) -> Frusta:
     """A copy whose fields do not share arrays."""
-    copy = Frusta(*(getattr(frusta, f.name) + _zeros(dr.width(frusta.near)) for f in fields(frusta)))
+    copy = Frusta(*(column + _zeros(dr.width(frusta.near)) for column in frusta.columns()))
     dr.eval(copy)
     return copy
 

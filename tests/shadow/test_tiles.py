@@ -1,0 +1,155 @@
+"""Tiles of a directional light's image plane: as many visible points in each, kept while they are, blended at their borders."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from shadowmap_dr.shadow import Frusta, Tiles, Views, directional_view, fit_tiles, stack_views, to_light_space
+from shadowmap_dr.shadow.light_camera import of_map
+from shadowmap_dr.shadow.tiles import BAND, neighbour, tile_of
+
+Array = npt.NDArray[np.float64]
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+def views_of(direction: tuple[float, float, float], count: int) -> Views:
+    return stack_views([directional_view(mi.Vector3f(direction))] * count)
+
+
+def receding(count: int = 20000, seed: int = 1) -> Array:
+    """Points (N, 3) on a ground as a camera above it sees them: dense before it, sparse far away; a few high roofs."""
+    generator = np.random.default_rng(seed)
+    away = 5 / np.tan(generator.uniform(0.01, 0.8, count))
+    side = generator.uniform(-0.6, 0.6, count) * away
+    return np.stack([away, side, generator.choice([0.0, 12.0], count)], 1)
+
+
+def seen(points: Array) -> tuple[mi.Point3f, mi.Bool]:
+    return mi.Point3f(points.T.astype(np.float32)), dr.full(mi.Bool, True, len(points))
+
+
+def in_plane(views: Views, points: Array) -> Array:
+    p = to_light_space(of_map(views, mi.UInt32(0), views.count), mi.Point3f(points.T.astype(np.float32)))
+    return np.stack([p.x.numpy(), p.y.numpy()], 1)
+
+
+def rectangles(tiles: Tiles) -> Array:
+    """(M, 4): x0, y0, x1, y1."""
+    return np.stack([column.numpy() for column in tiles.columns()], 1)
+
+
+def holders(tiles: Tiles, xy: Array) -> Array:
+    """Number of each point's tile, by brute force; -1 where none or several hold it."""
+    box = rectangles(tiles)
+    inside = ((xy[:, None] >= box[:, :2]) & (xy[:, None] < box[:, 2:])).all(-1)
+    return np.where(inside.sum(1) == 1, inside.argmax(1), -1)
+
+
+@pytest.mark.parametrize("number", [2, 4, 8, 16])
+@pytest.mark.parametrize("direction", [(0.3, 0.5, -1.0), (0.0, 0.0, -1.0), (-1.0, 0.2, -0.3)])
+def test_tiles_share_the_points_equally(direction: tuple[float, float, float], number: int) -> None:
+    points, views = receding(), views_of(direction, number)
+    tiles = fit_tiles(views, [(0, number)], seen(points), None)
+    assert tiles is not None
+    xy = in_plane(views, points)
+    found = holders(tiles, xy)
+    np.testing.assert_array_equal(tile_of(tiles, (0, number), *(mi.Float(xy[:, k]) for k in (0, 1))).numpy(), found)
+    counts = np.bincount(found, minlength=number)  # fails if a point has no tile
+    assert counts.min() > 0.75 * len(points) / number and counts.max() < 1.3 * len(points) / number
+    # Near the camera tiles are small.
+    box = rectangles(tiles)
+    finite = np.isfinite(box).all(1)
+    if number == 16 and finite.sum() > 1:
+        area = ((box[:, 2] - box[:, 0]) * (box[:, 3] - box[:, 1]))[finite]
+        assert area.max() > 3 * area.min()
+
+
+def test_lights_have_tiles_of_their_own() -> None:
+    """Maps 1 to 4 and 6 to 7; maps 0 and 5 are no tiles."""
+    points, masked = receding(), np.arange(20000) % 3 > 0
+    views = stack_views(
+        [directional_view(mi.Vector3f(d)) for d in ((0, 0, -1), *((1, 0, -1),) * 4, (0, 1, -1), *((0, -1, -1),) * 2)]
+    )
+    tiles = fit_tiles(views, [(1, 4), (6, 2)], (seen(points)[0], mi.Bool(masked)), None)
+    assert tiles is not None
+    box = rectangles(tiles)
+    assert np.isinf(box[[0, 5]]).all() and np.isfinite(box[1:5]).any(1).all() and np.isfinite(box[6:8]).sum() == 2
+    for first, number in ((1, 4), (6, 2)):
+        p = to_light_space(of_map(views, mi.UInt32(first), views.count), seen(points)[0])
+        counts = np.bincount(tile_of(tiles, (first, number), p.x, p.y).numpy()[masked] - first, minlength=number)
+        assert counts.max() < 1.3 * masked.sum() / number
+
+
+def test_tiles_stay_while_they_are_balanced() -> None:
+    points, views = receding(), views_of((0.3, 0.5, -1.0), 4)
+    first = fit_tiles(views, [(0, 4)], seen(points), None)
+    again = fit_tiles(views, [(0, 4)], seen(receding(seed=2) + [0.3, 0.2, 0.0]), first)
+    assert first is not None and again is not None
+    np.testing.assert_array_equal(rectangles(again), rectangles(first))
+    farther = fit_tiles(views, [(0, 4)], seen(points + [400.0, 0.0, 0.0]), again)
+    assert farther is not None
+    assert not np.array_equal(rectangles(farther), rectangles(first))
+    counts = np.bincount(holders(farther, in_plane(views, points + [400.0, 0.0, 0.0])), minlength=4)
+    assert counts.max() < 1.3 * len(points) / 4
+
+
+def test_no_points_and_equal_points_end_in_tiles_all_the_same() -> None:
+    views = views_of((0.3, 0.5, -1.0), 4)
+    nothing = mi.Point3f(np.zeros((3, 50), np.float32)), dr.full(mi.Bool, False, 50)
+    for points in (nothing, (nothing[0] + 2, dr.full(mi.Bool, True, 50))):
+        tiles = fit_tiles(views, [(0, 4)], points, None)
+        assert tiles is not None
+        found = tile_of(tiles, (0, 4), points[0].x, points[0].y).numpy()
+        assert found.max() < 4
+
+
+def test_shares_meet_at_borders() -> None:
+    """One half on either side of a border, none beyond the band, and the same from both sides."""
+    points, views, number = receding(), views_of((0.0, 0.0, -1.0), 4), 4
+    tiles = fit_tiles(views, [(0, number)], seen(points), None)
+    assert tiles is not None
+    halves = mi.Float([10.0, 20.0, 30.0, 40.0]), mi.Float([15.0, 25.0, 35.0, 45.0])
+    box = rectangles(tiles)
+    generator = np.random.default_rng(0)
+    for k in range(number):
+        for axis in (0, 1):
+            border = box[k, axis]
+            if not np.isfinite(border):
+                continue
+            low, high = (np.clip(box[k, 1 - axis + end], -500, 500) for end in (0, 2))
+            along = generator.uniform(low + 0.3 * (high - low), high - 0.3 * (high - low), 50)
+            for gap in (1e-4, 0.05, 3.0):
+                sides = []
+                for sign in (1, -1):
+                    xy = np.empty((50, 2), np.float32)
+                    xy[:, axis], xy[:, 1 - axis] = border + sign * gap, along
+                    x, y = mi.Float(xy[:, 0]), mi.Float(xy[:, 1])
+                    tile = tile_of(tiles, (0, number), x, y)
+                    other, share = neighbour(tiles, halves, (0, number), tile, x, y)
+                    sides.append((tile.numpy(), other.numpy(), share.numpy()))
+                if gap == 3.0:
+                    assert not sides[0][2].any() and not sides[1][2].any()
+                    continue
+                np.testing.assert_array_equal(sides[0][0], sides[1][1])
+                np.testing.assert_array_equal(sides[0][1], sides[1][0])
+                np.testing.assert_allclose(sides[0][2], sides[1][2], atol=1e-3)
+                size = np.array(halves[axis])[np.stack([sides[0][0], sides[0][1]])].min(0)
+                np.testing.assert_allclose(sides[0][2], np.maximum(0.5 - 0.5 * gap / (BAND * size), 0), atol=2e-3)
+
+
+def test_stored_fits_keep_their_tiles() -> None:
+    views = views_of((0.3, 0.5, -1.0), 4)
+    tiles = fit_tiles(views, [(0, 4)], seen(receding()), None)
+    row = dr.arange(mi.Float, 4)
+    fit = Frusta(*(row + k for k in range(8)), tiles=tiles)
+    other = Frusta(*(row * 0 for _ in range(8)), tiles=Tiles.whole(dr.llvm.ad, 4))
+    back = other.with_arrays(fit.arrays())
+    for one, two in zip([*fit.columns(), *fit.tiles.columns()], [*back.columns(), *back.tiles.columns()], strict=True):
+        np.testing.assert_array_equal(one.numpy(), two.numpy())
+    joined = Frusta.joined([Frusta(*(row[:2] for _ in range(8))), fit])
+    assert joined.tiles is not None and np.isinf(rectangles(joined.tiles)[:2]).all()
+    np.testing.assert_array_equal(rectangles(joined.part(2, 4).tiles), rectangles(fit.tiles))

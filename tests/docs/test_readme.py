@@ -11,6 +11,7 @@ import pytest
 
 import shadowmap_dr
 from shadowmap_dr.integrator.options import Options
+from shadowmap_dr.rendering.settings import AUTO
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -52,7 +53,7 @@ def test_named_parameters_exist(readme: str) -> None:
     named = {"shadow_map_resolution", "shadow_method", "shadow_filter", "shadow_filter_size", "antialias", "aovs"}
     for name in named:
         assert f"`{name}`" in readme and hasattr(Options(), name)
-    assert Options().shadow_map_resolution == 256 and Options().shadow_filter_size == 3
+    assert Options().shadow_map_resolution == AUTO and "(`auto`: as the film needs)" in " ".join(readme.split())
     assert shadowmap_dr.Renderer and mi.variants()
 
 

@@ -68,19 +68,19 @@ def _planes(views: Views, frusta: Frusta, seen: tuple[Point3f, Bool]) -> tuple[F
         active &= (dr.abs(p.x - window.center_x) <= window.half_x) & (dr.abs(p.y - window.center_y) <= window.half_y)
         row = dr.arange(module.UInt32, count)
 
-        def means(values: list[Float], points: Float | None = None) -> list[Float]:
-            sums = dr.zeros(module.Float, len(values) * count)
+        def sums(values: list[Float]) -> list[Float]:
+            """Sums over the visible points of each map."""
+            total = dr.zeros(module.Float, len(values) * count)
             for k, value in enumerate(values):
-                dr.scatter_add(sums, value, which * len(values) + k, active)
-            found = [dr.gather(module.Float, sums, row * len(values) + k) for k in range(len(values))]
-            return found if points is None else [value / points for value in found]
+                dr.scatter_add(total, value, which * len(values) + k, active)
+            return [dr.gather(module.Float, total, row * len(values) + k) for k in range(len(values))]
 
-        points, *middle = means([module.Float(1), p.x, p.y, p.z])
+        points, *totals = sums([module.Float(1), p.x, p.y, p.z])
         points = dr.maximum(points, 1)
-        middle = [value / points for value in middle]
+        middle = [total / points for total in totals]
         dr.eval(middle)
         x, y, z = (p[c] - dr.gather(module.Float, middle[c], which) for c in range(3))
-        xx, xy, yy, xz, yz, zz = means([x * x, x * y, y * y, x * z, y * z, z * z], points)
+        xx, xy, yy, xz, yz, zz = (total / points for total in sums([x * x, x * y, y * y, x * z, y * z, z * z]))
         xx, yy = xx + _RIDGE * zz + 1e-30, yy + _RIDGE * zz + 1e-30
         determinant = xx * yy - xy * xy
         a, b = (xz * yy - yz * xy) / determinant, (yz * xx - xz * xy) / determinant

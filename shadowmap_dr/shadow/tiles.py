@@ -1,8 +1,8 @@
 """Tiles of a light's image plane, each with a shadow map of its own: texels go where pixels are.
 
-A k-d tree over visible points divides the image plane of a light into rectangles that as many pixels see. Each
-rectangle has a map with a window, a depth range and texels of its own. A point belongs to one tile, whatever its depth, so that a
-look-up needs no search in depth.
+A k-d tree over visible points divides the image plane of a light into rectangles. Equally many pixels see each of them. A
+rectangle has a map with a window, a depth range and texels of its own. A point belongs to one tile, whatever its depth: a look-up
+does not search in depth.
 
 Source: Lauritzen, Salvi and Lefohn, "Sample Distribution Shadow Maps", 2011, who divide depths; here the light's image plane is
 divided (Fernando et al., "Adaptive Shadow Maps", 2001, with a quadtree).
@@ -95,7 +95,7 @@ def neighbour(tiles: Tiles, halves: tuple[Float, Float], group: Group, tile: UIn
     nearest = dr.minimum(dr.minimum(shares[0], shares[1]), dr.minimum(shares[2], shares[3]))
     near = nearest < BAND
     moves = [dr.select(near & (share == nearest), 2 * gap, 0) for share, gap in zip(shares, gaps, strict=True)]
-    across = near & ((moves[0] != 0) | (moves[1] != 0) | (shares[0] == nearest) | (shares[1] == nearest))
+    across = (shares[0] == nearest) | (shares[1] == nearest)
     # Beyond the border, as far as the point is before it.
     beyond = tile_of(tiles, group, x - moves[0] + moves[1], y - moves[2] + moves[3])
     gap = dr.select(across, nearest * sizes[0], nearest * sizes[1])

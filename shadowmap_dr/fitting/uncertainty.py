@@ -25,7 +25,7 @@ DISPLACEMENT, FACTOR, OFFSET = 0.02, 0.004, 0.001
 PIXEL = 0.005
 #: Factor of the blocks' covariance: errors of the model are alike over more than a block; and that of corrected images, which
 #: have smaller ones. Found, as the numbers above, on the calibration problems of `shadowmap-dr bench --only fits`: 99 % of 97
-#: intervals held the true value there without corrections, and 93 % of 101 do with them.
+#: intervals held the true value there without corrections, and 93 % of 108 do with them.
 INFLATION, INFLATION_CORRECTED = 10.0, 3.0
 #: Further factor for residuals of users, whose errors are not known as those of colours are. Found on ten places of a box with
 #: six functions: half of the intervals by edges and by shares of colours hold the truth without it, all of 120 with it.
@@ -42,7 +42,7 @@ _ALIKE_AFAR = 0.02
 _DEPENDENT, _SHARE = 0.25, 0.02
 # Images of the first step differ by about twice the first number, a share of their brightness. Steps grow by the second factor
 # while the square of the change is below the third share of the stated one. The others' part is corrected so many times at each.
-_LINEAR, _LONGER, _FEWER, _CORRECTED, _DAMPED = 0.02, 2.0, 0.1, 2, 1e-3
+_LINEAR, _LONGER, _FEWER, _CORRECTED, _DAMPED = 0.02, 2.0, 0.6, 2, 1e-3
 # Directions in which numbers move the images by less than this square share of their single effects are not determined. Residuals
 # say nothing of them: no change of the images can leave any. Their largest number gets this deviation.
 _LEAST, _FREE = 1e-6, 10.0

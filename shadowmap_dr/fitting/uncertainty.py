@@ -39,10 +39,12 @@ _NEARLY, _GROWN, _NEAR = 0.015, 1.7, 0.1
 _ALIKE_AFAR = 0.02
 # Numbers may depend on each other where an eigenvalue of the matrix, with a diagonal of one, is smaller: images tell how much.
 # Those with a smaller share of the eigenvector have no part in it.
-_DEPENDENT, _SHARE = 0.25, 0.02
+_DEPENDENT, _SHARE = 0.7, 0.02
 # Images of the first step differ by about twice the first number, a share of their brightness. Steps grow by the second factor
-# while the square of the change is below the third share of the stated one. The others' part is corrected so many times at each.
-_LINEAR, _LONGER, _FEWER, _CORRECTED, _DAMPED = 0.02, 2.0, 0.6, 2, 1e-3
+# while the square of the change is below the third share of the stated one. The others' part is corrected at most so many times at
+# each, while that lowers the square to below the fifth share of what it was: where derivatives overstate effects, corrections fall
+# short.
+_LINEAR, _LONGER, _FEWER, _CORRECTED, _GAIN, _DAMPED = 0.02, 2.0, 0.6, 8, 0.97, 1e-3
 # Directions in which numbers move the images by less than this square share of their single effects are not determined. Residuals
 # say nothing of them: no change of the images can leave any. Their largest number gets this deviation.
 _LEAST, _FREE = 1e-6, 10.0
@@ -172,7 +174,7 @@ def _joint_change(
     stated = max(float(direction @ matrix @ direction), 1e-30)
     best, found, step = 1.0, direction.copy(), _LINEAR / np.sqrt(stated)
     while True:
-        far = min(step, _FAR / np.abs(direction).max())
+        far, before = min(step, _FAR / np.abs(direction).max()), np.inf
         for _ in range(_CORRECTED):
             ends = [np.clip(point.x + sign * far * direction, low, high) for sign in (1, -1)]
             length = float((ends[0] - ends[1])[number])
@@ -182,6 +184,9 @@ def _joint_change(
             ratio = max(_square(above, below, point, objective) / length**2 / stated, 1e-6)
             if ratio < best:
                 best, found = ratio, direction.copy()
+            if ratio > _GAIN * before:
+                break
+            before = ratio
             direction[others] -= np.linalg.solve(own, _products(above, below, point, objective)[others] / length)
         if best > _FEWER or far < step:
             return best, found

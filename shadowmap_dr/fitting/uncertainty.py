@@ -35,15 +35,18 @@ OWN_INFLATION = 9.0
 _WEAK, _FAR, _SAME = 0.3, 0.3, 0.005
 # A larger difference, up to the first number, counts as none if it is below the second times that of a change by the third.
 _NEARLY, _GROWN, _NEAR = 0.015, 1.7, 0.1
+# But what differs may be a small thing in a large picture: its pixels differ by more than the first number, a share of the
+# brightness, and images by more than the second times what they do for a change by a third of the distance.
+_STRONG, _GROWS = 0.25, 1.2
 # And if the scene's own value makes no larger difference than this one.
 _ALIKE_AFAR = 0.02
 # Numbers may depend on each other where an eigenvalue of the matrix, with a diagonal of one, is smaller: images tell how much.
 # Those with a smaller share of the eigenvector have no part in it.
 _DEPENDENT, _SHARE = 0.7, 0.02
 # Images of the first step differ by about twice the first number, a share of their brightness. Steps grow by the second factor
-# while the square of the change is below the third share of the stated one. The others' part is corrected at most so many times at
-# each, while that lowers the square to below the fifth share of what it was: where derivatives overstate effects, corrections fall
-# short.
+# while the square of the change is below the third share of the stated one. The others' part is corrected at most so many times
+# at each, while that lowers the square to below the fifth share of what it was: where derivatives overstate effects, corrections
+# fall short.
 _LINEAR, _LONGER, _FEWER, _CORRECTED, _GAIN, _DAMPED = 0.02, 2.0, 0.6, 8, 0.97, 1e-3
 # Directions in which numbers move the images by less than this square share of their single effects are not determined. Residuals
 # say nothing of them: no change of the images can leave any. Their largest number gets this deviation.
@@ -197,20 +200,33 @@ def _is_idle(direction: Array, point: Point, objective: Objective, low: Array | 
     """True if images along a direction are alike.
 
     Differences in proportion to the distance tell. Those of facets do not grow with it, and shadow maps that are fitted anew make
-    a step somewhere.
+    a step somewhere. Small things change few pixels, but these much.
     """
-    far, near = (2 * step * np.sqrt(_change(direction, point, objective, low, high, step)) for step in (_FAR, _NEAR))
-    return bool(min(far, near * _FAR / _NEAR) < _SAME or far < _NEARLY and far < _GROWN * near)
+    sizes, strengths = zip(*(_effect(direction, point, objective, low, high, step) for step in (_FAR, _NEAR)), strict=True)
+    far, near = sizes
+    alike = min(far, near * _FAR / _NEAR) < _SAME or far < _NEARLY and far < _GROWN * near
+    return bool(alike and not (strengths[0] > _STRONG and far > _GROWS * near))
 
 
-def _change(
-    direction: Array, point: Point, objective: Objective, low: Array | float, high: Array | float, far: float = _FAR
-) -> float:
-    """Square of the change of the images along a direction, a share of the brightness for a step of one, from two images."""
+def _effect(
+    direction: Array, point: Point, objective: Objective, low: Array | float, high: Array | float, far: float
+) -> tuple[float, float]:
+    """(root mean square of the change of the images along a direction, root mean square where they change).
+
+    Both are shares of the brightness for steps of ``far`` to either side. Pixels count the more in the second, the more they
+    change.
+    """
     ends = [np.clip(point.x + sign * far * direction, low, high) for sign in (1, -1)]
-    above, below = (objective.at(end) for end in ends)
     step = float(np.linalg.norm(ends[0] - ends[1]) / np.linalg.norm(direction))
-    return _square(above, below, point, objective) / step**2 if step > 0 else np.inf
+    if not step:
+        return np.inf, np.inf
+    one, other = (objective.at(end) for end in ends)
+    square, fourth = 0.0, 0.0
+    for first, second, weight in zip(one.residuals, other.residuals, point.weights(), strict=True):
+        squares = np.square(first - second, dtype=np.float64).reshape(-1)
+        square += float((weight * squares).sum())
+        fourth += float((weight * squares**2).sum())
+    return 2 * far / step * float(np.sqrt(square / objective.terms)), float(np.sqrt(fourth / max(square, 1e-300)))
 
 
 def _square(one: Point, other: Point, point: Point, objective: Objective) -> float:
@@ -254,15 +270,28 @@ def _inverse(matrix: Array, idle: npt.NDArray[np.bool_]) -> tuple[Array, Array]:
 
 
 def _scores(point: Point, objective: Objective) -> Array:
-    """Sum over blocks of the outer products of the blocks' sums of weighted residuals times derivatives."""
+    """Sum over blocks of the outer products of the blocks' sums of weighted residuals times derivatives.
+
+    Sums of a block that alone tells of a number, such as the height of a small house, are zero where the fit ends. So single
+    pixels count, too, by their blocks' shares of what a picture tells of each number.
+    """
     total = np.zeros((objective.count, objective.count))
     for columns, weight, residual in zip(point.columns(), point.weights(), point.residuals, strict=True):
-        rows, width, _ = residual.shape
-        product = (columns * (weight * residual.reshape(-1))).reshape(objective.count, *residual.shape).sum(3, dtype=np.float64)
-        blocks = np.add.reduceat(np.add.reduceat(product, range(0, rows, _BLOCK), 1), range(0, width, _BLOCK), 2)
-        flat = blocks.reshape(objective.count, blocks[0].size if len(blocks) else 0)
-        total += flat @ flat.T
+        shape = objective.count, *residual.shape
+        product = (columns * (weight * residual.reshape(-1))).reshape(shape).sum(3, dtype=np.float64)
+        told = _sums_of_blocks((columns**2 * weight).reshape(shape).sum(3, dtype=np.float64))
+        share = told / np.maximum(told.sum((1, 2), keepdims=True), 1e-300)
+        row, column = (np.arange(side) // _BLOCK for side in residual.shape[:2])
+        for parts in (_sums_of_blocks(product), product * np.sqrt(share[:, row[:, None], column])):
+            flat = parts.reshape(objective.count, parts[0].size if len(parts) else 0)
+            total += flat @ flat.T
     return total
+
+
+def _sums_of_blocks(values: Array) -> Array:
+    """Sums (n, rows, columns) over the blocks of images (n, H, W)."""
+    _, height, width = values.shape
+    return np.add.reduceat(np.add.reduceat(values, range(0, height, _BLOCK), 1), range(0, width, _BLOCK), 2)
 
 
 def _shared_errors(point: Point, objective: Objective) -> list[Array]:

@@ -15,7 +15,7 @@ from fitting_scenes import box, camera, diffuse, floor, renderer_of, scene_of, s
 
 from shadowmap_dr import Renderer
 from shadowmap_dr.errors import ShadowmapError
-from shadowmap_dr.fitting import Estimate, Fit, FitOptions, FitResult, Vary, fit, make_target, prepared
+from shadowmap_dr.fitting import Estimate, Fit, FitOptions, FitResult, Own, SceneChange, Vary, fit, make_target, prepared
 from shadowmap_dr.io import assets
 
 Image = npt.NDArray[np.float32]
@@ -159,6 +159,28 @@ def test_brightness_and_exposure_cannot_be_told_apart(picture: Image) -> None:
     # A prior tells them apart.
     result = fit(renderer(), picture, ["sun:brightness,prior=0.1"], starts=1, exposure=True)
     assert result.found and not any("told apart" in words for words in result.words)
+
+
+def test_the_height_of_a_small_thing_is_found() -> None:
+    """A box of some 20 of 27,648 pixels, in a picture of a wide floor: less than 0.005 of its brightness."""
+    T = mi.ScalarTransform4f
+    tall = 1.2
+
+    def wide(height: float) -> mi.Scene:
+        place = T().translate([0.3, 0.4, 0]) @ T().scale([0.04, 0.04, height]) @ T().translate([0, 0, 1])
+        house = {"type": "cube", "to_world": place, "bsdf": diffuse(0.7, 0.7, 0.7)}
+        return scene_of(box=None, house=house, camera=camera(192, 144))
+
+    def put(numbers: list[mi.Float], change: SceneChange) -> None:
+        change.move(["house"], mi.Matrix4f(1, 0, 0, 0, 0, 1, 0, 0, 0, 0, numbers[0], 0, 0, 0, 0, 1))
+
+    height = Own("height", put, start=[1.0], spread=0.3, low=0.2)
+    result = fit(wide(0.03), photograph(wide(0.03 * tall)), [height], starts=2)
+    found = estimate(result, "height")
+    assert result.found and not result.words and found.half_width is not None
+    # The height is four pixels.
+    np.testing.assert_allclose(found.values, tall, rtol=0.04)
+    assert abs(float(found.values[0]) - tall) < float(found.half_width[0]) < 0.2
 
 
 def test_what_moves_nothing_is_named(picture: Image) -> None:

@@ -138,6 +138,20 @@ def test_intervals_cover_the_errors_of_fits() -> None:
 
 
 @pytest.mark.usefixtures("plain")
+@pytest.mark.parametrize("seed", range(3))
+def test_numbers_that_one_block_tells_have_intervals(seed: int) -> None:
+    """The residuals of a small thing add up to nothing where a fit ends, since it ends there."""
+    generator, jacobian = np.random.default_rng(seed), np.zeros((2, *SHAPE))
+    jacobian[0, 18:30, 2:14] = generator.normal(size=(12, 12, 3))
+    jacobian[1, 50:60, 36:46] = 1
+    jacobian = jacobian.reshape(2, -1)
+    noise, inverse = generator.normal(scale=NOISE, size=SHAPE).ravel(), np.linalg.inv(jacobian @ jacobian.T)
+    residual = noise - inverse @ (jacobian @ noise) @ jacobian
+    expected = 1.96 * NOISE * np.sqrt(np.diag(inverse))
+    np.testing.assert_allclose(found(made(jacobian, residual.reshape(SHAPE))).half_widths, expected, rtol=0.25)
+
+
+@pytest.mark.usefixtures("plain")
 def test_pictures_add_up() -> None:
     """Two pictures of independent noise: intervals narrow by the root of two. Sizes that no block divides are no matter."""
     shape = (50, 75, 3)

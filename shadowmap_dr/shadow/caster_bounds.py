@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import drjit as dr
 
-from ..jit.arrays import backend
-from ..jit.kernel_inputs import split
+from ..jit.arrays import backend, ravel
+from ..jit.kernel_inputs import split, uint_input
 from ..jit.types import Bool, Float, Normal3f, Point3f, UInt32
 from .light_camera import Views, of_map
 
@@ -75,7 +75,7 @@ def casting_shapes(
         views, shapes = dr.detach(views), boxes.count
         (normal, point) = planes
         dr.eval(normal, point, planar)
-        reach = _reach(normal, point, boxes)
+        reach = _reach(normal, point, planar, boxes)
         index = dr.arange(module.UInt32, views.count * shapes)
         which, shape = split(index, "shapes", shapes, views.count)
         view = of_map(views, which, views.count)
@@ -86,31 +86,45 @@ def casting_shapes(
         return casts if hidden is None else casts & (shape != dr.gather(module.UInt32, hidden, which))
 
 
-def _reach(normal: Normal3f, point: Point3f, boxes: Boxes) -> Float:
-    """Reach (2 S) of the other shapes' boxes beyond each shape's plane, on either side; at most 0 if they only touch it.
+def _reach(normal: Normal3f, point: Point3f, planar: Bool, boxes: Boxes) -> Float:
+    """Reach (2 S) of other shapes' boxes beyond the plane of each planar shape, on either side; at most 0 where they touch it.
 
     The first tenth of a shape that stands on the plane does not count: the maps shall not change if it sinks in a little.
     """
     module, shapes = backend(boxes.low), boxes.count
-    Float = module.Float
-    pair = dr.arange(module.UInt32, shapes * shapes)
-    own, other = split(pair, "shapes", shapes, shapes)
-    sizes = [dr.max(dr.gather(module.Array3f, dr.ravel(boxes.high - boxes.low), which)) for which in (own, other)]
-    before, behind, extent, far, stands = Float(0), Float(0), Float(0), Float(0), module.Bool(True)
-    for c in range(3):
-        n, p = dr.gather(Float, normal[c], own), dr.gather(Float, point[c], own)
-        low, high = dr.gather(Float, boxes.low[c], other), dr.gather(Float, boxes.high[c], other)
-        before += n * (dr.select(n > 0, high, low) - p)
-        behind -= n * (dr.select(n > 0, low, high) - p)
-        extent += dr.abs(n) * (high - low)
-        far = dr.maximum(far, dr.maximum(dr.abs(low), dr.abs(high)))
-        # A shape stands on the plane if it lies within the plane's outline, at any distance along the normal.
-        left, right = dr.gather(Float, boxes.low[c], own), dr.gather(Float, boxes.high[c], own)
-        border, room = BORDER * (right - left), dr.abs(n) * sizes[1]
-        stands &= (low >= left + border - room) & (high <= right - border + room)
-    touch = dr.fma(TOUCH, dr.minimum(*sizes), ROUNDING * far)
-    sunk = dr.select(stands, SUNK * extent, 0)
-    reach = dr.full(Float, -dr.inf, 2 * shapes)
-    for k, value in enumerate((before, behind)):
-        dr.scatter_reduce(dr.ReduceOp.Max, reach, value - sunk - touch, own * 2 + k, own != other)
+    corners = [dr.ravel(end) for end in (boxes.low, boxes.high)]
+    dr.eval(corners)
+    count = uint_input(module, "shapes", shapes)
+
+    def box_of(shape: UInt32) -> tuple[list[Float], list[Float], Float]:
+        low, high = (list(dr.gather(module.Array3f, end, shape)) for end in corners)
+        return low, high, dr.maximum(dr.maximum(high[0] - low[0], high[1] - low[1]), high[2] - low[2])
+
+    def add(own, other, before_most, behind_most):  # noqa: ANN001, ANN202
+        left, right, own_size = box_of(own)
+        low, high, size = box_of(other)
+        n, p = ([dr.gather(module.Float, v[c], own) for c in range(3)] for v in (normal, point))
+        zero = module.Float(0)
+        before, behind, extent, far, stands = zero, zero, zero, zero, module.Bool(True)
+        for c in range(3):
+            before += n[c] * (dr.select(n[c] > 0, high[c], low[c]) - p[c])
+            behind -= n[c] * (dr.select(n[c] > 0, low[c], high[c]) - p[c])
+            extent += dr.abs(n[c]) * (high[c] - low[c])
+            far = dr.maximum(far, dr.maximum(dr.abs(low[c]), dr.abs(high[c])))
+            # A shape stands on the plane if it lies within the plane's outline, at any distance along the normal.
+            border, room = BORDER * (right[c] - left[c]), dr.abs(n[c]) * size
+            stands &= (low[c] >= left[c] + border - room) & (high[c] <= right[c] - border + room)
+        touch = dr.fma(TOUCH, dr.minimum(own_size, size), ROUNDING * far)
+        less = dr.select(stands, SUNK * extent, 0) + touch
+        counts = own != other
+        before_most = dr.select(counts, dr.maximum(before_most, before - less), before_most)
+        behind_most = dr.select(counts, dr.maximum(behind_most, behind - less), behind_most)
+        return own, other + 1, before_most, behind_most
+
+    # Walls and floors alone look through all shapes: most of thousands of shapes have none.
+    none = module.Float(-dr.inf)
+    begin = dr.arange(module.UInt32, shapes), dr.select(planar, module.UInt32(0), count), none, none
+    _, _, *most = dr.while_loop(begin, lambda own, other, *_: other < count, add, mode="symbolic", label="behind a plane")
+    reach = ravel(module.Array2f(*most))
+    dr.eval(reach)
     return reach

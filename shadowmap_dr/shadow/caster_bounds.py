@@ -104,8 +104,8 @@ def _reach(normal: Normal3f, point: Point3f, planar: Bool, boxes: Boxes) -> Floa
         left, right, own_size = box_of(own)
         low, high, size = box_of(other)
         n, p = ([dr.gather(module.Float, v[c], own) for c in range(3)] for v in (normal, point))
-        zero = module.Float(0)
-        before, behind, extent, far, stands = zero, zero, zero, zero, module.Bool(True)
+        before, behind, extent, far = (module.Float(0) for _ in range(4))  # ``+=`` changes arrays in place
+        stands = module.Bool(True)
         for c in range(3):
             before += n[c] * (dr.select(n[c] > 0, high[c], low[c]) - p[c])
             behind -= n[c] * (dr.select(n[c] > 0, low[c], high[c]) - p[c])
@@ -122,8 +122,11 @@ def _reach(normal: Normal3f, point: Point3f, planar: Bool, boxes: Boxes) -> Floa
         return own, other + 1, before_most, behind_most
 
     # Walls and floors alone look through all shapes: most of thousands of shapes have none.
-    none = module.Float(-dr.inf)
-    begin = dr.arange(module.UInt32, shapes), dr.select(planar, module.UInt32(0), count), none, none
+    begin = (
+        dr.arange(module.UInt32, shapes),
+        dr.select(planar, module.UInt32(0), count),
+        *(module.Float(-dr.inf) for _ in range(2)),
+    )
     _, _, *most = dr.while_loop(begin, lambda own, other, *_: other < count, add, mode="symbolic", label="behind a plane")
     reach = ravel(module.Array2f(*most))
     dr.eval(reach)

@@ -148,7 +148,10 @@ class _Taken:
 
 @cached_by_type
 def _parts_of(kind: type) -> tuple[str, ...] | None:
-    """Names of the fields of a dataclass, an empty tuple for other types, None for types whose ``repr`` is complete."""
+    """Names of the fields of a dataclass, an empty tuple for other types, None for types whose ``repr`` is complete.
+
+    Dataclasses may name other attributes in ``RECORDED``, those that recordings depend on.
+    """
     if issubclass(kind, _PLAIN):
         return None
-    return () if hasattr(kind, "recording_text") else fields_of(kind) or ()
+    return () if hasattr(kind, "recording_text") else getattr(kind, "RECORDED", None) or fields_of(kind) or ()

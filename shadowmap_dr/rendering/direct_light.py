@@ -25,7 +25,7 @@ def direct_light(
 ) -> Color3f:
     """Radiance (colour, N) of one light towards the camera: BSDF * light * visibility.
 
-    ``visibility`` Float (N,), 0 dark to 1 lit. ``nodes``: :meth:`SceneData.materials`. ``gate`` removes light from directions
+    ``visibility`` Float (N,), 0 dark to 1 lit. ``nodes``: :attr:`SceneData.materials`. ``gate`` removes light from directions
     in front of the shading normal but behind the triangle, as a shadow ray would. Gradients flow to surface, light and
     visibility, not through the gate.
     """
@@ -88,7 +88,7 @@ def ambient_light(
 
     A fixed set of ``n_directions`` cosine-distributed directions in the hemisphere of the shading normal on the viewer's side
     (Fibonacci spiral): exact for diffuse surfaces under constant light, coarse for gloss. Gradients flow to surface and emitter.
-    ``nodes``: :meth:`SceneData.materials`.
+    ``nodes``: :attr:`SceneData.materials`.
     """
     total = dr.zeros(mi.UnpolarizedSpectrum, dr.width(surface.shape))
     side = dr.select(surface.si.wi.z < 0, -1.0, mi.Float(1.0))

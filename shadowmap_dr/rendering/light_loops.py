@@ -132,7 +132,7 @@ def many_lights(
 def light_of_table(seen: Surface, places: Places, table: LightTable, maps: ShadowMaps | None, nodes: Sequence[Any]) -> Color3f:
     """Radiance (colour, N) towards the camera of all lights of a table. Attached to the surface, lights and maps.
 
-    ``maps`` None: unshadowed. ``nodes``: :meth:`~shadowmap_dr.scene.load.SceneData.materials`.
+    ``maps`` None: unshadowed. ``nodes``: :attr:`~shadowmap_dr.scene.load.SceneData.materials`.
     """
 
     def one_light(index: UInt32, own: PyTree, shared: PyTree) -> Color3f:

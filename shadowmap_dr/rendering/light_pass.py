@@ -233,7 +233,7 @@ class LightPass:
             visible: list[AnyArray] = [*incident.visible] if self.settings.aovs else []
             return [value[k] for k in range(dr.size_v(mi.UnpolarizedSpectrum))], visible
 
-        nodes = [*self.data.materials(), *shining_objects(self.data)]
+        nodes = [*self.data.materials, *shining_objects(self.data)]
         tree = frame, lighting.lights, lighting.areas, shapes
         sums, visible = checkpointed_sum(term, len(self.slices), tree, attached_parameters(nodes))
         return mi.UnpolarizedSpectrum(*sums), [mi.Float(one) for part in visible for one in part]
@@ -274,7 +274,7 @@ class LightPass:
             samples = self._samples(tuple(white_area_light(area) for area in lighting.areas), geometry)
             visible = self.visibilities(frame, lighting, list(range(len(lights))), lights)
             reach = zip(self._outlined(frame, lights), visible, strict=True)
-            extended, maps, nodes = zip(self.soft, samples, strict=True), lighting.soft_maps, self.data.materials()
+            extended, maps, nodes = zip(self.soft, samples, strict=True), lighting.soft_maps, self.data.materials
             terms = [direct_light(seen, light, fraction) for light, fraction in reach]
             terms += [soft_light(seen, plan, own, maps, nodes, _interleaving(own, frame.view)) for plan, own in extended]
             return tuple(term[0] for term in terms)
@@ -290,7 +290,7 @@ class LightPass:
         """
         gate, seen = not self.settings.shadow.compat, frame.surface
         color = dr.zeros(mi.UnpolarizedSpectrum, dr.width(seen.shape))
-        nodes = self.data.materials()
+        nodes = self.data.materials
         for light, fraction in zip(incident.lights, incident.visible, strict=True):
             color += direct_light(seen, light, fraction, nodes, gate=gate)
         soft = self.soft if self.settings.lit else ()
@@ -302,7 +302,7 @@ class LightPass:
     def with_ambient(self, color: Color3f, seen: Surface) -> Color3f:
         """Radiance plus reflected ambient light, which nothing shadows."""
         if self.settings.ambient > 0 and self.settings.lit:
-            nodes, uniform = self.data.materials(), UniformRadiance(self.settings.ambient)
+            nodes, uniform = self.data.materials, UniformRadiance(self.settings.ambient)
             color += ambient_light(seen, uniform, _AMBIENT_DIRECTIONS, nodes)
         return color
 
@@ -357,7 +357,7 @@ class LightPass:
         if spots.copies > 1:  # they are lanes of their own
             return 0, every
         around = partial(self._around, frame)
-        return many_lights(seen, lighting.lights, self.plan, lighting.maps, spots.points, around, self.data.materials())
+        return many_lights(seen, lighting.lights, self.plan, lighting.maps, spots.points, around, self.data.materials)
 
     def _spots(self, frame: Frame) -> FootprintSamples:
         view, seen = frame.view, frame.surface

@@ -182,7 +182,7 @@ class Renderer:
         outward = mi.Bool(outward_faces(topology, positions.reshape(-1, 3))) if settings.shadow.cull_backfaces else None
         slices = plan_slices(data, plan, soft, settings)
         renderer = cls(data, topology, plan, settings, flat_faces(geometry, topology), creases, outward, soft, slices=slices)
-        renderer.untracked = UntrackedState((*data.scene.emitters(), *data.materials()))
+        renderer.untracked = UntrackedState((*data.scene.emitters(), *data.materials))
         # The first fit is made here, so that a step which is recorded later always starts from one.
         return renderer.with_maps_for() if data.sensors else renderer
 
@@ -230,7 +230,13 @@ class Renderer:
         return replace(self, creases=self.creases and self.creases.with_colours(self.data.geometry, sources))
 
     def refresh(self) -> Renderer:
-        """The same renderer with the scene's current vertices, lights and sensors, attached where they carry gradients."""
+        """The same renderer with the scene's current vertices, lights and sensors, attached where they carry gradients.
+
+        Raises:
+            ShadowmapError: in a function that is being frozen, which would keep what it reads of the scene now.
+        """
+        if dr.flag(dr.JitFlag.FreezingScope):
+            raise ShadowmapError("refresh(): a frozen function does not read the scene; call it before, and pass the renderer.")
         return self.with_data(refresh(self.data))
 
     @shared_inputs()
@@ -266,7 +272,7 @@ class Renderer:
         check_samples(spp)
         self.note_kernels(spp, sensor)
         cameras, geometry = self.data.cameras(sensor), self.data.geometry
-        rewrite_scalars(self.data.materials())
+        rewrite_scalars(self.data.materials)
         if vertex_positions is not None:
             geometry = geometry.with_positions(vertex_positions)
             _warn_of_lost_vertices(geometry, vertex_positions)

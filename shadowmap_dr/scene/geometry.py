@@ -19,6 +19,7 @@ import numpy.typing as npt
 from ..errors import ShadowmapError
 from ..jit.arrays import backend, device_array, ravel, replace_grad
 from ..jit.broadcast import copy_of_lane, in_copies
+from ..jit.pytree import StaticTuple
 from ..jit.types import AnyArray, Bool, Float, Matrix4f, Point3f, UInt32, Vector3f, Vector3u
 from ..jit.vectors import normalize_or
 
@@ -72,10 +73,6 @@ class ShapeInfo:
     faceted: bool = False
     against_winding: bool = False
 
-    def recording_text(self) -> str:
-        """All fields. Dr.Jit asks for them at each rendering; a walk through those of 5,000 shapes takes 0.1 s."""
-        return repr(tuple(vars(self).values()))
-
     @property
     def flags(self) -> int:
         """The booleans as bits, for ``Geometry.face_info``."""
@@ -122,7 +119,7 @@ class Geometry:
     face_info: UInt32
     vertex_shape: UInt32
     shape_face_start: UInt32
-    shapes: tuple[ShapeInfo, ...]
+    shapes: StaticTuple[ShapeInfo]
     changed: tuple[str, ...] | None = None
     as_loaded: bool = False
     stand_ins: UInt32 | None = None

@@ -6,10 +6,10 @@ parameters may change, attached where they carry gradients.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from numbers import Integral
-from typing import Any, cast
+from typing import Any, ClassVar, cast
 
 import drjit as dr
 import mitsuba as mi
@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from ..errors import ShadowmapError, UnsupportedShape, check_variant
 from ..jit.arrays import device_array
+from ..jit.pytree import StaticTuple
 from ..jit.types import Float
 from .descriptions import Parts, describe_all
 from .geometry import NOT_READ, Geometry, ShapeInfo, pack_face_info, size_guards_of, stand_ins
@@ -43,6 +44,7 @@ class SceneData:
     areas         area lights
     environments  constant, envmap and sunsky emitters (at most one)
     shape_ptr, bsdf_ptr   mi.ShapePtr, mi.BSDFPtr (S,), indexed by ``geometry.face_shape``
+    materials     different BSDFs, and meshes whose attributes they may read: all objects that Mitsuba shades with
     variant       Mitsuba variant of the scene
     soup          the shapes' vertices, None if there are few shapes
     needs_frames  whether any BSDF needs more than the cosines of directions: tangents, texture coordinates
@@ -58,10 +60,23 @@ class SceneData:
     shape_ptr: mi.ShapePtr
     bsdf_ptr: mi.BSDFPtr
     sources: tuple[ShapeSource, ...]
+    materials: tuple[mi.Object, ...]
     variant: str
     needs_frames: bool = True
     only_cosines: bool = False
     soup: Soup | None = None
+
+    # Neither the scene nor its meshes, which Dr.Jit would walk through at each call of a recorded function: 0.1 s for 5,000
+    # meshes. Images depend on the records that were read from them.
+    RECORDED: ClassVar[tuple[str, ...]] = (
+        *("geometry", "sensors", "lights", "areas", "environments", "shape_ptr", "bsdf_ptr", "recorded_sources", "materials"),
+        *("variant", "needs_frames", "only_cosines", "soup"),
+    )
+
+    @property
+    def recorded_sources(self) -> Sequence[ShapeSource]:
+        """Sources that recorded functions read: those of curves; all of the plug-in, which gets the scene at each call."""
+        return self.sources if self.scene is None else [one for one in self.sources if isinstance(one, CurveSource)]
 
     def cameras(self, sensor: int | Sensor) -> tuple[Sensor, ...]:
         """Cameras of a sensor: of the scene's sensor with that number, or the given record itself.
@@ -79,10 +94,6 @@ class SceneData:
             raise ShadowmapError(f"There is no sensor {sensor}: the scene has {len(self.sensors)}, counted from 0.")
         return self.sensors[sensor]
 
-    def materials(self) -> list[mi.Object]:
-        """BSDFs, and meshes whose attributes they may read: all objects that Mitsuba shades with."""
-        return [*(source.shape.bsdf() for source in self.sources), *self.with_attributes()]
-
     def light(self, name: str) -> Light | AreaLight:
         """The light called ``name``; raises ``ShadowmapError`` listing the known names otherwise."""
         lights = (*self.lights, *self.areas)
@@ -94,7 +105,7 @@ class SceneData:
 
     def with_attributes(self) -> list[mi.Mesh]:
         """Mitsuba's meshes that have attributes, such as colours of vertices, which materials may read."""
-        return [source.shape for source, info in zip(self.sources, self.geometry.shapes, strict=True) if info.reads_attributes]
+        return [node for node in self.materials if isinstance(node, mi.Mesh)]
 
     def curve_vertices(self, name: str, control_points: Float | npt.ArrayLike) -> Float:
         """See :meth:`shadowmap_dr.Renderer.curve_vertices`."""
@@ -162,12 +173,13 @@ def load(scene: mi.Scene, *, tessellation: int = 64, warn: bool = True) -> Scene
         face_info=device_array(mi.UInt32, pack_face_info(infos)),
         vertex_shape=device_array(mi.UInt32, vertex_shape),
         shape_face_start=device_array(mi.UInt32, [i.face_start for i in infos]),
-        shapes=infos,
+        shapes=StaticTuple(infos),
         stand_ins=None if settled is None else device_array(mi.UInt32, settled),
         size_guards=size_guards_of(infos),
     )
     bsdfs = [source.shape.bsdf() for source in sources]
     different = list(dict.fromkeys(bsdfs))
+    attributed = [source.shape for source, info in zip(sources, infos, strict=True) if info.reads_attributes]
     data = SceneData(
         scene=scene,
         geometry=geometry,
@@ -178,6 +190,7 @@ def load(scene: mi.Scene, *, tessellation: int = 64, warn: bool = True) -> Scene
         shape_ptr=_pointers(mi.ShapePtr, [source.shape for source in sources]),
         bsdf_ptr=_pointers(mi.BSDFPtr, bsdfs),
         sources=tuple(sources),
+        materials=(*different, *attributed),
         variant=mi.variant(),
         needs_frames=not all(is_plain(bsdf) for bsdf in different),
         only_cosines=all(is_cosine(bsdf) for bsdf in different),

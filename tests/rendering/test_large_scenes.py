@@ -198,3 +198,16 @@ def test_memory_bounds_the_maps() -> None:
     again = whole.with_maps_for(64**2).with_maps_for()
     assert again.plan.tiles == whole.plan.tiles and not again.slices
     assert np.array_equal(np.array(again.render()), np.array(Renderer.from_scene(scene).render()))
+
+
+@pytest.mark.usefixtures("variant")
+def test_recordings_do_not_walk_through_the_scene() -> None:
+    """Dr.Jit would look at all buffers of all meshes at each call of a frozen function."""
+    renderer = Renderer.from_scene(town())
+    leaves = renderer.recording_parts[1]
+    assert any(isinstance(leaf, mi.BSDF) for leaf in leaves)
+    assert not any(isinstance(leaf, mi.Scene | mi.Shape) for leaf in leaves)
+    frozen = dr.freeze(lambda renderer: renderer.refresh().render())
+    with pytest.raises(RuntimeError) as failure:
+        frozen(renderer)
+    assert "a frozen function does not read the scene" in str(failure.value.__cause__ or failure.value)

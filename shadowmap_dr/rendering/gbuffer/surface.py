@@ -196,7 +196,7 @@ def _cosine_colour(data: SceneData, seen: Surface) -> Color3f:
         return mi.UnpolarizedSpectrum(bsdf.eval(mi.BSDFContext(), at, at.wi, active))
 
     own = (si.p, si.uv, si.prim_index, si.shape, seen.bsdf, si.wi.z < 0, seen.active)
-    return evaluate(colour, own, data.materials(), width)
+    return evaluate(colour, own, data.materials, width)
 
 
 def _parametrisation(geometry: Geometry, flags: _Flags, hits: SurfacePoints) -> tuple[Any, Any, Any]:

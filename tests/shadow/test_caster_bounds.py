@@ -1,0 +1,79 @@
+"""Shapes that can cast a shadow, beside a look at all corners of all boxes with NumPy."""
+
+from __future__ import annotations
+
+import itertools
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
+
+from shadowmap_dr.shadow import Boxes, casting_shapes, directional_view, stack_views
+from shadowmap_dr.shadow.caster_bounds import BORDER, ROUNDING, SUNK, TOUCH
+
+Array = npt.NDArray[np.float64]
+
+
+def walls(generator: np.random.Generator, count: int) -> tuple[Array, Array, Array, Array]:
+    """(low, high, normals, planar) of boxes in a room of side 5.2: a third are walls; many others sink in one."""
+    centre, half = generator.uniform(-1.5, 1.5, (count, 3)), generator.uniform(0.05, 1, (count, 3))
+    axis, planar, side = generator.integers(0, 3, count), np.arange(count) % 3 == 0, generator.choice([-1.0, 1.0], count)
+    row = np.arange(count)
+    sinks = ~planar & (generator.uniform(size=count) < 0.4)
+    depth = generator.uniform(0, 0.4, count) * half[row, axis]
+    centre[row, axis] = np.where(sinks, side * (2.6 - half[row, axis] + depth), centre[row, axis])
+    centre[planar], half[planar] = 0, 2.6
+    centre[row, axis] = np.where(planar, side * generator.choice([2.6, 2.6, 1.8], count), centre[row, axis])
+    half[planar, axis[planar]] = 0
+    normals = np.eye(3)[axis] * generator.choice([-1, 1], (count, 1))
+    return centre - half, centre + half, normals, planar
+
+
+def brute_force(low: Array, high: Array, normals: Array, planar: Array, forward: Array) -> Array:
+    """(S,) mask: a planar shape casts shadows on what lies behind it, as seen along a direction."""
+    casts = ~planar
+    for own in np.flatnonzero(planar):
+        normal, point = normals[own], 0.5 * (low[own] + high[own])
+        behind = -normal if normal @ -forward > 0 else normal
+        for other in set(range(len(low))) - {own}:
+            corners = np.array(list(itertools.product(*zip(low[other], high[other], strict=True))))
+            depth = (corners - point) @ behind
+            touch = TOUCH * min(np.max(high[k] - low[k]) for k in (own, other)) + ROUNDING * np.abs(corners).max()
+            room = np.abs(normal) * np.max(high[other] - low[other])
+            border = BORDER * (high[own] - low[own])
+            stands = ((low[other] >= low[own] + border - room) & (high[other] <= high[own] - border + room)).all()
+            casts[own] |= depth.max() - (SUNK * np.ptp(depth) if stands else 0) > touch
+    return casts
+
+
+def arrays(low: Array, high: Array, normals: Array, planar: Array) -> tuple[tuple[mi.Normal3f, mi.Point3f], mi.Bool, Boxes]:
+    points = [mi.Point3f(values.T.astype(np.float32)) for values in (low, high, 0.5 * (low + high))]
+    return (mi.Normal3f(normals.T.astype(np.float32)), points[2]), mi.Bool(planar), Boxes(points[0], points[1])
+
+
+def test_walls_cast_shadows_on_what_is_behind_them(variant: str) -> None:
+    flat = []
+    for seed in range(8):
+        generator = np.random.default_rng(seed)
+        room = walls(generator, 12)
+        forward = generator.normal(size=(2, 3))
+        views = stack_views([directional_view(mi.Vector3f(*direction)) for direction in forward.tolist()])
+        found = casting_shapes(views, *arrays(*room)).numpy().reshape(2, -1)
+        expected = np.stack([brute_force(*room, direction) for direction in forward])
+        assert np.array_equal(found, expected)
+        flat.append(expected[:, room[3]])
+    assert 0.1 < np.mean(flat) < 0.9
+
+
+def test_thousands_of_shapes_are_not_compared_in_pairs(variant: str) -> None:
+    """A city of 5,000 shapes would have 25 million pairs. No kernel has more lanes than shapes."""
+    count = 2000
+    low, high, normals, planar = walls(np.random.default_rng(0), count)
+    given = arrays(low, high, normals, planar & (np.arange(count) < 20))
+    views = stack_views([directional_view(mi.Vector3f(0.2, 0.1, -1))])
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        dr.eval(casting_shapes(views, *given))
+        sizes = [kernel["size"] for kernel in dr.kernel_history([dr.KernelType.JIT])]
+    assert sizes and max(sizes) <= 3 * count

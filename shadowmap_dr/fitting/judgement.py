@@ -39,10 +39,12 @@ class Unexplained:
     Attributes:
         whole: of all edges that matter.
         numbers: (n,) of those that each of the scene's numbers moves; 0 for numbers that move few.
+        few: (n,) True for the numbers that move few.
     """
 
     whole: float
     numbers: Array
+    few: npt.NDArray[np.bool_]
 
     @property
     def largest(self) -> float:
@@ -130,7 +132,8 @@ def unexplained(point: Point, objective: Objective) -> Unexplained:
                 missing[k] += max(found - min(expected, _NOISY * there), 0.0)
                 total[k] += there
     shares = np.where(total > 0, missing / np.where(total > 0, total, 1), 0)
-    return Unexplained(float(shares[0]), np.where(blocks >= _FEW, shares, 0)[1:])
+    few = blocks[1:] < _FEW
+    return Unexplained(float(shares[0]), np.where(few, 0, shares[1:]), few)
 
 
 def _noise(residual: Image, weight: Image, times: int) -> Image:

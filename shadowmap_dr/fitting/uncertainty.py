@@ -25,7 +25,7 @@ DISPLACEMENT, FACTOR, OFFSET = 0.02, 0.004, 0.001
 PIXEL = 0.005
 #: Factor of the blocks' covariance: errors of the model are alike over more than a block; and that of corrected images, which
 #: have smaller ones. Found, as the numbers above, on the calibration problems of `shadowmap-dr bench --only fits`: 99 % of 97
-#: intervals held the true value there without corrections, and 93 % of 108 do with them.
+#: intervals held the true value there without corrections, and 94 % of 108 do with them.
 INFLATION, INFLATION_CORRECTED = 10.0, 3.0
 #: Further factor for residuals of users, whose errors are not known as those of colours are. Found on ten places of a box with
 #: six functions: half of the intervals by edges and by shares of colours hold the truth without it, all of 120 with it.

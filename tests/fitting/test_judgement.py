@@ -91,6 +91,6 @@ def test_a_small_object_elsewhere_is_no_small_matter() -> None:
 
 
 def test_a_number_may_leave_twice_the_share_of_the_whole() -> None:
-    assert Unexplained(0.04, np.array([0.08, 0.0])).is_small(0.04)
-    assert not Unexplained(0.04, np.array([0.081])).is_small(0.04)
-    assert not Unexplained(0.041, np.zeros(1)).is_small(0.04)
+    assert Unexplained(0.04, np.array([0.08, 0.0]), np.zeros(2, bool)).is_small(0.04)
+    assert not Unexplained(0.04, np.array([0.081]), np.zeros(1, bool)).is_small(0.04)
+    assert not Unexplained(0.041, np.zeros(1), np.zeros(1, bool)).is_small(0.04)

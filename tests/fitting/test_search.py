@@ -183,6 +183,30 @@ def test_the_height_of_a_small_thing_is_found() -> None:
     assert abs(float(found.values[0]) - tall) < float(found.half_width[0]) < 0.2
 
 
+def test_small_things_do_not_stay_in_minima_of_their_own() -> None:
+    """Heights of three houses, one behind the others: a descent makes the hindmost too low to be seen."""
+    T = mi.ScalarTransform4f
+    places, sides = [(-0.3, 0.21), (-0.1, 0.12), (-0.15, 0.02)], (0.042, 0.064, 0.069)
+    true = (1.361, 0.756, 1.198)
+
+    def village(heights: tuple[float, ...]) -> mi.Scene:
+        houses = {}
+        for k, ((x, y), side, height) in enumerate(zip(places, sides, heights, strict=True)):
+            place = T().translate([x, y, 0]) @ T().scale([side, side, 2 * side * height]) @ T().translate([0, 0, 1])
+            houses[f"house_{k}"] = {"type": "cube", "to_world": place, "bsdf": diffuse(0.7, 0.7, 0.7)}
+        return scene_of(box=None, camera=camera(128, 96), **houses)
+
+    def height(k: int) -> Own:
+        def put(numbers: list[mi.Float], change: SceneChange) -> None:
+            change.move([f"house_{k}"], mi.Matrix4f(1, 0, 0, 0, 0, 1, 0, 0, 0, 0, numbers[0], 0, 0, 0, 0, 1))
+
+        return Own(f"house_{k}", put, start=[1.0], spread=0.5, low=0.2)
+
+    result = fit(village((1.0, 1.0, 1.0)), photograph(village(true)), [height(k) for k in range(3)], starts=1)
+    assert result.found and not result.words
+    np.testing.assert_allclose([each.values[0] for each in result.estimates], true, rtol=0.02)
+
+
 def test_what_moves_nothing_is_named(picture: Image) -> None:
     """A box behind the camera."""
     result = fit(renderer(far=box(5, -9)), picture, ["sun:brightness", "far.bsdf.reflectance"], starts=1)

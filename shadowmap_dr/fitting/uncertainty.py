@@ -35,9 +35,9 @@ OWN_INFLATION = 9.0
 _WEAK, _FAR, _SAME = 0.3, 0.3, 0.005
 # A larger difference, up to the first number, counts as none if it is below the second times that of a change by the third.
 _NEARLY, _GROWN, _NEAR = 0.015, 1.7, 0.1
-# But what differs may be a small thing in a large picture: its pixels differ by more than the first number, a share of the
-# brightness, and images by more than the second times what they do for a change by a third of the distance.
-_STRONG, _GROWS = 0.25, 1.2
+# But what differs may be a small thing in a large picture: at least so many values of pixels differ by more than the second
+# number, a share of the brightness, and images by more than the third times what they do for a change by a third of the distance.
+_VALUES, _STRONG, _GROWS = 12, 0.25, 1.2
 # And if the scene's own value makes no larger difference than this one.
 _ALIKE_AFAR = 0.02
 # Numbers may depend on each other where an eigenvalue of the matrix, with a diagonal of one, is smaller: images tell how much.
@@ -205,7 +205,8 @@ def _is_idle(direction: Array, point: Point, objective: Objective, low: Array | 
     sizes, strengths = zip(*(_effect(direction, point, objective, low, high, step) for step in (_FAR, _NEAR)), strict=True)
     far, near = sizes
     alike = min(far, near * _FAR / _NEAR) < _SAME or far < _NEARLY and far < _GROWN * near
-    return bool(alike and not (strengths[0] > _STRONG and far > _GROWS * near))
+    several = objective.terms * far**2 >= _VALUES * strengths[0] ** 2
+    return bool(alike and not (several and strengths[0] > _STRONG and far > _GROWS * near))
 
 
 def _effect(

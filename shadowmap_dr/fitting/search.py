@@ -29,6 +29,7 @@ from .objective import Point
 from .options import FitOptions
 from .own_losses import OwnFunction, function_name
 from .parameters import Parameter
+from .places import best_places
 from .resolve import Resolver
 from .result import FitResult, Picture, Step
 from .scene_change import SceneChange
@@ -56,9 +57,6 @@ _SLIGHT = 0.15
 _WORTH_ANOTHER, _MOST_CORRECTIONS = 0.1, 24
 # Corrections after which a start is left, if it leaves a larger share unexplained.
 _FEW_CORRECTIONS, _CLOSE = 2, 0.15
-# Values of a number that moves few pixels that are tried, as shares of the range of its starts; how often the best is looked for
-# between them, at half the distance each time; and the improvement of the loss that makes a step of one.
-_PLACES, _HALVINGS, _BETTER = np.linspace(-1.25, 1.25, 11), 4, 1e-3
 # Growth of the ranges of starts from one try to the next. First stage of turned objects, and their least turn in ranges.
 _GROWTH, _TURNED_STAGE, _APART = 0.5, 2, 0.7
 # Least standard deviation of a prior, in the fit's own numbers: with less, matrices are singular.
@@ -248,28 +246,12 @@ class Fit:
         run.cost, run.corrected = self.stages[stage].objective.at(run.x).cost, True
 
     def _try_places(self, run: Run) -> bool:
-        """Set each number that moves few pixels to the best of many values, the others being kept. False if none is better.
-
-        The verdict does not see such numbers. One of many is often left in a minimum of its own, or where its derivative, which
-        few pixels tell, says nothing.
-        """
+        """Set numbers that move few pixels, which the verdict does not see, to their best places. False if none is better."""
         objective, ranges = self.stages[-1].objective, half_ranges(self.parameters)
-        moved = False
-        for k in np.flatnonzero(self._unexplained(run.x).few[: len(ranges)]).tolist():
-
-            def tried(values: Array, number: int = k) -> list[tuple[float, float]]:
-                at = np.clip(values, self._low[number], self._high[number]).tolist()
-                own = np.arange(len(run.x)) == number
-                return [(objective.at(np.where(own, value, run.x)).cost, value) for value in at]
-
-            step = ranges[k] * (_PLACES[1] - _PLACES[0])
-            now = objective.at(run.x).cost
-            best = min([(now, float(run.x[k])), *tried(ranges[k] * _PLACES)])
-            for _ in range(_HALVINGS):
-                step *= 0.5
-                best = min([best, *tried(np.array([best[1] - step, best[1] + step]))])
-            if best[0] < (1 - _BETTER) * now:
-                run.x, run.cost, moved = np.where(np.arange(len(run.x)) == k, best[1], run.x), best[0], True
+        numbers = np.flatnonzero(self._unexplained(run.x).few[: len(ranges)]).tolist()
+        x, cost = best_places(lambda x: objective.at(x).cost, run.x, numbers, ranges, self._low, self._high)
+        moved = bool((x != run.x).any())
+        run.x, run.cost = x, cost
         return moved
 
     def _share_of_intervals(self, step: Array, x: Array) -> float:

@@ -202,11 +202,10 @@ def _is_idle(direction: Array, point: Point, objective: Objective, low: Array | 
     Differences in proportion to the distance tell. Those of facets do not grow with it, and shadow maps that are fitted anew make
     a step somewhere. Small things change few pixels, but these much.
     """
-    sizes, strengths = zip(*(_effect(direction, point, objective, low, high, step) for step in (_FAR, _NEAR)), strict=True)
-    far, near = sizes
+    (far, strength), (near, _) = (_effect(direction, point, objective, low, high, step) for step in (_FAR, _NEAR))
     alike = min(far, near * _FAR / _NEAR) < _SAME or far < _NEARLY and far < _GROWN * near
-    several = objective.terms * far**2 >= _VALUES * strengths[0] ** 2
-    return bool(alike and not (several and strengths[0] > _STRONG and far > _GROWS * near))
+    several = objective.terms * far**2 >= _VALUES * strength**2
+    return bool(alike and not (several and strength > _STRONG and far > _GROWS * near))
 
 
 def _effect(
@@ -222,20 +221,21 @@ def _effect(
     if not step:
         return np.inf, np.inf
     one, other = (objective.at(end) for end in ends)
-    square, fourth = 0.0, 0.0
-    for first, second, weight in zip(one.residuals, other.residuals, point.weights(), strict=True):
-        squares = np.square(first - second, dtype=np.float64).reshape(-1)
-        square += float((weight * squares).sum())
-        fourth += float((weight * squares**2).sum())
-    return 2 * far / step * float(np.sqrt(square / objective.terms)), float(np.sqrt(fourth / max(square, 1e-300)))
+    square, fourth = (_mean_power(one, other, point, objective, power) for power in (2, 4))
+    return 2 * far / step * float(np.sqrt(square)), float(np.sqrt(fourth / max(square, 1e-300)))
 
 
 def _square(one: Point, other: Point, point: Point, objective: Objective) -> float:
     """Mean square of the difference of two images, weighted as at a point; a share of the brightness."""
-    square = 0.0
+    return _mean_power(one, other, point, objective, 2)
+
+
+def _mean_power(one: Point, other: Point, point: Point, objective: Objective, power: int) -> float:
+    """Mean of an even power of the difference of two images, weighted as at a point."""
+    total = 0.0
     for first, second, weight in zip(one.residuals, other.residuals, point.weights(), strict=True):
-        square += float((weight * np.square(first - second, dtype=np.float64).reshape(-1)).sum())
-    return square / objective.terms
+        total += float((weight * np.square(first - second, dtype=np.float64).reshape(-1) ** (power // 2)).sum())
+    return total / objective.terms
 
 
 def _products(one: Point, other: Point, point: Point, objective: Objective) -> Array:

@@ -91,7 +91,7 @@ class SceneCache:
             renderer = replace(Renderer.from_data(data, settings), untracked=None)
             sky, untracked = (
                 SkyWatch(data.environments),
-                UntrackedValues((*scene.emitters(), *_bsdfs(data), *data.with_attributes())),
+                UntrackedValues((*scene.emitters(), *data.materials)),
             )
         lights = tuple(light.name for light in data.lights) if settings.lit else ()
         record = cls(_parts(scene, data), _statics(scene, data), _sizes(data), lights, renderer.with_data(_without_scene(data)))

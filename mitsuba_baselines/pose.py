@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from shadowmap_dr.errors import ShadowmapError, did_you_mean
 from shadowmap_dr.inverse.pose import apply_pose
+from shadowmap_dr.jit.arrays import device_array
 from shadowmap_dr.scene.mitsuba_meshes import positions_in, set_positions
 
 from .proxy import Proxy, calibrate, with_proxy
@@ -157,7 +158,7 @@ class MitsubaPose:
 
         The image in the loss and the derivative use different random numbers: otherwise the gradient would be biased.
         """
-        pose = mi.Float(np.asarray(parameters, np.float32))
+        pose = device_array(mi.Float, parameters)
         dr.enable_grad(pose)
         self._place(pose)
         seeds = np.random.SeedSequence((self.seed, self._t)).generate_state(2)
@@ -177,7 +178,7 @@ class MitsubaPose:
 
     def render(self, parameters: npt.ArrayLike, spp: int = 64) -> np.ndarray:
         """(H, W, C) float32 linear image at a pose, lit by the proxy."""
-        self._place(mi.Float(np.asarray(parameters, np.float32)))
+        self._place(device_array(mi.Float, parameters))
         return np.array(self._integrator.render(self._scene, sensor=self._sensor, seed=self.seed, spp=spp), np.float32)
 
     def state(self) -> dict[str, np.ndarray]:

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from shadowmap_dr.errors import ShadowmapError
+from shadowmap_dr.jit.arrays import device_array
 from shadowmap_dr.scene.mitsuba_meshes import positions_in, set_positions
 
 from .derivatives import agreement
@@ -57,7 +58,7 @@ def projective_derivative(
         integrator = mi.load_dict({"type": "direct_projective", "sppc": 0, "sppp": 0, "sppi": sppi, "guiding": guiding})
         moved = mi.Float(rest)
         dr.enable_grad(moved)
-        dr.set_grad(moved, mi.Float(np.asarray(rate, np.float32).ravel()))
+        dr.set_grad(moved, device_array(mi.Float, rate))
         set_positions(params, moved, shape)
         params.update()
         image = integrator.render_forward(scene, params, sensor=scene.sensors()[0], seed=seed + index, spp=0)

@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import ShadowmapError
+from ..jit.arrays import device_array
 from ..scene.load import SceneData
 from ..scene.mitsuba_meshes import VERTEX_PARAMETERS, mesh_buffers, mesh_names
 from ..scene.shapes.sources import ShapeSource
@@ -147,5 +148,5 @@ def _like(old: Any, value: Array) -> Any:  # Any: an array type of Mitsuba's
 
 
 def _flat(old: Any, rows: Array) -> Any:  # Any: a Float or a TensorXf
-    values = mi.Float(np.ascontiguousarray(rows, np.float32).ravel())
+    values = device_array(mi.Float, rows)
     return mi.TensorXf(values, rows.shape) if dr.is_tensor_v(old) else values

@@ -1,7 +1,9 @@
 """Arrays in Dr.Jit's own memory.
 
-Dr.Jit borrows NumPy's memory where it can. The address, and with it its alignment, then becomes a part of the kernels that read
-the array and of the inputs that frozen functions compare. So a borrowed array causes a new kernel or recording now and then.
+Dr.Jit borrows NumPy's and PyTorch's memory where it can. Its kernels for CPUs read whole vectors of numbers, up to 60 bytes
+beyond an array's end, where foreign memory may end, too: the process is then lost. Arrays that begin at a multiple of 64 bytes,
+such as those of PyTorch's own, are safe. And the address, with its alignment, becomes a part of the kernels that read a borrowed
+array and of the inputs that frozen functions compare, so that there is a new kernel or recording now and then.
 """
 
 from __future__ import annotations
@@ -17,9 +19,6 @@ import numpy.typing as npt
 
 from .types import AnyArray, ArrayT, Bool, Float, UInt32
 
-# Waiting for Dr.Jit to read an array takes less time than a copy of this size.
-_MANY_BYTES = 1 << 20
-
 _DTYPES = {dr.VarType.Float32: np.float32, dr.VarType.UInt32: np.uint32, dr.VarType.Bool: np.bool_}
 
 
@@ -28,12 +27,12 @@ def device_array(kind: type[ArrayT], values: npt.ArrayLike) -> ArrayT:
 
     NumPy converts the numbers. ``values`` may change afterwards. The array is evaluated.
     """
-    host: npt.NDArray[Any] = np.ascontiguousarray(values, _DTYPES[dr.type_v(kind)])
-    make = cast(Callable[[npt.NDArray[Any]], ArrayT], kind)
-    if host.nbytes < _MANY_BYTES:
-        return own_memory(make(host.ravel().copy()))  # Dr.Jit may read it later
-    array = own_memory(make(host.ravel()))
-    dr.sync_thread()
+    host: npt.NDArray[Any] = np.ascontiguousarray(values, _DTYPES[dr.type_v(kind)]).ravel()
+    if dr.backend_v(kind) == dr.JitBackend.LLVM:
+        return _written(kind, host)
+    array = cast(Callable[[npt.NDArray[Any]], ArrayT], kind)(host)
+    dr.eval(array)
+    dr.sync_thread()  # Dr.Jit may read it later
     return array
 
 
@@ -42,10 +41,20 @@ def own_memory(array: ArrayT) -> ArrayT:
     flat: Any = dr.detach(array)  # Any: arithmetic on an array of any type
     if not dr.width(flat):
         return flat
+    if dr.backend_v(flat) == dr.JitBackend.LLVM and not dr.flag(dr.JitFlag.FreezingScope):
+        return _written(type(array), np.asarray(flat))
     kind: Any = type(dr.ravel(flat)) if dr.is_tensor_v(flat) else type(flat)  # Any: `dr.ravel` returns object
     copy = flat | dr.opaque(kind, False) if dr.is_mask_v(flat) else flat + dr.opaque(kind, 0)
     dr.eval(copy)
     return copy
+
+
+def _written(kind: type[ArrayT], host: npt.NDArray[Any]) -> ArrayT:
+    """An array of Dr.Jit's, on a CPU, into which NumPy has written numbers."""
+    array = dr.empty(kind, host.shape if dr.is_tensor_v(kind) else host.size)
+    if host.size:
+        np.asarray(array)[...] = host  # a view, for which Dr.Jit waits until the memory is free
+    return array
 
 
 # Dr.Jit's own functions, with the types that its stubs lack.

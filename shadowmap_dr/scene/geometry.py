@@ -376,7 +376,8 @@ def _checked_positions(name: str, value: AnyArray | npt.ArrayLike, count: int) -
     array: Any = value  # Any: Dr.Jit's predicates narrow no types
     if not dr.is_array_v(value):
         try:
-            array = mi.TensorXf(np.asarray(value, np.float32))  # Dr.Jit itself hangs on a string
+            numbers = np.asarray(value, np.float32)
+            array = mi.TensorXf(device_array(mi.Float, numbers), numbers.shape)  # Dr.Jit itself hangs on a string
         except (TypeError, ValueError) as error:
             raise ShadowmapError(f"Positions of shape '{name}' are {value!r:.60}: give an array of {count} points.") from error
     if dr.is_tensor_v(array):

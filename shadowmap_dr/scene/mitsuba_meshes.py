@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 import numpy.typing as npt
 
+from ..jit.arrays import device_array
 from ..jit.types import Float, UInt32
 
 
@@ -101,15 +101,16 @@ def make_mesh(
         faces: indices of vertices.
         bsdf: its material; None for Mitsuba's default.
     """
-    points, corners = np.ascontiguousarray(positions, np.float32), np.ascontiguousarray(faces, np.uint32)
+    points, corners = device_array(mi.Float, positions), device_array(mi.UInt32, faces)
     props = mi.Properties()
     if bsdf is not None:
         props["bsdf"] = bsdf
     if not _is_flat(mi.Mesh):
-        return mi.Mesh(name, faces=mi.TensorXu(corners), positions=mi.TensorXf(points), props=props)
-    mesh = mi.Mesh(name, len(points), len(corners), props=props)
+        tensors = mi.TensorXf(points, (len(points) // 3, 3)), mi.TensorXu(corners, (len(corners) // 3, 3))
+        return mi.Mesh(name, positions=tensors[0], faces=tensors[1], props=props)
+    mesh = mi.Mesh(name, len(points) // 3, len(corners) // 3, props=props)
     table = mi.traverse(mesh)
-    table[_FLAT.positions], table["faces"] = mi.Float(points.ravel()), mi.UInt32(corners.ravel())
+    table[_FLAT.positions], table["faces"] = points, corners
     table.update()
     return mesh
 

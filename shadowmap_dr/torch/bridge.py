@@ -24,6 +24,8 @@ from .transforms import outside
 #: Takes the place of an array in a record whose values a PyTorch tensor holds.
 IN_TENSOR: Any = None  # Any: arrays of several types
 
+# Bytes at a multiple of which an array begins that Dr.Jit's kernels may read where it lies, see `jit.arrays`.
+_ALIGNED = 64
 # Held by the thread in which Dr.Jit works.
 _TURN = threading.RLock()
 
@@ -57,8 +59,10 @@ def to_drjit(tensor: torch.Tensor) -> Any:  # Any: TensorXf or TensorXi, as the 
 
 def borrowed(tensor: torch.Tensor) -> Any:  # Any: TensorXf or TensorXi, as the tensor's type
     """A Dr.Jit tensor in the memory of a contiguous tensor, float32 or int32, whose numbers nobody will change."""
-    module = backend_of(tensor.device)
-    return (module.TensorXf if tensor.dtype == torch.float32 else module.TensorXi)(tensor.detach())
+    module, plain = backend_of(tensor.device), tensor.detach()
+    if plain.data_ptr() % _ALIGNED:
+        plain = plain.clone(memory_format=torch.contiguous_format)
+    return (module.TensorXf if tensor.dtype == torch.float32 else module.TensorXi)(plain)
 
 
 def index_array(indices: torch.Tensor) -> UInt32:

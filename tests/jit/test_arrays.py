@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from typing import Any
 
 import drjit as dr
@@ -70,3 +72,38 @@ def test_gradients_do_not_flow(variant: str) -> None:
     array = mi.Float([1, 2, 3])
     dr.enable_grad(array)
     assert not dr.grad_enabled(own_memory(array))
+
+
+# Numbers that end where memory ends that the process may read.
+GUARDED = """
+import ctypes, mmap, sys
+import mitsuba as mi
+import numpy as np
+mi.set_variant("llvm_ad_rgb")
+import drjit as dr
+from shadowmap_dr.jit.arrays import device_array, own_memory
+
+def guarded(values):
+    pages = -(-values.nbytes // mmap.PAGESIZE)
+    memory = np.frombuffer(mmap.mmap(-1, (pages + 1) * mmap.PAGESIZE), np.uint8)
+    end = pages * mmap.PAGESIZE
+    assert ctypes.CDLL(None).mprotect(ctypes.c_void_p(memory.ctypes.data + end), mmap.PAGESIZE, 0) == 0
+    result = memory[end - values.nbytes : end].view(values.dtype)
+    result[:] = values
+    return result
+
+count = int(sys.argv[1])
+for kind, dtype in ((mi.Float, np.float32), (mi.UInt32, np.uint32), (mi.Bool, np.bool_)):
+    values = guarded((np.arange(count) % 2).astype(dtype))
+    for found in (device_array(kind, values), own_memory(kind(values))):
+        assert (np.asarray(found) == values).all() and dr.width(found) == count
+tensor = own_memory(mi.TensorXf(guarded(np.arange(count, dtype=np.float32)).reshape(-1, 1)))
+assert tensor.shape == (count, 1) and (np.asarray(tensor).ravel() == np.arange(count)).all()
+"""
+
+
+@pytest.mark.parametrize("count", [5, 300_005])
+def test_memory_beyond_the_end_is_not_read(count: int) -> None:
+    """Dr.Jit's kernels for CPUs read whole vectors: programs ended once in a few hundred times."""
+    result = subprocess.run([sys.executable, "-c", GUARDED, str(count)], capture_output=True, text=True, timeout=120)
+    assert result.returncode == 0, result.stderr

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from ...io import files
 from ...io import images as io_images
 from ...io.animations import Pixels
+from ...jit.arrays import device_array
 from ...rendering.receivers.shadow_views import DISTANCE, HALF, ShadowView, height
 from ...rendering.renderer import Renderer
 from ..common.objects import occluder
@@ -65,7 +66,7 @@ class Stage:
         """Picture (H, W, 3), sRGB, of the object with the given vertices (V, 3), or with its first vertices."""
         points = self._points if vertices is None else np.asarray(vertices, np.float32)
         with dr.suspend_grad():
-            image = self._renderer.render({"object": mi.Float(np.ascontiguousarray(points).ravel())}, spp=4)
+            image = self._renderer.render({"object": device_array(mi.Float, points)}, spp=4)
         return np.round(255 * io_images.to_srgb(np.array(image)[..., :3])).astype(np.uint8)
 
 

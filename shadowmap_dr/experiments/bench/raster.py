@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...jit.arrays import device_array
 from ...jit.frozen import freeze, recordings_of
 from ...jit.types import Float, Matrix4f, UInt32
 from ...raster import Topology, antialias, build_topology, interpolate, rasterize
@@ -94,7 +95,7 @@ def raster_scene(options: BenchOptions, kind: str, resolution: int) -> RasterSce
 
 def offsets(batch: int = 1) -> Iterator[Float]:
     """Endless small offsets in x, Float (batch,), so that vertices differ from call to call."""
-    values = [mi.Float(np.linspace(0.001 * k, 0.001 * k + 0.01, batch, dtype=np.float32)) for k in range(8)]
+    values = [device_array(mi.Float, np.linspace(0.001 * k, 0.001 * k + 0.01, batch)) for k in range(8)]
     dr.make_opaque(values)
     return itertools.cycle(values)
 

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from ...errors import ShadowmapError
 from ...inverse.faces.morph_fit import MorphFit
+from ...jit.arrays import device_array
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -36,7 +37,7 @@ def image_derivatives(fit: MorphFit, parameters: npt.ArrayLike) -> FloatArray:
     for k in range(fit.count):
         values = mi.Float(at)
         dr.enable_grad(values)
-        dr.set_grad(values, mi.Float(np.eye(len(at), dtype=np.float32)[k]))
+        dr.set_grad(values, device_array(mi.Float, np.eye(len(at))[k]))
         columns.append(np.array(dr.forward_to(fit.image(values)), dtype=np.float64))
     return np.stack(columns, 1)
 

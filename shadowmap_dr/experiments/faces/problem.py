@@ -15,6 +15,7 @@ from ...errors import ShadowmapError
 from ...inverse.faces.morph_fit import MorphFit
 from ...inverse.faces.morphable import MorphableModel, load_model
 from ...io import assets
+from ...jit.arrays import device_array
 from ...rendering.receivers.planar_receiver import ReceiverShadows, Window
 from ...scene.mitsuba_meshes import make_mesh
 from ...shadow import ShadowSettings
@@ -84,7 +85,7 @@ class FaceScene:
     def shadow(self, vertices: npt.ArrayLike) -> FloatArray:
         """(H, W) visibility behind a head with the given (V, 3) vertices, rendered with this library. No gradients."""
         with dr.suspend_grad():
-            image = self.shadows.render(mi.Float(np.asarray(vertices, np.float32).ravel()))
+            image = self.shadows.render(device_array(mi.Float, vertices))
             return np.array(image).reshape(self.shadows.shape)
 
     def fit(

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...errors import ShadowmapError, did_you_mean
+from ...jit.arrays import device_array
 from ...jit.types import Float
 from ...rendering.renderer import Renderer
 from ...shadow import ShadowSettings, directional_view
@@ -65,7 +66,7 @@ def check_maps(resolutions: Iterable[int], filter_sizes: Iterable[int]) -> None:
 def image_of(renderer: Renderer, mesh: Mesh) -> Image:
     """The renderer's image (H, W, C) with a mesh's vertices as the occluder's. The renderer is not changed. No gradients."""
     with dr.suspend_grad():
-        return np.array(copy.copy(renderer).render({SHAPE: mi.Float(mesh.vertices.ravel())}))
+        return np.array(copy.copy(renderer).render({SHAPE: device_array(mi.Float, mesh.vertices)}))
 
 
 def forward_derivative(renderer: Renderer, rate: npt.NDArray[np.float64]) -> tuple[Image, Image]:
@@ -93,7 +94,7 @@ def reverse_error(renderer: Renderer, rate: npt.NDArray[np.float64], derivative:
     moved = mi.Float(dr.detach(dr.ravel(renderer.data.geometry.shape_positions(SHAPE))))
     dr.enable_grad(moved)
     image = copy.copy(renderer).render({SHAPE: moved})
-    dr.backward(dr.sum(image.array * mi.Float(weights.ravel())))
+    dr.backward(dr.sum(image.array * device_array(mi.Float, weights)))
     reverse = float(np.array(dr.grad(moved), np.float64) @ rate.ravel())
     terms = weights.astype(np.float64) * derivative
     return abs(reverse - float(terms.sum())) / max(float(np.abs(terms).sum()), 1e-300)

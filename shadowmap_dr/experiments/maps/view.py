@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
+from ...jit.arrays import device_array
 from ...jit.types import Float, TensorXf
 from ...rendering.renderer import Renderer
 from ...scene.lights.punctual import DirectionalLight
@@ -103,7 +104,7 @@ class View:
         if moved.shape:
             at = cast(Float, dr.ravel(renderer.data.geometry.shape_positions(moved.shape)))
             rate = np.broadcast_to(moved.rate, (dr.width(at) // 3, 3)).astype(np.float32)
-            image: TensorXf = renderer.render({moved.shape: at + mi.Float(rate.ravel()) * amount})
+            image: TensorXf = renderer.render({moved.shape: at + device_array(mi.Float, rate) * amount})
         else:
             x, y, z = (mi.Float(float(c)) for c in self.direction())
             cos, sin = dr.cos(amount), dr.sin(amount)

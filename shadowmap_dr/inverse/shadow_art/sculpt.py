@@ -88,7 +88,7 @@ class Sculptor:
         self._step_size, self._settings = step_size, dict(settings or {})
         # An array: a Python number would become a constant of the recorded step.
         self._consistency, self._smoothness = dr.opaque(mi.Float, consistency), smoothness
-        self._solver = _large_steps(mi.Float(self._start.ravel()), self._shadows.faces, smoothness)
+        self._solver = _large_steps(device_array(mi.Float, self._start), self._shadows.faces, smoothness)
         self._gradient, self._look = freeze(_gradient), freeze(_look)
         self.reset()
         if targets is None:
@@ -149,7 +149,7 @@ class Sculptor:
         start = self._start if vertices is None else real_array("vertices", vertices)
         if start.shape != self._start.shape or not np.isfinite(start).all():
             raise ShadowmapError(f"vertices of shape {start.shape}: give {self._start.shape} finite numbers.")
-        u = np.array(self._solver.to_differential(mi.Float(start.ravel())))
+        u = np.array(self._solver.to_differential(device_array(mi.Float, start)))
         self.load_state({"u": u, "m": np.zeros_like(u), "v": np.zeros_like(u), "t": np.zeros(1), "steps": np.zeros(1)})
 
     def calm(self) -> None:

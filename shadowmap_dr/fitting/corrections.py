@@ -59,14 +59,10 @@ class Corrections:
         """Correct the images so that they are Mitsuba's at the numbers x (n,). False if it cannot render them."""
         if self._known and np.array_equal(self._known[0][0], x):
             return True
-        objective = self._objective
-        changes = changes_of(objective.views[0].change(x), self._renderer)
-        cameras = [view.camera(x) for view in objective.views]
-        try:
-            images = self._reference.images(changes, cameras, [view.size for view in objective.views])
-        except (ShadowmapError, RuntimeError) as error:
-            self.failure = " ".join(str(error).split()).rstrip(".")
+        images = self._rendered(x)
+        if images is None:
             return False
+        objective = self._objective
         own = objective.images(x)
         differences = [passes - image for passes, image in zip(self._reference.passes, own, strict=True)]
         self._known = [(x.copy(), differences), *self._known[:_SECANTS]]
@@ -76,6 +72,32 @@ class Corrections:
             slopes = np.array([_change(here, other[number]) for _, other in self._known[1:]]).reshape(-1, *image.shape)
             objective.corrections[number] = AffineImage(image - plain, x.copy(), slopes, weights)
         return True
+
+    def derivatives(self, ends: Sequence[tuple[Array, Array]], numbers: Sequence[int]) -> list[Image] | None:
+        """Derivatives of Mitsuba's images by some numbers, as differences between the ends (n,), (n,) of a way for each.
+
+        For each view (n, H, W, 3); those by other numbers are zero. None if it cannot render one of the images.
+        """
+        objective = self._objective
+        found = [np.zeros((objective.count, view.size.height, view.size.width, 3), np.float32) for view in objective.views]
+        for k, (low, high) in zip(numbers, ends, strict=True):
+            below, above = (self._rendered(end, most_passes=1) for end in (low, high))
+            if below is None or above is None:
+                return None
+            for images, one, other in zip(found, below, above, strict=True):
+                images[k] = (other - one) / np.float32(high[k] - low[k])
+        return found
+
+    def _rendered(self, x: Array, most_passes: int | None = None) -> list[Image] | None:
+        """Mitsuba's images at the numbers x (n,). None if it cannot render them."""
+        views = self._objective.views
+        changes = changes_of(views[0].change(x), self._renderer)
+        cameras, sizes = [view.camera(x) for view in views], [view.size for view in views]
+        try:
+            return self._reference.images(changes, cameras, sizes, most_passes)
+        except (ShadowmapError, RuntimeError) as error:
+            self.failure = " ".join(str(error).split()).rstrip(".")
+            return None
 
     def keep(self, x: Array) -> None:
         """Keep the images' corrections at the numbers x (n,): those where they were rendered differ too little to matter."""

@@ -185,6 +185,10 @@ class Point:
             self._derivatives = self._columns = None
             self.is_exact = True
 
+    def replace_derivatives(self, images: list[Image]) -> None:
+        """Use other derivatives of the images by the scene's numbers: for each picture (n, H, W, 3), or more rows."""
+        self._derivatives, self._columns = [one[: self._owner.views[0].count] for one in images], None
+
     def derivatives(self) -> list[Image]:
         """Derivatives of the images, without their corrections, by the scene's numbers: for each picture (n, H, W, 3)."""
         if self._derivatives is None:

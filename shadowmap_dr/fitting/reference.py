@@ -52,32 +52,37 @@ class Reference:
         named = own is not None and own.class_name() in _INTEGRATORS
         self._integrator = own if named else mi.load_dict({"type": "direct"})
 
-    def images(self, changes: Changes, cameras: Sequence[Sensor], sizes: Sequence[ImageSize]) -> list[Image]:
+    def images(
+        self, changes: Changes, cameras: Sequence[Sensor], sizes: Sequence[ImageSize], most_passes: int | None = None
+    ) -> list[Image]:
         """Linear images (H, W, 3), detached.
 
         Args:
             changes: of the scene.
             cameras: one for each image, whose window is all of the film.
             sizes: of the images.
+            most_passes: passes of each image at most; None for four. Images of the same pass have the same random numbers.
 
         Raises:
             ShadowmapError: Mitsuba's objects cannot be changed so.
         """
         with dr.suspend_grad(), updated(self._data, changes) as scene:
-            each = zip(cameras, self._sizes, sizes, strict=True)
-            found = [self._passes(scene, camera, own, size, number) for number, (camera, own, size) in enumerate(each)]
+            each, most = zip(cameras, self._sizes, sizes, strict=True), most_passes or _PASSES
+            found = [self._passes(scene, camera, own, size, k, most) for k, (camera, own, size) in enumerate(each)]
         self.rendered = [np.asarray(np.mean(own, axis=0, dtype=np.float64), np.float32) for own in found]
         pairs = list(zip(found, sizes, strict=True))
         self.passes = [np.array([reduced(image, size) for image in passes]) for passes, size in pairs]
         return [reduced(image, size) for image, size in zip(self.rendered, sizes, strict=True)]
 
-    def _passes(self, scene: mi.Scene, camera: Sensor, own: tuple[int, int], size: ImageSize, number: int) -> list[Image]:
+    def _passes(
+        self, scene: mi.Scene, camera: Sensor, own: tuple[int, int], size: ImageSize, number: int, most: int
+    ) -> list[Image]:
         """Passes of an image, until their mean has little noise."""
         width, height = _film_size(own, size)
         sensor = _sensor(camera, width, height)
         spp = int(np.clip(_PASS // (width * height), 1, _MOST))
         passes: list[Image] = []
-        while len(passes) < _PASSES and _noise(passes) > _NOISE:
+        while len(passes) < most and _noise(passes) > _NOISE:
             rendered = mi.render(
                 scene, sensor=sensor, integrator=self._integrator, spp=spp, seed=_SEED + number * 256 + len(passes)
             )

@@ -30,6 +30,7 @@ from .options import FitOptions
 from .own_losses import OwnFunction, function_name
 from .parameters import Parameter
 from .places import best_places
+from .reference_steps import MOST_NUMBERS, reference_steps
 from .resolve import Resolver
 from .result import FitResult, Picture, Step
 from .scene_change import SceneChange
@@ -146,7 +147,7 @@ class Fit:
         if state is not None and resume and state.exists():
             self._state = State.read(state, fingerprint, self._sizes())
             self._began = time.perf_counter() - max((step["seconds"] for step in self.history), default=0.0)
-            self._set_values([mi.Float(own) for own in self._state.values])
+            self._set_values([device_array(mi.Float, own) for own in self._state.values])
         return self._all_steps(state, fingerprint)
 
     def _all_steps(self, state: Path | None, fingerprint: str) -> Iterator[Step]:
@@ -173,6 +174,7 @@ class Fit:
                 yield from self._correct(best, last=last)
             if attempt < tries - 1 and self._unexplained(self.best).is_small(largest_share(self.stages[-1].objective)):
                 break
+        yield from self._last_steps(self.best_run)
         for number in range(self._state.array_stage, len(self.stages) if self.arrays else 0):
             if number >= len(self.stages) - _ARRAY_STAGES:
                 yield from self._fit_arrays(self.best_run, number, self.stages[number])
@@ -244,6 +246,15 @@ class Fit:
                 break
         self._corrections.put(run.x)
         run.cost, run.corrected = self.stages[stage].objective.at(run.x).cost, True
+
+    def _last_steps(self, run: Run) -> Iterator[Step]:
+        """Steps of a corrected start by differences between Mitsuba's images, if few numbers vary."""
+        if self._corrections is None or not run.corrected or not 0 < self.stages[-1].objective.views[0].count <= MOST_NUMBERS:
+            return
+        limits = Limits(self._low, self._high, _LONGEST)
+        for better in reference_steps(self._corrections, self.stages[-1].objective, run.x, limits):
+            run.x, run.cost = better.x, better.cost
+            yield self._note(run, len(self.stages) - 1, better)
 
     def _try_places(self, run: Run) -> bool:
         """Set numbers that move few pixels, which the verdict does not see, to their best places. False if none is better."""

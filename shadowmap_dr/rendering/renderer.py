@@ -186,10 +186,12 @@ class Renderer:
         # The first fit is made here, so that a step which is recorded later always starts from one.
         return renderer.with_maps_for() if data.sensors else renderer
 
-    def with_maps_for(self, samples: int | None = None) -> Renderer:
+    def with_maps_for(self, samples: int | None = None, *, spp: int = 1) -> Renderer:
         """The same renderer with as many maps of each light as images of so many samples are worth, fitted to its first sensor.
 
-        None: images of the first sensor with a sample for each pixel.
+        Args:
+            samples: of an image; None for images of the first sensor with ``spp`` samples of a pixel.
+            spp: samples of a pixel.
         """
         data, plan = self.data, self.plan.undivided
         made = replace(self, plan=plan, slices=plan_slices(data, plan, self.soft, self.settings))
@@ -199,7 +201,7 @@ class Renderer:
             views = [cameras.view(camera, shapes, 1) for camera in sample_windows(data.sensors[0])]
             seen = cameras.seen(views, data.geometry)
             made.frusta, made.soft_frusta = made.light_pass.fit(shapes, seen)
-            samples = samples or sum(view.size.width * view.size.height for view in views)
+            samples = samples or spp * sum(view.size.width * view.size.height for view in views)
             plan = with_tiles(plan, data, self.settings, made.frusta, seen, samples)
             if plan.maps > made.plan.maps:
                 made.plan, made.slices = plan, plan_slices(data, plan, self.soft, self.settings)

@@ -195,6 +195,7 @@ def test_memory_bounds_the_maps() -> None:
     assert Renderer.from_scene(scene, light_memory=0.012).plan.tiles == (1,)
     whole = Renderer.from_scene(scene)
     assert whole.with_maps_for(64**2).plan.tiles == (1,) and whole.with_maps_for(1024**2).plan.maps > whole.plan.maps
+    assert whole.with_maps_for(spp=4).plan == whole.with_maps_for(1024**2).plan
     again = whole.with_maps_for(64**2).with_maps_for()
     assert again.plan.tiles == whole.plan.tiles and not again.slices
     assert np.array_equal(np.array(again.render()), np.array(Renderer.from_scene(scene).render()))

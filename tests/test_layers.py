@@ -36,7 +36,7 @@ MAY_IMPORT = {
     "importing": ("errors", "io"),
     "cameras": ("errors", "scene.pixel_filter", "scene.sensor"),
     "interactive": ("errors", "inverse", "io", "jit.types"),
-    "mitsuba_baselines": ("", "errors", "inverse", "io", "scene.mitsuba_meshes"),
+    "mitsuba_baselines": ("", "errors", "inverse", "io", "jit.arrays", "scene.mitsuba_meshes"),
     "experiments": (
         *(
             "",

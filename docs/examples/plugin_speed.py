@@ -1,4 +1,4 @@
-"""Time of a step through `mi.render`, through `mi.render` recorded, and with a recorded `Renderer`, in turns.
+"""Time of a step through `mi.render`, the same without recordings, with a recorded `Renderer`, and of Mitsuba's update, in turns.
 
     python docs/examples/plugin_speed.py [--scene pose] [--shape object] [--resolution 128] [--rounds 50]
 
@@ -74,7 +74,24 @@ class Frozen:
         return dr.detach(shift) - 1e-3 * gradient(image, shift)
 
 
-contenders = {"plug-in": Plugin(), "plug-in, recorded": Plugin(recorded=True), "renderer, recorded": Frozen()}
+class Update:
+    """What Mitsuba does when vertices change, without an image: the acceleration structure of its own ray tracing, normals."""
+
+    def __init__(self) -> None:
+        self.params = mi.traverse(scene)
+
+    def __call__(self) -> None:
+        self.params[key] = start + 0.01
+        self.params.update()
+        dr.eval(self.params[key])
+
+
+contenders = {
+    "plug-in": Plugin(),
+    "plug-in, recorded=False": Plugin(recorded=False),
+    "renderer, recorded": Frozen(),
+    "params.update() alone": Update(),
+}
 others = OtherWork()
 samples = alternate({name: Contender(call, options.rounds) for name, call in contenders.items()})
 for name, seconds in compare(samples)["seconds"].items():

@@ -31,6 +31,8 @@ _READ = (
     *sorted(VERTEX_PARAMETERS), "control_points", "to_world",
     "position", "intensity.value", "irradiance.value", "radiance.value", "cutoff_angle", "beam_width",
 )  # fmt: skip
+#: Those of lights that change neither visible surfaces nor shadow maps.
+COLOURS_OF_LIGHTS = ("intensity.value", "irradiance.value", "radiance.value")
 
 
 class DetachedInputs:
@@ -112,9 +114,11 @@ class DeferredImages:
         if self._state is None or not now.same(self._state):
             self._state, self._images = now, []
 
-    def welcomes(self, now: ParameterState, sensor: mi.Sensor) -> bool:
-        """True if an image of the current scene would depend on attached parameters through :class:`DetachedInputs` only."""
-        attached = (*now.attached, *ParameterState.of(sensor).attached)
+    def welcomes(self, attached: tuple[str, ...]) -> bool:
+        """True if an image would depend on the attached parameters through :class:`DetachedInputs` only.
+
+        ``attached``: names of the scene's and the sensor's.
+        """
         return bool(attached) and all(name.endswith(_READ) for name in attached)
 
     def add(self, sensor: mi.Sensor, spp: int, texels: int, image: TensorXf, inputs: DetachedInputs) -> None:

@@ -30,7 +30,9 @@ _FOREIGN = (
 
 
 # Types of values in ``mi.Properties`` that are not those of the defaults. They hold no sequences: names of channels are text.
-_KINDS: dict[str, type] = {"aovs": str, "shadow_map_resolution": int}
+_KINDS: dict[str, type] = {"aovs": str, "shadow_map_resolution": int, "recorded": bool}
+# Parameters that may be ``auto``, too.
+_AUTOMATIC = ("shadow_map_resolution", "recorded")
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,8 @@ class Options:
                            B-splines an eighth of it along each segment
     recorded               ``mi.render`` and its backward pass are recorded with ``dr.freeze`` and replayed while only numbers
                            change: up to twice as fast where passes are short, slower where they are long, since the backward
-                           pass renders again. Backward passes to materials and textures are not recorded
+                           pass renders again. Backward passes to materials and textures are not recorded. ``auto``: from the
+                           fifth step of a loop on, where images are small
     compat                 conventions of Worchel and Alexa's code
     """
 
@@ -95,7 +98,7 @@ class Options:
     max_depth: int = RenderSettings.max_depth
     aovs: tuple[str, ...] = RenderSettings.aovs
     tessellation: int = 64
-    recorded: bool = False
+    recorded: bool | str = AUTO
     compat: bool = ShadowSettings.compat
 
     def __post_init__(self) -> None:
@@ -109,7 +112,7 @@ class Options:
         foreign = []
         for name in props.keys():  # noqa: SIM118  (Properties is no dictionary)
             if name in defaults:
-                if name == "shadow_map_resolution" and props[name] == AUTO:
+                if name in _AUTOMATIC and props[name] == AUTO:
                     continue  # the default
                 values[name] = _typed(name, props[name], _KINDS.get(name) or type(defaults[name]))
             elif any(fnmatchcase(name, pattern) for pattern in _FOREIGN):

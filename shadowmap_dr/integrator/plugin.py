@@ -18,7 +18,7 @@ from ..jit.gpu import keep_registers
 from ..jit.types import Bool, Color3f, Float, TensorXf, UInt32
 from ..rendering.film.aovs import aov_names
 from ..rendering.film.film import put_into_film
-from ..rendering.settings import RenderSettings
+from ..rendering.settings import AUTO, RenderSettings
 from .deferred import DeferredImages, DetachedInputs, backward
 from .name import PLUGIN
 from .nesting import Nesting
@@ -51,13 +51,19 @@ class Shell:
         with dr.resume_grad():
             now = ParameterState.of(scene)
             record = self._record(scene, sensor, now)
-            if self._replays:
+            freezing = dr.flag(dr.JitFlag.FreezingScope)
+            if self.options.recorded is True and not freezing:
                 return record.replay(scene, sensor, spp or 1)
             waiting = record.waiting
             waiting.forget_older(now)
             # Mitsuba looks up mesh attributes through its own vertices, so the image would be attached to these, too.
-            alone = not record.renderer.data.with_attributes() and waiting.welcomes(now, sensor)
-            if alone and not dr.flag(dr.JitFlag.FreezingScope):
+            attached = (*now.attached, *ParameterState.of(sensor).attached)
+            alone = not record.renderer.data.with_attributes() and waiting.welcomes(attached)
+            if alone and not freezing and self.options.recorded == AUTO and record.is_steady(attached, sensor, spp or 1):
+                image = record.try_to_replay(scene, sensor, spp or 1)
+                if image is not None:
+                    return image
+            if alone and not freezing:
                 inputs = DetachedInputs()
                 image = record.render(scene, sensor, spp or 1, now, inputs)
                 if dr.grad_enabled(image):
@@ -72,12 +78,16 @@ class Shell:
         with dr.resume_grad():
             now = ParameterState.of(scene)
             record = self._record(scene, sensor, now)
-            if self._replays and record.replay_backward(scene, sensor, spp or 1, gradient):
-                return
             pending = record.waiting.take(now, sensor, spp or 1)
             if pending is not None:
                 pending.backward(gradient, record.data(scene, sensor))
                 return
+            attached = (*now.attached, *ParameterState.of(sensor).attached)
+            recorded = self.options.recorded
+            replays = recorded is True or recorded == AUTO and record.was_replayed(attached, sensor, spp or 1)
+            if replays and not dr.flag(dr.JitFlag.FreezingScope):
+                if record.replay_backward(scene, sensor, spp or 1, gradient, attached):
+                    return
             image = record.render(scene, sensor, spp or 1, now)
             if dr.grad_enabled(image):
                 backward(image, gradient)
@@ -88,10 +98,6 @@ class Shell:
         with dr.resume_grad():
             now = ParameterState.of(scene)
         return self._record(scene, sensor, now).render(scene, sensor, spp or 1, now)
-
-    @property
-    def _replays(self) -> bool:
-        return self.options.recorded and not dr.flag(dr.JitFlag.FreezingScope)
 
     def channel_names(self) -> list[str]:
         """Names of the AOV channels, in order; those of ``visibility`` follow the lights of the scene rendered last."""

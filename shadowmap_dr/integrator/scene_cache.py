@@ -24,14 +24,17 @@ from ..scene.sensor import lenses_of, sensors_of
 from ..scene.unsupported import warn_of
 from ..scene.untracked import UntrackedValues
 from ..shadow import Frusta
-from .deferred import TEXELS, DeferredImages, DetachedInputs
+from .deferred import COLOURS_OF_LIGHTS, TEXELS, DeferredImages, DetachedInputs
 from .parameter_state import ParameterState
 from .pass_caches import PassCaches, names_by_level
 from .recording import FrozenPasses, plain
+from .steady_steps import SteadySteps
 
 # Sensors whose fit of the shadow maps is remembered, and how many of them may be foreign to the scene. Some programs make a new
 # sensor for each image; remembered sensors are kept alive, and recordings hold only for a fixed number of objects.
 _REMEMBERED_SENSORS, _OTHERS = 64, 8
+# Samples of an image up to which replays are faster: the backward pass renders again.
+_LARGEST = 512 * 512
 
 
 @dataclass
@@ -53,6 +56,7 @@ class SceneCache:
     mirrors   watch over mirrored shapes
     checked   vertices that were found to be finite
     warned    whether the user was warned of parameters that frozen functions do not see
+    steady    steps of loops, for the option ``recorded="auto"``
     untracked  state that recordings do not see; ``untracked_then``: its values when they were made
     colours   watch over the mesh colours for which the renderer's creases were found
     passes    caches of passes for its sensors
@@ -68,6 +72,7 @@ class SceneCache:
     waiting: DeferredImages = field(default_factory=DeferredImages)
     recorded: FrozenPasses = field(default_factory=FrozenPasses)
     recordable: dict[tuple[str, ...], bool] = field(default_factory=dict)
+    steady: SteadySteps = field(default_factory=SteadySteps)
     untracked: UntrackedValues = field(default_factory=lambda: UntrackedValues(()))
     untracked_then: tuple[object, ...] = ()
     colours: ParameterWatch | None = None
@@ -159,6 +164,34 @@ class SceneCache:
         weight = samples + self.renderer.texels // TEXELS
         return self.passes.cache_for(now, camera, sensor, spp, weight, partial(names_by_level, scene, self.renderer.data))
 
+    def is_steady(self, attached: tuple[str, ...], sensor: mi.Sensor, spp: int) -> bool:
+        """True if the next image is a step of a loop that is worth a recording. Call once for each image.
+
+        ``attached``: names of the attached parameters of the scene and the sensor. Gradients flow only through data read from the
+        scene.
+        """
+        samples = int(np.prod(sensor.film().crop_size())) * spp
+        if all(name.endswith(COLOURS_OF_LIGHTS) for name in attached):
+            return False  # surfaces and maps of the last step serve again, which a recording would render
+        if samples > _LARGEST or not dr.flag(dr.JitFlag.KernelFreezing) or dr.flag(dr.JitFlag.Debug):
+            return False
+        values = self.untracked.now()
+        if values != self.steady.values:
+            self.steady = SteadySteps(values)
+        return self.steady.note(_kind(attached, sensor, spp), self.recorded.recordings)
+
+    def was_replayed(self, attached: tuple[str, ...], sensor: mi.Sensor, spp: int) -> bool:
+        """True if the last image of this kind was replayed."""
+        return self.steady.is_replayed(_kind(attached, sensor, spp))
+
+    def try_to_replay(self, scene: mi.Scene, sensor: mi.Sensor, spp: int) -> TensorXf | None:
+        """The same as :meth:`replay`; None, from now on, if the scene cannot be recorded."""
+        try:
+            return self.replay(scene, sensor, spp)
+        except RuntimeError:
+            self.steady.refuse()
+            return None
+
     def replay(self, scene: mi.Scene, sensor: mi.Sensor, spp: int) -> TensorXf:
         """The same image, detached, replayed from a recording that the first call makes."""
         self._forget_stale_recordings()
@@ -169,14 +202,15 @@ class SceneCache:
         self._remember(scene, sensor, frusta, soft_frusta)
         return image
 
-    def replay_backward(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, gradient: TensorXf) -> bool:
+    def replay_backward(
+        self, scene: mi.Scene, sensor: mi.Sensor, spp: int, gradient: TensorXf, attached: tuple[str, ...]
+    ) -> bool:
         """Add the gradients of <image, gradient> to the scene's parameters, through a recording, too.
 
         Does nothing and returns False if gradients also flow through materials, textures or the radiance of extended lights,
-        which Mitsuba itself evaluates.
+        which Mitsuba itself evaluates. ``attached``: names of the attached parameters of the scene and the sensor.
         """
         current = self._current(scene, sensor)
-        attached = (*ParameterState.of(scene).attached, *ParameterState.of(sensor).attached)
         if attached not in self.recordable:
             self.recordable[attached] = not dr.grad_enabled(plain(current).render(spp=spp))
         if self.recordable[attached]:
@@ -244,6 +278,11 @@ class SceneCache:
             if not strange or room >= 0:
                 kept.append(fit)
         self.fits = kept[:_REMEMBERED_SENSORS]
+
+
+def _kind(attached: tuple[str, ...], sensor: mi.Sensor, spp: int) -> tuple[object, ...]:
+    """Steps of a kind have the same passes."""
+    return attached, id(sensor), tuple(sensor.film().crop_size()), spp
 
 
 def _parts(scene: mi.Scene, data: SceneData) -> tuple[mi.Object, ...]:

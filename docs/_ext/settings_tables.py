@@ -73,6 +73,8 @@ def _accepted(option: Field[object]) -> str:
     """Values that the records accept for a parameter while all others have their defaults, found by trying."""
     if option.name == "aovs":
         return "[channels](channels.md)"
+    if option.name == "recorded":
+        return f"{code(AUTO)}, `true`, `false`"
     if isinstance(option.default, bool):
         return "`true`, `false`"
     if option.name == "shadow_map_resolution":

@@ -75,7 +75,7 @@ class Frozen:
 
 
 class Update:
-    """What Mitsuba does when vertices change, without an image: the acceleration structure of its own ray tracing, normals."""
+    """Mitsuba's own work when vertices change, without an image: the acceleration structure of its rays, normals."""
 
     def __init__(self) -> None:
         self.params = mi.traverse(scene)

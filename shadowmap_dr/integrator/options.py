@@ -103,6 +103,8 @@ class Options:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "aovs", split_aovs(self.aovs))
+        if self.recorded is not True and self.recorded is not False and self.recorded != AUTO:
+            raise ShadowmapError(f"recorded is {self.recorded!r}: give True, False or '{AUTO}'.")
 
     @classmethod
     def from_properties(cls, props: mi.Properties) -> Options:

@@ -160,6 +160,7 @@ def test_ranges_are_those_that_the_records_accept(extensions: None) -> None:
     assert accepted["shadow_order"] == "even, 2 to 16" and accepted["shadow_filter_size"] == "0; odd, 1 to 121"
     assert accepted["shadow_bleeding"] == "0 to below 1" and accepted["tessellation"] == "3 or more"
     assert accepted["shadow_map_resolution"] == "`auto`; 9 to 4096" and accepted["shadow_tiles"] == "0 to 16"
+    assert accepted["recorded"] == "`auto`, `true`, `false`"
     assert accepted["emitter_shadows"] == "`samples`, `single`" and accepted["light_memory"] == "above 0"
 
 

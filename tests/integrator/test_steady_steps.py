@@ -12,7 +12,9 @@ import pytest
 from integrator_scenes import camera, full_scene, shadowmap, small_scene
 from lit_scenes import lit_scene
 
+from shadowmap_dr import ShadowmapError
 from shadowmap_dr.integrator import scene_cache
+from shadowmap_dr.integrator.options import Options
 from shadowmap_dr.integrator.steady_steps import _FIRST, _RECORDINGS, _REPLAYS, SteadySteps
 from shadowmap_dr.jit.gc import gc_quiet
 from shadowmap_dr.rendering.renderer import Renderer
@@ -183,3 +185,12 @@ def test_recordings_that_are_not_replayed_end(made: Callable[[int], int], last: 
         replays += steps.note("a", made(replays))
     assert steps.note("a", made(replays)) == last
     assert last or _RECORDINGS <= replays <= 2 * _RECORDINGS
+
+
+@pytest.mark.parametrize("value", ["yes", 2])
+def test_other_values_are_named(variant: str, value: Any) -> None:
+    with pytest.raises(ShadowmapError, match="recorded"):
+        Options(recorded=value)
+    with pytest.raises(RuntimeError, match="'recorded' of 'shadowmap'"):  # Mitsuba's, around ours
+        shadowmap(recorded=value)
+    assert shadowmap(recorded="auto").shell.options.recorded == shadowmap().shell.options.recorded == "auto"

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from shadowmap_dr.errors import ShadowmapError, did_you_mean
 from shadowmap_dr.inverse.pose import apply_pose
-from shadowmap_dr.jit.arrays import device_array
+from shadowmap_dr.jit.arrays import device_array, device_tensor
 from shadowmap_dr.scene.mitsuba_meshes import positions_in, set_positions
 
 from .proxy import Proxy, calibrate, with_proxy
@@ -120,7 +120,7 @@ class MitsubaPose:
         self._scene = with_proxy(scene, self.proxy)
         self._params = mi.traverse(self._scene)
         self._sensor = self._scene.sensors()[0]
-        self._reference = mi.TensorXf(image)
+        self._reference = device_tensor(mi.TensorXf, image)
         self._integrator = mi.load_dict(
             {
                 "type": "direct_projective",

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import ShadowmapError
+from ..jit.arrays import device_tensor
 from ..jit.types import TensorXf
 from .comparison import Observation
 
@@ -87,9 +88,9 @@ class _OwnFunction:
 
     def _attached(self, image: Image, picture: Image) -> tuple[TensorXf, TensorXf]:
         """(image, attached, and the function's value)."""
-        given = mi.TensorXf(self._masked(image))
+        given = device_tensor(mi.TensorXf, self._masked(image))
         dr.enable_grad(given)
-        found = self._value(given, mi.TensorXf(picture))
+        found = self._value(given, device_tensor(mi.TensorXf, picture))
         if not dr.grad_enabled(found):
             raise ShadowmapError(
                 f"{self.name}: its result has no derivative by the image: it may detach the image, or take a way through "
@@ -100,12 +101,12 @@ class _OwnFunction:
     def _plain(self, image: Image, picture: Image) -> Image:
         """The function's value as an array of NumPy's."""
         with dr.suspend_grad():
-            return self._value(mi.TensorXf(self._masked(image)), mi.TensorXf(picture)).numpy()
+            return self._value(device_tensor(mi.TensorXf, self._masked(image)), device_tensor(mi.TensorXf, picture)).numpy()
 
     def _pulled(self, image: Image, adjoint: Image) -> Image:
         """Gradient by the image, from that by the function's value."""
         given, found = self._attached(image, self._picture)
-        dr.set_grad(found, mi.TensorXf(adjoint.reshape(found.shape)))
+        dr.set_grad(found, device_tensor(mi.TensorXf, adjoint.reshape(found.shape)))
         dr.enqueue(dr.ADMode.Backward, found)
         dr.traverse(dr.ADMode.Backward)
         gradient = dr.grad(given).numpy()
@@ -200,7 +201,7 @@ class OwnResiduals(_OwnFunction):
 
     def _pushed(self, image: Image, change: Image) -> Image:
         given, found = self._attached(image, self._picture)
-        dr.set_grad(given, mi.TensorXf(self._masked(change)))
+        dr.set_grad(given, device_tensor(mi.TensorXf, self._masked(change)))
         dr.enqueue(dr.ADMode.Forward, given)
         dr.traverse(dr.ADMode.Forward)
         derivative = self._shaped(dr.grad(found).numpy())

@@ -144,7 +144,7 @@ def _like(old: Any, value: Array) -> Any:  # Any: an array type of Mitsuba's
     if dr.depth_v(old) > 1:
         numbers = np.broadcast_to(value.ravel(), (len(old),)).tolist()
         return type(old)(*numbers)
-    return type(old)(np.broadcast_to(value.ravel(), (max(dr.width(old), value.size),)))
+    return type(old)(np.broadcast_to(value.ravel(), (max(dr.width(old), value.size),)).tolist())
 
 
 def _flat(old: Any, rows: Array) -> Any:  # Any: a Float or a TensorXf

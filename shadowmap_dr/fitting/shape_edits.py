@@ -10,6 +10,7 @@ import numpy as np
 
 from ..errors import ShadowmapError
 from ..io.meshes import write_ply
+from ..jit.arrays import device_array
 from ..scene.mitsuba_meshes import VERTEX_PARAMETERS, mesh_buffers, positions_in, set_positions
 from .changes import Array
 from .parsed_scene import ParsedScene
@@ -110,11 +111,11 @@ class MeshStep(Step):
         before = {name: type(table[name])(table[name]) for name in self.attributes}
         positions = mi.Float(positions_in(table))
         try:
-            set_positions(table, mi.Float(vertices.ravel()))
+            set_positions(table, device_array(mi.Float, vertices))
             for name, values in self.attributes.items():
                 if len(values) != np.size(table[name]):
                     raise Unwritable(f"{name} has {len(values)} numbers instead of {np.size(table[name])}")
-                table[name] = type(table[name])(mi.Float(values))
+                table[name] = type(table[name])(device_array(mi.Float, values))
             table.update()
             self.normals = np.array(mesh_buffers(self.shape).normals)
             write_ply(path, self.shape)
@@ -129,7 +130,7 @@ class MeshStep(Step):
         old = mesh_buffers(self.shape)
         mesh = mi.Mesh(self.name, len(vertices), len(old.faces) // 3, has_vertex_texcoords=bool(len(old.texcoords)))
         table = mi.traverse(mesh)
-        set_positions(table, mi.Float(vertices.ravel()))
+        set_positions(table, device_array(mi.Float, vertices))
         table["faces"] = old.faces
         if len(old.texcoords):
             table["vertex_texcoords"] = old.texcoords

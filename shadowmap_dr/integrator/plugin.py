@@ -83,10 +83,9 @@ class Shell:
                 pending.backward(gradient, record.data(scene, sensor))
                 return
             attached = (*now.attached, *ParameterState.of(sensor).attached)
-            recorded = self.options.recorded
-            replays = recorded is True or recorded == AUTO and record.was_replayed(attached, sensor, spp or 1)
-            if replays and not dr.flag(dr.JitFlag.FreezingScope):
-                if record.replay_backward(scene, sensor, spp or 1, gradient, attached):
+            if self.options.recorded and not dr.flag(dr.JitFlag.FreezingScope):
+                replay = record.replay_backward if self.options.recorded is True else record.try_to_replay_backward
+                if replay(scene, sensor, spp or 1, gradient, attached):
                     return
             image = record.render(scene, sensor, spp or 1, now)
             if dr.grad_enabled(image):

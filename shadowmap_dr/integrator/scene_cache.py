@@ -180,10 +180,6 @@ class SceneCache:
             self.steady = SteadySteps(values)
         return self.steady.note(_kind(attached, sensor, spp), self.recorded.recordings)
 
-    def was_replayed(self, attached: tuple[str, ...], sensor: mi.Sensor, spp: int) -> bool:
-        """True if the last image of this kind was replayed."""
-        return self.steady.is_replayed(_kind(attached, sensor, spp))
-
     def try_to_replay(self, scene: mi.Scene, sensor: mi.Sensor, spp: int) -> TensorXf | None:
         """The same as :meth:`replay`; None, from now on, if the scene cannot be recorded."""
         try:
@@ -217,6 +213,18 @@ class SceneCache:
             self._forget_stale_recordings()
             self.recorded.backward(spp, gradient, current)
         return self.recordable[attached]
+
+    def try_to_replay_backward(
+        self, scene: mi.Scene, sensor: mi.Sensor, spp: int, gradient: TensorXf, attached: tuple[str, ...]
+    ) -> bool:
+        """The same as :meth:`replay_backward` if the last image of this kind was replayed. False if it cannot be recorded."""
+        if not self.steady.is_replayed(_kind(attached, sensor, spp)):
+            return False
+        try:
+            return self.replay_backward(scene, sensor, spp, gradient, attached)
+        except RuntimeError:
+            self.steady.refuse()
+            return False
 
     def _name_constants_of_recordings(self) -> None:
         """Warn, once, of parameters that the user's frozen function takes for constants, since Dr.Jit does not see them."""

@@ -17,7 +17,7 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
-from .types import AnyArray, ArrayT, Bool, Float, UInt32
+from .types import AnyArray, ArrayT, Bool, Float, TensorXf, UInt32
 
 _DTYPES = {dr.VarType.Float32: np.float32, dr.VarType.UInt32: np.uint32, dr.VarType.Bool: np.bool_}
 
@@ -34,6 +34,12 @@ def device_array(kind: type[ArrayT], values: npt.ArrayLike) -> ArrayT:
     dr.eval(array)
     dr.sync_thread()  # Dr.Jit may read it later
     return array
+
+
+def device_tensor(kind: type[TensorXf], values: npt.ArrayLike) -> TensorXf:
+    """As :func:`device_array`, a tensor with the shape of ``values``."""
+    host = np.asarray(values, np.float32)
+    return kind(device_array(dr.array_t(kind), host), host.shape)
 
 
 def own_memory(array: ArrayT) -> ArrayT:

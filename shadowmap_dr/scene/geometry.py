@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import ShadowmapError
-from ..jit.arrays import backend, device_array, ravel, replace_grad
+from ..jit.arrays import backend, device_array, device_tensor, ravel, replace_grad
 from ..jit.broadcast import copy_of_lane, in_copies
 from ..jit.pytree import StaticTuple
 from ..jit.types import AnyArray, Bool, Float, Matrix4f, Point3f, UInt32, Vector3f, Vector3u
@@ -376,8 +376,7 @@ def _checked_positions(name: str, value: AnyArray | npt.ArrayLike, count: int) -
     array: Any = value  # Any: Dr.Jit's predicates narrow no types
     if not dr.is_array_v(value):
         try:
-            numbers = np.asarray(value, np.float32)
-            array = mi.TensorXf(device_array(mi.Float, numbers), numbers.shape)  # Dr.Jit itself hangs on a string
+            array = device_tensor(mi.TensorXf, np.asarray(value, np.float32))  # Dr.Jit itself hangs on a string
         except (TypeError, ValueError) as error:
             raise ShadowmapError(f"Positions of shape '{name}' are {value!r:.60}: give an array of {count} points.") from error
     if dr.is_tensor_v(array):

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from integrator_scenes import camera, full_scene, shadowmap, small_scene
+from integrator_scenes import camera, full_scene, recordings, shadowmap, small_scene, weighted_step
 from lit_scenes import lit_scene
 from unaligned import unaligned
 
@@ -27,27 +27,6 @@ def both(**options: Any) -> tuple[Any, Any]:
     return shadowmap(**options), shadowmap(recorded=True, **options)
 
 
-def recordings(integrator: Any) -> int:
-    return sum(record.recorded.recordings for record in integrator.shell.scenes)
-
-
-def step(scene: Any, integrator: Any, key: str, value: Any, **arguments: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Image with a new value of a parameter, and the gradients of a weighted sum of it."""
-    params = mi.traverse(scene)
-    value = type(value)(value)
-    dr.enable_grad(value)
-    params[key] = value
-    params.update()
-    image = mi.render(scene, params, integrator=integrator, **arguments)
-    weight = np.random.default_rng(1).uniform(0, 1, image.shape).astype(np.float32)
-    dr.backward(dr.sum(image * mi.TensorXf(weight), axis=None))
-    return image.numpy(), np.concatenate([np.ravel(dr.grad(part).numpy()) for part in _arrays(value)])
-
-
-def _arrays(value: Any) -> list[Any]:
-    return [value.matrix] if isinstance(value, mi.Transform4f) else [value]
-
-
 def assert_same(plain: tuple[np.ndarray, np.ndarray], replayed: tuple[np.ndarray, np.ndarray]) -> None:
     np.testing.assert_allclose(replayed[0], plain[0], atol=1e-5)
     assert np.abs(plain[1]).max() > 1e-3
@@ -62,12 +41,12 @@ def test_steps_are_replayed(variant: str, monkeypatch: pytest.MonkeyPatch) -> No
     with gc_quiet():  # other tests' scenes, freed meanwhile, would make it record anew
         for by in (0.0, 0.02, 0.1, -0.3, 0.2, -0.1):
             for sensor in (0, 1):
-                assert_same(*(step(scene, one, VERTICES, vertices + by, sensor=sensor) for one in (plain, recorded)))
+                assert_same(*(weighted_step(scene, one, VERTICES, vertices + by, sensor=sensor) for one in (plain, recorded)))
             counts.append(recordings(recorded))
         # The second camera is the first one with other numbers. At first Mitsuba's own arrays, and fits, still change their kind.
         assert 2 <= counts[0] <= 4 and counts[3] <= 8 and counts[3:] == 3 * counts[3:4]
         monkeypatch.setattr(Renderer, "render", lambda self, **options: pytest.fail("not replayed"))
-        step(scene, recorded, VERTICES, vertices + 0.05)
+        weighted_step(scene, recorded, VERTICES, vertices + 0.05)
 
 
 def test_views_in_one_call(variant: str) -> None:
@@ -147,7 +126,7 @@ def test_lights_and_cameras_have_gradients(variant: str, kind: str, key: str) ->
             new = value @ mi.Transform4f().translate([by, 0, by])
         else:
             new = type(value)(value + by)
-        assert_same(*(step(scene, integrator, key, new) for integrator in (plain, recorded)))
+        assert_same(*(weighted_step(scene, integrator, key, new) for integrator in (plain, recorded)))
 
 
 def test_materials_may_change_and_have_gradients(variant: str) -> None:
@@ -160,14 +139,14 @@ def test_materials_may_change_and_have_gradients(variant: str) -> None:
     for value in (0.2, 0.7):
         params[texture] = dr.full(mi.TensorXf, value, (4, 4, 3))
         params.update()
-        expected, found = (step(scene, integrator, VERTICES, vertices) for integrator in (plain, recorded))
+        expected, found = (weighted_step(scene, integrator, VERTICES, vertices) for integrator in (plain, recorded))
         assert_same(expected, found)
         images.append(found[0])
     assert np.abs(images[1] - images[0]).max() > 0.1
     # The backward pass to what Mitsuba evaluates itself is not recorded.
     new = mi.TensorXf(np.random.default_rng(2).uniform(0.2, 0.8, (4, 4, 3)).astype(np.float32))
     params[VERTICES] = vertices
-    assert_same(*(step(scene, integrator, texture, new) for integrator in (plain, recorded)))
+    assert_same(*(weighted_step(scene, integrator, texture, new) for integrator in (plain, recorded)))
 
 
 @pytest.mark.parametrize("case", ["principled metallic", "principled clearcoat", "principledthin diff_trans"])
@@ -183,7 +162,7 @@ def test_lobes_that_are_switched_on(variant: str, case: str) -> None:
     vertices = mi.Float(dr.detach(params[VERTICES]))
 
     def compare() -> np.ndarray:
-        expected, found = (step(scene, integrator, VERTICES, vertices) for integrator in (plain, recorded))
+        expected, found = (weighted_step(scene, integrator, VERTICES, vertices) for integrator in (plain, recorded))
         assert_same(expected, found)
         return found[0]
 
@@ -208,11 +187,11 @@ def test_other_sizes_are_recorded_anew(variant: str) -> None:
     vertices = mi.Float(dr.detach(mi.traverse(scene)[VERTICES]))
     film = mi.traverse(scene)["camera.film.size"]
     for arguments in ({"spp": 1}, {"spp": 4}, {"spp": 1}):
-        assert_same(*(step(scene, integrator, VERTICES, vertices, **arguments) for integrator in (plain, recorded)))
+        assert_same(*(weighted_step(scene, integrator, VERTICES, vertices, **arguments) for integrator in (plain, recorded)))
     params = mi.traverse(scene)
     params["camera.film.size"] = film // 2
     params.update()
-    expected, found = (step(scene, integrator, VERTICES, vertices) for integrator in (plain, recorded))
+    expected, found = (weighted_step(scene, integrator, VERTICES, vertices) for integrator in (plain, recorded))
     assert found[0].shape == (32, 32, 3)
     assert_same(expected, found)
 
@@ -237,7 +216,7 @@ def test_other_scenes_come_and_go(variant: str) -> None:
     scene, others = small_scene(), [full_scene() for _ in range(2)]
     vertices = mi.Float(dr.detach(mi.traverse(scene)[VERTICES]))
     for by in (0.0, 0.1, 0.2, 0.3):
-        assert_same(*(step(scene, integrator, VERTICES, vertices + by) for integrator in (plain, recorded)))
+        assert_same(*(weighted_step(scene, integrator, VERTICES, vertices + by) for integrator in (plain, recorded)))
         if by == 0.1:
             others += [full_scene()]
         elif others:

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from integrator_scenes import camera, full_scene, shadowmap, small_scene
+from integrator_scenes import camera, full_scene, recordings, shadowmap, small_scene, weighted_step
 from lit_scenes import lit_scene
 
 from shadowmap_dr import ShadowmapError
@@ -23,27 +23,9 @@ VERTICES = "ball.vertex_positions"
 FEW = {"area_light_samples": 4, "environment_light_samples": 8}
 
 
-def recordings(integrator: Any) -> int:
-    return sum(record.recorded.recordings for record in integrator.shell.scenes)
-
-
-def step(scene: Any, integrator: Any, key: str, value: Any, **arguments: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Image with a new value of a parameter, and the gradients of a weighted sum of it."""
-    params = mi.traverse(scene)
-    value = type(value)(value)
-    dr.enable_grad(value)
-    params[key] = value
-    params.update()
-    image = mi.render(scene, params, integrator=integrator, **arguments)
-    weight = np.random.default_rng(1).uniform(0, 1, image.shape).astype(np.float32)
-    dr.backward(dr.sum(image * mi.TensorXf(weight), axis=None))
-    gradient = value.matrix if isinstance(value, mi.Transform4f) else value
-    return image.numpy(), np.ravel(dr.grad(gradient).numpy())
-
-
 def assert_same(scene: Any, integrators: tuple[Any, Any], key: str, value: Any, **arguments: Any) -> np.ndarray:
     """A step is the same with two integrators. Returns the image."""
-    (image, gradient), (found, derivative) = (step(scene, one, key, value, **arguments) for one in integrators)
+    (image, gradient), (found, derivative) = (weighted_step(scene, one, key, value, **arguments) for one in integrators)
     np.testing.assert_allclose(found, image, atol=1e-5)
     assert np.abs(gradient).max() > 1e-3
     np.testing.assert_allclose(derivative, gradient, atol=2e-4 * np.abs(gradient).max())
@@ -80,7 +62,7 @@ def test_steps_are_the_same(variant: str, monkeypatch: pytest.MonkeyPatch, kind:
             assert_same(scene, integrators, key, new)
             assert (recordings(integrators[1]) > 0) == (k >= _FIRST)
         monkeypatch.setattr(Renderer, "render", lambda self, **options: pytest.fail("not replayed"))
-        step(scene, integrators[1], key, new)
+        weighted_step(scene, integrators[1], key, new)
 
 
 def test_views_in_turns(variant: str) -> None:
@@ -154,16 +136,17 @@ def test_large_images_are_not_recorded(variant: str, monkeypatch: pytest.MonkeyP
     assert not recordings(integrators[1])
 
 
-def test_scenes_that_cannot_be_recorded_are_rendered(variant: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("which", ["image", "backward"])
+def test_scenes_that_cannot_be_recorded_are_rendered(variant: str, monkeypatch: pytest.MonkeyPatch, which: str) -> None:
+    calls: list[int] = []
+
     def fails(*_: object) -> None:
+        calls.append(1)
         raise RuntimeError("cannot be recorded")
 
     scene, integrators = small_scene(), both()
     vertices = mi.Float(dr.detach(mi.traverse(scene)[VERTICES]))
-    calls: list[int] = []
-    attempt = scene_cache.SceneCache.try_to_replay
-    monkeypatch.setattr(scene_cache.FrozenPasses, "image", fails)
-    monkeypatch.setattr(scene_cache.SceneCache, "try_to_replay", lambda *given: calls.append(1) or attempt(*given))
+    monkeypatch.setattr(scene_cache.FrozenPasses, which, fails)
     for k in range(_FIRST + 3):
         assert_same(scene, integrators, VERTICES, vertices + 0.01 * k)
     assert len(calls) == 1

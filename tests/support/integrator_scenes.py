@@ -100,3 +100,24 @@ def image_and_derivative(
     image = renderer.render(vertex_positions={name: moved})
     dr.forward(x)
     return np.array(image), np.array(dr.grad(image))
+
+
+def recordings(integrator: Any) -> int:
+    return sum(record.recorded.recordings for record in integrator.shell.scenes)
+
+
+def weighted_step(scene: Any, integrator: Any, key: str, value: Any, **arguments: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Image with a new value of a parameter, and the gradients of a weighted sum of it."""
+    params = mi.traverse(scene)
+    value = type(value)(value)
+    dr.enable_grad(value)
+    params[key] = value
+    params.update()
+    image = mi.render(scene, params, integrator=integrator, **arguments)
+    weight = np.random.default_rng(1).uniform(0, 1, image.shape).astype(np.float32)
+    dr.backward(dr.sum(image * mi.TensorXf(weight), axis=None))
+    return image.numpy(), np.concatenate([np.ravel(dr.grad(part).numpy()) for part in _arrays(value)])
+
+
+def _arrays(value: Any) -> list[Any]:
+    return [value.matrix] if isinstance(value, mi.Transform4f) else [value]

@@ -198,7 +198,7 @@ def pytorch(integrator: dict[str, Any], size: int) -> Iterator[float]:
         with torch.no_grad():
             colour.clamp_(0, 1)
         step += 1
-        yield _error(mi.Float(colour.detach().cpu().numpy()), _TRUE_FLOOR)
+        yield _error(mi.Float(colour.tolist()), _TRUE_FLOOR)
 
 
 def moved_light(integrator: dict[str, Any], size: int) -> Iterator[float]:

@@ -18,6 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...errors import ShadowmapError, did_you_mean
+from ...jit.arrays import device_tensor
 from ...jit.frozen import freeze
 from ...jit.types import Float, TensorXf
 from ...rendering.renderer import Renderer
@@ -117,7 +118,7 @@ def _reverse(case: Sum, size: int, spp: int, mode: str) -> float:
     scene, change = _changed(case, size)
     integrator = mi.load_dict({"type": "shadowmap", "recorded": mode == "recorded"})
     mi.render(scene, integrator=integrator, spp=spp)
-    integrator.render_backward(scene, params=change, grad_in=mi.TensorXf(_weights(case, size)), spp=spp)
+    integrator.render_backward(scene, params=change, grad_in=device_tensor(mi.TensorXf, _weights(case, size)), spp=spp)
     return float(dr.grad(change)[0])
 
 
@@ -135,7 +136,7 @@ _OF_RENDERERS = ("irradiance.value", "intensity.value", "position", "vertex_posi
 def _of_renderer(case: Sum, size: int, spp: int, frozen: bool) -> float:
     """Reverse mode through a renderer, whose lights and vertices are arguments."""
     scene, _ = _changed(case, size)
-    renderer, weights = Renderer.from_scene(scene), mi.TensorXf(_weights(case, size))
+    renderer, weights = Renderer.from_scene(scene), device_tensor(mi.TensorXf, _weights(case, size))
     name, _, field = case.parameter.removesuffix(".value").partition(".")
 
     def step(change: Float, weights: TensorXf, renderer: Renderer) -> Float:

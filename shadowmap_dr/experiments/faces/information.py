@@ -35,7 +35,7 @@ def image_derivatives(fit: MorphFit, parameters: npt.ArrayLike) -> FloatArray:
     at = np.asarray(parameters, np.float32).reshape(-1)
     columns = []
     for k in range(fit.count):
-        values = mi.Float(at)
+        values = device_array(mi.Float, at)
         dr.enable_grad(values)
         dr.set_grad(values, device_array(mi.Float, np.eye(len(at))[k]))
         columns.append(np.array(dr.forward_to(fit.image(values)), dtype=np.float64))

@@ -24,7 +24,7 @@ from .name import PLUGIN
 from .nesting import Nesting
 from .options import Options
 from .parameter_state import ParameterState
-from .scene_cache import SceneCache, same_objects
+from .scene_cache import SceneCache, SceneState, same_objects
 
 # Scenes whose state one integrator keeps; each holds the scene's shapes in memory.
 _REMEMBERED_SCENES = 4
@@ -53,14 +53,14 @@ class Shell:
             record = self._record(scene, sensor, now)
             freezing = dr.flag(dr.JitFlag.FreezingScope)
             if self.options.recorded is True and not freezing:
-                return record.replay(scene, sensor, spp or 1)
+                return record.replay(scene, sensor, spp or 1, SceneState(now, ParameterState.of(sensor)))
             waiting = record.waiting
             waiting.forget_older(now)
             # Mitsuba looks up mesh attributes through its own vertices, so the image would be attached to these, too.
-            attached = (*now.attached, *ParameterState.of(sensor).attached)
-            alone = not record.renderer.data.with_attributes() and waiting.welcomes(attached)
-            if alone and not freezing and self.options.recorded == AUTO and record.is_steady(attached, sensor, spp or 1):
-                image = record.try_to_replay(scene, sensor, spp or 1)
+            state = SceneState(now, ParameterState.of(sensor))
+            alone = not record.renderer.data.with_attributes() and waiting.welcomes(state.attached)
+            if alone and not freezing and self.options.recorded == AUTO and record.is_steady(state.attached, sensor, spp or 1):
+                image = record.try_to_replay(scene, sensor, spp or 1, state)
                 if image is not None:
                     return image
             if alone and not freezing:
@@ -82,10 +82,9 @@ class Shell:
             if pending is not None:
                 pending.backward(gradient, record.data(scene, sensor))
                 return
-            attached = (*now.attached, *ParameterState.of(sensor).attached)
             if self.options.recorded and not dr.flag(dr.JitFlag.FreezingScope):
                 replay = record.replay_backward if self.options.recorded is True else record.try_to_replay_backward
-                if replay(scene, sensor, spp or 1, gradient, attached):
+                if replay(scene, sensor, spp or 1, gradient, SceneState(now, ParameterState.of(sensor))):
                     return
             image = record.render(scene, sensor, spp or 1, now)
             if dr.grad_enabled(image):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from itertools import count
 
@@ -10,6 +11,7 @@ import mitsuba as mi
 
 from ..jit.arrays import own_memory
 from ..jit.frozen import Frozen
+from ..jit.handover import Results, keeping, using
 from ..jit.pytree import attached_places, tree_map
 from ..jit.types import AnyArray, TensorXf
 from ..rendering.extended_lights import SoftFrusta
@@ -22,23 +24,29 @@ class FrozenPasses:
     """Two recordings: of a renderer's image, and of the gradients of its data.
 
     Dr.Jit records anew when more than numbers has changed: sizes, types, settings, the number of objects in Mitsuba. The backward
-    pass renders again, since one recording cannot use the intermediate results of another.
+    pass traces the image again, but takes what the image has evaluated from there, if it is handed over.
     """
 
     def __init__(self) -> None:
         self._image, self._gradients = Frozen(_image), Frozen(_gradients)
 
-    def image(self, spp: int, renderer: Renderer) -> tuple[TensorXf, Frusta | None, SoftFrusta]:
-        """(detached image, frusta of the shadow maps, frusta of extended lights' shadow maps)."""
-        with dr.suspend_grad():
-            return self._image(spp, plain(renderer))
+    def image(self, spp: int, renderer: Renderer, keep: bool) -> tuple[TensorXf, Frusta | None, SoftFrusta, Results]:
+        """(detached image, frusta of the shadow maps, frusta of extended lights' shadow maps, results for the backward pass).
 
-    def backward(self, spp: int, gradient: TensorXf, renderer: Renderer) -> None:
-        """Add the gradients of <image, gradient> to everything that the renderer's data are attached to."""
+        ``keep``: whether there are such results.
+        """
+        with dr.suspend_grad():
+            return self._image(spp, plain(renderer), keep)
+
+    def backward(self, spp: int, gradient: TensorXf, renderer: Renderer, results: Results) -> None:
+        """Add the gradients of <image, gradient> to everything that the renderer's data are attached to.
+
+        ``results``: of the same image, or an empty list.
+        """
         places, outer = attached_places(renderer.data)
         if not outer:
             return
-        pass_on(outer, self._gradients(spp, places, _owned(gradient), plain(renderer)))
+        pass_on(outer, self._gradients(spp, places, _owned(gradient), plain(renderer), results))
 
     @property
     def recordings(self) -> int:
@@ -51,12 +59,19 @@ def _owned(gradient: TensorXf) -> TensorXf:
     return own_memory(gradient) if gradient.array.state == dr.VarState.Evaluated else dr.detach(gradient)
 
 
-def _image(spp: int, renderer: Renderer) -> tuple[TensorXf, Frusta | None, SoftFrusta]:
-    image = renderer.render(spp=spp)
-    return image, renderer.frusta, renderer.soft_frusta
+def _image(spp: int, renderer: Renderer, keep: bool) -> tuple[TensorXf, Frusta | None, SoftFrusta, Results]:
+    with keeping() as results:
+        image = renderer.render(spp=spp)
+    return image, renderer.frusta, renderer.soft_frusta, results if keep else []
 
 
-def _gradients(spp: int, places: tuple[int, ...], gradient: TensorXf, renderer: Renderer) -> list[AnyArray]:
+def _gradients(
+    spp: int,
+    places: tuple[int, ...],
+    gradient: TensorXf,
+    renderer: Renderer,
+    results: Results,
+) -> list[AnyArray]:
     """Gradients of the arrays at some places of the renderer's data."""
     leaves: list[AnyArray] = []
     place = count()
@@ -69,7 +84,10 @@ def _gradients(spp: int, places: tuple[int, ...], gradient: TensorXf, renderer: 
         leaves.append(leaf)
         return leaf
 
-    backward(renderer.with_data(tree_map(renderer.data, attached)).render(spp=spp), gradient)
+    renderer = renderer.with_data(tree_map(renderer.data, attached))
+    with using(results) if results else nullcontext():
+        image = renderer.render(spp=spp)
+    backward(image, gradient)
     return [dr.grad(leaf) for leaf in leaves]
 
 
@@ -79,10 +97,22 @@ def plain(renderer: Renderer) -> Renderer:
     All numbers are evaluated copies: a recording would include constants, and also the fact that a camera shares its arrays with
     a sensor of the scene.
     """
-    data = tree_map(renderer.data, dr.detach)
+    arrays: list[AnyArray] = []
+
+    def kept(array: AnyArray) -> AnyArray:
+        arrays.append(dr.detach(array))
+        return arrays[-1]
+
     one = dr.opaque(mi.Float, 1)  # Dr.Jit optimises a product with the literal 1 away
-    copies = tree_map(data.sensors, lambda array: array * one)
+
+    def copied(array: AnyArray) -> AnyArray:
+        arrays.append(dr.detach(array) * one)
+        return arrays[-1]
+
+    copies = tree_map(renderer.data.sensors, copied)
+    data = tree_map(replace(renderer.data, sensors=()), kept)
     data = replace(data, sensors=tuple(tuple(replace(camera, name="") for camera in cameras) for cameras in copies))
     renderer = replace(renderer, data=data)
-    dr.make_opaque(data, renderer.frusta, renderer.soft_frusta)
+    # The arrays alone: Dr.Jit would walk through the scene, too.
+    dr.make_opaque(arrays, renderer.frusta, renderer.soft_frusta)
     return renderer

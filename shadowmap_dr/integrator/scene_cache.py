@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import ClassVar
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ..errors import ShadowmapError, warn
+from ..jit.frozen import take_apart
 from ..jit.gc import gc_paused
-from ..jit.types import AnyArray, Float, TensorXf, UInt32
+from ..jit.types import AnyArray, Float, PyTree, TensorXf, UInt32
 from ..rendering.extended_lights import SkyWatch, SoftFrusta, still_aimed
 from ..rendering.pass_cache import PassCache
 from ..rendering.renderer import Renderer
@@ -24,7 +26,8 @@ from ..scene.sensor import lenses_of, sensors_of
 from ..scene.unsupported import warn_of
 from ..scene.untracked import UntrackedValues
 from ..shadow import Frusta
-from .deferred import COLOURS_OF_LIGHTS, TEXELS, DeferredImages, DetachedInputs
+from .deferred import COLOURS_OF_LIGHTS, MOST_SAMPLES, TEXELS, DeferredImages, DetachedInputs
+from .handed import HandedResults
 from .parameter_state import ParameterState
 from .pass_caches import PassCaches, names_by_level
 from .recording import FrozenPasses, plain
@@ -35,6 +38,19 @@ from .steady_steps import SteadySteps
 _REMEMBERED_SENSORS, _OTHERS = 64, 8
 # Samples of an image up to which replays are faster: the backward pass renders again.
 _LARGEST = 512 * 512
+
+
+@dataclass(frozen=True)
+class SceneState:
+    """Parameters of a scene, and of the sensor of an image."""
+
+    scene: ParameterState
+    camera: ParameterState
+
+    @property
+    def attached(self) -> tuple[str, ...]:
+        """Names of the attached parameters of both."""
+        return *self.scene.attached, *self.camera.attached
 
 
 @dataclass
@@ -61,6 +77,7 @@ class SceneCache:
     colours   watch over the mesh colours for which the renderer's creases were found
     passes    caches of passes for its sensors
     matched   parameters of the scene at the last successful match
+    handed    results of the last replayed images, for their backward passes
     """
 
     parts: tuple[mi.Object, ...]
@@ -82,6 +99,18 @@ class SceneCache:
     warned: bool = False
     passes: PassCaches = field(default_factory=PassCaches)
     matched: ParameterState | None = None
+    handed: HandedResults = field(default_factory=HandedResults)
+    _taken: tuple[Renderer, tuple[str, list[PyTree]]] | None = None
+
+    # All that Dr.Jit is to know of, instead of the fields: it looks twice for each image.
+    DRJIT_STRUCT: ClassVar[dict[str, type]] = {"recording_parts": tuple}
+
+    @property
+    def recording_parts(self) -> tuple[object, ...]:
+        """The arrays and objects that users' frozen functions read from here, and a text that describes them."""
+        if self._taken is None or self._taken[0] is not self.renderer:
+            self._taken = self.renderer, take_apart(self.renderer)
+        return self._taken[1], self.statics, self.fits
 
     @classmethod
     def build(
@@ -158,7 +187,7 @@ class SceneCache:
 
     def _passes(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, now: ParameterState) -> PassCache:
         """Cache of passes for the next image."""
-        samples = int(np.prod(sensor.film().crop_size())) * spp
+        samples = _samples(sensor, spp)
         with dr.resume_grad():  # so that attached parameters are recognised
             camera = ParameterState.of(sensor)
         weight = samples + self.renderer.texels // TEXELS
@@ -170,7 +199,7 @@ class SceneCache:
         ``attached``: names of the attached parameters of the scene and the sensor. Gradients flow only through data read from the
         scene.
         """
-        samples = int(np.prod(sensor.film().crop_size())) * spp
+        samples = _samples(sensor, spp)
         if all(name.endswith(COLOURS_OF_LIGHTS) for name in attached):
             return False  # surfaces and maps of the last step serve again, which a recording would render
         if samples > _LARGEST or not dr.flag(dr.JitFlag.KernelFreezing) or dr.flag(dr.JitFlag.Debug):
@@ -180,48 +209,65 @@ class SceneCache:
             self.steady = SteadySteps(values)
         return self.steady.note(_kind(attached, sensor, spp), self.recorded.recordings)
 
-    def try_to_replay(self, scene: mi.Scene, sensor: mi.Sensor, spp: int) -> TensorXf | None:
+    def try_to_replay(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, now: SceneState) -> TensorXf | None:
         """The same as :meth:`replay`; None, from now on, if the scene cannot be recorded."""
         try:
-            return self.replay(scene, sensor, spp)
+            return self.replay(scene, sensor, spp, now)
         except RuntimeError:
             self.steady.refuse()
             return None
 
-    def replay(self, scene: mi.Scene, sensor: mi.Sensor, spp: int) -> TensorXf:
-        """The same image, detached, replayed from a recording that the first call makes."""
+    def replay(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, now: SceneState) -> TensorXf:
+        """The same image, detached, replayed from a recording that the first call makes. ``now``: the current parameters."""
         self._forget_stale_recordings()
         current = self._current(scene, sensor)
         self._check_vertices(current)
         current.note_kernels(spp)
-        image, frusta, soft_frusta = self.recorded.image(spp, current)
+        samples = _samples(sensor, spp)
+        keep = samples <= MOST_SAMPLES and current.is_one_pass
+        image, frusta, soft_frusta, results = self.recorded.image(spp, current, keep)
         self._remember(scene, sensor, frusta, soft_frusta)
+        if keep and now.attached:
+            self.handed.add(sensor, spp, samples, now.scene, now.camera, results)
+        self.handed.follow(now.scene, scene)
         return image
 
     def replay_backward(
-        self, scene: mi.Scene, sensor: mi.Sensor, spp: int, gradient: TensorXf, attached: tuple[str, ...]
+        self,
+        scene: mi.Scene,
+        sensor: mi.Sensor,
+        spp: int,
+        gradient: TensorXf,
+        now: SceneState,
     ) -> bool:
         """Add the gradients of <image, gradient> to the scene's parameters, through a recording, too.
 
         Does nothing and returns False if gradients also flow through materials, textures or the radiance of extended lights,
-        which Mitsuba itself evaluates. ``attached``: names of the attached parameters of the scene and the sensor.
+        which Mitsuba itself evaluates. ``now``: the current parameters.
         """
+        results, attached = self.handed.take(sensor, spp, now.scene, now.camera), now.attached
         current = self._current(scene, sensor)
         if attached not in self.recordable:
             self.recordable[attached] = not dr.grad_enabled(plain(current).render(spp=spp))
         if self.recordable[attached]:
             self._forget_stale_recordings()
-            self.recorded.backward(spp, gradient, current)
+            self.recorded.backward(spp, gradient, current, results)
+            self.handed.follow(now.scene, scene)
         return self.recordable[attached]
 
     def try_to_replay_backward(
-        self, scene: mi.Scene, sensor: mi.Sensor, spp: int, gradient: TensorXf, attached: tuple[str, ...]
+        self,
+        scene: mi.Scene,
+        sensor: mi.Sensor,
+        spp: int,
+        gradient: TensorXf,
+        now: SceneState,
     ) -> bool:
         """The same as :meth:`replay_backward` if the last image of this kind was replayed. False if it cannot be recorded."""
-        if not self.steady.is_replayed(_kind(attached, sensor, spp)):
+        if not self.steady.is_replayed(_kind(now.attached, sensor, spp)):
             return False
         try:
-            return self.replay_backward(scene, sensor, spp, gradient, attached)
+            return self.replay_backward(scene, sensor, spp, gradient, now)
         except RuntimeError:
             self.steady.refuse()
             return False
@@ -286,6 +332,12 @@ class SceneCache:
             if not strange or room >= 0:
                 kept.append(fit)
         self.fits = kept[:_REMEMBERED_SENSORS]
+
+
+def _samples(sensor: mi.Sensor, spp: int) -> int:
+    """Number of samples of an image."""
+    size = sensor.film().crop_size()
+    return int(size[0]) * int(size[1]) * spp
 
 
 def _kind(attached: tuple[str, ...], sensor: mi.Sensor, spp: int) -> tuple[object, ...]:

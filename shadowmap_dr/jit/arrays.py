@@ -71,6 +71,15 @@ def ravel(array: AnyArray) -> Float:
     return cast("Float", dr.ravel(array))
 
 
+def interleave(values: list[Float]) -> Float:
+    """Flat array with the entries of several arrays interleaved. Attached."""
+    module = backend(values[0])
+    if len(values) == 1:
+        return values[0]
+    packet = {2: module.Array2f, 4: module.Array4f}.get(len(values), module.ArrayXf)
+    return ravel(packet(*values) if packet is not module.ArrayXf else packet(values))
+
+
 def replace_grad(value: ArrayT, source: ArrayT) -> ArrayT:
     """``dr.replace_grad``: the numbers of ``value`` with the derivatives of ``source``."""
     return cast(Callable[[ArrayT, ArrayT], ArrayT], dr.replace_grad)(value, source)

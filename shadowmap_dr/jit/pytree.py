@@ -51,7 +51,10 @@ def tree_map(value: PyTree, function: Callable[[AnyArray], AnyArray]) -> PyTree:
         new = [tree_map(item, function) for item in old]
         if all(a is b for a, b in zip(old, new, strict=True)):
             return value
-        return dataclasses.replace(value, **dict(zip(fields, new, strict=True)))
+        # Not `dataclasses.replace`, which takes several times as long, and checks values that were checked before.
+        copy = object.__new__(type(value))
+        vars(copy).update(zip(fields, new, strict=True))
+        return copy
     names = getattr(type(value), "DRJIT_STRUCT", None)
     if names is None:
         return value

@@ -12,6 +12,7 @@ from typing import Any, cast
 import drjit as dr
 
 from ..jit.arrays import backend, replace_grad
+from ..jit.handover import computed
 from ..jit.kernel_inputs import float_input, split, uint_input
 from ..jit.types import Bool, Float, Float64, TensorXf, TensorXu, UInt32, UInt64, Vector4f
 from .barycentrics import pixel_barycentrics
@@ -109,7 +110,10 @@ def visible_triangles(
     flat, face_indices, batch, vertex_count = check_mesh(positions, faces, batch, False)
     size = (batch, vertex_count, *check_resolution(resolution))
     with dr.suspend_grad():
-        triangle, records = _visible_triangles(dr.detach(flat), face_indices, *size, transparent, layers, one_sided)
+        triangle, records = computed(
+            "visible triangles",
+            lambda: _visible_triangles(dr.detach(flat), face_indices, *size, transparent, layers, one_sided),
+        )
     return _locate(flat, face_indices, triangle, records, *size)
 
 

@@ -9,13 +9,15 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ..jit.arrays import interleave
 from ..jit.broadcast import broadcast_differentiable
+from ..jit.handover import evaluated
 from ..jit.types import Bool, Color3f, Float, TensorXf
 from ..raster import Crossings, antialias
 from ..scene.geometry import Geometry
 from .direct_light import shining_side
 from .film.aovs import collect_aovs
-from .film.film import film_channels, interleave
+from .film.film import film_channels
 from .gbuffer.camera_clip import least_gap
 from .gbuffer.camera_view import CameraPass, CameraView, Frame, PlacedShapes
 from .gbuffer.surface import coloured
@@ -57,11 +59,11 @@ class ImagePass:
         if crossings is None and settings.antialias:
             channels = self._channels(color, seen.active, view)
             # In one pass over the pixels, since both need much of the same.
-            dr.eval(channels, frame.sharpness)
+            channels, sharpness = evaluated("channels", (channels, frame.sharpness))
             flat = antialias(
                 *(channels, view.raster, view.clip, view.topology),
                 **shapes.creases,
-                crease_weights=frame.sharpness,
+                crease_weights=sharpness,
                 meetings=True,
                 gap=least_gap(view.sensor),
                 continued=True,

@@ -36,6 +36,7 @@ from .gbuffer.facet_normals import FlatFaces, flat_faces
 from .gbuffer.pixel_footprint import footprint_points
 from .gbuffer.shading_edges import ShadingEdges
 from .image_pass import ImagePass
+from .light_loops import MANY_LIGHTS
 from .light_pass import Lighting, LightPass, plan_extended_lights
 from .light_slices import LightSlice, plan_slices
 from .light_tiles import with_tiles
@@ -225,6 +226,11 @@ class Renderer:
             return 0
         side = self.settings.shadow.resolution * self.settings.shadow.supersampling
         return self.plan.maps * side**2 + sum(plan.maps for plan in self.soft) * self.settings.soft_map_resolution**2
+
+    @property
+    def is_one_pass(self) -> bool:
+        """True if an image and its derivatives need each shadow map once, and all of them together."""
+        return not (self.slices or self.soft or len(self.data.lights) >= MANY_LIGHTS)
 
     def with_updated_shading_edges(self) -> Renderer:
         """The same renderer with the edges at which colours of meshes jump, found again."""

@@ -13,6 +13,7 @@ import numpy as np
 
 from ..errors import ShadowmapError
 from ..jit.arrays import device_array
+from ..jit.handover import computed
 from ..jit.kernel_inputs import split
 from ..jit.types import Bool, Float, Point3f, UInt32, Vector3f
 from ..raster import RasterOutput, Topology
@@ -20,6 +21,7 @@ from ..scene.geometry import Geometry, rows_of
 from ..scene.lights.projected import Beam
 from ..scene.lights.read import Light
 from ..shadow import (
+    Bounds,
     Boxes,
     Frusta,
     Group,
@@ -196,35 +198,60 @@ def _fitted(
     """(cameras of all maps, light-space vertices, the map of each of these, the fit)."""
     each = zip(lights, plan.kinds, plan.tiles, strict=True)
     stacked = stack_views([view for light, kind, tiles in each for view in _views(plan, light, kind, settings) * tiles])
+    p_light, lanes, vertex = vertices_in_maps(stacked, geometry.positions)
+
+    def fit() -> Frusta:
+        if settings.compat:
+            return _compat_frusta(plan, stacked)
+        bounds = _bounds(plan, lights, geometry, stacked, (p_light, lanes, vertex))
+        return _fit(plan, lights, geometry, settings, stacked, bounds, previous, seen)
+
+    frusta = computed("frusta", fit)
+    attached = "directional" in plan.kinds and not settings.compat and dr.grad_enabled(stacked.forward)
+    if seen is not None and attached:
+        stacked = steady_axes(stacked, frusta, seen)
+        p_light, lanes, _ = vertices_in_maps(stacked, geometry.positions)
+    return stacked, p_light, lanes, frusta
+
+
+def _bounds(
+    plan: MapPlan, lights: Sequence[Light], geometry: Geometry, views: Views, in_maps: tuple[Point3f, UInt32, UInt32]
+) -> Bounds:
+    """Bounds of each shape in each map. ``in_maps``: light-space vertices, the map of each, its number in the geometry."""
+    p_light, lanes, vertex = in_maps
+    shape = dr.gather(mi.UInt32, geometry.vertex_shape, vertex)
+    return shape_bounds(views, _within_beams(plan, lights, p_light, lanes), lanes, shape, len(geometry.shapes))
+
+
+def _fit(
+    plan: MapPlan,
+    lights: Sequence[Light],
+    geometry: Geometry,
+    settings: ShadowSettings,
+    views: Views,
+    bounds: Bounds,
+    previous: Frusta | None,
+    seen: tuple[Point3f, Bool] | None,
+) -> Frusta:
+    """Frusta of the maps of all lights. Detached."""
     tiles = None
     if plan.groups:
         assert seen is not None, "lights have tiles only if visible points are known"
-        tiles = fit_tiles(stacked, plan.groups, seen, None if previous is None else previous.tiles)
-    p_light, lanes, vertex = vertices_in_maps(stacked, geometry.positions)
-    if settings.compat:
-        frusta = _compat_frusta(plan, stacked)
-    else:
-        shapes = len(geometry.shapes)
-        shape = dr.gather(mi.UInt32, geometry.vertex_shape, vertex)
-        planes, planar = shape_planes(plan, geometry)
-        bounds = shape_bounds(stacked, _within_beams(plan, lights, p_light, lanes), lanes, shape, shapes)
-        frusta = fit_frusta(
-            stacked,
-            bounds,
-            casting_shapes(stacked, planes, planar, boxes_of(geometry)),
-            shapes,
-            settings.resolution,
-            settings.filter_size,
-            previous,
-            seen,
-            settings.receiver_range,
-            tiles,
-        )
-        frusta = _from_beams_on(plan, lights, frusta)
-        if seen is not None and "directional" in plan.kinds and dr.grad_enabled(stacked.forward):
-            stacked = steady_axes(stacked, frusta, seen)
-            p_light, lanes, _ = vertices_in_maps(stacked, geometry.positions)
-    return stacked, p_light, lanes, frusta
+        tiles = fit_tiles(views, plan.groups, seen, None if previous is None else previous.tiles)
+    planes, planar = shape_planes(plan, geometry)
+    frusta = fit_frusta(
+        views,
+        bounds,
+        casting_shapes(views, planes, planar, boxes_of(geometry)),
+        len(geometry.shapes),
+        settings.resolution,
+        settings.filter_size,
+        previous,
+        seen,
+        settings.receiver_range,
+        tiles,
+    )
+    return _from_beams_on(plan, lights, frusta)
 
 
 def _culled(plan: MapPlan, count: int, outward: Bool | None) -> Bool | None:

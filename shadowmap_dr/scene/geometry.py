@@ -7,7 +7,7 @@ these two and never touches Mitsuba's meshes.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -100,8 +100,10 @@ class Geometry:
     face_info      UInt32 (F,)   index and flags of the shape, see ``shape_and_flags``
     vertex_shape   UInt32 (V,)   index of the shape
     shape_face_start  UInt32 (S,)  ``ShapeInfo.face_start`` as an array
-    changed        names of the shapes that ``with_positions`` replaced, if only their vertices may carry gradients; else None
+    changed        names of the shapes that are attached to a scene's parameters, have ``moved``, or were replaced by
+                   ``with_positions``, if only their vertices may carry gradients; else None
     as_loaded      whether the other shapes are as they were when the scene was loaded
+    moved          names of the planar and faceted shapes that may not be as they were then; None if that is not known
     stand_ins      UInt32 (V,), the vertex whose position each vertex takes; None if all vertices have faces. Invisible vertices,
                    those without faces, take the position of another vertex of their shape and so stretch no bounds (``settled``)
     packets        Float (4V,), positions padded to four numbers, through which derivatives flow back (``in_packets``)
@@ -122,6 +124,7 @@ class Geometry:
     shapes: StaticTuple[ShapeInfo]
     changed: tuple[str, ...] | None = None
     as_loaded: bool = False
+    moved: tuple[str, ...] | None = None
     stand_ins: UInt32 | None = None
     packets: Float | None = None
     copies: int = 1
@@ -171,9 +174,13 @@ class Geometry:
             found |= shape == k
         return found if wanted else ~found
 
+    def names_of(self, numbers: Sequence[int]) -> tuple[str, ...]:
+        """Names of shapes."""
+        return tuple(self.shapes[k].name for k in numbers)
+
     def known_unchanged(self, info: ShapeInfo) -> bool:
-        """True if a shape is known (on the host) to be as it was when the scene was loaded."""
-        return self.as_loaded and self.changed is not None and info.name not in self.changed
+        """True if a planar or faceted shape is known (on the host) to be as it was when the scene was loaded."""
+        return self.moved is not None and info.name not in self.moved and info.name not in (self.changed or ())
 
     def in_packets(self, lanes: int) -> Geometry:
         """The same geometry, prepared for look-ups of attached positions, normals and texture coordinates by ``lanes`` lanes.
@@ -227,7 +234,7 @@ class Geometry:
             return self
         changed = self.changed
         if changed is None and not dr.grad_enabled(self.positions, self.normals):
-            changed = ()
+            changed = self.moved or ()
         if changed is not None:
             changed = tuple(sorted({*changed, *positions}))
         merged = self.positions
@@ -261,7 +268,7 @@ class Geometry:
             return self
         positions, normals, changed = self.positions, self.normals, self.changed
         if changed is None and not dr.grad_enabled(positions, normals):
-            changed = ()
+            changed = self.moved or ()
         if changed is not None:
             changed = tuple(sorted({*changed, *transforms}))
         for name, value in transforms.items():

@@ -21,6 +21,7 @@ from ..jit.arrays import device_array
 from ..jit.pytree import StaticTuple
 from ..jit.types import Float
 from .descriptions import Parts, describe_all
+from .few_shapes import FewShapes
 from .geometry import NOT_READ, Geometry, ShapeInfo, pack_face_info, size_guards_of, stand_ins
 from .lights.area import AreaLight
 from .lights.environment import Environment
@@ -33,6 +34,8 @@ from .unsupported import omissions_of, warn_of
 
 # With fewer shapes, their vertices are concatenated anew for each image.
 _MANY_SHAPES = 16
+# Most shapes that are told apart from those without gradients that are as they were.
+_FEW_CHANGED = 8
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,7 @@ class SceneData:
     materials     different BSDFs, and meshes whose attributes they may read: all objects that Mitsuba shades with
     variant       Mitsuba variant of the scene
     soup          the shapes' vertices, None if there are few shapes
+    few           the same if there are few, else None
     needs_frames  whether any BSDF needs more than the cosines of directions: tangents, texture coordinates
     only_cosines  whether all BSDFs are the cosine of the light's direction times a factor that no direction changes
     """
@@ -65,6 +69,7 @@ class SceneData:
     needs_frames: bool = True
     only_cosines: bool = False
     soup: Soup | None = None
+    few: FewShapes | None = None
 
     # Neither the scene nor its meshes, which Dr.Jit would walk through at each call of a recorded function: 0.1 s for 5,000
     # meshes. Images depend on the records that were read from them.
@@ -197,11 +202,13 @@ def load(scene: mi.Scene, *, tessellation: int = 64, warn: bool = True) -> Scene
         soup=soup if len(sources) >= _MANY_SHAPES else None,
     )
     check_directions(scene)
+    if data.soup is None:
+        data = replace(data, few=FewShapes(sources, [k for k, info in enumerate(infos) if info.planar or info.faceted]))
     data = refresh(data)
     if warn:
         shapes = [(info.name, source.shape) for info, source in zip(infos, sources, strict=True)]
         warn_of(omissions_of(scene, shapes, unsupported))
-    return replace(data, geometry=replace(data.geometry, as_loaded=True))
+    return replace(data, geometry=replace(data.geometry, as_loaded=True, moved=()))
 
 
 def refresh(data: SceneData, sensors: tuple[mi.Sensor, ...] | None = None) -> SceneData:
@@ -212,7 +219,8 @@ def refresh(data: SceneData, sensors: tuple[mi.Sensor, ...] | None = None) -> Sc
     evaluates them. With few shapes nothing is read back to the host. With many, vertices and transformations without gradients
     are read back when they have been given other values.
     """
-    vertices = _vertices(data)
+    vertices, attached, moved = _vertices(data)
+    changed = {*attached, *(moved or ())}
     # Not an empty array: one among the arguments of a frozen function ends the process (Dr.Jit 1.5).
     rest = vertices.rest if any(info.reads_attributes for info in data.geometry.shapes) else None
     geometry = replace(
@@ -221,8 +229,9 @@ def refresh(data: SceneData, sensors: tuple[mi.Sensor, ...] | None = None) -> Sc
         normals=vertices.normals,
         texcoords=vertices.texcoords,
         rest_positions=rest,
-        changed=None,
+        changed=data.geometry.names_of(sorted(changed)) if attached and len(changed) <= _FEW_CHANGED else None,
         as_loaded=False,
+        moved=None if moved is None else data.geometry.names_of(moved),
         packets=None,
     )
     return replace(
@@ -283,7 +292,7 @@ class _Groups:
 
 def with_positions(data: SceneData) -> Geometry:
     """The geometry with the current vertex positions, attached. Normals and texture coordinates stay as they were read."""
-    return replace(data.geometry, positions=data.geometry.settled(_vertices(data).positions))
+    return replace(data.geometry, positions=data.geometry.settled(_vertices(data)[0].positions))
 
 
 def _described(names: list[str], sources: list[ShapeSource], faces: list[np.ndarray]) -> tuple[Soup, tuple[ShapeInfo, ...]]:
@@ -302,13 +311,22 @@ def _pointers(kind: type, objects: list[mi.Object]) -> mi.ShapePtr | mi.BSDFPtr:
     return dr.reinterpret_array(kind, device_array(mi.UInt32, numbers))
 
 
-def _vertices(data: SceneData) -> Vertices:
-    """The current vertices of all shapes, attached."""
+def _vertices(data: SceneData) -> tuple[Vertices, list[int], list[int] | None]:
+    """(the current vertices of all shapes, attached; numbers of shapes with gradients; those of planar and faceted shapes that
+    may not be as they were when the scene was loaded, None if that is not known)."""
     sources, infos = data.sources, data.geometry.shapes
-    if data.soup is None or dr.flag(dr.JitFlag.FreezingScope):  # a replay would not read again the vertices that the soup keeps
-        buffers = (_vertex_buffers(source, info) for source, info in zip(sources, infos, strict=True))
-        return Vertices(*(dr.concat(list(parts)) for parts in zip(*buffers, strict=True)))
-    return data.soup.vertices(lambda k: _vertex_buffers(sources[k], infos[k]))
+
+    def single(k: int) -> tuple[Float, Float, Float, Float]:
+        return _vertex_buffers(sources[k], infos[k])
+
+    if dr.flag(dr.JitFlag.FreezingScope):  # a replay would not read again the vertices that are kept
+        buffers = [single(k) for k in range(len(sources))]
+        attached = [k for k, own in enumerate(buffers) if dr.grad_enabled(own)]
+        return Vertices(*(dr.concat(list(parts)) for parts in zip(*buffers, strict=True))), attached, None
+    if data.soup is not None:
+        return *data.soup.vertices(single), None
+    assert data.few is not None, "made where there is no soup"
+    return data.few.vertices(single)
 
 
 def _vertex_buffers(source: ShapeSource, info: ShapeInfo) -> tuple[Float, Float, Float, Float]:

@@ -180,8 +180,8 @@ class Soup:
         """Constant: recordings do not depend on the soup, since they get the vertices themselves."""
         return "soup"
 
-    def vertices(self, single: Callable[[int], tuple[Float, Float, Float, Float]]) -> Vertices:
-        """All current vertices, attached.
+    def vertices(self, single: Callable[[int], tuple[Float, Float, Float, Float]]) -> tuple[Vertices, list[int]]:
+        """(all current vertices, attached; numbers of the shapes through whose vertices gradients flow).
 
         ``single``: returns the vertices (:class:`Vertices`, as a tuple) of the shape with the given number, attached.
         """
@@ -191,7 +191,7 @@ class Soup:
         still = self._still()
         attached = tuple(k for k, readings in enumerate(self._readings) if any(r.attached for r in readings))
         if not attached:
-            return still
+            return still, []
         if attached != self._over[0]:
             ids = np.concatenate([self._starts[k] + np.arange(self.counts[k]) for k in attached])
             flat = [(size * ids[:, None] + np.arange(size)).ravel() for size in (3, 2)]
@@ -200,7 +200,7 @@ class Soup:
         parts = zip(*(single(k) for k in attached), strict=True)
         under = (still.positions, still.normals, still.texcoords, still.rest)
         targets = zip(under, parts, (threes, threes, twos, threes), strict=True)
-        return Vertices(*(_written_over(buffer, list(pieces), index) for buffer, pieces, index in targets))
+        return Vertices(*(_written_over(buffer, list(pieces), index) for buffer, pieces, index in targets)), list(attached)
 
     def _look(self) -> None:
         for reading in (*(root.reading for root in self._roots), *(placement.reading for placement in self._placements)):

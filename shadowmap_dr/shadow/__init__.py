@@ -2,7 +2,7 @@
 
 from .caster_bounds import Boxes, casting_shapes, shape_boxes
 from .filters import FILTERS, filter_kernel, filter_map
-from .frustum_fit import fit_frusta, shape_bounds
+from .frustum_fit import Bounds, fit_frusta, shape_bounds
 from .light_camera import (
     Frusta,
     LightView,
@@ -31,6 +31,7 @@ __all__ = [
     "MAX_TILES",
     "METHODS",
     "PREFILTERED",
+    "Bounds",
     "Boxes",
     "Frusta",
     "Group",

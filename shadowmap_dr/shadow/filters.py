@@ -9,6 +9,7 @@ import drjit as dr
 import numpy as np
 
 from ..jit.arrays import backend, ravel
+from ..jit.handover import computed
 from ..jit.kernel_inputs import int_input, quotient, shared_inputs, split
 from ..jit.types import AnyArray, Float, Int32
 
@@ -93,7 +94,7 @@ class _Convolve(dr.CustomOp):
 
     def eval(self, values: Float, weights: list[float], axis: int, shape: tuple[int, int, int, int]) -> Float:
         self.arguments = (weights, axis, shape)
-        return _convolve(values, *self.arguments, transpose=False)
+        return computed("filtered maps", lambda: _convolve(values, *self.arguments, transpose=False))
 
     @shared_inputs()
     def forward(self) -> None:

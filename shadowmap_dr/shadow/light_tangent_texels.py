@@ -7,7 +7,7 @@ from typing import TypeAlias
 
 import drjit as dr
 
-from ..jit.arrays import backend
+from ..jit.arrays import backend, interleave
 from ..jit.kernel_inputs import float_input, quotient, uint_input
 from ..jit.types import Float, Point3f, UInt32, Vector3f
 from ..raster import NO_TRIANGLE, NO_VERTEX, Crossings, RasterOutput
@@ -17,7 +17,7 @@ from ..raster.types import pixel_coordinates
 from .light_camera import Frusta, Views, of_map
 from .methods.registry import PREFILTERED
 from .settings import ShadowSettings
-from .shadow_map import FAR, interleaved, texel_depths
+from .shadow_map import FAR, texel_depths
 
 #: Light-space coordinates (x, y, z), or their changes.
 Coordinates: TypeAlias = tuple[Float, Float, Float]
@@ -92,7 +92,7 @@ class TangentTexels:
         )
         own, changes = list(result[: len(free)]), list(result[len(free) :])
         if crossings is None or rates is None:
-            return interleaved(own), interleaved(changes)
+            return interleave(own), interleave(changes)
         incoming, side = incoming_weights(crossings, size), uint_input(module, "width", size)
         channels = len(own)
 
@@ -135,7 +135,7 @@ class TangentTexels:
             mode="symbolic",
             label="mixed texels",
         )
-        return interleaved(list(result[:channels])), interleaved(list(result[channels:]))
+        return interleave(list(result[:channels])), interleave(list(result[channels:]))
 
     def _own(self, image: UInt32, row: UInt32, column: UInt32, triangle: UInt32) -> tuple[list[Float], list[Float]]:
         """Values of texels before blending, and their changes with a, then with b."""

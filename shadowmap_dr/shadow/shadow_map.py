@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 
 import drjit as dr
 
-from ..jit.arrays import backend, ravel
+from ..jit.arrays import backend, interleave, ravel
 from ..jit.broadcast import in_copies
+from ..jit.handover import interleaved
 from ..jit.kernel_inputs import float_input, quotient, uint_input
 from ..jit.types import Bool, Float, Point3f, UInt32
 from ..raster import RasterOutput, Topology, antialias, visible_triangles
@@ -80,15 +81,18 @@ def render_maps(
         culled: (F,), or (M F,) by map: faces that are not drawn where they face away from the light.
     """
     count, size = views.count, settings.resolution * settings.supersampling
-    clip = ravel(to_clip(of_map(views, map_index, count), of_map(frusta, map_index, count), p_light))
-    dr.eval(clip)
+    in_maps = to_clip(of_map(views, map_index, count), of_map(frusta, map_index, count), p_light)
+    clip = interleaved("positions in maps", list(in_maps))
     # Seen from the front, outlines run clockwise: a light looks along the third of its right-handed axes.
     raster = visible_triangles(clip, faces, (size, size), batch=count, transparent=transparent, one_sided=culled)
-    values, channels = _texels(raster, clip, faces, views, frusta, settings, size)
+    texels = _texels(raster, clip, faces, views, frusta, settings, size)
+    channels = len(texels)
     if settings.antialias and settings.method != "standard":
-        dr.eval(values)
+        values = interleaved("texels", texels)
         blended = antialias(values, raster, clip, topology)
         values, channels = _two_depths(values, blended) if settings.method == "pcf" else (blended, channels)
+    else:
+        values = interleave(texels)
     if settings.supersampling > 1:
         values = block_means(values, size, channels, settings.supersampling)
     return ShadowMaps(values, views, frusta, settings, channels)
@@ -96,8 +100,8 @@ def render_maps(
 
 def _texels(
     raster: RasterOutput, clip: Float, faces: UInt32, views: Views, frusta: Frusta, settings: ShadowSettings, size: int
-) -> tuple[Float, int]:
-    """(numbers to store, flat; channels of a texel) for maps of ``size`` texels along each side."""
+) -> list[Float]:
+    """Channels of the texels, for maps of ``size`` texels along each side."""
     module = backend(raster.triangle)
     image, row, column = pixel_coordinates(module, views.count, size, size)
     view, frustum = of_map(views, image, views.count), of_map(frusta, image, views.count)
@@ -113,10 +117,9 @@ def _texels(
     method = PREFILTERED.get(settings.method)
     if method is None:
         if settings.method == "pcf" and settings.antialias:
-            return interleaved(list(variance_moments(depth))), 2
-        return depth, 1
-    values = method.encode(depth, slope_square, settings.order)
-    return interleaved(values), len(values)
+            return list(variance_moments(depth))
+        return [depth]
+    return list(method.encode(depth, slope_square, settings.order))
 
 
 @dataclass(frozen=True)
@@ -197,15 +200,6 @@ def block_means(values: Float, size: int, channels: int, factor: int) -> Float:
             # Each number is read once here, so that the backward pass needs no atomics. Other operations may read it, too.
             total += dr.gather(module.Float, values, first + (j * width + i) * channels, mode=dr.ReduceMode.NoConflicts)
     return total * (1 / factor**2)
-
-
-def interleaved(values: list[Float]) -> Float:
-    """Flat array with the entries of several arrays interleaved. Attached."""
-    module = backend(values[0])
-    if len(values) == 1:
-        return values[0]
-    packet = {2: module.Array2f, 4: module.Array4f}.get(len(values), module.ArrayXf)
-    return ravel(packet(*values) if packet is not module.ArrayXf else packet(values))
 
 
 def _radial_depth(view: Views, frustum: Frusta, raster: RasterOutput, row: UInt32, column: UInt32, size: int) -> Float:

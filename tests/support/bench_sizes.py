@@ -26,6 +26,8 @@ TINY = Sizes(
     crowds=({"instances": 4, "groups": 2, "shapes": 4, "lights": 3},),
     loop_size=8,
     loop_steps=0,
+    plugin_kinds=("camera", "reflectance"),
+    plugin_resolutions=(8,),
     fits=("bunny-pose",),
     fit_starts=1,
 )

@@ -17,7 +17,7 @@ import mitsuba as mi
 from ...errors import ShadowmapError, did_you_mean
 from ...io.options import option, setting
 
-SECTIONS = ("steps", "raster", "scaling", "breakdown", "sums", "loops", "first", "fits")
+SECTIONS = ("steps", "raster", "scaling", "breakdown", "sums", "loops", "first", "plug-in", "fits")
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,7 @@ class Sizes:
         loop_size: pixels along each side of images in the loops of `bench.loops`.
         loop_steps: steps over which their memory is measured, 0 for none.
         crowds: scenes of many shapes; see `bench.first.Crowd`.
+        plugin_kinds, plugin_resolutions: kinds of parameters, and sizes of images; see `bench.plugin`.
         fits: problems for the command `fit`; None: all that are scored. `fit_starts`: starts of each.
     """
 
@@ -84,6 +85,10 @@ class Sizes:
         {"shapes": 5000},
         {"shapes": 200, "lights": 40},
     )
+    plugin_kinds: tuple[str, ...] = (
+        *("vertices", "to_world", "light", "camera", "colour of the light", "reflectance", "texture"),
+    )
+    plugin_resolutions: tuple[int, ...] = (128, 512)
     fits: tuple[str, ...] | None = None
     fit_starts: int = 4
 
@@ -116,6 +121,8 @@ QUICK = Sizes(
     loop_size=64,
     loop_steps=0,
     crowds=({"instances": 30, "groups": 6}, {"shapes": 50, "lights": 6}),
+    plugin_kinds=("vertices", "reflectance"),
+    plugin_resolutions=(128,),
     fits=("bunny-pose", "house-pose-sun", "teapot-colours", "spot-aim", "panel-place", "camera-pose"),
     fit_starts=1,
 )

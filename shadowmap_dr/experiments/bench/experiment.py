@@ -26,6 +26,7 @@ from ..common.timing import OtherWork, load
 from . import breakdown as bench_breakdown
 from . import first as bench_first
 from . import loops as bench_loops
+from . import plugin as bench_plugin
 from . import raster as bench_raster
 from . import report as bench_report
 from . import scaling as bench_scaling
@@ -44,6 +45,7 @@ UNITS: dict[str, Callable[[BenchOptions], list[Unit]]] = {
     "sums": bench_sums.units,
     "loops": bench_loops.units,
     "first": bench_first.units,
+    "plug-in": bench_plugin.units,
     "fits": bench_fits.units,
 }
 

@@ -38,6 +38,8 @@ FIRST_OVER_DIRECT, FIRST_SECONDS, BACKWARD_SECONDS = 2.0, 0.5, 5.0
 #: Percentage of starts from which the command `fit` solves its problems, its seconds, percentage of intervals that hold true
 #: values, and how much wider than the error they may be.
 FITS_SOLVED, FIT_SECONDS, FITS_COVERAGE, FITS_WIDTH = 90.0, 60.0, (85.0, 99.0), 4.0
+#: Steps of the plug-in over the step of a frozen `Renderer` and Mitsuba's update.
+PLUGIN_OVER_RENDERER = 1.3
 EIGHT_LIGHTS, BATCH, OUTSIDE_KERNELS = 4.5, 1.2, 0.10
 
 
@@ -74,6 +76,7 @@ def rows(record: dict[str, Any]) -> list[Row]:
         "sums": _sum_rows,
         "loops": _loop_rows,
         "first": _first_rows,
+        "plug-in": _plugin_rows,
         "fits": _fit_rows,
     }
     result: list[Row] = []
@@ -307,6 +310,17 @@ def _first_rows(key: str, unit: dict[str, Any]) -> Iterator[Row]:
     aims = _aim(seconds["backward"], BACKWARD_SECONDS, "<= {:g} s", least=False)
     other = f"uncompiled {_time(unit['uncompiled']['backward'])}"
     yield Row("first derivative", key, _time(seconds["backward"]), other, "", *aims)
+
+
+def _plugin_rows(key: str, unit: dict[str, Any]) -> Iterator[Row]:
+    what, size = f"plug-in: {unit['kind']}", f"{unit['resolution']}"
+    seconds = {name: entry["median"] for name, entry in unit["seconds"].items()}
+    other = f"frozen {_time(seconds['renderer'])} + update {_time(seconds['update'])}"
+    value = unit["over_renderer_and_update"]
+    aims = _aim(value, PLUGIN_OVER_RENDERER, "<= {:g}x", least=False)
+    yield Row(what, size, _time(seconds["plug-in"]), other, f"{value:.2f}x", *aims)
+    value = unit["ratio_of_medians"]["not recorded / plug-in"]
+    yield Row(what, size, _time(seconds["plug-in"]), f"not recorded {_time(seconds['not recorded'])}", f"{value:.2f}x")
 
 
 def _fit_rows(key: str, unit: dict[str, Any]) -> Iterator[Row]:

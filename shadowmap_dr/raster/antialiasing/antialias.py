@@ -6,6 +6,7 @@ from typing import cast, overload
 
 import drjit as dr
 
+from ...jit.handover import computed
 from ...jit.types import Bool, Float, TensorXf
 from ..topology import Topology
 from ..types import RasterOutput, check_array
@@ -102,7 +103,10 @@ def antialias(
     positions, vertex_count = _flat_positions(positions, raster, topology)
     crease_weights = _checked_creases(creases, crease_weights, raster)
     if crossings is None:
-        crossings = find_crossings(positions, topology, raster, vertex_count, creases, crease_weights, meetings, gap, folds)
+        crossings = computed(
+            "crossings",
+            lambda: find_crossings(positions, topology, raster, vertex_count, creases, crease_weights, meetings, gap, folds),
+        )
     elif dr.width(crossings.right) != raster.batch * raster.height * raster.width:
         raise ValueError(f"crossings are those of {dr.width(crossings.right)} pixels, but {_size_of(raster)} are given")
     surroundings = Surroundings.of(raster, positions, topology, crossings.marked, crease_weights) if continued else None

@@ -8,6 +8,7 @@ from typing import cast
 import drjit as dr
 
 from ...jit.arrays import backend, reinterpret
+from ...jit.handover import computed
 from ...jit.kernel_inputs import shared_inputs, uint_input
 from ...jit.types import AnyArray, Bool, Float, UInt32, Vector4f
 from ..topology import NO_VERTEX
@@ -95,8 +96,13 @@ class Mixer:
         self.original = values
         # Sums of weights, defined only where neighbours reach into a pixel.
         self.claims = dr.empty(self.module.Float, self.pixels)
-        self.values = self._mix()
-        dr.eval(self.values, self.claims)
+        self.values, self.claims = computed("mixed values", self._evaluated)
+
+    def _evaluated(self) -> tuple[Float, Float]:
+        """(values, claims)."""
+        values = self._mix()
+        dr.eval(values, self.claims)
+        return values, self.claims
 
     def _mix(self) -> Float:
         if not self.planar:

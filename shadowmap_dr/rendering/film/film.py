@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ...errors import ShadowmapError, warn
-from ...jit.arrays import backend, ravel
+from ...jit.arrays import backend
 from ...jit.kernel_inputs import split, uint_input
 from ...jit.types import Bool, Color3f, Float, TensorXf
 from ...raster import MAX_RESOLUTION
@@ -155,18 +155,27 @@ def _means(image: TensorXf, factor: int) -> TensorXf:
 
 
 def put_into_film(film: mi.Film, image: TensorXf, aovs: list[str]) -> None:
-    """Make ``film.develop()``, ``film.bitmap()`` and ``film.write()`` give this image (detached)."""
+    """Make ``film.develop()``, ``film.bitmap()`` and ``film.write()`` give this image (detached).
+
+    Nothing is copied until one of them is called: most loops call none.
+    """
     film.prepare(aovs)
     base = film.base_channels_count()
     alpha = base in (2, 4)
-    colour = [image[..., k : k + 1] for k in range(base - alpha)]
+    height, width, channels = image.shape
     # A film stores three colours, even if it is to give luminance, then alpha, then the weight that it divides by.
-    planes = colour * 3 if len(colour) == 1 else colour
-    planes += [image[..., base - 1 : base]] if alpha else []
-    planes += [dr.ones(mi.TensorXf, (*image.shape[:2], 1))]
-    planes += [image[..., base:]] if image.shape[2] > base else []
-    block = mi.ImageBlock(dr.concat(planes, axis=2), offset=film.crop_offset(), rfilter=None, border=False)
-    film.put_block(block)
+    weight = 3 + alpha
+    count = weight + 1 + channels - base
+    number = dr.arange(mi.UInt32, height * width * count)
+    pixel = number // count
+    place = number - pixel * count
+    source = dr.select(place > weight, place - (weight + 1) + base, place if base - alpha == 3 else mi.UInt32(0))
+    if alpha:
+        source = dr.select(place == 3, base - 1, source)
+    is_weight = place == weight
+    values = dr.select(is_weight, 1, dr.gather(mi.Float, dr.detach(image).array, pixel * channels + source, ~is_weight))
+    stored = mi.TensorXf(values, shape=(height, width, count))
+    film.put_block(mi.ImageBlock(stored, offset=film.crop_offset(), rfilter=None, border=False))
 
 
 def film_channels(color: Color3f, active: Bool, sensor: Sensor) -> list[Float]:
@@ -179,18 +188,3 @@ def film_channels(color: Color3f, active: Bool, sensor: Sensor) -> list[Float]:
     if sensor.alpha:
         channels.append(dr.select(active, mi.Float(1), 0))
     return channels
-
-
-def interleave(channels: list[Float]) -> Float:
-    """Flat pixel-interleaved buffer of some channels, all of the same width."""
-    if len(channels) == 1:
-        return channels[0]
-    if len(channels) == 3:
-        return ravel(mi.Vector3f(*channels))
-    count = len(channels)
-    width = max(dr.width(c) for c in channels)
-    index = dr.arange(mi.UInt32, width) * count
-    result = dr.zeros(mi.Float, count * width)
-    for k, channel in enumerate(channels):
-        dr.scatter(result, channel, index + k)
-    return result

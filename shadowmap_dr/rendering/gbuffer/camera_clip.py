@@ -8,8 +8,9 @@ from collections.abc import Sequence
 import drjit as dr
 import mitsuba as mi
 
-from ...jit.arrays import backend, ravel
+from ...jit.arrays import backend
 from ...jit.broadcast import broadcast_differentiable
+from ...jit.handover import interleaved
 from ...jit.kernel_inputs import float_input, split, uint_input
 from ...jit.types import Bool, Float, Point3f
 from ...raster import DEPTH_GAP, NO_TRIANGLE, RasterOutput
@@ -45,7 +46,7 @@ def camera_clip(sensor: Sensor, geometry: Geometry) -> Float:
     p = dr.gather(mi.Point3f, geometry.positions, dr.arange(mi.UInt32, lanes))
     row = [dr.fma(m[r, 0], p.x, dr.fma(m[r, 1], p.y, dr.fma(m[r, 2], p.z, m[r, 3]))) for r in range(4)]
     # Identities written out: a row of zeros would still be multiplied with every vertex.
-    return ravel(mi.Point4f(*row))
+    return interleaved("positions in images", row)
 
 
 def without_shapes(clip: Float, geometry: Geometry, shapes: Sequence[int]) -> Float:

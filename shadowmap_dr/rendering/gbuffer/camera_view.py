@@ -132,7 +132,7 @@ class CameraPass:
         clip = camera_clip(sensor, geometry)
         if self.hidden:
             clip = without_shapes(clip, geometry, self.hidden)
-        dr.eval(clip)
+            dr.eval(clip)
         size = (sensor.height * factor, sensor.width * factor)
         raster = visible_triangles(clip, geometry.faces, size, transparent=self.transparent(geometry, sensor))
         return CameraView(sensor, factor, clip, raster, shapes.seen)

@@ -1,0 +1,54 @@
+"""Results of replayed images that wait for their backward passes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import mitsuba as mi
+
+from ..jit.handover import Results
+from .deferred import MOST_SAMPLES
+from .parameter_state import ParameterState
+
+
+@dataclass(frozen=True)
+class _Handed:
+    """Results of one image, its samples, and the parameters of scene and sensor."""
+
+    sensor: mi.Sensor
+    spp: int
+    samples: int
+    scene: ParameterState
+    camera: ParameterState
+    results: Results
+
+
+class HandedResults:
+    """Results of the last replayed images of one state of a scene, as far as memory allows."""
+
+    def __init__(self) -> None:
+        self._images: list[_Handed] = []
+
+    def add(
+        self, sensor: mi.Sensor, spp: int, samples: int, scene: ParameterState, camera: ParameterState, results: Results
+    ) -> None:
+        """Let results wait. Those of other states of the scene are dropped, and those that have waited longest make room."""
+        others = [one for one in self._images if one.scene.same(scene) and (one.sensor is not sensor or one.spp != spp)]
+        self._images = [*others, _Handed(sensor, spp, samples, scene, camera, results)]
+        while sum(one.samples for one in self._images) > MOST_SAMPLES:
+            self._images.pop(0)
+
+    def take(self, sensor: mi.Sensor, spp: int, scene: ParameterState, camera: ParameterState) -> Results:
+        """Remove and return the results of an image that would be the same now, given the current parameters; else none."""
+        self._images = [one for one in self._images if one.scene.same(scene)]
+        for one in self._images:
+            if one.sensor is sensor and one.spp == spp and one.camera.same(camera):
+                self._images.remove(one)
+                return one.results
+        return []
+
+    def follow(self, before: ParameterState, scene: mi.Scene) -> None:
+        """Note that a replay, and nothing else, has changed a scene's parameters: it renews the arrays of materials."""
+        if self._images:
+            after = ParameterState.of(scene)
+            self._images = [replace(one, scene=after) if one.scene.same(before) else one for one in self._images]

@@ -77,7 +77,7 @@ def _accepted(option: Field[object]) -> str:
         return f"{code(AUTO)}, `true`, `false`"
     if isinstance(option.default, bool):
         return "`true`, `false`"
-    if option.name == "shadow_map_resolution":
+    if option.name in ("shadow_map_resolution", "area_light_samples"):
         return f"{code(AUTO)}; {_whole_numbers(lambda value: _error(option.name, value) is None)}"
     if isinstance(option.default, str):
         return ", ".join(map(code, _choices(option.name)))

@@ -18,7 +18,9 @@ from ..jit.arrays import device_array
 from ..jit.branches import traversed_again
 from ..jit.frozen import freeze
 from ..jit.types import Float, TensorXf
+from ..rendering.extended_lights.sample_counts import MOST
 from ..rendering.renderer import Renderer
+from ..rendering.settings import RenderSettings
 from ..scene.pixel_filter import Filter
 from ..scene.sensor import ImageSize, Sensor
 from .arrays import ArrayParameter, TextureValues
@@ -393,13 +395,21 @@ def _input(numbers: Array) -> Float:
     return device_array(mi.Float, numbers if len(numbers) else np.zeros(1))
 
 
+def _area_light_samples(settings: RenderSettings, quality: Quality) -> int | str:
+    """Points on area lights, not more than the quality has."""
+    chosen = settings.area_light_samples
+    if not isinstance(chosen, int):
+        return chosen if quality.light_samples >= MOST else quality.light_samples
+    return max(1, min(chosen, quality.light_samples))
+
+
 def _at(renderer: Renderer, quality: Quality, pixels: int) -> Renderer:
     """A copy of a renderer at a quality, for images of so many pixels, with a fit of the shadow maps of its own."""
     settings = renderer.settings
     changed = replace(
         settings,
         shadow=replace(settings.shadow, resolution=min(quality.texels, settings.shadow.resolution)),
-        area_light_samples=max(1, min(settings.area_light_samples, quality.light_samples)),
+        area_light_samples=_area_light_samples(settings, quality),
         environment_light_samples=max(1, min(settings.environment_light_samples, 2 * quality.light_samples)),
         soft_map_resolution=min(settings.soft_map_resolution, quality.soft_texels),
     )

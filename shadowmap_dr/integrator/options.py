@@ -30,9 +30,9 @@ _FOREIGN = (
 
 
 # Types of values in ``mi.Properties`` that are not those of the defaults. They hold no sequences: names of channels are text.
-_KINDS: dict[str, type] = {"aovs": str, "shadow_map_resolution": int, "recorded": bool}
+_KINDS: dict[str, type] = {"aovs": str, "shadow_map_resolution": int, "area_light_samples": int, "recorded": bool}
 # Parameters that may be ``auto``, too.
-_AUTOMATIC = ("shadow_map_resolution", "recorded")
+_AUTOMATIC = ("shadow_map_resolution", "area_light_samples", "recorded")
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,8 @@ class Options:
     shadow_receiver_range  resolve depths only from the first receiver on, against light that bleeds through
     shadow_cull_backfaces  leave the backs of closed shapes out of the maps of directional lights: faster, with the same result as
                            long as no shape turns inside out, not even in a fold
-    area_light_samples     points on each area light that cast shadows (Mitsuba's ``emitter_samples`` is another number)
+    area_light_samples     points on each area light that cast shadows, or ``auto``: 8 to 32, as its penumbrae need (Mitsuba's
+                           ``emitter_samples`` is another number)
     environment_light_samples  directions of an environment that cast shadows
     soft_map_resolution    texels along each side of these points' and directions' shadow maps
     emitter_shadows        ``samples``, or ``single``: one map for each area light, penumbrae estimated from it
@@ -87,7 +88,7 @@ class Options:
     shadow_receiver_range: bool = ShadowSettings.receiver_range
     shadow_cull_backfaces: bool = ShadowSettings.cull_backfaces
     shadow_samples: int = RenderSettings.shadow_samples
-    area_light_samples: int = RenderSettings.area_light_samples
+    area_light_samples: int | str = RenderSettings.area_light_samples
     environment_light_samples: int = RenderSettings.environment_light_samples
     soft_map_resolution: int = RenderSettings.soft_map_resolution
     emitter_shadows: str = RenderSettings.emitter_shadows

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from dataclasses import replace
 from itertools import count
 
@@ -85,7 +84,7 @@ def _gradients(
         return leaf
 
     renderer = renderer.with_data(tree_map(renderer.data, attached))
-    with using(results) if results else nullcontext():
+    with using(results):
         image = renderer.render(spp=spp)
     backward(image, gradient)
     return [dr.grad(leaf) for leaf in leaves]

@@ -121,7 +121,8 @@ class SceneCache:
             raise ShadowmapError("A scene cannot be read while a function is frozen: render it once with this integrator before.")
         # Of a scene of thousands of shapes so many objects are made that collections would take a tenth of the time.
         with dr.suspend_grad(), gc_paused():
-            data = replace(load(scene, tessellation=tessellation, warn=warn), sensors=(sensors_of(sensor),))
+            data = load(scene, tessellation=tessellation, warn=warn)
+            data = replace(data, sensors=(sensors_of(sensor), *data.sensors))
             renderer = replace(Renderer.from_data(data, settings), untracked=None)
             sky, untracked = (
                 SkyWatch(data.environments),

@@ -112,7 +112,10 @@ def take_apart(record: PyTree) -> tuple[str, list[PyTree]]:
 
 
 class _Taken:
-    """Findings of :func:`take_apart`. (An inner function that calls itself would be garbage that holds arrays.)"""
+    """Findings of :func:`take_apart`. (An inner function that calls itself would be garbage that holds arrays.)
+
+    The second walk through a record that cannot change stores what it finds there, in the record: later walks do without it.
+    """
 
     def __init__(self) -> None:
         self.texts: list[str] = []
@@ -123,27 +126,116 @@ class _Taken:
         kind = type(value)
         names = _parts_of(kind)
         if names is None:
-            self.texts.append(repr(value))
+            self.text(repr(value))
         elif kind is tuple or kind is list:
-            self.texts.append(f"{kind.__name__}{len(value)}")
-            for item in value:
-                self.walk(item)
+            self.sequence(value)
         elif kind is dict:
-            self.texts.append(f"dict{len(value)}")
-            for name, item in value.items():
-                self.texts.append(repr(name))
-                self.walk(item)
+            self.mapping(value)
         elif names:
-            self.texts.append(kind.__qualname__)
-            for name in names:
-                self.walk(getattr(value, name))
+            if not (_is_frozen(kind) and self._known(value)):
+                self.text(kind.__qualname__)
+                for name in names:
+                    self.walk(getattr(value, name))
         elif hasattr(kind, "recording_text"):
-            self.texts.append(value.recording_text())
+            self.described(value)
         else:
-            number = self._numbers.setdefault(id(value), len(self.leaves))
-            self.texts.append(f"#{number}")
-            if number == len(self.leaves):
-                self.leaves.append(value)
+            self.leaf(value)
+
+    def text(self, text: str) -> None:
+        self.texts.append(text)
+
+    def leaf(self, value: PyTree) -> None:
+        number = self._numbers.setdefault(id(value), len(self.leaves))
+        self.texts.append(f"#{number}")
+        if number == len(self.leaves):
+            self.leaves.append(value)
+
+    def described(self, value: PyTree) -> None:
+        """An object that gives its own text, another one each time perhaps."""
+        self.texts.append(value.recording_text())
+
+    def sequence(self, values: PyTree) -> None:
+        self.text(f"{type(values).__name__}{len(values)}")
+        for item in values:
+            self.walk(item)
+
+    def mapping(self, values: PyTree) -> None:
+        self.text(f"dict{len(values)}")
+        for name, item in values.items():
+            self.text(repr(name))
+            self.walk(item)
+
+    def _known(self, record: PyTree) -> bool:
+        """True if the findings in a record were stored before, and are added now."""
+        own: dict[str, Any] = record.__dict__
+        steps: list[_Step] | None = own.get(_STEPS)
+        if _STEPS not in own:
+            own[_STEPS] = []
+            return False
+        if steps == []:
+            steps = own[_STEPS] = _Steps.of(record)
+        if steps is None:
+            return False
+        for add, value in steps:
+            add(self, value)
+        return True
+
+
+# Attribute of records with their steps: an empty list before the second walk, None if there can be none.
+_STEPS = "_recording_steps"
+_Step = tuple[Callable[[_Taken, PyTree], None], PyTree]
+
+
+class _Steps(_Taken):
+    """Steps of a walk through one record: functions of :class:`_Taken`, and their arguments."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.steps: list[_Step] = []
+        self.changes = False
+
+    @classmethod
+    def of(cls, record: PyTree) -> list[_Step] | None:
+        """The steps, or None if the record holds lists, dictionaries or other records that may change."""
+        found = cls()
+        found.text(type(record).__qualname__)
+        for name in _parts_of(type(record)) or ():
+            found.walk(getattr(record, name))
+        return None if found.changes else found.steps
+
+    def text(self, text: str) -> None:
+        if self.steps and self.steps[-1][0] is _Taken.text:
+            text = f"{self.steps.pop()[1]} {text}"
+        self.steps.append((_Taken.text, text))
+
+    def leaf(self, value: PyTree) -> None:
+        self.steps.append((_Taken.leaf, value))
+
+    def described(self, value: PyTree) -> None:
+        self.steps.append((_Taken.described, value))
+
+    def sequence(self, values: PyTree) -> None:
+        self.changes |= type(values) is list
+        super().sequence(values)
+
+    def mapping(self, values: PyTree) -> None:
+        self.changes = True
+
+    def _known(self, record: PyTree) -> bool:
+        return False
+
+    def walk(self, value: PyTree) -> None:
+        kind = type(value)
+        self.changes |= fields_of(kind) is not None and not _is_frozen(kind)
+        if not self.changes:
+            super().walk(value)
+
+
+@cached_by_type
+def _is_frozen(kind: type) -> bool:
+    """True for dataclasses that cannot change."""
+    parameters = getattr(kind, "__dataclass_params__", None)
+    return parameters is not None and bool(parameters.frozen)
 
 
 @cached_by_type

@@ -46,12 +46,12 @@ def keeping() -> Iterator[Results]:
 
 @contextmanager
 def using(results: Results) -> Iterator[None]:
-    """Use the results of an earlier computation, of the same steps with the same numbers, inside.
+    """Use the results of an earlier computation, of the same steps with the same numbers, inside; if any, else compute them.
 
     Raises:
         RuntimeError: the steps are not the same.
     """
-    before, _state.given = _state.given, iter(results)
+    before, _state.given = _state.given, iter(results) if results else None
     try:
         yield
     finally:

@@ -10,6 +10,7 @@ import drjit as dr
 
 from ..jit.arrays import backend, ravel, replace_grad
 from ..jit.branches import branch
+from ..jit.handover import interleaved
 from ..jit.kernel_inputs import double_input, float_input, split, uint_input
 from ..jit.types import Bool, Float, UInt32, Vector4f
 from .triangle_setup import Corners, beside, edge_lines, exact_centres, gather_triangle
@@ -35,7 +36,6 @@ def pixel_depth(
             of 1 / w, whose huge offset (if the near plane is close) would drown 1 / w in rounding.
     """
     depths, _ = planes(positions, faces, raster, False, reciprocal)
-    dr.eval(depths)
     return depth_at(depths, *pixels(raster), raster.valid)
 
 
@@ -79,9 +79,9 @@ def planes(
         reciprocal: see :func:`pixel_depth`.
 
     Returns:
-        Four numbers for each triangle, flat: the function of the depth (attached) and the packed reference pixel. And, if asked
-        for, a tuple (detached): four numbers for each of vertices 1 and 2, the function of its barycentric divided by w and the
-        change of 1 / w by column (row); and the values of 1 / w.
+        Four numbers for each triangle, flat: the function of the depth (attached) and the packed reference pixel. They are
+        evaluated unless barycentrics are asked for. And, if asked for, a tuple (detached): four numbers for each of vertices 1
+        and 2, the function of its barycentric divided by w and the change of 1 / w by column (row); and the values of 1 / w.
     """
     module = backend(positions)
     Float64 = module.Float64
@@ -133,9 +133,9 @@ def planes(
     seen = ~beside(dr.detach(gather_triangle(positions, faces, triangle, first, True)))
     zeros = (module.Float(0),) * (13 if barycentrics else 4)
     found = branch(seen, numbers, lambda *_: zeros, (triangle, image, first), "planes")
-    depths = ravel(module.Array4f(*found[:4]))
     if not barycentrics:
-        return depths, ()
+        return interleaved("depth planes", list(found)), ()
+    depths = ravel(module.Array4f(*found[:4]))
     with dr.suspend_grad():
         rows, inverse_w = found[4:10], found[10:]
         packets = [module.Array4f(*rows[3 * k : 3 * k + 3], inverse_w[k]) for k in range(2)]

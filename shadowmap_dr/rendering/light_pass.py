@@ -41,6 +41,7 @@ from .extended_lights import (
     soft_light,
 )
 from .extended_lights.interleaving import Interleaving
+from .extended_lights.sample_counts import MOST
 from .gbuffer.camera_view import CameraView, Frame, PlacedShapes
 from .gbuffer.pixel_footprint import FootprintSamples, footprint_points
 from .gbuffer.surface import Surface
@@ -369,7 +370,10 @@ def plan_extended_lights(data: SceneData, settings: RenderSettings) -> tuple[Sof
     """Sample the area lights and environments of a scene (on the host, once). ShadowmapError if maps are too many."""
     lights: tuple[SoftLight, ...] = (*data.areas, *data.environments)
     single = settings.emitter_shadows == "single"
-    soft = plan_soft(lights, data.geometry, settings.area_light_samples, settings.environment_light_samples, single)
+    # One map, from which penumbrae are estimated, serves as it is.
+    chosen = settings.area_light_samples if isinstance(settings.area_light_samples, int) else MOST if single else None
+    cameras = [camera for cameras in data.sensors for camera in cameras]
+    soft = plan_soft(lights, data.geometry, chosen, settings.environment_light_samples, single, cameras)
     if settings.shadow.method != "none":
         check_soft_sizes(soft, data.geometry, settings.soft_map_resolution)
     return soft

@@ -230,7 +230,7 @@ class Renderer:
     @property
     def is_one_pass(self) -> bool:
         """True if an image and its derivatives need each shadow map once, and all of them together."""
-        return not (self.slices or self.soft or len(self.data.lights) >= MANY_LIGHTS)
+        return not (self.slices or len(self.data.lights) >= MANY_LIGHTS)
 
     def with_updated_shading_edges(self) -> Renderer:
         """The same renderer with the edges at which colours of meshes jump, found again."""

@@ -43,8 +43,9 @@ class RenderSettings:
         hide_emitters: the camera looks through area lights, and sees black instead of environments, which light the scene all
             the same.
         max_depth: 0 is black, 1 shows emitters only, 2 is direct light, as in Mitsuba; more, or -1, is the same as 2.
-        area_light_samples: points on each area light, each with a shadow map. With 64 samples per pixel or more, each
-            sample sees a fourth (ninth, ...) of them if that number divides theirs (interleaved sampling).
+        area_light_samples: points on each area light, each with a shadow map; ``auto``: 8 to 32, twice as many as its penumbrae
+            have pixels (:mod:`.extended_lights.sample_counts`). With 64 samples per pixel or more, each sample sees a fourth
+            (ninth, ...) of them if that number divides theirs (interleaved sampling).
         environment_light_samples: directions of an environment, each with a shadow map.
         soft_map_resolution: texels along each side of these maps.
         emitter_shadows: ``samples``, or ``single``: one map of ``shadow.resolution`` texels (a power of two) for each area light,
@@ -63,7 +64,7 @@ class RenderSettings:
     hide_emitters: bool = False
     max_depth: int = DIRECT
     shadow_samples: int = 0
-    area_light_samples: int = 32
+    area_light_samples: int | str = AUTO
     environment_light_samples: int = 64
     soft_map_resolution: int = 128
     emitter_shadows: str = "samples"
@@ -81,14 +82,17 @@ class RenderSettings:
         for name in ("antialias", "hide_emitters"):
             if not isinstance(getattr(self, name), bool):
                 raise ShadowmapError(f"{name} is {getattr(self, name)!r}: give True or False.")
-        for name in ("shadow_samples", "area_light_samples", "environment_light_samples", "max_depth"):
+        chosen = {name: getattr(self, name) for name in ("area_light_samples", "environment_light_samples")}
+        if chosen["area_light_samples"] == AUTO:
+            del chosen["area_light_samples"]
+        for name in ("shadow_samples", *chosen, "max_depth"):
             if isinstance(getattr(self, name), bool) or not isinstance(getattr(self, name), Integral):
                 raise ShadowmapError(f"{name} is {getattr(self, name)!r}: give an integer.")
         if self.max_depth < -1:
             raise ShadowmapError(f"max_depth is {self.max_depth}: choose -1 (no limit), or 0 and more.")
         if not 0 <= self.shadow_samples <= 8:
             raise ShadowmapError(f"shadow_samples is {self.shadow_samples}: choose 0 (automatic) to 8.")
-        for name in ("area_light_samples", "environment_light_samples"):
+        for name in chosen:
             if not 1 <= getattr(self, name) <= MOST_SAMPLES:
                 raise ShadowmapError(f"{name} is {getattr(self, name)}: choose 1 to {MOST_SAMPLES}.")
         if self.emitter_shadows not in ("samples", "single"):

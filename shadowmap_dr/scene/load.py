@@ -6,7 +6,7 @@ parameters may change, attached where they carry gradients.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from numbers import Integral
 from typing import Any, ClassVar, cast
@@ -79,9 +79,9 @@ class SceneData:
     )
 
     @property
-    def recorded_sources(self) -> Sequence[ShapeSource]:
+    def recorded_sources(self) -> tuple[ShapeSource, ...]:
         """Sources that recorded functions read: those of curves; all of the plug-in, which gets the scene at each call."""
-        return self.sources if self.scene is None else [one for one in self.sources if isinstance(one, CurveSource)]
+        return self.sources if self.scene is None else tuple(one for one in self.sources if isinstance(one, CurveSource))
 
     def cameras(self, sensor: int | Sensor) -> tuple[Sensor, ...]:
         """Cameras of a sensor: of the scene's sensor with that number, or the given record itself.

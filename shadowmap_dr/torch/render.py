@@ -16,6 +16,7 @@ import torch
 
 from ..errors import ShadowmapError, check_variant
 from ..jit.frozen import Frozen
+from ..jit.handover import Results, keeping, using
 from ..jit.pytree import tree_map
 from ..jit.types import TensorXf
 from ..rendering.extended_lights import SkyWatch, SoftFrusta, still_aimed
@@ -191,7 +192,8 @@ class Renderer:
             raise ShadowmapError(f"sensor {sensor}, spp {samples:g}: {why}.")
         if camera and len(self._renderer.data.cameras(sensor)) != 1:
             raise ShadowmapError(f"camera: sensor {sensor} is a batch of cameras; render them one by one.")
-        operation = _Rendering(self, tuple(given), sensor, math.ceil(samples))
+        wanted = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in given.values())
+        operation = _Rendering(self, tuple(given), sensor, math.ceil(samples), wanted)
         if given:
             return cross(operation, *given.values())[0]
         with drjit_turn(self._device):
@@ -262,23 +264,28 @@ class _Place:
 
 
 class _Rendering:
-    """One image as an operation, rendered once more for its derivatives."""
+    """One image as an operation, rendered once more for its derivatives, from what the image has evaluated.
+
+    ``keep``: whether that is kept for a backward pass.
+    """
 
     name, unbatched = "Renderer.render", ""
 
-    def __init__(self, owner: Renderer, places: tuple[_Place, ...], sensor: int | Sensor, spp: int) -> None:
+    def __init__(self, owner: Renderer, places: tuple[_Place, ...], sensor: int | Sensor, spp: int, keep: bool) -> None:
         self.owner, self.places, self.camera = owner, places, (sensor, spp)
+        self.keep = keep and owner._renderer.is_one_pass
         self.changes_scene = any(place.kind == "parameter" for place in places)
         self.functions = (_forward, _backward) if self.changes_scene or owner._frozen is None else owner._frozen
         self.sky = owner._sky
         # Decisions of the forward pass that the backward pass repeats.
         self.fixed: dict[str, Any] = {}
+        self.results: Results = []
 
     def forward(self, arrays: list[TensorXf]) -> Sequence[TensorXf]:
         with dr.suspend_grad(), self._scene(arrays) as renderer:
-            image, fit = self.functions[0](self.places, *self.camera, arrays, renderer)
+            image, fit, self.results = self.functions[0](self.places, *self.camera, self.keep, arrays, renderer)
             # Evaluated while the scene has the parameters of this call.
-            dr.eval(image, fit)
+            dr.eval(image, fit, self.results)
         self.fixed = {"soft": renderer.soft, "frusta": fit[0], "soft_frusta": fit[1]}
         # The owner changes only now that nothing can fail any more.
         self.owner._renderer.frusta = fit[0]
@@ -292,17 +299,19 @@ class _Rendering:
         with dr.resume_grad():
             arrays = attached(arrays, wanted)  # before they enter the scene
             with self._scene(arrays) as renderer:
-                return self.functions[1](self.places, *self.camera, list(wanted), arrays, adjoints[0], renderer)
+                # Copies, as of the fits: there may be another backward pass.
+                results = tree_map(self.results, lambda array: type(array)(array))
+                return self.functions[1](self.places, *self.camera, list(wanted), arrays, adjoints[0], renderer, results)
 
     def jvp(self, arrays: list[TensorXf], tangents: Sequence[TensorXf | None]) -> Sequence[TensorXf]:
         with dr.resume_grad():
             arrays = attached(arrays, [tangent is not None for tangent in tangents])
             with self._scene(arrays) as renderer:
-                image, _ = _forward(self.places, *self.camera, arrays, renderer)
+                image = _image(self.places, *self.camera, arrays, renderer)
                 return forward_derivatives(arrays, (image,), tangents)
 
     def again(self) -> _Rendering:
-        return _Rendering(self.owner, self.places, *self.camera)
+        return _Rendering(self.owner, self.places, *self.camera, self.keep)
 
     @contextmanager
     def _scene(self, arrays: list[TensorXf]) -> Iterator[_Renderer]:
@@ -364,9 +373,15 @@ def _set(table: mi.SceneParameters, values: Mapping[str, Any]) -> None:
 
 
 def _forward(
-    places: tuple[_Place, ...], sensor: int | Sensor, spp: int, arrays: list[TensorXf], renderer: _Renderer
-) -> tuple[TensorXf, tuple[Frusta | None, SoftFrusta]]:
-    """Image and (frusta of the shadow maps, frusta of extended lights' maps)."""
+    places: tuple[_Place, ...], sensor: int | Sensor, spp: int, keep: bool, arrays: list[TensorXf], renderer: _Renderer
+) -> tuple[TensorXf, tuple[Frusta | None, SoftFrusta], Results]:
+    """Image, (frusta of the shadow maps, frusta of extended lights' maps), and results for the backward pass if ``keep``."""
+    with keeping() as results:
+        image = _image(places, sensor, spp, arrays, renderer)
+    return image, (renderer.frusta, renderer.soft_frusta), results if keep else []
+
+
+def _image(places: tuple[_Place, ...], sensor: int | Sensor, spp: int, arrays: list[TensorXf], renderer: _Renderer) -> TensorXf:
     given = list(zip(places, arrays, strict=True))
     vertices = {place.name: array for place, array in given if place.kind == "vertices"}
     lights: dict[str, Any] = {}
@@ -379,8 +394,7 @@ def _forward(
     if viewed:
         record = renderer.data.cameras(sensor)[0]
         sensor = replace(record, **{name: _converted(getattr(record, name), array) for name, array in viewed.items()})
-    image = renderer.render(vertices, lights, sensor, spp, transforms=transforms or None)
-    return image, (renderer.frusta, renderer.soft_frusta)
+    return renderer.render(vertices, lights, sensor, spp, transforms=transforms or None)
 
 
 def _backward(
@@ -391,12 +405,14 @@ def _backward(
     arrays: list[TensorXf],
     adjoint: TensorXf | None,
     renderer: _Renderer,
+    results: Results,
 ) -> list[TensorXf]:
-    """Gradients to the arrays. ``adjoint``: gradient to the image."""
+    """Gradients to the arrays. ``adjoint``: gradient to the image; ``results``: of the image, or an empty list."""
     for array, want in zip(arrays, wanted, strict=True):
         if want:
             dr.enable_grad(array)
-    image, _ = _forward(places, sensor, spp, arrays, renderer)
+    with using(results):
+        image = _image(places, sensor, spp, arrays, renderer)
     return gradients(arrays, (image,), (adjoint,))
 
 

@@ -19,6 +19,7 @@ torch = pytest.importorskip("torch", reason="PyTorch is not installed: pip insta
 import shadowmap_dr  # noqa: E402
 import shadowmap_dr.torch as sdr  # noqa: E402
 from shadowmap_dr import ShadowmapError  # noqa: E402
+from shadowmap_dr.torch import render as torch_render  # noqa: E402
 
 SIZE = 96
 OPTIONS = {"shadow_map_resolution": 128, "shadow_filter_size": 5, "shadow_samples": 1}
@@ -222,6 +223,34 @@ def test_frozen_or_not_no_graph_stays_behind(renderer: sdr.Renderer, capfd: pyte
         renderer.render({"ball": vertices})
         renderer.render({"ball": vertices}).square().sum().backward(retain_graph=True)
     assert nodes() == before
+
+
+def test_frozen_or_not_backward_passes_begin_with_what_the_image_has_evaluated(
+    renderer: sdr.Renderer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each of them, and only where somebody wants gradients."""
+    given: list[int] = []
+    using = torch_render.using
+    monkeypatch.setattr(torch_render, "using", lambda results: (given.append(len(results)), using(results))[1])
+    vertices = renderer.vertices("ball")
+    moved = vertices.clone().requires_grad_()
+    loss = (renderer.render({"ball": moved}) * weights()).sum()
+    loss.backward(retain_graph=True)
+    first, moved.grad = moved.grad, None
+    if not renderer._frozen:  # replays do not run the code
+        assert len(given) == 1 and given[0] > 5
+    loss.backward()
+    torch.testing.assert_close(moved.grad, first)
+    kept: list[bool] = []
+    rendering = torch_render._Rendering.__init__
+    monkeypatch.setattr(
+        torch_render._Rendering, "__init__", lambda self, *given: (rendering(self, *given), kept.append(self.keep))[0]
+    )
+    renderer.render({"ball": vertices})
+    with torch.no_grad():
+        renderer.render({"ball": moved})
+    renderer.render({"ball": moved})
+    assert kept == [False, False, True]
 
 
 def test_without_gradients(renderer: sdr.Renderer) -> None:

@@ -74,7 +74,7 @@ def _measure(kind: str, size: int, rounds: int, done: Mapping[str, Any], update:
 class _Loop:
     """The loop of a Mitsuba user."""
 
-    def __init__(self, kind: str, size: int, **parameters: Any) -> None:
+    def __init__(self, kind: str, size: int, **parameters: bool) -> None:
         self._scene = _scene(size)
         self._params, self._key = mi.traverse(self._scene), KINDS[kind]
         value = self._params[self._key]

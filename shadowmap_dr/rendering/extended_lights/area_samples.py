@@ -20,9 +20,10 @@ from .samples import Facets, LightSamples, brightness, cluster_sums
 # Pieces of the emitter for each sample, at least; and how many more of them a texture needs, up to so many in all.
 _PIECES = 64
 _TEXTURED, _MOST = 16, 1 << 17
-# Disks that stand for a sample's part of an emitter that is not flat; and of one whose normals differ within a disk by more than
-# this from those of an evenly bent sheet, such as an animal's.
+# Disks that stand for a sample's part of an emitter that is not flat; and if there are few samples, or normals differ within a
+# disk by more than this from those of an evenly bent sheet, as an animal's do.
 _FACETS, _MORE_FACETS, _UNEVEN = 4, 8, 0.15
+_FEW_SAMPLES = 16
 # Weight of what is dark in the middle of a facet, in units of the emitter's mean brightness.
 _DIM = 1e-3
 # Importance of what faces away from everything, in units of the mean.
@@ -108,9 +109,10 @@ def _divided(planar: bool, pieces: tuple[np.ndarray, ...], nearest: np.ndarray) 
     positions, normals, weights, cluster = pieces
     if planar:
         return facet_clusters(positions, normals, weights, cluster, 1, nearest), 1
-    facet = facet_clusters(positions, normals, weights, cluster, _FACETS, nearest)
-    if unevenness(positions, normals, weights, facet) <= _UNEVEN:
-        return facet, _FACETS
+    if cluster.max() + 1 >= _FEW_SAMPLES:
+        facet = facet_clusters(positions, normals, weights, cluster, _FACETS, nearest)
+        if unevenness(positions, normals, weights, facet) <= _UNEVEN:
+            return facet, _FACETS
     return facet_clusters(positions, normals, weights, cluster, _MORE_FACETS, nearest), _MORE_FACETS
 
 

@@ -9,12 +9,14 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
+from ...jit.handover import computed
 from ...jit.kernel_inputs import split
 from ...jit.types import Bool, Point3f, UInt32, Vector3f
 from ...raster import RasterOutput, Topology
 from ...scene.geometry import Geometry
 from ...scene.lights.area import AreaLight
 from ...scene.lights.environment import Environment
+from ...scene.sensor import Sensor
 from ...shadow import (
     Frusta,
     ShadowMaps,
@@ -34,8 +36,9 @@ from ...shadow import (
 from ...shadow.light_camera import of_map
 from ..shadow_pass import MapPlan, boxes_of, check_sizes, shape_planes
 from .area_samples import AreaPlan, area_samples, plan_area
-from .map_aim import WIDEST, aim, sees_all, shape_vertices
+from .map_aim import WIDEST, aim, other_corners, sees_all, shape_vertices
 from .penumbra import Pyramid
+from .sample_counts import area_light_count, spread_points
 from .samples import LightSamples, SampleTable
 from .sky_samples import SkyPlan, plan_sky, sky_samples
 
@@ -75,19 +78,37 @@ class SoftPlan:
 
 
 def plan_soft(
-    lights: Sequence[SoftLight], geometry: Geometry, area_count: int, sky_count: int, single: bool = False
+    lights: Sequence[SoftLight],
+    geometry: Geometry,
+    area_count: int | None,
+    sky_count: int,
+    single: bool = False,
+    cameras: Sequence[Sensor] = (),
 ) -> tuple[SoftPlan, ...]:
-    """Choose samples of the lights, and their maps (on the host, once). ``single``: area lights get one map if one suffices."""
+    """Choose samples of the lights, and their maps (on the host, once).
+
+    Args:
+        lights: the lights.
+        geometry: of the scene.
+        area_count, sky_count: samples of each area light, of an environment. ``area_count`` None: as many as ``cameras`` need.
+        single: area lights get one map if one suffices.
+        cameras: cameras of the scene.
+    """
     plans: list[SoftPlan] = []
     first = {True: 0, False: 0}
     for light in lights:
         if isinstance(light, Environment):
             plan = SoftPlan(plan_sky(light, sky_count, geometry), "distant", sky_count, 0, (0.0, 0.0, 0.0), NO_SHAPE)
         else:
-            parts = plan_area(light, geometry, area_count)
-            aimed = aim(shape_vertices(geometry), geometry.shapes, light.shape)
+            vertices = shape_vertices(geometry)
+            aimed = aim(vertices, geometry.shapes, light.shape)
             kind = "cube" if aimed.surrounded else "single" if single else "near"
-            plan = SoftPlan(parts, kind, area_count, 0, aimed.target, light.shape, casters=aimed.casters)
+            count = area_count
+            if count is None:
+                receivers = spread_points(other_corners(geometry, light.shape))
+                count = area_light_count(vertices[light.shape], [vertices[k] for k in aimed.casters], receivers, cameras)
+            parts = plan_area(light, geometry, count)
+            plan = SoftPlan(parts, kind, count, 0, aimed.target, light.shape, casters=aimed.casters)
             if kind != "single" and parts.dented:
                 info = geometry.shapes[light.shape]
                 plan = replace(plan, kind="cube", hides=NO_SHAPE, facing=(info.face_start, info.face_start + info.face_count))
@@ -203,7 +224,8 @@ def _fitted(
     views = _stack([_views(plan, s, settings) for plan, s in lights])
     hidden = dr.concat([dr.full(mi.UInt32, plan.hides, plan.maps) for plan in plans])
     dr.eval(views, hidden)
-    return views, hidden, _fit(views, hidden, scene, geometry, settings, previous, seen)
+    frusta = computed("frusta of extended lights", lambda: _fit(views, hidden, scene, geometry, settings, previous, seen))
+    return views, hidden, frusta
 
 
 def _make(

@@ -9,6 +9,7 @@ describes the structure, and a plain list of arrays and of Mitsuba's objects.
 from __future__ import annotations
 
 import enum
+import weakref
 from collections.abc import Callable
 from typing import Any, cast
 
@@ -114,7 +115,7 @@ def take_apart(record: PyTree) -> tuple[str, list[PyTree]]:
 class _Taken:
     """Findings of :func:`take_apart`. (An inner function that calls itself would be garbage that holds arrays.)
 
-    The second walk through a record that cannot change stores what it finds there, in the record: later walks do without it.
+    What the second walk through a record of a class with ``TAKEN_APART_ONCE`` finds there is stored: later walks do without it.
     """
 
     def __init__(self) -> None:
@@ -132,7 +133,7 @@ class _Taken:
         elif kind is dict:
             self.mapping(value)
         elif names:
-            if not (_is_frozen(kind) and self._known(value)):
+            if not (hasattr(kind, "TAKEN_APART_ONCE") and self._known(value)):
                 self.text(kind.__qualname__)
                 for name in names:
                     self.walk(getattr(value, name))
@@ -167,13 +168,15 @@ class _Taken:
 
     def _known(self, record: PyTree) -> bool:
         """True if the findings in a record were stored before, and are added now."""
-        own: dict[str, Any] = record.__dict__
-        steps: list[_Step] | None = own.get(_STEPS)
-        if _STEPS not in own:
-            own[_STEPS] = []
+        place = id(record)
+        found = _STORED.get(place)
+        if found is None or found[0]() is not record:
+            _STORED[place] = weakref.ref(record, lambda _: _STORED.pop(place, None)), []
             return False
+        steps = found[1]
         if steps == []:
-            steps = own[_STEPS] = _Steps.of(record)
+            steps = _Steps.of(record)
+            _STORED[place] = found[0], steps
         if steps is None:
             return False
         for add, value in steps:
@@ -181,9 +184,10 @@ class _Taken:
         return True
 
 
-# Attribute of records with their steps: an empty list before the second walk, None if there can be none.
-_STEPS = "_recording_steps"
 _Step = tuple[Callable[[_Taken, PyTree], None], PyTree]
+# Records that have been walked through, by identity, and the steps of these walks: an empty list before the second walk, None if
+# there can be none. Not in the records: nobody expects more in ``vars(record)`` than its fields.
+_STORED: dict[int, tuple[weakref.ref[Any], list[_Step] | None]] = {}
 
 
 class _Steps(_Taken):

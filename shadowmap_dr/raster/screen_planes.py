@@ -35,8 +35,14 @@ def pixel_depth(
         reciprocal: for each image, True to return 1 / w instead of the depth. In perspective, the depth is an affine function
             of 1 / w, whose huge offset (if the near plane is close) would drown 1 / w in rounding.
     """
-    depths, _ = planes(positions, faces, raster, False, reciprocal)
-    return depth_at(depths, *pixels(raster), raster.valid)
+    if raster.batch * raster.face_count <= dr.width(raster.triangle):
+        depths, _ = planes(positions, faces, raster, False, reciprocal)
+        return depth_at(depths, *pixels(raster), raster.valid)
+    # Most triangles are seen by no pixel: the planes of those that are, for each pixel anew.
+    module = backend(positions)
+    image, row, column = pixel_coordinates(module, raster.batch, raster.height, raster.width)
+    found = _numbers(positions, faces, raster, raster.triangle, image, raster.valid, False, reciprocal)
+    return _depth_on(module.Array4f(*found), row, column, raster.valid)
 
 
 def depth_at(depths: Float, index: UInt32, row: UInt32, column: UInt32, hit: Bool) -> tuple[Float, Float, Float]:
@@ -46,7 +52,11 @@ def depth_at(depths: Float, index: UInt32, row: UInt32, column: UInt32, hit: Boo
         depths: first result of :func:`planes`.
         index: index of the triangle in the batch, where a triangle is visible (``hit``).
     """
-    plane = dr.gather(backend(depths).Array4f, depths, index, hit)
+    return _depth_on(dr.gather(backend(depths).Array4f, depths, index, hit), row, column, hit)
+
+
+def _depth_on(plane: Vector4f, row: UInt32, column: UInt32, hit: Bool) -> tuple[Float, Float, Float]:
+    """Depth of pixels on planes of :func:`planes`, and its changes."""
     x, y = offset(plane, row, column)
     depth = dr.select(hit, dr.fma(plane.x, x, dr.fma(plane.y, y, plane.z)), 1)
     return depth, dr.detach(plane.x), dr.detach(plane.y)
@@ -84,10 +94,35 @@ def planes(
         and 2, the function of its barycentric divided by w and the change of 1 / w by column (row); and the values of 1 / w.
     """
     module = backend(positions)
-    Float64 = module.Float64
-    width, height = raster.width, raster.height
     index = dr.arange(module.UInt32, raster.batch * raster.face_count)
     image, triangle = split(index, "faces", raster.face_count, raster.batch)
+    first = image * uint_input(module, "vertices", dr.width(positions) // (4 * raster.batch))
+    # Triangles beside the image are seen by no pixel. In large scenes most of them are.
+    seen = ~beside(dr.detach(gather_triangle(positions, faces, triangle, first, True)))
+    found = _numbers(positions, faces, raster, triangle, image, seen, barycentrics, reciprocal)
+    if not barycentrics:
+        return interleaved("depth planes", list(found)), ()
+    depths = ravel(module.Array4f(*found[:4]))
+    with dr.suspend_grad():
+        rows, inverse_w = found[4:10], found[10:]
+        packets = [module.Array4f(*rows[3 * k : 3 * k + 3], inverse_w[k]) for k in range(2)]
+        return depths, (*(ravel(packet) for packet in packets), inverse_w[2])
+
+
+def _numbers(
+    positions: Float,
+    faces: UInt32,
+    raster: RasterOutput,
+    triangle: UInt32,
+    image: UInt32,
+    active: Bool,
+    barycentrics: bool,
+    reciprocal: Bool | None,
+) -> tuple[Float, ...]:
+    """Numbers of :func:`planes` for triangles of images where ``active``, zeros elsewhere."""
+    module = backend(positions)
+    Float64 = module.Float64
+    width, height = raster.width, raster.height
     first = image * uint_input(module, "vertices", dr.width(positions) // (4 * raster.batch))
 
     def numbers(triangle: UInt32, image: UInt32, first: UInt32) -> tuple[Float, ...]:
@@ -129,17 +164,9 @@ def planes(
         inverse_w = [module.Float(sum(row)) for row in (change_x, change_y, there)]
         return *found, *(row[k] for k in (1, 2) for row in weights), *inverse_w
 
-    # Triangles beside the image are seen by no pixel. In large scenes most of them are.
-    seen = ~beside(dr.detach(gather_triangle(positions, faces, triangle, first, True)))
     zeros = (module.Float(0),) * (13 if barycentrics else 4)
-    found = branch(seen, numbers, lambda *_: zeros, (triangle, image, first), "planes")
-    if not barycentrics:
-        return interleaved("depth planes", list(found)), ()
-    depths = ravel(module.Array4f(*found[:4]))
-    with dr.suspend_grad():
-        rows, inverse_w = found[4:10], found[10:]
-        packets = [module.Array4f(*rows[3 * k : 3 * k + 3], inverse_w[k]) for k in range(2)]
-        return depths, (*(ravel(packet) for packet in packets), inverse_w[2])
+    result: tuple[Float, ...] = branch(active, numbers, lambda *_: zeros, (triangle, image, first), "planes")
+    return result
 
 
 def _pixel_near(corners: Corners, axis: int, name: str, size: int) -> UInt32:

@@ -16,14 +16,10 @@ import mitsuba as mi
 from ..jit.gpu import keep_registers
 from ..jit.pytree import attached_arrays, with_arrays
 from ..jit.types import AnyArray, TensorXf
+from ..rendering.waiting import MOST_SAMPLES, TEXELS
 from ..scene.load import SceneData
 from ..scene.mitsuba_meshes import VERTEX_PARAMETERS
 from .parameter_state import ParameterState
-
-#: Most pixel samples of all waiting images together; each may hold half a kilobyte.
-MOST_SAMPLES = 1 << 20
-#: Texels of shadow maps that take as much memory as one sample.
-TEXELS = 6
 
 # Parameters that an image depends on only through the records of its scene. Materials and textures, in contrast, are evaluated by
 # Mitsuba itself.

@@ -7,17 +7,17 @@ from dataclasses import dataclass, replace
 import mitsuba as mi
 
 from ..jit.handover import Results
-from .deferred import MOST_SAMPLES
+from ..rendering.waiting import MOST_SAMPLES
 from .parameter_state import ParameterState
 
 
 @dataclass(frozen=True)
 class _Handed:
-    """Results of one image, its samples, and the parameters of scene and sensor."""
+    """Results of one image, its weight in samples, and the parameters of scene and sensor."""
 
     sensor: mi.Sensor
     spp: int
-    samples: int
+    weight: int
     scene: ParameterState
     camera: ParameterState
     results: Results
@@ -30,12 +30,16 @@ class HandedResults:
         self._images: list[_Handed] = []
 
     def add(
-        self, sensor: mi.Sensor, spp: int, samples: int, scene: ParameterState, camera: ParameterState, results: Results
+        self, sensor: mi.Sensor, spp: int, weight: int, scene: ParameterState, camera: ParameterState, results: Results
     ) -> None:
-        """Let results wait. Those of other states of the scene are dropped, and those that have waited longest make room."""
+        """Let results wait. Those of other states of the scene are dropped, and those that have waited longest make room.
+
+        ``weight``: measure of their memory, in samples.
+        """
         others = [one for one in self._images if one.scene.same(scene) and (one.sensor is not sensor or one.spp != spp)]
-        self._images = [*others, _Handed(sensor, spp, samples, scene, camera, results)]
-        while sum(one.samples for one in self._images) > MOST_SAMPLES:
+        self._images = [*others, _Handed(sensor, spp, weight, scene, camera, results)]
+        # The latest results wait whatever their size: computing them again would take as much memory.
+        while len(self._images) > 1 and sum(one.weight for one in self._images) > MOST_SAMPLES:
             self._images.pop(0)
 
     def take(self, sensor: mi.Sensor, spp: int, scene: ParameterState, camera: ParameterState) -> Results:

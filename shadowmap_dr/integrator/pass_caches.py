@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import mitsuba as mi
 
 from ..rendering.pass_cache import CacheLevel, PassCache
+from ..rendering.waiting import MOST_SAMPLES
 from ..scene.load import SceneData
 from ..scene.mitsuba_objects import children, is_attribute, owners
-from .deferred import MOST_SAMPLES
 from .parameter_state import ParameterState
 
 # Images whose parameters are remembered.

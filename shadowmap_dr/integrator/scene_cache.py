@@ -18,6 +18,7 @@ from ..rendering.extended_lights import SkyWatch, SoftFrusta, still_aimed
 from ..rendering.pass_cache import PassCache
 from ..rendering.renderer import Renderer
 from ..rendering.settings import RenderSettings
+from ..rendering.waiting import MOST_SAMPLES, TEXELS
 from ..scene.changes import MirrorWatch, ParameterWatch
 from ..scene.geometry import NOT_READ
 from ..scene.load import SceneData, load, refresh, with_positions
@@ -26,7 +27,7 @@ from ..scene.sensor import lenses_of, sensors_of
 from ..scene.unsupported import warn_of
 from ..scene.untracked import UntrackedValues
 from ..shadow import Frusta
-from .deferred import COLOURS_OF_LIGHTS, MOST_SAMPLES, TEXELS, DeferredImages, DetachedInputs
+from .deferred import COLOURS_OF_LIGHTS, DeferredImages, DetachedInputs
 from .handed import HandedResults
 from .parameter_state import ParameterState
 from .pass_caches import PassCaches, names_by_level
@@ -229,7 +230,7 @@ class SceneCache:
         image, frusta, soft_frusta, results = self.recorded.image(spp, current, keep)
         self._remember(scene, sensor, frusta, soft_frusta)
         if keep and now.attached:
-            self.handed.add(sensor, spp, samples, now.scene, now.camera, results)
+            self.handed.add(sensor, spp, samples + self.renderer.texels // TEXELS, now.scene, now.camera, results)
         self.handed.follow(now.scene, scene)
         return image
 

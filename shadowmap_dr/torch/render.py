@@ -5,10 +5,11 @@ from __future__ import annotations
 import copy
 import math
 import os
+import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -21,6 +22,7 @@ from ..jit.pytree import tree_map
 from ..jit.types import TensorXf
 from ..rendering.extended_lights import SkyWatch, SoftFrusta, still_aimed
 from ..rendering.renderer import Renderer as _Renderer
+from ..rendering.waiting import MOST_SAMPLES, TEXELS
 from ..scene.sensor import Sensor
 from ..shadow import Frusta
 from .bridge import attached, drjit_turn, forward_derivatives, gradients, number, to_torch
@@ -266,8 +268,10 @@ class _Place:
 class _Rendering:
     """One image as an operation, rendered once more for its derivatives, from what the image has evaluated.
 
-    ``keep``: whether that is kept for a backward pass.
+    ``keep``: whether that is kept for the first backward pass, unless earlier images that still wait for theirs keep too much.
     """
+
+    _waiting: ClassVar[weakref.WeakSet[_Rendering]] = weakref.WeakSet()
 
     name, unbatched = "Renderer.render", ""
 
@@ -280,12 +284,17 @@ class _Rendering:
         # Decisions of the forward pass that the backward pass repeats.
         self.fixed: dict[str, Any] = {}
         self.results: Results = []
+        self.weight = 0
 
     def forward(self, arrays: list[TensorXf]) -> Sequence[TensorXf]:
         with dr.suspend_grad(), self._scene(arrays) as renderer:
-            image, fit, self.results = self.functions[0](self.places, *self.camera, self.keep, arrays, renderer)
+            keep = self.keep and sum(other.weight for other in self._waiting) < MOST_SAMPLES
+            image, fit, self.results = self.functions[0](self.places, *self.camera, keep, arrays, renderer)
             # Evaluated while the scene has the parameters of this call.
             dr.eval(image, fit, self.results)
+        if self.results:
+            self.weight = math.prod(image.shape[:2]) * self.camera[1] + renderer.texels // TEXELS
+            self._waiting.add(self)
         self.fixed = {"soft": renderer.soft, "frusta": fit[0], "soft_frusta": fit[1]}
         # The owner changes only now that nothing can fail any more.
         self.owner._renderer.frusta = fit[0]
@@ -299,8 +308,9 @@ class _Rendering:
         with dr.resume_grad():
             arrays = attached(arrays, wanted)  # before they enter the scene
             with self._scene(arrays) as renderer:
-                # Copies, as of the fits: there may be another backward pass.
-                results = tree_map(self.results, lambda array: type(array)(array))
+                # Their memory is free after this backward pass. Another one computes them again.
+                results, self.results = self.results, []
+                self._waiting.discard(self)
                 return self.functions[1](self.places, *self.camera, list(wanted), arrays, adjoints[0], renderer, results)
 
     def jvp(self, arrays: list[TensorXf], tangents: Sequence[TensorXf | None]) -> Sequence[TensorXf]:

@@ -234,14 +234,7 @@ class SceneCache:
         self.handed.follow(now.scene, scene)
         return image
 
-    def replay_backward(
-        self,
-        scene: mi.Scene,
-        sensor: mi.Sensor,
-        spp: int,
-        gradient: TensorXf,
-        now: SceneState,
-    ) -> bool:
+    def replay_backward(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, gradient: TensorXf, now: SceneState) -> bool:
         """Add the gradients of <image, gradient> to the scene's parameters, through a recording, too.
 
         Does nothing and returns False if gradients also flow through materials, textures or the radiance of extended lights,
@@ -257,14 +250,7 @@ class SceneCache:
             self.handed.follow(now.scene, scene)
         return self.recordable[attached]
 
-    def try_to_replay_backward(
-        self,
-        scene: mi.Scene,
-        sensor: mi.Sensor,
-        spp: int,
-        gradient: TensorXf,
-        now: SceneState,
-    ) -> bool:
+    def try_to_replay_backward(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, gradient: TensorXf, now: SceneState) -> bool:
         """The same as :meth:`replay_backward` if the last image of this kind was replayed. False if it cannot be recorded."""
         if not self.steady.is_replayed(_kind(now.attached, sensor, spp)):
             return False

@@ -9,7 +9,6 @@ describes the structure, and a plain list of arrays and of Mitsuba's objects.
 from __future__ import annotations
 
 import enum
-import weakref
 from collections.abc import Callable
 from typing import Any, cast
 
@@ -113,10 +112,7 @@ def take_apart(record: PyTree) -> tuple[str, list[PyTree]]:
 
 
 class _Taken:
-    """Findings of :func:`take_apart`. (An inner function that calls itself would be garbage that holds arrays.)
-
-    What the second walk through a record of a class with ``TAKEN_APART_ONCE`` finds there is stored: later walks do without it.
-    """
+    """Findings of :func:`take_apart`. (An inner function that calls itself would be garbage that holds arrays.)"""
 
     def __init__(self) -> None:
         self.texts: list[str] = []
@@ -127,119 +123,27 @@ class _Taken:
         kind = type(value)
         names = _parts_of(kind)
         if names is None:
-            self.text(repr(value))
+            self.texts.append(repr(value))
         elif kind is tuple or kind is list:
-            self.sequence(value)
+            self.texts.append(f"{kind.__name__}{len(value)}")
+            for item in value:
+                self.walk(item)
         elif kind is dict:
-            self.mapping(value)
+            self.texts.append(f"dict{len(value)}")
+            for name, item in value.items():
+                self.texts.append(repr(name))
+                self.walk(item)
         elif names:
-            if not (hasattr(kind, "TAKEN_APART_ONCE") and self._known(value)):
-                self.text(kind.__qualname__)
-                for name in names:
-                    self.walk(getattr(value, name))
+            self.texts.append(kind.__qualname__)
+            for name in names:
+                self.walk(getattr(value, name))
         elif hasattr(kind, "recording_text"):
-            self.described(value)
+            self.texts.append(value.recording_text())
         else:
-            self.leaf(value)
-
-    def text(self, text: str) -> None:
-        self.texts.append(text)
-
-    def leaf(self, value: PyTree) -> None:
-        number = self._numbers.setdefault(id(value), len(self.leaves))
-        self.texts.append(f"#{number}")
-        if number == len(self.leaves):
-            self.leaves.append(value)
-
-    def described(self, value: PyTree) -> None:
-        """An object that gives its own text, another one each time perhaps."""
-        self.texts.append(value.recording_text())
-
-    def sequence(self, values: PyTree) -> None:
-        self.text(f"{type(values).__name__}{len(values)}")
-        for item in values:
-            self.walk(item)
-
-    def mapping(self, values: PyTree) -> None:
-        self.text(f"dict{len(values)}")
-        for name, item in values.items():
-            self.text(repr(name))
-            self.walk(item)
-
-    def _known(self, record: PyTree) -> bool:
-        """True if the findings in a record were stored before, and are added now."""
-        place = id(record)
-        found = _STORED.get(place)
-        if found is None or found[0]() is not record:
-            _STORED[place] = weakref.ref(record, lambda _: _STORED.pop(place, None)), []
-            return False
-        steps = found[1]
-        if steps == []:
-            steps = _Steps.of(record)
-            _STORED[place] = found[0], steps
-        if steps is None:
-            return False
-        for add, value in steps:
-            add(self, value)
-        return True
-
-
-_Step = tuple[Callable[[_Taken, PyTree], None], PyTree]
-# Records that have been walked through, by identity, and the steps of these walks: an empty list before the second walk, None if
-# there can be none. Not in the records: nobody expects more in ``vars(record)`` than its fields.
-_STORED: dict[int, tuple[weakref.ref[Any], list[_Step] | None]] = {}
-
-
-class _Steps(_Taken):
-    """Steps of a walk through one record: functions of :class:`_Taken`, and their arguments."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.steps: list[_Step] = []
-        self.changes = False
-
-    @classmethod
-    def of(cls, record: PyTree) -> list[_Step] | None:
-        """The steps, or None if the record holds lists, dictionaries or other records that may change."""
-        found = cls()
-        found.text(type(record).__qualname__)
-        for name in _parts_of(type(record)) or ():
-            found.walk(getattr(record, name))
-        return None if found.changes else found.steps
-
-    def text(self, text: str) -> None:
-        if self.steps and self.steps[-1][0] is _Taken.text:
-            text = f"{self.steps.pop()[1]} {text}"
-        self.steps.append((_Taken.text, text))
-
-    def leaf(self, value: PyTree) -> None:
-        self.steps.append((_Taken.leaf, value))
-
-    def described(self, value: PyTree) -> None:
-        self.steps.append((_Taken.described, value))
-
-    def sequence(self, values: PyTree) -> None:
-        self.changes |= type(values) is list
-        super().sequence(values)
-
-    def mapping(self, values: PyTree) -> None:
-        self.changes = True
-
-    def _known(self, record: PyTree) -> bool:
-        return False
-
-    def walk(self, value: PyTree) -> None:
-        kind = type(value)
-        self.changes |= fields_of(kind) is not None and not _is_frozen(kind)
-        if not self.changes:
-            super().walk(value)
-
-
-@cached_by_type
-def _is_frozen(kind: type) -> bool:
-    """True for dataclasses that cannot change."""
-    parameters = getattr(kind, "__dataclass_params__", None)
-    return parameters is not None and bool(parameters.frozen)
+            number = self._numbers.setdefault(id(value), len(self.leaves))
+            self.texts.append(f"#{number}")
+            if number == len(self.leaves):
+                self.leaves.append(value)
 
 
 @cached_by_type

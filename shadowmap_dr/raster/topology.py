@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import drjit as dr
 import numpy as np
@@ -63,8 +62,6 @@ class Topology:
             hide nothing.
         owners: (2 E,) faces of each edge, twice the same at an edge of one shape; None without ``see_through_faces``.
     """
-
-    TAKEN_APART_ONCE: ClassVar[bool] = True
 
     edges: UInt32
     opposite: UInt32

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields, replace
 from difflib import get_close_matches
 from numbers import Integral, Real
-from typing import Any, ClassVar
+from typing import Any
 
 from ..errors import ShadowmapError, did_you_mean
 from ..shadow import MAX_TILES, ShadowSettings
@@ -44,8 +44,8 @@ class RenderSettings:
             the same.
         max_depth: 0 is black, 1 shows emitters only, 2 is direct light, as in Mitsuba; more, or -1, is the same as 2.
         area_light_samples: points on each area light, each with a shadow map; ``auto``: 8 to 32, twice as many as its penumbrae
-            have pixels (:mod:`.extended_lights.sample_counts`). With 64 samples per pixel or more, each sample sees a fourth
-            (ninth, ...) of them if that number divides theirs (interleaved sampling).
+            have pixels, more for near lights (:mod:`.extended_lights.sample_counts`). With 64 samples per pixel or more, each
+            sample sees a fourth (ninth, ...) of them if that number divides theirs (interleaved sampling).
         environment_light_samples: directions of an environment, each with a shadow map.
         soft_map_resolution: texels along each side of these maps.
         emitter_shadows: ``samples``, or ``single``: one map of ``shadow.resolution`` texels (a power of two) for each area light,
@@ -57,8 +57,6 @@ class RenderSettings:
         aovs: names of further channels, see :data:`shadowmap_dr.rendering.film.aovs.AOVS`. Text with commas is split into a
             tuple, as in the plug-in.
     """
-
-    TAKEN_APART_ONCE: ClassVar[bool] = True
 
     shadow: ShadowSettings = field(default_factory=lambda: ShadowSettings(**_automatic({})))
     antialias: bool = True

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate
-from typing import Any, ClassVar
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -57,8 +57,6 @@ class MapPlan:
     ``planes``: index of the largest face of each planar shape, of any face for other shapes. ``planar``: Bool (S,).
     ``center``, ``radius``: a sphere around the scene at rest, world space, for the fixed frusta of ``compat``.
     """
-
-    TAKEN_APART_ONCE: ClassVar[bool] = True
 
     kinds: tuple[str, ...]
     tiles: tuple[int, ...]

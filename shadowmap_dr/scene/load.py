@@ -55,8 +55,6 @@ class SceneData:
     only_cosines  whether all BSDFs are the cosine of the light's direction times a factor that no direction changes
     """
 
-    TAKEN_APART_ONCE: ClassVar[bool] = True
-
     scene: mi.Scene
     geometry: Geometry
     sensors: tuple[tuple[Sensor, ...], ...]

@@ -11,7 +11,7 @@ in reverse and forward. Bad input raises a one-line :class:`shadowmap_dr.Shadowm
 Images are stored as in Mitsuba: row 0 of what is rasterized lies at y = -1 in clip space.
 
 PyTorch's threads on the CPU wait for their next work by spinning, and Dr.Jit's threads have fewer cores meanwhile: a step takes
-1.2 to 2 times as long. If PyTorch was not imported before, importing this module lets them sleep (``OMP_WAIT_POLICY=PASSIVE``,
+1.4 to 1.8 times as long. If PyTorch was not imported before, importing this module lets them sleep (``OMP_WAIT_POLICY=PASSIVE``,
 unless that is set); else set this variable before Python starts.
 
 Importing this module needs PyTorch: in a checkout ``pip install '.[torch]'``, elsewhere ``pip install torch``.

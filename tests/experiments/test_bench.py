@@ -25,7 +25,6 @@ from shadowmap_dr.experiments.bench import common as bench_common
 from shadowmap_dr.experiments.bench import experiment as bench
 from shadowmap_dr.experiments.bench import first as bench_first
 from shadowmap_dr.experiments.bench import loops as bench_loops
-from shadowmap_dr.experiments.bench import plugin as bench_plugin
 from shadowmap_dr.experiments.bench import raster as bench_raster
 from shadowmap_dr.experiments.bench import report as bench_report
 from shadowmap_dr.experiments.bench import sums as bench_sums
@@ -154,16 +153,6 @@ def test_steps_of_the_plugin(tmp_path: Path) -> None:
         )
     rows = [row for row in bench_report.rows(record) if row.what.startswith("plug-in")]
     assert len(rows) == 4 and [bool(row.aim) for row in rows] == [True, False] * 2
-
-
-@pytest.mark.parametrize("kind", [kind for kind in bench_plugin.KINDS if kind in bench_plugin._ARGUMENTS])
-def test_the_renderer_of_the_plugin_s_steps_has_their_derivatives(kind: str) -> None:
-    loop, frozen = bench_plugin._Loop(kind, 32), bench_plugin._Frozen(kind, 32)
-    expected, found = (float(call()[0]) for call in (loop, frozen))
-    # A number of degrees turns the light of the plug-in; that of the renderer is a component of a unit vector. The maps of
-    # both are fitted at other moments.
-    scale = -np.pi / 180 if kind == "light" else 1
-    assert abs(expected) > 1e-5 and found * scale == pytest.approx(expected, rel=0.06)
 
 
 def test_passes(tmp_path: Path) -> None:

@@ -63,11 +63,12 @@ def test_pixels_of_penumbrae(variant: str) -> None:
 
 def test_points_are_spread_by_area() -> None:
     corners = np.array([[[0.0, 0, 0], [3, 0, 0], [0, 1, 0]], [[10, 0, 0], [11, 0, 0], [10, 1, 0]], [[5, 5, 5]] * 3])
-    points = spread_points(corners, 400)
-    assert points.shape == (400, 3) and (points[:, 0] < 5).sum() == 300
+    positions, faces = corners.reshape(-1, 3).astype(np.float32), np.arange(9, dtype=np.uint32).reshape(3, 3)
+    points, face = spread_points(positions, faces, 400)
+    assert points.shape == (400, 3) and (points[:, 0] < 5).sum() == 300 == (face == 0).sum()
     inside = points[points[:, 0] < 5]
     assert (inside >= 0).all() and (inside[:, 0] / 3 + inside[:, 1] <= 1).all()
-    np.testing.assert_array_equal(spread_points(corners[2:]), corners[2:, 0])
+    np.testing.assert_array_equal(spread_points(positions, faces[2:])[0], corners[2:, 0])
 
 
 @pytest.mark.parametrize("kind", ["sphere", "disk"])
@@ -129,6 +130,7 @@ def test_nothing_to_see(variant: str) -> None:
     assert area_light_count(lamp, [floor + [0, 0, 10]], floor, cameras) == FEWEST
     assert area_light_count(lamp[:1], [floor + [0, 0, 1]], floor, cameras) == FEWEST
     assert area_light_count(lamp, [floor + [0, 0, 1]], floor, []) == MOST
+    assert area_light_count(lamp, [floor + [0, 0, 1]], floor[:0], cameras) == FEWEST
 
 
 @pytest.mark.parametrize("value", ["many", 0, 1.5])

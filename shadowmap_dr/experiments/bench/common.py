@@ -85,9 +85,7 @@ class Sizes:
         {"shapes": 5000},
         {"shapes": 200, "lights": 40},
     )
-    plugin_kinds: tuple[str, ...] = (
-        *("vertices", "to_world", "light", "camera", "colour of the light", "reflectance", "texture"),
-    )
+    plugin_kinds: tuple[str, ...] = ("vertices", "to_world", "light", "camera", "colour of the light", "reflectance", "texture")
     plugin_resolutions: tuple[int, ...] = (128, 512)
     fits: tuple[str, ...] | None = None
     fit_starts: int = 4

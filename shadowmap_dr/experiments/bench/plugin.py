@@ -86,12 +86,12 @@ class _Loop:
         self._x += 1e-4
         x = dr.opaque(mi.Float, self._x)
         dr.enable_grad(x)
-        if isinstance(self._start, mi.Transform4f):
-            self._params[self._key] = mi.Transform4f().translate(_shift(x)) @ self._start
-            if self._key.startswith("light"):
-                self._params[self._key] = mi.Transform4f().rotate(mi.Vector3f(0, 1, 0), x) @ self._start
-        else:
+        if not isinstance(self._start, mi.Transform4f):
             self._params[self._key] = type(self._start)(self._start + x)
+        elif self._key.startswith("light"):
+            self._params[self._key] = mi.Transform4f().rotate(mi.Vector3f(0, 1, 0), x) @ self._start
+        else:
+            self._params[self._key] = mi.Transform4f().translate(_shift(x)) @ self._start
         self._params.update()
         return x
 

@@ -37,15 +37,6 @@ def shape_vertices(geometry: Geometry) -> list[Points]:
     return [positions[i.vertex_start : i.vertex_start + i.vertex_count] for i in geometry.shapes]
 
 
-def other_corners(geometry: Geometry, own: int) -> Points:
-    """(F, 3, 3) world space, corners of the triangles of all shapes but ``own`` (of that one if there is no other), read back."""
-    positions = dr.detach(geometry.positions).numpy().reshape(-1, 3).astype(np.float64)
-    info, faces = geometry.shapes[own], geometry.faces.numpy().reshape(-1, 3)
-    others = np.delete(faces, slice(info.face_start, info.face_start + info.face_count), 0)
-    found: Points = positions[others if len(others) else faces]
-    return found
-
-
 def aim(vertices: Sequence[Points], shapes: Sequence[ShapeInfo], own: int) -> Aim:
     """Aim of maps on the emitter ``own``, at the shapes that can cast shadows."""
     emitter, others = vertices[own], [k for k in range(len(shapes)) if k != own]

@@ -20,6 +20,8 @@ _PER_PIXEL = 2.0
 _NEAR = 0.2
 # Receivers and vertices of casters that are looked at; a caster hides a receiver if the light sees both in about one direction.
 _RECEIVERS, _BLOCKERS, _TOGETHER = 2048, 512, 0.1
+# Triangles whose areas are computed at once.
+_PIECE = 1 << 16
 # Share of the receivers behind casters whose penumbrae count: the widest ones are those of a few points, far behind.
 _COUNTED = 0.95
 
@@ -40,7 +42,7 @@ def area_light_count(light: Points, casters: Sequence[Points], receivers: Points
     radius = float(np.linalg.norm(light - centre, axis=1).max())
     widths = _widths(_thinned(np.concatenate(casters), _BLOCKERS) - centre, receivers - centre, radius)
     widest = max((_pixels(camera, receivers, widths) for camera in cameras), default=float(MOST))
-    nearest = float(np.linalg.norm(receivers - centre, axis=1).min()) - radius
+    nearest = float(np.linalg.norm(receivers - centre, axis=1).min(initial=np.inf)) - radius
     angle = radius / nearest if nearest > 0 else np.inf
     needed = max(_PER_PIXEL * widest, MOST * (angle / _NEAR) ** 2)
     count = FEWEST
@@ -49,17 +51,30 @@ def area_light_count(light: Points, casters: Sequence[Points], receivers: Points
     return count
 
 
-def spread_points(corners: Points, count: int = _RECEIVERS) -> Points:
-    """Points (count, 3) spread over triangles (F, 3, 3) by area; the same in each call."""
+def spread_points(
+    positions: npt.NDArray[np.float32], faces: npt.NDArray[np.uint32], count: int = _RECEIVERS
+) -> tuple[Points, npt.NDArray[np.int64]]:
+    """Points (count, 3) spread over triangles by area, the same in each call, and the triangle of each (count,).
+
+    ``positions``: (V, 3); ``faces``: (F, 3). A scene may have millions of triangles: their corners are looked at in pieces.
+    """
     rng = np.random.default_rng(0)
-    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    if not areas.sum() > 0:
-        return corners[:, 0]
-    face = np.searchsorted(np.cumsum(areas) / areas.sum(), (np.arange(count) + 0.5) / count).clip(0, len(corners) - 1)
+    pieces = (positions[faces[start : start + _PIECE]] for start in range(0, len(faces), _PIECE))
+    sums = np.cumsum(np.concatenate([_areas(corners) for corners in pieces]), dtype=np.float64)
+    if not sums[-1] > 0:
+        return positions[faces[:count, 0]].astype(np.float64), np.arange(min(count, len(faces)))
+    face = np.searchsorted(sums / sums[-1], (np.arange(count) + 0.5) / count).clip(0, len(faces) - 1)
     u, v = rng.uniform(size=(2, count, 1))
     u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-    a, b, c = corners[face].transpose(1, 0, 2)
-    found: Points = a + u * (b - a) + v * (c - a)
+    a, b, c = positions[faces[face]].astype(np.float64).transpose(1, 0, 2)
+    return a + u * (b - a) + v * (c - a), face
+
+
+def _areas(corners: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """Twice the areas of triangles (F, 3, 3)."""
+    found: npt.NDArray[np.float32] = np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    )
     return found
 
 

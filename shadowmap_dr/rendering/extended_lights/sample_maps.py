@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
 
 from ...jit.handover import computed
 from ...jit.kernel_inputs import split
@@ -36,7 +38,7 @@ from ...shadow import (
 from ...shadow.light_camera import of_map
 from ..shadow_pass import MapPlan, boxes_of, check_sizes, shape_planes
 from .area_samples import AreaPlan, area_samples, plan_area
-from .map_aim import WIDEST, aim, other_corners, sees_all, shape_vertices
+from .map_aim import WIDEST, Points, aim, sees_all, shape_vertices
 from .penumbra import Pyramid
 from .sample_counts import area_light_count, spread_points
 from .samples import LightSamples, SampleTable
@@ -96,6 +98,7 @@ def plan_soft(
     """
     plans: list[SoftPlan] = []
     first = {True: 0, False: 0}
+    receivers: tuple[Points, npt.NDArray[np.uint32]] | None = None
     for light in lights:
         if isinstance(light, Environment):
             plan = SoftPlan(plan_sky(light, sky_count, geometry), "distant", sky_count, 0, (0.0, 0.0, 0.0), NO_SHAPE)
@@ -105,8 +108,9 @@ def plan_soft(
             kind = "cube" if aimed.surrounded else "single" if single else "near"
             count = area_count
             if count is None:
-                receivers = spread_points(other_corners(geometry, light.shape))
-                count = area_light_count(vertices[light.shape], [vertices[k] for k in aimed.casters], receivers, cameras)
+                receivers = _receivers(geometry) if receivers is None else receivers
+                others = receivers[0][receivers[1] != light.shape]
+                count = area_light_count(vertices[light.shape], [vertices[k] for k in aimed.casters], others, cameras)
             parts = plan_area(light, geometry, count)
             plan = SoftPlan(parts, kind, count, 0, aimed.target, light.shape, casters=aimed.casters)
             if kind != "single" and parts.dented:
@@ -116,6 +120,13 @@ def plan_soft(
         plans.append(replace(plan, first=first[alone]))
         first[alone] += plan.maps
     return tuple(plans)
+
+
+def _receivers(geometry: Geometry) -> tuple[Points, npt.NDArray[np.uint32]]:
+    """Points (R, 3) spread over all surfaces, and the shape of each (R,)."""
+    positions, faces = geometry.positions, geometry.faces
+    points, face = spread_points(dr.detach(positions).numpy().reshape(-1, 3), faces.numpy().reshape(-1, 3))
+    return points, geometry.face_shape.numpy()[face]
 
 
 def still_aimed(plans: Sequence[SoftPlan], geometry: Callable[[], Geometry]) -> bool:

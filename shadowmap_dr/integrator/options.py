@@ -41,7 +41,7 @@ class Options:
 
     shadow_map_resolution  texels along each side of a shadow map, at least six more than those of the filter, at most 4096; or
                            ``auto``: 256, and directional lights and spots get as many maps as the pixels that see their
-                           shadows are worth
+                           shadows are worth; 128 to 256 for four lights and more, as the image has pixels along a side
     shadow_tiles           most maps of such a light, at most 16; 0: 16 for ``auto``, else 1
     shadow_method          ``auto`` (``evsm4``), ``vsm``, ``esm``, ``evsm2``, ``evsm4``, ``msm``, ``csm``, ``pcf``, ``standard``
                            (no shadow gradients) or ``none`` (no shadows); see ``shadowmap_dr.shadow.ShadowSettings``

@@ -23,7 +23,7 @@ from ..scene.lights.soft_outline import softened
 from ..scene.load import SceneData
 from ..scene.sensor import ImageSize, Sensor
 from ..scene.sums import attached_parameters
-from ..shadow import Frusta, ShadowMaps
+from ..shadow import Frusta, ShadowMaps, ShadowSettings
 from .direct_light import ambient_light, background, direct_light, emission
 from .extended_lights import (
     LightSamples,
@@ -47,7 +47,8 @@ from .gbuffer.pixel_footprint import FootprintSamples, footprint_points
 from .gbuffer.surface import Surface
 from .light_colours import white_area_light, white_light
 from .light_loops import MANY_LIGHTS, many_lights
-from .light_slices import LightSlice, joined_fits, shining_objects
+from .light_slices import LightSlice, joined_fits, plan_slices, shining_objects
+from .light_tiles import sized
 from .settings import RenderSettings
 from .shadow_pass import MapPlan, fit_maps, light_visibility, make_maps
 
@@ -141,6 +142,7 @@ class LightPass:
         soft: samples of extended lights, and the shadow maps of the samples.
         outward: ``Bool`` (F,), faces that shadow maps show from the front only, or None.
         slices: slices of the lights, whose maps are in memory one after the other; none if all fit together.
+        shadow: settings of the maps of lights without extent, None for those of ``settings``.
     """
 
     data: SceneData
@@ -149,6 +151,21 @@ class LightPass:
     soft: tuple[SoftPlan, ...]
     outward: Bool | None
     slices: tuple[LightSlice, ...] = ()
+    shadow: ShadowSettings | None = None
+
+    def for_image(self, pixels: int) -> LightPass:
+        """The same pass with maps as large as images of so many pixels need (:func:`~.light_tiles.sized`)."""
+        shadow = sized(self.settings.shadow, self.plan, pixels)
+        if shadow is self.settings.shadow:
+            return self
+        # Slices were planned for larger maps.
+        slices = self.slices and plan_slices(self.data, self.plan, self.soft, self.settings, shadow)
+        return replace(self, shadow=shadow, slices=slices)
+
+    @property
+    def _maps(self) -> ShadowSettings:
+        """Settings of the maps of lights without extent."""
+        return self.shadow or self.settings.shadow
 
     @property
     def needs_frames(self) -> bool:
@@ -186,7 +203,7 @@ class LightPass:
         if settings.shadow.method != "none" and (lights or samples):
             points, common = seen(), (shapes.geometry, shapes.casting)
             if lights:
-                maps = make_maps(self.plan, lights, *common, settings.shadow, fits[0], transparent, points, self.outward)
+                maps = make_maps(self.plan, lights, *common, self._maps, fits[0], transparent, points, self.outward)
             if samples:
                 shadow = settings.soft_shadow
                 soft_maps = make_soft_maps(self.soft, samples, self.plan, *common, shadow, fits[1], transparent, points)
@@ -207,7 +224,7 @@ class LightPass:
             frusta: Frusta | None = None
             soft: SoftFrusta = (None, None)
             if data.lights:
-                frusta = fit_maps(self.plan, data.lights, geometry, settings.shadow, previous[0], seen)
+                frusta = fit_maps(self.plan, data.lights, geometry, self._maps, previous[0], seen)
             if samples:
                 soft = fit_soft_maps(self.soft, samples, self.plan, geometry, settings.soft_shadow, previous[1], seen)
             dr.eval(frusta, soft)

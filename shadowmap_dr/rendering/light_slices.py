@@ -69,17 +69,20 @@ def joined_fits(fits: Sequence[tuple[Frusta | None, SoftFrusta]]) -> tuple[Frust
     return frusta, (sampled, single)
 
 
-def plan_slices(data: SceneData, plan: MapPlan, soft: Sequence[SoftPlan], settings: RenderSettings) -> tuple[LightSlice, ...]:
+def plan_slices(
+    data: SceneData, plan: MapPlan, soft: Sequence[SoftPlan], settings: RenderSettings, shadow: ShadowSettings | None = None
+) -> tuple[LightSlice, ...]:
     """Slices of the lights, as few and as equal as fit into ``settings.light_memory`` each; none if all lights fit together.
 
     A light whose maps take more is a slice of its own. A single slice would save nothing: then there are none.
+    ``shadow``: settings of the maps of lights without extent, if they differ from ``settings.shadow``.
 
     Raises:
         ShadowmapError: the maps of a single light take more memory than that and than the machine has.
     """
     if settings.shadow.method == "none" or not settings.lit:
         return ()
-    sizes = _Sizes.of(data, plan, soft, settings)
+    sizes = _Sizes.of(data, plan, soft, settings, shadow or settings.shadow)
     budget, every = int(settings.light_memory * 2**30), sizes.count
     if sizes.bytes(0, every) <= budget:
         return ()
@@ -110,9 +113,11 @@ class _Sizes:
     gradients: list[int]
 
     @classmethod
-    def of(cls, data: SceneData, plan: MapPlan, soft: Sequence[SoftPlan], settings: RenderSettings) -> _Sizes:
+    def of(
+        cls, data: SceneData, plan: MapPlan, soft: Sequence[SoftPlan], settings: RenderSettings, shadow: ShadowSettings
+    ) -> _Sizes:
         sampled, single = settings.soft_shadow
-        kinds = [(count, settings.shadow) for count in plan.counts]
+        kinds = [(count, shadow) for count in plan.counts]
         kinds += [(one.maps, single if one.kind == "single" else sampled) for one in soft]
         maps = [count * map_bytes(setting, data.geometry) for count, setting in kinds]
         gradients = [count * _GRADIENT * _numbers(setting) * setting.resolution**2 for count, setting in kinds]

@@ -1,4 +1,4 @@
-"""The number of maps that share a light's image plane: texels follow pixels."""
+"""Texels follow pixels: the number of maps that share a light's image plane, and the texels of single maps."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from ..jit.types import Bool, Point3f
 from ..scene.load import SceneData
-from ..shadow import Frusta, project, stack_views
+from ..shadow import Frusta, ShadowSettings, project, stack_views
 from .light_loops import MANY_LIGHTS
 from .light_slices import map_bytes
 from .settings import RenderSettings
@@ -17,6 +17,21 @@ from .shadow_pass import MapPlan
 
 # Texels for each pixel in the part of the image that a light's map covers.
 _TEXELS = 1.25
+# From so many lights on, each has a small share in the errors of the image. In small images their maps have one texel for each
+# pixel, and at least so many along each side, a multiple of a number.
+_MANY_ERRORS, _FEWEST, _STEP = 4, 128, 32
+
+
+def sized(shadow: ShadowSettings, plan: MapPlan, pixels: int) -> ShadowSettings:
+    """Settings of the maps of lights without extent, for images of so many pixels: many lights have smaller maps in small images.
+
+    So they have the fewer texels, none smaller than a pixel, that tiles have in large images; like these, they are not filtered.
+    """
+    if not shadow.adaptive or shadow.resolution != ShadowSettings.resolution:
+        return shadow
+    if plan.groups or len(plan.kinds) < _MANY_ERRORS:
+        return shadow
+    return shadow.fewer(max(_FEWEST, _STEP * math.ceil(math.sqrt(pixels) / _STEP)))
 
 
 def with_tiles(

@@ -200,8 +200,8 @@ class Renderer:
             cameras = made.camera_pass
             shapes = cameras.placed(data.geometry)
             views = [cameras.view(camera, shapes, 1) for camera in sample_windows(data.sensors[0])]
-            seen = cameras.seen(views, data.geometry)
-            made.frusta, made.soft_frusta = made.light_pass.fit(shapes, seen)
+            seen, pixels = cameras.seen(views, data.geometry), _pixels(data.sensors[0])
+            made.frusta, made.soft_frusta = made.light_pass.for_image(pixels).fit(shapes, seen)
             samples = samples or spp * sum(view.size.width * view.size.height for view in views)
             plan = with_tiles(plan, data, self.settings, made.frusta, seen, samples)
             if plan.maps > made.plan.maps:
@@ -221,7 +221,7 @@ class Renderer:
 
     @property
     def texels(self) -> int:
-        """Texels of all shadow maps, before supersampled maps are averaged."""
+        """Most texels of all shadow maps, in large images, before supersampled maps are averaged."""
         if self.settings.shadow.method == "none":
             return 0
         side = self.settings.shadow.resolution * self.settings.shadow.supersampling
@@ -290,9 +290,10 @@ class Renderer:
         factor = sample_grid(spp, windows)
         margin = Margin.of(cameras, factor) if self.settings.antialias else Margin()
         cache = cache or PassCache()
-        if self.slices:
+        light = self.light_pass.for_image(_pixels(cameras))
+        if light.slices:
             cache.keep(min(cache.level, CacheLevel.VIEW))  # maps of lights in slices are not kept
-        images = ImagePass(self.camera_pass, self.light_pass)
+        images = ImagePass(self.camera_pass, light)
         samples = max(window.width * window.height for window in windows) * factor**2
         views: Sequence[CameraView] = cache.views
         lighting, shapes = None, cache.shapes
@@ -304,7 +305,7 @@ class Renderer:
         else:
             views = views or [images.cameras.view(margin.around(window), shapes, factor) for window in windows]
             if cache.maps is None:
-                lighting = self._lighting(views, shapes, lights).for_points(samples)
+                lighting = self._lighting(light, views, shapes, lights).for_points(samples)
             else:
                 lighting = images.light.relit(cache.maps, shapes.geometry)
             images.fill(cache, shapes, views, lighting)
@@ -361,12 +362,14 @@ class Renderer:
         """The pass that renders shadow maps and light."""
         return LightPass(self.data, self.settings, self.plan, self.soft, self.outward, self.slices)
 
-    def _lighting(self, views: Sequence[CameraView], shapes: PlacedShapes, replacements: Mapping[str, Any] | None) -> Lighting:
+    def _lighting(
+        self, light: LightPass, views: Sequence[CameraView], shapes: PlacedShapes, replacements: Mapping[str, Any] | None
+    ) -> Lighting:
         """All lights and their shadow maps."""
         cameras, fits = self.camera_pass, (self.frusta, self.soft_frusta)
         transparent = cameras.transparent(shapes.geometry, views[0].sensor)
         seen = partial(cameras.seen, views, shapes.geometry)
-        lighting = self.light_pass.lighting(shapes, replacements, fits, transparent, seen)
+        lighting = light.lighting(shapes, replacements, fits, transparent, seen)
         frusta, soft_frusta = lighting.fits
         if frusta is not None:
             self.frusta = frusta
@@ -393,6 +396,11 @@ class Renderer:
             points = footprint_points(windows[0], view.size, frame.depth, seen.p_world, seen.n_world, samples)
             crossings = cameras.crossings(view, frame.sharpness, shapes) if self.settings.antialias else None
             return GBuffer(windows[0], seen, points, crossings, cameras.seen([view], geometry))
+
+
+def _pixels(cameras: Sequence[Sensor]) -> int:
+    """Pixels of all cameras."""
+    return sum(camera.width * camera.height for camera in cameras)
 
 
 def _loaded_again(origin: SceneOrigin, settings: RenderSettings, frusta: Frusta | None, soft_frusta: SoftFrusta) -> Renderer:

@@ -159,4 +159,5 @@ def _automatic(shadow: dict[str, Any]) -> dict[str, Any]:  # Any: checked by the
     if given.get("filter_size", 0) == 0:
         given.pop("filter_size", None)
         given["tile_filter_size"] = 1  # texels of tiles are as small as pixels
+        given["adaptive"] = automatic and not given.get("compat") and given.get("supersampling", 1) == 1
     return given

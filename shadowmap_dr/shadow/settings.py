@@ -26,6 +26,7 @@ class ShadowSettings:
             ``pcf`` (percentage-closer: the look-up compares depths and filters the results; a texel that an outline crosses
             has two depths, weighted by area), ``standard`` (one comparison, no gradients) or ``none``.
         resolution: texels along each side of a map.
+        adaptive: a renderer may take fewer texels, unfiltered ones, where pixels are larger (:meth:`fewer`).
         tiles: most maps that share the image plane of a directional light or a spot. A renderer takes as many, a power of two, as
             the pixels that see shadows are worth.
         filter: ``box``, ``gaussian``, ``wendland`` or ``none``.
@@ -48,6 +49,7 @@ class ShadowSettings:
 
     method: str = "auto"
     resolution: int = 256
+    adaptive: bool = False
     tiles: int = 1
     filter: str = "gaussian"
     filter_size: int = 3
@@ -69,7 +71,7 @@ class ShadowSettings:
                 object.__setattr__(self, name, index(getattr(self, name)))
             except TypeError:
                 raise ValueError(f"shadow map {name} is {getattr(self, name)!r}; give a whole number") from None
-        for name in ("antialias", "compat", "receiver_range", "cull_backfaces"):
+        for name in ("adaptive", "antialias", "compat", "receiver_range", "cull_backfaces"):
             if not isinstance(getattr(self, name), bool):
                 raise ValueError(f"shadow map {name} is {getattr(self, name)!r}; give True or False")
         for name in ("bias", "bleeding"):
@@ -116,6 +118,10 @@ class ShadowSettings:
     def of_tiles(self) -> ShadowSettings:
         """Settings of maps that share a light's image plane."""
         return self if self.tile_filter_size is None else replace(self, filter_size=self.tile_filter_size)
+
+    def fewer(self, texels: int) -> ShadowSettings:
+        """Settings of maps of so many texels along each side, filtered as tiles, if that is fewer than ``resolution``."""
+        return replace(self.of_tiles, resolution=texels) if texels < self.resolution else self
 
     @property
     def filterable(self) -> bool:

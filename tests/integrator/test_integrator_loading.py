@@ -174,7 +174,8 @@ def test_parameters_are_the_settings_of_the_renderer() -> None:
     shadow = {name: getattr(ShadowSettings, SHADOW_NAMES[name]) for name in SHADOW_NAMES}
     shadow |= {"shadow_map_resolution": AUTO, "shadow_tiles": 0, "shadow_filter_size": 0}  # chosen by the renderer
     assert options == {**settings, **shadow}
-    assert {setting.name for setting in fields(ShadowSettings)} == {*SHADOW_NAMES.values(), "bias", "tile_filter_size"}
+    others = {"bias", "tile_filter_size", "adaptive"}
+    assert {setting.name for setting in fields(ShadowSettings)} == {*SHADOW_NAMES.values(), *others}
     assert RenderSettings.of(**options) == RenderSettings()
 
 

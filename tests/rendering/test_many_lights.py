@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-import shadowmap_dr  # noqa: F401  registers the plug-in
+from shadowmap_dr import Renderer
 from shadowmap_dr.rendering import light_loops, light_pass
 
 SIZE = 32
@@ -109,3 +109,33 @@ def test_many_lights_look_like_single_ones(variant: str, monkeypatch: pytest.Mon
     for one, other in zip(looped, found(), strict=True):
         scale = np.abs(other).max()
         assert scale > 1e-3 and np.allclose(one, other, rtol=1e-3, atol=1e-3 * scale)
+
+
+def test_many_lights_have_small_maps_in_small_images(variant: str) -> None:
+    """One texel for each pixel along a side, at least 128, unless texels or a filter were asked for; the image is the same."""
+
+    def texels(made: Any, pixels: int, **options: Any) -> int:
+        light = Renderer.from_scene(made, tessellation=8, **options).light_pass.for_image(pixels)
+        return (light.shadow or light.settings.shadow).resolution
+
+    made = scene((3, 0, 0))  # and a spot
+    assert [texels(made, side**2) for side in (32, 128, 150, 255, 512)] == [128, 128, 160, 256, 256]
+    assert texels(scene((2, 0, 0)), 32**2) == 256
+    for options in ({"shadow_map_resolution": 256}, {"shadow_filter_size": 3}, {"shadow_supersampling": 2}):
+        assert texels(made, 32**2, **options) == 256
+    assert texels(made, 32**2, shadow_map_resolution=64) == 64
+    for counts in ((3, 0, 0), (0, 4, 3)):
+        fine, image = (
+            np.array(Renderer.from_scene(scene(counts), tessellation=8, **options).render())
+            for options in ({"shadow_map_resolution": 256}, {})
+        )
+        assert 0 < np.abs(image - fine).mean() < 0.01 * fine.mean()
+
+
+def test_slices_follow_the_size_of_images(variant: str) -> None:
+    """Small maps of many lights take less memory, so that fewer slices are needed; larger images need more."""
+    renderer = Renderer.from_scene(scene((0, 8, 0)), tessellation=8, light_memory=0.2)
+    small, large = (renderer.light_pass.for_image(side**2) for side in (32, 512))
+    assert len(small.slices) < len(large.slices) == len(renderer.slices)
+    whole = np.array(Renderer.from_scene(scene((0, 8, 0)), tessellation=8).render())
+    np.testing.assert_allclose(np.array(renderer.render()), whole, atol=1e-5)

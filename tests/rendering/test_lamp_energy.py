@@ -14,6 +14,7 @@ import trimesh
 
 from mitsuba_baselines.unshadowed import unshadowed
 from shadowmap_dr import Renderer
+from shadowmap_dr.rendering.extended_lights import area_samples
 from shadowmap_dr.rendering.extended_lights.clusters import facet_clusters
 from shadowmap_dr.rendering.extended_lights.samples import disk_irradiance
 
@@ -185,6 +186,44 @@ def test_facets_keep_to_one_side_of_an_edge() -> None:
 def test_clusters_with_fewer_pieces_than_facets() -> None:
     facet = facet_clusters(np.eye(3), np.eye(3), np.ones(3), np.array([0, 0, 1], np.uint32), 4, np.zeros(3))
     assert sorted(facet[:2]) == [0, 1] and facet[2] == 4
+
+
+def distant(kind: str, elevation: float) -> dict[str, Any]:
+    """A lamp of radius 0.28 or so, 6 away from the origin, ``elevation`` degrees above the floor; flat ones face the origin."""
+    t = mi.ScalarTransform4f
+    angle = math.radians(elevation)
+    place = t().look_at([6 * math.cos(angle), 0, 6 * math.sin(angle)], [0, 0, 0], [0, 1, 0])
+    sizes = {"sphere": 0.28, "cylinder": 0.2, "cube": 0.15, "disk": 0.28, "rectangle": 0.19}
+    more = {"p0": [0, -1, 0], "p1": [0, 1, 0], "radius": 0.5} if kind == "cylinder" else {}
+    return {"type": kind, "to_world": place @ t().scale(sizes[kind]), **more}
+
+
+@pytest.mark.parametrize("kind", ["sphere", "cylinder", "cube", "disk", "rectangle"])
+@pytest.mark.parametrize("elevation", [0.5, 3.0, 60.0])
+def test_lamps_seen_from_afar(variant: str, kind: str, elevation: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As bright, and with the same derivative by the place of what they light, as if their disks were seen as disks.
+
+    To 0.3 % of either; where the horizon cuts the lamp, whose light is weak there, to 3 % of the light, 10 % of the derivative.
+    """
+    scene = scene_of(distant(kind, elevation), {"type": "rectangle"}, camera(0.5))
+
+    def found() -> tuple[np.ndarray, float, bool]:
+        renderer = Renderer.from_scene(scene, shadow_method="none", hide_emitters=True, area_light_samples=8)
+        shift = mi.Float(0)
+        dr.enable_grad(shift)
+        floor = renderer.vertices("receiver") + mi.Vector3f(0.6, 0, -0.8) * shift
+        image = renderer.render({"receiver": floor})
+        dr.forward(shift)
+        plan: Any = renderer.soft[0].parts
+        return np.array(dr.detach(image)), float(np.array(dr.grad(image)).sum()), plan.far
+
+    image, derivative, far = found()
+    monkeypatch.setattr(area_samples, "_FAR", 0.0)
+    right, expected, still_far = found()
+    assert far and not still_far
+    within = 0.003 if elevation > 1 else 0.03
+    assert np.abs(image - right).max() < within * right.max()
+    assert derivative == pytest.approx(expected, rel=within if elevation > 1 else 0.1)
 
 
 # ------------------------------------------------------------------------------------------------------------- derivatives

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -32,6 +32,8 @@ _AWAY = 0.1
 _OPPOSITE = 0.35
 # How far a part of an emitter must lie before the plane of another to be seen from it, in units of the emitter's extent.
 _DENT = 1e-3
+# Radius of an emitter over the distance of what is nearest, up to which it is far away.
+_FAR = 0.06
 # Points on the rest of the scene that are asked whether they see a piece.
 _PROBES = 256
 
@@ -48,6 +50,7 @@ class AreaPlan:
     shape     index of the emitter's shape
     facet     UInt32 (P,), facet of the piece; each cluster has ``facets`` of them
     facets    number of disks that represent the part of a sample
+    far       True if the emitter is small, seen from the nearest points of the scene
     dented    True if parts of the emitter face the shining side of other parts. False if the emitter shines on the backs of its
               triangles, since maps then show the fronts only
     """
@@ -62,6 +65,7 @@ class AreaPlan:
     dented: bool
     facet: UInt32
     facets: int
+    far: bool
 
 
 def plan_area(light: AreaLight, geometry: Geometry, count: int) -> AreaPlan:
@@ -101,7 +105,14 @@ def plan_area(light: AreaLight, geometry: Geometry, count: int) -> AreaPlan:
         dented=not info.planar and bool((sign > 0).all()) and _dented(centres[chosen], corners, normals),
         facet=device_array(mi.UInt32, facet),
         facets=facets,
+        far=_seen_from_afar(centres, nearest),
     )
+
+
+def _seen_from_afar(centres: np.ndarray, nearest: np.ndarray) -> bool:
+    """True if pieces (P, 3) lie close together, compared to their distances (P,) from what is nearest."""
+    radius = np.linalg.norm(centres - 0.5 * (centres.min(0) + centres.max(0)), axis=1).max()
+    return bool(radius < _FAR * nearest.min())
 
 
 def _divided(planar: bool, pieces: tuple[np.ndarray, ...], nearest: np.ndarray) -> tuple[np.ndarray, int]:
@@ -119,6 +130,9 @@ def _divided(planar: bool, pieces: tuple[np.ndarray, ...], nearest: np.ndarray) 
 def area_samples(light: AreaLight, plan: AreaPlan, geometry: Geometry) -> LightSamples:
     """Current samples of an emitter. Attached to its vertices and its radiance."""
     info, count = geometry.shapes[plan.shape], dr.width(plan.chosen)
+    if geometry.changed is not None and info.name not in geometry.changed:
+        # No gradients flow to its vertices, although they do to those of other shapes in the same arrays.
+        geometry = replace(geometry, positions=dr.detach(geometry.positions), packets=None)
     first, e1, e2 = _triangles(geometry, plan.face)
     vector = dr.cross(e1, e2) * (0.5 * plan.fraction)
     area = dr.norm(vector)
@@ -167,6 +181,7 @@ def _facets(
     return Facets(
         count=plan.facets,
         flat=planar,
+        far=plan.far,
         middle=_at(place, part) + middle,
         normal=normal * (sums * dr.rcp(dr.maximum(in_all, 1e-30))),
         radius=dr.sqrt(dr.maximum(shown * (1 / math.pi), 1e-30)),

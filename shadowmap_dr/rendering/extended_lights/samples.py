@@ -23,6 +23,7 @@ class Facets:
 
     count   static
     flat    True if all parts are flat (static)
+    far     True if the emitter is small, seen from all that is near it (static)
     middle  Vector3f (F,), centres, world space
     normal  Vector3f (F,), mean normals of the represented surface, times its share of the part
     radius  Float (F,)
@@ -33,6 +34,7 @@ class Facets:
 
     count: int
     flat: bool
+    far: bool
     middle: Vector3f
     normal: Vector3f
     radius: Float
@@ -95,8 +97,8 @@ class LightSamples:
             rows += self.facets.packets()
         packets = tuple(ravel(row) for row in rows)
         dr.eval(packets)
-        count, flat = (self.facets.count, self.facets.flat) if self.facets else (1, True)
-        return SampleTable(self.distant, self.count, packets, count, flat)
+        count, flat, far = (self.facets.count, self.facets.flat, self.facets.far) if self.facets else (1, True, False)
+        return SampleTable(self.distant, self.count, packets, count, flat, far)
 
 
 @dataclass(frozen=True)
@@ -108,6 +110,7 @@ class SampleTable:
     packets: tuple[Float, ...]
     facets: int
     flat: bool
+    far: bool
 
     def place(self, index: UInt32) -> Vector3f:
         """Vector3f, place of sample ``index`` (UInt32), detached."""
@@ -135,31 +138,74 @@ class SampleTable:
         """
         if self.distant:
             return [(*self.from_sky(index), mi.Bool(True))]
-        power = self._power(index)
-        vectors = [mi.Vector3f(0) for _ in sides]
-        for k in range(self.facets):
-            middle, n = (_packet(packet, index * self.facets + k) for packet in self.packets[2:])
-            offset, normal = mi.Vector3f(middle.x, middle.y, middle.z) - mi.Vector3f(p_world), mi.Vector3f(n.x, n.y, n.z)
-            size = mi.Float(1)
-            if self.facets > 1:
-                size = dr.squared_norm(normal)
-                inverse = dr.rsqrt(dr.maximum(size, 1e-20))
-                normal, size = normal * inverse, size * inverse
-            squared, height = dr.squared_norm(offset), -dr.dot(normal, offset)
-            if not self.flat:
-                height = _shown(height, 1.06 * middle.w * n.w, 1.5 * dr.square(n.w) * (squared - dr.square(height)), squared)
-            squared_radius = dr.square(middle.w)
-            along, across = disk_irradiance(squared, height, squared_radius)
-            vector = offset * along - normal * across
-            for i, side in enumerate(sides):
-                # Evenly spread this far above and below the centre, points have as much light above it as those of the disk.
-                reach = 0.72 * squared_radius * (1 - dr.square(dr.dot(normal, side)))
-                vectors[i] += _above(vector, along, side, dr.dot(offset, side), reach, squared) * size
-        found = []
-        for vector in vectors:
+        power, found = self._power(index), []
+        for vector in (self._from_afar if self.far else self._from_nearby)(index, p_world, sides):
             direction, irradiance, reached = direction_and_length(vector)
             found.append((direction, power * irradiance, reached))
         return found
+
+    def _from_nearby(self, index: UInt32, p_world: Point3f, sides: Sequence[Vector3f]) -> list[Vector3f]:
+        """Irradiance vector (Vector3f) of a sample's disks on each side of points, for a power of 1."""
+        vectors = [mi.Vector3f(0) for _ in sides]
+        for k in range(self.facets):
+            disk = self._disk(index, k, p_world)
+            along, across = disk_irradiance(disk.squared, disk.height, disk.squared_radius)
+            vector = disk.offset * along - disk.normal * across
+            for i, side in enumerate(sides):
+                vectors[i] += _above(vector, along, side, dr.dot(disk.offset, side), disk.reach(side), disk.squared) * disk.size
+        return vectors
+
+    def _from_afar(self, index: UInt32, p_world: Point3f, sides: Sequence[Vector3f]) -> list[Vector3f]:
+        """The same from points that see the disks as points, and a sample's disks in about one direction.
+
+        The horizon cuts all of them at once, by the mean and the variance of their levels above it.
+        """
+        vector, total, squares = mi.Vector3f(0), mi.Float(0), [mi.Float(0) for _ in sides]
+        for k in range(self.facets):
+            disk = self._disk(index, k, p_world)
+            along = dr.maximum(disk.height, 0) * dr.square(dr.rcp(disk.squared + disk.squared_radius)) * disk.size
+            vector += disk.offset * along
+            total += along
+            for i, side in enumerate(sides):
+                squares[i] += along * (dr.square(dr.dot(disk.offset, side)) + (1 / 3) * disk.reach(side))
+        share = dr.rcp(dr.maximum(total, 1e-30))
+        squared, vectors = dr.squared_norm(vector) * dr.square(share), []
+        for side, own in zip(sides, squares, strict=True):
+            level = dr.dot(vector, side) * share
+            vectors.append(_above(vector, total, side, level, 3 * (own * share - dr.square(level)), squared))
+        return vectors
+
+    def _disk(self, index: UInt32, k: int, p_world: Point3f) -> _Disk:
+        """Disk number ``k`` of sample ``index`` (UInt32), seen from points."""
+        middle, n = (_packet(packet, index * self.facets + k) for packet in self.packets[2:])
+        offset, normal = mi.Vector3f(middle.x, middle.y, middle.z) - mi.Vector3f(p_world), mi.Vector3f(n.x, n.y, n.z)
+        size = mi.Float(1)
+        if self.facets > 1:
+            size = dr.squared_norm(normal)
+            inverse = dr.rsqrt(dr.maximum(size, 1e-20))
+            normal, size = normal * inverse, size * inverse
+        squared, height = dr.squared_norm(offset), -dr.dot(normal, offset)
+        if not self.flat:
+            height = _shown(height, 1.06 * middle.w * n.w, 1.5 * dr.square(n.w) * (squared - dr.square(height)), squared)
+        return _Disk(offset, normal, size, squared, height, dr.square(middle.w))
+
+
+@dataclass(frozen=True)
+class _Disk:
+    """A disk seen from points. ``offset``: of its centre; ``normal``: unit; ``size``: its share of its sample; ``squared``:
+    distance; ``height``: of the points above it. All attached."""
+
+    offset: Vector3f
+    normal: Vector3f
+    size: Float
+    squared: Float
+    height: Float
+    squared_radius: Float
+
+    def reach(self, side: Vector3f) -> Float:
+        """Squared distance (Float): evenly spread so far above and below the disk's centre, points have as much light above it
+        as those of the disk. ``side``: upward direction (unit)."""
+        return 0.72 * self.squared_radius * (1 - dr.square(dr.dot(self.normal, side)))
 
 
 def _above(vector: Vector3f, along: Float, side: Vector3f, level: Float, variance: Float, squared: Float) -> Vector3f:

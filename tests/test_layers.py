@@ -51,6 +51,7 @@ MAY_IMPORT = {
             "rendering",
             "scene",
             "shadow",
+            "torch",
             "variants",
         ),
     ),

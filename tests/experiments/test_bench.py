@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
 import signal
@@ -15,20 +14,18 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
+from bench_runs import options, run
 from bench_sizes import TINY
 from rich.console import Console
 
-from shadowmap_dr import __version__
 from shadowmap_dr.errors import ShadowmapError
 from shadowmap_dr.experiments.bench import breakdown as bench_breakdown
 from shadowmap_dr.experiments.bench import common as bench_common
 from shadowmap_dr.experiments.bench import experiment as bench
-from shadowmap_dr.experiments.bench import first as bench_first
-from shadowmap_dr.experiments.bench import loops as bench_loops
 from shadowmap_dr.experiments.bench import raster as bench_raster
 from shadowmap_dr.experiments.bench import report as bench_report
 from shadowmap_dr.experiments.bench import sums as bench_sums
-from shadowmap_dr.experiments.bench.common import BenchOptions, Unit, run_child
+from shadowmap_dr.experiments.bench.common import Unit, run_child
 from shadowmap_dr.experiments.common import meshes as bench_meshes
 from shadowmap_dr.experiments.common import timing
 from shadowmap_dr.io import assets
@@ -38,24 +35,6 @@ from shadowmap_dr.scene.load import load
 @pytest.fixture(autouse=True)
 def _variant() -> None:
     mi.set_variant("llvm_ad_rgb")
-
-
-def options(out: Path, *only: str, **changes: Any) -> BenchOptions:
-    return BenchOptions(**{"out": out / "bench.json", "only": only, "sizes": TINY, "mitsuba_seconds": 1.0, **changes})
-
-
-def run(chosen: BenchOptions) -> dict[str, Any]:
-    record = bench.run_bench(chosen, console=Console(quiet=True))
-    assert bench.failures(record, chosen.only) == []
-    assert json.loads(chosen.out.read_text()) == record
-    assert chosen.out.with_suffix(".png").stat().st_size > 1000
-    assert not [name for name in os.listdir(chosen.out.parent) if name.startswith(".")]
-    assert {"processor", "threads", "mitsuba", "drjit", "variant"} <= record["machine"].keys()
-    assert record["shadowmap_dr"] == __version__ and record["settings"]["quick"] == chosen.quick
-    assert bench_report.table(record).row_count == len(record["figures"]) > 0
-    text = bench_report.markdown(record)
-    assert text.count("\n| ") >= len(record["figures"])
-    return record
 
 
 def assert_summary(entry: dict[str, Any]) -> None:
@@ -114,45 +93,6 @@ def test_sums(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert all(entry["ratio"] == pytest.approx(1, rel=bench_sums.TOLERANCE) for entry in entries)
     rows = [row for row in bench_report.rows(record) if row.what.startswith("sum")]
     assert len(rows) == 6 and all(row.met for row in rows)
-
-
-def test_loops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    loop = dataclasses.replace(bench_loops.LOOPS["clipped colours"], count=5)
-    monkeypatch.setattr(bench_loops, "LOOPS", {"clipped colours": loop})
-    record = run(options(tmp_path, "loops"))
-    unit = record["sections"]["loops"]["units"]["clipped colours"]
-    assert unit["seconds"].keys() == unit["errors"].keys() == {"ours", "original"}
-    assert unit["original"] == {"type": "prb", "max_depth": 2} and unit["ratio_of_medians"]["original / ours"] > 0
-    assert all(entry["last"] < entry["first"] for entry in unit["errors"].values()) and unit["ratio_of_totals"] > 0
-
-
-def test_memory_of_loops(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bench_loops, "_SETTLED", 10)
-    found = bench_loops.measure_memory("kept parameters", 8, 13, lambda result: None)
-    assert found["steps"] == 13 and found["settled"] > 0 and found["later"] > 0
-
-
-def test_first_pictures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    calls = {"bench.first:measure_first": bench_first.measure_first}
-    monkeypatch.setattr(bench_first, "run_child", lambda name, arguments, seconds: calls[name](**arguments, emit=None))
-    record = run(options(tmp_path, "first"))
-    (name, unit), *others = record["sections"]["first"]["units"].items()
-    assert name == "4 instances of 2 groups, 4 shapes, 3 lights" and not others
-    assert unit["seconds"].keys() == unit["uncompiled"].keys() == {"ours", "direct", "backward"}
-    rows = [row for row in bench_report.rows(record) if row.what.startswith("first")]
-    assert [row.what for row in rows] == ["first picture", "first derivative"] and all(row.aim for row in rows)
-
-
-def test_steps_of_the_plugin(tmp_path: Path) -> None:
-    record = run(options(tmp_path, "plug-in"))
-    units = record["sections"]["plug-in"]["units"]
-    assert list(units) == ["camera@8", "reflectance@8"]
-    for unit in units.values():
-        assert (
-            unit["seconds"].keys() == {"plug-in", "not recorded", "renderer", "update"} and unit["over_renderer_and_update"] > 0
-        )
-    rows = [row for row in bench_report.rows(record) if row.what.startswith("plug-in")]
-    assert len(rows) == 4 and [bool(row.aim) for row in rows] == [True, False] * 2
 
 
 def test_passes(tmp_path: Path) -> None:

@@ -28,6 +28,11 @@ TINY = Sizes(
     loop_steps=0,
     plugin_kinds=("camera", "reflectance"),
     plugin_resolutions=(8,),
+    plugin_samples=(2,),
+    plugin_lights=((2, "points"),),
+    torch_resolutions=(8,),
+    cold=("pose",),
+    cold_rounds=1,
     fits=("bunny-pose",),
     fit_starts=1,
 )

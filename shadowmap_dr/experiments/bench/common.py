@@ -17,7 +17,7 @@ import mitsuba as mi
 from ...errors import ShadowmapError, did_you_mean
 from ...io.options import option, setting
 
-SECTIONS = ("steps", "raster", "scaling", "breakdown", "sums", "loops", "first", "plug-in", "fits")
+SECTIONS = ("steps", "raster", "scaling", "breakdown", "sums", "loops", "first", "plug-in", "torch", "fits")
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,10 @@ class Sizes:
         loop_size: pixels along each side of images in the loops of `bench.loops`.
         loop_steps: steps over which their memory is measured, 0 for none.
         crowds: scenes of many shapes; see `bench.first.Crowd`.
+        cold: scenes of the first derivatives with no kernels on disk; see `bench.first`. `cold_rounds`: processes of each.
         plugin_kinds, plugin_resolutions: kinds of parameters, and sizes of images; see `bench.plugin`.
+        plugin_samples, plugin_lights: samples per pixel, at each size; (number, "suns" or "points") at the first.
+        torch_resolutions: sizes of images of steps through PyTorch.
         fits: problems for the command `fit`; None: all that are scored. `fit_starts`: starts of each.
     """
 
@@ -85,8 +88,13 @@ class Sizes:
         {"shapes": 5000},
         {"shapes": 200, "lights": 40},
     )
+    cold: tuple[str, ...] = ("pose", "pavilion")
+    cold_rounds: int = 5
     plugin_kinds: tuple[str, ...] = ("vertices", "to_world", "light", "camera", "colour of the light", "reflectance", "texture")
     plugin_resolutions: tuple[int, ...] = (128, 512)
+    plugin_samples: tuple[int, ...] = (4, 16)
+    plugin_lights: tuple[tuple[int, str], ...] = ((8, "suns"), (64, "points"))
+    torch_resolutions: tuple[int, ...] = (128, 512)
     fits: tuple[str, ...] | None = None
     fit_starts: int = 4
 
@@ -119,8 +127,13 @@ QUICK = Sizes(
     loop_size=64,
     loop_steps=0,
     crowds=({"instances": 30, "groups": 6}, {"shapes": 50, "lights": 6}),
+    cold=("pose",),
+    cold_rounds=1,
     plugin_kinds=("vertices", "reflectance"),
     plugin_resolutions=(128,),
+    plugin_samples=(4,),
+    plugin_lights=((8, "suns"),),
+    torch_resolutions=(128,),
     fits=("bunny-pose", "house-pose-sun", "teapot-colours", "spot-aim", "panel-place", "camera-pose"),
     fit_starts=1,
 )

@@ -32,6 +32,7 @@ from . import report as bench_report
 from . import scaling as bench_scaling
 from . import steps as bench_steps
 from . import sums as bench_sums
+from . import torch_steps as bench_torch
 from .common import BenchOptions, Unit
 from .fits import section as bench_fits
 
@@ -46,6 +47,7 @@ UNITS: dict[str, Callable[[BenchOptions], list[Unit]]] = {
     "loops": bench_loops.units,
     "first": bench_first.units,
     "plug-in": bench_plugin.units,
+    "torch": bench_torch.units,
     "fits": bench_fits.units,
 }
 

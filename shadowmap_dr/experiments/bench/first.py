@@ -1,21 +1,34 @@
-"""Benchmark: seconds from a loaded scene to its first picture, where scenes have many shapes.
+"""Benchmark: seconds to first pictures and derivatives.
 
-Each picture is of a newly loaded scene. Other scenes of its kind have been rendered before, so that kernels are compiled, as they
-are in the second process that renders a scene. Mitsuba's `direct` renders the same scenes in turns.
+Where scenes have many shapes, each picture is of a newly loaded scene. Other scenes of its kind have been rendered before, so
+that kernels are compiled, as they are in the second process that renders a scene. Mitsuba's `direct` renders the same scenes in
+turns.
+
+From nothing: each derivative is that of a new process, with no kernels on disk. Mitsuba's `direct_projective` takes turns,
+without indirect visibility (`sppi` 0), whose guiding takes several times as long as all else.
 """
 
 from __future__ import annotations
 
 import functools
 import gc
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...errors import ShadowmapError
+from ...io import assets
 from ...jit.types import Point3f
 from ..common.timing import compare, timed
 from .common import BenchOptions, Unit, Update, run_child
@@ -24,6 +37,9 @@ from .common import BenchOptions, Unit, Update, run_child
 _ROUNDS, _SECONDS = 3, 900.0
 _KINDS = ("cube", "rectangle", "sphere", "cylinder", "disk")
 _GROUPED = ("cube", "sphere", "cylinder")
+# Vertices of first derivatives from nothing, by scene; samples per pixel; pixels along each side.
+_VERTICES = {"pose": "object.vertex_positions", "pavilion": "hand.vertex_positions"}
+_SPP, _SIZE = 16, 128
 
 
 @dataclass(frozen=True)
@@ -92,7 +108,8 @@ def _place(random: np.random.Generator) -> mi.ScalarTransform4f:
 def units(options: BenchOptions) -> list[Unit]:
     """A unit for each scene."""
     crowds = [Crowd(**crowd) for crowd in options.what.crowds]
-    return [Unit(str(crowd), functools.partial(_measure, crowd)) for crowd in crowds]
+    cold = [Unit(f"{name}, no kernels", functools.partial(_measure_cold, options, name)) for name in options.what.cold]
+    return [Unit(str(crowd), functools.partial(_measure, crowd)) for crowd in crowds] + cold
 
 
 def _measure(crowd: Crowd, done: Mapping[str, Any], update: Update) -> dict[str, Any]:
@@ -127,3 +144,50 @@ def _derivative(scene: mi.Scene, integrator: mi.Integrator) -> Point3f:
     params.update()
     dr.backward(dr.sum(mi.render(scene, params, integrator=integrator, spp=1), axis=None))
     return dr.grad(change)
+
+
+def _measure_cold(options: BenchOptions, name: str, done: Mapping[str, Any], update: Update) -> dict[str, Any]:
+    """Seconds from the start of a process to the first derivative, in turns, and the ends of the parts before it."""
+    methods: dict[str, dict[str, Any]] = {
+        "ours": {"type": "shadowmap"},
+        "direct_projective": {"type": "direct_projective", "sppi": 0},
+    }
+    parts: dict[str, list[dict[str, float]]] = {method: [] for method in methods}
+    for count in range(options.what.cold_rounds):
+        update(count, options.what.cold_rounds, name)
+        for method, integrator in methods.items():
+            parts[method].append(_cold_seconds(name, integrator))
+    seconds = {method: [ends["derivative"] for ends in found] for method, found in parts.items()}
+    ends = {
+        method: {part: float(np.median([one[part] for one in found])) for part in found[0]} for method, found in parts.items()
+    }
+    return {"cold": True, "ends": ends, **compare(seconds, [("ours", "direct_projective")])}
+
+
+def _cold_seconds(name: str, integrator: dict[str, Any]) -> dict[str, float]:
+    """Seconds of `bench.cold` in a new process, whose home directory, where Dr.Jit keeps kernels, is empty."""
+    package = Path(__file__).resolve().parents[3]
+    paths = filter(None, (str(package), os.environ.get("PYTHONPATH")))
+    task = {
+        "integrator": dict(integrator),
+        "variant": mi.variant(),
+        "threads": dr.thread_count(),
+        "spp": _SPP,
+        "size": str(_SIZE),
+    }
+    task |= {"scene": str(assets.scene(name)), "parameter": _VERTICES[name]}
+    with tempfile.TemporaryDirectory() as home:
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "HOME": home, "LOCALAPPDATA": home}
+        process = subprocess.run(
+            [sys.executable, str(Path(__file__).with_name("cold.py"))],
+            input=json.dumps({**task, "began": time.time()}).encode(),
+            capture_output=True,
+            env=environment,
+            timeout=_SECONDS,
+            check=False,
+        )
+    if process.returncode:
+        lines = process.stderr.decode(errors="replace").strip().splitlines()
+        raise ShadowmapError(f"status {process.returncode}: {lines[-1] if lines else 'no message'}")
+    found: dict[str, float] = json.loads(process.stdout.decode(errors="replace").splitlines()[-1])["seconds"]
+    return found

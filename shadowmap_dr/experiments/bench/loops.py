@@ -45,13 +45,29 @@ _SECONDS = 1800.0
 
 @dataclass(frozen=True)
 class Loop:
-    """``steps(integrator, size)`` makes the generator; ``original``: dictionary of Mitsuba's integrator; ``bar``: largest share
-    of the first error after ``count`` steps."""
+    """A loop.
+
+    Attributes:
+        steps: ``steps(integrator, size)`` makes the generator.
+        original: dictionary of Mitsuba's integrator. If it is a projective one, so is a third contender, with ``sppi`` 0: no
+            samples for silhouettes that only shadows and reflections show, as Mitsuba's tutorials set it.
+        count: steps.
+        bar: largest share of the first error after them.
+        size: pixels along each side; None: those of the benchmark.
+    """
 
     steps: Callable[[dict[str, Any], int], Iterator[float]]
     original: dict[str, Any]
     count: int = 40
     bar: float = 0.5
+    size: int | None = None
+
+    def contenders(self, size: int) -> dict[str, Iterator[float]]:
+        """Our generator and those of Mitsuba's integrators."""
+        integrators = {"ours": OURS, "original": self.original}
+        if "projective" in self.original["type"]:
+            integrators["sppi 0"] = {**self.original, "sppi": 0}
+        return {name: self.steps(integrator, size) for name, integrator in integrators.items()}
 
 
 def _scene_dict(integrator: dict[str, Any], size: int, **changes: object) -> dict[str, Any]:
@@ -219,6 +235,43 @@ def moved_light(integrator: dict[str, Any], size: int) -> Iterator[float]:
         yield abs(offset)
 
 
+def object_pose(integrator: dict[str, Any], size: int) -> Iterator[float]:
+    """Mitsuba's tutorial on poses: a bunny before a wall, under a sphere that shines."""
+    t, many = mi.ScalarTransform4f(), 16
+    filtered = {"rfilter": {"type": "gaussian"}, "sample_border": True}
+    film = {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgb", **filtered}
+    light = {"type": "area", "radiance": {"type": "rgb", "value": 1e3}}
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": integrator,
+            "sensor": {"type": "perspective", "to_world": t.look_at([0, 0, 2], [0, 0, 0], [0, 1, 0]), "fov": 60, "film": film},
+            "wall": {"type": "rectangle", "to_world": t.translate([0, 0, -2]).scale(2)},
+            "ball": {"type": "ply", "filename": str(assets.mesh("bunny")), "to_world": t.scale(0.65)},
+            "light": {"type": "sphere", "center": [2.5, 2.5, 7], "radius": 0.25, "emitter": light},
+        }
+    )
+    params, name = mi.traverse(scene), "ball.vertex_positions"
+    start = dr.unravel(mi.Point3f, params[name])
+    opt = mi.ad.Adam(lr=0.025)
+    opt["angle"], opt["trans"] = mi.Float(0.25), mi.Point2f(0.1, -0.25)
+
+    def move() -> None:
+        opt["trans"], opt["angle"] = dr.clip(opt["trans"], -0.5, 0.5), dr.clip(opt["angle"], -0.5, 0.5)
+        moved = mi.Transform4f().translate([opt["trans"].x, opt["trans"].y, 0]).rotate([0, 1, 0], opt["angle"] * 100)
+        params[name] = dr.ravel(moved @ start)
+        params.update()
+
+    reference, step = mi.render(scene, spp=512), 0
+    while True:
+        move()
+        image = mi.render(scene, params, spp=many, seed=step)
+        dr.backward(dr.mean(dr.square(image - reference), axis=None))
+        opt.step()
+        step += 1
+        yield _error(opt["angle"], 0) + _error(opt["trans"], [0, 0])
+
+
 def large_steps(integrator: dict[str, Any], size: int) -> Iterator[float]:
     """Vertices through `mi.ad.LargeSteps`. Yields the image's RMSE."""
     scene = mi.load_dict(_scene_dict(integrator, size))
@@ -383,6 +436,7 @@ LOOPS: dict[str, Loop] = {
     "batch sensor": Loop(batch_sensor, _MATERIALS),
     "PyTorch": Loop(pytorch, _MATERIALS),
     "moved light": Loop(moved_light, _MOVES, count=20),
+    "object pose": Loop(object_pose, {"type": "direct_projective"}, size=64),
     "large steps": Loop(large_steps, _MOVES, bar=0.7),
     "remeshing": Loop(remeshing, _MOVES, count=30, bar=0.8),
     "texture": Loop(texture, _MATERIALS),
@@ -401,22 +455,23 @@ def units(options: BenchOptions) -> list[Unit]:
 
 def _measure(options: BenchOptions, name: str, done: Mapping[str, Any], update: Update) -> dict[str, Any]:
     """Time of our steps and the original's in turns, first and last errors, and the growth of memory over many steps."""
-    loop, size = LOOPS[name], options.what.loop_size
-    both = {"ours": loop.steps(OURS, size), "original": loop.steps(loop.original, size)}
-    seconds: dict[str, list[float]] = {key: [] for key in both}
-    errors: dict[str, list[float]] = {key: [] for key in both}
+    loop = LOOPS[name]
+    size = loop.size or options.what.loop_size
+    all_ = loop.contenders(size)
+    seconds: dict[str, list[float]] = {key: [] for key in all_}
+    errors: dict[str, list[float]] = {key: [] for key in all_}
 
     def advance(key: str) -> None:
-        errors[key].append(next(both[key]))
+        errors[key].append(next(all_[key]))
 
     with gc_quiet():
         for step in range(loop.count):
             update(step, loop.count, name)
-            for key in both:
+            for key in all_:
                 spent = timed(functools.partial(advance, key))
                 if step >= _WARM_UP:
                     seconds[key].append(spent)
-    result = {"size": size, "original": loop.original, **compare(seconds, [("original", "ours")])}
+    result = {"size": size, "original": loop.original, **compare(seconds, [("original", "ours"), ("sppi 0", "ours")])}
     # Unlike the ratio of medians, this includes the steps for which a loop loads its scene again and renders its reference.
     result["ratio_of_totals"] = sum(seconds["original"]) / sum(seconds["ours"])
     result["errors"] = {key: {"first": values[0], "last": values[-1]} for key, values in errors.items()}

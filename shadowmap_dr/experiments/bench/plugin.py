@@ -1,9 +1,10 @@
-"""Benchmark: steps of the plug-in as Mitsuba's users write them, by kind of parameter.
+"""Benchmark: steps of the plug-in as Mitsuba's users write them, by kind of parameter, samples per pixel, and lights.
 
 A step gives a parameter of `scenes/pose.xml` a new value, updates the scene, renders, and takes the gradient of a loss.
 Contenders in turns: the plug-in with its defaults; without recordings; the same derivative with a `Renderer` in a frozen
 function; and Mitsuba's `params.update()` alone. The last two together bound what the plug-in can reach. A `Renderer` does not
-take materials as arguments: beside these stands its step by the object's vertices.
+take materials as arguments: beside these stands its step by the object's vertices. Steps with more samples or lights are those by
+the vertices.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import functools
 import gc
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -24,6 +25,7 @@ from ...jit.frozen import freeze
 from ...jit.types import Float, TensorXf, Vector3f
 from ...rendering.renderer import Renderer
 from ...scene.lights.punctual import DirectionalLight
+from ..common import meshes as bench_meshes
 from ..common.timing import Contender, alternate, compare
 from .common import BenchOptions, Unit, Update
 
@@ -47,36 +49,66 @@ _ARGUMENTS: dict[str, Callable[[Renderer, Float, Float], dict[str, Any]]] = {
 }
 
 
+@dataclass(frozen=True)
+class Step:
+    """A step.
+
+    Attributes:
+        kind: of parameter, see `KINDS`.
+        resolution: pixels along each side.
+        spp: samples per pixel.
+        lights: number of lights, suns or ``points``.
+    """
+
+    kind: str
+    resolution: int
+    spp: int = 1
+    lights: int = 1
+    points: bool = False
+
+    @property
+    def title(self) -> str:
+        """All but the size."""
+        samples = [f"{self.spp} spp"] if self.spp > 1 else []
+        lights = [f"{self.lights} {'points' if self.points else 'suns'}"] if self.lights > 1 else []
+        return ", ".join([self.kind, *samples, *lights])
+
+    def __str__(self) -> str:
+        return f"{self.title}@{self.resolution}"
+
+
 def units(options: BenchOptions) -> list[Unit]:
-    """A unit for each kind of parameter and each size."""
-    kinds, sizes = options.what.plugin_kinds, options.what.plugin_resolutions
-    return [
-        Unit(f"{kind}@{size}", functools.partial(_measure, kind, size, options.what.rounds)) for size in sizes for kind in kinds
-    ]
+    """A unit for each kind of parameter and each size, and for each number of samples and lights."""
+    what = options.what
+    steps = [Step(kind, size) for size in what.plugin_resolutions for kind in what.plugin_kinds]
+    steps += [Step("vertices", size, spp) for size in what.plugin_resolutions for spp in what.plugin_samples]
+    steps += [Step("vertices", what.plugin_resolutions[0], 1, lights, kind == "points") for lights, kind in what.plugin_lights]
+    return [Unit(str(step), functools.partial(_measure, step, what.rounds)) for step in steps]
 
 
-def _measure(kind: str, size: int, rounds: int, done: Mapping[str, Any], update: Update) -> dict[str, Any]:
+def _measure(step: Step, rounds: int, done: Mapping[str, Any], update: Update) -> dict[str, Any]:
     gc.collect()  # scenes of earlier units: while they live, Mitsuba compiles calls of their objects
+    frozen = step if step.kind in _ARGUMENTS else replace(step, kind="vertices")
     contenders: dict[str, Callable[[], object]] = {
-        "plug-in": _Loop(kind, size),
-        "not recorded": _Loop(kind, size, recorded=False),
-        "renderer": _Frozen(kind if kind in _ARGUMENTS else "vertices", size),
-        "update": _Loop(kind, size).update,
+        "plug-in": _Loop(step),
+        "not recorded": _Loop(step, recorded=False),
+        "renderer": Frozen(frozen),
+        "update": _Loop(step).update,
     }
     # A loop is recorded from its fifth step on.
     timed = {name: Contender(call, rounds, warm_up=10) for name, call in contenders.items()}
     times = compare(alternate(timed, on_call=update), [("not recorded", "plug-in")])
     seconds = {name: entry["median"] for name, entry in times["seconds"].items()}
     over = seconds["plug-in"] / (seconds["renderer"] + seconds["update"])
-    return {"kind": kind, "resolution": size, "over_renderer_and_update": over, **times}
+    return {**asdict(step), "title": step.title, "over_renderer_and_update": over, **times}
 
 
 class _Loop:
     """The loop of a Mitsuba user."""
 
-    def __init__(self, kind: str, size: int, **parameters: bool) -> None:
-        self._scene = _scene(size)
-        self._params, self._key = mi.traverse(self._scene), KINDS[kind]
+    def __init__(self, step: Step, **parameters: bool) -> None:
+        self._scene, self._spp = scene_of(step), step.spp
+        self._params, self._key = mi.traverse(self._scene), KINDS[step.kind]
         value = self._params[self._key]
         self._start, self._x = type(value)(value), 0.0
         self._integrator = mi.load_dict({"type": "shadowmap", **parameters})
@@ -97,23 +129,23 @@ class _Loop:
 
     def __call__(self) -> Float:
         x = self.update()
-        return _gradient(mi.render(self._scene, self._params, integrator=self._integrator, spp=1), x)
+        return _gradient(mi.render(self._scene, self._params, integrator=self._integrator, spp=self._spp), x)
 
 
-class _Frozen:
+class Frozen:
     """The same derivative with a `Renderer`, in a frozen function."""
 
-    def __init__(self, kind: str, size: int) -> None:
-        scene = _scene(size)
+    def __init__(self, step: Step) -> None:
+        scene, arguments, spp = scene_of(step), _ARGUMENTS[step.kind], step.spp
         self._vertices = mi.Float(dr.detach(mi.traverse(scene)[KINDS["vertices"]]))
         self._renderer, self._x = Renderer.from_scene(scene), 0.0
 
-        def step(x: Float, vertices: Float, renderer: Renderer) -> Float:
+        def gradient(x: Float, vertices: Float, renderer: Renderer) -> Float:
             x = mi.Float(x)
             dr.enable_grad(x)
-            return _gradient(renderer.render(**_ARGUMENTS[kind](renderer, vertices, x)), x)
+            return _gradient(renderer.render(**arguments(renderer, vertices, x), spp=spp), x)
 
-        self._step = freeze(step)
+        self._step = freeze(gradient)
 
     def __call__(self) -> Float:
         self._x += 1e-4
@@ -141,9 +173,12 @@ def _moved(renderer: Renderer, x: Float) -> Any:  # Any: a `Sensor`
     return replace(camera, to_world=mi.Transform4f().translate(_shift(x)) @ camera.to_world)
 
 
-def _scene(size: int) -> mi.Scene:
-    """`scenes/pose.xml` whose wall has a texture."""
-    scene = mi.load_file(str(assets.scene("pose")), resolution=size, optimize=False)
+def scene_of(step: Step) -> mi.Scene:
+    """`scenes/pose.xml` whose wall has a texture, under the step's lights."""
+    if step.lights > 1:
+        scene = bench_meshes.scene(assets.mesh("spot"), step.resolution, step.lights, points=step.points)
+    else:
+        scene = mi.load_file(str(assets.scene("pose")), resolution=step.resolution, optimize=False)
     texels = np.random.default_rng(0).uniform(0.4, 0.6, (64, 64, 3)).astype(np.float32)
     wall = next(shape for shape in scene.shapes() if shape.id() == "wall")
     wall.set_bsdf(mi.load_dict({"type": "diffuse", "reflectance": {"type": "bitmap", "bitmap": mi.Bitmap(texels), "raw": True}}))

@@ -35,11 +35,15 @@ LARGE_MS, LARGE_GIB = 250.0, 3.0
 BUSY = 0.3
 #: A first picture may take this multiple of Mitsuba's `direct` and these seconds more; a first backward pass, these seconds.
 FIRST_OVER_DIRECT, FIRST_SECONDS, BACKWARD_SECONDS = 2.0, 0.5, 5.0
+#: A first derivative from nothing over that of Mitsuba's `direct_projective`.
+COLD_OVER_PROJECTIVE = 1.2
 #: Percentage of starts from which the command `fit` solves its problems, its seconds, percentage of intervals that hold true
 #: values, and how much wider than the error they may be.
 FITS_SOLVED, FIT_SECONDS, FITS_COVERAGE, FITS_WIDTH = 90.0, 60.0, (85.0, 99.0), 4.0
 #: Steps of the plug-in over the step of a frozen `Renderer` and Mitsuba's update.
 PLUGIN_OVER_RENDERER = 1.3
+#: A step through PyTorch over that of a frozen `Renderer`.
+TORCH_OVER_RENDERER = 1.3
 EIGHT_LIGHTS, BATCH, OUTSIDE_KERNELS = 4.5, 1.2, 0.10
 
 
@@ -77,6 +81,7 @@ def rows(record: dict[str, Any]) -> list[Row]:
         "loops": _loop_rows,
         "first": _first_rows,
         "plug-in": _plugin_rows,
+        "torch": _torch_rows,
         "fits": _fit_rows,
     }
     result: list[Row] = []
@@ -288,13 +293,15 @@ def _sum_rows(key: str, unit: dict[str, Any]) -> Iterator[Row]:
 
 def _loop_rows(key: str, unit: dict[str, Any]) -> Iterator[Row]:
     size, seconds, errors = f"{unit['size']}", unit["seconds"], unit["errors"]
-    ours, original = seconds["ours"]["median"], seconds["original"]["median"]
-    value = unit["ratio_of_medians"]["original / ours"]
-    other = f"{unit['original']['type']} {_time(original)}"
-    yield Row(f"loop: {key}", size, _time(ours), other, f"{value:.2f}x", *_aim(value, 1.0, ">= {:g}x", least=True))
     left = {name: entry["last"] / entry["first"] for name, entry in errors.items()}
-    other = f"{unit['original']['type']} {100 * left['original']:.0f} %"
-    yield Row(f"loop: {key}, error left", size, f"{100 * left['ours']:.0f} %", other)
+    titles = {"original": unit["original"]["type"], "sppi 0": f"{unit['original']['type']}, sppi 0"}
+    for name, title in titles.items():
+        if name not in seconds:
+            continue
+        value, ours = unit["ratio_of_medians"][f"{name} / ours"], _time(seconds["ours"]["median"])
+        aims = _aim(value, 1.0, ">= {:g}x", least=True)
+        yield Row(f"loop: {key}", size, ours, f"{title} {_time(seconds[name]['median'])}", f"{value:.2f}x", *aims)
+        yield Row(f"loop: {key}, error left", size, f"{100 * left['ours']:.0f} %", f"{title} {100 * left[name]:.0f} %")
     if "later" in unit.get("memory", {}):
         memory = unit["memory"]
         grown = (memory["later"] - memory["settled"]) / 2**20
@@ -303,6 +310,12 @@ def _loop_rows(key: str, unit: dict[str, Any]) -> Iterator[Row]:
 
 def _first_rows(key: str, unit: dict[str, Any]) -> Iterator[Row]:
     seconds = {name: entry["median"] for name, entry in unit["seconds"].items()}
+    if unit.get("cold"):
+        value = unit["ratio_of_medians"]["ours / direct_projective"]
+        aims = _aim(value, COLD_OVER_PROJECTIVE, "<= {:g}x", least=False)
+        other = f"direct_projective {_time(seconds['direct_projective'])}"
+        yield Row("first derivative", key, _time(seconds["ours"]), other, f"{value:.2f}x", *aims)
+        return
     ours, most = seconds["ours"], FIRST_OVER_DIRECT * seconds["direct"] + FIRST_SECONDS
     ratio = f"{unit['ratio_of_medians']['ours / direct']:.2f}x"
     aims = _aim(ours, most, f"<= {most:.2f} s", least=False)
@@ -313,7 +326,7 @@ def _first_rows(key: str, unit: dict[str, Any]) -> Iterator[Row]:
 
 
 def _plugin_rows(key: str, unit: dict[str, Any]) -> Iterator[Row]:
-    what, size = f"plug-in: {unit['kind']}", f"{unit['resolution']}"
+    what, size = f"plug-in: {unit['title']}", f"{unit['resolution']}"
     seconds = {name: entry["median"] for name, entry in unit["seconds"].items()}
     other = f"frozen {_time(seconds['renderer'])} + update {_time(seconds['update'])}"
     value = unit["over_renderer_and_update"]
@@ -321,6 +334,13 @@ def _plugin_rows(key: str, unit: dict[str, Any]) -> Iterator[Row]:
     yield Row(what, size, _time(seconds["plug-in"]), other, f"{value:.2f}x", *aims)
     value = unit["ratio_of_medians"]["not recorded / plug-in"]
     yield Row(what, size, _time(seconds["plug-in"]), f"not recorded {_time(seconds['not recorded'])}", f"{value:.2f}x")
+
+
+def _torch_rows(key: str, unit: dict[str, Any]) -> Iterator[Row]:
+    seconds, value = unit["seconds"], unit["ratio_of_medians"]["torch / renderer"]
+    aims = _aim(value, TORCH_OVER_RENDERER, "<= {:g}x", least=False)
+    ours, other = _time(seconds["torch"]["median"]), f"frozen {_time(seconds['renderer']['median'])}"
+    yield Row("PyTorch: vertices", f"{unit['resolution']}", ours, other, f"{value:.2f}x", *aims)
 
 
 def _fit_rows(key: str, unit: dict[str, Any]) -> Iterator[Row]:

@@ -161,9 +161,9 @@ def stored(kind: str, folder: Path) -> Path:
     return path
 
 
-def scene(mesh: Path, resolution: int, lights: int = 1, sensors: int = 1) -> mi.Scene:
+def scene(mesh: Path, resolution: int, lights: int = 1, sensors: int = 1, *, points: bool = False) -> mi.Scene:
     """`scenes/pose.xml` with a mesh, more lights from directions around the first (of the same total irradiance), or the
-    same camera several times side by side."""
+    same camera several times side by side. ``points``: point lights on a circle instead of directional ones."""
     text = assets.scene("pose").read_text(encoding="utf-8")
     begin, end = text.index("<emitter"), text.index("</emitter>") + len("</emitter>")
     emitters = []
@@ -171,7 +171,10 @@ def scene(mesh: Path, resolution: int, lights: int = 1, sensors: int = 1) -> mi.
         angle = 2 * np.pi * k / lights
         x, y = (0.3 * np.cos(angle), 0.3 * np.sin(angle)) if lights > 1 else (0.0, 0.0)
         emitters.append(
-            f'<emitter type="directional" id="light{k}"><vector name="direction" x="{x}" y="{y}" z="-1"/>'
+            f'<emitter type="point" id="light{k}"><point name="position" x="{-9 * x}" y="{-9 * y}" z="3"/>'
+            f'<rgb name="intensity" value="{20 * np.pi / lights}"/></emitter>'
+            if points
+            else f'<emitter type="directional" id="light{k}"><vector name="direction" x="{x}" y="{y}" z="-1"/>'
             f'<rgb name="irradiance" value="{np.pi / lights}"/></emitter>'
         )
     text = text[:begin] + "".join(emitters) + text[end:]

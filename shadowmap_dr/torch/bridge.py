@@ -26,6 +26,8 @@ IN_TENSOR: Any = None  # Any: arrays of several types
 
 # Bytes at a multiple of which an array begins that Dr.Jit's kernels may read where it lies, see `jit.arrays`.
 _ALIGNED = 64
+# Numbers of arrays that are copied by kernels.
+_LARGE = 1 << 16
 # Held by the thread in which Dr.Jit works.
 _TURN = threading.RLock()
 
@@ -65,6 +67,13 @@ def borrowed(tensor: torch.Tensor) -> Any:  # Any: TensorXf or TensorXi, as the 
     return (module.TensorXf if tensor.dtype == torch.float32 else module.TensorXi)(plain)
 
 
+def copy_of(tensor: torch.Tensor) -> Any:  # Any: TensorXf or TensorXi, as the tensor's type
+    """As :func:`to_drjit`, in a function that PyTorch calls outside of all transforms, and in :func:`drjit_turn`."""
+    if _is_large(tensor.numel()) and tensor.device.type == "cpu":
+        return copied(borrowed(tensor.contiguous()))
+    return borrowed(tensor.clone(memory_format=torch.contiguous_format))
+
+
 def index_array(indices: torch.Tensor) -> UInt32:
     """(Checked, plain) indices as a flat ``UInt32`` array."""
     with drjit_turn(indices.device) as module:
@@ -100,7 +109,25 @@ def _gathered(kind: type[ArrayT], flat: Float, index: UInt32 | int) -> ArrayT:
 
 def to_torch(array: AnyArray) -> torch.Tensor:
     """A PyTorch tensor with the values of a Dr.Jit tensor, in memory of its own. Call it in :func:`drjit_turn`: it waits."""
-    return cast(torch.Tensor, dr.detach(array).torch()).clone()
+    own = dr.detach(array)
+    if _is_large(dr.width(own.array)) and dr.backend_v(own) == dr.JitBackend.LLVM:
+        return cast(torch.Tensor, copied(own).torch())
+    return cast(torch.Tensor, own.torch()).clone()
+
+
+def copied(array: AnyArray) -> AnyArray:
+    """An evaluated copy of a (detached) Dr.Jit tensor, in memory of its own."""
+    flat = array.array
+    # By a kernel: Dr.Jit hands out memory that it has used before. The system would map new memory page by page.
+    lane = dr.arange(backend(flat).UInt32, dr.width(flat))
+    copy: AnyArray = type(array)(dr.gather(type(flat), flat, lane), array.shape)
+    dr.eval(copy)
+    return copy
+
+
+def _is_large(count: int) -> bool:
+    """True if the C library maps new memory for as many numbers, instead of using its own."""
+    return count >= _LARGE
 
 
 def forward_derivatives(

@@ -18,7 +18,7 @@ import torch
 
 from ..errors import ShadowmapError
 from ..jit.types import TensorXf
-from .bridge import attached, borrowed, drjit_turn, forward_derivatives, gradients, to_drjit, to_torch
+from .bridge import attached, borrowed, copy_of, drjit_turn, forward_derivatives, gradients, to_torch
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
@@ -248,7 +248,8 @@ def _arrays(given: _Derivative, tensors: tuple[torch.Tensor | None, ...]) -> Ite
     """Context in which Dr.Jit works, with its arrays for adjoints (tangents) and for inputs."""
     device = next(tensor.device for tensor in tensors if tensor is not None)
     with drjit_turn(device):
-        first = [None if tensor is None else to_drjit(tensor) for tensor in tensors[: given.count]]
+        # Copies: their memory belongs to PyTorch, and kernels may write into the arrays.
+        first = [None if tensor is None else copy_of(tensor) for tensor in tensors[: given.count]]
         yield first, [borrowed(tensor.contiguous()) for tensor in tensors[given.count :] if tensor is not None]
 
 

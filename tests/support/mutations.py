@@ -91,6 +91,10 @@ def _nowhere(function: Callable[..., Any]) -> Callable[..., Any]:
     return lambda *arguments: 0.0 * function(*arguments)
 
 
+def _both_nowhere(function: Callable[..., Any]) -> Callable[..., Any]:
+    return lambda *arguments: tuple(0.0 * found for found in function(*arguments))
+
+
 def _never(function: Callable[..., Any]) -> Callable[..., Any]:
     return lambda *arguments: function(*arguments) & False
 
@@ -207,7 +211,7 @@ MUTATIONS = (
              ("shadow/test_shadow_methods.py::test_one_surface_shadows_what_lies_behind_it[llvm_ad_rgb-vsm]",)),
     Mutation("look half a texel off", "shadow.lookup", "_bilinear", _half_a_texel_off,
              ("shadow/test_shadow_maps.py::test_compat_follows_the_authors_formulas[llvm_ad_rgb-spot]",)),
-    Mutation("do not see where surfaces meet", "raster.antialiasing.surface_intersections", "Meetings.weight", _nowhere,
+    Mutation("do not see where surfaces meet", "raster.antialiasing.surface_intersections", "Meetings.weights", _both_nowhere,
              (DIFFERENCES.format("crossing_boxes-camera_shift"), DIFFERENCES.format("fine_box-caster_rise"))),
     Mutation("do not see where a surface cuts itself", "raster.antialiasing.edge_crossings", "_cut", _never,
              ("raster/test_bends.py::test_a_curved_sheet_that_cuts_itself[llvm_ad_rgb-True]",)),

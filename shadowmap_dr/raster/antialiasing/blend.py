@@ -213,12 +213,16 @@ class Mixer:
         Array4f = module.Array4f
         result = dr.zeros(module.Float, size)
         crossings = self.crossings
+        # Gradients to the weights, by slot; only those of pairs that have a weight.
+        gains = None if crossings.meetings is None else dr.empty(module.Float, 2 * self.pixels)
 
         def visit(slot: UInt32, pair: UInt32) -> None:
             down, pixel, weight = self._pair(pair)
 
             def add(slot: UInt32, pixel: UInt32, down: Bool, weight: Float) -> Float:
                 gain, ends = self._gain(adjoint, pixel, down, weight), dr.gather(module.Array4u, crossings.ends, slot)
+                if gains is not None:
+                    dr.scatter(gains, gain, slot)
                 _add(result, gain, dr.gather(Array4f, crossings.slopes, slot), ends.x, ends.y, ends.x != NO_VERTEX)
                 two = ends.z != NO_VERTEX
 
@@ -232,20 +236,21 @@ class Mixer:
 
         crossings.pairs.for_each(visit)
         meetings = crossings.meetings
-        if meetings is None:
+        if meetings is None or gains is None:
             return result
+        dr.eval(result, gains)
 
         def meet(slot: UInt32) -> None:
             down, pixel, weight = self._pair(crossings.pairs.at(slot))
             active = (weight != 0) & self._bare(slot)
 
-            def add(pixel: UInt32, down: Bool, weight: Float) -> Float:
-                gain = self._gain(adjoint, pixel, down, weight)
-                for vertex, slope in meetings.slopes(pixel, down):
+            def add(slot: UInt32, pixel: UInt32, down: Bool, weight: Float) -> Float:
+                gain, rate = dr.gather(module.Float, gains, slot), self._rate(slot)
+                for vertex, slope in meetings.slopes(pixel, down, rate):
                     dr.scatter_add(result, slope * gain, vertex)
                 return weight
 
-            dr.if_stmt((pixel, down, weight), active, add, lambda *lanes: lanes[2], mode="symbolic")
+            dr.if_stmt((slot, pixel, down, weight), active, add, lambda *lanes: lanes[3], mode="symbolic")
 
         meetings.for_each(meet)
         return result
@@ -274,6 +279,10 @@ class Mixer:
     def _bare(self, slot: UInt32) -> Bool:
         """True if a pair has no edge."""
         return dr.gather(self.module.UInt32, self.crossings.ends, 4 * slot) == NO_VERTEX
+
+    def _rate(self, slot: UInt32) -> Float:
+        """Change of the weight of a pair without an edge with the depth."""
+        return dr.gather(self.module.Float, self.crossings.slopes, 4 * slot)
 
     def _gain(self, adjoint: Float, pixel: UInt32, down: Bool, weight: Float) -> Float:
         """Gradient to the weight of a pair."""
@@ -361,7 +370,7 @@ class Mixer:
 
         def meet(slot: UInt32) -> None:
             is_down, pixel, weight = self._pair(crossings.pairs.at(slot))
-            slopes = meetings.slopes(pixel, is_down)
+            slopes = meetings.slopes(pixel, is_down, self._rate(slot))
             change = sum(dr.dot(slope, dr.gather(Array4f, positions, vertex)) for vertex, slope in slopes)
             active = (weight != 0) & self._bare(slot)
             dr.scatter(right, change, pixel, active & ~is_down)

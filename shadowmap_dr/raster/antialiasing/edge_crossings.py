@@ -33,7 +33,8 @@ class Crossings:
         ends: four for each slot: ends of the edge and of a second edge, as vertices of the whole batch; ``NO_VERTEX`` if there
             is no edge.
         slopes, second_slopes: four for each slot: (s, slope x, slope y, slope w). The weight changes by the sum over x, y, w of
-            slope * (change of the clip-space edge at the crossing), where the edge's ends count by 1 - s and s.
+            slope * (change of the clip-space edge at the crossing), where the edge's ends count by 1 - s and s. For pairs of
+            ``meetings`` the first number is the change of the weight with the depth.
         meetings: intersections of surfaces, which give the weights of pairs without ends; None if these were not searched.
         marked: creases of all faces; None if there are none.
     """
@@ -220,9 +221,10 @@ def _meet(found: Crossings, meetings: Meetings, raster: RasterOutput) -> None:
     def visit(slot: UInt32) -> None:
         pair = found.pairs.at(slot)
         down, pixel = (pair & 1) != 0, pair >> 1
-        value = meetings.weight(pixel, down)
+        value, rate = meetings.weights(pixel, down)
         met = value != 0
         dr.scatter(found.ends, Array4u(NO_VERTEX), slot, met)
+        dr.scatter(found.slopes, rate, 4 * slot, met)
         dr.scatter(found.right, value, pixel, met & ~down)
         dr.scatter(found.down, value, pixel, met & down)
 

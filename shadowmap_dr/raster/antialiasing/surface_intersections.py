@@ -13,6 +13,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import ModuleType
 from typing import cast
 
 import drjit as dr
@@ -113,97 +114,157 @@ class Meetings:
         """Call ``visit(slot)``, which scatters its results, for all listed pairs: few, but each is expensive."""
         each_number(self.count, _LANES, lambda k: visit(dr.gather(type(k), self.slots, k)))
 
-    def weight(self, pixel: UInt32, down: Bool) -> Float:
-        """Signed weight (see :class:`Crossings`) of pairs of pixels, 0 where their triangles do not intersect in between."""
-        return self._between(pixel, down)[0]
+    def weights(self, pixel: UInt32, down: Bool) -> tuple[Float, Float]:
+        """Weights of pairs of pixels, and their change with the first pixel's depth minus the second's.
 
-    def slopes(self, pixel: UInt32, down: Bool) -> list[tuple[UInt32, Vector4f]]:
-        """(vertex, derivative of the weight by its clip-space position) for all six vertices."""
-        _, rate, triangles = self._between(pixel, down)
-        Array4f = backend(rate).Array4f
+        Both are 0 where the triangles do not intersect in between. Weights are signed (see :class:`Crossings`).
+        """
+        cut = self._cut(pixel, down)
+        # Weight of ridges and valleys; smooth surfaces have none.
+        soft = self.module.Float(0 if self.marked is None else 1)
+        parts = [dr.gather(self.module.UInt32, self.parts, triangle) for triangle in cut.triangles]
+        for p, triangle in zip(cut.pixels, cut.triangles, strict=True):
+            if self.marked is not None:
+                weight = 1 if self.crease_weights is None else dr.gather(self.module.Float, self.crease_weights, p)
+                flat = (self.marked.at(triangle) & 7) == 7  # creases on all sides
+                soft = dr.minimum(soft, dr.select(flat, weight, 0))
+        a, b, _ = cut.difference
+        start, change = cut.start, cut.change
+        end = start + change
+        first = cut.planes[0]
+        depth = first[0] * cut.x + first[1] * cut.y + first[2]
+        # Of two surfaces the nearer one is visible. Faces of one surface form a ridge or a valley.
+        folded = parts[0] == parts[1]
+        steepness = sum(dr.abs(cut.along(plane)) for plane in cut.planes)
+        least = dr.maximum(_LEAST_CHANGE * dr.abs(depth), dr.select(folded, _LEAST_FOLD * steepness, 0))
+        meet = (((start < 0) & (end > 0)) | (folded & (start > 0) & (end < 0))) & (dr.abs(change) > least)
+        slope = dr.select(meet, precise_rcp(dr.select(meet, change, 1)), 0)
+        t = -start * slope
+        across = (a * cut.step_x) ** 2
+        upwards = (b * cut.step_y) ** 2
+        soft *= self.module.Float(dr.clip(2 - self._bent(cut) / (_BENT * dr.select(meet, dr.abs(change), 1)), 0, 1))
+        # If the point lies inside both triangles, one passes through the other, whatever the adjacent faces are.
+        inside = start < 0
+        for places in cut.barycentrics(t):
+            inside &= functools.reduce(dr.minimum, places) > _INSIDE * sum(places)
+        soft = dr.select(inside, 1, soft)
+        share = dr.clip(0.5 + (across - upwards) / dr.select(meet, across + upwards, 1), 0, 1)
+        share = dr.select(meet, dr.select(down, 1 - share, share) * dr.select(folded, soft, 1), 0)
+        return self.module.Float(share) * beyond_middle(self.module.Float(t)), self.module.Float(-share * slope)
+
+    def slopes(self, pixel: UInt32, down: Bool, rate: Float) -> list[tuple[UInt32, Vector4f]]:
+        """(vertex, derivative of the weight by its clip-space position) for all six vertices of pairs that have a weight.
+
+        ``rate``: change of the weight with the depth, see :meth:`weights`.
+        """
+        module, cut = self.module, self._cut(pixel, down)
+        t = -cut.start * precise_rcp(dr.select(cut.change != 0, cut.change, 1))
         result = []
-        for sign, (vertices, plane, weights) in zip((1, -1), triangles, strict=True):
+        for k, (sign, weights) in enumerate(zip((1, -1), cut.barycentrics(t), strict=True)):
             # A x + B y + C w = z holds for each corner: the change of the plane balances that of the corner.
-            direction = Array4f(-plane[0], -plane[1], 1, -plane[2])
-            result += [(vertices[k], direction * (sign * rate * weights[k])) for k in range(3)]
+            plane = [module.Float(v) for v in cut.planes[k]]
+            direction = module.Array4f(-plane[0], -plane[1], 1, -plane[2])
+            result += [(cut.vertices[k][n], direction * (sign * rate * weights[n])) for n in range(3)]
         return result
 
-    def _between(self, pixel: UInt32, down: Bool) -> tuple[Float, Float, list[tuple[list[UInt32], list[Float], list[Float]]]]:
-        """Weight, its change with the first depth minus the second, and (vertices, depth plane, barycentrics / w) of both."""
-        module = backend(self.positions)
-        Float, UInt32 = module.Float, module.UInt32
+    @property
+    def module(self) -> ModuleType:
+        """Module of the arrays' types."""
+        return backend(self.positions)
+
+    def _cut(self, pixel: UInt32, down: Bool) -> _Cut:
+        """The planes of the triangles that pixels and their neighbours see, and where they cross in between."""
+        module = self.module
         image, row, column = by_pixel(pixel, self.batch, self.height, self.width)
         first = image * uint_input(module, "vertices", self.vertex_count)
         # Centre of the pixel, and the offset of its neighbour, in NDC.
         x, y = exact_centres(module, row, column, self.height, self.width)
         step_x, step_y = double_input(module, "width", 2 / self.width), double_input(module, "height", 2 / self.height)
-        step = dr.select(down, uint_input(module, "width", self.width), 1)
-        found, seen, parts = [], [], []
-        # Weight of ridges and valleys; smooth surfaces have none.
-        soft = Float(0 if self.marked is None else 1)
-        for p in (pixel, pixel + step):
-            triangle = dr.gather(UInt32, self.triangle, p)
-            parts.append(dr.gather(UInt32, self.parts, triangle))
-            if self.marked is not None:
-                weight = 1 if self.crease_weights is None else dr.gather(Float, self.crease_weights, p)
-                flat = (self.marked.at(triangle) & 7) == 7  # creases on all sides
-                soft = dr.minimum(soft, dr.select(flat, weight, 0))
-            corners = gather_triangle(self.positions, self.faces, triangle, first, True)
-            lines, plane = _plane(corners)
-            i = dr.gather(module.Array3u, self.faces, triangle)
-            found.append(([first + i[k] for k in range(3)], lines, plane))
-            seen.append((triangle, first, corners))
-        planes = [plane for _, _, plane in found]
-
-        def along(plane: Line) -> Float64:
-            """Change of depth on a plane from the pixel to its neighbour."""
-            return dr.select(down, plane[1] * step_y, plane[0] * step_x)
-
+        pixels = pixel, pixel + dr.select(down, uint_input(module, "width", self.width), 1)
+        triangles = [dr.gather(module.UInt32, self.triangle, p) for p in pixels]
+        found = [_plane(gather_triangle(self.positions, self.faces, triangle, first, True)) for triangle in triangles]
+        indices = [dr.gather(module.Array3u, self.faces, triangle) for triangle in triangles]
+        vertices = [[first + i[k] for k in range(3)] for i in indices]
+        lines, planes = [lines for lines, _ in found], [plane for _, plane in found]
         a, b, c = (u - v for u, v in zip(*planes, strict=True))
-        # Difference of the depths (first minus second) at the pixel, and its change from the pixel to its neighbour.
         start, change = dr.fma(a, x, dr.fma(b, y, c)), dr.select(down, b * step_y, a * step_x)
-        end = start + change
-        depth = found[0][2][0] * x + found[0][2][1] * y + found[0][2][2]
-        # Of two surfaces the nearer one is visible. Faces of one surface form a ridge or a valley.
-        folded = parts[0] == parts[1]
-        steepness = sum(dr.abs(along(plane)) for plane in planes)
-        least = dr.maximum(_LEAST_CHANGE * dr.abs(depth), dr.select(folded, _LEAST_FOLD * steepness, 0))
-        meet = (((start < 0) & (end > 0)) | (folded & (start > 0) & (end < 0))) & (dr.abs(change) > least)
-        slope = dr.select(meet, precise_rcp(dr.select(meet, change, 1)), 0)
-        t = -start * slope
-        across = (a * step_x) ** 2
-        upwards = (b * step_y) ** 2
-        bent = dr.maximum(*(self._bent(*one, planes, along) for one in seen))
-        soft *= Float(dr.clip(2 - bent / (_BENT * dr.select(meet, dr.abs(change), 1)), 0, 1))
-        # If the point lies inside both triangles, one passes through the other, whatever the adjacent faces are.
-        x, y = dr.select(down, x, x + t * step_x), dr.select(down, y + t * step_y, y)
-        at = [[Float(dr.fma(m, x, dr.fma(n, y, o))) for m, n, o in lines] for _, lines, _ in found]
-        inside = start < 0
-        for places in at:
-            inside &= functools.reduce(dr.minimum, places) > _INSIDE * sum(places)
-        soft = dr.select(inside, 1, soft)
-        share = dr.clip(0.5 + (across - upwards) / dr.select(meet, across + upwards, 1), 0, 1)
-        share = dr.select(meet, dr.select(down, 1 - share, share) * dr.select(folded, soft, 1), 0)
-        triangles = [(vertices, [Float(v) for v in plane], at[k]) for k, (vertices, _, plane) in enumerate(found)]
-        return Float(share) * beyond_middle(Float(t)), Float(-share * slope), triangles
+        return _Cut(pixels, triangles, vertices, first, lines, planes, (a, b, c), x, y, step_x, step_y, down, start, change)
 
-    def _bent(
-        self, triangle: UInt32, first: UInt32, corners: Corners, planes: list[Line], along: Callable[[Line], Float64]
-    ) -> Float64:
-        """Largest deviation of a triangle's adjacent faces from both planes, as change of depth from the pixel to its neighbour.
+    def _bent(self, cut: _Cut) -> Float64:
+        """Largest deviation of both triangles' adjacent faces from both planes, as change of depth from pixel to neighbour.
 
         At a ridge, the adjacent face lies in one of the two planes.
         """
-        module = backend(self.positions)
-        most = module.Float64(0)
-        for k in range(3):
-            vertex = dr.gather(module.UInt32, self.beyond, 3 * triangle + k)
+        module = self.module
+        slopes = [cut.along(plane) for plane in cut.planes]
+
+        # A loop, since six faces written out take several times as long to compile.
+        def look(number, most, triangle, other, first, down, step_x, step_y, slope, slope_2):  # noqa: ANN001, ANN202
+            second = number >= 3
+            k = dr.select(second, number - 3, number)
+            face = 3 * dr.select(second, other, triangle)
+            vertex = dr.gather(module.UInt32, self.beyond, face + k)
             has = vertex != NO_VERTEX
-            beside = corners[k], corners[(k + 1) % 3], dr.gather(module.Array4f, self.positions, first + vertex, has)
-            slope = along(_plane(beside)[1])
-            apart = dr.minimum(*(dr.abs(slope - along(plane)) for plane in planes))
+            ends = (dr.gather(module.UInt32, self.faces, face + corner) for corner in (k, dr.select(k == 2, 0, k + 1)))
+            active = [module.Bool(True)] * 2 + [has]
+            corners = tuple(
+                dr.gather(module.Array4f, self.positions, first + v, a) for v, a in zip((*ends, vertex), active, strict=True)
+            )
+            plane = _plane(cast("Corners", corners))[1]
+            own = dr.select(down, plane[1] * step_y, plane[0] * step_x)
+            apart = dr.minimum(dr.abs(own - slope), dr.abs(own - slope_2))
             most = dr.maximum(most, dr.select(has, apart, 0))
-        return most
+            return number + 1, most, triangle, other, first, down, step_x, step_y, slope, slope_2
+
+        lanes = dr.width(cut.triangles[0])
+        state = (
+            dr.zeros(module.UInt32, lanes),
+            dr.zeros(module.Float64, lanes),
+            *(*cut.triangles, cut.first, cut.down, cut.step_x, cut.step_y, *slopes),
+        )
+        found = dr.while_loop(state, lambda number, *_: number < 6, look, mode="symbolic", label="adjacent faces")
+        return cast("Float64", found[1])
+
+
+@dataclass(frozen=True)
+class _Cut:
+    """Triangles that pixels and their neighbours see, and the difference of the depths of their planes in between.
+
+    Attributes:
+        pixels, triangles, vertices, lines, planes: of the pixel, then of its neighbour. Barycentrics / w (``lines``) and depths
+            are affine functions in NDC.
+        first: first vertex of the image.
+        difference: first plane minus the second one.
+        x, y, step_x, step_y: centre of the pixel and offsets of its neighbours, in NDC.
+        down: True if the neighbour is the lower one.
+        start, change: difference at the pixel, and its change from there to the neighbour.
+    """
+
+    pixels: tuple[UInt32, UInt32]
+    triangles: list[UInt32]
+    vertices: list[list[UInt32]]
+    first: UInt32
+    lines: list[list[Line]]
+    planes: list[Line]
+    difference: Line
+    x: Float64
+    y: Float64
+    step_x: Float64
+    step_y: Float64
+    down: Bool
+    start: Float64
+    change: Float64
+
+    def along(self, plane: Line) -> Float64:
+        """Change of depth on a plane from the pixel to its neighbour."""
+        return dr.select(self.down, plane[1] * self.step_y, plane[0] * self.step_x)
+
+    def barycentrics(self, t: Float64) -> list[list[Float]]:
+        """Barycentrics / w in both triangles of the point at ``t`` (0 to 1) between the pixels' centres."""
+        Float = backend(t).Float
+        x = dr.select(self.down, self.x, self.x + t * self.step_x)
+        y = dr.select(self.down, self.y + t * self.step_y, self.y)
+        return [[Float(dr.fma(m, x, dr.fma(n, y, o))) for m, n, o in lines] for lines in self.lines]
 
 
 def beyond_middle(t: Float) -> Float:

@@ -22,6 +22,8 @@ CHANNELS = {
     "normal": ("shading normal, world space, unit length", "0"),
     "shape_index": ("number of the shape, counted from 0", "-1"),
     "prim_index": ("number of the triangle in its shape, counted from 0", "-1"),
+    "opacity": ("share of the light from behind all surfaces that they take away, anti-aliased where some are translucent", "0"),
+    "transmittance": ("share of the light that translucent casters let through; three channels for each such light", "1"),
     "visibility": ("fraction of the light that arrives; a channel for each light but area lights and skies, named after it", "1"),
 }
 #: Largest number that is tried.
@@ -77,7 +79,7 @@ def _accepted(option: Field[object]) -> str:
         return f"{code(AUTO)}, `true`, `false`"
     if isinstance(option.default, bool):
         return "`true`, `false`"
-    if option.name in ("shadow_map_resolution", "area_light_samples"):
+    if option.name in ("shadow_map_resolution", "area_light_samples", "translucent_layers"):
         return f"{code(AUTO)}; {_whole_numbers(lambda value: _error(option.name, value) is None)}"
     if isinstance(option.default, str):
         return ", ".join(map(code, _choices(option.name)))

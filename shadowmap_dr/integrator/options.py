@@ -30,9 +30,15 @@ _FOREIGN = (
 
 
 # Types of values in ``mi.Properties`` that are not those of the defaults. They hold no sequences: names of channels are text.
-_KINDS: dict[str, type] = {"aovs": str, "shadow_map_resolution": int, "area_light_samples": int, "recorded": bool}
+_KINDS: dict[str, type] = {
+    "aovs": str,
+    "shadow_map_resolution": int,
+    "area_light_samples": int,
+    "recorded": bool,
+    "translucent_layers": int,
+}
 # Parameters that may be ``auto``, too.
-_AUTOMATIC = ("shadow_map_resolution", "area_light_samples", "recorded")
+_AUTOMATIC = ("shadow_map_resolution", "area_light_samples", "translucent_layers", "recorded")
 
 
 @dataclass(frozen=True)
@@ -60,6 +66,12 @@ class Options:
     soft_map_resolution    texels along each side of these points' and directions' shadow maps
     emitter_shadows        ``samples``, or ``single``: one map for each area light, penumbrae estimated from it
     light_memory           GiB for the shadow maps of lights; more lights are rendered one slice after the other
+    translucent_layers     most translucent surfaces along a ray, nearest first, 1 to 64; ``auto``: as many as there are when the
+                           scene is loaded, and one more, at most 32. Farther ones are left out
+    transmittance_method   encoding of the depths of translucent casters in shadow maps: ``msm``, ``vsm``, ``esm``, ``evsm2``,
+                           ``evsm4`` or ``csm``
+    transmittance_groups   parts of the translucent casters, front to back, whose depths are encoded apart, 1 to 8; 0: 2, or 4 for
+                           more than eight layers
     shadow_samples         look-ups along each side of a pixel, 1 to 8; 0: automatic
     antialias              anti-alias the image; without it outlines have no gradient
     ambient                radiance of unshadowed light from all directions, added to the scene's environment
@@ -93,6 +105,9 @@ class Options:
     soft_map_resolution: int = RenderSettings.soft_map_resolution
     emitter_shadows: str = RenderSettings.emitter_shadows
     light_memory: float = RenderSettings.light_memory
+    translucent_layers: int | str = RenderSettings.translucent_layers
+    transmittance_method: str = ShadowSettings.transmittance_method
+    transmittance_groups: int = ShadowSettings.transmittance_groups
     antialias: bool = RenderSettings.antialias
     ambient: float = RenderSettings.ambient
     hide_emitters: bool = RenderSettings.hide_emitters

@@ -1,11 +1,11 @@
-"""Unit vectors with finite derivatives."""
+"""Unit vectors with finite derivatives, and means of components."""
 
 from __future__ import annotations
 
 import drjit as dr
 
 from .arrays import backend, reinterpret
-from .types import Bool, Float, Vector3f
+from .types import Bool, Color3f, Float, Vector3f
 
 #: Vectors whose components are all below this count as zero where zero is a case of its own.
 LEAST = 2.0**-100
@@ -46,3 +46,8 @@ def _near_one(vector: Vector3f) -> tuple[Vector3f, Float, Bool]:
     exponent = dr.clip(reinterpret(module.UInt32, largest) & 0x7F800000, (127 - 100) << 23, 0x7E800000)
     scale = reinterpret(module.Float, 0x7F000000 - exponent)
     return vector * scale, scale, largest > LEAST
+
+
+def mean_of(value: Float | Color3f) -> Float:
+    """Mean of the components of a colour, or the number itself. Attached."""
+    return dr.mean(value) if dr.depth_v(value) > 1 else value

@@ -5,13 +5,15 @@ from .antialiasing.creases import CoplanarCreases
 from .antialiasing.edge_crossings import DEPTH_GAP, Crossings, find_crossings
 from .closed_parts import drawing_order, outward_faces
 from .interpolate import interpolate
-from .rasterize import check_resolution, locate, rasterize, visible_triangles
+from .peeling import LEAST_LOSS, deepest, peeled_layers
+from .rasterize import check_resolution, locate, rasterize, visible_triangles, with_triangles
 from .shape_seams import detach_moved_seams
 from .topology import NO_VERTEX, Topology, build_topology
 from .types import MAX_RESOLUTION, NO_TRIANGLE, RasterOutput
 
 __all__ = [
     "DEPTH_GAP",
+    "LEAST_LOSS",
     "MAX_RESOLUTION",
     "NO_TRIANGLE",
     "NO_VERTEX",
@@ -27,7 +29,10 @@ __all__ = [
     "interpolate",
     "locate",
     "outward_faces",
+    "deepest",
     "detach_moved_seams",
+    "peeled_layers",
     "rasterize",
     "visible_triangles",
+    "with_triangles",
 ]

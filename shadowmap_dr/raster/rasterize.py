@@ -67,8 +67,8 @@ def rasterize(
     large ones in the list of their tile (:mod:`shadowmap_dr.raster.tile_lists`).
     """
     flat, face_indices, batch, _ = check_mesh(positions, faces, batch, check_indices)
-    located = visible_triangles(flat, face_indices, resolution, batch=batch, transparent=transparent, layers=layers)
-    return _with_barycentrics(located, flat, face_indices)
+    seen = visible_triangles(flat, face_indices, resolution, batch=batch, transparent=transparent, layers=layers)
+    return _with_barycentrics(seen, flat, face_indices)
 
 
 def locate(raster: RasterOutput, positions: Float, faces: UInt32) -> RasterOutput:
@@ -79,14 +79,26 @@ def locate(raster: RasterOutput, positions: Float, faces: UInt32) -> RasterOutpu
         positions, faces: flat, as rasterized.
     """
     size = raster.batch, dr.width(positions) // (4 * raster.batch), raster.height, raster.width
-    return _with_barycentrics(_locate(positions, faces, raster.triangle, raster.records, *size), positions, faces)
+    return _with_barycentrics(located(positions, faces, raster.triangle, raster.records, *size), positions, faces)
 
 
-def _with_barycentrics(located: RasterOutput, positions: Float, faces: UInt32) -> RasterOutput:
-    u, v, depth = pixel_barycentrics(located, positions, faces)
+def with_triangles(raster: RasterOutput, triangle: UInt32, positions: Float, faces: UInt32) -> RasterOutput:
+    """A raster of the same images that sees other triangles, attached to ``positions``.
+
+    Args:
+        raster: from :func:`rasterize` or :func:`visible_triangles`. Its records are read.
+        triangle: triangle of each pixel; the pixel's centre lies on it.
+        positions, faces: flat, as rasterized.
+    """
+    size = raster.batch, dr.width(positions) // (4 * raster.batch), raster.height, raster.width
+    return located(positions, faces, triangle, raster.records, *size)
+
+
+def _with_barycentrics(seen: RasterOutput, positions: Float, faces: UInt32) -> RasterOutput:
+    u, v, depth = pixel_barycentrics(seen, positions, faces)
     if dr.grad_enabled(positions):
-        u, v, depth = (replace_grad(a, b) for a, b in ((u, located.u), (v, located.v), (depth, located.depth)))
-    return replace(located, u=u, v=v, depth=depth)
+        u, v, depth = (replace_grad(a, b) for a, b in ((u, seen.u), (v, seen.v), (depth, seen.depth)))
+    return replace(seen, u=u, v=v, depth=depth)
 
 
 def visible_triangles(
@@ -98,6 +110,7 @@ def visible_triangles(
     transparent: Callable[[RasterOutput], Bool] | None = None,
     layers: int = 4,
     one_sided: Bool | None = None,
+    drawn: Bool | None = None,
 ) -> RasterOutput:
     """As :func:`rasterize`, for positions and faces known to be valid, without the cost of barycentrics and depths.
 
@@ -106,15 +119,16 @@ def visible_triangles(
     Args:
         one_sided: faces, (F,) or (B F,) for each image, that are drawn only if their corners run from +x to -y, that is,
             clockwise where y points up.
+        drawn: faces, (F,), that are drawn at all; None for all of them. The others have records, too.
     """
     flat, face_indices, batch, vertex_count = check_mesh(positions, faces, batch, False)
     size = (batch, vertex_count, *check_resolution(resolution))
     with dr.suspend_grad():
         triangle, records = computed(
             "visible triangles",
-            lambda: _visible_triangles(dr.detach(flat), face_indices, *size, transparent, layers, one_sided),
+            lambda: _visible_triangles(dr.detach(flat), face_indices, *size, transparent, layers, one_sided, drawn),
         )
-    return _locate(flat, face_indices, triangle, records, *size)
+    return located(flat, face_indices, triangle, records, *size)
 
 
 def check_resolution(resolution: tuple[int, int]) -> tuple[int, int]:
@@ -162,7 +176,7 @@ def check_mesh(
     return flat, indices, batch, vertex_count
 
 
-def _locate(
+def located(
     positions: Float, faces: UInt32, triangle: UInt32, records: Records, batch: int, vertex_count: int, height: int, width: int
 ) -> RasterOutput:
     """Perspective-correct barycentrics and depth of each pixel centre on its (given) triangle, attached to ``positions``.
@@ -227,26 +241,51 @@ def _visible_triangles(
     transparent: Callable[[RasterOutput], Bool] | None,
     layers: int,
     one_sided: Bool | None = None,
+    drawn: Bool | None = None,
 ) -> tuple[UInt32, Records]:
     """Triangle index of each pixel, row-major, and the records of all triangles."""
     mesh = (positions, faces, batch, vertex_count, height, width)
     if transparent is None:
-        return _nearest_fragments(*mesh, one_sided=one_sided)
-    keys, records = _nearest_fragments(*mesh, peel=True, one_sided=one_sided)
+        return _nearest_fragments(*mesh, one_sided=one_sided, drawn=drawn)
+    keys, records = nearest_fragments(*mesh, one_sided=one_sided, drawn=drawn)
     for _ in range(layers - 1):
-        seen = _locate(positions, faces, _triangle_of(keys), records, batch, vertex_count, height, width)
+        seen = located(positions, faces, triangle_of(keys), records, batch, vertex_count, height, width)
         through = seen.valid & dr.detach(transparent(seen))
         behind = dr.select(through, keys, type(keys)(EMPTY))
         dr.eval(behind)
-        farther, records = _nearest_fragments(*mesh, behind=behind, peel=True, one_sided=one_sided)
+        farther, records = nearest_fragments(*mesh, behind=behind, one_sided=one_sided, drawn=drawn)
         keys = dr.select(through, farther, keys)
         dr.eval(keys)
-    return _triangle_of(keys), records
+    return triangle_of(keys), records
 
 
-def _triangle_of(keys: UInt64) -> UInt32:
+def triangle_of(keys: UInt64) -> UInt32:
     """Triangle index of fragment keys: ``NO_TRIANGLE`` for an empty key."""
     return backend(keys).UInt32(keys)
+
+
+def nearest_fragments(
+    positions: Float,
+    faces: UInt32,
+    batch: int,
+    vertex_count: int,
+    height: int,
+    width: int,
+    *,
+    behind: UInt64 | None = None,
+    one_sided: Bool | None = None,
+    drawn: Bool | None = None,
+) -> tuple[UInt64, Records]:
+    """Keys of the nearest fragments, row-major, ``EMPTY`` where there is none, and the records of all triangles.
+
+    Keys grow with depth, and with the triangle's index at the same depth. The mesh is flat and known to be valid.
+
+    Args:
+        behind: keys: pixels see only fragments with larger keys, that is, farther ones.
+        one_sided, drawn: see :func:`visible_triangles`.
+    """
+    mesh = (positions, faces, batch, vertex_count, height, width)
+    return _nearest_fragments(*mesh, behind, True, one_sided, drawn)
 
 
 def _nearest_fragments(
@@ -259,13 +298,14 @@ def _nearest_fragments(
     behind: UInt64 | None = None,
     peel: bool = False,
     one_sided: Bool | None = None,
+    drawn: Bool | None = None,
 ) -> tuple[Any, Records]:
     """Triangle of each pixel, row-major, and the edge functions and depth planes of all triangles (see ``Triangles``).
 
     Args:
         behind: keys: pixels see only fragments with larger keys, that is, farther ones.
         peel: return fragment keys (``UInt64``) instead of triangles (``UInt32``), and keep triangles that large ones hide.
-        one_sided: see :func:`visible_triangles`.
+        one_sided, drawn: see :func:`visible_triangles`.
     """
     module = backend(positions)
     UInt64 = module.UInt64
@@ -297,6 +337,8 @@ def _nearest_fragments(
             _, det = triangles.exact()
             culled = dr.gather(module.Bool, one_sided, triangle if dr.width(one_sided) == face_count else index)
             triangles = replace(triangles, active=triangles.active & ((det < 0) | ~culled))
+        if drawn is not None:
+            triangles = replace(triangles, active=triangles.active & dr.gather(module.Bool, drawn, triangle))
         small = triangles.active & ((triangles.fragments <= _LARGE) | (triangles.fragments <= 5 * sides))
         draw(triangles, keys, behind, partial(pixel_index, image), triangle, triangles.box, small)
         large = triangles.active & ~small
@@ -312,7 +354,7 @@ def _nearest_fragments(
     first, last, large = dr.if_stmt((index, image, triangle), near, visit, lambda *_: nothing, mode="symbolic", label="triangle")
     dr.eval(records, keys, nearest, large, first, last)
     if empty:
-        return keys if peel else _triangle_of(keys), records
+        return keys if peel else triangle_of(keys), records
 
     def exact_lines(index: UInt32) -> tuple[list[Line], Float64]:
         image, triangle = split(index, "faces", face_count, batch)

@@ -21,13 +21,13 @@ from .gbuffer.surface import Surface
 
 
 def direct_light(
-    surface: Surface, light: Light, visibility: Float | float = 1.0, nodes: Sequence[Any] = (), *, gate: bool = True
+    surface: Surface, light: Light, visibility: Float | Color3f | float = 1.0, nodes: Sequence[Any] = (), *, gate: bool = True
 ) -> Color3f:
     """Radiance (colour, N) of one light towards the camera: BSDF * light * visibility.
 
-    ``visibility`` Float (N,), 0 dark to 1 lit. ``nodes``: :attr:`SceneData.materials`. ``gate`` removes light from directions
-    in front of the shading normal but behind the triangle, as a shadow ray would. Gradients flow to surface, light and
-    visibility, not through the gate.
+    ``visibility`` Float or colour (N,), 0 dark to 1 lit. ``nodes``: :attr:`SceneData.materials`. ``gate`` removes light from
+    directions in front of the shading normal but behind the triangle, as a shadow ray would. Gradients flow to surface, light
+    and visibility, not through the gate.
     """
     wo_world, weight = broadcast_differentiable(light, dr.width(surface.shape)).illuminate(surface.p_world, surface.active)
     wo = surface.si.to_local(wo_world)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -20,7 +21,10 @@ from .film.aovs import collect_aovs
 from .film.film import film_channels
 from .gbuffer.camera_clip import least_gap
 from .gbuffer.camera_view import CameraPass, CameraView, Frame, PlacedShapes
+from .gbuffer.layer_blending import Blended, merged_sharpness
 from .gbuffer.surface import coloured
+from .gbuffer.translucent_layers import Layers
+from .gbuffer.transmission import transmittance_of
 from .light_colours import colours_of
 from .light_loops import MANY_LIGHTS
 from .light_pass import IncidentLight, Lighting, LightPass, Visibilities
@@ -53,9 +57,11 @@ class ImagePass:
         visibilities if ``visible`` is given."""
         light, settings = self.light, self.light.settings
         frame = self.cameras.frame(view, shapes, light.needs_frames)
-        seen, incident, color = frame.surface, *self._reflected(frame, lighting, visible, shapes)
-        color = light.with_emission(color, seen, lighting, view.sensor, view.size)
-        named = collect_aovs(settings.aovs, seen, view.raster, lighting.lights, incident.visible)
+        incident, color = self._seen(frame, lighting, visible, shapes)
+        if view.layers is not None:
+            return self._layered(frame, view.layers, color, lighting, shapes)
+        seen = frame.surface
+        named = collect_aovs(settings.aovs, seen, view.raster, incident.visible, partial(light.transmittances, frame, lighting))
         if crossings is None and settings.antialias:
             channels = self._channels(color, seen.active, view)
             # In one pass over the pixels, since both need much of the same.
@@ -70,6 +76,47 @@ class ImagePass:
             )
             return _picture(flat, view, len(channels), named)
         return self._mixed(color, seen.active, view, crossings, named)
+
+    def _seen(
+        self, frame: Frame, lighting: Lighting, visible: Visibilities | None, shapes: PlacedShapes
+    ) -> tuple[IncidentLight, Color3f]:
+        """(light that reaches a frame, radiance (colour, N) that it sends to the camera). Attached."""
+        incident, color = self._reflected(frame, lighting, visible, shapes)
+        return incident, self.light.with_emission(color, frame.surface, lighting, frame.view.sensor, frame.view.size)
+
+    def _layered(self, frame: Frame, layers: Layers, color: Color3f, lighting: Lighting, shapes: PlacedShapes) -> TensorXf:
+        """The image of opaque surfaces (``frame``, of ``color``) and of the translucent layers before them. Attached."""
+        view, settings, sensor = frame.view, self.light.settings, frame.view.sensor
+        channels = dr.size_v(mi.UnpolarizedSpectrum)
+        coverage = dr.select(frame.surface.active & (settings.max_depth != 0), mi.Float(1), 0)
+        below = Blended.of(color, coverage)
+        for number in reversed(range(len(layers.levels))):
+            level, sharpness = layers.levels[number], frame.sharpness
+            if number < len(layers.translucent):
+                own = self.cameras.frame(
+                    replace(view, raster=layers.translucent[number], layers=None),
+                    shapes,
+                    self.light.needs_frames or layers.textured,
+                )
+                _, radiance = self._seen(own, lighting, None, shapes)
+                through = transmittance_of(own.surface, layers.bsdfs)
+                below = below.behind(radiance, through, own.surface.active)
+                sharpness = merged_sharpness(own, frame)
+            if settings.antialias:
+                below = below.outlined(view, level, sharpness, shapes, number > 0)
+        named = self._aovs_of_nearest(view, lighting, shapes, below.coverage)
+        flat = film_channels(mi.UnpolarizedSpectrum(*below.channels[:channels]), below.coverage, sensor)
+        return _picture(interleave(flat), view, len(flat), named)
+
+    def _aovs_of_nearest(self, view: CameraView, lighting: Lighting, shapes: PlacedShapes, coverage: Float) -> list[Float]:
+        """Further channels of the nearest surfaces, whether they are opaque or not."""
+        aovs = self.light.settings.aovs
+        if not aovs:
+            return []
+        frame = self.cameras.frame(view.nearest, shapes, True)
+        incident = self._reflected(frame, lighting, None, shapes)[0]
+        through = partial(self.light.transmittances, frame, lighting)
+        return collect_aovs(aovs, frame.surface, frame.view.raster, incident.visible, through, coverage)
 
     def coloured_image(self, lit: LitFrame, crossings: Crossings | None) -> TensorXf:
         """The image of one camera, given its light and edges. Attached to materials and the lights' colours."""
@@ -95,6 +142,9 @@ class ImagePass:
         cache.shapes, cache.views = shapes, tuple(views)
         if cache.level >= CacheLevel.LIGHTS:
             cache.maps = lighting.maps, lighting.soft_maps
+        if any(view.layers is not None for view in views):
+            dr.eval(shapes, cache.views, cache.maps)
+            return
         seen = cache.level >= CacheLevel.LIGHTS and not lit and not cache.visible and self._room_for_visible(views)
         if not (lit or seen) and (cache.crossings or not settings.antialias):
             return

@@ -21,11 +21,11 @@ from ..scene.lights.punctual import SpotLight
 from ..scene.lights.read import Light
 from ..scene.lights.soft_outline import Softened, share_inside
 from ..scene.sums import attached_parameters, sum_over
-from ..shadow import ShadowMaps, cube_face, visibility
+from ..shadow import ShadowMaps, cube_face
 from .direct_light import passes_gate
 from .gbuffer.surface import Surface
 from .light_colours import untextured
-from .shadow_pass import MapPlan
+from .shadow_pass import MapPlan, share_through
 
 #: Least number of lights of a kind that are summed up in a loop.
 MANY_LIGHTS = 8
@@ -146,7 +146,7 @@ def light_of_table(seen: Surface, places: Places, table: LightTable, maps: Shado
         active = seen.active & passes_gate(seen, wo_world, wo)
         value = seen.evaluate(wo, active) * weight
         if maps is not None:
-            lit = [_visibility(table, maps, index, light, seen.p_world + offset, seen.active) for offset in places.spots]
+            lit = [_share(table, maps, index, light, seen.p_world + offset, seen.active) for offset in places.spots]
             value *= sum(lit) * (1 / len(lit))
         return dr.select(active, value, 0)
 
@@ -155,13 +155,15 @@ def light_of_table(seen: Surface, places: Places, table: LightTable, maps: Shado
     return sum_over(one_light, table.size, start, (seen, places), (table, maps), implicit, seen.active)
 
 
-def _visibility(table: LightTable, maps: ShadowMaps, index: UInt32, light: Illumination, p_world: Point3f, active: Bool) -> Float:
+def _share(
+    table: LightTable, maps: ShadowMaps, index: UInt32, light: Illumination, p_world: Point3f, active: Bool
+) -> Float | Color3f:
     which = dr.gather(mi.UInt32, table.first, index)
     if table.cube:
         punctual: Any = light.light if isinstance(light, Softened) else light  # Any: lights with maps of cubes have a position
         position = punctual.position
         which += cube_face(dr.detach(mi.Vector3f(p_world - position)))
-    return visibility(maps, which, p_world, active)
+    return share_through(maps, which, p_world, active)
 
 
 def _numbers(light: Light) -> list[Float]:

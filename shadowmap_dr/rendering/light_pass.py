@@ -13,7 +13,7 @@ import mitsuba as mi
 from ..errors import ShadowmapError
 from ..jit.checkpoint import Term, checkpointed_sum
 from ..jit.types import AnyArray, Bool, Color3f, Float, Point3f, PyTree
-from ..raster import RasterOutput
+from ..jit.vectors import mean_of
 from ..scene.geometry import Geometry
 from ..scene.lights.area import AreaLight
 from ..scene.lights.environment import UniformRadiance
@@ -23,7 +23,7 @@ from ..scene.lights.soft_outline import softened
 from ..scene.load import SceneData
 from ..scene.sensor import ImageSize, Sensor
 from ..scene.sums import attached_parameters
-from ..shadow import Frusta, ShadowMaps, ShadowSettings
+from ..shadow import Frusta, ShadowMaps, ShadowSettings, TranslucentCasters
 from .direct_light import ambient_light, background, direct_light, emission
 from .extended_lights import (
     LightSamples,
@@ -39,6 +39,7 @@ from .extended_lights import (
     sample_visibilities,
     samples_of,
     soft_light,
+    soft_map_vertices,
 )
 from .extended_lights.interleaving import Interleaving
 from .extended_lights.sample_counts import MOST
@@ -50,10 +51,12 @@ from .light_loops import MANY_LIGHTS, many_lights
 from .light_slices import LightSlice, joined_fits, plan_slices, shining_objects
 from .light_tiles import sized
 from .settings import RenderSettings
-from .shadow_pass import MapPlan, fit_maps, light_visibility, make_maps
+from .shadow_pass import MapPlan, arriving_light, fit_maps, light_through, make_maps, map_vertices
 
 # Directions over which the light of environments is summed.
 _AMBIENT_DIRECTIONS = 16
+#: Mask of the opaque faces (Bool, F), and the casters that are not opaque; None each without such casters.
+Casters = tuple[Bool | None, TranslucentCasters | None]
 
 
 @dataclass(frozen=True)
@@ -91,12 +94,12 @@ class SlicedLighting:
 
     Attributes:
         fits: of the maps of each slice.
-        transparent, seen: as for :meth:`LightPass.lighting`.
+        casters, seen: as for :meth:`LightPass.lighting`.
         points: number of points that look the maps up, see :meth:`Lighting.for_points`.
     """
 
     fits: list[tuple[Frusta | None, SoftFrusta]]
-    transparent: Callable[[RasterOutput], Bool] | None
+    casters: Casters
     seen: tuple[Point3f, Bool]
     points: int = 1
 
@@ -120,13 +123,13 @@ class IncidentLight:
 
     Attributes:
         lights: lights that are added one by one, with soft outlines.
-        visible: visibility of each of these lights, ``Float`` (N,).
+        visible: visibility of each of these lights, ``Float`` (N,), or a colour (N,) with translucent casters.
         looped: radiance (colour, N) towards the camera from all other lights without extent, or 0.
         parts: see :attr:`Visibilities.parts`; None: look visibility up in the maps.
     """
 
     lights: tuple[Any, ...]
-    visible: list[Float]
+    visible: Sequence[Float | Color3f]
     looped: Color3f | int
     parts: tuple[Any, ...]
 
@@ -178,7 +181,7 @@ class LightPass:
         shapes: PlacedShapes,
         replacements: Mapping[str, Any] | None,
         fits: tuple[Frusta | None, SoftFrusta],
-        transparent: Callable[[RasterOutput], Bool] | None,
+        casters: Casters,
         seen: Callable[[], tuple[Any, Any]],
     ) -> Lighting:
         """All lights and their shadow maps.
@@ -187,7 +190,7 @@ class LightPass:
             shapes: where they are now.
             replacements: records of lights, by name, that replace those of the scene.
             fits: fit of the shadow maps, and of the maps of extended lights, in an earlier rendering.
-            transparent: alpha test, see :meth:`CameraPass.transparent`.
+            casters: mask of the opaque faces, and the other casters, None each without any.
             seen: returns points on visible surfaces, see :meth:`CameraPass.seen`.
         """
         data, settings = self.data, self.settings
@@ -197,16 +200,16 @@ class LightPass:
         if self.slices:
             points = seen()
             made = [self._part(one, lights, areas).fit(shapes, points, one.fits(fits)) for one in self.slices]
-            return Lighting(lights, None, areas, (), None, SlicedLighting(made, transparent, points))
+            return Lighting(lights, None, areas, (), None, SlicedLighting(made, casters, points))
         samples = self._samples(areas, shapes.geometry)
         maps = soft_maps = None
         if settings.shadow.method != "none" and (lights or samples):
             points, common = seen(), (shapes.geometry, shapes.casting)
             if lights:
-                maps = make_maps(self.plan, lights, *common, self._maps, fits[0], transparent, points, self.outward)
+                maps = make_maps(self.plan, lights, *common, self._maps, fits[0], points, self.outward, *casters)
             if samples:
                 shadow = settings.soft_shadow
-                soft_maps = make_soft_maps(self.soft, samples, self.plan, *common, shadow, fits[1], transparent, points)
+                soft_maps = make_soft_maps(self.soft, samples, self.plan, *common, shadow, fits[1], points, *casters)
         return Lighting(lights, maps, areas, samples, soft_maps)
 
     def fit(
@@ -230,6 +233,22 @@ class LightPass:
             dr.eval(frusta, soft)
             return frusta, soft
 
+    def map_vertices(self, geometry: Geometry, fits: tuple[Frusta | None, SoftFrusta]) -> list[tuple[Float, int, int]]:
+        """(clip-space vertices of all maps, texels along each side, number of maps) of each kind of maps. Detached.
+
+        ``fits``: as :meth:`fit` returns them. With lights in slices, of the first slice.
+        """
+        data, settings = self.data, self.settings
+        if not settings.lit or settings.shadow.method == "none":
+            return []
+        if self.slices:
+            first = self.slices[0]
+            return self._part(first, data.lights, data.areas).map_vertices(geometry, first.fits(fits))
+        found = []
+        if fits[0] is not None:
+            found.append(map_vertices(self.plan, data.lights, geometry, self._maps, fits[0]))
+        return found + soft_map_vertices(self.soft, self._samples(data.areas, geometry), geometry, settings.soft_shadow, fits[1])
+
     def _part(self, chosen: LightSlice, lights: Sequence[Light], areas: Sequence[AreaLight]) -> LightPass:
         """The light pass of a slice alone. ``lights``, ``areas``: current records of all lights."""
         data, soft = chosen.data(self.data, lights, areas), chosen.soft_plans(self.soft)
@@ -244,11 +263,11 @@ class LightPass:
         def term(number: int, tree: PyTree) -> Term:
             frame, lights, areas, shapes = tree
             part = self._part(self.slices[number], lights, areas)
-            lit = part.lighting(shapes, None, sliced.fits[number], sliced.transparent, lambda: sliced.seen)
+            lit = part.lighting(shapes, None, sliced.fits[number], sliced.casters, lambda: sliced.seen)
             lit = lit.for_points(sliced.points)
             incident = part.incident_light(frame, lit)
             value = mi.UnpolarizedSpectrum(part.reflected(frame, lit, incident))
-            visible: list[AnyArray] = [*incident.visible] if self.settings.aovs else []
+            visible: list[AnyArray] = [mean_of(one) for one in incident.visible] if self.settings.aovs else []
             return [value[k] for k in range(dr.size_v(mi.UnpolarizedSpectrum))], visible
 
         nodes = [*self.data.materials, *shining_objects(self.data)]
@@ -333,14 +352,33 @@ class LightPass:
             color = dr.select(seen.active, color, background(environment, sensor, size.width, size.height))
         return color
 
-    def visibilities(self, frame: Frame, lighting: Lighting, numbers: list[int], lights: Sequence[Light]) -> list[Float]:
-        """Visibility (Float, N) of lights from all pixels. ``numbers``: indices of the lights in the plan."""
+    def transmittances(self, frame: Frame, lighting: Lighting) -> list[Color3f]:
+        """Share of each light (colour, N) that translucent casters let through to the points of a frame. Attached.
+
+        Raises:
+            ShadowmapError: the maps of the lights are not in memory together.
+        """
+        if lighting.sliced is not None:
+            raise ShadowmapError("aovs: 'transmittance' needs the maps of all lights at once: raise light_memory.")
+        seen, maps = frame.surface, lighting.maps
+        if maps is None or maps.transmittance is None:
+            return [mi.UnpolarizedSpectrum(1) for _ in lighting.lights]
+        each = enumerate(lighting.lights)
+        return [light_through(maps, self.plan, light, k, seen.p_world, seen.active) for k, light in each]
+
+    def visibilities(
+        self, frame: Frame, lighting: Lighting, numbers: list[int], lights: Sequence[Light]
+    ) -> list[Float | Color3f]:
+        """Visibility (N) of lights from all pixels: numbers, or colours where there are translucent casters.
+
+        ``numbers``: indices of the lights in the plan.
+        """
         maps = lighting.maps
         if maps is None or not numbers:
             return [mi.Float(1) for _ in lights]
         spots = self._spots(frame)
         return [
-            spots.mean(partial(light_visibility, maps, self.plan, light, index))
+            spots.mean(partial(arriving_light, maps, self.plan, light, index))
             for index, light in zip(numbers, lights, strict=True)
         ]
 

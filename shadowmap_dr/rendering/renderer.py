@@ -35,6 +35,7 @@ from .gbuffer.camera_view import CameraPass, CameraView, GBuffer, PlacedShapes
 from .gbuffer.facet_normals import FlatFaces, flat_faces
 from .gbuffer.pixel_footprint import footprint_points
 from .gbuffer.shading_edges import ShadingEdges
+from .gbuffer.translucency import Translucency
 from .image_pass import ImagePass
 from .light_loops import MANY_LIGHTS
 from .light_pass import Lighting, LightPass, plan_extended_lights
@@ -66,6 +67,7 @@ class Renderer:
         frusta: fit of the shadow maps in the last rendering, None before the first. ``soft_frusta``: for extended lights.
         untracked: parameters of the scene that recordings do not see, or None if the caller watches them.
         slices: of the lights, whose shadow maps are in memory one slice after the other; none if all fit together.
+        translucency: surfaces that let light through, None if all are opaque.
         origin: file or dictionary of the scene, None if the scene was given.
 
     ``copy.deepcopy`` shares the scene, which Mitsuba cannot copy, and all records; the copy has a fit of its own. ``pickle``
@@ -85,6 +87,7 @@ class Renderer:
     soft_frusta: SoftFrusta = (None, None)
     untracked: UntrackedState | None = None
     slices: tuple[LightSlice, ...] = ()
+    translucency: Translucency | None = None
     origin: SceneOrigin | None = None
 
     # All that Dr.Jit is to know of, instead of the fields: see ``frozen``.
@@ -183,6 +186,7 @@ class Renderer:
         outward = mi.Bool(outward_faces(topology, positions.reshape(-1, 3))) if settings.shadow.cull_backfaces else None
         slices = plan_slices(data, plan, soft, settings)
         renderer = cls(data, topology, plan, settings, flat_faces(geometry, topology), creases, outward, soft, slices=slices)
+        renderer.translucency = Translucency.of(data, positions.reshape(-1, 3), _layers_of(settings))
         renderer.untracked = UntrackedState((*data.scene.emitters(), *data.materials))
         # The first fit is made here, so that a step which is recorded later always starts from one.
         return renderer.with_maps_for() if data.sensors else renderer
@@ -207,6 +211,11 @@ class Renderer:
             if plan.maps > made.plan.maps:
                 made.plan, made.slices = plan, plan_slices(data, plan, self.soft, self.settings)
                 made.frusta, made.soft_frusta = made.light_pass.fit(shapes, seen)
+            if made.translucency is not None:
+                pictures = [(view.clip, view.raster) for view in views]
+                maps = made.light_pass.for_image(pixels).map_vertices(shapes.geometry, (made.frusta, made.soft_frusta))
+                camera = data.sensors[0][0]
+                made.translucency = made.translucency.counted(data, shapes.geometry, camera, pictures, maps)
         return made
 
     def with_data(self, data: SceneData) -> Renderer:
@@ -355,7 +364,8 @@ class Renderer:
     def camera_pass(self) -> CameraPass:
         """The pass that renders visible surfaces."""
         hidden = tuple(light.shape for light in self.data.areas) if self.settings.hide_emitters else ()
-        return CameraPass(self.data, self.topology, self.flat, self.creases if self.settings.antialias else None, hidden)
+        creases = self.creases if self.settings.antialias else None
+        return CameraPass(self.data, self.topology, self.flat, creases, hidden, self.translucency)
 
     @property
     def light_pass(self) -> LightPass:
@@ -367,9 +377,8 @@ class Renderer:
     ) -> Lighting:
         """All lights and their shadow maps."""
         cameras, fits = self.camera_pass, (self.frusta, self.soft_frusta)
-        transparent = cameras.transparent(shapes.geometry, views[0].sensor)
         seen = partial(cameras.seen, views, shapes.geometry)
-        lighting = light.lighting(shapes, replacements, fits, transparent, seen)
+        lighting = light.lighting(shapes, replacements, fits, cameras.casters(shapes, views[0].sensor), seen)
         frusta, soft_frusta = lighting.fits
         if frusta is not None:
             self.frusta = frusta
@@ -401,6 +410,11 @@ class Renderer:
 def _pixels(cameras: Sequence[Sensor]) -> int:
     """Pixels of all cameras."""
     return sum(camera.width * camera.height for camera in cameras)
+
+
+def _layers_of(settings: RenderSettings) -> int | None:
+    """Number of translucent layers that was asked for, None for as many as there are."""
+    return settings.translucent_layers if isinstance(settings.translucent_layers, int) else None
 
 
 def _loaded_again(origin: SceneOrigin, settings: RenderSettings, frusta: Frusta | None, soft_frusta: SoftFrusta) -> Renderer:

@@ -18,6 +18,8 @@ MOST_SAMPLES = 4096
 SHADOW_NAMES = {
     "shadow_map_resolution": "resolution",
     "compat": "compat",
+    "transmittance_method": "transmittance_method",
+    "transmittance_groups": "transmittance_groups",
     **{
         f"shadow_{name}": name
         for name in (
@@ -28,6 +30,8 @@ SHADOW_NAMES = {
 }
 #: A ``shadow_map_resolution``: texels follow pixels.
 AUTO = "auto"
+#: Most translucent surfaces along a ray.
+MOST_LAYERS = 64
 #: ``max_depth`` of light that is reflected once on its way to the camera.
 DIRECT = 2
 
@@ -54,6 +58,8 @@ class RenderSettings:
             larger than the shadow map, else 2 to 4, one for every two texels of the map that a pixel of the image has.
         light_memory: memory (GiB) for the shadow maps of lights, derivatives included. Maps of more lights are made one slice of
             the lights after the other, and once more for derivatives.
+        translucent_layers: most translucent surfaces along the rays of cameras and of lights, nearest first; ``auto``: as many as
+            the scene has when it is loaded, and one more, at most 32. Farther ones are left out.
         aovs: names of further channels, see :data:`shadowmap_dr.rendering.film.aovs.AOVS`. Text with commas is split into a
             tuple, as in the plug-in.
     """
@@ -69,6 +75,7 @@ class RenderSettings:
     soft_map_resolution: int = 128
     emitter_shadows: str = "samples"
     light_memory: float = 2.0
+    translucent_layers: int | str = AUTO
     aovs: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -95,6 +102,9 @@ class RenderSettings:
         for name in chosen:
             if not 1 <= getattr(self, name) <= MOST_SAMPLES:
                 raise ShadowmapError(f"{name} is {getattr(self, name)}: choose 1 to {MOST_SAMPLES}.")
+        layers = self.translucent_layers
+        if layers != AUTO and (not isinstance(layers, int) or isinstance(layers, bool) or not 1 <= layers <= MOST_LAYERS):
+            raise ShadowmapError(f"translucent_layers is {layers!r}: give {AUTO}, or an integer from 1 to {MOST_LAYERS}.")
         if self.emitter_shadows not in ("samples", "single"):
             raise ShadowmapError(f"emitter_shadows is {self.emitter_shadows!r}: choose samples or single.")
         size = self.shadow.resolution

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate
 from typing import Any
@@ -15,8 +15,8 @@ from ..errors import ShadowmapError
 from ..jit.arrays import device_array
 from ..jit.handover import computed
 from ..jit.kernel_inputs import split
-from ..jit.types import Bool, Float, Point3f, UInt32, Vector3f
-from ..raster import RasterOutput, Topology
+from ..jit.types import Bool, Color3f, Float, Point3f, UInt32, Vector3f
+from ..raster import Topology
 from ..scene.geometry import Geometry, rows_of
 from ..scene.lights.projected import Beam
 from ..scene.lights.read import Light
@@ -28,6 +28,7 @@ from ..shadow import (
     LightView,
     ShadowMaps,
     ShadowSettings,
+    TranslucentCasters,
     Views,
     casting_shapes,
     cube_face,
@@ -39,8 +40,11 @@ from ..shadow import (
     shape_boxes,
     stack_views,
     steady_axes,
+    tiled_transmittance,
     tiled_visibility,
+    transmittance,
     vertices_in_maps,
+    vertices_of_maps,
     visibility,
 )
 
@@ -159,20 +163,23 @@ def make_maps(
     topology: Topology,
     settings: ShadowSettings,
     previous: Frusta | None,
-    transparent: Callable[[RasterOutput], Bool] | None = None,
     seen: tuple[Point3f, Bool] | None = None,
     outward: Bool | None = None,
+    drawn: Bool | None = None,
+    translucent: TranslucentCasters | None = None,
 ) -> ShadowMaps:
     """Render and filter the maps of all lights as one batch. Attached to lights and vertices.
 
-    ``transparent`` is the alpha test of :func:`shadowmap_dr.raster.rasterize`, ``previous`` the fit of an earlier call,
-    ``seen`` points on what the cameras see (Point3f, world space) and a mask of those that count, ``outward`` faces (Bool, F) of
-    which the maps of directional lights show the fronts only (:func:`shadowmap_dr.raster.outward_faces`).
+    ``previous`` is the fit of an earlier call, ``seen`` points on what the cameras see (Point3f, world space) and a mask of those
+    that count, ``outward`` faces (Bool, F) of which the maps of directional lights show the fronts only
+    (:func:`shadowmap_dr.raster.outward_faces`), ``drawn`` a mask of the opaque faces, and ``translucent`` the casters that are
+    not.
     """
     settings = plan.settings(settings)
     views, p_light, lanes, frusta = _fitted(plan, lights, geometry, settings, previous, seen)
-    culled = None if transparent is not None else _culled(plan, views.count, outward)
-    return filter_maps(render_maps(p_light, lanes, geometry.faces, topology, views, frusta, settings, transparent, culled))
+    culled = _culled(plan, views.count, outward)
+    maps = render_maps(p_light, lanes, geometry.faces, topology, views, frusta, settings, culled, drawn, translucent)
+    return filter_maps(maps)
 
 
 def fit_maps(
@@ -185,6 +192,17 @@ def fit_maps(
 ) -> Frusta:
     """The fit of the maps of :func:`make_maps`, without rendering them. Arguments as there."""
     return _fitted(plan, lights, geometry, plan.settings(settings), previous, seen)[3]
+
+
+def map_vertices(
+    plan: MapPlan, lights: Sequence[Light], geometry: Geometry, settings: ShadowSettings, frusta: Frusta
+) -> tuple[Float, int, int]:
+    """(clip-space vertices (4 M V,) of all maps, texels along each side, number M of maps) for a known fit. Detached."""
+    with dr.suspend_grad():
+        each = zip(lights, plan.kinds, plan.tiles, strict=True)
+        views = stack_views([view for light, kind, tiles in each for view in _views(plan, light, kind, settings) * tiles])
+        p_light, lanes, _ = vertices_in_maps(views, geometry.positions)
+        return vertices_of_maps(views, frusta, p_light, lanes), settings.resolution, views.count
 
 
 def _fitted(
@@ -359,14 +377,36 @@ def _still_planar(plan: MapPlan, geometry: Geometry, planes: tuple[Vector3f, Poi
         return plan.planar & (farthest <= 1e-4 * plan.radius)
 
 
-def light_visibility(maps: ShadowMaps, plan: MapPlan, light: Light, index: int, p_world: Point3f, active: Bool) -> Float:
-    """Visibility (Float) of light number ``index`` from world-space points. Attached to points, casters and light."""
-    if plan.tiles[index] > 1:
-        return tiled_visibility(maps, (plan.first[index], plan.tiles[index]), p_world, active)
-    # Wide, although it is one number: adjoints of look-ups with it then run in one kernel, others in one for each number.
-    which: UInt32 = dr.full(mi.UInt32, plan.first[index], dr.width(p_world))
+def arriving_light(maps: ShadowMaps, plan: MapPlan, light: Light, index: int, p_world: Point3f, active: Bool) -> Float | Color3f:
+    """Share of the light of light number ``index`` that reaches world-space points: visibility, times the colour that translucent
+    casters let through if there are any. Attached to points, casters and light.
+    """
+    if plan.tiles[index] == 1:
+        return share_through(maps, _map_at(plan, light, index, p_world), p_world, active)
+    lit = tiled_visibility(maps, (plan.first[index], plan.tiles[index]), p_world, active)
+    return lit if maps.transmittance is None else lit * light_through(maps, plan, light, index, p_world, active)
+
+
+def light_through(maps: ShadowMaps, plan: MapPlan, light: Light, index: int, p_world: Point3f, active: Bool) -> Color3f:
+    """Share of the light of light number ``index`` that translucent casters let through to world-space points. Attached."""
+    if plan.tiles[index] == 1:
+        return mi.UnpolarizedSpectrum(*transmittance(maps, _map_at(plan, light, index, p_world), p_world, active))
+    group = plan.first[index], plan.tiles[index]
+    return mi.UnpolarizedSpectrum(*tiled_transmittance(maps, group, p_world, active))
+
+
+def share_through(maps: ShadowMaps, map_index: UInt32, p_world: Point3f, active: Bool) -> Float | Color3f:
+    """As :func:`arriving_light`, for points that look the map ``map_index`` (``UInt32``, for each point) up."""
+    lit = visibility(maps, map_index, p_world, active)
+    if maps.transmittance is None:
+        return lit
+    return lit * mi.UnpolarizedSpectrum(*transmittance(maps, map_index, p_world, active))
+
+
+def _map_at(plan: MapPlan, light: Light, index: int, p_world: Point3f) -> UInt32:
+    """Map of a light without tiles in which each point lies."""
     if plan.kinds[index] == "cube":
         punctual: Any = light  # Any: of the records, those with six maps have a position
-        offset = dr.detach(mi.Vector3f(p_world - punctual.position))
-        which = plan.first[index] + cube_face(offset)
-    return visibility(maps, which, p_world, active)
+        return plan.first[index] + cube_face(dr.detach(mi.Vector3f(p_world - punctual.position)))
+    # Wide, although it is one number: adjoints of look-ups with it then run in one kernel, others in one for each number.
+    return dr.full(mi.UInt32, plan.first[index], dr.width(p_world))

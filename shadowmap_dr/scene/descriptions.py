@@ -111,6 +111,7 @@ def describe_all(
                 planar=flat,
                 against_winding=mirrored_ != turn,
                 see_through=see_through[bsdf],
+                unseen=bsdf.class_name() == "Null" and source.shape.emitter() is None,
                 faceted=facets,
             )
         )

@@ -51,10 +51,11 @@ class ShapeInfo:
     ``vertex_start .. vertex_start + vertex_count`` and faces ``face_start .. face_start + face_count`` of the soup.
     ``flip_geometric`` says that its geometric normal is *minus* (p1 - p0) x (p2 - p0), ``flip_shading`` that vertex normals
     are negated before use. ``reads_attributes``: it has mesh attributes, which Mitsuba finds through rest-pose positions.
-    ``planar``: all its vertices lay in one plane when the scene was loaded. ``see_through``: its BSDF (``mask``, ``null``) lets
-    some light pass straight on, as ``shading.opacity`` tells for each point. ``faceted``: its vertex normals were those of its
-    faces, as on a cube or rectangle, when the scene was loaded. ``against_winding``: its vertex normals, before ``flip_shading``,
-    are on the other side of (p1 - p0) x (p2 - p0), and stay there when its vertices are replaced.
+    ``planar``: all its vertices lay in one plane when the scene was loaded. ``see_through``: its BSDF (``mask``,
+    ``thindielectric``, ...) lets some light pass straight on. ``unseen``: its BSDF is ``null``, and it does not shine.
+    ``faceted``: its vertex normals were those of its faces, as on a cube or rectangle, when the scene was loaded.
+    ``against_winding``: its vertex normals, before ``flip_shading``, are on the other side of (p1 - p0) x (p2 - p0), and stay
+    there when its vertices are replaced.
     """
 
     name: str
@@ -72,6 +73,7 @@ class ShapeInfo:
     see_through: bool = False
     faceted: bool = False
     against_winding: bool = False
+    unseen: bool = False
 
     @property
     def flags(self) -> int:

@@ -118,26 +118,47 @@ def varies(texture: mi.Texture) -> bool:
 
 
 def is_plain(bsdf: mi.BSDF) -> bool:
-    """True if a BSDF is known to depend on nothing but the cosines of directions: diffuse, of the same colour everywhere."""
+    """True if a BSDF's values are known to depend on nothing but cosines: diffuse, of the same colour everywhere, or zero."""
     parts = [part for _, part in children(bsdf)]
     if bsdf.class_name() == "TwoSidedBRDF":
         return all(is_plain(part) for part in parts)
-    if bsdf.class_name() != "SmoothDiffuse":
-        return False
+    if bsdf.class_name() == "MaskBSDF":
+        return all(is_plain(part) if isinstance(part, mi.BSDF) else _is_uniform(part) for part in parts)
+    # Such surfaces send no light on that falls onto them from elsewhere.
+    if bsdf.class_name() in ("Null", "ThinDielectric"):
+        return True
+    return bsdf.class_name() == "SmoothDiffuse" and all(_is_uniform(part) for part in parts)
+
+
+def _is_uniform(texture: mi.Object) -> bool:
+    """True for a texture that is the same everywhere."""
     # Mitsuba does not count vertex colours as varying.
-    return all(isinstance(part, mi.Texture) and not varies(part) and part.class_name() != "MeshAttribute" for part in parts)
+    return isinstance(texture, mi.Texture) and not varies(texture) and texture.class_name() != "MeshAttribute"
 
 
 def is_cosine(bsdf: mi.BSDF) -> bool:
-    """True if a BSDF is known to be the light direction's cosine times a factor independent of directions: diffuse."""
+    """True if a BSDF is known to be the light direction's cosine times a factor independent of directions: diffuse, or zero."""
     kind = bsdf.class_name()
     if kind == "SmoothDiffuse":
         textures = [part for _, part in children(bsdf)]
         # Textures written in Python may depend on directions.
         return all(type(part) is mi.Texture for part in textures)
+    if kind in ("Null", "ThinDielectric"):
+        return True
     if kind not in ("TwoSidedBRDF", "MaskBSDF"):
         return False
     return all(is_cosine(part) if isinstance(part, mi.BSDF) else type(part) is mi.Texture for _, part in children(bsdf))
+
+
+def passes_evenly(bsdf: mi.BSDF) -> bool:
+    """True if the share of light that passes a BSDF straight on is known not to vary over a surface."""
+    for _, part in children(bsdf):
+        if isinstance(part, mi.BSDF):
+            if not passes_evenly(part):
+                return False
+        elif bsdf.class_name() in ("MaskBSDF", "BlendBSDF", "ThinDielectric") and not _is_uniform(part):
+            return False
+    return True
 
 
 def is_attribute(node: mi.Object, key: str) -> bool:

@@ -57,8 +57,10 @@ def _delta_materials(shapes: Sequence[tuple[str, mi.Shape]], mirrored: bool) -> 
         flags, what = bsdf.flags(), f"BSDF '{bsdf.id()}' ({bsdf.class_name()}) of {_named('shape', users)}"
         delta = mi.has_flag(flags, mi.BSDFFlags.DeltaReflection) or mi.has_flag(flags, mi.BSDFFlags.DeltaTransmission)
         if not mi.has_flag(flags, mi.BSDFFlags.Smooth):
-            shown = "lets all light through" if mi.has_flag(flags, mi.BSDFFlags.Null) else "renders black"
-            found.append(f"{what} has no smooth component and {shown}")
+            if not mi.has_flag(flags, mi.BSDFFlags.Null):
+                found.append(f"{what} has no smooth component and renders black")
+            elif delta and mirrored:
+                found.append(f"{what} shows no mirror images of lights, only the light that it lets through")
         elif delta and mirrored:
             found.append(f"{what} shows no mirror images of lights, only its smooth component")
     return found

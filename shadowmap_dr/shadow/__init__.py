@@ -16,15 +16,16 @@ from .light_camera import (
     to_light_space,
     vertices_in_maps,
 )
-from .lookup import tiled_visibility, visibility
+from .lookup import tiled_transmittance, tiled_visibility, transmittance, visibility
 from .methods.comparison import standard_visibility
 from .methods.registry import METHODS, PREFILTERED
 from .methods.variance import chebyshev_visibility, variance_moments
 from .settings import MAX_TILES, ShadowSettings
-from .shadow_map import ShadowMaps, filter_maps, render_maps
+from .shadow_map import ShadowMaps, filter_maps, render_maps, vertices_of_maps
 from .steady_axes import steady_axes
 from .tile_fit import fit_tiles
 from .tiles import Group, Tiles
+from .transmittance_maps import TranslucentCasters, TransmittanceMaps
 
 __all__ = [
     "FILTERS",
@@ -39,6 +40,8 @@ __all__ = [
     "ShadowMaps",
     "ShadowSettings",
     "Tiles",
+    "TranslucentCasters",
+    "TransmittanceMaps",
     "Views",
     "casting_shapes",
     "chebyshev_visibility",
@@ -58,9 +61,12 @@ __all__ = [
     "stack_views",
     "standard_visibility",
     "steady_axes",
+    "tiled_transmittance",
     "tiled_visibility",
     "to_light_space",
+    "transmittance",
     "variance_moments",
     "vertices_in_maps",
+    "vertices_of_maps",
     "visibility",
 ]

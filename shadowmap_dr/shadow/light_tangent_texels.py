@@ -17,7 +17,7 @@ from ..raster.types import pixel_coordinates
 from .light_camera import Frusta, Views, of_map
 from .methods.registry import PREFILTERED
 from .settings import ShadowSettings
-from .shadow_map import FAR, texel_depths
+from .texel_depths import FAR, texel_depths
 
 #: Light-space coordinates (x, y, z), or their changes.
 Coordinates: TypeAlias = tuple[Float, Float, Float]

@@ -28,7 +28,8 @@ from .lookup import Texels, entries, moved_weights, stored_texel
 from .methods.registry import PREFILTERED
 from .methods.variance import reduced_bleeding
 from .settings import ShadowSettings
-from .shadow_map import FAR, ShadowMaps, block_means
+from .shadow_map import ShadowMaps, block_means
+from .texel_depths import FAR
 
 
 @dataclass(frozen=True)

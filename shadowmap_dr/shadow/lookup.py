@@ -18,12 +18,16 @@ from .light_camera import of_map, project, to_light_space
 from .methods.comparison import soft_comparison, standard_visibility
 from .methods.registry import PREFILTERED
 from .methods.variance import MINIMUM_VARIANCE_COMPAT, chebyshev_visibility, reduced_bleeding
-from .shadow_map import FAR, ShadowMaps
+from .shadow_map import ShadowMaps
+from .texel_depths import FAR
 from .tile_fit import image_coordinates
 from .tiles import Group, neighbour, tile_of
+from .transmittance_maps import TransmittanceMaps, depth_encoding
 
 # Depth range over which the comparison of percentage-closer filtering falls from 1 to 0. A hard one has no derivative by depth.
 _SOFTNESS = 0.02
+# Weight from which on a texel's distribution counts.
+_NOTHING = 1e-9
 
 
 def visibility(maps: ShadowMaps, map_index: UInt32 | int, p_world: Point3f, active: Bool | bool = True) -> Float:
@@ -63,6 +67,13 @@ def tiled_visibility(maps: ShadowMaps, group: Group, p_world: Point3f, active: B
         p_world: points. Attached. The share of each tile is detached.
         active: mask of the points to look up; the others get 1.
     """
+    tile, other, share = _tiles_at(maps, group, p_world)
+    own = visibility(maps, tile, p_world, active)
+    return dr.fma(share, visibility(maps, other, p_world, active & (share > 0)) - own, own)
+
+
+def _tiles_at(maps: ShadowMaps, group: Group, p_world: Point3f) -> tuple[UInt32, UInt32, Float]:
+    """(tile, tile beyond the nearest border, its share) of points."""
     tiles, frusta = maps.frusta.tiles, maps.frusta
     assert tiles is not None, "fitted with the maps"
     x, y, _ = image_coordinates(maps.views, group[0], p_world)
@@ -70,8 +81,67 @@ def tiled_visibility(maps: ShadowMaps, group: Group, p_world: Point3f, active: B
     other, share = neighbour(tiles, (frusta.half_x, frusta.half_y), group, tile, x, y)
     if not dr.flag(dr.JitFlag.SymbolicScope):
         dr.eval(tile, other, share)  # otherwise each pass would find them again
-    own = visibility(maps, tile, p_world, active)
-    return dr.fma(share, visibility(maps, other, p_world, active & (share > 0)) - own, own)
+    return tile, other, share
+
+
+def transmittance(maps: ShadowMaps, map_index: UInt32 | int, p_world: Point3f, active: Bool | bool = True) -> list[Float]:
+    """Fraction of the light, by colour, that translucent casters let through to world-space points.
+
+    Args:
+        maps: filtered maps with translucent casters.
+        map_index: index of the map, for each point or one for all.
+        p_world: points. Attached.
+        active: mask of the points to look up; the others get 1.
+
+    Returns:
+        ``Float`` in 0..1 for each colour; 1 outside the map. Gradients flow to the points, the casters and the light.
+    """
+    module, veils = backend(maps.values), maps.transmittance
+    assert veils is not None, "looked up only where there are translucent casters"
+    index: UInt32 = module.UInt32(map_index)
+    frustum = of_map(maps.frusta, index, maps.count)
+    if maps.copies > 1:
+        index = index + copy_of_lane(module, dr.width(p_world), maps.copies) * maps.count
+    view = of_map(maps.views, index, maps.views.count)
+    u, v, depth, inside = project(view, frustum, p_world)
+    depth = dr.select(depth > FAR, FAR, depth)
+    found = branch(
+        inside & module.Bool(active),
+        lambda *lanes: _light_left(maps, veils, *lanes),
+        lambda *lanes: tuple(type(lanes[1])(1) for _ in range(veils.colours)),
+        (index, u, v, depth),
+        "transmittance",
+    )
+    return list(found)
+
+
+def tiled_transmittance(maps: ShadowMaps, group: Group, p_world: Point3f, active: Bool | bool = True) -> list[Float]:
+    """As :func:`transmittance`, from the tiles of a light, as :func:`tiled_visibility`."""
+    tile, other, share = _tiles_at(maps, group, p_world)
+    own = transmittance(maps, tile, p_world, active)
+    beside = transmittance(maps, other, p_world, active & (share > 0))
+    return [dr.fma(share, b - a, a) for a, b in zip(own, beside, strict=True)]
+
+
+def _light_left(
+    maps: ShadowMaps, veils: TransmittanceMaps, map_index: UInt32, u: Float, v: Float, depth: Float
+) -> tuple[Float, ...]:
+    """Light of each colour that is left at a depth."""
+    method, module = depth_encoding(maps.settings), backend(depth)
+    left = [module.Float(1)] * veils.colours
+    used = len(method.encode(depth, 0.0, maps.settings.order))
+    for group in veils.groups:
+        values = bilinear(maps, map_index, u, v, True, values=(group, veils.channels, veils.colours + 1 + used))
+        weight = values[veils.colours]
+        any_lost = weight > _NOTHING
+        inverse = dr.rcp(dr.select(any_lost, weight, 1))
+        moments = [value * inverse for value in values[veils.colours + 1 :]]
+        lit = method.resolve(moments, depth)
+        if method.bleeds:
+            lit = reduced_bleeding(lit, maps.settings.bleeding)
+        before = dr.select(any_lost, 1 - lit, 0)
+        left = [dr.fma(-values[k], before, value) for k, value in enumerate(left)]
+    return tuple(dr.clip(value, 0, 1) for value in left)
 
 
 def _where(active: Bool, function: Callable[..., Float], maps: ShadowMaps, *lanes: AnyArray) -> Float:
@@ -85,7 +155,7 @@ def _where(active: Bool, function: Callable[..., Float], maps: ShadowMaps, *lane
 def _resolve(maps: ShadowMaps, map_index: UInt32, u: Float, v: Float, depth: Float) -> Float:
     """Visibility from filtered moments or terms."""
     method = PREFILTERED[maps.settings.method]
-    value = method.resolve(_bilinear(maps, map_index, u, v, True), depth)
+    value = method.resolve(bilinear(maps, map_index, u, v, True), depth)
     return reduced_bleeding(value, maps.settings.bleeding) if method.bleeds else value
 
 
@@ -160,26 +230,43 @@ class Texels:
         return (c >= 0) & (c < self.size) & (r >= 0) & (r < self.size)
 
 
-def _bilinear(
-    maps: ShadowMaps, map_index: UInt32, u: Float, v: Float, active: Bool | bool, outside_reads_zero: bool = False
+def bilinear(
+    maps: ShadowMaps,
+    map_index: UInt32,
+    u: Float,
+    v: Float,
+    active: Bool | bool,
+    outside_reads_zero: bool = False,
+    values: tuple[Float, int, int] | None = None,
 ) -> list[Float]:
-    """Bilinear interpolation of the four texels around (u, v). Attached to the texels and to the coordinates."""
+    """Bilinear interpolation of the four texels around (u, v). Attached to the texels and to the coordinates.
+
+    ``values``: numbers that are read instead of the maps' own, how many of them a texel has, and how many of these are read.
+    """
     at = Texels(maps, map_index, u, v, active)
+    stored, channels, used = values or (maps.values, maps.channels, maps.channels)
     rows = []
     for j in range(2):
         use = [active & at.inside(i, j) if outside_reads_zero else active for i in range(2)]
-        left, right = (stored_texel(maps.values, maps.channels, at.index(i, j), use[i]) for i in range(2))
+        left, right = (stored_texel(stored, channels, at.index(i, j), use[i], used) for i in range(2))
         rows.append([dr.fma(b - a, at.fx, a) for a, b in zip(left, right, strict=True)])
     return [value for a, b in zip(*rows, strict=True) for value in entries(dr.fma(b - a, at.fy, a))]
 
 
-def stored_texel(values: Float, channels: int, texel: UInt32, active: Bool | bool) -> list[AnyArray]:
-    """All numbers of a texel, in the largest packets that divide ``channels``."""
+def stored_texel(values: Float, channels: int, texel: UInt32, active: Bool | bool, used: int | None = None) -> list[AnyArray]:
+    """The first ``used`` numbers of a texel, or all of them, in the largest packets that divide ``channels``.
+
+    No more than that: Dr.Jit 1.5 ends the process in forward mode where a symbolic branch leaves a part of a packet unused.
+    """
     module = backend(values)
-    size = next(n for n in (4, 2, 1) if channels % n == 0)
-    packet = {1: module.Float, 2: module.Array2f, 4: module.Array4f}[size]
-    count = channels // size
-    return [dr.gather(packet, values, texel * count + k, active) for k in range(count)]
+    packets = {1: module.Float, 2: module.Array2f, 4: module.Array4f}
+    found: list[AnyArray] = []
+    first, last = 0, channels if used is None else used
+    while first < last:
+        size = next(n for n in (4, 2, 1) if channels % n == 0 and n <= last - first)
+        found.append(dr.gather(packets[size], values, texel * (channels // size) + first // size, active))
+        first += size
+    return found
 
 
 def entries(packet: AnyArray) -> list[Float]:
@@ -187,5 +274,5 @@ def entries(packet: AnyArray) -> list[Float]:
 
 
 def _look_up_compat(maps: ShadowMaps, map_index: UInt32, u: Float, v: Float, depth: Float, active: Bool) -> Float:
-    moments = _bilinear(maps, map_index, dr.select(active, u, 0), dr.select(active, v, 0), active, outside_reads_zero=True)
+    moments = bilinear(maps, map_index, dr.select(active, u, 0), dr.select(active, v, 0), active, outside_reads_zero=True)
     return chebyshev_visibility(backend(depth).Array2f(*moments), depth, MINIMUM_VARIANCE_COMPAT)

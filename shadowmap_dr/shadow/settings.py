@@ -12,6 +12,8 @@ from .methods.registry import DEFAULT, METHODS, PREFILTERED
 
 #: Most texels along each side of a filter.
 MAX_FILTER_SIZE = 255
+#: Most parts of translucent casters whose depths are encoded apart.
+MAX_GROUPS = 8
 #: Most tiles of a light.
 MAX_TILES = 16
 
@@ -42,7 +44,11 @@ class ShadowSettings:
             before it does not matter, and causes no light bleeding.
         cull_backfaces: do not draw backfaces into the maps of directional lights, if they belong to parts that were closed and
             turned outwards when the scene was loaded. Saves a third of drawing. Shadows are the same as long as these parts do
-            not turn inside out, not even in a fold. Not with ``compat``; without effect in scenes with alpha tested materials.
+            not turn inside out, not even in a fold. Not with ``compat``.
+        transmittance_method: encoding of the depths at which translucent casters take light away: ``msm``, or another method
+            that is pre-filtered.
+        transmittance_groups: parts of these casters, front to back, whose depths are encoded apart, 1 to 8; 0 for 2, or 4 where a
+            texel sees more than eight casters. As many as there are casters tell them all apart.
         compat: the conventions of Worchel and Alexa's code: unnormalised radial depth, fixed frusta, dark outside of them, their
             kernels, minimum variance 1e-4.
     """
@@ -62,9 +68,11 @@ class ShadowSettings:
     supersampling: int = 1
     receiver_range: bool = True
     cull_backfaces: bool = False
+    transmittance_method: str = "msm"
+    transmittance_groups: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("resolution", "tiles", "filter_size", "order", "supersampling"):
+        for name in ("resolution", "tiles", "filter_size", "order", "supersampling", "transmittance_groups"):
             if isinstance(getattr(self, name), bool):
                 raise ValueError(f"shadow map {name} is {getattr(self, name)!r}; give a whole number")
             try:
@@ -88,6 +96,11 @@ class ShadowSettings:
             raise ValueError(f"shadow method {self.method!r} has no compatible variant; use vsm with compat")
         if not 0 <= self.bleeding < 1:
             raise ValueError(f"light bleeding is to be cut off below {self.bleeding}; give a number from 0 to below 1")
+        if not isinstance(self.transmittance_method, str) or self.transmittance_method not in PREFILTERED:
+            known = ", ".join(PREFILTERED)
+            raise ValueError(f"transmittance method {self.transmittance_method!r} is unknown; choose one of {known}")
+        if not 0 <= self.transmittance_groups <= MAX_GROUPS:
+            raise ValueError(f"transmittance groups are {self.transmittance_groups}; give 1 to {MAX_GROUPS}, or 0 for automatic")
         if not 2 <= self.order <= 16 or self.order % 2:
             raise ValueError(f"the order of the Fourier series is {self.order}; it must be an even number from 2 to 16")
         if not 1 <= self.resolution <= 4096:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import drjit as dr
@@ -15,17 +14,14 @@ from ..jit.types import Bool, Float, Point3f, UInt32
 from ..raster import RasterOutput, Topology, antialias, visible_triangles
 from ..raster.screen_planes import pixel_depth
 from ..raster.types import pixel_coordinates
-from .filters import filter_kernel, filter_map, reach_of
-from .light_camera import Frusta, Views, linear_depth, of_map, to_clip
+from .filters import filter_kernel, filter_map
+from .light_camera import Frusta, Views, of_map, to_clip
 from .methods.comparison import other_depth
 from .methods.registry import PREFILTERED
 from .methods.variance import variance_moments
 from .settings import ShadowSettings
-
-#: Depth of empty texels. Receivers behind it are moved to it, so that a receiver over empty texels lies at their mean.
-FAR = 0.5
-# Largest slope that counts as variance, in texels of depth per texel. Surfaces seen edge-on have unbounded slopes.
-_MAX_SLOPE = 2.0
+from .texel_depths import texel_depths
+from .transmittance_maps import TranslucentCasters, TransmittanceMaps, render_transmittance
 
 
 @dataclass(frozen=True)
@@ -37,6 +33,7 @@ class ShadowMaps:
         views, frusta: cameras of the maps.
         settings: settings of the maps.
         channels: C.
+        transmittance: light that translucent casters take away, None if there are none.
         copies: number of consecutive copies of values and views, one for each block of points (:meth:`for_points`).
     """
 
@@ -45,6 +42,7 @@ class ShadowMaps:
     frusta: Frusta
     settings: ShadowSettings
     channels: int
+    transmittance: TransmittanceMaps | None = None
     copies: int = 1
 
     @property
@@ -54,8 +52,13 @@ class ShadowMaps:
 
     def for_points(self, count: int) -> ShadowMaps:
         """The same maps, copied for look-ups by ``count`` points at once, so that gradients are summed exactly. Attached."""
-        (values, *columns), copies = in_copies([self.values, *self.views.columns()], count)
-        return replace(self, values=values, views=Views.of(columns), copies=copies) if copies > 1 else self
+        veils = () if self.transmittance is None else self.transmittance.groups
+        (values, *columns), copies = in_copies([self.values, *veils, *self.views.columns()], count)
+        if copies == 1:
+            return self
+        transmittance = self.transmittance and replace(self.transmittance, groups=tuple(columns[: len(veils)]))
+        views = Views.of(columns[len(veils) :])
+        return replace(self, values=values, views=views, transmittance=transmittance, copies=copies)
 
 
 def render_maps(
@@ -66,8 +69,9 @@ def render_maps(
     views: Views,
     frusta: Frusta,
     settings: ShadowSettings,
-    transparent: Callable[[RasterOutput], Bool] | None = None,
     culled: Bool | None = None,
+    drawn: Bool | None = None,
+    translucent: TranslucentCasters | None = None,
 ) -> ShadowMaps:
     """Step 1: rasterize all maps at once and encode the depths in each texel by the method. Attached to ``p_light``.
 
@@ -77,14 +81,14 @@ def render_maps(
         faces: (3 F,), flat, valid indices.
         topology: topology of the mesh.
         views, frusta: cameras of the M maps.
-        transparent: alpha test, see :func:`shadowmap_dr.raster.rasterize`.
         culled: (F,), or (M F,) by map: faces that are not drawn where they face away from the light.
+        drawn: (F,), faces that are opaque; None if all of them are.
+        translucent: the casters that are not. Attached.
     """
     count, size = views.count, settings.resolution * settings.supersampling
-    in_maps = to_clip(of_map(views, map_index, count), of_map(frusta, map_index, count), p_light)
-    clip = interleaved("positions in maps", list(in_maps))
+    clip = vertices_of_maps(views, frusta, p_light, map_index)
     # Seen from the front, outlines run clockwise: a light looks along the third of its right-handed axes.
-    raster = visible_triangles(clip, faces, (size, size), batch=count, transparent=transparent, one_sided=culled)
+    raster = visible_triangles(clip, faces, (size, size), batch=count, one_sided=culled, drawn=drawn)
     texels = _texels(raster, clip, faces, views, frusta, settings, size)
     channels = len(texels)
     if settings.antialias and settings.method != "standard":
@@ -95,7 +99,18 @@ def render_maps(
         values = interleave(texels)
     if settings.supersampling > 1:
         values = block_means(values, size, channels, settings.supersampling)
-    return ShadowMaps(values, views, frusta, settings, channels)
+    veils = None
+    if translucent is not None:
+        veils = render_transmittance(translucent, clip, views, frusta, settings)
+        if settings.supersampling > 1:
+            veils = veils.each(lambda group, channels: block_means(group, size, channels, settings.supersampling))
+    return ShadowMaps(values, views, frusta, settings, channels, veils)
+
+
+def vertices_of_maps(views: Views, frusta: Frusta, p_light: Point3f, map_index: UInt32) -> Float:
+    """Clip-space vertices (4 M V,) of all maps. Arguments as of :func:`render_maps`; attached to ``p_light``."""
+    in_maps = to_clip(of_map(views, map_index, views.count), of_map(frusta, map_index, views.count), p_light)
+    return interleaved("positions in maps", list(in_maps))
 
 
 def _texels(
@@ -120,53 +135,6 @@ def _texels(
             return list(variance_moments(depth))
         return [depth]
     return list(method.encode(depth, slope_square, settings.order))
-
-
-@dataclass(frozen=True)
-class TexelDepths:
-    """Depths of the surfaces that texels see, one lane for each texel.
-
-    Attributes:
-        shown: mask of the texels that see a surface whose depth is kept.
-        depth: linear depth (:func:`linear_depth`), ``FAR`` in other texels. Attached.
-        slope_square: squared change of the linear depth across a texel, detached.
-        seen, dx, dy: depth as :func:`pixel_depth` returns it (attached), and its change by column and by row (detached).
-    """
-
-    shown: Bool
-    depth: Float
-    slope_square: Float
-    seen: Float
-    dx: Float
-    dy: Float
-
-
-def texel_depths(
-    seen: tuple[Float, Float, Float], hit: Bool, view: Views, frustum: Frusta, settings: ShadowSettings
-) -> TexelDepths:
-    """Depths in maps.
-
-    Args:
-        seen: result of :func:`pixel_depth`.
-        hit: mask of the texels that see a surface.
-        view, frustum: those of each texel's map.
-        settings: settings of the maps.
-
-    Floors that cast no shadows may leave the depth range. If their depths were only clamped to the far plane, receivers would be
-    darkened along the line where the floor crosses it: filtered depths there lie before the floor. So the last texels of the
-    floor, which look-ups mix with empty texels, are treated as empty. That lets more light through, not less.
-    """
-    size = settings.resolution * settings.supersampling
-    depth, dx, dy = seen
-    linear, to_linear = linear_depth(view, frustum, depth)
-    with dr.suspend_grad():
-        slopes = [dr.detach(to_linear * slope) for slope in (dx, dy)]
-        slope_square = _slope_square(dr.detach(view), dr.detach(frustum), dr.detach(linear), slopes, size)
-        last = (frustum.last - frustum.first) / (frustum.far - frustum.first) - 0.5
-        ends = dr.fma(reach_of(settings.filter_size) * settings.supersampling, dr.sqrt(slope_square), dr.detach(linear)) > FAR
-        shown = hit & ~(ends & (dr.detach(linear) > last) & (frustum.last < frustum.far))
-        slope_square = dr.select(shown, slope_square, 0)
-    return TexelDepths(shown, dr.select(shown, linear, FAR), slope_square, depth, dx, dy)
 
 
 def _two_depths(plain: Float, blended: Float) -> tuple[Float, int]:
@@ -214,25 +182,14 @@ def _radial_depth(view: Views, frustum: Frusta, raster: RasterOutput, row: UInt3
     return dr.sqrt(dr.fma(x, x, dr.fma(y, y, z * z)))
 
 
-def _slope_square(view: Views, frustum: Frusta, linear: Float, slopes: list[Float], size: int) -> Float:
-    """Squared change of linear depth across a texel, given its change along both axes."""
-    n, f = frustum.first, frustum.far
-    # The side of a texel in units of depth.
-    texel = (
-        dr.select(view.spread > 0, dr.fma(linear + 0.5, f - n, n), 1.0)
-        * float_input(backend(linear), "width", 2 / size)
-        / (f - n)
-    )
-    sx = dr.minimum(dr.abs(slopes[0]), _MAX_SLOPE * texel * frustum.half_x)
-    sy = dr.minimum(dr.abs(slopes[1]), _MAX_SLOPE * texel * frustum.half_y)
-    return sx * sx + sy * sy
-
-
 def filter_maps(maps: ShadowMaps) -> ShadowMaps:
-    """Step 2: pre-filter. Maps whose depths are compared in the look-up are returned unchanged. Attached."""
-    s = maps.settings
-    if not s.filterable:
-        return maps
+    """Step 2: pre-filter. Depths that are compared in the look-up stay as they are. Attached."""
+    s, veils = maps.settings, maps.transmittance
     kernel = filter_kernel(s.filter, s.filter_size, s.compat)
-    values = filter_map(maps.values, kernel, maps.views.count, s.resolution, s.resolution, maps.channels)
-    return ShadowMaps(values, maps.views, maps.frusta, s, maps.channels)
+
+    def filtered(values: Float, channels: int) -> Float:
+        return filter_map(values, kernel, maps.views.count, s.resolution, s.resolution, channels)
+
+    if veils is not None:
+        maps = replace(maps, transmittance=veils.each(filtered))
+    return replace(maps, values=filtered(maps.values, maps.channels)) if s.filterable else maps

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from shadowmap_dr.rendering.direct_light import ambient_light, background, direct_light
-from shadowmap_dr.rendering.gbuffer.surface import opacity, surface
+from shadowmap_dr.rendering.gbuffer.surface import surface
+from shadowmap_dr.rendering.gbuffer.transmission import transmittance_of
 from shadowmap_dr.scene.geometry import NO_TRIANGLE
 from shadowmap_dr.scene.load import SceneData, load, refresh
 from shadowmap_dr.scene.mitsuba_objects import parameters
@@ -480,7 +481,7 @@ def test_background_and_environment_gradient(variant: str) -> None:
     assert np.allclose(x.grad.numpy(), light.numpy(), rtol=1e-3)
 
 
-def test_opacity(variant: str) -> None:
+def test_transmittance_of_surfaces(variant: str) -> None:
     mesh = bumpy_mesh("mesh", normals=True, texcoords=True)
     mesh.set_bsdf(mi.load_dict(BSDFS["mask"]()))
     solid = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -0.5]).scale(3)}
@@ -488,7 +489,8 @@ def test_opacity(variant: str) -> None:
     data = load(scene)
     triangle, u, v, _ = primary_hits(scene, data)
     seen = surface(data, data.geometry, data.sensors[0][0], triangle, u, v)
-    ours, shape = opacity(seen).numpy(), seen.shape.numpy()
+    bsdfs = [bsdf for bsdf in data.materials if mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)]
+    ours, shape = 1 - dr.mean(transmittance_of(seen, bsdfs)).numpy(), seen.shape.numpy()
     texture = mi.load_dict(bitmap(3, 1))
     masked = seen.active.numpy() & (shape == [info.name for info in data.geometry.shapes].index("mesh"))
     assert np.allclose(ours[masked], texture.eval_1(seen.si).numpy()[masked], atol=1e-5)

@@ -24,8 +24,9 @@ from ...io.ranges import check_ranges
 from ...jit.arrays import device_array
 from ...jit.frozen import freeze
 from ...jit.types import Float, Vector3f
+from ...jit.vectors import mean_of
 from ...rendering.renderer import Renderer
-from ...rendering.shadow_pass import light_visibility, make_maps
+from ...rendering.shadow_pass import arriving_light, make_maps
 from ...scene.lights.punctual import DirectionalLight
 from ..common import timing
 from .problem import LightProblem
@@ -154,7 +155,7 @@ def _reverse_image(renderer: Renderer, still: StillScene, to_light: list[Vector3
     maps = None
     if still.shadow.method != "none":
         common = (renderer.data.geometry, renderer.topology, still.shadow)
-        maps = make_maps(renderer.plan, lights, *common, renderer.frusta, None, still.seen)
+        maps = make_maps(renderer.plan, lights, *common, renderer.frusta, still.seen)
         renderer.frusta = maps.frusta
     total = [mi.Float(0) for _ in range(pixels.channels)]
     for k, light in enumerate(lights):
@@ -163,8 +164,8 @@ def _reverse_image(renderer: Renderer, still: StillScene, to_light: list[Vector3
         active = pixels.active & (cosine > 0) & (dr.dot(pixels.n_world, axis) > 0)
         shown = mi.Float(1)
         if maps is not None:
-            found = [light_visibility(maps, renderer.plan, light, k, p, active) for p in pixels.points]
-            shown = functools.reduce(operator.add, found) / len(found)
+            found = [arriving_light(maps, renderer.plan, light, k, p, active) for p in pixels.points]
+            shown = mean_of(functools.reduce(operator.add, found)) / len(found)
         for c in range(pixels.channels):
             total[c] = total[c] + dr.select(active, cosine * shown * still.irradiance[k][c], 0)
     colours = [value * colour for value, colour in zip(total, pixels.colours, strict=True)]

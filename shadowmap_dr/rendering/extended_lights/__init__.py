@@ -10,6 +10,7 @@ from .sample_maps import (
     make_soft_maps,
     plan_soft,
     samples_of,
+    soft_map_vertices,
     still_aimed,
 )
 from .samples import LightSamples
@@ -27,6 +28,7 @@ __all__ = [
     "fit_soft_maps",
     "interleaving_of",
     "make_soft_maps",
+    "soft_map_vertices",
     "plan_soft",
     "samples_of",
     "soft_light",

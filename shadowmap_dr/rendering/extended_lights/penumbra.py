@@ -18,7 +18,8 @@ from ...jit.types import Bool, Float, Point3f, PyTree, UInt32, Vector2f, Vector3
 from ...scene.sums import sum_over
 from ...shadow import Frusta, ShadowMaps, Views, chebyshev_visibility
 from ...shadow.light_camera import of_map, to_light_space
-from ...shadow.shadow_map import FAR, block_means
+from ...shadow.shadow_map import block_means
+from ...shadow.texel_depths import FAR
 
 # Places that are looked at for occluders, and again for visibility.
 _TAPS = 16

@@ -13,8 +13,8 @@ import numpy.typing as npt
 
 from ...jit.handover import computed
 from ...jit.kernel_inputs import split
-from ...jit.types import Bool, Point3f, UInt32, Vector3f
-from ...raster import RasterOutput, Topology
+from ...jit.types import Bool, Float, Point3f, UInt32, Vector3f
+from ...raster import Topology
 from ...scene.geometry import Geometry
 from ...scene.lights.area import AreaLight
 from ...scene.lights.environment import Environment
@@ -23,6 +23,7 @@ from ...shadow import (
     Frusta,
     ShadowMaps,
     ShadowSettings,
+    TranslucentCasters,
     Views,
     casting_shapes,
     cube_face,
@@ -34,6 +35,7 @@ from ...shadow import (
     shape_bounds,
     to_light_space,
     vertices_in_maps,
+    vertices_of_maps,
 )
 from ...shadow.light_camera import of_map
 from ..shadow_pass import MapPlan, boxes_of, check_sizes, shape_planes
@@ -178,8 +180,9 @@ def make_soft_maps(
     topology: Topology,
     settings: tuple[ShadowSettings, ShadowSettings],
     previous: SoftFrusta,
-    transparent: Callable[[RasterOutput], Bool] | None = None,
     seen: tuple[Point3f, Bool] | None = None,
+    drawn: Bool | None = None,
+    translucent: TranslucentCasters | None = None,
 ) -> SoftMaps:
     """Render and filter the maps of all samples as one batch, and those of single ones as another. Attached to samples, vertices.
 
@@ -188,7 +191,7 @@ def make_soft_maps(
     """
     made: list[ShadowMaps | None] = []
     for own, setting, fit in _kinds(plans, samples, settings, previous):
-        made.append(_make(own, scene, geometry, topology, setting, fit, transparent, seen) if own else None)
+        made.append(_make(own, scene, geometry, topology, setting, fit, seen, (drawn, translucent)) if own else None)
     sampled, single = made
     return SoftMaps(None if sampled is None else filter_maps(sampled), None if single is None else Pyramid.of(single))
 
@@ -246,9 +249,10 @@ def _make(
     topology: Topology,
     settings: ShadowSettings,
     previous: Frusta | None,
-    transparent: Callable[[RasterOutput], Bool] | None,
     seen: tuple[Point3f, Bool] | None,
+    casters: tuple[Bool | None, TranslucentCasters | None],
 ) -> ShadowMaps:
+    """Unfiltered maps of some lights. ``casters``: mask of the opaque faces, and the other casters."""
     plans = [plan for plan, _ in lights]
     views, hidden, frusta = _fitted(lights, scene, geometry, settings, previous, seen)
     p_light, which, vertex = vertices_in_maps(views, geometry.positions)
@@ -256,7 +260,26 @@ def _make(
         own = dr.gather(mi.UInt32, hidden, which) == dr.gather(mi.UInt32, geometry.vertex_shape, vertex)
         # Behind the light's camera, where no triangle is drawn.
         p_light = dr.select(own, type(p_light)(0, 0, -1), p_light)
-    return render_maps(p_light, which, geometry.faces, topology, views, frusta, settings, transparent, _facing(plans, geometry))
+    culled = _facing(plans, geometry)
+    return render_maps(p_light, which, geometry.faces, topology, views, frusta, settings, culled, *casters)
+
+
+def soft_map_vertices(
+    plans: Sequence[SoftPlan],
+    samples: Sequence[LightSamples],
+    geometry: Geometry,
+    settings: tuple[ShadowSettings, ShadowSettings],
+    frusta: SoftFrusta,
+) -> list[tuple[Float, int, int]]:
+    """As :func:`~shadowmap_dr.rendering.shadow_pass.map_vertices`, for the maps of samples, and for single ones."""
+    found = []
+    with dr.suspend_grad():
+        for own, setting, fit in _kinds(plans, samples, settings, frusta):
+            if own and fit is not None:
+                views = _stack([_views(plan, s, setting) for plan, s in own])
+                p_light, which, _ = vertices_in_maps(views, geometry.positions)
+                found.append((vertices_of_maps(views, fit, p_light, which), setting.resolution, views.count))
+    return found
 
 
 def _facing(plans: Sequence[SoftPlan], geometry: Geometry) -> Bool | None:

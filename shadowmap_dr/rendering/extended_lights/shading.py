@@ -12,14 +12,15 @@ from ...jit.kernel_inputs import split
 from ...jit.types import Color3f, Float, PyTree, UInt32, Vector3f
 from ...scene.sensor import ImageSize
 from ...scene.sums import attached_parameters, sum_over
-from ...shadow import visibility
+from ...shadow import transmittance
 from ..direct_light import passes_gate
 from ..gbuffer.surface import Surface
+from ..shadow_pass import share_through
 from .interleaving import Interleaving
 from .penumbra import penumbra_visibility
 from .sample_maps import SoftMaps, SoftPlan, map_of
 from .samples import LightSamples
-from .sky_light import reflects_only, sky_light
+from .sky_light import reflects_only, sky_light, transmits
 from .sky_samples import SkySamples
 
 
@@ -32,7 +33,7 @@ def soft_light(
     interleaving: Interleaving,
     *,
     gate: bool = True,
-    visible: Float | None = None,
+    visible: Float | Color3f | None = None,
 ) -> Color3f:
     """Radiance (colour, P) towards the camera of one extended light.
 
@@ -44,7 +45,7 @@ def soft_light(
     if isinstance(samples, SkySamples) and reflects_only(nodes):
         return sky_light(seen, plan, samples, maps, nodes, gate=gate, visible=visible)
     sampled = None if maps is None or plan.kind == "single" else maps.sampled
-    transmits = not samples.distant and any(_transmits(node) for node in nodes)
+    two_sided = not samples.distant and any(transmits(node) for node in nodes)
 
     def one_sample(number: UInt32, own: PyTree, shared: PyTree) -> Color3f:
         (seen, lane, group), (table, maps, visible) = own, shared
@@ -58,16 +59,16 @@ def soft_light(
             value += dr.select(passes, seen.evaluate(wo, passes) * weight, 0)
             active |= passes
         if visible is not None:
-            value *= dr.gather(mi.Float, visible, number * lanes + lane, active)
+            value *= dr.gather(type(visible), visible, number * lanes + lane, active)
         elif maps is not None:
-            value *= visibility(maps, map_of(plan, table, index, seen.p_world), seen.p_world, active)
+            value *= share_through(maps, map_of(plan, table, index, seen.p_world), seen.p_world, active)
         return dr.select(active, value, 0)
 
     def sides(seen: Surface) -> list[Vector3f]:
         """Normals on the sides of the surface that light may come from."""
         n = seen.si.sh_frame.n
         above = mi.Vector3f(dr.select(dr.detach(seen.si.wi.z) < 0, -n, n))
-        return [above, -above] if transmits else [above]
+        return [above, -above] if two_sided else [above]
 
     lanes = dr.width(seen.shape)
     start = dr.zeros(mi.UnpolarizedSpectrum, lanes)
@@ -80,7 +81,11 @@ def soft_light(
     if maps is None or maps.single is None or plan.kind != "single":
         return light
     radius = samples.radius_towards(seen.p_world)
-    return light * penumbra_visibility(maps.single, mi.UInt32(plan.first), radius, seen.p_world, seen.n_world, seen.active)
+    which, single = mi.UInt32(plan.first), maps.single.maps
+    light *= penumbra_visibility(maps.single, which, radius, seen.p_world, seen.n_world, seen.active)
+    if single.transmittance is None:
+        return light
+    return light * mi.UnpolarizedSpectrum(*transmittance(single, which, seen.p_world, seen.active))
 
 
 def interleaving_of(samples: LightSamples, size: ImageSize, factor: int) -> Interleaving:
@@ -93,8 +98,10 @@ def interleaving_of(samples: LightSamples, size: ImageSize, factor: int) -> Inte
 
 def sample_visibilities(
     seen: Surface, plan: SoftPlan, samples: LightSamples, maps: SoftMaps | None, interleaving: Interleaving
-) -> Float | None:
+) -> Float | Color3f | None:
     """Visibility (Float, K P) of the K samples of an extended light, sample by sample, or None without maps of samples.
+
+    A colour instead of a number with translucent casters.
 
     With several groups of samples: of the points that each lane sees. Detached. For images that differ only in materials and in
     the colours of lights.
@@ -109,11 +116,6 @@ def sample_visibilities(
         group = None if interleaving.group is None else dr.gather(mi.UInt32, interleaving.group, pixel)
         sample = interleaving.point(number, group)
         p_world, active = dr.gather(mi.Point3f, seen.p_world, pixel), dr.gather(mi.Bool, seen.active, pixel)
-        found = visibility(maps.sampled, map_of(plan, table, sample, p_world), p_world, active)
+        found = share_through(maps.sampled, map_of(plan, table, sample, p_world), p_world, active)
         dr.eval(found)
         return found
-
-
-def _transmits(node: mi.Object) -> bool:
-    flags = node.flags() if isinstance(node, mi.BSDF) else 0
-    return mi.has_flag(flags, mi.BSDFFlags.DiffuseTransmission) or mi.has_flag(flags, mi.BSDFFlags.GlossyTransmission)

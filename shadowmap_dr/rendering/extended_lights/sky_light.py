@@ -9,10 +9,11 @@ import drjit as dr
 import mitsuba as mi
 
 from ...jit.types import ArrayXf, Color3f, Float, PyTree, UInt32
+from ...jit.vectors import mean_of
 from ...scene.sums import attached_parameters, sum_over
-from ...shadow import visibility
 from ..direct_light import passes_gate
 from ..gbuffer.surface import Surface
+from ..shadow_pass import share_through
 from .sample_maps import SoftMaps, SoftPlan, map_of
 from .sky_samples import SkySamples
 
@@ -21,8 +22,14 @@ _LOW = 3.0
 
 
 def reflects_only(nodes: Sequence[Any]) -> bool:
-    """True if none of the BSDFs among ``nodes`` lets light through."""
-    return not any(mi.has_flag(node.flags(), mi.BSDFFlags.Transmission) for node in nodes if isinstance(node, mi.BSDF))
+    """True if none of the BSDFs among ``nodes`` spreads light to its other side."""
+    return not any(transmits(node) for node in nodes)
+
+
+def transmits(node: mi.Object) -> bool:
+    """True for a BSDF that spreads light to its other side."""
+    flags = node.flags() if isinstance(node, mi.BSDF) else 0
+    return mi.has_flag(flags, mi.BSDFFlags.DiffuseTransmission) or mi.has_flag(flags, mi.BSDFFlags.GlossyTransmission)
 
 
 def sky_light(
@@ -33,7 +40,7 @@ def sky_light(
     nodes: Sequence[Any],
     *,
     gate: bool = True,
-    visible: Float | None = None,
+    visible: Float | Color3f | None = None,
 ) -> Color3f:
     """Radiance (colour, P) towards the camera of an environment, on surfaces that reflect only.
 
@@ -69,13 +76,13 @@ def sky_light(
         further = value * dr.select(dr.detach(place) > 0, dr.square(1 - place) * dr.rcp(2 * (1 + upper)), 0.5 * (1 + place))
         above = dr.detach(height) > 0
         low = dr.maximum(height * (1 - height * dr.rcp(_LOW * half)), 0)
-        visible = mi.Float(1)
+        visible: Float | Color3f = mi.Float(1)
         lit = active & above
         if known is not None:
-            visible = dr.gather(mi.Float, known, index * lanes + lane, lit)
+            visible = dr.gather(type(known), known, index * lanes + lane, lit)
         elif maps is not None:
-            visible = dr.select(lit, visibility(maps, map_of(plan, table, index, seen.p_world), seen.p_world, lit), 0)
-        sums = [*(inner * visible), *further, low * visible, low]
+            visible = dr.select(lit, share_through(maps, map_of(plan, table, index, seen.p_world), seen.p_world, lit), 0)
+        sums = [*(inner * visible), *further, low * mean_of(visible), low]
         return mi.ArrayXf([mi.Float(dr.select(seen.active, x, 0)) for x in sums])
 
     implicit = [] if seen.colour is not None else attached_parameters(nodes)

@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 
 import drjit as dr
 import mitsuba as mi
 
-from ...jit.types import Float, UInt32
+from ...jit.types import Color3f, Float, UInt32
+from ...jit.vectors import mean_of
 from ...raster import RasterOutput
-from ...scene.lights.read import Light
 from ..gbuffer.surface import Surface
 
-#: Name -> channel suffixes. ``visibility`` has one channel for each light, named after it.
+#: Name -> channel suffixes. ``visibility`` has one channel for each light, named after it, ``transmittance`` three.
 AOVS: dict[str, tuple[str, ...]] = {
     "depth": ("",),
     "position": (".X", ".Y", ".Z"),
     "normal": (".X", ".Y", ".Z"),
     "shape_index": ("",),
     "prim_index": ("",),
+    "opacity": ("",),
     "visibility": (),
+    "transmittance": (),
 }
 
 
@@ -35,19 +37,36 @@ def aov_names(aovs: tuple[str, ...], light_names: list[str]) -> list[str]:
     for name in aovs:
         if name == "visibility":
             names += [f"visibility.{light}" for light in light_names]
+        elif name == "transmittance":
+            names += [f"transmittance.{light}{suffix}" for light in light_names for suffix in (".R", ".G", ".B")]
         else:
             names += [name + suffix for suffix in AOVS[name]]
     return names
 
 
 def collect_aovs(
-    aovs: tuple[str, ...], seen: Surface, raster: RasterOutput, lights: tuple[Light, ...], visible: list[Float]
+    aovs: tuple[str, ...],
+    seen: Surface,
+    raster: RasterOutput,
+    visible: Sequence[Float | Color3f],
+    through: Callable[[], Sequence[Color3f]],
+    coverage: Float | None = None,
 ) -> list[Float]:
-    """Channels (Float, one entry a pixel), 0 in the background, but visibility 1.
+    """Channels (Float, one entry a pixel), 0 in the background, but visibility and transmittance 1.
 
     ``depth``: distance from the camera, world units (as Mitsuba's). ``position``, ``normal``: world space, the normal is the
-    shading normal. ``shape_index``, ``prim_index``: counted from 0, -1 where nothing is seen. Not anti-aliased, and not passed
-    through the film's reconstruction filter.
+    shading normal. ``shape_index``, ``prim_index``: counted from 0, -1 where nothing is seen. ``visibility``: mean over colours
+    of the share of each light that arrives; ``transmittance``: share that translucent casters let through, by colour. These are
+    of the nearest surfaces, opaque or not. ``opacity``: share of the light from behind all surfaces that they take away.
+    Not anti-aliased, but for opacities in scenes with translucent surfaces, and not passed through the film's reconstruction
+    filter.
+
+    Args:
+        aovs: names of channels.
+        seen, raster: the nearest surfaces.
+        visible: for each light, the share that arrives: a number or a colour.
+        through: returns for each light the share that translucent casters let through.
+        coverage: opacities, None if all surfaces are opaque.
     """
     width = dr.width(raster.triangle)
 
@@ -68,5 +87,9 @@ def collect_aovs(
         elif name == "prim_index":
             channels.append(masked(seen.si.prim_index, -1.0))
         elif name == "visibility":
-            channels += [masked(fraction, 1.0) for fraction in visible]
+            channels += [masked(mean_of(fraction), 1.0) for fraction in visible]
+        elif name == "opacity":
+            channels.append(masked(mi.Float(1)) if coverage is None else coverage)
+        elif name == "transmittance":
+            channels += [masked(colour[min(k, len(colour) - 1)], 1.0) for colour in through() for k in range(3)]
     return channels

@@ -178,7 +178,7 @@ def put_into_film(film: mi.Film, image: TensorXf, aovs: list[str]) -> None:
     film.put_block(mi.ImageBlock(stored, offset=film.crop_offset(), rfilter=None, border=False))
 
 
-def film_channels(color: Color3f, active: Bool, sensor: Sensor) -> list[Float]:
+def film_channels(color: Color3f, coverage: Bool | Float, sensor: Sensor) -> list[Float]:
     """Channels (Float) of a colour in a sensor's film: one or three, and coverage if the film has alpha."""
     channels = [color[k] for k in range(len(color))]
     if sensor.channels == 1 and len(channels) == 3:
@@ -186,5 +186,5 @@ def film_channels(color: Color3f, active: Bool, sensor: Sensor) -> list[Float]:
     elif sensor.channels == 3 and len(channels) == 1:
         channels = channels * 3
     if sensor.alpha:
-        channels.append(dr.select(active, mi.Float(1), 0))
+        channels.append(mi.Float(coverage))
     return channels

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,18 +15,22 @@ from ...raster.antialiasing.edge_crossings import find_crossings
 from ...scene.geometry import Geometry
 from ...scene.load import SceneData
 from ...scene.sensor import ImageSize, Sensor
+from ...shadow import TranslucentCasters
 from .camera_clip import camera_clip, least_gap, seen_points, within_far_plane, without_shapes
 from .facet_normals import FlatFaces, facet_normals, mean_normals, prefilter_normals
 from .shading_edges import ShadingEdges
-from .surface import Surface, normals_at, opacity, surface, surface_at
+from .surface import Surface, normals_at, surface_at
 from .surface_points import pixel_hits
+from .translucency import Translucency
+from .translucent_layers import Layers
 
 
 @dataclass(frozen=True)
 class CameraView:
     """One camera's visibility: clip-space vertices and the triangle at each sample, ``factor`` x ``factor`` samples a pixel.
 
-    ``topology``: edges of the shapes that the camera sees, at their current places.
+    ``topology``: edges of the shapes that the camera sees, at their current places. ``raster``: of opaque surfaces. ``layers``:
+    translucent surfaces before them, None in scenes without any.
     """
 
     sensor: Sensor
@@ -34,6 +38,12 @@ class CameraView:
     clip: Float
     raster: RasterOutput
     topology: Topology
+    layers: Layers | None = None
+
+    @property
+    def nearest(self) -> CameraView:
+        """The same view of the nearest surfaces, opaque or not."""
+        return self if self.layers is None else replace(self, raster=self.layers.nearest, layers=None)
 
     @property
     def size(self) -> ImageSize:
@@ -55,6 +65,7 @@ class PlacedShapes:
         facets: (normals of flat faces (Float, 4 F), their sums at each place (Float, 4 V)), None without flat faces.
         creases: edges at which shading jumps, as arguments of :func:`~shadowmap_dr.raster.find_crossings`.
         seen, casting: edges of the shapes that cameras see, and of those that cast shadows.
+        translucent: edges of the translucent faces alone, None without any.
     """
 
     geometry: Geometry
@@ -62,6 +73,7 @@ class PlacedShapes:
     creases: dict[str, Any]
     seen: Topology
     casting: Topology
+    translucent: Topology | None = None
 
 
 @dataclass(frozen=True)
@@ -110,6 +122,7 @@ class CameraPass:
         flat: faces that are shaded flat, or None.
         creases: edges of faces at which shading jumps, None if images are not anti-aliased.
         hidden: shapes that cameras do not see.
+        translucency: the faces that are not opaque, None if all are.
     """
 
     data: SceneData
@@ -117,6 +130,7 @@ class CameraPass:
     flat: FlatFaces | None
     creases: ShadingEdges | None
     hidden: tuple[int, ...] = ()
+    translucency: Translucency | None = None
 
     def placed(self, geometry: Geometry) -> PlacedShapes:
         """Records of the shapes at the places that a geometry gives them. Attached to the geometry."""
@@ -134,22 +148,27 @@ class CameraPass:
             clip = without_shapes(clip, geometry, self.hidden)
             dr.eval(clip)
         size = (sensor.height * factor, sensor.width * factor)
-        raster = visible_triangles(clip, geometry.faces, size, transparent=self.transparent(geometry, sensor))
-        return CameraView(sensor, factor, clip, raster, shapes.seen)
+        translucency = self.translucency
+        if translucency is None:
+            return CameraView(sensor, factor, clip, visible_triangles(clip, geometry.faces, size), shapes.seen)
+        raster = visible_triangles(clip, geometry.faces, size, drawn=translucency.opaque)
+        return CameraView(
+            sensor, factor, clip, raster, shapes.seen, translucency.layers(self.data, geometry, sensor, clip, raster)
+        )
 
-    def transparent(self, geometry: Geometry, camera: Sensor) -> Callable[[RasterOutput], Bool] | None:
-        """Alpha test for cameras and shadow maps (from either side); None if no material is see-through."""
-        if not any(info.see_through for info in geometry.shapes):
-            return None
-
-        def transparent(raster: RasterOutput) -> Bool:
-            return opacity(surface(self.data, geometry, camera, raster.triangle, raster.u, raster.v)) < 0.5
-
-        return transparent
+    def casters(self, shapes: PlacedShapes, camera: Sensor) -> tuple[Bool | None, TranslucentCasters | None]:
+        """Mask of the opaque faces (Bool, F), and the casters that are not, None each without any. ``camera``: any camera."""
+        if self.translucency is None:
+            return None, None
+        return self.translucency.opaque, self.translucency.casters(self.data, shapes.geometry, camera, shapes.translucent)
 
     def seen(self, views: Sequence[CameraView], geometry: Geometry) -> tuple[Point3f, Bool]:
         """Points on surfaces that cameras see (Point3f, world space), and a mask of the valid ones. Detached."""
-        found = [seen_points(view.sensor, view.raster, geometry) for view in views]
+        found = [
+            seen_points(each.sensor, each.raster, geometry)
+            for view in views
+            for each in ((view,) if view.layers is None else (view, view.nearest))
+        ]
         if len(found) == 1:
             return found[0]
         points = mi.Point3f(*(dr.concat([p[c] for p, _ in found]) for c in range(3)))
@@ -185,10 +204,13 @@ class CameraPass:
         normals = facet_normals(geometry, self.flat)
         return dr.detach(normals), mean_normals(normals, self.topology, self.flat)
 
-    def _topologies(self, geometry: Geometry) -> tuple[Topology, Topology]:
-        """The topology of the shapes that cameras see, and of those that cast shadows."""
+    def _topologies(self, geometry: Geometry) -> tuple[Topology, Topology, Topology | None]:
+        """The topology of the shapes that cameras see, of those that cast shadows, and of translucent faces."""
         casting, shape = self.topology, geometry.vertex_shape
+        translucent = None if self.translucency is None else self.translucency.topology
         points = dr.gather(mi.Point3f, dr.detach(geometry.positions), dr.arange(mi.UInt32, geometry.vertex_count))
         if not (geometry.as_loaded and geometry.positions is self.data.geometry.positions):
             casting = detach_moved_seams(casting, points, shape)
-        return detach_moved_seams(self.topology, points, shape, self.hidden) if self.hidden else casting, casting
+            translucent = translucent and detach_moved_seams(translucent, points, shape)
+        seen = detach_moved_seams(self.topology, points, shape, self.hidden) if self.hidden else casting
+        return seen, casting, translucent

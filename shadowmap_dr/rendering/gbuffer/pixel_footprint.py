@@ -14,7 +14,7 @@ import mitsuba as mi
 from ...jit.arrays import backend
 from ...jit.broadcast import Copies, copied
 from ...jit.kernel_inputs import float_input
-from ...jit.types import Bool, Float, Point3f, Vector3f
+from ...jit.types import Bool, Color3f, Float, Point3f, Vector3f
 from ...scene.sensor import ImageSize, Sensor
 
 # Grids of up to this many points a side get an array for each point; larger grids do so if one array would exceed that length.
@@ -83,9 +83,10 @@ class FootprintSamples:
             offset = axes.offset(across, down)
         return cls([points + offset], copied(active, copies), copies)
 
-    def mean(self, look_up: Callable[[Point3f, Bool], Float]) -> Float:
-        """Mean (Float, N) of the values that ``look_up`` returns for points (Point3f) and their masks (Bool). Attached."""
-        total = functools.reduce(operator.add, (look_up(points, self.active) for points in self.points))
+    def mean(self, look_up: Callable[[Point3f, Bool], Float | Color3f]) -> Float | Color3f:
+        """Mean (N) of the values that ``look_up`` returns for points (Point3f) and their masks (Bool). Attached."""
+        found = [cast("Float", look_up(points, self.active)) for points in self.points]
+        total: Float = functools.reduce(operator.add, found)
         if self.copies > 1:
             (total,) = dr.custom(Copies, [total], self.copies, True)
         return total * (1 / (self.copies * len(self.points)))

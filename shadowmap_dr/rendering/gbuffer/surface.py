@@ -216,15 +216,6 @@ def _parametrisation(geometry: Geometry, flags: _Flags, hits: SurfacePoints) -> 
     return uv, dp_du, dp_dv
 
 
-def opacity(surface: Surface) -> Float:
-    """Float (N,): 1 where the surface is solid, 0 where its BSDF (``mask``, ``null``) lets everything through unchanged.
-
-    Gradients flow to the BSDF's opacity. Alpha tests compare this with 0.5.
-    """
-    through = surface.bsdf.eval_null_transmission(surface.si, surface.active)
-    return dr.select(surface.active, 1.0 - dr.mean(mi.UnpolarizedSpectrum(through)), 0.0)
-
-
 class _Flags:
     """Per-pixel booleans of the shape, read only if shapes of the scene differ in them."""
 

@@ -1,0 +1,76 @@
+"""Faces of a scene by what they do with light: opaque, translucent, or unseen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mitsuba as mi
+import numpy as np
+
+from ...jit.arrays import device_array
+from ...jit.types import Bool, UInt32
+from ...raster import Topology, build_topology
+from ...scene.geometry import Geometry
+from ...scene.load import SceneData
+from ...scene.mitsuba_objects import passes_evenly
+
+# Thickness of a flat shape, relative to its width.
+_FLAT = 1e-4
+
+
+@dataclass(frozen=True)
+class Faces:
+    """Faces by kind, F in all, T of them translucent. Static.
+
+    Attributes:
+        opaque: ``Bool`` (F,), faces that let no light through.
+        index: ``UInt32`` (T,), number of each translucent face.
+        corners: ``UInt32`` (3 T,), their vertices.
+        topology: edges of the translucent faces alone. A surface's edges count only where it is seen itself.
+        cutouts: True if transmittance may vary over a surface, as it does with opacities in textures.
+        room: most of these faces that a ray meets, wherever shapes move; None if that is not known.
+        bsdfs: BSDFs of these faces.
+    """
+
+    opaque: Bool
+    index: UInt32
+    corners: UInt32
+    topology: Topology
+    cutouts: bool
+    room: int | None
+    bsdfs: tuple[mi.BSDF, ...]
+
+
+def faces_of(data: SceneData, positions: np.ndarray) -> tuple[Bool | None, Faces | None]:
+    """(mask (F,) of the opaque faces, None if all are; faces by kind, None if none are translucent), on the host, once.
+
+    ``positions``: (V, 3) vertices of the scene's geometry.
+    """
+    geometry = data.geometry
+    if not any(info.see_through for info in geometry.shapes):
+        return None, None
+    shape = geometry.face_shape.numpy()
+    opaque = device_array(mi.Bool, np.array([not info.see_through for info in geometry.shapes])[shape])
+    translucent = np.array([info.see_through and not info.unseen for info in geometry.shapes])[shape]
+    if not translucent.any():
+        return opaque, None
+    index = np.flatnonzero(translucent).astype(np.uint32)
+    corners = geometry.faces.numpy().reshape(-1, 3)[index]
+    every = np.ones(len(index), bool)
+    topology = build_topology(corners, positions, mi.UInt32, geometry.vertex_shape.numpy(), every)
+    pairs = zip(data.sources, geometry.shapes, strict=True)
+    bsdfs = tuple(dict.fromkeys(source.shape.bsdf() for source, info in pairs if info.see_through and not info.unseen))
+    cutouts = not all(passes_evenly(bsdf) for bsdf in bsdfs)
+    numbers, vertices = device_array(mi.UInt32, index), device_array(mi.UInt32, corners.ravel())
+    return opaque, Faces(opaque, numbers, vertices, topology, cutouts, _room(geometry, positions), bsdfs)
+
+
+def _room(geometry: Geometry, positions: np.ndarray) -> int | None:
+    """Number of translucent shapes if all of them are flat, else None."""
+    shapes = [info for info in geometry.shapes if info.see_through and not info.unseen]
+    for info in shapes:
+        points = positions[info.vertex_start : info.vertex_start + info.vertex_count].astype(np.float64)
+        spread = np.linalg.eigvalsh(np.cov(points.T))
+        if spread[0] > _FLAT**2 * spread[2]:
+            return None
+    return len(shapes)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import drjit as dr
 
 from .arrays import backend, reinterpret
@@ -50,4 +52,4 @@ def _near_one(vector: Vector3f) -> tuple[Vector3f, Float, Bool]:
 
 def mean_of(value: Float | Color3f) -> Float:
     """Mean of the components of a colour, or the number itself. Attached."""
-    return dr.mean(value) if dr.depth_v(value) > 1 else value
+    return cast("Float", dr.mean(value) if dr.depth_v(value) > 1 else value)

@@ -198,6 +198,7 @@ def map_vertices(
     plan: MapPlan, lights: Sequence[Light], geometry: Geometry, settings: ShadowSettings, frusta: Frusta
 ) -> tuple[Float, int, int]:
     """(clip-space vertices (4 M V,) of all maps, texels along each side, number M of maps) for a known fit. Detached."""
+    settings = plan.settings(settings)
     with dr.suspend_grad():
         each = zip(lights, plan.kinds, plan.tiles, strict=True)
         views = stack_views([view for light, kind, tiles in each for view in _views(plan, light, kind, settings) * tiles])

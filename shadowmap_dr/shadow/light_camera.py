@@ -213,7 +213,10 @@ def of_map(table: ViewsOrFrusta, index: UInt32, count: int) -> ViewsOrFrusta:
             return module.Array3f(*(look_up(value[c], index) for c in range(3)))
         return look_up(cast("Float", value), index)
 
-    rows: list[Any] = [pick(getattr(table, name)) for name in table.__dataclass_fields__ if name != "tiles"]
+    columns = [getattr(table, name) for name in table.__dataclass_fields__ if name != "tiles"]
+    if count > 1:
+        dr.eval(columns)  # by one kernel: look-ups evaluate columns one by one
+    rows: list[Any] = [pick(column) for column in columns]
     return type(table)(*rows)
 
 

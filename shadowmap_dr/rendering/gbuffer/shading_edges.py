@@ -14,7 +14,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...jit.arrays import device_array
+from ...jit.arrays import backend, device_array
+from ...jit.kernel_inputs import split, uint_input
 from ...jit.types import Bool, Float, UInt32
 from ...raster import CoplanarCreases, Topology
 from ...scene.changes import ParameterWatch
@@ -201,21 +202,30 @@ def _other_colours(shape: mi.Shape, texcoords: Float, pairs: Pairs, first: int) 
 
     ``texcoords``: of the shape's vertices (Float, 2 each), of which the first is vertex ``first`` of the scene.
     """
-    ends = [[dr.gather(mi.Point2f, dr.detach(texcoords), v - first) for v in sides] for sides in pairs.ends]
-    places = [dr.lerp(ends[0][side], ends[1][side], t) for t in _LOOKED_AT for side in range(2)]
-    si = dr.zeros(mi.SurfaceInteraction3f, len(places) * dr.width(pairs.one))
-    si.uv = mi.Point2f(*(dr.concat([place[c] for place in places]) for c in range(2)))
+    # Numbers that differ from shape to shape are inputs of kernels.
+    module, count, places = backend(texcoords), dr.width(pairs.one), 2 * len(_LOOKED_AT)
+    before, edges = uint_input(module, "vertices before", first), uint_input(module, "edges of a shape", count)
+    place, pair = split(dr.arange(mi.UInt32, places * count), "edges of a shape", count, places)
+    along = mi.Float(_LOOKED_AT[0])
+    for k, value in enumerate(_LOOKED_AT):
+        along = dr.select(place >> 1 == k, value, along)
+    ends = []
+    for sides in pairs.ends:
+        here, there = (dr.gather(mi.UInt32, vertices, pair) for vertices in sides)
+        ends.append(dr.gather(mi.Point2f, dr.detach(texcoords), dr.select(place & 1 == 0, here, there) - before))
+    si = dr.zeros(mi.SurfaceInteraction3f, places * count)
+    si.uv = dr.lerp(ends[0], ends[1], along)
     si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
     si.sh_frame, si.n, si.wi = mi.Frame3f(mi.Vector3f(0, 0, 1)), mi.Normal3f(0, 0, 1), mi.Vector3f(0, 0, 1)
     colours = [shape.bsdf().eval(mi.BSDFContext(), si, si.wi)]
     if shape.is_emitter():
         colours.append(shape.emitter().eval(si))
-    lane, found = dr.arange(mi.UInt32, dr.width(pairs.one)), dr.full(mi.Bool, False, dr.width(pairs.one))
+    lane, found = dr.arange(mi.UInt32, count), dr.full(mi.Bool, False, count)
     channels = [channel + dr.zeros(mi.Float, dr.width(si.uv)) for colour in colours for channel in mi.UnpolarizedSpectrum(colour)]
     dr.eval(channels)
     for channel in channels:
         for k in range(len(_LOOKED_AT)):
-            one, other = (dr.gather(mi.Float, channel, lane + (2 * k + side) * dr.width(lane)) for side in range(2))
+            one, other = (dr.gather(mi.Float, channel, lane + (2 * k + side) * edges) for side in range(2))
             found |= dr.abs(one - other) > _COLOUR_JUMP * (1 + dr.abs(one))
     return found
 

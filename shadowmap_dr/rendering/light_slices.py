@@ -21,6 +21,8 @@ from .shadow_pass import MapPlan
 # Bytes of a map, its derivatives included: for each texel (as it is rasterized), and in addition for each number that the texel
 # stores; for each vertex; for each triangle. Measured peaks, rounded up (docs/performance.md).
 _TEXEL, _NUMBER, _VERTEX, _TRIANGLE = 50, 20, 112, 56
+# Bytes of a texel's translucent layers, if it has some four of them.
+_LAYERS = 600
 # Bytes of a stored number's gradient, of which each extended light has one for the maps of all of them.
 _GRADIENT = 4
 
@@ -135,7 +137,9 @@ class _Sizes:
 
 def map_bytes(settings: ShadowSettings, geometry: Geometry) -> int:
     """Estimate of the memory (bytes) for making, filtering and differentiating one map."""
-    texels = (settings.resolution * settings.supersampling) ** 2 * (_TEXEL + _NUMBER * _numbers(settings))
+    translucent = any(info.see_through and not info.unseen for info in geometry.shapes)
+    each = _TEXEL + _NUMBER * _numbers(settings) + _LAYERS * translucent
+    texels = (settings.resolution * settings.supersampling) ** 2 * each
     return texels + _VERTEX * geometry.vertex_count + _TRIANGLE * geometry.face_count
 
 

@@ -245,16 +245,25 @@ def bilinear(
     """
     at = Texels(maps, map_index, u, v, active)
     stored, channels, used = values or (maps.values, maps.channels, maps.channels)
+    # Few pixels read a texel: a copy of all texels for each thread and each look-up would cost more than atomic additions.
+    mode = dr.ReduceMode.Auto if values is None else dr.ReduceMode.Direct
     rows = []
     for j in range(2):
         use = [active & at.inside(i, j) if outside_reads_zero else active for i in range(2)]
-        left, right = (stored_texel(stored, channels, at.index(i, j), use[i], used) for i in range(2))
+        left, right = (stored_texel(stored, channels, at.index(i, j), use[i], used, mode) for i in range(2))
         rows.append([dr.fma(b - a, at.fx, a) for a, b in zip(left, right, strict=True)])
     return [value for a, b in zip(*rows, strict=True) for value in entries(dr.fma(b - a, at.fy, a))]
 
 
-def stored_texel(values: Float, channels: int, texel: UInt32, active: Bool | bool, used: int | None = None) -> list[AnyArray]:
-    """The first ``used`` numbers of a texel, or all of them, in the largest packets that divide ``channels``.
+def stored_texel(
+    values: Float,
+    channels: int,
+    texel: UInt32,
+    active: Bool | bool,
+    used: int | None = None,
+    mode: dr.ReduceMode = dr.ReduceMode.Auto,
+) -> list[AnyArray]:
+    """The first ``used`` numbers of a texel, or all of them, in the largest packets that divide ``channels``. ``mode``: of adjoints.
 
     No more than that: Dr.Jit 1.5 ends the process in forward mode where a symbolic branch leaves a part of a packet unused.
     """
@@ -264,7 +273,7 @@ def stored_texel(values: Float, channels: int, texel: UInt32, active: Bool | boo
     first, last = 0, channels if used is None else used
     while first < last:
         size = next(n for n in (4, 2, 1) if channels % n == 0 and n <= last - first)
-        found.append(dr.gather(packets[size], values, texel * (channels // size) + first // size, active))
+        found.append(dr.gather(packets[size], values, texel * (channels // size) + first // size, active, mode=mode))
         first += size
     return found
 

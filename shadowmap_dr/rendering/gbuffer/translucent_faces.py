@@ -10,12 +10,11 @@ import numpy as np
 from ...jit.arrays import device_array
 from ...jit.types import Bool, UInt32
 from ...raster import Topology, build_topology
-from ...scene.geometry import Geometry
 from ...scene.load import SceneData
 from ...scene.mitsuba_objects import passes_evenly
 
-# Thickness of a flat shape, relative to its width.
-_FLAT = 1e-4
+# Thickness of a flat part, relative to its width; most parts that are looked at.
+_FLAT, _FEW = 1e-4, 64
 
 
 @dataclass(frozen=True)
@@ -62,15 +61,17 @@ def faces_of(data: SceneData, positions: np.ndarray) -> tuple[Bool | None, Faces
     bsdfs = tuple(dict.fromkeys(source.shape.bsdf() for source, info in pairs if info.see_through and not info.unseen))
     cutouts = not all(passes_evenly(bsdf) for bsdf in bsdfs)
     numbers, vertices = device_array(mi.UInt32, index), device_array(mi.UInt32, corners.ravel())
-    return opaque, Faces(opaque, numbers, vertices, topology, cutouts, _room(geometry, positions), bsdfs)
+    return opaque, Faces(opaque, numbers, vertices, topology, cutouts, _room(topology, corners, positions), bsdfs)
 
 
-def _room(geometry: Geometry, positions: np.ndarray) -> int | None:
-    """Number of translucent shapes if all of them are flat, else None."""
-    shapes = [info for info in geometry.shapes if info.see_through and not info.unseen]
-    for info in shapes:
-        points = positions[info.vertex_start : info.vertex_start + info.vertex_count].astype(np.float64)
+def _room(topology: Topology, corners: np.ndarray, positions: np.ndarray) -> int | None:
+    """Number of connected parts if there are few and all of them are flat, else None. ``corners``: (T, 3), of the faces."""
+    if topology.part_count > _FEW:
+        return None
+    parts = topology.parts.numpy()
+    for part in range(topology.part_count):
+        points = positions[np.unique(corners[parts == part])].astype(np.float64)
         spread = np.linalg.eigvalsh(np.cov(points.T))
         if spread[0] > _FLAT**2 * spread[2]:
             return None
-    return len(shapes)
+    return topology.part_count

@@ -263,7 +263,7 @@ def stored_texel(
     used: int | None = None,
     mode: dr.ReduceMode = dr.ReduceMode.Auto,
 ) -> list[AnyArray]:
-    """The first ``used`` numbers of a texel, or all of them, in the largest packets that divide ``channels``. ``mode``: of adjoints.
+    """The first ``used`` numbers of a texel, or all, in the largest packets that divide ``channels``. ``mode``: of adjoints.
 
     No more than that: Dr.Jit 1.5 ends the process in forward mode where a symbolic branch leaves a part of a packet unused.
     """

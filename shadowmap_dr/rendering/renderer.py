@@ -387,7 +387,7 @@ class Renderer:
         return lighting
 
     def g_buffer(self, sensor: int = 0) -> GBuffer:
-        """Surfaces of the current scene that a camera sees, for callers who shade them themselves. Detached.
+        """Opaque surfaces of the current scene that a camera sees, for callers who shade them themselves. Detached.
 
         Raises:
             ShadowmapError: there is no such sensor, or it has several cameras, or a reconstruction filter that is not a box.

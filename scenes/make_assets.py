@@ -1,4 +1,6 @@
-"""Makes the textures and the two procedural meshes of the example scenes: ``python scenes/make_assets.py``.
+"""Makes the textures and the procedural meshes of the example scenes: ``python scenes/make_assets.py [NAME ...]``.
+
+Names are those of the functions of `ASSETS`; all without.
 
 Everything follows from the constants below, so the files can be made again at any time. The textures are smooth at the
 scale of a pixel (except the leaf's opacity, which is binary on purpose): hard texture edges would make a comparison
@@ -7,6 +9,7 @@ between two renderers one of their texture filters.
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import mitsuba as mi
@@ -163,8 +166,104 @@ def drape() -> None:
     write_mesh("drape.ply", np.stack([x, height(x, z), z], 1), faces, normals, np.stack([u, v], 1), colors)
 
 
-def main() -> None:
-    (HERE / "textures").mkdir(exist_ok=True)
+def leaf_card() -> np.ndarray:
+    """Opacity of a pointed leaf along u, with an outline as wide as a texel."""
+    x, y = grid(64)
+    half_width = 0.42 * np.sin(np.pi * np.clip((x - 0.04) / 0.92, 0, 1)) ** 0.8 * (1.15 - 0.35 * x)
+    return smooth_step(-0.016, 0.016, half_width - np.abs(y - 0.5))
+
+
+def quads(centres: np.ndarray, along: np.ndarray, across: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices, faces, normals and texture coordinates of N parallelograms, from their middles and half sides (N, 3)."""
+    count = len(centres)
+    corners = np.stack([centres + a * along + b * across for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))], 1)
+    faces = (4 * np.arange(count))[:, None, None] + np.array([[0, 1, 2], [0, 2, 3]])
+    normals = np.repeat(normalised(np.cross(along, across)), 4, axis=0)
+    texcoords = np.tile(np.array([[0, 0], [1, 0], [1, 1], [0, 1]]), (count, 1))
+    return corners.reshape(-1, 3), faces.reshape(-1, 3), normals, texcoords
+
+
+def leaves() -> None:
+    """A crown of 360 cards in an ellipsoid about (0, 2.1, 0), larger outwards; each is a square that a leaf fills."""
+    rng = np.random.default_rng(8)
+    directions = normalised(rng.normal(size=(360, 3)))
+    centres = directions * rng.uniform(0.35, 1.0, (360, 1)) ** 0.6 * np.array([1.15, 0.95, 1.15]) + np.array([0, 2.1, 0])
+    along = normalised(directions + 0.9 * rng.normal(size=(360, 3)) - np.array([0, 0.4, 0]))
+    across = normalised(np.cross(along, rng.normal(size=(360, 3))))
+    size = rng.uniform(0.15, 0.24, (360, 1))
+    write_mesh("leaves.ply", *quads(centres, size * along, size * across))
+
+
+def tube(points: np.ndarray, radii: np.ndarray, sides: int = 12) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices, faces, normals and texture coordinates of a tapered tube along points (N, 3)."""
+    u, v, faces = sheet(sides, len(points) - 1)
+    ring, angle = np.round(v * (len(points) - 1)).astype(int), 2 * np.pi * u
+    forward = normalised(points[-1] - points[0])
+    side = normalised(np.cross(forward, [0.3, 0.1, 1.0]))
+    around = np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * np.cross(forward, side)
+    return points[ring] + radii[ring, None] * around, faces, around, np.stack([u, v], 1)
+
+
+def joined(parts: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]) -> list[np.ndarray]:
+    """One mesh of several."""
+    starts = np.cumsum([0, *(len(part[0]) for part in parts[:-1])])
+    moved = [(vertices, faces + start, *rest) for (vertices, faces, *rest), start in zip(parts, starts, strict=True)]
+    return [np.concatenate(arrays) for arrays in zip(*moved, strict=True)]
+
+
+def trunk() -> None:
+    """A trunk from (0, 0, 0) to (0.05, 2.2, 0) with five branches."""
+    t = np.linspace(0, 1, 9)
+    bend = np.stack([0.08 * np.sin(3 * t), 2.2 * t, 0.05 * np.sin(4 * t)], 1)
+    parts = [tube(bend, 0.17 - 0.12 * t)]
+    for k in range(5):
+        angle, start = 2 * np.pi * (0.1 + k / 5), bend[4 + k % 3]
+        end = start + np.array([0.75 * np.cos(angle), 0.45 + 0.1 * k, 0.75 * np.sin(angle)])
+        parts.append(tube(start + (end - start) * t[:, None], 0.055 - 0.04 * t, 8))
+    write_mesh("trunk.ply", *joined(parts))
+
+
+def box(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The six sides of a box, with normals to the outside."""
+    middle, half = (np.array(high) + low) / 2, (np.array(high) - low) / 2
+    axes = [(sign, np.roll(np.eye(3), k, axis=0)) for k in range(3) for sign in (-1, 1)]
+    centres = np.stack([middle + sign * half * axis[0] for sign, axis in axes])
+    along = np.stack([half * axis[1] for _, axis in axes])
+    across = np.stack([sign * half * axis[2] for sign, axis in axes])
+    return quads(centres, along, across)
+
+
+#: Columns and rows of panes of the window, their side, and half the width of the bars between them.
+COLUMNS, ROWS, PANE, BAR = 3, 4, 0.5, 0.04
+
+
+def window() -> None:
+    """A frame about 3 x 4 panes in the plane z = 0, and the panes of three kinds; the lower left corner is the origin."""
+    width, height = COLUMNS * PANE, ROWS * PANE
+    upright = [box((k * PANE - BAR, -BAR, -BAR), (k * PANE + BAR, height + BAR, BAR)) for k in range(COLUMNS + 1)]
+    across = [box((-BAR, k * PANE - BAR, -0.9 * BAR), (width + BAR, k * PANE + BAR, 0.9 * BAR)) for k in range(ROWS + 1)]
+    write_mesh("window_frame.ply", *joined(upright + across))
+    column, row = (numbers.ravel() for numbers in np.meshgrid(np.arange(COLUMNS), np.arange(ROWS)))
+    middle = np.stack([(column + 0.5) * PANE, (row + 0.5) * PANE, 0 * row], 1)
+    sides = [np.broadcast_to(np.eye(3)[axis] * PANE / 2, middle.shape) for axis in (0, 1)]
+    for kind in range(3):
+        chosen = (column + row) % 3 == kind
+        write_mesh(f"window_panes_{kind + 1}.ply", *quads(middle[chosen], *(side[chosen] for side in sides)))
+
+
+def curtain() -> None:
+    """A sheet in folds about the plane z = 0, 2 wide and 2 high, standing on y = 0; its folds widen downwards."""
+    u, v, faces = sheet(96, 24)
+    width = 0.05 + 0.05 * (1 - v)
+    phase = 2 * np.pi * 5 * u + 0.6 * np.sin(3 * v)
+    vertices = np.stack([2 * u - 1, 2 * v, width * np.sin(phase)], 1)
+    slope_x = width * np.cos(phase) * 2 * np.pi * 5 / 2
+    slope_y = (-0.05 * np.sin(phase) + width * np.cos(phase) * 1.8 * np.cos(3 * v)) / 2
+    write_mesh("curtain.ply", vertices, faces, normalised(np.stack([-slope_x, -slope_y, 1 + 0 * u], 1)), np.stack([u, v], 1))
+
+
+def textures() -> None:
+    """The textures of the scenes without translucent surfaces, and of the meadow."""
     height, normal = hammered()
     leaf_color, leaf_opacity = leaf()
     save("tiles.png", tiles())
@@ -174,10 +273,25 @@ def main() -> None:
     save("leaf_color.png", leaf_color)
     save("leaf_opacity.png", leaf_opacity)
     save("slide.png", slide())
-    vase()
-    drape()
+
+
+def tree() -> None:
+    """The leaves, their opacity, and the trunk."""
+    save("leaf_card.png", leaf_card())
+    leaves()
+    trunk()
+
+
+ASSETS = (textures, vase, drape, tree, window, curtain)
+
+
+def main(names: list[str]) -> None:
+    (HERE / "textures").mkdir(exist_ok=True)
+    for make in ASSETS:
+        if not names or make.__name__ in names:
+            make()
 
 
 if __name__ == "__main__":
     mi.set_variant("llvm_ad_rgb")
-    main()
+    main(sys.argv[1:])

@@ -155,7 +155,7 @@ def test_verbose_commands_tell_their_time(run: Any) -> None:
         ("notes.txt", "notes.txt is no XML: give a Mitsuba scene"),
         ("folder", "no scene 'folder': it is a folder; give a file in it .room.xml."),
         ("folder/rom.xml", "no scene 'folder/rom.xml': there is no such file. Did you mean 'folder/room.xml'?"),
-        ("zzz.xml", "no scene 'zzz.xml': give a file that exists, or one of gallery"),
+        ("zzz.xml", "no scene 'zzz.xml': give a file that exists, or one of curtain, gallery"),
     ],
 )
 def test_what_is_no_scene(run: Any, tmp_path: Path, name: str, message: str) -> None:

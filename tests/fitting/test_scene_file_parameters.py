@@ -10,7 +10,9 @@ import pytest
 from scene_files import FILM, SCENES, check_all, read, scene, write
 
 
-@pytest.mark.parametrize("name", ["gallery", "meadow", "pavilion", "pose", "still_life"])
+@pytest.mark.parametrize(
+    "name", ["curtain", "gallery", "leafy_tree", "meadow", "pavilion", "pose", "stained_window", "still_life"]
+)
 def test_all_parameters_of_our_scenes(tmp_path: Path, variant: str, name: str) -> None:
     written = check_all(SCENES / f"{name}.xml", tmp_path)
     # Mitsuba takes pictures only for the one, and no transparent materials in `twosided` for the other.

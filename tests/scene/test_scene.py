@@ -19,7 +19,8 @@ from shadowmap_dr.scene.load import load, refresh
 from shadowmap_dr.scene.mitsuba_objects import children
 from shadowmap_dr.scene.shapes.sources import MeshSource
 
-EXAMPLES = ["pose", "gallery", "still_life", "pavilion", "meadow"]
+EXAMPLES = ["pose", "gallery", "still_life", "pavilion", "meadow", "leafy_tree", "curtain"]
+TRANSLUCENT = ("meadow", "leafy_tree", "curtain")
 
 
 @pytest.mark.parametrize("optimize", [False, True], ids=["apart", "merged"])
@@ -38,7 +39,7 @@ def test_example_scenes(variant: str, name: str, optimize: bool) -> None:
         assert faces[own].min() >= info.vertex_start and faces[own].max() < info.vertex_start + info.vertex_count
         assert np.all(geometry.vertex_shape.numpy()[faces[own]] == index)
     assert len({info.name for info in geometry.shapes}) == len(geometry.shapes)
-    assert any(info.see_through for info in geometry.shapes) == (name == "meadow")
+    assert any(info.see_through for info in geometry.shapes) == (name in TRANSLUCENT)
     p = geometry.positions.numpy().reshape(-1, 3)
     # The bounding box of a merged scene is too small in Mitsuba 3.9.
     box = mi.load_file(str(assets.scene(name)), optimize=False, resolution=32).bbox()

@@ -12,6 +12,8 @@ from gradients.model import Parameter
 FOLDER = Path(__file__).parent
 RESOLUTION = scenes.SIZE
 SCENES = ("pose", "gallery", "still_life", "meadow", "pavilion")
+#: Scenes whose light passes through leaves, panes and cloth, and pixels along each side of their references.
+TRANSLUCENT, TRANSLUCENT_RESOLUTION = ("leafy_tree", "stained_window", "curtain"), 96
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,6 @@ def relative_rmse(image: np.ndarray, target: np.ndarray) -> float:
     return float(np.sqrt(np.mean((image - target) ** 2) / np.mean(target**2)))
 
 
-@pytest.mark.filterwarnings("ignore:Not all in the scene is supported")
 @pytest.mark.parametrize("name", cases.TRANSLUCENT)
 def test_images(variant: str, name: str) -> None:
     image = np.array(Renderer.from_scene(load(name)).render(spp=16))

@@ -19,8 +19,8 @@ from shadowmap_dr.scene.load import load, refresh
 from shadowmap_dr.scene.mitsuba_objects import children
 from shadowmap_dr.scene.shapes.sources import MeshSource
 
-EXAMPLES = ["pose", "gallery", "still_life", "pavilion", "meadow", "leafy_tree", "curtain"]
-TRANSLUCENT = ("meadow", "leafy_tree", "curtain")
+EXAMPLES = ["pose", "gallery", "still_life", "pavilion", "meadow", "leafy_tree", "stained_window", "curtain"]
+TRANSLUCENT = ("meadow", "leafy_tree", "stained_window", "curtain")
 
 
 @pytest.mark.parametrize("optimize", [False, True], ids=["apart", "merged"])

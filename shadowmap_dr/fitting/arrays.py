@@ -14,6 +14,7 @@ from ..errors import ShadowmapError, install_hint
 from ..jit.arrays import device_array
 from ..jit.types import Float
 from ..rendering.renderer import Renderer
+from .parameters import is_roughness, is_share
 from .scene_change import SceneChange
 from .vary import Vary
 
@@ -152,7 +153,7 @@ def texture_values(renderer: Renderer, vary: Vary, key: str) -> TextureValues:
     value = mi.traverse(renderer.data.scene)[key]
     flat = np.array(dr.detach(value), np.float32)
     shape = tuple(int(n) for n in value.shape) if dr.is_tensor_v(value) else flat.shape
-    share = any(word in key for word in ("reflectance", "base_color", "albedo", "opacity", "alpha", "roughness", "weight"))
+    share = is_share(key) or is_roughness(key)
     given = [name for name in ("prior", "spread") if name in vary.plain()]
     if given:
         raise ShadowmapError(f"{vary.named}: textures have no {given[0]}: leave it out.")

@@ -15,19 +15,22 @@ _RECORDABLE = (
     *("SRGBReflectanceSpectrum", "SRGBEmitterSpectrum", "UniformSpectrum", "BitmapTextureImpl", "SmoothDiffuse", "TwoSidedBRDF"),
     *("AreaLight", "ConstantBackgroundEmitter", "EnvironmentMapEmitter"),
 )
+# Those in recordings of gradients only: recordings of derivatives in forward mode take longer here than differences of images.
+_RECORDABLE_GRADIENTS = (*_RECORDABLE, "MaskBSDF", "ThinDielectric")
 
 
-def is_recordable(scene: mi.Scene, key: str) -> bool:
+def is_recordable(scene: mi.Scene, key: str, *, gradients: bool = False) -> bool:
     """True if a recording may give the parameter of Mitsuba's called ``key`` another value, and its derivative is right.
 
     Other objects read their parameters back when these change, on which recordings fail; or their derivatives in forward mode are
-    wrong (docs/limits.md).
+    wrong (docs/limits.md). ``gradients``: for recordings of gradients, in reverse mode.
     """
+    known = _RECORDABLE_GRADIENTS if gradients else _RECORDABLE
     table = mi.traverse(scene)
     node = table.properties[key][2]
     while node is not None:
         kind = node.class_name().partition("[")[0]  # without the type of a texture's texels
-        if kind not in _RECORDABLE and not isinstance(node, (mi.Shape, mi.Scene)):
+        if kind not in known and not isinstance(node, (mi.Shape, mi.Scene)):
             return False
         node = table.hierarchy[node][0] if node in table.hierarchy else None
     return True

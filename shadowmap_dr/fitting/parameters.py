@@ -20,6 +20,27 @@ from .scene_change import SceneChange
 from .vary import Vary
 
 Array = npt.NDArray[np.float64]
+# Values between zero and one, by words of their names; other values that are positive stay positive.
+_SHARES = (
+    *("reflectance", "base_color", "albedo", "metallic", "specular_tint", "clearcoat", "sheen", "spec_tint", "flatness"),
+    *("opacity", "weight", "spec_trans", "transmittance", "specular"),
+)
+_ROUGHNESS = ("alpha", "roughness")
+
+
+def is_share(key: str) -> bool:
+    """True if a parameter of Mitsuba's called ``key`` lies between zero and one: a reflectance, an opacity, a tint."""
+    return any(word in _own_name(key) for word in _SHARES)
+
+
+def is_roughness(key: str) -> bool:
+    """True if a parameter of Mitsuba's called ``key`` is a roughness."""
+    return any(word in _own_name(key) for word in _ROUGHNESS)
+
+
+def _own_name(key: str) -> str:
+    """The name that a parameter has in its material or light."""
+    return next((part for part in reversed(key.split(".")) if part not in ("value", "data")), key)
 
 
 @dataclass(frozen=True)

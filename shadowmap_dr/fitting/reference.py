@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -21,13 +22,19 @@ Image = npt.NDArray[np.float32]
 
 # Integrators of Mitsuba's that show a scene as a camera sees it. Others' scenes are rendered by `direct`.
 _INTEGRATORS = (
-    *("DirectIntegrator", "PathIntegrator", "VolumetricPathIntegrator", "VolumetricMisPathIntegrator"),
+    *("DirectIntegrator", "PathIntegrator", "VolumetricPathIntegrator", "VolpathMisIntegratorImpl"),
     *("PRBIntegrator", "PRBVolpathIntegrator", "ThreePointIntegrator", "DirectProjectiveIntegrator"),
     *("PathProjectiveIntegrator", "BasicPRBIntegrator"),
 )
+# Those whose light passes through translucent surfaces, and those whose light bounces. In all others such surfaces stop the light
+# of points and directions: scenes with them are rendered by `volpath`.
+_PASSING = ("VolumetricPathIntegrator", "VolpathMisIntegratorImpl", "PRBVolpathIntegrator")
+_BOUNCING = ("PathIntegrator", "PRBIntegrator", "BasicPRBIntegrator", "PathProjectiveIntegrator")
+# The usual `max_depth`: one bounce.
+_DIRECT = 2
 # Samples of a pass, and of a pixel in it at most; passes at most; noise, a share of the brightness, below which a pass is the
 # last; pixels of an image.
-_PASS, _MOST, _PASSES, _NOISE, _PIXELS = 1 << 22, 256, 4, 0.02, 1 << 20
+_PASS, _MOST, _PASSES, _NOISE, _PIXELS = 1 << 22, 1024, 4, 0.02, 1 << 20
 
 # First seed of the noise: others than those that pictures of Mitsuba's usually have.
 _SEED = 0x5EED0000
@@ -48,9 +55,7 @@ class Reference:
     def __init__(self, data: SceneData, sizes: Sequence[tuple[int, int]]) -> None:
         self._data, self._sizes, self.rendered = data, tuple(sizes), list[Image]()
         self.passes = list[Image]()
-        own = data.scene.integrator()
-        named = own is not None and own.class_name() in _INTEGRATORS
-        self._integrator = own if named else mi.load_dict({"type": "direct"})
+        self._integrator = reference_integrator(data)
 
     def images(
         self, changes: Changes, cameras: Sequence[Sensor], sizes: Sequence[ImageSize], most_passes: int | None = None
@@ -88,6 +93,27 @@ class Reference:
             )
             passes.append(np.array(rendered, np.float32).reshape(height, width, -1))
         return passes
+
+
+def reference_integrator(data: SceneData) -> mi.Integrator:
+    """The integrator of a scene's images: its own, ``direct``, or ``volpath`` for scenes with translucent surfaces."""
+    own = data.scene.integrator()
+    name = own.class_name() if own is not None else ""
+    if name == "SamplingIntegrator":  # of those that are written in Python
+        name = type(own).__name__
+    translucent = any(info.see_through for info in data.geometry.shapes)
+    if not translucent or name in _PASSING:
+        return own if name in _INTEGRATORS else mi.load_dict({"type": "direct"})
+    hidden = name in _INTEGRATORS and own.hide_emitters
+    depth = _max_depth(own) if name in _BOUNCING else _DIRECT
+    return mi.load_dict({"type": "volpath", "max_depth": depth, "hide_emitters": bool(hidden)})
+
+
+def _max_depth(integrator: mi.Integrator) -> int:
+    """The largest number of a path's segments, -1 for no limit."""
+    found = re.search(r"max_depth = (-?\d+)", str(integrator))
+    depth = int(found[1]) if found else -1
+    return depth if depth < 1 << 31 else -1
 
 
 def reduced(image: Image, size: ImageSize) -> Image:

@@ -18,7 +18,7 @@ from .arrays import ArrayParameter, MeshVertices, TextureValues, mesh_vertices, 
 from .motion_parameters import CameraMotion, LightMotion, ShapeMotion
 from .motions import host_matrix, tangents
 from .own import Own
-from .parameters import FieldOfView, Parameter, Value
+from .parameters import FieldOfView, Parameter, Value, is_roughness, is_share
 from .vary import Vary
 
 Array = npt.NDArray[np.float64]
@@ -30,12 +30,6 @@ _FIELDS = {
     "cutoff_angle": "cutoff_angle",
     "beam_width": "beam_width",
 }
-# Values between zero and one, by words of their names; other values that are positive stay positive.
-_SHARES = (
-    *("reflectance", "base_color", "albedo", "metallic", "specular_tint", "clearcoat", "sheen", "spec_tint", "flatness"),
-    *("opacity", "weight", "spec_trans", "transmittance", "specular"),
-)
-_ROUGHNESS = ("alpha", "roughness")
 # Half range of starts of a translation: as a share of the scene's diameter; least and most as shares of the shape's.
 _ROOM, _LEAST_MOST = 0.08, (0.15, 0.5)
 # Most numbers of one value that are fitted by their full matrix of derivatives.
@@ -214,13 +208,12 @@ class Resolver:
             raise ShadowmapError(f"{vary.named}: {key} has {len(array)} values; give the kind texture.")
         owner, _, end = key.partition(".")
         light = owner if owner in self.lights and end in _FIELDS else ""
-        last = next((part for part in reversed(key.split(".")) if part not in ("value", "data")), key)
         natural = (0.0, np.inf)
         if end in ("cutoff_angle", "beam_width"):
             natural = (0.1, 179.0)
-        elif any(word in last for word in _ROUGHNESS):
+        elif is_roughness(key):
             natural = (1e-3, 1.0)
-        elif any(word in last for word in _SHARES):
+        elif is_share(key):
             natural = (0.0, 1.0)
         elif not (array > 0).all():
             natural = (-np.inf, np.inf)

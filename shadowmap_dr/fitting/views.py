@@ -90,7 +90,7 @@ class View:
         self._passes = [freeze(self._recorded(k)) for k in range(len(parameters))]
         self._jacobians = [freeze(self._recorded_jacobian(k)) for k in range(len(parameters))]
         keys = [array.key for array in arrays if isinstance(array, TextureValues)]
-        recordable = all(is_recordable(renderer.data.scene, key) for key in keys)
+        recordable = all(is_recordable(renderer.data.scene, key, gradients=True) for key in keys)
         self._image = freeze(self._recorded(-1))
         gradients = self._recorded_gradient(_of_huber), self._recorded_gradient(_given)
         self._gradient, self._pulled = (freeze(one) if recordable else one for one in gradients)

@@ -13,6 +13,7 @@ from .runs.sweep import run_sweep
 from .shadow_art.collection import Collection
 from .shadow_art.remeshing import RemeshingSculptor
 from .shadow_art.sculpt import Sculptor
+from .shadow_art.stained import StainedSheet
 from .shadow_art.start_meshes import even_sphere
 
 __all__ = [
@@ -31,6 +32,7 @@ __all__ = [
     "Sculptor",
     "ShadowView",
     "Stage",
+    "StainedSheet",
     "StillScene",
     "apply_pose",
     "blend",

@@ -61,6 +61,10 @@ class ArtOptions:
     targets: tuple[str, ...] = option(
         names=("--target",), metavar="NAME|IMAGE", help="Image (PNG, JPEG, SVG, ...) of a shadow; twice for two views."
     )
+    stained: str | None = option(
+        None, metavar="NAME|IMAGE", help="Picture that the sun throws in colours through a sheet of tinted panes."
+    )
+    panes: int = option(128, allowed=(1, 512), help="Panes along each side of the picture of --stained.")
     mesh: str | None = option(None, metavar="NAME|FILE", shown="a sphere of 12,800 triangles", help="Mesh to deform.")
     collection: str | None = option(None, metavar="NAME|FILE", help="Mesh whose moved, turned and scaled copies cast the shadow.")
     most: int = option(
@@ -68,7 +72,9 @@ class ArtOptions:
     )
     receiver: str = option("plane", choices=RECEIVERS, help="Receiver of the shadow.")
     camera: str = option("orthographic", choices=CAMERAS, help="Frontal view, or perspective from the side.")
-    iterations: int | None = option(None, shown="400; 1100 for a collection", allowed=STEPS, help="Steps of the optimiser.")
+    iterations: int | None = option(
+        None, shown="400; 1100 for a collection; 200 for panes", allowed=STEPS, help="Steps of the optimiser."
+    )
     smoothness: float = option(20.0, allowed=(0.0, 1e6), help="Stiffness of the mesh; finer meshes need more.")
     remesh: int | None = option(None, metavar="STEPS", allowed=STEPS, help="Remesh the surface every so many steps.")
     fill_holes: bool = option(False, help="Fill enclosed holes of the targets.")
@@ -95,7 +101,9 @@ class ArtOptions:
     def __post_init__(self) -> None:
         check_ranges(self)
         check_threads(self.threads)
-        if not 1 <= len(self.targets) <= len(DIRECTIONS):
+        if self.stained is not None:
+            self._check_stained()
+        elif not 1 <= len(self.targets) <= len(DIRECTIONS):
             raise ShadowmapError(f"{len(self.targets)} targets: give one, or two for two views.")
         if self.receiver not in RECEIVERS:
             raise ShadowmapError(
@@ -109,11 +117,22 @@ class ArtOptions:
             raise ShadowmapError("a mesh to deform and a collection: choose one of the two.")
         if self.remesh is not None and self.collection is not None:
             raise ShadowmapError("the copies of a collection are not deformed, and cannot be remeshed: leave one of the two out.")
-        default = 400 if self.collection is None else 1100
+        default = 200 if self.stained is not None else 400 if self.collection is None else 1100
         steps = default if self.iterations is None else self.iterations
         object.__setattr__(self, "iterations", steps)
         if self.animate is not None and self.animate not in animations.SUFFIXES:
             raise ShadowmapError(f"no animation {self.animate!r}: choose from {', '.join(animations.SUFFIXES)}.")
+
+    def _check_stained(self) -> None:
+        """ShadowmapError for settings of objects that are deformed, beside a sheet of panes."""
+        of_objects = {
+            "--target": self.targets, "--mesh": self.mesh, "--collection": self.collection, "--remesh": self.remesh,
+            "--fill-holes": self.fill_holes, "--printable": self.printable,
+            "--receiver": self.receiver != "plane", "--camera": self.camera != "orthographic",
+        }  # fmt: skip
+        given = [name for name, value in of_objects.items() if value]
+        if given:
+            raise ShadowmapError(f"a sheet of panes has no {given[0]}: leave it out, or --stained.")
 
 
 def read_target(target: str) -> Array:

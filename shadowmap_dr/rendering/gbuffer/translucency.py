@@ -42,7 +42,7 @@ class LayerCounts:
 
 @dataclass(frozen=True)
 class Translucency:
-    """What is not opaque in a scene. Static.
+    """Faces of a scene that let light through, and the numbers of layers. Static.
 
     Attributes:
         opaque: ``Bool`` (F,), the opaque faces of the scene.

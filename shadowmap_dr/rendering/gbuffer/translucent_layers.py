@@ -23,18 +23,15 @@ class Layers:
         translucent: K rasters of the whole mesh, front to back, with nothing where rays meet fewer of them.
         textured: True if transmittance needs tangents and texture coordinates.
         bsdfs: BSDFs of the translucent surfaces.
-        levels: K + 1 rasters for anti-aliasing: the first, second, ... surface of each ray, of which the opaque one is the last.
+        opaque: K + 1 rasters of the opaque surfaces that are seen behind no, one, ... translucent surfaces.
+        nearest: raster of the nearest surfaces of all.
     """
 
     translucent: tuple[RasterOutput, ...]
-    levels: tuple[RasterOutput, ...]
+    opaque: tuple[RasterOutput, ...]
+    nearest: RasterOutput
     bsdfs: tuple[mi.BSDF, ...]
     textured: bool
-
-    @property
-    def nearest(self) -> RasterOutput:
-        """The nearest surfaces of all."""
-        return self.levels[0]
 
 
 def see_layers(
@@ -69,9 +66,8 @@ def see_layers(
     def raster(triangle: UInt32) -> RasterOutput:
         return with_triangles(opaque, triangle, clip, geometry.faces)
 
-    levels = [
-        dr.select(used == k, opaque.triangle, triangles[k] if k < len(triangles) else mi.UInt32(NO_TRIANGLE))
-        for k in range(len(triangles) + 1)
-    ]
-    dr.eval(triangles, levels)
-    return Layers(tuple(map(raster, triangles)), tuple(map(raster, levels)), faces.bsdfs, faces.cutouts)
+    behind = [dr.select(used == k, opaque.triangle, NO_TRIANGLE) for k in range(len(triangles) + 1)]
+    nearest = dr.select(used == 0, opaque.triangle, triangles[0])
+    dr.eval(triangles, behind, nearest)
+    layers, rest = (tuple(map(raster, each)) for each in (triangles, behind))
+    return Layers(layers, rest, raster(nearest), faces.bsdfs, faces.cutouts)

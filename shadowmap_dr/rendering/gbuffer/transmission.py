@@ -59,7 +59,8 @@ def loss_counts(data: SceneData, geometry: Geometry, camera: Sensor, faces: Face
         return None
 
     passed = mean_transmittance(data, geometry, camera, faces)
-    return lambda raster: passed(raster) < 1 - LEAST_LOSS
+    # Not "<": broken opacities (NaN) must not look like clear ones.
+    return lambda raster: ~(passed(raster) >= 1 - LEAST_LOSS)
 
 
 def mean_transmittance(data: SceneData, geometry: Geometry, camera: Sensor, faces: Faces) -> Callable[[RasterOutput], Float]:

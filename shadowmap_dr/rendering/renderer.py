@@ -212,7 +212,8 @@ class Renderer:
                 made.plan, made.slices = plan, plan_slices(data, plan, self.soft, self.settings)
                 made.frusta, made.soft_frusta = made.light_pass.fit(shapes, seen)
             if made.translucency is not None:
-                pictures = [(view.clip, view.raster) for view in views]
+                others = [cameras.view(camera, shapes, 1) for each in data.sensors[1:] for camera in sample_windows(each)]
+                pictures = [(view.clip, view.raster) for view in (*views, *others)]
                 maps = made.light_pass.for_image(pixels).map_vertices(shapes.geometry, (made.frusta, made.soft_frusta))
                 camera = data.sensors[0][0]
                 made.translucency = made.translucency.counted(data, shapes.geometry, camera, pictures, maps)

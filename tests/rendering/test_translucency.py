@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from translucent_scenes import glass, leaf, lights, pane, panes, relative_error, scene_of, stacks, sun, traced, veil
+from translucent_scenes import camera, glass, leaf, lights, pane, panes, relative_error, scene_of, stacks, sun, traced, veil
 
 from mitsuba_baselines.derivatives import agreement
 from shadowmap_dr import Renderer
@@ -127,6 +127,14 @@ def test_no_more_layers_than_asked_for(variant: str) -> None:
             Renderer.from_scene(scene, transmittance_groups=wrong)
     with pytest.raises(ShadowmapError, match="transmittance method 'pcf' is unknown"):
         Renderer.from_scene(scene, transmittance_method="pcf")
+
+
+def test_layers_are_those_of_all_cameras(variant: str) -> None:
+    """The first one looks past the panes."""
+    scenes = scene_of(24, **stacks()["five"]), scene_of(24, camera=camera(24, 5.0), other=camera(24), **stacks()["five"])
+    one, two = (Renderer.from_scene(scene).translucency for scene in scenes)
+    assert one is not None and two is not None
+    assert two.camera == one.camera
 
 
 def test_opaque_scenes_have_no_layers(variant: str) -> None:

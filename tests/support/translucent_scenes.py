@@ -52,16 +52,21 @@ def lights() -> dict[str, Spec]:
     }
 
 
+def camera(size: int = 64, x: float = 0.0) -> Spec:
+    """Looks at the ball, or past it at a place further right."""
+    film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+    to_world = mi.ScalarTransform4f().look_at([x, -3.5, 3], [x, 0, 0.3], [0, 0, 1])
+    return {"type": "perspective", "fov": 40, "to_world": to_world, "film": film}
+
+
 def scene_of(size: int = 64, light: Spec | None = None, **parts: Spec | None) -> mi.Scene:
     """A floor, a ball on it unless that is None, and other parts."""
     T = mi.ScalarTransform4f
-    film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
-    to_world = T().look_at([0, -3.5, 3], [0, 0, 0.3], [0, 0, 1])
     ball = {"type": "sphere", "center": [0.1, -0.2, 0.35], "radius": 0.25, "bsdf": {"type": "diffuse", "reflectance": 0.5}}
     floor = {"type": "rectangle", "to_world": T().scale(2), "bsdf": {"type": "diffuse", "reflectance": 0.7}}
     full = {
         "type": "scene",
-        "camera": {"type": "perspective", "fov": 40, "to_world": to_world, "film": film},
+        "camera": camera(size),
         "light": light or sun(),
         "floor": floor,
         "ball": ball,

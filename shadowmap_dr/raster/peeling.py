@@ -66,7 +66,7 @@ def _peeled(
     found: list[UInt32] = []
     used = dr.zeros(module.UInt32, size[0] * size[2] * size[3])
     for number in range(passes):
-        keys, records = nearest_fragments(positions, faces, *size, behind=keys)
+        keys, records = nearest_fragments(positions, faces, *size, behind=keys, peel=True)
         dr.eval(keys)
         triangle = triangle_of(keys)
         if counts is None:
@@ -106,7 +106,7 @@ def deepest(
         keys: UInt64 | None = None
         used, left = (kind(start) for kind, start in ((module.UInt32, 0), (module.Float, 1)))
         for number in range(most):
-            keys, records = nearest_fragments(flat, indices, *size, behind=keys)
+            keys, records = nearest_fragments(flat, indices, *size, behind=keys, peel=True)
             seen = located(flat, indices, triangle_of(keys), records, *size)
             through = dr.select(seen.valid, dr.detach(passed(seen)), 1)
             reached = seen.valid & (left > LEAST_LIGHT)

@@ -246,14 +246,14 @@ def _visible_triangles(
     """Triangle index of each pixel, row-major, and the records of all triangles."""
     mesh = (positions, faces, batch, vertex_count, height, width)
     if transparent is None:
-        return _nearest_fragments(*mesh, one_sided=one_sided, drawn=drawn)
-    keys, records = nearest_fragments(*mesh, one_sided=one_sided, drawn=drawn)
+        return nearest_fragments(*mesh, one_sided=one_sided, drawn=drawn)
+    keys, records = nearest_fragments(*mesh, peel=True, one_sided=one_sided, drawn=drawn)
     for _ in range(layers - 1):
         seen = located(positions, faces, triangle_of(keys), records, batch, vertex_count, height, width)
         through = seen.valid & dr.detach(transparent(seen))
         behind = dr.select(through, keys, type(keys)(EMPTY))
         dr.eval(behind)
-        farther, records = nearest_fragments(*mesh, behind=behind, one_sided=one_sided, drawn=drawn)
+        farther, records = nearest_fragments(*mesh, behind=behind, peel=True, one_sided=one_sided, drawn=drawn)
         keys = dr.select(through, farther, keys)
         dr.eval(keys)
     return triangle_of(keys), records
@@ -271,30 +271,6 @@ def nearest_fragments(
     vertex_count: int,
     height: int,
     width: int,
-    *,
-    behind: UInt64 | None = None,
-    one_sided: Bool | None = None,
-    drawn: Bool | None = None,
-) -> tuple[UInt64, Records]:
-    """Keys of the nearest fragments, row-major, ``EMPTY`` where there is none, and the records of all triangles.
-
-    Keys grow with depth, and with the triangle's index at the same depth. The mesh is flat and known to be valid.
-
-    Args:
-        behind: keys: pixels see only fragments with larger keys, that is, farther ones.
-        one_sided, drawn: see :func:`visible_triangles`.
-    """
-    mesh = (positions, faces, batch, vertex_count, height, width)
-    return _nearest_fragments(*mesh, behind, True, one_sided, drawn)
-
-
-def _nearest_fragments(
-    positions: Float,
-    faces: UInt32,
-    batch: int,
-    vertex_count: int,
-    height: int,
-    width: int,
     behind: UInt64 | None = None,
     peel: bool = False,
     one_sided: Bool | None = None,
@@ -304,7 +280,8 @@ def _nearest_fragments(
 
     Args:
         behind: keys: pixels see only fragments with larger keys, that is, farther ones.
-        peel: return fragment keys (``UInt64``) instead of triangles (``UInt32``), and keep triangles that large ones hide.
+        peel: return fragment keys (``UInt64``, ``EMPTY`` where there is none) instead of triangles (``UInt32``), and keep
+            triangles that large ones hide. Keys grow with depth, and with the triangle's index at the same depth.
         one_sided, drawn: see :func:`visible_triangles`.
     """
     module = backend(positions)

@@ -14,7 +14,7 @@ from ..jit.broadcast import copy_of_lane
 from ..jit.kernel_inputs import float_input, int_input, uint_input
 from ..jit.types import AnyArray, Bool, Float, Point3f, UInt32
 from .filters import filter_kernel, separable_terms
-from .light_camera import of_map, project, to_light_space
+from .light_camera import Views, of_map, project, to_light_space
 from .methods.comparison import soft_comparison, standard_visibility
 from .methods.registry import PREFILTERED
 from .methods.variance import MINIMUM_VARIANCE_COMPAT, chebyshev_visibility, reduced_bleeding
@@ -42,6 +42,17 @@ def visibility(maps: ShadowMaps, map_index: UInt32 | int, p_world: Point3f, acti
     Returns:
         ``Float`` in 0..1; 1 outside the map (0 with ``compat``). Gradients flow to the points, the casters and the light.
     """
+    view, index, u, v, depth, inside = _place_in_map(maps, map_index, p_world)
+    if maps.settings.compat:
+        p = to_light_space(view, p_world)
+        return dr.select(active, _look_up_compat(maps, index, u, v, dr.norm(p), inside & active), 1)
+    inside &= backend(maps.values).Bool(active)
+    look_up = {"standard": _compare, "pcf": _compare_all}.get(maps.settings.method, _resolve)
+    return _where(inside, look_up, maps, index, u, v, depth)
+
+
+def _place_in_map(maps: ShadowMaps, map_index: UInt32 | int, p_world: Point3f) -> tuple[Views, UInt32, Float, Float, Float, Bool]:
+    """(camera, index among all copies of the maps, u, v, linear depth, whether it is in the map) of points. Attached."""
     module = backend(maps.values)
     index: UInt32 = module.UInt32(map_index)
     frustum = of_map(maps.frusta, index, maps.count)
@@ -49,13 +60,7 @@ def visibility(maps: ShadowMaps, map_index: UInt32 | int, p_world: Point3f, acti
         index = index + copy_of_lane(module, dr.width(p_world), maps.copies) * maps.count
     view = of_map(maps.views, index, maps.views.count)
     u, v, depth, inside = project(view, frustum, p_world)
-    if maps.settings.compat:
-        p = to_light_space(view, p_world)
-        return dr.select(active, _look_up_compat(maps, index, u, v, dr.norm(p), inside & active), 1)
-    inside &= module.Bool(active)
-    depth = dr.select(depth > FAR, FAR, depth)
-    look_up = {"standard": _compare, "pcf": _compare_all}.get(maps.settings.method, _resolve)
-    return _where(inside, look_up, maps, index, u, v, depth)
+    return view, index, u, v, dr.select(depth > FAR, FAR, depth), inside
 
 
 def tiled_visibility(maps: ShadowMaps, group: Group, p_world: Point3f, active: Bool | bool = True) -> Float:
@@ -96,19 +101,13 @@ def transmittance(maps: ShadowMaps, map_index: UInt32 | int, p_world: Point3f, a
     Returns:
         ``Float`` in 0..1 for each colour; 1 outside the map. Gradients flow to the points, the casters and the light.
     """
-    module, veils = backend(maps.values), maps.transmittance
-    assert veils is not None, "looked up only where there are translucent casters"
-    index: UInt32 = module.UInt32(map_index)
-    frustum = of_map(maps.frusta, index, maps.count)
-    if maps.copies > 1:
-        index = index + copy_of_lane(module, dr.width(p_world), maps.copies) * maps.count
-    view = of_map(maps.views, index, maps.views.count)
-    u, v, depth, inside = project(view, frustum, p_world)
-    depth = dr.select(depth > FAR, FAR, depth)
+    stored = maps.transmittance
+    assert stored is not None, "looked up only where there are translucent casters"
+    _, index, u, v, depth, inside = _place_in_map(maps, map_index, p_world)
     found = branch(
-        inside & module.Bool(active),
-        lambda *lanes: _light_left(maps, veils, *lanes),
-        lambda *lanes: tuple(type(lanes[1])(1) for _ in range(veils.colours)),
+        inside & backend(maps.values).Bool(active),
+        lambda *lanes: _light_left(maps, stored, *lanes),
+        lambda *lanes: tuple(type(lanes[1])(1) for _ in range(stored.colours)),
         (index, u, v, depth),
         "transmittance",
     )
@@ -124,18 +123,18 @@ def tiled_transmittance(maps: ShadowMaps, group: Group, p_world: Point3f, active
 
 
 def _light_left(
-    maps: ShadowMaps, veils: TransmittanceMaps, map_index: UInt32, u: Float, v: Float, depth: Float
+    maps: ShadowMaps, stored: TransmittanceMaps, map_index: UInt32, u: Float, v: Float, depth: Float
 ) -> tuple[Float, ...]:
     """Light of each colour that is left at a depth."""
     method, module = depth_encoding(maps.settings), backend(depth)
-    left = [module.Float(1)] * veils.colours
+    left = [module.Float(1)] * stored.colours
     used = len(method.encode(depth, 0.0, maps.settings.order))
-    for group in veils.groups:
-        values = bilinear(maps, map_index, u, v, True, values=(group, veils.channels, veils.colours + 1 + used))
-        weight = values[veils.colours]
+    for group in stored.groups:
+        values = bilinear(maps, map_index, u, v, True, values=(group, stored.channels, stored.colours + 1 + used))
+        weight = values[stored.colours]
         any_lost = weight > _NOTHING
         inverse = dr.rcp(dr.select(any_lost, weight, 1))
-        moments = [value * inverse for value in values[veils.colours + 1 :]]
+        moments = [value * inverse for value in values[stored.colours + 1 :]]
         lit = method.resolve(moments, depth)
         if method.bleeds:
             lit = reduced_bleeding(lit, maps.settings.bleeding)

@@ -52,12 +52,12 @@ class ShadowMaps:
 
     def for_points(self, count: int) -> ShadowMaps:
         """The same maps, copied for look-ups by ``count`` points at once, so that gradients are summed exactly. Attached."""
-        veils = () if self.transmittance is None else self.transmittance.groups
-        (values, *columns), copies = in_copies([self.values, *veils, *self.views.columns()], count)
+        stored = () if self.transmittance is None else self.transmittance.groups
+        (values, *columns), copies = in_copies([self.values, *stored, *self.views.columns()], count)
         if copies == 1:
             return self
-        transmittance = self.transmittance and replace(self.transmittance, groups=tuple(columns[: len(veils)]))
-        views = Views.of(columns[len(veils) :])
+        transmittance = self.transmittance and replace(self.transmittance, groups=tuple(columns[: len(stored)]))
+        views = Views.of(columns[len(stored) :])
         return replace(self, values=values, views=views, transmittance=transmittance, copies=copies)
 
 
@@ -99,12 +99,12 @@ def render_maps(
         values = interleave(texels)
     if settings.supersampling > 1:
         values = block_means(values, size, channels, settings.supersampling)
-    veils = None
+    transmittance = None
     if translucent is not None:
-        veils = render_transmittance(translucent, clip, views, frusta, settings)
+        transmittance = render_transmittance(translucent, clip, views, frusta, settings)
         if settings.supersampling > 1:
-            veils = veils.each(lambda group, channels: block_means(group, size, channels, settings.supersampling))
-    return ShadowMaps(values, views, frusta, settings, channels, veils)
+            transmittance = transmittance.each(lambda group, channels: block_means(group, size, channels, settings.supersampling))
+    return ShadowMaps(values, views, frusta, settings, channels, transmittance)
 
 
 def vertices_of_maps(views: Views, frusta: Frusta, p_light: Point3f, map_index: UInt32) -> Float:
@@ -184,12 +184,12 @@ def _radial_depth(view: Views, frustum: Frusta, raster: RasterOutput, row: UInt3
 
 def filter_maps(maps: ShadowMaps) -> ShadowMaps:
     """Step 2: pre-filter. Depths that are compared in the look-up stay as they are. Attached."""
-    s, veils = maps.settings, maps.transmittance
+    s = maps.settings
     kernel = filter_kernel(s.filter, s.filter_size, s.compat)
 
     def filtered(values: Float, channels: int) -> Float:
         return filter_map(values, kernel, maps.views.count, s.resolution, s.resolution, channels)
 
-    if veils is not None:
-        maps = replace(maps, transmittance=veils.each(filtered))
+    if maps.transmittance is not None:
+        maps = replace(maps, transmittance=maps.transmittance.each(filtered))
     return replace(maps, values=filtered(maps.values, maps.channels)) if s.filterable else maps

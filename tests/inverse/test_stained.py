@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
@@ -71,6 +73,6 @@ def test_states_go_on_where_they_were(variant: str) -> None:
         (np.ones((4, 4, 3)), {"step_size": -1}, "step size"),
     ],
 )
-def test_unusable_input_is_named(variant: str, pixels: npt.ArrayLike, settings: dict[str, float], words: str) -> None:
+def test_unusable_input_is_named(variant: str, pixels: npt.ArrayLike, settings: dict[str, Any], words: str) -> None:
     with pytest.raises(ShadowmapError, match=words):
-        StainedSheet(pixels, **settings)  # type: ignore[arg-type]
+        StainedSheet(pixels, **settings)

@@ -19,10 +19,9 @@ _FLAT, _FEW = 1e-4, 64
 
 @dataclass(frozen=True)
 class Faces:
-    """Faces by kind, F in all, T of them translucent. Static.
+    """The translucent faces of a scene, T of them. Static.
 
     Attributes:
-        opaque: ``Bool`` (F,), faces that let no light through.
         index: ``UInt32`` (T,), number of each translucent face.
         corners: ``UInt32`` (3 T,), their vertices.
         topology: edges of the translucent faces alone. A surface's edges count only where it is seen itself.
@@ -31,7 +30,6 @@ class Faces:
         bsdfs: BSDFs of these faces.
     """
 
-    opaque: Bool
     index: UInt32
     corners: UInt32
     topology: Topology
@@ -41,7 +39,7 @@ class Faces:
 
 
 def faces_of(data: SceneData, positions: np.ndarray) -> tuple[Bool | None, Faces | None]:
-    """(mask (F,) of the opaque faces, None if all are; faces by kind, None if none are translucent), on the host, once.
+    """(mask (F,) of the opaque faces, None if all are; the translucent faces, None without any), on the host, once.
 
     ``positions``: (V, 3) vertices of the scene's geometry.
     """
@@ -61,7 +59,7 @@ def faces_of(data: SceneData, positions: np.ndarray) -> tuple[Bool | None, Faces
     bsdfs = tuple(dict.fromkeys(source.shape.bsdf() for source, info in pairs if info.see_through and not info.unseen))
     cutouts = not all(passes_evenly(bsdf) for bsdf in bsdfs)
     numbers, vertices = device_array(mi.UInt32, index), device_array(mi.UInt32, corners.ravel())
-    return opaque, Faces(opaque, numbers, vertices, topology, cutouts, _room(topology, corners, positions), bsdfs)
+    return opaque, Faces(numbers, vertices, topology, cutouts, _room(topology, corners, positions), bsdfs)
 
 
 def _room(topology: Topology, corners: np.ndarray, positions: np.ndarray) -> int | None:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 
-from ...jit.types import Bool, Color3f, Float, UInt32
+from ...jit.types import Bool, Color3f, Float, Point3f, UInt32, Vector3f
 from ...raster import LEAST_LOSS, NO_TRIANGLE, RasterOutput
 from ...scene.geometry import Geometry
 from ...scene.load import SceneData
@@ -67,12 +67,7 @@ def mean_transmittance(data: SceneData, geometry: Geometry, camera: Sensor, face
     """Mean over colours of the share of the light that surfaces let through to a camera, for rasters of translucent faces."""
 
     def passed(raster: RasterOutput) -> Float:
-        hits = hits_at(geometry, whole_triangles(raster, faces), raster.u, raster.v)
-        towards = camera.wi_world(hits.p_world)
-        seen = surface_at(
-            data, geometry, camera, replace(hits, wi_world=towards), *normals_at(geometry, hits), frames=faces.cutouts
-        )
-        return dr.mean(transmittance_of(seen, faces.bsdfs))
+        return dr.mean(_transmittance(data, geometry, camera, faces, raster, camera.wi_world))
 
     return passed
 
@@ -87,12 +82,27 @@ def towards_lights(
     """
 
     def through(raster: RasterOutput, view: Views) -> list[Float]:
-        hits = hits_at(geometry, whole_triangles(raster, faces), raster.u, raster.v)
-        towards = dr.select(view.spread > 0, mi.Vector3f(view.origin) - mi.Vector3f(hits.p_world), -mi.Vector3f(view.forward))
-        length = dr.norm(towards)
-        hits = replace(hits, wi_world=towards / dr.select(length > 0, length, 1))
-        seen = surface_at(data, geometry, camera, hits, *normals_at(geometry, hits), frames=faces.cutouts)
-        passed = transmittance_of(seen, faces.bsdfs)
+        def towards(p_world: Point3f) -> Vector3f:
+            way = dr.select(view.spread > 0, mi.Vector3f(view.origin) - mi.Vector3f(p_world), -mi.Vector3f(view.forward))
+            length = dr.norm(way)
+            return way / dr.select(length > 0, length, 1)
+
+        passed = _transmittance(data, geometry, camera, faces, raster, towards)
         return [passed[k] for k in range(dr.size_v(mi.UnpolarizedSpectrum))]
 
     return through
+
+
+def _transmittance(
+    data: SceneData,
+    geometry: Geometry,
+    camera: Sensor,
+    faces: Faces,
+    raster: RasterOutput,
+    towards: Callable[[Point3f], Vector3f],
+) -> Color3f:
+    """Transmittance (colour, N) of the surfaces in a raster of the translucent faces. ``towards``: directions from points."""
+    hits = hits_at(geometry, whole_triangles(raster, faces), raster.u, raster.v)
+    hits = replace(hits, wi_world=towards(hits.p_world))
+    seen = surface_at(data, geometry, camera, hits, *normals_at(geometry, hits), frames=faces.cutouts)
+    return transmittance_of(seen, faces.bsdfs)

@@ -6,7 +6,6 @@ the headers) is below 0.06 % of the image's mean for every scene and is not take
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 
 import mitsuba as mi
@@ -23,6 +22,8 @@ SPP = 64
 SIDE = 8
 """Samples along each side of a pixel."""
 RESOLUTIONS = (256, 512, 1024, 2048)
+# Of translucent leaves: 2048 texels took 12 GB, and 40 seconds to get them. The error has to fall as far with 1024.
+FEWER_RESOLUTIONS = {"meadow": RESOLUTIONS[:-1]}
 DEPTH_GAP = 2e-3
 """A jump in depth by this fraction of the distance, beyond what the surface's slope explains, is a silhouette: a third to half a
 pixel's width in these scenes."""
@@ -40,9 +41,7 @@ def stored(name: str, kind: str) -> np.ndarray:
 def shadow_error(variant: str, name: str, resolution: int) -> float:
     """Mean absolute error of the whole image, relative to its mean."""
     del variant  # part of the key only
-    made = Renderer.from_scene(load(name))
-    shadow = replace(made.settings.shadow, resolution=resolution)
-    made = replace(made, settings=replace(made.settings, shadow=shadow), frusta=None)  # spares a first fit at this resolution
+    made = Renderer.from_scene(load(name), shadow_map_resolution=resolution)  # one map for each light, without tiles
     image, target = np.array(made.render(spp=SPP)), stored(name, "direct")
     return float(np.abs(image - target).mean() / target.mean())
 
@@ -82,7 +81,7 @@ def test_shadows_of_1024_texels(variant: str, name: str) -> None:
 
 @pytest.mark.parametrize("name", cases.SCENES)
 def test_error_falls_with_resolution(variant: str, name: str) -> None:
-    errors = [shadow_error(variant, name, resolution) for resolution in RESOLUTIONS]
+    errors = [shadow_error(variant, name, resolution) for resolution in FEWER_RESOLUTIONS.get(name, RESOLUTIONS)]
     listed = ", ".join(f"{error:.3%}" for error in errors)
     assert all(fine <= 1.02 * coarse for coarse, fine in zip(errors, errors[1:], strict=False)), listed
     assert errors[-1] <= 0.7 * errors[0], listed

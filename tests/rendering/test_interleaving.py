@@ -61,7 +61,7 @@ def painted() -> dict[str, Any]:
 
 def image_and_derivatives(parts: dict[str, Any], points: int, move: str) -> tuple[np.ndarray, np.ndarray, float]:
     """(image, derivative image by a number, derivative of a weighted sum by the same number in reverse mode)."""
-    scene = small_scene(camera=camera(64), **parts)
+    scene = small_scene(camera=camera(32), **parts)
     params, integrator = mi.traverse(scene), shadowmap(area_light_samples=points, shadow_map_resolution=64)
     rest = type(params[move])(params[move])
     found = []

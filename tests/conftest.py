@@ -125,6 +125,19 @@ def memory_is_given_back() -> Iterator[None]:
     dr.flush_malloc_cache()
 
 
+@pytest.fixture(scope="session", autouse=True)
+def few_samples_in_fits() -> Iterator[None]:
+    """Mitsuba's images in fits have a quarter of the usual samples, each image of them 2^20: fits took half their time for them.
+
+    Their random numbers are the same each time, and their noise is far below what tests of fits allow.
+    """
+    from shadowmap_dr.fitting import reference
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(reference, "_PASS", reference._PASS // 4)
+        yield
+
+
 @pytest.fixture(autouse=True)
 def no_garbage_while_frozen(request: pytest.FixtureRequest) -> Iterator[None]:
     """Scenes of earlier tests, collected between two calls of a frozen function, would change the registry that it checks."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import gc
 import os
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,8 @@ def pytest_configure(config: pytest.Config) -> None:
     # Parallel workers share the cores instead of each claiming all of them. Never one thread alone: with it, Mitsuba 3.9 waits
     # forever when it reads or writes an EXR file.
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    if hasattr(config.option, "loadscopereorder"):  # files with many tests first
+        config.option.loadscopereorder = False
     before = _threads()
     dr.set_thread_count(max(2, (os.cpu_count() or 1) // workers))
     if workers > 1:
@@ -63,13 +66,20 @@ def pytest_runtest_makereport() -> Iterator[None]:
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     slow = slow_tests()
+    seconds: Counter[Path] = Counter()
     for item in items:
-        if f"{item.path.relative_to(TESTS).as_posix()}::{getattr(item, 'originalname', item.name)}" in slow:
+        name = f"{item.path.relative_to(TESTS).as_posix()}::{getattr(item, 'originalname', item.name)}"
+        if name in slow:
             item.add_marker(pytest.mark.slow)
         # Before fixtures, some of which collect garbage.
         reason = _missing(str(_values(item).get("variant", "")))
         if reason:
             item.add_marker(pytest.mark.skip(reason=reason))
+        else:
+            seconds[item.path] += slow.get(name, 0.01)
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        # Files that take long first: all workers end at the same time.
+        items.sort(key=lambda item: -seconds[item.path])
     # Tests of one scene of the gradient suite after one another: they share derivative images, the first of them takes new ones.
     places = [place for place, item in enumerate(items) if item.path.name == "test_gradients.py"]
     for place, item in zip(places, sorted((items[place] for place in places), key=_scene_of), strict=True):

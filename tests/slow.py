@@ -22,9 +22,10 @@ _SHARED = ("integrator/test_broken_scenes.py", "integrator/test_gradients.py")
 
 
 @functools.cache
-def slow_tests() -> frozenset[str]:
-    """Names ``folder/test_file.py::test_function`` of the slow tests, relative to this folder."""
-    return frozenset(line.split()[0] for line in LIST.read_text().splitlines() if not line.startswith("#"))
+def slow_tests() -> dict[str, float]:
+    """Seconds of a case of each slow test, by its name ``folder/test_file.py::test_function``, relative to this folder."""
+    lines = [line.split() for line in LIST.read_text().splitlines() if not line.startswith("#")]
+    return {name: float(seconds) for name, seconds in lines}
 
 
 def mean_seconds(report: Path) -> dict[str, float]:

@@ -5,7 +5,7 @@ from .antialiasing.creases import CoplanarCreases
 from .antialiasing.edge_crossings import DEPTH_GAP, Crossings, find_crossings
 from .closed_parts import drawing_order, outward_faces
 from .interpolate import interpolate
-from .peeling import LEAST_LOSS, deepest, peeled_layers
+from .peeling import LEAST_LOSS, deepest, peeled_layers, stacked
 from .rasterize import check_resolution, locate, rasterize, visible_triangles, with_triangles
 from .shape_seams import detach_moved_seams
 from .topology import NO_VERTEX, Topology, build_topology
@@ -33,6 +33,7 @@ __all__ = [
     "detach_moved_seams",
     "peeled_layers",
     "rasterize",
+    "stacked",
     "visible_triangles",
     "with_triangles",
 ]

@@ -5,11 +5,13 @@ Source: Everitt, "Interactive Order-Independent Transparency", 2001.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import cast
 
 import drjit as dr
 
 from ..jit.arrays import backend
+from ..jit.broadcast import Copies, copied
 from ..jit.handover import computed
 from ..jit.types import Bool, Float, UInt32, UInt64
 from .rasterize import check_mesh, check_resolution, located, nearest_fragments, triangle_of
@@ -55,6 +57,24 @@ def peeled_layers(
             "peeled layers", lambda: _peeled(dr.detach(flat), indices, size, layers, passes or layers, counts)
         )
     return [located(flat, indices, triangle, records, *size) for triangle in triangles]
+
+
+def stacked(layers: Sequence[RasterOutput], positions: Float, faces: UInt32, batch: int) -> tuple[RasterOutput, Float]:
+    """(Raster of all images of the first layer, then of the second one, ..., clip-space vertices of all these). Attached.
+
+    Args:
+        layers: K of the rasters of :func:`peeled_layers`.
+        positions, faces, batch: as given there.
+    """
+    first, count = layers[0], len(layers)
+    if count == 1:
+        return first, positions
+    (copies,) = dr.custom(Copies, [positions], count, False)
+    records = tuple(copied(record, count) for record in first.records)
+    triangle = dr.concat([layer.triangle for layer in layers])
+    dr.eval(copies, records, triangle)
+    size = batch * count, dr.width(positions) // (4 * batch), first.height, first.width
+    return located(copies, faces, triangle, cast("Records", records), *size), copies
 
 
 def _peeled(

@@ -49,9 +49,9 @@ from .gbuffer.surface import Surface
 from .light_colours import white_area_light, white_light
 from .light_loops import MANY_LIGHTS, many_lights
 from .light_slices import LightSlice, joined_fits, plan_slices, shining_objects
-from .light_tiles import sized
+from .light_tiles import sized, with_transmittance
 from .settings import RenderSettings
-from .shadow_pass import MapPlan, arriving_light, fit_maps, light_through, make_maps, map_vertices
+from .shadow_pass import MapPlan, arriving_light, fit_maps, light_through, make_maps, map_vertices, visibility_of
 
 # Directions over which the light of environments is summed.
 _AMBIENT_DIRECTIONS = 16
@@ -156,9 +156,11 @@ class LightPass:
     slices: tuple[LightSlice, ...] = ()
     shadow: ShadowSettings | None = None
 
-    def for_image(self, pixels: int) -> LightPass:
-        """The same pass with maps as large as images of so many pixels need (:func:`~.light_tiles.sized`)."""
+    def for_image(self, pixels: int, spp: int = 1) -> LightPass:
+        """The same pass with maps as large as images of so many pixels, with ``spp`` samples each, need."""
         shadow = sized(self.settings.shadow, self.plan, pixels)
+        if any(info.see_through for info in self.data.geometry.shapes):
+            shadow = with_transmittance(self.settings, shadow, pixels * spp)
         if shadow is self.settings.shadow:
             return self
         # Slices were planned for larger maps.
@@ -376,11 +378,15 @@ class LightPass:
         maps = lighting.maps
         if maps is None or not numbers:
             return [mi.Float(1) for _ in lights]
-        spots = self._spots(frame)
-        return [
-            spots.mean(partial(arriving_light, maps, self.plan, light, index))
-            for index, light in zip(numbers, lights, strict=True)
-        ]
+        spots, seen = self._spots(frame), frame.surface
+        # One look-up for each pixel where texels are large.
+        apart = maps.transmittance is not None and maps.settings.transmittance_texels > 0
+        look_up = visibility_of if apart else arriving_light
+        found: list[Float | Color3f] = []
+        for index, light in zip(numbers, lights, strict=True):
+            lit = spots.mean(partial(look_up, maps, self.plan, light, index))
+            found.append(lit * light_through(maps, self.plan, light, index, seen.p_world, seen.active) if apart else lit)
+        return found
 
     def _samples(self, areas: tuple[AreaLight, ...], geometry: Geometry) -> tuple[LightSamples, ...]:
         extended: tuple[SoftLight, ...] = (*areas, *self.data.environments)

@@ -300,7 +300,7 @@ class Renderer:
         factor = sample_grid(spp, windows)
         margin = Margin.of(cameras, factor) if self.settings.antialias else Margin()
         cache = cache or PassCache()
-        light = self.light_pass.for_image(_pixels(cameras))
+        light = self.light_pass.for_image(_pixels(cameras), factor**2)
         if light.slices:
             cache.keep(min(cache.level, CacheLevel.VIEW))  # maps of lights in slices are not kept
         images = ImagePass(self.camera_pass, light)

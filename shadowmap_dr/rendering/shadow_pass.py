@@ -382,10 +382,17 @@ def arriving_light(maps: ShadowMaps, plan: MapPlan, light: Light, index: int, p_
     """Share of the light of light number ``index`` that reaches world-space points: visibility, times the colour that translucent
     casters let through if there are any. Attached to points, casters and light.
     """
-    if plan.tiles[index] == 1:
-        return share_through(maps, _map_at(plan, light, index, p_world), p_world, active)
-    lit = tiled_visibility(maps, (plan.first[index], plan.tiles[index]), p_world, active)
+    lit = visibility_of(maps, plan, light, index, p_world, active)
     return lit if maps.transmittance is None else lit * light_through(maps, plan, light, index, p_world, active)
+
+
+def visibility_of(maps: ShadowMaps, plan: MapPlan, light: Light, index: int, p_world: Point3f, active: Bool) -> Float:
+    """Share of the light of light number ``index`` that no opaque caster keeps from world-space points. Attached to points,
+    casters and light.
+    """
+    if plan.tiles[index] == 1:
+        return visibility(maps, _map_at(plan, light, index, p_world), p_world, active)
+    return tiled_visibility(maps, (plan.first[index], plan.tiles[index]), p_world, active)
 
 
 def light_through(maps: ShadowMaps, plan: MapPlan, light: Light, index: int, p_world: Point3f, active: Bool) -> Color3f:

@@ -180,6 +180,12 @@ class Geometry:
         """Names of shapes."""
         return tuple(self.shapes[k].name for k in numbers)
 
+    def attached(self, info: ShapeInfo) -> bool:
+        """True if vertices of a shape may carry gradients (known on the host)."""
+        if dr.grad_enabled(self.texcoords):
+            return True
+        return dr.grad_enabled(self.positions, self.normals) and (self.changed is None or info.name in self.changed)
+
     def known_unchanged(self, info: ShapeInfo) -> bool:
         """True if a planar or faceted shape is known (on the host) to be as it was when the scene was loaded."""
         return self.moved is not None and info.name not in self.moved and info.name not in (self.changed or ())

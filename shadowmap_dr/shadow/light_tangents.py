@@ -137,7 +137,10 @@ def tangent_visibility(maps: TangentMaps, map_index: UInt32, p_world: Point3f, a
         # Beyond the centres of the outermost texels, look-ups are constant.
         end = float_input(module, "texels", 1 - 1 / settings.resolution)
         rates = [dr.select(dr.abs(u if k % 3 == 0 else v) > end, 0, m) if k % 3 < 2 else m for k, m in enumerate(moves)]
-        at, channels = Texels(maps.maps, index, dr.clip(u, -end, end), dr.clip(v, -end, end)), maps.maps.channels
+        at, channels = (
+            Texels(maps.maps.settings.resolution, index, dr.clip(u, -end, end), dr.clip(v, -end, end)),
+            maps.maps.channels,
+        )
         (values, by_u, by_v), (own, _, _) = (_filtered(at, *numbers, *maps.taps) for numbers in (
             (maps.maps.values, channels), (maps.tangents, 2 * channels)
         ))  # fmt: skip

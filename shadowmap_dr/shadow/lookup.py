@@ -128,9 +128,10 @@ def _light_left(
     """Light of each colour that is left at a depth."""
     method, module = depth_encoding(maps.settings), backend(depth)
     left = [module.Float(1)] * stored.colours
-    used = len(method.encode(depth, 0.0, maps.settings.order))
-    for group in stored.groups:
-        values = bilinear(maps, map_index, u, v, True, values=(group, stored.channels, stored.colours + 1 + used))
+    used = stored.colours + 1 + len(method.encode(depth, 0.0, maps.settings.order))
+    for group in range(stored.groups):
+        first = group * stored.channels
+        values = bilinear(maps, map_index, u, v, True, values=(stored.values, stored.groups * stored.channels, first, used))
         weight = values[stored.colours]
         any_lost = weight > _NOTHING
         inverse = dr.rcp(dr.select(any_lost, weight, 1))
@@ -175,7 +176,7 @@ def _compare_all(maps: ShadowMaps, map_index: UInt32, u: Float, v: Float, depth:
     """
     module = backend(maps.values)
     s = maps.settings
-    at = Texels(maps, map_index, u, v)
+    at = Texels(s.resolution, map_index, u, v)
     total = module.Float(0)
     for column, row in separable_terms(filter_kernel(s.filter, s.filter_size)):
         radius = len(row) // 2
@@ -208,9 +209,9 @@ def moved_weights(weights: list[float], fraction: Float) -> list[Float]:
 class Texels:
     """The texels around points (u, v in -1..1). Texel centres lie at + 1/2."""
 
-    def __init__(self, maps: ShadowMaps, map_index: UInt32, u: Float, v: Float, active: Bool | bool = True) -> None:
-        module = backend(maps.values)
-        size = maps.settings.resolution
+    def __init__(self, size: int, map_index: UInt32, u: Float, v: Float, active: Bool | bool = True) -> None:
+        """``size``: texels along each side."""
+        module = backend(u)
         self.size = int_input(module, "texels", size)
         half, middle = float_input(module, "texels", 0.5 * size), float_input(module, "texels", 0.5 * size - 0.5)
         x, y = (dr.select(active, dr.fma(place, half, middle), 0) for place in (u, v))
@@ -236,20 +237,22 @@ def bilinear(
     v: Float,
     active: Bool | bool,
     outside_reads_zero: bool = False,
-    values: tuple[Float, int, int] | None = None,
+    values: tuple[Float, int, int, int] | None = None,
 ) -> list[Float]:
     """Bilinear interpolation of the four texels around (u, v). Attached to the texels and to the coordinates.
 
-    ``values``: numbers that are read instead of the maps' own, how many of them a texel has, and how many of these are read.
+    ``values``: numbers that are read instead of the maps' own, how many of them a texel has, the first of these that is read, and
+    how many are.
     """
-    at = Texels(maps, map_index, u, v, active)
-    stored, channels, used = values or (maps.values, maps.channels, maps.channels)
+    size = (maps.settings if values is None else maps.settings.of_transmittance).resolution
+    at = Texels(size, map_index, u, v, active)
+    stored, channels, first, used = values or (maps.values, maps.channels, 0, maps.channels)
     # Few pixels read a texel: a copy of all texels for each thread and each look-up would cost more than atomic additions.
     mode = dr.ReduceMode.Auto if values is None else dr.ReduceMode.Direct
     rows = []
     for j in range(2):
         use = [active & at.inside(i, j) if outside_reads_zero else active for i in range(2)]
-        left, right = (stored_texel(stored, channels, at.index(i, j), use[i], used, mode) for i in range(2))
+        left, right = (stored_texel(stored, channels, at.index(i, j), use[i], (first, used), mode) for i in range(2))
         rows.append([dr.fma(b - a, at.fx, a) for a, b in zip(left, right, strict=True)])
     return [value for a, b in zip(*rows, strict=True) for value in entries(dr.fma(b - a, at.fy, a))]
 
@@ -259,19 +262,22 @@ def stored_texel(
     channels: int,
     texel: UInt32,
     active: Bool | bool,
-    used: int | None = None,
+    used: tuple[int, int] | None = None,
     mode: dr.ReduceMode = dr.ReduceMode.Auto,
 ) -> list[AnyArray]:
-    """The first ``used`` numbers of a texel, or all, in the largest packets that divide ``channels``. ``mode``: of adjoints.
+    """Numbers of a texel, in the largest packets that divide ``channels``. ``mode``: of adjoints.
+
+    ``used``: the first of the numbers, a multiple of the packets' size, and how many are read; None for all.
 
     No more than that: Dr.Jit 1.5 ends the process in forward mode where a symbolic branch leaves a part of a packet unused.
     """
     module = backend(values)
     packets = {1: module.Float, 2: module.Array2f, 4: module.Array4f}
     found: list[AnyArray] = []
-    first, last = 0, channels if used is None else used
+    first, count = used or (0, channels)
+    last = first + count
     while first < last:
-        size = next(n for n in (4, 2, 1) if channels % n == 0 and n <= last - first)
+        size = next(n for n in (4, 2, 1) if channels % n == 0 and first % n == 0 and n <= last - first)
         found.append(dr.gather(packets[size], values, texel * (channels // size) + first // size, active, mode=mode))
         first += size
     return found

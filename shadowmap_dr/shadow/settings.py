@@ -49,6 +49,8 @@ class ShadowSettings:
             that is pre-filtered.
         transmittance_groups: parts of these casters, front to back, whose depths are encoded apart, 1 to 8; 0 for 2, or 4 where a
             texel sees more than eight casters. As many as there are casters tell them all apart.
+        transmittance_texels, transmittance_filter_size: ``resolution`` and ``filter_size`` of the maps of translucent casters,
+            which points then look up once where pixels look visibility up several times; 0 for those of the other maps.
         compat: the conventions of Worchel and Alexa's code: unnormalised radial depth, fixed frusta, dark outside of them, their
             kernels, minimum variance 1e-4.
     """
@@ -70,6 +72,8 @@ class ShadowSettings:
     cull_backfaces: bool = False
     transmittance_method: str = "msm"
     transmittance_groups: int = 0
+    transmittance_texels: int = 0
+    transmittance_filter_size: int = 3
 
     def __post_init__(self) -> None:
         for name in ("resolution", "tiles", "filter_size", "order", "supersampling", "transmittance_groups"):
@@ -135,6 +139,13 @@ class ShadowSettings:
     def fewer(self, texels: int) -> ShadowSettings:
         """Settings of maps of so many texels along each side, filtered as tiles, if that is fewer than ``resolution``."""
         return replace(self.of_tiles, resolution=texels) if texels < self.resolution else self
+
+    @property
+    def of_transmittance(self) -> ShadowSettings:
+        """Settings of transmittance maps."""
+        if not self.transmittance_texels:
+            return self
+        return replace(self, resolution=self.transmittance_texels, filter_size=self.transmittance_filter_size)
 
     @property
     def filterable(self) -> bool:

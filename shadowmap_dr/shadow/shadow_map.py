@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import drjit as dr
 
@@ -52,11 +53,11 @@ class ShadowMaps:
 
     def for_points(self, count: int) -> ShadowMaps:
         """The same maps, copied for look-ups by ``count`` points at once, so that gradients are summed exactly. Attached."""
-        stored = () if self.transmittance is None else self.transmittance.groups
+        stored = () if self.transmittance is None else (self.transmittance.values,)
         (values, *columns), copies = in_copies([self.values, *stored, *self.views.columns()], count)
         if copies == 1:
             return self
-        transmittance = self.transmittance and replace(self.transmittance, groups=tuple(columns[: len(stored)]))
+        transmittance = self.transmittance and replace(self.transmittance, values=columns[0])
         views = Views.of(columns[len(stored) :])
         return replace(self, values=values, views=views, transmittance=transmittance, copies=copies)
 
@@ -101,9 +102,9 @@ def render_maps(
         values = block_means(values, size, channels, settings.supersampling)
     transmittance = None
     if translucent is not None:
-        transmittance = render_transmittance(translucent, clip, views, frusta, settings)
+        transmittance = render_transmittance(translucent, clip, views, frusta, settings.of_transmittance)
         if settings.supersampling > 1:
-            transmittance = transmittance.each(lambda group, channels: block_means(group, size, channels, settings.supersampling))
+            transmittance = transmittance.map(lambda flat, channels: block_means(flat, size, channels, settings.supersampling))
     return ShadowMaps(values, views, frusta, settings, channels, transmittance)
 
 
@@ -185,11 +186,11 @@ def _radial_depth(view: Views, frustum: Frusta, raster: RasterOutput, row: UInt3
 def filter_maps(maps: ShadowMaps) -> ShadowMaps:
     """Step 2: pre-filter. Depths that are compared in the look-up stay as they are. Attached."""
     s = maps.settings
-    kernel = filter_kernel(s.filter, s.filter_size, s.compat)
 
-    def filtered(values: Float, channels: int) -> Float:
-        return filter_map(values, kernel, maps.views.count, s.resolution, s.resolution, channels)
+    def filtered(values: Float, channels: int, of: ShadowSettings = s) -> Float:
+        kernel = filter_kernel(of.filter, of.filter_size, of.compat)
+        return filter_map(values, kernel, maps.views.count, of.resolution, of.resolution, channels)
 
     if maps.transmittance is not None:
-        maps = replace(maps, transmittance=maps.transmittance.each(filtered))
+        maps = replace(maps, transmittance=maps.transmittance.map(partial(filtered, of=s.of_transmittance)))
     return replace(maps, values=filtered(maps.values, maps.channels)) if s.filterable else maps

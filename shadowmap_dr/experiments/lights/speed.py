@@ -26,7 +26,7 @@ from ...jit.frozen import freeze
 from ...jit.types import Float, Vector3f
 from ...jit.vectors import mean_of
 from ...rendering.renderer import Renderer
-from ...rendering.shadow_pass import arriving_light, make_maps
+from ...rendering.shadow_pass import make_maps, visibility_of
 from ...scene.lights.punctual import DirectionalLight
 from ..common import timing
 from .problem import LightProblem
@@ -164,7 +164,7 @@ def _reverse_image(renderer: Renderer, still: StillScene, to_light: list[Vector3
         active = pixels.active & (cosine > 0) & (dr.dot(pixels.n_world, axis) > 0)
         shown = mi.Float(1)
         if maps is not None:
-            found = [arriving_light(maps, renderer.plan, light, k, p, active) for p in pixels.points]
+            found = [visibility_of(maps, renderer.plan, light, k, p, active) for p in pixels.points]
             shown = mean_of(functools.reduce(operator.add, found)) / len(found)
         for c in range(pixels.channels):
             total[c] = total[c] + dr.select(active, cosine * shown * still.irradiance[k][c], 0)

@@ -14,6 +14,7 @@ from ...raster import RasterOutput, Topology, deepest
 from ...scene.geometry import Geometry
 from ...scene.load import SceneData
 from ...scene.sensor import Sensor
+from ...scene.sums import attached_parameters
 from ...shadow import TranslucentCasters
 from .translucent_faces import Faces, faces_of
 from .translucent_layers import Layers, see_layers
@@ -141,7 +142,14 @@ class Translucency:
             count.passes,
             towards_lights(data, geometry, camera, faces),
             loss_counts(data, geometry, camera, faces),
+            _attached(geometry, faces),
         )
+
+
+def _attached(geometry: Geometry, faces: Faces) -> bool:
+    """True if vertices or materials of translucent shapes may carry gradients."""
+    moving = any(info.see_through and geometry.attached(info) for info in geometry.shapes)
+    return moving or bool(attached_parameters(faces.bsdfs))
 
 
 def _before(opaque: RasterOutput, passed: Callable[[RasterOutput], Float], seen: RasterOutput) -> Float:

@@ -92,22 +92,30 @@ class ImagePass:
         if sensor.alpha or "opacity" in settings.aovs:
             coverage = dr.select(frame.surface.active & (settings.max_depth != 0), mi.Float(1), 0)
         opaque = below = Blended.of(color, coverage)
+        made = self._layers(view, layers, opaque, lighting, shapes)
         for number in reversed(range(len(layers.opaque))):
-            if number < len(layers.translucent):
-                seen = replace(view, raster=layers.translucent[number], layers=None)
-                own = self.cameras.frame(seen, shapes, self.light.needs_frames or layers.textured)
-                _, radiance = self._seen(own, lighting, None, shapes)
-                active = own.surface.active
-                layer = Layer.of(radiance, transmittance_of(own.surface, layers.bsdfs), active, len(opaque.channels))
-                if settings.antialias:
-                    layer = layer.outlined(view, seen.raster, active, opaque, own.sharpness, shapes)
-                below = below.behind(layer)
+            if number < len(made):
+                below = below.behind(made[number])
             if settings.antialias:
                 below = below.outlined(view, layers.opaque[number], frame.sharpness, shapes)
         taken = mi.Float(0) if coverage is None else below.channels[-1]
         named = self._aovs_of_nearest(view, lighting, shapes, taken)
         flat = film_channels(mi.UnpolarizedSpectrum(*below.channels[:channels]), taken, sensor)
         return _picture(interleave(flat), view, len(flat), named)
+
+    def _layers(self, view: CameraView, layers: Layers, opaque: Blended, lighting: Lighting, shapes: PlacedShapes) -> list[Layer]:
+        """The translucent layers of a view, front to back, several at once. Attached. ``opaque``: as of ``Layer.outlined``."""
+        made: list[Layer] = []
+        for chosen, clip in layers.in_batches(view.clip, shapes.geometry.faces):
+            seen = replace(view, raster=chosen, clip=clip, layers=None)
+            own = self.cameras.frame(seen, shapes, self.light.needs_frames or layers.textured)
+            radiance = self.light.with_shining(self._reflected(own, lighting, None, shapes)[1], own.surface, lighting)
+            active = own.surface.active
+            layer = Layer.of(radiance, transmittance_of(own.surface, layers.bsdfs), active, len(opaque.channels))
+            if self.light.settings.antialias:
+                layer = layer.outlined(seen, active, opaque, own.sharpness, shapes)
+            made += layer.apart(chosen.batch)
+        return made
 
     def _aovs_of_nearest(self, view: CameraView, lighting: Lighting, shapes: PlacedShapes, coverage: Float) -> list[Float]:
         """Further channels of the nearest surfaces, whether they are opaque or not."""

@@ -347,12 +347,20 @@ class LightPass:
 
     def with_emission(self, color: Color3f, seen: Surface, lighting: Lighting, sensor: Sensor, size: ImageSize) -> Color3f:
         """Radiance plus that of emitters that the camera sees. ``size``: samples of the image."""
-        if self.settings.hide_emitters or self.settings.max_depth == 0:
+        if not self._shows_emitters:
             return color
-        color += emission(seen, lighting.areas)
+        color = self.with_shining(color, seen, lighting)
         for environment in self.data.environments:
             color = dr.select(seen.active, color, background(environment, sensor, size.width, size.height))
         return color
+
+    def with_shining(self, color: Color3f, seen: Surface, lighting: Lighting) -> Color3f:
+        """Radiance plus that of shining surfaces."""
+        return color + emission(seen, lighting.areas) if self._shows_emitters else color
+
+    @property
+    def _shows_emitters(self) -> bool:
+        return not self.settings.hide_emitters and self.settings.max_depth != 0
 
     def transmittances(self, frame: Frame, lighting: Lighting) -> list[Color3f]:
         """Share of each light (colour, N) that translucent casters let through to the points of a frame. Attached.
@@ -441,4 +449,4 @@ def plan_extended_lights(data: SceneData, settings: RenderSettings) -> tuple[Sof
 
 
 def _interleaving(samples: LightSamples, view: CameraView) -> Interleaving:
-    return interleaving_of(samples, view.size, view.factor)
+    return interleaving_of(samples, view.size, view.factor, view.raster.batch)

@@ -179,16 +179,18 @@ class Sensor:
         linear = mi.Matrix3f(self.to_world.matrix)
         return dr.normalize(mi.Vector3f(linear @ mi.Vector3f(x, y, 1.0)))
 
-    def pixel_rays(self, width: int, height: int) -> tuple[Point3f, Vector3f, Float]:
+    def pixel_rays(self, width: int, height: int, images: int = 1) -> tuple[Point3f, Vector3f, Float]:
         """Rays through the pixel centres of a ``width`` x ``height`` picture, row-major, and the height of a pixel.
 
+        ``images``: number N of equal pictures, one after the other.
+
         Returns:
-            origin: Point3f (H * W,), or of width 1 if all rays share it (perspective). World space, attached.
-            direction: Vector3f (H * W,), or of width 1 if all rays share it (orthographic). World space, attached. Of unit length
-                (orthographic), or with a unit component along the viewing axis (perspective).
+            origin: Point3f (N * H * W,), or of width 1 if all rays share it (perspective). World space, attached.
+            direction: Vector3f (N * H * W,), or of width 1 if all rays share it (orthographic). World space, attached. Of unit
+                length (orthographic), or with a unit component along the viewing axis (perspective).
             pixel: Float (1,), height of a pixel, world units, at unit distance along a perspective camera's axis. Detached.
         """
-        ndc_x, ndc_y = _pixel_centres(width, height)
+        ndc_x, ndc_y = _pixel_centres(width, height, images)
         projection, linear = self.projection, mi.Matrix3f(self.to_world.matrix)
         column = 2 if self.kind == "perspective" else 3
         across, down = linear @ mi.Vector3f(dr.rcp(projection[0, 0]), 0, 0), linear @ mi.Vector3f(0, dr.rcp(projection[1, 1]), 0)
@@ -203,18 +205,19 @@ class Sensor:
         parts = (fixed, mi.Vector3f(centre), mi.Vector3f(across), mi.Vector3f(down))
         pixel = dr.norm(dr.detach(parts[3])) * float_input(backend(parts[3]), "height", 2.0 / height)
         dr.eval(parts, pixel)
-        fixed, centre, across, down = broadcast_differentiable(parts, width * height)
+        fixed, centre, across, down = broadcast_differentiable(parts, width * height * images)
         varying = dr.fma(across, ndc_x, dr.fma(down, ndc_y, centre))
         if self.kind == "perspective":
             return mi.Point3f(fixed), varying, pixel
         return mi.Point3f(varying), fixed, pixel
 
 
-def _pixel_centres(width: int, height: int) -> tuple[Float, Float]:
-    """Normalized device coordinates (-1 to 1) of all pixel centres, row-major, row 0 at -1."""
-    index = dr.arange(mi.UInt32, width * height)
+def _pixel_centres(width: int, height: int, images: int = 1) -> tuple[Float, Float]:
+    """Normalized device coordinates (-1 to 1) of all pixel centres, row-major, row 0 at -1. ``images``: as of ``pixel_rays``."""
+    index = dr.arange(mi.UInt32, width * height * images)
     module = backend(index)
-    row, column = split(index, "width", width, height)
+    line, column = split(index, "width", width, height * images)
+    _, row = split(line, "height", height, images)
     x, y = (mi.Float(place) + 0.5 for place in (column, row))
     return x * float_input(module, "width", 2.0 / width) - 1.0, y * float_input(module, "height", 2.0 / height) - 1.0
 

@@ -36,14 +36,14 @@ class Interleaving:
     group: UInt32 | None = None
 
     @classmethod
-    def of(cls, points: int, size: ImageSize, factor: int) -> Interleaving:
-        """Choose the groups. ``size``: samples of the image; ``factor``: samples along each side of a pixel."""
+    def of(cls, points: int, size: ImageSize, factor: int, images: int = 1) -> Interleaving:
+        """Choose the groups. ``size``: samples of each of some images; ``factor``: samples along each side of a pixel."""
         sides = [n for n in range(1, factor // _SAMPLES + 1) if factor % n == points % (n * n) == 0 and points >= _POINTS * n * n]
         side = max(sides, default=1)
         if side == 1:
             return cls(points)
-        lane = dr.arange(mi.UInt32, size.width * size.height)
-        _, row, column = by_pixel(lane, 1, size.height, size.width)
+        lane = dr.arange(mi.UInt32, images * size.width * size.height)
+        _, row, column = by_pixel(lane, images, size.height, size.width)
         return cls(points, side * side, column % side + row % side * side)
 
     @property

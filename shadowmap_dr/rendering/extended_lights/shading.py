@@ -88,12 +88,12 @@ def soft_light(
     return light * mi.UnpolarizedSpectrum(*transmittance(single, which, seen.p_world, seen.active))
 
 
-def interleaving_of(samples: LightSamples, size: ImageSize, factor: int) -> Interleaving:
+def interleaving_of(samples: LightSamples, size: ImageSize, factor: int, images: int = 1) -> Interleaving:
     """Interleaving of an image's samples over the points of an area light. All samples see all parts of the sky.
 
     ``size``: samples of the image; ``factor``: samples along each side of a pixel.
     """
-    return Interleaving(samples.count) if samples.distant else Interleaving.of(samples.count, size, factor)
+    return Interleaving(samples.count) if samples.distant else Interleaving.of(samples.count, size, factor, images)
 
 
 def sample_visibilities(

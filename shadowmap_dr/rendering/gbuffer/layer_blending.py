@@ -7,7 +7,10 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
+from ...jit.arrays import backend
+from ...jit.broadcast import Copies
 from ...jit.handover import evaluated
+from ...jit.kernel_inputs import uint_input
 from ...jit.types import Bool, Color3f, Float
 from ...raster import RasterOutput, antialias
 from .camera_clip import least_gap
@@ -81,17 +84,15 @@ class Layer:
     def outlined(
         self,
         view: CameraView,
-        raster: RasterOutput,
         active: Bool,
         opaque: Blended,
         sharpness: Float | None,
         shapes: PlacedShapes,
     ) -> Layer:
-        """The layer with anti-aliased outlines (``Layers.translucent``). Attached.
+        """The layer with anti-aliased outlines. Attached.
 
         Args:
-            view: the camera.
-            raster: of the layer.
+            view: the camera, and what it sees of the layer, or of several (``Layers.in_batches``).
             active: where it is.
             opaque: light of opaque surfaces, without anti-aliasing. They are what is seen beside the layer.
             sharpness: visibility of edges between facets, or None where all are fully visible.
@@ -99,14 +100,34 @@ class Layer:
         """
         count, covered = len(self.radiance), dr.select(active, mi.Float(1), 0)
         passed = [covered * value for value in self.through]
-        beside = [dr.select(active, 0, value) for value in opaque.channels]
-        values = outlined([*self.radiance, *passed, *beside, covered], view, raster, sharpness, shapes)
+        behind = list(opaque.channels)
+        if view.raster.batch > 1:
+            dr.eval(behind)  # together
+            behind = dr.custom(Copies, behind, view.raster.batch, False)
+        beside = [dr.select(active, 0, value) for value in behind]
+        values = outlined([*self.radiance, *passed, *beside, covered], view, view.raster, sharpness, shapes)
         share = values[-1]
         some = dr.detach(share) > _LEAST_SHARE
         inverse = dr.rcp(dr.select(some, share, 1))
         # Where the layer covers nothing, what is beside it is all that is behind, with its own outlines.
         through = [dr.select(some, value * inverse, 1) for value in values[count : 2 * count]]
         return Layer(tuple(values[:count]), tuple(through), tuple(values[2 * count : -1]))
+
+    def apart(self, count: int) -> list[Layer]:
+        """The layers, if this is ``count`` of them, one after the other."""
+        if count == 1:
+            return [self]
+        fields = self.radiance, self.through, self.beside
+        samples = max(dr.width(value) for values in fields for value in values) // count
+        dr.eval(fields)
+
+        def part(value: Float, number: int) -> Float:
+            if dr.width(value) == 1:
+                return value
+            lane = dr.arange(mi.UInt32, samples) + uint_input(backend(value), "first sample", number * samples)
+            return dr.gather(mi.Float, value, lane, mode=dr.ReduceMode.NoConflicts)  # each number is read once
+
+        return [Layer(*(tuple(part(value, number) for value in values) for values in fields)) for number in range(count)]
 
 
 def outlined(

@@ -86,7 +86,7 @@ def hits_at(geometry: Geometry, triangle: UInt32, u: Float, v: Float, active: Bo
 
 
 def pixel_hits(geometry: Geometry, sensor: Sensor, triangle: UInt32, size: ImageSize) -> SurfacePoints:
-    """Points that the pixel centres of a picture of a size see, given its triangles (row-major).
+    """Points that the pixel centres of pictures of a size see, one after the other, given their triangles (row-major).
 
     Attached to positions and camera: each point stays on the ray through its pixel and on its triangle's plane.
     """
@@ -94,7 +94,7 @@ def pixel_hits(geometry: Geometry, sensor: Sensor, triangle: UInt32, size: Image
     face = dr.gather(mi.Vector3u, geometry.faces, triangle, active)
     shape, flags = geometry.shape_and_flags(triangle, active)
     changed = active & geometry.has_changed(shape)
-    ray_o, ray_d, pixel = sensor.pixel_rays(size.width, size.height)
+    ray_o, ray_d, pixel = sensor.pixel_rays(size.width, size.height, dr.width(triangle) // (size.width * size.height))
     moving = dr.grad_enabled(ray_o, ray_d)
     row = geometry.row_of_copy(dr.width(triangle))
 

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 
 from ...jit.types import Bool, Float, UInt32
-from ...raster import NO_TRIANGLE, RasterOutput, peeled_layers, with_triangles
+from ...raster import NO_TRIANGLE, RasterOutput, peeled_layers, stacked, with_triangles
 from ...scene.geometry import Geometry
 from .translucent_faces import Faces
 from .transmission import whole_triangles
+
+# Most pixels, numbers of vertices or of triangles, of layers that are shaded at once.
+_MOST_NUMBERS = 1 << 22
 
 
 @dataclass(frozen=True)
@@ -32,6 +35,17 @@ class Layers:
     nearest: RasterOutput
     bsdfs: tuple[mi.BSDF, ...]
     textured: bool
+
+    def in_batches(self, clip: Float, faces: UInt32) -> Iterator[tuple[RasterOutput, Float]]:
+        """Rasters of several translucent layers each, one image for each layer, and the clip-space vertices of these images.
+
+        Args:
+            clip, faces: clip-space vertices (4 V,) and faces (3 F,) of the scene. Attached.
+        """
+        first = self.translucent[0]
+        at_once = max(1, _MOST_NUMBERS // max(dr.width(first.triangle), dr.width(clip), 4 * dr.width(faces)))
+        for start in range(0, len(self.translucent), at_once):
+            yield stacked(self.translucent[start : start + at_once], clip, faces, 1)
 
 
 def see_layers(

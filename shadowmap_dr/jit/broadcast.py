@@ -100,6 +100,7 @@ class Copies(dr.CustomOp):
         return "copies"
 
     def _apply(self, arrays: list[Float], transpose: bool) -> list[Float]:
+        dr.eval(arrays)  # together: gathers would evaluate one by one
         return [(sum_of_copies if transpose else copied)(array, self._arguments[0]) for array in arrays]
 
 

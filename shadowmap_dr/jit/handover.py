@@ -14,6 +14,7 @@ from typing import TypeVar, cast
 import drjit as dr
 
 from .arrays import backend, interleave, replace_grad
+from .kernel_inputs import uint_input
 from .pytree import tree_map
 from .types import Float, PyTree
 
@@ -87,6 +88,26 @@ def interleaved(name: str, values: list[Float]) -> Float:
         return evaluated(name, interleave(values))
     given = _next(name)
     return dr.custom(_Interleaved, given, values) if dr.grad_enabled(values) else given
+
+
+def apart(flat: Float, count: int, entries: int | None = None, first: int = 0) -> list[Float]:
+    """The ``count`` arrays whose entries ``interleave`` has put into a flat one. Attached.
+
+    Args:
+        flat: the array.
+        count: numbers of each entry.
+        entries: number of entries that are read; None for all of them.
+        first: the first of these. No entry may be read twice, as its adjoint is written, not added.
+    """
+    module = backend(flat)
+    size = next(size for size in (4, 2, 1) if count % size == 0)
+    packet = {1: module.Float, 2: module.Array2f, 4: module.Array4f}[size]
+    entry = dr.arange(module.UInt32, dr.width(flat) // count if entries is None else entries)
+    if first:
+        entry += uint_input(module, "first entry", first)
+    mode = dr.ReduceMode.NoConflicts
+    found = [dr.gather(packet, flat, entry * (count // size) + k, mode=mode) for k in range(count // size)]
+    return found if size == 1 else [value for values in found for value in values]
 
 
 class _Interleaved(dr.CustomOp):

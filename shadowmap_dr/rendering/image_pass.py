@@ -113,8 +113,9 @@ class ImagePass:
             active = own.surface.active
             layer = Layer.of(radiance, transmittance_of(own.surface, layers.bsdfs), active, len(opaque.channels))
             if self.light.settings.antialias:
-                layer = layer.outlined(seen, active, opaque, own.sharpness, shapes)
-            made += layer.apart(chosen.batch)
+                made += layer.outlined(seen, active, opaque, own.sharpness, shapes)
+            else:
+                made += layer.apart(chosen.batch)
         return made
 
     def _aovs_of_nearest(self, view: CameraView, lighting: Lighting, shapes: PlacedShapes, coverage: Float) -> list[Float]:

@@ -18,8 +18,8 @@ import drjit as dr
 
 from ..jit.arrays import backend
 from ..jit.broadcast import copied
-from ..jit.handover import interleaved
-from ..jit.kernel_inputs import split, uint_input
+from ..jit.handover import apart, interleaved
+from ..jit.kernel_inputs import split
 from ..jit.types import Bool, Float, UInt32
 from ..raster import RasterOutput, Topology, antialias, peeled_layers, stacked
 from ..raster.screen_planes import pixel_depth
@@ -130,7 +130,7 @@ def _rendered(
         raster, positions = stacked(chosen, clip, casters.faces, count)
         numbers, each, colours = _numbers(casters, raster, positions, views, frusta, settings)
         for k in range(len(chosen)):
-            light.lose(_of_layer(numbers, k, texels, each), colours, (first + k) * groups // casters.layers)
+            light.lose(apart(numbers, each, texels, k * texels), colours, (first + k) * groups // casters.layers)
         if at_once < casters.layers:
             dr.eval(light.left, light.groups)
     # A multiple of four numbers, as filters and look-ups need. Not zeros: Dr.Jit 1.5 ends the process in forward mode where only
@@ -194,18 +194,6 @@ def _numbers(
     if settings.antialias and casters.topology.count:
         values = antialias(values, raster, positions, casters.topology)
     return values, len(own), len(through)
-
-
-def _of_layer(numbers: Float, layer: int, texels: int, count: int) -> list[Float]:
-    """Numbers of the texels of one layer, ``count`` each."""
-    module = backend(numbers)
-    size = next(size for size in (4, 2, 1) if count % size == 0)
-    packet = {1: module.Float, 2: module.Array2f, 4: module.Array4f}[size]
-    each = count // size
-    first = (dr.arange(module.UInt32, texels) + uint_input(module, "first texel", layer * texels)) * each
-    mode = dr.ReduceMode.NoConflicts  # each number is read once
-    packets = [dr.gather(packet, numbers, first + k, mode=mode) for k in range(each)]
-    return packets if size == 1 else [value for found in packets for value in found]
 
 
 def _mean(values: list[Float]) -> Float:

@@ -7,10 +7,8 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from ...jit.arrays import backend
 from ...jit.broadcast import Copies
-from ...jit.handover import evaluated
-from ...jit.kernel_inputs import uint_input
+from ...jit.handover import apart, evaluated
 from ...jit.types import Bool, Color3f, Float
 from ...raster import RasterOutput, antialias
 from .camera_clip import least_gap
@@ -50,7 +48,8 @@ class Blended:
 
         ``sharpness``: visibility of edges between facets, or None where all are fully visible.
         """
-        return Blended(tuple(outlined(list(self.channels), view, raster, sharpness, shapes)))
+        channels = list(self.channels)
+        return Blended(tuple(apart(outlined(channels, view, raster, sharpness, shapes), len(channels))))
 
 
 @dataclass(frozen=True)
@@ -88,55 +87,60 @@ class Layer:
         opaque: Blended,
         sharpness: Float | None,
         shapes: PlacedShapes,
-    ) -> Layer:
-        """The layer with anti-aliased outlines. Attached.
+    ) -> list[Layer]:
+        """This layer, or these layers one after the other, with anti-aliased outlines. Attached.
 
         Args:
-            view: the camera, and what it sees of the layer, or of several (``Layers.in_batches``).
-            active: where it is.
-            opaque: light of opaque surfaces, without anti-aliasing. They are what is seen beside the layer.
+            view: the camera, and what it sees of each layer (``Layers.in_batches``).
+            active: where layers are.
+            opaque: light of opaque surfaces, without anti-aliasing. They are what is seen beside a layer.
             sharpness: visibility of edges between facets, or None where all are fully visible.
             shapes: where they are.
         """
-        count, covered = len(self.radiance), dr.select(active, mi.Float(1), 0)
+        number, covered = view.raster.batch, dr.select(active, mi.Float(1), 0)
         passed = [covered * value for value in self.through]
         behind = list(opaque.channels)
-        if view.raster.batch > 1:
-            dr.eval(behind)  # together
-            behind = dr.custom(Copies, behind, view.raster.batch, False)
+        if number > 1:
+            behind = dr.custom(Copies, behind, number, False)
         beside = [dr.select(active, 0, value) for value in behind]
-        values = outlined([*self.radiance, *passed, *beside, covered], view, view.raster, sharpness, shapes)
-        share = values[-1]
+        values = [*self.radiance, *passed, *beside, covered]
+        flat, samples = outlined(values, view, view.raster, sharpness, shapes), dr.width(active) // number
+        return [Layer._of_outlined(apart(flat, len(values), samples, k * samples)) for k in range(number)]
+
+    @classmethod
+    def _of_outlined(cls, values: list[Float]) -> Layer:
+        """A layer from anti-aliased numbers: radiance, what passes and what is beside, all times shares; the covered share."""
+        *values, share = values
+        count = len(values) // 3
         some = dr.detach(share) > _LEAST_SHARE
         inverse = dr.rcp(dr.select(some, share, 1))
         # Where the layer covers nothing, what is beside it is all that is behind, with its own outlines.
         through = [dr.select(some, value * inverse, 1) for value in values[count : 2 * count]]
-        return Layer(tuple(values[:count]), tuple(through), tuple(values[2 * count : -1]))
+        return cls(tuple(values[:count]), tuple(through), tuple(values[2 * count :]))
 
     def apart(self, count: int) -> list[Layer]:
         """The layers, if this is ``count`` of them, one after the other."""
         if count == 1:
             return [self]
-        fields = self.radiance, self.through, self.beside
-        samples = max(dr.width(value) for values in fields for value in values) // count
-        dr.eval(fields)
-
-        def part(value: Float, number: int) -> Float:
-            if dr.width(value) == 1:
-                return value
-            lane = dr.arange(mi.UInt32, samples) + uint_input(backend(value), "first sample", number * samples)
-            return dr.gather(mi.Float, value, lane, mode=dr.ReduceMode.NoConflicts)  # each number is read once
-
-        return [Layer(*(tuple(part(value, number) for value in values) for values in fields)) for number in range(count)]
+        samples = max(dr.width(value) for value in self.radiance) // count
+        dr.eval(self.radiance, self.through)
+        return [
+            Layer(*(tuple(_part(v, samples, k) for v in field) for field in (self.radiance, self.through, self.beside)))
+            for k in range(count)
+        ]
 
 
-def outlined(
-    values: list[Float], view: CameraView, raster: RasterOutput, sharpness: Float | None, shapes: PlacedShapes
-) -> list[Float]:
-    """Values (N,) with anti-aliased outlines of the surfaces of a raster. Edges count only where their surface is in it."""
+def _part(value: Float, samples: int, number: int) -> Float:
+    """The numbers of one layer."""
+    return value if dr.width(value) == 1 else apart(value, 1, samples, number * samples)[0]
+
+
+def outlined(values: list[Float], view: CameraView, raster: RasterOutput, sharpness: Float | None, shapes: PlacedShapes) -> Float:
+    """Values (N,) with anti-aliased outlines of the surfaces of a raster, interleaved. Edges count only where their surface is in
+    it."""
     values, sharpness = evaluated("layer", (values, sharpness))
     topology = replace(view.topology, see_through_faces=dr.full(mi.Bool, True, raster.face_count))
-    flat = antialias(
+    return antialias(
         *(values, raster, view.clip, topology),
         **shapes.creases,
         crease_weights=sharpness,
@@ -144,6 +148,3 @@ def outlined(
         gap=least_gap(view.sensor),
         continued=True,
     )
-    sample, count = dr.arange(mi.UInt32, dr.width(flat) // len(values)), len(values)
-    mode = dr.ReduceMode.NoConflicts  # each number is read once
-    return [dr.gather(mi.Float, flat, sample * count + k, mode=mode) for k in range(count)]

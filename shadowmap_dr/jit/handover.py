@@ -16,7 +16,7 @@ import drjit as dr
 from .arrays import backend, interleave, replace_grad
 from .kernel_inputs import uint_input
 from .pytree import tree_map
-from .types import Float, PyTree
+from .types import AnyArray, Float, PyTree, UInt32
 
 ResultT = TypeVar("ResultT")
 TreeT = TypeVar("TreeT", bound=PyTree)
@@ -90,24 +90,56 @@ def interleaved(name: str, values: list[Float]) -> Float:
     return dr.custom(_Interleaved, given, values) if dr.grad_enabled(values) else given
 
 
-def apart(flat: Float, count: int, entries: int | None = None, first: int = 0) -> list[Float]:
-    """The ``count`` arrays whose entries ``interleave`` has put into a flat one. Attached.
+def apart(flat: Float, count: int, parts: int = 1) -> list[list[Float]]:
+    """The arrays whose entries ``interleave`` has put into a flat one. Attached.
 
     Args:
-        flat: the array.
-        count: numbers of each entry.
-        entries: number of entries that are read; None for all of them.
-        first: the first of these. No entry may be read twice, as its adjoint is written, not added.
+        flat: ``parts`` arrays of ``count`` interleaved numbers for each entry, one after the other.
+
+    Returns:
+        For each part the ``count`` arrays.
     """
-    module = backend(flat)
-    size = next(size for size in (4, 2, 1) if count % size == 0)
-    packet = {1: module.Float, 2: module.Array2f, 4: module.Array4f}[size]
-    entry = dr.arange(module.UInt32, dr.width(flat) // count if entries is None else entries)
-    if first:
-        entry += uint_input(module, "first entry", first)
-    mode = dr.ReduceMode.NoConflicts
-    found = [dr.gather(packet, flat, entry * (count // size) + k, mode=mode) for k in range(count // size)]
-    return found if size == 1 else [value for values in found for value in values]
+    found: list[Float] = dr.custom(_Apart, flat, count, parts)
+    return [found[k * count : (k + 1) * count] for k in range(parts)]
+
+
+class _Apart(dr.CustomOp):
+    """:func:`apart`. Dr.Jit's own adjoint of these gathers would add to zeros, number by number."""
+
+    def eval(self, flat: Float, count: int, parts: int) -> list[Float]:
+        self.module, self.count, self.parts, self.width = backend(flat), count, parts, dr.width(flat)
+        self.size = next(size for size in (4, 2, 1) if count % size == 0)
+        return self._apart(flat)
+
+    def forward(self) -> None:
+        self.set_grad_out(self._apart(cast("Float", self.grad_in("flat"))))
+
+    def backward(self) -> None:
+        adjoints, result = cast("list[Float]", self.grad_out()), dr.empty(self.module.Float, self.width)
+        for k, packet in enumerate(self._packets()):
+            values = adjoints[k * self.size : (k + 1) * self.size]
+            dr.scatter(result, values[0] if self.size == 1 else self._kind(*values), packet)
+        self.set_grad_in("flat", result)
+
+    def name(self) -> str:
+        return "apart"
+
+    @property
+    def _kind(self) -> type[AnyArray]:
+        return {1: self.module.Float, 2: self.module.Array2f, 4: self.module.Array4f}[self.size]
+
+    def _packets(self) -> Iterator[UInt32]:
+        """Indices of packets of ``size`` numbers: for each part the first packet of all entries, then the second, ..."""
+        entries, each = self.width // (self.count * self.parts), self.count // self.size
+        entry = dr.arange(self.module.UInt32, entries)
+        for part in range(self.parts):
+            first = entry + uint_input(self.module, "first entry", part * entries) if part else entry
+            for k in range(each):
+                yield first * each + k
+
+    def _apart(self, flat: Float) -> list[Float]:
+        found = [dr.gather(self._kind, flat, packet) for packet in self._packets()]
+        return found if self.size == 1 else [value for values in found for value in values]
 
 
 class _Interleaved(dr.CustomOp):

@@ -122,15 +122,15 @@ def _rendered(
         passes=casters.passes,
         counts=casters.counts,
     )
-    texels, groups = count * size * size, groups_of(settings, casters.layers)
-    at_once = max(1, _MOST_NUMBERS // max(texels, dr.width(clip)))
+    groups = groups_of(settings, casters.layers)
+    at_once = max(1, _MOST_NUMBERS // max(count * size * size, dr.width(clip)))
     light, colours = _Light(), 0
     for first in range(0, casters.layers, at_once):
         chosen = layers[first : first + at_once]
         raster, positions = stacked(chosen, clip, casters.faces, count)
         numbers, each, colours = _numbers(casters, raster, positions, views, frusta, settings)
-        for k in range(len(chosen)):
-            light.lose(apart(numbers, each, texels, k * texels), colours, (first + k) * groups // casters.layers)
+        for k, own in enumerate(apart(numbers, each, len(chosen))):
+            light.lose(own, colours, (first + k) * groups // casters.layers)
         if at_once < casters.layers:
             dr.eval(light.left, light.groups)
     # A multiple of four numbers, as filters and look-ups need. Not zeros: Dr.Jit 1.5 ends the process in forward mode where only

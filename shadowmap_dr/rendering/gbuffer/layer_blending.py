@@ -49,7 +49,7 @@ class Blended:
         ``sharpness``: visibility of edges between facets, or None where all are fully visible.
         """
         channels = list(self.channels)
-        return Blended(tuple(apart(outlined(channels, view, raster, sharpness, shapes), len(channels))))
+        return Blended(tuple(apart(outlined(channels, view, raster, sharpness, shapes), len(channels))[0]))
 
 
 @dataclass(frozen=True)
@@ -104,8 +104,8 @@ class Layer:
             behind = dr.custom(Copies, behind, number, False)
         beside = [dr.select(active, 0, value) for value in behind]
         values = [*self.radiance, *passed, *beside, covered]
-        flat, samples = outlined(values, view, view.raster, sharpness, shapes), dr.width(active) // number
-        return [Layer._of_outlined(apart(flat, len(values), samples, k * samples)) for k in range(number)]
+        flat = outlined(values, view, view.raster, sharpness, shapes)
+        return [Layer._of_outlined(own) for own in apart(flat, len(values), number)]
 
     @classmethod
     def _of_outlined(cls, values: list[Float]) -> Layer:
@@ -122,17 +122,12 @@ class Layer:
         """The layers, if this is ``count`` of them, one after the other."""
         if count == 1:
             return [self]
-        samples = max(dr.width(value) for value in self.radiance) // count
         dr.eval(self.radiance, self.through)
+        radiance, through = ([apart(value, 1, count) for value in field] for field in (self.radiance, self.through))
         return [
-            Layer(*(tuple(_part(v, samples, k) for v in field) for field in (self.radiance, self.through, self.beside)))
+            Layer(tuple(value[k][0] for value in radiance), tuple(value[k][0] for value in through), self.beside)
             for k in range(count)
         ]
-
-
-def _part(value: Float, samples: int, number: int) -> Float:
-    """The numbers of one layer."""
-    return value if dr.width(value) == 1 else apart(value, 1, samples, number * samples)[0]
 
 
 def outlined(values: list[Float], view: CameraView, raster: RasterOutput, sharpness: Float | None, shapes: PlacedShapes) -> Float:

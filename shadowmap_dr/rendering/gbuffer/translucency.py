@@ -122,7 +122,8 @@ class Translucency:
         if faces is None:
             return None
         solid = loss_counts(data, geometry, camera, faces)
-        return see_layers(clip, geometry, faces, opaque, (count.layers, count.passes), solid)
+        attached = _attached(geometry, faces) or dr.grad_enabled(camera)
+        return see_layers(clip, geometry, faces, opaque, (count.layers, count.passes), solid, attached)
 
     def casters(
         self, data: SceneData, geometry: Geometry, camera: Sensor, topology: Topology | None

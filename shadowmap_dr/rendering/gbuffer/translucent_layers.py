@@ -28,6 +28,7 @@ class Layers:
         bsdfs: BSDFs of the translucent surfaces.
         opaque: K + 1 rasters of the opaque surfaces that are seen behind no, one, ... translucent surfaces.
         nearest: raster of the nearest surfaces of all.
+        attached: False if places and outlines of the translucent surfaces carry no gradients.
     """
 
     translucent: tuple[RasterOutput, ...]
@@ -35,6 +36,7 @@ class Layers:
     nearest: RasterOutput
     bsdfs: tuple[mi.BSDF, ...]
     textured: bool
+    attached: bool
 
     def in_batches(self, clip: Float, faces: UInt32) -> Iterator[tuple[RasterOutput, Float]]:
         """Rasters of several translucent layers each, one image for each layer, and the clip-space vertices of these images.
@@ -42,7 +44,7 @@ class Layers:
         Args:
             clip, faces: clip-space vertices (4 V,) and faces (3 F,) of the scene. Attached.
         """
-        first = self.translucent[0]
+        first, clip = self.translucent[0], clip if self.attached else dr.detach(clip)
         at_once = max(1, _MOST_NUMBERS // max(dr.width(first.triangle), dr.width(clip), 4 * dr.width(faces)))
         for start in range(0, len(self.translucent), at_once):
             yield stacked(self.translucent[start : start + at_once], clip, faces, 1)
@@ -55,6 +57,7 @@ def see_layers(
     opaque: RasterOutput,
     counts: tuple[int, int],
     solid: Callable[[RasterOutput], Bool] | None,
+    attached: bool,
 ) -> Layers:
     """Peel the translucent faces before the opaque ones.
 
@@ -65,6 +68,7 @@ def see_layers(
         opaque: raster of the opaque ones, with records of all.
         counts: numbers of layers that are kept, and that are looked at.
         solid: mask of the surfaces that take light away, for rasters of the translucent faces alone; None if all do.
+        attached: False if neither these faces nor the camera carry gradients.
     """
     end = dr.select(opaque.valid, dr.detach(opaque.depth), mi.Float(dr.inf))
 
@@ -84,4 +88,4 @@ def see_layers(
     nearest = dr.select(used == 0, opaque.triangle, triangles[0])
     dr.eval(triangles, behind, nearest)
     layers, rest = (tuple(map(raster, each)) for each in (triangles, behind))
-    return Layers(layers, rest, raster(nearest), faces.bsdfs, faces.cutouts)
+    return Layers(layers, rest, raster(nearest), faces.bsdfs, faces.cutouts, attached)

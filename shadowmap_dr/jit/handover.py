@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import drjit as dr
 
@@ -85,9 +85,14 @@ def interleaved(name: str, values: list[Float]) -> Float:
     if len(values) == 1:
         return evaluated(name, values[0])
     if _state.given is None:
-        return evaluated(name, interleave(values))
+        return evaluated(name, _in_packets(values) if len(values) > 4 and len(values) % 4 == 0 else interleave(values))
     given = _next(name)
     return dr.custom(_Interleaved, given, values) if dr.grad_enabled(values) else given
+
+
+def _in_packets(values: list[Float]) -> Float:
+    """As ``interleave``, for a multiple of four arrays: a kernel for each number would read all of them again."""
+    return dr.custom(_Packed, values)
 
 
 def apart(flat: Float, count: int, parts: int = 1) -> list[list[Float]]:
@@ -138,8 +143,33 @@ class _Apart(dr.CustomOp):
                 yield first * each + k
 
     def _apart(self, flat: Float) -> list[Float]:
-        found = [dr.gather(self._kind, flat, packet) for packet in self._packets()]
+        found: list[Any] = [dr.gather(self._kind, flat, packet) for packet in self._packets()]  # Any: packets of any size
         return found if self.size == 1 else [value for values in found for value in values]
+
+
+class _Packed(dr.CustomOp):
+    """Interleaved values, written in packets of four."""
+
+    def eval(self, values: list[Float]) -> Float:
+        self.count = len(values)
+        return self._written(values)
+
+    def forward(self) -> None:
+        self.set_grad_out(self._written(cast("list[Float]", self.grad_in("values"))))
+
+    def backward(self) -> None:
+        self.set_grad_in("values", apart(cast("Float", self.grad_out()), self.count)[0])
+
+    def name(self) -> str:
+        return "packed"
+
+    def _written(self, values: list[Float]) -> Float:
+        module = backend(values[0])
+        entry = dr.arange(module.UInt32, max(dr.width(value) for value in values))
+        result = dr.empty(module.Float, self.count * dr.width(entry))
+        for k in range(self.count // 4):
+            dr.scatter(result, module.Array4f(*values[4 * k : 4 * k + 4]), entry * (self.count // 4) + k)
+        return result
 
 
 class _Interleaved(dr.CustomOp):

@@ -20,10 +20,8 @@ _TEXELS = 1.25
 # From so many lights on, each has a small share in the errors of the image. In small images their maps have one texel for each
 # pixel, and at least so many along each side, a multiple of a number.
 _MANY_ERRORS, _FEWEST, _STEP = 4, 128, 32
-# Texels of transmittance maps for each sample, along each side, a multiple of a number; and the filter's size, as large as 1.5 or
-# more samples.
-_FINE, _FEWEST_OF_TRANSMITTANCE, _PACKET = math.sqrt(2), 32, 8
-_FILTERS = 5, 3
+# Texels of transmittance maps for each sample, along each side, a multiple of a number.
+_FINE, _FEWEST_OF_TRANSMITTANCE, _PACKET = 1.25, 32, 8
 
 
 def sized(shadow: ShadowSettings, plan: MapPlan, pixels: int) -> ShadowSettings:
@@ -42,15 +40,13 @@ def with_transmittance(settings: RenderSettings, shadow: ShadowSettings, samples
     """Settings of maps for scenes with translucent casters, for images of so many samples.
 
     In small images a pixel looks visibility up several times. Each texel of a transmittance map holds many more numbers: these
-    maps have larger texels and a larger filter instead, which takes the mean over the pixel's footprint.
+    maps have larger texels instead, and a filter that takes the mean over the pixel's footprint.
     """
     side = math.sqrt(samples)
     if not shadow.adaptive or settings.look_ups(int(side)) == 1:
         return shadow
     wanted = max(_FEWEST_OF_TRANSMITTANCE, _PACKET * math.ceil(_FINE * side / _PACKET))
-    texels = min(wanted, shadow.resolution)
-    fine, plain = _FILTERS
-    return replace(shadow, transmittance_texels=texels, transmittance_filter_size=fine if texels == wanted else plain)
+    return replace(shadow, transmittance_texels=min(wanted, shadow.resolution))
 
 
 def with_tiles(

@@ -16,6 +16,8 @@ MAX_FILTER_SIZE = 255
 MAX_GROUPS = 8
 #: Most tiles of a light.
 MAX_TILES = 16
+# Filter size of maps whose texels are about as large as pixels: as wide as the footprint of a pixel.
+_FOOTPRINT = 3
 
 
 @dataclass(frozen=True)
@@ -49,8 +51,8 @@ class ShadowSettings:
             that is pre-filtered.
         transmittance_groups: parts of these casters, front to back, whose depths are encoded apart, 1 to 8; 0 for 2, or 4 where a
             texel sees more than eight casters. As many as there are casters tell them all apart.
-        transmittance_texels, transmittance_filter_size: ``resolution`` and ``filter_size`` of the maps of translucent casters,
-            which points then look up once where pixels look visibility up several times; 0 for those of the other maps.
+        transmittance_texels: ``resolution`` of the maps of translucent casters if points look them up once where pixels look
+            visibility up several times; 0 if these maps are as the others.
         compat: the conventions of Worchel and Alexa's code: unnormalised radial depth, fixed frusta, dark outside of them, their
             kernels, minimum variance 1e-4.
     """
@@ -73,7 +75,6 @@ class ShadowSettings:
     transmittance_method: str = "msm"
     transmittance_groups: int = 0
     transmittance_texels: int = 0
-    transmittance_filter_size: int = 3
 
     def __post_init__(self) -> None:
         for name in ("resolution", "tiles", "filter_size", "order", "supersampling", "transmittance_groups"):
@@ -145,7 +146,8 @@ class ShadowSettings:
         """Settings of transmittance maps."""
         if not self.transmittance_texels:
             return self
-        return replace(self, resolution=self.transmittance_texels, filter_size=self.transmittance_filter_size)
+        filters = "box" if self.transmittance_texels < self.resolution else self.filter
+        return replace(self, resolution=self.transmittance_texels, filter=filters, filter_size=_FOOTPRINT)
 
     @property
     def filterable(self) -> bool:

@@ -15,6 +15,8 @@ from translucent_scenes import camera, glass, leaf, lights, pane, panes, relativ
 from mitsuba_baselines.derivatives import agreement
 from shadowmap_dr import Renderer
 from shadowmap_dr.errors import ShadowmapError
+from shadowmap_dr.rendering.gbuffer import translucency, translucent_layers
+from shadowmap_dr.shadow import transmittance_maps
 
 # Relative errors of scenes of more than one layer, 16 samples per pixel.
 WITHIN = {"two": 0.01, "five": 0.015, "thirty": 0.02, "null": 0.015, "around": 0.01, "blend": 0.01, "leaves": 0.015}
@@ -297,3 +299,36 @@ def test_frozen_steps(variant: str) -> None:
         plain, recorded = (run(renderer, mi.Float(value)) for run in (step, frozen))
         np.testing.assert_allclose(np.array(recorded[0]), np.array(plain[0]), atol=2e-4)
         assert float(recorded[1][0]) == pytest.approx(float(plain[1][0]), rel=2e-3)
+
+
+def placed(scene: mi.Scene, name: str, **settings: Any) -> tuple[np.ndarray, float]:
+    """(image, derivative of the sum of its squares by the place of a shape)."""
+    renderer = Renderer.from_scene(scene, **settings)
+    shift = mi.Float(0)
+    dr.enable_grad(shift)
+    points = renderer.vertices(name) + mi.Point3f(shift, 0, 0)
+    image = renderer.render({name: points}, spp=4)
+    dr.backward(dr.sum(image * image, axis=None))
+    return np.array(image), float(dr.grad(shift)[0])
+
+
+@pytest.mark.parametrize("antialias", [True, False])
+def test_layers_one_by_one_are_the_same(variant: str, monkeypatch: pytest.MonkeyPatch, antialias: bool) -> None:
+    """As if memory were short: layers are then not shaded or encoded together."""
+    scene = scene_of(32, **stacks()["five"])
+    image, gradient = placed(scene, "ball", antialias=antialias)
+    for module in (translucent_layers, transmittance_maps):
+        monkeypatch.setattr(module, "_MOST_NUMBERS", 1)
+    alone, other = placed(scene, "ball", antialias=antialias)
+    np.testing.assert_allclose(alone, image, atol=1e-5)
+    assert other == pytest.approx(gradient, rel=1e-3)
+
+
+def test_fixed_casters_make_no_attached_maps(variant: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Derivatives by the place of an opaque shape between panes are what they are when panes are attached, too."""
+    scene = scene_of(32, **stacks()["five"])
+    image, gradient = placed(scene, "ball")
+    monkeypatch.setattr(translucency, "_attached", lambda *_: True)
+    other, attached = placed(scene, "ball")
+    np.testing.assert_array_equal(other, image)
+    assert attached == pytest.approx(gradient, rel=1e-3)

@@ -12,7 +12,7 @@ import mitsuba as mi
 
 from ..jit.arrays import interleave
 from ..jit.broadcast import broadcast_differentiable
-from ..jit.handover import evaluated
+from ..jit.handover import computed, evaluated
 from ..jit.types import Bool, Color3f, Float, TensorXf
 from ..raster import Crossings, antialias
 from ..scene.geometry import Geometry
@@ -93,15 +93,25 @@ class ImagePass:
             coverage = dr.select(frame.surface.active & (settings.max_depth != 0), mi.Float(1), 0)
         opaque = below = Blended.of(color, coverage)
         made = self._layers(view, layers, opaque, lighting, shapes)
+        outlines = self._outlines_of_levels(frame, layers, shapes) if settings.antialias else ()
         for number in reversed(range(len(layers.opaque))):
             if number < len(made):
                 below = below.behind(made[number])
-            if settings.antialias:
-                below = below.outlined(view, layers.opaque[number], frame.sharpness, shapes)
+            if outlines:
+                below = below.outlined(replace(view, raster=layers.opaque[number]), outlines[number], frame.sharpness, shapes)
         taken = mi.Float(0) if coverage is None else below.channels[-1]
         named = self._aovs_of_nearest(view, lighting, shapes, taken)
         flat = film_channels(mi.UnpolarizedSpectrum(*below.channels[:channels]), taken, sensor)
         return _picture(interleave(flat), view, len(flat), named)
+
+    def _outlines_of_levels(self, frame: Frame, layers: Layers, shapes: PlacedShapes) -> tuple[Crossings, ...]:
+        """See ``Layers.outlines``. Detached."""
+
+        def found() -> tuple[Crossings, ...]:
+            with dr.suspend_grad():
+                return layers.outlines(frame.view.raster, self.cameras.crossings(frame.view, frame.sharpness, shapes))
+
+        return computed("outlines of levels", found)
 
     def _layers(self, view: CameraView, layers: Layers, opaque: Blended, lighting: Lighting, shapes: PlacedShapes) -> list[Layer]:
         """The translucent layers of a view, front to back, several at once. Attached. ``opaque``: as of ``Layer.outlined``."""

@@ -10,7 +10,7 @@ import mitsuba as mi
 from ...jit.broadcast import Copies
 from ...jit.handover import apart, evaluated
 from ...jit.types import Bool, Color3f, Float
-from ...raster import RasterOutput, antialias
+from ...raster import Crossings, antialias
 from .camera_clip import least_gap
 from .camera_view import CameraView, PlacedShapes
 
@@ -43,13 +43,17 @@ class Blended:
         each = zip(layer.radiance, layer.through, layer.beside, self.channels, strict=True)
         return Blended(tuple(radiance + beside + through * (whole - beside) for radiance, through, beside, whole in each))
 
-    def outlined(self, view: CameraView, raster: RasterOutput, sharpness: Float | None, shapes: PlacedShapes) -> Blended:
-        """The light with anti-aliased outlines of the opaque surfaces of a raster (``Layers.opaque``). Attached.
+    def outlined(self, view: CameraView, crossings: Crossings, sharpness: Float | None, shapes: PlacedShapes) -> Blended:
+        """The light with anti-aliased outlines of the opaque surfaces of a view (``Layers.opaque``). Attached.
 
-        ``sharpness``: visibility of edges between facets, or None where all are fully visible.
+        Args:
+            view: the camera, and the surfaces that it sees at one level.
+            crossings: those of their outlines (``Layers.outlines``).
+            sharpness: visibility of edges between facets, or None where all are fully visible.
+            shapes: where they are.
         """
         channels = list(self.channels)
-        return Blended(tuple(apart(outlined(channels, view, raster, sharpness, shapes), len(channels))[0]))
+        return Blended(tuple(apart(outlined(channels, view, sharpness, shapes, crossings), len(channels))[0]))
 
 
 @dataclass(frozen=True)
@@ -104,7 +108,7 @@ class Layer:
             behind = dr.custom(Copies, behind, number, False)
         beside = [dr.select(active, 0, value) for value in behind]
         values = [*self.radiance, *passed, *beside, covered]
-        flat = outlined(values, view, view.raster, sharpness, shapes)
+        flat = outlined(values, view, sharpness, shapes)
         return [Layer._of_outlined(own) for own in apart(flat, len(values), number)]
 
     @classmethod
@@ -130,13 +134,18 @@ class Layer:
         ]
 
 
-def outlined(values: list[Float], view: CameraView, raster: RasterOutput, sharpness: Float | None, shapes: PlacedShapes) -> Float:
-    """Values (N,) with anti-aliased outlines of the surfaces of a raster, interleaved. Edges count only where their surface is in
-    it."""
+def outlined(
+    values: list[Float], view: CameraView, sharpness: Float | None, shapes: PlacedShapes, crossings: Crossings | None = None
+) -> Float:
+    """Values (N,) with anti-aliased outlines of the surfaces of a view, interleaved.
+
+    ``crossings``: of these outlines; None: found here. Edges count then only where their surface is seen.
+    """
     values, sharpness = evaluated("layer", (values, sharpness))
-    topology = replace(view.topology, see_through_faces=dr.full(mi.Bool, True, raster.face_count))
+    topology = replace(view.topology, see_through_faces=dr.full(mi.Bool, True, view.raster.face_count))
     return antialias(
-        *(values, raster, view.clip, topology),
+        *(values, view.raster, view.clip, topology),
+        crossings=crossings,
         **shapes.creases,
         crease_weights=sharpness,
         meetings=True,

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 
+from ...jit.arrays import backend
+from ...jit.kernel_inputs import uint_input
 from ...jit.types import Bool, Float, UInt32
-from ...raster import NO_TRIANGLE, RasterOutput, peeled_layers, stacked, with_triangles
+from ...raster import NO_TRIANGLE, Crossings, RasterOutput, peeled_layers, stacked, with_triangles
 from ...scene.geometry import Geometry
 from .translucent_faces import Faces
 from .transmission import whole_triangles
@@ -25,6 +27,7 @@ class Layers:
     Attributes:
         translucent: K rasters of the whole mesh, front to back, with nothing where rays meet fewer of them.
         textured: True if transmittance needs tangents and texture coordinates.
+        used: number of translucent surfaces of each ray.
         bsdfs: BSDFs of the translucent surfaces.
         opaque: K + 1 rasters of the opaque surfaces that are seen behind no, one, ... translucent surfaces.
         nearest: raster of the nearest surfaces of all.
@@ -34,9 +37,33 @@ class Layers:
     translucent: tuple[RasterOutput, ...]
     opaque: tuple[RasterOutput, ...]
     nearest: RasterOutput
+    used: UInt32
     bsdfs: tuple[mi.BSDF, ...]
     textured: bool
     attached: bool
+
+    def outlines(self, raster: RasterOutput, crossings: Crossings) -> tuple[Crossings, ...]:
+        """The outlines of each of the rasters ``opaque``, from those of all opaque surfaces.
+
+        An outline belongs to the nearer one of the surfaces that it separates.
+
+        Args:
+            raster: of all opaque surfaces.
+            crossings: their outlines.
+        """
+        pixel, last = dr.arange(mi.UInt32, dr.width(self.used)), dr.width(self.used) - 1
+        depth, levels = dr.detach(raster.depth), []
+        dr.eval(depth)
+        for step in (1, raster.width):
+            other = dr.minimum(pixel + uint_input(backend(pixel), "width", step), last)
+            own = depth <= dr.gather(mi.Float, depth, other)
+            levels.append(dr.select(own, self.used, dr.gather(mi.UInt32, self.used, other)))
+        right, down = levels
+        parts = [
+            (dr.select(right == k, crossings.right, 0), dr.select(down == k, crossings.down, 0)) for k in range(len(self.opaque))
+        ]
+        dr.eval(parts)
+        return tuple(replace(crossings, right=right, down=down) for right, down in parts)
 
     def in_batches(self, clip: Float, faces: UInt32) -> Iterator[tuple[RasterOutput, Float]]:
         """Rasters of several translucent layers each, one image for each layer, and the clip-space vertices of these images.
@@ -86,6 +113,6 @@ def see_layers(
 
     behind = [dr.select(used == k, opaque.triangle, NO_TRIANGLE) for k in range(len(triangles) + 1)]
     nearest = dr.select(used == 0, opaque.triangle, triangles[0])
-    dr.eval(triangles, behind, nearest)
+    dr.eval(triangles, behind, nearest, used)
     layers, rest = (tuple(map(raster, each)) for each in (triangles, behind))
-    return Layers(layers, rest, raster(nearest), faces.bsdfs, faces.cutouts, attached)
+    return Layers(layers, rest, raster(nearest), used, faces.bsdfs, faces.cutouts, attached)

@@ -94,19 +94,20 @@ def derivatives() -> None:
 
 
 def steps() -> None:
-    """A step moves the ball below the panes."""
-    print("panes | ms a step | panes' share of a step without any")
+    """A step moves the ball below the panes, or the panes with it."""
+    print("panes | which move | ms a step | panes' share of a step without any")
 
-    def step_of(count: int) -> Any:
+    def step_of(count: int, moving: bool) -> Any:
         parts = {f"p{k}": pane(veil(0.5), 0.9 + 0.1 * k, 0.1 * k - 0.1, 5 * k) for k in range(count)}
         renderer = shadowmap_dr.Renderer.from_scene(scene_of(options.size, **parts))
-        rest, target = dr.ravel(renderer.vertices("ball")), dr.detach(renderer.render())
+        rest = {name: dr.ravel(renderer.vertices(name)) for name in ("ball", *(parts if moving else ()))}
+        target = dr.detach(renderer.render())
 
         @dr.freeze
         def step(renderer: Any, rest: Any, shift: Any, target: Any) -> Any:
             dr.enable_grad(shift)
-            image = renderer.render({"ball": dr.unravel(mi.Point3f, rest) + mi.Point3f(shift, 0, 0)})
-            dr.backward(dr.mean(dr.square(image - target), axis=None))
+            places = {name: dr.unravel(mi.Point3f, points) + mi.Point3f(shift, 0, 0) for name, points in rest.items()}
+            dr.backward(dr.mean(dr.square(renderer.render(places) - target), axis=None))
             return dr.grad(shift)
 
         def run(number: int) -> None:
@@ -117,17 +118,18 @@ def steps() -> None:
             run(number)
         return run
 
-    runs = {count: step_of(count) for count in (0, 1, 2, 4)}
-    taken: dict[int, list[float]] = {count: [] for count in runs}
+    kinds = [(0, False), *((count, moving) for count in (1, 2, 4) for moving in (False, True))]
+    runs = {kind: step_of(*kind) for kind in kinds}
+    taken: dict[tuple[int, bool], list[float]] = {kind: [] for kind in runs}
     for number in range(40):
-        for count, run in runs.items():
+        for kind, run in runs.items():
             start = time.perf_counter()
             run(number)
-            taken[count].append(1e3 * (time.perf_counter() - start))
-    medians = {count: float(np.median(times)) for count, times in taken.items()}
-    for count, median in medians.items():
-        share = f"{(median / medians[0] - 1) / count:.2f} each" if count else ""
-        print(count, f"{median:.2f}", share, sep=" | ", flush=True)
+            taken[kind].append(1e3 * (time.perf_counter() - start))
+    medians = {kind: float(np.median(times)) for kind, times in taken.items()}
+    for (count, moving), median in medians.items():
+        share = f"{(median / medians[0, False] - 1) / count:.2f} each" if count else ""
+        print(count, "all" if moving else "the ball", f"{median:.2f}", share, sep=" | ", flush=True)
 
 
 for section in options.only:

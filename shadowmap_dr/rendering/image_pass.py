@@ -24,7 +24,7 @@ from .gbuffer.camera_view import CameraPass, CameraView, Frame, PlacedShapes
 from .gbuffer.layer_blending import Blended, Layer
 from .gbuffer.surface import coloured
 from .gbuffer.translucent_layers import Layers
-from .gbuffer.transmission import transmittance_of
+from .gbuffer.transmission import transmittance_of, whole_triangles
 from .light_colours import colours_of
 from .light_loops import MANY_LIGHTS
 from .light_pass import IncidentLight, Lighting, LightPass, Visibilities
@@ -98,7 +98,9 @@ class ImagePass:
             if number < len(made):
                 below = below.behind(made[number])
             if outlines:
-                below = below.outlined(replace(view, raster=layers.opaque[number]), outlines[number], frame.sharpness, shapes)
+                below = below.outlined(
+                    replace(view, raster=layers.opaque[number]), outlines[number], frame.sharpness, shapes.creases
+                )
         taken = mi.Float(0) if coverage is None else below.channels[-1]
         named = self._aovs_of_nearest(view, lighting, shapes, taken)
         flat = film_channels(mi.UnpolarizedSpectrum(*below.channels[:channels]), taken, sensor)
@@ -116,14 +118,16 @@ class ImagePass:
     def _layers(self, view: CameraView, layers: Layers, opaque: Blended, lighting: Lighting, shapes: PlacedShapes) -> list[Layer]:
         """The translucent layers of a view, front to back, several at once. Attached. ``opaque``: as of ``Layer.outlined``."""
         made: list[Layer] = []
-        for chosen, clip in layers.in_batches(view.clip, shapes.geometry.faces):
-            seen = replace(view, raster=chosen, clip=clip, layers=None)
-            own = self.cameras.frame(seen, shapes, self.light.needs_frames or layers.textured)
+        faces = layers.faces
+        for chosen, clip in layers.in_batches(view.clip):
+            seen = replace(view, raster=chosen, clip=clip, topology=shapes.translucent, layers=None)
+            needs_frames = self.light.needs_frames or faces.cutouts
+            own = self.cameras.frame(seen, shapes, needs_frames, whole_triangles(chosen, faces))
             radiance = self.light.with_shining(self._reflected(own, lighting, None, shapes)[1], own.surface, lighting)
             active = own.surface.active
-            layer = Layer.of(radiance, transmittance_of(own.surface, layers.bsdfs), active, len(opaque.channels))
+            layer = Layer.of(radiance, transmittance_of(own.surface, faces.bsdfs), active, len(opaque.channels))
             if self.light.settings.antialias:
-                made += layer.outlined(seen, active, opaque, own.sharpness, shapes)
+                made += layer.outlined(seen, active, opaque, own.sharpness, shapes.translucent_creases)
             else:
                 made += layer.apart(chosen.batch)
         return made

@@ -16,6 +16,7 @@ from mitsuba_baselines.derivatives import agreement
 from shadowmap_dr import Renderer
 from shadowmap_dr.errors import ShadowmapError
 from shadowmap_dr.rendering.gbuffer import translucency, translucent_layers
+from shadowmap_dr.rendering.gbuffer.transmission import whole_triangles
 from shadowmap_dr.shadow import transmittance_maps
 
 # Relative errors of scenes of more than one layer, 16 samples per pixel.
@@ -34,9 +35,13 @@ def edges(scene: mi.Scene) -> np.ndarray:
         with dr.suspend_grad():
             cameras = renderer.camera_pass
             view = cameras.view(renderer.data.sensors[0][0], cameras.placed(renderer.data.geometry), 1)
-            levels = [view.raster] if view.layers is None else [view.raster, *view.layers.translucent, *view.layers.opaque]
+            levels = [view.raster.triangle]
+            if view.layers is not None:
+                seen = view.layers
+                levels += [whole_triangles(raster, seen.faces) for raster in seen.translucent]
+                levels += [raster.triangle for raster in seen.opaque]
         for level in levels:
-            triangle = level.triangle.numpy().reshape(found.shape).astype(np.int64)
+            triangle = level.numpy().reshape(found.shape).astype(np.int64)
             faces = renderer.data.geometry.face_shape.numpy()
             shape = np.where(triangle < len(faces), faces[np.minimum(triangle, len(faces) - 1)], -1)
             for axis in (0, 1):

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from ...jit.types import Bool, Float, Point3f
+from ...jit.types import Bool, Float, Point3f, UInt32
 from ...raster import Crossings, RasterOutput, Topology, detach_moved_seams, visible_triangles
 from ...raster.antialiasing.edge_crossings import find_crossings
 from ...scene.geometry import Geometry
@@ -65,7 +65,7 @@ class PlacedShapes:
         facets: (normals of flat faces (Float, 4 F), their sums at each place (Float, 4 V)), None without flat faces.
         creases: edges at which shading jumps, as arguments of :func:`~shadowmap_dr.raster.find_crossings`.
         seen, casting: edges of the shapes that cameras see, and of those that cast shadows.
-        translucent: edges of the translucent faces alone, None without any.
+        translucent, translucent_creases: edges of the translucent faces alone, None and nothing without any.
     """
 
     geometry: Geometry
@@ -74,6 +74,7 @@ class PlacedShapes:
     seen: Topology
     casting: Topology
     translucent: Topology | None = None
+    translucent_creases: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -138,7 +139,9 @@ class CameraPass:
         creases = {}
         if self.creases is not None:
             creases = {"creases": self.creases.now(geometry), "folds": self.creases.folds_of(facets and facets[0])}
-        return PlacedShapes(geometry, facets, creases, *self._topologies(geometry))
+        faces = None if self.translucency is None else self.translucency.faces
+        own = {} if faces is None else faces.creases(creases)
+        return PlacedShapes(geometry, facets, creases, *self._topologies(geometry), own)
 
     def view(self, sensor: Sensor, shapes: PlacedShapes, factor: int) -> CameraView:
         """Rasterize the scene. Clip-space vertices are attached to vertices and camera."""
@@ -174,10 +177,13 @@ class CameraPass:
         points = mi.Point3f(*(dr.concat([p[c] for p, _ in found]) for c in range(3)))
         return points, dr.concat([mi.Bool(hit) for _, hit in found])
 
-    def frame(self, view: CameraView, shapes: PlacedShapes, frames: bool) -> Frame:
-        """The surfaces that a camera sees, attached. ``frames``: as for :func:`surface_at`."""
-        sensor, raster, geometry = view.sensor, view.raster, shapes.geometry
-        hits = pixel_hits(geometry, sensor, raster.triangle, view.size)
+    def frame(self, view: CameraView, shapes: PlacedShapes, frames: bool, triangle: UInt32 | None = None) -> Frame:
+        """The surfaces that a camera sees, attached.
+
+        ``frames``: as for :func:`surface_at`; ``triangle``: triangles of the scene if the view shows a part of them alone.
+        """
+        sensor, geometry = view.sensor, shapes.geometry
+        hits = pixel_hits(geometry, sensor, view.raster.triangle if triangle is None else triangle, view.size)
         hits = replace(hits, active=hits.active & within_far_plane(sensor, hits.depth))
         normals, sharpness = normals_at(geometry, hits), None
         if shapes.facets is not None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -12,7 +13,7 @@ from ...jit.handover import apart, evaluated
 from ...jit.types import Bool, Color3f, Float
 from ...raster import Crossings, antialias
 from .camera_clip import least_gap
-from .camera_view import CameraView, PlacedShapes
+from .camera_view import CameraView
 
 # Share of a pixel; a layer that covers less is not there.
 _LEAST_SHARE = 1e-6
@@ -43,17 +44,17 @@ class Blended:
         each = zip(layer.radiance, layer.through, layer.beside, self.channels, strict=True)
         return Blended(tuple(radiance + beside + through * (whole - beside) for radiance, through, beside, whole in each))
 
-    def outlined(self, view: CameraView, crossings: Crossings, sharpness: Float | None, shapes: PlacedShapes) -> Blended:
+    def outlined(self, view: CameraView, crossings: Crossings, sharpness: Float | None, creases: dict[str, Any]) -> Blended:
         """The light with anti-aliased outlines of the opaque surfaces of a view (``Layers.opaque``). Attached.
 
         Args:
             view: the camera, and the surfaces that it sees at one level.
             crossings: those of their outlines (``Layers.outlines``).
             sharpness: visibility of edges between facets, or None where all are fully visible.
-            shapes: where they are.
+            creases: edges at which shading jumps (``PlacedShapes.creases``), those of the faces of the view.
         """
         channels = list(self.channels)
-        return Blended(tuple(apart(outlined(channels, view, sharpness, shapes, crossings), len(channels))[0]))
+        return Blended(tuple(apart(outlined(channels, view, sharpness, creases, crossings), len(channels))[0]))
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,7 @@ class Layer:
         active: Bool,
         opaque: Blended,
         sharpness: Float | None,
-        shapes: PlacedShapes,
+        creases: dict[str, Any],
     ) -> list[Layer]:
         """This layer, or these layers one after the other, with anti-aliased outlines. Attached.
 
@@ -99,7 +100,7 @@ class Layer:
             active: where layers are.
             opaque: light of opaque surfaces, without anti-aliasing. They are what is seen beside a layer.
             sharpness: visibility of edges between facets, or None where all are fully visible.
-            shapes: where they are.
+            creases: edges at which shading jumps (``PlacedShapes.creases``), those of the faces of the view.
         """
         number, covered = view.raster.batch, dr.select(active, mi.Float(1), 0)
         passed = [covered * value for value in self.through]
@@ -108,7 +109,7 @@ class Layer:
             behind = dr.custom(Copies, behind, number, False)
         beside = [dr.select(active, 0, value) for value in behind]
         values = [*self.radiance, *passed, *beside, covered]
-        flat = outlined(values, view, sharpness, shapes)
+        flat = outlined(values, view, sharpness, creases)
         return [Layer._of_outlined(own) for own in apart(flat, len(values), number)]
 
     @classmethod
@@ -135,18 +136,17 @@ class Layer:
 
 
 def outlined(
-    values: list[Float], view: CameraView, sharpness: Float | None, shapes: PlacedShapes, crossings: Crossings | None = None
+    values: list[Float], view: CameraView, sharpness: Float | None, creases: dict[str, Any], crossings: Crossings | None = None
 ) -> Float:
     """Values (N,) with anti-aliased outlines of the surfaces of a view, interleaved.
 
-    ``crossings``: of these outlines; None: found here. Edges count then only where their surface is seen.
+    ``crossings``: of these outlines; None: found here.
     """
     values, sharpness = evaluated("layer", (values, sharpness))
-    topology = replace(view.topology, see_through_faces=dr.full(mi.Bool, True, view.raster.face_count))
     return antialias(
-        *(values, view.raster, view.clip, topology),
+        *(values, view.raster, view.clip, view.topology),
         crossings=crossings,
-        **shapes.creases,
+        **creases,
         crease_weights=sharpness,
         meetings=True,
         gap=least_gap(view.sensor),

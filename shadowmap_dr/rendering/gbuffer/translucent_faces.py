@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...jit.arrays import device_array
+from ...jit.arrays import device_array, ravel
 from ...jit.types import Bool, UInt32
-from ...raster import Topology, build_topology
+from ...raster import CoplanarCreases, Topology, build_topology
 from ...scene.load import SceneData
 from ...scene.mitsuba_objects import passes_evenly
 
@@ -36,6 +38,21 @@ class Faces:
     cutouts: bool
     room: int | None
     bsdfs: tuple[mi.BSDF, ...]
+
+    def creases(self, creases: dict[str, Any]) -> dict[str, Any]:
+        """Those of the creases of all faces (``PlacedShapes.creases``) that the translucent faces have."""
+        corner = dr.arange(mi.UInt32, dr.width(self.corners))
+        face = corner // 3
+        edge = 3 * dr.gather(mi.UInt32, self.index, face) + corner - 3 * face
+
+        found, edges, folds = dict(creases), creases.get("creases"), creases.get("folds")
+        if edges is not None:
+            found["creases"] = dr.gather(mi.Bool, edges, edge)
+        if folds is not None:
+            normals = ravel(dr.gather(mi.Vector4f, folds.normals, self.index))
+            found["folds"] = CoplanarCreases(dr.gather(mi.Bool, folds.edges, edge), normals)
+        dr.eval(found)
+        return found
 
 
 def faces_of(data: SceneData, positions: np.ndarray) -> tuple[Bool | None, Faces | None]:

@@ -25,21 +25,19 @@ class Layers:
     """The translucent surfaces that a camera sees, K at most along each ray.
 
     Attributes:
-        translucent: K rasters of the whole mesh, front to back, with nothing where rays meet fewer of them.
-        textured: True if transmittance needs tangents and texture coordinates.
+        translucent: K rasters of the translucent faces alone, front to back, with nothing where rays meet fewer of them.
+        faces: these faces.
         used: number of translucent surfaces of each ray.
-        bsdfs: BSDFs of the translucent surfaces.
         opaque: K + 1 rasters of the opaque surfaces that are seen behind no, one, ... translucent surfaces.
         nearest: raster of the nearest surfaces of all.
         attached: False if places and outlines of the translucent surfaces carry no gradients.
     """
 
     translucent: tuple[RasterOutput, ...]
+    faces: Faces
     opaque: tuple[RasterOutput, ...]
     nearest: RasterOutput
     used: UInt32
-    bsdfs: tuple[mi.BSDF, ...]
-    textured: bool
     attached: bool
 
     def outlines(self, raster: RasterOutput, crossings: Crossings) -> tuple[Crossings, ...]:
@@ -65,16 +63,16 @@ class Layers:
         dr.eval(parts)
         return tuple(replace(crossings, right=right, down=down) for right, down in parts)
 
-    def in_batches(self, clip: Float, faces: UInt32) -> Iterator[tuple[RasterOutput, Float]]:
+    def in_batches(self, clip: Float) -> Iterator[tuple[RasterOutput, Float]]:
         """Rasters of several translucent layers each, one image for each layer, and the clip-space vertices of these images.
 
-        Args:
-            clip, faces: clip-space vertices (4 V,) and faces (3 F,) of the scene. Attached.
+        ``clip``: clip-space vertices (4 V,) of the scene. Attached.
         """
         first, clip = self.translucent[0], clip if self.attached else dr.detach(clip)
-        at_once = max(1, _MOST_NUMBERS // max(dr.width(first.triangle), dr.width(clip), 4 * dr.width(faces)))
+        corners = self.faces.corners
+        at_once = max(1, _MOST_NUMBERS // max(dr.width(first.triangle), dr.width(clip), 4 * dr.width(corners)))
         for start in range(0, len(self.translucent), at_once):
-            yield stacked(self.translucent[start : start + at_once], clip, faces, 1)
+            yield stacked(self.translucent[start : start + at_once], clip, corners, 1)
 
 
 def see_layers(
@@ -114,5 +112,4 @@ def see_layers(
     behind = [dr.select(used == k, opaque.triangle, NO_TRIANGLE) for k in range(len(triangles) + 1)]
     nearest = dr.select(used == 0, opaque.triangle, triangles[0])
     dr.eval(triangles, behind, nearest, used)
-    layers, rest = (tuple(map(raster, each)) for each in (triangles, behind))
-    return Layers(layers, rest, raster(nearest), used, faces.bsdfs, faces.cutouts, attached)
+    return Layers(tuple(peeled), faces, tuple(map(raster, behind)), raster(nearest), used, attached)

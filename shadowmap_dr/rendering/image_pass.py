@@ -118,9 +118,10 @@ class ImagePass:
     def _layers(self, view: CameraView, layers: Layers, opaque: Blended, lighting: Lighting, shapes: PlacedShapes) -> list[Layer]:
         """The translucent layers of a view, front to back, several at once. Attached. ``opaque``: as of ``Layer.outlined``."""
         made: list[Layer] = []
-        faces = layers.faces
+        faces, edges = layers.faces, shapes.translucent
+        assert edges is not None, "placed together with the translucent faces"
         for chosen, clip in layers.in_batches(view.clip):
-            seen = replace(view, raster=chosen, clip=clip, topology=shapes.translucent, layers=None)
+            seen = replace(view, raster=chosen, clip=clip, topology=edges, layers=None)
             needs_frames = self.light.needs_frames or faces.cutouts
             own = self.cameras.frame(seen, shapes, needs_frames, whole_triangles(chosen, faces))
             radiance = self.light.with_shining(self._reflected(own, lighting, None, shapes)[1], own.surface, lighting)

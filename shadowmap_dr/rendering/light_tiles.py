@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import drjit as dr
 import numpy as np
 
 from ..jit.types import Bool, Point3f
@@ -20,8 +21,12 @@ _TEXELS = 1.25
 # From so many lights on, each has a small share in the errors of the image. In small images their maps have one texel for each
 # pixel, and at least so many along each side, a multiple of a number.
 _MANY_ERRORS, _FEWEST, _STEP = 4, 128, 32
-# Texels of transmittance maps for each sample, along each side, a multiple of a number.
-_FINE, _FEWEST_OF_TRANSMITTANCE, _PACKET = 1.25, 32, 8
+# Texels of transmittance maps, along each side, over the root of the number of samples, if these cover all of a map.
+_FINE = 2.5
+# They have at least so many, a multiple of a number.
+_FEWEST_OF_TRANSMITTANCE, _PACKET = 32, 8
+# Cells along each side of a map that are looked at for points that the camera sees.
+_CELLS = 32
 
 
 def sized(shadow: ShadowSettings, plan: MapPlan, pixels: int) -> ShadowSettings:
@@ -36,8 +41,32 @@ def sized(shadow: ShadowSettings, plan: MapPlan, pixels: int) -> ShadowSettings:
     return shadow.fewer(max(_FEWEST, _STEP * math.ceil(math.sqrt(pixels) / _STEP)))
 
 
-def with_transmittance(settings: RenderSettings, shadow: ShadowSettings, samples: int) -> ShadowSettings:
-    """Settings of maps for scenes with translucent casters, for images of so many samples.
+def fineness(plan: MapPlan, data: SceneData, shadow: ShadowSettings, fit: Frusta | None, seen: tuple[Point3f, Bool]) -> float:
+    """Texels of maps, along each side, whose texels are somewhat smaller than samples, over the root of the number of samples.
+
+    The map decides in which the points that the camera sees lie closest together. Infinite without maps. Reads back.
+
+    Args:
+        plan, data, fit: as of :func:`with_tiles`, with one map for each image plane.
+        shadow: settings of the maps.
+        seen: points that the camera sees, one for each sample, and the mask of the valid ones.
+    """
+    if fit is None or not data.lights:
+        return math.inf
+    most, samples = 0.0, dr.width(seen[1])
+    for first, light, kind in zip(plan.first, data.lights, plan.kinds, strict=True):
+        for k, view in enumerate(light.map_views(kind, shadow.resolution, shadow.filter_size)):
+            u, v, _, inside = project(stack_views([view]), fit.part(first + k, 1), seen[0])
+            chosen = (inside & seen[1]).numpy()
+            places = [((place.numpy()[chosen] * 0.5 + 0.5) * _CELLS).astype(int) for place in (u, v)]
+            cells = len(np.unique(places[0] * _CELLS + places[1]))
+            if cells:
+                most = max(most, chosen.sum() / samples / (cells / _CELLS**2))
+    return _FINE * math.sqrt(most) if most else math.inf
+
+
+def with_transmittance(settings: RenderSettings, shadow: ShadowSettings, samples: int, fineness: float) -> ShadowSettings:
+    """Settings of maps for scenes with translucent casters, for images of so many samples. ``fineness``: see :func:`fineness`.
 
     In small images a pixel looks visibility up several times. Each texel of a transmittance map holds many more numbers: these
     maps have larger texels instead, and a filter that takes the mean over the pixel's footprint.
@@ -45,8 +74,9 @@ def with_transmittance(settings: RenderSettings, shadow: ShadowSettings, samples
     side = math.sqrt(samples)
     if not shadow.adaptive or settings.look_ups(int(side)) == 1:
         return shadow
-    wanted = max(_FEWEST_OF_TRANSMITTANCE, _PACKET * math.ceil(_FINE * side / _PACKET))
-    return replace(shadow, transmittance_texels=min(wanted, shadow.resolution))
+    wanted = min(fineness * side, shadow.resolution)
+    texels = max(_FEWEST_OF_TRANSMITTANCE, _PACKET * math.ceil(wanted / _PACKET))
+    return replace(shadow, transmittance_texels=min(texels, shadow.resolution))
 
 
 def with_tiles(

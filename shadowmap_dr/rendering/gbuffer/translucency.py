@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from math import inf
 
 import drjit as dr
 import numpy as np
@@ -50,6 +51,7 @@ class Translucency:
         faces: the translucent ones; None if the others are unseen.
         camera, maps: layers along the rays of cameras and of lights.
         fixed: number of layers that was asked for, None for as many as there are.
+        fineness: of transmittance maps, see :func:`~shadowmap_dr.rendering.light_tiles.fineness`.
     """
 
     opaque: Bool
@@ -57,6 +59,7 @@ class Translucency:
     camera: LayerCounts = LayerCounts()
     maps: LayerCounts = LayerCounts()
     fixed: int | None = None
+    fineness: float = inf
 
     @classmethod
     def of(cls, data: SceneData, positions: np.ndarray, layers: int | None) -> Translucency | None:

@@ -80,19 +80,18 @@ def evaluated(name: str, tree: TreeT) -> TreeT:
     return tree
 
 
-def interleaved(name: str, values: list[Float]) -> Float:
-    """Flat array with the entries of several arrays interleaved, :func:`evaluated`."""
+def interleaved(name: str, values: list[Float], parts: int = 1) -> Float:
+    """Flat array with the entries of several arrays interleaved, :func:`evaluated`.
+
+    ``parts``: number of equal parts of ``values`` that come after one another; of several, each is a multiple of four arrays.
+    """
     if len(values) == 1:
         return evaluated(name, values[0])
+    packed = parts > 1 or (len(values) > 4 and len(values) % 4 == 0)
     if _state.given is None:
-        return evaluated(name, _in_packets(values) if len(values) > 4 and len(values) % 4 == 0 else interleave(values))
+        return evaluated(name, dr.custom(_Packed, values, parts) if packed else interleave(values))
     given = _next(name)
-    return dr.custom(_Interleaved, given, values) if dr.grad_enabled(values) else given
-
-
-def _in_packets(values: list[Float]) -> Float:
-    """As ``interleave``, for a multiple of four arrays: a kernel for each number would read all of them again."""
-    return dr.custom(_Packed, values)
+    return dr.custom(_Interleaved, given, values, parts) if dr.grad_enabled(values) else given
 
 
 def apart(flat: Float, count: int, parts: int = 1) -> list[list[Float]]:
@@ -148,39 +147,45 @@ class _Apart(dr.CustomOp):
 
 
 class _Packed(dr.CustomOp):
-    """Interleaved values, written in packets of four."""
+    """Interleaved values, written in packets of four: a kernel for each number would read all of them again."""
 
-    def eval(self, values: list[Float]) -> Float:
-        self.count = len(values)
+    def eval(self, values: list[Float], parts: int) -> Float:
+        self.count, self.parts = len(values) // parts, parts
         return self._written(values)
 
     def forward(self) -> None:
         self.set_grad_out(self._written(cast("list[Float]", self.grad_in("values"))))
 
     def backward(self) -> None:
-        self.set_grad_in("values", apart(cast("Float", self.grad_out()), self.count)[0])
+        found = apart(cast("Float", self.grad_out()), self.count, self.parts)
+        self.set_grad_in("values", [value for part in found for value in part])
 
     def name(self) -> str:
         return "packed"
 
     def _written(self, values: list[Float]) -> Float:
-        module = backend(values[0])
-        entry = dr.arange(module.UInt32, max(dr.width(value) for value in values))
-        result = dr.empty(module.Float, self.count * dr.width(entry))
-        for k in range(self.count // 4):
-            dr.scatter(result, module.Array4f(*values[4 * k : 4 * k + 4]), entry * (self.count // 4) + k)
+        module, entries = backend(values[0]), max(dr.width(value) for value in values)
+        entry, each = dr.arange(module.UInt32, entries), self.count // 4
+        result = dr.empty(module.Float, len(values) * entries)
+        for k in range(len(values) // 4):
+            part, number = divmod(k, each)
+            place = entry + uint_input(module, "first entry", part * entries) if part else entry
+            dr.scatter(result, module.Array4f(*values[4 * k : 4 * k + 4]), place * each + number)
         return result
 
 
 class _Interleaved(dr.CustomOp):
     """Known interleaved values, with the derivatives of the values. Writing these once more would be a kernel of its own."""
 
-    def eval(self, given: Float, values: list[Float]) -> Float:
-        self.count = len(values)
+    def eval(self, given: Float, values: list[Float], parts: int) -> Float:
+        self.count, self.parts = len(values), parts
         return given
 
     def backward(self) -> None:
         adjoint = cast("Float", self.grad_out())
+        if self.parts > 1:
+            self.set_grad_in("values", [value for part in apart(adjoint, self.count // self.parts, self.parts) for value in part])
+            return
         module = backend(adjoint)
         packet = {2: module.Array2f, 4: module.Array4f}.get(self.count)
         lane = dr.arange(module.UInt32, dr.width(adjoint) // self.count)

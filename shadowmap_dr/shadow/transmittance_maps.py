@@ -124,58 +124,28 @@ def _rendered(
     )
     groups = groups_of(settings, casters.layers)
     at_once = max(1, _MOST_NUMBERS // max(count * size * size, dr.width(clip)))
-    light, colours = _Light(), 0
-    for first in range(0, casters.layers, at_once):
-        chosen = layers[first : first + at_once]
-        raster, positions = stacked(chosen, clip, casters.faces, count)
-        numbers, each, colours = _numbers(casters, raster, positions, views, frusta, settings)
-        for k, own in enumerate(apart(numbers, each, len(chosen))):
-            light.lose(own, colours, (first + k) * groups // casters.layers)
-        if at_once < casters.layers:
-            dr.eval(light.left, light.groups)
-    # A multiple of four numbers, as filters and look-ups need. Not zeros: Dr.Jit 1.5 ends the process in forward mode where only
-    # some of the numbers are attached.
-    padded = [group + group[-1:] * (-len(group) % 4) for group in light.groups]
-    values = interleaved("transmittance", [value for group in padded for value in group])
-    return TransmittanceMaps(values, groups, len(padded[0]), colours)
-
-
-class _Light:
-    """Light on its way through the layers of texels, front to back.
-
-    Attributes:
-        groups: numbers of texels, see :attr:`TransmittanceMaps.values`.
-        left: light of each colour that is left, and its mean.
-    """
-
-    def __init__(self) -> None:
-        self.groups: list[list[Float]] = []
-        self.left: list[Float] = []
-
-    def lose(self, numbers: list[Float], colours: int, group: int) -> None:
-        """Let the light pass one more layer. ``numbers``: those of the layer alone."""
-        lost = [*numbers[:colours], _mean(numbers[:colours])]
-        taken = numbers
-        if self.left:
-            factors = self.left + self.left[-1:] * (len(numbers) - colours - 1)
-            taken = [value * factor for value, factor in zip(numbers, factors, strict=True)]
-            self.left = [left - left * value for left, value in zip(self.left, lost, strict=True)]
-        else:
-            self.left = [1 - value for value in lost]
-        if group == len(self.groups):
-            self.groups.append(taken)
-        else:
-            self.groups[group] = [a + b for a, b in zip(self.groups[group], taken, strict=True)]
+    light: list[Float] = []
+    colours = 0
+    for last in range(casters.layers, 0, -at_once):
+        first = max(last - at_once, 0)
+        raster, positions = stacked(layers[first:last], clip, casters.faces, count)
+        own, colours = _numbers(casters, raster, positions, views, frusta, settings)
+        composites: list[list[Float]] = []
+        for number in reversed(range(first, last)):
+            behind = composites[0] if composites else light
+            composites.insert(0, _in_front(own[number - first], behind, colours, number * groups // casters.layers, groups))
+        light = composites[0]
+        if settings.antialias and casters.topology.count:
+            light = _outlined(composites, own, colours, raster, positions, casters.topology)
+        if first:
+            dr.eval(light)
+    return TransmittanceMaps(interleaved("transmittance", light), groups, len(light) // groups, colours)
 
 
 def _numbers(
     casters: TranslucentCasters, raster: RasterOutput, positions: Float, views: Views, frusta: Frusta, settings: ShadowSettings
-) -> tuple[Float, int, int]:
-    """(numbers of all texels of all layers, each for the surface of that layer alone, interleaved; how many a texel has; how many
-    colours).
-
-    They are anti-aliased, each layer by itself: what lies behind an outline is taken to be the same on both sides of it.
-    """
+) -> tuple[list[list[Float]], int]:
+    """(numbers of the texels of each layer, for the surface of that layer alone; number of colours)."""
     count = views.count
     image, _, _ = pixel_coordinates(backend(positions), raster.batch, raster.height, raster.width)
     map_index = split(image, "maps", count, raster.batch // count)[1] if raster.batch > count else image
@@ -190,10 +160,57 @@ def _numbers(
     taken = [dr.select(texels.shown, 1 - value, 0) for value in through]
     weight = _mean(taken) + dr.select(texels.shown, _LEAST_WEIGHT, 0)
     own = [*taken, weight, *(dr.select(texels.shown, weight * number, 0) for number in depth)]
-    values = interleaved("layers of texels", own)
-    if settings.antialias and casters.topology.count:
-        values = antialias(values, raster, positions, casters.topology)
-    return values, len(own), len(through)
+    # A multiple of four numbers, as filters and look-ups need. Not zeros: Dr.Jit 1.5 ends the process in forward mode where only
+    # some of the numbers are attached.
+    own += own[-1:] * (-len(own) % 4)
+    return apart(interleaved("layers of texels", own), len(own), raster.batch // count), len(through)
+
+
+def _in_front(own: list[Float], behind: list[Float], colours: int, group: int, groups: int) -> list[Float]:
+    """Numbers of all groups with a layer (``own`` numbers) in front of others (``behind``, none if empty)."""
+    first, last = group * len(own), (group + 1) * len(own)
+    passed = _passed(own, colours) * groups
+    numbers = [left * value for left, value in zip(passed, behind, strict=True)] if behind else [type(own[0])(0)] * len(passed)
+    numbers[first:last] = [a + b for a, b in zip(own, numbers[first:last], strict=True)]
+    return numbers
+
+
+def _passed(own: list[Float], colours: int) -> list[Float]:
+    """Share of each number of the surfaces behind that a layer lets through."""
+    lost = own[:colours]
+    return [*(1 - value for value in lost), *([1 - _mean(lost)] * (len(own) - colours))]
+
+
+def _outlined(
+    composites: list[list[Float]],
+    own: list[list[Float]],
+    colours: int,
+    raster: RasterOutput,
+    positions: Float,
+    topology: Topology,
+) -> list[Float]:
+    """Numbers of all groups, anti-aliased at the outlines of several layers.
+
+    Outlines of a layer blend that layer and all that lies behind it: surfaces may be in other layers on the other side. Outlines
+    of different layers are taken to lie in different texels.
+
+    Args:
+        composites: numbers of all groups for each layer and the layers behind it, front to back.
+        own: numbers of the surfaces of each layer alone.
+        colours: number of colours.
+        raster, positions, topology: of all layers.
+    """
+    count, parts = len(composites[0]), len(composites)
+    flat = interleaved("composites of layers", [value for numbers in composites for value in numbers], parts)
+    blended = apart(antialias(flat, raster, positions, topology), count, parts)
+    light: list[Float] = blended[0]
+    left: list[Float] = []
+    for k in range(1, parts):
+        passed = _passed(own[k - 1], colours) * (count // len(own[0]))
+        left = [a * b for a, b in zip(passed, left, strict=True)] if left else passed
+        changes = (b - a for a, b in zip(composites[k], blended[k], strict=True))
+        light = [dr.fma(factor, change, value) for factor, change, value in zip(left, changes, light, strict=True)]
+    return light
 
 
 def _mean(values: list[Float]) -> Float:

@@ -22,7 +22,7 @@ _TEXELS = 1.25
 # pixel, and at least so many along each side, a multiple of a number.
 _MANY_ERRORS, _FEWEST, _STEP = 4, 128, 32
 # Texels of transmittance maps, along each side, over the root of the number of samples, if these cover all of a map.
-_FINE = 2.5
+_FINE = 2.3
 # They have at least so many, a multiple of a number.
 _FEWEST_OF_TRANSMITTANCE, _PACKET = 32, 8
 # Cells along each side of a map that are looked at for points that the camera sees.

@@ -174,7 +174,7 @@ def test_parameters_are_the_settings_of_the_renderer() -> None:
     shadow = {name: getattr(ShadowSettings, SHADOW_NAMES[name]) for name in SHADOW_NAMES}
     shadow |= {"shadow_map_resolution": AUTO, "shadow_tiles": 0, "shadow_filter_size": 0}  # chosen by the renderer
     assert options == {**settings, **shadow}
-    others = {"bias", "tile_filter_size", "adaptive"}
+    others = {"bias", "tile_filter_size", "adaptive", "transmittance_texels"}
     assert {setting.name for setting in fields(ShadowSettings)} == {*SHADOW_NAMES.values(), *others}
     assert RenderSettings.of(**options) == RenderSettings()
 

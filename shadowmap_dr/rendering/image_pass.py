@@ -57,7 +57,8 @@ class ImagePass:
         visibilities if ``visible`` is given."""
         light, settings = self.light, self.light.settings
         frame = self.cameras.frame(view, shapes, light.needs_frames)
-        incident, color = self._seen(frame, lighting, visible, shapes)
+        incident, color = self._reflected(frame, lighting, visible, shapes)
+        color = light.with_emission(color, frame.surface, lighting, view.sensor, view.size)
         if view.layers is not None:
             return self._layered(frame, view.layers, color, lighting, shapes)
         seen = frame.surface
@@ -76,13 +77,6 @@ class ImagePass:
             )
             return _picture(flat, view, len(channels), named)
         return self._mixed(color, seen.active, view, crossings, named)
-
-    def _seen(
-        self, frame: Frame, lighting: Lighting, visible: Visibilities | None, shapes: PlacedShapes
-    ) -> tuple[IncidentLight, Color3f]:
-        """(light that reaches a frame, radiance (colour, N) that it sends to the camera). Attached."""
-        incident, color = self._reflected(frame, lighting, visible, shapes)
-        return incident, self.light.with_emission(color, frame.surface, lighting, frame.view.sensor, frame.view.size)
 
     def _layered(self, frame: Frame, layers: Layers, color: Color3f, lighting: Lighting, shapes: PlacedShapes) -> TensorXf:
         """The image of opaque surfaces (``frame``, of ``color``) and of the translucent layers before them. Attached."""

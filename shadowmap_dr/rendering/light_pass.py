@@ -146,7 +146,7 @@ class LightPass:
         outward: ``Bool`` (F,), faces that shadow maps show from the front only, or None.
         slices: slices of the lights, whose maps are in memory one after the other; none if all fit together.
         shadow: settings of the maps of lights without extent, None for those of ``settings``.
-        fineness: of transmittance maps (:func:`~.light_tiles.fineness`), None without translucent casters.
+        texel_density: of transmittance maps (:func:`~.light_tiles.texel_density`), None without translucent casters.
     """
 
     data: SceneData
@@ -156,13 +156,13 @@ class LightPass:
     outward: Bool | None
     slices: tuple[LightSlice, ...] = ()
     shadow: ShadowSettings | None = None
-    fineness: float | None = None
+    texel_density: float | None = None
 
     def for_image(self, pixels: int, spp: int = 1) -> LightPass:
         """The same pass with maps as large as images of so many pixels, with ``spp`` samples each, need."""
         shadow = sized(self.settings.shadow, self.plan, pixels)
-        if self.fineness is not None:
-            shadow = with_transmittance(self.settings, shadow, pixels * spp, self.fineness)
+        if self.texel_density is not None:
+            shadow = with_transmittance(self.settings, shadow, pixels * spp, self.texel_density)
         if shadow is self.settings.shadow:
             return self
         # Slices were planned for larger maps.

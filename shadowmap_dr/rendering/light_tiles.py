@@ -41,7 +41,9 @@ def sized(shadow: ShadowSettings, plan: MapPlan, pixels: int) -> ShadowSettings:
     return shadow.fewer(max(_FEWEST, _STEP * math.ceil(math.sqrt(pixels) / _STEP)))
 
 
-def fineness(plan: MapPlan, data: SceneData, shadow: ShadowSettings, fit: Frusta | None, seen: tuple[Point3f, Bool]) -> float:
+def texel_density(
+    plan: MapPlan, data: SceneData, shadow: ShadowSettings, fit: Frusta | None, seen: tuple[Point3f, Bool]
+) -> float:
     """Texels of maps, along each side, whose texels are somewhat smaller than samples, over the root of the number of samples.
 
     The map decides in which the points that the camera sees lie closest together. Infinite without maps. Reads back.
@@ -49,7 +51,7 @@ def fineness(plan: MapPlan, data: SceneData, shadow: ShadowSettings, fit: Frusta
     Args:
         plan, data, fit: as of :func:`with_tiles`, with one map for each image plane.
         shadow: settings of the maps.
-        seen: points that the camera sees, one for each sample, and the mask of the valid ones.
+        seen: points that the camera sees, spread evenly over the samples, and the mask of the valid ones.
     """
     if fit is None or not data.lights:
         return math.inf
@@ -65,8 +67,8 @@ def fineness(plan: MapPlan, data: SceneData, shadow: ShadowSettings, fit: Frusta
     return _FINE * math.sqrt(most) if most else math.inf
 
 
-def with_transmittance(settings: RenderSettings, shadow: ShadowSettings, samples: int, fineness: float) -> ShadowSettings:
-    """Settings of maps for scenes with translucent casters, for images of so many samples. ``fineness``: see :func:`fineness`.
+def with_transmittance(settings: RenderSettings, shadow: ShadowSettings, samples: int, density: float) -> ShadowSettings:
+    """Settings of maps for scenes with translucent casters, for images of so many samples. ``density``: :func:`texel_density`.
 
     In small images a pixel looks visibility up several times. Each texel of a transmittance map holds many more numbers: these
     maps have larger texels instead, and a filter that takes the mean over the pixel's footprint.
@@ -74,7 +76,7 @@ def with_transmittance(settings: RenderSettings, shadow: ShadowSettings, samples
     side = math.sqrt(samples)
     if not shadow.adaptive or settings.look_ups(int(side)) == 1:
         return shadow
-    wanted = min(fineness * side, shadow.resolution)
+    wanted = min(density * side, shadow.resolution)
     texels = max(_FEWEST_OF_TRANSMITTANCE, _PACKET * math.ceil(wanted / _PACKET))
     return replace(shadow, transmittance_texels=min(texels, shadow.resolution))
 

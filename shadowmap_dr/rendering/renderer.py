@@ -40,7 +40,7 @@ from .image_pass import ImagePass
 from .light_loops import MANY_LIGHTS
 from .light_pass import Lighting, LightPass, plan_extended_lights
 from .light_slices import LightSlice, plan_slices
-from .light_tiles import fineness, with_tiles
+from .light_tiles import texel_density, with_tiles
 from .pass_cache import CacheLevel, PassCache
 from .settings import RenderSettings
 from .shadow_pass import MapPlan, check_sizes, plan_maps
@@ -214,8 +214,10 @@ class Renderer:
                 made.frusta, made.soft_frusta = made.light_pass.fit(shapes, seen)
             if made.translucency is not None:
                 bare = [replace(view, layers=None) for view in views]
-                fine = fineness(self.plan.undivided, data, self.settings.shadow, undivided, cameras.seen(bare, data.geometry))
-                made.translucency = replace(made.translucency, fineness=fine)
+                density = texel_density(
+                    self.plan.undivided, data, self.settings.shadow, undivided, cameras.seen(bare, data.geometry)
+                )
+                made.translucency = replace(made.translucency, texel_density=density)
                 others = [cameras.view(camera, shapes, 1) for each in data.sensors[1:] for camera in sample_windows(each)]
                 pictures = [(view.clip, view.raster) for view in (*views, *others)]
                 maps = made.light_pass.for_image(pixels).map_vertices(shapes.geometry, (made.frusta, made.soft_frusta))
@@ -375,8 +377,8 @@ class Renderer:
     @property
     def light_pass(self) -> LightPass:
         """The pass that renders shadow maps and light."""
-        fine = None if self.translucency is None else self.translucency.fineness
-        return LightPass(self.data, self.settings, self.plan, self.soft, self.outward, self.slices, fineness=fine)
+        density = None if self.translucency is None else self.translucency.texel_density
+        return LightPass(self.data, self.settings, self.plan, self.soft, self.outward, self.slices, texel_density=density)
 
     def _lighting(
         self, light: LightPass, views: Sequence[CameraView], shapes: PlacedShapes, replacements: Mapping[str, Any] | None

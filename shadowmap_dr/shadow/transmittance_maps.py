@@ -18,8 +18,9 @@ import drjit as dr
 
 from ..jit.arrays import backend
 from ..jit.broadcast import copied
-from ..jit.handover import apart, interleaved
+from ..jit.handover import interleaved
 from ..jit.kernel_inputs import split
+from ..jit.packets import apart
 from ..jit.types import Bool, Float, UInt32
 from ..raster import RasterOutput, Topology, antialias, peeled_layers, stacked
 from ..raster.screen_planes import pixel_depth

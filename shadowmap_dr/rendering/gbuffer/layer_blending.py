@@ -9,7 +9,8 @@ import drjit as dr
 import mitsuba as mi
 
 from ...jit.broadcast import Copies
-from ...jit.handover import apart, evaluated
+from ...jit.handover import evaluated
+from ...jit.packets import apart
 from ...jit.types import Bool, Color3f, Float
 from ...raster import Crossings, antialias
 from .camera_clip import least_gap

@@ -51,7 +51,7 @@ class Translucency:
         faces: the translucent ones; None if the others are unseen.
         camera, maps: layers along the rays of cameras and of lights.
         fixed: number of layers that was asked for, None for as many as there are.
-        fineness: of transmittance maps, see :func:`~shadowmap_dr.rendering.light_tiles.fineness`.
+        texel_density: of transmittance maps, see :func:`~shadowmap_dr.rendering.light_tiles.texel_density`.
     """
 
     opaque: Bool
@@ -59,7 +59,7 @@ class Translucency:
     camera: LayerCounts = LayerCounts()
     maps: LayerCounts = LayerCounts()
     fixed: int | None = None
-    fineness: float = inf
+    texel_density: float = inf
 
     @classmethod
     def of(cls, data: SceneData, positions: np.ndarray, layers: int | None) -> Translucency | None:

@@ -37,6 +37,53 @@ def apart(flat: Float, count: int, parts: int = 1) -> list[list[Float]]:
     return [found[k * count : (k + 1) * count] for k in range(parts)]
 
 
+def sections(values: list[Float], parts: int) -> list[list[Float]]:
+    """Equal parts, which lie one after the other, of arrays of the same width. Attached.
+
+    Returns:
+        For each part a section of each array.
+    """
+    if parts == 1:
+        return [values]
+    found: list[Float] = dr.custom(_Sections, values, parts)
+    return [found[k * len(values) : (k + 1) * len(values)] for k in range(parts)]
+
+
+class _Sections(dr.CustomOp):
+    """:func:`sections`. The adjoint of Dr.Jit's own gather would add to zeros."""
+
+    def eval(self, values: list[Float], parts: int) -> list[Float]:
+        self._shape = dr.width(values[0]) // parts, parts
+        return self._cut(values)
+
+    def forward(self) -> None:
+        self.set_grad_out(self._cut(cast("list[Float]", self.grad_in("values"))))
+
+    def backward(self) -> None:
+        gradients, (width, parts) = cast("list[Float]", self.grad_out()), self._shape
+        count = len(gradients) // parts
+        found = []
+        for k in range(count):
+            whole = dr.empty(type(gradients[k]), width * parts)
+            for part, lane in enumerate(self._lanes(gradients[k])):
+                dr.scatter(whole, gradients[part * count + k], lane, mode=dr.ReduceMode.Permute)
+            found.append(whole)
+        self.set_grad_in("values", found)
+
+    def name(self) -> str:
+        return "sections"
+
+    def _cut(self, values: list[Float]) -> list[Float]:
+        lanes = self._lanes(values[0])
+        return [dr.gather(type(value), value, lane) for lane in lanes for value in values]
+
+    def _lanes(self, array: Float) -> list[UInt32]:
+        """Lanes of each part."""
+        (width, parts), module = self._shape, backend(array)
+        lane = dr.arange(module.UInt32, width)
+        return [lane + uint_input(module, "first lane", part * width) if part else lane for part in range(parts)]
+
+
 class _Apart(dr.CustomOp):
     """:func:`apart`."""
 
@@ -85,7 +132,7 @@ def _written(values: list[Float], width: int, count: int, parts: int) -> Float:
     result = dr.empty(module.Float, width)
     for k, packet in enumerate(_packets(module, width, count, parts)):
         numbers = values[k * size : (k + 1) * size]
-        dr.scatter(result, numbers[0] if size == 1 else _kind(module, size)(*numbers), packet)
+        dr.scatter(result, numbers[0] if size == 1 else _kind(module, size)(*numbers), packet, mode=dr.ReduceMode.Permute)
     return result
 
 

@@ -114,10 +114,11 @@ class ImagePass:
         made: list[Layer] = []
         faces, edges = layers.faces, shapes.translucent
         assert edges is not None, "placed together with the translucent faces"
+        placed = shapes if layers.attached else shapes.detached
         for chosen, clip in layers.in_batches(view.clip):
             seen = replace(view, raster=chosen, clip=clip, topology=edges, layers=None)
             needs_frames = self.light.needs_frames or faces.cutouts
-            own = self.cameras.frame(seen, shapes, needs_frames, whole_triangles(chosen, faces))
+            own = self.cameras.frame(seen, placed, needs_frames, whole_triangles(chosen, faces))
             radiance = self.light.with_shining(self._reflected(own, lighting, None, shapes)[1], own.surface, lighting)
             active = own.surface.active
             layer = Layer.of(radiance, transmittance_of(own.surface, faces.bsdfs), active, len(opaque.channels))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import cast, overload
+from typing import Literal, cast, overload
 
 import drjit as dr
 
@@ -35,6 +35,24 @@ def antialias(
 
 @overload
 def antialias(
+    values: list[Float],
+    raster: RasterOutput,
+    positions: TensorXf | Float,
+    topology: Topology,
+    *,
+    crossings: Crossings | None = ...,
+    creases: Bool | None = ...,
+    crease_weights: Float | None = ...,
+    meetings: bool = ...,
+    gap: float = ...,
+    folds: CoplanarCreases | None = ...,
+    continued: bool = ...,
+    separate: Literal[True],
+) -> list[Float]: ...
+
+
+@overload
+def antialias(
     values: Float | list[Float] | tuple[Float, ...],
     raster: RasterOutput,
     positions: TensorXf | Float,
@@ -63,7 +81,8 @@ def antialias(
     gap: float = DEPTH_GAP,
     folds: CoplanarCreases | None = None,
     continued: bool = False,
-) -> TensorXf | Float:
+    separate: bool = False,
+) -> TensorXf | Float | list[Float]:
     """Blend each pixel with the neighbours from which a silhouette separates it, by the share of the pixel they cover.
 
     Where a silhouette crosses the segment between two pixel centres, the pixel into which the other one's surface reaches
@@ -84,13 +103,15 @@ def antialias(
         folds: creases that do not count between coplanar faces, see :func:`find_crossings`.
         continued: for derivatives by the edges' positions, extrapolate values linearly from the pixels to the edge, instead of
             taking them as constant (:mod:`shadowmap_dr.raster.antialiasing.colour_jumps`).
+        separate: return a list for a list. Cheaper where the channels are not needed interleaved.
 
     Returns:
-        The blended values in the shape of ``values``; flat, with interleaved channels, for a list. Gradients flow to ``values``
+        The blended values in the shape of ``values``; flat, with interleaved channels, for a list, or ``separate``. Gradients flow to ``values``
         and, through the position of the silhouettes, to ``positions``.
 
     Raises:
-        ValueError: values, positions, topology, creases or crossings do not fit the raster; the topology has no edges.
+        ValueError: values, positions, topology, creases or crossings do not fit the raster; the topology has no edges;
+            ``separate`` without a list.
 
     Source: the idea of blending along the axis that crosses the edge is that of Laine et al., "Modular Primitives for
     High-Performance Differentiable Rendering", 2020, section 3.6; the search for edges and the weights are different.
@@ -98,6 +119,8 @@ def antialias(
     check_array("positions", positions)
     for array in values if isinstance(values, list | tuple) else [values]:
         check_array("values", array)
+    if separate and not isinstance(values, list):
+        raise ValueError("separate: channels are separate only in a list of arrays")
     tensor = cast("TensorXf", values) if dr.is_tensor_v(values) else None
     flat = _checked_values(values, raster)
     positions, vertex_count = _flat_positions(positions, raster, topology)
@@ -110,7 +133,7 @@ def antialias(
     elif dr.width(crossings.right) != raster.batch * raster.height * raster.width:
         raise ValueError(f"crossings are those of {dr.width(crossings.right)} pixels, but {_size_of(raster)} are given")
     surroundings = Surroundings.of(raster, positions, topology, crossings.marked, crease_weights) if continued else None
-    blended = blend(flat, positions, raster, crossings, surroundings)
+    blended = blend(flat, positions, raster, crossings, surroundings, separate)
     return blended if tensor is None else type(tensor)(blended, shape=tensor.shape)
 
 

@@ -25,7 +25,8 @@ def blend(
     raster: RasterOutput,
     crossings: Crossings,
     surroundings: Surroundings | None = None,
-) -> Float:
+    separate: bool = False,
+) -> Float | list[Float]:
     """Apply the weights of all pairs of pixels.
 
     Args:
@@ -34,15 +35,17 @@ def blend(
         raster: output of the rasterizer.
         crossings: edges between pixels, for the same positions.
         surroundings: given to extrapolate colours to the edges (:mod:`shadowmap_dr.raster.antialiasing.colour_jumps`), or None.
+        separate: return one array for each channel; ``values`` is a list, too.
 
-    Returns blended values, flat and interleaved.
+    Returns blended values, flat and interleaved, or separate.
     """
     with dr.suspend_grad():
         dr.eval(values)
     if not dr.is_diff_v(positions):
-        return Mixer(values, raster.width, crossings).values
+        return Mixer(values, raster.width, crossings, separate=separate).values
     wanted = dr.grad_enabled(values), dr.grad_enabled(positions)
-    return dr.custom(_Blend, values, positions, raster.width, crossings, wanted, surroundings)
+    blended: Float | list[Float] = dr.custom(_Blend, values, positions, raster.width, crossings, wanted, surroundings, separate)
+    return blended
 
 
 class _Blend(dr.CustomOp):
@@ -56,8 +59,9 @@ class _Blend(dr.CustomOp):
         crossings: Crossings,
         wanted: tuple[bool, bool],
         surroundings: Surroundings | None,
-    ) -> Float:
-        self.mixer = Mixer(values, width, crossings, surroundings)
+        separate: bool,
+    ) -> Float | list[Float]:
+        self.mixer = Mixer(values, width, crossings, surroundings, separate)
         self.wanted, self.vertices = wanted, dr.width(positions)
         return self.mixer.values
 
@@ -70,7 +74,7 @@ class _Blend(dr.CustomOp):
 
     @shared_inputs()
     def backward(self) -> None:
-        adjoint = cast("Float", self.grad_out())
+        adjoint = cast("Float | list[Float]", self.grad_out())
         dr.eval(adjoint)
         if self.wanted[0]:
             self.set_grad_in("values", self.mixer.adjoint_of_values(adjoint))
@@ -86,25 +90,30 @@ class Mixer:
     """
 
     def __init__(
-        self, values: Float | list[Float], width: int, crossings: Crossings, surroundings: Surroundings | None = None
+        self,
+        values: Float | list[Float],
+        width: int,
+        crossings: Crossings,
+        surroundings: Surroundings | None = None,
+        separate: bool = False,
     ) -> None:
         self.module = backend(crossings.right)
         self.crossings, self.width, self.surroundings = crossings, width, surroundings
         self.pixels = dr.width(crossings.right)
-        self.planar = isinstance(values, list)
+        self.planar, self.separate = isinstance(values, list), separate
         self.channels = len(values) if self.planar else dr.width(values) // self.pixels
         self.original = values
         # Sums of weights, defined only where neighbours reach into a pixel.
         self.claims = dr.empty(self.module.Float, self.pixels)
         self.values, self.claims = computed("mixed values", self._evaluated)
 
-    def _evaluated(self) -> tuple[Float, Float]:
+    def _evaluated(self) -> tuple[Float | list[Float], Float]:
         """(values, claims)."""
         values = self._mix()
         dr.eval(values, self.claims)
         return values, self.claims
 
-    def _mix(self) -> Float:
+    def _mix(self) -> Float | list[Float]:
         if not self.planar:
             return self._mix_few()
         pixel = dr.arange(self.module.UInt32, self.pixels)
@@ -152,10 +161,10 @@ class Mixer:
             total = [dr.fma(factor, dr.select(weight > 0, v - o, 0), t) for v, o, t in zip(other, own, total, strict=True)]
         return total
 
-    def adjoint_of_values(self, adjoint: Float) -> Float | list[Float]:
+    def adjoint_of_values(self, adjoint: Float | list[Float]) -> Float | list[Float]:
         """Gradient to the values from that of the result."""
         if not self.planar:
-            return self._adjoint_of_few(adjoint)
+            return self._adjoint_of_few(cast("Float", adjoint))
         pixel = dr.arange(self.module.UInt32, self.pixels)
         right, down = self.crossings.right, self.crossings.down
         incoming, outgoing = self.around(right, down, 1), self.around(right, down, -1)
@@ -196,7 +205,7 @@ class Mixer:
         return result
 
     def _spread(
-        self, adjoint: Float, pixel: UInt32, incoming: Sequence[Float], outgoing: Sequence[Float], own: Sequence[Float]
+        self, adjoint: Float | list[Float], pixel: UInt32, incoming: Sequence[Float], outgoing: Sequence[Float], own: Sequence[Float]
     ) -> list[Float]:
         claims = weight_sum(incoming)
         kept = 1 - claims * _scale(claims)
@@ -207,7 +216,7 @@ class Mixer:
             total = [dr.fma(factor, v, t) for v, t in zip(other, total, strict=True)]
         return total
 
-    def adjoint_of_positions(self, adjoint: Float, size: int) -> Float:
+    def adjoint_of_positions(self, adjoint: Float | list[Float], size: int) -> Float:
         """Gradient to the flat positions from that of the result."""
         module = self.module
         Array4f = module.Array4f
@@ -284,7 +293,7 @@ class Mixer:
         """Change of the weight of a pair without an edge with the depth."""
         return dr.gather(self.module.Float, self.crossings.slopes, 4 * slot)
 
-    def _gain(self, adjoint: Float, pixel: UInt32, down: Bool, weight: Float) -> Float:
+    def _gain(self, adjoint: Float | list[Float], pixel: UInt32, down: Bool, weight: Float) -> Float:
         """Gradient to the weight of a pair."""
         # The neighbour takes from the pixel where the weight is positive, else the other way round.
         neighbour = self._neighbour(pixel, down)
@@ -314,7 +323,7 @@ class Mixer:
 
         return self.surroundings.beyond(read, crossed, taker, giver, down, place, active)
 
-    def tangent(self, values: Float | list[Float] | None, positions: Float | None) -> Float:
+    def tangent(self, values: Float | list[Float] | None, positions: Float | None) -> Float | list[Float]:
         """Tangent of the result, given those of the values and of the positions (or None)."""
         module = self.module
         pixel = dr.arange(module.UInt32, self.pixels)
@@ -420,8 +429,10 @@ class Mixer:
         """Channels as one packet, for a single scatter."""
         return channels[0] if self.channels == 1 else self.module.ArrayXf(channels)
 
-    def written(self, channels: list[Float]) -> Float:
-        """Interleave the channels."""
+    def written(self, channels: list[Float]) -> Float | list[Float]:
+        """The channels, interleaved unless they are separate."""
+        if self.separate:
+            return channels
         if self.channels == 1:
             return channels[0]
         result = dr.empty(self.module.Float, self.channels * self.pixels)

@@ -9,6 +9,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ...jit.pytree import tree_map
 from ...jit.types import Bool, Float, Point3f, UInt32
 from ...raster import Crossings, RasterOutput, Topology, detach_moved_seams, visible_triangles
 from ...raster.antialiasing.edge_crossings import find_crossings
@@ -75,6 +76,12 @@ class PlacedShapes:
     casting: Topology
     translucent: Topology | None = None
     translucent_creases: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def detached(self) -> PlacedShapes:
+        """The same shapes without gradients to their places."""
+        geometry, facets = tree_map((self.geometry, self.facets), dr.detach)
+        return replace(self, geometry=geometry, facets=facets)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from ...jit.broadcast import Copies
 from ...jit.handover import evaluated
-from ...jit.packets import apart
+from ...jit.packets import sections
 from ...jit.types import Bool, Color3f, Float
 from ...raster import Crossings, antialias
 from .camera_clip import least_gap
@@ -55,7 +55,7 @@ class Blended:
             creases: edges at which shading jumps (``PlacedShapes.creases``), those of the faces of the view.
         """
         channels = list(self.channels)
-        return Blended(tuple(apart(outlined(channels, view, sharpness, creases, crossings), len(channels))[0]))
+        return Blended(tuple(outlined(channels, view, sharpness, creases, crossings)))
 
 
 @dataclass(frozen=True)
@@ -110,8 +110,8 @@ class Layer:
             behind = dr.custom(Copies, behind, number, False)
         beside = [dr.select(active, 0, value) for value in behind]
         values = [*self.radiance, *passed, *beside, covered]
-        flat = outlined(values, view, sharpness, creases)
-        return [Layer._of_outlined(own) for own in apart(flat, len(values), number)]
+        blended = outlined(values, view, sharpness, creases)
+        return [Layer._of_outlined(own) for own in sections(blended, number)]
 
     @classmethod
     def _of_outlined(cls, values: list[Float]) -> Layer:
@@ -129,17 +129,14 @@ class Layer:
         if count == 1:
             return [self]
         dr.eval(self.radiance, self.through)
-        radiance, through = ([apart(value, 1, count) for value in field] for field in (self.radiance, self.through))
-        return [
-            Layer(tuple(value[k][0] for value in radiance), tuple(value[k][0] for value in through), self.beside)
-            for k in range(count)
-        ]
+        radiance, through = (sections(list(field), count) for field in (self.radiance, self.through))
+        return [Layer(tuple(own), tuple(passed), self.beside) for own, passed in zip(radiance, through, strict=True)]
 
 
 def outlined(
     values: list[Float], view: CameraView, sharpness: Float | None, creases: dict[str, Any], crossings: Crossings | None = None
-) -> Float:
-    """Values (N,) with anti-aliased outlines of the surfaces of a view, interleaved.
+) -> list[Float]:
+    """Values (N,) with anti-aliased outlines of the surfaces of a view.
 
     ``crossings``: of these outlines; None: found here.
     """
@@ -152,4 +149,5 @@ def outlined(
         meetings=True,
         gap=least_gap(view.sensor),
         continued=True,
+        separate=True,
     )

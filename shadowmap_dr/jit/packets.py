@@ -132,6 +132,7 @@ def _written(values: list[Float], width: int, count: int, parts: int) -> Float:
     result = dr.empty(module.Float, width)
     for k, packet in enumerate(_packets(module, width, count, parts)):
         numbers = values[k * size : (k + 1) * size]
+        # Each number is written once, which Dr.Jit has to know: else it writes each packet in a kernel of its own.
         dr.scatter(result, numbers[0] if size == 1 else _kind(module, size)(*numbers), packet, mode=dr.ReduceMode.Permute)
     return result
 

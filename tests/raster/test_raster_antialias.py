@@ -291,7 +291,7 @@ def test_plain_dr_jit_arrays_do_as_well(variant: str) -> None:
 
 
 def test_channels_may_come_one_by_one(variant: str) -> None:
-    """A list of channels gives the values and derivatives (both modes) of the interleaved array."""
+    """A list of channels gives the values and derivatives (both modes) of the interleaved array, also if a list is returned."""
     rng, size = np.random.default_rng(5), 20
     world = rng.uniform(-1, 1, (45, 3)).astype(np.float32)
     faces = np.arange(45).reshape(15, 3).astype(np.uint32)
@@ -299,12 +299,17 @@ def test_channels_may_come_one_by_one(variant: str) -> None:
     channels = rng.random((3, size * size)).astype(np.float32)
     weights = mi.Float(rng.standard_normal(3 * size * size).astype(np.float32))
     results = []
-    for separate in (True, False):
+
+    def flat(values: Any) -> mi.Float:
+        return dr.ravel(mi.Color3f(*values)) if isinstance(values, list) else values
+
+    for separate, kept in ((True, False), (True, True), (False, False)):
         clip = mi.TensorXf(np.c_[world, np.ones(45)].astype(np.float32))
         planes = [mi.Float(c.copy()) for c in channels]
         dr.enable_grad(clip, planes)
         out = rasterize(clip, mi.TensorXu(faces), (size, size))
-        image = antialias(planes if separate else dr.ravel(mi.Color3f(*planes)), out, clip, topology)
+        given: Any = {"separate": True} if kept else {}
+        image = flat(antialias(planes if separate else dr.ravel(mi.Color3f(*planes)), out, clip, topology, **given))
         dr.backward(dr.sum(image * weights), flags=dr.ADFlag.Default & ~dr.ADFlag.ClearEdges)
         backward = [dr.grad(a).numpy().ravel() for a in (clip, *planes)]
         moved, delta = mi.TensorXf(dr.detach(clip)), mi.Float(0)
@@ -312,12 +317,15 @@ def test_channels_may_come_one_by_one(variant: str) -> None:
         moved = moved + delta * mi.TensorXf(0.3)
         lit = [mi.Float(c.copy()) + delta * (k + 1) for k, c in enumerate(channels)]
         out = rasterize(moved, mi.TensorXu(faces), (size, size))
-        image_2 = antialias(lit if separate else dr.ravel(mi.Color3f(*lit)), out, moved, topology)
+        image_2 = flat(antialias(lit if separate else dr.ravel(mi.Color3f(*lit)), out, moved, topology, **given))
         dr.forward(delta)
         results.append([image.numpy(), *backward, dr.grad(image_2).numpy()])
-    for a, b in zip(*results, strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
+    for other in results[1:]:
+        for a, b in zip(results[0], other, strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
     assert np.abs(results[0][-1]).max() > 0.1
+    with pytest.raises(ValueError, match="separate only in a list"):
+        antialias(dr.ravel(mi.Color3f(*planes)), out, clip, topology, separate=True)
     with pytest.raises(ValueError, match="channels hold"):
         antialias(planes[:1] + [mi.Float(1, 2, 3)], out, moved, topology)
 

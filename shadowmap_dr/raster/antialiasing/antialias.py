@@ -106,8 +106,8 @@ def antialias(
         separate: return a list for a list. Cheaper where the channels are not needed interleaved.
 
     Returns:
-        The blended values in the shape of ``values``; flat, with interleaved channels, for a list, or ``separate``. Gradients flow to ``values``
-        and, through the position of the silhouettes, to ``positions``.
+        The blended values in the shape of ``values``; flat, with interleaved channels, for a list, or a list if ``separate``.
+        Gradients flow to ``values`` and, through the position of the silhouettes, to ``positions``.
 
     Raises:
         ValueError: values, positions, topology, creases or crossings do not fit the raster; the topology has no edges;

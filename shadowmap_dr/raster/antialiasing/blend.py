@@ -205,7 +205,12 @@ class Mixer:
         return result
 
     def _spread(
-        self, adjoint: Float | list[Float], pixel: UInt32, incoming: Sequence[Float], outgoing: Sequence[Float], own: Sequence[Float]
+        self,
+        adjoint: Float | list[Float],
+        pixel: UInt32,
+        incoming: Sequence[Float],
+        outgoing: Sequence[Float],
+        own: Sequence[Float],
     ) -> list[Float]:
         claims = weight_sum(incoming)
         kept = 1 - claims * _scale(claims)

@@ -1,4 +1,4 @@
-"""Arrays whose entries lie interleaved in a flat one, written and read in packets of two or four numbers.
+"""Arrays that lie in a flat one: interleaved, in packets of two or four numbers, or one after the other.
 
 Dr.Jit's own operations run a kernel for each number, or add adjoints to zeros number by number.
 """

@@ -26,6 +26,9 @@ from .transmittance_maps import TransmittanceMaps, depth_encoding
 
 # Depth range over which the comparison of percentage-closer filtering falls from 1 to 0. A hard one has no derivative by depth.
 _SOFTNESS = 0.02
+# Visibility that is cut off at both ends in maps of tiles without a filter. Coverage of a texel and bilinear interpolation blur
+# an edge over two texels, which are somewhat smaller than pixels: it takes two thirds of a pixel then.
+_ENDS = 0.2
 # Weight from which on a texel's distribution counts.
 _NOTHING = 1e-9
 
@@ -66,6 +69,9 @@ def _place_in_map(maps: ShadowMaps, map_index: UInt32 | int, p_world: Point3f) -
 def tiled_visibility(maps: ShadowMaps, group: Group, p_world: Point3f, active: Bool | bool = True) -> Float:
     """Visibility as of :func:`visibility` from the tiles of a light; along borders a mean of both tiles.
 
+    Values of maps without a filter are sharpened: an edge is narrower than two texels. Gradients are those of the blurred edge,
+    which sum up to the same, and which more pixels sample.
+
     Args:
         maps: filtered maps.
         group: maps of the light.
@@ -74,7 +80,14 @@ def tiled_visibility(maps: ShadowMaps, group: Group, p_world: Point3f, active: B
     """
     tile, other, share = _tiles_at(maps, group, p_world)
     own = visibility(maps, tile, p_world, active)
-    return dr.fma(share, visibility(maps, other, p_world, active & (share > 0)) - own, own)
+    found = dr.fma(share, visibility(maps, other, p_world, active & (share > 0)) - own, own)
+    return found if maps.settings.filters else _sharpened(found)
+
+
+def _sharpened(visibility: Float) -> Float:
+    """Visibility with both ends cut off, and the rest stretched to 0..1; with the gradient of the visibility itself."""
+    with_gradient = cast("Callable[[Float, Float], Float]", dr.replace_grad)  # None in the stub
+    return with_gradient(dr.clip((dr.detach(visibility) - _ENDS) * (1 / (1 - 2 * _ENDS)), 0, 1), visibility)
 
 
 def _tiles_at(maps: ShadowMaps, group: Group, p_world: Point3f) -> tuple[UInt32, UInt32, Float]:

@@ -150,6 +150,11 @@ class ShadowSettings:
         return replace(self, resolution=self.transmittance_texels, filter=filters, filter_size=_FOOTPRINT)
 
     @property
+    def filters(self) -> bool:
+        """True if a filter blends neighbouring texels."""
+        return self.filter != "none" and self.filter_size > 1
+
+    @property
     def filterable(self) -> bool:
         """True if stored values may be blended, that is, anti-aliased and filtered."""
         return self.method in PREFILTERED

@@ -212,3 +212,53 @@ def test_recordings_do_not_walk_through_the_scene() -> None:
     with pytest.raises(RuntimeError) as failure:
         frozen(renderer)
     assert "a frozen function does not read the scene" in str(failure.value.__cause__ or failure.value)
+
+
+def _board(size: int) -> tuple[mi.Scene, Array]:
+    """A turned board, behind the camera, above a floor; and the share (size, size) of each pixel that its shadow covers."""
+    t, light, height = mi.ScalarTransform4f, np.array([0.3, 0.2, -1.0]), 1.0
+    film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+    view = t().look_at([0, 0, 0.5], [0, 0, 0], [0, 1, 0])
+    scene = mi.load_dict({
+        "type": "scene",
+        "sun": {"type": "directional", "direction": light.tolist(), "irradiance": 3.0},
+        "sensor": {"type": "orthographic", "to_world": view, "film": film},
+        "floor": {"type": "rectangle"},
+        "board": {"type": "rectangle", "to_world": t().translate([0, 0, height]).rotate([0, 0, 1], 20).scale([0.45, 0.3, 1])},
+    }, optimize=False)  # fmt: skip
+    side, angle = 16 * size, np.radians(20)
+    centres = (np.arange(side) + 0.5) / side * 2 - 1
+    x, y = centres[None, :] - height * light[0], -centres[:, None] - height * light[1]
+    across, up = np.cos(angle) * x + np.sin(angle) * y, np.cos(angle) * y - np.sin(angle) * x
+    inside = (abs(across) < 0.45) & (abs(up) < 0.3)
+    return scene, inside.reshape(size, 16, size, 16).mean((1, 3))
+
+
+@pytest.mark.usefixtures("variant")
+def test_edges_of_tiles_are_as_sharp_as_pixels_and_their_derivatives_exact() -> None:
+    """Against coverage by brute force, and the change of a rectangle's area with its size."""
+    size = 128
+    scene, covered = _board(size)
+    renderer = Renderer.from_scene(scene, shadow_map_resolution=64, shadow_tiles=4, shadow_filter_size=1)
+    assert renderer.plan.tiles == (2,)  # for the part of the image that the map covers
+    lit = np.array(Renderer.from_scene(scene, shadow_method="none").render(), np.float64)[..., 0]
+    seen = np.array(renderer.render(), np.float64)[..., 0] / lit
+    border = np.isin(np.arange(size), (0, size - 1))
+    inner = ~(border[:, None] | border[None])
+    assert np.sqrt(((seen - 1 + covered) ** 2)[inner].mean()) < 0.03
+    rim = np.lib.stride_tricks.sliding_window_view(np.pad(covered, 1, mode="edge"), (3, 3))
+    for whole, least, wrong in ((covered == 1, rim.min((-1, -2)), seen), (covered == 0, 1 - rim.max((-1, -2)), 1 - seen)):
+        beside = whole & (least < 1) & inner
+        assert beside.sum() > 100 and wrong[beside].mean() < 0.005  # 0.02 if edges took two texels
+    rest = renderer.data.geometry.shape_positions("board")
+    centre = mi.Point3f(0, 0, 1)
+    scale, pixels = mi.Float(1), (size / 2) ** 2
+    dr.enable_grad(scale)
+    image = renderer.render({"board": centre + scale * (rest - centre)})
+    dr.forward(scale, flags=dr.ADFlag.ClearEdges)
+    forward = (np.array(dr.grad(image), np.float64)[..., 0] / lit).sum()
+    assert forward == pytest.approx(-2 * 0.9 * 0.6 * pixels, rel=0.01)
+    weight = mi.TensorXf((np.eye(3)[0] / lit[..., None]).astype(np.float32))
+    dr.set_grad(scale, 0)
+    dr.backward(dr.sum(renderer.render({"board": centre + scale * (rest - centre)}) * weight, axis=None))
+    assert float(dr.grad(scale)[0]) == pytest.approx(forward, rel=1e-3)

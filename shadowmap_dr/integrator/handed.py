@@ -7,19 +7,21 @@ from dataclasses import dataclass, replace
 import mitsuba as mi
 
 from ..jit.handover import Results
+from ..rendering.renderer import Renderer
 from ..rendering.waiting import MOST_SAMPLES
 from .parameter_state import ParameterState
 
 
 @dataclass(frozen=True)
 class _Handed:
-    """Results of one image, its weight in samples, and the parameters of scene and sensor."""
+    """Results of one image, its renderer without gradients, its weight in samples, and the parameters of scene and sensor."""
 
     sensor: mi.Sensor
     spp: int
     weight: int
     scene: ParameterState
     camera: ParameterState
+    renderer: Renderer
     results: Results
 
 
@@ -30,26 +32,36 @@ class HandedResults:
         self._images: list[_Handed] = []
 
     def add(
-        self, sensor: mi.Sensor, spp: int, weight: int, scene: ParameterState, camera: ParameterState, results: Results
+        self,
+        sensor: mi.Sensor,
+        spp: int,
+        weight: int,
+        state: tuple[ParameterState, ParameterState],
+        renderer: Renderer,
+        results: Results,
     ) -> None:
         """Let results wait. Those of other states of the scene are dropped, and those that have waited longest make room.
 
-        ``weight``: measure of their memory, in samples.
+        ``weight``: measure of their memory, in samples. ``state``: parameters of the scene, and of the sensor.
         """
+        scene, camera = state
         others = [one for one in self._images if one.scene.same(scene) and (one.sensor is not sensor or one.spp != spp)]
-        self._images = [*others, _Handed(sensor, spp, weight, scene, camera, results)]
+        self._images = [*others, _Handed(sensor, spp, weight, scene, camera, renderer, results)]
         # The latest results wait whatever their size: computing them again would take as much memory.
         while len(self._images) > 1 and sum(one.weight for one in self._images) > MOST_SAMPLES:
             self._images.pop(0)
 
-    def take(self, sensor: mi.Sensor, spp: int, scene: ParameterState, camera: ParameterState) -> Results:
-        """Remove and return the results of an image that would be the same now, given the current parameters; else none."""
+    def take(self, sensor: mi.Sensor, spp: int, scene: ParameterState, camera: ParameterState) -> tuple[Results, Renderer | None]:
+        """Remove and return the results and the renderer of an image that would be the same now; else none.
+
+        ``scene``, ``camera``: the current parameters.
+        """
         self._images = [one for one in self._images if one.scene.same(scene)]
         for one in self._images:
             if one.sensor is sensor and one.spp == spp and one.camera.same(camera):
                 self._images.remove(one)
-                return one.results
-        return []
+                return one.results, one.renderer
+        return [], None
 
     def follow(self, before: ParameterState, scene: mi.Scene) -> None:
         """Note that a replay, and nothing else, has changed a scene's parameters: it renews the arrays of materials."""

@@ -36,24 +36,29 @@ class ParameterState:
         numbers: dict[str, tuple[Any, ...]] = {}
         attached: list[str] = []
         held: list[AnyArray] = []
+        array = mi.Float
         for name, value in parameters(node).items():
-            if isinstance(value, mi.Float):  # most are: these few lines are the fastest way
-                own = mi.Float(dr.detach(value))
-                which = [own.index]
-            else:
-                value = getattr(value, "matrix", value)
-                if not dr.is_array_v(value):
-                    numbers[name] = (value,)
-                    continue
-                own = type(value)(dr.detach(value))
-                if not dr.is_jit_v(value):
-                    numbers[name] = tuple(map(tuple, leaves(own)))
-                    continue
-                which = [leaf.index for leaf in leaves(own)]
-            held.append(own)
+            if isinstance(value, array):  # most are: these few lines are the fastest way
+                held.append(array(dr.detach(value)))
+                if dr.grad_enabled(value):
+                    attached.append(name)
+                    numbers[name] = (value.index, bool(value.index_ad))
+                else:
+                    numbers[name] = (value.index,)
+                continue
+            value = getattr(value, "matrix", value)
+            if not dr.is_array_v(value):
+                numbers[name] = (value,)
+                continue
+            if not dr.is_jit_v(value):
+                numbers[name] = tuple(map(tuple, leaves(type(value)(value))))
+                continue
+            flat = leaves(value)
+            which = [leaf.index for leaf in flat]
+            held.append(type(value)(dr.detach(value)))
             if dr.grad_enabled(value):
                 attached.append(name)
-                which += [bool(leaf.index_ad) for leaf in leaves(value)]
+                which += [bool(leaf.index_ad) for leaf in flat]
             numbers[name] = tuple(which)
         return cls(numbers, tuple(attached), held)
 

@@ -53,11 +53,11 @@ class Shell:
             record = self._record(scene, sensor, now)
             freezing = dr.flag(dr.JitFlag.FreezingScope)
             if self.options.recorded is True and not freezing:
-                return record.replay(scene, sensor, spp or 1, SceneState(now, ParameterState.of(sensor)))
+                return record.replay(scene, sensor, spp or 1, SceneState.of(scene, sensor, now))
             waiting = record.waiting
             waiting.forget_older(now)
             # Mitsuba looks up mesh attributes through its own vertices, so the image would be attached to these, too.
-            state = SceneState(now, ParameterState.of(sensor))
+            state = SceneState.of(scene, sensor, now)
             alone = not record.renderer.data.with_attributes() and waiting.welcomes(state.attached)
             if alone and not freezing and self.options.recorded == AUTO and record.is_steady(state.attached, sensor, spp or 1):
                 image = record.try_to_replay(scene, sensor, spp or 1, state)
@@ -84,7 +84,7 @@ class Shell:
                 return
             if self.options.recorded and not dr.flag(dr.JitFlag.FreezingScope):
                 replay = record.replay_backward if self.options.recorded is True else record.try_to_replay_backward
-                if replay(scene, sensor, spp or 1, gradient, SceneState(now, ParameterState.of(sensor))):
+                if replay(scene, sensor, spp or 1, gradient, SceneState.of(scene, sensor, now)):
                     return
             image = record.render(scene, sensor, spp or 1, now)
             if dr.grad_enabled(image):

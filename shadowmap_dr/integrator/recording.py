@@ -15,6 +15,7 @@ from ..jit.pytree import attached_places, tree_map
 from ..jit.types import AnyArray, TensorXf
 from ..rendering.extended_lights import SoftFrusta
 from ..rendering.renderer import Renderer
+from ..scene.load import SceneData
 from ..shadow import Frusta
 from .deferred import backward, pass_on
 
@@ -32,20 +33,20 @@ class FrozenPasses:
     def image(self, spp: int, renderer: Renderer, keep: bool) -> tuple[TensorXf, Frusta | None, SoftFrusta, Results]:
         """(detached image, frusta of the shadow maps, frusta of extended lights' shadow maps, results for the backward pass).
 
-        ``keep``: whether there are such results.
+        ``renderer``: from :func:`plain`. ``keep``: whether there are such results.
         """
         with dr.suspend_grad():
-            return self._image(spp, plain(renderer), keep)
+            return self._image(spp, renderer, keep)
 
-    def backward(self, spp: int, gradient: TensorXf, renderer: Renderer, results: Results) -> None:
-        """Add the gradients of <image, gradient> to everything that the renderer's data are attached to.
+    def backward(self, spp: int, gradient: TensorXf, data: SceneData, renderer: Renderer, results: Results) -> None:
+        """Add the gradients of <image, gradient> to everything that ``data`` is attached to.
 
-        ``results``: of the same image, or an empty list.
+        ``renderer``: from :func:`plain`, with the same data, detached. ``results``: of the same image, or an empty list.
         """
-        places, outer = attached_places(renderer.data)
+        places, outer = attached_places(data)
         if not outer:
             return
-        pass_on(outer, self._gradients(spp, places, _owned(gradient), plain(renderer), results))
+        pass_on(outer, self._gradients(spp, places, _owned(gradient), renderer, results))
 
     @property
     def recordings(self) -> int:

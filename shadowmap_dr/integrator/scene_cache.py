@@ -48,6 +48,12 @@ class SceneState:
     scene: ParameterState
     camera: ParameterState
 
+    @classmethod
+    def of(cls, scene: mi.Scene, sensor: mi.Sensor, now: ParameterState) -> SceneState:
+        """The current state. ``now``: the parameters of the scene, its own sensors among them."""
+        own = any(sensor is known for known in scene.sensors())
+        return cls(now, ParameterState({}, (), []) if own else ParameterState.of(sensor))
+
     @property
     def attached(self) -> tuple[str, ...]:
         """Names of the attached parameters of both."""
@@ -227,10 +233,12 @@ class SceneCache:
         current.note_kernels(spp)
         samples = _samples(sensor, spp)
         keep = samples <= MOST_SAMPLES and current.is_one_pass
-        image, frusta, soft_frusta, results = self.recorded.image(spp, current, keep)
+        still = plain(current)
+        image, frusta, soft_frusta, results = self.recorded.image(spp, still, keep)
         self._remember(scene, sensor, frusta, soft_frusta)
         if keep and now.attached:
-            self.handed.add(sensor, spp, samples + self.renderer.texels // TEXELS, now.scene, now.camera, results)
+            weight = samples + self.renderer.texels // TEXELS
+            self.handed.add(sensor, spp, weight, (now.scene, now.camera), still, results)
         self.handed.follow(now.scene, scene)
         return image
 
@@ -240,13 +248,15 @@ class SceneCache:
         Does nothing and returns False if gradients also flow through materials, textures or the radiance of extended lights,
         which Mitsuba itself evaluates. ``now``: the current parameters.
         """
-        results, attached = self.handed.take(sensor, spp, now.scene, now.camera), now.attached
+        (results, still), attached = self.handed.take(sensor, spp, now.scene, now.camera), now.attached
         current = self._current(scene, sensor)
         if attached not in self.recordable:
             self.recordable[attached] = not dr.grad_enabled(plain(current).render(spp=spp))
         if self.recordable[attached]:
             self._forget_stale_recordings()
-            self.recorded.backward(spp, gradient, current, results)
+            # That of the image, but with its fit of the maps.
+            still = plain(current) if still is None else replace(still, frusta=current.frusta, soft_frusta=current.soft_frusta)
+            self.recorded.backward(spp, gradient, current.data, still, results)
             self.handed.follow(now.scene, scene)
         return self.recordable[attached]
 

@@ -122,7 +122,11 @@ class _Taken:
     def walk(self, value: PyTree) -> None:
         kind = type(value)
         names = _parts_of(kind)
-        if names is None:
+        if names:
+            self.texts.append(kind.__qualname__)
+            for name in names:
+                self.walk(getattr(value, name))
+        elif names is None:
             self.texts.append(repr(value))
         elif kind is tuple or kind is list:
             self.texts.append(f"{kind.__name__}{len(value)}")
@@ -133,17 +137,19 @@ class _Taken:
             for name, item in value.items():
                 self.texts.append(repr(name))
                 self.walk(item)
-        elif names:
-            self.texts.append(kind.__qualname__)
-            for name in names:
-                self.walk(getattr(value, name))
-        elif hasattr(kind, "recording_text"):
+        elif _tells(kind):
             self.texts.append(value.recording_text())
         else:
             number = self._numbers.setdefault(id(value), len(self.leaves))
             self.texts.append(f"#{number}")
             if number == len(self.leaves):
                 self.leaves.append(value)
+
+
+@cached_by_type
+def _tells(kind: type) -> bool:
+    """True if objects of a class give their own text."""
+    return hasattr(kind, "recording_text")
 
 
 @cached_by_type
@@ -154,4 +160,4 @@ def _parts_of(kind: type) -> tuple[str, ...] | None:
     """
     if issubclass(kind, _PLAIN):
         return None
-    return () if hasattr(kind, "recording_text") else getattr(kind, "RECORDED", None) or fields_of(kind) or ()
+    return () if _tells(kind) else getattr(kind, "RECORDED", None) or fields_of(kind) or ()

@@ -10,11 +10,12 @@ from itertools import count
 from typing import TypeVar
 
 import drjit as dr
-import mitsuba as mi
 
 from .types import AnyArray, PyTree
 
 ResultT = TypeVar("ResultT")
+# Roles of values in trees.
+_ARRAY, _TRANSFORM, _SEQUENCE, _MAPPING, _RECORD, _STRUCT, _OTHER = range(7)
 
 
 class StaticTuple(tuple[ResultT, ...]):
@@ -34,35 +35,35 @@ def tree_map(value: PyTree, function: Callable[[AnyArray], AnyArray]) -> PyTree:
     Trees are made of dataclasses, tuples, lists, dictionaries, transformations and Mitsuba's records. Other objects, and records
     whose arrays are all unchanged, are shared with the copy.
     """
-    if dr.is_array_v(value):
+    role = _role_of(type(value))
+    if role == _ARRAY:
         return function(value)
-    if isinstance(value, mi.Transform4f):
-        matrix = function(value.matrix)
-        return value if matrix is value.matrix else mi.Transform4f(mi.Matrix4f(matrix))
-    if isinstance(value, StaticTuple):
+    if role == _OTHER:
         return value
-    if isinstance(value, tuple | list):
-        return type(value)([tree_map(item, function) for item in value])
-    if isinstance(value, dict):
-        return {key: tree_map(item, function) for key, item in value.items()}
-    fields = fields_of(type(value))
-    if fields is not None:
-        old = [getattr(value, name) for name in fields]
-        new = [tree_map(item, function) for item in old]
-        if all(a is b for a, b in zip(old, new, strict=True)):
+    if role == _RECORD:
+        old = vars(value)
+        new = {name: tree_map(old[name], function) for name in fields_of(type(value)) or ()}
+        for name, item in new.items():
+            if item is not old[name]:
+                break
+        else:
             return value
         # Not `dataclasses.replace`, which takes several times as long, and checks values that were checked before.
         copy = object.__new__(type(value))
-        vars(copy).update(zip(fields, new, strict=True))
+        vars(copy).update(new)
         return copy
-    names = getattr(type(value), "DRJIT_STRUCT", None)
-    if names is None:
-        return value
+    if role == _SEQUENCE:
+        return type(value)([tree_map(item, function) for item in value])
+    if role == _MAPPING:
+        return {key: tree_map(item, function) for key, item in value.items()}
+    if role == _TRANSFORM:
+        matrix = function(value.matrix)
+        return value if matrix is value.matrix else type(value)(type(value.matrix)(matrix))
     # Mitsuba's records can be changed, but not constructed from their fields.
-    changed = type(value)(value)
-    for name in names:
-        setattr(changed, name, tree_map(getattr(value, name), function))
-    return changed
+    struct = type(value)(value)
+    for name in type(value).DRJIT_STRUCT:
+        setattr(struct, name, tree_map(getattr(value, name), function))
+    return struct
 
 
 def cached_by_type(function: Callable[[type], ResultT]) -> Callable[[type], ResultT]:
@@ -74,6 +75,24 @@ def cached_by_type(function: Callable[[type], ResultT]) -> Callable[[type], Resu
 def fields_of(kind: type) -> tuple[str, ...] | None:
     """Names of the fields of a dataclass, None for other classes. Cached, for every optimisation step asks for them."""
     return tuple(field.name for field in dataclasses.fields(kind)) if dataclasses.is_dataclass(kind) else None
+
+
+@cached_by_type
+def _role_of(kind: type) -> int:
+    """Role of the values of a class in a tree. A walk through a tree at each step asks for it thousands of times."""
+    if dr.is_array_v(kind):
+        return _ARRAY
+    if kind.__name__ == "Transform4f":  # of any variant
+        return _TRANSFORM
+    if issubclass(kind, StaticTuple):
+        return _OTHER
+    if issubclass(kind, tuple | list):
+        return _SEQUENCE
+    if issubclass(kind, dict):
+        return _MAPPING
+    if fields_of(kind) is not None:
+        return _RECORD
+    return _OTHER if getattr(kind, "DRJIT_STRUCT", None) is None else _STRUCT
 
 
 def attached_arrays(record: PyTree) -> list[AnyArray]:

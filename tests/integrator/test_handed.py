@@ -25,9 +25,9 @@ def given(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     counts: list[int] = []
     backward = FrozenPasses.backward
 
-    def noted(self: FrozenPasses, spp: int, gradient: Any, renderer: Any, results: Any) -> None:
+    def noted(self: FrozenPasses, spp: int, gradient: Any, data: Any, renderer: Any, results: Any) -> None:
         counts.append(len(results))
-        backward(self, spp, gradient, renderer, results)
+        backward(self, spp, gradient, data, renderer, results)
 
     monkeypatch.setattr(FrozenPasses, "backward", noted)
     return counts

@@ -14,6 +14,10 @@ PyTorch's threads on the CPU wait for their next work by spinning, and Dr.Jit's 
 1.4 to 1.8 times as long. If PyTorch was not imported before, importing this module lets them sleep (``OMP_WAIT_POLICY=PASSIVE``,
 unless that is set); else set this variable before Python starts.
 
+Importing this module also tells glibc to keep freed blocks of up to 32 MiB, at most 256 MiB in all, for PyTorch's next tensors,
+unless ``MALLOC_TRIM_THRESHOLD_``, ``MALLOC_MMAP_THRESHOLD_`` or ``GLIBC_TUNABLES`` is set. A step at 512 x 512 takes 0.85 times as
+long.
+
 Importing this module needs PyTorch: in a checkout ``pip install '.[torch]'``, elsewhere ``pip install torch``.
 """
 
@@ -35,11 +39,14 @@ except ModuleNotFoundError as error:
     raise ImportError(f"shadowmap_dr.torch needs PyTorch: {install_hint('torch')}.", name="torch") from None
 
 from .antialias import antialias, build_topology
+from .memory import keep_freed_blocks
 from .parameters import Parameters
 from .raster import interpolate, rasterize
 from .records import Raster, Topology
 from .render import Renderer
 from .shadow import DirectionalLight, Light, PointLight, ShadowMaps, SpotLight, filter_maps, render_maps, visibility
+
+keep_freed_blocks()
 
 __all__ = [
     "DirectionalLight",

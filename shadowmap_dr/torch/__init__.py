@@ -15,8 +15,8 @@ PyTorch's threads on the CPU wait for their next work by spinning, and Dr.Jit's 
 unless that is set); else set this variable before Python starts.
 
 Importing this module also tells glibc to keep freed blocks of up to 32 MiB, at most 256 MiB in all, for PyTorch's next tensors,
-unless ``MALLOC_TRIM_THRESHOLD_``, ``MALLOC_MMAP_THRESHOLD_`` or ``GLIBC_TUNABLES`` is set. A step at 512 x 512 takes 0.85 times as
-long.
+unless ``MALLOC_TRIM_THRESHOLD_``, ``MALLOC_MMAP_THRESHOLD_`` or ``GLIBC_TUNABLES`` is set: 0.85 times the time of a step at
+512 x 512.
 
 Importing this module needs PyTorch: in a checkout ``pip install '.[torch]'``, elsewhere ``pip install torch``.
 """

@@ -29,7 +29,7 @@ from .methods.registry import PREFILTERED
 from .methods.variance import reduced_bleeding
 from .settings import ShadowSettings
 from .shadow_map import ShadowMaps, block_means
-from .texel_depths import FAR
+from .texel_depths import FAR, texel_side
 
 
 @dataclass(frozen=True)
@@ -127,13 +127,14 @@ def tangent_visibility(maps: TangentMaps, map_index: UInt32, p_world: Point3f, a
     per_z = dr.select(depth > FAR, 0, per_z)
     depth = dr.select(depth > FAR, FAR, depth)
     moves = [(dx * per_x, dy * per_y, dz * per_z) for dx, dy, dz in turned(twist, p)]
+    texel = texel_side(view, frustum, depth, settings.resolution) * dr.maximum(frustum.half_x, frustum.half_y)
     method = PREFILTERED[settings.method]
 
-    def resolve(values: list[Float], depth: Float) -> Float:
-        value = method.resolve(values, depth)
-        return reduced_bleeding(value, settings.bleeding) if method.bleeds else value
+    def look_up(index, u, v, depth, texel, *moves):  # noqa: ANN001, ANN002, ANN202
+        def resolve(values: list[Float], depth: Float) -> Float:
+            value = method.resolve(values, depth, texel)
+            return reduced_bleeding(value, settings.bleeding) if method.bleeds else value
 
-    def look_up(index, u, v, depth, *moves):  # noqa: ANN001, ANN002, ANN202
         # Beyond the centres of the outermost texels, look-ups are constant.
         end = float_input(module, "texels", 1 - 1 / settings.resolution)
         rates = [dr.select(dr.abs(u if k % 3 == 0 else v) > end, 0, m) if k % 3 < 2 else m for k, m in enumerate(moves)]
@@ -157,7 +158,7 @@ def tangent_visibility(maps: TangentMaps, map_index: UInt32, p_world: Point3f, a
         return tuple(result)
 
     return dr.if_stmt(
-        (map_index, u, v, depth, *moves[0], *moves[1]),
+        (map_index, u, v, depth, texel, *moves[0], *moves[1]),
         inside,
         look_up,
         lambda index, u, *_: (module.Float(1), module.Float(0), module.Float(0)),

@@ -68,13 +68,17 @@ def texel_depths(
 
 def _slope_square(view: Views, frustum: Frusta, linear: Float, slopes: list[Float], size: int) -> Float:
     """Squared change of linear depth across a texel, given its change along both axes."""
-    n, f = frustum.first, frustum.far
-    # The side of a texel in units of depth.
-    texel = (
-        dr.select(view.spread > 0, dr.fma(linear + 0.5, f - n, n), 1.0)
-        * float_input(backend(linear), "width", 2 / size)
-        / (f - n)
-    )
+    texel = texel_side(view, frustum, linear, size)
     sx = dr.minimum(dr.abs(slopes[0]), _MAX_SLOPE * texel * frustum.half_x)
     sy = dr.minimum(dr.abs(slopes[1]), _MAX_SLOPE * texel * frustum.half_y)
     return sx * sx + sy * sy
+
+
+def texel_side(view: Views, frustum: Frusta, linear: Float, size: int) -> Float:
+    """Side of a texel at a linear depth as a share of the depth range, over the map's half-width. Detached.
+
+    ``size``: texels along each side of the map.
+    """
+    n, f = frustum.first, frustum.far
+    distance = dr.select(view.spread > 0, dr.fma(dr.detach(linear) + 0.5, f - n, n), 1.0)
+    return distance * float_input(backend(linear), "width", 2 / size) / (f - n)

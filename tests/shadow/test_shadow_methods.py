@@ -45,10 +45,10 @@ def test_one_surface_shadows_what_lies_behind_it(variant: str, method: str) -> N
     depth = np.linspace(-0.45, 0.3, 60)
     texels = stored(method, depth[:, None], np.ones((60, 1)))
     resolve = PREFILTERED[method].resolve
-    assert resolve(texels, floats(depth)).numpy().min() > 0.98  # the surface itself
-    assert resolve(texels, floats(depth - 0.05)).numpy().min() > 0.98
+    assert resolve(texels, floats(depth), 1).numpy().min() > 0.98  # the surface itself
+    assert resolve(texels, floats(depth - 0.05), 1).numpy().min() > 0.98
     far = 0.3 if method == "csm" else 0.15  # a series of few terms has a soft step
-    assert resolve(texels, floats(depth + far)).numpy().max() < (0.08 if method == "csm" else 0.02)
+    assert resolve(texels, floats(depth + far), 1).numpy().max() < (0.08 if method == "csm" else 0.02)
 
 
 @pytest.mark.parametrize("method", PREFILTERED)
@@ -56,8 +56,19 @@ def test_half_covered_surfaces_are_half_lit(variant: str, method: str) -> None:
     """Two depths, a receiver on the farther one: half of the light arrives (the convolution map rounds the step off)."""
     near = np.linspace(-0.4, 0.0, 20)
     depths = np.stack([near, near + 0.3], 1)
-    value = PREFILTERED[method].resolve(stored(method, depths, np.full((20, 2), 0.5)), floats(near + 0.3)).numpy()
+    value = PREFILTERED[method].resolve(stored(method, depths, np.full((20, 2), 0.5)), floats(near + 0.3), 1).numpy()
     np.testing.assert_allclose(value, 0.5, atol=0.12 if method == "csm" else 0.02)
+
+
+@pytest.mark.parametrize("texels", [256, 1024, 4096])
+@pytest.mark.parametrize("method", ["evsm2", "evsm4"])
+def test_gaps_of_texels_are_told_apart(variant: str, method: str, texels: int) -> None:
+    """An occluder three texels before a receiver hides it, however small a texel is; a surface does not hide itself."""
+    receiver = np.linspace(-0.45, 0.5, 200)
+    for gap, dark in ((3 / texels, True), (0.0, False)):
+        depths = (receiver - gap)[:, None]
+        value = PREFILTERED[method].resolve(stored(method, depths, np.ones((200, 1))), floats(receiver), 1 / texels).numpy()
+        assert value.max() < 0.08 if dark else value.min() > 0.99
 
 
 @pytest.mark.parametrize(("method", "bleeds"), [("vsm", True), ("evsm4", False), ("evsm2", False), ("esm", False)])
@@ -66,7 +77,7 @@ def test_bleeding(variant: str, method: str, bleeds: bool) -> None:
     n = 20
     depths = np.tile([[-0.45, 0.1]], (n, 1))
     receiver = np.linspace(0.2, 0.4, n)
-    value = PREFILTERED[method].resolve(stored(method, depths, np.full((n, 2), 0.5)), floats(receiver)).numpy()
+    value = PREFILTERED[method].resolve(stored(method, depths, np.full((n, 2), 0.5)), floats(receiver), 1).numpy()
     assert (value.min() > 0.1) == bleeds
     assert bleeds or value.max() < 0.03
 
@@ -75,7 +86,7 @@ def test_moment_map_is_sharper_than_variance_map(variant: str) -> None:
     n = 20
     depths, receiver = np.tile([[-0.45, 0.1]], (n, 1)), floats(np.linspace(0.2, 0.4, n))
     weights = np.full((n, 2), 0.5)
-    vsm, msm = (PREFILTERED[m].resolve(stored(m, depths, weights), receiver).numpy() for m in ("vsm", "msm"))
+    vsm, msm = (PREFILTERED[m].resolve(stored(m, depths, weights), receiver, 1).numpy() for m in ("vsm", "msm"))
     assert msm.max() < 0.05 < vsm.min()
 
 
@@ -92,7 +103,7 @@ def test_hamburger_bound(variant: str) -> None:
     rng = np.random.default_rng(4)
     depths, weights = rng.uniform(-0.45, 0.45, (200, 5)), rng.dirichlet(np.ones(5), 200)
     receiver = rng.uniform(-0.5, 0.5, 200)
-    got = PREFILTERED["msm"].resolve(stored("msm", depths, weights), floats(receiver)).numpy()
+    got = PREFILTERED["msm"].resolve(stored("msm", depths, weights), floats(receiver), 1).numpy()
     want = []
     for z, w, d in zip(2 * depths, weights, 2 * receiver, strict=True):
         moments = np.array([(w * z**k).sum() for k in (1, 2, 3, 4)])
@@ -113,7 +124,7 @@ def test_large_derivatives_of_the_hamburger_bound_are_true(variant: str) -> None
     inputs = PREFILTERED["msm"].encode(floats(depth), floats(10.0 ** rng.uniform(-6, -3, n)), 0)
     inputs.append(floats(depth + 0.02 * rng.normal(size=n)))
     dr.enable_grad(inputs)
-    dr.backward(dr.sum(PREFILTERED["msm"].resolve(inputs[:4], inputs[4])))
+    dr.backward(dr.sum(PREFILTERED["msm"].resolve(inputs[:4], inputs[4], 1)))
     got = np.array([dr.grad(i).numpy() for i in inputs])
 
     def value(at: np.ndarray) -> float:
@@ -144,7 +155,7 @@ def test_bounded_and_finite_on_any_moments(variant: str, method: str) -> None:
     texels, receiver = random_texels(method)
     depth = floats(receiver)
     dr.enable_grad(texels, depth)
-    value = reduced_bleeding(PREFILTERED[method].resolve(texels, depth), 0.2)
+    value = reduced_bleeding(PREFILTERED[method].resolve(texels, depth, 1), 0.2)
     assert np.isfinite(value.numpy()).all()
     assert ((value.numpy() >= 0) & (value.numpy() <= 1)).all()
     dr.backward(dr.sum(value))
@@ -253,7 +264,7 @@ def test_two_depths_are_bounded_and_finite_on_any_moments(variant: str) -> None:
 def test_occluders_and_receivers_at_the_ends_of_the_range(variant: str, method: str) -> None:
     """If all casters lie before all receivers, one ends up at -1/2 and the other at 1/2."""
     depths = np.full((4, 1), -0.5)
-    value = PREFILTERED[method].resolve(stored(method, depths, np.ones((4, 1))), floats([0.3, 0.4, 0.45, 0.5])).numpy()
+    value = PREFILTERED[method].resolve(stored(method, depths, np.ones((4, 1))), floats([0.3, 0.4, 0.45, 0.5]), 1).numpy()
     assert value.max() < (0.1 if method == "csm" else 0.01)
 
 

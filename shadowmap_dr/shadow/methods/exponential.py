@@ -8,9 +8,11 @@ from ...jit.arrays import backend
 from ...jit.types import Float, Vector2f
 from .variance import chebyshev_visibility
 
-#: Smallest variance of warped depths, to first order, for a squared exponent of 1. With less, surfaces at grazing angles to the
-#: light would shadow themselves.
-MINIMUM_WARPED_VARIANCE = 1e-5
+# Smallest deviation that depths are taken to have: a share of the side of a texel, and at most a share of the depth range. With
+# less, surfaces at grazing angles to the light would shadow themselves.
+_TEXELS, _MOST = 0.8, 3.2e-3
+# Smallest variance relative to the squared warped depth that single precision can tell.
+_PRECISE = 1e-6
 
 
 def exponential_moment(depth: Float, exponent: float) -> Float:
@@ -40,13 +42,17 @@ def warped_moments(depth: Float, slope_square: Float | float, exponent: float) -
     return backend(depth).Array2f(warped, dr.fma(warped, warped, 0.25 * dr.detach(slope_square) * slope * slope))
 
 
-def warped_visibility(moments: Vector2f, depth: Float, exponent: float) -> Float:
-    """Chebyshev's bound for warped depths. Attached to moments and depth."""
+def warped_visibility(moments: Vector2f, depth: Float, exponent: float, texel: Float | float = 1) -> Float:
+    """Chebyshev's bound for warped depths. Attached to moments and depth.
+
+    ``texel``: side of a texel as a share of the depth range, detached.
+    """
     warped = _warp(depth, exponent)
     # Moments span many orders of magnitude: everything is scaled by the receiver's own warped depth.
     scale = dr.rcp(dr.detach(dr.abs(warped)))
     relative = backend(depth).Array2f(moments.x * scale, moments.y * scale * scale)
-    return chebyshev_visibility(relative, warped * scale, MINIMUM_WARPED_VARIANCE * exponent * exponent)
+    deviation = exponent * dr.minimum(_TEXELS * backend(depth).Float(texel), _MOST)
+    return chebyshev_visibility(relative, warped * scale, dr.maximum(deviation * deviation, _PRECISE))
 
 
 def _warp(depth: Float, exponent: float) -> Float:

@@ -282,13 +282,14 @@ def test_small_convergence(variant: str, tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_outlines_that_are_not_parallel_to_texels_are_placed_exactly(variant: str, tmp_path: Path) -> None:
-    """All of a parallel one lies at the same place within its texels, and ends a tenth to a fifth of one away."""
+    """All of a parallel one lies at the same place within its texels, and ends up to a fifth of one away."""
     options = {
         "cameras": ("orthographic",),
         "filter_sizes": (3,),
         "displacements": (0.1, 0.3),
         "map_resolution": 96,
-        "resolution": 256,
+        "resolution": 128,
+        "iterations": 170,
         "spp": 128,
     }
     occluders, candidates = ("plane", "turned plane"), ("default", "no anti-aliasing")
@@ -312,7 +313,7 @@ def test_largest_recovered() -> None:
 
 
 def test_small_minimal_plane(variant: str, tmp_path: Path) -> None:
-    record = run_plane(PlaneOptions(resolution=384, spp=64, out=tmp_path))
+    record = run_plane(PlaneOptions(resolution=192, spp=64, out=tmp_path))
     for run in record["runs"]:
         assert run["recovered"] == run["antialiased"], run["error"]
         assert run["error_curve"][0] == pytest.approx(0.375 * np.sqrt(2), rel=1e-5)

@@ -158,7 +158,7 @@ CASES = (
                                    "light": {"type": "rectangle", "to_world": _beside(), "emitter": lamp(3.0)}},
          ("light.emitter.radiance.value",), _brighter, 0.5),
     Case("seen_lamp_radiance", lambda: {"light": {"type": "rectangle", "emitter": lamp(1.0)}},
-         ("light.emitter.radiance.value",), _brighter, 0.5),
+         ("light.emitter.radiance.value",), _brighter, 0.5, options=_FEW),
     Case("point_intensity", lambda: {"plane": _plane(1.0), "ball": _small_sphere(), "light": {
         "type": "point", "position": [1.25, 0, 1], "intensity": {"type": "rgb", "value": 5.0}}},
          ("light.intensity.value",), _brighter, 0.5),
@@ -173,10 +173,11 @@ CASES = (
     Case("ball_in_constant", lambda: {"ball": ball("ball"), "light": _constant()}, ("ball." + _VERTICES,), _moved, 0.01),
     Case("square_in_constant", lambda: {"plane": square("plane"), "light": _constant()}, ("plane." + _VERTICES,), _moved, 0.01),
     Case("lamp_square_moves", lambda: {"light": square("light", _at(1.25, 0, 0), emitter=lamp(1.0))},
-         ("light." + _VERTICES,), _moved, 0.01),
+         ("light." + _VERTICES,), _moved, 0.01, options=_FEW),
     Case("lamp_ball_moves", lambda: {"light": ball("light", _at(1.25, 0, 0), rows=48, emitter=lamp(1.0))},
-         ("light." + _VERTICES,), _moved, 0.01),
-    Case("lamp_ball_grows", lambda: {"light": ball("light", rows=48, emitter=lamp(1.0))}, ("light." + _VERTICES,), _grown, 0.01),
+         ("light." + _VERTICES,), _moved, 0.01, options=_FEW),
+    Case("lamp_ball_grows", lambda: {"light": ball("light", rows=48, emitter=lamp(1.0))}, ("light." + _VERTICES,), _grown, 0.01,
+         options=_FEW),
     Case("painted_lamp_moves", lambda: {"light": square("light", _at(0.6, 0, 0), emitter={
         "type": "area", "radiance": rough_picture(16)})}, ("light." + _VERTICES,), _moved, 0.01, spp=256, options=_FEW),
     Case("painted_plane_moves", lambda: {"plane": square("plane", _at(0, 0, 0, 2), bsdf={

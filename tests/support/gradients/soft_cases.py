@@ -13,7 +13,7 @@ from .changes import brighter, lightened, moved, one_corner, swung, translated, 
 from .model import Case, Parameter
 
 SIZE = 64
-OPTIONS = {"area_light_samples": 64, "environment_light_samples": 128}
+OPTIONS = {"area_light_samples": 16, "environment_light_samples": 128}
 # Twice the steps of the larger images: boundaries move by as many pixels.
 CASTER = {
     "caster_translation": Parameter("object.vertex_positions", translated(1, 0, 0), 0.02),

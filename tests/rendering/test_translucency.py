@@ -244,7 +244,7 @@ def test_derivatives(variant: str, name: str) -> None:
     change = changes(64)[name]
     build, step = change[:2]
     image, forward, backward = derivative(change, 16 if name == "pane" else 4)
-    reference = (traced(build(step), 512) - traced(build(-step), 512)) / (2 * step)
+    reference = (traced(build(step), 256) - traced(build(-step), 256)) / (2 * step)
     found = agreement(image, reference)
     assert found.cosine >= 0.97
     # Below 0.97 where outlines of a layer leave out the surfaces behind it, which are another layer beside it.

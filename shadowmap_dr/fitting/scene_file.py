@@ -180,23 +180,22 @@ class _Writer:
         return f"the scene has no such shape, only {', '.join(map(repr, self.parsed.shapes)) or 'none'}"
 
     def _loadable(self, steps: dict[str, Step], notes: dict[str, str]) -> dict[str, Step]:
-        """The steps after which Mitsuba still loads the scene."""
-        try:
-            self._read(steps, notes)
-            return {name: step for name, step in steps.items() if name not in notes}
-        except ShadowmapError:
-            kept = dict[str, Step]()
-        self._read(kept, notes)  # raises if it is not the changes that are at fault
-        for name, step in steps.items():
-            if name in notes:
-                continue
+        """The steps after which Mitsuba still loads the scene. Where it does not, they are halved: each try loads the scene."""
+        kept, waiting = dict[str, Step](), [list(steps)]
+        while waiting:
+            names = [name for name in waiting.pop() if name not in notes]
             try:
-                self._read(kept | {name: step}, notes)
-                if name not in notes:
-                    kept[name] = step
+                self._read(kept | {name: steps[name] for name in names}, notes)
             except ShadowmapError as error:
+                if not names or len(names) == len(steps):
+                    self._read(kept, notes)  # raises if it is not the changes that are at fault
+                if len(names) > 1:
+                    half = len(names) // 2
+                    waiting += [names[half:], names[:half]]
+                    continue
                 reason = mitsuba_message(error.__cause__ or error).rstrip(".!")
-                notes[name] = f"Mitsuba refuses the file with it: {re.sub(r'^At .*?[)]: ', '', reason)}"
+                notes[names[0]] = f"Mitsuba refuses the file with it: {re.sub(r'^At .*?[)]: ', '', reason)}"
+            kept |= {name: steps[name] for name in names if name not in notes}
         return kept
 
     def _read(self, steps: Mapping[str, Step], notes: dict[str, str]) -> ParsedScene:

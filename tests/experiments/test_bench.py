@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,6 @@ from bench_runs import options, run
 from bench_sizes import TINY
 from rich.console import Console
 
-from mitsuba_baselines import fair_settings
 from shadowmap_dr.errors import ShadowmapError
 from shadowmap_dr.experiments.bench import breakdown as bench_breakdown
 from shadowmap_dr.experiments.bench import common as bench_common
@@ -135,16 +133,14 @@ def test_running_the_passes_one_by_one_changes_no_derivative(tmp_path: Path) -> 
     np.testing.assert_allclose(fit.state()["m"], expected["m"], rtol=1e-3, atol=1e-6)
 
 
-def test_steps_and_poses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With fewer of Mitsuba's samples than are fair in images this small: a step of those takes four seconds."""
-    monkeypatch.setattr(fair_settings, "fair_setting", lambda *_: bench_steps_setting())
+def test_steps_and_poses(tmp_path: Path) -> None:
     record = run(options(tmp_path, "steps"))
     step, pose = record["sections"]["steps"]["units"].values()
     for name in ("shadows", "rasterizer", "mitsuba"):
         assert_summary(step["seconds"][name])
         assert pose["methods"][name]["starts"] <= 1
     assert {"mitsuba / shadows", "shadows / rasterizer"} <= step["ratio_of_medians"].keys()
-    assert isinstance(step["mitsuba"]["fair"], bool) and step["mitsuba"]["setting"] == asdict(bench_steps_setting())
+    assert isinstance(step["mitsuba"]["fair"], bool) and step["mitsuba"]["setting"]["sppi"] >= 1
     run_ = pose["methods"]["shadows"]["runs"][0]
     assert run_["iterations"] == 3 and not run_["cut_short"] and len(run_["start"]) == len(run_["final"]) == 3
     assert pose["cut"]["mitsuba_seconds"] == 1.0
@@ -177,6 +173,8 @@ def test_limit_for_mitsuba_cuts_runs_and_says_so(tmp_path: Path, monkeypatch: py
 
     monkeypatch.setattr(bench_steps, "_methods", lambda *_: ({"shadows": Slow(), "mitsuba": Slow()}, None))
     monkeypatch.setattr(bench_steps, "_problem", lambda *_: (None, None, None))
+    from dataclasses import replace
+
     chosen = options(tmp_path, "steps", sizes=replace(TINY, starts=2, iterations=5), mitsuba_seconds=0.05)
     result = bench_steps.measure_poses(chosen, 16, {}, lambda *_: None)
     assert result["cut"]["mitsuba_starts_cut_short"] == [0] and result["cut"]["mitsuba_starts_not_run"] == [1]

@@ -8,9 +8,10 @@ from ...jit.arrays import backend
 from ...jit.types import Float, Vector2f
 from .variance import chebyshev_visibility
 
-# Smallest deviation that depths are taken to have: a share of the side of a texel, and at most a share of the depth range. With
-# less, surfaces at grazing angles to the light would shadow themselves.
-_TEXELS, _MOST = 0.8, 3.2e-3
+# Smallest deviation that depths are taken to have: in sides of a texel, and at most a share of the depth range. With less,
+# surfaces at grazing angles to the light would shadow themselves, and derivatives by depth, which grow as it falls, would have
+# single large values.
+_TEXELS, _MOST = 1.2, 3.2e-3
 # Smallest variance relative to the squared warped depth that single precision can tell.
 _PRECISE = 1e-6
 

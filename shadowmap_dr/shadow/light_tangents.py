@@ -127,12 +127,13 @@ def tangent_visibility(maps: TangentMaps, map_index: UInt32, p_world: Point3f, a
     per_z = dr.select(depth > FAR, 0, per_z)
     depth = dr.select(depth > FAR, FAR, depth)
     moves = [(dx * per_x, dy * per_y, dz * per_z) for dx, dy, dz in turned(twist, p)]
-    texel = texel_side(view, frustum, depth, settings.resolution) * dr.maximum(frustum.half_x, frustum.half_y)
+    footprint = texel_side(view, frustum, depth, settings.resolution) * dr.maximum(frustum.half_x, frustum.half_y)
+    footprint = footprint * settings.footprint
     method = PREFILTERED[settings.method]
 
-    def look_up(index, u, v, depth, texel, *moves):  # noqa: ANN001, ANN002, ANN202
+    def look_up(index, u, v, depth, footprint, *moves):  # noqa: ANN001, ANN002, ANN202
         def resolve(values: list[Float], depth: Float) -> Float:
-            value = method.resolve(values, depth, texel)
+            value = method.resolve(values, depth, footprint)
             return reduced_bleeding(value, settings.bleeding) if method.bleeds else value
 
         # Beyond the centres of the outermost texels, look-ups are constant.
@@ -158,7 +159,7 @@ def tangent_visibility(maps: TangentMaps, map_index: UInt32, p_world: Point3f, a
         return tuple(result)
 
     return dr.if_stmt(
-        (map_index, u, v, depth, texel, *moves[0], *moves[1]),
+        (map_index, u, v, depth, footprint, *moves[0], *moves[1]),
         inside,
         look_up,
         lambda index, u, *_: (module.Float(1), module.Float(0), module.Float(0)),

@@ -45,21 +45,21 @@ def visibility(maps: ShadowMaps, map_index: UInt32 | int, p_world: Point3f, acti
     Returns:
         ``Float`` in 0..1; 1 outside the map (0 with ``compat``). Gradients flow to the points, the casters and the light.
     """
-    view, index, u, v, depth, inside, texel = _place_in_map(maps, map_index, p_world)
+    view, index, u, v, depth, inside, footprint = _place_in_map(maps, map_index, p_world)
     if maps.settings.compat:
         p = to_light_space(view, p_world)
         return dr.select(active, _look_up_compat(maps, index, u, v, dr.norm(p), inside & active), 1)
     inside &= backend(maps.values).Bool(active)
     look_up = {"standard": _compare, "pcf": _compare_all}.get(maps.settings.method, _resolve)
-    return _where(inside, look_up, maps, index, u, v, depth, texel)
+    return _where(inside, look_up, maps, index, u, v, depth, footprint)
 
 
 def _place_in_map(
     maps: ShadowMaps, map_index: UInt32 | int, p_world: Point3f
 ) -> tuple[Views, UInt32, Float, Float, Float, Bool, Float]:
-    """(camera, index among all copies of the maps, u, v, linear depth, whether it is in the map, texel) of points.
+    """(camera, index among all copies of the maps, u, v, linear depth, whether it is in the map, footprint) of points.
 
-    All but the last are attached, which is the side of a texel as a share of the depth range.
+    All but the last are attached, which is the side of the filter's footprint as a share of the depth range.
     """
     module = backend(maps.values)
     index: UInt32 = module.UInt32(map_index)
@@ -69,8 +69,8 @@ def _place_in_map(
     view = of_map(maps.views, index, maps.views.count)
     u, v, depth, inside = project(view, frustum, p_world)
     side = texel_side(dr.detach(view), frustum, depth, maps.settings.resolution)
-    texel = side * dr.maximum(frustum.half_x, frustum.half_y)
-    return view, index, u, v, dr.select(depth > FAR, FAR, depth), inside, texel
+    footprint = side * dr.maximum(frustum.half_x, frustum.half_y) * maps.settings.footprint
+    return view, index, u, v, dr.select(depth > FAR, FAR, depth), inside, footprint
 
 
 def tiled_visibility(maps: ShadowMaps, group: Group, p_world: Point3f, active: Bool | bool = True) -> Float:
@@ -123,12 +123,12 @@ def transmittance(maps: ShadowMaps, map_index: UInt32 | int, p_world: Point3f, a
     """
     stored = maps.transmittance
     assert stored is not None, "looked up only where there are translucent casters"
-    _, index, u, v, depth, inside, texel = _place_in_map(maps, map_index, p_world)
+    _, index, u, v, depth, inside, footprint = _place_in_map(maps, map_index, p_world)
     found = branch(
         inside & backend(maps.values).Bool(active),
         lambda *lanes: _light_left(maps, stored, *lanes),
         lambda *lanes: tuple(type(lanes[1])(1) for _ in range(stored.colours)),
-        (index, u, v, depth, texel),
+        (index, u, v, depth, footprint),
         "transmittance",
     )
     return list(found)
@@ -143,7 +143,7 @@ def tiled_transmittance(maps: ShadowMaps, group: Group, p_world: Point3f, active
 
 
 def _light_left(
-    maps: ShadowMaps, stored: TransmittanceMaps, map_index: UInt32, u: Float, v: Float, depth: Float, texel: Float
+    maps: ShadowMaps, stored: TransmittanceMaps, map_index: UInt32, u: Float, v: Float, depth: Float, footprint: Float
 ) -> tuple[Float, ...]:
     """Light of each colour that is left at a depth."""
     method, module = depth_encoding(maps.settings), backend(depth)
@@ -156,7 +156,7 @@ def _light_left(
         any_lost = weight > _NOTHING
         inverse = dr.rcp(dr.select(any_lost, weight, 1))
         moments = [value * inverse for value in values[stored.colours + 1 :]]
-        lit = method.resolve(moments, depth, texel)
+        lit = method.resolve(moments, depth, footprint)
         if method.bleeds:
             lit = reduced_bleeding(lit, maps.settings.bleeding)
         before = dr.select(any_lost, 1 - lit, 0)
@@ -172,14 +172,14 @@ def _where(active: Bool, function: Callable[..., Float], maps: ShadowMaps, *lane
     return found
 
 
-def _resolve(maps: ShadowMaps, map_index: UInt32, u: Float, v: Float, depth: Float, texel: Float) -> Float:
+def _resolve(maps: ShadowMaps, map_index: UInt32, u: Float, v: Float, depth: Float, footprint: Float) -> Float:
     """Visibility from filtered moments or terms."""
     method = PREFILTERED[maps.settings.method]
-    value = method.resolve(bilinear(maps, map_index, u, v, True), depth, texel)
+    value = method.resolve(bilinear(maps, map_index, u, v, True), depth, footprint)
     return reduced_bleeding(value, maps.settings.bleeding) if method.bleeds else value
 
 
-def _compare(maps: ShadowMaps, map_index: UInt32, u: Float, v: Float, depth: Float, texel: Float) -> Float:
+def _compare(maps: ShadowMaps, map_index: UInt32, u: Float, v: Float, depth: Float, footprint: Float) -> Float:
     """One comparison with the nearest texel."""
     module = backend(maps.values)
     size = maps.settings.resolution
@@ -189,7 +189,7 @@ def _compare(maps: ShadowMaps, map_index: UInt32, u: Float, v: Float, depth: Flo
     return standard_visibility(stored, depth, maps.settings.bias)
 
 
-def _compare_all(maps: ShadowMaps, map_index: UInt32, u: Float, v: Float, depth: Float, texel: Float) -> Float:
+def _compare_all(maps: ShadowMaps, map_index: UInt32, u: Float, v: Float, depth: Float, footprint: Float) -> Float:
     """Weighted comparisons with all texels under the filter, which moves continuously with the point. Attached to both.
 
     Source: Reeves et al., "Rendering Antialiased Shadows with Depth Maps", 1987.

@@ -155,6 +155,11 @@ class ShadowSettings:
         return self.filter != "none" and self.filter_size > 1
 
     @property
+    def footprint(self) -> int:
+        """Texels along each side that a stored texel is made of."""
+        return self.filter_size if self.filters else 1
+
+    @property
     def filterable(self) -> bool:
         """True if stored values may be blended, that is, anti-aliased and filtered."""
         return self.method in PREFILTERED

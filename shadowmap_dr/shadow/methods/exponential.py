@@ -8,10 +8,10 @@ from ...jit.arrays import backend
 from ...jit.types import Float, Vector2f
 from .variance import chebyshev_visibility
 
-# Smallest deviation that depths are taken to have: in sides of a texel, and at most a share of the depth range. With less,
-# surfaces at grazing angles to the light would shadow themselves, and derivatives by depth, which grow as it falls, would have
-# single large values.
-_TEXELS, _MOST = 1.2, 3.2e-3
+# Smallest deviation that depths are taken to have: in sides of the filter's footprint, and at most a share of the depth range.
+# With less, surfaces at grazing angles to the light would shadow themselves, and derivatives by depth, which grow as it falls,
+# would have single large values.
+_FOOTPRINTS, _MOST = 1.2, 1e-5**0.5
 # Smallest variance relative to the squared warped depth that single precision can tell.
 _PRECISE = 1e-6
 
@@ -43,16 +43,16 @@ def warped_moments(depth: Float, slope_square: Float | float, exponent: float) -
     return backend(depth).Array2f(warped, dr.fma(warped, warped, 0.25 * dr.detach(slope_square) * slope * slope))
 
 
-def warped_visibility(moments: Vector2f, depth: Float, exponent: float, texel: Float | float = 1) -> Float:
+def warped_visibility(moments: Vector2f, depth: Float, exponent: float, footprint: Float | float = 1) -> Float:
     """Chebyshev's bound for warped depths. Attached to moments and depth.
 
-    ``texel``: side of a texel as a share of the depth range, detached.
+    ``footprint``: side of the filter's footprint as a share of the depth range, detached.
     """
     warped = _warp(depth, exponent)
     # Moments span many orders of magnitude: everything is scaled by the receiver's own warped depth.
     scale = dr.rcp(dr.detach(dr.abs(warped)))
     relative = backend(depth).Array2f(moments.x * scale, moments.y * scale * scale)
-    deviation = exponent * dr.minimum(_TEXELS * backend(depth).Float(texel), _MOST)
+    deviation = exponent * dr.minimum(_FOOTPRINTS * backend(depth).Float(footprint), _MOST)
     return chebyshev_visibility(relative, warped * scale, dr.maximum(deviation * deviation, _PRECISE))
 
 

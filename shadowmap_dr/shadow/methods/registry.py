@@ -26,8 +26,8 @@ class Method:
 
     Attributes:
         encode: (linear depth, squared change of depth across a texel, order) -> numbers to store. Attached to the depth.
-        resolve: (the filtered numbers, receiver's depth, side of a texel as a share of the depth range) -> visibility in 0..1.
-            Attached to the first two.
+        resolve: (the filtered numbers, receiver's depth, side of the filter's footprint over the depth range) -> visibility
+            in 0..1. Attached to the first two.
         bleeds: True if small visibilities may be cut off, see :attr:`ShadowSettings.bleeding`.
     """
 
@@ -40,13 +40,13 @@ def _pair(values: list[Float]) -> Vector2f:
     return backend(values[0]).Array2f(*values)
 
 
-def _evsm2(values: list[Float], depth: Float, texel: Float | float) -> Float:
-    return reduced_bleeding(warped_visibility(_pair(values), depth, _EVSM2, texel), _LEAK)
+def _evsm2(values: list[Float], depth: Float, footprint: Float | float) -> Float:
+    return reduced_bleeding(warped_visibility(_pair(values), depth, _EVSM2, footprint), _LEAK)
 
 
-def _evsm4(values: list[Float], depth: Float, texel: Float | float) -> Float:
-    positive = warped_visibility(_pair(values[:2]), depth, _EVSM4, texel)
-    negative = warped_visibility(_pair(values[2:]), depth, _EVSM4_NEGATIVE, texel)
+def _evsm4(values: list[Float], depth: Float, footprint: Float | float) -> Float:
+    positive = warped_visibility(_pair(values[:2]), depth, _EVSM4, footprint)
+    negative = warped_visibility(_pair(values[2:]), depth, _EVSM4_NEGATIVE, footprint)
     return reduced_bleeding(_least(positive, negative), _LEAK)
 
 
@@ -57,12 +57,12 @@ def _least(a: Float, b: Float) -> Float:
 PREFILTERED: dict[str, Method] = {
     "vsm": Method(
         lambda z, slope, order: list(variance_moments(z, slope)),
-        lambda values, z, texel: chebyshev_visibility(_pair(values), z),
+        lambda values, z, footprint: chebyshev_visibility(_pair(values), z),
         bleeds=True,
     ),
     "esm": Method(
         lambda z, slope, order: [exponential_moment(z, _ESM)],
-        lambda values, z, texel: exponential_visibility(values[0], z, _ESM),
+        lambda values, z, footprint: exponential_visibility(values[0], z, _ESM),
     ),
     "evsm2": Method(
         lambda z, slope, order: list(warped_moments(z, slope, _EVSM2)),
@@ -76,10 +76,10 @@ PREFILTERED: dict[str, Method] = {
     ),
     "msm": Method(
         lambda z, slope, order: power_moments(z, slope),
-        lambda values, z, texel: power_moments_visibility(values, z),
+        lambda values, z, footprint: power_moments_visibility(values, z),
         bleeds=True,
     ),
-    "csm": Method(fourier_terms, lambda values, z, texel: fourier_visibility(values, z)),
+    "csm": Method(fourier_terms, lambda values, z, footprint: fourier_visibility(values, z)),
 }
 
 #: Hardly any light bleeding, and no more error than ``vsm`` on any scene of `shadowmap-dr maps`, which compares all methods.

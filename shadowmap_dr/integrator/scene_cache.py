@@ -233,12 +233,12 @@ class SceneCache:
         current.note_kernels(spp)
         samples = _samples(sensor, spp)
         keep = samples <= MOST_SAMPLES and current.is_one_pass
-        still = plain(current)
-        image, frusta, soft_frusta, results = self.recorded.image(spp, still, keep)
+        detached = plain(current)
+        image, frusta, soft_frusta, results = self.recorded.image(spp, detached, keep)
         self._remember(scene, sensor, frusta, soft_frusta)
         if keep and now.attached:
             weight = samples + self.renderer.texels // TEXELS
-            self.handed.add(sensor, spp, weight, (now.scene, now.camera), still, results)
+            self.handed.add(sensor, spp, weight, (now.scene, now.camera), detached, results)
         self.handed.follow(now.scene, scene)
         return image
 
@@ -248,15 +248,17 @@ class SceneCache:
         Does nothing and returns False if gradients also flow through materials, textures or the radiance of extended lights,
         which Mitsuba itself evaluates. ``now``: the current parameters.
         """
-        (results, still), attached = self.handed.take(sensor, spp, now.scene, now.camera), now.attached
+        (results, detached), attached = self.handed.take(sensor, spp, now.scene, now.camera), now.attached
         current = self._current(scene, sensor)
         if attached not in self.recordable:
             self.recordable[attached] = not dr.grad_enabled(plain(current).render(spp=spp))
         if self.recordable[attached]:
             self._forget_stale_recordings()
-            # That of the image, but with its fit of the maps.
-            still = plain(current) if still is None else replace(still, frusta=current.frusta, soft_frusta=current.soft_frusta)
-            self.recorded.backward(spp, gradient, current.data, still, results)
+            if detached is None:
+                detached = plain(current)
+            else:  # with the fit of the maps that the image has made
+                detached = replace(detached, frusta=current.frusta, soft_frusta=current.soft_frusta)
+            self.recorded.backward(spp, gradient, current.data, detached, results)
             self.handed.follow(now.scene, scene)
         return self.recordable[attached]
 

@@ -29,7 +29,7 @@ from .methods.registry import PREFILTERED
 from .methods.variance import reduced_bleeding
 from .settings import ShadowSettings
 from .shadow_map import ShadowMaps, block_means
-from .texel_depths import FAR, texel_side
+from .texel_depths import FAR, footprint_side
 
 
 @dataclass(frozen=True)
@@ -127,8 +127,7 @@ def tangent_visibility(maps: TangentMaps, map_index: UInt32, p_world: Point3f, a
     per_z = dr.select(depth > FAR, 0, per_z)
     depth = dr.select(depth > FAR, FAR, depth)
     moves = [(dx * per_x, dy * per_y, dz * per_z) for dx, dy, dz in turned(twist, p)]
-    footprint = texel_side(view, frustum, depth, settings.resolution) * dr.maximum(frustum.half_x, frustum.half_y)
-    footprint = footprint * settings.footprint
+    footprint = footprint_side(view, frustum, depth, settings)
     method = PREFILTERED[settings.method]
 
     def look_up(index, u, v, depth, footprint, *moves):  # noqa: ANN001, ANN002, ANN202

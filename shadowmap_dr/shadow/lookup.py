@@ -19,7 +19,7 @@ from .methods.comparison import soft_comparison, standard_visibility
 from .methods.registry import PREFILTERED
 from .methods.variance import MINIMUM_VARIANCE_COMPAT, chebyshev_visibility, reduced_bleeding
 from .shadow_map import ShadowMaps
-from .texel_depths import FAR, texel_side
+from .texel_depths import FAR, footprint_side
 from .tile_fit import image_coordinates
 from .tiles import Group, neighbour, tile_of
 from .transmittance_maps import TransmittanceMaps, depth_encoding
@@ -50,8 +50,10 @@ def visibility(maps: ShadowMaps, map_index: UInt32 | int, p_world: Point3f, acti
         p = to_light_space(view, p_world)
         return dr.select(active, _look_up_compat(maps, index, u, v, dr.norm(p), inside & active), 1)
     inside &= backend(maps.values).Bool(active)
-    look_up = {"standard": _compare, "pcf": _compare_all}.get(maps.settings.method, _resolve)
-    return _where(inside, look_up, maps, index, u, v, depth, footprint)
+    compare = {"standard": _compare, "pcf": _compare_all}.get(maps.settings.method)
+    if compare is not None:
+        return _where(inside, compare, maps, index, u, v, depth)
+    return _where(inside, _resolve, maps, index, u, v, depth, footprint)
 
 
 def _place_in_map(
@@ -68,8 +70,7 @@ def _place_in_map(
         index = index + copy_of_lane(module, dr.width(p_world), maps.copies) * maps.count
     view = of_map(maps.views, index, maps.views.count)
     u, v, depth, inside = project(view, frustum, p_world)
-    side = texel_side(dr.detach(view), frustum, depth, maps.settings.resolution)
-    footprint = side * dr.maximum(frustum.half_x, frustum.half_y) * maps.settings.footprint
+    footprint = footprint_side(view, frustum, depth, maps.settings)
     return view, index, u, v, dr.select(depth > FAR, FAR, depth), inside, footprint
 
 
@@ -179,7 +180,7 @@ def _resolve(maps: ShadowMaps, map_index: UInt32, u: Float, v: Float, depth: Flo
     return reduced_bleeding(value, maps.settings.bleeding) if method.bleeds else value
 
 
-def _compare(maps: ShadowMaps, map_index: UInt32, u: Float, v: Float, depth: Float, footprint: Float) -> Float:
+def _compare(maps: ShadowMaps, map_index: UInt32, u: Float, v: Float, depth: Float) -> Float:
     """One comparison with the nearest texel."""
     module = backend(maps.values)
     size = maps.settings.resolution
@@ -189,7 +190,7 @@ def _compare(maps: ShadowMaps, map_index: UInt32, u: Float, v: Float, depth: Flo
     return standard_visibility(stored, depth, maps.settings.bias)
 
 
-def _compare_all(maps: ShadowMaps, map_index: UInt32, u: Float, v: Float, depth: Float, footprint: Float) -> Float:
+def _compare_all(maps: ShadowMaps, map_index: UInt32, u: Float, v: Float, depth: Float) -> Float:
     """Weighted comparisons with all texels under the filter, which moves continuously with the point. Attached to both.
 
     Source: Reeves et al., "Rendering Antialiased Shadows with Depth Maps", 1987.

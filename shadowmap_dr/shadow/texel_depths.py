@@ -82,3 +82,9 @@ def texel_side(view: Views, frustum: Frusta, linear: Float, size: int) -> Float:
     n, f = frustum.first, frustum.far
     distance = dr.select(view.spread > 0, dr.fma(dr.detach(linear) + 0.5, f - n, n), 1.0)
     return distance * float_input(backend(linear), "width", 2 / size) / (f - n)
+
+
+def footprint_side(view: Views, frustum: Frusta, linear: Float, settings: ShadowSettings) -> Float:
+    """Longer side of the filter's footprint (of a texel without a filter) at a linear depth, over the depth range. Detached."""
+    half = dr.maximum(frustum.half_x, frustum.half_y)
+    return texel_side(dr.detach(view), frustum, linear, settings.resolution) * half * settings.footprint

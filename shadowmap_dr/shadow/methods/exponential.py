@@ -43,7 +43,7 @@ def warped_moments(depth: Float, slope_square: Float | float, exponent: float) -
     return backend(depth).Array2f(warped, dr.fma(warped, warped, 0.25 * dr.detach(slope_square) * slope * slope))
 
 
-def warped_visibility(moments: Vector2f, depth: Float, exponent: float, footprint: Float | float = 1) -> Float:
+def warped_visibility(moments: Vector2f, depth: Float, exponent: float, footprint: Float | float) -> Float:
     """Chebyshev's bound for warped depths. Attached to moments and depth.
 
     ``footprint``: side of the filter's footprint as a share of the depth range, detached.

@@ -21,7 +21,6 @@ from ..scene.geometry import Geometry, rows_of
 from ..scene.lights.projected import Beam
 from ..scene.lights.read import Light
 from ..shadow import (
-    Bounds,
     Boxes,
     Frusta,
     Group,
@@ -46,6 +45,7 @@ from ..shadow import (
     vertices_in_maps,
     vertices_of_maps,
     visibility,
+    with_depths_from_planes,
 )
 
 # Vertices whose coordinates are looked at at once on the host: temporary arrays of all of them would take longer to allocate.
@@ -202,7 +202,7 @@ def map_vertices(
     with dr.suspend_grad():
         each = zip(lights, plan.kinds, plan.tiles, strict=True)
         views = stack_views([view for light, kind, tiles in each for view in _views(plan, light, kind, settings) * tiles])
-        p_light, lanes, _ = vertices_in_maps(views, geometry.positions)
+        p_light, lanes, _ = vertices_in_maps(with_depths_from_planes(views, frusta.tiles), geometry.positions)
         return vertices_of_maps(views, frusta, p_light, lanes), settings.resolution, views.count
 
 
@@ -217,29 +217,19 @@ def _fitted(
     """(cameras of all maps, light-space vertices, the map of each of these, the fit)."""
     each = zip(lights, plan.kinds, plan.tiles, strict=True)
     stacked = stack_views([view for light, kind, tiles in each for view in _views(plan, light, kind, settings) * tiles])
-    p_light, lanes, vertex = vertices_in_maps(stacked, geometry.positions)
 
     def fit() -> Frusta:
         if settings.compat:
             return _compat_frusta(plan, stacked)
-        bounds = _bounds(plan, lights, geometry, stacked, (p_light, lanes, vertex))
-        return _fit(plan, lights, geometry, settings, stacked, bounds, previous, seen)
+        return _fit(plan, lights, geometry, settings, stacked, previous, seen)
 
     frusta = computed("frusta", fit)
     attached = "directional" in plan.kinds and not settings.compat and dr.grad_enabled(stacked.forward)
     if seen is not None and attached:
         stacked = steady_axes(stacked, frusta, seen)
-        p_light, lanes, _ = vertices_in_maps(stacked, geometry.positions)
+    stacked = with_depths_from_planes(stacked, frusta.tiles)
+    p_light, lanes, _ = vertices_in_maps(stacked, geometry.positions)
     return stacked, p_light, lanes, frusta
-
-
-def _bounds(
-    plan: MapPlan, lights: Sequence[Light], geometry: Geometry, views: Views, in_maps: tuple[Point3f, UInt32, UInt32]
-) -> Bounds:
-    """Bounds of each shape in each map. ``in_maps``: light-space vertices, the map of each, its number in the geometry."""
-    p_light, lanes, vertex = in_maps
-    shape = dr.gather(mi.UInt32, geometry.vertex_shape, vertex)
-    return shape_bounds(views, _within_beams(plan, lights, p_light, lanes), lanes, shape, len(geometry.shapes))
 
 
 def _fit(
@@ -248,7 +238,6 @@ def _fit(
     geometry: Geometry,
     settings: ShadowSettings,
     views: Views,
-    bounds: Bounds,
     previous: Frusta | None,
     seen: tuple[Point3f, Bool] | None,
 ) -> Frusta:
@@ -256,12 +245,19 @@ def _fit(
     tiles = None
     if plan.groups:
         assert seen is not None, "lights have tiles only if visible points are known"
-        tiles = fit_tiles(views, plan.groups, seen, None if previous is None else previous.tiles)
+        earlier = None if previous is None else previous.tiles
+        tiles = fit_tiles(views, plan.groups, seen, earlier, planes=settings.counts_from_planes)
     planes, planar = shape_planes(plan, geometry)
+    casts = casting_shapes(views, planes, planar, boxes_of(geometry))
+    views = with_depths_from_planes(views, tiles)
+    with dr.suspend_grad():
+        p_light, lanes, vertex = vertices_in_maps(views, geometry.positions)
+        shape = dr.gather(mi.UInt32, geometry.vertex_shape, vertex)
+    bounds = shape_bounds(views, _within_beams(plan, lights, p_light, lanes), lanes, shape, len(geometry.shapes))
     frusta = fit_frusta(
         views,
         bounds,
-        casting_shapes(views, planes, planar, boxes_of(geometry)),
+        casts,
         len(geometry.shapes),
         settings.resolution,
         settings.filter_size,

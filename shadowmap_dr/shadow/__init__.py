@@ -15,6 +15,7 @@ from .light_camera import (
     stack_views,
     to_light_space,
     vertices_in_maps,
+    with_depths_from_planes,
 )
 from .lookup import tiled_transmittance, tiled_visibility, transmittance, visibility
 from .methods.comparison import standard_visibility
@@ -69,4 +70,5 @@ __all__ = [
     "vertices_in_maps",
     "vertices_of_maps",
     "visibility",
+    "with_depths_from_planes",
 ]

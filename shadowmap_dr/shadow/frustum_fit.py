@@ -19,8 +19,12 @@ Extent: TypeAlias = tuple[Float, Float, Float, Float, Float, Float]
 # A frustum is kept while it contains the scene and the scene fills at least this fraction of it.
 _KEEP_FILL = 0.6
 _MARGIN = 0.10
+# That of tiles, whose texels are worth more than fits that last.
+_MARGIN_OF_TILES = 0.03
 # Least depth range of a frustum in units of its lateral extent.
 _FLATTEST = 1e-2
+# That of tiles, in texels: depths are told apart by about one, and the range must tell receivers from casters.
+_FLATTEST_OF_TILES = 16
 # Least depth range in units of its distance from the light: rounding changes depths by some 1e-7 of the distance.
 _THINNEST = 1e-3
 # Fraction of the depth range between the last possible caster and the far plane (see `texel_depths`).
@@ -112,7 +116,7 @@ def fit_frusta(
         window = _window(views, seen, tiles)
         if not receiver_range:
             window = (*window[:4], module.Float(-dr.inf), window[5])
-        fitted = _fit(views, extent, casts, map_index, window, resolution, filter_size)
+        fitted = _fit(views, extent, casts, map_index, window, tiles, resolution, filter_size)
         result = fitted[0]
         if previous is not None:
             keep = _still_fits(views, previous, *fitted, resolution, filter_size)
@@ -163,6 +167,7 @@ def _fit(
     casts: Bool,
     map_index: UInt32,
     window: Extent,
+    tiles: Tiles | None,
     resolution: int,
     filter_size: int,
 ) -> tuple[Frusta, tuple[Float, ...]]:
@@ -186,7 +191,8 @@ def _fit(
     # A flat caster that faces the light has no extent in depth. In a tiny range, any tilt would be a huge change of depth, and
     # the derivative of visibility a small difference of huge numbers.
     lateral = dr.maximum(x1 - x0, y1 - y0) * dr.select(perspective, dr.abs(z1), 1)
-    least = dr.maximum(_FLATTEST * lateral, _THINNEST * dr.maximum(dr.abs(z1), 1e-3))
+    flattest = _FLATTEST if tiles is None else max(_FLATTEST, _FLATTEST_OF_TILES / resolution)
+    least = dr.maximum(float_input(module, "flattest", flattest) * lateral, _THINNEST * dr.maximum(dr.abs(z1), 1e-3))
     # Visible receivers are known from samples only: some may lie a little before these.
     spread = dr.select(dr.isfinite(window[5]), window[5] - receivers, 0)
     depth = dr.maximum(dr.maximum(z1 - receivers, least), 0.1 * spread)
@@ -201,15 +207,21 @@ def _fit(
     near = dr.select(perspective, dr.maximum(near, 1e-3 * far), near)
     first = dr.maximum(near, receivers - _BEFORE * depth)
 
-    def widen(lo: Float, hi: Float) -> tuple[Float, Float]:
-        half = 0.5 * (hi - lo)
-        grown = half * float_input(module, "texels", max(1 + 2 * _MARGIN, 1 / (1 - 2 * (filter_size / 2 + 2) / resolution)))
-        middle = 0.5 * (lo + hi)
-        lo, hi = dr.maximum(middle - grown, -views.limit), dr.minimum(middle + grown, views.limit)
-        limited = dr.isfinite(views.limit)
-        return dr.select(limited, 0.5 * (lo + hi), middle), dr.select(limited, 0.5 * (hi - lo), grown)
+    texels = float_input(module, "texels", 2 * (filter_size / 2 + 2) / resolution)
 
-    (cx, hx), (cy, hy) = widen(x0, x1), widen(y0, y1)
+    def widen(lo: Float, hi: Float, ends: tuple[Float, Float] | None) -> tuple[Float, Float]:
+        half, middle = 0.5 * (hi - lo), 0.5 * (lo + hi)
+        grown = half * dr.maximum(1 + 2 * (_MARGIN if tiles is None else _MARGIN_OF_TILES), 1 / (1 - texels))
+        lo, hi = middle - grown, middle + grown
+        if ends is not None:
+            # Borders between tiles stay where they are: beyond them, a map needs room for the filter alone.
+            room = texels * grown
+            lo, hi = dr.maximum(lo, ends[0] - room), dr.minimum(hi, ends[1] + room)
+        lo, hi = dr.maximum(lo, -views.limit), dr.minimum(hi, views.limit)
+        return 0.5 * (lo + hi), 0.5 * (hi - lo)
+
+    in_x, in_y = (None, None) if tiles is None else ((tiles.low_x, tiles.high_x), (tiles.low_y, tiles.high_y))
+    (cx, hx), (cy, hy) = widen(x0, x1, in_x), widen(y0, y1, in_y)
     return Frusta(cx, cy, hx, hy, near, far, first, last), (x0, y0, x1, y1, z0, z1, receivers)
 
 

@@ -113,7 +113,9 @@ class Frusta:
         made = {name: device_array(type(self.near), value) for name, value in stored.items()}
         tiles = {name.removeprefix("tiles."): value for name, value in made.items() if name.startswith("tiles.")}
         own: dict[str, Any] = {name: value for name, value in made.items() if not name.startswith("tiles.")}
-        return replace(self, **own, tiles=Tiles(**tiles) if tiles else self.tiles)
+        # Stored fits of older versions have tiles without slopes.
+        whole = Tiles.whole(backend(self.near), len(stored["near"]))
+        return replace(self, **own, tiles=replace(whole, **tiles) if tiles else self.tiles)
 
     @classmethod
     def joined(cls, parts: Sequence[Frusta]) -> Frusta:
@@ -224,6 +226,18 @@ def to_light_space(view: Views, p_world: Point3f) -> Point3f:
     """Coordinates (x, y, z) along a light's axes; z is the distance along ``forward``. Attached to points and light."""
     d = backend(p_world).Array3f(p_world) - view.origin
     return backend(p_world).Array3f(dr.dot(d, view.right), dr.dot(d, view.up), dr.dot(d, view.forward))
+
+
+def with_depths_from_planes(views: Views, tiles: Tiles | None) -> Views:
+    """Views whose depths count from planes with the slopes of the tiles. Attached to the views.
+
+    Points on a ray of light share (x, y): depths along it differ by as much as before, but the depth range of a tile is that
+    of the surfaces above and below its plane. ``forward`` is no unit vector then, and no longer the light's direction.
+    """
+    if tiles is None:
+        return views
+    forward = views.forward - tiles.slope_x * views.right - tiles.slope_y * views.up
+    return replace(views, forward=backend(views.spread).Array3f(forward))
 
 
 def vertices_in_maps(views: Views, positions: Float) -> tuple[Point3f, UInt32, UInt32]:

@@ -15,6 +15,7 @@ from ..raster.antialiasing.neighbour_weights import incoming_weights, weight_sum
 from ..raster.screen_planes import depth_at, planes
 from ..raster.types import pixel_coordinates
 from .light_camera import Frusta, Views, of_map
+from .methods.depth_scale import DepthScale
 from .methods.registry import PREFILTERED
 from .settings import ShadowSettings
 from .texel_depths import FAR, texel_depths
@@ -75,7 +76,7 @@ class TangentTexels:
         module, size = self.module, self.size
         image, row, column = pixel_coordinates(module, self.raster.batch, size, size)
         texel = dr.arange(module.UInt32, self.raster.batch * size * size)
-        free = self.method.encode(module.Float(FAR), module.Float(0), self.settings.order)
+        free = self.method.encode(module.Float(FAR), module.Float(0), self.settings.order, DepthScale(0))
 
         def plain(*lanes: UInt32) -> tuple[Float, ...]:
             own, changes = self._own(*lanes)
@@ -161,7 +162,8 @@ class TangentTexels:
         scale = dr.select(texels.shown & (texels.depth > -0.5), dr.rcp(f - frustum.first), 0)
         # The texel stays in place while the triangle moves through it.
         rates = [(dz - slope_x * dx - slope_y * dy) * scale for dx, dy, dz in turned(twist, p)]
-        values, slopes = _with_slopes(lambda z: self.method.encode(z, texels.slope_square, self.settings.order), texels.depth)
+        order = self.settings.order
+        values, slopes = _with_slopes(lambda z: self.method.encode(z, texels.slope_square, order, DepthScale(0)), texels.depth)
         return values, [slope * rate for rate in rates for slope in slopes]
 
 

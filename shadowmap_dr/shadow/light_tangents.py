@@ -25,11 +25,12 @@ from .filters import filter_kernel, filter_map, separable_terms
 from .light_camera import Frusta, Views, of_map, project, to_clip, to_light_space
 from .light_tangent_texels import TangentTexels, turned, twist_of, weight_rates
 from .lookup import Texels, entries, moved_weights, stored_texel
+from .methods.depth_scale import DepthScale
 from .methods.registry import PREFILTERED
 from .methods.variance import reduced_bleeding
 from .settings import ShadowSettings
 from .shadow_map import ShadowMaps, block_means
-from .texel_depths import FAR, footprint_side
+from .texel_depths import FAR, depth_scale
 
 
 @dataclass(frozen=True)
@@ -127,12 +128,12 @@ def tangent_visibility(maps: TangentMaps, map_index: UInt32, p_world: Point3f, a
     per_z = dr.select(depth > FAR, 0, per_z)
     depth = dr.select(depth > FAR, FAR, depth)
     moves = [(dx * per_x, dy * per_y, dz * per_z) for dx, dy, dz in turned(twist, p)]
-    footprint = footprint_side(view, frustum, depth, settings)
+    deviation = module.Float(depth_scale(view, frustum, depth, settings, tiled=False).deviation)
     method = PREFILTERED[settings.method]
 
-    def look_up(index, u, v, depth, footprint, *moves):  # noqa: ANN001, ANN002, ANN202
+    def look_up(index, u, v, depth, deviation, *moves):  # noqa: ANN001, ANN002, ANN202
         def resolve(values: list[Float], depth: Float) -> Float:
-            value = method.resolve(values, depth, footprint)
+            value = method.resolve(values, depth, DepthScale(deviation))
             return reduced_bleeding(value, settings.bleeding) if method.bleeds else value
 
         # Beyond the centres of the outermost texels, look-ups are constant.
@@ -158,7 +159,7 @@ def tangent_visibility(maps: TangentMaps, map_index: UInt32, p_world: Point3f, a
         return tuple(result)
 
     return dr.if_stmt(
-        (map_index, u, v, depth, footprint, *moves[0], *moves[1]),
+        (map_index, u, v, depth, deviation, *moves[0], *moves[1]),
         inside,
         look_up,
         lambda index, u, *_: (module.Float(1), module.Float(0), module.Float(0)),

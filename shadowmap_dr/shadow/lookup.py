@@ -16,10 +16,11 @@ from ..jit.types import AnyArray, Bool, Float, Point3f, UInt32
 from .filters import filter_kernel, separable_terms
 from .light_camera import Views, of_map, project, to_light_space
 from .methods.comparison import soft_comparison, standard_visibility
+from .methods.depth_scale import DepthScale
 from .methods.registry import PREFILTERED
 from .methods.variance import MINIMUM_VARIANCE_COMPAT, chebyshev_visibility, reduced_bleeding
 from .shadow_map import ShadowMaps
-from .texel_depths import FAR, footprint_side
+from .texel_depths import FAR, depth_scale
 from .tile_fit import image_coordinates
 from .tiles import Group, neighbour, tile_of
 from .transmittance_maps import TransmittanceMaps, depth_encoding
@@ -45,7 +46,7 @@ def visibility(maps: ShadowMaps, map_index: UInt32 | int, p_world: Point3f, acti
     Returns:
         ``Float`` in 0..1; 1 outside the map (0 with ``compat``). Gradients flow to the points, the casters and the light.
     """
-    view, index, u, v, depth, inside, footprint = _place_in_map(maps, map_index, p_world)
+    view, index, u, v, depth, inside, scale = _place_in_map(maps, map_index, p_world)
     if maps.settings.compat:
         p = to_light_space(view, p_world)
         return dr.select(active, _look_up_compat(maps, index, u, v, dr.norm(p), inside & active), 1)
@@ -53,16 +54,14 @@ def visibility(maps: ShadowMaps, map_index: UInt32 | int, p_world: Point3f, acti
     compare = {"standard": _compare, "pcf": _compare_all}.get(maps.settings.method)
     if compare is not None:
         return _where(inside, compare, maps, index, u, v, depth)
-    return _where(inside, _resolve, maps, index, u, v, depth, footprint)
+    lanes = [backend(maps.values).Float(number) for number in (scale.deviation, scale.exponent)]
+    return _where(inside, _resolve, maps, index, u, v, depth, *lanes)
 
 
 def _place_in_map(
     maps: ShadowMaps, map_index: UInt32 | int, p_world: Point3f
-) -> tuple[Views, UInt32, Float, Float, Float, Bool, Float]:
-    """(camera, index among all copies of the maps, u, v, linear depth, whether it is in the map, footprint) of points.
-
-    All but the last are attached, which is the side of the filter's footprint as a share of the depth range.
-    """
+) -> tuple[Views, UInt32, Float, Float, Float, Bool, DepthScale]:
+    """(camera, index among all copies of the maps, u, v, linear depth, whether it is in the map, scale) of points. Attached."""
     module = backend(maps.values)
     index: UInt32 = module.UInt32(map_index)
     frustum = of_map(maps.frusta, index, maps.count)
@@ -70,8 +69,8 @@ def _place_in_map(
         index = index + copy_of_lane(module, dr.width(p_world), maps.copies) * maps.count
     view = of_map(maps.views, index, maps.views.count)
     u, v, depth, inside = project(view, frustum, p_world)
-    footprint = footprint_side(view, frustum, depth, maps.settings)
-    return view, index, u, v, dr.select(depth > FAR, FAR, depth), inside, footprint
+    scale = depth_scale(view, frustum, depth, maps.settings, maps.frusta.tiles is not None)
+    return view, index, u, v, dr.select(depth > FAR, FAR, depth), inside, scale
 
 
 def tiled_visibility(maps: ShadowMaps, group: Group, p_world: Point3f, active: Bool | bool = True) -> Float:
@@ -124,12 +123,12 @@ def transmittance(maps: ShadowMaps, map_index: UInt32 | int, p_world: Point3f, a
     """
     stored = maps.transmittance
     assert stored is not None, "looked up only where there are translucent casters"
-    _, index, u, v, depth, inside, footprint = _place_in_map(maps, map_index, p_world)
+    _, index, u, v, depth, inside, scale = _place_in_map(maps, map_index, p_world)
     found = branch(
         inside & backend(maps.values).Bool(active),
         lambda *lanes: _light_left(maps, stored, *lanes),
         lambda *lanes: tuple(type(lanes[1])(1) for _ in range(stored.colours)),
-        (index, u, v, depth, footprint),
+        (index, u, v, depth, scale.deviation),
         "transmittance",
     )
     return list(found)
@@ -144,12 +143,13 @@ def tiled_transmittance(maps: ShadowMaps, group: Group, p_world: Point3f, active
 
 
 def _light_left(
-    maps: ShadowMaps, stored: TransmittanceMaps, map_index: UInt32, u: Float, v: Float, depth: Float, footprint: Float
+    maps: ShadowMaps, stored: TransmittanceMaps, map_index: UInt32, u: Float, v: Float, depth: Float, deviation: Float
 ) -> tuple[Float, ...]:
     """Light of each colour that is left at a depth."""
     method, module = depth_encoding(maps.settings), backend(depth)
     left = [module.Float(1)] * stored.colours
-    used = stored.colours + 1 + len(method.encode(depth, 0.0, maps.settings.order))
+    scale = DepthScale(deviation)
+    used = stored.colours + 1 + len(method.encode(depth, 0.0, maps.settings.order, scale))
     for group in range(stored.groups):
         first = group * stored.channels
         values = bilinear(maps, map_index, u, v, True, values=(stored.values, stored.groups * stored.channels, first, used))
@@ -157,7 +157,7 @@ def _light_left(
         any_lost = weight > _NOTHING
         inverse = dr.rcp(dr.select(any_lost, weight, 1))
         moments = [value * inverse for value in values[stored.colours + 1 :]]
-        lit = method.resolve(moments, depth, footprint)
+        lit = method.resolve(moments, depth, scale)
         if method.bleeds:
             lit = reduced_bleeding(lit, maps.settings.bleeding)
         before = dr.select(any_lost, 1 - lit, 0)
@@ -173,10 +173,10 @@ def _where(active: Bool, function: Callable[..., Float], maps: ShadowMaps, *lane
     return found
 
 
-def _resolve(maps: ShadowMaps, map_index: UInt32, u: Float, v: Float, depth: Float, footprint: Float) -> Float:
+def _resolve(maps: ShadowMaps, map_index: UInt32, u: Float, v: Float, depth: Float, deviation: Float, exponent: Float) -> Float:
     """Visibility from filtered moments or terms."""
     method = PREFILTERED[maps.settings.method]
-    value = method.resolve(bilinear(maps, map_index, u, v, True), depth, footprint)
+    value = method.resolve(bilinear(maps, map_index, u, v, True), depth, DepthScale(deviation, exponent))
     return reduced_bleeding(value, maps.settings.bleeding) if method.bleeds else value
 
 

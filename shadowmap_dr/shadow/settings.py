@@ -160,6 +160,12 @@ class ShadowSettings:
         return self.filter_size if self.filters else 1
 
     @property
+    def counts_from_planes(self) -> bool:
+        """True if depths in tiles count from the plane that fits the visible points best. Other methods' biases and errors are
+        shares of the depth range, which would be too little on slopes then."""
+        return self.method in PREFILTERED and PREFILTERED[self.method].scales
+
+    @property
     def filterable(self) -> bool:
         """True if stored values may be blended, that is, anti-aliased and filtered."""
         return self.method in PREFILTERED

@@ -18,10 +18,11 @@ from ..raster.types import pixel_coordinates
 from .filters import filter_kernel, filter_map
 from .light_camera import Frusta, Views, of_map, to_clip
 from .methods.comparison import other_depth
+from .methods.depth_scale import DepthScale
 from .methods.registry import PREFILTERED
 from .methods.variance import variance_moments
 from .settings import ShadowSettings
-from .texel_depths import texel_depths
+from .texel_depths import depth_scale, texel_depths
 from .transmittance_maps import TranslucentCasters, TransmittanceMaps, render_transmittance
 
 
@@ -123,6 +124,7 @@ def _texels(
     view, frustum = of_map(views, image, views.count), of_map(frusta, image, views.count)
     hit = raster.valid
     slope_square: Float | float = 0
+    scale = DepthScale(0)
     if settings.compat:
         depth = _radial_depth(view, frustum, raster, row, column, size)
         depth = dr.select(hit, depth, frustum.far)
@@ -130,12 +132,13 @@ def _texels(
         seen = pixel_depth(raster, clip, faces, dr.detach(views.spread) > 0)
         texels = texel_depths(seen, hit, view, frustum, settings)
         depth, slope_square = texels.depth, texels.slope_square
+        scale = depth_scale(view, frustum, depth, settings, frusta.tiles is not None)
     method = PREFILTERED.get(settings.method)
     if method is None:
         if settings.method == "pcf" and settings.antialias:
             return list(variance_moments(depth))
         return [depth]
-    return list(method.encode(depth, slope_square, settings.order))
+    return list(method.encode(depth, slope_square, settings.order, scale))
 
 
 def _two_depths(plain: Float, blended: Float) -> tuple[Float, int]:

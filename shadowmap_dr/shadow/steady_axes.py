@@ -26,7 +26,7 @@ def steady_axes(views: Views, frusta: Frusta, seen: tuple[Point3f, Bool]) -> Vie
     """Views with the same values, attached so that visible surfaces hardly move when a light turns. Perspective views stay.
 
     Args:
-        views: cameras of the M maps.
+        views: cameras of the M maps; ``forward`` is the light's direction, before :func:`with_depths_from_planes`.
         frusta: what the maps cover; only visible points inside count.
         seen: (points in world space, spread over the visible receivers; mask of valid points).
     """

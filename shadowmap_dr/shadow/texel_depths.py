@@ -11,12 +11,17 @@ from ..jit.kernel_inputs import float_input
 from ..jit.types import Bool, Float
 from .filters import reach_of
 from .light_camera import Frusta, Views, linear_depth
+from .methods.depth_scale import DepthScale
 from .settings import ShadowSettings
 
 #: Depth of empty texels. Receivers behind it are moved to it, so that a receiver over empty texels lies at their mean.
 FAR = 0.5
 # Largest slope that counts as variance, in texels of depth per texel. Surfaces seen edge-on have unbounded slopes.
 _MAX_SLOPE = 2.0
+# Least deviation of depths: in sides of the filter's footprint, and at most a share of the depth range.
+_FOOTPRINTS, _MOST = 1.2, 1e-5**0.5
+# That of tiles. The warp for near casters has such an exponent that it changes by one fifth over a footprint, within limits.
+_FOOTPRINTS_OF_TILES, _SPREAD, _LARGEST = 1.1, 0.2, 20.0
 
 
 @dataclass(frozen=True)
@@ -84,7 +89,18 @@ def texel_side(view: Views, frustum: Frusta, linear: Float, size: int) -> Float:
     return distance * float_input(backend(linear), "width", 2 / size) / (f - n)
 
 
-def footprint_side(view: Views, frustum: Frusta, linear: Float, settings: ShadowSettings) -> Float:
-    """Longer side of the filter's footprint (of a texel without a filter) at a linear depth, over the depth range. Detached."""
+def depth_scale(view: Views, frustum: Frusta, linear: Float, settings: ShadowSettings, tiled: bool) -> DepthScale:
+    """Scale on which a map tells apart depths about a linear depth.
+
+    It follows the longer side of the filter's footprint (of a texel without a filter). ``tiled``: the map is one of tiles, whose
+    depth range hardly exceeds that of the surfaces in view.
+    """
+    view = dr.detach(view)
     half = dr.maximum(frustum.half_x, frustum.half_y)
-    return texel_side(dr.detach(view), frustum, linear, settings.resolution) * half * settings.footprint
+    side = texel_side(view, frustum, linear, settings.resolution) * half * settings.footprint
+    if not tiled:
+        return DepthScale(dr.minimum(_FOOTPRINTS * side, _MOST))
+    # All depths of a map share an exponent; in perspective, texels grow with depth.
+    local: Float = dr.clip(_SPREAD / side, 1, _LARGEST)
+    exponent = dr.select(view.spread > 0, backend(linear).Float(1), local)
+    return DepthScale(_FOOTPRINTS_OF_TILES * side, exponent)

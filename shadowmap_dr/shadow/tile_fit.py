@@ -1,8 +1,9 @@
-"""The fit of tiles to visible points: a k-d tree, kept while it is balanced."""
+"""The fit of tiles to visible points: a k-d tree with the smallest texels on the mean, kept while it is about as good."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import drjit as dr
 
@@ -11,20 +12,27 @@ from ..jit.types import Bool, Float, Point3f, UInt32
 from .light_camera import Views, of_map, to_light_space
 from .tiles import Group, Tiles, tile_of
 
-# Bins of the histogram that finds a median.
-_BINS = 32
-# Tiles are kept while none has more than the first share of its part of the points, nor less than the second.
-_MOST, _LEAST = 1.8, 0.3
+# Bins between which a node may be cut, and the least share of its points on either side.
+_BINS, _LEAST = 32, 1 / 8
+# Tiles are kept while the mean side of texels is at most so many times that of new tiles, and slopes differ by no more than that.
+_MOST, _TURN = 1.2, 0.1
+# Least variance across the light, a share of that along it, that the slope of a plane is fitted to.
+_RIDGE = 1e-3
 
 
-def fit_tiles(views: Views, groups: Sequence[Group], seen: tuple[Point3f, Bool], previous: Tiles | None) -> Tiles | None:
-    """Tiles of all lights in ``groups``, as many visible points in each, or the previous ones while they are balanced. Detached.
+def fit_tiles(
+    views: Views, groups: Sequence[Group], seen: tuple[Point3f, Bool], previous: Tiles | None, *, planes: bool = True
+) -> Tiles | None:
+    """Tiles of all lights in ``groups``, or the previous ones while their texels are about as small. Detached.
+
+    A light's tiles have equally many texels. The k-d tree makes the mean side of texels over all visible points small.
 
     Args:
         views: cameras of the M maps.
         groups: lights with several tiles, a power of two.
         seen: (points in world space, spread over what cameras see; mask of valid points).
         previous: tiles of an earlier call, None if there are none.
+        planes: fit planes to the points of each tile, from which depths count.
 
     Returns:
         None without ``groups``.
@@ -36,12 +44,17 @@ def fit_tiles(views: Views, groups: Sequence[Group], seen: tuple[Point3f, Bool],
         index = dr.arange(module.UInt32, count)
         sides = Tiles.whole(module, count).columns()
         for first, number in groups:
-            x, y, lit = image_coordinates(views, first, seen[0])
+            x, y, z, lit = _coordinates(views, first, seen[0])
             lit &= module.Bool(seen[1])
             found = _divided(x, y, lit, number)
+            if planes:
+                found = _with_slopes(found, number, (x, y, z), lit)
             if previous is not None:
                 kept = previous.rows(dr.arange(module.UInt32, number) + first)
-                keep = _balanced(previous, (first, number), x, y, lit)
+                # The leaves found are those of one light alone.
+                sizes = [_mean_size(each, (at, number), x, y, lit) for each, at in ((previous, first), (found, 0))]
+                turned = dr.maximum(dr.abs(kept.slope_x - found.slope_x), dr.abs(kept.slope_y - found.slope_y))
+                keep = (sizes[0] <= _MOST * sizes[1]) & (dr.max(turned) <= _TURN)
                 found = Tiles(*(dr.select(keep, a, b) for a, b in zip(kept.columns(), found.columns(), strict=True)))
             row = index - first
             own = (index >= first) & (row < number)
@@ -57,6 +70,12 @@ def image_coordinates(views: Views, first: int, p_world: Point3f) -> tuple[Float
 
     Detached.
     """
+    x, y, _, inside = _coordinates(views, first, p_world)
+    return x, y, inside
+
+
+def _coordinates(views: Views, first: int, p_world: Point3f) -> tuple[Float, Float, Float, Bool]:
+    """As :func:`image_coordinates`, with depths along the light (0 in perspective) after (x, y)."""
     module = backend(views.spread)
     with dr.suspend_grad():
         view = of_map(dr.detach(views), module.UInt32(first), views.count)
@@ -65,78 +84,142 @@ def image_coordinates(views: Views, first: int, p_world: Point3f) -> tuple[Float
         before = ~perspective | (p.z > 0)
         w = dr.select(perspective & before, p.z, 1)
         x, y = p.x / w, p.y / w
-        return x, y, before & (~perspective | ((dr.abs(x) <= view.spread) & (dr.abs(y) <= view.spread)))
+        return (
+            x,
+            y,
+            dr.select(perspective, 0, p.z),
+            before & (~perspective | ((dr.abs(x) <= view.spread) & (dr.abs(y) <= view.spread))),
+        )
 
 
 def _divided(x: Float, y: Float, active: Bool, number: int) -> Tiles:
-    """A k-d tree's leaves: ``number`` rectangles with as many of the points (x, y) each. Longer sides are halved first."""
+    """A k-d tree's leaves: ``number`` rectangles of the points (x, y), each node cut where :func:`_cuts` says."""
     module = backend(x)
     node = dr.zeros(module.UInt32, dr.width(x))
     leaves = Tiles.whole(module, 1)
     nodes = 1
     while nodes < number:
-        row = dr.arange(module.UInt32, nodes)
-        ends = dr.full(module.Float, -dr.inf, 4 * nodes)
-        for k, value in enumerate((-x, -y, x, y)):
-            dr.scatter_reduce(dr.ReduceOp.Max, ends, value, node * 4 + k, active)
-        low_x, low_y, high_x, high_y = (dr.gather(module.Float, ends, row * 4 + k) for k in range(4))
-        wide, high = high_x + low_x, high_y + low_y
-        across = wide >= high
-        start, length = dr.select(across, -low_x, -low_y), dr.maximum(dr.maximum(wide, high), 1e-30)
-        dr.eval(across, start, length)
-        along = dr.select(dr.gather(module.Bool, across, node), x, y)
-        split = _medians(along, start, length, node, nodes, active)
+        across, cut = _cuts(x, y, node, nodes, active)
         child = dr.arange(module.UInt32, 2 * nodes)
         parent, upper = child >> 1, (child & 1) == 1
-        dr.eval(split)
-        sides, cut = leaves.rows(parent), dr.gather(module.Float, split, parent)
-        in_x = dr.gather(module.Bool, across, parent)
+        sides, in_x, border = leaves.rows(parent), dr.gather(module.Bool, across, parent), dr.gather(module.Float, cut, parent)
         leaves = Tiles(
-            dr.select(upper & in_x, cut, sides.low_x),
-            dr.select(upper & ~in_x, cut, sides.low_y),
-            dr.select(~upper & in_x, cut, sides.high_x),
-            dr.select(~upper & ~in_x, cut, sides.high_y),
+            dr.select(upper & in_x, border, sides.low_x),
+            dr.select(upper & ~in_x, border, sides.low_y),
+            dr.select(~upper & in_x, border, sides.high_x),
+            dr.select(~upper & ~in_x, border, sides.high_y),
+            sides.slope_x,
+            sides.slope_y,
         )
-        dr.eval(leaves)
-        node = 2 * node + dr.select(along >= dr.gather(module.Float, split, node), module.UInt32(1), 0)
+        along = dr.select(dr.gather(module.Bool, across, node), x, y)
+        node = 2 * node + dr.select(along >= dr.gather(module.Float, cut, node), module.UInt32(1), 0)
+        dr.eval(leaves, node)
         nodes *= 2
     return leaves
 
 
-def _medians(values: Float, start: Float, length: Float, node: UInt32, nodes: int, active: Bool) -> Float:
-    """Medians (nodes,) of the values in each node, which lie in ``start`` to ``start + length``. The error is small beside these.
+def _cuts(x: Float, y: Float, node: UInt32, nodes: int, active: Bool) -> tuple[Bool, Float]:
+    """(across x, place), (nodes,) each: the cut through each node that leaves the least mean of :func:`_sizes` over its points.
 
-    A histogram finds the bin of the median, a second one the place in the bin: most points may lie in a few bins.
+    Candidates are borders between bins with equally many points, along both axes. Bins of equal width come first, in which points
+    are taken to lie evenly: most points may lie in few of them. Without a candidate, a node is cut through its middle.
     """
-    module = backend(values)
-    row = dr.arange(module.UInt32, nodes)
-    below = dr.zeros(module.Float, nodes)
-    half: Float | None = None
-    for _ in range(2):
-        place = (values - dr.gather(module.Float, start, node)) / dr.gather(module.Float, length, node) * _BINS
-        counts = dr.zeros(module.UInt32, nodes * _BINS)
-        inside = active & (place >= 0) & (place <= _BINS)
-        bin_ = dr.minimum(module.UInt32(dr.select(inside, place, 0)), _BINS - 1)
-        dr.scatter_add(counts, module.UInt32(1), node * _BINS + bin_, inside)
-        numbers = [module.Float(dr.gather(module.UInt32, counts, row * _BINS + k)) for k in range(_BINS)]
-        half = 0.5 * sum(numbers[1:], numbers[0]) if half is None else half
-        passed, found, before, within = below, module.Float(0), below, module.Float(0.5)
-        for k, number in enumerate(numbers):
-            here = (passed < half) & (passed + number >= half)
-            found, before = dr.select(here, float(k), found), dr.select(here, passed, before)
-            within = dr.select(here, (half - passed) / dr.maximum(number, 1), within)
-            passed = passed + number
-        start, length, below = start + length * (found / _BINS), length / _BINS, before
-        dr.eval(start, length, below, within, half)
-    return start + length * within
-
-
-def _balanced(tiles: Tiles, group: Group, x: Float, y: Float, active: Bool) -> Bool:
-    """True if each tile of a light still has its share of the points."""
-    first, number = group
     module = backend(x)
-    counts = dr.zeros(module.UInt32, number)
-    dr.scatter_add(counts, module.UInt32(1), tile_of(tiles, group, x, y) - first, active)
-    total = module.Float(dr.sum(counts))
-    shares = module.Float(counts) * number / dr.maximum(total, 1)
-    return (dr.max(shares) <= _MOST) & (dr.min(shares) >= _LEAST)
+    # Rows are nodes, cut across x, and again, cut across y. ``value`` is the coordinate that is cut.
+    rows = 2 * nodes
+    value, other, row = dr.concat([x, y]), dr.concat([y, x]), dr.concat([node, node + nodes])
+    active = dr.concat([active, active])
+    low, high = _maxima([-value, value], row, rows, active)
+    start, length = -low, dr.maximum(high + low, 1e-30)
+    dr.eval(start, length)
+    place = (value - dr.gather(module.Float, start, row)) / dr.gather(module.Float, length, row)
+    even = _bin(place, active)
+    counts = _counts(row * _BINS + even, rows * _BINS, active)
+    before, total = dr.block_prefix_sum(counts, _BINS), dr.maximum(dr.block_sum(counts, _BINS), 1)
+    at = row * _BINS + even
+    rank = dr.gather(module.Float, before, at) + (place * _BINS - module.Float(even)) * dr.gather(module.Float, counts, at)
+    bin_ = row * _BINS + _bin(rank / dr.gather(module.Float, total, row), active)
+
+    counts = _counts(bin_, rows * _BINS, active)
+    ends = _maxima([-value, -other, value, other], bin_, rows * _BINS, active)
+    lower = [dr.block_prefix_reduce(dr.ReduceOp.Max, end, _BINS) for end in ends]
+    upper = [dr.block_prefix_reduce(dr.ReduceOp.Max, end, _BINS, exclusive=False, reverse=True) for end in ends]
+    border = dr.arange(module.UInt32, rows * _BINS)
+    below = dr.block_prefix_sum(counts, _BINS) / dr.gather(module.Float, total, border // _BINS)
+    mean = below * _sizes(lower) + (1 - below) * _sizes(upper)
+    mean = dr.select((below >= _LEAST) & (below <= 1 - _LEAST), mean, dr.inf)
+    place = 0.5 * (lower[2] - upper[0])
+
+    index = dr.arange(module.UInt32, nodes)
+    least = dr.block_reduce(dr.ReduceOp.Min, mean, _BINS)
+    first = dr.block_reduce(
+        dr.ReduceOp.Min, dr.select(mean == dr.gather(module.Float, least, border // _BINS), border, rows * _BINS - 1), _BINS
+    )
+    by_x, by_y = (dr.gather(module.Float, least, index + k * nodes) for k in (0, 1))
+    found = dr.minimum(by_x, by_y) < dr.inf
+    wide = dr.gather(module.Float, length, index) >= dr.gather(module.Float, length, index + nodes)
+    across = dr.select(found, by_x <= by_y, wide)
+    chosen = dr.select(across, index, index + nodes)
+    middle = dr.gather(module.Float, start, chosen) + 0.5 * dr.gather(module.Float, length, chosen)
+    cut = dr.select(found, dr.gather(module.Float, place, dr.gather(module.UInt32, first, chosen)), middle)
+    dr.eval(across, cut)
+    return across, cut
+
+
+def _bin(share: Float, active: Bool) -> UInt32:
+    """Number of the bin in which a share from 0 to 1 lies."""
+    module = backend(share)
+    return dr.minimum(module.UInt32(dr.select(active, dr.maximum(share * _BINS, 0), 0)), _BINS - 1)
+
+
+def _counts(index: UInt32, size: int, active: Bool) -> Float:
+    """Numbers of points (size,) at each index."""
+    module = backend(index)
+    counts = dr.zeros(module.UInt32, size)
+    dr.scatter_add(counts, module.UInt32(1), index, active)
+    return module.Float(counts)
+
+
+def _maxima(values: Sequence[Float], index: UInt32, size: int, active: Bool) -> list[Float]:
+    """Maxima (size,) of each value at each index; minus infinity where there is none."""
+    found = []
+    for value in values:
+        found.append(dr.full(backend(index).Float, -dr.inf, size))
+        dr.scatter_reduce(dr.ReduceOp.Max, found[-1], value, index, active)
+    dr.eval(found)
+    return found
+
+
+def _sizes(ends: Sequence[Float]) -> Float:
+    """Diagonals of rectangles, to which the sides of their texels are proportional. ``ends``: maxima of -x, -y, x, y."""
+    return dr.sqrt(dr.square(ends[0] + ends[2]) + dr.square(ends[1] + ends[3]))
+
+
+def _with_slopes(tiles: Tiles, number: int, points: tuple[Float, Float, Float], active: Bool) -> Tiles:
+    """Tiles of one light with slopes of the planes nearest to the points (x, y, z) in each."""
+    module = backend(points[0])
+    tile = tile_of(tiles, (0, number), points[0], points[1])
+
+    def means(values: list[Float]) -> list[Float]:
+        totals = []
+        for value in values:
+            totals.append(dr.zeros(module.Float, number))
+            dr.scatter_add(totals[-1], value, tile, active)
+        dr.eval(totals)
+        return [total / counts for total in totals]
+
+    counts = dr.maximum(_counts(tile, number, active), 1)
+    x, y, z = (value - dr.gather(module.Float, mean, tile) for value, mean in zip(points, means(list(points)), strict=True))
+    xx, xy, yy, xz, yz, zz = means([x * x, x * y, y * y, x * z, y * z, z * z])
+    xx, yy = xx + _RIDGE * zz + 1e-30, yy + _RIDGE * zz + 1e-30
+    determinant = xx * yy - xy * xy
+    return replace(tiles, slope_x=(xz * yy - yz * xy) / determinant, slope_y=(yz * xx - xz * xy) / determinant)
+
+
+def _mean_size(tiles: Tiles, group: Group, x: Float, y: Float, active: Bool) -> Float:
+    """Mean of :func:`_sizes` over the points (x, y), of those parts of a light's tiles that hold points."""
+    first, number = group
+    tile = tile_of(tiles, group, x, y) - first
+    counts = _counts(tile, number, active)
+    sizes: Float = dr.select(counts > 0, _sizes(_maxima([-x, -y, x, y], tile, number, active)), 0)
+    return dr.sum(sizes * counts) / dr.maximum(dr.sum(counts), 1)

@@ -1,8 +1,9 @@
 """Tiles of a light's image plane, each with a shadow map of its own: texels go where pixels are.
 
-A k-d tree over visible points divides the image plane of a light into rectangles. Equally many pixels see each of them. A
+A k-d tree over visible points divides the image plane of a light into rectangles, each as small as the pixels in it are many. A
 rectangle has a map with a window, a depth range and texels of its own. A point belongs to one tile, whatever its depth: a look-up
-does not search in depth.
+does not search in depth. Depths count from the plane that fits the tile's visible points best: ground that the light falls on
+aslant needs no depth range.
 
 Source: Lauritzen, Salvi and Lefohn, "Sample Distribution Shadow Maps", 2011, who divide depths; here the light's image plane is
 divided (Fernando et al., "Adaptive Shadow Maps", 2001, with a quadtree).
@@ -30,21 +31,25 @@ class Tiles:
 
     Attributes:
         low_x, low_y, high_x, high_y: (M,) bounds in the light's image plane; infinite at the outer sides.
+        slope_x, slope_y: (M,) change of depth along the light with x and y, on the plane nearest to the visible points; 0 for
+            maps that are no tiles, and in perspective. Maps measure depths from that plane.
     """
 
     low_x: Float
     low_y: Float
     high_x: Float
     high_y: Float
+    slope_x: Float
+    slope_y: Float
 
     @classmethod
     def whole(cls, module: ModuleType, count: int) -> Tiles:
         """Infinite rectangles of ``count`` maps, in arrays of a Dr.Jit module."""
-        return cls(*(dr.full(module.Float, end, count) for end in (-dr.inf, -dr.inf, dr.inf, dr.inf)))
+        return cls(*(dr.full(module.Float, value, count) for value in (-dr.inf, -dr.inf, dr.inf, dr.inf, 0, 0)))
 
     def columns(self) -> list[Float]:
         """All numbers, (M,) each, in a fixed order."""
-        return [self.low_x, self.low_y, self.high_x, self.high_y]
+        return [self.low_x, self.low_y, self.high_x, self.high_y, self.slope_x, self.slope_y]
 
     def rows(self, index: UInt32) -> Tiles:
         """The rectangles of some maps."""

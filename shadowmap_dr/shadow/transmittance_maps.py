@@ -26,6 +26,7 @@ from ..raster import RasterOutput, Topology, antialias, peeled_layers, stacked
 from ..raster.screen_planes import pixel_depth
 from ..raster.types import pixel_coordinates
 from .light_camera import Frusta, Views, of_map
+from .methods.depth_scale import DepthScale
 from .methods.registry import PREFILTERED, Method
 from .settings import ShadowSettings
 from .texel_depths import texel_depths
@@ -157,7 +158,7 @@ def _numbers(
     through = casters.through(raster, view)
     seen = pixel_depth(raster, positions, casters.faces, perspective)
     texels = texel_depths(seen, raster.valid, view, frustum, settings)
-    depth = depth_encoding(settings).encode(texels.depth, texels.slope_square, settings.order)
+    depth = depth_encoding(settings).encode(texels.depth, texels.slope_square, settings.order, DepthScale(0))
     taken = [dr.select(texels.shown, 1 - value, 0) for value in through]
     weight = _mean(taken) + dr.select(texels.shown, _LEAST_WEIGHT, 0)
     own = [*taken, weight, *(dr.select(texels.shown, weight * number, 0) for number in depth)]

@@ -13,14 +13,25 @@ import pytest
 import shadow_scene
 import trimesh
 
-from shadowmap_dr.shadow import PREFILTERED, ShadowSettings, cube_views, directional_view, visibility
+from shadowmap_dr.shadow import PREFILTERED, Frusta, ShadowSettings, cube_views, directional_view, stack_views, visibility
 from shadowmap_dr.shadow.methods.comparison import other_depth, soft_comparison
+from shadowmap_dr.shadow.methods.depth_scale import DepthScale
 from shadowmap_dr.shadow.methods.variance import reduced_bleeding, variance_moments
+from shadowmap_dr.shadow.texel_depths import depth_scale
 
 FAMILY = (*PREFILTERED, "pcf")
 BOX = trimesh.creation.box((0.8, 0.5, 0.6), transform=trimesh.transformations.euler_matrix(0.3, 0.5, 0.2))
 DIRECTION = np.array([0.2, -0.15, -1.0])
 ORDER = 8
+#: That of a coarse map.
+SCALE = DepthScale(1e-5**0.5)
+
+
+def scale_of(texels: int, *, tiled: bool = False) -> DepthScale:
+    """Scale of a map without a filter whose depth range equals its width."""
+    view, one = stack_views([directional_view(mi.Vector3f(0, 0, -1))]), mi.Float(1)
+    frustum = Frusta(one * 0, one * 0, one, one, one * 0, one * 2, one * 0, one * 2)
+    return depth_scale(view, frustum, mi.Float(0), ShadowSettings(resolution=texels, filter_size=1), tiled)
 
 
 def points(array: np.ndarray) -> Any:
@@ -31,11 +42,11 @@ def floats(array: Any) -> Any:
     return mi.Float(np.ascontiguousarray(array, np.float32))
 
 
-def stored(method: str, depths: np.ndarray, weights: np.ndarray) -> list[Any]:
+def stored(method: str, depths: np.ndarray, weights: np.ndarray, scale: DepthScale = SCALE) -> list[Any]:
     """Filtered texels at some depths (n, k) with weights (n, k)."""
     total: list[Any] = []
     for depth, weight in zip(depths.T, weights.T, strict=True):
-        part = [value * floats(weight) for value in PREFILTERED[method].encode(floats(depth), 0, ORDER)]
+        part = [value * floats(weight) for value in PREFILTERED[method].encode(floats(depth), 0, ORDER, scale)]
         total = [a + b for a, b in zip(total, part, strict=True)] if total else part
     return total
 
@@ -45,10 +56,10 @@ def test_one_surface_shadows_what_lies_behind_it(variant: str, method: str) -> N
     depth = np.linspace(-0.45, 0.3, 60)
     texels = stored(method, depth[:, None], np.ones((60, 1)))
     resolve = PREFILTERED[method].resolve
-    assert resolve(texels, floats(depth), 1).numpy().min() > 0.98  # the surface itself
-    assert resolve(texels, floats(depth - 0.05), 1).numpy().min() > 0.98
+    assert resolve(texels, floats(depth), SCALE).numpy().min() > 0.98  # the surface itself
+    assert resolve(texels, floats(depth - 0.05), SCALE).numpy().min() > 0.98
     far = 0.3 if method == "csm" else 0.15  # a series of few terms has a soft step
-    assert resolve(texels, floats(depth + far), 1).numpy().max() < (0.08 if method == "csm" else 0.02)
+    assert resolve(texels, floats(depth + far), SCALE).numpy().max() < (0.08 if method == "csm" else 0.02)
 
 
 @pytest.mark.parametrize("method", PREFILTERED)
@@ -56,7 +67,7 @@ def test_half_covered_surfaces_are_half_lit(variant: str, method: str) -> None:
     """Two depths, a receiver on the farther one: half of the light arrives (the convolution map rounds the step off)."""
     near = np.linspace(-0.4, 0.0, 20)
     depths = np.stack([near, near + 0.3], 1)
-    value = PREFILTERED[method].resolve(stored(method, depths, np.full((20, 2), 0.5)), floats(near + 0.3), 1).numpy()
+    value = PREFILTERED[method].resolve(stored(method, depths, np.full((20, 2), 0.5)), floats(near + 0.3), SCALE).numpy()
     np.testing.assert_allclose(value, 0.5, atol=0.12 if method == "csm" else 0.02)
 
 
@@ -67,8 +78,27 @@ def test_gaps_of_texels_are_told_apart(variant: str, method: str, texels: int) -
     receiver = np.linspace(-0.45, 0.5, 200)
     for gap, dark in ((5 / texels, True), (0.0, False)):
         depths = (receiver - gap)[:, None]
-        value = PREFILTERED[method].resolve(stored(method, depths, np.ones((200, 1))), floats(receiver), 1 / texels).numpy()
+        value = PREFILTERED[method].resolve(stored(method, depths, np.ones((200, 1))), floats(receiver), scale_of(texels)).numpy()
         assert value.max() < 0.08 if dark else value.min() > 0.99
+
+
+@pytest.mark.parametrize("share", [0.05, 0.1, 0.2])
+def test_backgrounds_let_no_light_to_receivers_close_behind_a_caster(variant: str, share: float) -> None:
+    """A roof's edge covers most of a texel, the ground far below the rest. Just below the roof it is as dark as coverage says.
+
+    Chebyshev's bound for depths that are hardly warped lets twice as much through.
+    """
+    roof = np.linspace(-0.4, 0.1, 20)
+    weights = np.tile([1 - share, share], (20, 1))
+
+    def value(scale: DepthScale) -> np.ndarray:
+        texels = stored("evsm4", np.stack([roof, roof + 0.3], 1), weights, scale)
+        found: np.ndarray = PREFILTERED["evsm4"].resolve(texels, floats(roof + 10 / 64), scale).numpy()
+        return found
+
+    found = value(scale_of(64, tiled=True))
+    assert found.min() > 0.9 * share and found.max() < 1.4 * share
+    assert value(scale_of(64)).min() > 2 * share
 
 
 @pytest.mark.parametrize(("method", "bleeds"), [("vsm", True), ("evsm4", False), ("evsm2", False), ("esm", False)])
@@ -77,7 +107,7 @@ def test_bleeding(variant: str, method: str, bleeds: bool) -> None:
     n = 20
     depths = np.tile([[-0.45, 0.1]], (n, 1))
     receiver = np.linspace(0.2, 0.4, n)
-    value = PREFILTERED[method].resolve(stored(method, depths, np.full((n, 2), 0.5)), floats(receiver), 1).numpy()
+    value = PREFILTERED[method].resolve(stored(method, depths, np.full((n, 2), 0.5)), floats(receiver), SCALE).numpy()
     assert (value.min() > 0.1) == bleeds
     assert bleeds or value.max() < 0.03
 
@@ -86,7 +116,7 @@ def test_moment_map_is_sharper_than_variance_map(variant: str) -> None:
     n = 20
     depths, receiver = np.tile([[-0.45, 0.1]], (n, 1)), floats(np.linspace(0.2, 0.4, n))
     weights = np.full((n, 2), 0.5)
-    vsm, msm = (PREFILTERED[m].resolve(stored(m, depths, weights), receiver, 1).numpy() for m in ("vsm", "msm"))
+    vsm, msm = (PREFILTERED[m].resolve(stored(m, depths, weights), receiver, SCALE).numpy() for m in ("vsm", "msm"))
     assert msm.max() < 0.05 < vsm.min()
 
 
@@ -103,7 +133,7 @@ def test_hamburger_bound(variant: str) -> None:
     rng = np.random.default_rng(4)
     depths, weights = rng.uniform(-0.45, 0.45, (200, 5)), rng.dirichlet(np.ones(5), 200)
     receiver = rng.uniform(-0.5, 0.5, 200)
-    got = PREFILTERED["msm"].resolve(stored("msm", depths, weights), floats(receiver), 1).numpy()
+    got = PREFILTERED["msm"].resolve(stored("msm", depths, weights), floats(receiver), SCALE).numpy()
     want = []
     for z, w, d in zip(2 * depths, weights, 2 * receiver, strict=True):
         moments = np.array([(w * z**k).sum() for k in (1, 2, 3, 4)])
@@ -121,10 +151,10 @@ def test_large_derivatives_of_the_hamburger_bound_are_true(variant: str) -> None
     rng = np.random.default_rng(7)
     n, step = 200_000, 1e-8
     depth = rng.uniform(-0.5, 0.5, n)
-    inputs = PREFILTERED["msm"].encode(floats(depth), floats(10.0 ** rng.uniform(-6, -3, n)), 0)
+    inputs = PREFILTERED["msm"].encode(floats(depth), floats(10.0 ** rng.uniform(-6, -3, n)), 0, SCALE)
     inputs.append(floats(depth + 0.02 * rng.normal(size=n)))
     dr.enable_grad(inputs)
-    dr.backward(dr.sum(PREFILTERED["msm"].resolve(inputs[:4], inputs[4], 1)))
+    dr.backward(dr.sum(PREFILTERED["msm"].resolve(inputs[:4], inputs[4], SCALE)))
     got = np.array([dr.grad(i).numpy() for i in inputs])
 
     def value(at: np.ndarray) -> float:
@@ -155,7 +185,7 @@ def test_bounded_and_finite_on_any_moments(variant: str, method: str) -> None:
     texels, receiver = random_texels(method)
     depth = floats(receiver)
     dr.enable_grad(texels, depth)
-    value = reduced_bleeding(PREFILTERED[method].resolve(texels, depth, 1), 0.2)
+    value = reduced_bleeding(PREFILTERED[method].resolve(texels, depth, SCALE), 0.2)
     assert np.isfinite(value.numpy()).all()
     assert ((value.numpy() >= 0) & (value.numpy() <= 1)).all()
     dr.backward(dr.sum(value))
@@ -264,7 +294,7 @@ def test_two_depths_are_bounded_and_finite_on_any_moments(variant: str) -> None:
 def test_occluders_and_receivers_at_the_ends_of_the_range(variant: str, method: str) -> None:
     """If all casters lie before all receivers, one ends up at -1/2 and the other at 1/2."""
     depths = np.full((4, 1), -0.5)
-    value = PREFILTERED[method].resolve(stored(method, depths, np.ones((4, 1))), floats([0.3, 0.4, 0.45, 0.5]), 1).numpy()
+    value = PREFILTERED[method].resolve(stored(method, depths, np.ones((4, 1))), floats([0.3, 0.4, 0.45, 0.5]), SCALE).numpy()
     assert value.max() < (0.1 if method == "csm" else 0.01)
 
 

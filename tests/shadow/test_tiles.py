@@ -1,4 +1,4 @@
-"""Tiles of a directional light's image plane: as many visible points in each, kept while they are, blended at their borders."""
+"""Tiles of a directional light's image plane: small texels where many points are, kept while they are, blended at borders."""
 
 from __future__ import annotations
 
@@ -8,7 +8,17 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from shadowmap_dr.shadow import Frusta, Tiles, Views, directional_view, fit_tiles, stack_views, to_light_space
+from shadowmap_dr.shadow import (
+    Frusta,
+    Tiles,
+    Views,
+    directional_view,
+    fit_tiles,
+    spot_view,
+    stack_views,
+    to_light_space,
+    with_depths_from_planes,
+)
 from shadowmap_dr.shadow.light_camera import of_map
 from shadowmap_dr.shadow.tiles import BAND, neighbour, tile_of
 
@@ -39,7 +49,7 @@ def in_plane(views: Views, points: Array) -> Array:
 
 def rectangles(tiles: Tiles) -> Array:
     """(M, 4): x0, y0, x1, y1."""
-    return np.stack([column.numpy() for column in tiles.columns()], 1)
+    return np.stack([column.numpy() for column in tiles.columns()[:4]], 1)
 
 
 def holders(tiles: Tiles, xy: Array) -> Array:
@@ -49,9 +59,37 @@ def holders(tiles: Tiles, xy: Array) -> Array:
     return np.where(inside.sum(1) == 1, inside.argmax(1), -1)
 
 
+def mean_size(xy: Array, parts: Array) -> float:
+    """Mean over the points of the diagonal of what holds all points of the same part: texels' sides are proportional to it."""
+    sizes = [np.hypot(*np.ptp(xy[parts == k], axis=0)) * (parts == k).sum() for k in np.unique(parts)]
+    return float(sum(sizes) / len(xy))
+
+
+def medians(xy: Array, number: int) -> Array:
+    """Leaves of a k-d tree with equally many points in each, whose longer sides are halved."""
+    parts = np.zeros(len(xy), int)
+    count = 1
+    while count < number:
+        for k in reversed(range(count)):  # 2 k and 2 k + 1 are free then
+            own = np.flatnonzero(parts == k)
+            axis = int(np.ptp(xy[own], axis=0).argmax())
+            parts[own] = 2 * k + (xy[own, axis] >= np.median(xy[own, axis]))
+        count *= 2
+    return parts
+
+
+def best_cut(xy: Array) -> float:
+    """Least mean size of two parts, each with an eighth of the points at least, by brute force over 400 borders."""
+    found = []
+    for axis in (0, 1):
+        for border in np.quantile(xy[:, axis], np.linspace(0.125, 0.875, 200)):
+            found.append(mean_size(xy, xy[:, axis] >= border))
+    return min(found)
+
+
 @pytest.mark.parametrize("number", [2, 4, 8, 16])
 @pytest.mark.parametrize("direction", [(0.3, 0.5, -1.0), (0.0, 0.0, -1.0), (-1.0, 0.2, -0.3)])
-def test_tiles_share_the_points_equally(direction: tuple[float, float, float], number: int) -> None:
+def test_tiles_have_small_texels_where_many_points_are(direction: tuple[float, float, float], number: int) -> None:
     points, views = receding(), views_of(direction, number)
     tiles = fit_tiles(views, [(0, number)], seen(points), None)
     assert tiles is not None
@@ -59,13 +97,41 @@ def test_tiles_share_the_points_equally(direction: tuple[float, float, float], n
     found = holders(tiles, xy)
     np.testing.assert_array_equal(tile_of(tiles, (0, number), *(mi.Float(xy[:, k]) for k in (0, 1))).numpy(), found)
     counts = np.bincount(found, minlength=number)  # fails if a point has no tile
-    assert counts.min() > 0.75 * len(points) / number and counts.max() < 1.3 * len(points) / number
-    # Near the camera tiles are small.
-    box = rectangles(tiles)
-    finite = np.isfinite(box).all(1)
-    if number == 16 and finite.sum() > 1:
-        area = ((box[:, 2] - box[:, 0]) * (box[:, 3] - box[:, 1]))[finite]
-        assert area.max() > 3 * area.min()
+    # Each cut leaves an eighth of the points on either side.
+    assert counts.min() > 0.9 * len(points) / 8 ** np.log2(number)
+    assert mean_size(xy, found) < 0.85 * mean_size(xy, medians(xy, number))
+    if number == 2:
+        assert mean_size(xy, found) < 1.08 * best_cut(xy)
+
+
+@pytest.mark.parametrize("kind", ["directional", "spot"])
+def test_depths_count_from_the_plane_that_points_lie_on(kind: str) -> None:
+    """Points within 5 of a slope, hundreds apart along the light: differences along rays stay, those across them vanish."""
+    points = receding() * [1, 1, 0.3]
+    points[:, 2] += 0.4 * points[:, 0] - 0.2 * points[:, 1]
+    if kind == "directional":
+        views = views_of((0.3, 0.5, -1.0), 4)
+    else:
+        axes = (mi.Point3f(1, 0, 0), mi.Point3f(0, -1, 0), mi.Point3f(0, 0, -1))
+        views = stack_views([spot_view(mi.Point3f(100, 0, 900), *axes, mi.Float(1.7))] * 4)
+    tiles = fit_tiles(views, [(0, 4)], seen(points), None)
+    assert tiles is not None
+    moved = with_depths_from_planes(views, tiles)
+    xy = in_plane(views, points) if kind == "directional" else np.zeros((len(points), 2))
+    before = []
+    for k in range(4 if kind == "directional" else 1):
+        own = points[holders(tiles, xy) == k] if kind == "directional" else points
+        old, new = (to_light_space(of_map(v, mi.UInt32(k), 4), seen(own)[0]) for v in (views, moved))
+        behind = own + 10 * (dr.ravel(views.forward).numpy()[:3])
+        np.testing.assert_allclose(new.x.numpy(), old.x.numpy())
+        if kind == "spot":
+            np.testing.assert_array_equal(new.z.numpy(), old.z.numpy())
+            continue
+        before.append(np.ptp(old.z.numpy()))
+        assert np.ptp(new.z.numpy()) < 10
+        farther = to_light_space(of_map(moved, mi.UInt32(k), 4), seen(behind)[0]).z.numpy()
+        np.testing.assert_allclose(farther - new.z.numpy(), 10, atol=2e-3)
+    assert kind == "spot" or max(before) > 150
 
 
 def test_lights_have_tiles_of_their_own() -> None:
@@ -81,20 +147,22 @@ def test_lights_have_tiles_of_their_own() -> None:
     for first, number in ((1, 4), (6, 2)):
         p = to_light_space(of_map(views, mi.UInt32(first), views.count), seen(points)[0])
         counts = np.bincount(tile_of(tiles, (first, number), p.x, p.y).numpy()[masked] - first, minlength=number)
-        assert counts.max() < 1.3 * masked.sum() / number
+        assert counts.min() > 0.9 * masked.sum() / 8 ** np.log2(number)
 
 
-def test_tiles_stay_while_they_are_balanced() -> None:
+def test_tiles_stay_while_their_texels_are_small() -> None:
     points, views = receding(), views_of((0.3, 0.5, -1.0), 4)
     first = fit_tiles(views, [(0, 4)], seen(points), None)
     again = fit_tiles(views, [(0, 4)], seen(receding(seed=2) + [0.3, 0.2, 0.0]), first)
     assert first is not None and again is not None
     np.testing.assert_array_equal(rectangles(again), rectangles(first))
+    tilted = fit_tiles(views, [(0, 4)], seen(points + points[:, :1] * [0, 0, 0.3]), again)
+    assert tilted is not None and not np.array_equal(tilted.slope_x.numpy(), first.slope_x.numpy())
     farther = fit_tiles(views, [(0, 4)], seen(points + [400.0, 0.0, 0.0]), again)
     assert farther is not None
     assert not np.array_equal(rectangles(farther), rectangles(first))
-    counts = np.bincount(holders(farther, in_plane(views, points + [400.0, 0.0, 0.0])), minlength=4)
-    assert counts.max() < 1.3 * len(points) / 4
+    moved = in_plane(views, points + [400.0, 0.0, 0.0])
+    assert mean_size(moved, holders(farther, moved)) < 0.85 * mean_size(moved, holders(first, moved))
 
 
 def test_no_points_and_equal_points_end_in_tiles_all_the_same() -> None:

@@ -83,7 +83,8 @@ def towards_lights(
 
     def through(raster: RasterOutput, view: Views) -> list[Float]:
         def towards(p_world: Point3f) -> Vector3f:
-            way = dr.select(view.spread > 0, mi.Vector3f(view.origin) - mi.Vector3f(p_world), -mi.Vector3f(view.forward))
+            along = dr.cross(mi.Vector3f(view.right), mi.Vector3f(view.up))  # `forward` may be another axis for depths
+            way = dr.select(view.spread > 0, mi.Vector3f(view.origin) - mi.Vector3f(p_world), -along)
             length = dr.norm(way)
             return way / dr.select(length > 0, length, 1)
 

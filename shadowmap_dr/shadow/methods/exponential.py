@@ -8,10 +8,6 @@ from ...jit.arrays import backend
 from ...jit.types import Float, Vector2f
 from .variance import chebyshev_visibility
 
-# Smallest deviation that depths are taken to have: in sides of the filter's footprint, and at most a share of the depth range.
-# With less, surfaces at grazing angles to the light would shadow themselves, and derivatives by depth, which grow as it falls,
-# would have single large values.
-_FOOTPRINTS, _MOST = 1.2, 1e-5**0.5
 # Smallest variance relative to the squared warped depth that single precision can tell.
 _PRECISE = 1e-6
 
@@ -32,29 +28,32 @@ def exponential_visibility(moment: Float, depth: Float, exponent: float) -> Floa
     return dr.select(dark, positive, 1)
 
 
-def warped_moments(depth: Float, slope_square: Float | float, exponent: float) -> Vector2f:
-    """First and second moment of ``sign(exponent) * exp(exponent * depth)``, which grows with depth. Attached.
+def warped_moments(depth: Float, slope_square: Float | float, exponent: Float | float, sign: int = 1) -> Vector2f:
+    """First and second moment of ``sign * exp(sign * exponent * depth)``, which grows with depth. Attached.
 
     Source: Lauritzen and McCool, "Layered Variance Shadow Maps", 2008, section 4.2. A plane's variance within the texel is
     carried over to first order, detached.
     """
-    warped = _warp(depth, exponent)
+    warped = _warp(depth, exponent, sign)
     slope = dr.detach(exponent * warped)
     return backend(depth).Array2f(warped, dr.fma(warped, warped, 0.25 * dr.detach(slope_square) * slope * slope))
 
 
-def warped_visibility(moments: Vector2f, depth: Float, exponent: float, footprint: Float | float) -> Float:
+def warped_visibility(
+    moments: Vector2f, depth: Float, exponent: Float | float, least_deviation: Float | float, sign: int = 1
+) -> Float:
     """Chebyshev's bound for warped depths. Attached to moments and depth.
 
-    ``footprint``: side of the filter's footprint as a share of the depth range, detached.
+    ``least_deviation``: see :class:`DepthScale`; the others are those of :func:`warped_moments`.
     """
-    warped = _warp(depth, exponent)
+    warped = _warp(depth, exponent, sign)
     # Moments span many orders of magnitude: everything is scaled by the receiver's own warped depth.
     scale = dr.rcp(dr.detach(dr.abs(warped)))
     relative = backend(depth).Array2f(moments.x * scale, moments.y * scale * scale)
-    deviation = exponent * dr.minimum(_FOOTPRINTS * backend(depth).Float(footprint), _MOST)
+    deviation = exponent * backend(depth).Float(least_deviation)
     return chebyshev_visibility(relative, warped * scale, dr.maximum(deviation * deviation, _PRECISE))
 
 
-def _warp(depth: Float, exponent: float) -> Float:
-    return dr.exp(exponent * depth) if exponent > 0 else -dr.exp(exponent * depth)
+def _warp(depth: Float, exponent: Float | float, sign: int) -> Float:
+    warped = dr.exp(sign * exponent * depth)
+    return warped if sign > 0 else -warped

@@ -17,9 +17,7 @@ from ..jit.arrays import backend, replace_grad
 from ..jit.kernel_inputs import split
 from ..jit.types import Bool, Float, Point3f, Vector3f
 from .light_camera import Frusta, Views, of_map, to_light_space
-
-# Least variance across the light, a share of that along it, that the slope of a plane is fitted to.
-_RIDGE = 1e-3
+from .nearest_planes import nearest_planes
 
 
 def steady_axes(views: Views, frusta: Frusta, seen: tuple[Point3f, Bool]) -> Views:
@@ -66,24 +64,4 @@ def _planes(views: Views, frusta: Frusta, seen: tuple[Point3f, Bool]) -> tuple[F
         active = dr.gather(module.Bool, module.Bool(seen[1]), source)
         window = of_map(frusta, which, count)
         active &= (dr.abs(p.x - window.center_x) <= window.half_x) & (dr.abs(p.y - window.center_y) <= window.half_y)
-        row = dr.arange(module.UInt32, count)
-
-        def sums(values: list[Float]) -> list[Float]:
-            """Sums over the visible points of each map."""
-            total = dr.zeros(module.Float, len(values) * count)
-            for k, value in enumerate(values):
-                dr.scatter_add(total, value, which * len(values) + k, active)
-            return [dr.gather(module.Float, total, row * len(values) + k) for k in range(len(values))]
-
-        points, *totals = sums([module.Float(1), p.x, p.y, p.z])
-        points = dr.maximum(points, 1)
-        middle = [total / points for total in totals]
-        dr.eval(middle)
-        x, y, z = (p[c] - dr.gather(module.Float, middle[c], which) for c in range(3))
-        xx, xy, yy, xz, yz, zz = (total / points for total in sums([x * x, x * y, y * y, x * z, y * z, z * z]))
-        xx, yy = xx + _RIDGE * zz + 1e-30, yy + _RIDGE * zz + 1e-30
-        determinant = xx * yy - xy * xy
-        a, b = (xz * yy - yz * xy) / determinant, (yz * xx - xz * xy) / determinant
-        c = middle[2] - a * middle[0] - b * middle[1]
-        dr.eval(a, b, c)
-        return a, b, c
+        return nearest_planes((p.x, p.y, p.z), which, count, active)

@@ -10,14 +10,13 @@ import drjit as dr
 from ..jit.arrays import backend
 from ..jit.types import Bool, Float, Point3f, UInt32
 from .light_camera import Views, of_map, to_light_space
+from .nearest_planes import nearest_planes
 from .tiles import Group, Tiles, tile_of
 
 # Bins between which a node may be cut, and the least share of its points on either side.
 _BINS, _LEAST = 32, 1 / 8
 # Tiles are kept while the mean side of texels is at most so many times that of new tiles, and slopes differ by no more than that.
 _MOST, _TURN = 1.2, 0.1
-# Least variance across the light, a share of that along it, that the slope of a plane is fitted to.
-_RIDGE = 1e-3
 
 
 def fit_tiles(
@@ -48,7 +47,8 @@ def fit_tiles(
             lit &= module.Bool(seen[1])
             found = _divided(x, y, lit, number)
             if planes:
-                found = _with_slopes(found, number, (x, y, z), lit)
+                slope_x, slope_y, _ = nearest_planes((x, y, z), tile_of(found, (0, number), x, y), number, lit)
+                found = replace(found, slope_x=slope_x, slope_y=slope_y)
             if previous is not None:
                 kept = previous.rows(dr.arange(module.UInt32, number) + first)
                 # The leaves found are those of one light alone.
@@ -193,27 +193,6 @@ def _maxima(values: Sequence[Float], index: UInt32, size: int, active: Bool) -> 
 def _sizes(ends: Sequence[Float]) -> Float:
     """Diagonals of rectangles, to which the sides of their texels are proportional. ``ends``: maxima of -x, -y, x, y."""
     return dr.sqrt(dr.square(ends[0] + ends[2]) + dr.square(ends[1] + ends[3]))
-
-
-def _with_slopes(tiles: Tiles, number: int, points: tuple[Float, Float, Float], active: Bool) -> Tiles:
-    """Tiles of one light with slopes of the planes nearest to the points (x, y, z) in each."""
-    module = backend(points[0])
-    tile = tile_of(tiles, (0, number), points[0], points[1])
-
-    def means(values: list[Float]) -> list[Float]:
-        totals = []
-        for value in values:
-            totals.append(dr.zeros(module.Float, number))
-            dr.scatter_add(totals[-1], value, tile, active)
-        dr.eval(totals)
-        return [total / counts for total in totals]
-
-    counts = dr.maximum(_counts(tile, number, active), 1)
-    x, y, z = (value - dr.gather(module.Float, mean, tile) for value, mean in zip(points, means(list(points)), strict=True))
-    xx, xy, yy, xz, yz, zz = means([x * x, x * y, y * y, x * z, y * z, z * z])
-    xx, yy = xx + _RIDGE * zz + 1e-30, yy + _RIDGE * zz + 1e-30
-    determinant = xx * yy - xy * xy
-    return replace(tiles, slope_x=(xz * yy - yz * xy) / determinant, slope_y=(yz * xx - xz * xy) / determinant)
 
 
 def _mean_size(tiles: Tiles, group: Group, x: Float, y: Float, active: Bool) -> Float:

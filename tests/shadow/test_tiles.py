@@ -173,6 +173,7 @@ def test_no_points_and_equal_points_end_in_tiles_all_the_same() -> None:
         assert tiles is not None
         found = tile_of(tiles, (0, 4), points[0].x, points[0].y).numpy()
         assert found.max() < 4
+        assert not tiles.slope_x.numpy().any() and not tiles.slope_y.numpy().any()
 
 
 def test_shares_meet_at_borders() -> None:

@@ -192,6 +192,18 @@ def test_a_city_of_a_file(variant: str, tmp_path: Path, hamlet: City) -> None:
     meshes = file_meshes(folder / "munich.xml")
     assert len(meshes) == len(hamlet.bodies)
     np.testing.assert_allclose(points_of(meshes["mesh-ground"]), hamlet.bodies[0].solid.points, atol=1e-3)
+    # A building in two materials is one mesh.
+    text, (one, two) = (folder / "munich.xml").read_text(), [f"mesh-{body.name}" for body in hamlet.bodies[1:3]]
+    both = text.replace(f'"{one}"', '"mesh-inn-itu_marble"').replace(f'"{two}"', '"mesh-inn-itu_metal"')
+    (folder / "munich.xml").write_text(both)
+    joined = file_meshes(folder / "munich.xml")
+    assert len(joined) == len(meshes) - 1
+    points = np.concatenate([points_of(meshes[one]), points_of(meshes[two])])
+    np.testing.assert_array_equal(points_of(joined["mesh-inn"]), points)
+    corners = [points_of(mesh)[np.array(mesh.faces_buffer()).reshape(-1, 3)] for mesh in (meshes[one], meshes[two])]
+    own = np.array(joined["mesh-inn"].faces_buffer()).reshape(-1, 3)
+    np.testing.assert_array_equal(points_of(joined["mesh-inn"])[own], np.concatenate(corners))
+    (folder / "munich.xml").write_text(text)
     assert next(file_views(folder / "munich.xml")).name == "munich, street 0, sun 20"
     assert MapsOptions(city_folder=tmp_path).city_folder == tmp_path
     with pytest.raises(ShadowmapError, match="munich"):

@@ -5,6 +5,7 @@ The same for a city of a file: its meshes, whose materials are left out, are rea
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...errors import ShadowmapError
+from ...scene.mitsuba_meshes import make_mesh, mesh_buffers
 from .city import City, make_city
 from .view import USUAL, Motion, Seen, View, points_of, seen_by
 
@@ -68,11 +70,14 @@ def file_views(path: Path) -> Iterator[View]:
 def file_meshes(path: Path) -> dict[str, mi.Mesh]:
     """The meshes of a scene file with one grey material.
 
+    Scene files of Sionna have a mesh for each material of a building, such as walls and roof. These become one mesh: their edges
+    coincide, and a building's height is that of both.
+
     Raises:
         ShadowmapError: the file or one of its meshes cannot be read.
     """
     material = mi.load_dict({"type": "twosided", "bsdf": {"type": "diffuse"}})
-    meshes: dict[str, mi.Mesh] = {}
+    parts: dict[str, list[mi.Mesh]] = {}
     try:
         for index, shape in enumerate(ElementTree.parse(path).getroot().findall("shape")):
             file = shape.find("string[@name='filename']")
@@ -80,12 +85,22 @@ def file_meshes(path: Path) -> dict[str, mi.Mesh]:
                 continue
             source = {"type": shape.get("type"), "filename": str(path.parent / file.get("value", "")), "face_normals": True}
             name = shape.get("id") or f"shape_{index}"
-            meshes[name] = mi.load_dict({"type": "scene", name: {**source, "bsdf": material}}, optimize=False).shapes()[0]
+            mesh = mi.load_dict({"type": "scene", name: {**source, "bsdf": material}}, optimize=False).shapes()[0]
+            parts.setdefault(re.sub("-itu_[a-z_]+$", "", name), []).append(mesh)
     except (OSError, ElementTree.ParseError, RuntimeError) as error:
         raise ShadowmapError(f"cannot read the city {path}: {' '.join(str(error).split())}") from error
-    if not meshes:
+    if not parts:
         raise ShadowmapError(f"the city {path} has no meshes: give a scene file with shapes that name files.")
-    return meshes
+    return {name: own[0] if len(own) == 1 else _joined(name, own, material) for name, own in parts.items()}
+
+
+def _joined(name: str, parts: list[mi.Mesh], material: mi.BSDF) -> mi.Mesh:
+    """One mesh with the triangles of all parts."""
+    buffers = [mesh_buffers(part) for part in parts]
+    points = [np.array(buffer.positions).reshape(-1, 3) for buffer in buffers]
+    starts = np.cumsum([0, *(len(own) for own in points[:-1])])
+    faces = [np.array(buffer.faces).reshape(-1, 3) + start for buffer, start in zip(buffers, starts, strict=True)]
+    return make_mesh(name, np.concatenate(points), np.concatenate(faces), material)
 
 
 def protocol_places(meshes: Mapping[str, mi.Mesh]) -> list[Place]:

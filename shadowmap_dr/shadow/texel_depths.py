@@ -20,8 +20,9 @@ FAR = 0.5
 _MAX_SLOPE = 2.0
 # Least deviation of depths: in sides of the filter's footprint, and at most a share of the depth range.
 _FOOTPRINTS, _MOST = 1.2, 1e-5**0.5
-# That of tiles. The warp for near casters has such an exponent that it changes by one fifth over a footprint, within limits.
-_FOOTPRINTS_OF_TILES, _SPREAD, _LARGEST = 1.1, 0.2, 20.0
+# That of tiles. The exponent of the warp for near casters is 1 for depth ranges of 16 footprints, and grows by a quarter for each
+# further one, up to a limit.
+_FOOTPRINTS_OF_TILES, _SPREAD, _SHALLOW, _LARGEST = 1.1, 0.25, 16, 20.0
 
 
 @dataclass(frozen=True)
@@ -101,6 +102,6 @@ def depth_scale(view: Views, frustum: Frusta, linear: Float, settings: ShadowSet
     if not tiled:
         return DepthScale(dr.minimum(_FOOTPRINTS * side, _MOST))
     # All depths of a map share an exponent; in perspective, texels grow with depth.
-    local: Float = dr.clip(_SPREAD / side, 1, _LARGEST)
+    local: Float = dr.clip(1 + _SPREAD * (dr.rcp(side) - _SHALLOW), 1, _LARGEST)
     exponent = dr.select(view.spread > 0, backend(linear).Float(1), local)
     return DepthScale(_FOOTPRINTS_OF_TILES * side, exponent)

@@ -121,30 +121,20 @@ def _divided(x: Float, y: Float, active: Bool, number: int) -> Tiles:
 def _cuts(x: Float, y: Float, node: UInt32, nodes: int, active: Bool) -> tuple[Bool, Float]:
     """(across x, place), (nodes,) each: the cut through each node that leaves the least mean of :func:`_sizes` over its points.
 
-    Candidates are borders between bins with equally many points, along both axes. Bins of equal width come first, in which points
-    are taken to lie evenly: most points may lie in few of them. Without a candidate, a node is cut through its middle.
+    Candidates are borders between bins with equally many points, along both axes. Without one, a node is cut through its middle.
     """
     module = backend(x)
     # Rows are nodes, cut across x, and again, cut across y. ``value`` is the coordinate that is cut.
     rows = 2 * nodes
     value, other, row = dr.concat([x, y]), dr.concat([y, x]), dr.concat([node, node + nodes])
     active = dr.concat([active, active])
-    low, high = _maxima([-value, value], row, rows, active)
-    start, length = -low, dr.maximum(high + low, 1e-30)
-    dr.eval(start, length)
-    place = (value - dr.gather(module.Float, start, row)) / dr.gather(module.Float, length, row)
-    even = _bin(place, active)
-    counts = _counts(row * _BINS + even, rows * _BINS, active)
-    before, total = dr.block_prefix_sum(counts, _BINS), dr.maximum(dr.block_sum(counts, _BINS), 1)
-    at = row * _BINS + even
-    rank = dr.gather(module.Float, before, at) + (place * _BINS - module.Float(even)) * dr.gather(module.Float, counts, at)
-    bin_ = row * _BINS + _bin(rank / dr.gather(module.Float, total, row), active)
-
+    bin_, (start, length) = _even_bins(value, row, rows, active)
     counts = _counts(bin_, rows * _BINS, active)
     ends = _maxima([-value, -other, value, other], bin_, rows * _BINS, active)
     lower = [dr.block_prefix_reduce(dr.ReduceOp.Max, end, _BINS) for end in ends]
     upper = [dr.block_prefix_reduce(dr.ReduceOp.Max, end, _BINS, exclusive=False, reverse=True) for end in ends]
     border = dr.arange(module.UInt32, rows * _BINS)
+    total = dr.maximum(dr.block_sum(counts, _BINS), 1)
     below = dr.block_prefix_sum(counts, _BINS) / dr.gather(module.Float, total, border // _BINS)
     mean = below * _sizes(lower) + (1 - below) * _sizes(upper)
     mean = dr.select((below >= _LEAST) & (below <= 1 - _LEAST), mean, dr.inf)
@@ -164,6 +154,24 @@ def _cuts(x: Float, y: Float, node: UInt32, nodes: int, active: Bool) -> tuple[B
     cut = dr.select(found, dr.gather(module.Float, place, dr.gather(module.UInt32, first, chosen)), middle)
     dr.eval(across, cut)
     return across, cut
+
+
+def _even_bins(value: Float, row: UInt32, rows: int, active: Bool) -> tuple[UInt32, tuple[Float, Float]]:
+    """(index of each value's bin, (least value, extent) of each row), for bins that hold about equally many values of their row.
+
+    Bins of equal width come first, in which values are taken to lie evenly: most may lie in few of them.
+    """
+    module = backend(value)
+    low, high = _maxima([-value, value], row, rows, active)
+    start, length = -low, dr.maximum(high + low, 1e-30)
+    dr.eval(start, length)
+    place = (value - dr.gather(module.Float, start, row)) / dr.gather(module.Float, length, row)
+    wide = _bin(place, active)
+    at = row * _BINS + wide
+    counts = _counts(at, rows * _BINS, active)
+    before, total = dr.block_prefix_sum(counts, _BINS), dr.maximum(dr.block_sum(counts, _BINS), 1)
+    rank = dr.gather(module.Float, before, at) + (place * _BINS - module.Float(wide)) * dr.gather(module.Float, counts, at)
+    return row * _BINS + _bin(rank / dr.gather(module.Float, total, row), active), (start, length)
 
 
 def _bin(share: Float, active: Bool) -> UInt32:

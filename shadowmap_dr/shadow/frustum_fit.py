@@ -23,7 +23,7 @@ _MARGIN = 0.10
 _MARGIN_OF_TILES = 0.03
 # Least depth range of a frustum in units of its lateral extent.
 _FLATTEST = 1e-2
-# That of tiles, in texels: depths are told apart by about one, and the range must tell receivers from casters.
+# That of tiles of suns, in texels: depths are told apart by about one, and the range must tell receivers from casters.
 _FLATTEST_OF_TILES = 16
 # Least depth range in units of its distance from the light: rounding changes depths by some 1e-7 of the distance.
 _THINNEST = 1e-3
@@ -191,8 +191,11 @@ def _fit(
     # A flat caster that faces the light has no extent in depth. In a tiny range, any tilt would be a huge change of depth, and
     # the derivative of visibility a small difference of huge numbers.
     lateral = dr.maximum(x1 - x0, y1 - y0) * dr.select(perspective, dr.abs(z1), 1)
-    flattest = _FLATTEST if tiles is None else max(_FLATTEST, _FLATTEST_OF_TILES / resolution)
-    least = dr.maximum(float_input(module, "flattest", flattest) * lateral, _THINNEST * dr.maximum(dr.abs(z1), 1e-3))
+    flattest = module.Float(_FLATTEST)
+    if tiles is not None:
+        of_tiles = float_input(module, "flattest", max(_FLATTEST, _FLATTEST_OF_TILES / resolution))
+        flattest = dr.select(perspective, flattest, of_tiles)
+    least = dr.maximum(flattest * lateral, _THINNEST * dr.maximum(dr.abs(z1), 1e-3))
     # Visible receivers are known from samples only: some may lie a little before these.
     spread = dr.select(dr.isfinite(window[5]), window[5] - receivers, 0)
     depth = dr.maximum(dr.maximum(z1 - receivers, least), 0.1 * spread)

@@ -99,9 +99,11 @@ def depth_scale(view: Views, frustum: Frusta, linear: Float, settings: ShadowSet
     view = dr.detach(view)
     half = dr.maximum(frustum.half_x, frustum.half_y)
     side = texel_side(view, frustum, linear, settings.resolution) * half * settings.footprint
+    coarse: Float = dr.minimum(_FOOTPRINTS * side, _MOST)
     if not tiled:
-        return DepthScale(dr.minimum(_FOOTPRINTS * side, _MOST))
-    # All depths of a map share an exponent; in perspective, texels grow with depth.
-    local: Float = dr.clip(1 + _SPREAD * (dr.rcp(side) - _SHALLOW), 1, _LARGEST)
-    exponent = dr.select(view.spread > 0, backend(linear).Float(1), local)
-    return DepthScale(_FOOTPRINTS_OF_TILES * side, exponent)
+        return DepthScale(coarse)
+    # Depths of spots do not count from planes.
+    perspective = view.spread > 0
+    fine: Float = dr.clip(1 + _SPREAD * (dr.rcp(side) - _SHALLOW), 1, _LARGEST)
+    one = backend(linear).Float(1)
+    return DepthScale(dr.select(perspective, coarse, _FOOTPRINTS_OF_TILES * side), dr.select(perspective, one, fine))

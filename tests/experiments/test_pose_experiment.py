@@ -190,7 +190,7 @@ def test_a_killed_sweep_goes_on_with_more_runs(tmp_path: Path) -> None:
 def test_workers_make_the_same_runs(tmp_path: Path) -> None:
     pytest.importorskip("distributed")
     # A start from which the last digits, which depend on the order of sums, do not grow at once.
-    small = {"resolutions": (24,), "iterations": 6, "seed": 11}
+    small = {"resolutions": (24,), "iterations": 6, "seed": 3}
     here = run_pose(options(tmp_path / "here", **small))
     there = run_pose(options(tmp_path / "there", runs=1, scheduler="processes:1", threads=1, **small))
     more = run_pose(options(tmp_path / "there", resume=True, scheduler="processes:1", threads=1, **small))

@@ -10,6 +10,7 @@ import drjit as dr
 from ..jit.arrays import backend
 from ..jit.kernel_inputs import float_input, quotient, split
 from ..jit.types import Bool, Float, Point3f, UInt32
+from .grouped import grouped_maxima, numbers_of
 from .light_camera import Frusta, Views, of_map, to_light_space
 from .tiles import Tiles
 
@@ -37,28 +38,15 @@ _BEFORE = 1.0
 class Bounds:
     """Light-space bounds of each shape in each map: image coordinates and depths.
 
-    ``negated`` holds -x0, -y0, -z0, x1, y1, z1 for each shape in each map: all of them maxima, in one buffer, for a reduction
-    costs more to launch than to run.
+    ``negated`` holds -x0, -y0, -z0, x1, y1, z1 for each shape in each map: all of them maxima (:func:`grouped_maxima`).
     """
 
     negated: Float
 
     def of(self, index: UInt32) -> Extent:
         """(x0, y0, x1, y1, z0, z1) of entry ``map * shapes + shape``."""
-        x0, y0, z0, x1, y1, z1 = _rows(self.negated, index, 6)
+        x0, y0, z0, x1, y1, z1 = numbers_of(self.negated, index, 6)
         return -x0, -y0, x1, y1, -z0, z1
-
-
-def _maxima(values: list[Float], index: UInt32, count: int, active: Bool | bool = True) -> Float:
-    """Maxima of several values over the lanes with the same ``index`` (below ``count``), interleaved in one buffer."""
-    target = dr.full(backend(index).Float, -dr.inf, len(values) * count)
-    for k, value in enumerate(values):
-        dr.scatter_reduce(dr.ReduceOp.Max, target, value, index * len(values) + k, active)
-    return target
-
-
-def _rows(flat: Float, index: UInt32, count: int) -> list[Float]:
-    return [dr.gather(backend(index).Float, flat, index * count + k) for k in range(count)]
 
 
 def shape_bounds(view: Views, p_light: Point3f, map_index: UInt32, shape_index: UInt32, shape_count: int) -> Bounds:
@@ -74,7 +62,7 @@ def shape_bounds(view: Views, p_light: Point3f, map_index: UInt32, shape_index: 
         values = [*sides[:2], -p.z, *sides[2:], p.z]
         # Vertices that are not finite are not drawn.
         drawn = dr.isfinite(p.x + p.y + p.z)
-        return Bounds(_maxima(values, map_index * shape_count + shape_index, view.count * shape_count, drawn))
+        return Bounds(grouped_maxima(values, map_index * shape_count + shape_index, view.count * shape_count, drawn))
 
 
 def fit_frusta(
@@ -153,7 +141,9 @@ def _window(views: Views, seen: tuple[Point3f, Bool] | None, tiles: Tiles | None
     if tiles is not None:
         active &= tiles.rows(map_index).hold(p.x / w, p.y / w)
     values = [*(dr.select(behind, dr.inf, v / w) for v in (-p.x, -p.y, p.x, p.y)), -p.z, p.z]
-    *sides, nearest, farthest = _rows(_maxima(values, map_index, views.count, active), dr.arange(module.UInt32, views.count), 6)
+    *sides, nearest, farthest = numbers_of(
+        grouped_maxima(values, map_index, views.count, active), dr.arange(module.UInt32, views.count), 6
+    )
     if tiles is not None:
         borders = (-tiles.low_x, -tiles.low_y, tiles.high_x, tiles.high_y)
         sides = [dr.select(dr.isfinite(border), border, side) for border, side in zip(borders, sides, strict=True)]
@@ -173,7 +163,7 @@ def _fit(
 ) -> tuple[Frusta, tuple[Float, ...]]:
     module = backend(views.spread)
     x0, y0, x1, y1, z0, z1 = extent
-    needed = _maxima([-x0, -y0, -z0, x1, y1, z1], map_index, views.count, casts)
+    needed = grouped_maxima([-x0, -y0, -z0, x1, y1, z1], map_index, views.count, casts)
     x0, y0, x1, y1, z0, z1 = Bounds(needed).of(dr.arange(module.UInt32, views.count))
     nothing = ~(x1 >= x0)
     x0, y0, x1, y1 = (dr.select(nothing, s, v) for s, v in ((-1.0, x0), (-1.0, y0), (1.0, x1), (1.0, y1)))

@@ -48,7 +48,11 @@ class LightView:
 
 @dataclass(frozen=True)
 class Views:
-    """Cameras of all M maps, see :class:`LightView`; arrays of width M. Attached to the lights."""
+    """Cameras of all M maps, see :class:`LightView`; arrays of width M. Attached to the lights.
+
+    ``forward`` is the axis of depths: after :func:`with_depths_from_planes` it is not the light's direction, which is the cross
+    product of ``right`` and ``up``.
+    """
 
     right: Vector3f
     up: Vector3f

@@ -6,6 +6,7 @@ import drjit as dr
 
 from ..jit.arrays import backend
 from ..jit.types import Bool, Float, UInt32
+from .grouped import grouped_sums, numbers_of
 
 # Least variance across the light, a share of that along it, that the slope of a plane is fitted to.
 _RIDGE = 1e-3
@@ -24,10 +25,7 @@ def nearest_planes(points: tuple[Float, Float, Float], group: UInt32, count: int
 
     def sums(values: list[Float]) -> list[Float]:
         """Sums over the points of each group."""
-        total = dr.zeros(module.Float, len(values) * count)
-        for k, value in enumerate(values):
-            dr.scatter_add(total, value, group * len(values) + k, active)
-        return [dr.gather(module.Float, total, row * len(values) + k) for k in range(len(values))]
+        return numbers_of(grouped_sums(values, group, count, active), row, len(values))
 
     with dr.suspend_grad():
         number, *totals = sums([module.Float(1), *points])

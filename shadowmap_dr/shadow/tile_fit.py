@@ -9,6 +9,7 @@ import drjit as dr
 
 from ..jit.arrays import backend
 from ..jit.types import Bool, Float, Point3f, UInt32
+from .grouped import grouped_maxima, numbers_of
 from .light_camera import Views, of_map, to_light_space
 from .nearest_planes import nearest_planes
 from .tiles import Group, Tiles, tile_of
@@ -188,14 +189,10 @@ def _counts(index: UInt32, size: int, active: Bool) -> Float:
     return module.Float(counts)
 
 
-def _maxima(values: Sequence[Float], index: UInt32, size: int, active: Bool) -> list[Float]:
-    """Maxima (size,) of each value at each index; minus infinity where there is none."""
-    found = []
-    for value in values:
-        found.append(dr.full(backend(index).Float, -dr.inf, size))
-        dr.scatter_reduce(dr.ReduceOp.Max, found[-1], value, index, active)
-    dr.eval(found)
-    return found
+def _maxima(values: Sequence[Float], group: UInt32, count: int, active: Bool) -> list[Float]:
+    """Maxima (count,) of each value over the points of each group; minus infinity where there is none."""
+    found = grouped_maxima(values, group, count, active)
+    return numbers_of(found, dr.arange(backend(group).UInt32, count), len(values))
 
 
 def _sizes(ends: Sequence[Float]) -> Float:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from numbers import Real
+from typing import cast
 
 import drjit as dr
 import mitsuba as mi
@@ -141,17 +142,45 @@ def _means(image: TensorXf, factor: int) -> TensorXf:
     if factor == 1:
         return image
     height, width, channels = image.shape[0] // factor, image.shape[1] // factor, image.shape[2]
-    index = dr.arange(mi.UInt32, height * width * channels)
-    pixel, channel = index // channels, index % channels
-    module = backend(index)
-    row, column = split(pixel, "width", width, height)
-    samples = uint_input(module, "width", width * factor)
-    total = dr.zeros(mi.Float, height * width * channels)
-    for j in range(factor):
-        for i in range(factor):
-            source = ((row * factor + j) * samples + column * factor + i) * channels + channel
-            total += dr.gather(mi.Float, image.array, source)
-    return mi.TensorXf(total * (1 / factor**2), shape=(height, width, channels))
+    return mi.TensorXf(dr.custom(_Means, image.array, height, width, channels, factor), shape=(height, width, channels))
+
+
+class _Means(dr.CustomOp):
+    """Means over blocks of samples. The adjoint of Dr.Jit's own gathers would add to zeros, with a copy for each thread."""
+
+    def eval(self, samples: Float, height: int, width: int, channels: int, factor: int) -> Float:
+        self._shape = height, width, channels, factor
+        return self._mean(samples)
+
+    def forward(self) -> None:
+        self.set_grad_out(self._mean(cast("Float", self.grad_in("samples"))))
+
+    def backward(self) -> None:
+        gradient = cast("Float", self.grad_out())
+        height, width, channels, factor = self._shape
+        module = backend(gradient)
+        index = dr.arange(module.UInt32, height * width * channels * factor**2)
+        sample, channel = split(index, "channels", channels, height * width * factor**2)
+        row, column = split(sample, "samples of a row", width * factor, height * factor)
+        pixel = (row // factor) * uint_input(module, "width", width) + column // factor
+        self.set_grad_in("samples", dr.gather(module.Float, gradient, pixel * channels + channel) * (1 / factor**2))
+
+    def name(self) -> str:
+        return "means over samples"
+
+    def _mean(self, samples: Float) -> Float:
+        height, width, channels, factor = self._shape
+        module = backend(samples)
+        index = dr.arange(module.UInt32, height * width * channels)
+        pixel, channel = index // channels, index % channels
+        row, column = split(pixel, "width", width, height)
+        columns = uint_input(module, "width", width * factor)
+        total = dr.zeros(module.Float, height * width * channels)
+        for j in range(factor):
+            for i in range(factor):
+                source = ((row * factor + j) * columns + column * factor + i) * channels + channel
+                total += dr.gather(module.Float, samples, source)
+        return total * (1 / factor**2)
 
 
 def put_into_film(film: mi.Film, image: TensorXf, aovs: list[str]) -> None:

@@ -21,7 +21,7 @@ from ..jit.broadcast import from_one_buffer, look_up
 from ..jit.kernel_inputs import float_input, split
 from ..jit.types import AnyArray, Bool, Float, Point3f, UInt32, Vector3f, Vector4f
 from ..jit.vectors import unit
-from .tiles import Tiles
+from .tiles import Group, TileNumbers, Tiles
 
 #: Half-angle (tangent) of one cube face, before the margin for the filter.
 CUBE_FACE = 1.0
@@ -102,9 +102,14 @@ class Frusta:
         tiles = None if self.tiles is None else self.tiles.rows(index)
         return Frusta(*(dr.gather(type(column), column, index) for column in self.columns()), tiles=tiles)
 
+    @classmethod
+    def names(cls) -> tuple[str, ...]:
+        """Names of the numbers of the maps, without their tiles, in a fixed order."""
+        return tuple(name for name in cls.__dataclass_fields__ if name != "tiles")
+
     def columns(self) -> list[Float]:
-        """All numbers of the maps, (M,) each, in a fixed order; without their tiles."""
-        return [getattr(self, name) for name in self.__dataclass_fields__ if name != "tiles"]
+        """All numbers of the maps, (M,) each, in the order of :meth:`names`."""
+        return [getattr(self, name) for name in self.names()]
 
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
         """All numbers, (M,) each, by name, to be stored."""
@@ -131,6 +136,8 @@ class Frusta:
         return replace(joined, tiles=Tiles(*(dr.concat(list(c)) for c in zip(*(t.columns() for t in tiles), strict=True))))
 
 
+# Names of the axis of depths among the numbers of tiles.
+_FORWARD = ("forward_x", "forward_y", "forward_z")
 ViewsOrFrusta = TypeVar("ViewsOrFrusta", Views, Frusta)
 
 
@@ -224,6 +231,29 @@ def of_map(table: ViewsOrFrusta, index: UInt32, count: int) -> ViewsOrFrusta:
         dr.eval(columns)  # by one kernel: look-ups evaluate columns one by one
     rows: list[Any] = [pick(column) for column in columns]
     return type(table)(*rows)
+
+
+def of_tile(numbers: TileNumbers, views: Views, tile: UInt32) -> tuple[Views, Frusta]:
+    """Rows as of :func:`of_map` for the map ``tile``, one of a light's, of each lane. Detached.
+
+    ``numbers``: from :func:`tile_numbers`; ``views``: of all maps.
+    """
+    module = backend(tile)
+    common = of_map(dr.detach(views), module.UInt32(numbers.group[0]), views.count)
+    frustum = Frusta(*numbers.at(Frusta.names(), tile))
+    return replace(common, forward=module.Array3f(*numbers.at(_FORWARD, tile))), frustum
+
+
+def tile_numbers(views: Views, frusta: Frusta, group: Group, points: int = 1) -> TileNumbers:
+    """Numbers in which the maps of a light differ from each other, for so many ``points``. Detached.
+
+    The tiles of a light share its camera; only the axis of depths is their own.
+    """
+    tiles = frusta.tiles
+    assert tiles is not None, "a light has several maps"
+    forward = dict(zip(_FORWARD, dr.detach(views).forward, strict=True))
+    own = dict(zip(Frusta.names(), frusta.columns(), strict=True))
+    return TileNumbers.of({**own, **tiles.by_name(), **forward}, group, points)
 
 
 def to_light_space(view: Views, p_world: Point3f) -> Point3f:

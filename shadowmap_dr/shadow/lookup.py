@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import cast
 
 import drjit as dr
@@ -14,7 +15,7 @@ from ..jit.broadcast import copy_of_lane
 from ..jit.kernel_inputs import float_input, int_input, uint_input
 from ..jit.types import AnyArray, Bool, Float, Point3f, UInt32
 from .filters import filter_kernel, separable_terms
-from .light_camera import Views, of_map, project, to_light_space
+from .light_camera import Views, of_map, of_tile, project, tile_numbers, to_light_space
 from .methods.comparison import soft_comparison, standard_visibility
 from .methods.depth_scale import DepthScale
 from .methods.registry import PREFILTERED
@@ -22,7 +23,7 @@ from .methods.variance import MINIMUM_VARIANCE_COMPAT, chebyshev_visibility, red
 from .shadow_map import ShadowMaps
 from .texel_depths import FAR, depth_scale
 from .tile_fit import image_coordinates
-from .tiles import Group, neighbour, tile_of
+from .tiles import Group, TileNumbers, neighbour, tile_of
 from .transmittance_maps import TransmittanceMaps, depth_encoding
 
 # Depth range over which the comparison of percentage-closer filtering falls from 1 to 0. A hard one has no derivative by depth.
@@ -46,31 +47,60 @@ def visibility(maps: ShadowMaps, map_index: UInt32 | int, p_world: Point3f, acti
     Returns:
         ``Float`` in 0..1; 1 outside the map (0 with ``compat``). Gradients flow to the points, the casters and the light.
     """
-    view, index, u, v, depth, inside, scale = _place_in_map(maps, map_index, p_world)
+    return _visibility(maps, _place_in_map(maps, map_index, p_world), p_world, active)
+
+
+def _visibility(maps: ShadowMaps, place: _Place, p_world: Point3f, active: Bool | bool) -> Float:
+    """:func:`visibility` of points at known places in the maps."""
     if maps.settings.compat:
-        p = to_light_space(view, p_world)
-        return dr.select(active, _look_up_compat(maps, index, u, v, dr.norm(p), inside & active), 1)
-    inside &= backend(maps.values).Bool(active)
+        p = to_light_space(place.view, p_world)
+        inside = place.inside & active
+        return dr.select(active, _look_up_compat(maps, place.index, place.u, place.v, dr.norm(p), inside), 1)
+    inside = place.inside & backend(maps.values).Bool(active)
+    lanes: list[AnyArray] = [place.index, place.u, place.v, place.depth]
     compare = {"standard": _compare, "pcf": _compare_all}.get(maps.settings.method)
     if compare is not None:
-        return _where(inside, compare, maps, index, u, v, depth)
-    lanes = [backend(maps.values).Float(number) for number in (scale.deviation, scale.exponent)]
-    return _where(inside, _resolve, maps, index, u, v, depth, *lanes)
+        return _where(inside, compare, maps, *lanes)
+    lanes += [backend(maps.values).Float(number) for number in (place.scale.deviation, place.scale.exponent)]
+    return _where(inside, _resolve, maps, *lanes)
 
 
-def _place_in_map(
-    maps: ShadowMaps, map_index: UInt32 | int, p_world: Point3f
-) -> tuple[Views, UInt32, Float, Float, Float, Bool, DepthScale]:
-    """(camera, index among all copies of the maps, u, v, linear depth, whether it is in the map, scale) of points. Attached."""
+@dataclass(frozen=True)
+class _Place:
+    """Places of points in maps.
+
+    Attributes:
+        view: cameras of the maps.
+        index: of the map among all copies of the maps.
+        u, v, depth: in -1..1, and linear depth. Attached.
+        inside: whether a point lies in the map.
+        scale: on which the map tells depths apart. Detached.
+    """
+
+    view: Views
+    index: UInt32
+    u: Float
+    v: Float
+    depth: Float
+    inside: Bool
+    scale: DepthScale
+
+
+def _place_in_map(maps: ShadowMaps, map_index: UInt32 | int, p_world: Point3f, numbers: TileNumbers | None = None) -> _Place:
+    """Places of points in the maps with an index, for each point or one for all. ``numbers``: of the light, if the maps are its
+    tiles and its camera carries no gradient."""
     module = backend(maps.values)
-    index: UInt32 = module.UInt32(map_index)
-    frustum = of_map(maps.frusta, index, maps.count)
+    row: UInt32 = module.UInt32(map_index)
+    index = row
     if maps.copies > 1:
-        index = index + copy_of_lane(module, dr.width(p_world), maps.copies) * maps.count
-    view = of_map(maps.views, index, maps.views.count)
+        index = row + copy_of_lane(module, dr.width(p_world), maps.copies) * maps.count
+    if numbers is None:
+        view, frustum = of_map(maps.views, index, maps.views.count), of_map(maps.frusta, row, maps.count)
+    else:
+        view, frustum = of_tile(numbers, maps.views, row)
     u, v, depth, inside = project(view, frustum, p_world)
     scale = depth_scale(view, frustum, depth, maps.settings, maps.frusta.tiles is not None)
-    return view, index, u, v, dr.select(depth > FAR, FAR, depth), inside, scale
+    return _Place(view, index, u, v, dr.select(depth > FAR, FAR, depth), inside, scale)
 
 
 def tiled_visibility(maps: ShadowMaps, group: Group, p_world: Point3f, active: Bool | bool = True) -> Float:
@@ -85,9 +115,10 @@ def tiled_visibility(maps: ShadowMaps, group: Group, p_world: Point3f, active: B
         p_world: points. Attached. The share of each tile is detached.
         active: mask of the points to look up; the others get 1.
     """
-    tile, other, share = _tiles_at(maps, group, p_world)
-    own = visibility(maps, tile, p_world, active)
-    found = dr.fma(share, visibility(maps, other, p_world, active & (share > 0)) - own, own)
+    at = _Tiled.of(maps, group, p_world)
+    own = _visibility(maps, at.place(maps, at.tile, p_world), p_world, active)
+    beside = _visibility(maps, at.place(maps, at.other, p_world), p_world, active & (at.share > 0))
+    found = dr.fma(at.share, beside - own, own)
     return found if maps.settings.filters else _sharpened(found)
 
 
@@ -97,16 +128,33 @@ def _sharpened(visibility: Float) -> Float:
     return with_gradient(dr.clip((dr.detach(visibility) - _ENDS) * (1 / (1 - 2 * _ENDS)), 0, 1), visibility)
 
 
-def _tiles_at(maps: ShadowMaps, group: Group, p_world: Point3f) -> tuple[UInt32, UInt32, Float]:
-    """(tile, tile beyond the nearest border, its share) of points."""
-    tiles, frusta = maps.frusta.tiles, maps.frusta
-    assert tiles is not None, "fitted with the maps"
-    x, y, _ = image_coordinates(maps.views, group[0], p_world)
-    tile = tile_of(tiles, group, x, y)
-    other, share = neighbour(tiles, (frusta.half_x, frusta.half_y), group, tile, x, y)
-    if not dr.flag(dr.JitFlag.SymbolicScope):
-        dr.eval(tile, other, share)  # otherwise each pass would find them again
-    return tile, other, share
+@dataclass(frozen=True)
+class _Tiled:
+    """Tiles of a light in which points lie: ``tile``, and beyond the nearest border ``other``, which has a ``share``.
+
+    ``numbers``: as of :func:`_place_in_map`.
+    """
+
+    tile: UInt32
+    other: UInt32
+    share: Float
+    numbers: TileNumbers | None
+
+    @classmethod
+    def of(cls, maps: ShadowMaps, group: Group, p_world: Point3f) -> _Tiled:
+        numbers = tile_numbers(maps.views, maps.frusta, group, 1 if dr.grad_enabled(maps.views) else dr.width(p_world))
+        x, y, _ = image_coordinates(maps.views, group[0], p_world)
+        tile = tile_of(numbers, x, y)
+        other, share = neighbour(numbers, tile, x, y)
+        if numbers.rows is not None:
+            return cls(tile, other, share, numbers)
+        if not dr.flag(dr.JitFlag.SymbolicScope):
+            dr.eval(tile, other, share)  # otherwise each pass would find them again
+        return cls(tile, other, share, None)
+
+    def place(self, maps: ShadowMaps, tile: UInt32, p_world: Point3f) -> _Place:
+        """Places of the points in one of their tiles."""
+        return _place_in_map(maps, tile, p_world, self.numbers)
 
 
 def transmittance(maps: ShadowMaps, map_index: UInt32 | int, p_world: Point3f, active: Bool | bool = True) -> list[Float]:
@@ -123,12 +171,16 @@ def transmittance(maps: ShadowMaps, map_index: UInt32 | int, p_world: Point3f, a
     """
     stored = maps.transmittance
     assert stored is not None, "looked up only where there are translucent casters"
-    _, index, u, v, depth, inside, scale = _place_in_map(maps, map_index, p_world)
+    return _transmittance(maps, stored, _place_in_map(maps, map_index, p_world), active)
+
+
+def _transmittance(maps: ShadowMaps, stored: TransmittanceMaps, place: _Place, active: Bool | bool) -> list[Float]:
+    """:func:`transmittance` of points at known places in the maps."""
     found = branch(
-        inside & backend(maps.values).Bool(active),
+        place.inside & backend(maps.values).Bool(active),
         lambda *lanes: _light_left(maps, stored, *lanes),
         lambda *lanes: tuple(type(lanes[1])(1) for _ in range(stored.colours)),
-        (index, u, v, depth, scale.deviation),
+        (place.index, place.u, place.v, place.depth, place.scale.deviation),
         "transmittance",
     )
     return list(found)
@@ -136,10 +188,12 @@ def transmittance(maps: ShadowMaps, map_index: UInt32 | int, p_world: Point3f, a
 
 def tiled_transmittance(maps: ShadowMaps, group: Group, p_world: Point3f, active: Bool | bool = True) -> list[Float]:
     """As :func:`transmittance`, from the tiles of a light, as :func:`tiled_visibility`."""
-    tile, other, share = _tiles_at(maps, group, p_world)
-    own = transmittance(maps, tile, p_world, active)
-    beside = transmittance(maps, other, p_world, active & (share > 0))
-    return [dr.fma(share, b - a, a) for a, b in zip(own, beside, strict=True)]
+    stored = maps.transmittance
+    assert stored is not None, "looked up only where there are translucent casters"
+    at = _Tiled.of(maps, group, p_world)
+    own = _transmittance(maps, stored, at.place(maps, at.tile, p_world), active)
+    beside = _transmittance(maps, stored, at.place(maps, at.other, p_world), active & (at.share > 0))
+    return [dr.fma(at.share, b - a, a) for a, b in zip(own, beside, strict=True)]
 
 
 def _light_left(

@@ -12,7 +12,7 @@ from ..jit.types import Bool, Float, Point3f, UInt32
 from .grouped import grouped_maxima, numbers_of
 from .light_camera import Views, of_map, to_light_space
 from .nearest_planes import nearest_planes
-from .tiles import Group, Tiles, tile_of
+from .tiles import Group, TileNumbers, Tiles, tile_of
 
 # Bins between which a node may be cut, and the least share of its points on either side.
 _BINS, _LEAST = 32, 1 / 8
@@ -48,7 +48,9 @@ def fit_tiles(
             lit &= module.Bool(seen[1])
             found = _divided(x, y, lit, number)
             if planes:
-                slope_x, slope_y, _ = nearest_planes((x, y, z), tile_of(found, (0, number), x, y), number, lit)
+                slope_x, slope_y, _ = nearest_planes(
+                    (x, y, z), tile_of(TileNumbers.of(found.by_name(), (0, number)), x, y), number, lit
+                )
                 found = replace(found, slope_x=slope_x, slope_y=slope_y)
             if previous is not None:
                 kept = previous.rows(dr.arange(module.UInt32, number) + first)
@@ -203,7 +205,7 @@ def _sizes(ends: Sequence[Float]) -> Float:
 def _mean_size(tiles: Tiles, group: Group, x: Float, y: Float, active: Bool) -> Float:
     """Mean of :func:`_sizes` over the points (x, y), of those parts of a light's tiles that hold points."""
     first, number = group
-    tile = tile_of(tiles, group, x, y) - first
+    tile = tile_of(TileNumbers.of(tiles.by_name(), group), x, y) - first
     counts = _counts(tile, number, active)
     sizes: Float = dr.select(counts > 0, _sizes(_maxima([-x, -y, x, y], tile, number, active)), 0)
     return dr.sum(sizes * counts) / dr.maximum(dr.sum(counts), 1)

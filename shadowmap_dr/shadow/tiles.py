@@ -11,16 +11,19 @@ divided (Fernando et al., "Adaptive Shadow Maps", 2001, with a quadtree).
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import ModuleType
 
 import drjit as dr
 
-from ..jit.arrays import backend, ravel
+from ..jit.arrays import backend
 from ..jit.types import Bool, Float, UInt32
 
 #: Width of the band along a border in which two tiles are blended, on either side, in half-widths of the smaller tile's map.
 BAND = 0.01
+# Most tiles of a light from whose numbers points select, and least number of points that do: otherwise they gather.
+_SELECTED, _MANY = 8, 1 << 16
 #: Maps of a light: number of the first one, and of its tiles.
 Group = tuple[int, int]
 
@@ -51,6 +54,10 @@ class Tiles:
         """All numbers, (M,) each, in a fixed order."""
         return [self.low_x, self.low_y, self.high_x, self.high_y, self.slope_x, self.slope_y]
 
+    def by_name(self) -> dict[str, Float]:
+        """All numbers, (M,) each."""
+        return {name: getattr(self, name) for name in self.__dataclass_fields__}
+
     def rows(self, index: UInt32) -> Tiles:
         """The rectangles of some maps."""
         return Tiles(*(dr.gather(backend(index).Float, column, index) for column in self.columns()))
@@ -60,51 +67,91 @@ class Tiles:
         return (x >= self.low_x) & (x < self.high_x) & (y >= self.low_y) & (y < self.high_y)
 
 
-def tile_of(tiles: Tiles, group: Group, x: Float, y: Float) -> UInt32:
-    """Number of the map whose tile holds points of a light's image plane.
+@dataclass(frozen=True)
+class TileNumbers:
+    """Numbers of the maps of one light, read by points for the tile that each lies in. Detached.
+
+    Attributes:
+        group: maps of the light, a power of two.
+        columns: numbers of all maps, (M,) each, by name.
+        rows: numbers of the light's maps, of width 1 each: by name one for each map. None: points gather from ``columns``.
+
+    Selecting from a few numbers that all points share takes a third of the time of gathering one for each point.
+    """
+
+    group: Group
+    columns: Mapping[str, Float]
+    rows: Mapping[str, list[Float]] | None = None
+
+    @classmethod
+    def of(cls, columns: Mapping[str, Float], group: Group, points: int = 1) -> TileNumbers:
+        """Prepare the numbers (``columns``) of the maps of a light (``group``) for so many ``points``."""
+        first, number = group
+        if number > _SELECTED or points < _MANY or dr.flag(dr.JitFlag.SymbolicScope):
+            return cls(group, columns)
+        rows = {
+            name: [dr.gather(type(column), column, backend(column).UInt32(first + k)) for k in range(number)]
+            for name, column in columns.items()
+        }
+        dr.eval(rows)
+        return cls(group, columns, rows)
+
+    def at(self, names: Sequence[str], tile: UInt32) -> list[Float]:
+        """Numbers (those of ``names``) of the map ``tile``, one of the light's, of each point."""
+        if self.rows is None:
+            return [dr.gather(type(column), column, tile) for column in (self.columns[name] for name in names)]
+        place, found = tile - self.group[0], [self.rows[name] for name in names]
+        while len(found[0]) > 1:
+            upper = (place & 1) == 1
+            found = [[dr.select(upper, b, a) for a, b in zip(rows[::2], rows[1::2], strict=True)] for rows in found]
+            place >>= 1
+        return [rows[0] for rows in found]
+
+
+def tile_of(numbers: TileNumbers, x: Float, y: Float) -> UInt32:
+    """Number of the map whose tile holds points of a light's image plane. ``numbers``: with those of ``Tiles``.
 
     The tiles of a light are the leaves of a k-d tree, in its order: the first tile in the upper half of a node begins at the
     border of the halves, and differs from the first one in the lower half by that coordinate.
     """
-    first, number = group
-    module = backend(x)
-    corners = ravel(module.Array2f(tiles.low_x, tiles.low_y))
-    found = dr.full(module.UInt32, first, dr.width(x))
-    low = dr.gather(module.Array2f, corners, found)
+    first, number = numbers.group
+    names = ("low_x", "low_y")
+    found = dr.full(backend(x).UInt32, first, dr.width(x))
+    low = numbers.at(names, found)
     half = number // 2
     while half:
         upper = found + half
-        border = dr.gather(module.Array2f, corners, upper)
-        beyond = dr.select(border.x > low.x, x >= border.x, y >= border.y)
-        found, low = dr.select(beyond, upper, found), dr.select(beyond, border, low)
+        border = numbers.at(names, upper)
+        beyond = dr.select(border[0] > low[0], x >= border[0], y >= border[1])
+        found = dr.select(beyond, upper, found)
+        low = [dr.select(beyond, b, a) for a, b in zip(low, border, strict=True)]
         half //= 2
     return found
 
 
-def neighbour(tiles: Tiles, halves: tuple[Float, Float], group: Group, tile: UInt32, x: Float, y: Float) -> tuple[UInt32, Float]:
+def neighbour(numbers: TileNumbers, tile: UInt32, x: Float, y: Float) -> tuple[UInt32, Float]:
     """(tile beyond the nearest border, its share of the light) for points that lie in a tile; the share is 0 beyond the band.
 
     Args:
-        tiles: of all maps.
-        halves: half-widths and half-heights (M,) of the maps.
-        group: maps of the light.
+        numbers: with those of ``Tiles``, and ``half_x`` and ``half_y`` of ``Frusta``.
         tile: tile of each point.
         x, y: points in the light's image plane.
     """
-    module = backend(x)
-    own = tiles.rows(tile)
-    gaps = [x - own.low_x, own.high_x - x, y - own.low_y, own.high_y - y]
-    sizes = [dr.gather(module.Float, half, tile) for half in halves]
+    halves = ("half_x", "half_y")
+    low_x, low_y, high_x, high_y, *sizes = numbers.at(("low_x", "low_y", "high_x", "high_y", *halves), tile)
+    gaps = [x - low_x, high_x - x, y - low_y, high_y - y]
     # The nearest border, as the map's texels count.
     shares = [gap / sizes[k // 2] for k, gap in enumerate(gaps)]
-    nearest = dr.minimum(dr.minimum(shares[0], shares[1]), dr.minimum(shares[2], shares[3]))
+    beside: Float = dr.minimum(shares[0], shares[1])
+    above: Float = dr.minimum(shares[2], shares[3])
+    nearest: Float = dr.minimum(beside, above)
     near = nearest < BAND
     moves = [dr.select(near & (share == nearest), 2 * gap, 0) for share, gap in zip(shares, gaps, strict=True)]
     across = (shares[0] == nearest) | (shares[1] == nearest)
     # Beyond the border, as far as the point is before it.
-    beyond = tile_of(tiles, group, x - moves[0] + moves[1], y - moves[2] + moves[3])
+    beyond = tile_of(numbers, x - moves[0] + moves[1], y - moves[2] + moves[3])
     gap = dr.select(across, nearest * sizes[0], nearest * sizes[1])
-    theirs = [dr.gather(module.Float, half, beyond) for half in halves]
-    band = BAND * dr.select(across, dr.minimum(sizes[0], theirs[0]), dr.minimum(sizes[1], theirs[1]))
+    narrower = [dr.select(own < other, own, other) for own, other in zip(sizes, numbers.at(halves, beyond), strict=True)]
+    band = BAND * dr.select(across, narrower[0], narrower[1])
     share = dr.maximum(0.5 - 0.5 * gap / band, 0)
     return beyond, dr.select(near & (beyond != tile), share, 0)

@@ -147,6 +147,28 @@ def test_both_modes_agree_across_tiles() -> None:
 
 
 @pytest.mark.usefixtures("variant")
+@pytest.mark.parametrize("number", [2, 4, 8])
+def test_numbers_of_tiles_that_are_selected_or_gathered(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Large images select the numbers of a point's tile from those of all tiles, small ones gather them: the same image, and the
+    same derivatives by the houses' places."""
+    renderer = Renderer.from_scene(town(), shadow_map_resolution=64, shadow_tiles=number)
+    assert renderer.plan.maps == number
+    rest = renderer.data.geometry.shape_positions("houses")
+    weight = mi.TensorXf(np.random.default_rng(1).normal(size=(SIZE, SIZE, 3)).astype(np.float32))
+    found = []
+    for least in (1, 1 << 30):
+        monkeypatch.setattr("shadowmap_dr.shadow.tiles._MANY", least)
+        places = mi.Point3f(rest)
+        dr.enable_grad(places)
+        image = renderer.render({"houses": places})
+        dr.backward(dr.sum(image * weight, axis=None))
+        found.append((np.array(image), np.array(dr.grad(places))))
+    assert np.abs(found[0][1]).max() > 0
+    for selected, gathered in zip(*found, strict=True):
+        np.testing.assert_allclose(selected, gathered, atol=1e-4 * np.abs(gathered).max())
+
+
+@pytest.mark.usefixtures("variant")
 def test_frozen_steps_with_tiles() -> None:
     """A recording replays with a turning sun, and equals the step that is not recorded."""
     renderer, plain = (Renderer.from_scene(town(), shadow_map_resolution=64, shadow_tiles=4) for _ in range(2))

@@ -20,7 +20,7 @@ from shadowmap_dr.shadow import (
     with_depths_from_planes,
 )
 from shadowmap_dr.shadow.light_camera import of_map
-from shadowmap_dr.shadow.tiles import BAND, neighbour, tile_of
+from shadowmap_dr.shadow.tiles import BAND, TileNumbers, neighbour, tile_of
 
 Array = npt.NDArray[np.float64]
 pytestmark = pytest.mark.usefixtures("variant")
@@ -95,7 +95,10 @@ def test_tiles_have_small_texels_where_many_points_are(direction: tuple[float, f
     assert tiles is not None
     xy = in_plane(views, points)
     found = holders(tiles, xy)
-    np.testing.assert_array_equal(tile_of(tiles, (0, number), *(mi.Float(xy[:, k]) for k in (0, 1))).numpy(), found)
+    for points_of_image in (1, 1 << 20):  # few gather the numbers of tiles, many select from them
+        numbers = TileNumbers.of(tiles.by_name(), (0, number), points_of_image)
+        assert (numbers.rows is None) == (points_of_image == 1 or number > 8)
+        np.testing.assert_array_equal(tile_of(numbers, *(mi.Float(xy[:, k]) for k in (0, 1))).numpy(), found)
     counts = np.bincount(found, minlength=number)  # fails if a point has no tile
     # Each cut leaves an eighth of the points on either side.
     assert counts.min() > 0.9 * len(points) / 8 ** np.log2(number)
@@ -146,7 +149,9 @@ def test_lights_have_tiles_of_their_own() -> None:
     assert np.isinf(box[[0, 5]]).all() and np.isfinite(box[1:5]).any(1).all() and np.isfinite(box[6:8]).sum() == 2
     for first, number in ((1, 4), (6, 2)):
         p = to_light_space(of_map(views, mi.UInt32(first), views.count), seen(points)[0])
-        counts = np.bincount(tile_of(tiles, (first, number), p.x, p.y).numpy()[masked] - first, minlength=number)
+        counts = np.bincount(
+            tile_of(TileNumbers.of(tiles.by_name(), (first, number)), p.x, p.y).numpy()[masked] - first, minlength=number
+        )
         assert counts.min() > 0.9 * masked.sum() / 8 ** np.log2(number)
 
 
@@ -171,17 +176,19 @@ def test_no_points_and_equal_points_end_in_tiles_all_the_same() -> None:
     for points in (nothing, (nothing[0] + 2, dr.full(mi.Bool, True, 50))):
         tiles = fit_tiles(views, [(0, 4)], points, None)
         assert tiles is not None
-        found = tile_of(tiles, (0, 4), points[0].x, points[0].y).numpy()
+        found = tile_of(TileNumbers.of(tiles.by_name(), (0, 4)), points[0].x, points[0].y).numpy()
         assert found.max() < 4
         assert not tiles.slope_x.numpy().any() and not tiles.slope_y.numpy().any()
 
 
-def test_shares_meet_at_borders() -> None:
+@pytest.mark.parametrize("points_of_image", [1, 1 << 20])
+def test_shares_meet_at_borders(points_of_image: int) -> None:
     """One half on either side of a border, none beyond the band, and the same from both sides."""
     points, views, number = receding(), views_of((0.0, 0.0, -1.0), 4), 4
     tiles = fit_tiles(views, [(0, number)], seen(points), None)
     assert tiles is not None
     halves = mi.Float([10.0, 20.0, 30.0, 40.0]), mi.Float([15.0, 25.0, 35.0, 45.0])
+    numbers = TileNumbers.of({**tiles.by_name(), "half_x": halves[0], "half_y": halves[1]}, (0, number), points_of_image)
     box = rectangles(tiles)
     generator = np.random.default_rng(0)
     for k in range(number):
@@ -197,8 +204,8 @@ def test_shares_meet_at_borders() -> None:
                     xy = np.empty((50, 2), np.float32)
                     xy[:, axis], xy[:, 1 - axis] = border + sign * gap, along
                     x, y = mi.Float(xy[:, 0]), mi.Float(xy[:, 1])
-                    tile = tile_of(tiles, (0, number), x, y)
-                    other, share = neighbour(tiles, halves, (0, number), tile, x, y)
+                    tile = tile_of(numbers, x, y)
+                    other, share = neighbour(numbers, tile, x, y)
                     sides.append((tile.numpy(), other.numpy(), share.numpy()))
                 if gap == 3.0:
                     assert not sides[0][2].any() and not sides[1][2].any()

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import mitsuba as mi
 
-from ..jit.handover import Results
+from ..jit.handover import PackedResults
 from ..rendering.renderer import Renderer
 from ..rendering.waiting import MOST_SAMPLES
 from .parameter_state import ParameterState
@@ -22,7 +22,7 @@ class _Handed:
     scene: ParameterState
     camera: ParameterState
     renderer: Renderer
-    results: Results
+    results: PackedResults
 
 
 class HandedResults:
@@ -38,7 +38,7 @@ class HandedResults:
         weight: int,
         state: tuple[ParameterState, ParameterState],
         renderer: Renderer,
-        results: Results,
+        results: PackedResults,
     ) -> None:
         """Let results wait. Those of other states of the scene are dropped, and those that have waited longest make room.
 
@@ -51,7 +51,9 @@ class HandedResults:
         while len(self._images) > 1 and sum(one.weight for one in self._images) > MOST_SAMPLES:
             self._images.pop(0)
 
-    def take(self, sensor: mi.Sensor, spp: int, scene: ParameterState, camera: ParameterState) -> tuple[Results, Renderer | None]:
+    def take(
+        self, sensor: mi.Sensor, spp: int, scene: ParameterState, camera: ParameterState
+    ) -> tuple[PackedResults, Renderer | None]:
         """Remove and return the results and the renderer of an image that would be the same now; else none.
 
         ``scene``, ``camera``: the current parameters.
@@ -61,7 +63,7 @@ class HandedResults:
             if one.sensor is sensor and one.spp == spp and one.camera.same(camera):
                 self._images.remove(one)
                 return one.results, one.renderer
-        return [], None
+        return PackedResults.of([]), None
 
     def follow(self, before: ParameterState, scene: mi.Scene) -> None:
         """Note that a replay, and nothing else, has changed a scene's parameters: it renews the arrays of materials."""

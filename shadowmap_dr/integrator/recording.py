@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from ..jit.arrays import own_memory
 from ..jit.frozen import Frozen
-from ..jit.handover import Results, keeping, using
+from ..jit.handover import PackedResults, keeping, using
 from ..jit.pytree import attached_places, tree_map
 from ..jit.types import AnyArray, TensorXf
 from ..rendering.extended_lights import SoftFrusta
@@ -30,7 +30,7 @@ class FrozenPasses:
     def __init__(self) -> None:
         self._image, self._gradients = Frozen(_image), Frozen(_gradients)
 
-    def image(self, spp: int, renderer: Renderer, keep: bool) -> tuple[TensorXf, Frusta | None, SoftFrusta, Results]:
+    def image(self, spp: int, renderer: Renderer, keep: bool) -> tuple[TensorXf, Frusta | None, SoftFrusta, PackedResults]:
         """(detached image, frusta of the shadow maps, frusta of extended lights' shadow maps, results for the backward pass).
 
         ``renderer``: from :func:`plain`. ``keep``: whether there are such results.
@@ -38,10 +38,10 @@ class FrozenPasses:
         with dr.suspend_grad():
             return self._image(spp, renderer, keep)
 
-    def backward(self, spp: int, gradient: TensorXf, data: SceneData, renderer: Renderer, results: Results) -> None:
+    def backward(self, spp: int, gradient: TensorXf, data: SceneData, renderer: Renderer, results: PackedResults) -> None:
         """Add the gradients of <image, gradient> to everything that ``data`` is attached to.
 
-        ``renderer``: from :func:`plain`, with the same data, detached. ``results``: of the same image, or an empty list.
+        ``renderer``: from :func:`plain`, with the same data, detached. ``results``: of the same image, or of none.
         """
         places, outer = attached_places(data)
         if not outer:
@@ -59,10 +59,10 @@ def _owned(gradient: TensorXf) -> TensorXf:
     return own_memory(gradient) if gradient.array.state == dr.VarState.Evaluated else dr.detach(gradient)
 
 
-def _image(spp: int, renderer: Renderer, keep: bool) -> tuple[TensorXf, Frusta | None, SoftFrusta, Results]:
+def _image(spp: int, renderer: Renderer, keep: bool) -> tuple[TensorXf, Frusta | None, SoftFrusta, PackedResults]:
     with keeping() as results:
         image = renderer.render(spp=spp)
-    return image, renderer.frusta, renderer.soft_frusta, results if keep else []
+    return image, renderer.frusta, renderer.soft_frusta, PackedResults.of(results if keep else [])
 
 
 def _gradients(
@@ -70,7 +70,7 @@ def _gradients(
     places: tuple[int, ...],
     gradient: TensorXf,
     renderer: Renderer,
-    results: Results,
+    results: PackedResults,
 ) -> list[AnyArray]:
     """Gradients of the arrays at some places of the renderer's data."""
     leaves: list[AnyArray] = []
@@ -85,7 +85,7 @@ def _gradients(
         return leaf
 
     renderer = renderer.with_data(tree_map(renderer.data, attached))
-    with using(results):
+    with using(results.unpacked()):
         image = renderer.render(spp=spp)
     backward(image, gradient)
     return [dr.grad(leaf) for leaf in leaves]

@@ -10,14 +10,17 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Callable
+from itertools import count
 from typing import Any, cast
 
 import drjit as dr
 
 from .gc import gc_paused
-from .pytree import cached_by_type, fields_of, tree_map
+from .pytree import ArrayTuple, StaticTuple, cached_by_type, fields_of, tree_map
 from .types import AnyArray, PyTree
 
+# Attribute of a record in which its findings are stored.
+_FINDINGS = "_recording_findings"
 _PLAIN = (int, float, complex, str, bytes, type(None), enum.Enum, type)
 
 
@@ -104,7 +107,8 @@ def take_apart(record: PyTree) -> tuple[str, list[PyTree]]:
     """(text that describes everything in a record but the contents of its leaves, leaves).
 
     Leaves are Dr.Jit's arrays and records, Mitsuba's objects, and all other objects that no text describes. The text also says
-    which leaves are the same object. Objects with a method ``recording_text`` give their own text.
+    which leaves are the same object. Objects with a method ``recording_text`` give their own text. Records of classes that are
+    ``RECORDED_OFTEN`` store their findings, if nothing in them can change.
     """
     taken = _Taken()
     taken.walk(record)
@@ -112,32 +116,40 @@ def take_apart(record: PyTree) -> tuple[str, list[PyTree]]:
 
 
 class _Taken:
-    """Findings of :func:`take_apart`. (An inner function that calls itself would be garbage that holds arrays.)"""
+    """Findings of :func:`take_apart`. (An inner function that calls itself would be garbage that holds arrays.)
+
+    ``changing``: whether a later walk through the same records may find another text.
+    """
 
     def __init__(self) -> None:
         self.texts: list[str] = []
         self.leaves: list[PyTree] = []
+        self.changing = False
         self._numbers: dict[int, int] = {}
 
     def walk(self, value: PyTree) -> None:
         kind = type(value)
         names = _parts_of(kind)
         if names:
-            self.texts.append(kind.__qualname__)
-            for name in names:
-                self.walk(getattr(value, name))
+            if not (_is_kept(kind) and self._take(value, kind, names)):
+                self._walk_parts(value, kind, names)
         elif names is None:
             self.texts.append(repr(value))
-        elif kind is tuple or kind is list:
-            self.texts.append(f"{kind.__name__}{len(value)}")
-            for item in value:
-                self.walk(item)
+        elif kind is tuple:
+            self._walk_items(value)
+        elif kind is ArrayTuple:
+            self._take_arrays(value)
+        elif kind is list:
+            self.changing = True
+            self._walk_items(value)
         elif kind is dict:
+            self.changing = True
             self.texts.append(f"dict{len(value)}")
             for name, item in value.items():
                 self.texts.append(repr(name))
                 self.walk(item)
         elif _tells(kind):
+            self.changing |= kind is not StaticTuple
             self.texts.append(value.recording_text())
         else:
             number = self._numbers.setdefault(id(value), len(self.leaves))
@@ -145,11 +157,66 @@ class _Taken:
             if number == len(self.leaves):
                 self.leaves.append(value)
 
+    def _take_arrays(self, value: ArrayTuple) -> None:
+        """The leaves of a tuple of arrays, all at once if they are new."""
+        identities = [id(array) for array in value]
+        if len(set(identities)) < len(value) or not self._numbers.keys().isdisjoint(identities):
+            self._walk_items(value)
+            return
+        first = len(self.leaves)
+        self._numbers.update(zip(identities, count(first), strict=False))
+        self.leaves += value
+        self.texts.append(f"{first}+{len(value)}")
+
+    def _walk_items(self, value: PyTree) -> None:
+        self.texts.append(f"{type(value).__name__}{len(value)}")
+        for item in value:
+            self.walk(item)
+
+    def _walk_parts(self, value: PyTree, kind: type, names: tuple[str, ...]) -> None:
+        self.texts.append(kind.__qualname__)
+        self.changing |= not _is_frozen(kind)
+        for name in names:
+            self.walk(getattr(value, name))
+
+    def _take(self, value: PyTree, kind: type, names: tuple[str, ...]) -> bool:
+        """Take the findings of a record that are stored with it, or store them. False, and nothing is done, if a leaf was found
+        before: it has a number already."""
+        found: tuple[str, list[PyTree], list[int]] | None = vars(value).get(_FINDINGS)
+        if found is None:
+            own = _Taken()
+            own._walk_parts(value, kind, names)
+            found = " ".join(own.texts), own.leaves, [id(leaf) for leaf in own.leaves]
+            if own.changing:
+                self.changing = True
+            else:
+                object.__setattr__(value, _FINDINGS, found)
+        text, leaves, identities = found
+        if not self._numbers.keys().isdisjoint(identities):
+            return False
+        first = len(self.leaves)
+        self._numbers.update(zip(identities, count(first), strict=False))
+        self.leaves += leaves
+        self.texts.append(f"{first}({text})")
+        return True
+
 
 @cached_by_type
 def _tells(kind: type) -> bool:
     """True if objects of a class give their own text."""
     return hasattr(kind, "recording_text")
+
+
+@cached_by_type
+def _is_kept(kind: type) -> bool:
+    """True for dataclasses of which an object serves many calls. They say so by ``RECORDED_OFTEN``."""
+    return bool(getattr(kind, "RECORDED_OFTEN", False))
+
+
+@cached_by_type
+def _is_frozen(kind: type) -> bool:
+    """True for dataclasses whose fields never change."""
+    return bool(kind.__dataclass_params__.frozen)  # type: ignore[attr-defined]
 
 
 @cached_by_type

@@ -9,20 +9,63 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import TypeVar, cast
 
 import drjit as dr
 
 from .arrays import interleave, replace_grad
+from .frozen import take_apart
 from .packets import apart, packed
-from .pytree import tree_map
-from .types import Float, PyTree
+from .pytree import ArrayTuple, tree_map
+from .types import AnyArray, Float, PyTree
 
 ResultT = TypeVar("ResultT")
 TreeT = TypeVar("TreeT", bound=PyTree)
 
 #: Names of results, and the detached results, in the order of the first computation.
 Results = list[tuple[str, PyTree]]
+
+
+class _Layout:
+    """Results without their arrays. (No record: recordings do not walk through it.)"""
+
+    def __init__(self, results: Results) -> None:
+        self.results = tree_map(results, lambda array: type(array)())
+        self._text = take_apart(results)[0]
+
+    def recording_text(self) -> str:
+        """Everything but the arrays, as it was when the results were packed."""
+        return self._text
+
+
+@dataclass(frozen=True)
+class PackedResults:
+    """Results as one tuple of arrays: to walk through their records for each recording would take longer than to pass them on."""
+
+    layout: _Layout
+    arrays: ArrayTuple
+
+    @classmethod
+    def of(cls, results: Results) -> PackedResults:
+        """Pack results."""
+        arrays: list[AnyArray] = []
+
+        def collect(array: AnyArray) -> AnyArray:
+            arrays.append(array)
+            return array
+
+        tree_map(results, collect)
+        return cls(_Layout(results), ArrayTuple(arrays))
+
+    def unpacked(self) -> Results:
+        """The results."""
+        given = iter(self.arrays)
+        found: Results = tree_map(self.layout.results, lambda array: next(given))
+        return found
+
+    def __bool__(self) -> bool:
+        return bool(self.arrays)
 
 
 class _State(threading.local):

@@ -15,7 +15,7 @@ from .types import AnyArray, PyTree
 
 ResultT = TypeVar("ResultT")
 # Roles of values in trees.
-_ARRAY, _TRANSFORM, _SEQUENCE, _MAPPING, _RECORD, _STRUCT, _OTHER = range(7)
+_ARRAY, _ARRAYS, _TRANSFORM, _SEQUENCE, _MAPPING, _RECORD, _STRUCT, _OTHER = range(8)
 
 
 class StaticTuple(tuple[ResultT, ...]):
@@ -27,6 +27,10 @@ class StaticTuple(tuple[ResultT, ...]):
         if found is None:
             found = vars(self)["text"] = hashlib.sha256(repr(tuple(self)).encode()).hexdigest()
         return found
+
+
+class ArrayTuple(tuple[AnyArray, ...]):
+    """A tuple of Dr.Jit's arrays and nothing else. Recordings take all of its arrays at once."""
 
 
 def tree_map(value: PyTree, function: Callable[[AnyArray], AnyArray]) -> PyTree:
@@ -52,6 +56,8 @@ def tree_map(value: PyTree, function: Callable[[AnyArray], AnyArray]) -> PyTree:
         copy = object.__new__(type(value))
         vars(copy).update(new)
         return copy
+    if role == _ARRAYS:
+        return ArrayTuple(map(function, value))
     if role == _SEQUENCE:
         return type(value)([tree_map(item, function) for item in value])
     if role == _MAPPING:
@@ -86,6 +92,8 @@ def _role_of(kind: type) -> int:
         return _TRANSFORM
     if issubclass(kind, StaticTuple):
         return _OTHER
+    if issubclass(kind, ArrayTuple):
+        return _ARRAYS
     if issubclass(kind, tuple | list):
         return _SEQUENCE
     if issubclass(kind, dict):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import drjit as dr
 import numpy as np
@@ -62,6 +63,8 @@ class Topology:
             hide nothing.
         owners: (2 E,) faces of each edge, twice the same at an edge of one shape; None without ``see_through_faces``.
     """
+
+    RECORDED_OFTEN: ClassVar[bool] = True
 
     edges: UInt32
     opposite: UInt32

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields, replace
 from difflib import get_close_matches
 from numbers import Integral, Real
-from typing import Any
+from typing import Any, ClassVar
 
 from ..errors import ShadowmapError, did_you_mean
 from ..shadow import MAX_TILES, ShadowSettings
@@ -63,6 +63,8 @@ class RenderSettings:
         aovs: names of further channels, see :data:`shadowmap_dr.rendering.film.aovs.AOVS`. Text with commas is split into a
             tuple, as in the plug-in.
     """
+
+    RECORDED_OFTEN: ClassVar[bool] = True
 
     shadow: ShadowSettings = field(default_factory=lambda: ShadowSettings(**_automatic({})))
     antialias: bool = True

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate
-from typing import Any
+from typing import Any, ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -61,6 +61,8 @@ class MapPlan:
     ``planes``: index of the largest face of each planar shape, of any face for other shapes. ``planar``: Bool (S,).
     ``center``, ``radius``: a sphere around the scene at rest, world space, for the fixed frusta of ``compat``.
     """
+
+    RECORDED_OFTEN: ClassVar[bool] = True
 
     kinds: tuple[str, ...]
     tiles: tuple[int, ...]

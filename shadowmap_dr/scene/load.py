@@ -55,6 +55,8 @@ class SceneData:
     only_cosines  whether all BSDFs are the cosine of the light's direction times a factor that no direction changes
     """
 
+    RECORDED_OFTEN: ClassVar[bool] = True
+
     scene: mi.Scene
     geometry: Geometry
     sensors: tuple[tuple[Sensor, ...], ...]

@@ -26,7 +26,7 @@ def given(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     backward = FrozenPasses.backward
 
     def noted(self: FrozenPasses, spp: int, gradient: Any, data: Any, renderer: Any, results: Any) -> None:
-        counts.append(len(results))
+        counts.append(len(results.unpacked()))
         backward(self, spp, gradient, data, renderer, results)
 
     monkeypatch.setattr(FrozenPasses, "backward", noted)

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from shadowmap_dr.jit.arrays import interleave
-from shadowmap_dr.jit.handover import Results, computed, evaluated, interleaved, keeping, using
+from shadowmap_dr.jit.frozen import take_apart
+from shadowmap_dr.jit.handover import PackedResults, Results, computed, evaluated, interleaved, keeping, using
 
 
 def steps(x: Any, calls: list[str]) -> Any:
@@ -94,3 +95,24 @@ def test_results_are_kept_for_one_computation(variant: str) -> None:
         evaluated("value", mi.Float(1))
     evaluated("value", mi.Float(2))
     assert not outer and [float(value[0]) for _, value in inner] == [1]
+
+
+def test_packed_results(variant: str) -> None:
+    """One tuple of arrays, which recordings take at once, in the place of records; the text tells different layouts apart."""
+    found, results, _ = first(mi.Float(1, 2, 3))
+    packed = PackedResults.of(results)
+    assert packed and not PackedResults.of([])
+    text, leaves = take_apart(packed)
+    assert [id(leaf) for leaf in leaves] == [id(array) for array in packed.arrays] and len(leaves) == 3
+    back = packed.unpacked()
+    assert [name for name, _ in back] == [name for name, _ in results]
+    for (_, one), (_, two) in zip(back, results, strict=True):
+        np.testing.assert_array_equal(np.array(one), np.array(two))
+    with using(back):
+        np.testing.assert_array_equal(steps(mi.Float(1, 2, 3), []).numpy(), found.numpy())
+    # The same layout with other arrays is the same recording, another layout is not, nor are arrays that came before.
+    assert take_apart(PackedResults.of(first(mi.Float(4, 5, 6))[1]))[0] == text
+    assert take_apart(PackedResults.of(results[:2]))[0] != text
+    shared, again = take_apart([leaves[1], packed])
+    other, apart_ = take_apart([mi.Float(0), packed])
+    assert len(again) == 3 and len(apart_) == 4 and shared != other

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -65,6 +66,8 @@ class SoftPlan:
     ``hides``: shape that casts no shadow of this light: its own, unless parts of it see others of it, ``facing``; then these cast
     shadows with the sides that shine.
     """
+
+    RECORDED_OFTEN: ClassVar[bool] = True
 
     parts: AreaPlan | SkyPlan
     kind: str

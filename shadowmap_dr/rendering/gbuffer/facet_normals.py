@@ -9,6 +9,7 @@ normal, so the mean normal is shaded.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -32,6 +33,8 @@ class FlatFaces:
 
     ``flat``: ``Bool`` (F,), True for flat faces.
     """
+
+    RECORDED_OFTEN: ClassVar[bool] = True
 
     start: UInt32
     faces: UInt32

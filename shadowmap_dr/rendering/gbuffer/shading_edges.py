@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -74,6 +74,8 @@ class ShadingEdges:
     attributed  (number of the shape, its edges at which attributes may differ)
     textured    (number of the shape, its edges at which texture coordinates may differ)
     """
+
+    RECORDED_OFTEN: ClassVar[bool] = True
 
     always: Bool
     bendable: Bool | None

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from math import inf
+from typing import ClassVar
 
 import drjit as dr
 import numpy as np
@@ -53,6 +54,8 @@ class Translucency:
         fixed: number of layers that was asked for, None for as many as there are.
         texel_density: of transmittance maps, see :func:`~shadowmap_dr.rendering.light_tiles.texel_density`.
     """
+
+    RECORDED_OFTEN: ClassVar[bool] = True
 
     opaque: Bool
     faces: Faces | None

@@ -13,7 +13,7 @@ import pytest
 from integrator_scenes import camera, floor, render, shadowmap, small_scene
 
 from shadowmap_dr import Renderer, ShadowmapError
-from shadowmap_dr.rendering.film.film import Margin
+from shadowmap_dr.rendering.film.film import Margin, develop
 from shadowmap_dr.scene.sensor import sensors_of
 
 SIZE = 32
@@ -102,6 +102,30 @@ def test_box_is_left_alone(variant: str) -> None:
         assert np.array_equal(render(plain, spp=spp), render(bordered, spp=spp))
     (sensor,) = sensors_of(bordered.sensors()[0])
     assert sensor.border == 0
+
+
+@pytest.mark.parametrize("factor", [2, 3])
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_means_over_samples_and_their_derivatives(variant: str, factor: int, channels: int) -> None:
+    """A box filter gives the means over the samples of each pixel. In both modes derivatives are those of NumPy's means."""
+    (sensor,) = sensors_of(mi.load_dict(camera(SIZE)))
+    assert sensor.filter.is_box
+    generator = np.random.default_rng(factor)
+    values, change, weight = (generator.normal(size=(5 * k, 7 * k, channels)).astype(np.float32) for k in (factor, factor, 1))
+
+    def means(samples: np.ndarray) -> np.ndarray:
+        return samples.reshape(5, factor, 7, factor, channels).mean((1, 3))
+
+    t, samples = mi.Float(0), mi.TensorXf(values)
+    dr.enable_grad(t)
+    found = develop([mi.TensorXf(values) + t * mi.TensorXf(change)], sensor, factor)
+    dr.forward(t)
+    np.testing.assert_allclose(found.numpy(), means(values), atol=1e-6)
+    np.testing.assert_allclose(dr.grad(found).numpy(), means(change), atol=1e-6)
+    dr.enable_grad(samples)
+    dr.backward(dr.sum(develop([samples], sensor, factor) * mi.TensorXf(weight), axis=None))
+    expected = np.repeat(np.repeat(weight, factor, 0), factor, 1) / factor**2
+    np.testing.assert_allclose(dr.grad(samples).numpy(), expected, rtol=1e-6)
 
 
 def test_further_channels_are_not_filtered(variant: str) -> None:

@@ -21,7 +21,7 @@ from ..jit.broadcast import from_one_buffer, look_up
 from ..jit.kernel_inputs import float_input, split
 from ..jit.types import AnyArray, Bool, Float, Point3f, UInt32, Vector3f, Vector4f
 from ..jit.vectors import unit
-from .tiles import Group, TileNumbers, Tiles
+from .tiles import Group, Rows, TileNumbers, Tiles, rows_of
 
 #: Half-angle (tangent) of one cube face, before the margin for the filter.
 CUBE_FACE = 1.0
@@ -136,6 +136,8 @@ class Frusta:
         return replace(joined, tiles=Tiles(*(dr.concat(list(c)) for c in zip(*(t.columns() for t in tiles), strict=True))))
 
 
+# Least number of points that select from the numbers of maps, and most maps whose numbers are arrays of their own.
+_MANY, _MOST_ROWS = 1 << 16, 16
 # Names of the axis of depths among the numbers of tiles.
 _FORWARD = ("forward_x", "forward_y", "forward_z")
 ViewsOrFrusta = TypeVar("ViewsOrFrusta", Views, Frusta)
@@ -244,16 +246,29 @@ def of_tile(numbers: TileNumbers, views: Views, tile: UInt32) -> tuple[Views, Fr
     return replace(common, forward=module.Array3f(*numbers.at(_FORWARD, tile))), frustum
 
 
-def tile_numbers(views: Views, frusta: Frusta, group: Group, points: int = 1) -> TileNumbers:
-    """Numbers in which the maps of a light differ from each other, for so many ``points``. Detached.
+def tile_rows(views: Views, frusta: Frusta, points: int) -> Rows | None:
+    """Numbers of all maps, from which many ``points`` select. Detached.
+
+    None for few points or many maps, without tiles, and if the views are attached: points gather these numbers.
+    """
+    if frusta.tiles is None or points < _MANY or views.count > _MOST_ROWS or dr.grad_enabled(views):
+        return None
+    return rows_of(_numbers(views, frusta))
+
+
+def tile_numbers(views: Views, frusta: Frusta, group: Group, rows: Rows | None) -> TileNumbers:
+    """Numbers in which the maps of a light differ from each other. ``rows``: from :func:`tile_rows`. Detached.
 
     The tiles of a light share its camera; only the axis of depths is their own.
     """
-    tiles = frusta.tiles
-    assert tiles is not None, "a light has several maps"
-    forward = dict(zip(_FORWARD, dr.detach(views).forward, strict=True))
-    own = dict(zip(Frusta.names(), frusta.columns(), strict=True))
-    return TileNumbers.of({**own, **tiles.by_name(), **forward}, group, points)
+    return TileNumbers.of(_numbers(views, frusta), group, rows)
+
+
+def _numbers(views: Views, frusta: Frusta) -> dict[str, Float]:
+    """All numbers of maps that may be tiles, by name, (M,) each."""
+    assert frusta.tiles is not None, "a light has several maps"
+    forward = zip(_FORWARD, dr.detach(views).forward, strict=True)
+    return {**dict(zip(Frusta.names(), frusta.columns(), strict=True)), **frusta.tiles.by_name(), **dict(forward)}
 
 
 def to_light_space(view: Views, p_world: Point3f) -> Point3f:

@@ -142,7 +142,7 @@ class _Tiled:
 
     @classmethod
     def of(cls, maps: ShadowMaps, group: Group, p_world: Point3f) -> _Tiled:
-        numbers = tile_numbers(maps.views, maps.frusta, group, 1 if dr.grad_enabled(maps.views) else dr.width(p_world))
+        numbers = tile_numbers(maps.views, maps.frusta, group, maps.tile_rows)
         x, y, _ = image_coordinates(maps.views, group[0], p_world)
         tile = tile_of(numbers, x, y)
         other, share = neighbour(numbers, tile, x, y)
@@ -322,12 +322,10 @@ def bilinear(
     size = (maps.settings if values is None else maps.settings.of_transmittance).resolution
     at = Texels(size, map_index, u, v, active)
     stored, channels, first, used = values or (maps.values, maps.channels, 0, maps.channels)
-    # Few pixels read a texel: a copy of all texels for each thread and each look-up would cost more than atomic additions.
-    mode = dr.ReduceMode.Auto if values is None else dr.ReduceMode.Direct
     rows = []
     for j in range(2):
         use = [active & at.inside(i, j) if outside_reads_zero else active for i in range(2)]
-        left, right = (stored_texel(stored, channels, at.index(i, j), use[i], (first, used), mode) for i in range(2))
+        left, right = (stored_texel(stored, channels, at.index(i, j), use[i], (first, used)) for i in range(2))
         rows.append([dr.fma(b - a, at.fx, a) for a, b in zip(left, right, strict=True)])
     return [value for a, b in zip(*rows, strict=True) for value in entries(dr.fma(b - a, at.fy, a))]
 

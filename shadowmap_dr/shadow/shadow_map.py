@@ -16,13 +16,14 @@ from ..raster import RasterOutput, Topology, antialias, visible_triangles
 from ..raster.screen_planes import pixel_depth
 from ..raster.types import pixel_coordinates
 from .filters import filter_kernel, filter_map
-from .light_camera import Frusta, Views, of_map, to_clip
+from .light_camera import Frusta, Views, of_map, tile_rows, to_clip
 from .methods.comparison import other_depth
 from .methods.depth_scale import DepthScale
 from .methods.registry import PREFILTERED
 from .methods.variance import variance_moments
 from .settings import ShadowSettings
 from .texel_depths import depth_scale, texel_depths
+from .tiles import Rows
 from .transmittance_maps import TranslucentCasters, TransmittanceMaps, render_transmittance
 
 
@@ -37,6 +38,7 @@ class ShadowMaps:
         channels: C.
         transmittance: light that translucent casters take away, None if there are none.
         copies: number of consecutive copies of values and views, one for each block of points (:meth:`for_points`).
+        tile_rows: numbers of the maps, if many points look up tiles (:meth:`for_points`); else None.
     """
 
     values: Float
@@ -46,6 +48,7 @@ class ShadowMaps:
     channels: int
     transmittance: TransmittanceMaps | None = None
     copies: int = 1
+    tile_rows: Rows | None = None
 
     @property
     def count(self) -> int:
@@ -53,14 +56,18 @@ class ShadowMaps:
         return self.views.count // self.copies
 
     def for_points(self, count: int) -> ShadowMaps:
-        """The same maps, copied for look-ups by ``count`` points at once, so that gradients are summed exactly. Attached."""
+        """The same maps, prepared for look-ups by ``count`` points at once, and copied so that gradients are summed exactly.
+
+        Attached.
+        """
+        rows = tile_rows(self.views, self.frusta, count)
         stored = () if self.transmittance is None else (self.transmittance.values,)
         (values, *columns), copies = in_copies([self.values, *stored, *self.views.columns()], count)
         if copies == 1:
-            return self
+            return self if rows is None else replace(self, tile_rows=rows)
         transmittance = self.transmittance and replace(self.transmittance, values=columns[0])
         views = Views.of(columns[len(stored) :])
-        return replace(self, values=values, views=views, transmittance=transmittance, copies=copies)
+        return replace(self, values=values, views=views, transmittance=transmittance, copies=copies, tile_rows=rows)
 
 
 def render_maps(

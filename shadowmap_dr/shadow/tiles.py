@@ -22,8 +22,8 @@ from ..jit.types import Bool, Float, UInt32
 
 #: Width of the band along a border in which two tiles are blended, on either side, in half-widths of the smaller tile's map.
 BAND = 0.01
-# Most tiles of a light from whose numbers points select, and least number of points that do: otherwise they gather.
-_SELECTED, _MANY = 8, 1 << 16
+# Most tiles of a light from whose numbers points select: with more, they gather them.
+_SELECTED = 8
 #: Maps of a light: number of the first one, and of its tiles.
 Group = tuple[int, int]
 
@@ -67,6 +67,20 @@ class Tiles:
         return (x >= self.low_x) & (x < self.high_x) & (y >= self.low_y) & (y < self.high_y)
 
 
+#: Numbers of maps, each in an array of its own: by name one for each map.
+Rows = Mapping[str, list[Float]]
+
+
+def rows_of(columns: Mapping[str, Float]) -> Rows:
+    """The numbers of all maps (``columns``, (M,) each) as arrays of width 1, evaluated."""
+    rows = {
+        name: [dr.gather(type(column), column, backend(column).UInt32(k)) for k in range(dr.width(column))]
+        for name, column in columns.items()
+    }
+    dr.eval(rows)
+    return rows
+
+
 @dataclass(frozen=True)
 class TileNumbers:
     """Numbers of the maps of one light, read by points for the tile that each lies in. Detached.
@@ -74,33 +88,26 @@ class TileNumbers:
     Attributes:
         group: maps of the light, a power of two.
         columns: numbers of all maps, (M,) each, by name.
-        rows: numbers of the light's maps, of width 1 each: by name one for each map. None: points gather from ``columns``.
+        rows: the same numbers; None: points gather from ``columns``.
 
     Selecting from a few numbers that all points share takes a third of the time of gathering one for each point.
     """
 
     group: Group
     columns: Mapping[str, Float]
-    rows: Mapping[str, list[Float]] | None = None
+    rows: Rows | None = None
 
     @classmethod
-    def of(cls, columns: Mapping[str, Float], group: Group, points: int = 1) -> TileNumbers:
-        """Prepare the numbers (``columns``) of the maps of a light (``group``) for so many ``points``."""
-        first, number = group
-        if number > _SELECTED or points < _MANY or dr.flag(dr.JitFlag.SymbolicScope):
-            return cls(group, columns)
-        rows = {
-            name: [dr.gather(type(column), column, backend(column).UInt32(first + k)) for k in range(number)]
-            for name, column in columns.items()
-        }
-        dr.eval(rows)
-        return cls(group, columns, rows)
+    def of(cls, columns: Mapping[str, Float], group: Group, rows: Rows | None = None) -> TileNumbers:
+        """The numbers of the maps of a light (``group``), given those of all maps (``rows``: from :func:`rows_of`)."""
+        return cls(group, columns, rows if group[1] <= _SELECTED else None)
 
     def at(self, names: Sequence[str], tile: UInt32) -> list[Float]:
         """Numbers (those of ``names``) of the map ``tile``, one of the light's, of each point."""
         if self.rows is None:
             return [dr.gather(type(column), column, tile) for column in (self.columns[name] for name in names)]
-        place, found = tile - self.group[0], [self.rows[name] for name in names]
+        first, number = self.group
+        place, found = tile - first, [self.rows[name][first : first + number] for name in names]
         while len(found[0]) > 1:
             upper = (place & 1) == 1
             found = [[dr.select(upper, b, a) for a, b in zip(rows[::2], rows[1::2], strict=True)] for rows in found]

@@ -157,7 +157,7 @@ def test_numbers_of_tiles_that_are_selected_or_gathered(number: int, monkeypatch
     weight = mi.TensorXf(np.random.default_rng(1).normal(size=(SIZE, SIZE, 3)).astype(np.float32))
     found = []
     for least in (1, 1 << 30):
-        monkeypatch.setattr("shadowmap_dr.shadow.tiles._MANY", least)
+        monkeypatch.setattr("shadowmap_dr.shadow.light_camera._MANY", least)
         places = mi.Point3f(rest)
         dr.enable_grad(places)
         image = renderer.render({"houses": places})

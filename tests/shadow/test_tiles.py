@@ -20,7 +20,7 @@ from shadowmap_dr.shadow import (
     with_depths_from_planes,
 )
 from shadowmap_dr.shadow.light_camera import of_map
-from shadowmap_dr.shadow.tiles import BAND, TileNumbers, neighbour, tile_of
+from shadowmap_dr.shadow.tiles import BAND, TileNumbers, neighbour, rows_of, tile_of
 
 Array = npt.NDArray[np.float64]
 pytestmark = pytest.mark.usefixtures("variant")
@@ -95,9 +95,9 @@ def test_tiles_have_small_texels_where_many_points_are(direction: tuple[float, f
     assert tiles is not None
     xy = in_plane(views, points)
     found = holders(tiles, xy)
-    for points_of_image in (1, 1 << 20):  # few gather the numbers of tiles, many select from them
-        numbers = TileNumbers.of(tiles.by_name(), (0, number), points_of_image)
-        assert (numbers.rows is None) == (points_of_image == 1 or number > 8)
+    for rows in (None, rows_of(tiles.by_name())):  # few points gather the numbers of tiles, many select from them
+        numbers = TileNumbers.of(tiles.by_name(), (0, number), rows)
+        assert (numbers.rows is None) == (rows is None or number > 8)
         np.testing.assert_array_equal(tile_of(numbers, *(mi.Float(xy[:, k]) for k in (0, 1))).numpy(), found)
     counts = np.bincount(found, minlength=number)  # fails if a point has no tile
     # Each cut leaves an eighth of the points on either side.
@@ -181,14 +181,15 @@ def test_no_points_and_equal_points_end_in_tiles_all_the_same() -> None:
         assert not tiles.slope_x.numpy().any() and not tiles.slope_y.numpy().any()
 
 
-@pytest.mark.parametrize("points_of_image", [1, 1 << 20])
-def test_shares_meet_at_borders(points_of_image: int) -> None:
+@pytest.mark.parametrize("selected", [False, True])
+def test_shares_meet_at_borders(selected: bool) -> None:
     """One half on either side of a border, none beyond the band, and the same from both sides."""
     points, views, number = receding(), views_of((0.0, 0.0, -1.0), 4), 4
     tiles = fit_tiles(views, [(0, number)], seen(points), None)
     assert tiles is not None
     halves = mi.Float([10.0, 20.0, 30.0, 40.0]), mi.Float([15.0, 25.0, 35.0, 45.0])
-    numbers = TileNumbers.of({**tiles.by_name(), "half_x": halves[0], "half_y": halves[1]}, (0, number), points_of_image)
+    columns = {**tiles.by_name(), "half_x": halves[0], "half_y": halves[1]}
+    numbers = TileNumbers.of(columns, (0, number), rows_of(columns) if selected else None)
     box = rectangles(tiles)
     generator = np.random.default_rng(0)
     for k in range(number):

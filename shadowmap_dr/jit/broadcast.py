@@ -33,11 +33,23 @@ _ArrayT = TypeVar("_ArrayT", bound="AnyArray")
 LANES = 1 << 20
 #: Lanes that add to one copy where all terms may be equal, such as those of a light's intensity. A power of two.
 LIKE_LANES = 1 << 18
+# Most numbers in the copies of an array for threads.
+_MOST_IN_COPIES = 1 << 26
 
 
 def look_up(column: Float, index: UInt32) -> Float:
     """``column[index]`` for a small array and valid indices. Attached to the column."""
     return dr.gather(type(column), column, index, mode=dr.ReduceMode.Local)
+
+
+def copies_for_threads(array: Float) -> dr.ReduceMode:
+    """Mode of look-ups by many lanes in a large array: on a CPU each thread adds gradients to a copy of its own.
+
+    An atomic addition takes several times as long. Dr.Jit does so up to a million packets; here the copies may have 256 MiB.
+    """
+    if dr.backend_v(array) == dr.JitBackend.LLVM and dr.width(array) * (dr.thread_count() + 1) <= _MOST_IN_COPIES:
+        return dr.ReduceMode.Expand
+    return dr.ReduceMode.Auto
 
 
 def one_buffer(columns: Sequence[Float]) -> Float:

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..jit.arrays import backend
 from ..jit.branches import branch
-from ..jit.broadcast import copy_of_lane
+from ..jit.broadcast import copies_for_threads, copy_of_lane
 from ..jit.kernel_inputs import float_input, int_input, uint_input
 from ..jit.types import AnyArray, Bool, Float, Point3f, UInt32
 from .filters import filter_kernel, separable_terms
@@ -322,10 +322,10 @@ def bilinear(
     size = (maps.settings if values is None else maps.settings.of_transmittance).resolution
     at = Texels(size, map_index, u, v, active)
     stored, channels, first, used = values or (maps.values, maps.channels, 0, maps.channels)
-    rows = []
+    mode, rows = copies_for_threads(stored), []
     for j in range(2):
         use = [active & at.inside(i, j) if outside_reads_zero else active for i in range(2)]
-        left, right = (stored_texel(stored, channels, at.index(i, j), use[i], (first, used)) for i in range(2))
+        left, right = (stored_texel(stored, channels, at.index(i, j), use[i], (first, used), mode) for i in range(2))
         rows.append([dr.fma(b - a, at.fx, a) for a, b in zip(left, right, strict=True)])
     return [value for a, b in zip(*rows, strict=True) for value in entries(dr.fma(b - a, at.fy, a))]
 

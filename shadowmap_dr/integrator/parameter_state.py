@@ -13,6 +13,9 @@ from ..jit.types import AnyArray
 from ..scene.changes import leaves
 from ..scene.mitsuba_objects import parameters
 
+# Bits of the number of a variable, above which that of its AD variable lies.
+_AD = 32
+
 
 @dataclass(frozen=True)
 class ParameterState:
@@ -39,7 +42,7 @@ class ParameterState:
         array = mi.Float
         for name, value in parameters(node).items():
             if isinstance(value, array):  # most are: these few lines are the fastest way
-                held.append(array(dr.detach(value)))
+                held.append(array(dr.detach(value) if value.index_ad else value))
                 if dr.grad_enabled(value):
                     attached.append(name)
                     numbers[name] = (value.index, bool(value.index_ad))
@@ -53,13 +56,14 @@ class ParameterState:
             if not dr.is_jit_v(value):
                 numbers[name] = tuple(map(tuple, leaves(type(value)(value))))
                 continue
-            flat = leaves(value)
-            which = [leaf.index for leaf in flat]
+            which = dr.detail.collect_indices(value)  # of all variables, each with the number of its AD variable above it
+            if max(which, default=0) >> _AD == 0:
+                held.append(type(value)(value))
+                numbers[name] = tuple(which)
+                continue
             held.append(type(value)(dr.detach(value)))
-            if dr.grad_enabled(value):
-                attached.append(name)
-                which += [bool(leaf.index_ad) for leaf in flat]
-            numbers[name] = tuple(which)
+            attached.append(name)
+            numbers[name] = (*(number & ((1 << _AD) - 1) for number in which), *(number >> _AD > 0 for number in which))
         return cls(numbers, tuple(attached), held)
 
     def same(self, other: ParameterState, names: Iterable[str] | None = None) -> bool:

@@ -35,10 +35,13 @@ def _walk(root: mi.Object) -> list[tuple[str, Any, type | None, mi.Object]]:
     """
     found: list[tuple[str, Any, type | None, mi.Object]] = []
     seen, prefixes = {root}, set()
+    callback, kinds = _collector(mi.variant())(), mi.Object
 
     def visit(node: mi.Object, prefix: str) -> None:
-        for name, value, kind in _parts_of(node):
-            if not isinstance(value, mi.Object):
+        callback.found = []  # one callback for all nodes: to make one takes as long as to list a node's parameters
+        node.traverse(callback)
+        for name, value, kind in callback.found:
+            if not isinstance(value, kinds):
                 found.append((prefix + name, value, kind, node))
             elif value not in seen:
                 full, number = prefix + name, 1

@@ -64,7 +64,7 @@ class Topology:
         owners: (2 E,) faces of each edge, twice the same at an edge of one shape; None without ``see_through_faces``.
     """
 
-    RECORDED_OFTEN: ClassVar[bool] = True
+    RECORDED_OFTEN: ClassVar[bool] = True  # see `jit.frozen.take_apart`
 
     edges: UInt32
     opposite: UInt32

@@ -64,7 +64,7 @@ class RenderSettings:
             tuple, as in the plug-in.
     """
 
-    RECORDED_OFTEN: ClassVar[bool] = True
+    RECORDED_OFTEN: ClassVar[bool] = True  # see `jit.frozen.take_apart`
 
     shadow: ShadowSettings = field(default_factory=lambda: ShadowSettings(**_automatic({})))
     antialias: bool = True

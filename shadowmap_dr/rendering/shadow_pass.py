@@ -62,7 +62,7 @@ class MapPlan:
     ``center``, ``radius``: a sphere around the scene at rest, world space, for the fixed frusta of ``compat``.
     """
 
-    RECORDED_OFTEN: ClassVar[bool] = True
+    RECORDED_OFTEN: ClassVar[bool] = True  # see `jit.frozen.take_apart`
 
     kinds: tuple[str, ...]
     tiles: tuple[int, ...]

@@ -55,7 +55,7 @@ class SceneData:
     only_cosines  whether all BSDFs are the cosine of the light's direction times a factor that no direction changes
     """
 
-    RECORDED_OFTEN: ClassVar[bool] = True
+    RECORDED_OFTEN: ClassVar[bool] = True  # see `jit.frozen.take_apart`
 
     scene: mi.Scene
     geometry: Geometry

@@ -67,7 +67,7 @@ class SoftPlan:
     shadows with the sides that shine.
     """
 
-    RECORDED_OFTEN: ClassVar[bool] = True
+    RECORDED_OFTEN: ClassVar[bool] = True  # see `jit.frozen.take_apart`
 
     parts: AreaPlan | SkyPlan
     kind: str

@@ -34,7 +34,7 @@ class FlatFaces:
     ``flat``: ``Bool`` (F,), True for flat faces.
     """
 
-    RECORDED_OFTEN: ClassVar[bool] = True
+    RECORDED_OFTEN: ClassVar[bool] = True  # see `jit.frozen.take_apart`
 
     start: UInt32
     faces: UInt32

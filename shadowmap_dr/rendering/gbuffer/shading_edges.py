@@ -75,7 +75,7 @@ class ShadingEdges:
     textured    (number of the shape, its edges at which texture coordinates may differ)
     """
 
-    RECORDED_OFTEN: ClassVar[bool] = True
+    RECORDED_OFTEN: ClassVar[bool] = True  # see `jit.frozen.take_apart`
 
     always: Bool
     bendable: Bool | None

@@ -55,7 +55,7 @@ class Translucency:
         texel_density: of transmittance maps, see :func:`~shadowmap_dr.rendering.light_tiles.texel_density`.
     """
 
-    RECORDED_OFTEN: ClassVar[bool] = True
+    RECORDED_OFTEN: ClassVar[bool] = True  # see `jit.frozen.take_apart`
 
     opaque: Bool
     faces: Faces | None

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import mitsuba as mi
 
-from ..jit.handover import PackedResults
+from ..jit.handover import NO_RESULTS, PackedResults
 from ..rendering.renderer import Renderer
 from ..rendering.waiting import MOST_SAMPLES
 from .parameter_state import ParameterState
@@ -63,7 +63,7 @@ class HandedResults:
             if one.sensor is sensor and one.spp == spp and one.camera.same(camera):
                 self._images.remove(one)
                 return one.results, one.renderer
-        return PackedResults.of([]), None
+        return NO_RESULTS, None
 
     def follow(self, before: ParameterState, scene: mi.Scene) -> None:
         """Note that a replay, and nothing else, has changed a scene's parameters: it renews the arrays of materials."""

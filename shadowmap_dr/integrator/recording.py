@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from ..jit.arrays import own_memory
 from ..jit.frozen import Frozen
-from ..jit.handover import PackedResults, keeping, using
+from ..jit.handover import NO_RESULTS, PackedResults, keeping, using
 from ..jit.pytree import attached_places, tree_map
 from ..jit.types import AnyArray, TensorXf
 from ..rendering.extended_lights import SoftFrusta
@@ -62,7 +62,7 @@ def _owned(gradient: TensorXf) -> TensorXf:
 def _image(spp: int, renderer: Renderer, keep: bool) -> tuple[TensorXf, Frusta | None, SoftFrusta, PackedResults]:
     with keeping() as results:
         image = renderer.render(spp=spp)
-    return image, renderer.frusta, renderer.soft_frusta, PackedResults.of(results if keep else [])
+    return image, renderer.frusta, renderer.soft_frusta, PackedResults.of(results) if keep else NO_RESULTS
 
 
 def _gradients(

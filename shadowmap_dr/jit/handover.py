@@ -68,6 +68,10 @@ class PackedResults:
         return bool(self.arrays)
 
 
+#: Of a computation that has kept none.
+NO_RESULTS = PackedResults.of([])
+
+
 class _State(threading.local):
     """``kept``: results of the computation that runs, if any are kept; ``given``: those of the first, if there were any."""
 

@@ -17,7 +17,7 @@ import torch
 
 from ..errors import ShadowmapError, check_variant
 from ..jit.frozen import Frozen
-from ..jit.handover import PackedResults, keeping, using
+from ..jit.handover import NO_RESULTS, PackedResults, keeping, using
 from ..jit.pytree import tree_map
 from ..jit.types import TensorXf
 from ..rendering.extended_lights import SkyWatch, SoftFrusta, still_aimed
@@ -283,7 +283,7 @@ class _Rendering:
         self.sky = owner._sky
         # Decisions of the forward pass that the backward pass repeats.
         self.fixed: dict[str, Any] = {}
-        self.results = PackedResults.of([])
+        self.results = NO_RESULTS
         self.weight = 0
 
     def forward(self, arrays: list[TensorXf]) -> Sequence[TensorXf]:
@@ -309,7 +309,7 @@ class _Rendering:
             arrays = attached(arrays, wanted)  # before they enter the scene
             with self._scene(arrays) as renderer:
                 # Their memory is free after this backward pass. Another one computes them again.
-                results, self.results = self.results, PackedResults.of([])
+                results, self.results = self.results, NO_RESULTS
                 self._waiting.discard(self)
                 return self.functions[1](self.places, *self.camera, list(wanted), arrays, adjoints[0], renderer, results)
 
@@ -388,7 +388,7 @@ def _forward(
     """Image, (frusta of the shadow maps, frusta of extended lights' maps), and results for the backward pass if ``keep``."""
     with keeping() as results:
         image = _image(places, sensor, spp, arrays, renderer)
-    return image, (renderer.frusta, renderer.soft_frusta), PackedResults.of(results if keep else [])
+    return image, (renderer.frusta, renderer.soft_frusta), PackedResults.of(results) if keep else NO_RESULTS
 
 
 def _image(places: tuple[_Place, ...], sensor: int | Sensor, spp: int, arrays: list[TensorXf], renderer: _Renderer) -> TensorXf:

@@ -45,9 +45,9 @@ def look_up(column: Float, index: UInt32) -> Float:
 def copies_for_threads(array: Float) -> dr.ReduceMode:
     """Mode of look-ups by many lanes in a large array: on a CPU each thread adds gradients to a copy of its own.
 
-    An atomic addition takes several times as long. Dr.Jit does so up to a million packets; here the copies may have 256 MiB.
+    Atomic additions take longer. Dr.Jit makes such copies of arrays of up to a million numbers; here all copies may have 256 MiB.
     """
-    if dr.backend_v(array) == dr.JitBackend.LLVM and dr.width(array) * (dr.thread_count() + 1) <= _MOST_IN_COPIES:
+    if dr.backend_v(array) == dr.JitBackend.LLVM and dr.width(array) * dr.thread_count() <= _MOST_IN_COPIES:
         return dr.ReduceMode.Expand
     return dr.ReduceMode.Auto
 

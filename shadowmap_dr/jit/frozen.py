@@ -215,8 +215,8 @@ def _is_kept(kind: type) -> bool:
 
 @cached_by_type
 def _is_frozen(kind: type) -> bool:
-    """True for dataclasses whose fields never change."""
-    return bool(kind.__dataclass_params__.frozen)  # type: ignore[attr-defined]
+    """True for dataclasses whose fields never change. Any other class may change."""
+    return bool(getattr(getattr(kind, "__dataclass_params__", None), "frozen", False))
 
 
 @cached_by_type

@@ -35,13 +35,12 @@ def _walk(root: mi.Object) -> list[tuple[str, Any, type | None, mi.Object]]:
     """
     found: list[tuple[str, Any, type | None, mi.Object]] = []
     seen, prefixes = {root}, set()
-    callback, kinds = _collector(mi.variant())(), mi.Object
+    # One for all nodes: to make a callback takes as long as to list a node's parameters.
+    callback = _collector(mi.variant())()
 
     def visit(node: mi.Object, prefix: str) -> None:
-        callback.found = []  # one callback for all nodes: to make one takes as long as to list a node's parameters
-        node.traverse(callback)
-        for name, value, kind in callback.found:
-            if not isinstance(value, kinds):
+        for name, value, kind in _parts_of(node, callback):
+            if not isinstance(value, mi.Object):
                 found.append((prefix + name, value, kind, node))
             elif value not in seen:
                 full, number = prefix + name, 1
@@ -90,11 +89,16 @@ class Parameter:
         raise KeyError(self._name)
 
 
-def _parts_of(node: mi.Object) -> list[tuple[str, Any, type | None]]:
-    """(name, child or handle of a parameter's value, type of the parameter) of a Mitsuba object's children and parameters."""
-    callback = _collector(mi.variant())()
+def _parts_of(node: mi.Object, callback: Any = None) -> list[tuple[str, Any, type | None]]:  # Any: a class of a variant
+    """(name, child or handle of a parameter's value, type of the parameter) of a Mitsuba object's children and parameters.
+
+    ``callback``: an object of :func:`_collector` that serves again.
+    """
+    callback = callback or _collector(mi.variant())()
+    found: list[tuple[str, Any, type | None]] = []
+    callback.found = found
     node.traverse(callback)
-    return callback.found
+    return found
 
 
 @functools.cache

@@ -7,7 +7,6 @@ derivatives are themselves nodes of the graph (:class:`_First`) that depend on a
 from __future__ import annotations
 
 import functools
-import inspect
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -242,11 +241,6 @@ class _First(_Node):
         several = any(dim is not None for dim in in_dims[1 + given.count :])
         calls = [given.at(k) if several else given for k in range(info.batch_size)]
         return _First.looped(calls, info.batch_size, in_dims[1:], tensors)
-
-
-# PyTorch asks for the signature at each call: found once, it takes no time.
-for _node in (_Crossing, _First):
-    setattr(_node.forward, "__signature__", inspect.signature(_node.forward))  # noqa: B010  (functions have no such attribute)
 
 
 @contextmanager

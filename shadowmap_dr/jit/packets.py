@@ -62,12 +62,11 @@ class _Sections(dr.CustomOp):
     def backward(self) -> None:
         gradients, (width, parts) = cast("list[Float]", self.grad_out()), self._shape
         count = len(gradients) // parts
-        found = []
-        for k in range(count):
-            whole = dr.empty(type(gradients[k]), width * parts)
-            for part, lane in enumerate(self._lanes(gradients[k])):
-                dr.scatter(whole, gradients[part * count + k], lane, mode=dr.ReduceMode.Permute)
-            found.append(whole)
+        found = [dr.empty(type(gradients[k]), width * parts) for k in range(count)]
+        for part, lane in enumerate(self._lanes(gradients[0])):
+            for k in range(count):
+                dr.scatter(found[k], gradients[part * count + k], lane, mode=dr.ReduceMode.Permute)
+            dr.eval(found)
         self.set_grad_in("values", found)
 
     def name(self) -> str:

@@ -11,6 +11,7 @@ from typing import cast
 import drjit as dr
 
 from ..jit.arrays import backend
+from ..jit.branches import branch
 from ..jit.broadcast import Copies, copied
 from ..jit.handover import computed
 from ..jit.types import Bool, Float, UInt32, UInt64
@@ -92,8 +93,13 @@ def _peeled(
         if counts is None:
             found.append(triangle)
         else:
-            seen = located(positions, faces, triangle, records, *size)
-            kept = seen.valid & dr.detach(counts(seen))
+
+            # In a branch: most pixels of scenes with few panes see none of them.
+            def keep(triangle: UInt32, records: Records = records) -> Bool:
+                return module.Bool(dr.detach(counts(located(positions, faces, triangle, records, *size))))
+
+            lanes = (triangle,)
+            kept = branch(triangle != NO_TRIANGLE, keep, lambda triangle: module.Bool(False), lanes, "peeled surface")
             if number < layers:
                 found.append(dr.full(module.UInt32, NO_TRIANGLE, dr.width(triangle)))
             found = [dr.select(kept & (used == k), triangle, old) for k, old in enumerate(found)]

@@ -93,7 +93,6 @@ def _peeled(
         if counts is None:
             found.append(triangle)
         else:
-
             # In a branch: most pixels of scenes with few panes see none of them.
             def keep(triangle: UInt32, records: Records = records) -> Bool:
                 return module.Bool(dr.detach(counts(located(positions, faces, triangle, records, *size))))

@@ -9,6 +9,7 @@ import mitsuba as mi
 from ..jit.handover import NO_RESULTS, PackedResults
 from ..rendering.renderer import Renderer
 from ..rendering.waiting import MOST_SAMPLES
+from ..scene.mitsuba_objects import Parameter, owners
 from .parameter_state import ParameterState
 
 
@@ -30,6 +31,7 @@ class HandedResults:
 
     def __init__(self) -> None:
         self._images: list[_Handed] = []
+        self._renewed: dict[str, Parameter] = {}  # by each replay so far
 
     def add(
         self,
@@ -63,10 +65,19 @@ class HandedResults:
             if one.sensor is sensor and one.spp == spp and one.camera.same(camera):
                 self._images.remove(one)
                 return one.results, one.renderer
+        self._renewed = {}  # the replay of an image may have renewed other arrays
         return NO_RESULTS, None
 
     def follow(self, before: ParameterState, scene: mi.Scene) -> None:
         """Note that a replay, and nothing else, has changed a scene's parameters: it renews the arrays of materials."""
-        if self._images:
+        if not self._images:
+            return
+        after = before.with_values({name: parameter.now() for name, parameter in self._renewed.items()})
+        if not self._renewed or after.same(before):
+            # The first replay, or one that has renewed others: these are looked for. Otherwise the few that are known are read.
             after = ParameterState.of(scene)
-            self._images = [replace(one, scene=after) if one.scene.same(before) else one for one in self._images]
+            changed = [pair for pair in owners(scene) if after.numbers.get(pair[0]) != before.numbers.get(pair[0])]
+            # Attributes of meshes may be removed, and what was known of them with it.
+            if not any(isinstance(node, mi.Shape) for _, node in changed):
+                self._renewed = {name: Parameter(node, name.rpartition(".")[2]) for name, node in changed}
+        self._images = [replace(one, scene=after) if one.scene.same(before) else one for one in self._images]

@@ -36,16 +36,24 @@ class ParameterState:
     @classmethod
     def of(cls, node: mi.Object) -> ParameterState:
         """The current parameters."""
+        return cls._of_values(parameters(node))
+
+    @classmethod
+    def _of_values(cls, values: dict[str, Any]) -> ParameterState:  # Any: parameters have values of all kinds
         numbers: dict[str, tuple[Any, ...]] = {}
         attached: list[str] = []
         held: list[AnyArray] = []
         array = mi.Float
-        for name, value in parameters(node).items():
+        for name, value in values.items():
             if isinstance(value, array):  # most are: these few lines are the fastest way
-                held.append(array(dr.detach(value) if value.index_ad else value))
+                if not value.index_ad:
+                    held.append(array(value))
+                    numbers[name] = (value.index,)
+                    continue
+                held.append(array(dr.detach(value)))
                 if dr.grad_enabled(value):
                     attached.append(name)
-                    numbers[name] = (value.index, bool(value.index_ad))
+                    numbers[name] = (value.index, True)
                 else:
                     numbers[name] = (value.index,)
                 continue
@@ -65,6 +73,12 @@ class ParameterState:
             attached.append(name)
             numbers[name] = (*(number & ((1 << _AD) - 1) for number in which), *(number >> _AD > 0 for number in which))
         return cls(numbers, tuple(attached), held)
+
+    def with_values(self, values: dict[str, Any]) -> ParameterState:  # Any: as above
+        """The same state with other values of some parameters."""
+        new = self._of_values(values)
+        attached = tuple(name for name in self.numbers if name in (new.attached if name in values else self.attached))
+        return ParameterState(self.numbers | new.numbers, attached, self.held + new.held)
 
     def same(self, other: ParameterState, names: Iterable[str] | None = None) -> bool:
         """True if parameters (all, or those in ``names``) are the same in both."""

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from itertools import count
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -15,7 +17,7 @@ from ..jit.pytree import attached_places, tree_map
 from ..jit.types import AnyArray, TensorXf
 from ..rendering.extended_lights import SoftFrusta
 from ..rendering.renderer import Renderer
-from ..scene.load import SceneData
+from ..scene.load import PARTS, READ, SceneData
 from ..shadow import Frusta
 from .deferred import backward, pass_on
 
@@ -38,15 +40,29 @@ class FrozenPasses:
         with dr.suspend_grad():
             return self._image(spp, renderer, keep)
 
-    def backward(self, spp: int, gradient: TensorXf, data: SceneData, renderer: Renderer, results: PackedResults) -> None:
+    def backward(
+        self,
+        spp: int,
+        gradient: TensorXf,
+        data: SceneData,
+        renderer: Renderer,
+        results: PackedResults,
+        fields: tuple[str, ...] = READ,
+    ) -> None:
         """Add the gradients of <image, gradient> to everything that ``data`` is attached to.
 
-        ``renderer``: from :func:`plain`, with the same data, detached. ``results``: of the same image, or of none.
+        Args:
+            spp: samples of a pixel.
+            gradient: of the image.
+            data: current records of the scene.
+            renderer: from :func:`plain`, with the same data, detached.
+            results: of the same image, or of none.
+            fields: of the data, those that may be attached.
         """
-        places, outer = attached_places(data)
+        places, outer = attached_places(_fields_of(data, fields))
         if not outer:
             return
-        pass_on(outer, self._gradients(spp, places, _owned(gradient), renderer, results))
+        pass_on(outer, self._gradients(spp, (fields, places), _owned(gradient), renderer, results))
 
     @property
     def recordings(self) -> int:
@@ -67,14 +83,14 @@ def _image(spp: int, renderer: Renderer, keep: bool) -> tuple[TensorXf, Frusta |
 
 def _gradients(
     spp: int,
-    places: tuple[int, ...],
+    attached_to: tuple[tuple[str, ...], tuple[int, ...]],
     gradient: TensorXf,
     renderer: Renderer,
     results: PackedResults,
 ) -> list[AnyArray]:
-    """Gradients of the arrays at some places of the renderer's data."""
+    """Gradients of the arrays at some places of some fields of the renderer's data."""
     leaves: list[AnyArray] = []
-    place = count()
+    (fields, places), place = attached_to, count()
 
     def attached(array: AnyArray) -> AnyArray:
         if next(place) not in places:
@@ -84,23 +100,29 @@ def _gradients(
         leaves.append(leaf)
         return leaf
 
-    renderer = renderer.with_data(tree_map(renderer.data, attached))
+    found = dict(zip(fields, tree_map(_fields_of(renderer.data, fields), attached), strict=True))
+    renderer = renderer.with_data(replace(renderer.data, **found))
     with using(results.unpacked()):
         image = renderer.render(spp=spp)
     backward(image, gradient)
     return [dr.grad(leaf) for leaf in leaves]
 
 
-def plain(renderer: Renderer) -> Renderer:
+def _fields_of(data: SceneData, fields: tuple[str, ...]) -> tuple[Any, ...]:  # Any: records of different types
+    return tuple(getattr(data, field) for field in fields)
+
+
+def plain(renderer: Renderer, known: Mapping[str, Any] | None = None) -> Renderer:  # Any: fields of different types
     """A renderer with detached data, of which one recording serves all cameras of one kind.
 
     All numbers are evaluated copies: a recording would include constants, and also the fact that a camera shares its arrays with
-    a sensor of the scene.
+    a sensor of the scene. ``known``: the :data:`PARTS` of its data that the renderer of an earlier call serves for.
     """
     arrays: list[AnyArray] = []
 
     def kept(array: AnyArray) -> AnyArray:
-        arrays.append(dr.detach(array))
+        # The same object without gradients, so that records of these arrays stay the same, too.
+        arrays.append(dr.detach(array) if dr.grad_enabled(array) else array)
         return arrays[-1]
 
     one = dr.opaque(mi.Float, 1)  # Dr.Jit optimises a product with the literal 1 away
@@ -109,10 +131,16 @@ def plain(renderer: Renderer) -> Renderer:
         arrays.append(dr.detach(array) * one)
         return arrays[-1]
 
-    copies = tree_map(renderer.data.sensors, copied)
-    data = tree_map(replace(renderer.data, sensors=()), kept)
-    data = replace(data, sensors=tuple(tuple(replace(camera, name="") for camera in cameras) for cameras in copies))
-    renderer = replace(renderer, data=data)
+    data, parts = renderer.data, dict(known or {})
+    if "sensors" not in parts:
+        copies = tree_map(data.sensors, copied)
+        parts["sensors"] = tuple(tuple(replace(camera, name="") for camera in cameras) for cameras in copies)
+    for part in PARTS:
+        if part not in parts:
+            parts[part] = tree_map(getattr(data, part), kept)
+    nothing: dict[str, Any] = dict.fromkeys(PARTS)
+    rest = tree_map(replace(data, **nothing), kept)
+    renderer = replace(renderer, data=replace(rest, **parts))
     # The arrays alone: Dr.Jit would walk through the scene, too.
     dr.make_opaque(arrays, renderer.frusta, renderer.soft_frusta)
     return renderer

@@ -32,6 +32,7 @@ from .handed import HandedResults
 from .parameter_state import ParameterState
 from .pass_caches import PassCaches, names_by_level
 from .recording import FrozenPasses, plain
+from .scene_reader import SceneReader
 from .steady_steps import SteadySteps
 
 # Sensors whose fit of the shadow maps is remembered, and how many of them may be foreign to the scene. Some programs make a new
@@ -85,6 +86,7 @@ class SceneCache:
     passes    caches of passes for its sensors
     matched   parameters of the scene at the last successful match
     handed    results of the last replayed images, for their backward passes
+    reader    reads the scene for replays
     """
 
     parts: tuple[mi.Object, ...]
@@ -107,6 +109,7 @@ class SceneCache:
     passes: PassCaches = field(default_factory=PassCaches)
     matched: ParameterState | None = None
     handed: HandedResults = field(default_factory=HandedResults)
+    reader: SceneReader = field(default_factory=SceneReader)
     _taken: tuple[Renderer, tuple[str, list[PyTree]]] | None = None
 
     # All that Dr.Jit is to know of, instead of the fields: it looks twice for each image.
@@ -212,15 +215,15 @@ class SceneCache:
             return False  # surfaces and maps of the last step serve again, which a recording would render
         if samples > _LARGEST or not dr.flag(dr.JitFlag.KernelFreezing) or dr.flag(dr.JitFlag.Debug):
             return False
-        values = self.untracked.now()
-        if values != self.steady.values:
-            self.steady = SteadySteps(values)
+        self._forget_stale_recordings()
+        if self.untracked_then != self.steady.values:
+            self.steady = SteadySteps(self.untracked_then)
         return self.steady.note(_kind(attached, sensor, spp), self.recorded.recordings)
 
     def try_to_replay(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, now: SceneState) -> TensorXf | None:
         """The same as :meth:`replay`; None, from now on, if the scene cannot be recorded."""
         try:
-            return self.replay(scene, sensor, spp, now)
+            return self._replayed(scene, sensor, spp, now)  # `is_steady` has dropped stale recordings
         except RuntimeError:
             self.steady.refuse()
             return None
@@ -228,12 +231,15 @@ class SceneCache:
     def replay(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, now: SceneState) -> TensorXf:
         """The same image, detached, replayed from a recording that the first call makes. ``now``: the current parameters."""
         self._forget_stale_recordings()
-        current = self._current(scene, sensor)
+        return self._replayed(scene, sensor, spp, now)
+
+    def _replayed(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, now: SceneState) -> TensorXf:
+        current = self._current(scene, sensor, now)
         self._check_vertices(current)
         current.note_kernels(spp)
         samples = _samples(sensor, spp)
         keep = samples <= MOST_SAMPLES and current.is_one_pass
-        detached = plain(current)
+        detached = self._plain(current)
         image, frusta, soft_frusta, results = self.recorded.image(spp, detached, keep)
         self._remember(scene, sensor, frusta, soft_frusta)
         if keep and now.attached:
@@ -249,16 +255,16 @@ class SceneCache:
         which Mitsuba itself evaluates. ``now``: the current parameters.
         """
         (results, detached), attached = self.handed.take(sensor, spp, now.scene, now.camera), now.attached
-        current = self._current(scene, sensor)
+        current = self._current(scene, sensor, now)
         if attached not in self.recordable:
-            self.recordable[attached] = not dr.grad_enabled(plain(current).render(spp=spp))
+            self.recordable[attached] = not dr.grad_enabled(self._plain(current).render(spp=spp))
         if self.recordable[attached]:
             self._forget_stale_recordings()
             if detached is None:
-                detached = plain(current)
+                detached = self._plain(current)
             else:  # with the fit of the maps that the image has made
                 detached = replace(detached, frusta=current.frusta, soft_frusta=current.soft_frusta)
-            self.recorded.backward(spp, gradient, current.data, detached, results)
+            self.recorded.backward(spp, gradient, current.data, detached, results, self.reader.fields(current.data))
             self.handed.follow(now.scene, scene)
         return self.recordable[attached]
 
@@ -291,8 +297,14 @@ class SceneCache:
         if now != self.untracked_then:
             self.recorded, self.untracked_then = FrozenPasses(), now
 
-    def _current(self, scene: mi.Scene, sensor: mi.Sensor) -> Renderer:
-        """The renderer for the current scene.
+    def _plain(self, current: Renderer) -> Renderer:
+        """See :func:`plain`."""
+        detached = plain(current, self.reader.copies(current.data))
+        self.reader.copied(current.data, detached.data)
+        return detached
+
+    def _current(self, scene: mi.Scene, sensor: mi.Sensor, now: SceneState | None = None) -> Renderer:
+        """The renderer for the current scene. ``now``: the current parameters, for recordings, which see other arrays anyway.
 
         Each sensor starts from its own last fit. Fitting again to the same vertices and lights changes no bit, so the backward
         pass uses the frusta of its image, whatever other sensors have rendered in between.
@@ -303,7 +315,11 @@ class SceneCache:
         kept = self.renderer
         fits = ((frusta, soft_frusta) for known, frusta, soft_frusta in self.fits if known is sensor)
         frusta, soft_frusta = next(fits, (kept.frusta, kept.soft_frusta))
-        return replace(kept, data=self.data(scene, sensor), frusta=frusta, soft_frusta=soft_frusta)
+        if now is None:
+            data = self.data(scene, sensor)
+        else:
+            data = self.reader.read(replace(kept.data, scene=scene), sensor, now.scene, now.camera)
+        return replace(kept, data=data, frusta=frusta, soft_frusta=soft_frusta)
 
     def _check_vertices(self, current: Renderer) -> None:
         """Raise ShadowmapError for vertices that are not finite: their triangles and derivatives would silently vanish."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import Any, ClassVar, cast
 
 import drjit as dr
 import mitsuba as mi
@@ -113,6 +113,8 @@ class Geometry:
     size_guards    UInt32 (Vs,) or (3Vs,) each, zeros: two arrays for each number of vertices that shapes have. Recordings add
                    them to new positions (``bound``)
     """
+
+    RECORDED_OFTEN: ClassVar[bool] = True  # see `jit.frozen.take_apart`
 
     positions: Float
     normals: Float

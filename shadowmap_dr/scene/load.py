@@ -6,7 +6,7 @@ parameters may change, attached where they carry gradients.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from numbers import Integral
 from typing import Any, ClassVar, cast
@@ -34,6 +34,10 @@ from .unsupported import omissions_of, warn_of
 
 # With fewer shapes, their vertices are concatenated anew for each image.
 _MANY_SHAPES = 16
+#: Fields of the records that :func:`refresh` reads, and those of them that it need not read: of shapes, of lights without extent,
+#: of sensors.
+READ = ("geometry", "lights", "sensors", "areas", "environments")
+PARTS = READ[:3]
 # Most shapes that are told apart from those without gradients that are as they were.
 _FEW_CHANGED = 8
 
@@ -213,19 +217,38 @@ def load(scene: mi.Scene, *, tessellation: int = 64, warn: bool = True) -> Scene
     return replace(data, geometry=replace(data.geometry, as_loaded=True, moved=()))
 
 
-def refresh(data: SceneData, sensors: tuple[mi.Sensor, ...] | None = None) -> SceneData:
+def refresh(
+    data: SceneData,
+    sensors: tuple[mi.Sensor, ...] | None = None,
+    known: Mapping[str, Any] | None = None,  # Any: fields of different types
+) -> SceneData:
     """Read again all values that scene parameters may have changed: vertices, normals, texture coordinates, lights, sensors.
 
-    ``sensors``: Mitsuba's sensors to read instead of all sensors of the scene.
+    ``sensors``: Mitsuba's sensors to read instead of all sensors of the scene. ``known``: those of the :data:`PARTS` that still
+    hold.
     Values are attached where the scene's parameters are. Topology must be that of ``load``. BSDFs need no refresh: Mitsuba itself
     evaluates them. With few shapes nothing is read back to the host. With many, vertices and transformations without gradients
     are read back when they have been given other values.
     """
+    known, scene = known or {}, data.scene
+    chosen = scene.sensors() if sensors is None else sensors
+    return replace(
+        data,
+        geometry=known["geometry"] if "geometry" in known else _geometry_now(data),
+        sensors=known["sensors"] if "sensors" in known else tuple(sensors_of(sensor) for sensor in chosen),
+        lights=known["lights"] if "lights" in known else lights_of(scene),
+        areas=area_lights_of(scene, [source.shape for source in data.sources]),
+        environments=environments_of(scene),
+    )
+
+
+def _geometry_now(data: SceneData) -> Geometry:
+    """The current vertices of a scene. Attached."""
     vertices, attached, moved = _vertices(data)
     changed = {*attached, *(moved or ())}
     # Not an empty array: one among the arguments of a frozen function ends the process (Dr.Jit 1.5).
     rest = vertices.rest if any(info.reads_attributes for info in data.geometry.shapes) else None
-    geometry = replace(
+    return replace(
         data.geometry,
         positions=data.geometry.settled(vertices.positions),
         normals=vertices.normals,
@@ -235,14 +258,6 @@ def refresh(data: SceneData, sensors: tuple[mi.Sensor, ...] | None = None) -> Sc
         as_loaded=False,
         moved=None if moved is None else data.geometry.names_of(moved),
         packets=None,
-    )
-    return replace(
-        data,
-        geometry=geometry,
-        sensors=tuple(sensors_of(sensor) for sensor in (data.scene.sensors() if sensors is None else sensors)),
-        lights=lights_of(data.scene),
-        areas=area_lights_of(data.scene, [source.shape for source in data.sources]),
-        environments=environments_of(data.scene),
     )
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -59,6 +60,8 @@ class Sensor:
 
     Gradients flow from ``view_projection``, ``origin``, ``direction`` and ``wi_world`` to to_world, x_fov and principal_point.
     """
+
+    RECORDED_OFTEN: ClassVar[bool] = True  # see `jit.frozen.take_apart`
 
     name: str
     kind: str

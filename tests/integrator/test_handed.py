@@ -13,6 +13,7 @@ from integrator_scenes import camera, shadowmap, small_scene
 
 from shadowmap_dr import Renderer
 from shadowmap_dr.integrator import handed
+from shadowmap_dr.integrator.parameter_state import ParameterState
 from shadowmap_dr.integrator.recording import FrozenPasses
 from shadowmap_dr.integrator.steady_steps import _FIRST
 
@@ -25,9 +26,9 @@ def given(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     counts: list[int] = []
     backward = FrozenPasses.backward
 
-    def noted(self: FrozenPasses, spp: int, gradient: Any, data: Any, renderer: Any, results: Any) -> None:
+    def noted(self: FrozenPasses, spp: int, gradient: Any, data: Any, renderer: Any, results: Any, *rest: Any) -> None:
         counts.append(len(results.unpacked()))
-        backward(self, spp, gradient, data, renderer, results)
+        backward(self, spp, gradient, data, renderer, results, *rest)
 
     monkeypatch.setattr(FrozenPasses, "backward", noted)
     return counts
@@ -182,3 +183,25 @@ def test_renderers_know_of_normals_that_have_changed(variant: str) -> None:
     expected = Renderer.from_scene(scene).render(vertices)
     np.testing.assert_allclose(now.numpy(), expected.numpy(), atol=1e-5)
     assert np.abs(now.numpy() - before.numpy()).mean() > 0.02 * before.numpy().mean()
+
+
+def test_parameters_are_listed_twice_a_step(variant: str, given: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
+    """For the image and for its backward pass. What a replay renews is known from the first one."""
+    listed: list[int] = []
+    of = ParameterState.of
+
+    def noted(node: mi.Object) -> ParameterState:
+        listed[-1] += isinstance(node, mi.Scene)
+        return of(node)
+
+    monkeypatch.setattr(ParameterState, "of", noted)
+    scene, integrator = small_scene(), shadowmap(recorded=True)
+    params = mi.traverse(scene)
+    for _ in range(5):
+        listed.append(0)
+        moved = mi.Float(dr.detach(params[VERTICES]) + 0.01)
+        dr.enable_grad(moved)
+        params[VERTICES] = moved
+        params.update()
+        dr.backward(dr.mean(mi.render(scene, params, integrator=integrator), axis=None))
+    assert listed[2:] == [2] * 3 and min(given) > 5

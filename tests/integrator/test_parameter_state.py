@@ -59,3 +59,18 @@ def test_attached_parameters(scene: mi.Scene, name: str) -> None:
     assert not any(getattr(array, "index_ad", 0) for array in after.held)
     # Another variable of AD with the same numbers is the same state.
     assert ParameterState.of(scene).same(after)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_other_values_of_some_parameters(scene: mi.Scene, name: str) -> None:
+    """The state with these values is that of a scene that has been given them."""
+    before, params = ParameterState.of(scene), mi.traverse(scene)
+    x = mi.Float(0)
+    dr.enable_grad(x)
+    value = again(params[name])
+    params[name] = mi.Transform4f().translate(mi.Vector3f(x, 0, 0)) @ value if isinstance(value, mi.Transform4f) else value + x
+    after = ParameterState.of(scene)
+    found = before.with_values({name: params[name]})
+    assert found.same(after) and found.attached == after.attached == (name,)
+    assert after.with_values({name: value}).attached == ()
+    assert not any(getattr(array, "index_ad", 0) for array in found.held)

@@ -215,15 +215,15 @@ class SceneCache:
             return False  # surfaces and maps of the last step serve again, which a recording would render
         if samples > _LARGEST or not dr.flag(dr.JitFlag.KernelFreezing) or dr.flag(dr.JitFlag.Debug):
             return False
-        self._forget_stale_recordings()
-        if self.untracked_then != self.steady.values:
-            self.steady = SteadySteps(self.untracked_then)
+        values = self.untracked.now()
+        if values != self.steady.values:
+            self.steady = SteadySteps(values)
         return self.steady.note(_kind(attached, sensor, spp), self.recorded.recordings)
 
     def try_to_replay(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, now: SceneState) -> TensorXf | None:
         """The same as :meth:`replay`; None, from now on, if the scene cannot be recorded."""
         try:
-            return self._replayed(scene, sensor, spp, now)  # `is_steady` has dropped stale recordings
+            return self.replay(scene, sensor, spp, now)
         except RuntimeError:
             self.steady.refuse()
             return None
@@ -231,10 +231,8 @@ class SceneCache:
     def replay(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, now: SceneState) -> TensorXf:
         """The same image, detached, replayed from a recording that the first call makes. ``now``: the current parameters."""
         self._forget_stale_recordings()
-        return self._replayed(scene, sensor, spp, now)
-
-    def _replayed(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, now: SceneState) -> TensorXf:
-        current = self._current(scene, sensor, now)
+        with dr.suspend_grad():
+            current = self._current(scene, sensor, now)
         self._check_vertices(current)
         current.note_kernels(spp)
         samples = _samples(sensor, spp)

@@ -15,6 +15,7 @@ from ..jit.frozen import take_apart
 from ..jit.gc import gc_paused
 from ..jit.types import AnyArray, Float, PyTree, TensorXf, UInt32
 from ..rendering.extended_lights import SkyWatch, SoftFrusta, still_aimed
+from ..rendering.light_loops import MANY_LIGHTS
 from ..rendering.pass_cache import PassCache
 from ..rendering.renderer import Renderer
 from ..rendering.settings import RenderSettings
@@ -38,8 +39,10 @@ from .steady_steps import SteadySteps
 # Sensors whose fit of the shadow maps is remembered, and how many of them may be foreign to the scene. Some programs make a new
 # sensor for each image; remembered sensors are kept alive, and recordings hold only for a fixed number of objects.
 _REMEMBERED_SENSORS, _OTHERS = 64, 8
-# Samples of an image up to which replays are faster: the backward pass renders again.
-_LARGEST = 512 * 512
+# Samples of an image, and texels of its maps that take as long, up to which replays are faster under extended lights, which take
+# longer in recordings, and under many lights, whose results are not handed to the backward pass. Otherwise the limit is that of
+# results that are handed over.
+_LARGEST = 3 << 16
 
 
 @dataclass(frozen=True)
@@ -213,7 +216,13 @@ class SceneCache:
         samples = _samples(sensor, spp)
         if all(name.endswith(COLOURS_OF_LIGHTS) for name in attached):
             return False  # surfaces and maps of the last step serve again, which a recording would render
-        if samples > _LARGEST or not dr.flag(dr.JitFlag.KernelFreezing) or dr.flag(dr.JitFlag.Debug):
+        if not dr.flag(dr.JitFlag.KernelFreezing) or dr.flag(dr.JitFlag.Debug):
+            return False
+        renderer = self.renderer
+        if renderer.soft or renderer.slices or len(self.lights) >= MANY_LIGHTS:
+            if samples + renderer.texels // TEXELS > _LARGEST:
+                return False
+        elif samples > MOST_SAMPLES:
             return False
         values = self.untracked.now()
         if values != self.steady.values:

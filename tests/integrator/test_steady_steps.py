@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from integrator_scenes import camera, full_scene, recordings, shadowmap, small_scene, weighted_step
+from integrator_scenes import camera, full_scene, recordings, shadowmap, small_scene, sun, weighted_step
 from lit_scenes import lit_scene
 
 from shadowmap_dr import ShadowmapError
@@ -127,13 +127,30 @@ def test_what_recordings_do_not_see_begins_a_new_count(variant: str) -> None:
     assert recordings(integrators[1]) == made  # this step was rendered as it is
 
 
-def test_large_images_are_not_recorded(variant: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scene_cache, "_LARGEST", 64 * 64)
-    scene, integrators = small_scene(), both()
-    vertices = mi.Float(dr.detach(mi.traverse(scene)[VERTICES]))
+@pytest.mark.parametrize(
+    ("kind", "limits", "recorded"),
+    [
+        ("few lights", {"MOST_SAMPLES": 4 * 64 * 64 - 1}, False),
+        ("few lights", {"MOST_SAMPLES": 4 * 64 * 64, "_LARGEST": 0}, True),
+        ("many lights", {"_LARGEST": 4 * 64 * 64}, False),
+        ("many lights", {}, True),
+        ("lamps", {"_LARGEST": 4 * 64 * 64}, False),
+    ],
+)
+def test_large_images_are_not_recorded(
+    variant: str, monkeypatch: pytest.MonkeyPatch, kind: str, limits: dict[str, int], recorded: bool
+) -> None:
+    """The backward pass of few lights is handed what the image has found. Others, whose maps count, too, find it again."""
+    for name, limit in limits.items():
+        monkeypatch.setattr(scene_cache, name, limit)
+    suns = {f"sun {k}": {**sun(), "direction": [0.1 * k - 0.4, 0.3, -1]} for k in range(9)} if kind == "many lights" else {}
+    scene = lit_scene("lamps") if kind == "lamps" else small_scene(**suns)
+    key = "box.vertex_positions" if kind == "lamps" else VERTICES
+    vertices = mi.Float(dr.detach(mi.traverse(scene)[key]))
+    integrators = both(**FEW)
     for k in range(_FIRST + 2):
-        assert_same(scene, integrators, VERTICES, vertices + 0.01 * k, spp=4)
-    assert not recordings(integrators[1])
+        assert_same(scene, integrators, key, vertices + 0.01 * k, spp=4)
+    assert (recordings(integrators[1]) > 0) == recorded
 
 
 @pytest.mark.parametrize("which", ["image", "backward"])

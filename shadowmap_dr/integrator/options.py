@@ -82,9 +82,9 @@ class Options:
     tessellation           triangles around spheres, disks and cylinders, at least 3; curves have half as many around them, and
                            B-splines an eighth of it along each segment
     recorded               ``mi.render`` and its backward pass are recorded with ``dr.freeze`` and replayed while only numbers
-                           change: up to twice as fast where passes are short, slower where they are long, since the backward
-                           pass renders again. Backward passes to materials and textures are not recorded. ``auto``: from the
-                           fifth step of a loop on, where images are small
+                           change: up to four times as fast where passes are short, slower where they are long. Backward passes
+                           to materials and textures are not recorded. ``auto``: from the fifth step of a loop on, where images
+                           are small
     compat                 conventions of Worchel and Alexa's code
     """
 

@@ -311,7 +311,7 @@ class SceneCache:
         return detached
 
     def _current(self, scene: mi.Scene, sensor: mi.Sensor, now: SceneState | None = None) -> Renderer:
-        """The renderer for the current scene. ``now``: the current parameters, for recordings, which see other arrays anyway.
+        """The renderer for the current scene. ``now``: its parameters, if parts that have not changed need not be read again.
 
         Each sensor starts from its own last fit. Fitting again to the same vertices and lights changes no bit, so the backward
         pass uses the frusta of its image, whatever other sensors have rendered in between.

@@ -9,7 +9,7 @@ import mitsuba as mi
 from ..jit.handover import NO_RESULTS, PackedResults
 from ..rendering.renderer import Renderer
 from ..rendering.waiting import MOST_SAMPLES
-from ..scene.mitsuba_objects import Parameter, owners
+from ..scene.mitsuba_objects import Parameter, parameters_named
 from .parameter_state import ParameterState
 
 
@@ -76,8 +76,9 @@ class HandedResults:
         if not self._renewed or after.same(before):
             # The first replay, or one that has renewed others: these are looked for. Otherwise the few that are known are read.
             after = ParameterState.of(scene)
-            changed = [pair for pair in owners(scene) if after.numbers.get(pair[0]) != before.numbers.get(pair[0])]
+            changed = {name for name, keys in after.numbers.items() if keys != before.numbers.get(name)}
+            found = parameters_named(scene, changed)
             # Attributes of meshes may be removed, and what was known of them with it.
-            if not any(isinstance(node, mi.Shape) for _, node in changed):
-                self._renewed = {name: Parameter(node, name.rpartition(".")[2]) for name, node in changed}
+            if not any(isinstance(parameter.node, mi.Shape) for parameter in found.values()):
+                self._renewed = found
         self._images = [replace(one, scene=after) if one.scene.same(before) else one for one in self._images]

@@ -17,7 +17,7 @@ from ..jit.pytree import attached_places, tree_map
 from ..jit.types import AnyArray, TensorXf
 from ..rendering.extended_lights import SoftFrusta
 from ..rendering.renderer import Renderer
-from ..scene.load import PARTS, READ, SceneData
+from ..scene.load import PARTS, SceneData
 from ..shadow import Frusta
 from .deferred import backward, pass_on
 
@@ -47,7 +47,7 @@ class FrozenPasses:
         data: SceneData,
         renderer: Renderer,
         results: PackedResults,
-        fields: tuple[str, ...] = READ,
+        fields: tuple[str, ...],
     ) -> None:
         """Add the gradients of <image, gradient> to everything that ``data`` is attached to.
 
@@ -116,7 +116,8 @@ def plain(renderer: Renderer, known: Mapping[str, Any] | None = None) -> Rendere
     """A renderer with detached data, of which one recording serves all cameras of one kind.
 
     All numbers are evaluated copies: a recording would include constants, and also the fact that a camera shares its arrays with
-    a sensor of the scene. ``known``: the :data:`PARTS` of its data that the renderer of an earlier call serves for.
+    a sensor of the scene. ``known``: the :data:`PARTS` of the result that an earlier call has made
+    from the same records.
     """
     arrays: list[AnyArray] = []
 
@@ -125,14 +126,14 @@ def plain(renderer: Renderer, known: Mapping[str, Any] | None = None) -> Rendere
         arrays.append(dr.detach(array) if dr.grad_enabled(array) else array)
         return arrays[-1]
 
-    one = dr.opaque(mi.Float, 1)  # Dr.Jit optimises a product with the literal 1 away
-
-    def copied(array: AnyArray) -> AnyArray:
-        arrays.append(dr.detach(array) * one)
-        return arrays[-1]
-
     data, parts = renderer.data, dict(known or {})
     if "sensors" not in parts:
+        one = dr.opaque(mi.Float, 1)  # Dr.Jit optimises a product with the literal 1 away
+
+        def copied(array: AnyArray) -> AnyArray:
+            arrays.append(dr.detach(array) * one)
+            return arrays[-1]
+
         copies = tree_map(data.sensors, copied)
         parts["sensors"] = tuple(tuple(replace(camera, name="") for camera in cameras) for cameras in copies)
     for part in PARTS:

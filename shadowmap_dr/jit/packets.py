@@ -66,6 +66,7 @@ class _Sections(dr.CustomOp):
         for part, lane in enumerate(self._lanes(gradients[0])):
             for k in range(count):
                 dr.scatter(found[k], gradients[part * count + k], lane, mode=dr.ReduceMode.Permute)
+            # One part after the other: caches do not follow the arrays of all parts at once.
             dr.eval(found)
         self.set_grad_in("values", found)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Container
 from typing import Any
 
 import drjit as dr
@@ -19,21 +20,27 @@ def parameters(node: mi.Object) -> dict[str, Any]:
 
     Parameters without a value are left out: a ``hair`` material has some.
     """
-    found = {name: value if kind is None else mi.get_property(value, kind, owner) for name, value, kind, owner in _walk(node)}
+    found = {name: value if kind is None else mi.get_property(value, kind, owner) for name, value, kind, owner, _ in _walk(node)}
     return {name: value for name, value in found.items() if value is not None}
 
 
 def owners(node: mi.Object) -> list[tuple[str, mi.Object]]:
     """(relative name, owning object) of all parameters of a Mitsuba object and its children."""
-    return [(name, owner) for name, _, _, owner in _walk(node)]
+    return [(name, owner) for name, *_, owner, _ in _walk(node)]
 
 
-def _walk(root: mi.Object) -> list[tuple[str, Any, type | None, mi.Object]]:
-    """(name, handle of the value, type, owner) of all parameters, with the names and in the order of ``mi.traverse``.
+def parameters_named(node: mi.Object, names: Container[str]) -> dict[str, Parameter]:
+    """Parameters of a Mitsuba object and its children, by their relative names, to be read repeatedly."""
+    return {name: Parameter(owner, own) for name, *_, owner, own in _walk(node) if name in names}
+
+
+def _walk(root: mi.Object) -> list[tuple[str, Any, type | None, mi.Object, str]]:
+    """(name, handle of the value, type, owner, name within the owner) of all parameters, with the names and in the order of
+    ``mi.traverse``.
 
     That takes three times as long: it makes a class at each call, and records that serve to change parameters.
     """
-    found: list[tuple[str, Any, type | None, mi.Object]] = []
+    found: list[tuple[str, Any, type | None, mi.Object, str]] = []
     seen, prefixes = {root}, set()
     # One for all nodes: to make a callback takes as long as to list a node's parameters.
     callback = _collector(mi.variant())()
@@ -41,7 +48,7 @@ def _walk(root: mi.Object) -> list[tuple[str, Any, type | None, mi.Object]]:
     def visit(node: mi.Object, prefix: str) -> None:
         for name, value, kind in _parts_of(node, callback):
             if not isinstance(value, mi.Object):
-                found.append((prefix + name, value, kind, node))
+                found.append((prefix + name, value, kind, node, name))
             elif value not in seen:
                 full, number = prefix + name, 1
                 while full in prefixes:
@@ -75,15 +82,15 @@ class Parameter:
     """
 
     def __init__(self, node: mi.Object, name: str) -> None:
-        self._node, self._name = node, name
+        self.node, self._name = node, name
         self._place, self._kind = self._found()
 
     def now(self) -> Any:  # Any: parameters have values of all kinds
         """The current, possibly attached, value."""
-        return self._found()[0] if self._kind is None else mi.get_property(self._place, self._kind, self._node)
+        return self._found()[0] if self._kind is None else mi.get_property(self._place, self._kind, self.node)
 
     def _found(self) -> tuple[Any, type | None]:
-        for name, value, kind in _parts_of(self._node):
+        for name, value, kind in _parts_of(self.node):
             if name == self._name and not isinstance(value, mi.Object):
                 return value, kind
         raise KeyError(self._name)

@@ -205,3 +205,36 @@ def test_parameters_are_listed_twice_a_step(variant: str, given: list[int], monk
         params.update()
         dr.backward(dr.mean(mi.render(scene, params, integrator=integrator), axis=None))
     assert listed[2:] == [2] * 3 and min(given) > 5
+
+
+def dotted_material() -> Any:
+    """A diffuse material in Python, whose parameter has a dot in its name."""
+
+    class Dotted(mi.BSDF):
+        def __init__(self, props: mi.Properties) -> None:
+            super().__init__(props)
+            self.grey = dr.opaque(mi.Float, 0.5)
+            self.m_components = [mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide]
+            self.m_flags = self.m_components[0]
+
+        def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            return mi.Spectrum(self.grey / dr.pi * dr.maximum(wo.z, 0)) & (active & (si.wi.z > 0) & (wo.z > 0))
+
+        def traverse(self, callback: Any) -> None:
+            callback.put("shade.grey", self.grey, mi.ParamFlags.Differentiable)
+
+    mi.register_bsdf("dotted", Dotted)
+    return mi.load_dict({"type": "dotted"})
+
+
+def test_names_with_dots(variant: str, given: list[int]) -> None:
+    scene, integrator = small_scene(), shadowmap(recorded=True)
+    next(shape for shape in scene.shapes() if shape.id() == "ball").set_bsdf(dotted_material())
+    params = mi.traverse(scene)
+    for _ in range(4):
+        moved = mi.Float(dr.detach(params[VERTICES]) + 0.01)
+        dr.enable_grad(moved)
+        params[VERTICES] = moved
+        params.update()
+        dr.backward(dr.mean(mi.render(scene, params, integrator=integrator), axis=None))
+    assert len(given) == 4 and min(given) > 5

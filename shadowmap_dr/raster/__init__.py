@@ -3,6 +3,7 @@
 from .antialiasing.antialias import antialias
 from .antialiasing.creases import CoplanarCreases
 from .antialiasing.edge_crossings import DEPTH_GAP, Crossings, find_crossings
+from .antialiasing.front_surfaces import FrontSurfaces
 from .closed_parts import drawing_order, outward_faces
 from .interpolate import interpolate
 from .peeling import LEAST_LOSS, deepest, peeled_layers, stacked
@@ -19,6 +20,7 @@ __all__ = [
     "NO_VERTEX",
     "Crossings",
     "CoplanarCreases",
+    "FrontSurfaces",
     "RasterOutput",
     "Topology",
     "antialias",

@@ -34,6 +34,19 @@ def pane(bsdf: Spec, height: float = 0.8, x: float = 0.1, tilt: float = 10, half
     return {"type": "rectangle", "to_world": T().translate([x, 0, height]).rotate([0, 1, 0], tilt).scale(half), "bsdf": bsdf}
 
 
+def standing(bsdf: Spec, y: float = 0.0) -> Spec:
+    """A square that leans backwards, and cuts the floor and the ball."""
+    T = mi.ScalarTransform4f
+    place = T().translate([0.05, y - 0.1, 0.2]).rotate([0, 0, 1], 20).rotate([1, 0, 0], 60).scale([0.6, 0.45, 1])
+    return {"type": "rectangle", "to_world": place, "bsdf": bsdf}
+
+
+def along() -> Spec:
+    """A sun whose light runs along the leaning square, which casts no shadow then."""
+    up = np.array(standing({})["to_world"].matrix)[:3, 1]
+    return {"type": "directional", "direction": list(-up), "irradiance": 3.0}
+
+
 def sun(x: float = 0.3) -> Spec:
     return {"type": "directional", "direction": [x, 0.1, -1], "irradiance": 3.0}
 

@@ -260,7 +260,7 @@ class Mixer:
 
             def add(slot: UInt32, pixel: UInt32, down: Bool, weight: Float) -> Float:
                 gain, rate = dr.gather(module.Float, gains, slot), self._rate(slot)
-                for vertex, slope in meetings.slopes(pixel, down, rate):
+                for vertex, slope in meetings.slopes(slot, pixel, down, rate):
                     dr.scatter_add(result, slope * gain, vertex)
                 return weight
 
@@ -384,7 +384,7 @@ class Mixer:
 
         def meet(slot: UInt32) -> None:
             is_down, pixel, weight = self._pair(crossings.pairs.at(slot))
-            slopes = meetings.slopes(pixel, is_down, self._rate(slot))
+            slopes = meetings.slopes(slot, pixel, is_down, self._rate(slot))
             change = sum(dr.dot(slope, dr.gather(Array4f, positions, vertex)) for vertex, slope in slopes)
             active = (weight != 0) & self._bare(slot)
             dr.scatter(right, change, pixel, active & ~is_down)

@@ -14,6 +14,7 @@ from ..topology import NO_VERTEX, Topology
 from ..triangle_setup import centred
 from ..types import NO_TRIANGLE, RasterOutput, by_pixel, zeros
 from .creases import CoplanarCreases, MarkedFaces, find_creases, touching
+from .front_surfaces import FrontSurfaces
 from .pixel_pairs import PairList, differing_pairs, empty_list
 from .silhouettes import BEFORE, register_silhouettes
 from .surface_intersections import LEAST_WEIGHT, Meetings, beyond_middle
@@ -37,6 +38,8 @@ class Crossings:
             ``meetings`` the first number is the change of the weight with the depth.
         meetings: intersections of surfaces, which give the weights of pairs without ends; None if these were not searched.
         marked: creases of all faces; None if there are none.
+        cuts: for each pixel, not 0 if a translucent surface intersects the raster's between it and its right (lower) neighbour;
+            None without translucent surfaces.
     """
 
     right: Float
@@ -47,6 +50,7 @@ class Crossings:
     second_slopes: Float
     meetings: Meetings | None = None
     marked: MarkedFaces | None = None
+    cuts: tuple[Float, Float] | None = None
 
 
 def find_crossings(
@@ -59,6 +63,7 @@ def find_crossings(
     meetings: bool = False,
     gap: float = DEPTH_GAP,
     folds: CoplanarCreases | None = None,
+    front: FrontSurfaces | None = None,
 ) -> Crossings:
     """Find the edges between neighbouring pixels.
 
@@ -75,6 +80,8 @@ def find_crossings(
         folds: creases that do not count between coplanar faces. None: all creases count.
         gap: least distance (NDC depth) of a silhouette before the surface behind it, besides 1e-5 of the depth there. Use 0 for
             depths that keep their relative precision, such as -near / distance, and more for depths that approach 1 far away.
+        front: with ``meetings``, also find the lines along which these surfaces intersect the raster's. Its records are those of
+            all triangles, those in front included.
 
     A silhouette is an edge whose faces all lie on one side of it in the image. It separates two pixels that see different
     triangles when it crosses the segment between their centres and lies before the surface that the uncovered one sees
@@ -99,14 +106,15 @@ def find_crossings(
             pairs, keys = empty_list(raster)
             register_silhouettes(positions, topology, raster, vertex_count, keys, pairs, gap)
         else:
-            pairs, keys = differing_pairs(raster)
+            pairs, keys = differing_pairs(raster, front)
             register_silhouettes(positions, topology, raster, vertex_count, keys, None, gap, meetings)
             crease_weights = None if crease_weights is None else dr.detach(crease_weights)
             dr.eval(crease_weights)
         dr.eval(keys, pairs)
         if marked is not None or meetings:
             meet = Meetings.of(positions, topology, raster, vertex_count, meetings, marked, crease_weights)
-        return _measure(positions, topology, raster, vertex_count, keys, pairs, marked, crease_weights, meet)
+        front = front if meetings else None
+        return _measure(positions, topology, raster, vertex_count, keys, pairs, marked, crease_weights, meet, front)
 
 
 def _measure(
@@ -119,11 +127,12 @@ def _measure(
     marked: MarkedFaces | None,
     crease_weights: Float | None,
     meetings: Meetings | None,
+    front: FrontSurfaces | None,
 ) -> Crossings:
     module = backend(positions)
     Float, Array4f = module.Float, module.Array4f
     pixels = dr.width(raster.triangle)
-    right, down = zeros(module, pixels, 2)
+    right, down, *cuts = zeros(module, pixels, 2 if front is None else 4)
     found = Crossings(
         right,
         down,
@@ -133,6 +142,7 @@ def _measure(
         dr.empty(Float, 8 * pixels),
         meetings,
         marked,
+        (cuts[0], cuts[1]) if cuts else None,
     )
 
     def visit(slot: UInt32, pair: UInt32) -> None:
@@ -144,6 +154,12 @@ def _measure(
         ends = dr.gather(module.Array2u, topology.edges, ~module.UInt32(key & 0xFFFFFFFF), silhouette)
         a, b = (dr.select(silhouette, end, NO_VERTEX) for end in (ends.x, ends.y))
         c, d, weight, weight_2, soft = module.UInt32(NO_VERTEX), module.UInt32(NO_VERTEX), Float(1), Float(0), Float(1)
+        seen, edged = None, silhouette
+        if front is not None:
+            cut, seen = _cut_in_front(topology, raster, front, image, pixel, step, down, ~silhouette | (key < BEFORE))
+            edged |= cut | (seen[0] == seen[1])
+            for array, active in zip(cuts, (cut & ~down, cut & down), strict=True):
+                dr.scatter(array, Float(1), pixel, active)
         if marked is not None:
             if crease_weights is not None:
                 soft = dr.minimum(*(dr.gather(Float, crease_weights, p, ~silhouette) for p in (pixel, pixel + step)))
@@ -156,7 +172,7 @@ def _measure(
             none = dr.full(module.UInt32, NO_VERTEX, dr.width(pair))
             a, b, c, d, weight, weight_2 = dr.if_stmt(
                 (image, pixel, step, down, a, b, soft),
-                ~silhouette & (soft > 0),
+                ~edged & (soft > 0),
                 crease,
                 lambda *lanes: (lanes[4], lanes[5], none, none, Float(1), Float(0)),
                 mode="symbolic",
@@ -164,7 +180,10 @@ def _measure(
             )
         if meetings is not None:
             bare = (a == NO_VERTEX) | (silhouette & (key < BEFORE))
-            here, there = (dr.gather(module.UInt32, raster.triangle, p, bare) for p in (pixel, pixel + step))
+            if seen is None:
+                seen = tuple(dr.gather(module.UInt32, raster.triangle, p, bare) for p in (pixel, pixel + step))
+            here, there = seen
+            bare &= here != there
             cross = functools.partial(_cut, topology, raster, image, pixel, here, there, down)
             meetings.add(slot, dr.select(bare, here, NO_TRIANGLE), there, soft, cross)
         first = image * uint_input(module, "vertices", vertex_count)
@@ -214,6 +233,39 @@ def _cut(
     return active & (start < 0) & (start + dr.select(down, b, a) > 0)
 
 
+def _cut_in_front(
+    topology: Topology,
+    raster: RasterOutput,
+    front: FrontSurfaces,
+    image: UInt32,
+    pixel: UInt32,
+    step: UInt32,
+    down: Bool,
+    bare: Bool,
+) -> tuple[Bool, tuple[UInt32, UInt32]]:
+    """(True if a surface in front may cut the raster's between two pixels, the triangles to look at there).
+
+    ``bare``: True without a silhouette between the pixels.
+    """
+    here, there = (dr.gather(backend(pixel).UInt32, raster.triangle, p) for p in (pixel, pixel + step))
+
+    def look(image, pixel, step, down, here, there, cut):  # noqa: ANN001, ANN202
+        one, other = front.triangles(pixel, pixel + step, here, there, cut)
+        cut &= (one != NO_TRIANGLE) & (other != NO_TRIANGLE)
+        cut = _cut(topology, raster, image, pixel, one, other, down, cut)
+        return cut, dr.select(cut, one, here), dr.select(cut, other, there)
+
+    cut, here, there = dr.if_stmt(
+        (image, pixel, step, down, here, there, bare),
+        front.differ(pixel, pixel + step, bare),
+        look,
+        lambda *lanes: (lanes[6] & False, lanes[4], lanes[5]),
+        mode="symbolic",
+        label="surfaces in front",
+    )
+    return cut, (here, there)
+
+
 def _meet(found: Crossings, meetings: Meetings, raster: RasterOutput) -> None:
     """Write the weights of pairs whose triangles intersect. These replace edges that only touch the surface behind them."""
     Array4u = backend(found.ends).Array4u
@@ -221,7 +273,7 @@ def _meet(found: Crossings, meetings: Meetings, raster: RasterOutput) -> None:
     def visit(slot: UInt32) -> None:
         pair = found.pairs.at(slot)
         down, pixel = (pair & 1) != 0, pair >> 1
-        value, rate = meetings.weights(pixel, down)
+        value, rate = meetings.weights(slot, pixel, down)
         met = value != 0
         dr.scatter(found.ends, Array4u(NO_VERTEX), slot, met)
         dr.scatter(found.slopes, rate, 4 * slot, met)

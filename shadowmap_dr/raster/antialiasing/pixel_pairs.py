@@ -14,6 +14,7 @@ from ...jit.arrays import backend, scatter_inc
 from ...jit.kernel_inputs import double_input, uint_input
 from ...jit.types import Bool, UInt32, UInt64
 from ..types import RasterOutput, by_pixel
+from .front_surfaces import FrontSurfaces
 
 # Slots for each lane. Lanes take slots in rounds, so that short lists end after the first round.
 _ROUNDS = 8
@@ -95,8 +96,8 @@ def empty_list(raster: RasterOutput) -> tuple[PairList, UInt64]:
     return PairList(dr.empty(UInt32, capacity), dr.zeros(UInt32, 1), dr.zeros(UInt32, 1), touched), keys
 
 
-def differing_pairs(raster: RasterOutput) -> tuple[PairList, UInt64]:
-    """Pairs whose pixels see different triangles, and keys: 0 for these pairs, undefined for others."""
+def differing_pairs(raster: RasterOutput, front: FrontSurfaces | None = None) -> tuple[PairList, UInt64]:
+    """Pairs whose pixels see different triangles or front surfaces, and keys: 0 for these pairs, undefined for others."""
     module = backend(raster.triangle)
     pixels = dr.width(raster.triangle)
     pixel = dr.arange(module.UInt32, pixels)
@@ -104,8 +105,13 @@ def differing_pairs(raster: RasterOutput) -> tuple[PairList, UInt64]:
     width, height = uint_input(module, "width", raster.width), uint_input(module, "height", raster.height)
     right, below = column + 1 < width, row + 1 < height
     here = raster.triangle
-    right &= dr.gather(module.UInt32, here, pixel + 1, right) != here
-    below &= dr.gather(module.UInt32, here, pixel + width, below) != here
+    apart = [
+        dr.gather(module.UInt32, here, other, active) != here for other, active in ((pixel + 1, right), (pixel + width, below))
+    ]
+    if front is not None:
+        apart[0] |= front.differ(pixel, pixel + 1, right)
+        apart[1] |= front.differ(pixel, pixel + width, below)
+    right, below = right & apart[0], below & apart[1]
     keys = dr.empty(module.UInt64, 2 * pixels)
     result = PairList(dr.empty(module.UInt32, 2 * pixels), dr.zeros(module.UInt32, 1), dr.zeros(module.UInt32, 1))
 

@@ -51,20 +51,19 @@ class Meetings:
         positions: flat clip-space vertices (4 V B), as rasterized.
         faces: (3 F,) vertex indices.
         parts, beyond: (F,) and (3 F,), see :class:`Topology`.
-        triangle: triangle that each pixel sees.
         batch: number of images.
         height, width, vertex_count: of an image.
         unconnected: True to intersect faces of different parts, and faces of one part that cut each other.
         marked, crease_weights: creases, and their weights, see
             :func:`shadowmap_dr.raster.antialiasing.edge_crossings.find_crossings`. If None, faces of one part form no creases.
         slots, count: candidate pairs without an edge, as slots in the list of all pairs, and their number.
+        here, there: triangles of the pairs in these slots, at the pixel and at its neighbour.
     """
 
     positions: Float
     faces: UInt32
     parts: UInt32
     beyond: UInt32
-    triangle: UInt32
     batch: int
     height: int
     width: int
@@ -74,6 +73,8 @@ class Meetings:
     crease_weights: Float | None
     slots: UInt32
     count: UInt32
+    here: UInt32
+    there: UInt32
 
     @classmethod
     def of(
@@ -87,9 +88,10 @@ class Meetings:
         crease_weights: Float | None = None,
     ) -> Meetings:
         size = raster.batch, raster.height, raster.width, vertex_count
-        surfaces = topology.faces, topology.parts, topology.beyond, raster.triangle
-        UInt32 = backend(raster.triangle).UInt32
-        found = dr.empty(UInt32, 2 * dr.width(raster.triangle)), dr.zeros(UInt32, 1)
+        surfaces = topology.faces, topology.parts, topology.beyond
+        UInt32, pairs = backend(raster.triangle).UInt32, 2 * dr.width(raster.triangle)
+        slots, count, here, there = dr.empty(UInt32, pairs), dr.zeros(UInt32, 1), dr.empty(UInt32, pairs), dr.empty(UInt32, pairs)
+        found = slots, count, here, there
         return cls(dr.detach(positions), *surfaces, *size, unconnected, marked, crease_weights, *found)
 
     def add(self, slot: UInt32, here: UInt32, there: UInt32, soft: Float, cross: Callable[[Bool], Bool]) -> None:
@@ -109,17 +111,19 @@ class Meetings:
         if self.unconnected:
             listed |= cross(both & ~listed)
         dr.scatter(self.slots, slot, scatter_inc(self.count, UInt32(0), listed), listed)
+        dr.scatter(self.here, here, slot, listed)
+        dr.scatter(self.there, there, slot, listed)
 
     def for_each(self, visit: Callable[[UInt32], None]) -> None:
         """Call ``visit(slot)``, which scatters its results, for all listed pairs: few, but each is expensive."""
         each_number(self.count, _LANES, lambda k: visit(dr.gather(type(k), self.slots, k)))
 
-    def weights(self, pixel: UInt32, down: Bool) -> tuple[Float, Float]:
-        """Weights of pairs of pixels, and their change with the first pixel's depth minus the second's.
+    def weights(self, slot: UInt32, pixel: UInt32, down: Bool) -> tuple[Float, Float]:
+        """Weights of listed pairs, and their change with the first pixel's depth minus the second's.
 
         Both are 0 where the triangles do not intersect in between. Weights are signed (see :class:`Crossings`).
         """
-        cut = self._cut(pixel, down)
+        cut = self._cut(slot, pixel, down)
         # Weight of ridges and valleys; smooth surfaces have none.
         soft = self.module.Float(0 if self.marked is None else 1)
         parts = [dr.gather(self.module.UInt32, self.parts, triangle) for triangle in cut.triangles]
@@ -152,12 +156,12 @@ class Meetings:
         share = dr.select(meet, dr.select(down, 1 - share, share) * dr.select(folded, soft, 1), 0)
         return self.module.Float(share) * beyond_middle(self.module.Float(t)), self.module.Float(-share * slope)
 
-    def slopes(self, pixel: UInt32, down: Bool, rate: Float) -> list[tuple[UInt32, Vector4f]]:
+    def slopes(self, slot: UInt32, pixel: UInt32, down: Bool, rate: Float) -> list[tuple[UInt32, Vector4f]]:
         """(vertex, derivative of the weight by its clip-space position) for all six vertices of pairs that have a weight.
 
         ``rate``: change of the weight with the depth, see :meth:`weights`.
         """
-        module, cut = self.module, self._cut(pixel, down)
+        module, cut = self.module, self._cut(slot, pixel, down)
         t = -cut.start * precise_rcp(dr.select(cut.change != 0, cut.change, 1))
         result = []
         for k, (sign, weights) in enumerate(zip((1, -1), cut.barycentrics(t), strict=True)):
@@ -172,8 +176,8 @@ class Meetings:
         """Module of the arrays' types."""
         return backend(self.positions)
 
-    def _cut(self, pixel: UInt32, down: Bool) -> _Cut:
-        """The planes of the triangles that pixels and their neighbours see, and where they cross in between."""
+    def _cut(self, slot: UInt32, pixel: UInt32, down: Bool) -> _Cut:
+        """The planes of the triangles of listed pairs, and where they cross in between."""
         module = self.module
         image, row, column = by_pixel(pixel, self.batch, self.height, self.width)
         first = image * uint_input(module, "vertices", self.vertex_count)
@@ -181,7 +185,7 @@ class Meetings:
         x, y = exact_centres(module, row, column, self.height, self.width)
         step_x, step_y = double_input(module, "width", 2 / self.width), double_input(module, "height", 2 / self.height)
         pixels = pixel, pixel + dr.select(down, uint_input(module, "width", self.width), 1)
-        triangles = [dr.gather(module.UInt32, self.triangle, p) for p in pixels]
+        triangles = [dr.gather(module.UInt32, triangles, slot) for triangles in (self.here, self.there)]
         found = [_plane(gather_triangle(self.positions, self.faces, triangle, first, True)) for triangle in triangles]
         indices = [dr.gather(module.Array3u, self.faces, triangle) for triangle in triangles]
         vertices = [[first + i[k] for k in range(3)] for i in indices]

@@ -208,6 +208,7 @@ class CameraPass:
             crease_weights=sharpness,
             meetings=True,
             gap=least_gap(view.sensor),
+            front=None if view.layers is None else view.layers.front,
             **shapes.creases,
         )
 

@@ -11,7 +11,7 @@ import mitsuba as mi
 from ...jit.arrays import backend
 from ...jit.kernel_inputs import uint_input
 from ...jit.types import Bool, Float, UInt32
-from ...raster import NO_TRIANGLE, Crossings, RasterOutput, peeled_layers, stacked, with_triangles
+from ...raster import NO_TRIANGLE, Crossings, FrontSurfaces, RasterOutput, peeled_layers, stacked, with_triangles
 from ...scene.geometry import Geometry
 from .translucent_faces import Faces
 from .transmission import whole_triangles
@@ -27,7 +27,7 @@ class Layers:
     Attributes:
         translucent: K rasters of the translucent faces alone, front to back, with nothing where rays meet fewer of them.
         faces: these faces.
-        used: number of translucent surfaces of each ray.
+        front: the translucent surfaces of each ray: their number, and the last one.
         opaque: K + 1 rasters of the opaque surfaces that are seen behind no, one, ... translucent surfaces.
         nearest: raster of the nearest surfaces of all.
         attached: False if places and outlines of the translucent surfaces carry no gradients.
@@ -37,25 +37,30 @@ class Layers:
     faces: Faces
     opaque: tuple[RasterOutput, ...]
     nearest: RasterOutput
-    used: UInt32
+    front: FrontSurfaces
     attached: bool
 
     def outlines(self, raster: RasterOutput, crossings: Crossings) -> tuple[Crossings, ...]:
         """The outlines of each of the rasters ``opaque``, from those of all opaque surfaces.
 
-        An outline belongs to the nearer one of the surfaces that it separates.
+        An outline belongs to the nearer one of the surfaces that it separates. A line along which a translucent surface
+        intersects an opaque one belongs to what lies behind the surfaces before that one.
 
         Args:
             raster: of all opaque surfaces.
             crossings: their outlines.
         """
-        pixel, last = dr.arange(mi.UInt32, dr.width(self.used)), dr.width(self.used) - 1
+        used = self.front.count
+        pixel, last = dr.arange(mi.UInt32, dr.width(used)), dr.width(used) - 1
         depth, levels = dr.detach(raster.depth), []
         dr.eval(depth)
-        for step in (1, raster.width):
+        for number, step in enumerate((1, raster.width)):
             other = dr.minimum(pixel + uint_input(backend(pixel), "width", step), last)
-            own = depth <= dr.gather(mi.Float, depth, other)
-            levels.append(dr.select(own, self.used, dr.gather(mi.UInt32, self.used, other)))
+            own, there = depth <= dr.gather(mi.Float, depth, other), dr.gather(mi.UInt32, used, other)
+            level = dr.select(own, used, there)
+            if crossings.cuts is not None:
+                level = dr.select(crossings.cuts[number] != 0, dr.minimum(used, there), level)
+            levels.append(level)
         right, down = levels
         parts = [
             (dr.select(right == k, crossings.right, 0), dr.select(down == k, crossings.down, 0)) for k in range(len(self.opaque))
@@ -111,5 +116,9 @@ def see_layers(
 
     behind = [dr.select(used == k, opaque.triangle, NO_TRIANGLE) for k in range(len(triangles) + 1)]
     nearest = dr.select(used == 0, opaque.triangle, triangles[0])
-    dr.eval(triangles, behind, nearest, used)
-    return Layers(tuple(peeled), faces, tuple(map(raster, behind)), raster(nearest), used, attached)
+    last = mi.UInt32(NO_TRIANGLE)
+    for triangle in triangles:
+        last = dr.select(triangle != NO_TRIANGLE, triangle, last)
+    dr.eval(triangles, behind, nearest, used, last)
+    front = FrontSurfaces(used, last)
+    return Layers(tuple(peeled), faces, tuple(map(raster, behind)), raster(nearest), front, attached)

@@ -63,7 +63,9 @@ class _Checkpointed(dr.CustomOp):
     def eval(self, arrays: list[AnyArray], implicit: list[AnyArray], call: _Call) -> Any:  # Any: nested lists of arrays
         self._call = call
         self.add_input(implicit)
-        return _evaluated(call.term, call.count, call.tree)
+        # Dr.Jit detaches only what it is given: graphs from implicit arrays would keep all terms in memory.
+        with dr.suspend_grad():
+            return _evaluated(call.term, call.count, call.tree)
 
     def forward(self) -> None:
         call, totals, own = self._call, None, []

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -81,19 +82,25 @@ class ImagePass:
     def _layered(self, frame: Frame, layers: Layers, color: Color3f, lighting: Lighting, shapes: PlacedShapes) -> TensorXf:
         """The image of opaque surfaces (``frame``, of ``color``) and of the translucent layers before them. Attached."""
         view, settings, sensor = frame.view, self.light.settings, frame.view.sensor
+        layers.check_memory(layers.attached or dr.grad_enabled(color))
         channels = dr.size_v(mi.UnpolarizedSpectrum)
         coverage = None
         if sensor.alpha or "opacity" in settings.aovs:
             coverage = dr.select(frame.surface.active & (settings.max_depth != 0), mi.Float(1), 0)
         opaque = below = Blended.of(color, coverage)
         made = self._layers(view, layers, opaque, lighting, shapes)
+        if layers.at_once(view.clip) >= len(layers.translucent):
+            # Before anything is blended: their look-ups in maps and those of opaque surfaces then have one adjoint.
+            made = iter(list(made))
         outlines = self._outlines_of_levels(frame, layers, shapes) if settings.antialias else ()
-        for number in reversed(range(len(layers.opaque))):
-            if number < len(made):
-                below = below.behind(made[number])
+        # One behind all layers, then the layers from the last to the first.
+        for number, layer in enumerate(itertools.chain([None], made)):
+            if layer is not None:
+                below = below.behind(layer)
             if outlines:
+                level = len(outlines) - 1 - number
                 below = below.outlined(
-                    replace(view, raster=layers.opaque[number]), outlines[number], frame.sharpness, shapes.creases
+                    replace(view, raster=layers.opaque[level]), outlines[level], frame.sharpness, shapes.creases
                 )
         taken = mi.Float(0) if coverage is None else below.channels[-1]
         named = self._aovs_of_nearest(view, lighting, shapes, taken)
@@ -109,9 +116,13 @@ class ImagePass:
 
         return computed("outlines of levels", found)
 
-    def _layers(self, view: CameraView, layers: Layers, opaque: Blended, lighting: Lighting, shapes: PlacedShapes) -> list[Layer]:
-        """The translucent layers of a view, front to back, several at once. Attached. ``opaque``: as of ``Layer.outlined``."""
-        made: list[Layer] = []
+    def _layers(
+        self, view: CameraView, layers: Layers, opaque: Blended, lighting: Lighting, shapes: PlacedShapes
+    ) -> Iterator[Layer]:
+        """The translucent layers of a view, back to front, several made at once. Attached.
+
+        ``opaque``: as of ``Layer.outlined``.
+        """
         faces, edges = layers.faces, shapes.translucent
         assert edges is not None, "placed together with the translucent faces"
         placed = shapes if layers.attached else shapes.detached
@@ -123,10 +134,10 @@ class ImagePass:
             active = own.surface.active
             layer = Layer.of(radiance, transmittance_of(own.surface, faces.bsdfs), active, len(opaque.channels))
             if self.light.settings.antialias:
-                made += layer.outlined(seen, active, opaque, own.sharpness, shapes.translucent_creases)
+                made = layer.outlined(seen, active, opaque, own.sharpness, shapes.translucent_creases)
             else:
-                made += layer.apart(chosen.batch)
-        return made
+                made = layer.apart(chosen.batch)
+            yield from reversed(made)
 
     def _aovs_of_nearest(self, view: CameraView, lighting: Lighting, shapes: PlacedShapes, coverage: Float) -> list[Float]:
         """Further channels of the nearest surfaces, whether they are opaque or not."""

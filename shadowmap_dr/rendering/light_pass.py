@@ -48,7 +48,7 @@ from .gbuffer.pixel_footprint import FootprintSamples, footprint_points
 from .gbuffer.surface import Surface
 from .light_colours import white_area_light, white_light
 from .light_loops import MANY_LIGHTS, many_lights
-from .light_slices import LightSlice, joined_fits, plan_slices, shining_objects
+from .light_slices import LightSlice, TexelLayers, joined_fits, plan_slices, shining_objects
 from .light_tiles import sized, with_transmittance
 from .settings import RenderSettings
 from .shadow_pass import MapPlan, arriving_light, fit_maps, light_through, make_maps, map_vertices, visibility_of
@@ -147,6 +147,7 @@ class LightPass:
         slices: slices of the lights, whose maps are in memory one after the other; none if all fit together.
         shadow: settings of the maps of lights without extent, None for those of ``settings``.
         texel_density: of transmittance maps (:func:`~.light_tiles.texel_density`), None without translucent casters.
+        layers: number of translucent layers of a texel, 0 without translucent casters.
     """
 
     data: SceneData
@@ -157,16 +158,21 @@ class LightPass:
     slices: tuple[LightSlice, ...] = ()
     shadow: ShadowSettings | None = None
     texel_density: float | None = None
+    layers: int = 0
 
-    def for_image(self, pixels: int, spp: int = 1) -> LightPass:
-        """The same pass with maps as large as images of so many pixels, with ``spp`` samples each, need."""
+    def for_image(self, pixels: int, spp: int = 1, attached: bool = False) -> LightPass:
+        """The same pass with maps as large as images of so many pixels, with ``spp`` samples each, need.
+
+        ``attached``: True if transmittance maps carry gradients.
+        """
         shadow = sized(self.settings.shadow, self.plan, pixels)
         if self.texel_density is not None:
             shadow = with_transmittance(self.settings, shadow, pixels * spp, self.texel_density)
-        if shadow is self.settings.shadow:
-            return self
-        # Slices were planned for larger maps.
-        slices = self.slices and plan_slices(self.data, self.plan, self.soft, self.settings, shadow)
+        slices = self.slices
+        # Slices were planned for larger maps, but without translucent layers.
+        if self.layers or (slices and shadow is not self.settings.shadow):
+            layers = TexelLayers(self.layers, attached)
+            slices = plan_slices(self.data, self.plan, self.soft, self.settings, shadow, layers)
         return replace(self, shadow=shadow, slices=slices)
 
     @property

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import drjit as dr
 import mitsuba as mi
 
 from ..errors import ShadowmapError
@@ -14,6 +15,7 @@ from ..scene.lights.area import AreaLight
 from ..scene.lights.read import Light
 from ..scene.load import SceneData
 from ..shadow import Frusta, ShadowSettings
+from ..shadow.transmittance_maps import numbers_of_texel
 from .extended_lights import SoftFrusta, SoftPlan
 from .settings import RenderSettings
 from .shadow_pass import MapPlan
@@ -21,10 +23,28 @@ from .shadow_pass import MapPlan
 # Bytes of a map, its derivatives included: for each texel (as it is rasterized), and in addition for each number that the texel
 # stores; for each vertex; for each triangle. Measured peaks, rounded up (docs/performance.md).
 _TEXEL, _NUMBER, _VERTEX, _TRIANGLE = 50, 20, 112, 56
-# Bytes of a texel's translucent layers, if it has some four of them.
-_LAYERS = 600
+# Bytes of a texel of a transmittance map: for all layers; for each layer, for each number of a layer, and for the outlines of a
+# layer; for each layer without derivatives.
+_TRANSMITTANCE, _LAYER, _LAYER_NUMBER, _LAYER_OUTLINES, _FIXED_LAYER = 600, 50, 11, 420, 55
 # Bytes of a stored number's gradient, of which each extended light has one for the maps of all of them.
 _GRADIENT = 4
+
+
+@dataclass(frozen=True)
+class TexelLayers:
+    """Translucent layers of the texels of shadow maps. Static.
+
+    Attributes:
+        count: their number.
+        attached: True if they carry gradients.
+    """
+
+    count: int = 0
+    attached: bool = False
+
+
+#: Those of scenes without translucent casters.
+NO_LAYERS = TexelLayers()
 
 
 @dataclass(frozen=True)
@@ -72,19 +92,30 @@ def joined_fits(fits: Sequence[tuple[Frusta | None, SoftFrusta]]) -> tuple[Frust
 
 
 def plan_slices(
-    data: SceneData, plan: MapPlan, soft: Sequence[SoftPlan], settings: RenderSettings, shadow: ShadowSettings | None = None
+    data: SceneData,
+    plan: MapPlan,
+    soft: Sequence[SoftPlan],
+    settings: RenderSettings,
+    shadow: ShadowSettings | None = None,
+    layers: TexelLayers = NO_LAYERS,
 ) -> tuple[LightSlice, ...]:
     """Slices of the lights, as few and as equal as fit into ``settings.light_memory`` each; none if all lights fit together.
 
     A light whose maps take more is a slice of its own. A single slice would save nothing: then there are none.
-    ``shadow``: settings of the maps of lights without extent, if they differ from ``settings.shadow``.
+
+    Args:
+        data: the scene.
+        plan, soft: maps of the lights without extent, and of the others.
+        settings: settings of the rendering.
+        shadow: settings of the maps of lights without extent, if they differ from ``settings.shadow``.
+        layers: translucent layers of texels.
 
     Raises:
         ShadowmapError: the maps of a single light take more memory than that and than the machine has.
     """
     if settings.shadow.method == "none" or not settings.lit:
         return ()
-    sizes = _Sizes.of(data, plan, soft, settings, shadow or settings.shadow)
+    sizes = _Sizes.of(data, plan, soft, settings, shadow or settings.shadow, layers)
     budget, every = int(settings.light_memory * 2**30), sizes.count
     if sizes.bytes(0, every) <= budget:
         return ()
@@ -95,7 +126,7 @@ def plan_slices(
         raise ShadowmapError(
             f"The shadow maps of light '{names[largest]}' take {least / 2**30:.3g} GiB, more than light_memory "
             f"({settings.light_memory:g} GiB) and this machine ({memory / 2**30:.3g} GiB): lower shadow_map_resolution, "
-            f"soft_map_resolution or the number of the light's samples."
+            f"soft_map_resolution{', translucent_layers' if layers.count else ''} or the number of the light's samples."
         )
     own = plan.counts
     groups = _groups(sizes, budget)
@@ -116,12 +147,18 @@ class _Sizes:
 
     @classmethod
     def of(
-        cls, data: SceneData, plan: MapPlan, soft: Sequence[SoftPlan], settings: RenderSettings, shadow: ShadowSettings
+        cls,
+        data: SceneData,
+        plan: MapPlan,
+        soft: Sequence[SoftPlan],
+        settings: RenderSettings,
+        shadow: ShadowSettings,
+        layers: TexelLayers,
     ) -> _Sizes:
         sampled, single = settings.soft_shadow
         kinds = [(count, shadow) for count in plan.counts]
         kinds += [(one.maps, single if one.kind == "single" else sampled) for one in soft]
-        maps = [count * map_bytes(setting, data.geometry) for count, setting in kinds]
+        maps = [count * map_bytes(setting, data.geometry, layers) for count, setting in kinds]
         gradients = [count * _GRADIENT * _numbers(setting) * setting.resolution**2 for count, setting in kinds]
         return cls(maps, [0] * len(plan.kinds) + gradients[len(plan.kinds) :])
 
@@ -135,12 +172,22 @@ class _Sizes:
         return sum(self.maps[first:last]) + len(gradients) * sum(gradients)
 
 
-def map_bytes(settings: ShadowSettings, geometry: Geometry) -> int:
-    """Estimate of the memory (bytes) for making, filtering and differentiating one map."""
-    translucent = any(info.see_through and not info.unseen for info in geometry.shapes)
-    each = _TEXEL + _NUMBER * _numbers(settings) + _LAYERS * translucent
-    texels = (settings.resolution * settings.supersampling) ** 2 * each
+def map_bytes(settings: ShadowSettings, geometry: Geometry, layers: TexelLayers = NO_LAYERS) -> int:
+    """Estimate of the memory (bytes) for making, filtering and differentiating one map. ``layers``: of its texels."""
+    each = _TEXEL + _NUMBER * _numbers(settings)
+    texels = (settings.resolution * settings.supersampling) ** 2 * each + _transmittance_bytes(settings, layers)
     return texels + _VERTEX * geometry.vertex_count + _TRIANGLE * geometry.face_count
+
+
+def _transmittance_bytes(settings: ShadowSettings, layers: TexelLayers) -> int:
+    """Estimate of the memory (bytes) for making, filtering and differentiating one transmittance map."""
+    if not layers.count:
+        return 0
+    settings, each = settings.of_transmittance, _FIXED_LAYER
+    if layers.attached:
+        numbers = numbers_of_texel(settings, layers.count, dr.size_v(mi.UnpolarizedSpectrum))
+        each = _LAYER + _LAYER_NUMBER * numbers + _LAYER_OUTLINES * settings.antialias
+    return (settings.resolution * settings.supersampling) ** 2 * (_TRANSMITTANCE + each * layers.count)
 
 
 def _numbers(settings: ShadowSettings) -> int:

@@ -12,7 +12,7 @@ from ..jit.types import Bool, Point3f
 from ..scene.load import SceneData
 from ..shadow import Frusta, ShadowSettings, project, stack_views
 from .light_loops import MANY_LIGHTS
-from .light_slices import map_bytes
+from .light_slices import TexelLayers, map_bytes
 from .settings import RenderSettings
 from .shadow_pass import MapPlan
 
@@ -82,7 +82,13 @@ def with_transmittance(settings: RenderSettings, shadow: ShadowSettings, samples
 
 
 def with_tiles(
-    plan: MapPlan, data: SceneData, settings: RenderSettings, fit: Frusta | None, seen: tuple[Point3f, Bool], samples: int
+    plan: MapPlan,
+    data: SceneData,
+    settings: RenderSettings,
+    fit: Frusta | None,
+    seen: tuple[Point3f, Bool],
+    samples: int,
+    layers: int = 0,
 ) -> MapPlan:
     """The plan with tiles for each directional light and each spot, as many as its pixels are worth. Reads back.
 
@@ -96,6 +102,7 @@ def with_tiles(
         fit: fit of the plan's maps, None if there are none.
         seen: points that the camera sees (Point3f, world space), and the mask of the valid ones.
         samples: samples of the image.
+        layers: number of translucent layers of a texel, 0 without translucent casters.
     """
     shadow, lights = settings.shadow, data.lights
     small = samples * _TEXELS < math.sqrt(2) * shadow.resolution**2
@@ -108,7 +115,8 @@ def with_tiles(
             _, _, _, inside = project(view, fit.part(plan.first[k], 1), seen[0])
             texels = np.mean((inside & seen[1]).numpy()) * samples * _TEXELS
             wanted[k] = 2 ** round(math.log2(max(texels / shadow.resolution**2, 1)))
-    most, room = 2 ** int(math.log2(shadow.tiles)), settings.light_memory * 2**30 / map_bytes(shadow, data.geometry)
+    most = 2 ** int(math.log2(shadow.tiles))
+    room = settings.light_memory * 2**30 / map_bytes(shadow, data.geometry, TexelLayers(layers))
     while True:
         divided = replace(plan, tiles=tuple(min(tiles, most) for tiles in wanted))
         if most == 1 or divided.maps <= room:

@@ -18,7 +18,7 @@ from ..jit.frozen import take_apart
 from ..jit.gpu import keep_registers
 from ..jit.kernel_cache import note_size
 from ..jit.kernel_inputs import shared_inputs
-from ..jit.pytree import tree_map
+from ..jit.pytree import attached_arrays, tree_map
 from ..jit.types import Bool, Float, Point3f, TensorXf
 from ..raster import Topology, build_topology, outward_faces
 from ..scene.geometry import Geometry
@@ -208,7 +208,7 @@ class Renderer:
             made.frusta, made.soft_frusta = made.light_pass.for_image(pixels).fit(shapes, seen)
             undivided = made.frusta
             samples = samples or spp * sum(view.size.width * view.size.height for view in views)
-            plan = with_tiles(plan, data, self.settings, made.frusta, seen, samples)
+            plan = with_tiles(plan, data, self.settings, made.frusta, seen, samples, made.light_pass.layers)
             if plan.maps > made.plan.maps:
                 made.plan, made.slices = plan, plan_slices(data, plan, self.soft, self.settings)
                 made.frusta, made.soft_frusta = made.light_pass.fit(shapes, seen)
@@ -223,6 +223,7 @@ class Renderer:
                 maps = made.light_pass.for_image(pixels).map_vertices(shapes.geometry, (made.frusta, made.soft_frusta))
                 camera = data.sensors[0][0]
                 made.translucency = made.translucency.counted(data, shapes.geometry, camera, pictures, maps)
+                made.slices = made.light_pass.for_image(pixels).slices
         return made
 
     def with_data(self, data: SceneData) -> Renderer:
@@ -306,7 +307,10 @@ class Renderer:
         factor = sample_grid(spp, windows)
         margin = Margin.of(cameras, factor) if self.settings.antialias else Margin()
         cache = cache or PassCache()
-        light = self.light_pass.for_image(_pixels(cameras), factor**2)
+        attached = self.translucency is not None and (
+            self.translucency.attached(geometry) or bool(attached_arrays((lights, self.data.lights, self.data.areas)))
+        )
+        light = self.light_pass.for_image(_pixels(cameras), factor**2, attached)
         if light.slices:
             cache.keep(min(cache.level, CacheLevel.VIEW))  # maps of lights in slices are not kept
         images = ImagePass(self.camera_pass, light)
@@ -377,8 +381,11 @@ class Renderer:
     @property
     def light_pass(self) -> LightPass:
         """The pass that renders shadow maps and light."""
-        density = None if self.translucency is None else self.translucency.texel_density
-        return LightPass(self.data, self.settings, self.plan, self.soft, self.outward, self.slices, texel_density=density)
+        made = LightPass(self.data, self.settings, self.plan, self.soft, self.outward, self.slices)
+        translucent = self.translucency
+        if translucent is None or translucent.faces is None:
+            return made
+        return replace(made, texel_density=translucent.texel_density, layers=translucent.maps.layers)
 
     def _lighting(
         self, light: LightPass, views: Sequence[CameraView], shapes: PlacedShapes, replacements: Mapping[str, Any] | None

@@ -144,7 +144,8 @@ class _Sum(dr.CustomOp):
         self._trees, self._owned, self._call, self._lanes = trees, owned, call, lanes
         self.add_input(implicit)
         own, shared = trees[0]
-        found = _loop(lambda index: call.term(index, own, shared), call.count, call.zero, call.active)
+        with dr.suspend_grad():  # Dr.Jit detaches only what it is given, not implicit arrays
+            found = _loop(lambda index: call.term(index, own, shared), call.count, call.zero, call.active)
         self._shared_value = dr.width(found) == 1
         return found
 

@@ -95,6 +95,12 @@ def groups_of(settings: ShadowSettings, layers: int) -> int:
     return min(settings.transmittance_groups or (_FEW_GROUPS if layers <= _FEW_LAYERS else _MANY_GROUPS), layers)
 
 
+def numbers_of_texel(settings: ShadowSettings, layers: int, colours: int) -> int:
+    """Numbers that a texel stores if it sees so many translucent casters: of all distributions, in packets of four."""
+    own = colours + 1 + (2 * settings.order if settings.transmittance_method == "csm" else 4)
+    return groups_of(settings, layers) * (own + -own % 4)
+
+
 def render_transmittance(
     casters: TranslucentCasters, clip: Float, views: Views, frusta: Frusta, settings: ShadowSettings
 ) -> TransmittanceMaps:

@@ -344,6 +344,19 @@ def placed(scene: mi.Scene, name: str, **settings: Any) -> tuple[np.ndarray, flo
     return np.array(image), float(dr.grad(shift)[0])
 
 
+def test_layers_that_do_not_fit_into_memory_are_refused(variant: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    renderer = Renderer.from_scene(scene_of(16, **stacks()["five"]), translucent_layers=4)
+    needed = 16 * 16 * 4 * (320 + 32)
+    monkeypatch.setattr(translucent_layers, "physical_memory", lambda: needed)
+    renderer.render()
+    with pytest.raises(ShadowmapError, match=r"4 translucent layers of 1,024 samples take .* GiB, but .*: lower spp or"):
+        renderer.render(spp=4)
+    moved = dr.unravel(mi.Point3f, dr.ravel(renderer.vertices("ball")))
+    dr.enable_grad(moved)
+    with pytest.raises(ShadowmapError, match="4 translucent layers of 256 samples .*derivatives included"):
+        renderer.render({"ball": moved})
+
+
 @pytest.mark.parametrize("antialias", [True, False])
 def test_layers_one_by_one_are_the_same(variant: str, monkeypatch: pytest.MonkeyPatch, antialias: bool) -> None:
     """As if memory were short: layers are not shaded or encoded together. Texels differ where outlines of two layers meet."""
@@ -361,7 +374,7 @@ def test_fixed_casters_make_no_attached_maps(variant: str, monkeypatch: pytest.M
     """Derivatives by the place of an opaque shape between panes are what they are when panes are attached, too."""
     scene = scene_of(32, **stacks()["five"])
     image, gradient = placed(scene, "ball")
-    monkeypatch.setattr(translucency, "_attached", lambda *_: True)
+    monkeypatch.setattr(translucency.Translucency, "attached", lambda *_: True)
     other, attached = placed(scene, "ball")
     np.testing.assert_allclose(other, image, atol=1e-6)
     assert attached == pytest.approx(gradient, rel=1e-3)

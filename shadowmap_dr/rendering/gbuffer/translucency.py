@@ -128,7 +128,7 @@ class Translucency:
         if faces is None:
             return None
         solid = loss_counts(data, geometry, camera, faces)
-        attached = _attached(geometry, faces) or dr.grad_enabled(camera)
+        attached = self.attached(geometry) or dr.grad_enabled(camera)
         return see_layers(clip, geometry, faces, opaque, (count.layers, count.passes), solid, attached)
 
     def casters(
@@ -149,14 +149,15 @@ class Translucency:
             count.passes,
             towards_lights(data, geometry, camera, faces),
             loss_counts(data, geometry, camera, faces),
-            _attached(geometry, faces),
+            self.attached(geometry),
         )
 
-
-def _attached(geometry: Geometry, faces: Faces) -> bool:
-    """True if vertices or materials of translucent shapes may carry gradients."""
-    moving = any(info.see_through and geometry.attached(info) for info in geometry.shapes)
-    return moving or bool(attached_parameters(faces.bsdfs))
+    def attached(self, geometry: Geometry) -> bool:
+        """True if vertices or materials of translucent shapes may carry gradients."""
+        if self.faces is None:
+            return False
+        moving = any(info.see_through and geometry.attached(info) for info in geometry.shapes)
+        return moving or bool(attached_parameters(self.faces.bsdfs))
 
 
 def _before(opaque: RasterOutput, passed: Callable[[RasterOutput], Float], seen: RasterOutput) -> Float:

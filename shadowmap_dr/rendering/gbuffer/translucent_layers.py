@@ -8,8 +8,10 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
+from ...errors import ShadowmapError
 from ...jit.arrays import backend
 from ...jit.kernel_inputs import uint_input
+from ...jit.memory import physical_memory
 from ...jit.types import Bool, Float, UInt32
 from ...raster import NO_TRIANGLE, Crossings, FrontSurfaces, RasterOutput, peeled_layers, stacked, with_triangles
 from ...scene.geometry import Geometry
@@ -18,6 +20,9 @@ from .transmission import whole_triangles
 
 # Most pixels, numbers of vertices or of triangles, of layers that are shaded at once.
 _MOST_NUMBERS = 1 << 22
+# Bytes for each sample of each layer: while it is shaded, from then on, and from then on if it has derivatives. Measured with 24
+# layers of 512 to 2048 samples along a side.
+_SHADED, _KEPT, _KEPT_FOR_DERIVATIVES = 320, 32, 160
 
 
 @dataclass(frozen=True)
@@ -39,6 +44,18 @@ class Layers:
     nearest: RasterOutput
     front: FrontSurfaces
     attached: bool
+
+    def check_memory(self, attached: bool) -> None:
+        """Raise ShadowmapError if the layers take more memory than the machine has. ``attached``: with derivatives."""
+        samples, count, memory = dr.width(self.front.count), len(self.translucent), physical_memory()
+        kept = count * (_KEPT_FOR_DERIVATIVES if attached else _KEPT)
+        needed = _SHADED * min(count * samples, max(samples, _MOST_NUMBERS)) + kept * samples
+        if needed > memory:
+            raise ShadowmapError(
+                f"{count} translucent layers of {samples:,} samples take {needed / 2**30:.3g} GiB"
+                f"{', derivatives included' if attached else ''}, but this machine has {memory / 2**30:.3g} GiB: lower spp or "
+                "translucent_layers, or render parts of the image with crop windows."
+            )
 
     def outlines(self, raster: RasterOutput, crossings: Crossings) -> tuple[Crossings, ...]:
         """The outlines of each of the rasters ``opaque``, from those of all opaque surfaces.
@@ -68,15 +85,20 @@ class Layers:
         dr.eval(parts)
         return tuple(replace(crossings, right=right, down=down) for right, down in parts)
 
+    def at_once(self, clip: Float) -> int:
+        """Number of layers that are shaded at once. ``clip``: clip-space vertices (4 V,) of the scene."""
+        pixels = dr.width(self.front.count)
+        return max(1, _MOST_NUMBERS // max(pixels, dr.width(clip), 4 * dr.width(self.faces.corners)))
+
     def in_batches(self, clip: Float) -> Iterator[tuple[RasterOutput, Float]]:
         """Rasters of several translucent layers each, one image for each layer, and the clip-space vertices of these images.
 
+        From the last layers to the first, so that images without derivatives need memory for some layers at once only.
+
         ``clip``: clip-space vertices (4 V,) of the scene. Attached.
         """
-        first, clip = self.translucent[0], clip if self.attached else dr.detach(clip)
-        corners = self.faces.corners
-        at_once = max(1, _MOST_NUMBERS // max(dr.width(first.triangle), dr.width(clip), 4 * dr.width(corners)))
-        for start in range(0, len(self.translucent), at_once):
+        at_once, clip, corners = self.at_once(clip), clip if self.attached else dr.detach(clip), self.faces.corners
+        for start in reversed(range(0, len(self.translucent), at_once)):
             yield stacked(self.translucent[start : start + at_once], clip, corners, 1)
 
 

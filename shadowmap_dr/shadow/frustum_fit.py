@@ -17,6 +17,8 @@ from .tiles import Tiles
 #: Bounds in a light's image plane and of depths: (x0, y0, x1, y1, z0, z1).
 Extent: TypeAlias = tuple[Float, Float, Float, Float, Float, Float]
 
+# Distance of maps from the light, and before a directional light's origin, where nothing casts shadows and receivers are not known.
+_CLOSE, _AWAY = 1e-6, 1e6
 # A frustum is kept while it contains the scene and the scene fills at least this fraction of it.
 _KEEP_FILL = 0.6
 _MARGIN = 0.10
@@ -167,15 +169,18 @@ def _fit(
     x0, y0, x1, y1, z0, z1 = Bounds(needed).of(dr.arange(module.UInt32, views.count))
     nothing = ~(x1 >= x0)
     x0, y0, x1, y1 = (dr.select(nothing, s, v) for s, v in ((-1.0, x0), (-1.0, y0), (1.0, x1), (1.0, y1)))
-    z0, z1 = dr.select(nothing, 0.0, z0), dr.select(nothing, 1.0, z1)
 
     perspective = views.spread > 0
     x0, y0 = dr.maximum(x0, window[0]), dr.maximum(y0, window[1])
     x1, y1 = dr.minimum(x1, window[2]), dr.minimum(y1, window[3])
+    # If no caster lies between the light and visible receivers, maps end before these: whatever else they show is lit.
+    nothing |= (x1 < x0) | (y1 < y0)
+    before = _before_receivers(perspective, window)
+    z0, z1 = dr.select(nothing, before, z0), dr.select(nothing, before, z1)
     # Casters behind all visible receivers do not matter; but visible receivers may end before the first caster.
     z1 = dr.maximum(dr.minimum(z1, window[5]), z0)
     # The distance of casters before all visible receivers does not matter. All casters may lie there.
-    receivers = dr.select(dr.isfinite(window[4]), dr.maximum(window[4], z0), z0)
+    receivers = dr.select(dr.isfinite(window[4]) & ~nothing, dr.maximum(window[4], z0), z0)
     # If all casters lie outside of the window, the rectangle is empty; replace it by any small one.
     x1, y1 = dr.maximum(x1, x0 + 1e-4 * (1 + dr.abs(x0))), dr.maximum(y1, y0 + 1e-4 * (1 + dr.abs(y0)))
     # A flat caster that faces the light has no extent in depth. In a tiny range, any tilt would be a huge change of depth, and
@@ -187,7 +192,7 @@ def _fit(
         flattest = dr.select(perspective, flattest, of_tiles)
     least = dr.maximum(flattest * lateral, _THINNEST * dr.maximum(dr.abs(z1), 1e-3))
     # Visible receivers are known from samples only: some may lie a little before these.
-    spread = dr.select(dr.isfinite(window[5]), window[5] - receivers, 0)
+    spread = dr.select(dr.isfinite(window[5]) & ~nothing, window[5] - receivers, 0)
     depth = dr.maximum(dr.maximum(z1 - receivers, least), 0.1 * spread)
     near = z0 - 0.05 * dr.maximum(z1 - z0, least)
     # If all casters end before the visible receivers, so does the far plane. If a floor lay right on it, rounding would decide
@@ -216,6 +221,14 @@ def _fit(
     in_x, in_y = (None, None) if tiles is None else ((tiles.low_x, tiles.high_x), (tiles.low_y, tiles.high_y))
     (cx, hx), (cy, hy) = widen(x0, x1, in_x), widen(y0, y1, in_y)
     return Frusta(cx, cy, hx, hy, near, far, first, last), (x0, y0, x1, y1, z0, z1, receivers)
+
+
+def _before_receivers(perspective: Bool, window: Extent) -> Float:
+    """Depth of a place between the light and all visible receivers; close to the light, or far away, if these are not known."""
+    nearest, farthest = window[4], window[5]
+    away = dr.maximum(dr.maximum(farthest - nearest, _THINNEST * dr.abs(nearest)), _THINNEST)
+    known = dr.select(perspective, 0.5 * nearest, nearest - away)
+    return dr.select(dr.isfinite(nearest), known, dr.select(perspective, _CLOSE, -_AWAY))
 
 
 def _still_fits(views: Views, old: Frusta, new: Frusta, needed: tuple[Float, ...], resolution: int, filter_size: int) -> Bool:

@@ -17,7 +17,7 @@ from .tiles import Tiles
 #: Bounds in a light's image plane and of depths: (x0, y0, x1, y1, z0, z1).
 Extent: TypeAlias = tuple[Float, Float, Float, Float, Float, Float]
 
-# Distance of maps from the light, and before a directional light's origin, where nothing casts shadows and receivers are not known.
+# Distance of maps from the light, or before the origin of a directional one, where nothing casts and receivers are not known.
 _CLOSE, _AWAY = 1e-6, 1e6
 # A frustum is kept while it contains the scene and the scene fills at least this fraction of it.
 _KEEP_FILL = 0.6
@@ -26,6 +26,9 @@ _MARGIN = 0.10
 _MARGIN_OF_TILES = 0.03
 # Least depth range of a frustum in units of its lateral extent.
 _FLATTEST = 1e-2
+# Least depth range, in texels, where visible receivers may shadow themselves: the least deviation of depths, which is a share of
+# the range, has to exceed the changes of depth where a surface bends.
+_NARROWEST = 64
 # That of tiles of suns, in texels: depths are told apart by about one, and the range must tell receivers from casters.
 _FLATTEST_OF_TILES = 16
 # Least depth range in units of its distance from the light: rounding changes depths by some 1e-7 of the distance.
@@ -191,19 +194,24 @@ def _fit(
         of_tiles = float_input(module, "flattest", max(_FLATTEST, _FLATTEST_OF_TILES / resolution))
         flattest = dr.select(perspective, flattest, of_tiles)
     least = dr.maximum(flattest * lateral, _THINNEST * dr.maximum(dr.abs(z1), 1e-3))
+    # Depth before which a range has to begin where receivers may shadow themselves.
+    latest = module.Float(dr.inf)
+    if tiles is None:
+        wide = lateral * float_input(module, "narrowest", _NARROWEST / resolution)
+        latest = dr.select(dr.isfinite(window[4]) & (z1 > window[4]), z1 - wide, latest)
     # Visible receivers are known from samples only: some may lie a little before these.
     spread = dr.select(dr.isfinite(window[5]) & ~nothing, window[5] - receivers, 0)
     depth = dr.maximum(dr.maximum(z1 - receivers, least), 0.1 * spread)
-    near = z0 - 0.05 * dr.maximum(z1 - z0, least)
+    near = dr.minimum(z0 - 0.05 * dr.maximum(z1 - z0, least), latest)
     # If all casters end before the visible receivers, so does the far plane. If a floor lay right on it, rounding would decide
     # whether the floor is drawn: its depth in the map would have a derivative, but the depth of a receiver, clamped to the far
     # plane, would have none.
     last = dr.maximum(z1, receivers - 0.1 * depth) + 0.05 * depth
     last = dr.select(perspective, dr.maximum(last, 1e-6), last)
-    first = dr.maximum(near, receivers - _BEFORE * depth)
+    first = dr.maximum(near, dr.minimum(receivers - _BEFORE * depth, latest))
     far = last + _BEHIND_LAST * (last - first)
     near = dr.select(perspective, dr.maximum(near, 1e-3 * far), near)
-    first = dr.maximum(near, receivers - _BEFORE * depth)
+    first = dr.maximum(near, dr.minimum(receivers - _BEFORE * depth, latest))
 
     texels = float_input(module, "texels", 2 * (filter_size / 2 + 2) / resolution)
 
@@ -226,7 +234,8 @@ def _fit(
 def _before_receivers(perspective: Bool, window: Extent) -> Float:
     """Depth of a place between the light and all visible receivers; close to the light, or far away, if these are not known."""
     nearest, farthest = window[4], window[5]
-    away = dr.maximum(dr.maximum(farthest - nearest, _THINNEST * dr.abs(nearest)), _THINNEST)
+    least = _THINNEST * dr.maximum(dr.abs(nearest), 1)
+    away = dr.maximum(farthest - nearest, least)
     known = dr.select(perspective, 0.5 * nearest, nearest - away)
     return dr.select(dr.isfinite(nearest), known, dr.select(perspective, _CLOSE, -_AWAY))
 

@@ -194,24 +194,24 @@ def _fit(
         of_tiles = float_input(module, "flattest", max(_FLATTEST, _FLATTEST_OF_TILES / resolution))
         flattest = dr.select(perspective, flattest, of_tiles)
     least = dr.maximum(flattest * lateral, _THINNEST * dr.maximum(dr.abs(z1), 1e-3))
-    # Depth before which a range has to begin where receivers may shadow themselves.
-    latest = module.Float(dr.inf)
-    if tiles is None:
-        wide = lateral * float_input(module, "narrowest", _NARROWEST / resolution)
-        latest = dr.select(dr.isfinite(window[4]) & (z1 > window[4]), z1 - wide, latest)
     # Visible receivers are known from samples only: some may lie a little before these.
     spread = dr.select(dr.isfinite(window[5]) & ~nothing, window[5] - receivers, 0)
     depth = dr.maximum(dr.maximum(z1 - receivers, least), 0.1 * spread)
-    near = dr.minimum(z0 - 0.05 * dr.maximum(z1 - z0, least), latest)
+    near = z0 - 0.05 * dr.maximum(z1 - z0, least)
     # If all casters end before the visible receivers, so does the far plane. If a floor lay right on it, rounding would decide
     # whether the floor is drawn: its depth in the map would have a derivative, but the depth of a receiver, clamped to the far
     # plane, would have none.
     last = dr.maximum(z1, receivers - 0.1 * depth) + 0.05 * depth
     last = dr.select(perspective, dr.maximum(last, 1e-6), last)
-    first = dr.maximum(near, dr.minimum(receivers - _BEFORE * depth, latest))
-    far = last + _BEHIND_LAST * (last - first)
+    first = dr.maximum(near, receivers - _BEFORE * depth)
+    missing = module.Float(0)
+    if tiles is None:
+        narrowest = lateral * float_input(module, "narrowest", _NARROWEST / resolution)
+        missing = dr.select(dr.isfinite(window[4]) & (z1 > window[4]), dr.maximum(narrowest - (last - first), 0), 0)
+    far = last + _BEHIND_LAST * (last - first) + 0.5 * missing
+    near -= 0.5 * missing
     near = dr.select(perspective, dr.maximum(near, 1e-3 * far), near)
-    first = dr.maximum(near, dr.minimum(receivers - _BEFORE * depth, latest))
+    first = dr.maximum(near, receivers - _BEFORE * depth - 0.5 * missing)
 
     texels = float_input(module, "texels", 2 * (filter_size / 2 + 2) / resolution)
 

@@ -22,6 +22,7 @@ class Known:
 KNOWN = {
     ("corner_moves", "forward"): Known(0.065, "shadows that rows of directions throw alike, and the contact: 5.93 %"),
     ("corner_moves", "reverse"): Known(0.035, "the same: 3.0 %"),
+    ("painted_plane_moves", "reverse"): Known(0.02, "a hundredth of its terms, at texels that samples meet by chance: 1.5 %"),
     ("occluder_in_sky", "reverse"): Known(0.025, "a penumbra of 256 sharper shadows, of which each is sampled: 2.14 %"),
 }
 

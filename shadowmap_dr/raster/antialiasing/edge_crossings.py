@@ -182,8 +182,9 @@ def _measure(
             bare = (a == NO_VERTEX) | (silhouette & (key < BEFORE))
             if seen is None:
                 seen = tuple(dr.gather(module.UInt32, raster.triangle, p, bare) for p in (pixel, pixel + step))
+            else:
+                bare &= seen[0] != seen[1]
             here, there = seen
-            bare &= here != there
             cross = functools.partial(_cut, topology, raster, image, pixel, here, there, down)
             meetings.add(slot, dr.select(bare, here, NO_TRIANGLE), there, soft, cross)
         first = image * uint_input(module, "vertices", vertex_count)

@@ -15,6 +15,7 @@ from ..scene.lights.area import AreaLight
 from ..scene.lights.read import Light
 from ..scene.load import SceneData
 from ..shadow import Frusta, ShadowSettings
+from ..shadow.methods.registry import most_numbers
 from ..shadow.transmittance_maps import numbers_of_texel
 from .extended_lights import SoftFrusta, SoftPlan
 from .settings import RenderSettings
@@ -159,7 +160,9 @@ class _Sizes:
         kinds = [(count, shadow) for count in plan.counts]
         kinds += [(one.maps, single if one.kind == "single" else sampled) for one in soft]
         maps = [count * map_bytes(setting, data.geometry, layers) for count, setting in kinds]
-        gradients = [count * _GRADIENT * _numbers(setting) * setting.resolution**2 for count, setting in kinds]
+        gradients = [
+            count * _GRADIENT * most_numbers(setting.method, setting.order) * setting.resolution**2 for count, setting in kinds
+        ]
         return cls(maps, [0] * len(plan.kinds) + gradients[len(plan.kinds) :])
 
     @property
@@ -174,7 +177,7 @@ class _Sizes:
 
 def map_bytes(settings: ShadowSettings, geometry: Geometry, layers: TexelLayers = NO_LAYERS) -> int:
     """Estimate of the memory (bytes) for making, filtering and differentiating one map. ``layers``: of its texels."""
-    each = _TEXEL + _NUMBER * _numbers(settings)
+    each = _TEXEL + _NUMBER * most_numbers(settings.method, settings.order)
     texels = (settings.resolution * settings.supersampling) ** 2 * each + _transmittance_bytes(settings, layers)
     return texels + _VERTEX * geometry.vertex_count + _TRIANGLE * geometry.face_count
 
@@ -188,11 +191,6 @@ def _transmittance_bytes(settings: ShadowSettings, layers: TexelLayers) -> int:
         numbers = numbers_of_texel(settings, layers.count, dr.size_v(mi.UnpolarizedSpectrum))
         each = _LAYER + _LAYER_NUMBER * numbers + _LAYER_OUTLINES * settings.antialias
     return (settings.resolution * settings.supersampling) ** 2 * (_TRANSMITTANCE + each * layers.count)
-
-
-def _numbers(settings: ShadowSettings) -> int:
-    """Most numbers that a texel stores."""
-    return max(4, 2 * settings.order if settings.method == "csm" else 4)
 
 
 def _groups(sizes: _Sizes, budget: int) -> list[tuple[int, int]]:

@@ -27,7 +27,7 @@ from ..raster.screen_planes import pixel_depth
 from ..raster.types import pixel_coordinates
 from .light_camera import Frusta, Views, of_map
 from .methods.depth_scale import DepthScale
-from .methods.registry import PREFILTERED, Method
+from .methods.registry import PREFILTERED, Method, most_numbers
 from .settings import ShadowSettings
 from .texel_depths import texel_depths
 
@@ -97,7 +97,7 @@ def groups_of(settings: ShadowSettings, layers: int) -> int:
 
 def numbers_of_texel(settings: ShadowSettings, layers: int, colours: int) -> int:
     """Numbers that a texel stores if it sees so many translucent casters: of all distributions, in packets of four."""
-    own = colours + 1 + (2 * settings.order if settings.transmittance_method == "csm" else 4)
+    own = colours + 1 + most_numbers(settings.transmittance_method, settings.order)
     return groups_of(settings, layers) * (own + -own % 4)
 
 

@@ -103,15 +103,20 @@ def test_derivatives_are_those_of_the_current_scene(variant: str, given: list[in
         assert gradient @ derivative > 0.99 * length * np.linalg.norm(gradient)
 
 
+def move(params: mi.SceneParameters) -> None:
+    """Move the ball, with gradients to its vertices."""
+    moved = mi.Float(dr.detach(params[VERTICES]) + 0.01)
+    dr.enable_grad(moved)
+    params[VERTICES] = moved
+    params.update()
+
+
 def test_later_images_without_backward_passes(variant: str, given: list[int]) -> None:
     """An evaluation between image and backward pass takes nothing away."""
     scene, integrator = views(), shadowmap(recorded=True)
     params = mi.traverse(scene)
     for _ in range(3):
-        moved = mi.Float(dr.detach(params[VERTICES]) + 0.01)
-        dr.enable_grad(moved)
-        params[VERTICES] = moved
-        params.update()
+        move(params)
         image = mi.render(scene, params, sensor=0, integrator=integrator)
         with dr.suspend_grad():
             mi.render(scene, sensor=1, integrator=integrator)
@@ -199,10 +204,7 @@ def test_parameters_are_listed_twice_a_step(variant: str, given: list[int], monk
     params = mi.traverse(scene)
     for _ in range(5):
         listed.append(0)
-        moved = mi.Float(dr.detach(params[VERTICES]) + 0.01)
-        dr.enable_grad(moved)
-        params[VERTICES] = moved
-        params.update()
+        move(params)
         dr.backward(dr.mean(mi.render(scene, params, integrator=integrator), axis=None))
     assert listed[2:] == [2] * 3 and min(given) > 5
 
@@ -232,9 +234,6 @@ def test_names_with_dots(variant: str, given: list[int]) -> None:
     next(shape for shape in scene.shapes() if shape.id() == "ball").set_bsdf(dotted_material())
     params = mi.traverse(scene)
     for _ in range(4):
-        moved = mi.Float(dr.detach(params[VERTICES]) + 0.01)
-        dr.enable_grad(moved)
-        params[VERTICES] = moved
-        params.update()
+        move(params)
         dr.backward(dr.mean(mi.render(scene, params, integrator=integrator), axis=None))
     assert len(given) == 4 and min(given) > 5

@@ -92,6 +92,12 @@ PREFILTERED: dict[str, Method] = {
     ),
 }
 
+
+def most_numbers(method: str, order: int) -> int:
+    """Most numbers that a texel stores for a depth, by the name of the method."""
+    return max(4, 2 * order) if method == "csm" else 4
+
+
 #: Hardly any light bleeding, and no more error than ``vsm`` on any scene of `shadowmap-dr maps`, which compares all methods.
 DEFAULT = "evsm4"
 

@@ -65,6 +65,7 @@ MAY_IMPORT = {
         "interactive",
         "inverse",
         "io",
+        "jit.threads",
         "rendering.film.aovs",
         "variants",
     ),

@@ -13,6 +13,7 @@ from ..errors import ShadowmapError, mitsuba_message, nearest, quoted, shortened
 from ..importing.reader import SUFFIXES as IMPORTED
 from ..io import assets, files
 from ..io.pictures import SUFFIXES
+from ..jit.threads import second_thread
 
 # Suffixes of models; those of `IMPORTED` become scenes by `shadowmap-dr import`.
 _MODELS = (*IMPORTED, ".serialized", ".fbx", ".blend", ".dae", ".usd", ".usdz", ".3ds")
@@ -64,7 +65,8 @@ def definitions(entries: list[str]) -> dict[str, str]:
 def load(path: Path, values: dict[str, str], loader: Callable[[str, dict[str, str]], object] | None = None) -> mi.Scene:
     """Load a scene file. ``loader``: instead of ``mi.load_file``."""
     try:
-        loaded = mi.load_file(str(path), **values) if loader is None else loader(str(path), values)
+        with second_thread():
+            loaded = mi.load_file(str(path), **values) if loader is None else loader(str(path), values)
     except ShadowmapError:
         raise
     except (RuntimeError, UnicodeError) as error:

@@ -13,6 +13,7 @@ from typing import Any
 import mitsuba as mi
 
 from ..errors import ShadowmapError, mitsuba_message
+from ..jit.threads import second_thread
 from .xml_text import Element, XmlText
 
 
@@ -171,7 +172,8 @@ def instantiated(config: mi.parser.ParserConfig, state: mi.parser.ParserState, f
     """The scene of a parsed file. ShadowmapError if it cannot be made, or is none."""
     try:
         mi.parser.transform_all(config, state)
-        scene: Any = mi.parser.instantiate(config, state)  # Any: no stub says it is a scene
+        with second_thread():
+            scene: Any = mi.parser.instantiate(config, state)  # Any: no stub says it is a scene
     except (RuntimeError, TypeError, UnicodeError) as error:
         raise ShadowmapError(f"cannot load {file}: {mitsuba_message(error)}") from error
     scene = scene[0] if isinstance(scene, list) and len(scene) == 1 else scene

@@ -11,6 +11,7 @@ import mitsuba as mi
 
 from ..errors import ShadowmapError, warn
 from ..io import console, files
+from ..jit.threads import second_thread
 from .film import encode_film
 from .glb import write_glb
 from .report import write_report
@@ -83,7 +84,8 @@ def _scene_files(
     for note in written.notes:
         warn(f"{written.files[0]}: {note}.")
     try:
-        loaded = mi.load_file(str(written.files[0]), optimize=False)
+        with second_thread():
+            loaded = mi.load_file(str(written.files[0]), optimize=False)
         for note in write_glb(loaded, out / MODEL):
             console.note(f"{out / MODEL}: {note}.")
     except (ShadowmapError, RuntimeError) as error:

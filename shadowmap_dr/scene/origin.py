@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import ShadowmapError, check_variant, mitsuba_message
+from ..jit.threads import second_thread
 
 #: A dictionary for ``mi.load_dict``: numbers, texts, arrays, transformations, dictionaries.
 Description: TypeAlias = Mapping[str, Any]
@@ -54,10 +55,11 @@ class SceneOrigin:
         check_variant(mi.variant(), self.variant)
         what = self.file or "the dictionary"
         try:
-            if self.file is None:
-                scene: object = mi.load_dict(self.description, optimize=False)
-            else:
-                scene = mi.load_file(self.file, optimize=False, **self.parameters)
+            with second_thread():
+                if self.file is None:
+                    scene: object = mi.load_dict(self.description, optimize=False)
+                else:
+                    scene = mi.load_file(self.file, optimize=False, **self.parameters)
         except (RuntimeError, TypeError, UnicodeError) as error:
             raise ShadowmapError(f"cannot load {what}: {mitsuba_message(error)}") from error
         if not isinstance(scene, mi.Scene):

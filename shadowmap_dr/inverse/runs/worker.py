@@ -16,6 +16,7 @@ import mitsuba as mi
 
 from ...io.records import digest, plain
 from ...jit.gc import gc_quiet
+from ...jit.threads import second_thread
 from .problems import Problem
 
 
@@ -81,7 +82,8 @@ class Worker:
             began = time.perf_counter()
             if key != self._key:
                 self._key, self._built = "", None  # frees the memory of the old problem first
-                self._key, self._built = key, batch.problem.build()
+                with second_thread():
+                    self._key, self._built = key, batch.problem.build()
             built = time.perf_counter()
             checkpoint = None
             if folder is not None and folder.is_dir():

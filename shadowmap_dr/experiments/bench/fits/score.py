@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ....io.images import to_linear
+from ....jit.threads import second_thread
 from ....scene.mitsuba_meshes import mesh_buffers
 from . import space
 from .meshes import mesh
@@ -266,7 +267,8 @@ def _value_error(problem: FitProblem, variation: Variation, estimate: Record, re
 
 def _fitted(folder: Path) -> mi.Scene:
     """The scene that the command has written."""
-    return mi.load_file(str(folder / "scene.xml"))
+    with second_thread():
+        return mi.load_file(str(folder / "scene.xml"))
 
 
 def _texture_error(problem: FitProblem, variation: Variation, folder: Path) -> float:
@@ -286,7 +288,8 @@ def seen_texels(problem: FitProblem, variation: Variation, folder: Path) -> npt.
 
     The true scene is written into a folder ``truth`` beside that of the command's output.
     """
-    scene = mi.load_file(str(write_scene(problem.truth, folder.parent / "truth", ".exr")))
+    with second_thread():
+        scene = mi.load_file(str(write_scene(problem.truth, folder.parent / "truth", ".exr")))
     key = f"{variation.part}.bsdf.{variation.detail}.data"
     params = mi.traverse(scene)
     data = mi.TensorXf(params[key])

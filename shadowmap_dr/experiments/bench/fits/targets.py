@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from ....io.files import atomic
 from ....io.images import read_image, write_exr
+from ....jit.threads import second_thread
 from .problem import FitProblem
 from .scenes import MAX_DEPTH, Scene, write_scene
 
@@ -75,7 +76,8 @@ def _pictures(scene: Scene, problem: FitProblem, cache: Path) -> list[Array]:
 
 def render(file: Path, integrator: str, spp: int) -> list[Array]:
     """Linear pictures (H, W, 3) by all sensors of a scene file, from one of Mitsuba's integrators."""
-    scene = mi.load_file(str(file))
+    with second_thread():
+        scene = mi.load_file(str(file))
     settings = {"max_depth": MAX_DEPTH} if integrator == "path" else {}
     method = mi.load_dict({"type": integrator, **settings})
     pictures = []

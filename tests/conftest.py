@@ -27,18 +27,26 @@ from tests.slow import slow_tests
 TESTS = Path(__file__).parent
 
 
+#: Folders whose tests are about arrays that several threads write to, and that alone would show it if they disturbed each other.
+_TWO_THREADS = ("jit", "raster", "shadow")
+
+
 def pytest_configure(config: pytest.Config) -> None:
-    # Parallel workers share the cores instead of each claiming all of them. Never one thread alone: with it, Mitsuba 3.9 waits
-    # forever when it reads or writes an EXR file.
-    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
     if hasattr(config.option, "loadscopereorder"):  # files with many tests first
         config.option.loadscopereorder = False
+
+
+def _set_threads(two: bool) -> None:
+    """Threads of Dr.Jit in one of several workers; alone it has all cores.
+
+    They look for work in a loop before they sleep. Two in each worker take a third more of the processors' time than one.
+    """
+    if "PYTEST_XDIST_WORKER" not in os.environ or dr.thread_count() == 1 + two:
+        return
     before = _threads()
-    dr.set_thread_count(max(2, (os.cpu_count() or 1) // workers))
-    if workers > 1:
-        # Dr.Jit's threads look for work in a loop before they sleep: a sixth of all time, for which other workers wait.
-        for thread in _threads() - before:
-            os.setpriority(os.PRIO_PROCESS, thread, 19)
+    dr.set_thread_count(1 + two)
+    for thread in _threads() - before:  # others wait for the time in which they look for work
+        os.setpriority(os.PRIO_PROCESS, thread, 19)
 
 
 def _threads() -> set[int]:
@@ -48,12 +56,19 @@ def _threads() -> set[int]:
 
 
 @pytest.hookimpl(hookwrapper=True, trylast=True)
-def pytest_runtest_call() -> Iterator[None]:
+def pytest_runtest_setup(item: pytest.Item) -> Iterator[None]:
+    _set_threads(item.path.relative_to(TESTS).parts[0] in _TWO_THREADS)  # before fixtures
     yield
     quick_kernels.flush_messages()  # while they are captured
 
 
-pytest_runtest_setup = pytest_runtest_teardown = pytest_runtest_call
+@pytest.hookimpl(hookwrapper=True, trylast=True)
+def pytest_runtest_call() -> Iterator[None]:
+    yield
+    quick_kernels.flush_messages()
+
+
+pytest_runtest_teardown = pytest_runtest_call
 
 
 @pytest.hookimpl(hookwrapper=True)

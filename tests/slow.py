@@ -1,6 +1,6 @@
 """The slow tests, which ``pytest -m "not slow"`` leaves out, from a measurement.
 
-    python -m pytest -n 2 --dist loadfile --junitxml=times.xml tests
+    python -m pytest -n 3 --dist loadfile --junitxml=times.xml tests
     python -m tests.slow times.xml [--above 0.15]
 
 writes ``slow.txt``: each test function whose cases take longer than so many seconds on average, and all tests of modules in which

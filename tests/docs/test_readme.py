@@ -71,4 +71,4 @@ def test_ci_finds_the_test_command(readme: str) -> None:
     pattern = re.search(r"sed -n 's/(.*)/\\1/p'", script)
     assert pattern is not None
     commands = re.findall(r"^ *(pip install .*pytest.*)$", readme, re.MULTILINE)
-    assert commands == ["pip install '.[test]' && python -m pytest -n 2 --dist loadfile tests"]
+    assert commands == ["pip install '.[test]' && python -m pytest -n 3 --dist loadfile tests"]

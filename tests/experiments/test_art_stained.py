@@ -17,6 +17,7 @@ from shadowmap_dr.experiments.art import stained
 from shadowmap_dr.experiments.art.experiment import ArtOptions
 from shadowmap_dr.inverse import StainedSheet
 from shadowmap_dr.io import images
+from shadowmap_dr.jit.threads import second_thread
 
 SMALL = {"resolution": 32, "panes": 16, "picture_size": 32, "map_resolution": 96}
 
@@ -50,7 +51,9 @@ def test_a_sheet_has_all_its_files(variant: str, tmp_path: Path, picture: Path) 
         assert still.size == (64, 64)
     tints = images.read_image(tmp_path / "out" / "sheet.exr")
     assert tints.shape == (20, 20, 3)
-    floor = np.array(mi.render(mi.load_file(str(tmp_path / "out" / "sheet.xml")), spp=64))[..., :3]
+    with second_thread():
+        sheet = mi.load_file(str(tmp_path / "out" / "sheet.xml"))
+    floor = np.array(mi.render(sheet, spp=64))[..., :3]
     assert np.sqrt(np.mean((floor - stained.read_square(str(picture), 32)) ** 2)) < 0.08
     assert len(stained.table(record).rows) == 1 and "40 steps" in stained.summary(record)
 

@@ -13,7 +13,7 @@ from shadowmap_dr.errors import ShadowmapError
 from shadowmap_dr.experiments.bench.common import QUICK
 from shadowmap_dr.experiments.bench.fits import catalogue, meshes, score, stages
 from shadowmap_dr.experiments.bench.fits.problem import FitProblem
-from shadowmap_dr.experiments.bench.fits.scenes import write_scene
+from shadowmap_dr.experiments.bench.fits.scenes import load_scene, write_scene
 
 
 @pytest.fixture(autouse=True)
@@ -73,7 +73,7 @@ def test_each_start_is_another() -> None:
 
 def test_mitsuba_loads_all_scenes(tmp_path: Path) -> None:
     for problem in EVERY:
-        scene = mi.load_file(str(write_scene(problem.start(0), tmp_path / problem.name)))
+        scene = load_scene(write_scene(problem.start(0), tmp_path / problem.name))
         table = mi.traverse(scene)
         parts = {part.id() for part in (*scene.shapes(), *scene.emitters(), *scene.sensors())}
         assert len(scene.sensors()) == len(problem.photographs)
@@ -88,7 +88,7 @@ def test_mitsuba_loads_all_scenes(tmp_path: Path) -> None:
 
 def test_mitsuba_sees_the_places_that_the_record_has(tmp_path: Path) -> None:
     problem = next(one for one in EVERY if one.name == "camera-fov")
-    scene = mi.load_file(str(write_scene(problem.truth, tmp_path)))
+    scene = load_scene(write_scene(problem.truth, tmp_path))
     table = mi.traverse(scene)
     camera = problem.truth.camera("camera")
     found = np.array(mi.Matrix4f(table["camera.to_world"].matrix), float).reshape(4, 4, -1)[..., 0]

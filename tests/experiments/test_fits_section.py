@@ -15,7 +15,7 @@ from shadowmap_dr.errors import ShadowmapError
 from shadowmap_dr.experiments.bench import report as bench_report
 from shadowmap_dr.experiments.bench.common import BenchOptions, Sizes
 from shadowmap_dr.experiments.bench.fits import catalogue, section, trial
-from shadowmap_dr.experiments.bench.fits.scenes import write_scene
+from shadowmap_dr.experiments.bench.fits.scenes import load_scene, write_scene
 
 
 @pytest.fixture(autouse=True)
@@ -85,5 +85,5 @@ def test_meshes_of_the_user(tmp_path: Path) -> None:
     units = section.units(options(tmp_path, meshes=folder))
     assert [unit.name for unit in units] == ["bunny-pose", "mesh-my_part_2"]
     problem = catalogue.of_meshes(folder)[0]
-    scene = mi.load_file(str(write_scene(problem.start(0), tmp_path / "scene")))
+    scene = load_scene(write_scene(problem.start(0), tmp_path / "scene"))
     assert "my_part_2" in {shape.id() for shape in scene.shapes()}

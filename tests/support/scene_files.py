@@ -13,6 +13,7 @@ from PIL import Image
 
 from shadowmap_dr.fitting.changes import Changes
 from shadowmap_dr.fitting.scene_file import Written, write_fitted_scene
+from shadowmap_dr.jit.threads import second_thread
 
 SCENES = Path(__file__).resolve().parents[2] / "scenes"
 FILM = '<film type="hdrfilm"><integer name="width" value="12"/><integer name="height" value="8"/></film>'
@@ -39,7 +40,8 @@ def numbers(value: Any) -> np.ndarray:
 
 
 def read(written: Written) -> mi.SceneParameters:
-    return mi.traverse(mi.load_file(str(written.files[0]), optimize=False))
+    with second_thread():
+        return mi.traverse(mi.load_file(str(written.files[0]), optimize=False))
 
 
 def turned(seed: int = 0) -> np.ndarray:

@@ -23,10 +23,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ....io.images import to_srgb
-from ....jit.threads import second_thread
 from . import catalogue
 from .problem import FitProblem
-from .scenes import Scene, write_scene
+from .scenes import Scene, load_scene, write_scene
 from .score import ANGLE_DEG, POSITION, VALUE
 from .variations import Variation, freedoms, nudged
 
@@ -106,8 +105,7 @@ def _smaller(scene: Scene) -> Scene:
 def _pictures(scene: Scene) -> list[Array]:
     """Pictures of all cameras, flat."""
     with tempfile.TemporaryDirectory() as folder:
-        with second_thread():
-            loaded = mi.load_file(str(write_scene(scene, Path(folder))))
+        loaded = load_scene(write_scene(scene, Path(folder)))
     method = mi.load_dict({"type": "shadowmap"})
     images = [mi.render(loaded, sensor=sensor, integrator=method, spp=4) for sensor in range(len(scene.cameras))]
     return [np.array(image, float)[..., :3].ravel() for image in images]

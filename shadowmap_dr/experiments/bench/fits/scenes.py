@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import TypeVar, cast
 from xml.etree import ElementTree
 
+import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
 from ....io.images import write_exr, write_image
 from ....io.meshes import write_ply
+from ....jit.threads import second_thread
 from ....scene.mitsuba_meshes import make_mesh
 from . import space
 from .meshes import mesh
@@ -179,6 +181,12 @@ def write_scene(scene: Scene, folder: Path, suffix: str = ".png", integrator: st
     path = folder / "scene.xml"
     path.write_text('<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n", encoding="utf-8")
     return path
+
+
+def load_scene(path: Path) -> mi.Scene:
+    """The scene of a file of :func:`write_scene`."""
+    with second_thread():
+        return mi.load_file(str(path))
 
 
 def _camera(root: ElementTree.Element, camera: Camera) -> None:

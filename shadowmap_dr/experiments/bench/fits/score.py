@@ -20,12 +20,11 @@ import numpy as np
 import numpy.typing as npt
 
 from ....io.images import to_linear
-from ....jit.threads import second_thread
 from ....scene.mitsuba_meshes import mesh_buffers
 from . import space
 from .meshes import mesh
 from .problem import FitProblem
-from .scenes import Scene, write_scene
+from .scenes import Scene, load_scene, write_scene
 from .variations import Variation, is_round, parse, texture, value
 
 Array = npt.NDArray[np.float64]
@@ -267,8 +266,7 @@ def _value_error(problem: FitProblem, variation: Variation, estimate: Record, re
 
 def _fitted(folder: Path) -> mi.Scene:
     """The scene that the command has written."""
-    with second_thread():
-        return mi.load_file(str(folder / "scene.xml"))
+    return load_scene(folder / "scene.xml")
 
 
 def _texture_error(problem: FitProblem, variation: Variation, folder: Path) -> float:
@@ -288,8 +286,7 @@ def seen_texels(problem: FitProblem, variation: Variation, folder: Path) -> npt.
 
     The true scene is written into a folder ``truth`` beside that of the command's output.
     """
-    with second_thread():
-        scene = mi.load_file(str(write_scene(problem.truth, folder.parent / "truth", ".exr")))
+    scene = load_scene(write_scene(problem.truth, folder.parent / "truth", ".exr"))
     key = f"{variation.part}.bsdf.{variation.detail}.data"
     params = mi.traverse(scene)
     data = mi.TensorXf(params[key])

@@ -13,9 +13,8 @@ import numpy.typing as npt
 
 from ....io.files import atomic
 from ....io.images import read_image, write_exr
-from ....jit.threads import second_thread
 from .problem import FitProblem
-from .scenes import MAX_DEPTH, Scene, write_scene
+from .scenes import MAX_DEPTH, Scene, load_scene, write_scene
 
 Array = npt.NDArray[np.float64]
 #: Samples of a pass: their memory is what one render takes.
@@ -76,8 +75,7 @@ def _pictures(scene: Scene, problem: FitProblem, cache: Path) -> list[Array]:
 
 def render(file: Path, integrator: str, spp: int) -> list[Array]:
     """Linear pictures (H, W, 3) by all sensors of a scene file, from one of Mitsuba's integrators."""
-    with second_thread():
-        scene = mi.load_file(str(file))
+    scene = load_scene(file)
     settings = {"max_depth": MAX_DEPTH} if integrator == "path" else {}
     method = mi.load_dict({"type": integrator, **settings})
     pictures = []

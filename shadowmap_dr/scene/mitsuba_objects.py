@@ -41,24 +41,34 @@ def _walk(root: mi.Object) -> list[tuple[str, Any, type | None, mi.Object, str]]
     That takes three times as long: it makes a class at each call, and records that serve to change parameters.
     """
     found: list[tuple[str, Any, type | None, mi.Object, str]] = []
-    seen, prefixes = {root}, set()
-    # One for all nodes: to make a callback takes as long as to list a node's parameters.
-    callback = _collector(mi.variant())()
-
-    def visit(node: mi.Object, prefix: str) -> None:
-        for name, value, kind in _parts_of(node, callback):
-            if not isinstance(value, mi.Object):
-                found.append((prefix + name, value, kind, node, name))
-            elif value not in seen:
-                full, number = prefix + name, 1
-                while full in prefixes:
-                    full, number = f"{prefix}{name}_{number}", number + 1
-                prefixes.add(full)
-                seen.add(value)
-                visit(value, full + ".")
-
-    visit(root, "")
+    # One callback for all nodes: to make one takes as long as to list a node's parameters.
+    _visit(root, "", found, {root}, set(), _collector(mi.variant())())
     return found
+
+
+def _visit(
+    node: mi.Object,
+    prefix: str,
+    found: list[tuple[str, Any, type | None, mi.Object, str]],
+    seen: set[mi.Object],
+    prefixes: set[str],
+    callback: Any,  # Any: a class of a variant
+) -> None:
+    """Add the parameters of a node and its children to ``found``.
+
+    Not a function within :func:`_walk`: a function that calls itself there refers to itself, and would keep these objects until
+    garbage is collected. An area light that outlives its shape ends the process when Mitsuba calls all emitters.
+    """
+    for name, value, kind in _parts_of(node, callback):
+        if not isinstance(value, mi.Object):
+            found.append((prefix + name, value, kind, node, name))
+        elif value not in seen:
+            full, number = prefix + name, 1
+            while full in prefixes:
+                full, number = f"{prefix}{name}_{number}", number + 1
+            prefixes.add(full)
+            seen.add(value)
+            _visit(value, full + ".", found, seen, prefixes, callback)
 
 
 def children(node: mi.Object) -> list[tuple[str, mi.Object]]:

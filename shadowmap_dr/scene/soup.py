@@ -69,8 +69,10 @@ class _Placement:
     """A ``to_world``, and its row in the table of transformations."""
 
     def __init__(self, node: mi.Shape, row: int) -> None:
-        self._parameter, self.row = Parameter(node, "to_world"), row
-        self.reading = _Reading(lambda: [entry for line in self._parameter.now().matrix for entry in line])
+        parameter = Parameter(node, "to_world")
+        self._parameter, self.row = parameter, row
+        # Not through self, which would then refer to itself and keep the shape until garbage is collected.
+        self.reading = _Reading(lambda: [entry for line in parameter.now().matrix for entry in line])
 
     def matrices(self) -> list[Matrix4f]:
         """Matrix for points and matrix for normals, detached."""

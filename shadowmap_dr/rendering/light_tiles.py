@@ -7,10 +7,11 @@ from dataclasses import replace
 
 import drjit as dr
 import numpy as np
+import numpy.typing as npt
 
 from ..jit.types import Bool, Point3f
 from ..scene.load import SceneData
-from ..shadow import Frusta, ShadowSettings, project, stack_views
+from ..shadow import Frusta, ShadowSettings, Views, project, stack_views
 from .light_loops import MANY_LIGHTS
 from .light_slices import TexelLayers, map_bytes
 from .settings import RenderSettings
@@ -27,16 +28,23 @@ _FINE = 2.3
 _FEWEST_OF_TRANSMITTANCE, _PACKET = 32, 8
 # Cells along each side of a map that are looked at for points that the camera sees.
 _CELLS = 32
+# Most maps of a light that its pixels are not worth, where the camera sees most of them in a small part of one map.
+_MOST_CROWDED = 4
+# Pixels that see a tile, at most, over their mean number.
+_UNEVEN = 2
 
 
 def sized(shadow: ShadowSettings, plan: MapPlan, pixels: int) -> ShadowSettings:
-    """Settings of the maps of lights without extent, for images of so many pixels: many lights have smaller maps in small images.
+    """Settings of the maps of lights without extent, for images of so many pixels: many lights, and tiles, have smaller maps in
+    small images.
 
-    So they have the fewer texels, none smaller than a pixel, that tiles have in large images; like these, they are not filtered.
+    They have the fewer texels, none smaller than a pixel, that tiles have in large images; like these, they are not filtered.
     """
-    if not shadow.adaptive or shadow.resolution != ShadowSettings.resolution:
+    if not _is_automatic(shadow):
         return shadow
-    if plan.groups or len(plan.kinds) < _MANY_ERRORS:
+    if plan.groups:
+        pixels = math.ceil(_UNEVEN * _TEXELS * pixels / min(plan.tiles))
+    elif len(plan.kinds) < _MANY_ERRORS:
         return shadow
     return shadow.fewer(max(_FEWEST, _STEP * math.ceil(math.sqrt(pixels) / _STEP)))
 
@@ -58,12 +66,9 @@ def texel_density(
     most, samples = 0.0, dr.width(seen[1])
     for first, light, kind in zip(plan.first, data.lights, plan.kinds, strict=True):
         for k, view in enumerate(light.map_views(kind, shadow.resolution, shadow.filter_size)):
-            u, v, _, inside = project(stack_views([view]), fit.part(first + k, 1), seen[0])
-            chosen = (inside & seen[1]).numpy()
-            places = [((place.numpy()[chosen] * 0.5 + 0.5) * _CELLS).astype(int) for place in (u, v)]
-            cells = len(np.unique(places[0] * _CELLS + places[1]))
-            if cells:
-                most = max(most, chosen.sum() / samples / (cells / _CELLS**2))
+            found = _cells_of(stack_views([view]), fit.part(first + k, 1), seen)
+            if len(found):
+                most = max(most, len(found) / samples / (len(np.unique(found)) / _CELLS**2))
     return _FINE * math.sqrt(most) if most else math.inf
 
 
@@ -92,8 +97,11 @@ def with_tiles(
 ) -> MapPlan:
     """The plan with tiles for each directional light and each spot, as many as its pixels are worth. Reads back.
 
+    Small images are worth one map. If their maps are automatic and the camera sees half of its points where texels are few, as
+    where a ground reaches the horizon, they have up to four: as many as samples share a texel at the median of these points.
+
     They are at most ``settings.shadow.tiles``, and fewer where all maps would take more than ``settings.light_memory``. Many
-    lights, which are summed up in a loop, keep one map each.
+    lights, which are summed up in a loop, keep one map each; so do four and more in small images.
 
     Args:
         plan: plan with one map for each light.
@@ -106,15 +114,20 @@ def with_tiles(
     """
     shadow, lights = settings.shadow, data.lights
     small = samples * _TEXELS < math.sqrt(2) * shadow.resolution**2
-    if fit is None or shadow.tiles == 1 or small or len(lights) >= MANY_LIGHTS:
+    crowds = _is_automatic(shadow) and len(lights) < _MANY_ERRORS
+    if fit is None or shadow.tiles == 1 or (small and not crowds) or len(lights) >= MANY_LIGHTS:
         return plan
     wanted = list(plan.tiles)
     for k, (light, kind) in enumerate(zip(lights, plan.kinds, strict=True)):
         if kind in ("directional", "spot"):  # a cube has six maps, each fitted to the points that it sees
             view = stack_views(light.map_views(kind, shadow.resolution, shadow.filter_size))
-            _, _, _, inside = project(view, fit.part(plan.first[k], 1), seen[0])
-            texels = np.mean((inside & seen[1]).numpy()) * samples * _TEXELS
-            wanted[k] = 2 ** round(math.log2(max(texels / shadow.resolution**2, 1)))
+            cells = _cells_of(view, fit.part(plan.first[k], 1), seen)
+            share, texels = samples / dr.width(seen[1]), shadow.resolution**2
+            spread = len(cells) * share * _TEXELS / texels
+            wanted[k] = 2 ** round(math.log2(max(spread, 1)))
+            if crowds and len(cells):
+                crowd = np.median(np.bincount(cells)[cells]) * share * _CELLS**2 / texels
+                wanted[k] = max(wanted[k], min(2 ** int(math.log2(max(crowd, 1))), _MOST_CROWDED))
     most = 2 ** int(math.log2(shadow.tiles))
     room = settings.light_memory * 2**30 / map_bytes(shadow, data.geometry, TexelLayers(layers))
     while True:
@@ -122,3 +135,16 @@ def with_tiles(
         if most == 1 or divided.maps <= room:
             return divided
         most //= 2
+
+
+def _cells_of(view: Views, fit: Frusta, seen: tuple[Point3f, Bool]) -> npt.NDArray[np.int64]:
+    """Cell of a map (one of ``_CELLS`` squared) in which each of the visible points within the map lies."""
+    u, v, _, inside = project(view, fit, seen[0])
+    chosen = (inside & seen[1]).numpy()
+    column, row = (((place.numpy()[chosen] * 0.5 + 0.5) * _CELLS).astype(np.int64) for place in (u, v))
+    return np.clip(row, 0, _CELLS - 1) * _CELLS + np.clip(column, 0, _CELLS - 1)
+
+
+def _is_automatic(shadow: ShadowSettings) -> bool:
+    """True if a renderer chooses the texels of maps."""
+    return shadow.adaptive and shadow.resolution == ShadowSettings.resolution

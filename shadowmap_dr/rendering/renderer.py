@@ -211,7 +211,7 @@ class Renderer:
             plan = with_tiles(plan, data, self.settings, made.frusta, seen, samples, made.light_pass.layers)
             if plan.maps > made.plan.maps:
                 made.plan, made.slices = plan, plan_slices(data, plan, self.soft, self.settings)
-                made.frusta, made.soft_frusta = made.light_pass.fit(shapes, seen)
+                made.frusta, made.soft_frusta = made.light_pass.for_image(pixels).fit(shapes, seen)
             if made.translucency is not None:
                 bare = [replace(view, layers=None) for view in views]
                 density = texel_density(

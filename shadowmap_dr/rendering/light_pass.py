@@ -12,7 +12,7 @@ import mitsuba as mi
 
 from ..errors import ShadowmapError
 from ..jit.checkpoint import Term, checkpointed_sum
-from ..jit.types import AnyArray, Bool, Color3f, Float, Point3f, PyTree
+from ..jit.types import AnyArray, Bool, Color3f, Float, PyTree
 from ..jit.vectors import mean_of
 from ..scene.geometry import Geometry
 from ..scene.lights.area import AreaLight
@@ -23,7 +23,7 @@ from ..scene.lights.soft_outline import softened
 from ..scene.load import SceneData
 from ..scene.sensor import ImageSize, Sensor
 from ..scene.sums import attached_parameters
-from ..shadow import Frusta, ShadowMaps, ShadowSettings, TranslucentCasters
+from ..shadow import Frusta, ShadowMaps, ShadowSettings, TranslucentCasters, VisiblePoints
 from .direct_light import ambient_light, background, direct_light, emission
 from .extended_lights import (
     LightSamples,
@@ -100,7 +100,7 @@ class SlicedLighting:
 
     fits: list[tuple[Frusta | None, SoftFrusta]]
     casters: Casters
-    seen: tuple[Point3f, Bool]
+    seen: VisiblePoints
     points: int = 1
 
 
@@ -192,7 +192,7 @@ class LightPass:
         replacements: Mapping[str, Any] | None,
         fits: tuple[Frusta | None, SoftFrusta],
         casters: Casters,
-        seen: Callable[[], tuple[Any, Any]],
+        seen: Callable[[], VisiblePoints],
     ) -> Lighting:
         """All lights and their shadow maps.
 
@@ -216,14 +216,14 @@ class LightPass:
         if settings.shadow.method != "none" and (lights or samples):
             points, common = seen(), (shapes.geometry, shapes.casting)
             if lights:
-                maps = make_maps(self.plan, lights, *common, self._maps, fits[0], points, self.outward, *casters)
+                maps = make_maps(self.plan, lights, *common, self._maps, fits[0], points[:2], self.outward, *casters)
             if samples:
                 shadow = settings.soft_shadow
                 soft_maps = make_soft_maps(self.soft, samples, self.plan, *common, shadow, fits[1], points, *casters)
         return Lighting(lights, maps, areas, samples, soft_maps)
 
     def fit(
-        self, shapes: PlacedShapes, seen: tuple[Point3f, Bool], previous: tuple[Frusta | None, SoftFrusta] = (None, (None, None))
+        self, shapes: PlacedShapes, seen: VisiblePoints, previous: tuple[Frusta | None, SoftFrusta] = (None, (None, None))
     ) -> tuple[Frusta | None, SoftFrusta]:
         """Fit the maps of all lights. ``previous``: an earlier fit; others as of :meth:`lighting`. Detached."""
         data, settings, geometry = self.data, self.settings, shapes.geometry
@@ -237,7 +237,7 @@ class LightPass:
             frusta: Frusta | None = None
             soft: SoftFrusta = (None, None)
             if data.lights:
-                frusta = fit_maps(self.plan, data.lights, geometry, self._maps, previous[0], seen)
+                frusta = fit_maps(self.plan, data.lights, geometry, self._maps, previous[0], seen[:2])
             if samples:
                 soft = fit_soft_maps(self.soft, samples, self.plan, geometry, settings.soft_shadow, previous[1], seen)
             dr.eval(frusta, soft)

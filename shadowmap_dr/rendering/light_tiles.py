@@ -9,9 +9,8 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
-from ..jit.types import Bool, Point3f
 from ..scene.load import SceneData
-from ..shadow import Frusta, ShadowSettings, Views, project, stack_views
+from ..shadow import Frusta, ShadowSettings, Views, VisiblePoints, project, stack_views
 from .light_loops import MANY_LIGHTS
 from .light_slices import TexelLayers, map_bytes
 from .settings import RenderSettings
@@ -49,9 +48,7 @@ def sized(shadow: ShadowSettings, plan: MapPlan, pixels: int) -> ShadowSettings:
     return shadow.fewer(max(_FEWEST, _STEP * math.ceil(math.sqrt(pixels) / _STEP)))
 
 
-def texel_density(
-    plan: MapPlan, data: SceneData, shadow: ShadowSettings, fit: Frusta | None, seen: tuple[Point3f, Bool]
-) -> float:
+def texel_density(plan: MapPlan, data: SceneData, shadow: ShadowSettings, fit: Frusta | None, seen: VisiblePoints) -> float:
     """Texels of maps, along each side, whose texels are somewhat smaller than samples, over the root of the number of samples.
 
     The map decides in which the points that the camera sees lie closest together. Infinite without maps. Reads back.
@@ -91,7 +88,7 @@ def with_tiles(
     data: SceneData,
     settings: RenderSettings,
     fit: Frusta | None,
-    seen: tuple[Point3f, Bool],
+    seen: VisiblePoints,
     samples: int,
     layers: int = 0,
 ) -> MapPlan:
@@ -137,7 +134,7 @@ def with_tiles(
         most //= 2
 
 
-def _cells_of(view: Views, fit: Frusta, seen: tuple[Point3f, Bool]) -> npt.NDArray[np.int64]:
+def _cells_of(view: Views, fit: Frusta, seen: VisiblePoints) -> npt.NDArray[np.int64]:
     """Cell of a map (one of ``_CELLS`` squared) in which each of the visible points within the map lies."""
     u, v, _, inside = project(view, fit, seen[0])
     chosen = (inside & seen[1]).numpy()

@@ -178,7 +178,7 @@ class Renderer:
         )
         if not topology.count:
             raise ShadowmapError("There is nothing to render: all triangles of the scene have two corners at the same place.")
-        plan, creases = plan_maps(data.lights, geometry), ShadingEdges.of(geometry, topology, data.sources)
+        plan, creases = plan_maps(data.lights, geometry, data.materials), ShadingEdges.of(geometry, topology, data.sources)
         soft = plan_extended_lights(data, settings)
         if settings.shadow.method != "none":
             texels = settings.shadow.resolution * settings.shadow.supersampling

@@ -20,6 +20,7 @@ from ..raster import Topology
 from ..scene.geometry import Geometry, rows_of
 from ..scene.lights.projected import Beam
 from ..scene.lights.read import Light
+from ..scene.mitsuba_objects import transmits
 from ..shadow import (
     Boxes,
     Frusta,
@@ -59,6 +60,7 @@ class MapPlan:
     ``kinds``: ``directional``, ``beam``, ``spot`` (one map each) or ``cube`` (six). ``tiles``: maps that share the image plane of
     each light, 1 for beams and cubes.
     ``planes``: index of the largest face of each planar shape, of any face for other shapes. ``planar``: Bool (S,).
+    ``reflecting``: planar shapes that light from behind does not reach: all, unless a material spreads light to its other side.
     ``center``, ``radius``: a sphere around the scene at rest, world space, for the fixed frusta of ``compat``.
     """
 
@@ -68,6 +70,7 @@ class MapPlan:
     tiles: tuple[int, ...]
     planes: UInt32
     planar: Bool
+    reflecting: Bool
     center: tuple[float, float, float]
     radius: float
 
@@ -105,8 +108,8 @@ class MapPlan:
         return replace(self, kinds=self.kinds[first:last], tiles=self.tiles[first:last])
 
 
-def plan_maps(lights: Sequence[Light], geometry: Geometry) -> MapPlan:
-    """Choose the maps of the lights, and find planar shapes (on the host, once)."""
+def plan_maps(lights: Sequence[Light], geometry: Geometry, materials: Sequence[mi.Object]) -> MapPlan:
+    """Choose the maps of the lights, and find planar shapes (on the host, once). ``materials``: of the scene."""
     kinds = tuple(light.map_kind() for light in lights)
     positions = dr.detach(geometry.positions).numpy().reshape(-1, 3)
     faces = geometry.faces.numpy().reshape(-1, 3)
@@ -122,11 +125,13 @@ def plan_maps(lights: Sequence[Light], geometry: Geometry) -> MapPlan:
         largest[geometry.face_shape.numpy()[rows[order]]] = rows[order]
         planes[planar] = largest[planar]
     center, radius = _sphere_around(positions)
+    opaque = not any(transmits(node) for node in materials)
     return MapPlan(
         kinds,
         (1,) * len(kinds),
         device_array(mi.UInt32, planes),
         device_array(mi.Bool, [info.planar for info in geometry.shapes]),
+        device_array(mi.Bool, [info.planar and opaque for info in geometry.shapes]),
         center,
         radius or 1.0,
     )

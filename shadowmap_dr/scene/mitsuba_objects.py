@@ -174,6 +174,12 @@ def is_cosine(bsdf: mi.BSDF) -> bool:
     return all(is_cosine(part) if isinstance(part, mi.BSDF) else type(part) is mi.Texture for _, part in children(bsdf))
 
 
+def transmits(node: mi.Object) -> bool:
+    """True for a BSDF that spreads light to its other side."""
+    flags = node.flags() if isinstance(node, mi.BSDF) else 0
+    return mi.has_flag(flags, mi.BSDFFlags.DiffuseTransmission) or mi.has_flag(flags, mi.BSDFFlags.GlossyTransmission)
+
+
 def passes_evenly(bsdf: mi.BSDF) -> bool:
     """True if the share of light that passes a BSDF straight on is known not to vary over a surface."""
     for _, part in children(bsdf):

@@ -1,8 +1,8 @@
 """Shadow maps for directional, spot and point lights: cameras, moments, filters, visibility. No Mitsuba."""
 
-from .caster_bounds import Boxes, casting_shapes, shape_boxes
+from .caster_bounds import Boxes, casting_shapes, receiving_shapes, shape_boxes
 from .filters import FILTERS, filter_kernel, filter_map
-from .frustum_fit import Bounds, fit_frusta, shape_bounds
+from .frustum_fit import Bounds, VisiblePoints, fit_frusta, shape_bounds
 from .light_camera import (
     Frusta,
     LightView,
@@ -44,6 +44,7 @@ __all__ = [
     "TranslucentCasters",
     "TransmittanceMaps",
     "Views",
+    "VisiblePoints",
     "casting_shapes",
     "chebyshev_visibility",
     "cube_face",
@@ -55,6 +56,7 @@ __all__ = [
     "fit_frusta",
     "fit_tiles",
     "project",
+    "receiving_shapes",
     "render_maps",
     "shape_bounds",
     "shape_boxes",

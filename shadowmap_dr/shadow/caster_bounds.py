@@ -8,7 +8,7 @@ import drjit as dr
 
 from ..jit.arrays import backend, ravel
 from ..jit.kernel_inputs import split, uint_input
-from ..jit.types import Bool, Float, Normal3f, Point3f, UInt32
+from ..jit.types import Bool, Float, Normal3f, Point3f, UInt32, Vector4f
 from .light_camera import Views, of_map
 
 #: Fraction of a shape's extent that may sink into the floor on which it stands, before the floor counts as its caster.
@@ -84,6 +84,36 @@ def casting_shapes(
         behind = dr.gather(module.Float, reach, shape * 2 + dr.select(above, module.UInt32(1), 0)) > 0
         casts = ~dr.gather(module.Bool, planar, shape) | behind
         return casts if hidden is None else casts & (shape != dr.gather(module.UInt32, hidden, which))
+
+
+def receiving_shapes(views: Views, planes: tuple[Normal3f, Point3f], reflecting: Bool, eyes: Vector4f) -> Bool:
+    """Shapes whose light cameras can see in each map: all but planar shapes that are seen from the side that faces away.
+
+    Args:
+        views: cameras of the M maps.
+        planes: as of :func:`casting_shapes`.
+        reflecting: (S,) mask of the planar shapes that send no light to their other side.
+        eyes: places of cameras, in homogeneous coordinates, world space.
+
+    Returns:
+        As of :func:`casting_shapes`.
+    """
+    module = backend(views.spread)
+    with dr.suspend_grad():
+        views, shapes = dr.detach(views), dr.width(reflecting)
+        normal, point = planes
+        dr.eval(normal, point, reflecting, eyes)
+        index = dr.arange(module.UInt32, views.count * shapes)
+        which, shape = split(index, "shapes", shapes, views.count)
+        view = of_map(views, which, views.count)
+        n, p = (module.Array3f(*(dr.gather(module.Float, v[c], shape) for c in range(3))) for v in (normal, point))
+        above = dr.dot(n, dr.select(view.spread > 0, view.origin - p, -view.forward)) > 0
+        receives = ~dr.gather(module.Bool, reflecting, shape)
+        for k in range(dr.width(eyes)):
+            eye = [dr.gather(module.Float, eyes[c], module.UInt32(k)) for c in range(4)]
+            towards = module.Array3f(*(eye[c] - eye[3] * p[c] for c in range(3)))
+            receives |= (dr.dot(n, towards) > 0) == above
+        return receives
 
 
 def _reach(normal: Normal3f, point: Point3f, planar: Bool, boxes: Boxes) -> Float:

@@ -9,14 +9,19 @@ import drjit as dr
 
 from ..jit.arrays import backend
 from ..jit.kernel_inputs import float_input, quotient, split
-from ..jit.types import Bool, Float, Point3f, UInt32
+from ..jit.types import Bool, Float, Point3f, UInt32, Vector4f
 from .grouped import grouped_maxima, numbers_of
 from .light_camera import Frusta, Views, of_map, to_light_space
 from .tiles import Tiles
 
+#: Points in world space, spread over the surfaces that cameras see; the mask of the valid ones; and the places of these cameras,
+#: in homogeneous coordinates: points, or directions to orthographic ones.
+VisiblePoints: TypeAlias = tuple[Point3f, Bool, Vector4f]
 #: Bounds in a light's image plane and of depths: (x0, y0, x1, y1, z0, z1).
 Extent: TypeAlias = tuple[Float, Float, Float, Float, Float, Float]
 
+# Largest share of a window's area at which a part of it is worth another fit: fits are to stay while little changes.
+_MUCH_LESS = 0.05
 # Distance of maps from the light, or before the origin of a directional one, where nothing casts and receivers are not known.
 _CLOSE, _AWAY = 1e-6, 1e6
 # A frustum is kept while it contains the scene and the scene fills at least this fraction of it.
@@ -78,9 +83,10 @@ def fit_frusta(
     resolution: int,
     filter_size: int,
     previous: Frusta | None,
-    seen: tuple[Point3f, Bool] | None = None,
+    seen: tuple[Point3f, Bool] | VisiblePoints | None = None,
     receiver_range: bool = True,
     tiles: Tiles | None = None,
+    receives: Bool | None = None,
 ) -> Frusta:
     """Frusta that cover all possible casters of visible shadows, or the previous frusta as long as they still do. Detached.
 
@@ -93,9 +99,10 @@ def fit_frusta(
         filter_size: of the maps' filter, in texels.
         previous: frusta of an earlier call. Kept bit by bit while the casters lie inside them with room for the filter
             and fill most of them.
-        seen: (points in world space, spread over the visible receivers; mask of valid points). None: receivers may be anywhere.
+        seen: points on the visible receivers. None: receivers may be anywhere.
         receiver_range: resolve depths only from shortly before the first receiver on, not from the first caster on.
         tiles: parts of the image planes that the maps serve; only visible points inside count for a map.
+        receives: mask of the shapes that can be lit in each map (:func:`receiving_shapes`), None for all of them.
 
     All arithmetic stays on the device: nothing is read back.
     """
@@ -107,6 +114,8 @@ def fit_frusta(
         extent = bounds.of(index)
         casts &= ~(of_map(views, map_index, views.count).spread > 0) | (extent[5] > 0)
         window = _window(views, seen, tiles)
+        if receives is not None:
+            window = _around(window, extent, receives, map_index, views.count)
         if not receiver_range:
             window = (*window[:4], module.Float(-dr.inf), window[5])
         fitted = _fit(views, extent, casts, map_index, window, tiles, resolution, filter_size)
@@ -120,7 +129,7 @@ def fit_frusta(
         return result
 
 
-def _window(views: Views, seen: tuple[Point3f, Bool] | None, tiles: Tiles | None) -> Extent:
+def _window(views: Views, seen: tuple[Point3f, Bool] | VisiblePoints | None, tiles: Tiles | None) -> Extent:
     """(x0, y0, x1, y1, z0, z1): bounds of the visible points in each map's image plane, within the light's cone, and in depth.
 
     The window of a tile reaches to its borders, which other points lie on.
@@ -130,7 +139,7 @@ def _window(views: Views, seen: tuple[Point3f, Bool] | None, tiles: Tiles | None
     limit = dr.select(perspective, views.spread, dr.inf)
     if seen is None:
         return -limit, -limit, limit, limit, module.Float(-dr.inf), module.Float(dr.inf)
-    points, active = seen
+    points, active = seen[0], seen[1]
     count = dr.width(points)
     lane = dr.arange(module.UInt32, views.count * count)
     map_index, source = split(lane, "points", count, views.count)
@@ -154,6 +163,21 @@ def _window(views: Views, seen: tuple[Point3f, Bool] | None, tiles: Tiles | None
         sides = [dr.select(dr.isfinite(border), border, side) for border, side in zip(borders, sides, strict=True)]
     x0, y0, x1, y1 = (dr.minimum(side, limit) for side in sides)
     return -x0, -y0, x1, y1, -nearest, farthest
+
+
+def _around(window: Extent, extent: Extent, chosen: Bool, map_index: UInt32, count: int) -> Extent:
+    """The part of a window around chosen shapes, where that is much less. ``extent``, ``chosen``, ``map_index``: of all shapes in
+    all maps."""
+    x0, y0, x1, y1, z0, z1 = extent
+    bounds = Bounds(grouped_maxima([-x0, -y0, -z0, x1, y1, z1], map_index, count, chosen))
+    x0, y0, x1, y1, z0, z1 = bounds.of(dr.arange(type(map_index), count))
+    x0, y0, z0 = dr.maximum(x0, window[0]), dr.maximum(y0, window[1]), dr.maximum(z0, window[4])
+    x1, y1, z1 = dr.minimum(x1, window[2]), dr.minimum(y1, window[3]), dr.minimum(z1, window[5])
+    area = dr.maximum(x1 - x0, 0) * dr.maximum(y1 - y0, 0)
+    less = area <= _MUCH_LESS * (window[2] - window[0]) * (window[3] - window[1])
+    pairs = zip((x0, y0, x1, y1, z0, z1), window, strict=True)
+    x0, y0, x1, y1, z0, z1 = (dr.select(less, part, whole) for part, whole in pairs)
+    return x0, y0, x1, y1, z0, z1
 
 
 def _fit(

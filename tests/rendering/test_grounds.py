@@ -19,18 +19,18 @@ Array = npt.NDArray[np.float64]
 SIZE = 96
 
 
-def bunny_on(half: float, size: int = SIZE, shift: float = 0, **lights: Any) -> mi.Scene:
-    """A bunny, 1.4 high, on a ground of so much in each direction, in the sun."""
+def bunny_on(half: float, size: int = SIZE, shift: float = 0, sunk: float = 0.25, ground: Any = None, **others: Any) -> mi.Scene:
+    """A bunny, 1.4 high, that has sunk into a ground of so much in each direction, in the sun. ``others``: instead of the sun."""
     t = mi.ScalarTransform4f
     film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
     view = t().look_at([-1.5, -3.2, 1.6], [0, 0, 0.5], [0, 0, 1])
-    place = t().translate([shift, 0, 0]).rotate([1, 0, 0], 90).scale(0.7).translate([0, 0.6, 0])
+    place = t().translate([shift, 0, 0]).rotate([1, 0, 0], 90).scale(0.7).translate([0, 0.97 - sunk / 0.7, 0])
     sun = {"type": "directional", "direction": [0.9, -0.3, -1.0]}
     return mi.load_dict({
         "type": "scene",
-        **(lights or {"sun": sun}),
+        **(others or {"sun": sun}),
         "sensor": {"type": "perspective", "fov": 45, "to_world": view, "film": film},
-        "ground": {"type": "rectangle", "to_world": t().scale(half)},
+        "ground": {"type": "rectangle", "to_world": t().scale(half), "bsdf": ground or {"type": "diffuse"}},
         "bunny": {"type": "ply", "filename": str(assets.mesh("bunny")), "to_world": place},
     }, optimize=False)  # fmt: skip
 
@@ -75,3 +75,20 @@ def test_many_lights_keep_one_map_each_in_small_images() -> None:
     assert Renderer.from_scene(bunny_on(100, **suns)).plan.tiles == (1,) * 4
     del suns["sun3"]
     assert Renderer.from_scene(bunny_on(100, **suns)).plan.tiles == (4,) * 3
+
+
+@pytest.mark.usefixtures("variant")
+@pytest.mark.parametrize("half", [3.0, 300.0])
+def test_skies_do_not_shine_through_wide_grounds(half: float) -> None:
+    """Maps of the sky below the ground are as wide as its view, if they count the points on it. The error was 0.10 then."""
+    scene = bunny_on(half, sunk=0, sky={"type": "constant"})
+    assert relative_error(np.array(Renderer.from_scene(scene).render(spp=4), np.float64), traced(scene, 256)) < 0.03
+
+
+@pytest.mark.usefixtures("variant")
+def test_grounds_that_spread_light_are_lit_from_below() -> None:
+    """Points on them count in maps of the sky below them."""
+    thin = {"type": "principledthin", "diff_trans": 1.6, "base_color": {"type": "rgb", "value": 0.8}}
+    below = {"type": "sphere", "center": [-0.6, -1.2, -0.5], "radius": 0.4}
+    scene = bunny_on(3, sunk=0, ground=thin, sky={"type": "constant"}, below=below)
+    assert relative_error(np.array(Renderer.from_scene(scene).render(spp=4), np.float64), traced(scene, 256)) < 0.045

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from shadowmap_dr.shadow import Boxes, casting_shapes, directional_view, stack_views
+from shadowmap_dr.shadow import Boxes, casting_shapes, cube_views, directional_view, receiving_shapes, stack_views
 from shadowmap_dr.shadow.caster_bounds import BORDER, ROUNDING, SUNK, TOUCH
 
 Array = npt.NDArray[np.float64]
@@ -77,3 +77,23 @@ def test_thousands_of_shapes_are_not_compared_in_pairs(variant: str) -> None:
         dr.eval(casting_shapes(views, *given))
         sizes = [kernel["size"] for kernel in dr.kernel_history([dr.KernelType.JIT])]
     assert sizes and max(sizes) <= 3 * count
+
+
+def test_walls_receive_light_that_cameras_see(variant: str) -> None:
+    """From the side on which a light and one of the cameras lie, with suns and with lamps, for cameras of both kinds."""
+    shares = []
+    for seed in range(8):
+        generator = np.random.default_rng(seed)
+        low, high, normals, planar = walls(generator, 12)
+        points = 0.5 * (low + high)
+        sun, lamp = generator.normal(size=(2, 3))
+        eyes = np.concatenate([generator.normal(size=(2, 3)) * 2, [[1], [seed % 2]]], axis=1)
+        views = stack_views([directional_view(mi.Vector3f(*sun.tolist())), *cube_views(mi.Point3f(*lamp.tolist()), 64, 3)])
+        planes, reflecting, _ = arrays(low, high, normals, planar)
+        found = receiving_shapes(views, planes, reflecting, mi.Vector4f(eyes.T.astype(np.float32))).numpy().reshape(7, -1)
+        sides = [((eye[:3] - eye[3] * points) * normals).sum(1) > 0 for eye in eyes]
+        for k, towards in enumerate([np.broadcast_to(-sun, points.shape), *[lamp - points] * 6]):
+            lit = (towards * normals).sum(1) > 0
+            assert np.array_equal(found[k], ~planar | (sides[0] == lit) | (sides[1] == lit))
+        shares.append(found[:, planar])
+    assert 0.3 < np.mean(shares) < 0.95

@@ -140,7 +140,7 @@ class StillScene:
                 planes,
                 planar,
                 boxes_of(geometry),
-                buffer.seen,
+                buffer.seen[:2],
             )
             dr.eval(scene)
             return scene

@@ -26,12 +26,14 @@ from ...shadow import (
     ShadowSettings,
     TranslucentCasters,
     Views,
+    VisiblePoints,
     casting_shapes,
     cube_face,
     cube_views,
     directional_view,
     filter_maps,
     fit_frusta,
+    receiving_shapes,
     render_maps,
     shape_bounds,
     to_light_space,
@@ -183,7 +185,7 @@ def make_soft_maps(
     topology: Topology,
     settings: tuple[ShadowSettings, ShadowSettings],
     previous: SoftFrusta,
-    seen: tuple[Point3f, Bool] | None = None,
+    seen: VisiblePoints | None = None,
     drawn: Bool | None = None,
     translucent: TranslucentCasters | None = None,
 ) -> SoftMaps:
@@ -206,7 +208,7 @@ def fit_soft_maps(
     geometry: Geometry,
     settings: tuple[ShadowSettings, ShadowSettings],
     previous: SoftFrusta,
-    seen: tuple[Point3f, Bool] | None = None,
+    seen: VisiblePoints | None = None,
 ) -> SoftFrusta:
     """The fit of the maps of :func:`make_soft_maps`, without rendering them. Arguments as there."""
     kinds = _kinds(plans, samples, settings, previous)
@@ -234,7 +236,7 @@ def _fitted(
     geometry: Geometry,
     settings: ShadowSettings,
     previous: Frusta | None,
-    seen: tuple[Point3f, Bool] | None,
+    seen: VisiblePoints | None,
 ) -> tuple[Views, UInt32, Frusta]:
     """(cameras of all maps, hidden shape of each map, the fit)."""
     plans = [plan for plan, _ in lights]
@@ -252,7 +254,7 @@ def _make(
     topology: Topology,
     settings: ShadowSettings,
     previous: Frusta | None,
-    seen: tuple[Point3f, Bool] | None,
+    seen: VisiblePoints | None,
     casters: tuple[Bool | None, TranslucentCasters | None],
 ) -> ShadowMaps:
     """Unfiltered maps of some lights. ``casters``: mask of the opaque faces, and the other casters."""
@@ -356,7 +358,7 @@ def _fit(
     geometry: Geometry,
     settings: ShadowSettings,
     previous: Frusta | None,
-    seen: tuple[Point3f, Bool] | None,
+    seen: VisiblePoints | None,
 ) -> Frusta:
     """Frusta around the boxes of shapes. With many maps, a fit to each vertex would cost more than drawing it."""
     with dr.suspend_grad():
@@ -367,7 +369,9 @@ def _fit(
         which, shape = split(entry, "shapes", shapes, count)
         corner = boxes.corners(shape, lane & 7)
         bounds = shape_bounds(views, to_light_space(of_map(dr.detach(views), which, count), corner), which, shape, shapes)
-        casts = casting_shapes(views, *shape_planes(scene, geometry), boxes, hidden)
+        planes, planar = shape_planes(scene, geometry)
+        casts = casting_shapes(views, planes, planar, boxes, hidden)
+        receives = None if seen is None else receiving_shapes(views, planes, planar & scene.reflecting, seen[2])
         return fit_frusta(
             views,
             bounds,
@@ -378,16 +382,18 @@ def _fit(
             previous,
             _few(seen),
             settings.receiver_range,
+            receives=receives,
         )
 
 
-def _few(seen: tuple[Point3f, Bool] | None) -> tuple[Point3f, Bool] | None:
+def _few(seen: VisiblePoints | None) -> VisiblePoints | None:
     """A subset of about 1,000 visible points."""
     if seen is None:
         return None
-    points, active = seen
+    points, active, eyes = seen
     stride = max(1, dr.width(points) // _SEEN)
     # Odd steps do not run down the columns of an image.
     stride += stride > 1 and stride % 2 == 0
     index = dr.arange(mi.UInt32, dr.width(points) // stride) * stride
-    return mi.Point3f(*(dr.gather(mi.Float, points[c], index) for c in range(3))), dr.gather(mi.Bool, mi.Bool(active), index)
+    points = mi.Point3f(*(dr.gather(mi.Float, points[c], index) for c in range(3)))
+    return points, dr.gather(mi.Bool, mi.Bool(active), index), eyes

@@ -10,6 +10,7 @@ import mitsuba as mi
 
 from ...jit.kernel_inputs import split
 from ...jit.types import Color3f, Float, PyTree, UInt32, Vector3f
+from ...scene.mitsuba_objects import transmits
 from ...scene.sensor import ImageSize
 from ...scene.sums import attached_parameters, sum_over
 from ...shadow import transmittance
@@ -20,7 +21,7 @@ from .interleaving import Interleaving
 from .penumbra import penumbra_visibility
 from .sample_maps import SoftMaps, SoftPlan, map_of
 from .samples import LightSamples
-from .sky_light import reflects_only, sky_light, transmits
+from .sky_light import reflects_only, sky_light
 from .sky_samples import SkySamples
 
 

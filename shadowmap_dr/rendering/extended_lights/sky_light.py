@@ -10,6 +10,7 @@ import mitsuba as mi
 
 from ...jit.types import ArrayXf, Color3f, Float, PyTree, UInt32
 from ...jit.vectors import mean_of
+from ...scene.mitsuba_objects import transmits
 from ...scene.sums import attached_parameters, sum_over
 from ..direct_light import passes_gate
 from ..gbuffer.surface import Surface
@@ -24,12 +25,6 @@ _LOW = 3.0
 def reflects_only(nodes: Sequence[Any]) -> bool:
     """True if none of the BSDFs among ``nodes`` spreads light to its other side."""
     return not any(transmits(node) for node in nodes)
-
-
-def transmits(node: mi.Object) -> bool:
-    """True for a BSDF that spreads light to its other side."""
-    flags = node.flags() if isinstance(node, mi.BSDF) else 0
-    return mi.has_flag(flags, mi.BSDFFlags.DiffuseTransmission) or mi.has_flag(flags, mi.BSDFFlags.GlossyTransmission)
 
 
 def sky_light(

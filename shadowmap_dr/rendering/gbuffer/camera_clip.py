@@ -12,7 +12,7 @@ from ...jit.arrays import backend
 from ...jit.broadcast import broadcast_differentiable
 from ...jit.handover import interleaved
 from ...jit.kernel_inputs import float_input, split, uint_input
-from ...jit.types import Bool, Float, Point3f
+from ...jit.types import Bool, Float, Point3f, Vector4f
 from ...raster import DEPTH_GAP, NO_TRIANGLE, RasterOutput
 from ...raster.triangle_setup import centred
 from ...raster.types import by_pixel
@@ -92,6 +92,15 @@ def seen_points(sensor: Sensor, raster: RasterOutput, geometry: Geometry) -> tup
             z = dr.fma(0.5 * depth + 0.5, _orthographic_reach(sensor, geometry), near)
             local = mi.Point3f((x - projection[0, 3]) / projection[0, 0], (y - projection[1, 3]) / projection[1, 1], z)
         return mi.Transform4f(dr.detach(sensor.to_world.matrix)) @ local, hit
+
+
+def eye_of(sensor: Sensor) -> Vector4f:
+    """Place of a camera in homogeneous coordinates, world space: a point, or the direction to an orthographic one. Detached."""
+    with dr.suspend_grad():
+        to_world = mi.Transform4f(dr.detach(sensor.to_world.matrix))
+        if sensor.kind == "perspective":
+            return mi.Vector4f(*(to_world @ mi.Point3f(0)), 1)
+        return mi.Vector4f(*(to_world @ mi.Vector3f(0, 0, -1)), 0)
 
 
 def _orthographic_reach(sensor: Sensor, geometry: Geometry) -> Float:

@@ -16,8 +16,8 @@ from ...raster.antialiasing.edge_crossings import find_crossings
 from ...scene.geometry import Geometry
 from ...scene.load import SceneData
 from ...scene.sensor import ImageSize, Sensor
-from ...shadow import TranslucentCasters
-from .camera_clip import camera_clip, least_gap, seen_points, within_far_plane, without_shapes
+from ...shadow import TranslucentCasters, VisiblePoints
+from .camera_clip import camera_clip, eye_of, least_gap, seen_points, within_far_plane, without_shapes
 from .facet_normals import FlatFaces, facet_normals, mean_normals, prefilter_normals
 from .shading_edges import ShadingEdges
 from .surface import Surface, normals_at, surface_at
@@ -110,14 +110,14 @@ class GBuffer:
         surface: the surface at each pixel.
         points: places of visibility look-ups, spread over the pixel (Point3f, H * W each); a pixel's visibility is their mean.
         crossings: how pixels mix, None without anti-aliasing.
-        seen: sample points on all surfaces that the camera sees (Point3f, world space) and a mask of the valid ones.
+        seen: sample points on all surfaces that the camera sees.
     """
 
     sensor: Sensor
     surface: Surface
     points: list[Point3f]
     crossings: Crossings | None
-    seen: tuple[Point3f, Bool]
+    seen: VisiblePoints
 
 
 @dataclass(frozen=True)
@@ -172,17 +172,19 @@ class CameraPass:
             return None, None
         return self.translucency.opaque, self.translucency.casters(self.data, shapes.geometry, camera, shapes.translucent)
 
-    def seen(self, views: Sequence[CameraView], geometry: Geometry) -> tuple[Point3f, Bool]:
-        """Points on surfaces that cameras see (Point3f, world space), and a mask of the valid ones. Detached."""
+    def seen(self, views: Sequence[CameraView], geometry: Geometry) -> VisiblePoints:
+        """Points on surfaces that cameras see. Detached."""
         found = [
             seen_points(each.sensor, each.raster, geometry)
             for view in views
             for each in ((view,) if view.layers is None else (view, view.nearest))
         ]
-        if len(found) == 1:
-            return found[0]
-        points = mi.Point3f(*(dr.concat([p[c] for p, _ in found]) for c in range(3)))
-        return points, dr.concat([mi.Bool(hit) for _, hit in found])
+        points, hits = found[0]
+        if len(found) > 1:
+            points = mi.Point3f(*(dr.concat([p[c] for p, _ in found]) for c in range(3)))
+            hits = dr.concat([mi.Bool(hit) for _, hit in found])
+        eyes = [eye_of(view.sensor) for view in views]
+        return points, hits, mi.Vector4f(*(dr.concat([mi.Float(eye[c]) for eye in eyes]) for c in range(4)))
 
     def frame(self, view: CameraView, shapes: PlacedShapes, frames: bool, triangle: UInt32 | None = None) -> Frame:
         """The surfaces that a camera sees, attached.

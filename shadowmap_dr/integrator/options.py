@@ -47,7 +47,8 @@ class Options:
 
     shadow_map_resolution  texels along each side of a shadow map, at least six more than those of the filter, at most 4096; or
                            ``auto``: 256, and directional lights and spots get as many maps as the pixels that see their
-                           shadows are worth; 128 to 256 for four lights and more, as the image has pixels along a side
+                           shadows are worth, or up to four where most of these see a small part of one; 128 to 256 in small
+                           images, for several maps of a light, or for four lights and more
     shadow_tiles           most maps of such a light, at most 16; 0: 16 for ``auto``, else 1
     shadow_method          ``auto`` (``evsm4``), ``vsm``, ``esm``, ``evsm2``, ``evsm4``, ``msm``, ``csm``, ``pcf``, ``standard``
                            (no shadow gradients) or ``none`` (no shadows); see ``shadowmap_dr.shadow.ShadowSettings``

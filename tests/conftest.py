@@ -39,7 +39,8 @@ def pytest_configure(config: pytest.Config) -> None:
 def _set_threads(two: bool) -> None:
     """Threads of Dr.Jit in one of several workers; alone it has all cores.
 
-    They look for work in a loop before they sleep. Two in each worker take a third more of the processors' time than one.
+    They look for work in a loop before they sleep. Two in each worker take a third more of the processors' time than one. With
+    one, Mitsuba 3.9 waits forever when it reads or writes an EXR file: see :func:`shadowmap_dr.jit.threads.second_thread`.
     """
     if "PYTEST_XDIST_WORKER" not in os.environ or dr.thread_count() == 1 + two:
         return

@@ -23,7 +23,7 @@ from ..scene.lights.soft_outline import softened
 from ..scene.load import SceneData
 from ..scene.sensor import ImageSize, Sensor
 from ..scene.sums import attached_parameters
-from ..shadow import Frusta, ShadowMaps, ShadowSettings, TranslucentCasters, VisiblePoints
+from ..shadow import Frusta, ShadowMaps, ShadowSettings, TranslucentCasters
 from .direct_light import ambient_light, background, direct_light, emission
 from .extended_lights import (
     LightSamples,
@@ -43,7 +43,7 @@ from .extended_lights import (
 )
 from .extended_lights.interleaving import Interleaving
 from .extended_lights.sample_counts import MOST
-from .gbuffer.camera_view import CameraView, Frame, PlacedShapes
+from .gbuffer.camera_view import CameraView, Frame, PlacedShapes, VisiblePoints
 from .gbuffer.pixel_footprint import FootprintSamples, footprint_points
 from .gbuffer.surface import Surface
 from .light_colours import white_area_light, white_light

@@ -10,7 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ..scene.load import SceneData
-from ..shadow import Frusta, ShadowSettings, Views, VisiblePoints, project, stack_views
+from ..shadow import Frusta, ShadowSettings, Views, project, stack_views
+from .gbuffer.camera_view import VisiblePoints
 from .light_loops import MANY_LIGHTS
 from .light_slices import TexelLayers, map_bytes
 from .settings import RenderSettings

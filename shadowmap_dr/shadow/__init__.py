@@ -2,7 +2,7 @@
 
 from .caster_bounds import Boxes, casting_shapes, receiving_shapes, shape_boxes
 from .filters import FILTERS, filter_kernel, filter_map
-from .frustum_fit import Bounds, VisiblePoints, fit_frusta, shape_bounds
+from .frustum_fit import Bounds, fit_frusta, shape_bounds
 from .light_camera import (
     Frusta,
     LightView,
@@ -44,7 +44,6 @@ __all__ = [
     "TranslucentCasters",
     "TransmittanceMaps",
     "Views",
-    "VisiblePoints",
     "casting_shapes",
     "chebyshev_visibility",
     "cube_face",

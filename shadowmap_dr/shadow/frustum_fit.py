@@ -9,14 +9,11 @@ import drjit as dr
 
 from ..jit.arrays import backend
 from ..jit.kernel_inputs import float_input, quotient, split
-from ..jit.types import Bool, Float, Point3f, UInt32, Vector4f
+from ..jit.types import Bool, Float, Point3f, UInt32
 from .grouped import grouped_maxima, numbers_of
 from .light_camera import Frusta, Views, of_map, to_light_space
 from .tiles import Tiles
 
-#: Points in world space, spread over the surfaces that cameras see; the mask of the valid ones; and the places of these cameras,
-#: in homogeneous coordinates: points, or directions to orthographic ones.
-VisiblePoints: TypeAlias = tuple[Point3f, Bool, Vector4f]
 #: Bounds in a light's image plane and of depths: (x0, y0, x1, y1, z0, z1).
 Extent: TypeAlias = tuple[Float, Float, Float, Float, Float, Float]
 
@@ -83,7 +80,7 @@ def fit_frusta(
     resolution: int,
     filter_size: int,
     previous: Frusta | None,
-    seen: tuple[Point3f, Bool] | VisiblePoints | None = None,
+    seen: tuple[Point3f, Bool] | None = None,
     receiver_range: bool = True,
     tiles: Tiles | None = None,
     receives: Bool | None = None,
@@ -99,7 +96,7 @@ def fit_frusta(
         filter_size: of the maps' filter, in texels.
         previous: frusta of an earlier call. Kept bit by bit while the casters lie inside them with room for the filter
             and fill most of them.
-        seen: points on the visible receivers. None: receivers may be anywhere.
+        seen: (points in world space, spread over the visible receivers; mask of valid points). None: receivers may be anywhere.
         receiver_range: resolve depths only from shortly before the first receiver on, not from the first caster on.
         tiles: parts of the image planes that the maps serve; only visible points inside count for a map.
         receives: mask of the shapes that can be lit in each map (:func:`receiving_shapes`), None for all of them.
@@ -129,7 +126,7 @@ def fit_frusta(
         return result
 
 
-def _window(views: Views, seen: tuple[Point3f, Bool] | VisiblePoints | None, tiles: Tiles | None) -> Extent:
+def _window(views: Views, seen: tuple[Point3f, Bool] | None, tiles: Tiles | None) -> Extent:
     """(x0, y0, x1, y1, z0, z1): bounds of the visible points in each map's image plane, within the light's cone, and in depth.
 
     The window of a tile reaches to its borders, which other points lie on.
@@ -139,7 +136,7 @@ def _window(views: Views, seen: tuple[Point3f, Bool] | VisiblePoints | None, til
     limit = dr.select(perspective, views.spread, dr.inf)
     if seen is None:
         return -limit, -limit, limit, limit, module.Float(-dr.inf), module.Float(dr.inf)
-    points, active = seen[0], seen[1]
+    points, active = seen
     count = dr.width(points)
     lane = dr.arange(module.UInt32, views.count * count)
     map_index, source = split(lane, "points", count, views.count)

@@ -26,7 +26,6 @@ from ...shadow import (
     ShadowSettings,
     TranslucentCasters,
     Views,
-    VisiblePoints,
     casting_shapes,
     cube_face,
     cube_views,
@@ -41,6 +40,7 @@ from ...shadow import (
     vertices_of_maps,
 )
 from ...shadow.light_camera import of_map
+from ..gbuffer.camera_view import VisiblePoints
 from ..shadow_pass import MapPlan, boxes_of, check_sizes, shape_planes
 from .area_samples import AreaPlan, area_samples, plan_area
 from .map_aim import WIDEST, Points, aim, sees_all, shape_vertices
@@ -386,14 +386,13 @@ def _fit(
         )
 
 
-def _few(seen: VisiblePoints | None) -> VisiblePoints | None:
+def _few(seen: VisiblePoints | None) -> tuple[Point3f, Bool] | None:
     """A subset of about 1,000 visible points."""
     if seen is None:
         return None
-    points, active, eyes = seen
+    points, active, _ = seen
     stride = max(1, dr.width(points) // _SEEN)
     # Odd steps do not run down the columns of an image.
     stride += stride > 1 and stride % 2 == 0
     index = dr.arange(mi.UInt32, dr.width(points) // stride) * stride
-    points = mi.Point3f(*(dr.gather(mi.Float, points[c], index) for c in range(3)))
-    return points, dr.gather(mi.Bool, mi.Bool(active), index), eyes
+    return mi.Point3f(*(dr.gather(mi.Float, points[c], index) for c in range(3))), dr.gather(mi.Bool, mi.Bool(active), index)

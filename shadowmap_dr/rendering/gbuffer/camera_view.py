@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeAlias
 
 import drjit as dr
 import mitsuba as mi
 
 from ...jit.pytree import tree_map
-from ...jit.types import Bool, Float, Point3f, UInt32
+from ...jit.types import Bool, Float, Point3f, UInt32, Vector4f
 from ...raster import Crossings, RasterOutput, Topology, detach_moved_seams, visible_triangles
 from ...raster.antialiasing.edge_crossings import find_crossings
 from ...scene.geometry import Geometry
 from ...scene.load import SceneData
 from ...scene.sensor import ImageSize, Sensor
-from ...shadow import TranslucentCasters, VisiblePoints
+from ...shadow import TranslucentCasters
 from .camera_clip import camera_clip, eye_of, least_gap, seen_points, within_far_plane, without_shapes
 from .facet_normals import FlatFaces, facet_normals, mean_normals, prefilter_normals
 from .shading_edges import ShadingEdges
@@ -24,6 +24,10 @@ from .surface import Surface, normals_at, surface_at
 from .surface_points import pixel_hits
 from .translucency import Translucency
 from .translucent_layers import Layers
+
+#: Points in world space, spread over the surfaces that cameras see; the mask of the valid ones; and the places of these cameras,
+#: in homogeneous coordinates: points, or directions to orthographic ones.
+VisiblePoints: TypeAlias = tuple[Point3f, Bool, Vector4f]
 
 
 @dataclass(frozen=True)

@@ -80,7 +80,9 @@ INSIDE = {
     ),
     "shadow.methods": (),
     "scene.shapes": ("scene.mitsuba_meshes", "scene.mitsuba_objects", "scene.changes"),
-    "scene.lights": ("scene.geometry", "scene.mitsuba_objects", "scene.changes", "scene.sums", "scene.transforms"),
+    "scene.lights": (
+        *("scene.geometry", "scene.mitsuba_objects", "scene.changes", "scene.naming", "scene.sums", "scene.transforms"),
+    ),
     "rendering.gbuffer": (),
     "rendering.receivers": (),
     "rendering.film": ("rendering.gbuffer",),

@@ -59,7 +59,8 @@ def fit(
     if listing:
         from ..fitting.listing import listed
 
-        console.show(listed(loaded, [one for one in task.options.vary if isinstance(one, Vary)]))
+        entries = [one for one in task.options.vary if isinstance(one, Vary)]
+        console.show(listed(loaded, entries, {picture.sensor for picture in task.pictures}))
         return
     from ..fitting.command import run_fit
     from ..fitting.table import directions, table

@@ -14,6 +14,8 @@ import mitsuba as mi
 
 from ..errors import ShadowmapError, mitsuba_message
 from ..jit.threads import second_thread
+from ..scene.mitsuba_objects import children
+from ..scene.naming import name_objects
 from .xml_text import Element, XmlText
 
 
@@ -54,7 +56,7 @@ class ParsedScene:
         self.constants = {**self.defaults, **parameters}
         self._found: dict[str, tuple[XmlText, Element]] = {}
         counts: dict[str, int] = {}
-        # Mitsuba names children of the scene by their ids, and those without by their place in memory.
+        # Mitsuba tells by ids which element an object comes from.
         for node in state.nodes:
             kind = node.type.name.lower()
             counts[kind] = counts.get(kind, 0) + 1
@@ -64,19 +66,12 @@ class ParsedScene:
             if element is not None:
                 self._found[name] = text, element
             node.props.set_id(name)
-        root = state.root.props
-        roots = {
-            key: state.nodes[root[key].index()].props.id()
-            for key in root.keys()
-            if root.type(key) == mi.Properties.Type.ResolvedReference
-        }
         with resolving(self._folders()):
             scene = instantiated(config, state, file)
         self.scene = scene
-        self.parameters = self._stable(mi.traverse(scene), state.root.props, roots)
-        self.shapes = {
-            shape.id() if not shape.id().startswith(_UNNAMED) else f"shape_{k}": shape for k, shape in enumerate(scene.shapes())
-        }
+        self._name_objects()
+        self.parameters = mi.traverse(scene)
+        self.shapes = {shape.id(): shape for shape in scene.shapes()}
 
     def place(self, name: str) -> Place | None:
         """The place of a parameter in the files; None if none is found."""
@@ -96,6 +91,11 @@ class ParsedScene:
         value, kind, owner, _ = self.parameters.properties.get(name, (None, None, None, 0))
         return value if kind is None else mi.get_property(value, kind, owner)
 
+    def shape(self, name: str) -> mi.Shape | None:
+        """The shape of a name: an id, or ``shape_N`` for the N-th one, as scenes have it that Mitsuba itself loads."""
+        numbered = {f"shape_{number}": shape for number, shape in enumerate(self.scene.shapes())}
+        return self.shapes.get(name) or numbered.get(name)
+
     def shape_element(self, shape: mi.Shape) -> tuple[XmlText, Element] | None:
         """The element of a shape of the scene."""
         return self._found.get(shape.id())
@@ -114,20 +114,15 @@ class ParsedScene:
         found = Path(str(mi.file_resolver().resolve(name))) if name else Path()
         return found.absolute() if found.is_file() else None
 
-    def _stable(self, table: mi.SceneParameters, root: mi.Properties, roots: Mapping[str, str]) -> mi.SceneParameters:
-        """Parameters under names that do not depend on memory: some plug-ins become others, which know no id.
-
-        ``roots``: names of the scene's children by the keys of its properties.
-        """
-        names = {root[key]: name for key, name in roots.items() if isinstance(root[key], mi.Object)}
-        found = {}
-        for key, entry in table.properties.items():
-            child = entry[2]
-            while table.hierarchy[child][1] > 1:
-                child = table.hierarchy[child][0]
-            first, dot, rest = key.partition(".")
-            found[names.get(child, first) + dot + rest if table.hierarchy[child][1] else key] = entry
-        return type(table)(found, table.hierarchy)
+    def _name_objects(self) -> None:
+        """Give objects of the scene the names that they have in a fit."""
+        found = [(child, child.id()) for _, child in children(self.scene) if child.id().startswith(_UNNAMED)]
+        for child, _ in found:
+            child.set_id("")
+        name_objects(self.scene)
+        for child, name in found:
+            if name in self._found:
+                self._found[child.id()] = self._found.pop(name)
 
     def _descended(self, text: XmlText, element: Element, path: tuple[str, ...]) -> Place:
         """The place within nested elements, as far as they are written out: some plug-ins become others, which know no id."""
@@ -163,13 +158,28 @@ def parsed(file: Path, parameters: Mapping[str, str]) -> tuple[mi.parser.ParserC
     config.merge_equivalent = config.merge_meshes = False
     try:
         with resolving([file.parent]):
-            return config, mi.parser.parse_file(config, str(file), **parameters)
+            state = mi.parser.parse_file(config, str(file), **parameters)
     except (RuntimeError, TypeError, UnicodeError) as error:
         raise ShadowmapError(f"cannot load {file}: {mitsuba_message(error)}") from error
+    # Mitsuba's own writer of scene files writes names instead of ids.
+    taken = {node.props.id() for node in state.nodes}
+    for key, node in _children_of_root(state):
+        if not node.props.id() and not key.startswith("_") and key not in taken:
+            node.props.set_id(key)
+            taken.add(key)
+    return config, state
+
+
+def _children_of_root(state: mi.parser.ParserState) -> list[tuple[str, Any]]:  # Any: no stub names nodes
+    """(key of the scene's property, node) of the objects of a scene."""
+    root = state.root.props
+    references = [key for key in root.keys() if root.type(key) == mi.Properties.Type.ResolvedReference]
+    return [(key, state.nodes[root[key].index()]) for key in references]
 
 
 def instantiated(config: mi.parser.ParserConfig, state: mi.parser.ParserState, file: Path) -> mi.Scene:
     """The scene of a parsed file. ShadowmapError if it cannot be made, or is none."""
+    ids = {key: node.props.id() for key, node in _children_of_root(state)}
     try:
         mi.parser.transform_all(config, state)
         with second_thread():
@@ -179,6 +189,11 @@ def instantiated(config: mi.parser.ParserConfig, state: mi.parser.ParserState, f
     scene = scene[0] if isinstance(scene, list) and len(scene) == 1 else scene
     if not isinstance(scene, mi.Scene):
         raise ShadowmapError(f"cannot load {file}: its root is no scene.")
+    # Some plug-ins become others, which know no id.
+    for key, name in ids.items():
+        child = state.root.props[key]
+        if isinstance(child, mi.Object) and not child.id():
+            child.set_id(name)
     return scene
 
 

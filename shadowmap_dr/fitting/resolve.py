@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from ..errors import ShadowmapError, did_you_mean, quoted, shortened
 from ..rendering.renderer import Renderer
+from ..scene.naming import name_objects
 from .arrays import ArrayParameter, MeshVertices, TextureValues, mesh_vertices, texture_values
 from .motion_parameters import CameraMotion, LightMotion, ShapeMotion
 from .motions import host_matrix, tangents
@@ -46,7 +47,7 @@ class Candidate:
 
 
 class Resolver:
-    """The objects and values of one scene by name.
+    """The objects and values of one scene by name. Objects without an id get one.
 
     Args:
         renderer: the renderer of the scene.
@@ -57,6 +58,7 @@ class Resolver:
         self.shapes = [info.name for info in renderer.data.geometry.shapes]
         self.lights = [light.name for light in renderer.data.lights]
         self.sensors = {cameras[0].name: k for k, cameras in enumerate(renderer.data.sensors) if len(cameras) == 1}
+        name_objects(renderer.data.scene)
         self.table = mi.traverse(renderer.data.scene)
         # Names alone: to list a table loads values, which may be large.
         self.keys = list(self.table.properties)

@@ -131,7 +131,7 @@ class _Writer:
         parsed, steps = self.parsed, dict[str, Step]()
         meshes: dict[str, MeshStep] = {}
         for name, points in changes.vertices.items():
-            shape = parsed.shapes.get(name)
+            shape = parsed.shape(name)
             if shape is None:
                 notes[f"{name}:vertices"] = self._no_shape(name)
             elif not isinstance(shape, mi.Mesh):
@@ -163,7 +163,7 @@ class _Writer:
             else:
                 steps[name] = ValueStep(name, key, np.asarray(value), parsed)
         for name, matrix in changes.transforms.items():
-            shape = parsed.shapes.get(name)
+            shape = parsed.shape(name)
             if shape is None:
                 notes[f"{name}:pose"] = self._no_shape(name)
             elif name in meshes:

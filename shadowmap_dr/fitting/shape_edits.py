@@ -55,7 +55,7 @@ class TransformStep(Step):
             text.append(own, moved)
 
     def difference(self, before: ParsedScene, after: ParsedScene) -> str:
-        old, new = before.shapes[self.name], after.shapes[self.name]
+        old, new = before.shapes[self.owner], after.shapes[self.owner]
         if isinstance(old, mi.Mesh):
             expected, found = mapped(self.matrix, vertices_of(old)), vertices_of(new)
             return _difference_of_points(found, expected)
@@ -138,7 +138,7 @@ class MeshStep(Step):
         write_ply(path, mesh)
 
     def difference(self, before: ParsedScene, after: ParsedScene) -> str:
-        old, new = before.shapes[self.name], after.shapes[self.name]
+        old, new = before.shapes[self.owner], after.shapes[self.owner]
         if not np.array_equal(np.array(mesh_buffers(old).faces), np.array(mesh_buffers(new).faces)):
             return "the triangles are others there"
         expected = vertices_of(old) if self.vertices is None else self.vertices

@@ -27,6 +27,7 @@ from .lights.area import AreaLight
 from .lights.environment import Environment
 from .lights.read import Light, area_lights_of, check_directions, environments_of, lights_of
 from .mitsuba_objects import children, held_arrays, is_cosine, is_plain
+from .naming import names_of, unique
 from .sensor import Sensor, sensors_of
 from .shapes.sources import CurveSource, ShapeSource, source_of
 from .soup import Soup, Vertices
@@ -235,7 +236,7 @@ def refresh(
     return replace(
         data,
         geometry=known["geometry"] if "geometry" in known else _geometry_now(data),
-        sensors=known["sensors"] if "sensors" in known else tuple(sensors_of(sensor) for sensor in chosen),
+        sensors=known["sensors"] if "sensors" in known else tuple(map(sensors_of, chosen, names_of(chosen, "camera"))),
         lights=known["lights"] if "lights" in known else lights_of(scene),
         areas=area_lights_of(scene, [source.shape for source in data.sources]),
         environments=environments_of(scene),
@@ -265,21 +266,13 @@ def _shapes_of(scene: mi.Scene) -> Iterator[tuple[str, mi.Shape, mi.Shape | None
     """(unique name, shape, instance or None) of all shapes, shape groups resolved."""
     groups = _Groups(scene)
     taken: set[str] = set()
-    for index, shape in enumerate(scene.shapes()):
-        name = shape.id() or f"shape_{index}"
+    shapes = scene.shapes()
+    for name, shape in zip(names_of(shapes, "shape"), shapes, strict=True):
         if shape.class_name() == "Instance":
             for child_index, child in enumerate(groups.shapes_of(shape, name)):
-                yield _unique(f"{name}.{child.id() or child_index}", taken), child, shape
+                yield unique(f"{name}.{child.id() or child_index}", taken), child, shape
         else:
-            yield _unique(name, taken), shape, None
-
-
-def _unique(name: str, taken: set[str]) -> str:
-    candidate, count = name, 1
-    while candidate in taken:
-        candidate, count = f"{name}_{count}", count + 1
-    taken.add(candidate)
-    return candidate
+            yield unique(name, taken), shape, None
 
 
 class _Groups:

@@ -246,8 +246,11 @@ def _cameras_of(batch: mi.Sensor) -> list[mi.Sensor]:
     return [child for _, child in children(batch) if isinstance(child, mi.Sensor)]
 
 
-def sensors_of(sensor: mi.Sensor) -> tuple[Sensor, ...]:
-    """Records of a ``mi.Sensor``: one, or one for each camera of a batch sensor, left to right."""
+def sensors_of(sensor: mi.Sensor, name: str = "") -> tuple[Sensor, ...]:
+    """Records of a ``mi.Sensor``: one, or one for each camera of a batch sensor, left to right.
+
+    ``name``: of one that has no id.
+    """
     kind = sensor.class_name()
     if kind == "BatchSensor":
         cameras, film = _cameras_of(sensor), sensor.film()
@@ -259,7 +262,7 @@ def sensors_of(sensor: mi.Sensor) -> tuple[Sensor, ...]:
             )
         share = ImageSize(columns // len(cameras), int(film.crop_size()[1]))
         return tuple(_squeezed(_sensor_of(camera, film, i * share.width), share) for i, camera in enumerate(cameras))
-    return (_sensor_of(sensor, sensor.film(), 0),)
+    return (_sensor_of(sensor, sensor.film(), 0, name),)
 
 
 def _squeezed(camera: Sensor, size: ImageSize) -> Sensor:
@@ -269,7 +272,7 @@ def _squeezed(camera: Sensor, size: ImageSize) -> Sensor:
     return replace(camera, film_size=size, crop_size=size, crop_offset=(0, 0), pixel_aspect=aspect)
 
 
-def _sensor_of(sensor: mi.Sensor, film: mi.Film, film_column: int) -> Sensor:
+def _sensor_of(sensor: mi.Sensor, film: mi.Film, film_column: int, name: str = "") -> Sensor:
     kind = _KINDS.get(sensor.class_name())
     if kind is None:
         raise ShadowmapError(
@@ -289,7 +292,7 @@ def _sensor_of(sensor: mi.Sensor, film: mi.Film, film_column: int) -> Sensor:
     alpha = film.base_channels_count() in (2, 4)
     zero = mi.Float(0.0)
     return Sensor(
-        name=sensor.id(),
+        name=sensor.id() or name,
         kind=kind,
         to_world=values["to_world"],
         x_fov=values.get("x_fov", mi.Float(90.0)),

@@ -15,6 +15,7 @@ import numpy as np
 from ...errors import ShadowmapError
 from ...jit.types import Color3f
 from ..mitsuba_objects import children, parameters, varies
+from ..naming import names_of
 from ..transforms import axis
 from .area import AreaLight
 from .environment import ENVIRONMENTS, SUNSKY, Environment, SunSky, environment_of
@@ -102,7 +103,8 @@ def environments_of(scene: mi.Scene) -> tuple[Environment, ...]:
 
 def named_emitters(scene: mi.Scene) -> list[tuple[str, mi.Emitter]]:
     """(name, ``mi.Emitter``) of all emitters of a ``mi.Scene``."""
-    return [(emitter.id() or f"light_{i}", emitter) for i, emitter in enumerate(scene.emitters())]
+    emitters = scene.emitters()
+    return list(zip(names_of(emitters, "light"), emitters, strict=True))
 
 
 def _light_of(emitter: mi.Emitter, name: str) -> Light:

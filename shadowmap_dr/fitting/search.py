@@ -40,6 +40,7 @@ from .starts import LARGEST_FACTOR, chosen, draw, groups_of, half_ranges, redraw
 from .state import Run, Sizes, State
 from .targets import Target, short_names
 from .texture_brightness import TextureBrightness
+from .transparency import as_rendered
 from .uncertainty import shares_of_intervals, uncertainty
 
 Array = npt.NDArray[np.float64]
@@ -101,6 +102,7 @@ class Fit:
         if not options.vary and not any(gain.count for gain in self.gains):
             raise ShadowmapError("nothing varies: name something by --vary; --list lists all that can vary.")
         _check_sizes(renderer, self.targets)
+        self.targets = tuple(as_rendered(renderer, target) for target in self.targets)
         numbers = bool(self.parameters) or any(gain.count for gain in self.gains)
         _check_functions(residuals, loss, numbers=numbers)
         # Textures make up for exposures, lights and colours.
@@ -114,7 +116,7 @@ class Fit:
         self._low, self._high, prior = _bounds(self.parameters, self.gains)
         side = min(options.resolution, max(max(target.width, target.height) for target in targets))
         levels = qualities(side, options.spp, renderer.settings.shadow.resolution)
-        pictures = self.parameters, self.arrays, targets, self.gains
+        pictures = self.parameters, self.arrays, self.targets, self.gains
         compared = Loss(options.loss, options.delta), levels, residuals, loss
         self.stages: list[Stage] = make_stages(renderer, *pictures, prior, *compared)
         windows = [(target.width, target.height) for target in targets]

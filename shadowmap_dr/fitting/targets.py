@@ -37,6 +37,7 @@ class Target:
     ``image`` float32 (H, W, 3), finite, not negative. ``weight`` float32 (H, W) in 0..1: 0 for masked, transparent and saturated
     pixels, and for pixels that are not finite; there ``image`` is 0, too. ``sensor``: number of the scene's sensor that took it.
     ``name``: path of the file, for messages. ``exposure``: known exposure, the factor of the rendered colours, as in fit.toml.
+    ``opaque``: for linear pictures with alpha, the same with colours as they are in the file, where transparent pixels count.
     """
 
     image: Array
@@ -44,6 +45,7 @@ class Target:
     sensor: int = 0
     name: str = ""
     exposure: float = 1.0
+    opaque: Target | None = None
 
     def __post_init__(self) -> None:
         if not 0 < self.exposure <= MOST_EXPOSED:
@@ -89,7 +91,8 @@ class Target:
             return np.concatenate([self.image[at] * weight, weight], axis=-1)
 
         image, weight = _divided(area_average(rows, self.weight.shape, (height, width)))
-        return replace(self, image=image, weight=weight)
+        opaque = None if self.opaque is None else self.opaque.resized(width, height)
+        return replace(self, image=image, weight=weight, opaque=opaque)
 
     @property
     def _named(self) -> str:
@@ -127,7 +130,7 @@ def read_target(
     pixels = read_pixels(path)
     if saturation is None:
         saturation = np.inf if pixels.dtype == np.float32 else SATURATED
-    return replace(_target(pixels, mask, sensor, str(path), saturation, longer_side), exposure=exposure)
+    return _with_opaque(pixels, mask, sensor, str(path), saturation, longer_side, exposure)
 
 
 def make_target(
@@ -168,7 +171,7 @@ def make_target(
     if values.shape[2] < 4:
         colours = np.broadcast_to(values, (*values.shape[:2], 3))
         values = np.concatenate([colours, np.ones_like(values[..., :1])], axis=-1)
-    return replace(_target(values, mask, sensor, name, saturation, longer_side), exposure=exposure)
+    return _with_opaque(values, mask, sensor, name, saturation, longer_side, exposure)
 
 
 def short_names(targets: Sequence[Target]) -> list[str]:
@@ -201,6 +204,24 @@ def is_same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
 
 
 # ------------------------------------------------------------------------------------------------------------------- pixels
+
+
+def _with_opaque(
+    pixels: npt.NDArray[Any],
+    mask: str | os.PathLike[str] | npt.ArrayLike | None,
+    sensor: int,
+    name: str,
+    saturation: float,
+    longer_side: int,
+    exposure: float,
+) -> Target:
+    """A target of pixels as :func:`read_pixels` returns them; of linear ones with alpha, beside its opaque self."""
+    arguments = mask, sensor, name, saturation, longer_side
+    target = replace(_target(pixels, *arguments), exposure=exposure)
+    if pixels.dtype != np.float32 or not (pixels[..., 3] < 1).any():
+        return target
+    colours = np.concatenate([pixels[..., :3], np.ones_like(pixels[..., :1])], axis=-1)
+    return replace(target, opaque=replace(_target(colours, *arguments), exposure=exposure))
 
 
 def _target(

@@ -154,6 +154,22 @@ def test_premultiplied_colours(tmp_path: Path) -> None:
         assert not target.image[0, 0].any()
 
 
+def test_pictures_with_alpha_have_an_opaque_self() -> None:
+    colours, alpha = noise(4, 6, 3, most=5), noise(4, 6, 1, seed=1)
+    alpha[0, 0], mask = 0, np.ones((4, 6))
+    mask[3, 3:] = 0
+    target = make_target(np.concatenate([colours, alpha], -1), mask, sensor=2, exposure=1.5)
+    seen = target.opaque
+    assert seen is not None and (seen.sensor, seen.exposure, seen.opaque) == (2, 1.5, None)
+    np.testing.assert_array_equal(seen.weight, mask)
+    np.testing.assert_allclose(seen.image, colours * mask[..., None], rtol=1e-6)
+    assert make_target(colours, mask).opaque is None
+    small, expected = target.resized(3, 2).opaque, by_brute_force(seen.image, seen.weight, 2, 3)
+    assert small is not None
+    np.testing.assert_allclose(small.image, expected[0], rtol=1e-5)
+    np.testing.assert_allclose(small.weight, expected[1], rtol=1e-5)
+
+
 @pytest.mark.parametrize(("name", "levels"), [("8.png", 255), ("16.png", 65535), ("8.tif", 255), ("16.tif", 65535)])
 def test_saturated_pixels_do_not_count(tmp_path: Path, name: str, levels: int) -> None:
     values = np.full((4, 6, 3), 0.5)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
+import logging
 import struct
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import unquote
 
 import numpy as np
 
@@ -16,12 +19,14 @@ from ..io import obj
 from ..io.files import check_readable
 from ..io.images import check_size, to_linear
 from ..io.meshes import MOST_BYTES, MOST_TRIANGLES, read_placed_mesh
-from . import gltf, gltf_arrays
+from . import gltf, gltf_arrays, obj_materials
 from .model import Array, Material, Model, Part, Picture, PlacedCamera, PlacedLight
 
 if TYPE_CHECKING:
     import PIL.Image
     import trimesh
+
+    from .named_files import NamedFiles
 
 #: Suffixes of files that can be imported.
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off")
@@ -51,7 +56,8 @@ def read_model(path: Path, normals: str = "auto") -> Model:
             raise ShadowmapError(f"cannot import {path}: its nodes, cameras or lights are damaged ({error}).") from error
         content = _rewritten(path, document)
     smooth = normals == "smooth" or (normals == "auto" and suffix not in (".glb", ".gltf", ".stl"))
-    parts = [replace(part, smooth=smooth) for part in _parts(path, suffix, content)]
+    parts, more = _parts(path, suffix, content)
+    parts, notes = [replace(part, smooth=smooth) for part in parts], [*notes, *more]
     kinds = {light.kind for light in lights}
     lights = [light for light in lights if light.kind in ("directional", "point", "spot")]
     notes += [f"lights of the kind {kind!r} are left out" for kind in sorted(kinds - {light.kind for light in lights})]
@@ -90,21 +96,23 @@ def _rewritten(path: Path, document: gltf.Json) -> bytes | None:
 def _check_counts(path: Path, document: gltf.Json) -> None:
     """ShadowmapError if the file announces more values than its buffers hold: the loader would make room for them."""
     beside = [str(buffer.get("uri", "")) for buffer in document.get("buffers", ())]
-    held = path.stat().st_size + sum(
-        file.stat().st_size for uri in beside if uri and not uri.startswith("data:") and (file := path.parent / uri).is_file()
-    )
+    files = [path.parent / unquote(uri) for uri in beside if uri and not uri.startswith("data:")]
+    held = path.stat().st_size + sum(file.stat().st_size for file in files if file.is_file())
     for accessor in document.get("accessors", ()):
         count = accessor.get("count", 0)
         if isinstance(count, bool) or not isinstance(count, (int, float)) or not 0 <= count <= held:
             raise ShadowmapError(f"cannot import {path}: it announces {count} values, but its buffers have {held} bytes.")
 
 
-def _parts(path: Path, suffix: str, content: bytes | None) -> list[Part]:
-    """All meshes of a file. ``content`` is that of a text glTF file instead of its own."""
+def _parts(path: Path, suffix: str, content: bytes | None) -> tuple[list[Part], list[str]]:
+    """(all meshes of a file, notes). ``content`` is that of a text glTF file instead of its own."""
     if suffix in _PLAIN:
-        return [_plain(path)]
+        return [_plain(path)], []
+    from .named_files import NamedFiles
+
+    files = NamedFiles(path)
     try:
-        scene = _loaded(path, suffix) if content is None else _loaded(path, ".gltf", content)
+        scene = _loaded(path, suffix, files) if content is None else _loaded(path, ".gltf", files, content)
         instances = [scene.graph[node] for node in scene.graph.nodes_geometry]
         count = sum(len(getattr(scene.geometry[name], "faces", ())) for _, name in instances)
         if count > MOST_TRIANGLES:
@@ -117,7 +125,7 @@ def _parts(path: Path, suffix: str, content: bytes | None) -> list[Part]:
         raise ShadowmapError(f"cannot import {path}: its content does not fit into memory; it may be damaged.") from None
     except Exception as error:  # loaders of these formats raise errors of many kinds
         if suffix == ".ply":
-            return [_plain(path)]  # of what trimesh refuses, some can be read
+            return [_plain(path)], []  # of what trimesh refuses, some can be read
         raise ShadowmapError(
             f"cannot import {path}: it is no model, or it is damaged, or a file that it names is missing."
         ) from error
@@ -126,7 +134,9 @@ def _parts(path: Path, suffix: str, content: bytes | None) -> list[Part]:
     for part in found:
         if not np.isfinite(part.vertices).all():
             raise ShadowmapError(f"{path}: mesh {part.name!r} has vertices that are not finite (NaN or inf): repair the file.")
-    return found
+    sources = {id(source): source for mesh in scene.geometry.values() if (source := getattr(mesh.visual, "material", None))}
+    kinds = sorted({kind for source in sources.values() for kind in obj_materials.left_out(getattr(source, "kwargs", {}))})
+    return found, [*files.notes, *(f"{kind} are left out" for kind in kinds)]
 
 
 def _plain(path: Path) -> Part:
@@ -134,32 +144,44 @@ def _plain(path: Path) -> Part:
     return Part(path.stem, vertices.astype(np.float64) * scale + middle, faces.astype(np.int64))
 
 
-def _loaded(path: Path, suffix: str, content: bytes | None = None) -> trimesh.Scene:
+def _loaded(path: Path, suffix: str, files: NamedFiles, content: bytes | None = None) -> trimesh.Scene:
     import trimesh
+
+    from .named_files import with_one_library
 
     options: dict[str, Any] = {"split_objects": True, "group_material": True} if suffix == ".obj" else {}
     data = path.read_bytes() if content is None else content
     if suffix == ".obj":
-        data = obj.split_concave_faces(data)
-    # glTF's nodes are kept apart: their names are those of the scene.
-    return trimesh.load_scene(io.BytesIO(data), file_type=suffix[1:], resolver=_resolver(path), process=False, **options)
+        data = obj.split_concave_faces(with_one_library(data))
+    with _quiet(logging.getLogger("trimesh")):
+        # glTF's nodes are kept apart: their names are those of the scene.
+        return trimesh.load_scene(io.BytesIO(data), file_type=suffix[1:], resolver=files, process=False, **options)
 
 
-def _resolver(path: Path) -> Any:  # Any: trimesh's resolver
-    from trimesh.resolvers import FilePathResolver
-
-    return FilePathResolver(str(path))
+@contextlib.contextmanager
+def _quiet(log: logging.Logger) -> Iterator[None]:
+    """Context in which a logger and those below it write nothing: notes and errors are ours."""
+    handler, before = logging.NullHandler(), log.propagate
+    log.addHandler(handler)
+    log.propagate = False
+    try:
+        yield
+    finally:
+        log.removeHandler(handler)
+        log.propagate = before
 
 
 def _placed(scene: trimesh.Scene, path: Path, materials: dict[int, Material | None]) -> Iterator[Part]:
     linear = path.suffix.lower() in (".glb", ".gltf")
+    names = {name: str(getattr(getattr(mesh.visual, "material", None), "name", "")) for name, mesh in scene.geometry.items()}
+    objects = obj_materials.objects_of(names) if path.suffix.lower() == ".obj" else {}
     for node in scene.graph.nodes_geometry:
         matrix, name = scene.graph[node]
         mesh = scene.geometry[name]
         faces = np.asarray(getattr(mesh, "faces", np.empty((0, 3))), np.int64).reshape(-1, 3)
         if not len(faces):
             continue  # points and lines
-        label = str(node) if len(scene.geometry) > 1 or "." not in str(node) else path.stem
+        label = objects.get(str(node), str(node)) if len(scene.geometry) > 1 or "." not in str(node) else path.stem
         if faces.min() < 0 or faces.max() >= len(mesh.vertices):
             raise ShadowmapError(
                 f"cannot import {path}: mesh {label!r} has {len(mesh.vertices)} vertices, but its triangles go to {faces.max()}."
@@ -235,8 +257,8 @@ def _material(source: Any) -> Material:  # Any: a material of trimesh
         if picture is not None and picture[..., 3].min() < 255:
             opacity = np.clip(np.rint(picture[..., 3] * factor[3]), 0, 255).astype(np.uint8)
     cutoff = float(0.5 if pbr.alphaCutoff is None else pbr.alphaCutoff) if mode == "MASK" else None
-    return Material(
-        name=str(pbr.name or "material"),
+    made = Material(
+        name=str(source.name or "material"),
         colour=factor[:3],
         picture=None if picture is None else picture[..., :3],
         opacity=opacity,
@@ -247,6 +269,7 @@ def _material(source: Any) -> Material:  # Any: a material of trimesh
         emission=emission,
         emission_picture=glow if emission.any() else None,
     )
+    return obj_materials.completed(made, getattr(source, "kwargs", {}))
 
 
 def _factor(values: Any, count: int, default: Array) -> Array:  # Any: a sequence, bytes or None

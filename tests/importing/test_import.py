@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
 from shadowmap_dr import ShadowmapError
 from shadowmap_dr.importing import Imported, ImportOptions, import_model
@@ -312,3 +314,23 @@ def test_wrong_options(tmp_path: Path) -> None:
         import_model(path, tmp_path / "scene.json")
     with pytest.raises(ShadowmapError, match="none.ply"):
         import_model(tmp_path / "none.ply", tmp_path / "scene.xml")
+
+
+@pytest.mark.parametrize(
+    ("uri", "words"), [("none.png", "there is no file 'none.png'"), ("bad.png", "'bad.png' is left out"), ("my%20paint.png", "")]
+)
+def test_pictures_beside_gltf_files(tmp_path: Path, uri: str, words: str) -> None:
+    mesh = trimesh.creation.box()
+    paint = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.new("RGB", (4, 4), (200, 100, 50)), name="paint")
+    mesh.visual = trimesh.visual.TextureVisuals(np.random.default_rng(0).random((8, 2)), material=paint)
+    for name, content in trimesh.Scene([mesh]).export(file_type="gltf").items():
+        (tmp_path / name.replace("buffer_0", "buffer 0")).write_bytes(content)
+    document = json.loads((tmp_path / "model.gltf").read_text())
+    document["images"][0] = {"uri": uri}
+    document["buffers"][0]["uri"] = document["buffers"][0]["uri"].replace("buffer_0", "buffer%200")
+    (tmp_path / "model.gltf").write_text(json.dumps(document))
+    (tmp_path / "bad.png").write_bytes(b"no picture")
+    Image.new("RGB", (4, 4), (200, 100, 50)).save(tmp_path / "my paint.png")
+    found = import_model(tmp_path / "model.gltf", tmp_path / "model.xml")
+    assert found.triangles == 12 and ((tmp_path / "model_files" / "paint-colour.png").exists() == (not words))
+    assert any(words in note for note in found.notes) if words else not any("left out" in note for note in found.notes)

@@ -11,12 +11,15 @@ import numpy as np
 import typer
 
 from .. import __version__
-from ..errors import ShadowmapError
+from ..errors import ShadowmapError, did_you_mean, shortened
 from ..io import files, images
 from ..rendering.film.aovs import AOVS
 from ..variants import ANY, DEFAULT_VARIANT, set_variant
 from .options import Variant
 from .scene_argument import definitions, load, one_line, scene_file
+
+# Mitsuba's plug-ins that make images, and ours.
+_INTEGRATORS = ("shadowmap", "scene", "direct", "path", "volpath", "volpathmis", "ptracer", "depth", "direct_projective", "prb")
 
 
 def render(
@@ -125,7 +128,10 @@ def _integrator(scene: mi.Scene, name: str, aovs: str | None) -> mi.Integrator:
             return mi.load_dict({"type": name, "aovs": aovs})
         return mi.load_dict({"type": "aov", "aovs": aovs, "img": {"type": name}})
     except RuntimeError as error:
-        raise ShadowmapError(f"--integrator {name}: {one_line(error)}") from error
+        if "not found" in str(error):
+            near = did_you_mean(name, _INTEGRATORS)
+            raise ShadowmapError(f"--integrator {shortened(name)}: there is no such plug-in.{near}") from error
+        raise ShadowmapError(f"--integrator {shortened(name)}: {one_line(error)}") from error
 
 
 def _channel_names(integrator: mi.Integrator, count: int) -> list[str]:

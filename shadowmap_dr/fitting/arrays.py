@@ -80,6 +80,11 @@ class TextureValues:
     def arrays(self, values: Array) -> dict[str, npt.NDArray[np.float64]]:
         return {"texture": values.reshape(self.shape).astype(np.float64)}
 
+    @property
+    def channels(self) -> int:
+        """Values of a texel."""
+        return self.shape[-1] if len(self.shape) == 3 else 1
+
 
 @dataclass(frozen=True, eq=False)
 class MeshVertices:

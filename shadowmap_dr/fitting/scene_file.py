@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import OutputError, ShadowmapError, mitsuba_message
-from ..io.files import atomic, make_folder
+from ..io.files import atomic, make_folder, no_file
 from .changes import Changes
 from .parsed_scene import ParsedScene
 from .scene_edits import FILES_FOLDER, Step, Unwritable, is_close, numbers_of
@@ -62,17 +62,14 @@ def write_fitted_scene(
         OutputError: A file cannot be written, or the scene file would be overwritten.
     """
     target = Path(out).absolute() / SCENE_NAME
-    try:
-        make_folder(target.parent / FILES_FOLDER)
-    except OSError as error:
-        raise OutputError(f"cannot write {target}: {error.strerror or error}.") from error
+    make_folder(target.parent / FILES_FOLDER)
     if isinstance(scene_file, Mapping):
         with tempfile.TemporaryDirectory() as folder:
             file = _written_dictionary(scene_file, Path(folder))
             return _Writer(ParsedScene(file, {}), {}, target, copy_files, names).write(changes)
     file = Path(scene_file).absolute()
     if not file.is_file():
-        raise ShadowmapError(f"no scene {str(scene_file)!r}: the file does not exist.")
+        raise no_file("scene", scene_file)
     if target.exists() and target.samefile(file):
         raise OutputError(f"cannot write {target}: the scene itself would be overwritten; give another folder.")
     return _Writer(ParsedScene(file, parameters), parameters, target, copy_files, names).write(changes)

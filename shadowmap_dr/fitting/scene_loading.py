@@ -8,7 +8,7 @@ from pathlib import Path
 
 import mitsuba as mi
 
-from ..errors import ShadowmapError
+from ..io.files import no_file
 from .parsed_scene import instantiated, parsed, resolving
 
 
@@ -26,7 +26,7 @@ def load_scene(file: str | os.PathLike[str], parameters: Mapping[str, str] | Non
     """
     path = Path(file).absolute()
     if not os.path.isfile(path):
-        raise ShadowmapError(f"no scene {str(file)!r}: the file does not exist.")
+        raise no_file("scene", file)
     config, state = parsed(path, parameters or {})
     for node in state.nodes:
         if node.props.plugin_name() == "bitmap" and "format" not in node.props:

@@ -34,13 +34,13 @@ from .reference_steps import MOST_NUMBERS, reference_steps
 from .resolve import Resolver
 from .result import FitResult, Picture, Step
 from .scene_change import SceneChange
+from .sensor_pictures import as_seen, colourless
 from .shadow_pictures import lit_share
 from .stages import Stage, make_stages, qualities
 from .starts import LARGEST_FACTOR, chosen, draw, groups_of, half_ranges, redraw, with_gains
 from .state import Run, Sizes, State
 from .targets import Target, short_names
 from .texture_brightness import TextureBrightness
-from .transparency import as_rendered
 from .uncertainty import shares_of_intervals, uncertainty
 
 Array = npt.NDArray[np.float64]
@@ -101,8 +101,7 @@ class Fit:
         self.gains = [Gain(colours, options.vignetting, target.exposure) for target in targets]
         if not options.vary and not any(gain.count for gain in self.gains):
             raise ShadowmapError("nothing varies: name something by --vary; --list lists all that can vary.")
-        _check_sizes(renderer, self.targets)
-        self.targets = tuple(as_rendered(renderer, target) for target in self.targets)
+        self.targets = as_seen(renderer, self.targets)
         numbers = bool(self.parameters) or any(gain.count for gain in self.gains)
         _check_functions(residuals, loss, numbers=numbers)
         # Textures make up for exposures, lights and colours.
@@ -392,8 +391,10 @@ class Fit:
         of_gains, names_of_gains = gain_estimates(x, short_names(self.targets), self.gains, objective.gains, spread)
         names += names_of_gains
         shares = unexplained(point, objective)
+        textures = [array for array in self.arrays if isinstance(array, TextureValues)]
         found = shares.is_small(largest_share(objective))
         words = sentences(found, shares, point.error, spread, names, own=objective.has_own_residuals)
+        words += [] if found else colourless(textures, self.targets)
         if self._corrections is not None and self._corrections.failure:
             words.append(f"Images are not corrected, since Mitsuba cannot render the fitted scene: {self._corrections.failure}.")
         seconds = time.perf_counter() - self._began
@@ -479,21 +480,3 @@ def _check_functions(residuals: OwnFunction | None, loss: OwnFunction | None, *,
             f"loss {function_name(loss)}: a function of one number serves textures and vertices, which follow gradients; poses, "
             "lights, colours and exposures need residuals: give residuals=, or use shadowmap_dr.torch.Parameters in a loop."
         )
-
-
-def _check_sizes(renderer: Renderer, targets: Sequence[Target]) -> None:
-    """ShadowmapError for a picture of a sensor that does not exist, or of another shape than the sensor's."""
-    for target in targets:
-        name = f"picture {target.name or 'of the target'}"
-        count = len(renderer.data.sensors)
-        if not 0 <= target.sensor < count:
-            raise ShadowmapError(f"{name} is of sensor {target.sensor}, but the scene has {count}, counted from 0.")
-        cameras = renderer.data.cameras(target.sensor)
-        if len(cameras) != 1:
-            raise ShadowmapError(f"{name}: sensor {target.sensor} is a batch of cameras: use one of a single camera.")
-        width, height = cameras[0].width, cameras[0].height
-        if abs(width / height * target.height / target.width - 1) > 0.01 + 1 / min(target.width, target.height):
-            raise ShadowmapError(
-                f"{name} has {target.width} x {target.height} pixels, sensor {target.sensor} has {width} x {height}, of "
-                "another shape: crop the picture, or change the film's width and height in the scene."
-            )

@@ -39,7 +39,7 @@ def atomic(path: str | os.PathLike[str]) -> Iterator[Path]:
     try:
         if path.is_dir():
             raise IsADirectoryError(errno.EISDIR, "Is a directory")
-        make_folder(path.parent)
+        _make_folder(path.parent)
         remove_leftovers(path.parent)
         handle, name = tempfile.mkstemp(prefix=f".{path.stem}-{_HOST}-{os.getpid()}-", suffix=path.suffix, dir=path.parent)
         os.close(handle)
@@ -58,6 +58,14 @@ def atomic(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def make_folder(folder: Path) -> None:
+    """Create a folder and its parents. Raises OutputError if that is not allowed, or if one of them is a file."""
+    try:
+        _make_folder(folder)
+    except OSError as error:
+        raise OutputError(f"cannot write into {folder}: {error.strerror or error}; give another folder.") from error
+
+
+def _make_folder(folder: Path) -> None:
     """Create a folder and its parents; raises an OSError that names a parent which is a file."""
     for path in (folder, *folder.parents):
         if path.exists() and not path.is_dir():
@@ -100,7 +108,7 @@ def check_output(path: str | os.PathLike[str], suffixes: tuple[str, ...] = SUFFI
             raise IsADirectoryError(errno.EISDIR, "Is a directory")
         if path.exists() and not os.access(path, os.W_OK):
             raise PermissionError(errno.EACCES, "Permission denied")
-        make_folder(path.parent)
+        _make_folder(path.parent)
         remove_leftovers(path.parent)
         with tempfile.TemporaryFile(dir=path.parent):
             pass
@@ -113,7 +121,13 @@ def check_readable(path: Path) -> None:
     """ShadowmapError if a file does not exist, or if libraries cannot be told its name: names may be of any bytes."""
     check_name(path)
     if not os.path.isfile(path):
-        raise ShadowmapError(f"no file {str(path)!r}.")
+        raise no_file("file", path)
+
+
+def no_file(kind: str, path: str | os.PathLike[str]) -> ShadowmapError:
+    """An error about a name that is no file's: there is none, or it is a folder's. ``kind``: noun, such as ``image``."""
+    reason = "it is a folder; give a file" if os.path.isdir(path) else "the file does not exist"
+    return ShadowmapError(f"no {kind} {os.fspath(path)!r}: {reason}.")
 
 
 def check_name(path: str | os.PathLike[str]) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import OutputError, ShadowmapError
-from .files import SUFFIXES, atomic
+from .files import SUFFIXES, atomic, no_file
 
 Array = npt.NDArray[np.generic]
 
@@ -54,7 +54,7 @@ def read_exr(path: str | os.PathLike[str]) -> tuple[dict[str, Array], dict[str, 
     import OpenEXR
 
     if not os.path.isfile(path):
-        raise ShadowmapError(f"no image {str(path)!r}: the file does not exist.")
+        raise no_file("image", path)
     try:
         with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
             for k in range(len(file.parts)):  # headers are empty after the block

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import ShadowmapError
+from .files import no_file
 from .images import MOST_DECODED, MOST_PIXELS, check_size, read_exr, to_srgb
 from .resampling import area_average
 
@@ -77,7 +78,7 @@ def read_pixels(path: str | os.PathLike[str], data: bytes | None = None) -> npt.
     Raises ShadowmapError if it is too large, damaged, or no picture.
     """
     if data is None and not os.path.isfile(path):
-        raise ShadowmapError(f"no image {str(path)!r}: the file does not exist.")
+        raise no_file("image", path)
     if data is None and Path(path).suffix.lower() == ".exr":
         return _exr_pixels(path)
     from PIL import Image

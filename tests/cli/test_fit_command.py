@@ -150,7 +150,7 @@ BAD: list[tuple[tuple[str, ...], str]] = [
     (("room.xml", *TARGET), "nothing varies: name something by --vary; --list lists all"),
     (("room.xml", "--vary", "sun"), "there is no picture to fit to: give one by --target"),
     (("room.xml", "--vary", "sun", "--target", "none.png"), "none.png"),
-    (("room.xml", "--vary", "sun", "--target", "folder"), "folder"),
+    (("room.xml", "--vary", "sun", "--target", "folder"), "no image 'folder': it is a folder; give a file"),
     (("room.xml", "--vary", "sun", "--target", "room.xml"), "room.xml"),
     (("room.xml", "--vary", "sun", "--target", "square.png"), "square.png has 40 x 40 pixels, sensor 0 has 48 x 36"),
     (("room.xml", "--vary", "sun", "--target", "1=photo.png"), "is of sensor 1, but the scene has 1, counted from 0"),
@@ -173,7 +173,10 @@ BAD: list[tuple[tuple[str, ...], str]] = [
     (("photo.png", "--vary", "sun", *TARGET), "photo.png is a picture: give a Mitsuba scene"),
     (("none.toml", "--vary", "sun", *TARGET), "none.toml"),
     (("bad.toml",), "bad.toml: there is no key 'strats'. Did you mean 'starts'?"),
-    (("room.xml", "--vary", "sun", *TARGET, "--out", "photo.png"), "photo.png"),
+    (
+        ("room.xml", "--vary", "sun", *TARGET, "--out", "photo.png"),
+        "cannot write into photo.png: photo.png is a file; give another folder",
+    ),
     (("room.xml", "--vary", "sun", *TARGET, "-D", "height=0"), "The film of sensor 'camera' has 48 x 0 pixels"),
     (("room.xml", "--vary", "sun", "--target", f"{5000 * '9'}=photo.png"), "no scene has so many sensors"),
     (("room.xml", "--vary", "box:scale,max=-1", *TARGET), "vary box:scale: the bounds leave nothing between 0 and -1"),
@@ -192,6 +195,7 @@ BAD: list[tuple[tuple[str, ...], str]] = [
     (("room.xml", "--vary", "sun", *TARGET, "--variant", LONG), "no variant 'x"),
     ((LONG, "--vary", "sun", *TARGET), "give a file that exists"),
     ((f"{LONG}.toml",), "no file 'x"),
+    (("folder.toml",), "no file 'folder.toml': it is a folder"),
     (("long.toml",), "long.toml: there is no key 'x"),
 ]
 
@@ -205,7 +209,8 @@ def test_wrong_usage_is_one_short_line(run: Any, arguments: tuple[str, ...]) -> 
 
 @pytest.mark.parametrize(("arguments", "words"), BAD, ids=lambda value: " ".join(value)[:80] if isinstance(value, tuple) else "")
 def test_bad_input_is_one_line(run: Any, tmp_path: Path, arguments: tuple[str, ...], words: str) -> None:
-    (tmp_path / "folder").mkdir()
+    for name in ("folder", "folder.toml"):
+        (tmp_path / name).mkdir()
     (tmp_path / "bad.toml").write_text("scene = 'room.xml'\nstrats = 3")
     (tmp_path / "long.toml").write_text(f"scene = 'room.xml'\n{LONG} = 3")
     Image.fromarray(np.full((40, 40, 3), 128, np.uint8)).save(tmp_path / "square.png")

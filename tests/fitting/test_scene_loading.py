@@ -76,3 +76,14 @@ def test_whole_numbers_and_bad_files_are_refused_in_a_line(file: Path, tmp_path:
     (tmp_path / "bad.xml").write_text("<scene version='3.0.0'><shape type='nothing'/></scene>")
     with pytest.raises(ShadowmapError, match=r"cannot load .*bad\.xml"):
         load_scene(tmp_path / "bad.xml")
+
+
+@pytest.mark.parametrize("coloured", [True, False])
+def test_grey_textures_of_coloured_pictures(file: Path, coloured: bool) -> None:
+    """The words say what is wrong with the texture, not with the start."""
+    seen = np.array(mi.render(mi.load_file(str(file)), spp=64, integrator=mi.load_dict({"type": "direct"})))[..., :3]
+    picture = seen if coloured else np.repeat(seen.mean(2, keepdims=True), 3, 2)
+    Image.fromarray(np.full((8, 8), 128, np.uint8)).save(file.parent / "wall.png")
+    result = prepared(file, picture, ["wall.bsdf:texture"], steps=120).run()
+    words = "wall.bsdf has one channel, so that it is grey, and the picture has colours: give it three channels."
+    assert (words in result.words) == coloured and result.found != coloured

@@ -402,7 +402,7 @@ def test_bad_files(tmp_path: Path) -> None:
         ("cut.exr", "it is no OpenEXR file, or it is damaged"),
         ("depth.exr", "it has no colour channels, only depth.Z"),
         ("white.png", "no pixel counts; 100 % of them are saturated. Give another picture or mask"),
-        (".", "the file does not exist"),
+        (".", "it is a folder; give a file"),
     ):
         with pytest.raises(ShadowmapError, match=words) as caught:
             read_target(tmp_path / name)

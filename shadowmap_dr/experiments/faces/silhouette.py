@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...errors import ShadowmapError
+from ...io.files import no_file
 from ...io.pictures import read_picture
 
 FloatArray = npt.NDArray[np.float32]
@@ -99,7 +100,7 @@ def resample(silhouette: FloatArray, shape: tuple[int, int], placement: Placemen
 def _grey(path: Path) -> npt.NDArray[np.floating[Any]]:
     """Grey values (H, W) in 0..1 of an image file, over white."""
     if not path.is_file():
-        raise ShadowmapError(f"no image {str(path)!r}: the file does not exist.")
+        raise no_file("image", path)
     pixels = read_picture(path)
     alpha = pixels[..., 3]
     grey = pixels[..., :3].mean(2)

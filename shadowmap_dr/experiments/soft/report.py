@@ -97,7 +97,7 @@ def write(record: Mapping[str, Any], out: Path) -> None:
 def save_pictures(path: Path, pictures: Mapping[str, Image]) -> None:
     """Write images (H, W, 3) of the same size as channels of one EXR file."""
     channels = {f"{title}.{'RGB'[k]}": image[..., k].astype(np.float32) for title, image in pictures.items() for k in range(3)}
-    path.parent.mkdir(parents=True, exist_ok=True)
+    files.make_folder(path.parent)
     images.write_exr(path, channels)
 
 

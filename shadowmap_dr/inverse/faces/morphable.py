@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...errors import ShadowmapError
-from ...io.files import atomic, read_arrays
+from ...io.files import atomic, no_file, read_arrays
 
 #: Arrays that every model file holds, and optional arrays.
 REQUIRED, OPTIONAL = ("mean", "faces", "identity"), ("expression", "identity_names", "expression_names", "mask")
@@ -103,7 +103,7 @@ def load_model(path: str | os.PathLike[str]) -> MorphableModel:
     """
     path = Path(path)
     if not path.is_file():
-        raise ShadowmapError(f"no morphable model {str(path)!r}: the file does not exist.")
+        raise no_file("morphable model", path)
     arrays = read_arrays(path, (*REQUIRED, *OPTIONAL))
     missing = [name for name in REQUIRED if name not in arrays]
     if missing:

@@ -10,9 +10,10 @@ from typing import Any
 import mitsuba as mi
 from rich.console import Console
 
-from ...errors import OutputError, ShadowmapError, warn
+from ...errors import ShadowmapError, warn
 from ...io import console as io_console
 from ...io import records
+from ...io.files import make_folder
 from .problems import Problem
 from .schedulers import check_scheduler, check_threads, do_batches
 from .worker import Batch, stem
@@ -74,10 +75,7 @@ def run_sweep(
             for path in [*_files(problem, folder, variant), *_files(problem, folder, variant, _CHECKPOINT)]:
                 path.unlink()
     batches = [batch for problem in problems for batch in _batches(problem, variant, done[problem.name], memory)]
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"cannot write {folder}: {error.strerror or error}.") from error
+    make_folder(folder)
     with io_console.progress(console or io_console.notes()) as progress:
         total = progress.add_task("batches", total=len(batches), note="")
         task = progress.add_task("", total=None, note="", visible=False)

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...errors import ShadowmapError
+from ...io.files import no_file
 from ...io.pictures import SUFFIXES as PICTURE_SUFFIXES
 from ...io.pictures import read_picture, scaled_to_bytes
 from .drawings import rasterized
@@ -43,7 +44,7 @@ def read_figure(path: str | os.PathLike[str]) -> Array:
     """
     path = Path(path)
     if not path.is_file():
-        raise ShadowmapError(f"no image {str(path)!r}: the file does not exist.")
+        raise no_file("image", path)
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise ShadowmapError(f"cannot read {path}: the suffix {path.suffix!r} is not one of {', '.join(SUFFIXES)}.")

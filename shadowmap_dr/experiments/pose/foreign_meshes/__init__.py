@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from ....io.files import make_folder
 from .blocks import chair, crystals, fence, letters, sponge, stairs
 from .machine_parts import bracket, cad_plate, flange, gear, heat_sink, loose_parts, screw
 from .parts import Mesh
@@ -32,7 +33,7 @@ def write(name: str, folder: Path) -> Path:
     import trimesh
 
     path = folder / f"{name}.{'stl' if name in UNWELDED else 'ply'}"
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     vertices, faces = MAKERS[name]()
     trimesh.Trimesh(vertices, faces, process=False).export(path)
     return path

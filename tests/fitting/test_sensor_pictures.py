@@ -11,7 +11,7 @@ import pytest
 from fitting_scenes import box, camera, diffuse, renderer_of, rgb, scene_of
 
 from shadowmap_dr.fitting import FitResult, fit, make_target
-from shadowmap_dr.fitting.transparency import as_rendered
+from shadowmap_dr.fitting.sensor_pictures import as_rendered
 
 Image = npt.NDArray[np.float32]
 FILM = {"pixel_format": "rgba"}

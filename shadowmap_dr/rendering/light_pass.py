@@ -216,7 +216,7 @@ class LightPass:
         if settings.shadow.method != "none" and (lights or samples):
             points, common = seen(), (shapes.geometry, shapes.casting)
             if lights:
-                maps = make_maps(self.plan, lights, *common, self._maps, fits[0], points[:2], self.outward, *casters)
+                maps = make_maps(self.plan, lights, *common, self._maps, fits[0], points, self.outward, *casters)
             if samples:
                 shadow = settings.soft_shadow
                 soft_maps = make_soft_maps(self.soft, samples, self.plan, *common, shadow, fits[1], points, *casters)
@@ -237,7 +237,7 @@ class LightPass:
             frusta: Frusta | None = None
             soft: SoftFrusta = (None, None)
             if data.lights:
-                frusta = fit_maps(self.plan, data.lights, geometry, self._maps, previous[0], seen[:2])
+                frusta = fit_maps(self.plan, data.lights, geometry, self._maps, previous[0], seen)
             if samples:
                 soft = fit_soft_maps(self.soft, samples, self.plan, geometry, settings.soft_shadow, previous[1], seen)
             dr.eval(frusta, soft)

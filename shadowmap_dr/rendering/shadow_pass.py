@@ -48,6 +48,7 @@ from ..shadow import (
     visibility,
     with_depths_from_planes,
 )
+from .gbuffer.camera_view import VisiblePoints
 
 # Vertices whose coordinates are looked at at once on the host: temporary arrays of all of them would take longer to allocate.
 _PIECE = 1 << 15
@@ -60,6 +61,7 @@ class MapPlan:
     ``kinds``: ``directional``, ``beam``, ``spot`` (one map each) or ``cube`` (six). ``tiles``: maps that share the image plane of
     each light, 1 for beams and cubes.
     ``planes``: index of the largest face of each planar shape, of any face for other shapes. ``planar``: Bool (S,).
+    ``opaque``: planar shapes that nothing is seen through.
     ``reflecting``: planar shapes that light from behind does not reach: all, unless a material spreads light to its other side.
     ``center``, ``radius``: a sphere around the scene at rest, world space, for the fixed frusta of ``compat``.
     """
@@ -70,6 +72,7 @@ class MapPlan:
     tiles: tuple[int, ...]
     planes: UInt32
     planar: Bool
+    opaque: Bool
     reflecting: Bool
     center: tuple[float, float, float]
     radius: float
@@ -131,6 +134,7 @@ def plan_maps(lights: Sequence[Light], geometry: Geometry, materials: Sequence[m
         (1,) * len(kinds),
         device_array(mi.UInt32, planes),
         device_array(mi.Bool, [info.planar for info in geometry.shapes]),
+        device_array(mi.Bool, [info.planar and not info.see_through for info in geometry.shapes]),
         device_array(mi.Bool, [info.planar and opaque for info in geometry.shapes]),
         center,
         radius or 1.0,
@@ -170,17 +174,16 @@ def make_maps(
     topology: Topology,
     settings: ShadowSettings,
     previous: Frusta | None,
-    seen: tuple[Point3f, Bool] | None = None,
+    seen: VisiblePoints | None = None,
     outward: Bool | None = None,
     drawn: Bool | None = None,
     translucent: TranslucentCasters | None = None,
 ) -> ShadowMaps:
     """Render and filter the maps of all lights as one batch. Attached to lights and vertices.
 
-    ``previous`` is the fit of an earlier call, ``seen`` points on what the cameras see (Point3f, world space) and a mask of those
-    that count, ``outward`` faces (Bool, F) of which the maps of directional lights show the fronts only
-    (:func:`shadowmap_dr.raster.outward_faces`), ``drawn`` a mask of the opaque faces, and ``translucent`` the casters that are
-    not.
+    ``previous`` is the fit of an earlier call, ``seen`` points on what the cameras see, and the places of these, ``outward``
+    faces (Bool, F) of which the maps of directional lights show the fronts only (:func:`shadowmap_dr.raster.outward_faces`),
+    ``drawn`` a mask of the opaque faces, and ``translucent`` the casters that are not.
     """
     settings = plan.settings(settings)
     views, p_light, lanes, frusta = _fitted(plan, lights, geometry, settings, previous, seen)
@@ -195,7 +198,7 @@ def fit_maps(
     geometry: Geometry,
     settings: ShadowSettings,
     previous: Frusta | None,
-    seen: tuple[Point3f, Bool] | None = None,
+    seen: VisiblePoints | None = None,
 ) -> Frusta:
     """The fit of the maps of :func:`make_maps`, without rendering them. Arguments as there."""
     return _fitted(plan, lights, geometry, plan.settings(settings), previous, seen)[3]
@@ -219,7 +222,7 @@ def _fitted(
     geometry: Geometry,
     settings: ShadowSettings,
     previous: Frusta | None,
-    seen: tuple[Point3f, Bool] | None,
+    seen: VisiblePoints | None,
 ) -> tuple[Views, Point3f, UInt32, Frusta]:
     """(cameras of all maps, light-space vertices, the map of each of these, the fit)."""
     each = zip(lights, plan.kinds, plan.tiles, strict=True)
@@ -233,7 +236,7 @@ def _fitted(
     frusta = computed("frusta", fit)
     attached = "directional" in plan.kinds and not settings.compat and dr.grad_enabled(stacked.forward)
     if seen is not None and attached:
-        stacked = steady_axes(stacked, frusta, seen)
+        stacked = steady_axes(stacked, frusta, seen[:2])
     stacked = with_depths_from_planes(stacked, frusta.tiles)
     p_light, lanes, _ = vertices_in_maps(stacked, geometry.positions)
     return stacked, p_light, lanes, frusta
@@ -246,16 +249,17 @@ def _fit(
     settings: ShadowSettings,
     views: Views,
     previous: Frusta | None,
-    seen: tuple[Point3f, Bool] | None,
+    seen: VisiblePoints | None,
 ) -> Frusta:
     """Frusta of the maps of all lights. Detached."""
+    points = None if seen is None else seen[:2]
     tiles = None
     if plan.groups:
-        assert seen is not None, "lights have tiles only if visible points are known"
+        assert points is not None, "lights have tiles only if visible points are known"
         earlier = None if previous is None else previous.tiles
-        tiles = fit_tiles(views, plan.groups, seen, earlier, planes=settings.counts_from_planes)
+        tiles = fit_tiles(views, plan.groups, points, earlier, planes=settings.counts_from_planes)
     planes, planar = shape_planes(plan, geometry)
-    casts = casting_shapes(views, planes, planar, boxes_of(geometry))
+    casts = casting_shapes(views, planes, planar, boxes_of(geometry), eyes=None if seen is None else seen[2], opaque=plan.opaque)
     views = with_depths_from_planes(views, tiles)
     with dr.suspend_grad():
         p_light, lanes, vertex = vertices_in_maps(views, geometry.positions)
@@ -269,7 +273,7 @@ def _fit(
         settings.resolution,
         settings.filter_size,
         previous,
-        seen,
+        points,
         settings.receiver_range,
         tiles,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -11,10 +12,16 @@ from ..jit.kernel_inputs import split, uint_input
 from ..jit.types import Bool, Float, Normal3f, Point3f, UInt32, Vector4f
 from .light_camera import Views, of_map
 
-#: Fraction of a shape's extent that may sink into the floor on which it stands, before the floor counts as its caster.
-SUNK = 0.1
+#: Fraction of a shape's extent that may sink into the floor on which it stands, before the floor counts as its caster; and the
+#: same where the floor hides that part from all cameras.
+SUNK, SUNK_UNSEEN = 0.1, 0.95
 #: Distance from a floor's border that a shape on the floor keeps, as a fraction of the floor's size.
 BORDER = 0.01
+_Ends = tuple[Sequence[Float], Sequence[Float]]
+# Most cameras of which it is asked what floors hide from them.
+_MOST_EYES = 4
+# Rounding of places on a plane, as a fraction of its extent.
+_SLACK = 1e-3
 #: Distance at which shapes touch: a fraction of the smaller one's size, plus (for rounding) a fraction of their coordinates.
 TOUCH, ROUNDING = 1e-4, 1e-6
 
@@ -56,7 +63,13 @@ def shape_boxes(p_world: Point3f, shape: UInt32, count: int) -> Boxes:
 
 
 def casting_shapes(
-    views: Views, planes: tuple[Normal3f, Point3f], planar: Bool, boxes: Boxes, hidden: UInt32 | None = None
+    views: Views,
+    planes: tuple[Normal3f, Point3f],
+    planar: Bool,
+    boxes: Boxes,
+    hidden: UInt32 | None = None,
+    eyes: Vector4f | None = None,
+    opaque: Bool | None = None,
 ) -> Bool:
     """Shapes that can cast a shadow in each map: all but planar shapes with nothing behind them, as seen from the light.
 
@@ -66,6 +79,8 @@ def casting_shapes(
         planar: (S,) mask of the planar shapes.
         boxes: boxes of the S shapes.
         hidden: (M,) shape that casts no shadow in each map. None: all shapes may.
+        eyes: places of all cameras, in homogeneous coordinates, world space. None: cameras may be anywhere.
+        opaque: (S,) mask of the planar shapes that nothing is seen through. None: all.
 
     Returns:
         Mask of width M * S (entry ``map * S + shape``), detached.
@@ -75,7 +90,8 @@ def casting_shapes(
         views, shapes = dr.detach(views), boxes.count
         (normal, point) = planes
         dr.eval(normal, point, planar)
-        reach = _reach(normal, point, planar, boxes)
+        covers = planar if opaque is None else planar & opaque
+        reach = _reach(normal, point, planar, boxes, covers, None if eyes is None or dr.width(eyes) > _MOST_EYES else eyes)
         index = dr.arange(module.UInt32, views.count * shapes)
         which, shape = split(index, "shapes", shapes, views.count)
         view = of_map(views, which, views.count)
@@ -116,14 +132,17 @@ def receiving_shapes(views: Views, planes: tuple[Normal3f, Point3f], reflecting:
         return receives
 
 
-def _reach(normal: Normal3f, point: Point3f, planar: Bool, boxes: Boxes) -> Float:
+def _reach(normal: Normal3f, point: Point3f, planar: Bool, boxes: Boxes, covers: Bool, eyes: Vector4f | None) -> Float:
     """Reach (2 S) of other shapes' boxes beyond the plane of each planar shape, on either side; at most 0 where they touch it.
 
     The first tenth of a shape that stands on the plane does not count: the maps shall not change if it sinks in a little.
+    Nor does what planes (mask ``covers``) hide from all ``eyes``, unless it is nearly all of a shape.
     """
     module, shapes = backend(boxes.low), boxes.count
     corners = [dr.ravel(end) for end in (boxes.low, boxes.high)]
-    dr.eval(corners)
+    dr.eval(corners, covers, eyes)
+    cameras = [] if eyes is None else [module.UInt32(k) for k in range(dr.width(eyes))]
+    places = [[dr.gather(module.Float, eyes[c], camera) for c in range(4)] for camera in cameras if eyes is not None]
     count = uint_input(module, "shapes", shapes)
 
     def box_of(shape: UInt32) -> tuple[list[Float], list[Float], Float]:
@@ -145,10 +164,16 @@ def _reach(normal: Normal3f, point: Point3f, planar: Bool, boxes: Boxes) -> Floa
             border, room = BORDER * (right[c] - left[c]), dr.abs(n[c]) * size
             stands &= (low[c] >= left[c] + border - room) & (high[c] <= right[c] - border + room)
         touch = dr.fma(TOUCH, dr.minimum(own_size, size), ROUNDING * far)
-        less = dr.select(stands, SUNK * extent, 0) + touch
         counts = own != other
-        before_most = dr.select(counts, dr.maximum(before_most, before - less), before_most)
-        behind_most = dr.select(counts, dr.maximum(behind_most, behind - less), behind_most)
+        most = [before_most, behind_most]
+        for k, (reached, side) in enumerate(((before, -1.0), (behind, 1.0))):
+            unseen = stands & dr.gather(module.Bool, covers, own)
+            for eye in places:
+                unseen &= _hides(eye, [side * each for each in n], p, (left, right), (low, high))
+            share = dr.select(unseen, SUNK_UNSEEN, SUNK) if places else SUNK
+            less = dr.select(stands, share * extent, 0) + touch
+            most[k] = dr.select(counts, dr.maximum(most[k], reached - less), most[k])
+        before_most, behind_most = most
         return own, other + 1, before_most, behind_most
 
     # Walls and floors alone look through all shapes: most of thousands of shapes have none.
@@ -161,3 +186,34 @@ def _reach(normal: Normal3f, point: Point3f, planar: Bool, boxes: Boxes) -> Floa
     reach = ravel(module.Array2f(*most))
     dr.eval(reach)
     return reach
+
+
+def _hides(eye: Sequence[Float], n: Sequence[Float], p: Sequence[Float], own: _Ends, box: _Ends) -> Bool:
+    """True if a planar shape hides the part of a box behind it from a camera: all corners there lie behind its outline.
+
+    Args:
+        eye: place of the camera (4 homogeneous coordinates).
+        n, p: normal towards the camera's side, and a point, of the plane.
+        own: corners (low, high) of the box of the planar shape.
+        box: corners of the box.
+    """
+    height = _dot(n, [eye[c] - eye[3] * p[c] for c in range(3)])
+    slack = _SLACK * dr.maximum(dr.maximum(own[1][0] - own[0][0], own[1][1] - own[0][1]), own[1][2] - own[0][2])
+    hides = height > 0
+    for corner in range(8):
+        place = [box[corner >> c & 1][c] for c in range(3)]
+        depth = -_dot(n, [place[c] - p[c] for c in range(3)])
+        inside = type(hides)(True)
+        for c in range(3):
+            # Where the way to the camera passes through the plane, times a positive number.
+            weight = height + eye[3] * depth
+            through = place[c] * height + eye[c] * depth
+            border = BORDER * (own[1][c] - own[0][c])
+            room = dr.abs(n[c]) * slack
+            inside &= (through >= weight * (own[0][c] + border - room)) & (through <= weight * (own[1][c] - border + room))
+        hides &= inside | (depth <= 0)
+    return hides
+
+
+def _dot(a: Sequence[Float], b: Sequence[Float]) -> Float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

@@ -35,6 +35,11 @@ def bunny_on(half: float, size: int = SIZE, shift: float = 0, sunk: float = 0.25
     }, optimize=False)  # fmt: skip
 
 
+# Below the ground, so that this casts a shadow on it, and its maps cover all of the ground.
+CELLAR: dict[str, Any] = {"type": "sphere", "center": [0, 0, -2], "radius": 0.3}
+SUN: dict[str, Any] = {"sun": {"type": "directional", "direction": [0.9, -0.3, -1.0]}}
+
+
 def traced(scene: mi.Scene, spp: int) -> Array:
     return np.array(mi.render(scene, integrator=mi.load_dict({"type": "direct"}), spp=spp), np.float64)
 
@@ -48,18 +53,61 @@ def relative_error(image: Array, reference: Array) -> float:
 def test_shadows_are_as_sharp_on_wide_grounds(half: float, tiles: int, most: float) -> None:
     """With one map the error was 0.046 and 0.123 on the wider ones."""
     size = 128
-    scene = bunny_on(half, size)
+    scene = bunny_on(half, size, cellar=CELLAR, **SUN)
     renderer = Renderer.from_scene(scene)
     assert renderer.plan.tiles == (tiles,)
     assert relative_error(np.array(renderer.render(spp=4), np.float64), traced(scene, 64)) < most
 
 
 @pytest.mark.usefixtures("variant")
-def test_derivatives_by_places_on_wide_grounds() -> None:
-    """With one map cosine and scale were 0.86 and 0.81 at 128 x 128 pixels."""
+@pytest.mark.parametrize("light", ["sun", "spot", "lamp", "sky"])
+@pytest.mark.parametrize(("sunk", "most"), [(0.02, 0.02), (0.3, 0.02), (0.8, 0.02)])
+def test_grounds_hide_what_has_sunk_into_them(light: str, sunk: float, most: float) -> None:
+    """No map has to cover the ground for it. Before, the sun had four maps, the lamp six times as many as now.
+
+    Errors were up to 0.06 under the spot, and 0.05 under the sky.
+    """
+    t = mi.ScalarTransform4f
+    lights: dict[str, Any] = {
+        "sun": SUN["sun"],
+        "spot": {"type": "spot", "to_world": t().look_at([-3, 1, 4], [0, 0, 0], [0, 0, 1]), "cutoff_angle": 60},
+        "lamp": {"type": "rectangle", "to_world": t().look_at([-3, 1, 4], [0, 0, 0], [0, 0, 1]), "emitter": {"type": "area"}},
+        "sky": {"type": "constant"},
+    }
+    scene = bunny_on(100, 64, sunk=sunk, **{light: lights[light]})
+    renderer = Renderer.from_scene(scene)
+    assert renderer.plan.tiles in ((1,), ()) and all(plan.kind != "cube" for plan in renderer.light_pass.soft)
+    spp = 1024 if light in ("lamp", "sky") else 64
+    assert relative_error(np.array(renderer.render(spp=4), np.float64), traced(scene, spp)) < most
+
+
+@pytest.mark.usefixtures("variant")
+@pytest.mark.parametrize("kind", ["edge", "below", "glass"])
+def test_grounds_cast_shadows_on_what_cameras_see_of_it(kind: str) -> None:
+    """Past the edge of a small ground, from below, and through glass."""
+    t = mi.ScalarTransform4f
+    film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+    origin = [0, -5, -0.6] if kind == "below" else [0, -5, 0.6 if kind == "edge" else 2.5]
+    glass = {"type": "mask", "opacity": 0.3, "nested": {"type": "twosided", "nested": {"type": "diffuse"}}}
+    scene = mi.load_dict({
+        "type": "scene", "sun": {"type": "directional", "direction": [0.2, 0.3, -1]},
+        "sensor": {"type": "perspective", "fov": 35, "to_world": t().look_at(origin, [0, 0, -0.3], [0, 0, 1]), "film": film},
+        "ground": {"type": "rectangle", "to_world": t().scale(1.2), "bsdf": glass if kind == "glass" else {"type": "diffuse"}},
+        "post": {"type": "cube", "to_world": t().scale([0.3, 0.3, 0.9])},
+    }, optimize=False)  # fmt: skip
+    direct = mi.load_dict({"type": "volpath", "max_depth": 2})
+    reference = np.array(mi.render(scene, integrator=direct, spp=256), np.float64)
+    assert relative_error(np.array(Renderer.from_scene(scene).render(spp=4), np.float64), reference) < 0.03
+
+
+@pytest.mark.usefixtures("variant")
+@pytest.mark.parametrize("tiles", [True, False])
+def test_derivatives_by_places_on_wide_grounds(tiles: bool) -> None:
+    """With one map of all of the ground cosine and scale were 0.86 and 0.81 at 128 x 128 pixels."""
     step = 0.012
     pair = [traced(bunny_on(100, shift=sign * step), 256) for sign in (1, -1)]
-    renderer = Renderer.from_scene(bunny_on(100))
+    renderer = Renderer.from_scene(bunny_on(100, **({"cellar": CELLAR} if tiles else {}), **SUN))
+    assert (renderer.plan.tiles[0] > 1) == tiles
     shift = mi.Float(0)
     dr.enable_grad(shift)
     moved = renderer.vertices("bunny") + mi.Point3f(shift, 0, 0)
@@ -72,9 +120,9 @@ def test_derivatives_by_places_on_wide_grounds() -> None:
 @pytest.mark.usefixtures("variant")
 def test_many_lights_keep_one_map_each_in_small_images() -> None:
     suns = {f"sun{k}": {"type": "directional", "direction": [0.3 * k, -0.3, -1.0]} for k in range(4)}
-    assert Renderer.from_scene(bunny_on(100, **suns)).plan.tiles == (1,) * 4
+    assert Renderer.from_scene(bunny_on(100, cellar=CELLAR, **suns)).plan.tiles == (1,) * 4
     del suns["sun3"]
-    assert Renderer.from_scene(bunny_on(100, **suns)).plan.tiles == (4,) * 3
+    assert Renderer.from_scene(bunny_on(100, cellar=CELLAR, **suns)).plan.tiles == (4,) * 3
 
 
 @pytest.mark.usefixtures("variant")

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from shadowmap_dr.shadow import Boxes, casting_shapes, cube_views, directional_view, receiving_shapes, stack_views
-from shadowmap_dr.shadow.caster_bounds import BORDER, ROUNDING, SUNK, TOUCH
+from shadowmap_dr.shadow.caster_bounds import BORDER, ROUNDING, SUNK, SUNK_UNSEEN, TOUCH
 
 Array = npt.NDArray[np.float64]
 
@@ -30,7 +30,9 @@ def walls(generator: np.random.Generator, count: int) -> tuple[Array, Array, Arr
     return centre - half, centre + half, normals, planar
 
 
-def brute_force(low: Array, high: Array, normals: Array, planar: Array, forward: Array) -> Array:
+def brute_force(
+    low: Array, high: Array, normals: Array, planar: Array, forward: Array, eyes: Array | None = None, opaque: Array | None = None
+) -> Array:
     """(S,) mask: a planar shape casts shadows on what lies behind it, as seen along a direction."""
     casts = ~planar
     for own in np.flatnonzero(planar):
@@ -43,8 +45,26 @@ def brute_force(low: Array, high: Array, normals: Array, planar: Array, forward:
             room = np.abs(normal) * np.max(high[other] - low[other])
             border = BORDER * (high[own] - low[own])
             stands = ((low[other] >= low[own] + border - room) & (high[other] <= high[own] - border + room)).all()
-            casts[own] |= depth.max() - (SUNK * np.ptp(depth) if stands else 0) > touch
+            unseen = eyes is not None and (opaque is None or opaque[own])
+            for eye in () if eyes is None else eyes:
+                unseen &= hides(point, -behind, low[own] + border, high[own] - border, corners[depth > 0], eye)
+            share = 0 if not stands else SUNK_UNSEEN if unseen else SUNK
+            casts[own] |= depth.max() - share * np.ptp(depth) > touch
     return casts
+
+
+def hides(point: Array, normal: Array, low: Array, high: Array, behind: Array, eye: Array) -> bool:
+    """True if a wall lies between a camera and all points behind it. ``eye`` (4,): homogeneous."""
+    if normal @ (eye[:3] - eye[3] * point) <= 0:
+        return False
+    for place in behind:
+        towards = eye[:3] - eye[3] * place
+        share = normal @ (point - place) / (normal @ towards)
+        through = place + share * towards
+        along = normal == 0
+        if not ((through >= low) & (through <= high))[along].all():
+            return False
+    return True
 
 
 def arrays(low: Array, high: Array, normals: Array, planar: Array) -> tuple[tuple[mi.Normal3f, mi.Point3f], mi.Bool, Boxes]:
@@ -64,6 +84,36 @@ def test_walls_cast_shadows_on_what_is_behind_them(variant: str) -> None:
         assert np.array_equal(found, expected)
         flat.append(expected[:, room[3]])
     assert 0.1 < np.mean(flat) < 0.9
+
+
+def test_what_walls_hide_from_all_cameras_does_not_count(variant: str) -> None:
+    """Shapes sunk in a wall, seen by one camera and two, in the room and outside, near and infinitely far away."""
+    changed, kept = 0, 0
+    for seed in range(24):
+        generator = np.random.default_rng(seed)
+        low, high, normals, planar = walls(generator, 12)
+        opaque = generator.uniform(size=12) < 0.8
+        eyes = np.concatenate([generator.normal(size=(2, 3)) * generator.choice([1.0, 3.0]), [[1], [seed % 2]]], axis=1)
+        eyes = eyes[: 1 + seed % 3 // 2]
+        directions = generator.normal(size=(2, 3))
+        views = stack_views([directional_view(mi.Vector3f(*direction)) for direction in directions.tolist()])
+        planes, flat, boxes = arrays(low, high, normals, planar)
+        places = mi.Vector4f(eyes.T.astype(np.float32))
+        found = casting_shapes(views, planes, flat, boxes, eyes=places, opaque=mi.Bool(opaque)).numpy().reshape(2, -1)
+        room = low, high, normals, planar
+        expected = np.stack([brute_force(*room, direction, eyes, opaque) for direction in directions])
+        assert np.array_equal(found, expected), seed
+        usual = np.stack([brute_force(*room, direction) for direction in directions])
+        assert (usual | ~expected).all()
+        changed, kept = changed + int((usual & ~expected).sum()), kept + int((usual & expected)[:, planar].sum())
+    assert changed > 5 and kept > 20
+
+
+def test_many_cameras_are_not_asked(variant: str) -> None:
+    room = walls(np.random.default_rng(1), 12)
+    views = stack_views([directional_view(mi.Vector3f(0.2, 0.1, -1))])
+    eyes = mi.Vector4f(np.random.default_rng(0).normal(size=(4, 20)).astype(np.float32))
+    assert np.array_equal(casting_shapes(views, *arrays(*room), eyes=eyes).numpy(), casting_shapes(views, *arrays(*room)).numpy())
 
 
 def test_thousands_of_shapes_are_not_compared_in_pairs(variant: str) -> None:

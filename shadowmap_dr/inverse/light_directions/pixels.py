@@ -16,6 +16,7 @@ from ...jit.types import Bool, Float, Normal3f, Point3f, UInt32, Vector3f
 from ...raster import Topology, build_topology, drawing_order, outward_faces
 from ...raster.antialiasing.blend import Mixer
 from ...raster.antialiasing.edge_crossings import Crossings
+from ...rendering.gbuffer.camera_view import VisiblePoints
 from ...rendering.renderer import GBuffer, Renderer
 from ...rendering.shadow_pass import boxes_of, shape_planes
 from ...scene.lights.punctual import DirectionalLight
@@ -71,7 +72,7 @@ class StillScene:
         outward: Bool, faces that shadow maps show from the front only.
         vertex_shape, shapes: number of each vertex's shape, and S.
         planes, planar, boxes: extents of the shapes, see :func:`shadowmap_dr.shadow.casting_shapes`.
-        seen: visible points, and a mask of the valid ones.
+        seen: visible points, a mask of the valid ones, and the places of cameras.
     """
 
     pixels: Pixels
@@ -86,7 +87,7 @@ class StillScene:
     planes: tuple[Vector3f, Point3f]
     planar: Bool
     boxes: Boxes
-    seen: tuple[Point3f, Bool]
+    seen: VisiblePoints
 
     @property
     def lights(self) -> int:
@@ -140,7 +141,7 @@ class StillScene:
                 planes,
                 planar,
                 boxes_of(geometry),
-                buffer.seen[:2],
+                buffer.seen,
             )
             dr.eval(scene)
             return scene

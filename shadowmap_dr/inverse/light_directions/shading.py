@@ -40,9 +40,9 @@ def fit_maps(scene: StillScene, views: Views, previous: Frusta | None) -> Frusta
     vertex = lane - index * vertices
     p_light = to_light_space(of_map(views, index, views.count), dr.gather(mi.Point3f, scene.p_world, vertex))
     bounds = shape_bounds(views, p_light, index, dr.gather(mi.UInt32, scene.vertex_shape, vertex), scene.shapes)
-    casts = casting_shapes(views, scene.planes, scene.planar, scene.boxes)
+    casts = casting_shapes(views, scene.planes, scene.planar, scene.boxes, eyes=scene.seen[2])
     s = scene.shadow
-    return fit_frusta(views, bounds, casts, scene.shapes, s.resolution, s.filter_size, previous, scene.seen, s.receiver_range)
+    return fit_frusta(views, bounds, casts, scene.shapes, s.resolution, s.filter_size, previous, scene.seen[:2], s.receiver_range)
 
 
 def lit(scene: StillScene, views: Views, maps: TangentMaps | None) -> Float:

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...scene.geometry import Geometry, ShapeInfo
-from ...shadow.caster_bounds import BORDER, ROUNDING, SUNK, TOUCH
+from ...shadow.caster_bounds import BORDER, ROUNDING, SUNK, SUNK_UNSEEN, TOUCH
 
 #: Half-angle in degrees that one perspective map may cover: beyond it, a light looks around itself with the faces of a cube.
 WIDEST = 75.0
@@ -37,10 +37,13 @@ def shape_vertices(geometry: Geometry) -> list[Points]:
     return [positions[i.vertex_start : i.vertex_start + i.vertex_count] for i in geometry.shapes]
 
 
-def aim(vertices: Sequence[Points], shapes: Sequence[ShapeInfo], own: int) -> Aim:
-    """Aim of maps on the emitter ``own``, at the shapes that can cast shadows."""
+def aim(vertices: Sequence[Points], shapes: Sequence[ShapeInfo], own: int, cameras: Points) -> Aim:
+    """Aim of maps on the emitter ``own``, at the shapes that can cast shadows.
+
+    ``cameras``: places (C, 4) of all cameras in homogeneous coordinates, world space.
+    """
     emitter, others = vertices[own], [k for k in range(len(shapes)) if k != own]
-    casters = [k for k in others if _may_cast(shapes, vertices, k, others, emitter.mean(0))] or others or [own]
+    casters = [k for k in others if _may_cast(shapes, vertices, k, others, emitter.mean(0), cameras)] or others or [own]
     points = np.concatenate([vertices[k] for k in casters])
     centre = 0.5 * (points.min(0) + points.max(0))
     eyes = np.concatenate([_box(emitter), emitter[:: max(1, len(emitter) // _EYES)]])
@@ -67,7 +70,9 @@ def _widest(eyes: Points, points: Points, centre: Points) -> float:
     return widest
 
 
-def _may_cast(shapes: Sequence[ShapeInfo], parts: Sequence[Points], k: int, others: Sequence[int], light: Points) -> bool:
+def _may_cast(
+    shapes: Sequence[ShapeInfo], parts: Sequence[Points], k: int, others: Sequence[int], light: Points, cameras: Points
+) -> bool:
     """True if something lies behind a shape, as seen from the light. Nothing lies behind walls and floors."""
     if not shapes[k].planar:
         return True
@@ -76,15 +81,30 @@ def _may_cast(shapes: Sequence[ShapeInfo], parts: Sequence[Points], k: int, othe
     _, _, axes = np.linalg.svd(own - middle, full_matrices=False)
     side = np.sign((light - middle) @ axes[-1])
     floor = (own - middle) @ axes.T
+    eyes = np.concatenate([(cameras[:, :3] - cameras[:, 3:] * middle) @ axes.T, cameras[:, 3:]], 1)
     for other in (parts[o] for o in others if o != k):
         placed = (other - middle) @ axes.T
         border = BORDER * np.ptp(floor, axis=0)
         stands = ((placed.min(0) >= floor.min(0) + border) & (placed.max(0) <= floor.max(0) - border))[:2].all()
         behind = -side * placed[:, 2]
         touch = TOUCH * min(np.ptp(own, axis=0).max(), np.ptp(other, axis=0).max()) + ROUNDING * np.abs(other).max()
-        if behind.max() - (SUNK * np.ptp(behind) if stands else 0) > touch:
+        share = 0.0
+        if stands:
+            hidden = not shapes[k].see_through and len(eyes) and all(_hides(floor, border, placed, side, eye) for eye in eyes)
+            share = SUNK_UNSEEN if hidden else SUNK
+        if behind.max() - share * np.ptp(behind) > touch:
             return True
     return False
+
+
+def _hides(floor: Points, border: Points, points: Points, side: float, eye: Points) -> bool:
+    """True if a floor hides all points behind it from a camera. All in the floor's frame; ``side``: sign of z in front of it."""
+    height, depth = side * eye[2], -side * points[:, 2]
+    behind, depth = points[depth > 0], depth[depth > 0, None]
+    if height <= 0:
+        return False
+    through = (behind * height + eye[:3] * depth) / (height + eye[3] * depth)
+    return bool(((through >= floor.min(0) + border) & (through <= floor.max(0) - border))[:, :2].all())
 
 
 def _box(points: Points) -> Points:

@@ -40,6 +40,7 @@ from ...shadow import (
     vertices_of_maps,
 )
 from ...shadow.light_camera import of_map
+from ..gbuffer.camera_clip import eye_of
 from ..gbuffer.camera_view import VisiblePoints
 from ..shadow_pass import MapPlan, boxes_of, check_sizes, shape_planes
 from .area_samples import AreaPlan, area_samples, plan_area
@@ -106,12 +107,13 @@ def plan_soft(
     plans: list[SoftPlan] = []
     first = {True: 0, False: 0}
     receivers: tuple[Points, npt.NDArray[np.uint32]] | None = None
+    eyes = np.concatenate([np.zeros((0, 4)), *(np.array(eye_of(camera), np.float64).reshape(1, 4) for camera in cameras)])
     for light in lights:
         if isinstance(light, Environment):
             plan = SoftPlan(plan_sky(light, sky_count, geometry), "distant", sky_count, 0, (0.0, 0.0, 0.0), NO_SHAPE)
         else:
             vertices = shape_vertices(geometry)
-            aimed = aim(vertices, geometry.shapes, light.shape)
+            aimed = aim(vertices, geometry.shapes, light.shape, eyes)
             kind = "cube" if aimed.surrounded else "single" if single else "near"
             count = area_count
             if count is None:
@@ -370,8 +372,9 @@ def _fit(
         corner = boxes.corners(shape, lane & 7)
         bounds = shape_bounds(views, to_light_space(of_map(dr.detach(views), which, count), corner), which, shape, shapes)
         planes, planar = shape_planes(scene, geometry)
-        casts = casting_shapes(views, planes, planar, boxes, hidden)
-        receives = None if seen is None else receiving_shapes(views, planes, planar & scene.reflecting, seen[2])
+        eyes = None if seen is None else seen[2]
+        casts = casting_shapes(views, planes, planar, boxes, hidden, eyes, scene.opaque)
+        receives = None if eyes is None else receiving_shapes(views, planes, planar & scene.reflecting, eyes)
         return fit_frusta(
             views,
             bounds,

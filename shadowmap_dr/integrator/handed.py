@@ -31,7 +31,7 @@ class HandedResults:
 
     def __init__(self) -> None:
         self._images: list[_Handed] = []
-        self._renewed: dict[str, Parameter] = {}  # by each replay so far
+        self._renewed: dict[str, Parameter] | None = None  # by each replay so far, if that is known
 
     def add(
         self,
@@ -65,15 +65,16 @@ class HandedResults:
             if one.sensor is sensor and one.spp == spp and one.camera.same(camera):
                 self._images.remove(one)
                 return one.results, one.renderer
-        self._renewed = {}  # the replay of an image may have renewed other arrays
+        self._renewed = None  # the replay of an image may have renewed other arrays
         return NO_RESULTS, None
 
     def follow(self, before: ParameterState, scene: mi.Scene) -> None:
-        """Note that a replay, and nothing else, has changed a scene's parameters: it renews the arrays of materials."""
+        """Note that a replay, and nothing else, has changed a scene's parameters: it renews arrays of lamps, for instance."""
         if not self._images:
             return
-        after = before.with_values({name: parameter.now() for name, parameter in self._renewed.items()})
-        if not self._renewed or after.same(before):
+        renewed = self._renewed or {}
+        after = before.with_values({name: parameter.now() for name, parameter in renewed.items()})
+        if self._renewed is None or renewed and after.same(before):
             # The first replay, or one that has renewed others: these are looked for. Otherwise the few that are known are read.
             after = ParameterState.of(scene)
             changed = {name for name, keys in after.numbers.items() if keys != before.numbers.get(name)}

@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..jit.arrays import own_memory
+from ..jit.call_data import restored_scalars
 from ..jit.frozen import Frozen
 from ..jit.handover import NO_RESULTS, PackedResults, keeping, using
 from ..jit.pytree import attached_places, tree_map
@@ -76,7 +77,7 @@ def _owned(gradient: TensorXf) -> TensorXf:
 
 
 def _image(spp: int, renderer: Renderer, keep: bool) -> tuple[TensorXf, Frusta | None, SoftFrusta, PackedResults]:
-    with keeping() as results:
+    with keeping() as results, restored_scalars():
         image = renderer.render(spp=spp)
     return image, renderer.frusta, renderer.soft_frusta, PackedResults.of(results) if keep else NO_RESULTS
 
@@ -102,9 +103,10 @@ def _gradients(
 
     found = dict(zip(fields, tree_map(_fields_of(renderer.data, fields), attached), strict=True))
     renderer = renderer.with_data(replace(renderer.data, **found))
-    with using(results.unpacked()):
-        image = renderer.render(spp=spp)
-    backward(image, gradient)
+    with restored_scalars():
+        with using(results.unpacked()):
+            image = renderer.render(spp=spp)
+        backward(image, gradient)
     return [dr.grad(leaf) for leaf in leaves]
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from types import ModuleType
 from typing import cast
 
@@ -39,22 +40,52 @@ def rewrite_scalars(nodes: Iterable[mi.Object]) -> None:
     with dr.scoped_set_flag(dr.JitFlag.EnableObjectTraversal, True):
         for node in unique:
             node._traverse_1_cb_ro(lambda index, variant, domain: found.append(index))
-        copies = _copies(found)
+        scalars = _scalars(found)
+        copies = {index: own_memory(scalar) for index, scalar in scalars.items()}
         dr.eval(list(copies.values()))
-        for node in unique:
-            node._traverse_1_cb_rw(lambda index, variant, domain: _index(copies[index]) if index in copies else index)
+    _replace(unique, copies)
+    if _ORIGINALS:
+        nodes_so_far, originals = _ORIGINALS[-1]
+        nodes_so_far += unique
+        originals |= {_index(copy): originals.get(index, scalars[index]) for index, copy in copies.items()}
 
 
-def _copies(indices: Iterable[int]) -> Mapping[int, AnyArray]:
-    """Copies of evaluated scalars without gradients. The upper 32 bits of an index are that of the AD variable."""
-    module, types, copies = sys.modules[mi.Float.__module__], _types_now(), {}
+@contextmanager
+def restored_scalars() -> Iterator[None]:
+    """Context at whose end Mitsuba's objects have the scalars again that :func:`rewrite_scalars` has replaced in it.
+
+    A replay gives objects new arrays where their recording has left others than it found. ``params.update()`` would then tell all
+    these objects that they have changed: some compute tables anew, and ``principled`` switches on all of its lobes.
+    """
+    _ORIGINALS.append(([], {}))
+    try:
+        yield
+    finally:
+        nodes, originals = _ORIGINALS.pop()
+        _replace({id(node): node for node in nodes}.values(), originals)
+
+
+# For each `restored_scalars`, objects whose scalars were replaced, and the scalars of before by the numbers of the others.
+_ORIGINALS: list[tuple[list[mi.Object], dict[int, AnyArray]]] = []
+
+
+def _replace(nodes: Iterable[mi.Object], others: Mapping[int, AnyArray]) -> None:
+    """Replace arrays of Mitsuba's objects by others, by their numbers."""
+    with dr.scoped_set_flag(dr.JitFlag.EnableObjectTraversal, True):
+        for node in nodes:
+            node._traverse_1_cb_rw(lambda index, variant, domain: _index(others[index]) if index in others else index)
+
+
+def _scalars(indices: Iterable[int]) -> dict[int, AnyArray]:
+    """Evaluated scalars without gradients. The upper 32 bits of an index are that of the AD variable."""
+    module, types, scalars = sys.modules[mi.Float.__module__], _types_now(), {}
     # Not by `dr.grad_enabled`, which is false wherever gradients are suspended.
     for index in {index for index in indices if index >> 32 == 0}:
         kind = _kind(module, types.get(index & 0xFFFFFFFF))
         array = None if kind is None else cast(AnyArray, dr.detail.update_indices(kind(0), [index]))
         if array is not None and len(array) == 1 and array.state == dr.VarState.Evaluated:
-            copies[index] = own_memory(array)
-    return copies
+            scalars[index] = array
+    return scalars
 
 
 def _types_now() -> dict[int, str]:

@@ -16,6 +16,7 @@ import mitsuba as mi
 import torch
 
 from ..errors import ShadowmapError, check_variant
+from ..jit.call_data import restored_scalars
 from ..jit.frozen import Frozen
 from ..jit.handover import NO_RESULTS, PackedResults, keeping, using
 from ..jit.pytree import tree_map
@@ -386,7 +387,7 @@ def _forward(
     places: tuple[_Place, ...], sensor: int | Sensor, spp: int, keep: bool, arrays: list[TensorXf], renderer: _Renderer
 ) -> tuple[TensorXf, tuple[Frusta | None, SoftFrusta], PackedResults]:
     """Image, (frusta of the shadow maps, frusta of extended lights' maps), and results for the backward pass if ``keep``."""
-    with keeping() as results:
+    with keeping() as results, restored_scalars():
         image = _image(places, sensor, spp, arrays, renderer)
     return image, (renderer.frusta, renderer.soft_frusta), PackedResults.of(results) if keep else NO_RESULTS
 
@@ -421,9 +422,10 @@ def _backward(
     for array, want in zip(arrays, wanted, strict=True):
         if want:
             dr.enable_grad(array)
-    with using(results.unpacked()):
-        image = _image(places, sensor, spp, arrays, renderer)
-    return gradients(arrays, (image,), (adjoint,))
+    with restored_scalars():
+        with using(results.unpacked()):
+            image = _image(places, sensor, spp, arrays, renderer)
+        return gradients(arrays, (image,), (adjoint,))
 
 
 def _shapes_of(what: str, value: Any) -> tuple[tuple[int, ...], ...]:  # Any: parameters have values of all kinds

@@ -169,12 +169,20 @@ def texture_values(renderer: Renderer, vary: Vary, key: str) -> TextureValues:
     return TextureValues(vary, key, shape, flat.ravel(), low, high)
 
 
+def has_vertices(renderer: Renderer, shape: str) -> bool:
+    """True for meshes; False for round shapes, curves, and parts of instances, which others may share."""
+    source = renderer.data.sources[[info.name for info in renderer.data.geometry.shapes].index(shape)]
+    return isinstance(source.shape, mi.Mesh) and source.instance is None
+
+
 def mesh_vertices(renderer: Renderer, vary: Vary, shape: str) -> MeshVertices:
     """The parameter of the vertices of a mesh."""
     given = [name for name in ("min", "max", "prior", "spread") if name in vary.plain()]
     if given:
         raise ShadowmapError(f"{vary.named}: vertices have no {given[0]}: leave it out.")
     geometry = renderer.data.geometry
+    if not has_vertices(renderer, shape):
+        raise ShadowmapError(f"{vary.named}: {shape} is no mesh of its own, and has no vertices to vary: give another kind.")
     info = geometry.shape(shape)
     faces = geometry.faces.numpy().reshape(-1, 3)[info.face_start : info.face_start + info.face_count] - info.vertex_start
     points = np.array(dr.detach(geometry.positions), np.float32).reshape(-1, 3)

@@ -25,9 +25,14 @@ _SMOOTH = 0.5
 # Largest share of the edges that noise may explain, multiple of its deviation that residuals exceed where they matter, and
 # multiple of its median variance that it has at most.
 _NOISY, _ABOVE, _UNEVEN = 0.5, 2.5, 4.0
+# Largest variance of a block of one colour, over its mean square, and least share of the others by which noise is measured.
+_CONSTANT, _FOREGROUND = 1e-6, 0.25
 # Pixels matter where a change of a number by the first moves them by more than the second, a share of the brightness; and
-# where the residual is larger. Numbers that move fewer blocks of pixels are not judged on their own.
+# where the residual is larger. Numbers that move fewer blocks of pixels are not judged on their own, nor are fewer
+# residuals where nothing moves.
 _CHANGE, _VISIBLE, _FEW = 0.05, 0.03, 8
+# Distance from a bound, in the fit's own numbers, that is none.
+_AT_BOUND = 1e-4
 # Largest share of the edges that one number moves, as a multiple of that of the whole.
 _OF_NUMBER = 2.0
 
@@ -101,6 +106,13 @@ def sentences(
     return words
 
 
+def bound_sentences(x: Array, low: Array, high: Array, names: Sequence[str], given: npt.NDArray[np.bool_]) -> list[str]:
+    """Sentences about numbers that end at bounds of the user's. ``given``: (n, 2) True for lower and upper bounds that are."""
+    close = np.stack([x <= low + _AT_BOUND, x >= high - _AT_BOUND], 1) & given
+    ends = ("min: the pictures ask for less", "max: the pictures ask for more")
+    return [f"{names[k]} is at its {ends[side]}." for k, side in np.argwhere(close).tolist()]
+
+
 def unexplained(point: Point, objective: Objective) -> Unexplained:
     """Shares of the pictures' edges that the images do not have, or have elsewhere.
 
@@ -116,11 +128,11 @@ def unexplained(point: Point, objective: Objective) -> Unexplained:
         weight = np.broadcast_to(compared.weight, (*residual.shape[:2], 1))[..., 0]
         arrays = *compared.contents(image), residual, weight, np.asarray(weight > 0, np.float32)
         times = max(2, round(max(weight.shape) / _SIDE)) if is_image(residual.shape) else 1
-        noise = _noise(residual, weight, times)
+        noise = _noise(residual, arrays[1], weight, times)
         ours, theirs, left, weight, whole = (_reduced(one, times) for one in arrays)
         pairs = isinstance(compared, Colours) or is_image(residual.shape) and _is_smooth(theirs)
         moved = [_reduced(np.abs(column).reshape(residual.shape).max(2) * _CHANGE, times) > _VISIBLE for column in columns]
-        wrong = np.abs(left).mean(2) > np.maximum(_VISIBLE, _ABOVE * np.sqrt(noise[..., 0]))
+        wrong = _beside_others(np.abs(left).mean(2) > np.maximum(_VISIBLE, _ABOVE * np.sqrt(noise[..., 0])))
         for k, matters in enumerate([np.any([*moved, wrong], axis=0), *moved[:count]]):
             # Pixels that do not count are black: blocks with one count for nothing.
             counted = np.asarray(weight * (whole == 1) * matters, np.float32)
@@ -136,17 +148,34 @@ def unexplained(point: Point, objective: Objective) -> Unexplained:
     return Unexplained(float(shares[0]), np.where(few, 0, shares[1:]), few)
 
 
-def _noise(residual: Image, weight: Image, times: int) -> Image:
+def _noise(residual: Image, picture: Image, weight: Image, times: int) -> Image:
     """Variance (h, w, 1) of blocks' means that noise of single pixels makes.
 
-    It differs from place to place, but edges that are elsewhere, which vary in few blocks alone, are no noise.
+    It differs from place to place, but edges that are elsewhere, which vary in few blocks alone, are no noise. Of a path-traced
+    picture, nothing but the background is without noise: what is constant there tells nothing of the rest.
     """
     if times < 2:
         return np.zeros((*weight.shape, 1), np.float32)
-    inside = (_reduced(np.square(residual), times) - np.square(_reduced(residual, times))).mean(2) / (times**2 - 1)
+    inside = _variances(residual, times) / (times**2 - 1)
     counts = _reduced(np.asarray(weight > 0, np.float32), times) == 1
+    if picture.shape[:2] == residual.shape[:2]:
+        varies = counts & (_variances(picture, times) > _CONSTANT * np.square(_reduced(picture, times)).mean(2))
+        counts = varies if varies.sum() >= _FOREGROUND * counts.sum() else counts
     most = max(_UNEVEN * float(np.median(inside[counts])), 0.0) if counts.any() else 0.0
     return np.asarray(np.clip(inside, 0, most)[..., None], np.float32)
+
+
+def _beside_others(chosen: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    """Chosen blocks (h, w) with a chosen one beside them; none if they are few. Noise exceeds its deviation here and there, while
+    edges that are elsewhere lie along lines."""
+    wide = np.pad(chosen, 1)
+    found = np.asarray(chosen & (wide[:-2, 1:-1] | wide[2:, 1:-1] | wide[1:-1, :-2] | wide[1:-1, 2:]))
+    return found if found.sum() >= _FEW else np.zeros_like(found)
+
+
+def _variances(image: Image, times: int) -> Image:
+    """Variances (h, w) within blocks of pixels, means over the channels."""
+    return np.asarray((_reduced(np.square(image), times) - np.square(_reduced(image, times))).mean(2), np.float32)
 
 
 def _is_smooth(image: Image) -> bool:

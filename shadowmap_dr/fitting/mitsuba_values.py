@@ -28,6 +28,8 @@ def is_recordable(scene: mi.Scene, key: str, *, gradients: bool = False) -> bool
     known = _RECORDABLE_GRADIENTS if gradients else _RECORDABLE
     table = mi.traverse(scene)
     node = table.properties[key][2]
+    if isinstance(node, mi.Emitter) and dr.is_tensor_v(table[key]):
+        return False  # the pixels of a sky
     while node is not None:
         kind = node.class_name().partition("[")[0]  # without the type of a texture's texels
         if kind not in known and not isinstance(node, (mi.Shape, mi.Scene)):

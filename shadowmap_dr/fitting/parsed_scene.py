@@ -46,13 +46,8 @@ class ParsedScene:
     def __init__(self, file: Path, parameters: Mapping[str, str]) -> None:
         self.file, self.folder = file, file.parent
         config, state = parsed(file, parameters)
-        self.texts = [XmlText(Path(str(path))) for path in state.files]
-        self.defaults = {
-            element.get("name"): element.get("value")
-            for text in reversed(self.texts)
-            for element in text.root.walk()
-            if element.tag == "default"
-        }
+        self.texts = texts_of(state)
+        self.defaults = _defaults(self.texts)
         self.constants = {**self.defaults, **parameters}
         self._found: dict[str, tuple[XmlText, Element]] = {}
         counts: dict[str, int] = {}
@@ -102,9 +97,7 @@ class ParsedScene:
 
     def substituted(self, text: str) -> str:
         """A text with the values of ``$name`` in it."""
-        longest = sorted(self.constants, key=len, reverse=True)
-        pattern = "|".join(re.escape("$" + name) for name in longest)
-        return re.sub(pattern, lambda found: self.constants[found[0][1:]], text) if longest else text
+        return _substituted(text, self.constants)
 
     def resolved(self, name: str) -> Path | None:
         """The file that a name in the scene means; None if there is none."""
@@ -144,12 +137,38 @@ class ParsedScene:
 
     def _folders(self) -> list[Path]:
         """Folders in which Mitsuba looks for files."""
-        found = []
-        for text in self.texts:
-            for element in text.root.walk():
-                if element.tag == "path":
-                    found.append(self.folder / self.substituted(element.get("value")))
-        return [*reversed(found), self.folder]
+        return search_folders(self.texts, self.constants)
+
+
+def texts_of(state: mi.parser.ParserState) -> list[XmlText]:
+    """Texts of all files of a scene, its own first."""
+    return [XmlText(Path(str(path))) for path in state.files]
+
+
+def search_folders(texts: Sequence[XmlText], parameters: Mapping[str, str]) -> list[Path]:
+    """Folders in which Mitsuba looks for files that a scene names: its own, and those that it calls ``path``.
+
+    Args:
+        texts: of all files of the scene, its own first.
+        parameters: values of ``$name`` in them.
+    """
+    folder, constants = texts[0].path.parent, {**_defaults(texts), **parameters}
+    elements = (element for text in texts for element in text.root.walk() if element.tag == "path")
+    found = [folder / _substituted(element.get("value"), constants) for element in elements]
+    return [*reversed(found), folder]
+
+
+def _defaults(texts: Sequence[XmlText]) -> dict[str, str]:
+    """Values of ``$name`` that files of a scene give themselves, those of the first ones before others."""
+    elements = (element for text in reversed(texts) for element in text.root.walk() if element.tag == "default")
+    return {element.get("name"): element.get("value") for element in elements}
+
+
+def _substituted(text: str, constants: Mapping[str, str]) -> str:
+    """A text with the values of ``$name`` in it."""
+    longest = sorted(constants, key=len, reverse=True)
+    pattern = "|".join(re.escape("$" + name) for name in longest)
+    return re.sub(pattern, lambda found: constants[found[0][1:]], text) if longest else text
 
 
 def parsed(file: Path, parameters: Mapping[str, str]) -> tuple[mi.parser.ParserConfig, mi.parser.ParserState]:

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from ..errors import ShadowmapError, did_you_mean, quoted, shortened
 from ..rendering.renderer import Renderer
 from ..scene.naming import name_objects
-from .arrays import ArrayParameter, MeshVertices, TextureValues, mesh_vertices, texture_values
+from .arrays import ArrayParameter, MeshVertices, TextureValues, has_vertices, mesh_vertices, texture_values
 from .motion_parameters import CameraMotion, LightMotion, ShapeMotion
 from .motions import host_matrix, tangents
 from .own import Own
@@ -105,8 +105,14 @@ class Resolver:
         """The parameters of entries: those that few numbers describe, and those with many values."""
         few: list[Parameter] = []
         many: list[ArrayParameter] = []
+        known: dict[str, Vary] = {}
         for vary in entries:
             found = vary if isinstance(vary, Own) else self.parameter(vary)
+            if isinstance(found, (Value, TextureValues)):
+                earlier = known.setdefault(found.key, found.vary)
+                if earlier is not found.vary:
+                    names = f"vary {shortened(earlier.label)} and {shortened(found.vary.label)}"
+                    raise ShadowmapError(f"{names}: both vary {found.key}; leave one out.")
             if isinstance(found, (MeshVertices, TextureValues)):
                 many.append(found)
             else:
@@ -115,7 +121,7 @@ class Resolver:
 
     def candidates(self) -> list[Candidate]:
         """All that can vary."""
-        found = [Candidate(name, ("pose", "rotation", "translation", "scale", "vertices"), "shape") for name in self.shapes]
+        found = [Candidate(name, self._shape_kinds(name), "shape") for name in self.shapes]
         for light in self.renderer.data.lights:
             kinds = tuple(self._light_kinds(light))
             if kinds:
@@ -125,15 +131,18 @@ class Resolver:
             array = self._numbers(key)
             if array is not None:
                 kind = ("value", "brightness") if len(array) == 3 else ("value",)
-                found.append(Candidate(key, kind if len(array) <= _MOST else ("texture",), _shown(array)))
+                found.append(Candidate(key, ("texture",) if self._is_texture(key, array) else kind, _shown(array)))
         return found
 
     # ------------------------------------------------------------------------------------------------------ shapes
 
+    def _shape_kinds(self, name: str) -> tuple[str, ...]:
+        return ("pose", "rotation", "translation", "scale", *(["vertices"] if has_vertices(self.renderer, name) else []))
+
     def _shape(self, vary: Vary, shapes: Sequence[str]) -> Parameter:
         parts = {**_rigid_parts(vary.axes), "scale": ("s",)}.get(vary.kind or "pose")
         if parts is None:
-            raise _no_kind(vary, "a shape", ("pose", "rotation", "translation", "scale", "vertices"))
+            raise _no_kind(vary, "a shape", self._shape_kinds(shapes[0]))
         infos = [self.renderer.data.geometry.shape(shape) for shape in shapes]
         points = np.concatenate([self._points[info.vertex_start : info.vertex_start + info.vertex_count] for info in infos])
         middle, diameter = _bounds(points)
@@ -206,7 +215,7 @@ class Resolver:
         common = vary.kind in ("brightness", "sky")
         if vary.kind not in ("", "value", "brightness", "sky"):
             raise _no_kind(vary, "a value", ("value", "brightness"))
-        if len(array) > _MOST:
+        if self._is_texture(key, array):
             raise ShadowmapError(f"{vary.named}: {key} has {len(array)} values; give the kind texture.")
         owner, _, end = key.partition(".")
         light = owner if owner in self.lights and end in _FIELDS else ""
@@ -239,13 +248,14 @@ class Resolver:
             if key in self.keys:
                 return key
         known = [*self.shapes, *self.lights, *self.sensors, *(key.removesuffix(".value") for key in self.keys)]
-        near = did_you_mean(name, known)
+        parts = [shape for shape in self.shapes if shape.startswith(f"{name}.")]
+        near = f" Did you mean its parts, '{name}.*'?" if parts else did_you_mean(name, known)
         raise ShadowmapError(f"{vary.named}: the scene has no object or value {quoted(name)}; --list lists all.{near}")
 
     def _texture_key(self, vary: Vary) -> str:
         """Mitsuba's name of the array of an entry: itself, or the only one of a material or light."""
         own = [key for key in self.keys if key == vary.name or key.startswith(f"{vary.name}.")]
-        arrays = [key for key in own if (array := self._numbers(key)) is not None and len(array) > _MOST]
+        arrays = [key for key in own if (array := self._numbers(key)) is not None and self._is_texture(key, array)]
         if len(arrays) == 1:
             return arrays[0]
         if arrays:
@@ -261,6 +271,10 @@ class Resolver:
         raise ShadowmapError(
             f"{vary.named}: {quoted(vary.name)} has no texture; textures: {shortened(', '.join(known), 160) or 'none'}.{near}"
         )
+
+    def _is_texture(self, key: str, array: Array) -> bool:
+        """True for pictures, however small, and for arrays of more numbers than a full matrix of derivatives serves."""
+        return len(array) > _MOST or dr.is_tensor_v(self.table[key])
 
     def _numbers(self, key: str) -> Array | None:
         """The values (n,) of a parameter of Mitsuba's; None if no derivatives flow to it, and for parts of meshes and films."""

@@ -17,7 +17,8 @@ import numpy as np
 
 from ..errors import OutputError, ShadowmapError, mitsuba_message
 from ..io.files import atomic, make_folder, no_file
-from .changes import Changes
+from ..scene.load import named_shapes
+from .changes import Array, Changes
 from .parsed_scene import ParsedScene
 from .scene_edits import FILES_FOLDER, Step, Unwritable, is_close, numbers_of
 from .shape_edits import MeshStep, TransformStep, mapped, vertices_of
@@ -162,13 +163,25 @@ class _Writer:
         for name, matrix in changes.transforms.items():
             shape = parsed.shape(name)
             if shape is None:
-                notes[f"{name}:pose"] = self._no_shape(name)
+                self._move_instance(name, changes.transforms, steps, notes)
             elif name in meshes:
                 if meshes[name].vertices is None:
                     meshes[name].vertices = mapped(np.asarray(matrix, np.float64), vertices_of(shape))
             else:
                 steps[f"{name}:pose"] = TransformStep(name, shape, np.asarray(matrix, np.float64))
         return steps | {f"{name}:vertices": step for name, step in meshes.items()}
+
+    def _move_instance(self, name: str, transforms: Mapping[str, Array], steps: dict[str, Step], notes: dict[str, str]) -> None:
+        """Add the step of the instance that a shape is a part of, if all of its parts move alike."""
+        instances = {part: instance for part, _, instance in named_shapes(self.parsed.scene) if instance is not None}
+        instance, matrix = instances.get(name), np.asarray(transforms[name], np.float64)
+        parts = [part for part, other in instances.items() if instance is not None and other == instance]
+        if instance is None:
+            notes[f"{name}:pose"] = self._no_shape(name)
+        elif not all(part in transforms and np.array_equal(transforms[part], matrix) for part in parts):
+            notes[f"{name}:pose"] = f"other parts of {instance.id()!r} do not move along, but instances move as a whole"
+        else:
+            steps[f"{instance.id()}:pose"] = TransformStep(instance.id(), instance, matrix)
 
     def _no_shape(self, name: str) -> str:
         instance = next((known for known in self.parsed.shapes if name.startswith(f"{known}.")), None)

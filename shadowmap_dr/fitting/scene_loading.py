@@ -9,7 +9,7 @@ from pathlib import Path
 import mitsuba as mi
 
 from ..io.files import no_file
-from .parsed_scene import instantiated, parsed, resolving
+from .parsed_scene import instantiated, parsed, resolving, search_folders, texts_of
 
 
 def load_scene(file: str | os.PathLike[str], parameters: Mapping[str, str] | None = None) -> mi.Scene:
@@ -31,5 +31,5 @@ def load_scene(file: str | os.PathLike[str], parameters: Mapping[str, str] | Non
     for node in state.nodes:
         if node.props.plugin_name() == "bitmap" and "format" not in node.props:
             node.props["format"] = "variant"
-    with resolving([path.parent]):
+    with resolving(search_folders(texts_of(state), parameters or {})):
         return instantiated(config, state, path)

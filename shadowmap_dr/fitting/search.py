@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
@@ -22,7 +23,7 @@ from .changes import Changes, FittedScene
 from .corrections import Corrections
 from .estimates import array_estimates, changes_of, estimates_of, gain_estimates
 from .gains import Gain
-from .judgement import Unexplained, largest_share, sentences, unexplained
+from .judgement import Unexplained, bound_sentences, largest_share, sentences, unexplained
 from .levenberg_marquardt import Limits, minimise
 from .losses import Loss
 from .objective import Point
@@ -113,6 +114,8 @@ class Fit:
         functions = {"residuals": residuals, "loss": loss}
         self._own_settings = {key: function_name(one) for key, one in functions.items() if one is not None}
         self._low, self._high, prior = _bounds(self.parameters, self.gains)
+        given = [[one.vary.low is not None, one.vary.high is not None] for one in self.parameters for _ in one.labels]
+        self._given = np.array(given + [[False, False]] * (len(self._low) - len(given)), bool).reshape(-1, 2)
         side = min(options.resolution, max(max(target.width, target.height) for target in targets))
         levels = qualities(side, options.spp, renderer.settings.shadow.resolution)
         pictures = self.parameters, self.arrays, self.targets, self.gains
@@ -344,9 +347,22 @@ class Fit:
 
     def _fingerprint(self) -> str:
         """Text that identifies the fit."""
-        sums = [[float(t.image.sum(dtype=np.float64)), float(t.weight.sum(dtype=np.float64)), t.sensor] for t in self.targets]
-        entries = {"options": repr(self.options), "pictures": sums, "numbers": len(self._low), "functions": self._own_settings}
-        return records.digest(entries)
+        pictures = [[records.digest_of(t.image, t.weight), t.sensor, t.exposure] for t in self.targets]
+        entries = {
+            "options": repr(self.options),
+            "pictures": pictures,
+            "numbers": len(self._low),
+            "functions": self._own_settings,
+        }
+        return records.digest({**entries, "scene": self._scene_digest()})
+
+    def _scene_digest(self) -> str:
+        """Text that identifies the scene: numbers of Mitsuba's parameters, but for normals, whose last digits may differ."""
+        table = mi.traverse(self.renderer.data.scene)
+        keys = [key for key in table.properties if not key.endswith("normals")]
+        values = [value for key in keys if dr.is_array_v(value := table[key])]
+        matrices = [camera.to_world.matrix for cameras in self.renderer.data.sensors for camera in cameras]
+        return records.digest_of(*(np.array(dr.detach(value)) for value in (*values, *matrices)))
 
     # ------------------------------------------------------------------------------------------------------ results
 
@@ -394,6 +410,7 @@ class Fit:
         textures = [array for array in self.arrays if isinstance(array, TextureValues)]
         found = shares.is_small(largest_share(objective))
         words = sentences(found, shares, point.error, spread, names, own=objective.has_own_residuals)
+        words += bound_sentences(x, self._low, self._high, names, self._given)
         words += [] if found else colourless(textures, self.targets)
         if self._corrections is not None and self._corrections.failure:
             words.append(f"Images are not corrected, since Mitsuba cannot render the fitted scene: {self._corrections.failure}.")

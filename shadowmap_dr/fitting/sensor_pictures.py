@@ -24,7 +24,7 @@ def as_seen(renderer: Renderer, targets: Sequence[Target]) -> tuple[Target, ...]
     """Pictures as the scene's sensors could see them: transparent parts that are those of renderings count.
 
     Raises:
-        ShadowmapError: a picture of a sensor that does not exist, or of another shape than the sensor's.
+        ShadowmapError: a black picture, one of a sensor that does not exist, or of another shape than the sensor's.
     """
     _check_sizes(renderer, targets)
     return tuple(as_rendered(renderer, target) for target in targets)
@@ -67,7 +67,7 @@ def as_rendered(renderer: Renderer, target: Target) -> Target:
 
 
 def _check_sizes(renderer: Renderer, targets: Sequence[Target]) -> None:
-    """ShadowmapError for a picture of a sensor that does not exist, or of another shape than the sensor's."""
+    """ShadowmapError for a black picture, one of a sensor that does not exist, or of another shape than the sensor's."""
     for target in targets:
         name = f"picture {target.name or 'of the target'}"
         count = len(renderer.data.sensors)
@@ -76,6 +76,8 @@ def _check_sizes(renderer: Renderer, targets: Sequence[Target]) -> None:
         cameras = renderer.data.cameras(target.sensor)
         if len(cameras) != 1:
             raise ShadowmapError(f"{name}: sensor {target.sensor} is a batch of cameras: use one of a single camera.")
+        if not target.image.any():
+            raise ShadowmapError(f"{name} is black where it counts: nothing can be found in it; give another picture or mask.")
         width, height = cameras[0].width, cameras[0].height
         if abs(width / height * target.height / target.width - 1) > 0.01 + 1 / min(target.width, target.height):
             raise ShadowmapError(

@@ -264,6 +264,9 @@ class ValueStep(Step):
                 expected, found = np.asarray(self.value, np.float64), np.array(table[key])
             if expected.shape != found.shape:
                 return f"the picture has the shape {found.shape} there instead of {expected.shape}"
+            if isinstance(self.parsed.parameters.properties[self.key][2], mi.Emitter) and expected.shape[1] > 2:
+                # Mitsuba repeats columns of a sky at its ends.
+                expected, found = expected[:, 1:-1], found[:, 1:-1]
             worst = float(np.abs(expected - found).max())
             return "" if worst <= TEXTURE_TOLERANCE * max(1.0, np.abs(expected).max()) else f"it differs by {worst:.2g} there"
         wanted = self.value

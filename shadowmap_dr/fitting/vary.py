@@ -66,7 +66,8 @@ class Vary:
         if self.kind and self.kind not in KINDS:
             known = ", ".join(KINDS)
             raise ShadowmapError(
-                f"{self.named}: there is no kind {quoted(self.kind)}: choose from {known}.{did_you_mean(self.kind, KINDS)}"
+                f"{self.named}: there is no kind {quoted(self.kind)}: choose from {known}.{did_you_mean(self.kind, KINDS)} "
+                "Names with a colon go into fit.toml."
             )
         if self.axes and self.kind not in _WITH_AXES:
             raise ShadowmapError(f"{self.named}: only {', '.join(_WITH_AXES)} have axes.")
@@ -110,7 +111,8 @@ class Vary:
             key, equals, value = option.strip().partition("=")
             if key not in _OPTIONS or not equals:
                 raise ShadowmapError(
-                    f"vary {shortened(text)}: {quoted(option.strip())} is not understood: write {', '.join(_OPTIONS)} = a number."
+                    f"vary {shortened(text)}: {quoted(option.strip())} is not understood: write {', '.join(_OPTIONS)} = a "
+                    "number. Names with a comma or a colon go into fit.toml."
                 )
             try:
                 values[_OPTIONS[key]] = float(value)

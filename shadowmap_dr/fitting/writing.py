@@ -82,7 +82,7 @@ def _scene_files(
         warn(f"the fitted scene was not written: {error}")
         return []
     for note in written.notes:
-        warn(f"{written.files[0]}: {note}.")
+        warn(f"{written.files[0]}: {note}")
     try:
         with second_thread():
             loaded = mi.load_file(str(written.files[0]), optimize=False)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from ..errors import OutputError, ShadowmapError, warn
 from .files import atomic
@@ -37,6 +38,14 @@ def read_json(path: str | os.PathLike[str]) -> Any:  # Any: JSON
 def digest(value: Any) -> str:  # Any: JSON
     """Short hash of a JSON value, which tells whether a stored one has been edited."""
     return hashlib.sha256(json.dumps(plain(value), sort_keys=True).encode()).hexdigest()[:12]
+
+
+def digest_of(*arrays: npt.NDArray[Any]) -> str:
+    """Short hash of the contents, shapes and types of arrays."""
+    found = hashlib.sha256()
+    for array in arrays:
+        found.update(f"{array.shape} {array.dtype}".encode() + np.ascontiguousarray(array).tobytes())
+    return found.hexdigest()[:12]
 
 
 def write_record(path: str | os.PathLike[str], record: Mapping[str, Any], *parts: str) -> None:

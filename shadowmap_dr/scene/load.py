@@ -157,7 +157,7 @@ def load(scene: mi.Scene, *, tessellation: int = 64, warn: bool = True) -> Scene
         raise ShadowmapError(f"tessellation is {tessellation!r}, but must be an integer of at least 3.")
     names, sources, faces, unsupported = [], [], [], []
     known: dict[Any, Any] = {}
-    for name, shape, instance in _shapes_of(scene):
+    for name, shape, instance in named_shapes(scene):
         try:
             source, own_faces = source_of(name, shape, instance, tessellation, known)
         except UnsupportedShape as error:
@@ -262,7 +262,7 @@ def _geometry_now(data: SceneData) -> Geometry:
     )
 
 
-def _shapes_of(scene: mi.Scene) -> Iterator[tuple[str, mi.Shape, mi.Shape | None]]:
+def named_shapes(scene: mi.Scene) -> Iterator[tuple[str, mi.Shape, mi.Shape | None]]:
     """(unique name, shape, instance or None) of all shapes, shape groups resolved."""
     groups = _Groups(scene)
     taken: set[str] = set()

@@ -24,7 +24,7 @@ from ..raster import Topology, find_crossings, visible_triangles
 from .filters import filter_kernel, filter_map, separable_terms
 from .light_camera import Frusta, Views, of_map, project, to_clip, to_light_space
 from .light_tangent_texels import TangentTexels, turned, twist_of, weight_rates
-from .lookup import Texels, entries, moved_weights, stored_texel
+from .lookup import Texels, entries, has_neighbours, moved_weights, stored_texel
 from .methods.depth_scale import DepthScale
 from .methods.registry import PREFILTERED
 from .methods.variance import reduced_bleeding
@@ -121,7 +121,7 @@ def tangent_visibility(maps: TangentMaps, map_index: UInt32, p_world: Point3f, a
     views, frusta = maps.maps.views, maps.maps.frusta
     view, frustum = of_map(views, map_index, count), of_map(frusta, map_index, count)
     u, v, depth, inside = project(view, frustum, p_world)
-    inside &= active
+    inside &= active & has_neighbours(settings, view, frustum, u, v)
     p = to_light_space(view, p_world)
     twist = dr.gather(module.Float, maps.twist, map_index, inside)
     per_x, per_y, per_z = dr.rcp(frustum.half_x), dr.rcp(frustum.half_y), dr.rcp(frustum.far - frustum.first)

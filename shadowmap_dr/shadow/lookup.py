@@ -15,11 +15,12 @@ from ..jit.broadcast import copies_for_threads, copy_of_lane
 from ..jit.kernel_inputs import float_input, int_input, uint_input
 from ..jit.types import AnyArray, Bool, Float, Point3f, UInt32
 from .filters import filter_kernel, separable_terms
-from .light_camera import Views, of_map, of_tile, project, tile_numbers, to_light_space
+from .light_camera import Frusta, Views, of_map, of_tile, project, tile_numbers, to_light_space
 from .methods.comparison import soft_comparison, standard_visibility
 from .methods.depth_scale import DepthScale
 from .methods.registry import PREFILTERED
 from .methods.variance import MINIMUM_VARIANCE_COMPAT, chebyshev_visibility, reduced_bleeding
+from .settings import ShadowSettings
 from .shadow_map import ShadowMaps
 from .texel_depths import FAR, depth_scale
 from .tile_fit import image_coordinates
@@ -33,6 +34,8 @@ _SOFTNESS = 0.02
 _ENDS = 0.2
 # Weight from which on a texel's distribution counts.
 _NOTHING = 1e-9
+# Most texels along a border of a map that are not looked up, both sides together, and share of a light's limit that is its end.
+_RING, _LIMIT = 4, 1 - 1e-4
 
 
 def visibility(maps: ShadowMaps, map_index: UInt32 | int, p_world: Point3f, active: Bool | bool = True) -> Float:
@@ -99,8 +102,25 @@ def _place_in_map(maps: ShadowMaps, map_index: UInt32 | int, p_world: Point3f, n
     else:
         view, frustum = of_tile(numbers, maps.views, row)
     u, v, depth, inside = project(view, frustum, p_world)
+    if not maps.settings.compat:
+        inside &= has_neighbours(maps.settings, view, frustum, u, v)
     scale = depth_scale(view, frustum, depth, maps.settings, maps.frusta.tiles is not None)
     return _Place(view, index, u, v, dr.select(depth > FAR, FAR, depth), inside, scale)
+
+
+def has_neighbours(settings: ShadowSettings, view: Views, frustum: Frusta, u: Float, v: Float) -> Bool:
+    """Mask of points so far from a map's border that a filter of three texels and interpolation read no replicated ones.
+
+    Depths of surfaces that a light strikes at a slant are wrong there. No shadow reaches that far, not even a filtered one, but
+    at borders where a light ends, or a face of a cube.
+    """
+    texels = min(settings.filter_size + 1, _RING)
+    ring = float_input(backend(u), "ring", texels / settings.resolution)
+    found = type(dr.detach(u) > 0)(True)
+    for place, centre, half in ((u, frustum.center_x, frustum.half_x), (v, frustum.center_y, frustum.half_y)):
+        ends = dr.abs(centre) + half >= _LIMIT * view.limit
+        found &= ends | (dr.abs(dr.detach(place)) <= 1 - ring)
+    return found
 
 
 def tiled_visibility(maps: ShadowMaps, group: Group, p_world: Point3f, active: Bool | bool = True) -> Float:

@@ -22,10 +22,10 @@ def disc(x: float, y: float, softness: float = 1.0) -> np.ndarray:
     return np.repeat((1 - 0.8 * inside)[..., None], 3, 2).astype(np.float32)
 
 
-def judged(image: np.ndarray, picture: np.ndarray, weight: np.ndarray | None = None) -> float:
-    """The whole share for one number that moves the image sideways, by 20 pixels for a change by one."""
+def judged(image: np.ndarray, picture: np.ndarray, weight: np.ndarray | None = None, *, moves: bool = True) -> float:
+    """The whole share for one number that moves the image sideways, by 20 pixels for a change by one, or that moves nothing."""
     weight = np.ones((SIDE, SIDE), np.float32) if weight is None else weight
-    slope = 20 * np.gradient(image, axis=1).reshape(1, -1)
+    slope = 20 * moves * np.gradient(image, axis=1).reshape(1, -1)
     objective: Any = SimpleNamespace(
         views=[SimpleNamespace(count=1)], comparisons=[Colours(Observation(picture, weight, Gain()))]
     )
@@ -58,6 +58,17 @@ def test_noise_of_single_pixels_hides_no_displacement() -> None:
     assert noisy == pytest.approx(clean, rel=0.2)
     # A picture of noise alone is explained by nothing.
     assert judged(disc(60, 60), 8 * noise) > EXPLAINED
+
+
+@pytest.mark.parametrize("moves", [True, False])
+@pytest.mark.parametrize("background", [0.0, 0.4, 0.65])
+def test_backgrounds_without_noise_hide_no_noise(background: float, moves: bool) -> None:
+    """A path tracer's sky is constant. Residuals that noise makes here and there are no edges, also where no number moves any."""
+    noise = np.random.default_rng(0).normal(0, 0.12, (SIDE, SIDE, 3)).astype(np.float32)
+    noise[: round(background * SIDE)] = 0
+    row = 64 + background * 32
+    right, elsewhere = (judged(disc(60, row), disc(x, row) + noise, moves=moves) for x in (60, 66))
+    assert right < EXPLAINED_CORRECTED and elsewhere > 3 * EXPLAINED_CORRECTED
 
 
 def test_masked_parts_count_for_nothing() -> None:

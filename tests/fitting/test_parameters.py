@@ -216,7 +216,7 @@ def test_patterns_move_shapes_together(resolver: Resolver) -> None:
         ("car_bodi", "Did you mean 'car_body'?"),
         ("sun.iradiance", "Did you mean 'sun.irradiance'?"),
         ("camra:pose", "Did you mean 'camera'?"),
-        ("ball:fov", "'ball' is a shape and has the kinds pose, rotation, translation, scale, vertices."),
+        ("ball:fov", "'ball' is a shape and has the kinds pose, rotation, translation, scale."),
         ("ball:direction", "'ball' is a shape"),
         ("sun:pose", "'sun' is a DirectionalLight and has the kinds direction, brightness."),
         ("lamp:direction", "'lamp' is a PointLight and has the kinds position, brightness."),

@@ -129,7 +129,7 @@ def test_colours_of_vertices(tmp_path: Path, variant: str) -> None:
         ({"vertices": {"a": np.full((42, 3), np.nan)}}, "some vertices are not finite"),
         ({"vertices": {"ball": np.zeros((3, 3))}}, "ball:vertices .*: the shape is a Sphere, no mesh"),
         ({"vertices": {"c": np.zeros((3, 3))}}, "c:vertices .*: the scene has no such shape, only 'a', 'ball', 'i'"),
-        ({"transforms": {"i.part": np.eye(4)}}, "i.part:pose .*: it is a part of 'i', which other instances may share"),
+        ({"transforms": {"i.part": np.eye(4)}}, "i.part:pose .*: other parts of 'i' do not move along"),
         ({"transforms": {"none": np.eye(4)}}, "none:pose .*: the scene has no such shape"),
         ({"values": {"g.part.vertex_positions": np.zeros(72)}}, "its shape is part of a shape group"),
         ({"values": {"nothing.value": np.zeros(3)}}, "nothing.value .*: the scene file has no such parameter"),
@@ -140,7 +140,7 @@ def test_colours_of_vertices(tmp_path: Path, variant: str) -> None:
     ],
 )  # fmt: skip
 def test_notes_of_what_cannot_be(tmp_path: Path, variant: str, changes: dict[str, Any], words: str) -> None:
-    group = '<shape type="shapegroup" id="g"><shape type="cube" id="part"/></shape>'
+    group = '<shape type="shapegroup" id="g"><shape type="cube" id="part"/><shape type="cube" id="other"/></shape>'
     group += '<shape type="instance" id="i"><ref id="g"/></shape>'
     body = SHAPES["ply"] + '<shape type="sphere" id="ball"><bsdf type="diffuse"/></shape>' + group
     file = shape_scene(tmp_path, body)
@@ -152,3 +152,14 @@ def test_notes_of_what_cannot_be(tmp_path: Path, variant: str, changes: dict[str
     again = read(written)
     assert again["ball.silhouette_sampling_weight"] == 0.5
     assert sorted((tmp_path / "out").rglob("*.*")) == sorted(written.files)
+
+
+def test_instances_move_with_their_parts(tmp_path: Path, variant: str) -> None:
+    group = '<shape type="shapegroup" id="g"><shape type="cube" id="part"/><shape type="cube" id="other"/></shape>'
+    body = SHAPES["ply"] + group + "".join(f'<shape type="instance" id="{name}"><ref id="g"/></shape>' for name in "ij")
+    file, matrix = shape_scene(tmp_path, body), turned()
+    written = write(file, tmp_path, transforms={"i.part": matrix, "i.other": matrix})
+    assert not written.notes
+    again = read(written)
+    np.testing.assert_allclose(np.array(again["i.to_world"].matrix).reshape(4, 4), matrix, atol=1e-6)
+    np.testing.assert_allclose(np.array(again["j.to_world"].matrix).reshape(4, 4), np.eye(4), atol=1e-6)

@@ -12,10 +12,11 @@ from PIL import Image
 
 from shadowmap_dr import Renderer
 from shadowmap_dr.errors import ShadowmapError
-from shadowmap_dr.fitting import Vary, prepared
+from shadowmap_dr.fitting import Vary, fit, prepared, write_fit
 from shadowmap_dr.fitting.resolve import Resolver
 from shadowmap_dr.fitting.scene_loading import load_scene
 from shadowmap_dr.io import assets
+from shadowmap_dr.io.images import write_image
 
 KEY = "wall.bsdf.reflectance.data"
 SCENE = """<scene version="3.0.0">
@@ -87,3 +88,31 @@ def test_grey_textures_of_coloured_pictures(file: Path, coloured: bool) -> None:
     result = prepared(file, picture, ["wall.bsdf:texture"], steps=120).run()
     words = "wall.bsdf has one channel, so that it is grey, and the picture has colours: give it three channels."
     assert (words in result.words) == coloured and result.found != coloured
+
+
+def test_files_in_other_folders(file: Path) -> None:
+    """``path`` says where they are, also with the value of a parameter."""
+    (file.parent / "pictures").mkdir()
+    (file.parent / "wall.png").rename(file.parent / "pictures" / "wall.png")
+    text = SCENE.replace("<default", '<default name="folder" value="none"/><path value="$folder"/><default', 1)
+    (file.parent / "none").mkdir()
+    file.write_text(text)
+    scene = load_scene(file, {"folder": "pictures"})
+    assert np.shape(mi.traverse(scene)[KEY])[:2] == (8, 8)
+    with pytest.raises(ShadowmapError, match="wall.png"):
+        load_scene(file)
+
+
+def test_pixels_of_a_sky(file: Path) -> None:
+    """They are fitted without recordings, since Mitsuba reads them back, and are written."""
+    pixels = np.random.default_rng(0).uniform(0.2, 1, (4, 8, 3)).astype(np.float32)
+    sky = '<emitter type="envmap" id="sky"><string name="filename" value="{}"/></emitter></scene>'
+    for name, picture in (("true", pixels), ("grey", np.full_like(pixels, 0.5))):
+        write_image(file.parent / f"{name}.exr", picture)
+        (file.parent / f"{name}.xml").write_text(SCENE.replace("</scene>", sky.format(f"{name}.exr")))
+    direct, files = mi.load_dict({"type": "direct"}), [file.parent / f"{name}.xml" for name in ("true", "grey")]
+    seen, before = (np.array(mi.render(load_scene(one), spp=256, integrator=direct)) for one in files)
+    result = fit(files[1], seen[..., :3], ["sky.data:texture"], steps=60, starts=1)
+    write_fit(result, file.parent / "out")
+    after = np.array(mi.render(load_scene(file.parent / "out" / "scene.xml"), spp=256, integrator=direct))
+    assert np.abs(after - seen).mean() < 0.3 * np.abs(before - seen).mean()

@@ -201,7 +201,7 @@ def test_instances_of_several_groups(variant: str, kinds: tuple[str, ...]) -> No
             node.set_id("")
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
-        found = [(name, shape.class_name().lower()) for name, shape, _ in scene_module._shapes_of(scene)]
+        found = [(name, shape.class_name().lower()) for name, shape, _ in scene_module.named_shapes(scene)]
         assert not dr.kernel_history()
     assert [name for name, _ in found] == [f"copy{k}.shape{k % 3}" for k in range(6)]
     if len(set(kinds)) > 1:

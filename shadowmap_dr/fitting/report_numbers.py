@@ -78,7 +78,8 @@ def correlations(result: FitResult) -> str:
     more = len(pairs) - _MOST_SENTENCES
     shown += f"<li>So have {more} further {'pair' if more == 1 else 'pairs'}.</li>" if more > 0 else ""
     words = (
-        f"<p>The pictures hardly tell these numbers apart; a target from another side, or fewer things that vary, would:</p>"
+        f"<p>The pictures tell combinations of these numbers better than each one alone. Intervals include that; a target from "
+        f"another side, or fewer things that vary, would make them narrower:</p>"
         f"<ul>{shown}</ul>"
         if pairs
         else f"<p>No two numbers have a correlation above {STRONG}: the pictures tell all of them apart.</p>"

@@ -145,7 +145,7 @@ def test_a_loop_of_pytorch_finds_a_pose(renderer: sdr.Renderer) -> None:
 def test_what_is_refused(renderer: sdr.Renderer) -> None:
     for entries, words in (
         (["bal:pose"], "no object or value 'bal'"),
-        (["ball:vertices"], "textures and vertices are tensors already"),
+        (["floor:vertices"], "textures and vertices are tensors already"),
         ([], "nothing varies"),
     ):
         with pytest.raises(ShadowmapError, match=words):

@@ -18,6 +18,8 @@ from .targets import Target
 _COVERED, _LEAST = 0.999, 0.5
 # Least difference between a pixel's colours in a picture with colours, as a share of its brightest value.
 _COLOURFUL = 0.02
+# Words in the names of Mitsuba's parameters that are colours.
+_COLOURS = ("reflectance", "color", "transmittance", "radiance")
 
 
 def as_seen(renderer: Renderer, targets: Sequence[Target]) -> tuple[Target, ...]:
@@ -31,14 +33,14 @@ def as_seen(renderer: Renderer, targets: Sequence[Target]) -> tuple[Target, ...]
 
 
 def colourless(textures: Sequence[TextureValues], targets: Sequence[Target]) -> list[str]:
-    """Sentences about textures of one channel, if pictures have colours."""
+    """Sentences about textures of colours that have one channel, if pictures have colours."""
     spreads = [float(np.max(target.weight * np.ptp(target.image, axis=2))) for target in targets]
     if max(spreads, default=0) < _COLOURFUL * max(float(target.image.max()) for target in targets):
         return []
     return [
         f"{texture.vary.name} has one channel, so that it is grey, and the picture has colours: give it three channels."
         for texture in textures
-        if texture.channels == 1
+        if texture.channels == 1 and any(word in texture.key for word in _COLOURS)
     ]
 
 

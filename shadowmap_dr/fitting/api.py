@@ -38,7 +38,8 @@ def fit(
     """Fit a scene to pictures: find poses, lights, materials, cameras, textures or vertices.
 
     Args:
-        scene: a scene, loaded with ``optimize=False`` so that shapes keep their names; a renderer of it; or a scene file.
+        scene: a scene, loaded with ``optimize=False`` so that shapes keep their names; a renderer of it; or a scene file. Its
+            objects without an id get one: ``shape_0``, ``light_0``, ``camera_0``.
         targets: a picture of the scene's first sensor, several of the first, second, ... sensor, or a mapping from numbers of
             sensors. A picture is a file (sRGB, or OpenEXR: linear), an array of linear colours (H, W, 3), or a
             :class:`~shadowmap_dr.fitting.targets.Target`, which has a mask and a known exposure.

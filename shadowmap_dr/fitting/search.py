@@ -113,9 +113,7 @@ class Fit:
         self.parameters += factors
         functions = {"residuals": residuals, "loss": loss}
         self._own_settings = {key: function_name(one) for key, one in functions.items() if one is not None}
-        self._low, self._high, prior = _bounds(self.parameters, self.gains)
-        given = [[one.vary.low is not None, one.vary.high is not None] for one in self.parameters for _ in one.labels]
-        self._given = np.array(given + [[False, False]] * (len(self._low) - len(given)), bool).reshape(-1, 2)
+        self._low, self._high, prior, self._given = _bounds(self.parameters, self.gains)
         side = min(options.resolution, max(max(target.width, target.height) for target in targets))
         levels = qualities(side, options.spp, renderer.settings.shadow.resolution)
         pictures = self.parameters, self.arrays, self.targets, self.gains
@@ -462,9 +460,11 @@ class Fit:
         return frames
 
 
-def _bounds(parameters: Sequence[Parameter], gains: Sequence[Gain]) -> tuple[Array, Array, Array]:
-    """(lower bounds, upper bounds, standard deviations of priors), all (n,), in the fit's own numbers."""
+def _bounds(parameters: Sequence[Parameter], gains: Sequence[Gain]) -> tuple[Array, Array, Array, npt.NDArray[np.bool_]]:
+    """(lower bounds, upper bounds, standard deviations of priors), all (n,), in the fit's own numbers; and which of the lower and
+    upper bounds are the user's (n, 2)."""
     low, high, prior = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)]
+    given = list[tuple[bool, bool]]()
     for parameter in parameters:
         vary, scale, count = parameter.vary, parameter.scale, len(parameter.labels)
         least = parameter.natural[0] if vary.low is None else vary.low
@@ -480,12 +480,14 @@ def _bounds(parameters: Sequence[Parameter], gains: Sequence[Gain]) -> tuple[Arr
         low.append(np.broadcast_to(scale.number(least) if np.isfinite(least) else -np.inf, count))
         high.append(np.broadcast_to(scale.number(most) if np.isfinite(most) else np.inf, count))
         unit = np.abs(scale.shown(np.zeros(count)) if scale.logarithmic else scale.factor)
+        given += [(vary.low is not None, vary.high is not None)] * count
         prior.append(np.full(count, np.inf) if vary.prior is None else np.maximum(vary.prior / unit, _TIGHTEST))
     for gain in gains:
         low.append(np.array([-8.0] * gain.colours + [-0.95] * gain.vignetting))
         high.append(np.array([8.0] * gain.colours + [1.0] * gain.vignetting))
+        given += [(False, False)] * gain.count
         prior.append(np.full(gain.count, np.inf))
-    return np.concatenate(low), np.concatenate(high), np.concatenate(prior)
+    return np.concatenate(low), np.concatenate(high), np.concatenate(prior), np.array(given, bool).reshape(-1, 2)
 
 
 def _check_functions(residuals: OwnFunction | None, loss: OwnFunction | None, *, numbers: bool) -> None:

@@ -130,7 +130,7 @@ def read_target(
     pixels = read_pixels(path)
     if saturation is None:
         saturation = np.inf if pixels.dtype == np.float32 else SATURATED
-    return _with_opaque(pixels, mask, sensor, str(path), saturation, longer_side, exposure)
+    return _target(pixels, mask, sensor, str(path), saturation, longer_side, exposure)
 
 
 def make_target(
@@ -171,7 +171,7 @@ def make_target(
     if values.shape[2] < 4:
         colours = np.broadcast_to(values, (*values.shape[:2], 3))
         values = np.concatenate([colours, np.ones_like(values[..., :1])], axis=-1)
-    return _with_opaque(values, mask, sensor, name, saturation, longer_side, exposure)
+    return _target(values, mask, sensor, name, saturation, longer_side, exposure)
 
 
 def short_names(targets: Sequence[Target]) -> list[str]:
@@ -206,24 +206,6 @@ def is_same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
 # ------------------------------------------------------------------------------------------------------------------- pixels
 
 
-def _with_opaque(
-    pixels: npt.NDArray[Any],
-    mask: str | os.PathLike[str] | npt.ArrayLike | None,
-    sensor: int,
-    name: str,
-    saturation: float,
-    longer_side: int,
-    exposure: float,
-) -> Target:
-    """A target of pixels as :func:`read_pixels` returns them; of linear ones with alpha, beside its opaque self."""
-    arguments = mask, sensor, name, saturation, longer_side
-    target = replace(_target(pixels, *arguments), exposure=exposure)
-    if pixels.dtype != np.float32 or not (pixels[..., 3] < 1).any():
-        return target
-    colours = np.concatenate([pixels[..., :3], np.ones_like(pixels[..., :1])], axis=-1)
-    return replace(target, opaque=replace(_target(colours, *arguments), exposure=exposure))
-
-
 def _target(
     pixels: npt.NDArray[Any],
     mask: str | os.PathLike[str] | npt.ArrayLike | None,
@@ -231,6 +213,7 @@ def _target(
     name: str,
     saturation: float,
     longer_side: int,
+    exposure: float,
 ) -> Target:
     """A target of pixels as :func:`read_pixels` returns them."""
     if not saturation > 0:
@@ -260,7 +243,11 @@ def _target(
             f"{100 * count / (height * width):.0f} % of them are {what}" for what, count in without.items() if count
         )
         raise ShadowmapError(f"{name}: no pixel counts; {found}. Give another picture or mask (white counts).")
-    return Target(image, weight, sensor, name)
+    target = Target(image, weight, sensor, name, exposure)
+    if curve is not None or not (pixels[..., 3] < 1).any():
+        return target
+    colours = np.concatenate([pixels[..., :3], np.ones_like(pixels[..., :1])], axis=-1)
+    return replace(target, opaque=_target(colours, mask, sensor, name, saturation, longer_side, exposure))
 
 
 def _weighted(

@@ -26,6 +26,7 @@ KINDS = {
 }
 _WITH_AXES = ("rotation", "translation", "position")
 _OPTIONS = {"min": "low", "max": "high", "prior": "prior", "spread": "spread"}
+_PUNCTUATION = "A name with a colon or a comma goes into fit.toml, as name = ..."
 # Largest size of numbers: squares of such colours are numbers in single precision.
 _LARGEST = 1e12
 
@@ -66,8 +67,7 @@ class Vary:
         if self.kind and self.kind not in KINDS:
             known = ", ".join(KINDS)
             raise ShadowmapError(
-                f"{self.named}: there is no kind {quoted(self.kind)}: choose from {known}.{did_you_mean(self.kind, KINDS)} "
-                "Names with a colon go into fit.toml."
+                f"{self.named}: there is no kind {quoted(self.kind)}: choose from {known}.{did_you_mean(self.kind, KINDS)}"
             )
         if self.axes and self.kind not in _WITH_AXES:
             raise ShadowmapError(f"{self.named}: only {', '.join(_WITH_AXES)} have axes.")
@@ -112,13 +112,18 @@ class Vary:
             if key not in _OPTIONS or not equals:
                 raise ShadowmapError(
                     f"vary {shortened(text)}: {quoted(option.strip())} is not understood: write {', '.join(_OPTIONS)} = a "
-                    "number. Names with a comma or a colon go into fit.toml."
+                    f"number. {_PUNCTUATION}"
                 )
             try:
                 values[_OPTIONS[key]] = float(value)
             except ValueError:
                 raise ShadowmapError(f"vary {shortened(text)}: {key} is {quoted(value)}; give a number.") from None
-        return cls(name, kind, axes, **values)
+        try:
+            return cls(name, kind, axes, **values)
+        except ShadowmapError as error:
+            if not kind or kind in KINDS:
+                raise
+            raise ShadowmapError(f"{error} {_PUNCTUATION}") from None
 
     @classmethod
     def of(cls, entry: str | Mapping[str, Any] | Vary) -> Vary:

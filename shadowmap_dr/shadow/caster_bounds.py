@@ -17,13 +17,11 @@ from .light_camera import Views, of_map
 SUNK, SUNK_UNSEEN = 0.1, 0.95
 #: Distance from a floor's border that a shape on the floor keeps, as a fraction of the floor's size.
 BORDER = 0.01
-_Ends = tuple[Sequence[Float], Sequence[Float]]
-# Most cameras of which it is asked what floors hide from them.
-_MOST_EYES = 4
-# Rounding of places on a plane, as a fraction of its extent.
-_SLACK = 1e-3
 #: Distance at which shapes touch: a fraction of the smaller one's size, plus (for rounding) a fraction of their coordinates.
 TOUCH, ROUNDING = 1e-4, 1e-6
+# Most cameras of which it is asked what floors hide from them; rounding of places on a plane, as a fraction of its extent.
+_MOST_EYES, _SLACK = 4, 1e-3
+_Ends = tuple[Sequence[Float], Sequence[Float]]  # lowest and highest corner of a box
 
 
 @dataclass(frozen=True)
@@ -203,10 +201,10 @@ def _hides(eye: Sequence[Float], n: Sequence[Float], p: Sequence[Float], own: _E
     for corner in range(8):
         place = [box[corner >> c & 1][c] for c in range(3)]
         depth = -_dot(n, [place[c] - p[c] for c in range(3)])
-        inside = type(hides)(True)
+        # Where the way to the camera passes through the plane, times a positive number.
+        weight = height + eye[3] * depth
+        inside = backend(height).Bool(True)
         for c in range(3):
-            # Where the way to the camera passes through the plane, times a positive number.
-            weight = height + eye[3] * depth
             through = place[c] * height + eye[c] * depth
             border = BORDER * (own[1][c] - own[0][c])
             room = dr.abs(n[c]) * slack

@@ -115,8 +115,9 @@ def has_neighbours(settings: ShadowSettings, view: Views, frustum: Frusta, u: Fl
     at borders where a light ends, or a face of a cube.
     """
     texels = min(settings.filter_size + 1, _RING)
-    ring = float_input(backend(u), "ring", texels / settings.resolution)
-    found = type(dr.detach(u) > 0)(True)
+    module = backend(u)
+    ring = float_input(module, "ring", texels / settings.resolution)
+    found = module.Bool(True)
     for place, centre, half in ((u, frustum.center_x, frustum.half_x), (v, frustum.center_y, frustum.half_y)):
         ends = dr.abs(centre) + half >= _LIMIT * view.limit
         found &= ends | (dr.abs(dr.detach(place)) <= 1 - ring)

@@ -493,29 +493,3 @@ def test_materials_that_recordings_cannot_change(material: dict[str, Any], names
     table = mi.traverse(start.data.scene)
     for name in grey:
         np.testing.assert_allclose(np.array(table[f"box.bsdf.{name}.value"]).ravel(), 0.5)
-
-
-def test_black_pictures_are_refused() -> None:
-    """With an exposure of nothing, anything is like them."""
-    with pytest.raises(ShadowmapError, match="is black where it counts"):
-        fit(scene(), np.zeros((36, 48, 3)), ["box:pose"], exposure=True)
-
-
-def test_numbers_at_bounds_are_named(picture: Image) -> None:
-    result = fit(scene(), picture, ["sun.irradiance:brightness,min=1.2,max=2", "box:translation:x,max=0.5"], starts=1)
-    assert [words for words in result.words if " at its " in words] == [
-        "sun.irradiance:brightness is at its min: the pictures ask for less."
-    ]
-
-
-def test_other_fits_are_not_gone_on_with(picture: Image) -> None:
-    """Of another scene, a mirrored picture, another exposure of it."""
-
-    def of(image: Any = picture, **parts: Any) -> str:
-        return prepared(scene(**parts), image, ["box:pose"])._fingerprint()
-
-    same = of()
-    assert of() == same
-    others = [of(picture[:, ::-1].copy()), of(box=box(0.3)), of(sun=sun(irradiance={"type": "rgb", "value": 2.5}))]
-    others += [of(make_target(picture, exposure=2.0)), of(camera=camera(film=SIZE, fov=46))]
-    assert same not in others and len(set(others)) == len(others)

@@ -266,7 +266,7 @@ def test_within_a_frozen_function(variant: str) -> None:
 def test_replays_leave_materials_as_they_are(variant: str, material: str) -> None:
     """``params.update()`` tells those objects alone that have changed.
 
-    Before, all materials had new arrays after each replay: rough plastic took 90 ms in each update, and ``principled`` switched
+    Before, all materials had new arrays after each replay: rough plastic took 70 ms in each update, and ``principled`` switched
     all its lobes on, so that later images under a sky were others.
     """
     sky = {"type": "constant", "radiance": {"type": "rgb", "value": 0.5}}

@@ -338,9 +338,13 @@ def from_sensor(sensor: Any) -> Camera:  # Any: a sensor of any variant, or a re
     Raises:
         ShadowmapError: Another kind of sensor; a transformation that scales or mirrors.
     """
-    from ..scene.sensor import Sensor, sensors_of
+    from ..scene.sensor import Sensor, check_film, sensors_of
 
-    records = (sensor,) if isinstance(sensor, Sensor) else sensors_of(sensor)
+    if isinstance(sensor, Sensor):
+        records: tuple[Sensor, ...] = (sensor,)
+    else:
+        records = sensors_of(sensor)
+        check_film(sensor)
     record = records[0]
     if len(records) > 1 or record.kind != "perspective":
         raise ShadowmapError(f"Sensor {record.name!r} is no single perspective camera: K, R and t describe only those.")

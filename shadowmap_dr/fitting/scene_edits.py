@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import mitsuba as mi
 import numpy as np
 
+from ..scene.transforms import is_transform
 from .changes import Array
 from .parsed_scene import ParsedScene
 from .xml_text import Element, XmlText
@@ -66,11 +67,6 @@ def matrix_of(value: Any) -> Array:  # Any: a transformation of Mitsuba's, or an
     if matrix.shape not in ((4, 4), (3, 3)):
         raise Unwritable(f"its shape {matrix.shape} is not (4, 4)")
     return matrix
-
-
-def is_transform(value: Any) -> bool:  # Any: parameters have values of all kinds
-    """True if a value is a transformation. Not by its ``matrix``: Dr.Jit's vectors have that, too, as letters of coordinates."""
-    return "Transform" in type(value).__name__
 
 
 def is_close(found: Array, expected: Array, tolerance: float = TOLERANCE) -> bool:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import mitsuba as mi
 
 from ..jit.handover import NO_RESULTS, PackedResults
+from ..jit.pytree import with_fields
 from ..rendering.renderer import Renderer
 from ..rendering.waiting import MOST_SAMPLES
 from ..scene.mitsuba_objects import Parameter, parameters_named
@@ -82,4 +83,4 @@ class HandedResults:
             # Attributes of meshes may be removed, and what was known of them with it.
             if not any(isinstance(parameter.node, mi.Shape) for parameter in found.values()):
                 self._renewed = found
-        self._images = [replace(one, scene=after) if one.scene.same(before) else one for one in self._images]
+        self._images = [with_fields(one, scene=after) if one.scene.same(before) else one for one in self._images]

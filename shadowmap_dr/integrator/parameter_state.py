@@ -9,12 +9,23 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ..jit.pytree import cached_by_type
 from ..jit.types import AnyArray
 from ..scene.changes import leaves
 from ..scene.mitsuba_objects import parameters
+from ..scene.transforms import is_transform
 
 # Bits of the number of a variable, above which that of its AD variable lies.
 _AD = 32
+# Roles of parameters: Python's numbers and other objects, transformations, other arrays.
+_VALUE, _TRANSFORM, _ARRAY = range(3)
+
+
+@cached_by_type
+def _role_of(kind: type) -> int:
+    if is_transform(kind):
+        return _TRANSFORM
+    return _ARRAY if dr.is_array_v(kind) else _VALUE
 
 
 @dataclass(frozen=True)
@@ -45,7 +56,8 @@ class ParameterState:
         held: list[AnyArray] = []
         array = mi.Float
         for name, value in values.items():
-            if isinstance(value, array):  # most are: these few lines are the fastest way
+            kind = type(value)
+            if kind is array:  # most are: these few lines are the fastest way
                 if not value.index_ad:
                     held.append(array(value))
                     numbers[name] = (value.index,)
@@ -57,10 +69,12 @@ class ParameterState:
                 else:
                     numbers[name] = (value.index,)
                 continue
-            value = getattr(value, "matrix", value)
-            if not dr.is_array_v(value):
+            role = _role_of(kind)
+            if role == _VALUE:
                 numbers[name] = (value,)
                 continue
+            if role == _TRANSFORM:
+                value = value.matrix
             if not dr.is_jit_v(value):
                 numbers[name] = tuple(map(tuple, leaves(type(value)(value))))
                 continue
@@ -79,6 +93,13 @@ class ParameterState:
         new = self._of_values(values)
         attached = tuple(name for name in self.numbers if name in (new.attached if name in values else self.attached))
         return ParameterState(self.numbers | new.numbers, attached, self.held + new.held)
+
+    def same_but_for(self, other: ParameterState, names: frozenset[str]) -> bool:
+        """True if at most the parameters in ``names`` differ."""
+        return self.numbers == other.numbers or (
+            self.numbers.keys() == other.numbers.keys()
+            and all(keys == other.numbers[name] for name, keys in self.numbers.items() if name not in names)
+        )
 
     def same(self, other: ParameterState, names: Iterable[str] | None = None) -> bool:
         """True if parameters (all, or those in ``names``) are the same in both."""

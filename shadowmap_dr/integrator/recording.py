@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from itertools import count
 from typing import Any
 
 import drjit as dr
-import mitsuba as mi
 
 from ..jit.arrays import own_memory
 from ..jit.call_data import restored_scalars
 from ..jit.frozen import Frozen
 from ..jit.handover import NO_RESULTS, PackedResults, keeping, using
-from ..jit.pytree import attached_places, tree_map
+from ..jit.pytree import arrays_of, attached_places, tree_map, with_fields
 from ..jit.types import AnyArray, TensorXf
 from ..rendering.extended_lights import SoftFrusta
 from ..rendering.renderer import Renderer
@@ -31,7 +29,7 @@ class FrozenPasses:
     """
 
     def __init__(self) -> None:
-        self._image, self._gradients = Frozen(_image), Frozen(_gradients)
+        self._image, self._gradients = Frozen(_image, evaluated=True), Frozen(_gradients, evaluated=True)
 
     def image(self, spp: int, renderer: Renderer, keep: bool) -> tuple[TensorXf, Frusta | None, SoftFrusta, PackedResults]:
         """(detached image, frusta of the shadow maps, frusta of extended lights' shadow maps, results for the backward pass).
@@ -102,7 +100,7 @@ def _gradients(
         return leaf
 
     found = dict(zip(fields, tree_map(_fields_of(renderer.data, fields), attached), strict=True))
-    renderer = renderer.with_data(replace(renderer.data, **found))
+    renderer = renderer.with_data(with_fields(renderer.data, **found))
     with restored_scalars():
         with using(results.unpacked()):
             image = renderer.render(spp=spp)
@@ -114,12 +112,15 @@ def _fields_of(data: SceneData, fields: tuple[str, ...]) -> tuple[Any, ...]:  # 
     return tuple(getattr(data, field) for field in fields)
 
 
-def plain(renderer: Renderer, known: Mapping[str, Any] | None = None) -> Renderer:  # Any: fields of different types
+def plain(
+    renderer: Renderer,
+    known: Mapping[str, Any] | None = None,  # Any: fields of different types
+    rest: SceneData | None = None,
+) -> Renderer:
     """A renderer with detached data, of which one recording serves all cameras of one kind.
 
-    All numbers are evaluated copies: a recording would include constants, and also the fact that a camera shares its arrays with
-    a sensor of the scene. ``known``: the :data:`PARTS` of the result that an earlier call has made
-    from the same records.
+    All numbers are evaluated: a recording would include constants. ``known``: :data:`PARTS` of an earlier result, made from the
+    same records. ``rest``: the data of an earlier result, if all of its other fields are to be the same.
     """
     arrays: list[AnyArray] = []
 
@@ -128,22 +129,22 @@ def plain(renderer: Renderer, known: Mapping[str, Any] | None = None) -> Rendere
         arrays.append(dr.detach(array) if dr.grad_enabled(array) else array)
         return arrays[-1]
 
+    def own(array: AnyArray) -> AnyArray:
+        # Another object: a replay may write into its arguments, and these belong to Mitsuba's sensor.
+        arrays.append(dr.detach(array))
+        return arrays[-1]
+
     data, parts = renderer.data, dict(known or {})
     if "sensors" not in parts:
-        one = dr.opaque(mi.Float, 1)  # Dr.Jit optimises a product with the literal 1 away
-
-        def copied(array: AnyArray) -> AnyArray:
-            arrays.append(dr.detach(array) * one)
-            return arrays[-1]
-
-        copies = tree_map(data.sensors, copied)
-        parts["sensors"] = tuple(tuple(replace(camera, name="") for camera in cameras) for cameras in copies)
+        sensors = tree_map(data.sensors, own)
+        parts["sensors"] = tuple(tuple(with_fields(camera, name="") for camera in cameras) for cameras in sensors)
     for part in PARTS:
         if part not in parts:
             parts[part] = tree_map(getattr(data, part), kept)
-    nothing: dict[str, Any] = dict.fromkeys(PARTS)
-    rest = tree_map(replace(data, **nothing), kept)
-    renderer = replace(renderer, data=replace(rest, **parts))
+    if rest is None:
+        nothing: dict[str, Any] = dict.fromkeys(PARTS)
+        rest = tree_map(with_fields(data, **nothing), kept)
+    renderer = with_fields(renderer, data=with_fields(rest, scene=data.scene, **parts))
     # The arrays alone: Dr.Jit would walk through the scene, too.
-    dr.make_opaque(arrays, renderer.frusta, renderer.soft_frusta)
+    dr.make_opaque(arrays, arrays_of((renderer.frusta, renderer.soft_frusta)))
     return renderer

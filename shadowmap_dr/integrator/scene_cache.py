@@ -13,6 +13,7 @@ import numpy as np
 from ..errors import ShadowmapError, warn
 from ..jit.frozen import take_apart
 from ..jit.gc import gc_paused
+from ..jit.pytree import with_fields
 from ..jit.types import AnyArray, Float, PyTree, TensorXf, UInt32
 from ..rendering.extended_lights import SkyWatch, SoftFrusta, still_aimed
 from ..rendering.light_loops import MANY_LIGHTS
@@ -24,7 +25,7 @@ from ..scene.changes import MirrorWatch, ParameterWatch
 from ..scene.geometry import NOT_READ
 from ..scene.load import SceneData, load, refresh, with_positions
 from ..scene.mitsuba_objects import parameters
-from ..scene.sensor import lenses_of, sensors_of
+from ..scene.sensor import check_film, lenses_of, sensors_of
 from ..scene.unsupported import warn_of
 from ..scene.untracked import UntrackedValues
 from ..shadow import Frusta
@@ -103,7 +104,7 @@ class SceneCache:
     recordable: dict[tuple[str, ...], bool] = field(default_factory=dict)
     steady: SteadySteps = field(default_factory=SteadySteps)
     untracked: UntrackedValues = field(default_factory=lambda: UntrackedValues(()))
-    untracked_then: tuple[object, ...] = ()
+    untracked_then: object = ()
     colours: ParameterWatch | None = None
     sky: SkyWatch = field(default_factory=lambda: SkyWatch(()))
     mirrors: MirrorWatch = field(default_factory=lambda: MirrorWatch(()))
@@ -113,6 +114,7 @@ class SceneCache:
     matched: ParameterState | None = None
     handed: HandedResults = field(default_factory=HandedResults)
     reader: SceneReader = field(default_factory=SceneReader)
+    _rest: tuple[SceneData, SceneData] | None = None
     _taken: tuple[Renderer, tuple[str, list[PyTree]]] | None = None
 
     # All that Dr.Jit is to know of, instead of the fields: it looks twice for each image.
@@ -136,6 +138,7 @@ class SceneCache:
         with dr.suspend_grad(), gc_paused():
             data = load(scene, tessellation=tessellation, warn=warn)
             data = replace(data, sensors=(sensors_of(sensor), *data.sensors))
+            check_film(sensor)
             renderer = replace(Renderer.from_data(data, settings), untracked=None)
             sky, untracked = (
                 SkyWatch(data.environments),
@@ -156,7 +159,7 @@ class SceneCache:
         data = self.renderer.data
         if not same_objects(self.parts, _parts(scene, data)):
             return False
-        if self.matched is not None and now.same(self.matched):
+        if self.matched is not None and now.same_but_for(self.matched, self.reader.of_cameras):
             return True
         fits = self._fits(scene, data)
         if fits and not dr.flag(dr.JitFlag.FreezingScope):
@@ -179,7 +182,7 @@ class SceneCache:
 
     def data(self, scene: mi.Scene, sensor: mi.Sensor) -> SceneData:
         """Records of the current scene with one sensor, attached to the scene's parameters."""
-        return refresh(replace(self.renderer.data, scene=scene), sensors=(sensor,))
+        return refresh(with_fields(self.renderer.data, scene=scene), sensors=(sensor,))
 
     def render(
         self, scene: mi.Scene, sensor: mi.Sensor, spp: int, now: ParameterState, inputs: DetachedInputs | None = None
@@ -232,14 +235,17 @@ class SceneCache:
     def try_to_replay(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, now: SceneState) -> TensorXf | None:
         """The same as :meth:`replay`; None, from now on, if the scene cannot be recorded."""
         try:
-            return self.replay(scene, sensor, spp, now)
+            return self.replay(scene, sensor, spp, now, self.steady.values)  # which were read just now
         except RuntimeError:
             self.steady.refuse()
             return None
 
-    def replay(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, now: SceneState) -> TensorXf:
-        """The same image, detached, replayed from a recording that the first call makes. ``now``: the current parameters."""
-        self._forget_stale_recordings()
+    def replay(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, now: SceneState, untracked: object = None) -> TensorXf:
+        """The same image, detached, replayed from a recording that the first call makes.
+
+        ``now``: the current parameters. ``untracked``: values that recordings do not see, if they are known.
+        """
+        self._forget_stale_recordings(untracked)
         with dr.suspend_grad():
             current = self._current(scene, sensor, now)
         self._check_vertices(current)
@@ -270,7 +276,7 @@ class SceneCache:
             if detached is None:
                 detached = self._plain(current)
             else:  # with the fit of the maps that the image has made
-                detached = replace(detached, frusta=current.frusta, soft_frusta=current.soft_frusta)
+                detached = with_fields(detached, frusta=current.frusta, soft_frusta=current.soft_frusta)
             self.recorded.backward(spp, gradient, current.data, detached, results, self.reader.fields(current.data))
             self.handed.follow(now.scene, scene)
         return self.recordable[attached]
@@ -298,16 +304,20 @@ class SceneCache:
             f"or leave the recording to the integrator's parameter 'recorded'."
         )
 
-    def _forget_stale_recordings(self) -> None:
-        """Drop the recordings if values of materials or lights that they do not see have changed."""
-        now = self.untracked.now()
+    def _forget_stale_recordings(self, now: object = None) -> None:
+        """Drop the recordings if values of materials or lights that they do not see have changed. ``now``: these, if known."""
+        now = self.untracked.now() if now is None else now
         if now != self.untracked_then:
             self.recorded, self.untracked_then = FrozenPasses(), now
 
     def _plain(self, current: Renderer) -> Renderer:
         """See :func:`plain`."""
-        detached = plain(current, self.reader.copies(current.data))
+        constant = self.renderer.data
+        rest = self._rest[1] if self._rest is not None and self._rest[0] is constant else None
+        detached = plain(current, self.reader.copies(current.data), rest)
         self.reader.copied(current.data, detached.data)
+        if rest is None and not (current.data.areas or current.data.environments):
+            self._rest = constant, _without_scene(detached.data)
         return detached
 
     def _current(self, scene: mi.Scene, sensor: mi.Sensor, now: SceneState | None = None) -> Renderer:
@@ -320,13 +330,15 @@ class SceneCache:
             self.renderer = self.renderer.with_updated_shading_edges()
             self.passes.forget_edges()
         kept = self.renderer
-        fits = ((frusta, soft_frusta) for known, frusta, soft_frusta in self.fits if known is sensor)
-        frusta, soft_frusta = next(fits, (kept.frusta, kept.soft_frusta))
+        found = next((fit for fit in self.fits if fit[0] is sensor), None)
+        _, frusta, soft_frusta = found or (sensor, kept.frusta, kept.soft_frusta)
         if now is None:
             data = self.data(scene, sensor)
         else:
-            data = self.reader.read(replace(kept.data, scene=scene), sensor, now.scene, now.camera)
-        return replace(kept, data=data, frusta=frusta, soft_frusta=soft_frusta)
+            data = self.reader.read(with_fields(kept.data, scene=scene), sensor, now.scene, now.camera)
+        if found is None:
+            check_film(sensor)
+        return with_fields(kept, data=data, frusta=frusta, soft_frusta=soft_frusta)
 
     def _check_vertices(self, current: Renderer) -> None:
         """Raise ShadowmapError for vertices that are not finite: their triangles and derivatives would silently vanish."""

@@ -40,6 +40,8 @@ class SceneReader:
     def __init__(self) -> None:
         self._names: dict[str, list[str]] = {}
         self._all: set[str] = set()
+        #: Names of parameters that nothing but cameras is read from.
+        self.of_cameras: frozenset[str] = frozenset()
         self._parts: dict[str, _Part] = {}
         self._copies: dict[str, tuple[Any, Any]] = dict.fromkeys(PARTS, _NONE)  # Any: as above
 
@@ -53,6 +55,8 @@ class SceneReader:
         """
         if scene.numbers.keys() != self._all:
             self._all, self._names, self._parts = set(scene.numbers), _names_by_part(data.scene), {}
+            shapes, lights, cameras = (frozenset(self._names[part]) for part in PARTS)
+            self.of_cameras = cameras - shapes - lights
         still: dict[str, Any] = {}
         keys: dict[str, list[Any]] = {}
         attached = set(scene.attached)

@@ -16,7 +16,7 @@ from typing import Any, cast
 import drjit as dr
 
 from .gc import gc_paused
-from .pytree import ArrayTuple, StaticTuple, cached_by_type, fields_of, tree_map
+from .pytree import ArrayTuple, StaticTuple, arrays_of, cached_by_type, fields_of, tree_map
 from .types import AnyArray, PyTree
 
 # Attribute of a record in which its findings are stored.
@@ -52,21 +52,23 @@ class Frozen:
     stored when it is recorded, but not when it is replayed.
     """
 
-    def __init__(self, function: Callable[..., PyTree]) -> None:
+    def __init__(self, function: Callable[..., PyTree], *, evaluated: bool = False) -> None:
+        """Wrap a function. ``evaluated``: whether all arrays among its arguments will be evaluated."""
         call = _Call(function)
 
         def recorded(key: str, leaves: list[PyTree]) -> tuple[str, list[AnyArray]]:
             return call.run()
 
-        self._call, self._recorded = call, dr.freeze(recorded)
+        self._call, self._recorded, self._evaluated = call, dr.freeze(recorded), evaluated
 
     def __call__(self, *arguments: PyTree) -> PyTree:
         call = self._call
         call.arguments = arguments
         try:
             key, leaves = take_apart(arguments)
-            # Dr.Jit distinguishes evaluated and unevaluated inputs, and would record once for each.
-            dr.eval([leaf for leaf in leaves if dr.is_array_v(leaf)])
+            if not self._evaluated:
+                # Dr.Jit distinguishes evaluated and unevaluated inputs, and would record once for each.
+                dr.eval([leaf for leaf in leaves if dr.is_array_v(leaf)])
             with gc_paused():
                 number, arrays = self._recorded(key, leaves)
         finally:
@@ -91,13 +93,7 @@ class _Call:
     def run(self) -> tuple[str, list[AnyArray]]:
         """Call the function; returns (index of its result in ``results``, arrays of the result)."""
         result = self.function(*self.arguments)
-        arrays: list[AnyArray] = []
-
-        def collect(array: AnyArray) -> AnyArray:
-            arrays.append(array)
-            return array
-
-        tree_map(result, collect)
+        arrays = arrays_of(result)
         # Empty arrays take the place of the result's own, which would stay in memory.
         self.results.append(tree_map(result, lambda array: type(array)()))
         return str(len(self.results) - 1), arrays

@@ -17,7 +17,7 @@ import drjit as dr
 from .arrays import interleave, replace_grad
 from .frozen import take_apart
 from .packets import apart, packed
-from .pytree import ArrayTuple, tree_map
+from .pytree import ArrayTuple, arrays_of, tree_map
 from .types import AnyArray, Float, PyTree
 
 ResultT = TypeVar("ResultT")
@@ -119,7 +119,7 @@ def computed(name: str, function: Callable[[], ResultT]) -> ResultT:
 def evaluated(name: str, tree: TreeT) -> TreeT:
     """Evaluate the arrays of a tree, or take their values from the first computation. Derivatives are those of the tree."""
     if _state.given is not None:
-        values = iter(_arrays(_next(name)))
+        values = iter(arrays_of(_next(name)))
         return tree_map(tree, lambda array: replace_grad(next(values), array))
     dr.eval(tree)
     if _state.kept is not None:
@@ -159,14 +159,3 @@ def _next(name: str) -> PyTree:
     if known != name:
         raise RuntimeError(f"the second computation needs {name} where the first one has {known}")
     return result
-
-
-def _arrays(tree: PyTree) -> list[PyTree]:
-    found: list[PyTree] = []
-
-    def collect(array: PyTree) -> PyTree:
-        found.append(array)
-        return array
-
-    tree_map(tree, collect)
-    return found

@@ -7,13 +7,14 @@ import functools
 import hashlib
 from collections.abc import Callable
 from itertools import count
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import drjit as dr
 
 from .types import AnyArray, PyTree
 
 ResultT = TypeVar("ResultT")
+RecordT = TypeVar("RecordT")
 # Roles of values in trees.
 _ARRAY, _ARRAYS, _TRANSFORM, _SEQUENCE, _MAPPING, _RECORD, _STRUCT, _OTHER = range(8)
 
@@ -52,10 +53,7 @@ def tree_map(value: PyTree, function: Callable[[AnyArray], AnyArray]) -> PyTree:
                 break
         else:
             return value
-        # Not `dataclasses.replace`, which takes several times as long, and checks values that were checked before.
-        copy = object.__new__(type(value))
-        vars(copy).update(new)
-        return copy
+        return _record_of(type(value), new)
     if role == _ARRAYS:
         return ArrayTuple(map(function, value))
     if role == _SEQUENCE:
@@ -70,6 +68,25 @@ def tree_map(value: PyTree, function: Callable[[AnyArray], AnyArray]) -> PyTree:
     for name in type(value).DRJIT_STRUCT:
         setattr(struct, name, tree_map(getattr(value, name), function))
     return struct
+
+
+def with_fields(record: RecordT, **values: Any) -> RecordT:  # Any: fields of different types
+    """A copy of a dataclass with other values of some fields.
+
+    For records that each step of a loop copies: ``dataclasses.replace`` takes five times as long, since it calls ``__init__``.
+    """
+    old = vars(record)
+    new = {name: old[name] for name in fields_of(type(record)) or ()}
+    if not new.keys() >= values.keys():
+        raise TypeError(f"{type(record).__name__} has no field {', '.join(values.keys() - new.keys())}.")
+    return _record_of(type(record), new | values)
+
+
+def _record_of(kind: type[RecordT], values: dict[str, Any]) -> RecordT:  # Any: as above
+    """A dataclass of these values, made without its ``__init__``."""
+    record = object.__new__(kind)
+    vars(record).update(values)
+    return record
 
 
 def cached_by_type(function: Callable[[type], ResultT]) -> Callable[[type], ResultT]:
@@ -103,6 +120,18 @@ def _role_of(kind: type) -> int:
     return _OTHER if getattr(kind, "DRJIT_STRUCT", None) is None else _STRUCT
 
 
+def arrays_of(tree: PyTree) -> list[AnyArray]:
+    """All arrays of a tree, in the order of :func:`tree_map`."""
+    found: list[AnyArray] = []
+
+    def collect(array: AnyArray) -> AnyArray:
+        found.append(array)
+        return array
+
+    tree_map(tree, collect)
+    return found
+
+
 def attached_arrays(record: PyTree) -> list[AnyArray]:
     """The attached arrays of a tree, in the order of :func:`tree_map`."""
     return attached_places(record)[1]
@@ -125,13 +154,7 @@ def attached_places(record: PyTree) -> tuple[tuple[int, ...], list[AnyArray]]:
 
 def attached_of(tree: PyTree, places: tuple[int, ...]) -> list[AnyArray]:
     """The arrays at some places of a tree, counted in the order of :func:`tree_map`."""
-    found: list[AnyArray] = []
-
-    def collect(array: AnyArray) -> AnyArray:
-        found.append(array)
-        return array
-
-    tree_map(tree, collect)
+    found = arrays_of(tree)
     return [found[place] for place in places]
 
 

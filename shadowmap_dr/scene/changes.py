@@ -11,6 +11,7 @@ import numpy as np
 
 from ..jit.types import AnyArray, Matrix4f
 from .mitsuba_objects import Parameter
+from .transforms import is_transform
 
 
 def fingerprint(value: Any) -> object:  # Any: parameters have values of all kinds
@@ -20,10 +21,10 @@ def fingerprint(value: Any) -> object:  # Any: parameters have values of all kin
     """
     if dr.is_array_v(value):
         return tuple(_Same(leaf) for leaf in leaves(dr.detach(value)))
-    matrix = getattr(value, "matrix", None)
-    if matrix is None:
+    if not is_transform(value):
         return repr(value)
-    return fingerprint(matrix) if dr.is_jit_v(matrix) else np.array(matrix).tobytes()
+    matrix = value.matrix
+    return fingerprint(matrix) if dr.is_jit_v(matrix) else matrix.numpy().tobytes()
 
 
 class _Same:

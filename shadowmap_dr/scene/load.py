@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from ..errors import ShadowmapError, UnsupportedShape, check_variant
 from ..jit.arrays import device_array
-from ..jit.pytree import StaticTuple
+from ..jit.pytree import StaticTuple, with_fields
 from ..jit.types import Float
 from .descriptions import Parts, describe_all
 from .few_shapes import FewShapes
@@ -28,7 +28,7 @@ from .lights.environment import Environment
 from .lights.read import Light, area_lights_of, check_directions, environments_of, lights_of
 from .mitsuba_objects import children, held_arrays, is_cosine, is_plain
 from .naming import names_of, unique
-from .sensor import Sensor, sensors_of
+from .sensor import Sensor, check_film, sensors_of
 from .shapes.sources import CurveSource, ShapeSource, source_of
 from .soup import Soup, Vertices
 from .unsupported import omissions_of, warn_of
@@ -212,6 +212,8 @@ def load(scene: mi.Scene, *, tessellation: int = 64, warn: bool = True) -> Scene
     if data.soup is None:
         data = replace(data, few=FewShapes(sources, [k for k, info in enumerate(infos) if info.planar or info.faceted]))
     data = refresh(data)
+    for sensor in scene.sensors():
+        check_film(sensor)
     if warn:
         shapes = [(info.name, source.shape) for info, source in zip(infos, sources, strict=True)]
         warn_of(omissions_of(scene, shapes, unsupported))
@@ -233,7 +235,7 @@ def refresh(
     """
     known, scene = known or {}, data.scene
     chosen = scene.sensors() if sensors is None else sensors
-    return replace(
+    return with_fields(
         data,
         geometry=known["geometry"] if "geometry" in known else _geometry_now(data),
         sensors=known["sensors"] if "sensors" in known else tuple(map(sensors_of, chosen, names_of(chosen, "camera"))),
@@ -249,7 +251,7 @@ def _geometry_now(data: SceneData) -> Geometry:
     changed = {*attached, *(moved or ())}
     # Not an empty array: one among the arguments of a frozen function ends the process (Dr.Jit 1.5).
     rest = vertices.rest if any(info.reads_attributes for info in data.geometry.shapes) else None
-    return replace(
+    return with_fields(
         data.geometry,
         positions=data.geometry.settled(vertices.positions),
         normals=vertices.normals,

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from ..errors import ShadowmapError, check_variant, mitsuba_message
 from ..jit.threads import second_thread
+from .transforms import is_transform
 
 #: A dictionary for ``mi.load_dict``: numbers, texts, arrays, transformations, dictionaries.
 Description: TypeAlias = Mapping[str, Any]
@@ -83,10 +84,10 @@ class _Packed:
     gamma: bool = False
 
 
-def _packed(value: object, place: str) -> Any:  # Any: a value of any type
+def _packed(value: Any, place: str) -> Any:  # Any: a value of any type
     if isinstance(value, Mapping):
         return {key: _packed(item, f"{place}.{key}" if place else str(key)) for key, item in value.items()}
-    if hasattr(value, "matrix") and hasattr(mi, type(value).__name__):
+    if is_transform(value):
         return _Packed("transform", np.array(value.matrix), type(value).__name__)
     if isinstance(value, mi.Bitmap):
         return _Packed("bitmap", np.array(value), value.pixel_format().name, value.srgb_gamma())

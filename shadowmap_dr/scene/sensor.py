@@ -246,8 +246,22 @@ def _cameras_of(batch: mi.Sensor) -> list[mi.Sensor]:
     return [child for _, child in children(batch) if isinstance(child, mi.Sensor)]
 
 
+def check_film(sensor: mi.Sensor) -> None:
+    """Raise ShadowmapError if the film of a ``mi.Sensor`` has pixels that cannot be rendered.
+
+    Once for each sensor is enough: a film never changes its format.
+    """
+    film = sensor.film()
+    if film.base_channels_count() not in (1, 2, 3, 4):
+        raise ShadowmapError(
+            f"The film of sensor '{sensor.id()}' has {film.base_channels_count()} channels: use pixel_format luminance or rgb."
+        )
+    if "pixel_format = xyz" in str(film):
+        raise ShadowmapError(f"The film of sensor '{sensor.id()}' stores XYZ, which is not supported: use pixel_format rgb.")
+
+
 def sensors_of(sensor: mi.Sensor, name: str = "") -> tuple[Sensor, ...]:
-    """Records of a ``mi.Sensor``: one, or one for each camera of a batch sensor, left to right.
+    """Records of a ``mi.Sensor`` (see :func:`check_film`): one, or one for each camera of a batch sensor, left to right.
 
     ``name``: of one that has no id.
     """
@@ -278,12 +292,6 @@ def _sensor_of(sensor: mi.Sensor, film: mi.Film, film_column: int, name: str = "
         raise ShadowmapError(
             f"Sensor '{sensor.id()}' ({sensor.class_name()}) is not supported: use perspective, orthographic or batch."
         )
-    if film.base_channels_count() not in (1, 2, 3, 4):
-        raise ShadowmapError(
-            f"The film of sensor '{sensor.id()}' has {film.base_channels_count()} channels: use pixel_format luminance or rgb."
-        )
-    if "pixel_format = xyz" in str(film):
-        raise ShadowmapError(f"The film of sensor '{sensor.id()}' stores XYZ, which is not supported: use pixel_format rgb.")
     values = parameters(sensor)
     window = sensor.film()  # for a camera of a batch sensor its own film, not the common one
     width, height = _pair(window.crop_size())

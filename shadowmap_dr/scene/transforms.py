@@ -1,10 +1,19 @@
-"""Parts of transformations."""
+"""Mitsuba's transformations: which objects are some, and their parts."""
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 
 from ..jit.types import Point3f, Vector3f
+
+
+def is_transform(value: object) -> bool:
+    """True for transformations of all of Mitsuba's types, scalar or not; ``value`` may be a type as well.
+
+    Dr.Jit's vectors have a ``matrix``, too: all names that end in x, y or z name components of theirs (``docs/dr-jit-faults``).
+    """
+    return not dr.is_array_v(value) and hasattr(value, "matrix")
 
 
 def translation(to_world: mi.Transform4f) -> Point3f:

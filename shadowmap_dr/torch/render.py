@@ -25,6 +25,7 @@ from ..rendering.extended_lights import SkyWatch, SoftFrusta, still_aimed
 from ..rendering.renderer import Renderer as _Renderer
 from ..rendering.waiting import MOST_SAMPLES, TEXELS
 from ..scene.sensor import Sensor
+from ..scene.transforms import is_transform
 from ..shadow import Frusta
 from .bridge import attached, drjit_turn, forward_derivatives, gradients, number, to_torch
 from .checks import check_devices, check_floats, check_kind, number_of
@@ -430,7 +431,7 @@ def _backward(
 
 def _shapes_of(what: str, value: Any) -> tuple[tuple[int, ...], ...]:  # Any: parameters have values of all kinds
     """Shapes of tensors that may replace a parameter."""
-    if _is_transform(value):
+    if is_transform(value):
         return ((4, 4),)
     if not dr.is_array_v(value) or not dr.is_float_v(value):
         raise ShadowmapError(f"{what} is a {type(value).__name__}, which no tensor can replace.")
@@ -441,19 +442,14 @@ def _shapes_of(what: str, value: Any) -> tuple[tuple[int, ...], ...]:  # Any: pa
     return ((1,), ()) if len(value) == 1 else ((len(value),),)
 
 
-def _is_transform(value: object) -> bool:
-    # By attribute, since Mitsuba has several types of transformations. But arrays have attributes of many names.
-    return not dr.is_array_v(value) and hasattr(value, "matrix")
-
-
 def _converted(old: Any, array: TensorXf) -> Any:  # Any: parameters have values of all kinds
     """A (checked) tensor converted to the type of the value that it replaces, attached."""
     if dr.is_tensor_v(old):
         return type(old)(array)
     flat = array.array
-    if not _is_transform(old) and dr.depth_v(old) == 1:
+    if not is_transform(old) and dr.depth_v(old) == 1:
         return type(old)(flat)
     numbers = [number(flat, k) for k in range(len(flat))]
-    if _is_transform(old):
+    if is_transform(old):
         return type(old)(mi.Matrix4f(*(numbers[4 * row : 4 * row + 4] for row in range(4))))
     return type(old)(*numbers)

@@ -63,6 +63,27 @@ def test_normals_that_come_later_and_go(variant: str) -> None:
     assert_noticed(scene, "floor.vertex_normals", lambda _: mi.Float([]))
 
 
+@pytest.mark.parametrize("recorded", [False, True])
+def test_single_numbers_of_a_colour(variant: str, recorded: bool) -> None:
+    """Red stays the same array. The images, and the derivatives by blue, are those of an integrator that has seen no other."""
+    scene, used = small_scene(), shadowmap(recorded=recorded)
+    params, red = mi.traverse(scene), dr.opaque(mi.Float, 0.5)
+    found = []
+    for k in range(3):
+        for integrator in (used, shadowmap()):
+            blue = dr.opaque(mi.Float, 0.5 + k)
+            dr.enable_grad(blue)
+            params["sun.irradiance.value"] = mi.Color3f(red, red, blue)
+            params.update()
+            rendered = mi.render(scene, params, integrator=integrator)
+            dr.backward(dr.mean(rendered, axis=None))
+            found.append((np.array(rendered), float(dr.grad(blue)[0])))
+    for (first, slope), (second, expected) in zip(found[::2], found[1::2], strict=True):
+        np.testing.assert_allclose(first, second, atol=1e-5)
+        assert slope == pytest.approx(expected, rel=1e-4) and expected > 0.01
+    assert np.abs(found[0][0] - found[-1][0]).max() > 0.2
+
+
 def test_a_sphere_that_is_mirrored(variant: str) -> None:
     """Mitsuba turns its normals over."""
     place = mi.ScalarTransform4f().translate([0, 0, 0.9])

@@ -41,6 +41,23 @@ def test_a_new_value_counts_even_if_it_is_equal(scene: mi.Scene, name: str) -> N
     assert after.same(before, [other for other in before.numbers if other != name])
 
 
+@pytest.mark.parametrize("number", range(3))
+def test_each_number_of_a_colour_counts(scene: mi.Scene, number: int) -> None:
+    """Whichever is given another value, and whichever carries gradients."""
+    name, params = "light.irradiance.value", mi.traverse(scene)
+    numbers = [dr.opaque(mi.Float, 0.5 + k) for k in range(3)]
+    params[name] = mi.Color3f(*numbers)
+    states = [ParameterState.of(scene)]
+    for is_attached in (False, True):
+        numbers[number] = dr.opaque(mi.Float, 0.25)
+        if is_attached:
+            dr.enable_grad(numbers[number])
+        params[name] = mi.Color3f(*numbers)
+        states.append(ParameterState.of(scene))
+        assert not states[-1].same(states[-2], [name])
+        assert states[-1].attached == ((name,) if is_attached else ())
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_attached_parameters(scene: mi.Scene, name: str) -> None:
     """They are told from the same numbers without gradients. What the state holds carries none."""

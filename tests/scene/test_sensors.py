@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 from shadowmap_dr import ShadowmapError
+from shadowmap_dr.cameras import from_sensor
+from shadowmap_dr.scene.load import load
 from shadowmap_dr.scene.sensor import sensors_of
 
 
@@ -132,6 +134,21 @@ def test_unsupported_sensor_is_named(variant: str) -> None:
     scene = mi.load_dict({"type": "scene", "probe": {"type": "distant", "film": one_pixel}})
     with pytest.raises(ShadowmapError, match="'probe'"):
         sensors_of(scene.sensors()[0])
-    sensor = mi.load_dict({"type": "scene", "eye": {"type": "perspective", "film": film(pixel_format="xyz")}}).sensors()[0]
+
+
+def test_unsupported_film_is_named(variant: str) -> None:
+    """In the scene, as a first image's own camera, and as one of later images, recorded or not."""
+    eye = {"type": "perspective", "film": film(pixel_format="xyz")}
+    ball: dict[str, object] = {"type": "scene", "ball": {"type": "sphere"}, "sun": {"type": "directional"}}
     with pytest.raises(ShadowmapError, match="'eye'.*rgb"):
-        sensors_of(sensor)
+        load(mi.load_dict(ball | {"eye": eye}))
+    scene = mi.load_dict(ball | {"near": {"type": "perspective", "film": film()}})
+    foreign = mi.load_dict({"type": "scene", "eye": eye}).sensors()[0]
+    with pytest.raises(ShadowmapError, match="'eye'.*rgb"):
+        from_sensor(foreign)
+    for recorded in (False, True):
+        integrator = mi.load_dict({"type": "shadowmap", "recorded": recorded})
+        for _ in range(2):
+            with pytest.raises(ShadowmapError, match="'eye'.*rgb"):
+                integrator.render(scene, sensor=foreign)
+            integrator.render(scene)

@@ -14,6 +14,7 @@ from PIL import Image
 from shadowmap_dr.fitting.changes import Changes
 from shadowmap_dr.fitting.scene_file import Written, write_fitted_scene
 from shadowmap_dr.jit.threads import second_thread
+from shadowmap_dr.scene.transforms import is_transform
 
 SCENES = Path(__file__).resolve().parents[2] / "scenes"
 FILM = '<film type="hdrfilm"><integer name="width" value="12"/><integer name="height" value="8"/></film>'
@@ -28,10 +29,6 @@ def scene(folder: Path, body: str, name: str = "source.xml", version: str = "3.0
 
 def write(file: Path, folder: Path, given: Mapping[str, str] | None = None, **changes: Any) -> Written:
     return write_fitted_scene(file, given or {}, Changes(**changes), folder / "out")
-
-
-def is_transform(value: Any) -> bool:
-    return "Transform" in type(value).__name__
 
 
 def numbers(value: Any) -> np.ndarray:

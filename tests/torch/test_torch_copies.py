@@ -58,6 +58,15 @@ def test_pickles_of_dictionaries_render_the_same(kind: Any) -> None:
     assert pickle.loads(pickle.dumps(again)) is not again
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_pickles_of_points_and_vectors(kind: Any) -> None:
+    """Mitsuba's own, of which Dr.Jit says that they have a matrix."""
+    stone = {"type": "sphere", "center": mi.ScalarPoint3f(0.5, -0.5, 0.4), "radius": 0.3}
+    more = {"stone": stone, "lamp": {"type": "directional", "direction": mi.ScalarVector3f(-0.5, 0.2, -1)}}
+    renderer = kind.from_dict(description(**more), **OPTIONS)
+    np.testing.assert_allclose(image(pickle.loads(pickle.dumps(renderer))), image(renderer), atol=1e-6)
+
+
 @pytest.mark.parametrize("frozen", [False, True])
 def test_pickles_keep_the_fit_of_shadow_maps(frozen: bool) -> None:
     renderer = sdr.Renderer.from_dict(description(), frozen=frozen, **OPTIONS)

@@ -19,7 +19,7 @@ from ..errors import ShadowmapError, check_variant
 from ..jit.call_data import restored_scalars
 from ..jit.frozen import Frozen
 from ..jit.handover import NO_RESULTS, PackedResults, keeping, using
-from ..jit.pytree import tree_map
+from ..jit.pytree import tree_map, with_fields
 from ..jit.types import TensorXf
 from ..rendering.extended_lights import SkyWatch, SoftFrusta, still_aimed
 from ..rendering.renderer import Renderer as _Renderer
@@ -70,7 +70,7 @@ class Renderer:
         self._device = _device_of(self._variant)
         with drjit_turn(self._device):
             self._sky = SkyWatch(renderer.data.environments)
-        self._frozen = (Frozen(_forward), Frozen(_backward)) if frozen else None
+        self._frozen = (Frozen(_forward, evaluated=True), Frozen(_backward, evaluated=True)) if frozen else None
 
     @classmethod
     @eager
@@ -329,7 +329,7 @@ class _Rendering:
     def _scene(self, arrays: list[TensorXf]) -> Iterator[_Renderer]:
         """Context with the renderer for this call, in which the scene has the parameters of this call."""
         # Fitting maps again to the same vertices changes no bit, so derivatives are those of the image.
-        renderer = replace(self.owner._renderer, **(self.fixed or (self.owner._planned if self.changes_scene else {})))
+        renderer = with_fields(self.owner._renderer, **(self.fixed or (self.owner._planned if self.changes_scene else {})))
         # Copies, since a replayed function writes into its arguments, which another image's backward pass may need.
         fits = (renderer.frusta, renderer.soft_frusta)
         renderer.frusta, renderer.soft_frusta = tree_map(fits, lambda array: type(array)(array))

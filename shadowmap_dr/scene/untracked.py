@@ -23,7 +23,7 @@ class UntrackedValues:
     They are shapes of tensors (an ``envmap`` stores its own), Python's numbers and Mitsuba's scalar transformations (``to_uv`` of
     a bitmap, ``eta`` of a plastic, ``scale`` of a bump map), and arrays that Mitsuba 3.9 does not show to Dr.Jit: textures inside
     bump maps, attributes of meshes, and the parameters of a ``sunsky``'s tables. Lobes of ``principled`` materials count too:
-    Mitsuba leaves out a lobe whose parameter is 0 at loading until the parameter is given another value.
+    Mitsuba leaves out a lobe whose parameter is 0 at loading until the parameter is given a value, be it 0 again.
 
     Args:
         nodes: Mitsuba's BSDFs, emitters, and shapes whose attributes are read. They are kept alive.
@@ -35,6 +35,7 @@ class UntrackedValues:
         self._held: list[tuple[mi.SceneParameters, str]] = []
         self._sized: list[tuple[mi.SceneParameters, str]] = []
         self._off: list[_Off] = []
+        self._switched: list[mi.BSDF] = []
         self._names: list[tuple[mi.Object, str]] = []
         if len(self._nodes) <= _FEW:
             self._look()
@@ -43,7 +44,8 @@ class UntrackedValues:
         """Find the values to read. Most scenes are never recorded and do without."""
         self._known = True
         for node in self._nodes:
-            table, switched = mi.traverse(node), _has_switches(node)
+            table, switched = mi.traverse(node), _switched(node)
+            self._switched += switched
             for key in table.keys():
                 with suppress(TypeError):  # raised for parameters without a value
                     value = table[key]
@@ -66,7 +68,8 @@ class UntrackedValues:
         if not self._known:
             self._look()
         shapes = (tuple(table[key].shape) for table, key in self._sized)
-        return (*(fingerprint(table[key]) for table, key in self._held), *shapes, *(value.still() for value in self._off))
+        lobes = (node.flags() for node in self._switched)
+        return (*(fingerprint(table[key]) for table, key in self._held), *shapes, *(value.still() for value in self._off), *lobes)
 
 
 class UntrackedState:
@@ -116,11 +119,12 @@ class _Off:
         return self._still
 
 
-def _has_switches(node: mi.Object) -> bool:
-    """True if a BSDF, or a BSDF inside it, has lobes that Mitsuba switches on when their parameters change."""
+def _switched(node: mi.Object) -> list[mi.BSDF]:
+    """Those among a BSDF and the BSDFs inside it with lobes that Mitsuba switches on when their parameters change."""
     if not isinstance(node, mi.BSDF):
-        return False
-    return node.class_name().startswith("Principled") or any(_has_switches(child) for _, child in children(node))
+        return []
+    own = [node] if node.class_name().startswith("Principled") else []
+    return [*own, *(found for _, child in children(node) for found in _switched(child))]
 
 
 def _is_tracked(node: mi.Object, key: str, value: object) -> bool:

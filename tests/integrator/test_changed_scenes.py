@@ -170,6 +170,19 @@ def test_recordings_do_not_hold_for_other_values(variant: str, name: str, key: s
         assert np.abs(expected - before).max() > 5e-3
 
 
+def test_lobes_that_are_switched_on_at_zero(variant: str) -> None:
+    """To Mitsuba, a ``principled`` whose ``spec_trans`` is 0 anew spreads light to its other side: skies below floors count."""
+    scene = small_scene(camera=camera(32), floor=floor(bsdf={"type": "principled"}), sky={"type": "constant"}, sun=None)
+    recorded, plain = (shadowmap(recorded=on, soft_map_resolution=32, environment_light_samples=8) for on in (True, False))
+    for _ in range(4):
+        image(scene, recorded)
+    before = image(scene, plain)
+    change(scene, "floor.bsdf.spec_trans.value", lambda v: mi.Float(v) + dr.opaque(mi.Float, 0))
+    expected = image(scene, plain)
+    np.testing.assert_allclose(image(scene, recorded), expected, atol=1e-4)
+    assert np.abs(expected - before).max() > 5e-3
+
+
 def test_unchanged_scenes_stay_recorded(variant: str) -> None:
     scene = small_scene(floor=floor(bsdf={"type": "bumpmap", "texture": bitmap(1), "bsdf": {"type": "plastic"}}), sun=sun())
     integrator = shadowmap(recorded=True)

@@ -30,7 +30,7 @@ MAY_IMPORT = {
     "scene.lights": ("errors", "jit", "shadow.light_camera"),
     "rendering": ("errors", "jit", "raster", "scene", "shadow"),
     "integrator": ("errors", "jit", "rendering", "scene", "shadow"),
-    "torch": ("errors", "fitting", "jit", "raster", "rendering", "scene.sensor", "shadow"),
+    "torch": ("errors", "fitting", "jit", "raster", "rendering", "scene.sensor", "scene.transforms", "shadow"),
     "inverse": ("errors", "io", "jit", "raster", "rendering", "scene.lights", "shadow"),
     "fitting": ("errors", "io", "jit", "raster", "rendering", "scene", "shadow"),
     "importing": ("errors", "io"),

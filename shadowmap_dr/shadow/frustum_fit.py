@@ -84,6 +84,7 @@ def fit_frusta(
     receiver_range: bool = True,
     tiles: Tiles | None = None,
     receives: Bool | None = None,
+    nearer: tuple[Bool, Bool] | None = None,
 ) -> Frusta:
     """Frusta that cover all possible casters of visible shadows, or the previous frusta as long as they still do. Detached.
 
@@ -99,6 +100,7 @@ def fit_frusta(
         seen: (points in world space, spread over the visible receivers; mask of valid points). None: receivers may be anywhere.
         receiver_range: resolve depths only from shortly before the first receiver on, not from the first caster on.
         tiles: parts of the image planes that the maps serve; only visible points inside count for a map.
+        nearer: (mask of the maps that serve some of the seen points alone, mask of these points). None: there are no such maps.
         receives: mask of the shapes that can be lit in each map (:func:`receiving_shapes`), None for all of them.
 
     All arithmetic stays on the device: nothing is read back.
@@ -111,6 +113,9 @@ def fit_frusta(
         extent = bounds.of(index)
         casts &= ~(of_map(views, map_index, views.count).spread > 0) | (extent[5] > 0)
         window = _window(views, seen, tiles)
+        if nearer is not None and seen is not None:
+            of_some = _window(views, (seen[0], backend(views.spread).Bool(seen[1]) & nearer[1]), tiles)
+            window = _chosen(nearer[0], of_some, window)
         if receives is not None:
             window = _around(window, extent, receives, map_index, views.count)
         if not receiver_range:
@@ -160,6 +165,12 @@ def _window(views: Views, seen: tuple[Point3f, Bool] | None, tiles: Tiles | None
         sides = [dr.select(dr.isfinite(border), border, side) for border, side in zip(borders, sides, strict=True)]
     x0, y0, x1, y1 = (dr.minimum(side, limit) for side in sides)
     return -x0, -y0, x1, y1, -nearest, farthest
+
+
+def _chosen(mask: Bool, some: Extent, others: Extent) -> Extent:
+    """Bounds that are one or the other, map by map."""
+    x0, y0, x1, y1, z0, z1 = (dr.select(mask, a, b) for a, b in zip(some, others, strict=True))
+    return x0, y0, x1, y1, z0, z1
 
 
 def _around(window: Extent, extent: Extent, chosen: Bool, map_index: UInt32, count: int) -> Extent:

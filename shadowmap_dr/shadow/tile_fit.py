@@ -15,7 +15,7 @@ from .nearest_planes import nearest_planes
 from .tiles import Group, TileNumbers, Tiles, tile_of
 
 # Bins between which a node may be cut, and the least share of its points on either side.
-_BINS, _LEAST = 32, 1 / 8
+BINS, _LEAST = 32, 1 / 8
 # Tiles are kept while the mean side of texels is at most so many times that of new tiles, and slopes differ by no more than that.
 _MOST, _TURN = 1.2, 0.1
 
@@ -131,22 +131,22 @@ def _cuts(x: Float, y: Float, node: UInt32, nodes: int, active: Bool) -> tuple[B
     rows = 2 * nodes
     value, other, row = dr.concat([x, y]), dr.concat([y, x]), dr.concat([node, node + nodes])
     active = dr.concat([active, active])
-    bin_, (start, length) = _even_bins(value, row, rows, active)
-    counts = _counts(bin_, rows * _BINS, active)
-    ends = _maxima([-value, -other, value, other], bin_, rows * _BINS, active)
-    lower = [dr.block_prefix_reduce(dr.ReduceOp.Max, end, _BINS) for end in ends]
-    upper = [dr.block_prefix_reduce(dr.ReduceOp.Max, end, _BINS, exclusive=False, reverse=True) for end in ends]
-    border = dr.arange(module.UInt32, rows * _BINS)
-    total = dr.maximum(dr.block_sum(counts, _BINS), 1)
-    below = dr.block_prefix_sum(counts, _BINS) / dr.gather(module.Float, total, border // _BINS)
+    bin_, (start, length) = even_bins(value, row, rows, active)
+    counts = _counts(bin_, rows * BINS, active)
+    ends = _maxima([-value, -other, value, other], bin_, rows * BINS, active)
+    lower = [dr.block_prefix_reduce(dr.ReduceOp.Max, end, BINS) for end in ends]
+    upper = [dr.block_prefix_reduce(dr.ReduceOp.Max, end, BINS, exclusive=False, reverse=True) for end in ends]
+    border = dr.arange(module.UInt32, rows * BINS)
+    total = dr.maximum(dr.block_sum(counts, BINS), 1)
+    below = dr.block_prefix_sum(counts, BINS) / dr.gather(module.Float, total, border // BINS)
     mean = below * _sizes(lower) + (1 - below) * _sizes(upper)
     mean = dr.select((below >= _LEAST) & (below <= 1 - _LEAST), mean, dr.inf)
     place = 0.5 * (lower[2] - upper[0])
 
     index = dr.arange(module.UInt32, nodes)
-    least = dr.block_reduce(dr.ReduceOp.Min, mean, _BINS)
+    least = dr.block_reduce(dr.ReduceOp.Min, mean, BINS)
     first = dr.block_reduce(
-        dr.ReduceOp.Min, dr.select(mean == dr.gather(module.Float, least, border // _BINS), border, rows * _BINS - 1), _BINS
+        dr.ReduceOp.Min, dr.select(mean == dr.gather(module.Float, least, border // BINS), border, rows * BINS - 1), BINS
     )
     by_x, by_y = (dr.gather(module.Float, least, index + k * nodes) for k in (0, 1))
     found = dr.minimum(by_x, by_y) < dr.inf
@@ -159,7 +159,7 @@ def _cuts(x: Float, y: Float, node: UInt32, nodes: int, active: Bool) -> tuple[B
     return across, cut
 
 
-def _even_bins(value: Float, row: UInt32, rows: int, active: Bool) -> tuple[UInt32, tuple[Float, Float]]:
+def even_bins(value: Float, row: UInt32, rows: int, active: Bool) -> tuple[UInt32, tuple[Float, Float]]:
     """(index of each value's bin, (least value, extent) of each row), for bins that hold about equally many values of their row.
 
     Bins of equal width come first, in which values are taken to lie evenly: most may lie in few of them.
@@ -170,17 +170,17 @@ def _even_bins(value: Float, row: UInt32, rows: int, active: Bool) -> tuple[UInt
     dr.eval(start, length)
     place = (value - dr.gather(module.Float, start, row)) / dr.gather(module.Float, length, row)
     wide = _bin(place, active)
-    at = row * _BINS + wide
-    counts = _counts(at, rows * _BINS, active)
-    before, total = dr.block_prefix_sum(counts, _BINS), dr.maximum(dr.block_sum(counts, _BINS), 1)
-    rank = dr.gather(module.Float, before, at) + (place * _BINS - module.Float(wide)) * dr.gather(module.Float, counts, at)
-    return row * _BINS + _bin(rank / dr.gather(module.Float, total, row), active), (start, length)
+    at = row * BINS + wide
+    counts = _counts(at, rows * BINS, active)
+    before, total = dr.block_prefix_sum(counts, BINS), dr.maximum(dr.block_sum(counts, BINS), 1)
+    rank = dr.gather(module.Float, before, at) + (place * BINS - module.Float(wide)) * dr.gather(module.Float, counts, at)
+    return row * BINS + _bin(rank / dr.gather(module.Float, total, row), active), (start, length)
 
 
 def _bin(share: Float, active: Bool) -> UInt32:
     """Number of the bin in which a share from 0 to 1 lies."""
     module = backend(share)
-    return dr.minimum(module.UInt32(dr.select(active, dr.maximum(share * _BINS, 0), 0)), _BINS - 1)
+    return dr.minimum(module.UInt32(dr.select(active, dr.maximum(share * BINS, 0), 0)), BINS - 1)
 
 
 def _counts(index: UInt32, size: int, active: Bool) -> Float:

@@ -45,6 +45,7 @@ from ..gbuffer.camera_view import VisiblePoints
 from ..shadow_pass import MapPlan, boxes_of, check_sizes, shape_planes
 from .area_samples import AreaPlan, area_samples, plan_area
 from .map_aim import WIDEST, Points, aim, sees_all, shape_vertices
+from .near_maps import lies_within, near_points, want_near_maps
 from .penumbra import Pyramid
 from .sample_counts import area_light_count, spread_points
 from .samples import LightSamples, SampleTable
@@ -67,7 +68,7 @@ class SoftPlan:
     :mod:`shadowmap_dr.rendering.extended_lights.penumbra`). ``first``: number of the first map, single ones and others counted
     apart. ``target``: point that the maps of a ``near`` or ``single`` light face, in the middle of the shapes ``casters``.
     ``hides``: shape that casts no shadow of this light: its own, unless parts of it see others of it, ``facing``; then these cast
-    shadows with the sides that shine.
+    shadows with the sides that shine. ``near``: each sample has a second map, see :mod:`.near_maps`.
     """
 
     RECORDED_OFTEN: ClassVar[bool] = True  # see `jit.frozen.take_apart`
@@ -80,11 +81,12 @@ class SoftPlan:
     hides: int
     facing: tuple[int, int] = (0, 0)
     casters: tuple[int, ...] = ()
+    near: bool = False
 
     @property
     def maps(self) -> int:
         """Number of its maps."""
-        return 1 if self.kind == "single" else self.count * (6 if self.kind == "cube" else 1)
+        return 1 if self.kind == "single" else self.count * (6 if self.kind == "cube" else 1 + self.near)
 
 
 def plan_soft(
@@ -110,7 +112,9 @@ def plan_soft(
     eyes = np.concatenate([np.zeros((0, 4)), *(np.array(eye_of(camera), np.float64).reshape(1, 4) for camera in cameras)])
     for light in lights:
         if isinstance(light, Environment):
-            plan = SoftPlan(plan_sky(light, sky_count, geometry), "distant", sky_count, 0, (0.0, 0.0, 0.0), NO_SHAPE)
+            receivers = _receivers(geometry) if receivers is None else receivers
+            near = want_near_maps(geometry, receivers[0], cameras)
+            plan = SoftPlan(plan_sky(light, sky_count, geometry), "distant", sky_count, 0, (0.0, 0.0, 0.0), NO_SHAPE, near=near)
         else:
             vertices = shape_vertices(geometry)
             aimed = aim(vertices, geometry.shapes, light.shape, eyes)
@@ -245,7 +249,8 @@ def _fitted(
     views = _stack([_views(plan, s, settings) for plan, s in lights])
     hidden = dr.concat([dr.full(mi.UInt32, plan.hides, plan.maps) for plan in plans])
     dr.eval(views, hidden)
-    frusta = computed("frusta of extended lights", lambda: _fit(views, hidden, scene, geometry, settings, previous, seen))
+    nearer = _serve_near_points(plans) if any(plan.near for plan in plans) else None
+    frusta = computed("frusta of extended lights", lambda: _fit(views, hidden, scene, geometry, settings, previous, seen, nearer))
     return views, hidden, frusta
 
 
@@ -299,8 +304,16 @@ def _facing(plans: Sequence[SoftPlan], geometry: Geometry) -> Bool | None:
     return (face >= dr.gather(mi.UInt32, first, which)) & (face < dr.gather(mi.UInt32, last, which))
 
 
-def map_of(plan: SoftPlan, table: SampleTable, sample: UInt32, p_world: Point3f) -> UInt32:
-    """Index of the map (UInt32) in which points look up the visibility of a sample (UInt32)."""
+def _serve_near_points(plans: Sequence[SoftPlan]) -> Bool:
+    """Mask of the maps that serve points near the cameras alone."""
+    return dr.concat([mi.Bool((dr.arange(mi.UInt32, plan.maps) & 1) == int(plan.near)) & plan.near for plan in plans])
+
+
+def map_of(plan: SoftPlan, table: SampleTable, sample: UInt32, p_world: Point3f, maps: ShadowMaps) -> UInt32:
+    """Index of the map (UInt32), one of ``maps``, in which points look up the visibility of a sample (UInt32)."""
+    if plan.near:
+        far = plan.first + 2 * sample
+        return dr.select(lies_within(maps, far + 1, p_world), far + 1, far)
     if plan.kind == "cube":
         return plan.first + sample * 6 + cube_face(dr.detach(mi.Vector3f(p_world) - table.place(sample)))
     return plan.first + sample
@@ -311,7 +324,11 @@ def _views(plan: SoftPlan, samples: LightSamples, settings: ShadowSettings) -> V
     count = plan.maps
     zero = dr.zeros(mi.Float, count)
     if plan.kind == "distant":
-        view = directional_view(samples.place)
+        place = samples.place
+        if plan.near:
+            sample = dr.arange(mi.UInt32, count) // 2
+            place = type(place)(*(dr.gather(mi.Float, place[c], sample) for c in range(3)))
+        view = directional_view(place)
         return Views(view.right, view.up, view.forward, mi.Vector3f(zero), zero, zero + dr.inf)
     if plan.kind in ("near", "single"):
         place = samples.centre() if plan.kind == "single" else samples.place
@@ -361,8 +378,12 @@ def _fit(
     settings: ShadowSettings,
     previous: Frusta | None,
     seen: VisiblePoints | None,
+    nearer: Bool | None = None,
 ) -> Frusta:
-    """Frusta around the boxes of shapes. With many maps, a fit to each vertex would cost more than drawing it."""
+    """Frusta around the boxes of shapes. With many maps, a fit to each vertex would cost more than drawing it.
+
+    ``nearer``: mask of the maps that serve points near the cameras alone.
+    """
     with dr.suspend_grad():
         shapes, count = len(geometry.shapes), views.count
         boxes = boxes_of(geometry)
@@ -375,6 +396,8 @@ def _fit(
         eyes = None if seen is None else seen[2]
         casts = casting_shapes(views, planes, planar, boxes, hidden, eyes, scene.opaque)
         receives = None if eyes is None else receiving_shapes(views, planes, planar & scene.reflecting, eyes)
+        few = _few(seen)
+        chosen = None if few is None or eyes is None or nearer is None else (nearer, near_points(few, eyes))
         return fit_frusta(
             views,
             bounds,
@@ -383,9 +406,10 @@ def _fit(
             settings.resolution,
             settings.filter_size,
             previous,
-            _few(seen),
+            few,
             settings.receiver_range,
             receives=receives,
+            nearer=chosen,
         )
 
 

@@ -62,7 +62,7 @@ def soft_light(
         if visible is not None:
             value *= dr.gather(type(visible), visible, number * lanes + lane, active)
         elif maps is not None:
-            value *= share_through(maps, map_of(plan, table, index, seen.p_world), seen.p_world, active)
+            value *= share_through(maps, map_of(plan, table, index, seen.p_world, maps), seen.p_world, active)
         return dr.select(active, value, 0)
 
     def sides(seen: Surface) -> list[Vector3f]:
@@ -117,6 +117,6 @@ def sample_visibilities(
         group = None if interleaving.group is None else dr.gather(mi.UInt32, interleaving.group, pixel)
         sample = interleaving.point(number, group)
         p_world, active = dr.gather(mi.Point3f, seen.p_world, pixel), dr.gather(mi.Bool, seen.active, pixel)
-        found = share_through(maps.sampled, map_of(plan, table, sample, p_world), p_world, active)
+        found = share_through(maps.sampled, map_of(plan, table, sample, p_world, maps.sampled), p_world, active)
         dr.eval(found)
         return found

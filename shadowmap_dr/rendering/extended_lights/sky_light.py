@@ -76,7 +76,7 @@ def sky_light(
         if known is not None:
             visible = dr.gather(type(known), known, index * lanes + lane, lit)
         elif maps is not None:
-            visible = dr.select(lit, share_through(maps, map_of(plan, table, index, seen.p_world), seen.p_world, lit), 0)
+            visible = dr.select(lit, share_through(maps, map_of(plan, table, index, seen.p_world, maps), seen.p_world, lit), 0)
         sums = [*(inner * visible), *further, low * mean_of(visible), low]
         return mi.ArrayXf([mi.Float(dr.select(seen.active, x, 0)) for x in sums])
 

@@ -61,7 +61,7 @@ def relative_error(image: Array, reference: Array) -> float:
 
 def has_near_maps(scene: mi.Scene) -> bool:
     (plan,) = Renderer.from_scene(scene).soft
-    return plan.near
+    return plan.doubled
 
 
 @pytest.mark.usefixtures("variant")

@@ -68,7 +68,8 @@ class SoftPlan:
     :mod:`shadowmap_dr.rendering.extended_lights.penumbra`). ``first``: number of the first map, single ones and others counted
     apart. ``target``: point that the maps of a ``near`` or ``single`` light face, in the middle of the shapes ``casters``.
     ``hides``: shape that casts no shadow of this light: its own, unless parts of it see others of it, ``facing``; then these cast
-    shadows with the sides that shine. ``near``: each sample has a second map, see :mod:`.near_maps`.
+    shadows with the sides that shine. ``doubled``: each sample of a ``distant`` light has a second
+    map, see :mod:`.near_maps`.
     """
 
     RECORDED_OFTEN: ClassVar[bool] = True  # see `jit.frozen.take_apart`
@@ -81,12 +82,12 @@ class SoftPlan:
     hides: int
     facing: tuple[int, int] = (0, 0)
     casters: tuple[int, ...] = ()
-    near: bool = False
+    doubled: bool = False
 
     @property
     def maps(self) -> int:
         """Number of its maps."""
-        return 1 if self.kind == "single" else self.count * (6 if self.kind == "cube" else 1 + self.near)
+        return 1 if self.kind == "single" else self.count * (6 if self.kind == "cube" else 1 + self.doubled)
 
 
 def plan_soft(
@@ -113,8 +114,10 @@ def plan_soft(
     for light in lights:
         if isinstance(light, Environment):
             receivers = _receivers(geometry) if receivers is None else receivers
-            near = want_near_maps(geometry, receivers[0], cameras)
-            plan = SoftPlan(plan_sky(light, sky_count, geometry), "distant", sky_count, 0, (0.0, 0.0, 0.0), NO_SHAPE, near=near)
+            doubled = want_near_maps(geometry, receivers[0], cameras)
+            plan = SoftPlan(
+                plan_sky(light, sky_count, geometry), "distant", sky_count, 0, (0.0, 0.0, 0.0), NO_SHAPE, doubled=doubled
+            )
         else:
             vertices = shape_vertices(geometry)
             aimed = aim(vertices, geometry.shapes, light.shape, eyes)
@@ -249,7 +252,7 @@ def _fitted(
     views = _stack([_views(plan, s, settings) for plan, s in lights])
     hidden = dr.concat([dr.full(mi.UInt32, plan.hides, plan.maps) for plan in plans])
     dr.eval(views, hidden)
-    nearer = _serve_near_points(plans) if any(plan.near for plan in plans) else None
+    nearer = _serve_near_points(plans) if any(plan.doubled for plan in plans) else None
     frusta = computed("frusta of extended lights", lambda: _fit(views, hidden, scene, geometry, settings, previous, seen, nearer))
     return views, hidden, frusta
 
@@ -306,12 +309,12 @@ def _facing(plans: Sequence[SoftPlan], geometry: Geometry) -> Bool | None:
 
 def _serve_near_points(plans: Sequence[SoftPlan]) -> Bool:
     """Mask of the maps that serve points near the cameras alone."""
-    return dr.concat([mi.Bool((dr.arange(mi.UInt32, plan.maps) & 1) == int(plan.near)) & plan.near for plan in plans])
+    return dr.concat([mi.Bool((dr.arange(mi.UInt32, plan.maps) & 1) == 1) & plan.doubled for plan in plans])
 
 
 def map_of(plan: SoftPlan, table: SampleTable, sample: UInt32, p_world: Point3f, maps: ShadowMaps) -> UInt32:
     """Index of the map (UInt32), one of ``maps``, in which points look up the visibility of a sample (UInt32)."""
-    if plan.near:
+    if plan.doubled:
         far = plan.first + 2 * sample
         return dr.select(lies_within(maps, far + 1, p_world), far + 1, far)
     if plan.kind == "cube":
@@ -325,7 +328,7 @@ def _views(plan: SoftPlan, samples: LightSamples, settings: ShadowSettings) -> V
     zero = dr.zeros(mi.Float, count)
     if plan.kind == "distant":
         place = samples.place
-        if plan.near:
+        if plan.doubled:
             sample = dr.arange(mi.UInt32, count) // 2
             place = type(place)(*(dr.gather(mi.Float, place[c], sample) for c in range(3)))
         view = directional_view(place)

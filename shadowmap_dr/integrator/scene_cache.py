@@ -91,6 +91,7 @@ class SceneCache:
     matched   parameters of the scene at the last successful match
     handed    results of the last replayed images, for their backward passes
     reader    reads the scene for replays
+    _rest     (data of the renderer, the same for replays, without what each rendering reads again)
     """
 
     parts: tuple[mi.Object, ...]

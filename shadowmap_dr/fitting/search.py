@@ -19,6 +19,7 @@ from ..jit.arrays import device_array
 from ..jit.types import Float
 from ..rendering.renderer import Renderer
 from .arrays import ArrayParameter, TextureValues, ValueDescent
+from .bounds import bounds_of
 from .changes import Changes, FittedScene
 from .corrections import Corrections
 from .estimates import array_estimates, changes_of, estimates_of, gain_estimates
@@ -29,7 +30,6 @@ from .losses import Loss
 from .objective import Point
 from .options import FitOptions
 from .own_losses import OwnFunction, function_name
-from .parameters import Parameter
 from .places import best_places
 from .reference_steps import MOST_NUMBERS, reference_steps
 from .resolve import Resolver
@@ -38,7 +38,7 @@ from .scene_change import SceneChange
 from .sensor_pictures import as_seen, colourless
 from .shadow_pictures import lit_share
 from .stages import Stage, make_stages, qualities
-from .starts import LARGEST_FACTOR, chosen, draw, groups_of, half_ranges, redraw, with_gains
+from .starts import chosen, draw, groups_of, half_ranges, redraw, with_gains
 from .state import Run, Sizes, State
 from .targets import Target, short_names
 from .texture_brightness import TextureBrightness
@@ -62,8 +62,6 @@ _WORTH_ANOTHER, _MOST_CORRECTIONS = 0.1, 24
 _FEW_CORRECTIONS, _CLOSE = 2, 0.15
 # Growth of the ranges of starts from one try to the next. First stage of turned objects, and their least turn in ranges.
 _GROWTH, _TURNED_STAGE, _APART = 0.5, 2, 0.7
-# Least standard deviation of a prior, in the fit's own numbers: with less, matrices are singular.
-_TIGHTEST = 1e-6
 # Textures and vertices: stages in which they are fitted, the last ones; rounds of a stage, in turns with the numbers; size of the
 # last step as a share of the first one's.
 _ARRAY_STAGES, _ROUNDS, _LAST_SHARE = 3, 3, 0.1
@@ -113,12 +111,13 @@ class Fit:
         self.parameters += factors
         functions = {"residuals": residuals, "loss": loss}
         self._own_settings = {key: function_name(one) for key, one in functions.items() if one is not None}
-        self._low, self._high, prior, self._given = _bounds(self.parameters, self.gains)
+        bounds = bounds_of(self.parameters, self.gains)
+        self._low, self._high, self._given = bounds.low, bounds.high, bounds.given
         side = min(options.resolution, max(max(target.width, target.height) for target in targets))
         levels = qualities(side, options.spp, renderer.settings.shadow.resolution)
         pictures = self.parameters, self.arrays, self.targets, self.gains
         compared = Loss(options.loss, options.delta), levels, residuals, loss
-        self.stages: list[Stage] = make_stages(renderer, *pictures, prior, *compared)
+        self.stages: list[Stage] = make_stages(renderer, *pictures, bounds.prior, *compared)
         windows = [(target.width, target.height) for target in targets]
         self._corrections = Corrections(renderer, self.stages[-1].objective, windows) if options.correct else None
         self._began = time.perf_counter()
@@ -458,36 +457,6 @@ class Fit:
             image = objective.recorded(number, objective.views[number].image(x).copy(), x)
             frames.append((f"{self.stages[stage].name}, step {count}", image))
         return frames
-
-
-def _bounds(parameters: Sequence[Parameter], gains: Sequence[Gain]) -> tuple[Array, Array, Array, npt.NDArray[np.bool_]]:
-    """(lower bounds, upper bounds, standard deviations of priors), all (n,), in the fit's own numbers; and which of the lower and
-    upper bounds are the user's (n, 2)."""
-    low, high, prior = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)]
-    given = list[tuple[bool, bool]]()
-    for parameter in parameters:
-        vary, scale, count = parameter.vary, parameter.scale, len(parameter.labels)
-        least = parameter.natural[0] if vary.low is None else vary.low
-        most = parameter.natural[1] if vary.high is None else vary.high
-        nothing = vary.low is not None and vary.high is None and least >= most or vary.high is not None and most <= least
-        if nothing or scale.logarithmic and most <= 0:
-            least = max(least, 0.0) if scale.logarithmic else least
-            raise ShadowmapError(f"{vary.named}: the bounds leave nothing between {least:g} and {most:g}.")
-        if vary.spread is not None and scale.logarithmic and not 1 / LARGEST_FACTOR <= vary.spread <= LARGEST_FACTOR:
-            raise ShadowmapError(
-                f"{vary.named}: spread is {vary.spread:g}, a factor here: give one from 1 to {LARGEST_FACTOR:g}."
-            )
-        low.append(np.broadcast_to(scale.number(least) if np.isfinite(least) else -np.inf, count))
-        high.append(np.broadcast_to(scale.number(most) if np.isfinite(most) else np.inf, count))
-        unit = np.abs(scale.shown(np.zeros(count)) if scale.logarithmic else scale.factor)
-        given += [(vary.low is not None, vary.high is not None)] * count
-        prior.append(np.full(count, np.inf) if vary.prior is None else np.maximum(vary.prior / unit, _TIGHTEST))
-    for gain in gains:
-        low.append(np.array([-8.0] * gain.colours + [-0.95] * gain.vignetting))
-        high.append(np.array([8.0] * gain.colours + [1.0] * gain.vignetting))
-        given += [(False, False)] * gain.count
-        prior.append(np.full(gain.count, np.inf))
-    return np.concatenate(low), np.concatenate(high), np.concatenate(prior), np.array(given, bool).reshape(-1, 2)
 
 
 def _check_functions(residuals: OwnFunction | None, loss: OwnFunction | None, *, numbers: bool) -> None:

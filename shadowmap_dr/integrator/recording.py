@@ -29,7 +29,7 @@ class FrozenPasses:
     """
 
     def __init__(self) -> None:
-        self._image, self._gradients = Frozen(_image, evaluated=True), Frozen(_gradients, evaluated=True)
+        self._image, self._gradients = Frozen(_image), Frozen(_gradients)
 
     def image(self, spp: int, renderer: Renderer, keep: bool) -> tuple[TensorXf, Frusta | None, SoftFrusta, PackedResults]:
         """(detached image, frusta of the shadow maps, frusta of extended lights' shadow maps, results for the backward pass).
@@ -112,15 +112,11 @@ def _fields_of(data: SceneData, fields: tuple[str, ...]) -> tuple[Any, ...]:  # 
     return tuple(getattr(data, field) for field in fields)
 
 
-def plain(
-    renderer: Renderer,
-    known: Mapping[str, Any] | None = None,  # Any: fields of different types
-    rest: SceneData | None = None,
-) -> Renderer:
+def plain(renderer: Renderer, known: Mapping[str, Any] | None = None) -> Renderer:  # Any: fields of different types
     """A renderer with detached data, of which one recording serves all cameras of one kind.
 
     All numbers are evaluated: a recording would include constants. ``known``: :data:`PARTS` of an earlier result, made from the
-    same records. ``rest``: the data of an earlier result, if all of its other fields are to be the same.
+    same records.
     """
     arrays: list[AnyArray] = []
 
@@ -141,10 +137,9 @@ def plain(
     for part in PARTS:
         if part not in parts:
             parts[part] = tree_map(getattr(data, part), kept)
-    if rest is None:
-        nothing: dict[str, Any] = dict.fromkeys(PARTS)
-        rest = tree_map(with_fields(data, **nothing), kept)
-    renderer = with_fields(renderer, data=with_fields(rest, scene=data.scene, **parts))
+    nothing: dict[str, Any] = dict.fromkeys(PARTS)
+    rest = tree_map(with_fields(data, **nothing), kept)
+    renderer = with_fields(renderer, data=with_fields(rest, **parts))
     # The arrays alone: Dr.Jit would walk through the scene, too.
     dr.make_opaque(arrays, arrays_of((renderer.frusta, renderer.soft_frusta)))
     return renderer

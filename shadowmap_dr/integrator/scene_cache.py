@@ -91,7 +91,6 @@ class SceneCache:
     matched   parameters of the scene at the last successful match
     handed    results of the last replayed images, for their backward passes
     reader    reads the scene for replays
-    _rest     (data of the renderer, the same for replays, without what each rendering reads again)
     """
 
     parts: tuple[mi.Object, ...]
@@ -105,7 +104,7 @@ class SceneCache:
     recordable: dict[tuple[str, ...], bool] = field(default_factory=dict)
     steady: SteadySteps = field(default_factory=SteadySteps)
     untracked: UntrackedValues = field(default_factory=lambda: UntrackedValues(()))
-    untracked_then: object = ()
+    untracked_then: tuple[object, ...] = ()
     colours: ParameterWatch | None = None
     sky: SkyWatch = field(default_factory=lambda: SkyWatch(()))
     mirrors: MirrorWatch = field(default_factory=lambda: MirrorWatch(()))
@@ -115,7 +114,6 @@ class SceneCache:
     matched: ParameterState | None = None
     handed: HandedResults = field(default_factory=HandedResults)
     reader: SceneReader = field(default_factory=SceneReader)
-    _rest: tuple[SceneData, SceneData] | None = None
     _taken: tuple[Renderer, tuple[str, list[PyTree]]] | None = None
 
     # All that Dr.Jit is to know of, instead of the fields: it looks twice for each image.
@@ -236,17 +234,14 @@ class SceneCache:
     def try_to_replay(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, now: SceneState) -> TensorXf | None:
         """The same as :meth:`replay`; None, from now on, if the scene cannot be recorded."""
         try:
-            return self.replay(scene, sensor, spp, now, self.steady.values)  # which were read just now
+            return self.replay(scene, sensor, spp, now)
         except RuntimeError:
             self.steady.refuse()
             return None
 
-    def replay(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, now: SceneState, untracked: object = None) -> TensorXf:
-        """The same image, detached, replayed from a recording that the first call makes.
-
-        ``now``: the current parameters. ``untracked``: values that recordings do not see, if they are known.
-        """
-        self._forget_stale_recordings(untracked)
+    def replay(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, now: SceneState) -> TensorXf:
+        """The same image, detached, replayed from a recording that the first call makes. ``now``: the current parameters."""
+        self._forget_stale_recordings()
         with dr.suspend_grad():
             current = self._current(scene, sensor, now)
         self._check_vertices(current)
@@ -305,20 +300,16 @@ class SceneCache:
             f"or leave the recording to the integrator's parameter 'recorded'."
         )
 
-    def _forget_stale_recordings(self, now: object = None) -> None:
-        """Drop the recordings if values of materials or lights that they do not see have changed. ``now``: these, if known."""
-        now = self.untracked.now() if now is None else now
+    def _forget_stale_recordings(self) -> None:
+        """Drop the recordings if values of materials or lights that they do not see have changed."""
+        now = self.untracked.now()
         if now != self.untracked_then:
             self.recorded, self.untracked_then = FrozenPasses(), now
 
     def _plain(self, current: Renderer) -> Renderer:
         """See :func:`plain`."""
-        constant = self.renderer.data
-        rest = self._rest[1] if self._rest is not None and self._rest[0] is constant else None
-        detached = plain(current, self.reader.copies(current.data), rest)
+        detached = plain(current, self.reader.copies(current.data))
         self.reader.copied(current.data, detached.data)
-        if rest is None and not (current.data.areas or current.data.environments):
-            self._rest = constant, _without_scene(detached.data)
         return detached
 
     def _current(self, scene: mi.Scene, sensor: mi.Sensor, now: SceneState | None = None) -> Renderer:

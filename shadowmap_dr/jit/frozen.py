@@ -52,23 +52,21 @@ class Frozen:
     stored when it is recorded, but not when it is replayed.
     """
 
-    def __init__(self, function: Callable[..., PyTree], *, evaluated: bool = False) -> None:
-        """Wrap a function. ``evaluated``: whether all arrays among its arguments will be evaluated."""
+    def __init__(self, function: Callable[..., PyTree]) -> None:
         call = _Call(function)
 
         def recorded(key: str, leaves: list[PyTree]) -> tuple[str, list[AnyArray]]:
             return call.run()
 
-        self._call, self._recorded, self._evaluated = call, dr.freeze(recorded), evaluated
+        self._call, self._recorded = call, dr.freeze(recorded)
 
     def __call__(self, *arguments: PyTree) -> PyTree:
         call = self._call
         call.arguments = arguments
         try:
             key, leaves = take_apart(arguments)
-            if not self._evaluated:
-                # Dr.Jit distinguishes evaluated and unevaluated inputs, and would record once for each.
-                dr.eval([leaf for leaf in leaves if dr.is_array_v(leaf)])
+            # Dr.Jit distinguishes evaluated and unevaluated inputs, and would record once for each.
+            dr.eval([leaf for leaf in leaves if dr.is_array_v(leaf)])
             with gc_paused():
                 number, arrays = self._recorded(key, leaves)
         finally:

@@ -183,9 +183,7 @@ def _around(window: Extent, extent: Extent, chosen: Bool, map_index: UInt32, cou
     x1, y1, z1 = dr.minimum(x1, window[2]), dr.minimum(y1, window[3]), dr.minimum(z1, window[5])
     area = dr.maximum(x1 - x0, 0) * dr.maximum(y1 - y0, 0)
     less = area <= _MUCH_LESS * (window[2] - window[0]) * (window[3] - window[1])
-    pairs = zip((x0, y0, x1, y1, z0, z1), window, strict=True)
-    x0, y0, x1, y1, z0, z1 = (dr.select(less, part, whole) for part, whole in pairs)
-    return x0, y0, x1, y1, z0, z1
+    return _chosen(less, (x0, y0, x1, y1, z0, z1), window)
 
 
 def _fit(

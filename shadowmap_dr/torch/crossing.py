@@ -7,7 +7,6 @@ derivatives are themselves nodes of the graph (:class:`_First`) that depend on a
 from __future__ import annotations
 
 import functools
-import inspect
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -136,11 +135,6 @@ class _Derivative:
 
 class _Node(torch.autograd.Function):
     """A function of (something, tensors...), some of them None, with what all of them have in common."""
-
-    def __init_subclass__(cls) -> None:
-        super().__init_subclass__()
-        # PyTorch asks for it at each call. Finding it anew takes 0.05 ms.
-        cls.forward.__signature__ = inspect.signature(cls.forward)  # type: ignore[attr-defined]
 
     @classmethod
     def looped(cls, things: Sequence[object], size: int, in_dims: tuple[Any, ...], tensors: tuple[Any, ...]) -> _Batched:

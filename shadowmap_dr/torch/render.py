@@ -70,7 +70,7 @@ class Renderer:
         self._device = _device_of(self._variant)
         with drjit_turn(self._device):
             self._sky = SkyWatch(renderer.data.environments)
-        self._frozen = (Frozen(_forward, evaluated=True), Frozen(_backward, evaluated=True)) if frozen else None
+        self._frozen = (Frozen(_forward), Frozen(_backward)) if frozen else None
 
     @classmethod
     @eager

@@ -69,7 +69,7 @@ class SoftPlan:
     apart. ``target``: point that the maps of a ``near`` or ``single`` light face, in the middle of the shapes ``casters``.
     ``hides``: shape that casts no shadow of this light: its own, unless parts of it see others of it, ``facing``; then these cast
     shadows with the sides that shine. ``doubled``: each sample of a ``distant`` light has
-    a second map, see :mod:`.near_maps`.
+    two maps, see :mod:`.near_maps`.
     """
 
     RECORDED_OFTEN: ClassVar[bool] = True  # see `jit.frozen.take_apart`

@@ -127,6 +127,20 @@ def evaluated(name: str, tree: TreeT) -> TreeT:
     return tree
 
 
+def stored(name: str, tree: TreeT) -> TreeT:
+    """Write the arrays of a tree to memory with what is evaluated next, so that derivatives need not compute them again.
+
+    Values may be those of the first computation. Derivatives are those of the tree. Images without derivatives leave them alone.
+    """
+    if _state.given is not None:
+        return evaluated(name, tree)
+    if _state.kept is not None:
+        _state.kept.append((name, tree_map(tree, dr.detach)))
+    if _state.kept is not None or dr.grad_enabled(tree):
+        dr.schedule(tree)
+    return tree
+
+
 def interleaved(name: str, values: list[Float], parts: int = 1) -> Float:
     """Flat array with the entries of several arrays interleaved, :func:`evaluated`.
 

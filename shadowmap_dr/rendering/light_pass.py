@@ -12,6 +12,7 @@ import mitsuba as mi
 
 from ..errors import ShadowmapError
 from ..jit.checkpoint import Term, checkpointed_sum
+from ..jit.handover import stored
 from ..jit.types import AnyArray, Bool, Color3f, Float, PyTree
 from ..jit.vectors import mean_of
 from ..scene.geometry import Geometry
@@ -298,7 +299,7 @@ class LightPass:
             return IncidentLight(self._outlined(frame, lighting.lights), known.lights, 0, known.parts)
         looped, written = self._in_tables(frame, lighting)
         lights = [lighting.lights[k] for k in written]
-        visible = self.visibilities(frame, lighting, written, lights)
+        visible = stored("visibilities", self.visibilities(frame, lighting, written, lights))
         return IncidentLight(self._outlined(frame, lights), visible, looped, (None,) * len(lighting.samples))
 
     def visible(self, frame: Frame, lighting: Lighting) -> Visibilities:

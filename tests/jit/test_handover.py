@@ -11,7 +11,7 @@ import pytest
 
 from shadowmap_dr.jit.arrays import interleave
 from shadowmap_dr.jit.frozen import take_apart
-from shadowmap_dr.jit.handover import PackedResults, Results, computed, evaluated, interleaved, keeping, using
+from shadowmap_dr.jit.handover import PackedResults, Results, computed, evaluated, interleaved, keeping, stored, using
 
 
 def steps(x: Any, calls: list[str]) -> Any:
@@ -116,3 +116,30 @@ def test_packed_results(variant: str) -> None:
     shared, again = take_apart([leaves[1], packed])
     other, apart_ = take_apart([mi.Float(0), packed])
     assert len(again) == 3 and len(apart_) == 4 and shared != other
+
+
+@pytest.mark.parametrize("attached", [True, False])
+def test_stored_values_are_written_with_what_is_evaluated_next(variant: str, attached: bool) -> None:
+    x = mi.Float(1, 2, 3)
+    dr.set_grad_enabled(x, attached)
+    (square,) = stored("square", [x * x])
+    assert square.state == dr.VarState.Unevaluated
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        dr.eval(square + 1)
+        assert len(dr.kernel_history((dr.KernelType.JIT,))) == 1
+    # Nothing needs the values again where there are no derivatives.
+    assert square.state == (dr.VarState.Evaluated if attached else dr.VarState.Unevaluated)
+
+
+def test_stored_values_are_handed_over(variant: str) -> None:
+    x = mi.Float(1, 2, 3)
+    with keeping() as results:
+        stored("square", [x * x])
+    results[0][1][0] = mi.Float(100, 100, 100)  # to be seen again
+    dr.enable_grad(x)
+    with using(results):
+        (square,) = stored("square", [x * x])
+    np.testing.assert_array_equal(square.numpy(), [100, 100, 100])
+    dr.backward(dr.sum(square))
+    np.testing.assert_array_equal(dr.grad(x).numpy(), [2, 4, 6])

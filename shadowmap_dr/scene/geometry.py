@@ -17,8 +17,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import ShadowmapError
-from ..jit.arrays import backend, device_array, device_tensor, ravel, replace_grad
+from ..jit.arrays import backend, device_array, device_tensor, ravel, reinterpret, replace_grad
 from ..jit.broadcast import copy_of_lane, in_copies
+from ..jit.handover import interleaved
 from ..jit.pytree import StaticTuple
 from ..jit.types import AnyArray, Bool, Float, Matrix4f, Point3f, UInt32, Vector3f, Vector3u
 from ..jit.vectors import normalize_or
@@ -30,6 +31,8 @@ NOT_READ: Any = None  # Any: stands for buffers of several types, until ``load.r
 
 # Shape indices are compared with each index of a list up to this length. Longer lists cost more than they save.
 _MANY_SHAPES = 8
+# Look-ups for each triangle from which it pays to write the numbers of all triangles anew, side by side.
+_LOOK_UPS = 4
 # Numbers of vertices, the largest, to which recordings hold new positions.
 _MOST_GUARDS = 64
 
@@ -109,6 +112,8 @@ class Geometry:
     stand_ins      UInt32 (V,), the vertex whose position each vertex takes; None if all vertices have faces. Invisible vertices,
                    those without faces, take the position of another vertex of their shape and so stretch no bounds (``settled``)
     packets        Float (4V,), positions padded to four numbers, through which derivatives flow back (``in_packets``)
+    corners        Float (12F,), detached, for each triangle: vertex 0, vertices 1 and 2 minus vertex 0, and the bits of its three
+                   indices; None where they are not worth it (``in_packets``)
     copies         number of copies of packets, normals and texture coordinates in their buffers, one for each block of lanes
     size_guards    UInt32 (Vs,) or (3Vs,) each, zeros: two arrays for each number of vertices that shapes have. Recordings add
                    them to new positions (``bound``)
@@ -131,6 +136,7 @@ class Geometry:
     moved: tuple[str, ...] | None = None
     stand_ins: UInt32 | None = None
     packets: Float | None = None
+    corners: Float | None = None
     copies: int = 1
     size_guards: tuple[UInt32, ...] = ()
 
@@ -195,18 +201,44 @@ class Geometry:
     def in_packets(self, lanes: int) -> Geometry:
         """The same geometry, prepared for look-ups of attached positions, normals and texture coordinates by ``lanes`` lanes.
 
-        Sums over packets of four numbers run several times faster than those of three.
+        Sums over packets of four numbers run several times faster than those of three. Where many lanes look up few triangles,
+        three packets for each triangle (``corners``) take less time than its indices and vertices one by one.
         """
-        packets = self.packets
+        packets, corners = self.packets, None
+        if _LOOK_UPS * self.face_count <= lanes:
+            corners = interleaved("corners of triangles", self._corners())
         if dr.grad_enabled(self.positions):
             p = dr.gather(mi.Point3f, self.positions, dr.arange(mi.UInt32, self.vertex_count))
             packets = ravel(mi.Point4f(p.x, p.y, p.z, 0))
         buffers = [array for array in (packets, self.normals, self.texcoords) if array is not None]
         made, copies = in_copies(buffers, lanes)
         if copies == 1:
-            return replace(self, packets=packets)
+            return replace(self, packets=packets, corners=corners)
         *first, normals, texcoords = made
-        return replace(self, packets=first[0] if first else None, normals=normals, texcoords=texcoords, copies=copies)
+        found = replace(self, packets=first[0] if first else None, normals=normals, texcoords=texcoords, copies=copies)
+        return replace(found, corners=corners)
+
+    def _corners(self) -> list[Float]:
+        """Numbers of ``corners``."""
+        with dr.suspend_grad():
+            face = dr.gather(mi.Vector3u, self.faces, dr.arange(mi.UInt32, self.face_count))
+            first, e1, e2 = self.triangle(face)
+            return [mi.Float(x) for x in (*first, *e1, *e2, *(reinterpret(mi.Float, index) for index in face))]
+
+    def triangle(self, face: Vector3u, active: Bool | bool = True, row: UInt32 | int = 0) -> tuple[Point3f, Vector3f, Vector3f]:
+        """Vertex 0 of triangles (``face``: their vertices), and vertices 1 and 2 minus vertex 0. ``row``: as :meth:`vertices`."""
+        first, second, third = (self.vertices(face[k], active, row=row) for k in range(3))
+        return first, second - first, third - first
+
+    def triangle_now(self, index: UInt32, active: Bool) -> tuple[Vector3u, tuple[Point3f, Vector3f, Vector3f]]:
+        """The vertices of triangles (UInt32), and what :meth:`triangle` returns for them; detached."""
+        with dr.suspend_grad():
+            if self.corners is None:
+                face = dr.gather(mi.Vector3u, self.faces, index, active)
+                return face, self.triangle(face, active)
+            n = [number for k in range(3) for number in dr.gather(mi.Vector4f, self.corners, 3 * index + k, active)]
+            face = mi.Vector3u(*(reinterpret(mi.UInt32, bits) for bits in n[9:]))
+            return face, (mi.Point3f(*n[:3]), mi.Point3f(*n[3:6]), mi.Point3f(*n[6:9]))
 
     def row_of_copy(self, lanes: int) -> UInt32:
         """First row (UInt32) of the copy of the vertices that each lane reads; a constant if there is only one copy."""
@@ -260,7 +292,7 @@ class Geometry:
                 own = dr.arange(mi.UInt32, info.vertex_count) + info.vertex_start
                 outward = dr.gather(mi.Normal3f, smooth, own) * (-1 if info.against_winding else 1)
                 normals = _write_vertices(normals, outward, info.vertex_start, info.vertex_count, self.vertex_count)
-        return replace(self, positions=self.settled(merged), normals=normals, changed=changed, packets=None)
+        return replace(self, positions=self.settled(merged), normals=normals, changed=changed, packets=None, corners=None)
 
     def with_transforms(self, transforms: Mapping[str, Matrix4f | mi.Transform4f]) -> Geometry:
         """A new Geometry in which some shapes have moved as a whole.
@@ -291,7 +323,7 @@ class Geometry:
             if info.has_normals:
                 turned = _turned(matrix, dr.gather(mi.Vector3f, normals, own))
                 normals = _write_vertices(normals, mi.Point3f(turned), *where)
-        return replace(self, positions=self.settled(positions), normals=normals, changed=changed, packets=None)
+        return replace(self, positions=self.settled(positions), normals=normals, changed=changed, packets=None, corners=None)
 
     def bound(self, value: Float | Point3f) -> Float | Point3f:
         """New positions of a shape, in a recording held to their number: a replay with another number is an error of Dr.Jit's.

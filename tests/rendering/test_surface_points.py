@@ -93,3 +93,22 @@ def test_tangents_make_no_difference_to_diffuse_materials(variant: str) -> None:
     assert not renderer.data.needs_frames
     with_frames = renderer.with_data(replace(renderer.data, needs_frames=True))
     np.testing.assert_allclose(renderer.render().numpy(), with_frames.render().numpy(), atol=1e-5)
+
+
+def test_corners_of_triangles_are_those_of_their_vertices(variant: str) -> None:
+    renderer = build("perspective")
+    geometry, camera = renderer.data.geometry, renderer.data.sensors[0][0]
+    count = SIZE * (SIZE + 4)
+    assert geometry.in_packets(geometry.face_count).corners is None  # not worth it
+    prepared = geometry.in_packets(4 * geometry.face_count)
+    assert prepared.corners is not None and dr.width(prepared.corners) == 12 * geometry.face_count
+    raster = renderer.camera_pass.view(camera, renderer.camera_pass.placed(geometry), 1).raster
+    plain, packed = (pixel_hits(g, camera, raster.triangle, ImageSize(SIZE, SIZE + 4)) for g in (geometry, prepared))
+    assert 0.3 < np.mean(plain.active.numpy()) < 1
+    for name in ("face", "e1", "e2", "n_face", "u", "v", "p_world"):
+        a, b = (np.array(getattr(hits, name))[..., plain.active.numpy()] for hits in (plain, packed))
+        assert a.shape[-1] > 0.3 * count
+        np.testing.assert_array_equal(b, a)
+    # They are numbers of these positions only.
+    moved = prepared.with_positions({"ball": geometry.shape_positions("ball") + 0.1})
+    assert moved.corners is None

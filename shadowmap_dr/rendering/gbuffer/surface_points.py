@@ -80,7 +80,7 @@ def hits_at(geometry: Geometry, triangle: UInt32, u: Float, v: Float, active: Bo
     shape, flags = geometry.shape_and_flags(triangle, active)
     u, v = dr.select(active, u, 0.0), dr.select(active, v, 0.0)
     row = geometry.row_of_copy(dr.width(triangle))
-    origin, e1, e2 = _triangle(geometry, face, active, row)
+    origin, e1, e2 = geometry.triangle(face, active, row)
     p_world = origin + e1 * u + e2 * v
     return SurfacePoints(triangle, active, active, face, row, shape, flags, e1, e2, _normal(e1, e2), u, v, p_world)
 
@@ -91,22 +91,21 @@ def pixel_hits(geometry: Geometry, sensor: Sensor, triangle: UInt32, size: Image
     Attached to positions and camera: each point stays on the ray through its pixel and on its triangle's plane.
     """
     active = triangle != NO_TRIANGLE
-    face = dr.gather(mi.Vector3u, geometry.faces, triangle, active)
+    face, now = geometry.triangle_now(triangle, active)
     shape, flags = geometry.shape_and_flags(triangle, active)
     changed = active & geometry.has_changed(shape)
     ray_o, ray_d, pixel = sensor.pixel_rays(size.width, size.height, dr.width(triangle) // (size.width * size.height))
-    moving = dr.grad_enabled(ray_o, ray_d)
     row = geometry.row_of_copy(dr.width(triangle))
 
     def intersect(face: Vector3u, active: Bool, ray_o: Point3f, ray_d: Vector3f, row: UInt32) -> tuple[Any, ...]:
-        return _intersect(_triangle(geometry, face, active, row), active, ray_o, ray_d)
+        return _intersect(geometry.triangle(face, active, row), active, ray_o, ray_d)
 
-    if moving or not dr.grad_enabled(geometry.positions):
+    attached, moving = dr.grad_enabled(geometry.positions), dr.grad_enabled(ray_o, ray_d)
+    if attached and moving:
         found = intersect(face, active, ray_o, ray_d, row)
     else:
-        with dr.suspend_grad():
-            found = intersect(face, active, ray_o, ray_d, row)
-
+        found = _intersect(now, active, ray_o, ray_d)
+    if attached and not moving:
         # The types only: a function that holds the arrays would keep the whole AD graph alive if nothing ever traverses it.
         kinds = [type(value) for value in found]
 
@@ -114,15 +113,13 @@ def pixel_hits(geometry: Geometry, sensor: Sensor, triangle: UInt32, size: Image
             return tuple(dr.zeros(kind) for kind in kinds)
 
         # Derivatives separately, in a branch: in many images most pixels see nothing that moves.
-        attached = branch(changed, intersect, none, (face, changed, ray_o, ray_d, row), "attached hits")
-        found = tuple(replace_grad(value, other) for value, other in zip(found, attached, strict=True))
+        moved = branch(changed, intersect, none, (face, changed, ray_o, ray_d, row), "attached hits")
+        found = tuple(replace_grad(value, other) for value, other in zip(found, moved, strict=True))
     e1, e2, normal, u, v, p_world = found
     wi_world = -dr.normalize(ray_d)
-    # Directions have unit length along the axis, so the ray's parameter is the depth.
     depth = None
     if sensor.kind == "perspective":
-        d = dr.detach(ray_d)
-        depth = dr.dot(dr.detach(p_world) - dr.detach(ray_o), d) * dr.rcp(dr.squared_norm(d))
+        depth = dr.dot(dr.detach(p_world) - dr.detach(ray_o), dr.detach(sensor.direction))
         pixel *= depth
     return SurfacePoints(
         triangle, active, changed, face, row, shape, flags, e1, e2, normal, u, v, p_world, wi_world, depth, pixel
@@ -139,15 +136,14 @@ def _intersect(
         n = dr.cross(a, b)
         across = dr.dot(n, d)
         edge_on = ~(dr.abs(across) > 0)
-        inverse = dr.rcp(dr.select(edge_on, 1, across))
         s = o - q
         # The rasterizer found the pixel inside: rounding, on triangles seen edge-on, must not move the point outside.
-        u = dr.maximum(dr.dot(d, dr.cross(s, b)) * inverse, 0)
-        v = dr.maximum(dr.dot(d, dr.cross(a, s)) * inverse, 0)
-        excess = dr.rcp(dr.maximum(u + v, 1))
-        u, v = dr.select(active, u * excess, 0), dr.select(active, v * excess, 0)
+        u = dr.maximum(dr.mulsign(dr.dot(d, dr.cross(s, b)), across), 0)
+        v = dr.maximum(dr.mulsign(dr.dot(d, dr.cross(a, s)), across), 0)
+        inside = dr.rcp(dr.maximum(u + v, dr.select(edge_on, 1, dr.abs(across))))
+        u, v = dr.select(active, u * inside, 0), dr.select(active, v * inside, 0)
         # The derivative is infinite where a triangle is seen exactly edge-on: it is set to 0.
-        inverse = dr.select(edge_on, 0, inverse)
+        inverse = dr.select(edge_on, 0, dr.rcp(dr.select(edge_on, 1, across)))
         area2 = dr.squared_norm(n)
         dual = dr.select(area2 > 0, dr.rcp(area2), 0)
         dual_u, dual_v = dr.cross(b, n) * dual, dr.cross(n, a) * dual
@@ -169,11 +165,6 @@ def _intersect(
 
 def _normal(e1: Vector3f, e2: Vector3f) -> Vector3f:
     return normalize_or(mi.Normal3f(dr.cross(e1, e2)), mi.Normal3f(0.0, 0.0, 1.0))
-
-
-def _triangle(geometry: Geometry, face: Vector3u, active: Bool, row: UInt32) -> tuple[Point3f, Vector3f, Vector3f]:
-    first, second, third = (geometry.vertices(face[k], active, row=row) for k in range(3))
-    return first, second - first, third - first
 
 
 def corner_values(

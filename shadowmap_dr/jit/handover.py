@@ -23,6 +23,9 @@ from .types import AnyArray, Float, PyTree
 ResultT = TypeVar("ResultT")
 TreeT = TypeVar("TreeT", bound=PyTree)
 
+# Lanes, the most, of trees that are stored for derivatives: 48 MiB for a colour.
+_MOST_STORED = 1 << 22
+
 #: Names of results, and the detached results, in the order of the first computation.
 Results = list[tuple[str, PyTree]]
 
@@ -130,8 +133,11 @@ def evaluated(name: str, tree: TreeT) -> TreeT:
 def stored(name: str, tree: TreeT) -> TreeT:
     """Write the arrays of a tree to memory with what is evaluated next, so that derivatives need not compute them again.
 
-    Values may be those of the first computation. Derivatives are those of the tree. Images without derivatives leave them alone.
+    Values may be those of the first computation. Derivatives are those of the tree. Trees without derivatives, and those of more
+    than four million lanes, are left alone.
     """
+    if max((dr.width(array) for array in arrays_of(tree)), default=0) > _MOST_STORED:
+        return tree
     if _state.given is not None:
         return evaluated(name, tree)
     if _state.kept is not None:

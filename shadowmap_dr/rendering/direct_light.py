@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..jit.broadcast import broadcast_differentiable
+from ..jit.handover import stored
 from ..jit.types import Bool, Color3f, Float, Vector3f
 from ..scene.lights.area import AreaLight
 from ..scene.lights.environment import Environment, UniformRadiance
@@ -41,7 +42,8 @@ def _reflected(surface: Surface, wo: Vector3f, active: Bool, nodes: Sequence[Any
     """:meth:`Surface.evaluate` with accurate sums of derivatives by the parameters of ``nodes``."""
     if surface.colour is not None:
         return surface.evaluate(wo, active)
-    return evaluate(lambda own: own[0].evaluate(*own[1:]), (surface, wo, mi.Bool(active)), nodes, dr.width(surface.shape))
+    own = surface, wo, mi.Bool(active)
+    return stored("reflected", evaluate(lambda own: own[0].evaluate(*own[1:]), own, nodes, dr.width(surface.shape)))
 
 
 def passes_gate(surface: Surface, wo_world: Vector3f, wo: Vector3f) -> Bool:

@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from shadowmap_dr.jit import handover
 from shadowmap_dr.jit.arrays import interleave
 from shadowmap_dr.jit.frozen import take_apart
 from shadowmap_dr.jit.handover import PackedResults, Results, computed, evaluated, interleaved, keeping, stored, using
@@ -130,6 +131,19 @@ def test_stored_values_are_written_with_what_is_evaluated_next(variant: str, att
         assert len(dr.kernel_history((dr.KernelType.JIT,))) == 1
     # Nothing needs the values again where there are no derivatives.
     assert square.state == (dr.VarState.Evaluated if attached else dr.VarState.Unevaluated)
+
+
+def test_large_values_are_not_stored(variant: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(handover, "_MOST_STORED", 2)
+    x = mi.Float(1, 2, 3)
+    dr.enable_grad(x)
+    with keeping() as results:
+        (square,) = stored("square", [x * x])
+    assert not results
+    dr.eval(square + 1)
+    assert square.state == dr.VarState.Unevaluated
+    with using(results):
+        assert stored("square", [square])[0].index_ad == square.index_ad
 
 
 def test_stored_values_are_handed_over(variant: str) -> None:

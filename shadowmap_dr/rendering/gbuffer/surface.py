@@ -11,6 +11,7 @@ import mitsuba as mi
 from ...jit.arrays import backend, ravel
 from ...jit.branches import branch
 from ...jit.broadcast import LIKE_LANES, broadcast_differentiable, copy_of_lane, in_copies
+from ...jit.handover import stored
 from ...jit.types import Bool, Color3f, Float, Normal3f, Point3f, UInt32, Vector3f, Vector3u
 from ...jit.vectors import normalize_or
 from ...scene.geometry import FACETED, FLIP_GEOMETRIC, FLIP_SHADING, HAS_NORMALS, HAS_TEXCOORDS, READS_ATTRIBUTES, Geometry
@@ -196,7 +197,7 @@ def _cosine_colour(data: SceneData, seen: Surface) -> Color3f:
         return mi.UnpolarizedSpectrum(bsdf.eval(mi.BSDFContext(), at, at.wi, active))
 
     own = (si.p, si.uv, si.prim_index, si.shape, seen.bsdf, si.wi.z < 0, seen.active)
-    return evaluate(colour, own, data.materials, width)
+    return stored("colours", evaluate(colour, own, data.materials, width))
 
 
 def _parametrisation(geometry: Geometry, flags: _Flags, hits: SurfacePoints) -> tuple[Any, Any, Any]:

@@ -20,6 +20,10 @@ from .front_surfaces import FrontSurfaces
 _ROUNDS = 8
 # Number of neighbouring lanes that work on neighbouring slots.
 _PACKET = 16
+# Lanes that a thread takes at once. Threads that count with one number wait for each other.
+_BLOCK = 1 << 14
+# Distance of numbers of which each is to have a cache line of its own.
+_LINE = 16
 
 
 @dataclass(frozen=True)
@@ -113,17 +117,60 @@ def differing_pairs(raster: RasterOutput, front: FrontSurfaces | None = None) ->
         apart[1] |= front.differ(pixel, pixel + width, below)
     right, below = right & apart[0], below & apart[1]
     keys = dr.empty(module.UInt64, 2 * pixels)
-    result = PairList(dr.empty(module.UInt32, 2 * pixels), dr.zeros(module.UInt32, 1), dr.zeros(module.UInt32, 1))
+    blocks = -(-pixels // _BLOCK) if dr.backend_v(here) == dr.JitBackend.LLVM else 1
+    found = dr.empty(module.UInt32, 2 * blocks * _BLOCK if blocks > 1 else 2 * pixels)
+    counts = [dr.zeros(module.UInt32, blocks * _LINE if blocks > 1 else 1) for _ in range(2)]
 
     def add(pixel: UInt32, right: Bool, below: Bool) -> UInt32:
-        slot = scatter_inc(result.front, module.UInt32(0), right)
-        dr.scatter(result.pairs, 2 * pixel, slot, right)
-        slot = scatter_inc(result.back, module.UInt32(0), below)
-        dr.scatter(result.pairs, 2 * pixel + 1, uint_input(module, "pairs", 2 * pixels - 1) - slot, below)
+        first, last, counter = module.UInt32(0), uint_input(module, "pairs", 2 * pixels - 1), module.UInt32(0)
+        if blocks > 1:
+            block = pixel // _BLOCK
+            first, last, counter = 2 * _BLOCK * block, 2 * _BLOCK * block + (2 * _BLOCK - 1), _LINE * block
+        dr.scatter(found, 2 * pixel, first + scatter_inc(counts[0], counter, right), right)
+        dr.scatter(found, 2 * pixel + 1, last - scatter_inc(counts[1], counter, below), below)
         dr.scatter(keys, module.UInt64(0), 2 * pixel, right)
         dr.scatter(keys, module.UInt64(0), 2 * pixel + 1, below)
         return pixel
 
     dr.if_stmt((pixel, right, below), right | below, add, lambda pixel, *_: pixel, mode="symbolic", label="differ")
-    dr.eval(result.front, result.back, result.pairs, keys)
-    return result, keys
+    dr.eval(found, keys, counts)
+    return (_joined(found, counts, pixels) if blocks > 1 else PairList(found, *counts)), keys
+
+
+def _joined(found: UInt32, counts: list[UInt32], pixels: int) -> PairList:
+    """One list of the pairs in ``found``, where each block has a part of its own, filled from both ends.
+
+    A packet of lanes copies each part. ``counts``: how many there are at the front and at the back, the first number of each
+    block's line.
+    """
+    module = backend(found)
+    kind = module.UInt32
+    result = PairList(dr.empty(kind, 2 * pixels), dr.empty(kind, 1), dr.empty(kind, 1))
+    lane = dr.arange(kind, dr.width(counts[0]))
+    block, within = lane // _LINE, lane % _LINE
+
+    def before(other: UInt32, front: UInt32, back: UInt32) -> tuple[UInt32, UInt32, UInt32]:
+        own = [dr.gather(kind, count, other * _LINE) for count in counts]
+        return other + 1, front + own[0], back + own[1]
+
+    state = kind(0), kind(0), kind(0)
+    _, front, back = dr.while_loop(state, lambda other, *_: other < block, before, mode="symbolic", label="blocks before")
+    own_front, own_back = (dr.gather(kind, count, block * _LINE) for count in counts)
+    last = lane == uint_input(module, "blocks", dr.width(lane) - 1)
+    dr.scatter(result.front, front + own_front, kind(0), last)
+    dr.scatter(result.back, back + own_back, kind(0), last)
+
+    def copy(
+        number: UInt32, block: UInt32, front: UInt32, back: UInt32, own_front: UInt32, own_back: UInt32
+    ) -> tuple[UInt32, ...]:
+        ahead, behind = number < own_front, number - own_front
+        start, end = 2 * _BLOCK * block, 2 * _BLOCK * block + (2 * _BLOCK - 1)
+        pair = dr.gather(kind, found, dr.select(ahead, start + number, end - behind))
+        place = dr.select(ahead, front + number, uint_input(module, "pairs", 2 * pixels - 1) - (back + behind))
+        dr.scatter(result.pairs, pair, place)
+        return number + _LINE, block, front, back, own_front, own_back
+
+    lanes = within, block, front, back, own_front, own_back
+    dr.while_loop(lanes, lambda number, *rest: number < rest[3] + rest[4], copy, mode="symbolic", label="join blocks")
+    dr.eval(result.pairs, result.front, result.back)
+    return result

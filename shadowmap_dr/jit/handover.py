@@ -130,11 +130,12 @@ def evaluated(name: str, tree: TreeT) -> TreeT:
     return tree
 
 
-def stored(name: str, tree: TreeT) -> TreeT:
+def stored(name: str, tree: TreeT, beside: PyTree = None) -> TreeT:
     """Write the arrays of a tree to memory with what is evaluated next, so that derivatives need not compute them again.
 
-    Values may be those of the first computation. Derivatives are those of the tree. Trees without derivatives, and those of more
-    than four million lanes, are left alone.
+    Derivatives need them if the tree is attached, or arrays that it is multiplied with (``beside``).
+    Values may be those of the first computation. Derivatives are those of the tree. Trees of more than four
+    million lanes are left alone.
     """
     if max((dr.width(array) for array in arrays_of(tree)), default=0) > _MOST_STORED:
         return tree
@@ -142,7 +143,7 @@ def stored(name: str, tree: TreeT) -> TreeT:
         return evaluated(name, tree)
     if _state.kept is not None:
         _state.kept.append((name, tree_map(tree, dr.detach)))
-    if _state.kept is not None or dr.grad_enabled(tree):
+    if _state.kept is not None or dr.grad_enabled(tree, beside):
         dr.schedule(tree)
     return tree
 

@@ -35,15 +35,17 @@ def direct_light(
     active = mi.Bool(surface.active)
     if gate:
         active &= passes_gate(surface, wo_world, wo)
-    return dr.select(active, _reflected(surface, wo, active, nodes) * weight * visibility, 0.0)
+    reflected = _reflected(surface, wo, active, nodes)
+    if surface.colour is None:
+        reflected = stored("reflected", reflected, beside=(weight, visibility))
+    return dr.select(active, reflected * weight * visibility, 0.0)
 
 
 def _reflected(surface: Surface, wo: Vector3f, active: Bool, nodes: Sequence[Any]) -> Color3f:
     """:meth:`Surface.evaluate` with accurate sums of derivatives by the parameters of ``nodes``."""
     if surface.colour is not None:
         return surface.evaluate(wo, active)
-    own = surface, wo, mi.Bool(active)
-    return stored("reflected", evaluate(lambda own: own[0].evaluate(*own[1:]), own, nodes, dr.width(surface.shape)))
+    return evaluate(lambda own: own[0].evaluate(*own[1:]), (surface, wo, mi.Bool(active)), nodes, dr.width(surface.shape))
 
 
 def passes_gate(surface: Surface, wo_world: Vector3f, wo: Vector3f) -> Bool:

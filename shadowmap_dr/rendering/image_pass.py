@@ -13,7 +13,7 @@ import mitsuba as mi
 
 from ..jit.arrays import interleave
 from ..jit.broadcast import broadcast_differentiable
-from ..jit.handover import computed, evaluated
+from ..jit.handover import computed, evaluated, stored
 from ..jit.types import Bool, Color3f, Float, TensorXf
 from ..raster import Crossings, antialias
 from ..scene.geometry import Geometry
@@ -229,6 +229,8 @@ class ImagePass:
         irradiance = light.radiance(white, lighting, incident)
         if dr.grad_enabled(colour) and lighting.samples:
             dr.eval(irradiance)  # else the derivative would run its loops again
+        if light.needs_frames:  # else a look-up in a small table
+            colour = stored("colours", colour, beside=irradiance)
         return incident, colour * irradiance
 
     def _lit(self, frame: Frame, lighting: Lighting) -> LitFrame:

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from ..errors import ShadowmapError
 from .geometry import ShapeInfo, rows_of, with_faces
 from .mitsuba_meshes import has_reversed_faces
+from .mitsuba_objects import is_even
 from .shapes.sources import ShapeSource
 
 # Most squared distance of vertices from a common plane, relative to the shape's squared extent, for a planar shape.
@@ -86,6 +87,7 @@ def describe_all(
     turned = _turned(parts, has_normals & np.array([kind == "Rectangle" for kind in kinds]))
     faceted, planar = _faceted(parts, meshes & has_normals & ~reversed_), _planar(parts)
     see_through: dict[mi.BSDF, bool] = {}
+    even: dict[mi.BSDF, bool] = {}
     infos = []
     columns = (reversed_, flipped, turned, faceted, planar)
     sizes = (parts.vertex_starts, parts.vertex_counts, parts.face_starts, parts.face_counts)
@@ -95,6 +97,8 @@ def describe_all(
         bsdf = source.shape.bsdf()
         if bsdf not in see_through:
             see_through[bsdf] = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
+            even[bsdf] = is_even(bsdf)
+        emitter = source.shape.emitter()
         infos.append(
             ShapeInfo(
                 name=name,
@@ -111,7 +115,8 @@ def describe_all(
                 planar=flat,
                 against_winding=mirrored_ != turn,
                 see_through=see_through[bsdf],
-                unseen=bsdf.class_name() == "Null" and source.shape.emitter() is None,
+                unseen=bsdf.class_name() == "Null" and emitter is None,
+                varied=not even[bsdf] or not (emitter is None or is_even(emitter)),
                 faceted=facets,
             )
         )

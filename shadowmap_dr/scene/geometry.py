@@ -58,7 +58,7 @@ class ShapeInfo:
     ``thindielectric``, ...) lets some light pass straight on. ``unseen``: its BSDF is ``null``, and it does not shine.
     ``faceted``: its vertex normals were those of its faces, as on a cube or rectangle, when the scene was loaded.
     ``against_winding``: its vertex normals, before ``flip_shading``, are on the other side of (p1 - p0) x (p2 - p0), and stay
-    there when its vertices are replaced.
+    there when its vertices are replaced. ``varied``: what it reflects or emits may differ from place to place, as with a texture.
     """
 
     name: str
@@ -77,6 +77,7 @@ class ShapeInfo:
     faceted: bool = False
     against_winding: bool = False
     unseen: bool = False
+    varied: bool = True
 
     @property
     def flags(self) -> int:
@@ -193,6 +194,12 @@ class Geometry:
         if dr.grad_enabled(self.texcoords):
             return True
         return dr.grad_enabled(self.positions, self.normals) and (self.changed is None or info.name in self.changed)
+
+    def attached_places(self) -> bool:
+        """True if the triangles or texture coordinates of shapes with textures may carry gradients (known on the host)."""
+        return dr.grad_enabled(self.positions, self.normals, self.texcoords) and any(
+            info.varied and self.attached(info) for info in self.shapes
+        )
 
     def known_unchanged(self, info: ShapeInfo) -> bool:
         """True if a planar or faceted shape is known (on the host) to be as it was when the scene was loaded."""

@@ -13,6 +13,19 @@ from ..jit.types import Float
 from .mitsuba_meshes import VERTEX_PARAMETERS
 
 _NO_ATTRIBUTES = VERTEX_PARAMETERS | {"vertex_count", "face_count"}
+# Classes of BSDFs and emitters whose values depend on the place through their textures only.
+_EVEN = {
+    *(
+        "SmoothDiffuse",
+        "SmoothPlastic",
+        "RoughPlastic",
+        "SmoothConductor",
+        "RoughConductor",
+        "SmoothDielectric",
+        "RoughDielectric",
+    ),
+    *("Principled", "PrincipledThin", "ThinDielectric", "Null", "MaskBSDF", "BlendBSDF", "TwoSidedBRDF", "AreaLight"),
+}
 
 
 def parameters(node: mi.Object) -> dict[str, Any]:
@@ -152,6 +165,13 @@ def is_plain(bsdf: mi.BSDF) -> bool:
     if bsdf.class_name() in ("Null", "ThinDielectric"):
         return True
     return bsdf.class_name() == "SmoothDiffuse" and all(_is_uniform(part) for part in parts)
+
+
+def is_even(node: mi.BSDF | mi.Emitter) -> bool:
+    """True if a BSDF or emitter is known to be the same everywhere: one of a known class, whose textures are."""
+    if node.class_name() not in _EVEN:
+        return False
+    return all(is_even(part) if isinstance(part, mi.BSDF) else _is_uniform(part) for _, part in children(node))
 
 
 def _is_uniform(texture: mi.Object) -> bool:

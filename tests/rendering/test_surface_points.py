@@ -112,3 +112,54 @@ def test_corners_of_triangles_are_those_of_their_vertices(variant: str) -> None:
     # They are numbers of these positions only.
     moved = prepared.with_positions({"ball": geometry.shape_positions("ball") + 0.1})
     assert moved.corners is None
+
+
+def textured(names: tuple[str, ...]) -> Renderer:
+    """A ball and a block before a wall, with textures on some of them."""
+    pattern = np.random.default_rng(5).uniform(0.1, 0.9, (5, 4, 3)).astype(np.float32)
+    paint = {"type": "bitmap", "bitmap": mi.Bitmap(pattern), "raw": True}
+    film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
+    to_world = mi.ScalarTransform4f().look_at([-2, 1.5, 4], [0, 0, 0], [0, 1, 0])
+    shapes = {
+        "ball": {"type": "sphere", "radius": 0.8},
+        "block": {
+            "type": "cube",
+            "to_world": mi.ScalarTransform4f().translate([1.1, -0.2, 0.4]).rotate([0, 1, 0], 30).scale(0.4),
+        },
+        "wall": {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -1.2]).scale(4)},
+    }
+    for name in names:
+        shapes[name]["bsdf"] = {"type": "diffuse", "reflectance": paint}
+    scene = {"type": "scene", "sun": {"type": "directional", "direction": [0.3, -0.2, -1.0]}, **shapes}
+    return Renderer.from_scene(
+        mi.load_dict({**scene, "camera": {"type": "perspective", "fov": 40, "to_world": to_world, "film": film}}, optimize=False),
+        tessellation=16,
+    )
+
+
+@pytest.mark.parametrize("moving", ["ball", "block", "camera", "sun"])
+@pytest.mark.parametrize("names", [("wall",), ("ball",), ("wall", "block")])
+def test_only_textures_at_rest_are_not_asked_for_derivatives(variant: str, names: tuple[str, ...], moving: str) -> None:
+    """Derivative images against differences of images."""
+    renderer = textured(names)
+    assert {info.name for info in renderer.data.geometry.shapes if info.varied} == set(names)
+
+    def image(x: mi.Float) -> Any:
+        move = mi.Transform4f().translate([x, 0, 0]) @ mi.Transform4f().rotate([0, 1, 0], 20 * x)
+        given: dict[str, Any] = {"transforms": {moving: move}}
+        if moving == "camera":
+            camera = renderer.data.sensors[0][0]
+            given = {"sensor": replace(camera, to_world=move @ camera.to_world)}
+        elif moving == "sun":
+            light = renderer.light("sun")
+            given = {"lights": {"sun": replace(light, direction=move @ light.direction)}}
+        return renderer.render(spp=64, **given)
+
+    x, step = mi.Float(0), 0.005
+    dr.enable_grad(x)
+    moved = image(x)
+    dr.forward(x)
+    got = moved.grad.numpy()
+    want = (image(mi.Float(step)).numpy() - image(mi.Float(-step)).numpy()) / (2 * step)
+    assert np.sum(got * want) / np.sqrt(np.sum(got**2) * np.sum(want**2)) > 0.97
+    assert np.sum(got * want) / np.sum(want**2) == pytest.approx(1, abs=0.05)

@@ -16,7 +16,7 @@ from shadowmap_dr.rendering.gbuffer.surface import surface
 from shadowmap_dr.scene import load as scene_module
 from shadowmap_dr.scene.descriptions import Parts, describe_all
 from shadowmap_dr.scene.load import load, refresh
-from shadowmap_dr.scene.mitsuba_objects import children
+from shadowmap_dr.scene.mitsuba_objects import children, is_even
 from shadowmap_dr.scene.shapes.sources import MeshSource
 
 EXAMPLES = ["pose", "gallery", "still_life", "pavilion", "meadow", "leafy_tree", "stained_window", "curtain"]
@@ -266,3 +266,39 @@ def test_scalar_variant_is_refused(variant: str) -> None:
             load(mi.load_dict({"type": "scene", "box": {"type": "cube"}}))
     finally:
         mi.set_variant(variant)
+
+
+EVEN = {"type": "rgb", "value": [0.2, 0.5, 0.3]}
+CHECKS = {"type": "checkerboard"}
+
+
+@pytest.mark.parametrize(
+    ("material", "varied"),
+    [
+        ({"type": "diffuse", "reflectance": EVEN}, False),
+        ({"type": "diffuse", "reflectance": CHECKS}, True),
+        ({"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_color"}}, True),
+        ({"type": "roughplastic", "diffuse_reflectance": EVEN, "alpha": 0.3}, False),
+        ({"type": "plastic", "specular_reflectance": CHECKS}, True),
+        ({"type": "roughconductor", "alpha": CHECKS}, True),
+        ({"type": "principled", "base_color": EVEN}, False),
+        ({"type": "principled", "roughness": CHECKS}, True),
+        ({"type": "thindielectric"}, False),
+        ({"type": "thindielectric", "specular_transmittance": CHECKS}, True),
+        ({"type": "twosided", "inner": {"type": "diffuse", "reflectance": CHECKS}}, True),
+        ({"type": "mask", "opacity": 0.5, "inner": {"type": "diffuse"}}, False),
+        ({"type": "mask", "opacity": CHECKS, "inner": {"type": "diffuse"}}, True),
+        ({"type": "blendbsdf", "weight": CHECKS, "a": {"type": "diffuse"}, "b": {"type": "plastic"}}, True),
+        ({"type": "bumpmap", "arbitrary": CHECKS, "inner": {"type": "diffuse"}}, True),
+        ({"type": "hair"}, True),
+    ],
+)
+def test_materials_that_vary_over_a_surface(variant: str, material: dict[str, Any], varied: bool) -> None:
+    assert is_even(mi.load_dict(material)) != varied
+
+
+@pytest.mark.parametrize(("radiance", "varied"), [(EVEN, False), (CHECKS, True)])
+def test_lamps_that_vary_over_a_surface(variant: str, radiance: dict[str, Any], varied: bool) -> None:
+    lamp = {"type": "rectangle", "light": {"type": "area", "radiance": radiance}}
+    data = load(mi.load_dict({"type": "scene", "lamp": lamp, "floor": {"type": "rectangle"}}), warn=False)
+    assert {info.name: info.varied for info in data.geometry.shapes} == {"lamp": varied, "floor": False}

@@ -11,7 +11,6 @@ import mitsuba as mi
 from ...jit.arrays import backend, ravel
 from ...jit.branches import branch
 from ...jit.broadcast import LIKE_LANES, broadcast_differentiable, copy_of_lane, in_copies
-from ...jit.handover import stored
 from ...jit.types import Bool, Color3f, Float, Normal3f, Point3f, UInt32, Vector3f, Vector3u
 from ...jit.vectors import normalize_or
 from ...scene.geometry import FACETED, FLIP_GEOMETRIC, FLIP_SHADING, HAS_NORMALS, HAS_TEXCOORDS, READS_ATTRIBUTES, Geometry
@@ -150,6 +149,9 @@ def surface_at(
         si.sh_frame = mi.Frame3f(mi.Vector3f(0), mi.Vector3f(0), n_shading)
     si.t = dr.select(active, dr.norm(sensor.origin - hits.p_world), dr.inf)
     si.p = _interaction_position(geometry, flags, hits)
+    if not hits.sliding:
+        # Textures are not asked for derivatives that are zero.
+        si.p, si.uv = dr.detach(si.p), dr.detach(si.uv)
     si.n = flags.negate(FLIP_GEOMETRIC, hits.n_face)
     si.wi = si.to_local(hits.wi_world)
     si.shape = dr.gather(mi.ShapePtr, data.shape_ptr, shape, active)
@@ -197,7 +199,7 @@ def _cosine_colour(data: SceneData, seen: Surface) -> Color3f:
         return mi.UnpolarizedSpectrum(bsdf.eval(mi.BSDFContext(), at, at.wi, active))
 
     own = (si.p, si.uv, si.prim_index, si.shape, seen.bsdf, si.wi.z < 0, seen.active)
-    return stored("colours", evaluate(colour, own, data.materials, width))
+    return evaluate(colour, own, data.materials, width)
 
 
 def _parametrisation(geometry: Geometry, flags: _Flags, hits: SurfacePoints) -> tuple[Any, Any, Any]:

@@ -42,6 +42,7 @@ class SurfacePoints:
     wi_world     Vector3f (N,), unit vector to the camera, attached; None if no camera was given
     depth        Float (N,), distance along a perspective camera's axis, detached; None if there is no such camera
     pixel        Float (N,) or of width 1, height of the camera's pixels at that distance, world units, detached; None likewise
+    sliding      False if it is known (on the host) that no point moves over a shape with textures, and none with such a shape
     """
 
     triangle: UInt32
@@ -60,6 +61,7 @@ class SurfacePoints:
     wi_world: Vector3f = NOT_GIVEN
     depth: Float | None = None
     pixel: Float | None = None
+    sliding: bool = True
 
     def corners(self, kind: type[ArrayT], buffer: AnyArray) -> tuple[ArrayT, ArrayT, ArrayT]:
         """A vertex attribute at vertex 0 and the differences of vertices 1 and 2 to it. Attached where vertices move.
@@ -122,7 +124,8 @@ def pixel_hits(geometry: Geometry, sensor: Sensor, triangle: UInt32, size: Image
         depth = dr.dot(dr.detach(p_world) - dr.detach(ray_o), dr.detach(sensor.direction))
         pixel *= depth
     return SurfacePoints(
-        triangle, active, changed, face, row, shape, flags, e1, e2, normal, u, v, p_world, wi_world, depth, pixel
+        *(triangle, active, changed, face, row, shape, flags, e1, e2, normal, u, v, p_world, wi_world, depth, pixel),
+        sliding=moving or geometry.attached_places(),
     )
 
 

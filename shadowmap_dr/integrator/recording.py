@@ -61,7 +61,9 @@ class FrozenPasses:
         places, outer = attached_places(_fields_of(data, fields))
         if not outer:
             return
-        pass_on(outer, self._gradients(spp, (fields, places), _owned(gradient), renderer, results))
+        # Not the renderer's own: images are read without gradients, which leaves open what carries any.
+        changed = data.geometry.changed if "geometry" in fields else renderer.data.geometry.changed
+        pass_on(outer, self._gradients(spp, (fields, places), changed, _owned(gradient), renderer, results))
 
     @property
     def recordings(self) -> int:
@@ -83,11 +85,12 @@ def _image(spp: int, renderer: Renderer, keep: bool) -> tuple[TensorXf, Frusta |
 def _gradients(
     spp: int,
     attached_to: tuple[tuple[str, ...], tuple[int, ...]],
+    changed: tuple[str, ...] | None,
     gradient: TensorXf,
     renderer: Renderer,
     results: PackedResults,
 ) -> list[AnyArray]:
-    """Gradients of the arrays at some places of some fields of the renderer's data."""
+    """Gradients of the arrays at some places of some fields of the renderer's data. ``changed``: :attr:`Geometry.changed`."""
     leaves: list[AnyArray] = []
     (fields, places), place = attached_to, count()
 
@@ -100,6 +103,7 @@ def _gradients(
         return leaf
 
     found = dict(zip(fields, tree_map(_fields_of(renderer.data, fields), attached), strict=True))
+    found["geometry"] = with_fields(found.get("geometry", renderer.data.geometry), changed=changed)
     renderer = renderer.with_data(with_fields(renderer.data, **found))
     with restored_scalars():
         with using(results.unpacked()):

@@ -75,6 +75,22 @@ def test_all_views_of_a_loss_hand_over(variant: str, given: list[int], recorded:
     assert_same(found, steps(shadowmap(recorded=False), _FIRST + 3))
 
 
+@pytest.mark.parametrize("recorded", [True, False])
+def test_derivatives_know_which_shapes_carry_gradients(variant: str, recorded: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pixels of other shapes have nothing to do then."""
+    changed = []
+    render = Renderer.render
+
+    def noted(self: Renderer, *args: Any, **kwargs: Any) -> Any:
+        if dr.grad_enabled(self.data.geometry.positions):
+            changed.append(self.data.geometry.changed)
+        return render(self, *args, **kwargs)
+
+    monkeypatch.setattr(Renderer, "render", noted)
+    steps(shadowmap(recorded=recorded), 2, sensors=(0,))
+    assert changed and set(changed) == {("ball",)}
+
+
 def change_material(params: Any, k: int) -> None:
     params["ball.bsdf.reflectance.value"] = mi.Float(0.2 + 0.02 * k)
     params.update()

@@ -16,11 +16,10 @@ from ..jit.gc import gc_paused
 from ..jit.pytree import with_fields
 from ..jit.types import AnyArray, Float, PyTree, TensorXf, UInt32
 from ..rendering.extended_lights import SkyWatch, SoftFrusta, still_aimed
-from ..rendering.light_loops import MANY_LIGHTS
 from ..rendering.pass_cache import PassCache
 from ..rendering.renderer import Renderer
 from ..rendering.settings import RenderSettings
-from ..rendering.waiting import MOST_SAMPLES, TEXELS
+from ..rendering.waiting import MOST_OF_LATEST, TEXELS
 from ..scene.changes import MirrorWatch, ParameterWatch
 from ..scene.geometry import NOT_READ
 from ..scene.load import SceneData, load, refresh, with_positions
@@ -40,9 +39,8 @@ from .steady_steps import SteadySteps
 # Sensors whose fit of the shadow maps is remembered, and how many of them may be foreign to the scene. Some programs make a new
 # sensor for each image; remembered sensors are kept alive, and recordings hold only for a fixed number of objects.
 _REMEMBERED_SENSORS, _OTHERS = 64, 8
-# Samples of an image, and texels of its maps that take as long, up to which replays are faster under extended lights, which take
-# longer in recordings, and under many lights, whose results are not handed to the backward pass. Otherwise the limit is that of
-# results that are handed over.
+# Samples of an image, and texels of its maps that take as long, up to which replays are faster under skies, which take longer in
+# recordings, and where maps are made in slices. Otherwise the limit is that of results that are handed over.
 _LARGEST = 3 << 16
 
 
@@ -203,11 +201,14 @@ class SceneCache:
 
     def _passes(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, now: ParameterState) -> PassCache:
         """Cache of passes for the next image."""
-        samples = _samples(sensor, spp)
         with dr.resume_grad():  # so that attached parameters are recognised
             camera = ParameterState.of(sensor)
-        weight = samples + self.renderer.texels // TEXELS
+        weight = self._weight(sensor, spp)
         return self.passes.cache_for(now, camera, sensor, spp, weight, partial(names_by_level, scene, self.renderer.data))
+
+    def _weight(self, sensor: mi.Sensor, spp: int) -> int:
+        """Samples of an image, and texels of its shadow maps as samples that take as much memory."""
+        return _samples(sensor, spp) + self.renderer.texels // TEXELS
 
     def is_steady(self, attached: tuple[str, ...], sensor: mi.Sensor, spp: int) -> bool:
         """True if the next image is a step of a loop that is worth a recording. Call once for each image.
@@ -215,16 +216,13 @@ class SceneCache:
         ``attached``: names of the attached parameters of the scene and the sensor. Gradients flow only through data read from the
         scene.
         """
-        samples = _samples(sensor, spp)
         if all(name.endswith(COLOURS_OF_LIGHTS) for name in attached):
             return False  # surfaces and maps of the last step serve again, which a recording would render
         if not dr.flag(dr.JitFlag.KernelFreezing) or dr.flag(dr.JitFlag.Debug):
             return False
         renderer = self.renderer
-        if renderer.soft or renderer.slices or len(self.lights) >= MANY_LIGHTS:
-            if samples + renderer.texels // TEXELS > _LARGEST:
-                return False
-        elif samples > MOST_SAMPLES:
+        slow = renderer.slices or any(plan.kind == "distant" for plan in renderer.soft)
+        if self._weight(sensor, spp) > (_LARGEST if slow else MOST_OF_LATEST):
             return False
         values = self.untracked.now()
         if values != self.steady.values:
@@ -246,13 +244,12 @@ class SceneCache:
             current = self._current(scene, sensor, now)
         self._check_vertices(current)
         current.note_kernels(spp)
-        samples = _samples(sensor, spp)
-        keep = samples <= MOST_SAMPLES and current.is_one_pass
+        weight = self._weight(sensor, spp)
+        keep = weight <= MOST_OF_LATEST and current.is_one_pass
         detached = self._plain(current)
         image, frusta, soft_frusta, results = self.recorded.image(spp, detached, keep)
         self._remember(scene, sensor, frusta, soft_frusta)
         if keep and now.attached:
-            weight = samples + self.renderer.texels // TEXELS
             self.handed.add(sensor, spp, weight, (now.scene, now.camera), detached, results)
         self.handed.follow(now.scene, scene)
         return image

@@ -37,7 +37,6 @@ from .gbuffer.pixel_footprint import footprint_points
 from .gbuffer.shading_edges import ShadingEdges
 from .gbuffer.translucency import Translucency
 from .image_pass import ImagePass
-from .light_loops import MANY_LIGHTS
 from .light_pass import Lighting, LightPass, plan_extended_lights
 from .light_slices import LightSlice, plan_slices
 from .light_tiles import texel_density, with_tiles
@@ -247,7 +246,7 @@ class Renderer:
     @property
     def is_one_pass(self) -> bool:
         """True if an image and its derivatives need each shadow map once, and all of them together."""
-        return not (self.slices or len(self.data.lights) >= MANY_LIGHTS)
+        return not self.slices
 
     def with_updated_shading_edges(self) -> Renderer:
         """The same renderer with the edges at which colours of meshes jump, found again."""

@@ -6,3 +6,6 @@ from __future__ import annotations
 MOST_SAMPLES = 1 << 20
 #: Texels of shadow maps that take as much memory as one sample.
 TEXELS = 6
+#: Most samples, and texels that take as much memory, of an image whose results are handed to its backward pass. Only the latest
+#: image may have more than ``MOST_SAMPLES``: computing its results again would take as much memory.
+MOST_OF_LATEST = 1 << 22

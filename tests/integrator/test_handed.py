@@ -75,6 +75,16 @@ def test_all_views_of_a_loss_hand_over(variant: str, given: list[int], recorded:
     assert_same(found, steps(shadowmap(recorded=False), _FIRST + 3))
 
 
+@pytest.mark.parametrize("others", [0, 9])
+def test_many_lights_hand_over(variant: str, given: list[int], monkeypatch: pytest.MonkeyPatch, others: int) -> None:
+    """Also lights that are summed up in a loop."""
+    lights = {f"sun {k}": {"type": "directional", "direction": [0.1 * k - 0.4, 0.3, -1]} for k in range(others)}
+    monkeypatch.setitem(globals(), "views", lambda: small_scene(**lights))
+    found = steps(shadowmap(recorded=True), 3, sensors=(0,))
+    assert len(given) == 3 and min(given) > 5
+    assert_same(found, steps(shadowmap(recorded=False), 3, sensors=(0,)))
+
+
 @pytest.mark.parametrize("recorded", [True, False])
 def test_derivatives_know_which_shapes_carry_gradients(variant: str, recorded: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Pixels of other shapes have nothing to do then."""

@@ -8,4 +8,4 @@ MOST_SAMPLES = 1 << 20
 TEXELS = 6
 #: Most samples, and texels that take as much memory, of an image whose results are handed to its backward pass. Only the latest
 #: image may have more than ``MOST_SAMPLES``: computing its results again would take as much memory.
-MOST_OF_LATEST = 1 << 22
+MOST_OF_LATEST = 6 << 20

@@ -22,13 +22,19 @@ from .gbuffer.surface import Surface
 
 
 def direct_light(
-    surface: Surface, light: Light, visibility: Float | Color3f | float = 1.0, nodes: Sequence[Any] = (), *, gate: bool = True
+    surface: Surface,
+    light: Light,
+    visibility: Float | Color3f | float = 1.0,
+    nodes: Sequence[Any] = (),
+    *,
+    gate: bool = True,
+    keep: bool = False,
 ) -> Color3f:
     """Radiance (colour, N) of one light towards the camera: BSDF * light * visibility.
 
     ``visibility`` Float or colour (N,), 0 dark to 1 lit. ``nodes``: :attr:`SceneData.materials`. ``gate`` removes light from
-    directions in front of the shading normal but behind the triangle, as a shadow ray would. Gradients flow to surface, light
-    and visibility, not through the gate.
+    directions in front of the shading normal but behind the triangle, as a shadow ray would. ``keep``: store for derivatives what
+    materials that depend on directions reflect. Gradients flow to surface, light and visibility, not through the gate.
     """
     wo_world, weight = broadcast_differentiable(light, dr.width(surface.shape)).illuminate(surface.p_world, surface.active)
     wo = surface.si.to_local(wo_world)
@@ -36,7 +42,7 @@ def direct_light(
     if gate:
         active &= passes_gate(surface, wo_world, wo)
     reflected = _reflected(surface, wo, active, nodes)
-    if surface.colour is None:
+    if keep and surface.colour is None:
         reflected = stored("reflected", reflected, beside=(weight, visibility))
     return dr.select(active, reflected * weight * visibility, 0.0)
 

@@ -217,19 +217,23 @@ class ImagePass:
     ) -> tuple[IncidentLight, Any]:
         """(light that reaches a frame, reflected radiance (colour, N) towards the camera)."""
         light, colour = self.light, frame.surface.colour
+        # Samples of several layers are not evaluated together: stored values would need kernels of their own.
+        keep = self.cameras.translucency is None
         if lighting.sliced is not None:
             color, each = light.reflected_in_slices(frame, lighting, shapes)
             return IncidentLight((), each, 0, ()), light.with_ambient(color, frame.surface)
         if colour is None:
             incident = light.incident_light(frame, lighting, visible)
+            incident = incident.stored() if keep else incident
             return incident, light.radiance(frame, lighting, incident)
         # In the same order as with cached light, so that images of an unchanged scene are equal bit by bit.
         white = _white(frame)
         incident = light.incident_light(white, lighting, visible)
+        incident = incident.stored() if keep else incident
         irradiance = light.radiance(white, lighting, incident)
         if dr.grad_enabled(colour) and lighting.samples:
             dr.eval(irradiance)  # else the derivative would run its loops again
-        if light.needs_frames:  # else a look-up in a small table
+        if keep and light.needs_frames:  # else a look-up in a small table
             colour = stored("colours", colour, beside=irradiance)
         return incident, colour * irradiance
 

@@ -127,12 +127,18 @@ class IncidentLight:
         visible: visibility of each of these lights, ``Float`` (N,), or a colour (N,) with translucent casters.
         looped: radiance (colour, N) towards the camera from all other lights without extent, or 0.
         parts: see :attr:`Visibilities.parts`; None: look visibility up in the maps.
+        kept: whether values are :func:`~shadowmap_dr.jit.handover.stored` for derivatives.
     """
 
     lights: tuple[Any, ...]
     visible: Sequence[Float | Color3f]
     looped: Color3f | int
     parts: tuple[Any, ...]
+    kept: bool = False
+
+    def stored(self) -> IncidentLight:
+        """The same light, of which derivatives read the visibilities that the image has found."""
+        return replace(self, visible=stored("visibilities", list(self.visible)), kept=True)
 
 
 @dataclass(frozen=True)
@@ -299,7 +305,7 @@ class LightPass:
             return IncidentLight(self._outlined(frame, lighting.lights), known.lights, 0, known.parts)
         looped, written = self._in_tables(frame, lighting)
         lights = [lighting.lights[k] for k in written]
-        visible = stored("visibilities", self.visibilities(frame, lighting, written, lights))
+        visible = self.visibilities(frame, lighting, written, lights)
         return IncidentLight(self._outlined(frame, lights), visible, looped, (None,) * len(lighting.samples))
 
     def visible(self, frame: Frame, lighting: Lighting) -> Visibilities:
@@ -340,7 +346,7 @@ class LightPass:
         color = dr.zeros(mi.UnpolarizedSpectrum, dr.width(seen.shape))
         nodes = self.data.materials
         for light, fraction in zip(incident.lights, incident.visible, strict=True):
-            color += direct_light(seen, light, fraction, nodes, gate=gate)
+            color += direct_light(seen, light, fraction, nodes, gate=gate, keep=incident.kept)
         soft = self.soft if self.settings.lit else ()
         for plan, samples, parts in zip(soft, lighting.samples, incident.parts, strict=True):
             interleaving = _interleaving(samples, frame.view)

@@ -133,9 +133,8 @@ def evaluated(name: str, tree: TreeT) -> TreeT:
 def stored(name: str, tree: TreeT, beside: PyTree = None) -> TreeT:
     """Write the arrays of a tree to memory with what is evaluated next, so that derivatives need not compute them again.
 
-    Derivatives need them if the tree is attached, or arrays that it is multiplied with (``beside``).
-    Values may be those of the first computation. Derivatives are those of the tree. Trees of more than four
-    million lanes are left alone.
+    Derivatives need them if the tree is attached, or arrays that it is multiplied with (``beside``). Values may be those of the
+    first computation. Derivatives are those of the tree. Trees of more than four million lanes are left alone.
     """
     if max((dr.width(array) for array in arrays_of(tree)), default=0) > _MOST_STORED:
         return tree

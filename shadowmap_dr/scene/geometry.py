@@ -222,8 +222,8 @@ class Geometry:
         if copies == 1:
             return replace(self, packets=packets, corners=corners)
         *first, normals, texcoords = made
-        found = replace(self, packets=first[0] if first else None, normals=normals, texcoords=texcoords, copies=copies)
-        return replace(found, corners=corners)
+        packets = first[0] if first else None
+        return replace(self, packets=packets, corners=corners, normals=normals, texcoords=texcoords, copies=copies)
 
     def _corners(self) -> list[Float]:
         """Numbers of ``corners``."""

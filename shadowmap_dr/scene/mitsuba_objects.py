@@ -14,18 +14,10 @@ from .mitsuba_meshes import VERTEX_PARAMETERS
 
 _NO_ATTRIBUTES = VERTEX_PARAMETERS | {"vertex_count", "face_count"}
 # Classes of BSDFs and emitters whose values depend on the place through their textures only.
-_EVEN = {
-    *(
-        "SmoothDiffuse",
-        "SmoothPlastic",
-        "RoughPlastic",
-        "SmoothConductor",
-        "RoughConductor",
-        "SmoothDielectric",
-        "RoughDielectric",
-    ),
-    *("Principled", "PrincipledThin", "ThinDielectric", "Null", "MaskBSDF", "BlendBSDF", "TwoSidedBRDF", "AreaLight"),
-}
+_EVEN = frozenset(
+    "SmoothDiffuse SmoothPlastic RoughPlastic SmoothConductor RoughConductor SmoothDielectric RoughDielectric Principled "
+    "PrincipledThin ThinDielectric Null MaskBSDF BlendBSDF TwoSidedBRDF AreaLight".split()
+)
 
 
 def parameters(node: mi.Object) -> dict[str, Any]:

@@ -119,9 +119,11 @@ def pixel_hits(geometry: Geometry, sensor: Sensor, triangle: UInt32, size: Image
         found = tuple(replace_grad(value, other) for value, other in zip(found, moved, strict=True))
     e1, e2, normal, u, v, p_world = found
     wi_world = -dr.normalize(ray_d)
+    # Directions have unit length along the axis, so the ray's parameter is the depth.
     depth = None
     if sensor.kind == "perspective":
-        depth = dr.dot(dr.detach(p_world) - dr.detach(ray_o), dr.detach(sensor.direction))
+        d = dr.detach(ray_d)
+        depth = dr.dot(dr.detach(p_world) - dr.detach(ray_o), d) * dr.rcp(dr.squared_norm(d))
         pixel *= depth
     return SurfacePoints(
         *(triangle, active, changed, face, row, shape, flags, e1, e2, normal, u, v, p_world, wi_world, depth, pixel),
@@ -139,14 +141,15 @@ def _intersect(
         n = dr.cross(a, b)
         across = dr.dot(n, d)
         edge_on = ~(dr.abs(across) > 0)
+        inverse = dr.rcp(dr.select(edge_on, 1, across))
         s = o - q
         # The rasterizer found the pixel inside: rounding, on triangles seen edge-on, must not move the point outside.
-        u = dr.maximum(dr.mulsign(dr.dot(d, dr.cross(s, b)), across), 0)
-        v = dr.maximum(dr.mulsign(dr.dot(d, dr.cross(a, s)), across), 0)
-        inside = dr.rcp(dr.maximum(u + v, dr.select(edge_on, 1, dr.abs(across))))
-        u, v = dr.select(active, u * inside, 0), dr.select(active, v * inside, 0)
+        u = dr.maximum(dr.dot(d, dr.cross(s, b)) * inverse, 0)
+        v = dr.maximum(dr.dot(d, dr.cross(a, s)) * inverse, 0)
+        excess = dr.rcp(dr.maximum(u + v, 1))
+        u, v = dr.select(active, u * excess, 0), dr.select(active, v * excess, 0)
         # The derivative is infinite where a triangle is seen exactly edge-on: it is set to 0.
-        inverse = dr.select(edge_on, 0, dr.rcp(dr.select(edge_on, 1, across)))
+        inverse = dr.select(edge_on, 0, inverse)
         area2 = dr.squared_norm(n)
         dual = dr.select(area2 > 0, dr.rcp(area2), 0)
         dual_u, dual_v = dr.cross(b, n) * dual, dr.cross(n, a) * dual

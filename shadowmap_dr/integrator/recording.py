@@ -61,8 +61,8 @@ class FrozenPasses:
         places, outer = attached_places(_fields_of(data, fields))
         if not outer:
             return
-        # Not the renderer's own: images are read without gradients, which leaves open what carries any.
-        changed = data.geometry.changed if "geometry" in fields else renderer.data.geometry.changed
+        # The renderer's geometry does not tell which shapes carry gradients: images are read without any.
+        changed = data.geometry.changed
         pass_on(outer, self._gradients(spp, (fields, places), changed, _owned(gradient), renderer, results))
 
     @property
@@ -102,9 +102,9 @@ def _gradients(
         leaves.append(leaf)
         return leaf
 
-    found = dict(zip(fields, tree_map(_fields_of(renderer.data, fields), attached), strict=True))
-    found["geometry"] = with_fields(found.get("geometry", renderer.data.geometry), changed=changed)
-    renderer = renderer.with_data(with_fields(renderer.data, **found))
+    data = with_fields(renderer.data, geometry=with_fields(renderer.data.geometry, changed=changed))
+    found = dict(zip(fields, tree_map(_fields_of(data, fields), attached), strict=True))
+    renderer = renderer.with_data(with_fields(data, **found))
     with restored_scalars():
         with using(results.unpacked()):
             image = renderer.render(spp=spp)

@@ -364,11 +364,10 @@ def shape_planes(plan: MapPlan, geometry: Geometry) -> tuple[tuple[Vector3f, Poi
 def _planes(plan: MapPlan, geometry: Geometry) -> tuple[Vector3f, Point3f]:
     """(unit normal, point) of each planar shape where it is now, detached, world space."""
     with dr.suspend_grad():
-        corners = dr.gather(mi.Vector3u, geometry.faces, plan.planes)
-        a, b, c = (dr.gather(mi.Point3f, dr.detach(geometry.positions), corners[k]) for k in range(3))
-        normal = dr.cross(b - a, c - a)
+        first, e1, e2 = geometry.triangle(dr.gather(mi.Vector3u, geometry.faces, plan.planes))
+        normal = dr.cross(e1, e2)
         length = dr.norm(normal)
-        return normal / dr.select(length > 0, length, 1), a
+        return normal / dr.select(length > 0, length, 1), first
 
 
 def _still_planar(plan: MapPlan, geometry: Geometry, planes: tuple[Vector3f, Point3f]) -> Bool:

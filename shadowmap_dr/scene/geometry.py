@@ -7,9 +7,9 @@ these two and never touches Mitsuba's meshes.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -17,12 +17,13 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import ShadowmapError
-from ..jit.arrays import backend, device_array, device_tensor, ravel, reinterpret, replace_grad
+from ..jit.arrays import backend, device_array, ravel, reinterpret, replace_grad
 from ..jit.broadcast import copy_of_lane, in_copies
 from ..jit.handover import interleaved
 from ..jit.pytree import StaticTuple
 from ..jit.types import AnyArray, Bool, Float, Matrix4f, Point3f, UInt32, Vector3f, Vector3u
 from ..jit.vectors import normalize_or
+from .replaced_vertices import checked_matrix, checked_positions, moved, turned, with_vertices
 
 NO_TRIANGLE = 0xFFFFFFFF
 """Triangle index that means "nothing was hit"."""
@@ -281,16 +282,11 @@ class Geometry:
             raise ShadowmapError(f"vertex_positions is a {type(positions).__name__}: give a dictionary of the shapes' names.")
         if not positions:
             return self
-        changed = self.changed
-        if changed is None and not dr.grad_enabled(self.positions, self.normals):
-            changed = self.moved or ()
-        if changed is not None:
-            changed = tuple(sorted({*changed, *positions}))
         merged = self.positions
         for name, value in positions.items():
             info = self.shape(name)
-            checked = self.bound(_checked_positions(name, value, info.vertex_count))
-            merged = _write_vertices(merged, checked, info.vertex_start, info.vertex_count, self.vertex_count)
+            checked = self.bound(checked_positions(name, value, info.vertex_count))
+            merged = with_vertices(merged, checked, info.vertex_start, info.vertex_count, self.vertex_count)
         normals = self.normals
         for name in positions:
             info = self.shape(name)
@@ -298,8 +294,8 @@ class Geometry:
                 smooth = vertex_normals(merged, _faces_of(self.faces, info), self.vertex_count)
                 own = dr.arange(mi.UInt32, info.vertex_count) + info.vertex_start
                 outward = dr.gather(mi.Normal3f, smooth, own) * (-1 if info.against_winding else 1)
-                normals = _write_vertices(normals, outward, info.vertex_start, info.vertex_count, self.vertex_count)
-        return replace(self, positions=self.settled(merged), normals=normals, changed=changed, packets=None, corners=None)
+                normals = with_vertices(normals, outward, info.vertex_start, info.vertex_count, self.vertex_count)
+        return self._replaced(merged, normals, positions)
 
     def with_transforms(self, transforms: Mapping[str, Matrix4f | mi.Transform4f]) -> Geometry:
         """A new Geometry in which some shapes have moved as a whole.
@@ -315,21 +311,25 @@ class Geometry:
             raise ShadowmapError(f"transforms is a {type(transforms).__name__}: give a dictionary of the shapes' names.")
         if not transforms:
             return self
-        positions, normals, changed = self.positions, self.normals, self.changed
-        if changed is None and not dr.grad_enabled(positions, normals):
-            changed = self.moved or ()
-        if changed is not None:
-            changed = tuple(sorted({*changed, *transforms}))
+        positions, normals = self.positions, self.normals
         for name, value in transforms.items():
-            info, matrix = self.shape(name), _checked_matrix(name, value)
+            info, matrix = self.shape(name), checked_matrix(name, value)
             where = info.vertex_start, info.vertex_count, self.vertex_count
             own = dr.arange(mi.UInt32, info.vertex_count) + info.vertex_start
             # Twelve numbers that all vertices share: evaluated once.
             dr.eval(matrix)
-            positions = _write_vertices(positions, _moved(matrix, dr.gather(mi.Point3f, positions, own)), *where)
+            positions = with_vertices(positions, moved(matrix, dr.gather(mi.Point3f, positions, own)), *where)
             if info.has_normals:
-                turned = _turned(matrix, dr.gather(mi.Vector3f, normals, own))
-                normals = _write_vertices(normals, mi.Point3f(turned), *where)
+                normals = with_vertices(normals, mi.Point3f(turned(matrix, dr.gather(mi.Vector3f, normals, own))), *where)
+        return self._replaced(positions, normals, transforms)
+
+    def _replaced(self, positions: Float, normals: Float, names: Iterable[str]) -> Geometry:
+        """The same geometry with other buffers, in which the vertices of some shapes are new."""
+        changed = self.changed
+        if changed is None and not dr.grad_enabled(self.positions, self.normals):
+            changed = self.moved or ()
+        if changed is not None:
+            changed = tuple(sorted({*changed, *names}))
         return replace(self, positions=self.settled(positions), normals=normals, changed=changed, packets=None, corners=None)
 
     def bound(self, value: Float | Point3f) -> Float | Point3f:
@@ -425,88 +425,3 @@ def pack_face_info(shapes: tuple[ShapeInfo, ...]) -> np.ndarray:
 
 def _faces_of(faces: UInt32, info: ShapeInfo) -> Vector3u:
     return dr.gather(mi.Vector3u, faces, dr.arange(mi.UInt32, info.face_count) + info.face_start)
-
-
-def _checked_positions(name: str, value: AnyArray | npt.ArrayLike, count: int) -> Float | Point3f:
-    """Convert positions to Float (3Vs,) or Point3f (Vs,). Sizes are checked without evaluating arrays."""
-    array: Any = value  # Any: Dr.Jit's predicates narrow no types
-    if not dr.is_array_v(value):
-        try:
-            array = device_tensor(mi.TensorXf, np.asarray(value, np.float32))  # Dr.Jit itself hangs on a string
-        except (TypeError, ValueError) as error:
-            raise ShadowmapError(f"Positions of shape '{name}' are {value!r:.60}: give an array of {count} points.") from error
-    if dr.is_tensor_v(array):
-        if tuple(array.shape) not in ((count, 3), (3 * count,)):
-            raise ShadowmapError(
-                f"Positions of shape '{name}' have the tensor shape {tuple(array.shape)}, but it has {count} vertices: "
-                f"give a tensor of shape ({count}, 3)."
-            )
-        array = array.array
-    if dr.depth_v(array) == 2 and dr.size_v(array) == 3:
-        if dr.width(array) not in (1, count):
-            raise ShadowmapError(
-                f"Positions of shape '{name}' are an array of {dr.width(array)} points, but it has {count} vertices."
-            )
-        return mi.Point3f(array)
-    if dr.depth_v(array) != 1 or dr.width(array) != 3 * count:
-        raise ShadowmapError(
-            f"Positions of shape '{name}' are an array of {dr.width(array)} numbers, but {count} vertices need {3 * count}."
-        )
-    return mi.Float(array)
-
-
-def _checked_matrix(name: str, value: Matrix4f | mi.Transform4f | npt.ArrayLike) -> Matrix4f:
-    """The map of a shape as Matrix4f."""
-    given: Any = value.matrix if isinstance(value, (mi.Transform4f, mi.ScalarTransform4f)) else value  # Any: no stub narrows it
-    try:
-        if not dr.is_array_v(given) or dr.is_tensor_v(given):
-            numbers = np.asarray(given, np.float64)
-            if numbers.shape != (4, 4):  # a matrix of a number is a multiple of the identity
-                raise ValueError("no matrix")
-            given = mi.ScalarMatrix4f(numbers.tolist())
-        elif not dr.is_matrix_v(given) or dr.size_v(given) != 4:
-            raise TypeError("no matrix")
-        matrix = mi.Matrix4f(given)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise ShadowmapError(
-            f"transforms['{name}'] is a {type(value).__name__}: give a Transform4f or a 4 x 4 matrix."
-        ) from error
-    if dr.width(matrix) != 1:
-        raise ShadowmapError(f"transforms['{name}'] holds {dr.width(matrix)} transformations: give one.")
-    return matrix
-
-
-def _moved(matrix: Matrix4f, p: Point3f) -> Point3f:
-    """Points after an affine map."""
-    x, y, z = (
-        dr.fma(matrix[row, 0], p.x, dr.fma(matrix[row, 1], p.y, dr.fma(matrix[row, 2], p.z, matrix[row, 3]))) for row in range(3)
-    )
-    return mi.Point3f(x, y, z)
-
-
-def _turned(matrix: Matrix4f, n: Vector3f) -> Vector3f:
-    """Unit normals after an affine map. Where the map mirrors faces, it mirrors normals, too."""
-    a, b, c = (mi.Vector3f(matrix[0, k], matrix[1, k], matrix[2, k]) for k in range(3))
-    turned = n.x * dr.cross(b, c) + n.y * dr.cross(c, a) + n.z * dr.cross(a, b)  # by the cofactors
-    return normalize_or(turned, mi.Vector3f(1.0, 0.0, 0.0))
-
-
-def _write_vertices(target: Float, value: Float | Point3f, start: int, count: int, total: int) -> Float:
-    """A copy of the flat buffer ``target`` with ``count`` vertices from ``start`` on replaced, differentiable in both."""
-    points = dr.size_v(value) == 3
-    if start == 0 and count == total:
-        return ravel(value) if points and dr.width(value) == count else _fill(value, count)
-    result = type(target)(target)
-    each = 1 if points else 3
-    index = dr.arange(mi.UInt32, each * count) + each * start
-    # Not all shapes have a size guard: a replay with more vertices must not write behind those of its shape.
-    within = index < each * (start + count) if dr.flag(dr.JitFlag.FreezingScope) else True
-    # Not ``Permute``: that promises that all of the target is written, and its gradient would be dropped.
-    dr.scatter(result, value, index, within, mode=dr.ReduceMode.NoConflicts)
-    return result
-
-
-def _fill(value: Float | Point3f, count: int) -> Float:
-    if dr.size_v(value) == 3:
-        return ravel(dr.gather(mi.Point3f, ravel(value), dr.zeros(mi.UInt32, count)))
-    return cast(Float, value)

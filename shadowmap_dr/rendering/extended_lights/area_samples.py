@@ -133,7 +133,8 @@ def area_samples(light: AreaLight, plan: AreaPlan, geometry: Geometry) -> LightS
     if geometry.changed is not None and info.name not in geometry.changed:
         # No gradients flow to its vertices, although they do to those of other shapes in the same arrays.
         geometry = replace(geometry, positions=dr.detach(geometry.positions), packets=None)
-    first, e1, e2 = _triangles(geometry, plan.face)
+    corners = geometry.triangle(dr.gather(mi.Vector3u, geometry.faces, plan.face))
+    first, e1, e2 = (mi.Vector3f(corner) for corner in corners)
     vector = dr.cross(e1, e2) * (0.5 * plan.fraction)
     area = dr.norm(vector)
     radiance = light.radiance(_uv(geometry, plan.face, plan.u, plan.v, info))
@@ -202,12 +203,6 @@ def _relative(radiance: Color3f) -> Float:
     """Brightness of pieces (Float, P) relative to their mean, plus a small number, so that dark parts have a centre, too."""
     bright = dr.maximum(dr.mean(mi.UnpolarizedSpectrum(radiance)), 0)
     return bright * dr.rcp(dr.maximum(dr.detach(dr.mean(bright)), 1e-30)) + _DIM
-
-
-def _triangles(geometry: Geometry, face: UInt32) -> tuple[Vector3f, Vector3f, Vector3f]:
-    corner = dr.gather(mi.Vector3u, geometry.faces, face)
-    a, b, c = (mi.Vector3f(geometry.vertices(corner[k])) for k in range(3))
-    return a, b - a, c - a
 
 
 def _uv(geometry: Geometry, face: UInt32, u: Float, v: Float, info: ShapeInfo) -> Point2f:

@@ -60,9 +60,8 @@ def facet_normals(geometry: Geometry, flat: FlatFaces) -> Float:
     Four numbers and not three (the last is 0), since packets of four are read faster.
     """
     face = dr.arange(mi.UInt32, geometry.face_count)
-    corner = dr.gather(mi.Vector3u, geometry.faces, face, flat.flat)
-    p = [geometry.vertices(corner[k], flat.flat) for k in range(3)]
-    n = dr.cross(p[1] - p[0], p[2] - p[0])
+    _, e1, e2 = geometry.triangle(dr.gather(mi.Vector3u, geometry.faces, face, flat.flat), flat.flat)
+    n = dr.cross(e1, e2)
     normals = ravel(mi.Vector4f(n.x, n.y, n.z, 0))
     dr.eval(normals)
     return normals

@@ -87,7 +87,7 @@ class ImagePass:
         coverage = None
         if sensor.alpha or "opacity" in settings.aovs:
             coverage = dr.select(frame.surface.active & (settings.max_depth != 0), mi.Float(1), 0)
-        opaque = below = Blended.of(color, coverage)
+        opaque = below = Blended(evaluated("opaque light", Blended.of(color, coverage).channels))
         made = self._layers(view, layers, opaque, lighting, shapes)
         if layers.at_once(view.clip) >= len(layers.translucent):
             # Before anything is blended: their look-ups in maps and those of opaque surfaces then have one adjoint.
@@ -217,23 +217,19 @@ class ImagePass:
     ) -> tuple[IncidentLight, Any]:
         """(light that reaches a frame, reflected radiance (colour, N) towards the camera)."""
         light, colour = self.light, frame.surface.colour
-        # Samples of several layers are not evaluated together: stored values would need kernels of their own.
-        keep = self.cameras.translucency is None
         if lighting.sliced is not None:
             color, each = light.reflected_in_slices(frame, lighting, shapes)
             return IncidentLight((), each, 0, ()), light.with_ambient(color, frame.surface)
         if colour is None:
-            incident = light.incident_light(frame, lighting, visible)
-            incident = incident.stored() if keep else incident
+            incident = light.incident_light(frame, lighting, visible).stored()
             return incident, light.radiance(frame, lighting, incident)
         # In the same order as with cached light, so that images of an unchanged scene are equal bit by bit.
         white = _white(frame)
-        incident = light.incident_light(white, lighting, visible)
-        incident = incident.stored() if keep else incident
+        incident = light.incident_light(white, lighting, visible).stored()
         irradiance = light.radiance(white, lighting, incident)
         if dr.grad_enabled(colour) and lighting.samples:
             dr.eval(irradiance)  # else the derivative would run its loops again
-        if keep and light.needs_frames:  # else a look-up in a small table
+        if light.needs_frames:  # else a look-up in a small table
             colour = stored("colours", colour, beside=irradiance)
         return incident, colour * irradiance
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import drjit as dr
 
+from .kernel_inputs import with_current_inputs
 from .types import Bool
 
 _AGAIN: ContextVar[bool] = ContextVar("_AGAIN", default=False)
@@ -40,6 +41,7 @@ def branch(
     ``function`` gets zeros for arguments of inactive lanes, and must allow for those.
     """
     if not _AGAIN.get():
+        function, other = with_current_inputs(function), with_current_inputs(other)
         return dr.if_stmt(tuple(arguments), active, function, other, mode="symbolic", label=label)
     found = function(*(dr.select(active, argument, dr.zeros(type(argument))) for argument in arguments))
     rest = other(*arguments)

@@ -23,7 +23,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .arrays import backend
-from .kernel_inputs import split, uint_input
+from .kernel_inputs import SharingOp, split, uint_input
 from .pytree import tree_map
 from .types import AnyArray, Float, PyTree, UInt32
 
@@ -92,7 +92,7 @@ def copy_of_lane(module: ModuleType, lanes: int, copies: int, block: int = LANES
     return dr.minimum(dr.arange(module.UInt32, lanes) >> (block.bit_length() - 1), copies - 1)
 
 
-class Copies(dr.CustomOp):
+class Copies(SharingOp):
     """Copies of arrays, one after the other, or (``transpose``) the sums of such copies: each is the adjoint of the other.
 
     Dr.Jit's own adjoint of a repeated gather would use atomics.

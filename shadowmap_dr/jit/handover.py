@@ -16,6 +16,7 @@ import drjit as dr
 
 from .arrays import interleave, replace_grad
 from .frozen import take_apart
+from .kernel_inputs import SharingOp
 from .packets import apart, packed
 from .pytree import ArrayTuple, arrays_of, tree_map
 from .types import AnyArray, Float, PyTree
@@ -161,7 +162,7 @@ def interleaved(name: str, values: list[Float], parts: int = 1) -> Float:
     return dr.custom(_Interleaved, given, values, parts) if dr.grad_enabled(values) else given
 
 
-class _Interleaved(dr.CustomOp):
+class _Interleaved(SharingOp):
     """Known interleaved values, with the derivatives of the values. Writing these once more would be a kernel of its own."""
 
     def eval(self, given: Float, values: list[Float], parts: int) -> Float:

@@ -8,16 +8,19 @@ from __future__ import annotations
 
 import atexit
 import threading
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
-from functools import lru_cache
+from functools import lru_cache, wraps
 from types import ModuleType
-from typing import Any, cast
+from typing import Any, ParamSpec, TypeVar, cast
 
 import drjit as dr
 
 from .arrays import backend
 from .types import Float, Float64, Int32, UInt32
+
+P = ParamSpec("P")
+ResultT = TypeVar("ResultT")
 
 # Inputs that are kept. An image has a few dozen.
 _MOST = 4096
@@ -31,28 +34,70 @@ def _kept(kind: Any, name: str, value: float, scope: int) -> Any:  # Any: a type
 atexit.register(_kept.cache_clear)  # before Dr.Jit looks for leaked arrays
 
 
+Inputs = dict[tuple[Any, str, float], Any]
+
+
 class _Current(threading.local):
-    shared: dict[tuple[Any, str, float], Any] | None = None
+    shared: Inputs | None = None
 
 
 _current = _Current()
 
 
 @contextmanager
-def shared_inputs() -> Generator[None]:
+def shared_inputs(inputs: Inputs | None = None) -> Generator[None]:
     """Let all code inside share equal inputs while a function is recorded; outside of recordings they are always shared.
 
     A recording refuses arrays that were made before it. Without this, it would make an array after each symbolic loop anew, and
     each replay would write hundreds of them.
+
+    ``inputs``: those of code that ran before in the same recording, to be shared as well.
     """
-    if _current.shared is not None or not dr.flag(dr.JitFlag.FreezingScope):
+    before = _current.shared
+    if not dr.flag(dr.JitFlag.FreezingScope) or (inputs is None and before is not None):
         yield
         return
-    _current.shared = {}
+    _current.shared = {} if inputs is None else inputs
     try:
         yield
     finally:
-        _current.shared = None
+        _current.shared = before
+
+
+def with_current_inputs(function: Callable[P, ResultT]) -> Callable[P, ResultT]:
+    """A function that shares the inputs of the code around, also where derivatives call it once more."""
+    inputs = _current.shared
+    if inputs is None:
+        return function
+
+    def sharing(*args: P.args, **kwargs: P.kwargs) -> ResultT:
+        with shared_inputs(inputs):
+            return function(*args, **kwargs)
+
+    return sharing
+
+
+class SharingOp(dr.CustomOp):
+    """A differentiable operation whose derivatives share the inputs of the code around it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._inputs = _current.shared
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        for name in ("forward", "backward"):
+            if name in vars(cls):
+                setattr(cls, name, _shared(vars(cls)[name]))
+
+
+def _shared(method: Callable[[Any], None]) -> Callable[[Any], None]:
+    @wraps(method)
+    def run(op: SharingOp) -> None:
+        with shared_inputs(op._inputs):
+            method(op)
+
+    return run
 
 
 def _number(kind: Any, name: str, value: float) -> Any:  # Any: as above

@@ -12,7 +12,7 @@ from typing import Any, cast
 import drjit as dr
 
 from .arrays import backend
-from .kernel_inputs import uint_input
+from .kernel_inputs import SharingOp, uint_input
 from .types import AnyArray, Float, UInt32
 
 
@@ -49,7 +49,7 @@ def sections(values: list[Float], parts: int) -> list[list[Float]]:
     return [found[k * len(values) : (k + 1) * len(values)] for k in range(parts)]
 
 
-class _Sections(dr.CustomOp):
+class _Sections(SharingOp):
     """:func:`sections`. The adjoint of Dr.Jit's own gather would add to zeros."""
 
     def eval(self, values: list[Float], parts: int) -> list[Float]:
@@ -84,7 +84,7 @@ class _Sections(dr.CustomOp):
         return [lane + uint_input(module, "first lane", part * width) if part else lane for part in range(parts)]
 
 
-class _Apart(dr.CustomOp):
+class _Apart(SharingOp):
     """:func:`apart`."""
 
     def eval(self, flat: Float, count: int, parts: int) -> list[Float]:
@@ -101,7 +101,7 @@ class _Apart(dr.CustomOp):
         return "apart"
 
 
-class _Packed(dr.CustomOp):
+class _Packed(SharingOp):
     """:func:`packed`."""
 
     def eval(self, values: list[Float], parts: int) -> Float:

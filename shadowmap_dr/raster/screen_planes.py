@@ -11,7 +11,7 @@ import drjit as dr
 from ..jit.arrays import backend, ravel, replace_grad
 from ..jit.branches import branch
 from ..jit.handover import interleaved
-from ..jit.kernel_inputs import double_input, float_input, split, uint_input
+from ..jit.kernel_inputs import double_input, float_input, split, uint_input, with_current_inputs
 from ..jit.types import Bool, Float, UInt32, Vector4f
 from .triangle_setup import Corners, beside, edge_lines, exact_centres, gather_triangle
 from .types import MAX_RESOLUTION, RasterOutput, pixel_coordinates, precise_rcp
@@ -125,6 +125,7 @@ def _numbers(
     width, height = raster.width, raster.height
     first = image * uint_input(module, "vertices", dr.width(positions) // (4 * raster.batch))
 
+    @with_current_inputs
     def numbers(triangle: UInt32, image: UInt32, first: UInt32) -> tuple[Float, ...]:
         """Numbers of the depth, then of the barycentrics if asked for."""
         corners = gather_triangle(positions, faces, triangle, first, True)

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..jit.arrays import backend, ravel
 from ..jit.handover import computed
-from ..jit.kernel_inputs import int_input, quotient, shared_inputs, split
+from ..jit.kernel_inputs import SharingOp, int_input, quotient, split
 from ..jit.types import AnyArray, Float, Int32
 
 FILTERS = ("box", "gaussian", "wendland", "none")
@@ -89,18 +89,16 @@ def filter_map(values: Float, kernel: np.ndarray, maps: int, height: int, width:
     return total
 
 
-class _Convolve(dr.CustomOp):
+class _Convolve(SharingOp):
     """Convolution along one axis (0: rows, 1: columns) with a replicated border; its transpose as the backward pass."""
 
     def eval(self, values: Float, weights: list[float], axis: int, shape: tuple[int, int, int, int]) -> Float:
         self.arguments = (weights, axis, shape)
         return computed("filtered maps", lambda: _convolve(values, *self.arguments, transpose=False))
 
-    @shared_inputs()
     def forward(self) -> None:
         self.set_grad_out(_convolve(cast("Float", self.grad_in("values")), *self.arguments, transpose=False))
 
-    @shared_inputs()
     def backward(self) -> None:
         self.set_grad_in("values", _convolve(cast("Float", self.grad_out()), *self.arguments, transpose=True))
 

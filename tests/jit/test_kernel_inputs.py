@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -9,6 +11,7 @@ import pytest
 from renderer_scenes import build
 
 from shadowmap_dr import Renderer
+from shadowmap_dr.jit import kernel_inputs
 from shadowmap_dr.jit.arrays import backend
 from shadowmap_dr.jit.kernel_inputs import float_input, quotient, shared_inputs, split, uint_input
 
@@ -60,6 +63,37 @@ def test_inputs_in_recordings(variant: str) -> None:
             np.testing.assert_array_equal(sums(start, size).numpy(), expected)
             for _ in range(3):
                 np.testing.assert_array_equal(recorded(start, size).numpy(), expected)
+
+
+def test_derivatives_share_inputs_with_images(variant: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A recording of an image and its derivatives makes each input once."""
+    made: list[tuple[Any, str, float]] = []
+    number, opaque = kernel_inputs._number, dr.opaque
+
+    def counting(kind: Any, name: str, value: float) -> Any:
+        def make(*args: Any) -> Any:
+            made.append((kind, name, value))
+            return opaque(*args)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(dr, "opaque", make)
+            return number(kind, name, value)
+
+    renderer = Renderer.from_scene(build())
+    name = renderer.data.geometry.shapes[-1].name
+    rest = dr.ravel(renderer.vertices(name))
+
+    @dr.freeze
+    def step(renderer: Renderer, rest: mi.Float, shift: mi.Float) -> mi.Float:
+        dr.enable_grad(shift)
+        places = dr.unravel(mi.Point3f, rest) + mi.Vector3f(shift, 0, 0)
+        dr.backward(dr.mean(renderer.render({name: dr.ravel(places)}), axis=None))
+        return dr.grad(shift)
+
+    monkeypatch.setattr(kernel_inputs, "_number", counting)
+    dr.eval(step(renderer, rest, mi.Float(0.01)))
+    assert step.n_recordings == 1 and len(made) > 10
+    assert len(made) == len(set(made)), "the same input was made twice"
 
 
 @pytest.mark.parametrize("spp", [1, 4])

@@ -9,7 +9,7 @@ import drjit as dr
 
 from ...jit.arrays import backend, reinterpret
 from ...jit.handover import computed
-from ...jit.kernel_inputs import shared_inputs, uint_input
+from ...jit.kernel_inputs import SharingOp, uint_input
 from ...jit.types import AnyArray, Bool, Float, UInt32, Vector4f
 from ..topology import NO_VERTEX
 from ..types import RasterOutput
@@ -48,7 +48,7 @@ def blend(
     return blended
 
 
-class _Blend(dr.CustomOp):
+class _Blend(SharingOp):
     """Blending as one differentiable operation, whose derivatives also work only on blended pixels."""
 
     def eval(
@@ -65,14 +65,12 @@ class _Blend(dr.CustomOp):
         self.wanted, self.vertices = wanted, dr.width(positions)
         return self.mixer.values
 
-    @shared_inputs()
     def forward(self) -> None:
         values = cast("Float | list[Float]", self.grad_in("values")) if self.wanted[0] else None
         positions = cast("Float", self.grad_in("positions")) if self.wanted[1] else None
         dr.eval(values, positions)
         self.set_grad_out(self.mixer.tangent(values, positions))
 
-    @shared_inputs()
     def backward(self) -> None:
         adjoint = cast("Float | list[Float]", self.grad_out())
         dr.eval(adjoint)

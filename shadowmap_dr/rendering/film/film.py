@@ -13,7 +13,7 @@ import mitsuba as mi
 
 from ...errors import ShadowmapError, warn
 from ...jit.arrays import backend
-from ...jit.kernel_inputs import split, uint_input
+from ...jit.kernel_inputs import SharingOp, split, uint_input
 from ...jit.types import Bool, Color3f, Float, TensorXf
 from ...raster import MAX_RESOLUTION
 from ...scene.sensor import ImageSize, Sensor
@@ -145,7 +145,7 @@ def _means(image: TensorXf, factor: int) -> TensorXf:
     return mi.TensorXf(dr.custom(_Means, image.array, height, width, channels, factor), shape=(height, width, channels))
 
 
-class _Means(dr.CustomOp):
+class _Means(SharingOp):
     """Means over blocks of samples. The adjoint of Dr.Jit's own gathers would add to zeros, with a copy for each thread."""
 
     def eval(self, samples: Float, height: int, width: int, channels: int, factor: int) -> Float:

@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ...jit.arrays import backend, ravel
-from ...jit.kernel_inputs import int_input, split, uint_input
+from ...jit.kernel_inputs import SharingOp, int_input, split, uint_input
 from ...jit.types import Float, TensorXf, UInt32
 from ...scene.pixel_filter import Filter
 
@@ -67,7 +67,7 @@ class _Axis:
     first: int
 
 
-class _Gathered(dr.CustomOp):
+class _Gathered(SharingOp):
     """Weighted sums of samples along an axis, and their transpose."""
 
     def eval(self, values: Float, weights: tuple[float, ...], axis: _Axis) -> Float:

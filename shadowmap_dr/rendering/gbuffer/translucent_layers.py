@@ -10,10 +10,13 @@ import mitsuba as mi
 
 from ...errors import ShadowmapError
 from ...jit.arrays import backend
+from ...jit.branches import branch
 from ...jit.kernel_inputs import uint_input
 from ...jit.memory import physical_memory
 from ...jit.types import Bool, Float, UInt32
 from ...raster import NO_TRIANGLE, Crossings, FrontSurfaces, RasterOutput, peeled_layers, stacked, with_triangles
+from ...raster.triangle_setup import centred
+from ...raster.types import by_pixel
 from ...scene.geometry import Geometry
 from .translucent_faces import Faces
 from .transmission import whole_triangles
@@ -67,17 +70,19 @@ class Layers:
             raster: of all opaque surfaces.
             crossings: their outlines.
         """
-        used = self.front.count
-        pixel, last = dr.arange(mi.UInt32, dr.width(used)), dr.width(used) - 1
-        depth, levels = dr.detach(raster.depth), []
-        dr.eval(depth)
-        for number, step in enumerate((1, raster.width)):
-            other = dr.minimum(pixel + uint_input(backend(pixel), "width", step), last)
-            own, there = depth <= dr.gather(mi.Float, depth, other), dr.gather(mi.UInt32, used, other)
-            level = dr.select(own, used, there)
-            if crossings.cuts is not None:
-                level = dr.select(crossings.cuts[number] != 0, dr.minimum(used, there), level)
-            levels.append(level)
+        used, pixel = self.front.count, dr.arange(mi.UInt32, dr.width(self.front.count))
+        levels, cuts = [], crossings.cuts or (mi.Float(0), mi.Float(0))
+        for weight, cut, step in zip((crossings.right, crossings.down), cuts, (1, raster.width), strict=True):
+
+            def level(pixel: UInt32, used: UInt32, cut: Float, step: int = step) -> UInt32:
+                other = pixel + uint_input(backend(pixel), "width", step)
+                there = dr.gather(mi.UInt32, self.front.count, other)
+                nearer = dr.select(_depth(raster, pixel) <= _depth(raster, other), used, there)
+                return dr.select(cut != 0, dr.minimum(used, there), nearer)
+
+            # Few pixels have an outline beside them.
+            lanes = pixel, used, cut
+            levels.append(branch(weight != 0, level, lambda pixel, used, cut: used, lanes, "level of an outline"))
         right, down = levels
         parts = [
             (dr.select(right == k, crossings.right, 0), dr.select(down == k, crossings.down, 0)) for k in range(len(self.opaque))
@@ -100,6 +105,16 @@ class Layers:
         at_once, clip, corners = self.at_once(clip), clip if self.attached else dr.detach(clip), self.faces.corners
         for start in reversed(range(0, len(self.translucent), at_once)):
             yield stacked(self.translucent[start : start + at_once], clip, corners, 1)
+
+
+def _depth(raster: RasterOutput, pixel: UInt32) -> Float:
+    """NDC depths of the surfaces that pixels see, 1 (the far plane) where they see none. Detached."""
+    triangle = dr.gather(mi.UInt32, raster.triangle, pixel)
+    hit = triangle != NO_TRIANGLE
+    image, row, column = by_pixel(pixel, raster.batch, raster.height, raster.width)
+    x, y = centred(backend(pixel), row, column, raster.height, raster.width)
+    dx, dy, start = raster.depth_plane(image, triangle, hit)
+    return dr.select(hit, dr.fma(dx, x, dr.fma(dy, y, start)), 1)
 
 
 def see_layers(

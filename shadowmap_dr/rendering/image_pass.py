@@ -66,12 +66,10 @@ class ImagePass:
         named = collect_aovs(settings.aovs, seen, view.raster, incident.visible, partial(light.transmittances, frame, lighting))
         if crossings is None and settings.antialias:
             channels = self._channels(color, seen.active, view)
-            # In one pass over the pixels, since both need much of the same.
-            channels, sharpness = evaluated("channels", (channels, frame.sharpness))
             flat = antialias(
                 *(channels, view.raster, view.clip, view.topology),
                 **shapes.creases,
-                crease_weights=sharpness,
+                crease_weights=frame.sharpness,
                 meetings=True,
                 gap=least_gap(view.sensor),
                 continued=True,

@@ -101,9 +101,11 @@ def render_maps(
     texels = _texels(raster, clip, faces, views, frusta, settings, size)
     channels = len(texels)
     if settings.antialias and settings.method != "standard":
-        values = interleaved("texels", texels)
-        blended = antialias(values, raster, clip, topology)
-        values, channels = _two_depths(values, blended) if settings.method == "pcf" else (blended, channels)
+        if settings.method == "pcf":
+            plain = interleaved("texels", texels)
+            values, channels = _two_depths(plain, antialias(plain, raster, clip, topology))
+        else:
+            values = antialias(texels, raster, clip, topology)
     else:
         values = interleave(texels)
     if settings.supersampling > 1:

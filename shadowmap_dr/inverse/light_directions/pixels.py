@@ -14,8 +14,8 @@ from ...errors import ShadowmapError
 from ...jit.arrays import device_array
 from ...jit.types import Bool, Float, Normal3f, Point3f, UInt32, Vector3f
 from ...raster import Topology, build_topology, drawing_order, outward_faces
-from ...raster.antialiasing.blend import Mixer
 from ...raster.antialiasing.edge_crossings import Crossings
+from ...raster.antialiasing.neighbour_weights import around, neighbours
 from ...rendering.gbuffer.camera_view import VisiblePoints
 from ...rendering.renderer import GBuffer, Renderer
 from ...rendering.shadow_pass import boxes_of, shape_planes
@@ -182,16 +182,15 @@ def _pixels(buffer: GBuffer, channels: int) -> Pixels:
 
 def _shares(crossings: Crossings, width: int, count: int) -> tuple[Float, Float]:
     """``incoming`` and ``outgoing`` of :class:`Pixels`."""
-    mixer = Mixer([dr.zeros(mi.Float, count)], width, crossings)
     pixel = dr.arange(mi.UInt32, count)
     right, down = crossings.right, crossings.down
-    incoming, outgoing = mixer.around(right, down, 1), mixer.around(right, down, -1)
+    incoming, outgoing = around(right, down, width, 1), around(right, down, width, -1)
     total: Float = functools.reduce(operator.add, incoming)
     scale = dr.rcp(dr.maximum(1, total))
     dr.eval(scale)
     given = [
         weight * dr.gather(mi.Float, scale, neighbour, weight > 0)
-        for weight, neighbour in zip(outgoing, mixer.neighbours(pixel), strict=True)
+        for weight, neighbour in zip(outgoing, neighbours(pixel, width), strict=True)
     ]
     shares = mi.Vector4f(*(weight * scale for weight in incoming)), mi.Vector4f(*given)
     return cast(Float, dr.ravel(shares[0])), cast(Float, dr.ravel(shares[1]))

@@ -10,7 +10,7 @@ from ...jit.handover import computed
 from ...jit.types import Bool, Float, TensorXf
 from ..topology import Topology
 from ..types import RasterOutput, check_array
-from .blend import blend
+from .blend import Canvas, blend
 from .colour_jumps import Surroundings
 from .creases import CoplanarCreases
 from .edge_crossings import DEPTH_GAP, Crossings, find_crossings
@@ -125,6 +125,12 @@ def antialias(
     flat = _checked_values(values, raster)
     positions, vertex_count = _flat_positions(positions, raster, topology)
     crease_weights = _checked_creases(creases, crease_weights, raster)
+    if isinstance(flat, list):
+        canvas, crease_weights = Canvas.of(flat, crease_weights, separate)
+    else:
+        with dr.suspend_grad():
+            dr.eval(flat)
+        canvas = Canvas(dr.detach(flat))
     if crossings is None:
         crossings = computed(
             "crossings",
@@ -133,7 +139,7 @@ def antialias(
     elif dr.width(crossings.right) != raster.batch * raster.height * raster.width:
         raise ValueError(f"crossings are those of {dr.width(crossings.right)} pixels, but {_size_of(raster)} are given")
     surroundings = Surroundings.of(raster, positions, topology, crossings.marked, crease_weights) if continued else None
-    blended = blend(flat, positions, raster, crossings, surroundings, separate)
+    blended = blend(flat, positions, raster, crossings, canvas, surroundings)
     return blended if tensor is None else type(tensor)(blended, shape=tensor.shape)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import cast
 
 import drjit as dr
@@ -10,13 +10,65 @@ import drjit as dr
 from ...jit.arrays import backend, reinterpret
 from ...jit.handover import computed
 from ...jit.kernel_inputs import SharingOp, uint_input
-from ...jit.types import AnyArray, Bool, Float, UInt32, Vector4f
+from ...jit.packets import packed
+from ...jit.types import Bool, Float, UInt32, Vector4f
 from ..topology import NO_VERTEX
 from ..types import RasterOutput
 from .colour_jumps import Surroundings
 from .edge_crossings import Crossings
-from .neighbour_weights import around, weight_sum
+from .neighbour_weights import around, neighbours, weight_sum
 from .pixel_pairs import each_number
+
+
+class Canvas:
+    """Values of all pixels, and a copy in which those of blended pixels are overwritten. Detached.
+
+    (No record: :func:`dr.custom` would hold the arrays of one, and overwriting would copy them once more.)
+
+    Attributes:
+        original: the values, flat and interleaved, or a list with one array for each channel. Evaluated.
+        separate: the copy has one array for each channel, too; else it is flat.
+    """
+
+    def __init__(self, original: Float | list[Float], separate: bool = False) -> None:
+        self.original, self.separate = original, separate
+        self._copy: Float | list[Float] | None = None
+
+    @classmethod
+    def of(cls, values: list[Float], beside: Float | None, separate: bool) -> tuple[Canvas, Float | None]:
+        """(Canvas of channels that need not be evaluated, values of ``beside``). One kernel writes all of it."""
+        made: list[Float | list[Float]] = []
+
+        def write() -> tuple[list[Float], Float | None]:
+            plain = [dr.detach(channel) for channel in values], None if beside is None else dr.detach(beside)
+            made.append([_copied(channel) for channel in plain[0]] if separate else packed(plain[0]))
+            dr.eval(plain, made)
+            return plain
+
+        original, beside = computed("values of pixels", write)
+        canvas = cls(original, separate)
+        canvas._copy = made[0] if made else None
+        return canvas, beside
+
+    @property
+    def channels(self) -> list[Float] | None:
+        """The values as a list, or None."""
+        return self.original if isinstance(self.original, list) else None
+
+    def copy(self) -> Float | list[Float]:
+        """The copy, to be written once. Evaluated."""
+        if self._copy is None:
+            self._copy = _copied(cast("Float", self.original))
+            dr.eval(self._copy)
+        return self._copy
+
+
+def _copied(flat: Float) -> Float:
+    """A writable copy, made by all threads; Dr.Jit's own copy uses a single thread."""
+    module = backend(flat)
+    # An expression that Dr.Jit does not recognise as the same array.
+    bits = reinterpret(module.UInt32, flat) ^ (dr.arange(module.UInt32, dr.width(flat)) >> 31)
+    return reinterpret(module.Float, bits)
 
 
 def blend(
@@ -24,8 +76,8 @@ def blend(
     positions: Float,
     raster: RasterOutput,
     crossings: Crossings,
+    canvas: Canvas,
     surroundings: Surroundings | None = None,
-    separate: bool = False,
 ) -> Float | list[Float]:
     """Apply the weights of all pairs of pixels.
 
@@ -34,17 +86,16 @@ def blend(
         positions: flat clip-space vertices of all images. Attached.
         raster: output of the rasterizer.
         crossings: edges between pixels, for the same positions.
+        canvas: of the values.
         surroundings: given to extrapolate colours to the edges (:mod:`shadowmap_dr.raster.antialiasing.colour_jumps`), or None.
-        separate: return one array for each channel; ``values`` is a list, too.
 
-    Returns blended values, flat and interleaved, or separate.
+    Returns blended values, flat and interleaved, or separate if those of the canvas are.
     """
-    with dr.suspend_grad():
-        dr.eval(values)
     if not dr.is_diff_v(positions):
-        return Mixer(values, raster.width, crossings, separate=separate).values
+        return _Mixer(canvas, raster.width, crossings).values
     wanted = dr.grad_enabled(values), dr.grad_enabled(positions)
-    blended: Float | list[Float] = dr.custom(_Blend, values, positions, raster.width, crossings, wanted, surroundings, separate)
+    mixer = _Mixer(canvas, raster.width, crossings, surroundings)
+    blended: Float | list[Float] = dr.custom(_Blend, values, positions, mixer, wanted)
     return blended
 
 
@@ -52,18 +103,10 @@ class _Blend(SharingOp):
     """Blending as one differentiable operation, whose derivatives also work only on blended pixels."""
 
     def eval(
-        self,
-        values: Float | list[Float],
-        positions: Float,
-        width: int,
-        crossings: Crossings,
-        wanted: tuple[bool, bool],
-        surroundings: Surroundings | None,
-        separate: bool,
+        self, values: Float | list[Float], positions: Float, mixer: _Mixer, wanted: tuple[bool, bool]
     ) -> Float | list[Float]:
-        self.mixer = Mixer(values, width, crossings, surroundings, separate)
-        self.wanted, self.vertices = wanted, dr.width(positions)
-        return self.mixer.values
+        self.mixer, self.wanted, self.vertices = mixer, wanted, dr.width(positions)
+        return mixer.values
 
     def forward(self) -> None:
         values = cast("Float | list[Float]", self.grad_in("values")) if self.wanted[0] else None
@@ -80,56 +123,25 @@ class _Blend(SharingOp):
             self.set_grad_in("positions", self.mixer.adjoint_of_positions(adjoint, self.vertices))
 
 
-class Mixer:
+class _Mixer:
     """Blended ``values``, and the data of their derivatives. Detached.
 
     A pixel mixes ``scale * weight`` of each neighbour that reaches into it. Up to four neighbours may each claim half of an
     isolated pixel, but not more than the whole in all: ``scale = 1 / max(1, sum of weights)``.
     """
 
-    def __init__(
-        self,
-        values: Float | list[Float],
-        width: int,
-        crossings: Crossings,
-        surroundings: Surroundings | None = None,
-        separate: bool = False,
-    ) -> None:
+    def __init__(self, canvas: Canvas, width: int, crossings: Crossings, surroundings: Surroundings | None = None) -> None:
         self.module = backend(crossings.right)
         self.crossings, self.width, self.surroundings = crossings, width, surroundings
         self.pixels = dr.width(crossings.right)
-        self.planar, self.separate = isinstance(values, list), separate
-        self.channels = len(values) if self.planar else dr.width(values) // self.pixels
-        self.original = values
-        # Sums of weights, defined only where neighbours reach into a pixel.
-        self.claims = dr.empty(self.module.Float, self.pixels)
-        self.values, self.claims = computed("mixed values", self._evaluated)
+        self.original, self.separate = canvas.original, canvas.separate
+        self.channels = dr.width(self.original) // self.pixels if canvas.channels is None else len(canvas.channels)
+        # Blended values, and sums of weights, which are defined only where neighbours reach into a pixel.
+        self.values, self.claims = computed("mixed values", lambda: self._mix(canvas.copy()))
 
-    def _evaluated(self) -> tuple[Float | list[Float], Float]:
-        """(values, claims)."""
-        values = self._mix()
-        dr.eval(values, self.claims)
-        return values, self.claims
-
-    def _mix(self) -> Float | list[Float]:
-        if not self.planar:
-            return self._mix_few()
-        pixel = dr.arange(self.module.UInt32, self.pixels)
-        incoming = self.around(self.crossings.right, self.crossings.down, 1)
-        own = self.read(self.original, pixel)
-
-        def mix(pixel: UInt32, *lanes: Float) -> tuple[Float, ...]:
-            incoming, own = lanes[:4], lanes[4:]
-            claims = weight_sum(incoming)
-            dr.scatter(self.claims, claims, pixel)
-            return tuple(self._mixed(pixel, incoming, claims, own))
-
-        return self.written(self._where(weight_sum(incoming) > 0, mix, pixel, (*incoming, *own), own))
-
-    def _mix_few(self) -> Float:
-        # Copy all interleaved values, then overwrite those of the few blended pixels.
-        result = self.copied(cast("Float", self.original))
-        dr.eval(result)
+    def _mix(self, result: Float | list[Float]) -> tuple[Float | list[Float], Float]:
+        """(values, claims). ``result``: a copy of the values, in which those of the few blended pixels are overwritten."""
+        sums = dr.empty(self.module.Float, self.pixels)
 
         def visit(slot: UInt32, pair: UInt32) -> None:
             down, pixel, weight = self._pair(pair)
@@ -140,15 +152,24 @@ class Mixer:
                 claims = weight_sum(incoming)
                 # A pixel may take from several pairs; only the first of them writes it.
                 first = self._is_first(incoming, taker != pixel, down)
-                dr.scatter(self.claims, claims, taker, first)
-                mixed = self._mixed(taker, incoming, claims, self.read(self.original, taker))
-                dr.scatter(result, self.packet(mixed), taker, first)
+                dr.scatter(sums, claims, taker, first)
+                self._write(result, self._mixed(taker, incoming, claims, self.read(self.original, taker)), taker, first)
                 return weight
 
             dr.if_stmt((pixel, down, weight), weight != 0, mix, lambda *lanes: lanes[2], mode="symbolic")
 
         self.crossings.pairs.for_each(visit)
-        return result
+        dr.eval(result, sums)
+        return result, sums
+
+    def _write(self, result: Float | list[Float], values: list[Float], pixel: UInt32, active: Bool) -> None:
+        """Write all channels of pixels."""
+        if not isinstance(result, list):
+            packet = values[0] if self.channels == 1 else self.module.ArrayXf(values)
+            dr.scatter(result, packet, pixel, active)
+            return
+        for channel, value in zip(result, values, strict=True):
+            dr.scatter(channel, value, pixel, active)
 
     def _mixed(self, pixel: UInt32, incoming: Sequence[Float], claims: Float, own: Sequence[Float]) -> list[Float]:
         scale = _scale(claims)
@@ -161,7 +182,7 @@ class Mixer:
 
     def adjoint_of_values(self, adjoint: Float | list[Float]) -> Float | list[Float]:
         """Gradient to the values from that of the result."""
-        if not self.planar:
+        if not isinstance(self.original, list):
             return self._adjoint_of_few(cast("Float", adjoint))
         pixel = dr.arange(self.module.UInt32, self.pixels)
         right, down = self.crossings.right, self.crossings.down
@@ -172,12 +193,12 @@ class Mixer:
             return tuple(self._spread(adjoint, pixel, lanes[:4], lanes[4:8], lanes[8:]))
 
         touched = weight_sum(incoming) + weight_sum(outgoing) > 0
-        result = self._where(touched, spread, pixel, (*incoming, *outgoing, *own), own)
-        dr.eval(result)  # several kernels may read it
-        return result
+        lanes = (pixel, *incoming, *outgoing, *own)
+        result = dr.if_stmt(lanes, touched, spread, lambda *lanes: lanes[9:], mode="symbolic", label="blend")
+        return list(result)
 
     def _adjoint_of_few(self, adjoint: Float) -> Float:
-        result = self.copied(adjoint)
+        result = _copied(adjoint)
         dr.eval(result)
 
         def visit(slot: UInt32, end: UInt32) -> None:
@@ -190,7 +211,7 @@ class Mixer:
                 incoming, outgoing = [dr.maximum(w, 0) for w in signed], [dr.maximum(-w, 0) for w in signed]
                 first = self._is_first([dr.abs(w) for w in signed], second, down)
                 total = self._spread(adjoint, pixel, incoming, outgoing, self.read(adjoint, pixel))
-                dr.scatter(result, self.packet(total), pixel, first)
+                self._write(result, total, pixel, first)
                 return weight
 
             lanes = (pixel, down, weight, end)
@@ -353,7 +374,7 @@ class Mixer:
                 other = self._beyond(pixel, neighbour, self.module.Bool(k % 2 == 1), 0.5 - weight, active)
                 factor = dr.select(active, rates[k] * scale, 0)
                 total = [dr.fma(factor, v - m, t) for v, m, t in zip(other, mean, total, strict=True)]
-        return self.written(total)
+        return self._written(total)
 
     def _tangent_of_weights(self, positions: Float) -> tuple[Float, Float]:
         module = self.module
@@ -394,29 +415,13 @@ class Mixer:
 
     def neighbours(self, pixel: UInt32) -> tuple[UInt32, UInt32, UInt32, UInt32]:
         """Indices of the right, lower, left and upper neighbours."""
-        width = uint_input(self.module, "width", self.width)
-        return pixel + 1, pixel + width, pixel - 1, pixel - width
+        return neighbours(pixel, self.width)
 
     def around(
         self, right: Float, down: Float, sign: int, signed: bool = False, at: UInt32 | None = None
     ) -> tuple[Float, Float, Float, Float]:
         """Weights of neighbours, see :func:`shadowmap_dr.raster.antialiasing.neighbour_weights.around`."""
         return around(right, down, self.width, sign, signed, at)
-
-    def _where(
-        self,
-        active: Bool,
-        function: Callable[..., tuple[Float, ...]],
-        pixel: UInt32,
-        lanes: tuple[Float, ...],
-        otherwise: list[Float],
-    ) -> list[Float]:
-        """``function(pixel, *lanes)``, one number for each channel, where ``active``; elsewhere the last of ``lanes``."""
-        count = len(otherwise)
-        result = dr.if_stmt(
-            (pixel, *lanes), active, function, lambda pixel, *lanes: tuple(lanes[-count:]), mode="symbolic", label="blend"
-        )
-        return list(result)
 
     def read(self, flat: Float | list[Float], pixel: UInt32, active: Bool | bool = True) -> list[Float]:
         """All channels of pixels."""
@@ -428,26 +433,9 @@ class Mixer:
             return list(dr.gather(packet, flat, pixel, active))
         return [dr.gather(module.Float, flat, pixel * self.channels + c, active) for c in range(self.channels)]
 
-    def packet(self, channels: list[Float]) -> AnyArray:
-        """Channels as one packet, for a single scatter."""
-        return channels[0] if self.channels == 1 else self.module.ArrayXf(channels)
-
-    def written(self, channels: list[Float]) -> Float | list[Float]:
+    def _written(self, channels: list[Float]) -> Float | list[Float]:
         """The channels, interleaved unless they are separate."""
-        if self.separate:
-            return channels
-        if self.channels == 1:
-            return channels[0]
-        result = dr.empty(self.module.Float, self.channels * self.pixels)
-        dr.scatter(result, self.packet(channels), dr.arange(self.module.UInt32, self.pixels))
-        return result
-
-    def copied(self, flat: Float) -> Float:
-        """A writable copy, made by all threads; Dr.Jit's own copy uses a single thread."""
-        UInt32 = self.module.UInt32
-        # An expression that Dr.Jit does not recognise as the same array.
-        bits = reinterpret(UInt32, flat) ^ (dr.arange(UInt32, dr.width(flat)) >> 31)
-        return reinterpret(self.module.Float, bits)
+        return channels if self.separate else packed(channels)
 
 
 def _scale(claims: Float) -> Float:

@@ -45,6 +45,12 @@ def around(
     return right, down, left, up
 
 
+def neighbours(pixel: UInt32, width: int) -> tuple[UInt32, UInt32, UInt32, UInt32]:
+    """Indices of the right, lower, left and upper neighbours of pixels in images ``width`` pixels wide."""
+    columns = uint_input(backend(pixel), "width", width)
+    return pixel + 1, pixel + columns, pixel - 1, pixel - columns
+
+
 def weight_sum(weights: Iterable[Float]) -> Float:
     """Sum of at least one weight."""
     return cast("Float", sum(weights))

@@ -9,7 +9,6 @@ import drjit as dr
 import mitsuba as mi
 
 from ...jit.broadcast import Copies
-from ...jit.handover import evaluated
 from ...jit.packets import sections
 from ...jit.types import Bool, Color3f, Float
 from ...raster import Crossings, antialias
@@ -140,7 +139,6 @@ def outlined(
 
     ``crossings``: of these outlines; None: found here.
     """
-    values, sharpness = evaluated("layer", (values, sharpness))
     return antialias(
         *(values, view.raster, view.clip, view.topology),
         crossings=crossings,

@@ -57,6 +57,7 @@ class ImagePass:
         """The image of one camera. Attached to all inputs, but not through edges if ``crossings`` are given, and not through
         visibilities if ``visible`` is given."""
         light, settings = self.light, self.light.settings
+        lighting = lighting.in_lanes(view.raster.height * view.raster.width)
         frame = self.cameras.frame(view, shapes, light.needs_frames)
         incident, color = self._reflected(frame, lighting, visible, shapes)
         color = light.with_emission(color, frame.surface, lighting, view.sensor, view.size)
@@ -127,6 +128,7 @@ class ImagePass:
         for chosen, clip in layers.in_batches(view.clip):
             seen = replace(view, raster=chosen, clip=clip, topology=edges, layers=None)
             needs_frames = self.light.needs_frames or faces.cutouts
+            lighting = lighting.in_lanes(dr.width(chosen.triangle))
             own = self.cameras.frame(seen, placed, needs_frames, whole_triangles(chosen, faces))
             radiance = self.light.with_shining(self._reflected(own, lighting, None, shapes)[1], own.surface, lighting)
             active = own.surface.active
@@ -142,6 +144,7 @@ class ImagePass:
         aovs = self.light.settings.aovs
         if not aovs:
             return []
+        lighting = lighting.in_lanes(dr.width(view.nearest.raster.triangle))
         frame = self.cameras.frame(view.nearest, shapes, True)
         incident = self._reflected(frame, lighting, None, shapes)[0]
         through = partial(self.light.transmittances, frame, lighting)

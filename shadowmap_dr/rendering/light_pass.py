@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..errors import ShadowmapError
+from ..jit.broadcast import broadcast_differentiable
 from ..jit.checkpoint import Term, checkpointed_sum
 from ..jit.handover import stored
 from ..jit.types import AnyArray, Bool, Color3f, Float, PyTree
@@ -65,6 +66,7 @@ class Lighting:
     """The lights of one rendering and their shadow maps, or None without maps.
 
     ``sliced``: with lights in slices, their fits, and the function that makes the lighting of a slice; there are no maps then.
+    ``lanes``: lights with numbers for each lane, see :meth:`in_lanes`.
     """
 
     lights: tuple[Light, ...]
@@ -73,6 +75,12 @@ class Lighting:
     samples: tuple[LightSamples, ...]
     soft_maps: SoftMaps | None
     sliced: SlicedLighting | None = None
+    lanes: tuple[Light, ...] | None = None
+
+    @property
+    def wide(self) -> tuple[Light, ...]:
+        """The lights with numbers for each lane (:meth:`in_lanes`), or the lights themselves."""
+        return self.lights if self.lanes is None else self.lanes
 
     @property
     def fits(self) -> tuple[Frusta | None, SoftFrusta]:
@@ -87,6 +95,15 @@ class Lighting:
         if self.sliced is not None:
             return replace(self, sliced=replace(self.sliced, points=count))
         return self if self.maps is None else replace(self, maps=self.maps.for_points(count))
+
+    def in_lanes(self, count: int) -> Lighting:
+        """The same lights, prepared for ``count`` lanes that are computed from now on.
+
+        Later, the backward pass would compute the lanes twice: for the sums of gradients to the lights' numbers, and for others.
+        """
+        if self.sliced is not None or len(self.lights) >= MANY_LIGHTS:
+            return self
+        return replace(self, lanes=broadcast_differentiable(self.lights, count))
 
 
 @dataclass(frozen=True)
@@ -302,11 +319,11 @@ class LightPass:
     def incident_light(self, frame: Frame, lighting: Lighting, known: Visibilities | None = None) -> IncidentLight:
         """Light that reaches the surfaces that a camera sees. ``known``: visibilities that still hold. Attached."""
         if known is not None:
-            return IncidentLight(self._outlined(frame, lighting.lights), known.lights, 0, known.parts)
+            return IncidentLight(self._outlined(frame, lighting.wide), known.lights, 0, known.parts)
         looped, written = self._in_tables(frame, lighting)
-        lights = [lighting.lights[k] for k in written]
-        visible = self.visibilities(frame, lighting, written, lights)
-        return IncidentLight(self._outlined(frame, lights), visible, looped, (None,) * len(lighting.samples))
+        visible = self.visibilities(frame, lighting, written, [lighting.lights[k] for k in written])
+        lights = self._outlined(frame, [lighting.wide[k] for k in written])
+        return IncidentLight(lights, visible, looped, (None,) * len(lighting.samples))
 
     def visible(self, frame: Frame, lighting: Lighting) -> Visibilities:
         """Visibility of all lights from the surfaces that a camera sees. Detached."""

@@ -33,6 +33,11 @@ _ArrayT = TypeVar("_ArrayT", bound="AnyArray")
 LANES = 1 << 20
 #: Lanes that add to one copy where all terms may be equal, such as those of a light's intensity. A power of two.
 LIKE_LANES = 1 << 18
+# Least number of lanes of such a block, and blocks from which on blocks become larger: threads that add to copies of their own do
+# not wait for each other.
+_FEW_LANES, _BLOCKS = 1 << 13, 32
+# Numbers of a cache line. No two copies of a table for all lanes share one.
+_LINE = 16
 # Most numbers in the copies of an array for threads.
 _MOST_IN_COPIES = 1 << 26
 
@@ -65,6 +70,11 @@ def from_one_buffer(columns: Sequence[Float]) -> list[Float]:
     return [dr.gather(type(c), buffer, row + k * rows, mode=dr.ReduceMode.NoConflicts) for k, c in enumerate(columns)]
 
 
+def like_lanes(lanes: int) -> int:
+    """Lanes that add to one copy of a table where all of so many lanes read the same numbers, a power of two."""
+    return min(max(_FEW_LANES, 1 << (lanes // _BLOCKS).bit_length()), LIKE_LANES)
+
+
 def in_copies(arrays: Sequence[Float], lanes: int, block: int = LANES) -> tuple[list[Float], int]:
     """Copies of flat ``Float`` arrays, one for each block of lanes that look numbers up in them (:func:`copy_of_lane`).
 
@@ -89,7 +99,8 @@ def copy_of_lane(module: ModuleType, lanes: int, copies: int, block: int = LANES
     """Index of the copy that each lane reads; the constant 0 if there is only one."""
     if copies == 1:
         return module.UInt32(0)
-    return dr.minimum(dr.arange(module.UInt32, lanes) >> (block.bit_length() - 1), copies - 1)
+    shift, last = uint_input(module, "lanes of a copy", block.bit_length() - 1), uint_input(module, "last copy", copies - 1)
+    return dr.minimum(dr.arange(module.UInt32, lanes) >> shift, last)
 
 
 class Copies(SharingOp):
@@ -148,10 +159,10 @@ def broadcast_differentiable(record: PyTree, width: int) -> PyTree:
     tree_map(record, lambda array: _map_numbers(array, collect))
     if not leaves or width == 1:
         return record
-    flat = one_buffer(leaves)
+    flat, block = dr.concat([*leaves, dr.zeros(type(leaves[0]), 1 + (-len(leaves) - 1) % _LINE)]), like_lanes(width)
     numbers = dr.width(flat)
-    (flat,), copies = in_copies([flat], width, LIKE_LANES)
-    first = copy_of_lane(backend(flat), width, copies, LIKE_LANES) * numbers
+    (flat,), copies = in_copies([flat], width, block)
+    first = copy_of_lane(backend(flat), width, copies, block) * uint_input(backend(flat), "numbers of a copy", numbers)
     position = iter(range(len(leaves)))
 
     def wide(number: Float) -> Float:

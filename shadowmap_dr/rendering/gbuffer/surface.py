@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from ...jit.arrays import backend, ravel
 from ...jit.branches import branch
-from ...jit.broadcast import LIKE_LANES, broadcast_differentiable, copy_of_lane, in_copies
+from ...jit.broadcast import broadcast_differentiable, copy_of_lane, in_copies, like_lanes
 from ...jit.types import Bool, Color3f, Float, Normal3f, Point3f, UInt32, Vector3f, Vector3u
 from ...jit.vectors import normalize_or
 from ...scene.geometry import FACETED, FLIP_GEOMETRIC, FLIP_SHADING, HAS_NORMALS, HAS_TEXCOORDS, READS_ATTRIBUTES, Geometry
@@ -175,8 +175,9 @@ def _plain_colour(data: SceneData, seen: Surface) -> Color3f:
     """``Surface.colour`` of materials without textures."""
     width, table, channels = dr.width(seen.shape), plain_colours(data), dr.size_v(mi.UnpolarizedSpectrum)
     rows = dr.width(table) // 4
-    (sides,), copies = in_copies([table], width, LIKE_LANES)
-    row = copy_of_lane(backend(sides), width, copies, LIKE_LANES) * rows
+    block = like_lanes(width)
+    (sides,), copies = in_copies([table], width, block)
+    row = copy_of_lane(backend(sides), width, copies, block) * rows
     row += 2 * seen.shape + dr.select(seen.si.wi.z < 0, mi.UInt32(1), 0)
     colour = dr.gather(mi.Vector4f, sides, row, seen.active, mode=dr.ReduceMode.Local)
     return mi.UnpolarizedSpectrum(*(colour[c] for c in range(channels)))

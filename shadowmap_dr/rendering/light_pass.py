@@ -46,7 +46,7 @@ from .extended_lights import (
 from .extended_lights.interleaving import Interleaving
 from .extended_lights.sample_counts import MOST
 from .gbuffer.camera_view import CameraView, Frame, PlacedShapes, VisiblePoints
-from .gbuffer.pixel_footprint import FootprintSamples, footprint_points
+from .gbuffer.pixel_footprint import FootprintSamples, footprint_points, footprints
 from .gbuffer.surface import Surface
 from .light_colours import white_area_light, white_light
 from .light_loops import MANY_LIGHTS, many_lights
@@ -448,7 +448,8 @@ class LightPass:
         """Lights with outlines as soft as pixels are wide."""
         compat = self.settings.shadow.compat
         shining = [SquareSpot(light) if compat and isinstance(light, SpotLight) else light for light in lights]
-        return softened(shining, frame.surface.p_world, lambda: self._around(frame))
+        view, seen = frame.view, frame.surface
+        return softened(shining, seen.p_world, lambda: footprints(view.sensor, view.size, frame.depth, seen.n_world))
 
     def _in_tables(self, frame: Frame, lighting: Lighting) -> tuple[Color3f | int, list[int]]:
         """(radiance of all lights of frequent kinds, indices of the other lights)."""

@@ -9,8 +9,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from shadowmap_dr import Renderer
 from shadowmap_dr.rendering.gbuffer import pixel_footprint
-from shadowmap_dr.rendering.gbuffer.pixel_footprint import FootprintSamples, footprint_points
+from shadowmap_dr.rendering.gbuffer.pixel_footprint import FootprintSamples, footprint_points, footprints
+from shadowmap_dr.scene.lights.soft_outline import share_inside, softened
 from shadowmap_dr.scene.sensor import ImageSize, Sensor, sensors_of
 
 SIZE = 12
@@ -116,3 +118,39 @@ def test_many_spots_are_one_array(variant: str, monkeypatch: pytest.MonkeyPatch)
         assert len(spots(count).points) == arrays and arrays * spots(count).copies == count**2
     monkeypatch.setattr(pixel_footprint, "_MOST_LANES", 9 * dr.width(points))
     assert (len(spots(3).points), len(spots(4).points)) == (1, 16)
+
+
+LOOK = {"origin": [0.4, 2.0, 1.5], "target": [0.1, 0.0, 0.0], "up": [0, 0, 1]}
+BOUNDED: dict[str, dict[str, Any]] = {
+    "spot": {"type": "spot", "cutoff_angle": 3.0, "beam_width": 2.999},
+    "soft spot": {"type": "spot", "cutoff_angle": 8.0, "beam_width": 1.0},
+    "wide spot": {"type": "spot", "cutoff_angle": 88.0, "beam_width": 87.9},
+    "projector": {"type": "projector", "fov": 7.0, "irradiance": {"type": "rgb", "value": 1.0}},
+    "rectangle": {"type": "rectangle"},
+    "disk": {"type": "disk"},
+}
+
+
+@pytest.mark.parametrize("name", BOUNDED)
+@pytest.mark.parametrize("kind", ["perspective", "orthographic"])
+def test_outlines_that_are_softened_beside_them_alone(variant: str, kind: str, name: str) -> None:
+    """Shares of light are those of ramps measured at all pixels; pixels are smaller and larger than the outline's distance."""
+    mitsuba_sensor, sensor = camera(kind)
+    points, normal, depth = seen_by(kind, mitsuba_sensor)
+    description = {**BOUNDED[name], "to_world": mi.ScalarTransform4f().look_at(**LOOK)}
+    if name in ("rectangle", "disk"):
+        description["to_world"] = description["to_world"] @ mi.ScalarTransform4f().scale([0.13, 0.07, 1])
+        description["glow"] = {"type": "directionalarea", "radiance": 1.0}
+    if name == "wide spot":
+        # Close to the plane, along which it looks.
+        description["to_world"] = mi.ScalarTransform4f().look_at([0.005, 0.15, 0.01], [0.942, -0.2, 0.01], [0, 0, 1])
+    scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere"}, "sensor": mitsuba_sensor, "light": description})
+    (light,) = Renderer.from_scene(scene).data.lights
+    within = 0
+    for scale in (0.1, 1, 10):
+        size = ImageSize(round(SIZE * scale), round((SIZE + 2) * scale))
+        expected = share_inside(light, points, footprint_points(sensor, size, depth, points, normal, 2)).numpy()
+        (soft,) = softened([light], points, lambda size=size: footprints(sensor, size, depth, normal))
+        np.testing.assert_allclose(soft.inside.numpy(), expected, atol=1e-6)
+        within += np.count_nonzero((expected > 0.01) & (expected < 0.99))
+    assert within > 10, "the outline is somewhere in the picture"

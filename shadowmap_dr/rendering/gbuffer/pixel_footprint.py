@@ -15,11 +15,14 @@ from ...jit.arrays import backend
 from ...jit.broadcast import Copies, copied
 from ...jit.kernel_inputs import float_input
 from ...jit.types import Bool, Color3f, Float, Point3f, Vector3f
+from ...scene.lights.soft_outline import Footprints
 from ...scene.sensor import ImageSize, Sensor
 
 # Grids of up to this many points a side get an array for each point; larger grids do so if one array would exceed that length.
 _WRITTEN_OUT = 2
 _MOST_LANES = 1 << 22
+# Least cosine between viewing direction and normal. At grazing angles the footprint grows without bound.
+_LEAST_SLOPE = 0.25
 
 
 def footprint_points(
@@ -36,6 +39,19 @@ def footprint_points(
         axes = _Axes.of(sensor, size, depth, p_world, n_world)
         offsets = [axes.offset((i + 0.5) / count - 0.5, (j + 0.5) / count - 0.5) for j in range(count) for i in range(count)]
     return [p_world + offset for offset in offsets]
+
+
+def footprints(sensor: Sensor, size: ImageSize, depth: Float | None, n_world: Vector3f) -> Footprints:
+    """The points of :func:`footprint_points` half way to the pixels' corners, for some of the pixels. Arguments as there."""
+    with dr.suspend_grad():
+        right, up, _ = _extent(sensor, size, depth)
+        # Along a slanted surface, at most so many times as far.
+        reach = 0.25 * (1 + 1 / _LEAST_SLOPE) * (dr.norm(right) + dr.norm(up))
+
+    def points(p_world: Point3f, n_world: Vector3f, depth: Float | None = None) -> list[Point3f]:
+        return footprint_points(sensor, size, depth, p_world, n_world, 2)
+
+    return Footprints((dr.detach(n_world), *([] if depth is None else [dr.detach(depth)])), points, reach)
 
 
 @dataclass(frozen=True)
@@ -92,6 +108,27 @@ class FootprintSamples:
         return total * (1 / (self.copies * len(self.points)))
 
 
+def _extent(sensor: Sensor, size: ImageSize, depth: Float | None) -> tuple[Vector3f, Vector3f, Vector3f]:
+    """(width and height of pixels at their depth, as world-space vectors; direction of the camera's axis). Detached."""
+    matrix = dr.detach(sensor.to_world.matrix)
+    columns = [mi.Vector3f(matrix[0, k], matrix[1, k], matrix[2, k]) for k in range(3)]
+    axes: list[Vector3f] = [dr.normalize(column) for column in columns]
+    right, up, forward = axes
+    projection: Any = dr.detach(sensor.projection)  # Any: in the stub the entries of matrices are vectors
+    if sensor.kind == "perspective":
+        assert depth is not None, "perspective cameras have depths"
+        scale = dr.detach(depth)
+    else:
+        # An orthographic camera's scale lies in its transformation, whose columns were normalised above.
+        scale = mi.Float(1)
+        right *= dr.norm(columns[0])
+        up *= dr.norm(columns[1])
+    module = backend(scale)
+    right *= float_input(module, "width", 2 / size.width) / dr.abs(projection[0, 0]) * scale
+    up *= float_input(module, "height", 2 / size.height) / dr.abs(projection[1, 1]) * scale
+    return right, up, forward
+
+
 @dataclass(frozen=True)
 class _Axes:
     """Width and height of a pixel at its surface as world-space vectors (``right``, ``up``), and the surface's slant.
@@ -107,28 +144,14 @@ class _Axes:
 
     @classmethod
     def of(cls, sensor: Sensor, size: ImageSize, depth: Float | None, p_world: Point3f, n_world: Vector3f) -> _Axes:
-        matrix = dr.detach(sensor.to_world.matrix)
-        columns = [mi.Vector3f(matrix[0, k], matrix[1, k], matrix[2, k]) for k in range(3)]
-        axes: list[Vector3f] = [dr.normalize(column) for column in columns]
-        right, up, forward = axes
-        projection: Any = dr.detach(sensor.projection)  # Any: in the stub the entries of matrices are vectors
+        right, up, forward = _extent(sensor, size, depth)
+        view = forward
         if sensor.kind == "perspective":
-            assert depth is not None, "perspective cameras have depths"
-            scale = dr.detach(depth)
             view = dr.normalize(dr.detach(p_world) - dr.detach(sensor.origin))
-        else:
-            # An orthographic camera's scale lies in its transformation, whose columns were normalised above.
-            scale = mi.Float(1)
-            right *= dr.norm(mi.Vector3f(matrix[0, 0], matrix[1, 0], matrix[2, 0]))
-            up *= dr.norm(mi.Vector3f(matrix[0, 1], matrix[1, 1], matrix[2, 1]))
-            view = forward
-        module = backend(scale)
-        right *= float_input(module, "width", 2 / size.width) / dr.abs(projection[0, 0]) * scale
-        up *= float_input(module, "height", 2 / size.height) / dr.abs(projection[1, 1]) * scale
         n = dr.detach(n_world)
         slope = dr.dot(n, view)
         # At grazing angles the footprint grows without bound: it is cut off at a length of four pixels.
-        slope = dr.select(slope < 0, dr.minimum(slope, -0.25), dr.maximum(slope, 0.25))
+        slope = dr.select(slope < 0, dr.minimum(slope, -_LEAST_SLOPE), dr.maximum(slope, _LEAST_SLOPE))
         return cls(right, up, view, n, slope)
 
     def offset(self, across: Float | float, down: Float | float) -> Vector3f:

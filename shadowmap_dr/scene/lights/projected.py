@@ -86,6 +86,16 @@ class Projector(BoundedLight):
         _, uv = self._local(p_world)
         return [0.5 - dr.abs(uv[k] - 0.5) for k in range(2)]
 
+    def change(self, p_world: Point3f) -> Float:
+        """Upper bound of the change of texture coordinates where points move by one unit. Detached."""
+        inverse, (local, uv) = dr.rcp(mi.Matrix3f(dr.detach(self.to_world).matrix)), dr.detach(self._local(p_world))
+        scale: Float = mi.Float(dr.sqrt(sum(dr.square(inverse[i, k]) for i in range(3) for k in range(3))))
+        slopes = [mi.Float(0.5 / dr.detach(self.tangents[k]) + dr.abs(uv[k] - 0.5)) for k in range(2)]
+        steepest: Float = dr.select(slopes[0] > slopes[1], slopes[0], slopes[1])
+        before = local.z > 0
+        # Twice as much, for points that also come nearer.
+        return dr.select(before, 2 * scale * dr.maximum(steepest, 1) / dr.select(before, local.z, 1), dr.inf)
+
     def _local(self, p_world: Point3f) -> tuple[Vector3f, Point2f]:
         """Points in the projector's own space, and their texture coordinates in the picture."""
         local = dr.rcp(mi.Matrix3f(self.to_world.matrix)) @ mi.Vector3f(p_world - self.position)
@@ -176,6 +186,10 @@ class Beam(BoundedLight):
             radius = dr.norm(local)
             return [(1 - radius) * radius / dr.norm(rows[0] * local.x + rows[1] * local.y)]
         return [(1 - dr.abs(local[k])) / dr.norm(rows[k]) for k in range(2)]
+
+    def change(self, p_world: Point3f) -> Float:
+        """Upper bound of the change of distances where points move by one unit (none for ellipses). Detached."""
+        return mi.Float(dr.inf if self.shape == "disk" else 1)
 
     def _local(self, p_world: Point3f) -> tuple[Float, Vector2f, list[Vector3f]]:
         """(distance along the beam, place on the shape (Vector2f), derivatives of its two coordinates by the point)."""

@@ -135,6 +135,10 @@ class SpotLight(BoundedLight):
         angle = dr.safe_acos(self._local(towards(p_world, self.position)[0]).z)
         return [0.5 * (self.cutoff_angle + self._full) * _DEGREE - angle]
 
+    def change(self, p_world: Point3f) -> Float:
+        """Upper bound of the change of the angle, in radians, where points move by one unit. Detached."""
+        return dr.sqrt(dr.detach(towards(p_world, self.position)[1]))
+
     @property
     def _full(self) -> Float:
         """Half-angle in degrees up to which intensity is full, at most that of the cone."""
